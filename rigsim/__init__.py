@@ -1,1 +1,1 @@
-"""The same rig, made of physics: emulated boxes, sensors, subjects, scenes."""
+"""Simulated rigs: emulated controllers, sensors, subjects and scenes."""

@@ -1,4 +1,4 @@
-"""What is slow to make, kept: the latest of it, or as long as an object lives."""
+"""Cache expensive results: the latest ones, or for the lifetime of an object."""
 
 from collections import OrderedDict
 from collections.abc import Callable
@@ -11,12 +11,12 @@ Key = ParamSpec("Key")
 
 
 class LruCache(Generic[KeyT, ValueT]):
-    """The latest of what is slow to make.
+    """Cache of the latest expensive results.
 
     Parameters
     ----------
     most
-        How many values like a given one are kept, at least 1.
+        Maximum number of cached values like a given one, at least 1.
     """
 
     def __init__(self, most: Callable[[ValueT], int]) -> None:
@@ -24,7 +24,7 @@ class LruCache(Generic[KeyT, ValueT]):
         self._values: OrderedDict[KeyT, ValueT] = OrderedDict()
 
     def get(self, key: KeyT, make: Callable[[], ValueT]) -> ValueT:
-        """Return what is kept under a key, or make it."""
+        """Return the cached value of a key, or compute it."""
         if key not in self._values:
             value = make()
             while self._values and len(self._values) >= self._most(value):
@@ -34,14 +34,14 @@ class LruCache(Generic[KeyT, ValueT]):
         return self._values[key]
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Clear the cache."""
         self._values.clear()
 
 
 def cached_method(
     make: Callable[Concatenate[Any, Key], ValueT],
 ) -> Callable[Concatenate[Any, Key], ValueT]:
-    """Have a method's result made once for the same arguments, and kept as long as its object."""
+    """Cache a method's results per arguments, for the lifetime of its object."""
     name = f"_kept_{make.__name__}"
 
     @wraps(make)

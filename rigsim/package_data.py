@@ -1,4 +1,4 @@
-"""Tables that come with the package, read from its folder ``data``."""
+"""Read the tables in the package's folder ``data``."""
 
 import tomllib
 from functools import cache

@@ -1,4 +1,4 @@
-"""An image sensor: light on it to digital numbers, step by step in electrons."""
+"""Simulate an image sensor: from light to digital numbers, stepwise in electrons."""
 
 import hashlib
 import math
@@ -17,15 +17,15 @@ CFA_CHANNELS: Final = {"R": 0, "G": 1, "B": 2}
 
 
 class SensorError(ValueError):
-    """A sensor or the light on it is described wrongly."""
+    """A sensor or light with an invalid description."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """One sensor with its fixed imperfections; the pattern follows from its serial number."""
+    """One sensor with its fixed imperfections; the serial number seeds the pattern."""
 
     full_well_e: float
-    """Electrons that give the white level, > 0."""
+    """Electrons at the white level, > 0."""
     gain_e_per_dn: float
     """Conversion gain in electrons per DN, > 0."""
     read_noise_e: float
@@ -45,12 +45,12 @@ class Sensor:
     cfa: Literal["RGGB", "BGGR", "GRBG", "GBRG", "MONO"]
     """Colors of the 2 x 2 cell read row by row, or MONO."""
     vignetting: float
-    """Light lost in the corner relative to the middle, 0 to 0.9."""
+    """Light lost in the corner relative to the center, 0 to 0.9."""
     serial: str
     """Serial number; seeds the fixed pattern."""
 
     WELL_HEADROOM = 1.05
-    """The well holds this many times the electrons of the white level: the converter clips first,
+    """Electrons of the full well over those of the white level: the converter clips first,
     so that saturated pixels all read the white level."""
 
     def __post_init__(self) -> None:
@@ -105,7 +105,7 @@ def make_sensor(
     dsnu_e: float = 1.0,
     vignetting: float = 0.25,
 ) -> Sensor:
-    """Return the sensor of a view, with typical values for what the rig does not state.
+    """Return the sensor of a view, with typical values where the rig has none.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def make_sensor(
     Returns
     -------
     Sensor
-        A sensor whose full well gives the white level.
+        A sensor whose full well corresponds to the white level.
     """
     return Sensor(
         full_well_e=view.full_well_e,
@@ -138,19 +138,19 @@ def make_sensor(
 def expose_sensor(
     irradiance_rgb: ArrayLike, *, sensor: Sensor, rng: np.random.Generator, exposure_s: float = 0.0
 ) -> UInt16Array:
-    """Expose the sensor once.
+    """Simulate one exposure of the sensor.
 
     Parameters
     ----------
     irradiance_rgb
-        Light collected behind each filter as fraction of full scale in the middle of an ideal
-        sensor, shape (H, W, 3), >= 0; a MONO sensor may get (H, W) and takes the mean of three.
+        Light behind each filter as fraction of full scale in the center of an ideal
+        sensor, shape (H, W, 3), >= 0; a MONO sensor accepts (H, W) and averages three channels.
     sensor
         The sensor.
     rng
         Source of shot, dark and read noise.
     exposure_s
-        Exposure time, s; it matters to the dark current only, as the light is given.
+        Exposure time, s; it affects the dark current only, since the light is given.
 
     Returns
     -------
@@ -172,7 +172,7 @@ def expose_sensor(
     full_e = sensor.gain_e_per_dn * (sensor.white - sensor.black)
     mean_e = filtered * pattern.response * np.float32(full_e)
     mean_e += np.float32(sensor.dark_e_per_s * exposure_s)
-    # numpy's Poisson sampler ends at 2^63; the well is full long before.
+    # NumPy's Poisson sampler is limited to 2^63; the well saturates far below.
     well_e = sensor.WELL_HEADROOM * sensor.full_well_e
     electrons = rng.poisson(np.minimum(mean_e, 4.0 * well_e + 1e3)).astype(np.float32)
     np.minimum(electrons, np.float32(well_e), out=electrons)
@@ -183,7 +183,7 @@ def expose_sensor(
 
 
 def apply_cfa(light: ArrayLike, cfa: str) -> Float32Array:
-    """Return what lies behind each pixel's filter.
+    """Return the channel of each pixel's filter.
 
     Parameters
     ----------
@@ -219,16 +219,16 @@ def apply_cfa(light: ArrayLike, cfa: str) -> Float32Array:
 
 @dataclass(frozen=True, slots=True)
 class FixedPattern:
-    """What differs from pixel to pixel and stays the same from frame to frame."""
+    """Variation between pixels that is constant between frames."""
 
     response: Float32Array
-    """Relative response with vignetting, shape (H, W), 1 in the middle on average."""
+    """Relative response with vignetting, shape (H, W), 1 in the center on average."""
     offset_e: Float32Array
     """Offset in electrons, shape (H, W), 0 on average."""
 
 
 def fixed_pattern(sensor: Sensor, shape: tuple[int, ...]) -> FixedPattern:
-    """Return the fixed pattern of a sensor; it follows from the serial number and the size.
+    """Return the fixed pattern of a sensor, determined by its serial number and size.
 
     Parameters
     ----------
@@ -245,12 +245,12 @@ def fixed_pattern(sensor: Sensor, shape: tuple[int, ...]) -> FixedPattern:
     return _fixed_pattern(sensor, int(shape[0]), int(shape[1]))
 
 
-@lru_cache(maxsize=16)  # one for each camera of a dome
+@lru_cache(maxsize=16)  # one per camera of a dome
 def _fixed_pattern(sensor: Sensor, rows: int, columns: int) -> FixedPattern:
     digest = hashlib.sha256(sensor.serial.encode()).digest()
     rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
     response = 1.0 + np.float32(sensor.prnu) * rng.standard_normal((rows, columns), np.float32)
-    # A deviation below -5 sigma of a bad sensor must not turn light into darkness.
+    # A deviation below -5 sigma must not make a pixel's response negative.
     response = np.maximum(response, np.float32(0.01))
     response *= vignetting_map(sensor.vignetting, rows, columns)
     offset = np.float32(sensor.dsnu_e) * rng.standard_normal((rows, columns), np.float32)
@@ -260,7 +260,7 @@ def _fixed_pattern(sensor: Sensor, rows: int, columns: int) -> FixedPattern:
 
 
 def vignetting_map(loss: float, rows: int, columns: int) -> Float32Array:
-    """Return the falloff of a lens with the form of the cos^4 law, 1 in the middle.
+    """Return the falloff of a lens with the form of the cos^4 law, 1 in the center.
 
     Parameters
     ----------
@@ -284,5 +284,6 @@ def vignetting_map(loss: float, rows: int, columns: int) -> Float32Array:
     x = np.linspace(-1.0, 1.0, columns) if columns > 1 else np.zeros(1)
     diagonal2 = rows**2 + columns**2
     r2 = ((y * rows) ** 2)[:, None] / diagonal2 + ((x * columns) ** 2)[None, :] / diagonal2
+    # cos^4 = (1 + tan^2)^-2 with tan^2 proportional to r^2; r = 1 in the corner sets k.
     k = 1.0 / math.sqrt(1.0 - loss) - 1.0
     return ((1.0 + k * r2) ** -2).astype(np.float32)

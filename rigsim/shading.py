@@ -1,19 +1,19 @@
 """Closed-form polarized shading of a rough dielectric surface over a depolarizing interior.
 
-Light that is reflected by the surface keeps its polarization, turned and weighted by Fresnel's
-amplitudes at the facet; light that comes back from the interior has lost it, and gets a little
-anew when it leaves. Both are given as Stokes vectors (S0, S1, S2) in the frame of the camera ray,
-so that one pass answers every angle of the analyser. No circular part arises, because Fresnel's
-amplitudes are real below total reflection.
+Light reflected by the surface keeps its polarization, rotated and weighted by Fresnel's amplitudes
+at the facet. Light from the interior is depolarized, and is slightly repolarized at its exit. Both
+are Stokes vectors (S0, S1, S2) in the frame of the camera ray, so that one pass serves every angle
+of the analyzer. No circular part arises, because Fresnel's amplitudes are real below total
+reflection.
 
 Notes
 -----
 The camera ray's frame is (h, g): h is the image's x axis made perpendicular to the ray, g is
 perpendicular to both and points up in the image. S1 > 0 means polarized along h.
-Film polarizers absorb along one axis that lies in the film; the light they pass is polarized
-perpendicular to that axis and to the ray. ``extinction`` is the ratio of the transmittances along
-and across the passing axis, 1e3 to 1e4 for real film and infinite for an ideal one; the larger
-transmittance is taken as 1.
+Film polarizers absorb along one axis in their plane; they transmit light polarized perpendicular
+to that axis and to the ray. ``extinction`` is the ratio of the transmittances along and across the
+transmission axis, 1e3 to 1e4 for real polarizers and infinite for an ideal one; the larger
+transmittance is normalized to 1.
 
 References
 ----------
@@ -30,11 +30,11 @@ from rigsim import shading_kernels as kernels
 from rigsim.arrays import Float32Array, Float64Array, FloatArray
 
 ALPHA_RANGE = (1e-3, 1.0)
-"""Roughness (GGX alpha) that is evaluated without loss of digits."""
+"""Roughness (GGX alpha) range without loss of precision."""
 
 
 class ShadingError(ValueError):
-    """An argument of the shading is outside its domain."""
+    """An argument outside the domain of the shading."""
 
 
 def specular_stokes(
@@ -49,7 +49,7 @@ def specular_stokes(
     extinction: float = math.inf,
     metal: float = 0.0,
 ) -> Float32Array:
-    """Return the surface reflection of filtered light as Stokes vectors.
+    """Return the surface reflection of polarized light as Stokes vectors.
 
     Parameters
     ----------
@@ -60,24 +60,24 @@ def specular_stokes(
     eta
         Refractive index of the interior relative to air, > 1.
     light_absorbs
-        Absorbing axis of the light's film, unit vector, shape (3,).
+        Absorbing axis of the light's polarizer, unit vector, shape (3,).
     image_right
         The image's x axis, unit vector, shape (3,).
     extinction
-        Extinction ratio of the light's film, > 1.
+        Extinction ratio of the light's polarizer, > 1.
     metal
-        When above 0, facets are an ideal metal of this reflectance at every angle, and ``eta`` does
-        not matter: both amplitudes are its root, with the signs of normal incidence.
+        When above 0, facets are an ideal metal of this reflectance at every angle, and ``eta`` is
+        ignored: both amplitudes are its root, with the signs of normal incidence.
 
     Returns
     -------
     ndarray of float32
-        Shape (N, 3): radiance in 1/sr per unit of irradiance that a surface across the beam would
-        get without the film; the cosine at the surface is included. Zero where light or camera is
-        below the surface.
+        Shape (N, 3): radiance in 1/sr per unit of irradiance across the beam without the
+        polarizer; the cosine at the surface is included. Zero where light or camera is below the
+        surface.
     """
     n, light, v = _directions(normal, to_light, to_camera)
-    # a copy: a view would be read-only, which is another type to the compiler
+    # a copy: a broadcast view is read-only, which is a different type for the compiler
     rough = np.array(np.broadcast_to(np.asarray(alpha, np.float32), len(n)))
     _check(eta, extinction)
     if len(rough) and not (ALPHA_RANGE[0] <= rough.min() and rough.max() <= ALPHA_RANGE[1]):
@@ -102,7 +102,7 @@ def entry_transmittance(
     light_absorbs: ArrayLike,
     extinction: float = math.inf,
 ) -> Float32Array:
-    """Return which part of the light, before its film, enters the surface.
+    """Return the fraction of the light, before its polarizer, that enters the surface.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def entry_transmittance(
     Returns
     -------
     ndarray of float32
-        Shape (N,), at most 1/2 for an ideal film; without the cosine; zero below the surface.
+        Shape (N,), at most 1/2 for an ideal polarizer; without the cosine; zero below the surface.
     """
     n, light, _ = _directions(normal, to_light, to_light)
     _check(eta, extinction)
@@ -126,7 +126,7 @@ def entry_transmittance(
 def exit_stokes(
     normal: ArrayLike, to_camera: ArrayLike, *, eta: float, image_right: ArrayLike
 ) -> Float32Array:
-    """Return the Stokes vector of unpolarized interior light after it has left the surface.
+    """Return the Stokes vector of unpolarized interior light after its exit from the surface.
 
     Parameters
     ----------
@@ -154,20 +154,20 @@ def apply_analyzer(
     image_up: ArrayLike,
     extinction: float = math.inf,
 ) -> Float32Array:
-    """Return the radiance behind the camera's analyser (Malus's law, with leakage).
+    """Return the radiance behind the camera's analyzer (Malus's law, with leakage).
 
     Parameters
     ----------
     stokes
         Stokes vectors, shape (..., 3).
     to_camera
-        Unit vectors against the camera rays, shape (..., 3).
+        Unit vectors opposite to the camera rays, shape (..., 3).
     passes_deg
-        Passing axis of the analyser in degrees, from the image's x axis towards its top.
+        Transmission axis of the analyzer in degrees, from the image's x axis toward its top.
     image_right, image_up
         The image's axes, unit vectors, shape (3,).
     extinction
-        Extinction ratio of the analyser's film, > 1.
+        Extinction ratio of the analyzer, > 1.
 
     Returns
     -------
@@ -187,7 +187,7 @@ def apply_analyzer(
 def analyzer_frame(
     to_camera: ArrayLike, *, passes_deg: float, image_right: ArrayLike, image_up: ArrayLike
 ) -> tuple[Float32Array, Float32Array]:
-    """Return cosine and sine of twice the analyser's angle in each camera ray's frame.
+    """Return cosine and sine of twice the analyzer's angle in each camera ray's frame.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def analyzer_frame(
     Returns
     -------
     cos2, sin2 : ndarray of float32
-        Shape (...). On the optical axis they belong to ``passes_deg`` itself.
+        Shape (...). On the optical axis the angle is ``passes_deg`` itself.
     """
     v = np.asarray(to_camera, np.float32)
     right, up = _vector(image_right), _vector(image_up)
@@ -208,7 +208,7 @@ def analyzer_frame(
 
 
 def fresnel_amplitudes(cos_incident: ArrayLike, eta: float) -> tuple[FloatArray, FloatArray]:
-    """Return Fresnel's amplitudes of reflection, across (s) and in (p) the plane of incidence.
+    """Return Fresnel's amplitudes of reflection, perpendicular (s) and parallel (p) to incidence.
 
     Parameters
     ----------
@@ -261,7 +261,7 @@ def average_transmittance(eta: float) -> float:
 
 
 def interior_scale(eta: float) -> float:
-    """Return the factor that turns a diffuse reflectance at normal incidence into an inner albedo.
+    """Return the factor from a diffuse reflectance at normal incidence to an inner albedo.
 
     With light entering by T(incident) and leaving by T(exit), a surface whose inner albedo is this
     factor times R has the total diffuse reflectance R for light at normal incidence.
@@ -281,16 +281,16 @@ def interior_scale(eta: float) -> float:
 
 
 def axis_in_plane(angle_deg: float, facing: ArrayLike, up: ArrayLike) -> Float64Array:
-    """Return a unit vector at an angle in the plane across a beam.
+    """Return a unit vector at an angle in the plane perpendicular to a beam.
 
     Parameters
     ----------
     angle_deg
-        Angle in degrees from the horizontal, on the right for somebody who stands at the subject's
-        place and is looked at, towards ``up``: +x for a beam along z.
+        Angle in degrees from the horizontal axis (``up`` x ``facing``) toward ``up``; for a beam
+        along +z and ``up`` +y the horizontal axis is +x.
     facing
-        Direction from the film to the subject or from the film to the light, shape (3,); its sign
-        does not matter for the horizontal one.
+        Direction from the polarizer to the subject or to the light, shape (3,); its sign
+        does not affect the horizontal axis.
     up
         Up direction, shape (3,), not along ``facing``.
 
@@ -323,7 +323,9 @@ def _check(eta: float, extinction: float) -> None:
     if not 1.0 < eta < 4.0:
         raise ShadingError(f"eta: got {eta}, expected 1 < eta < 4")
     if not extinction > 1.0:
-        raise ShadingError(f"extinction: got {extinction}, expected > 1 (inf is an ideal film)")
+        raise ShadingError(
+            f"extinction: got {extinction}, expected > 1 (inf is an ideal polarizer)"
+        )
 
 
 def _directions(*vectors: ArrayLike) -> list[Float32Array]:

@@ -1,4 +1,4 @@
-"""Kernels of `rigsim.shading`: reflection, entry and exit of filtered light, element by element."""
+"""Kernels of `rigsim.shading`: reflection, entry and exit of polarized light, per element."""
 
 import math
 
@@ -8,7 +8,7 @@ from numba import njit, prange
 
 @njit(cache=True, inline="always")
 def _transmitted(cosine, eta):  # type: ignore[no-untyped-def]
-    """Return the transmittances across (s) and in (p) the plane of incidence."""
+    """Return the transmittances perpendicular (s) and parallel (p) to the plane of incidence."""
     inside = math.sqrt(max(0.0, 1.0 - (1.0 - cosine * cosine) / (eta * eta)))
     rs = (cosine - eta * inside) / (cosine + eta * inside)
     rp = (eta * cosine - inside) / (eta * cosine + inside)
@@ -46,7 +46,7 @@ def specular_stokes_element(  # type: ignore[no-untyped-def]
         rp = (eta * hl - inside) / (eta * hl + inside)
         if metal > 0.0:
             rs, rp = -metal, metal
-        # s = h x l across the plane of incidence; light, camera and facet in line leave it free.
+        # s = h x l across the plane of incidence; it is arbitrary at normal incidence.
         s0, s1, s2 = h1 * l2 - h2 * l1, h2 * l0 - h0 * l2, h0 * l1 - h1 * l0
         length = math.sqrt(s0 * s0 + s1 * s1 + s2 * s2)
         if length < 1e-7:
@@ -54,15 +54,16 @@ def specular_stokes_element(  # type: ignore[no-untyped-def]
             s2 = right[0] * l1 - right[1] * l0
             length = math.sqrt(s0 * s0 + s1 * s1 + s2 * s2)
         s0, s1, s2 = s0 / length, s1 / length, s2 / length
-        i0, i1, i2 = s1 * l2 - s2 * l1, s2 * l0 - s0 * l2, s0 * l1 - s1 * l0  # p in: -l x s
-        o0, o1, o2 = v1 * s2 - v2 * s1, v2 * s0 - v0 * s2, v0 * s1 - v1 * s0  # p out: v x s
-        # Field that the light's film passes: across its absorbing axis and the ray.
+        # The p axes complete the frames of both rays: incident -l x s, reflected v x s.
+        i0, i1, i2 = s1 * l2 - s2 * l1, s2 * l0 - s0 * l2, s0 * l1 - s1 * l0
+        o0, o1, o2 = v1 * s2 - v2 * s1, v2 * s0 - v0 * s2, v0 * s1 - v1 * s0
+        # Field transmitted by the polarizer: perpendicular to its absorbing axis and the ray.
         e0 = absorbs[1] * l2 - absorbs[2] * l1
         e1 = absorbs[2] * l0 - absorbs[0] * l2
         e2 = absorbs[0] * l1 - absorbs[1] * l0
         length = math.sqrt(e0 * e0 + e1 * e1 + e2 * e2)
         e0, e1, e2 = e0 / length, e1 / length, e2 / length
-        f0, f1, f2 = l1 * e2 - l2 * e1, l2 * e0 - l0 * e2, l0 * e1 - l1 * e0  # what leaks
+        f0, f1, f2 = l1 * e2 - l2 * e1, l2 * e0 - l0 * e2, l0 * e1 - l1 * e0  # leaked field
         # Frame of the camera ray.
         along = right[0] * v0 + right[1] * v1 + right[2] * v2
         x0, x1, x2 = right[0] - along * v0, right[1] - along * v1, right[2] - along * v2
@@ -170,7 +171,7 @@ def analyzer_frame(camera, right, absorbs):  # type: ignore[no-untyped-def]
         along = right[0] * v0 + right[1] * v1 + right[2] * v2
         x0, x1, x2 = right[0] - along * v0, right[1] - along * v1, right[2] - along * v2
         y0, y1, y2 = v1 * x2 - v2 * x1, v2 * x0 - v0 * x2, v0 * x1 - v1 * x0
-        # What passes is perpendicular to the ray and to the absorbing axis.
+        # Transmitted light is polarized perpendicular to the ray and to the absorbing axis.
         p0 = absorbs[1] * v2 - absorbs[2] * v1
         p1 = absorbs[2] * v0 - absorbs[0] * v2
         p2 = absorbs[0] * v1 - absorbs[1] * v0

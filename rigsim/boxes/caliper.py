@@ -1,17 +1,19 @@
-"""The stretching caliper's box: two jaws on a motor, a force sensor, a turning ring; sans-I/O.
+"""Emulate the stretching caliper's controller (sans-I/O).
 
-Its manual is its command table (`CaliperUnit.commands`) and these rules. Nothing moves unless the
-box is armed (-203), has been told a force limit, for which there is no default, and, for steps, has
-found its home mark (-213 each). Moves are absolute and slow: they are accepted at once with their
-number, and over when ``*OPC?`` says 1; the event ``CAL:END`` and ``CAL:LAST?`` tell how. Force is
-looked at once each control period. Where it meets the limit, pulling or pushing, the jaws go back
-to where they stood before, and a move that way again is refused with 106. A motor that has lost
-steps stops, and must be homed. Force that falls to nothing while the jaws open is skin that has
-come off. ``CAL:REL`` lets the skin go, and so does all that makes other boxes dark: ``SAFE``,
-``ABOR``, ``*RST``, a silent host, the emergency stop, and the loss of power. After that a person
-has to tape the jaws to the skin again, and to say so with ``CAL:ATT``, which tares the sensor.
+The device has two jaws on a motor, a force sensor and a turning ring. Its manual is its command
+table (`CaliperUnit.commands`) and these rules. Motion requires an armed controller (-203), a force
+limit, which has no default, and, for steps, a found home mark (-213 each). Moves are absolute and
+slow: the controller accepts them at once and returns their number. They are complete when
+``*OPC?`` returns 1; the event ``CAL:END`` and ``CAL:LAST?`` report the outcome. The controller
+samples the force once per control period. Where the force reaches the limit, pulling or pushing,
+the jaws return to their previous position, and a further move in that direction is refused with
+106. A motor that has lost steps stops and must be homed. A force that drops to zero while the jaws
+open means that the skin has detached. ``CAL:REL`` releases the skin, and so does everything that
+makes other controllers dark: ``SAFE``, ``ABOR``, ``*RST``, a silent host, the emergency stop, and
+the loss of power. After that the operator tapes the jaws to the skin again and confirms it with
+``CAL:ATT``, which tares the sensor.
 
-The box does not know what is between its jaws: it moves a `JawLoad` and feels its force.
+The controller has no model of the skin: it moves a `JawLoad` and measures its force.
 """
 
 import math
@@ -31,29 +33,29 @@ from rigsim.boxes.command import (
 from rigsim.boxes.device import Device, Wiring
 
 CALIPER_CONTROL_PERIOD_S = 5e-3
-"""Period in which position and force are looked at while the motor runs, s."""
+"""Period in which position and force are sampled while the motor runs, s."""
 MAX_CAPTURE_STEPS = 15
 FORCE_LIMIT_N = (0.05, 10.0)
-"""What the sensor can tell; what skin may bear is for a person to say."""
+"""Measuring range of the sensor, N; the operator chooses the limit that the skin tolerates."""
 STALL_LAG_MM = 0.05
-"""Steps that the motor has lost, mm, from which a stall is known."""
+"""Position error from which the motor counts as stalled, mm."""
 ROTATION_DEG_PER_S = 90.0
 FORCE_ZERO_DEVIATION_N = 0.01
-"""Deviation of what a sensor says of no force before it is tared, N."""
+"""Standard deviation of the sensor's zero before it is tared, N."""
 HOMING_SPEED_FRACTION = 0.5
-"""Of the normal one."""
+"""Homing speed relative to the normal speed."""
 MIN_DETACHMENT_FORCE_N = 0.05
 DETACHED_FORCE_FRACTION = 0.25
-"""Share that is left, after one control period, of the force on skin that has come off."""
+"""Fraction of the force that remains one control period after the skin has detached."""
 RELEASE_TIME_S = 0.25
-"""Force that is still beyond the limit so long after the jaws have turned back: let go."""
+"""Time after a force trip, s; a force still beyond the limit then releases the skin."""
 
 _STEP_PATTERN = re.compile(r"-?[0-9]{1,3}")
 
 
 @dataclass(slots=True)
 class _Move:
-    """A move that is under way."""
+    """A move in progress."""
 
     number: int
     homing: bool
@@ -63,8 +65,8 @@ class _Move:
     speed_mm_per_s: float
     stalls_at_mm: float | None
     ticks: int = 0
-    tripped_s: float = math.inf  # when the force met its limit; since then it goes back
-    reading_mm: float = 0.0  # of that moment
+    tripped_s: float = math.inf  # time when the force met its limit; then the jaws return
+    reading_mm: float = 0.0  # at that time
     force_n: float = 0.0
 
     @property
@@ -86,12 +88,12 @@ class _Move:
 
 
 class CaliperUnit(Device):
-    """State of the caliper's box behind its controller.
+    """State of the caliper's device behind its controller.
 
     Parameters
     ----------
     wiring
-        Its caliper's travel, of which at most 15 steps either way, angles and speed; the skin.
+        The caliper's travel (at most 15 steps in either direction), angles and speed; the skin.
     """
 
     kind = "caliper"
@@ -113,12 +115,12 @@ class CaliperUnit(Device):
             caliper.reading_mm(self.step_min) - half,
             caliper.reading_mm(self.step_max) + half,
         )
-        # what stays as it is without power: jaws, ring, and the count of moves
+        # state that survives the loss of power: jaws, ring, and the count of moves
         self.aperture_mm = float(rng.uniform(*self._ends_mm))
         self.angle_deg = caliper.angles_deg[0]
         self._offset_n = float(rng.normal(0.0, FORCE_ZERO_DEVIATION_N))
         self._zero_n = 0.0
-        self.moves: list[tuple[float, float]] = []  # when and whereto each began
+        self.moves: list[tuple[float, float]] = []  # start time and target of each
         self._move: _Move | None = None
         self.attached = False
         load.move(self.aperture_mm)
@@ -128,18 +130,18 @@ class CaliperUnit(Device):
     # settings ---------------------------------------------------------------------------------
 
     def reset(self, now: float, *, power_up: bool) -> None:
-        """Return to the settings of power-up: nothing held, no force limit, not homed."""
+        """Restore the power-up settings: nothing held, no force limit, not homed."""
         super().reset(now, power_up=power_up)
         if power_up:
             self.last_report = ""
         self.homed = False
         self.limit_n: float | None = None
-        self._barred: tuple[int, float] | None = None  # direction and reading of a force trip
-        self._turning: tuple[float, float] | None = None  # until when, and whereto
+        self._barred: tuple[int, float] | None = None  # direction and position of a force trip
+        self._turning: tuple[float, float] | None = None  # end time and target angle
         self._last_force_n = 0.0
 
     def capabilities(self) -> Mapping[str, Any]:
-        """Return limits and counts, units in the names."""
+        """Return limits and counts; the names include the units."""
         return {
             "step_min": self.step_min,
             "step_max": self.step_max,
@@ -154,7 +156,7 @@ class CaliperUnit(Device):
         }
 
     def commands(self) -> dict[str, Command]:
-        """Return the command table: the manual of the box."""
+        """Return the command table, which is the controller's manual."""
         acts: dict[str, CommandHandler] = {
             "CAL:HOME": self._home,
             "CAL:STEP:ABS": self._step,
@@ -176,7 +178,7 @@ class CaliperUnit(Device):
     # time -------------------------------------------------------------------------------------
 
     def deadline(self) -> float:
-        """Return when the box will next look at a move, or something ends by itself, in s."""
+        """Return the time of the next sample of a move or other change of its own, in s."""
         due = self._stop_opens_s()
         if self._move is not None:
             due = min(due, self._move.next_s)
@@ -185,7 +187,7 @@ class CaliperUnit(Device):
         return due
 
     def advance(self, now: float) -> None:
-        """Let time pass up to `now`, in s."""
+        """Advance time to `now`, in s."""
         while (due := self.deadline()) <= now:
             if self._stop_opens_s() <= due:
                 self.interlock = True
@@ -198,25 +200,25 @@ class CaliperUnit(Device):
                 self._control(self._move, due)
 
     def go_dark(self, now: float) -> None:
-        """Let the skin go and stop whatever moves."""
+        """Release the skin and stop all motion."""
         self._release(now, "DARK")
 
     def is_busy(self, now: float) -> bool:
-        """Tell whether jaws or ring move."""
+        """Return whether the jaws or the ring move."""
         return self._move is not None or self._turning is not None
 
     def states(self, now: float) -> dict[int, bool]:
-        """Return 16 moving, 32 homed, 512 skin held, 1024 force limit met."""
+        """Return bits 16 moving, 32 homed, 512 skin held, 1024 force limit met."""
         tripped = self._barred is not None
         return {16: self.is_busy(now), 32: self.homed, 512: self.attached, 1024: tripped}
 
     @property
     def measured_force_n(self) -> float:
-        """What the sensor says since it was tared, N."""
+        """Force reading since the sensor was tared, N."""
         return self._load.force_n + self._offset_n - self._zero_n
 
     def _control(self, move: _Move, now: float) -> None:
-        """Drive the jaws on by one control period, and look at what they meet."""
+        """Drive the jaws for one control period and check force and position."""
         driven_mm = move.driven_to_mm(now)
         stop_mm, direction = move.stalls_at_mm, move.direction
         stuck = stop_mm is not None and direction * (driven_mm - stop_mm) > 0.0
@@ -251,7 +253,7 @@ class CaliperUnit(Device):
         return pulled and abs(force_n) <= DETACHED_FORCE_FRACTION * before_n
 
     def _turn_back(self, move: _Move, now: float) -> None:
-        """Go back to where the jaws stood before: the force has met its limit."""
+        """Return the jaws to their previous position: the force has met its limit."""
         move.reading_mm, move.force_n, move.tripped_s = self.aperture_mm, self.measured_force_n, now
         self._barred = (move.direction, self.aperture_mm)
         self.queue_event(
@@ -261,7 +263,7 @@ class CaliperUnit(Device):
         move.start_s, move.ticks, move.stalls_at_mm = now, 0, None
 
     def _lose_steps(self, move: _Move, now: float) -> None:
-        """End a move whose motor no longer follows: only the home mark tells where the jaws are."""
+        """End a move whose motor has lost steps: only the home mark restores the position."""
         if move.homing:
             self._end(move, "NOHOME", now)
             return
@@ -298,14 +300,14 @@ class CaliperUnit(Device):
     # moves ------------------------------------------------------------------------------------
 
     def _require_fit(self, now: float) -> None:
-        """Refuse to move with the stop open, a dead sensor, no limit, or on the move."""
+        """Refuse motion with an open stop, a dead force sensor, or another move in progress."""
         self._require_closed_stop()
         CommandRefused.raise_if(self.faults.force_dead, Code.HARDWARE, "the force sensor is dead")
         CommandRefused.raise_if(self.is_busy(now), Code.IGNORED, "on the move")
 
     def _require_limit(self) -> None:
         if self.limit_n is None:
-            raise CommandRefused(Code.IGNORED, "CAL:FORC:LIM first; there is no default")
+            raise CommandRefused(Code.IGNORED, "CAL:FORC:LIM first; it has no default")
 
     def _require_free(self) -> None:
         CommandRefused.raise_if(self.attached, Code.IGNORED, "skin is held; CAL:REL first")
@@ -332,7 +334,7 @@ class CaliperUnit(Device):
         home_mm = self._caliper.aperture_mm
         answer = self._begin(home_mm, now, homing=True)
         if self.faults.home_missed and self._move is not None:
-            # on to the end of the travel, where the motor loses its steps
+            # the jaws continue to the end of the travel, where the motor loses its steps
             end_mm = self._ends_mm[0] if self.aperture_mm > home_mm else self._ends_mm[1]
             beyond_mm = math.copysign(2.0 * STALL_LAG_MM, end_mm - home_mm)
             self._move.to_mm, self._move.stalls_at_mm = end_mm + beyond_mm, end_mm

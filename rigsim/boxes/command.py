@@ -1,4 +1,4 @@
-"""Commands of a box: the rows of its table, the arguments they read, and how they refuse."""
+"""Command tables of controllers: rows, argument parsers, and refusals."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +23,7 @@ _CODE_TEXTS = {
     Code.THERMAL: "Too hot",
     Code.RECYCLE: "Recycling",
     Code.LIGHT_DOSE: "Light dose",
-    Code.FLICKER: "Flicker; SAFE:EYES says whether eyes are safe",
+    Code.FLICKER: "Flicker; set SAFE:EYES to CLOSED or SHIELDED once eyes are safe",
     Code.FORCE: "Force limit",
     Code.INTERLOCK: "Interlock open",
     Code.WATCHDOG_TRIPPED: "Watchdog tripped; SYST:ARM first",
@@ -35,7 +35,7 @@ _CODE_TEXTS = {
 
 
 class CommandRefused(Exception):
-    """A command that is not carried out, with its code; the box did nothing."""
+    """A command that is refused, with its code; the controller has done nothing."""
 
     def __init__(self, code: Code, detail: str = "") -> None:
         super().__init__(code, detail)
@@ -44,23 +44,23 @@ class CommandRefused(Exception):
 
     @classmethod
     def raise_if(cls, condition: object, code: Code, detail: str = "") -> None:
-        """Refuse the command when something is wrong."""
+        """Refuse the command when `condition` is true."""
         if condition:
             raise cls(code, detail)
 
 
 @dataclass(frozen=True, slots=True)
 class PendingReply:
-    """An act that is under way: it is answered when it is over."""
+    """A command in progress: it is answered when it is complete."""
 
     at_s: float
-    """When, s, on the world's clock."""
+    """Time of the answer on the world's clock, s."""
     outcome: Callable[[], str | CommandRefused]
-    """Payload of the answer, or why there is none; asked for then."""
+    """Payload of the answer, or the refusal; evaluated at that time."""
 
 
 CommandHandler: TypeAlias = Callable[[str, float], str | PendingReply | None]
-"""(arguments, now in s) -> payload of the answer (None: empty), or when it comes; may refuse."""
+"""(arguments, now in s) -> payload of the answer (None: empty), or a pending one; may refuse."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,25 +69,25 @@ class Command:
 
     run: CommandHandler
     arguments: str = ""
-    """What follows the header, as the manual writes it; empty: nothing may follow."""
+    """Arguments after the header, in the manual's notation; empty: none are allowed."""
     armed: bool = False
-    """Whether it makes light, and so is refused unless the box is armed."""
+    """Whether it makes light and is therefore refused unless the controller is armed."""
     bare: bool = False
-    """Whether it is taken without a frame although it is no query: only what makes dark."""
+    """Whether it is accepted without a frame although it is not a query, as for going dark."""
     harmless: Sequence[str] = ()
-    """Arguments, upper case, with which it makes dark: taken unarmed and without a frame."""
+    """Arguments, upper case, that make dark: accepted unarmed and without a frame."""
     manual: str = ""
-    """What it does, in one line."""
+    """Effect, in one line."""
 
 
 def build_command_table(kind: str, handlers: Mapping[str, CommandHandler]) -> dict[str, Command]:
-    """Return the commands of a kind of box, in its manual's order, each with what it does."""
+    """Return the commands of a kind of controller with their effects, in its manual's order."""
     rows = package_table("box_commands")[kind]
     return {header: Command(handlers[header], **row) for header, row in rows.items()}
 
 
 def parse_number(text: str, low: float, high: float, unit: str) -> float:
-    """Return the number that a command gives, or refuse with -102 or -222.
+    """Parse the number of a command, or refuse with -102 or -222.
 
     Examples
     --------
@@ -103,21 +103,21 @@ def parse_number(text: str, low: float, high: float, unit: str) -> float:
 
 
 def parse_choice(text: str, names: tuple[str, ...]) -> str:
-    """Return the upper-case word that a command gives, or refuse with -102."""
+    """Parse the word of a command, upper case, or refuse with -102."""
     if text.upper() not in names:
         raise CommandRefused(Code.SYNTAX, f"expected {' or '.join(names)}")
     return text.upper()
 
 
 def parse_token(text: str) -> str:
-    """Return the token that a command gives, or refuse with -102."""
+    """Parse the token of a command, or refuse with -102."""
     if _WORD_PATTERN.fullmatch(text) is None:
         raise CommandRefused(Code.SYNTAX, "expected 1 to 48 of A-Z a-z 0-9 . _ -")
     return text
 
 
 def parse_integer(text: str, low: int, high: int) -> int:
-    """Return a whole number that a command gives, or refuse with -102 or -222."""
+    """Parse the integer of a command, or refuse with -102 or -222."""
     if not (text.isascii() and text.isdecimal() and len(text) <= 9):
         raise CommandRefused(Code.SYNTAX, "expected a whole number")
     value = int(text)

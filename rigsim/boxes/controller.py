@@ -1,10 +1,10 @@
-"""What every box has: protocol endpoint, error queue, arming and the lease watchdog; sans-I/O.
+"""Protocol endpoint of all controllers: error queue, arming and the lease watchdog (sans-I/O).
 
-A `Controller` is fed bytes and time and returns bytes; it never sleeps and opens nothing. What the
-box is good for - lamps, motors - is a `Device` with a command table of its own.
+A `Controller` takes bytes and time and returns bytes; it never sleeps and opens nothing. A `Device`
+with its own command table implements the hardware, such as lamps and motors.
 
-The lease: an armed box wants a valid frame at least every ``SYST:WDOG`` milliseconds. When none
-comes it goes dark and disarms itself, and only a deliberate ``SYST:ARM`` arms it again.
+The lease: an armed controller requires a valid frame at least every ``SYST:WDOG`` milliseconds.
+Without one it goes dark and disarms itself, and only an explicit ``SYST:ARM`` arms it again.
 """
 
 import json
@@ -29,20 +29,20 @@ FIRMWARE = "1.0"
 MAX_CACHED_REPLIES = 8
 MAX_QUEUED_ERRORS = 16
 CAPABILITY_CHUNK_CHARS = 48
-"""Characters of the limits that one line carries: a short line survives a bad cable."""
+"""Characters of the limits per line: a short line survives a bad cable."""
 LEASE_RANGE_MS = (300, 5000)
 DEFAULT_LEASE_MS = 1000
 
 
 class Controller:
-    """A box as its port sees it.
+    """A controller as seen from its port.
 
     Parameters
     ----------
     device
-        What it controls.
+        The controlled device.
     serial
-        The serial number is the box, whatever its port is called.
+        Serial number; it identifies the controller, whatever its port's name.
     rng
         Draws the boot epochs.
     """
@@ -55,21 +55,21 @@ class Controller:
         self._rng = rng
         self._announce = False
         self.commands: dict[str, Command] = {**self._own_commands(), **device.commands()}
-        self._forget(0.0, boot_s=0.0)
+        self._reset_state(0.0, boot_s=0.0)
 
     # power ------------------------------------------------------------------------------------
 
     def power_cycle(self, now: float, *, boot_s: float, announce: bool) -> None:
-        """Reset: dark, disarmed, deaf for `boot_s`, and a new epoch.
+        """Reset: dark, disarmed, deaf for `boot_s`, and in a new epoch.
 
-        `announce`: print a banner and a BOOT event when ready; a brown-out says nothing.
+        `announce`: print a banner and send a BOOT event when ready; a brown-out is silent.
         """
         self.device.advance(now)
         self.device.go_dark(now)
-        self._forget(now, boot_s=boot_s)
+        self._reset_state(now, boot_s=boot_s)
         self._announce = announce
 
-    def _forget(self, now: float, *, boot_s: float) -> None:
+    def _reset_state(self, now: float, *, boot_s: float) -> None:
         fresh = [self.boot, wire.UNKNOWN_BOOT]
         while self.boot in fresh:
             self.boot = int(self._rng.integers(1, 0x10000))
@@ -89,13 +89,13 @@ class Controller:
     # time and bytes ---------------------------------------------------------------------------
 
     def deadline(self) -> float:
-        """Return when the box will next do something by itself, in s; inf for never."""
+        """Return the time of the controller's next action of its own, in s; inf for never."""
         ready = self._ready_at if self._announce else math.inf
         over = math.inf if self._under_way is None else self._under_way[1].at_s
         return min(ready, self._lease_end, over, self.device.deadline())
 
     def advance(self, now: float) -> bytes:
-        """Let time pass up to `now`, in s, and return what the box says by itself."""
+        """Advance time to `now`, in s, and return unsolicited output."""
         output = b""
         while (due := self.deadline()) <= now:
             self.device.advance(due)
@@ -115,7 +115,7 @@ class Controller:
         return output + self._device_events()
 
     def feed(self, data: bytes, now: float) -> bytes:
-        """Take bytes from the host at `now`, in s, and return what the box answers."""
+        """Process bytes from the host at `now`, in s, and return the answer."""
         output = self.advance(now)
         if now < self._ready_at:
             return output
@@ -138,7 +138,7 @@ class Controller:
         except wire.BadFrame:
             return self._event("NAK", str(int(Code.BAD_CRC)))
         if not isinstance(frame, Request):
-            return b""  # our own words back, from an echoing line
+            return b""  # the controller's own output, returned by an echoing line
         if frame.boot == wire.UNKNOWN_BOOT and frame.text == "SYST:HELLO?":
             return wire.encode(Reply(frame.seq, self.boot, Code.OK, self._hello()))
         if self._foreign_epoch(frame.boot):
@@ -148,14 +148,14 @@ class Controller:
         answers = list(self._replies)
         if self._under_way is not None:
             request = self._under_way[0]
-            # a retry gets nothing yet: the answer comes when the act is over
+            # a retry is not answered yet: the answer follows when the command is complete
             answers.append((request.seq, request.text, b""))
         for seq, text, answer in answers:
             if self._same_request(seq, text, frame):
                 return answer
             if seq == frame.seq:
                 refused = CommandRefused(Code.SEQ_REUSED)
-                self._remember(refused)
+                self._record_error(refused)
                 return wire.encode(Reply(frame.seq, self.boot, refused.code, refused.reason))
         try:
             outcome = self._execute(frame.text, now)
@@ -169,7 +169,7 @@ class Controller:
 
     def _answer(self, request: Request, outcome: str | CommandRefused, now: float) -> bytes:
         if isinstance(outcome, CommandRefused):
-            self._remember(outcome)
+            self._record_error(outcome)
             reply = Reply(request.seq, self.boot, outcome.code, outcome.reason)
         else:
             reply = Reply(request.seq, self.boot, Code.OK, outcome)
@@ -189,7 +189,7 @@ class Controller:
                 CommandRefused.raise_if(not (header.endswith("?") or dark), Code.UNFRAMED)
             payload = self._execute(text, now)
         except CommandRefused as refused:
-            self._remember(refused)
+            self._record_error(refused)
             return b""
         return f"{payload}\n".encode() if header.endswith("?") else b""
 
@@ -216,7 +216,7 @@ class Controller:
         number, self._events = self._events, wire.next_seq(self._events)
         return wire.encode(Event(number, self.boot, name, payload))
 
-    def _remember(self, refused: CommandRefused) -> None:
+    def _record_error(self, refused: CommandRefused) -> None:
         if len(self._errors) == MAX_QUEUED_ERRORS:
             self._errors.pop()
             refused = CommandRefused(Code.QUEUE_OVERFLOW)
@@ -232,7 +232,7 @@ class Controller:
         self._lease_end = math.inf
         self.device.go_dark(now)
 
-    # the commands every box knows -------------------------------------------------------------
+    # commands of every controller -------------------------------------------------------------
 
     def _own_commands(self) -> dict[str, Command]:
         acts: dict[str, CommandHandler] = {
@@ -242,8 +242,8 @@ class Controller:
             "*OPC?": lambda _, now: "0" if self.device.is_busy(now) else "1",
             "SYST:ERR?": self._error,
             "SYST:HELLO?": lambda *_: self._hello(),
-            "SYST:CAP?": self._capable,
-            "SYST:CAP:PART?": self._capable_part,
+            "SYST:CAP?": self._get_capabilities,
+            "SYST:CAP:PART?": self._get_capability_chunk,
             "SYST:WDOG": self._set_lease,
             "SYST:WDOG?": lambda *_: str(self._lease_ms),
             "SYST:ARM": self._arm,
@@ -266,7 +266,7 @@ class Controller:
         code, text = self._errors.popleft() if self._errors else (0, "No error")
         return f'{code},"{text}"'
 
-    def _capable(self, _: str, now: float) -> str:
+    def _get_capabilities(self, _: str, now: float) -> str:
         table = {
             "kind": self.device.kind,
             "protocol": self._protocol,
@@ -276,8 +276,8 @@ class Controller:
         }
         return wire.seal(json.dumps(table, separators=(",", ":"), allow_nan=False))
 
-    def _capable_part(self, arguments: str, now: float) -> str:
-        text = self._capable("", now)
+    def _get_capability_chunk(self, arguments: str, now: float) -> str:
+        text = self._get_capabilities("", now)
         last = (len(text) - 1) // CAPABILITY_CHUNK_CHARS
         part = int(parse_number(arguments, 0, last, "parts"))
         start = part * CAPABILITY_CHUNK_CHARS

@@ -1,4 +1,4 @@
-"""What a controller controls, and what all of them have: a clock, events, an emergency stop."""
+"""Interface of controlled devices: clock, events, emergency stop, and the loads they act on."""
 
 import math
 from abc import ABC, abstractmethod
@@ -17,45 +17,45 @@ STATUS_INTERLOCK = 256
 
 
 class JawLoad(Protocol):
-    """What the jaws act upon."""
+    """Load on the caliper's jaws."""
 
     @property
     def force_n(self) -> float:
         """Force on the jaws, N; > 0 pulls them together."""
 
     def attach(self, angle_deg: float) -> None:
-        """Be held, at the jaws' present distance, from now on."""
+        """Attach the load at the jaws' present distance."""
 
     def turn(self, angle_deg: float) -> None:
-        """Have the jaws turned while they hold nothing."""
+        """Turn the empty jaws."""
 
     def move(self, aperture_mm: float) -> None:
-        """Have the jaws moved to a distance."""
+        """Move the jaws to a distance."""
 
     def release(self) -> None:
-        """Be let go."""
+        """Detach the load."""
 
 
 class SuctionLoad(Protocol):
-    """What the pump acts upon."""
+    """Load on the suction pump."""
 
     def place(self, site: str, angle_deg: float, now: float) -> None:
-        """Be put somewhere by a person."""
+        """Place the head at a site."""
 
     def remove(self, now: float) -> None:
-        """Be taken off."""
+        """Take the head off."""
 
     def start_suction(self, target_mbar: float, now: float) -> None:
-        """Have the vent closed and the pump switched on."""
+        """Close the vent and switch the pump on."""
 
     def vent(self, now: float) -> None:
-        """Have the pump switched off and the vent opened."""
+        """Switch the pump off and open the vent."""
 
     def suction_mbar(self, now: float) -> float:
         """Return the suction now, mbar."""
 
     def camera_c(self, now: float) -> float:
-        """Return the temperature of the camera behind it, degrees Celsius."""
+        """Return the temperature of the camera behind the head, degrees Celsius."""
 
 
 def _ignore(*_: object) -> None:
@@ -64,34 +64,35 @@ def _ignore(*_: object) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wiring:
-    """What a box is wired to."""
+    """Connections of a controller: rig, loads, faults and observers."""
 
     rig: Rig
-    """What it drives: lights and what they may do, cameras, caliper or probe."""
+    """The driven rig: lights with their limits, cameras, caliper or probe."""
     rng: np.random.Generator
-    """Its chance, for as long as it lives: noise, misfires, what sticks and where jaws stand."""
+    """Random numbers of its whole life: noise, misfires, sticking parts, initial jaw position."""
     faults: Faults = NO_FAULTS
-    """What is wrong with it."""
+    """Its faults."""
     on_light: Callable[[Any], None] = _ignore
-    """Called with each pop, and with each stretch of other light when it has ended."""
+    """Called with each pop, and with each interval of other light when it has ended."""
     on_trigger: Callable[..., None] = _ignore
-    """Called with the world time in s of each pulse on the camera line, and, where each camera has
-    a line of its own, the mask of those that are pulsed."""
+    """Called with the world time in s of each pulse on the camera line. Where each camera has its
+    own line, the mask of the pulsed cameras is also passed."""
     on_grip: Callable[[float], None] = _ignore
-    """Called with the world time in s after whatever has changed what the caliper's jaws hold."""
+    """Called with the world time in s after each change of the load that the caliper's jaws
+    hold."""
     skin: JawLoad | None = None
-    """What is between the caliper's jaws; None where the rig has no caliper."""
+    """Skin between the caliper's jaws; None where the rig has no caliper."""
     head: SuctionLoad | None = None
-    """The contact probe's head and what it sits on; None where the rig has no probe."""
+    """The contact probe's head and the skin below it; None where the rig has no probe."""
 
 
 class Device(ABC):
-    """What a controller controls.
+    """Base class of controlled devices.
 
     Parameters
     ----------
     wiring
-        What it drives, what is wrong with it, and who notices what it does.
+        The driven rig, its faults, and observers of its actions.
     """
 
     kind: str
@@ -106,52 +107,52 @@ class Device(ABC):
 
     @abstractmethod
     def commands(self) -> dict[str, Command]:
-        """Return the command table: the manual of the box."""
+        """Return the command table, which is the controller's manual."""
 
     @abstractmethod
     def capabilities(self) -> Mapping[str, Any]:
-        """Return limits and counts, units in the names, as JSON values."""
+        """Return limits and counts as JSON values; the names include the units."""
 
     @abstractmethod
     def states(self, now: float) -> dict[int, bool]:
-        """Return bits 4 and up of ``STAT?`` but `STATUS_INTERLOCK`, and whether each is set."""
+        """Return the bits from 4 of ``STAT?`` except `STATUS_INTERLOCK`, each with its state."""
 
     @abstractmethod
     def is_busy(self, now: float) -> bool:
-        """Return whether something that was accepted is still going on."""
+        """Return whether an accepted action is still in progress."""
 
     @abstractmethod
     def go_dark(self, now: float) -> None:
-        """Switch every light off at once, and let go of the skin."""
+        """Switch off every light at once and release the skin."""
 
     @abstractmethod
     def advance(self, now: float) -> None:
-        """Let time pass up to `now`, in s."""
+        """Advance time to `now`, in s."""
 
     @abstractmethod
     def deadline(self) -> float:
-        """Return when the device will next change by itself, in s; inf for never."""
+        """Return the time of the device's next change of its own, in s; inf for never."""
 
     def reset(self, now: float, *, power_up: bool) -> None:
-        """Return to the settings of power-up."""
+        """Restore the power-up settings."""
         self.go_dark(now)
         if power_up:
             self._powered_at = now
             self._events.clear()
 
     def status_bits(self, now: float) -> int:
-        """Return bits 4 and up of ``STAT?``."""
+        """Return the bits from 4 of ``STAT?``."""
         states = self.states(now) | {STATUS_INTERLOCK: self.interlock}
         return sum(bit for bit, is_set in states.items() if is_set)
 
     def take_events(self) -> list[tuple[str, str]]:
-        """Return and forget what the device has to say unasked: name and payload."""
+        """Return and clear the pending events: name and payload."""
         events = list(self._events)
         self._events.clear()
         return events
 
     def queue_event(self, name: str, payload: str) -> None:
-        """Have an event sent."""
+        """Queue an event for sending."""
         self._events.append((name, payload))
 
     def clock_us(self, now: float) -> int:
@@ -159,7 +160,7 @@ class Device(ABC):
         return round((now - self._powered_at) * 1e6)
 
     def light_now(self, now: float) -> Sequence[Any]:
-        """Return the stretches of light that have not ended, as given so far."""
+        """Return the intervals of light that have not ended, as emitted so far."""
         return ()
 
     def _trigger_camera(self, arguments: str, now: float) -> str:
@@ -171,5 +172,5 @@ class Device(ABC):
         CommandRefused.raise_if(self.interlock, Code.INTERLOCK)
 
     def _stop_opens_s(self) -> float:
-        """Return when somebody will open the stop, s; inf where it is open."""
+        """Return when the emergency stop will open, s; inf where it is open."""
         return math.inf if self.interlock else self.faults.interlock_after

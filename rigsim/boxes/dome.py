@@ -1,13 +1,14 @@
-"""The dome's box: LEDs stepped by a table, cameras released by a mask.
+"""Emulate the dome's controller: LEDs stepped by a table, cameras released by a mask.
 
-Its manual is its command table (`DomeUnit.commands`) and these rules. A table of rows is uploaded,
-compared by its checksum, armed and triggered; the box then steps by itself: the next row's LEDs
-come on shortly before the last row's go off, the cameras of the row's mask are released once its
-light is steady, and each release is reported as an event ``SEQ:STEP``. A table, and every
-``LED:ON``, is refused beyond the duty (101), heat (102) or dose (104) that an LED may give, and, as
-long as a person has not said that the subject's eyes are closed or shielded, beyond the flicker
-that open eyes may see (105). Light carries its own end; LEDs that draw no current are refused with
--240, or reported as ``LED:FAIL`` in a sequence. Heat, dose and duty survive a reset.
+Its manual is its command table (`DomeUnit.commands`) and these rules. The host uploads a table of
+rows, compares its checksum, arms and triggers it; the controller then steps autonomously. The next
+row's LEDs come on shortly before the last row's go off, the cameras of the row's mask are released
+once its light is steady, and each release is reported as an event ``SEQ:STEP``. A table, and every
+``LED:ON``, is refused beyond the duty (101), heat (102) or dose (104) limit of an LED. Until the
+operator has confirmed that the subject's eyes are closed or shielded, it is also refused beyond the
+flicker limit for open eyes (105). Each command of light includes its end. LEDs that draw no current
+are refused with -240, or reported as ``LED:FAIL`` in a sequence. Heat, dose and duty survive a
+reset.
 """
 
 from collections.abc import Sequence
@@ -30,12 +31,12 @@ DEFAULT_LED_MS = 100.0
 
 
 class DomeUnit(LedSequencer[LedTableRow]):
-    """State of the dome's box behind its controller.
+    """State of the dome's device behind its controller.
 
     Parameters
     ----------
     wiring
-        Its LEDs, what they may do, and its cameras; each stretch of light is a `LedPulse`.
+        Its LEDs with their limits, and its cameras; each interval of light is a `LedPulse`.
     """
 
     kind = "dome"
@@ -46,7 +47,7 @@ class DomeUnit(LedSequencer[LedTableRow]):
         self.reset(0.0, power_up=True)
 
     def commands(self) -> dict[str, Command]:
-        """Return the command table: the manual of the box."""
+        """Return the command table, which is the controller's manual."""
         acts: dict[str, CommandHandler] = {
             "SEQ:DEF": self._define_rows,
             "LED:ON": self._light,
@@ -66,7 +67,7 @@ class DomeUnit(LedSequencer[LedTableRow]):
             max_us=self._row_max_us,
         )
 
-    def _lit_by(self, rows: Sequence[LedTableRow], now: float) -> list[LedPulse]:
+    def _pulses_from_table(self, rows: Sequence[LedTableRow], now: float) -> list[LedPulse]:
         return led_table.pulses_from_rows(rows, now, overlap_s=self._limits.overlap_s)
 
     def _schedule(self, rows: Sequence[LedTableRow]) -> list[SequenceEvent]:
@@ -96,7 +97,7 @@ class DomeUnit(LedSequencer[LedTableRow]):
                 self.queue_event("LED:FAIL", str(led))
 
     def light_now(self, now: float) -> list[LedPulse]:
-        """Return the stretches of light that are going on, as given so far."""
+        """Return the intervals of light in progress, as emitted so far."""
         return self.bank.ongoing_pulses(now)
 
     # single LEDs ------------------------------------------------------------------------------
@@ -127,7 +128,7 @@ class DomeUnit(LedSequencer[LedTableRow]):
         end_s = now + span_ms / 1e3
         wanted = [LedPulse(led, level, now, end_s) for led in leds]
         self.bank.require_within_limits(wanted, now)
-        self._require_calm(wanted, now)
+        self._require_flicker_limits(wanted, now)
         self._sequence_armed = False
         for led in leds:
             self.bank.switch_on(led, level, now, end_s=end_s)

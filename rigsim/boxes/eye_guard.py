@@ -1,8 +1,8 @@
-"""What the dome's box knows of the subject's eyes: how much its LEDs would flicker for them.
+"""Compute the flicker of the dome's LEDs at the subject's eyes, as the controller limits it.
 
-The box judges by itself and with arithmetic of its own, so that a wrong plan on the host cannot
-hide from it: one eye between the subject's two, exact integrals of light that is switched, and
-Fourier sums instead of a transform.
+The controller evaluates flicker independently of the host, so that a wrong plan on the host cannot
+pass: one eye midway between the subject's two, exact integrals of switched light, and Fourier sums
+instead of a transform.
 """
 
 import math
@@ -15,15 +15,15 @@ from rigsim.arrays import Float64Array
 from rigsim.boxes.led_table import LedPulse
 
 EYE_POSITION_MM = (0.0, 25.0, 80.0)
-"""Between the eyes of a nominal head, rig frame; it looks along +z."""
+"""Position midway between the eyes of a nominal head, rig frame; the gaze is +z."""
 FLICKER_BAND_HZ = (3.0, 65.0)
 FLICKER_FUSION_S = 1.0 / 65.0
-"""Shortest time in which flicker is seen."""
+"""Shortest period of visible flicker, s."""
 FLICKER_SAMPLE_S = 2e-3
 MIN_FLASH_FRACTION = 0.1
-"""Least change of a flash, of the brightest light."""
+"""Smallest change that counts as a flash, relative to the brightest light."""
 MIN_RMS_SPAN_S = 2.0
-"""Shorter light is judged by its flashes alone."""
+"""Shorter light is limited by its flashes alone."""
 
 
 class EyeFlickerMonitor:
@@ -32,17 +32,19 @@ class EyeFlickerMonitor:
     Parameters
     ----------
     lights
-        The LEDs, with their places.
+        The LEDs with their positions.
     """
 
     def __init__(self, lights: Sequence[Light]) -> None:
         self.weights = np.array([_irradiance_at_eye(light) for light in lights])
 
     def flashes_per_s(self, light: Iterable[LedPulse]) -> float:
-        """Return the flashes in the worst second: half the turns of a tenth of the brightest."""
+        """Return the flashes in the worst second: half the reversals by >= 0.1 of the peak."""
         times, integral = self._integral(light)
         if times.size == 0:
             return 0.0
+        # The eye averages over the fusion time: a difference of the integral at both ends of the
+        # window.
         grid = np.arange(times[0] - 0.1, times[-1] + 0.1, FLICKER_SAMPLE_S)
         upper = np.interp(grid + 0.5 * FLICKER_FUSION_S, times, integral)
         seen = (
@@ -60,7 +62,7 @@ class EyeFlickerMonitor:
 
     def rms(self, light: Iterable[LedPulse]) -> float:
         """Return the rms of the 3 to 65 Hz part over the mean, from first light to last; or 0."""
-        # LEDs that are lit together are one light to the eye
+        # LEDs that are lit together add up to one light at the eye
         lit: dict[tuple[float, float], float] = {}
         for pulse in light:
             if pulse.t_off_s > pulse.t_on_s:
@@ -77,6 +79,9 @@ class EyeFlickerMonitor:
         orders = np.arange(
             math.ceil(FLICKER_BAND_HZ[0] * span), math.floor(FLICKER_BAND_HZ[1] * span) + 1
         )
+        # A pulse's Fourier coefficient over the span is (exp(-i w off) - exp(-i w on)) / (-i w
+        # span). By Parseval the band's mean square is twice the sum of |c_n|^2 over positive
+        # orders.
         omega = 2.0 * np.pi * orders / span
         power = 0.0
         for part in np.array_split(omega, max(1, omega.size * on.size // 200_000)):
@@ -87,7 +92,7 @@ class EyeFlickerMonitor:
         return math.sqrt(2.0 * power) / mean
 
     def _integral(self, light: Iterable[LedPulse]) -> tuple[Float64Array, Float64Array]:
-        """Return times at which light is switched, and the light until then, W s/m^2."""
+        """Return the switching times and the cumulative light until then, W s/m^2."""
         changes: dict[float, float] = {}
         for pulse in light:
             step = float(self.weights[pulse.led]) * pulse.level
@@ -106,6 +111,8 @@ def _irradiance_at_eye(light: Light) -> float:
     cosine = max(-z / distance_mm, 0.0)
     px, py, pz = light.position_mm
     along = -(x * px + y * py + z * pz) / (distance_mm * math.hypot(px, py, pz))
+    # The lobe cos^n halves at the half-intensity angle: n = -ln 2 / ln cos(half). Its integral over
+    # the hemisphere is 2 pi / (n + 1), which normalizes it to the LED's power.
     half_rad = math.radians(light.half_intensity_deg or 60.0)
     order = -math.log(2.0) / math.log(math.cos(half_rad))
     spread = (order + 1.0) / (2.0 * math.pi) * max(along, 0.0) ** order
@@ -113,7 +120,7 @@ def _irradiance_at_eye(light: Light) -> float:
 
 
 def _turning_points(values: Float64Array, min_change: float) -> list[int]:
-    """Return where a curve has risen, or fallen, by ``min_change`` since its last turn."""
+    """Return where a curve has risen, or fallen, by ``min_change`` since its last reversal."""
     found: list[int] = []
     low = high = float(values[0])
     direction = 0

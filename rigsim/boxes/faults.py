@@ -1,8 +1,8 @@
-"""What can go wrong on the wire, in a box and in a camera: switches with numbers, seeded.
+"""Faults of wire, controllers and cameras: seeded switches with values.
 
-`Faults` holds one switch per thing that can go wrong; all of them are off by default and each can
-be set in a ``sim://`` URL. `FAULT_CATALOG` names the twenty kinds of trouble a rig must survive,
-which switches provoke each, and what is promised when it happens.
+`Faults` has one switch per fault; all are off by default and each can be set in a ``sim://`` URL.
+`FAULT_CATALOG` lists the twenty kinds of fault that a rig must survive, the switches that provoke
+each, and the guaranteed response.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Seconds: TypeAlias = float
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Faults:
-    """Switches; probabilities are per byte, line or frame as each says, times in s.
+    """Fault switches; each probability is per byte, line or frame as stated, times in s.
 
     Examples
     --------
@@ -43,86 +43,86 @@ class Faults:
     glue: Probability = 0.0
     """Probability that the newline of a line is lost, so that two lines become one."""
     cut: Probability = 0.0
-    """Probability that a line is cut somewhere and its rest, newline included, is lost."""
+    """Probability that a line is cut at random; its rest, newline included, is lost."""
     late: Probability = 0.0
-    """Probability that an answer comes late (and all behind it: the line keeps its order)."""
+    """Probability that an answer is late (with all that follow it: the line keeps its order)."""
     late_s: Seconds = 0.6
-    """How late."""
+    """Delay of a late answer, s."""
     lose_answer: Probability = 0.0
-    """Probability that an answer is lost after the act was done."""
+    """Probability that an answer is lost after the command was carried out."""
     duplicate: Probability = 0.0
     """Probability that a line arrives twice, either way."""
     babble: Probability = 0.0
-    """Probability that the box prints a line of its own before an answer."""
+    """Probability that the controller prints a line of its own before an answer."""
     latency: Seconds = 0.0
     """Delay of the line one way, s."""
     baud: float = 115_200.0
     """Bits per second at ten bits per byte; 0: bytes take no time."""
     reset_on_open: bool = False
-    """Opening the port resets the box, as the DTR line of many boards does."""
+    """Opening the port resets the controller, as the DTR line of many boards does."""
     boot_s: Seconds = 0.8
-    """How long the box is deaf after a reset, s."""
+    """Time for which the controller is deaf after a reset, s."""
     reset_after: Seconds = math.inf
-    """The box resets without a word, once, so long after power-up, s."""
+    """The controller resets silently, once, at this time after power-up, s."""
     brownout: Probability = 0.0
-    """Probability that a line to the box finds its supply dipping: a reset without a word."""
+    """Probability that a line to the controller coincides with a supply dip: a silent reset."""
     unplug_after: Seconds = math.inf
-    """The cable is pulled so long after the port was first opened, s."""
+    """The cable is pulled at this time after the port was first opened, s."""
     replug_after: Seconds = math.inf
-    """... and put back so much later, s."""
+    """The cable is reconnected at this time after it was pulled, s."""
     stall_after: Seconds = math.inf
-    """The box stops taking bytes so long after the port was first opened, s."""
+    """The controller stops taking bytes at this time after the port was first opened, s."""
     stall_s: Seconds = 2.0
-    """... for so long, s."""
+    """Duration of that stall, s."""
     serial: str = ""
-    """Serial number of another box behind the same name."""
+    """Serial number of a different controller behind the same name."""
     protocol: int = 1
-    """Version of the protocol that the firmware speaks."""
+    """Protocol version of the firmware."""
     lamp_dead: bool = False
     """The modelling lamp draws no current."""
     heat: float = 0.0
-    """How hot lamps' and LEDs' drivers are at power-up, 0 to 1; the flash's trips at 0.8."""
+    """Heat of the drivers of lamps and LEDs at power-up, 0 to 1; the flash's trips at 0.8."""
     led_dead: str = ""
     """Numbers of LEDs that draw no current, joined by +."""
     led_weak: str = ""
-    """LEDs that give less light than they are driven for: number=share, joined by +."""
+    """LEDs that emit less light than they are driven for: number=fraction, joined by +."""
     misfire: Probability = 0.0
     """Probability that the tube does not ignite."""
     slow_charge: float = 1.0
-    """How many times longer the capacitor takes."""
+    """Charging time of the capacitor relative to normal."""
     interlock: bool = False
     """The emergency-stop line is open."""
     interlock_after: Seconds = math.inf
-    """The emergency stop of a caliper or a probe is opened so long after power-up, s."""
+    """The emergency stop of a caliper or a probe opens at this time after power-up, s."""
     jaw_stall: Probability = 0.0
     """Probability that the motor of a caliper stalls in a move."""
     home_missed: bool = False
-    """The home mark of a caliper is never seen."""
+    """The home mark of a caliper is never detected."""
     force_dead: bool = False
     """The force sensor of a caliper draws no current."""
     skin_stiff: float = 1.0
-    """How many times stiffer than usual the skin between a caliper's jaws is."""
+    """Stiffness of the skin between a caliper's jaws relative to normal."""
     pump_leak: float = 0.0
-    """Leak under a probe's head relative to what its pump's regulator takes: the suction settles
-    at no more than 1 / (1 + leak) of what is asked."""
+    """Leak under a probe's head relative to the intake of its pump's regulator: the suction settles
+    at no more than 1 / (1 + leak) of the requested one."""
     pump_dead: bool = False
     """The motor of a probe's pump does not turn."""
     gauge_dead_after: Seconds = math.inf
-    """The pressure gauge of a probe draws no current from then on, s after power-up."""
+    """The pressure gauge of a probe draws no current from this time after power-up on, s."""
     head_lifts_after: Seconds = math.inf
-    """A probe's head comes off the skin so long after its pump was first switched on, s, once."""
+    """A probe's head detaches, once, at this time after its pump was first switched on, s."""
     shutter_stuck: Probability = 0.0
     """Probability that a probe's shutter does not open."""
     shutter_jam: Probability = 0.0
     """Probability that a probe's shutter, once open, does not close."""
     camera_warms_after: Seconds = math.inf
-    """The cooling of a probe's camera fails so long after power-up, s."""
+    """The cooling of a probe's camera fails at this time after power-up, s."""
     stale: Probability = 0.0
-    """Probability that a camera hands out its previous frame first."""
+    """Probability that a camera returns its previous frame first."""
     drop_frame: Probability = 0.0
     """Probability that a frame is lost."""
     wrong_camera: Probability = 0.0
-    """Probability that a frame bears another camera's serial number."""
+    """Probability that a frame carries another camera's serial number."""
     wrong_exposure: Probability = 0.0
     """Probability that a frame was taken one stop off."""
     drift_ppm: float = 0.0
@@ -148,8 +148,8 @@ class Faults:
         if not abs(self.drift_ppm) < 1e5:
             raise ValueError(f"drift_ppm: got {self.drift_ppm}, expected less than 1e5")
         if not all(0.0 <= share <= 1.0 for share in self.weak_leds.values()):
-            raise ValueError(f"led_weak: got {self.led_weak!r}, expected shares from 0 to 1")
-        _ = self.dead_leds  # complains where it is no list
+            raise ValueError(f"led_weak: got {self.led_weak!r}, expected fractions from 0 to 1")
+        _ = self.dead_leds  # raises ValueError unless it is a list of numbers
 
     @property
     def dead_leds(self) -> frozenset[int]:
@@ -173,7 +173,7 @@ class Faults:
 
     @classmethod
     def from_text(cls, switches: Mapping[str, str]) -> Faults:
-        """Build from texts, as they stand in the query of a URL.
+        """Parse switches from the texts of a URL query.
 
         Raises
         ------
@@ -214,16 +214,16 @@ NO_FAULTS = Faults()
 
 @dataclass(frozen=True, slots=True)
 class FaultKind:
-    """One of the kinds of trouble a rig must survive."""
+    """One of the kinds of fault that a rig must survive."""
 
     number: int
     """1 to 20."""
     what: str
-    """What happens."""
+    """Description of the fault."""
     switches: tuple[str, ...]
     """Fields of `Faults` that provoke it; empty where a test provokes it from outside."""
     promise: str
-    """What is promised then."""
+    """Guaranteed response."""
 
 
 FAULT_CATALOG: Final = tuple(FaultKind(**kind) for kind in package_table("faults")["faults"])

@@ -1,14 +1,14 @@
-"""The flash box: two heads fired together, modelling lamps, a turning analyser, a camera line.
+"""Emulate the flash controller: two heads fired together, modelling lamps, analyzer, camera line.
 
-Its manual is its command table (`FlashUnit.commands`) and these rules. A pop takes its share of the
-capacitor's energy; the charger brings it back. ``FLAS:FIRE`` pulses the camera line and pops. It is
-refused while the analyser turns (-213), before the tube has recovered (103: the recycle time is
+Its manual is its command table (`FlashUnit.commands`) and these rules. A pop takes its fraction of
+the capacitor's energy; the charger restores it. ``FLAS:FIRE`` pulses the camera line and pops. It
+is refused while the analyzer turns (-213), before the tube has recovered (103: the recycle time is
 proportional to the last power), beyond the pops per minute (101), before the charge suffices
-(-213), with the emergency stop open (107), and fails with -240 when the tube does not ignite; the
-camera line has pulsed then, so that frame is dark. ``FLAS:SYNC`` sets how long after the camera
-line the tube pops, for cameras whose shutters take time to open; the answer comes after the pop,
-and what makes dark before it prevents it (-240 too). Modelling lamps carry their own end,
-go out before a pop, and their driver trips when too hot (102).
+(-213), and with the emergency stop open (107). It fails with -240 when the tube does not ignite;
+the camera line has pulsed by then, so that frame is dark. ``FLAS:SYNC`` sets the delay from the
+camera line to the pop, for cameras whose shutters take time to open. The answer follows the pop;
+any command that makes dark before the pop prevents it (-240 too). Modelling lamps include their own
+end and go out before a pop; their driver trips when too hot (102).
 """
 
 import math
@@ -36,34 +36,34 @@ MIN_POWER = 1.0 / 256.0
 LAMP_RANGE_MS = (1.0, 500.0)
 ANALYZER_RANGE_DEG = (0.0, 180.0)
 SYNC_RANGE_US = (0.0, 50_000.0)
-"""Delay from camera line to pop; an answer may not keep the line waiting for longer."""
+"""Delay from camera line to pop; an answer must not block the line for longer."""
 POP_WINDOW_S = 60.0
 POLARIZER_READING_DEG: dict[Polarizer, float] = {"parallel": 0.0, "crossed": 90.0}
 
 CHARGER_HEADROOM = 1.05
-"""Voltage the charger aims at, relative to full; it stops at full."""
+"""Target voltage of the charger relative to full; charging stops at full."""
 CHARGE_TIME_FRACTION = 0.9
-"""Time from empty to full as a share of the recycle time."""
+"""Time from empty to full as a fraction of the recycle time."""
 LAMP_TAU_S = 20.0
 """Time constant of the lamp driver's temperature, s."""
 HEAT_TRIP, HEAT_CLEAR = 0.8, 0.5
-"""Temperatures at which the lamp's driver trips and recovers; 1 is where it would settle."""
+"""Temperatures at which the lamp's driver trips and recovers; 1 is its steady state."""
 
 
 @dataclass(frozen=True, slots=True)
 class FlashPop:
-    """Light that came out."""
+    """A pop of the flash that was emitted."""
 
     token: str
-    """Name that the host gave it."""
+    """Name given by the host."""
     t_s: float
     """World time, s."""
     power: float
     """Energy relative to a full pop, 0 to 1."""
     polarizer: Polarizer
-    """Analyser at its parallel (0 degrees) or crossed (90 degrees) stop."""
+    """Analyzer at its parallel (0 degrees) or crossed (90 degrees) stop."""
     analyser_deg: float | None
-    """Reading of the rotator in degrees when it stands elsewhere than at a stop asked for."""
+    """Reading of the rotator in degrees when it is not at a requested stop."""
 
 
 @dataclass(slots=True)
@@ -75,12 +75,12 @@ class _Lamp:
 
 
 class FlashUnit(Device):
-    """State of the flash box behind its controller.
+    """State of the flash device behind its controller.
 
     Parameters
     ----------
     wiring
-        Its recycling, pops per minute and analyser; each pop is passed on as a `FlashPop`.
+        Its recycling, pops per minute and analyzer; each pop is passed on as a `FlashPop`.
     """
 
     kind = "flash"
@@ -94,17 +94,17 @@ class FlashUnit(Device):
         headroom = math.log(CHARGER_HEADROOM / (CHARGER_HEADROOM - 1.0))
         self._charge_tau_s = faults.slow_charge * CHARGE_TIME_FRACTION * rig.recycle_s / headroom
         self._now = 0.0
-        # what the box keeps without power: the count, heat, charge and the last pops
+        # state that survives the loss of power: the count, heat, charge and the last pops
         self.count = 0
         self.lamp_times: deque[tuple[float, float]] = deque(maxlen=10_000)
         self._lamp = _Lamp(heat=faults.heat, hot=faults.heat >= HEAT_TRIP)
         self._lamp_since = 0.0
         self._pops: deque[float] = deque(maxlen=max(1, self._pops_per_min))
-        self._volt = 1.0  # of full, at `_volt_at`; delivered charged
+        self._volt = 1.0  # relative to full, at `_volt_at`; initially charged
         self._volt_at = 0.0
         self._last_pop = -math.inf
         self._last_power = 0.0
-        self._coming: tuple[float, str] | None = None  # when the tube will pop, and its token
+        self._coming: tuple[float, str] | None = None  # time of the next pop, and its token
         self._outcome: str | CommandRefused = ""
         self.angle_deg = 0.0
         self._settled_at = 0.0
@@ -113,7 +113,7 @@ class FlashUnit(Device):
     # settings ---------------------------------------------------------------------------------
 
     def reset(self, now: float, *, power_up: bool) -> None:
-        """Return to the settings of power-up: parallel, full power, dark."""
+        """Restore the power-up settings: parallel, full power, dark."""
         super().reset(now, power_up=power_up)
         self.power = 1.0
         self.sync_s = 0.0
@@ -123,7 +123,7 @@ class FlashUnit(Device):
         self._turn(POLARIZER_READING_DEG["parallel"], now)
 
     def capabilities(self) -> Mapping[str, Any]:
-        """Return limits and counts, units in the names."""
+        """Return limits and counts; the names include the units."""
         return {
             "power_min": MIN_POWER,
             "power_max": 1.0,
@@ -139,7 +139,7 @@ class FlashUnit(Device):
         }
 
     def commands(self) -> dict[str, Command]:
-        """Return the command table: the manual of the box."""
+        """Return the command table, which is the controller's manual."""
         acts: dict[str, CommandHandler] = {
             "FLAS:POL": self._set_polarizer,
             "FLAS:POL?": self._get_polarizer,
@@ -162,7 +162,7 @@ class FlashUnit(Device):
     # time -------------------------------------------------------------------------------------
 
     def deadline(self) -> float:
-        """Return when the tube will pop or a lamp go out by itself, in s; inf for never."""
+        """Return the time of the next pop or timed lamp-off, in s; inf for never."""
         pop = math.inf if self._coming is None else self._coming[0]
         return min(pop, self._lamp_out())
 
@@ -173,7 +173,7 @@ class FlashUnit(Device):
         return min(self._lamp.end_s, self._now + LAMP_TAU_S * math.log(max(span, 1.0)))
 
     def advance(self, now: float) -> None:
-        """Let time pass up to `now`, in s."""
+        """Advance time to `now`, in s."""
         while (due := self.deadline()) <= now:
             lamp_ends = self._lamp_out() <= due
             self._heat_until(due)
@@ -194,7 +194,7 @@ class FlashUnit(Device):
         self._now = max(now, self._now)
 
     def go_dark(self, now: float) -> None:
-        """Switch the lamps off and prevent a pop that has not come yet."""
+        """Switch the lamps off and prevent a pending pop."""
         self._lamps_out(now)
         if self._coming is not None:
             self._coming = None
@@ -212,15 +212,15 @@ class FlashUnit(Device):
         return self._lamp.lit
 
     def is_busy(self, now: float) -> bool:
-        """Tell whether the analyser is turning."""
+        """Return whether the analyzer is turning."""
         return now < self._settled_at
 
     def states(self, now: float) -> dict[int, bool]:
-        """Return 16 turning, 32 no pop possible yet, 64 lamp on, 128 too hot."""
+        """Return bits 16 turning, 32 no pop possible yet, 64 lamp on, 128 too hot."""
         waits = self._wait_for_fire(now)[0] > 0.0
         return {16: self.is_busy(now), 32: waits, 64: self._lamp.lit, 128: self._lamp.hot}
 
-    # analyser ---------------------------------------------------------------------------------
+    # analyzer ---------------------------------------------------------------------------------
 
     def _turn(self, reading_deg: float, now: float) -> None:
         start = max(now, self._settled_at)
@@ -259,20 +259,23 @@ class FlashUnit(Device):
         return self._voltage(now) ** 2
 
     def _voltage(self, now: float) -> float:
+        # V(t) = V_end - (V_end - V_0) exp(-t / tau), cut at full; the energy is V^2.
         gap = CHARGER_HEADROOM - self._volt
         return min(
             1.0, CHARGER_HEADROOM - gap * math.exp(-(now - self._volt_at) / self._charge_tau_s)
         )
 
     def _wait_for_fire(self, now: float) -> tuple[float, Code, str]:
-        """Return how long FIRE would be refused, in s, why, and in words."""
+        """Return the time until FIRE is accepted, in s, with the code and text of the refusal."""
+        # The charge suffices from V = sqrt(power) on: t = tau ln((V_end - V) / (V_end -
+        # sqrt(power))).
         need = math.sqrt(self.power)
         gap = (CHARGER_HEADROOM - self._voltage(now)) / (CHARGER_HEADROOM - need)
         full = len(self._pops) == self._pops_per_min
         coming_s = -math.inf if self._coming is None else self._coming[0] - now
         waits = [
             (coming_s, Code.IGNORED, "about to pop"),
-            (self._settled_at - now, Code.IGNORED, "analyser turning"),
+            (self._settled_at - now, Code.IGNORED, "analyzer turning"),
             (self._last_pop + self.rig.recycle_s * self._last_power - now, Code.RECYCLE, "tube"),
             (self._pops[0] + POP_WINDOW_S - now if full else 0.0, Code.DUTY, "pops per minute"),
             (self._charge_tau_s * math.log(max(gap, 1.0)), Code.IGNORED, "charging"),
@@ -287,7 +290,7 @@ class FlashUnit(Device):
         token = parse_token(arguments)
         self._require_closed_stop()
         wait_s, code, why = self._wait_for_fire(now)
-        # a clock of microseconds cannot tell a shorter wait from none
+        # a shorter wait is below the microsecond resolution of the clock
         if wait_s > 1e-6:
             raise CommandRefused(code, f"{why}, {math.ceil(wait_s * 1e3)} ms")
         self._lamps_out(now)
@@ -302,7 +305,7 @@ class FlashUnit(Device):
         return self._outcome
 
     def _pop(self, now: float) -> None:
-        """Let the tube pop as announced, and keep what is to be said of it."""
+        """Fire the tube as scheduled and record the outcome."""
         token = "" if self._coming is None else self._coming[1]
         self._coming = None
         self._lamps_out(now)

@@ -1,14 +1,14 @@
-"""The gradient sphere's box: patterns of light of all LEDs, and a turning analyser; sans-I/O.
+"""Emulate the gradient sphere's controller: LED patterns and a turning analyzer (sans-I/O).
 
-Its manual is its command table (`GradientSphereUnit.commands`) and these rules. A pattern is a
-light of all LEDs at once: full, or weighted by (1 + w) / 2 or (1 - w) / 2 with w a coordinate of
-the unit way to the LED. ``PATT`` carries its own end. A scan is a table of patterns with readings
-of the analyser, see `rigsim.boxes.led_sequencer`: the box steps by itself; where a row asks for
-another reading than the row before, the light goes out, the analyser turns, and only then the
-row's light comes on. Outside of scans, light while the analyser turns and turning in the light are
-refused (-213). Gains make every LED give a share of what the pattern asks of it. LEDs that draw no
-current are reported as ``LED:FAIL``; that others give less light than they are driven for, the box
-does not notice.
+Its manual is its command table (`GradientSphereUnit.commands`) and these rules. A pattern lights
+all LEDs at once: at full level, or weighted by (1 + w) / 2 or (1 - w) / 2 with w a coordinate of
+the unit direction to the LED. ``PATT`` includes its own end. A scan is a table of patterns with
+readings of the analyzer, see `rigsim.boxes.led_sequencer`, and the controller steps it
+autonomously. Where a row requests another reading than the row before, the light goes out, the
+analyzer turns, and only then the row's light comes on. Outside of scans, light while the analyzer
+turns and turning in the light are refused (-213). Gains scale the level of each LED relative to the
+pattern's. LEDs that draw no current are reported as ``LED:FAIL``. The controller does not detect
+LEDs that emit less light than they are driven for.
 """
 
 import math
@@ -40,30 +40,30 @@ _GAINS_PATTERN = re.compile(r"[0-9]{1,4}(\+[0-9]{1,4})*")
 
 @dataclass(frozen=True, slots=True)
 class PatternLight:
-    """Light of one pattern from one switching to the next."""
+    """Light of one pattern between two switching times."""
 
     pattern: str
     """full, x, y, z, -x, -y or -z."""
     level: float
-    """Light that all LEDs were driven for, relative to full, 0 to 1."""
+    """Drive level of all LEDs relative to full, 0 to 1."""
     t_on_s: float
     """World time when it came on, s."""
     t_off_s: float
     """World time when it went off, s."""
     analyser_deg: float
-    """Reading of the analyser meanwhile, degrees; 0 parallel, 90 crossed."""
+    """Reading of the analyzer meanwhile, degrees; 0 parallel, 90 crossed."""
     led_shares: tuple[float, ...] = ()
-    """What each LED gave of what the pattern at this level asks of it: its gain, times its health
-    (0 when dead, less than 1 when weak); empty: 1 for all."""
+    """Light of each LED relative to the pattern at this level: its gain, times its health (0 when
+    dead, less than 1 when weak); empty: 1 for all."""
 
 
 class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
-    """State of the gradient sphere's box behind its controller.
+    """State of the gradient sphere's device behind its controller.
 
     Parameters
     ----------
     wiring
-        Its LEDs, what they may do, analyser and cameras; each stretch of light is a `PatternLight`.
+        Its LEDs with limits, analyzer and cameras; each interval of light is a `PatternLight`.
     """
 
     kind = "gradient_sphere"
@@ -78,14 +78,14 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
             health[led] = share
         health[list(faults.dead_leds)] = 0.0
         self._health = health
-        self._shining: PatternLight | None = None  # what is on; its end is not known yet
+        self._shining: PatternLight | None = None  # light in progress; its end is not known yet
         self.analyser_deg = 0.0
         self._settled_at = 0.0
-        super().__init__(wiring, self._ended)
+        super().__init__(wiring, self._on_pulse_end)
         self.reset(0.0, power_up=True)
 
     def reset(self, now: float, *, power_up: bool) -> None:
-        """Return to the settings of power-up; the analyser turns to parallel."""
+        """Restore the power-up settings; the analyzer turns to parallel."""
         super().reset(now, power_up=power_up)
         self.gains = [LEVEL_STEPS] * self.bank.count
         self._gains_sent: list[int] = []
@@ -93,7 +93,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         self._turn(0.0, now)
 
     def capabilities(self) -> Mapping[str, Any]:
-        """Return limits and counts, units in the names."""
+        """Return limits and counts; the names include the units."""
         return {
             **super().capabilities(),
             "analyser_min_deg": led_table.ANALYZER_RANGE_DEG[0],
@@ -102,7 +102,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         }
 
     def commands(self) -> dict[str, Command]:
-        """Return the command table: the manual of the box."""
+        """Return the command table, which is the controller's manual."""
         acts: dict[str, CommandHandler] = {
             "SEQ:DEF": self._define_rows,
             "PATT": self._light,
@@ -116,18 +116,18 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         }
         return super().commands() | build_command_table("gradient_sphere", acts)
 
-    # analyser ---------------------------------------------------------------------------------
+    # analyzer ---------------------------------------------------------------------------------
 
     def is_analyzer_rotating(self, now: float) -> bool:
-        """Tell whether the analyser turns."""
+        """Return whether the analyzer turns."""
         return now < self._settled_at
 
     def is_busy(self, now: float) -> bool:
-        """Tell whether a scan is stepping or the analyser turns."""
+        """Return whether a scan is stepping or the analyzer turns."""
         return super().is_busy(now) or self.is_analyzer_rotating(now)
 
     def states(self, now: float) -> dict[int, bool]:
-        """Return those of all boxes with LEDs, and 1024 turning."""
+        """Return the bits of all controllers with LEDs, and 1024 turning."""
         return super().states(now) | {1024: self.is_analyzer_rotating(now)}
 
     def _turn(self, reading_deg: float, now: float) -> None:
@@ -148,34 +148,36 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
     def _require_settled(self, now: float) -> None:
         if self.is_analyzer_rotating(now):
             wait_ms = (self._settled_at - now) * 1e3
-            raise CommandRefused(Code.IGNORED, f"analyser turning, {wait_ms:.0f} ms")
+            raise CommandRefused(Code.IGNORED, f"analyzer turning, {wait_ms:.0f} ms")
 
     # light ------------------------------------------------------------------------------------
 
     def light_now(self, now: float) -> list[PatternLight]:
-        """Return the light that is going on, as given so far."""
+        """Return the light in progress, as emitted so far."""
         shining = self._shining
         if shining is None or not self.lit:
             return []
-        return [self._until(shining, max(now, shining.t_on_s))]
+        return [self._with_end(shining, max(now, shining.t_on_s))]
 
-    def _until(self, light: PatternLight, t_off_s: float) -> PatternLight:
+    def _with_end(self, light: PatternLight, t_off_s: float) -> PatternLight:
         return replace(light, t_off_s=t_off_s)
 
-    def _ended(self, lit: LedPulse) -> None:
-        """Pass on a pattern when the first of its LEDs goes out: all of them do at once."""
+    def _on_pulse_end(self, lit: LedPulse) -> None:
+        """Report a pattern when its first LED goes out: all LEDs go out at once."""
         shining, self._shining = self._shining, None
         if shining is not None:
-            self._on_light(self._until(shining, lit.t_off_s))
+            self._on_light(self._with_end(shining, lit.t_off_s))
 
     def _levels(self, pattern: str, level: float) -> list[float]:
-        """Return what each LED is driven for."""
+        """Return the drive level of each LED."""
         gains = np.array(self.gains) / LEVEL_STEPS
         driven: list[float] = (level * gains * self._shares[pattern]).tolist()
         return driven
 
-    def _shine(self, pattern: str, level: float, now: float, *, end_s: float = math.inf) -> None:
-        """Replace what is on by a pattern."""
+    def _start_pattern(
+        self, pattern: str, level: float, now: float, *, end_s: float = math.inf
+    ) -> None:
+        """Replace the light in progress by a pattern."""
         self.bank.all_off(now)
         if pattern == "dark":
             return
@@ -187,7 +189,9 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         given = () if (shares == 1.0).all() else tuple(shares.tolist())
         self._shining = PatternLight(pattern, level, now, now, self.analyser_deg, given)
 
-    def _wanted(self, pattern: str, level: float, on_s: float, off_s: float) -> list[LedPulse]:
+    def _requested_pulses(
+        self, pattern: str, level: float, on_s: float, off_s: float
+    ) -> list[LedPulse]:
         levels = self._levels(pattern, level)
         return [
             LedPulse(led, driven, on_s, off_s) for led, driven in enumerate(levels) if driven > 0.0
@@ -210,12 +214,12 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         self._require_closed_stop()
         self._require_settled(now)
         end_s = now + span_ms / 1e3
-        wanted = self._wanted(pattern, level, now, end_s)
+        wanted = self._requested_pulses(pattern, level, now, end_s)
         self.bank.require_within_limits(wanted, now)
-        self._require_calm(wanted, now)
+        self._require_flicker_limits(wanted, now)
         self._sequence_armed = False
         self._failed = set()
-        self._shine(pattern, level, now, end_s=end_s)
+        self._start_pattern(pattern, level, now, end_s=end_s)
 
     def _lit_now(self, _: str, now: float) -> str:
         shining = self._shining
@@ -226,7 +230,9 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
     def _parse_rows(self, text: str) -> list[led_table.PatternRow]:
         return led_table.parse_pattern_rows(text, cameras=self._cameras, max_us=self._row_max_us)
 
-    def _lit_by(self, rows: Sequence[led_table.PatternRow], now: float) -> list[LedPulse]:
+    def _pulses_from_table(
+        self, rows: Sequence[led_table.PatternRow], now: float
+    ) -> list[LedPulse]:
         self._require_settled(now)
         times = led_table.pattern_start_times(
             rows, reading_deg=self.analyser_deg, s_per_deg=self._s_per_deg
@@ -234,7 +240,9 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         found: list[LedPulse] = []
         for row, (_, lit_s) in zip(rows, times, strict=True):
             start_s = now + lit_s
-            found += self._wanted(row.pattern, row.level, start_s, start_s + row.dwell_us * 1e-6)
+            found += self._requested_pulses(
+                row.pattern, row.level, start_s, start_s + row.dwell_us * 1e-6
+            )
         return found
 
     def _schedule(self, rows: Sequence[led_table.PatternRow]) -> list[SequenceEvent]:
@@ -254,7 +262,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
             self.bank.all_off(now)
             self._turn(row.analyser_deg, now)
         else:
-            self._shine(row.pattern, row.level, now)
+            self._start_pattern(row.pattern, row.level, now)
 
     # gains ------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""The LEDs of the dome and their driver: switching, heat, duty and dose; sans-I/O."""
+"""Model the LEDs and their driver: switching, heat, duty and dose (sans-I/O)."""
 
 import math
 from collections import deque
@@ -13,20 +13,20 @@ from rigsim.boxes.faults import Faults
 from rigsim.boxes.led_table import LedPulse
 
 TRIP_RESET_FRACTION = 0.5
-"""Temperature, of the trip's, below which a hot LED may be lit again."""
+"""Temperature below which a hot LED may be lit again, relative to the trip temperature."""
 
 
 class LedBank:
-    """LEDs that are lit and dark, and what their driver remembers of it.
+    """Switching state of the LEDs and the history that their driver keeps.
 
     Parameters
     ----------
     rig
-        Whose they are, and what they may do.
+        Rig of the LEDs, with their limits.
     on_light
-        Called with each stretch of light when it ends: LED, level, start and end in s.
+        Called with each interval of light when it ends: LED, level, start and end in s.
     faults
-        Dead LEDs, weak ones, which the driver does not notice, and the heat of all at power-up.
+        Dead LEDs; weak LEDs, which the driver does not detect; and the heat of all at power-up.
     """
 
     def __init__(self, rig: Rig, faults: Faults, on_light: Callable[[LedPulse], None]) -> None:
@@ -37,7 +37,7 @@ class LedBank:
         self._power_w = np.array([light.power_w or 0.0 for light in lights])
         self._weak = faults.weak_leds
         self._on_light = on_light
-        # number -> (level, since, end); a stretch of light that is still going on
+        # number -> (level, since, end); an interval of light in progress
         self._lit: dict[int, tuple[float, float, float]] = {}
         self._past: dict[int, deque[LedPulse]] = {}
         self._heat = np.full(self.count, faults.heat)
@@ -58,11 +58,11 @@ class LedBank:
         return bool(self._hot.any())
 
     def dose_ws(self, led: int) -> float:
-        """Return what an LED has sent out to this subject, Ws."""
+        """Return the energy that an LED has emitted toward this subject, Ws."""
         return float(self._dose_ws[led])
 
     def new_subject(self) -> None:
-        """Begin to count the dose anew."""
+        """Restart the dose count."""
         self._dose_ws[:] = 0.0
 
     # time -------------------------------------------------------------------------------------
@@ -79,7 +79,7 @@ class LedBank:
         return due
 
     def advance(self, now: float) -> list[int]:
-        """Let time pass up to `now`, at most one deadline; return LEDs that have tripped."""
+        """Advance time to `now`, at most one deadline; return LEDs that have tripped."""
         self._heat_until(now)
         tripped = [k for k in self._lit if self._heat[k] >= self.limits.thermal_trip - 1e-9]
         for led in tripped:
@@ -92,6 +92,7 @@ class LedBank:
     def _heat_until(self, now: float) -> None:
         if now <= self._heat_at:
             return
+        # dT/dt = (level - T) / tau: each temperature relaxes exponentially toward its LED's level.
         goal = np.zeros(self.count)
         for led, (level, _, _) in self._lit.items():
             goal[led] = level
@@ -129,7 +130,7 @@ class LedBank:
             self.switch_off(led, now)
 
     def ongoing_pulses(self, now: float) -> list[LedPulse]:
-        """Return the stretches of light that have not ended, as given so far."""
+        """Return the intervals of light that have not ended, as emitted so far."""
         return [
             LedPulse(led, level * self._weak.get(led, 1.0), since, max(now, since))
             for led, (level, since, _) in self._lit.items()
@@ -138,7 +139,7 @@ class LedBank:
     # what is asked for ------------------------------------------------------------------------
 
     def pulses_since(self, start_s: float) -> list[LedPulse]:
-        """Return light driven after `start_s` and, to its end, what is still going on."""
+        """Return light driven after `start_s`, and intervals in progress to their end."""
         past = [pulse for row in self._past.values() for pulse in row if pulse.t_off_s > start_s]
         still = [LedPulse(led, level, on, end) for led, (level, on, end) in self._lit.items()]
         return past + [pulse for pulse in still if math.isfinite(pulse.t_off_s)]
@@ -146,7 +147,7 @@ class LedBank:
     def require_within_limits(
         self, requested: Iterable[LedPulse], now: float
     ) -> tuple[float, float, float]:
-        """Return most duty, heat and dose (Ws) with `requested` light; refuse what is too much."""
+        """Return the maximum duty, heat and dose (Ws) with `requested` light, or refuse it."""
         limits = self.limits
         rows: dict[int, list[LedPulse]] = {}
         for pulse in requested:
@@ -176,11 +177,11 @@ class LedBank:
         return most_duty, most_heat, most_dose
 
     def _duty(self, led: int, new: Sequence[LedPulse], now: float) -> float:
-        """Return the most mean level of an LED in any window that ends in `new` light."""
+        """Return the maximum mean level of an LED over all windows that end in `new` light."""
         window = self.limits.duty_window_s
         past = [pulse for pulse in self._past.get(led, ()) if pulse.t_off_s > now - window]
         if led in self._lit and self._lit[led][1] < now:
-            # what goes on is replaced by what is asked for, but what it has given counts
+            # the request replaces light in progress, but its energy so far counts
             past.append(LedPulse(led, self._lit[led][0], self._lit[led][1], now))
         pulses = [*past, *new]
         on = np.array([pulse.t_on_s for pulse in pulses])

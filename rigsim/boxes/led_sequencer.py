@@ -1,10 +1,10 @@
-"""What boxes have that step through LEDs by themselves: tables, cameras, eyes, dose; sans-I/O.
+"""Emulate controllers that step LEDs by a table: rows, cameras, eyes, dose (sans-I/O).
 
-A table of rows is uploaded, compared by its checksum, armed and triggered; the box then steps by
-itself, releases the cameras of a row's mask once its light is steady, and reports each release as
-an event ``SEQ:STEP``. Light is refused beyond the duty (101), heat (102) or dose (104) that an LED
-may give, and, as long as a person has not said that the subject's eyes are closed or shielded,
-beyond the flicker that open eyes may see (105). Heat, dose and duty survive a reset.
+The host uploads a table of rows, compares its checksum, arms and triggers it. The controller then
+steps autonomously, releases the cameras of a row's mask once its light is steady, and reports each
+release as an event ``SEQ:STEP``. Light is refused beyond the duty (101), heat (102) or dose (104)
+limit of an LED. Until the operator has confirmed that the subject's eyes are closed or shielded, it
+is also refused beyond the flicker limit for open eyes (105). Heat, dose and duty survive a reset.
 """
 
 import re
@@ -39,7 +39,7 @@ _MASK_PATTERN = re.compile(r"[0-9A-Fa-f]{1,8}")
 LED_RANGE_MS = (1.0, 500.0)
 EYE_STATES = ("OPEN", "CLOSED", "SHIELDED")
 FLICKER_HISTORY_S = 1.0
-"""Light so long ago counts as one with light to come."""
+"""Past interval whose light is evaluated together with the requested light, s."""
 
 
 RowT = TypeVar("RowT", bound=TableRow)
@@ -47,7 +47,7 @@ RowT = TypeVar("RowT", bound=TableRow)
 
 @dataclass(slots=True)
 class SequenceRun(Generic[RowT]):
-    """A sequence that was triggered."""
+    """A triggered sequence."""
 
     token: str
     start_s: float
@@ -58,14 +58,14 @@ class SequenceRun(Generic[RowT]):
 
 
 class LedSequencer(Device, Generic[RowT]):
-    """State of a box with LEDs and a table, behind its controller.
+    """State of a device with LEDs and a table, behind its controller.
 
     Parameters
     ----------
     wiring
-        Its LEDs, what they may do, and its cameras.
+        Its LEDs with their limits, and its cameras.
     on_light
-        Called with each stretch of light of an LED when it has ended.
+        Called with each interval of an LED's light when it has ended.
     """
 
     def __init__(self, wiring: Wiring, on_light: Callable[[LedPulse], None]) -> None:
@@ -76,31 +76,31 @@ class LedSequencer(Device, Generic[RowT]):
         self._limits = self.bank.limits
         self._guard = EyeFlickerMonitor(rig.lights)
         self._run: SequenceRun[RowT] | None = None
-        # tokens and times of all sequences since the box was made
+        # tokens and times of all sequences since the controller was built
         self.runs: list[tuple[str, float]] = []
 
-    # what a box of a kind does ----------------------------------------------------------------
+    # specific to the kind of box ----------------------------------------------------------------
 
     @abstractmethod
     def _parse_rows(self, text: str) -> list[RowT]:
-        """Return the rows that ``SEQ:DEF`` gives, or refuse."""
+        """Parse the rows of ``SEQ:DEF``, or refuse."""
 
     @abstractmethod
-    def _lit_by(self, rows: Sequence[RowT], now: float) -> list[LedPulse]:
+    def _pulses_from_table(self, rows: Sequence[RowT], now: float) -> list[LedPulse]:
         """Return the light of a sequence that would begin at `now`."""
 
     @abstractmethod
     def _schedule(self, rows: Sequence[RowT]) -> list[SequenceEvent]:
-        """Return everything that happens in a sequence, in order of time."""
+        """Return all events of a sequence, in order of time."""
 
     @abstractmethod
     def _switch_light(self, run: SequenceRun[RowT], switch: SequenceEvent, now: float) -> None:
-        """Do what a switch says that is neither ``pulse`` nor ``end``."""
+        """Carry out an event other than ``pulse`` and ``end``."""
 
     # settings ---------------------------------------------------------------------------------
 
     def reset(self, now: float, *, power_up: bool) -> None:
-        """Return to the settings of power-up: no table, all cameras, open eyes, dark."""
+        """Restore the power-up settings: no table, all cameras, open eyes, dark."""
         super().reset(now, power_up=power_up)
         self.table: list[RowT] = []
         self.mask = (1 << self._cameras) - 1
@@ -110,7 +110,7 @@ class LedSequencer(Device, Generic[RowT]):
         self._steps: dict[int, int] = {}
 
     def capabilities(self) -> Mapping[str, Any]:
-        """Return limits and counts, units in the names."""
+        """Return limits and counts; the names include the units."""
         limits = self._limits
         return {
             "leds": self.bank.count,
@@ -137,7 +137,7 @@ class LedSequencer(Device, Generic[RowT]):
         return min(ROW_RANGE_US[1], round(self._limits.max_on_s * 1e6))
 
     def commands(self) -> dict[str, Command]:
-        """Return the commands that these boxes share."""
+        """Return the commands that these controllers share."""
         acts: dict[str, CommandHandler] = {
             "SEQ:CLE": self._clear_table,
             "SEQ:CRC?": lambda *_: f"{len(self.table)},{table_crc(self.table)}",
@@ -166,15 +166,15 @@ class LedSequencer(Device, Generic[RowT]):
         return due
 
     def advance(self, now: float) -> None:
-        """Let time pass up to `now`, in s."""
+        """Advance time to `now`, in s."""
         while (due := self.deadline()) <= now:
-            self._pass_until(due)
+            self._advance_bank(due)
             run = self._run
             while run is not None and run.pending and run.start_s + run.pending[0].t_s <= due:
                 self._switch(run, run.pending.pop(0), due)
-        self._pass_until(now)
+        self._advance_bank(now)
 
-    def _pass_until(self, now: float) -> None:
+    def _advance_bank(self, now: float) -> None:
         tripped = self.bank.advance(now)
         if tripped:
             self._events += [("LED:HOT", str(led)) for led in tripped]
@@ -194,7 +194,7 @@ class LedSequencer(Device, Generic[RowT]):
             self._switch_light(run, switch, now)
 
     def go_dark(self, now: float) -> None:
-        """Put every LED out and stop the sequence."""
+        """Switch off every LED and stop the sequence."""
         self.bank.all_off(now)
         self._sequence_armed = False
         run = self._run
@@ -214,11 +214,11 @@ class LedSequencer(Device, Generic[RowT]):
         return self._run is not None and self._run.state == "RUN"
 
     def is_busy(self, now: float) -> bool:
-        """Tell whether a sequence is stepping."""
+        """Return whether a sequence is stepping."""
         return self.is_running
 
     def states(self, now: float) -> dict[int, bool]:
-        """Return 16 running, 32 sequence armed, 64 lit, 128 hot, 512 eyes safe."""
+        """Return bits 16 running, 32 sequence armed, 64 lit, 128 hot, 512 eyes safe."""
         running = {16: self.is_running, 32: self._sequence_armed, 64: self.lit}
         return running | {128: self.bank.has_tripped, 512: self.eyes != "OPEN"}
 
@@ -236,7 +236,7 @@ class LedSequencer(Device, Generic[RowT]):
         self._require_still()
         first_text, comma, rest = arguments.partition(",")
         CommandRefused.raise_if(not comma, Code.SYNTAX, "expected FIRST,ROW;...")
-        # a gap in the table would be a row that nobody described
+        # a gap in the table would leave a row undefined
         first = parse_integer(first_text, 0, len(self.table))
         rows = self._parse_rows(rest)
         if first + len(rows) > self._limits.max_rows:
@@ -255,14 +255,16 @@ class LedSequencer(Device, Generic[RowT]):
         if rows != len(self.table):
             raise CommandRefused(Code.OUT_OF_RANGE, f"the table has {len(self.table)} rows")
         self._require_closed_stop()
-        wanted = self._lit_by(self.table, now)
+        wanted = self._pulses_from_table(self.table, now)
         duty, heat, dose_ws = self.bank.require_within_limits(wanted, now)
-        flashes, rms = self._require_calm(wanted, now)
+        flashes, rms = self._require_flicker_limits(wanted, now)
         self._sequence_armed = True
         return f"{flashes:.2f},{rms:.4f},{duty:.4f},{heat:.4f},{dose_ws:.4f}"
 
-    def _require_calm(self, wanted: Sequence[LedPulse], now: float) -> tuple[float, float]:
-        """Return flashes per second and rms of what is wanted; refuse what open eyes must not see.
+    def _require_flicker_limits(
+        self, wanted: Sequence[LedPulse], now: float
+    ) -> tuple[float, float]:
+        """Return flashes per second and rms of the request, or refuse it for open eyes.
 
         Flashes are counted together with those of the last second.
         """
@@ -283,10 +285,10 @@ class LedSequencer(Device, Generic[RowT]):
         self._require_still()
         self._require_closed_stop()
         CommandRefused.raise_if(
-            not self._sequence_armed, Code.NOT_ARMED, "SEQ:ARM judges the table first"
+            not self._sequence_armed, Code.NOT_ARMED, "SEQ:ARM checks the table first"
         )
-        # light that was under way at SEQ:ARM, or came after it, has been given by now
-        self.bank.require_within_limits(self._lit_by(self.table, now), now)
+        # light in progress at SEQ:ARM, or switched on after it, has been emitted by now
+        self.bank.require_within_limits(self._pulses_from_table(self.table, now), now)
         self._sequence_armed = False
         self.bank.all_off(now)
         rows = list(self.table)
@@ -336,5 +338,5 @@ class LedSequencer(Device, Generic[RowT]):
         parse_token(arguments)
         self._require_still()
         self.bank.new_subject()
-        # eyes are a person's, and so is what was said of them
+        # the eye state was confirmed for the previous subject only
         self.eyes = "OPEN"

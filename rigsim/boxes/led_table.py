@@ -1,4 +1,4 @@
-"""Rows of light that hosts send to boxes with LEDs, and what those switch when."""
+"""Parse and schedule the rows of light that hosts send to controllers with LEDs."""
 
 import math
 import re
@@ -26,12 +26,12 @@ _ROW_PATTERN = re.compile(r"(-|[0-9+]{1,400}):([0-9]{1,4}):([0-9]{1,7}):([0-9A-F
 
 @dataclass(frozen=True, slots=True)
 class LedPulse:
-    """Light of one LED from one switching to the next, past or to come."""
+    """Light of one LED between two switching times, past or to come."""
 
     led: int
     """Number of the LED, an index into the rig's lights."""
     level: float
-    """Light given relative to full, 0 to 1; a weak LED gives less than it was asked for."""
+    """Emitted light relative to full, 0 to 1; a weak LED emits less than requested."""
     t_on_s: float
     """World time when it came on, s."""
     t_off_s: float
@@ -39,13 +39,13 @@ class LedPulse:
 
 
 class TableRow:
-    """What rows of all tables have; their text is what the checksum is taken of."""
+    """Fields of the rows of all tables; the checksum covers the text of a row."""
 
     __slots__ = ()
     level_steps: int
     """Light in thousandths of full, 0 when dark."""
     dwell_us: int
-    """How long it is lit, us."""
+    """Time for which it is lit, us."""
     mask: int
     """Cameras that are released: bit 0 is the first."""
 
@@ -56,11 +56,11 @@ class TableRow:
 
     @property
     def dwell_s(self) -> float:
-        """How long it is lit, s."""
+        """Time for which it is lit, s."""
         return self.dwell_us * 1e-6
 
     def require_valid(self, is_dark: bool, *, cameras: int, max_us: int) -> Self:
-        """Return the row, or refuse what the box cannot do."""
+        """Return the row, or refuse values that the controller does not support."""
         if self.level_steps > LEVEL_STEPS or is_dark != (self.level_steps == 0):
             raise CommandRefused(
                 Code.OUT_OF_RANGE, f"expected level 1 to {LEVEL_STEPS}, 0 when dark"
@@ -77,27 +77,27 @@ class LedTableRow(TableRow):
     """One row of the table."""
 
     leds: tuple[int, ...]
-    """Numbers of the LEDs that are on, rising; empty: dark."""
+    """Numbers of the lit LEDs, ascending; empty: dark."""
     level_steps: int
     """Light in thousandths of full."""
     dwell_us: int
-    """How long, us."""
+    """Time for which it is lit, us."""
     mask: int
     """Cameras that are released: bit 0 is the first."""
 
     def __str__(self) -> str:
-        """Return the row in the one spelling that the table's checksum is taken of."""
+        """Return the row in the canonical spelling that the table's checksum covers."""
         leds = "+".join(map(str, self.leds)) or "-"
         return f"{leds}:{self.level_steps}:{self.dwell_us}:{self.mask:X}"
 
 
 def parse_leds(text: str, *, count: int, max_leds: int) -> tuple[int, ...]:
-    """Return the numbers in ``3+17``, rising; refuse what is no list of existing LEDs."""
+    """Parse ``3+17`` to ascending numbers; refuse text that is not a list of existing LEDs."""
     parts = text.split("+")
     if not all(part.isdecimal() and len(part) <= 4 for part in parts):
         raise CommandRefused(Code.SYNTAX, "expected LED numbers joined by +")
     numbers = tuple(sorted({int(part) for part in parts}))
-    CommandRefused.raise_if(len(numbers) != len(parts), Code.SYNTAX, "an LED stands twice")
+    CommandRefused.raise_if(len(numbers) != len(parts), Code.SYNTAX, "an LED is listed twice")
     CommandRefused.raise_if(
         numbers[-1] >= count, Code.OUT_OF_RANGE, f"expected LED 0 to {count - 1}"
     )
@@ -109,7 +109,7 @@ def parse_leds(text: str, *, count: int, max_leds: int) -> tuple[int, ...]:
 def parse_rows(
     text: str, *, count: int, max_leds: int, cameras: int, max_us: int
 ) -> list[LedTableRow]:
-    """Return rows separated by ``;``, each ``leds:level:us:mask``."""
+    """Parse rows separated by ``;``, each ``leds:level:us:mask``."""
     rows = []
     for part in text.split(";"):
         found = _ROW_PATTERN.fullmatch(part)
@@ -129,12 +129,12 @@ def table_crc(rows: Sequence[object]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class SequenceEvent:
-    """Something that the sequencer does at a time."""
+    """An action of the sequencer at a time."""
 
     t_s: float
-    """Since the sequence began, s."""
+    """Time since the sequence began, s."""
     action: str
-    """``on``, ``turn`` (of one row into the next), ``pulse`` or ``end``."""
+    """``on``, ``turn`` (from one row to the next), ``pulse`` or ``end``."""
     row: int
     """Row that it belongs to."""
 
@@ -142,9 +142,9 @@ class SequenceEvent:
 def schedule_rows(
     rows: Sequence[LedTableRow], *, overlap_s: float, settle_s: float
 ) -> list[SequenceEvent]:
-    """Return everything that happens in a sequence, in order of time.
+    """Return all events of a sequence, in order of time.
 
-    The next row's LEDs come on `overlap_s` before the last row's go off; cameras are released
+    The next row's LEDs come on `overlap_s` before the last row's go off. Cameras are released
     `settle_s` after the row's turn, when only its own LEDs are on and steady.
     """
     found: list[SequenceEvent] = []
@@ -185,23 +185,24 @@ class PatternRow(TableRow):
     pattern: str
     """full, x, y, z, -x, -y, -z or dark."""
     analyser_deg: float
-    """Reading of the analyser, degrees; where it differs from the row before, it is turned."""
+    """Reading of the analyzer, degrees; where it differs from the row before, the analyzer
+    turns."""
     level_steps: int
     """Light in thousandths of full, 0 when dark."""
     dwell_us: int
-    """How long, us, without the turning before."""
+    """Time for which it is lit, us, without the turning before."""
     mask: int
     """Cameras that are released: bit 0 is the first."""
 
     def __str__(self) -> str:
-        """Return the row in the one spelling that the table's checksum is taken of."""
+        """Return the row in the canonical spelling that the table's checksum covers."""
         angle = f"{self.analyser_deg:.3f}".rstrip("0").rstrip(".")
         text = f"{self.pattern.upper()}:{angle}:{self.level_steps}:{self.dwell_us}"
         return f"{text}:{self.mask:X}"
 
 
 def parse_pattern_name(text: str) -> str:
-    """Return the pattern that a command names, or refuse."""
+    """Parse the pattern name of a command, or refuse."""
     name = text.lower()
     if name not in LIGHT_PATTERNS:
         raise CommandRefused(Code.SYNTAX, f"expected {' or '.join(LIGHT_PATTERNS).upper()}")
@@ -209,7 +210,7 @@ def parse_pattern_name(text: str) -> str:
 
 
 def parse_pattern_rows(text: str, *, cameras: int, max_us: int) -> list[PatternRow]:
-    """Return rows separated by ``;``, each ``pattern:degrees:level:us:mask``."""
+    """Parse rows separated by ``;``, each ``pattern:degrees:level:us:mask``."""
     rows = []
     for part in text.split(";"):
         found = _PATTERN_ROW_PATTERN.fullmatch(part)
@@ -224,7 +225,7 @@ def parse_pattern_rows(text: str, *, cameras: int, max_us: int) -> list[PatternR
 
 
 def pattern_led_fractions(lights: Sequence[Light]) -> dict[str, Float64Array]:
-    """Return what each pattern asks of each LED, 0 to 1: pattern -> (L,).
+    """Return each LED's level in each pattern, 0 to 1: pattern -> (L,).
 
     Examples
     --------
@@ -244,16 +245,16 @@ def pattern_led_fractions(lights: Sequence[Light]) -> dict[str, Float64Array]:
 def pattern_start_times(
     rows: Sequence[PatternRow], *, reading_deg: float, s_per_deg: float
 ) -> list[tuple[float, float]]:
-    """Return when each row's turning of the analyser begins and when its light does, s.
+    """Return the start of each row's analyzer rotation and of its light, s.
 
     Parameters
     ----------
     rows
         The scan; it begins at 0 s.
     reading_deg
-        Where the analyser stands before it, degrees.
+        Reading of the analyzer before the scan, degrees.
     s_per_deg
-        How long it takes per degree.
+        Rotation time per degree, s.
     """
     found = []
     t_s = 0.0
@@ -268,10 +269,10 @@ def pattern_start_times(
 def schedule_pattern_rows(
     rows: Sequence[PatternRow], *, reading_deg: float, s_per_deg: float, settle_s: float
 ) -> list[SequenceEvent]:
-    """Return everything that happens in a scan, in order of time.
+    """Return all events of a scan, in order of time.
 
-    ``rotate``: dark, and the analyser begins to turn; ``light``: a row's pattern comes on in place
-    of the last; ``pulse``: its cameras are released, `settle_s` later; ``end``.
+    ``rotate``: dark, and the analyzer begins to turn. ``light``: a row's pattern replaces the last.
+    ``pulse``: its cameras are released, `settle_s` later. ``end``: the scan ends.
     """
     found: list[SequenceEvent] = []
     end_s = 0.0

@@ -1,17 +1,18 @@
-"""The contact probe's box: source, shutter, cover of the fibres, suction, camera; sans-I/O.
+"""Emulate the contact probe's controller: source, shutter, fiber cover, suction, camera (sans-I/O).
 
-Its manual is its command table (`ProbeUnit.commands`) and these rules. Light and suction need an
-armed box and carry their own end; the shutter pulses the camera's line when its blades have cleared
-the fibre, and answers then. No light leaves a head that is not held, because an eye may be before
-it: with the LED on, the shutter opens only when the gauge has seen the suction that was asked for,
-and shuts when the pump goes off. Before the pump a person has to say with ``HEAD:SITE`` where the
-head sits, which means after each change, and after each time that the box has let go by itself:
-what makes other boxes dark (``SAFE``, ``ABOR``, ``*RST``, a silent host, the emergency stop, the
-loss of power) shuts the shutter, puts the LED out, vents, and forgets the place, because nobody
-knows whether a head that nothing holds is still there. ``PUMP VENT`` and the pump's own end keep
-it: the skin rests, and is sucked at again. A suction that ends by a fault forgets the place, too.
+Its manual is its command table (`ProbeUnit.commands`) and these rules. Light and suction require an
+armed controller and include their own end. The shutter pulses the camera's line when its blades
+have cleared the fiber, and answers then. No light leaves a head that suction does not hold, because
+an eye may be in front of it: with the LED on, the shutter opens only once the gauge has measured
+the requested suction, and closes when the pump goes off. Before the pump starts, the operator
+declares the head's site with ``HEAD:SITE``: after each change of site, and after each time that the
+controller has released the head by itself. Everything that makes other controllers dark (``SAFE``,
+``ABOR``, ``*RST``, a silent host, the emergency stop, the loss of power) closes the shutter,
+switches off the LED, vents, and clears the site, because a released head may have moved. ``PUMP
+VENT`` and the pump's own end keep the site: the skin rests and takes suction again. A suction that
+ends by a fault clears the site, too.
 
-The box does not know what it sits on: it draws at a `SuctionLoad` and has a gauge.
+The controller has no model of the skin: it acts on a `SuctionLoad` and reads a gauge.
 """
 
 import re
@@ -53,12 +54,12 @@ _WHOLE_PATTERN = re.compile(r"[0-9]{1,4}")
 
 
 class ProbeUnit(Device):
-    """State of the probe's box behind its controller.
+    """State of the probe's device behind its controller.
 
     Parameters
     ----------
     wiring
-        Its probe, the LED at the source fibre, the head; each stretch of light is a `SourceLight`.
+        Its probe, the LED at the source fiber, the head; each interval of light is a `SourceLight`.
     """
 
     kind = "probe"
@@ -78,14 +79,14 @@ class ProbeUnit(Device):
     # settings ---------------------------------------------------------------------------------
 
     def reset(self, now: float, *, power_up: bool) -> None:
-        """Return to the settings of power-up: dark, vented, no place, no fibre covered."""
+        """Restore the power-up settings: dark, vented, no site, no fiber covered."""
         super().reset(now, power_up=power_up)
         self.shutter.forget(power_up=power_up, now=now)
         if power_up:
             self.pump.last_report = ""
 
     def capabilities(self) -> Mapping[str, Any]:
-        """Return limits and counts, units in the names."""
+        """Return limits and counts; the names include the units."""
         probe = self._probe
         return {
             "fibres": len(probe.fibres),
@@ -107,11 +108,11 @@ class ProbeUnit(Device):
         }
 
     def commands(self) -> dict[str, Command]:
-        """Return the command table: the manual of the box."""
+        """Return the command table, which is the controller's manual."""
         acts: dict[str, CommandHandler] = {
             "HEAD:SITE": self._place,
             "HEAD:SITE?": self._get_place,
-            "HEAD:FREE": self._take_away,
+            "HEAD:FREE": self._remove_head,
             "PUMP": self._pump,
             "PUMP?": lambda _, now: self.pump.state(now),
             "PUMP:LAST?": lambda *_: self.pump.last_report or "NONE",
@@ -136,42 +137,42 @@ class ProbeUnit(Device):
     # time -------------------------------------------------------------------------------------
 
     def deadline(self) -> float:
-        """Return when something will next happen by itself, in s."""
+        """Return the time of the next change of its own, in s."""
         return min(self._stop_opens_s(), self.shutter.deadline(), self.pump.deadline())
 
     def advance(self, now: float) -> None:
-        """Let time pass up to `now`, in s."""
+        """Advance time to `now`, in s."""
         while (due := self.deadline()) <= now:
             if self._stop_opens_s() <= due:
                 self.interlock = True
-                self._let_go(due, "INTERLOCK")
+                self._release_head(due, "INTERLOCK")
             self.shutter.advance(due)
             self.pump.advance(due)
 
     def go_dark(self, now: float) -> None:
-        """Shut the shutter, put the LED out, vent, and forget where the head sits."""
-        self._let_go(now, "DARK")
+        """Close the shutter, switch off the LED, vent, and clear the head's site."""
+        self._release_head(now, "DARK")
 
     def light_now(self, now: float) -> list[SourceLight]:
-        """Return the light that has not ended, as given so far."""
+        """Return the light that has not ended, as emitted so far."""
         return self.shutter.light_now(now)
 
     @property
     def lit(self) -> bool:
-        """Whether light comes out of the source."""
+        """Whether the source emits light."""
         return self.shutter.lit
 
     def is_busy(self, now: float) -> bool:
-        """Tell whether the shutter is open or the cover moves."""
+        """Return whether the shutter is open or the cover moves."""
         return self.shutter.is_moving(now)
 
     def states(self, now: float) -> dict[int, bool]:
-        """Return 16 busy, 32 sucking, 64 lit, 512 placed, 1024 resting, 2048 jammed."""
+        """Return bits 16 busy, 32 suction, 64 lit, 512 placed, 1024 resting, 2048 jammed."""
         pump, shutter = self.pump, self.shutter
         lit = {16: self.is_busy(now), 32: pump.is_pumping, 64: shutter.lit, 2048: shutter.jammed}
         return lit | {512: pump.placement is not None, 1024: pump.remaining_rest_ms(now) > 0}
 
-    def _let_go(self, now: float, how: str) -> None:
+    def _release_head(self, now: float, how: str) -> None:
         self.shutter.go_dark(now, how)
         self.pump.vent(now, how)
         self.pump.remove_head(now)
@@ -194,7 +195,7 @@ class ProbeUnit(Device):
         site, angle_deg = self.pump.placement
         return f"{site},{angle_deg:g}"
 
-    def _take_away(self, _: str, now: float) -> None:
+    def _remove_head(self, _: str, now: float) -> None:
         self.shutter.abort_opening(now, "ASKED")
         self.pump.vent(now, "ASKED")
         self.pump.remove_head(now)
@@ -247,7 +248,7 @@ class ProbeUnit(Device):
             self.shutter.cover(None, now)
             return
         if _WHOLE_PATTERN.fullmatch(arguments) is None:
-            raise CommandRefused(Code.SYNTAX, "expected the number of a fibre, or ALL")
+            raise CommandRefused(Code.SYNTAX, "expected the number of a fiber, or ALL")
         if int(arguments) >= self.shutter.fibres:
             raise CommandRefused(
                 Code.OUT_OF_RANGE, f"expected 0 to {self.shutter.fibres - 1} or ALL"

@@ -1,7 +1,7 @@
-"""The light of a contact probe: an LED, the shutter before its fibre, and the fibres' cover.
+"""Model the light source of a contact probe: LED, shutter, and the cover of the fibers.
 
-The LED shines on the closed shutter and is steady when it opens. The blades carry a sensor: an
-opening that does not happen is known, and when blades stay open the LED is put out instead.
+The LED shines on the closed shutter and is steady when it opens. A sensor monitors the blades: an
+opening that fails is detected, and when blades stay open the LED is switched off instead.
 """
 
 import math
@@ -15,25 +15,25 @@ from rigsim.boxes.device import Device, Wiring
 
 LEVEL_STEPS = 1000
 MIN_OPENING_MS = 1.0
-"""Shortest opening, ms, and time from the command to blades that have cleared the fibre."""
+"""Shortest opening, ms, and time from the command until the blades have cleared the fiber."""
 JAM_DETECTION_S = 0.02
-"""Time after which blades that have not closed are known to be stuck, s."""
+"""Time after which blades that have not closed count as stuck, s."""
 COVER_MOVE_S = 0.3
-"""Time in which the cover goes from any place to any other, s."""
+"""Time of the cover from any position to any other, s."""
 
 
 @dataclass(frozen=True, slots=True)
 class SourceLight:
-    """A stretch of light out of the probe's source fibre."""
+    """An interval of light from the probe's source fiber."""
 
     level: float
     """Light relative to full, 0 < level <= 1."""
     t_on_s: float
-    """World time of its beginning, s."""
+    """World time of its start, s."""
     t_off_s: float
     """World time of its end, s."""
     fiber: int | None
-    """Number of the only detection fibre that is not covered, from 0; None: none is covered."""
+    """Number of the only detection fiber that is not covered, from 0; None: none is covered."""
 
 
 @dataclass(slots=True)
@@ -43,21 +43,21 @@ class _Opening:
     number: int
     clears_s: float
     ends_s: float
-    outcome: str | CommandRefused | None = None  # how the command is answered, once that is known
+    outcome: str | CommandRefused | None = None  # answer to the command, once known
     open: bool = False
-    jams_s: float = math.inf  # when the LED is put out because the blades do not close
+    jams_s: float = math.inf  # when the LED is switched off because the blades do not close
 
 
 class SourceShutter:
-    """LED, shutter and cover, and what they remember.
+    """LED, shutter and cover with their state.
 
     Parameters
     ----------
     box
-        Who sends events.
+        Sender of events.
     wiring
-        Whose rig has the fibres and the LED, whose faults say what sticks, and who notices light;
-        the camera line is pulsed when the blades have cleared the fibre.
+        The rig with fibers and LED, the faults, and the observers of light; the camera line is
+        pulsed when the blades have cleared the fiber.
     """
 
     def __init__(self, box: Device, wiring: Wiring) -> None:
@@ -84,43 +84,43 @@ class SourceShutter:
 
     @property
     def is_open(self) -> bool:
-        """Whether the blades leave the fibre free."""
+        """Whether the blades leave the fiber free."""
         return self.jammed or (self._opening is not None and self._opening.open)
 
     @property
     def lit(self) -> bool:
-        """Whether light comes out of the source."""
+        """Whether the source emits light."""
         return self._light_since is not None
 
     def is_moving(self, now: float) -> bool:
-        """Tell whether an opening is going on or the cover moves."""
+        """Return whether an opening is in progress or the cover moves."""
         return self._opening is not None or now < self._settled_s
 
     def light_now(self, now: float) -> list[SourceLight]:
-        """Return the light that has not ended, as given so far."""
+        """Return the light that has not ended, as emitted so far."""
         if self._light_since is None:
             return []
-        return [self._stretch(self._light_since, max(now, self._light_since))]
+        return [self._light_interval(self._light_since, max(now, self._light_since))]
 
     def remaining_ms(self, now: float) -> int:
-        """Return how long the shutter will be open yet, ms."""
+        """Return the remaining open time of the shutter, ms."""
         left_s = 0.0 if self._opening is None else self._opening.ends_s - now
         return max(0, math.ceil(left_s * 1e3)) if math.isfinite(left_s) else 0
 
-    def _stretch(self, t_on_s: float, t_off_s: float) -> SourceLight:
+    def _light_interval(self, t_on_s: float, t_off_s: float) -> SourceLight:
         return SourceLight(self.level / LEVEL_STEPS * self._weak, t_on_s, t_off_s, self.fibre)
 
     # time -------------------------------------------------------------------------------------
 
     def deadline(self) -> float:
-        """Return when blades or LED will next do something by themselves, in s."""
+        """Return the time of the next change of blades or LED of their own, in s."""
         opening = self._opening
         if opening is None:
             return math.inf
         return min(opening.ends_s, opening.jams_s) if opening.open else opening.clears_s
 
     def advance(self, now: float) -> None:
-        """Let time pass up to `now`, at most one deadline."""
+        """Advance time to `now`, at most one deadline."""
         opening = self._opening
         if opening is None or self.deadline() > now:
             return
@@ -143,14 +143,14 @@ class SourceShutter:
         self._on_open(now)
 
     def _shut(self, opening: _Opening, how: str, now: float) -> None:
-        """Let the blades fall, at a moment of the box's own or the host's choice."""
+        """Close the blades at a time chosen by the controller or the host."""
         if self._rng.random() < self._jam:
             opening.ends_s, opening.jams_s = math.inf, now + JAM_DETECTION_S
             return
         self._end(opening, how, now)
 
     def _give_up(self, opening: _Opening, now: float) -> None:
-        """Put the LED out: the blades do not."""
+        """Switch off the LED because the blades do not close."""
         self._put_out(now)
         self.jammed = True
         self._end(opening, "JAM", now)
@@ -169,7 +169,7 @@ class SourceShutter:
     def _end_light(self, now: float) -> None:
         if self._light_since is None:
             return
-        light = self._stretch(self._light_since, now)
+        light = self._light_interval(self._light_since, now)
         self._light_since = None
         self.dose_ws += self._power_w * self.level / LEVEL_STEPS * (now - light.t_on_s)
         if light.t_off_s > light.t_on_s:
@@ -179,10 +179,10 @@ class SourceShutter:
         self._end_light(now)
         self.level = 0
 
-    # what is asked for ------------------------------------------------------------------------
+    # commands ------------------------------------------------------------------------
 
     def open(self, seconds: float, now: float) -> tuple[float, Callable[[], str | CommandRefused]]:
-        """Begin an opening; return when it is known how that went, and what tells it."""
+        """Begin an opening; return when its outcome is known, and the function that returns it."""
         CommandRefused.raise_if(self.jammed, Code.HARDWARE, "the shutter is stuck open; SHUT CLOSE")
         self.require_closed(now)
         give_ws = self._power_w * self.level / LEVEL_STEPS * seconds
@@ -200,7 +200,7 @@ class SourceShutter:
         return clears_s, outcome
 
     def close(self, now: float) -> None:
-        """Let the blades fall because the host says so; try it again where they are stuck."""
+        """Close the blades by command; retry where they are stuck."""
         if self.jammed:
             self.jammed = self._rng.random() < self._jam
             CommandRefused.raise_if(self.jammed, Code.HARDWARE, "the shutter is stuck open")
@@ -210,12 +210,12 @@ class SourceShutter:
             self._shut(self._opening, "ASKED", now)
 
     def go_dark(self, now: float, outcome: str) -> None:
-        """Put the LED out and let the blades fall, at once."""
+        """Switch off the LED and close the blades, at once."""
         self._put_out(now)
         self.abort_opening(now, outcome)
 
     def abort_opening(self, now: float, outcome: str) -> None:
-        """End an opening at once, for a reason of the box's own."""
+        """End an opening at once, for a reason of the controller's own."""
         opening = self._opening
         if opening is None or not opening.open:
             self._opening = None
@@ -225,7 +225,7 @@ class SourceShutter:
             self._end(opening, outcome, now)
 
     def require_closed(self, now: float) -> None:
-        """Refuse while the shutter is open, or opens, or the cover moves."""
+        """Refuse while the shutter is open or opening, or the cover moves."""
         if self._opening is not None:
             raise CommandRefused(Code.IGNORED, "the shutter is open")
         CommandRefused.raise_if(now < self._settled_s, Code.IGNORED, "the cover moves")
@@ -243,14 +243,14 @@ class SourceShutter:
             self._put_out(now)
 
     def cover(self, fibre: int | None, now: float) -> None:
-        """Begin to move the cover: over all detection fibres but one, or off them all."""
+        """Begin to move the cover: over all detection fibers but one, or off all of them."""
         self.require_closed(now)
         if fibre != self.fibre:
             self.fibre = fibre
             self._settled_s = now + COVER_MOVE_S
 
     def forget(self, *, power_up: bool, now: float) -> None:
-        """Return to the settings of power-up, dark already: no fibre covered."""
+        """Restore the power-up settings; the source is dark already, no fiber covered."""
         if power_up:
             self.last_report = ""
         if self.fibre is not None:

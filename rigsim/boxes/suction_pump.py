@@ -1,9 +1,9 @@
-"""The suction of a contact probe as its box runs it: gauge, end time, rest, and what goes wrong.
+"""Model the suction control of a contact probe: gauge, end time, rest, and faults.
 
-The box knows the pump's switch, its vent, and what the gauge says. It looks at the gauge once each
-control period and vents when the suction is not reached, is lost, or is more than the limit. Skin
-rests between two times of suction. Only a vent that was asked for and the pump's own end leave the
-head where it was placed: after anything else nobody knows whether it is still there.
+The controller has the pump's switch, its vent, and the gauge's reading. It samples the gauge once
+per control period and vents when the suction is not reached, is lost, or exceeds the limit. The
+skin rests between two intervals of suction. Only a requested vent and the pump's own end keep the
+head's site; after anything else the head may have moved.
 """
 
 import math
@@ -18,23 +18,23 @@ from rigsim.boxes.device import Device, SuctionLoad
 from rigsim.boxes.source_shutter import SourceShutter
 
 PUMP_CONTROL_PERIOD_S = 0.05
-"""Period in which the gauge is looked at while the pump runs, s."""
+"""Sampling period of the gauge while the pump runs, s."""
 MAX_PUMPING_S = 2.0
-"""Time in which `HELD_SHARE` of the suction must be there, s."""
+"""Time within which `HELD_SHARE` of the suction must be reached, s."""
 HELD_SHARE, LOST_SHARE = 0.7, 0.4
-"""Of what was asked: from there on it holds; below that it is lost."""
+"""Fractions of the requested suction: reached from the first on, lost below the second."""
 MAX_SUCTION_RATIO = 1.1
-"""Of the most that may be asked: above that the regulator is broken."""
+"""Suction relative to the maximum of requests, above which the regulator counts as broken."""
 MIN_SUCTION_MBAR = 10.0
-"""Least suction that may be asked for, well above the gauge's deviation."""
+"""Smallest suction that may be requested, well above the gauge's deviation."""
 MIN_SUCTION_MS = 100.0
 GAUGE_NOISE_MBAR = 0.3
 GAUGE_ZERO_DEVIATION_MBAR = 0.7
-"""Standard deviations of one reading of the gauge, and of its zero from box to box."""
+"""Standard deviations of one reading of the gauge, and of its zero between controllers."""
 
 
 class Gauge:
-    """A pressure sensor with a zero of its own, and noise.
+    """A pressure sensor with a zero offset and noise.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class Gauge:
 
 @dataclass(slots=True)
 class _Draw:
-    """A time of suction that is under way."""
+    """An interval of suction in progress."""
 
     number: int
     start_s: float
@@ -74,20 +74,20 @@ class _Draw:
 
 
 class SuctionPump:
-    """Pump, vent and gauge, and where a person says that the head sits.
+    """Pump, vent and gauge, and the declared site of the head.
 
     Parameters
     ----------
     box
-        Who sends events.
+        Sender of events.
     probe
-        Its limits and the skin's rest.
+        Its limits and the skin's rest time.
     load
         The head on the skin.
     gauge
-        Of the suction under it.
+        Gauge of the suction under the head.
     shutter
-        Shuts when the suction has ended, whatever the reason.
+        Closes when the suction has ended, whatever the reason.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class SuctionPump:
         self._box, self._probe, self._load, self._gauge = box, probe, load, gauge
         self._shutter = shutter
         self._draw: _Draw | None = None
-        # a clock of its own keeps the skin's rest through a reset of the box
+        # a separate clock keeps the skin's rest through a reset of the controller
         self._rested_s = -math.inf
         self.count = 0
         self.placement: tuple[str, float] | None = None
@@ -111,12 +111,12 @@ class SuctionPump:
 
     @property
     def has_reached_target(self) -> bool:
-        """Whether the suction that was asked for is, or was, there since the pump went on."""
+        """Whether the requested suction has been reached since the pump went on."""
         return self._draw is not None and self._draw.held
 
     def remaining_rest_ms(self, now: float) -> int:
-        """Return how long the skin rests yet, ms."""
-        # a clock of microseconds cannot tell a shorter rest from none
+        """Return the remaining rest time of the skin, ms."""
+        # a shorter rest is below the microsecond resolution of the clock
         rest_s = self._rested_s - now
         return math.ceil(rest_s * 1e3) if rest_s > 1e-6 and not self.is_pumping else 0
 
@@ -129,7 +129,7 @@ class SuctionPump:
         return f"REST,{rest_ms}" if rest_ms else "VENT"
 
     def read(self, now: float) -> float:
-        """Return what the gauge says, mbar."""
+        """Return the gauge's reading, mbar."""
         reading = self._gauge.read(self._load.suction_mbar(now), now)
         if reading is None:
             raise CommandRefused(Code.HARDWARE, "the pressure gauge is dead")
@@ -138,11 +138,11 @@ class SuctionPump:
     # time -------------------------------------------------------------------------------------
 
     def deadline(self) -> float:
-        """Return when the gauge will next be looked at, or the pump ends by itself, in s."""
+        """Return when the gauge will next be sampled, or the pump ends by itself, in s."""
         return math.inf if self._draw is None else self._draw.next_s
 
     def advance(self, now: float) -> None:
-        """Let time pass up to `now`, at most one deadline."""
+        """Advance time to `now`, at most one deadline."""
         draw = self._draw
         if draw is None or draw.next_s > now:
             return
@@ -174,22 +174,22 @@ class SuctionPump:
         self._end(draw, how, now)
         self.remove_head(now)
 
-    # what is asked for ------------------------------------------------------------------------
+    # commands ------------------------------------------------------------------------
 
     def place(self, site: str, angle_deg: float, now: float) -> None:
-        """Take down where a person says that the head sits now."""
+        """Record the head's site as the operator declares it."""
         if self._draw is not None:
             raise CommandRefused(Code.IGNORED, "the pump is on; PUMP VENT first")
         self._load.place(site, angle_deg, now)
         self.placement = (site, angle_deg)
 
     def remove_head(self, now: float) -> None:
-        """Forget where the head sits: it is taken off."""
+        """Clear the head's site: the head is taken off."""
         self.placement = None
         self._load.remove(now)
 
     def draw(self, seconds: float, mbar: float, now: float) -> str:
-        """Switch the pump on until its own end; return the number of this time of suction."""
+        """Switch the pump on until its own end; return the number of this interval of suction."""
         if self._draw is not None:
             raise CommandRefused(Code.IGNORED, "the pump is on; PUMP VENT first")
         if self.placement is None:

@@ -1,19 +1,19 @@
-"""Light from skin to skin, between coarse patches of a face.
+"""Compute interreflection between coarse patches of a face.
 
-Light that leaves the interior of one patch falls on another, enters it and leaves again. Patches
-are the texels of a coarse texture; the exchange between two that see each other is that of two
+Light that leaves the interior of one patch reaches another, enters it and leaves again. Patches are
+the texels of a coarse texture. The exchange between two mutually visible patches is that of two
 points, each with the boundary's transmittance at its own angle. The series over bounces is summed
-until what is left is below `DEFAULT_MIN_BOUNCE_FRACTION`.
+until the remainder is below `DEFAULT_MIN_BOUNCE_FRACTION`.
 
-Light that went from skin to skin is reflected twice or more, so it is redder than once. A
-camera's channel is a sum over wavelengths. What is reflected once may be summed before, as its
-channel's mean reflectance; a product of two reflectances may not: in skin's red channel, which
-blood and melanin make uneven, the mean of the square is larger than the square of the mean.
+Interreflected light has been reflected at least twice, so it is redder than direct light. A
+camera's channel is a sum over wavelengths. For one reflection the channel's mean reflectance
+suffices. A product of two reflectances requires the sum over wavelengths: in skin's red channel,
+where blood and melanin vary the spectrum, the mean of the square exceeds the square of the mean.
 
 Notes
 -----
-Only light from inside is passed on, and it is taken up by the interior only: highlights of lit skin
-on skin, and lit skin mirrored in skin, are left out (a few percent of a few percent).
+Only subsurface light is exchanged, and it enters interiors only. Highlights of lit skin on skin,
+and specular reflections of lit skin, are omitted (a few percent of a few percent).
 """
 
 import math
@@ -33,26 +33,26 @@ from rigsim.render import RAY_OFFSET_MM, Caster
 from rigsim.tissue.skin_table import SkinTable
 
 DEFAULT_MIN_BOUNCE_FRACTION: Final = 1e-3
-"""Share of the first bounce below which further ones are left out."""
+"""Fraction of the first bounce below which further bounces are omitted."""
 
 MAX_BOUNCES: Final = 30
 
 PATCHES_PER_SIDE: Final = 96
-"""Texels along one side of the coarse texture. On a pale head under one light what comes by other
-skin, 1 % of all, is 16 % low with 64, 6 % with 96 and 4 % with 128, against Mitsuba."""
+"""Texels along each side of the coarse texture. On a pale head under one light, interreflection is
+1 % of all light; against Mitsuba it is 16 % low with 64, 6 % with 96 and 4 % with 128."""
 
 PAIRS_PER_BLOCK: Final = 1 << 21
 
 
 class Interreflection:
-    """How light goes from patch to patch on one face.
+    """Light exchange between the patches of one face.
 
     Parameters
     ----------
     caster
         The face's mesh.
     patches
-        Texels along one side of the coarse texture, >= 8.
+        Texels along each side of the coarse texture, >= 8.
     """
 
     def __init__(self, caster: Caster, *, patches: int = PATCHES_PER_SIDE) -> None:
@@ -64,8 +64,8 @@ class Interreflection:
         normal = self.atlas.normal[covered]
         self._area_mm2 = _texel_area(self.atlas)[covered]
         self.exchange = _exchange(caster, point, normal, self._area_mm2)
-        """Light that enters a row's patch per light that has been inside a column's patch and is
-        sent out with R_d 1, shape (P, P), sparse."""
+        """Light entering a row's patch per light that has entered a column's patch and leaves it
+        with R_d 1, shape (P, P), sparse."""
 
     def coarsen(self, texture: Float32Array) -> Float32Array:
         """Average a texture over the patches, shape (P, C), from shape (N, N, C)."""
@@ -79,7 +79,7 @@ class Interreflection:
         return np.asarray(mean[self._covered], np.float32)
 
     def surface(self) -> tuple[Float32Array, Float32Array]:
-        """Return the patches' middles in mm and their normals, shape (1, P, 3) each."""
+        """Return the patches' centers in mm and their normals, shape (1, P, 3) each."""
         return (self.atlas.position_mm[self._covered][None], self.atlas.normal[self._covered][None])
 
     def indirect_irradiance(
@@ -89,7 +89,7 @@ class Interreflection:
         *,
         min_bounce_fraction: float = DEFAULT_MIN_BOUNCE_FRACTION,
     ) -> Float32Array:
-        """Return what enters by way of other skin.
+        """Return the light that enters after interreflection.
 
         Parameters
         ----------
@@ -97,15 +97,17 @@ class Interreflection:
             Light that enters each patch directly, shape (P,).
         r_d
             Factor of the diffuse term, shape (P, C).
-        enough
-            Share of the first bounce below which further ones are left out.
+        min_bounce_fraction
+            Fraction of the first bounce below which further bounces are omitted.
 
         Returns
         -------
         ndarray of float32
-            Light that enters after one or more bounces, same unit, as the coarse texture, shape
+            Light that enters after one or more bounces, same unit, on the coarse texture, shape
             (N, N, C), 0 where the texture has no surface.
         """
+        # Neumann series over bounces: sum of (X R)^n E for n >= 1, with X the exchange and R the
+        # R_d.
         latest = self.exchange @ (r_d * entered[:, None])
         total = latest.copy()
         least = min_bounce_fraction * float(np.abs(latest).max(initial=0.0))
@@ -123,8 +125,8 @@ _living: WeakValueDictionary[int, Interreflection] = WeakValueDictionary()
 
 
 def interreflection_for(caster: Caster) -> Interreflection:
-    """Return the exchange on a mesh, the same as long as anybody holds it."""
-    found = _living.get(id(caster.mesh))  # which is the mesh's own while the exchange holds it
+    """Return the exchange on a mesh; the same as long as any caller holds it."""
+    found = _living.get(id(caster.mesh))  # the id stays unique while the exchange holds the mesh
     if found is None:
         found = _living[id(caster.mesh)] = Interreflection(caster)
     return found
@@ -144,7 +146,7 @@ def _exchange(
     for first in range(0, count, step):
         block = np.arange(first, min(first + step, count))
         strength = np.zeros((len(block), count - first), np.float32)
-        _form(point, normal, first, strength)
+        _pair_transfer(point, normal, first, strength)
         i, j = np.nonzero(strength)
         start = point[block[i]] + np.float32(RAY_OFFSET_MM) * normal[block[i]]
         way = point[first + j] + np.float32(RAY_OFFSET_MM) * normal[first + j] - start
@@ -153,9 +155,10 @@ def _exchange(
         free = ~caster.is_blocked(start, way, 0.999 * length)
         i, j = i[free], j[free]
         share = strength[i, j]
-        # what two patches send each other goes along one line: it is traced once
+        # both directions between two patches share one visibility ray
         for here, there in ((block[i], first + j), (first + j, block[i])):
-            # A patch that is near is no point: its whole hemisphere holds no more than all light.
+            # A distant patch of area A receives f = cos cos T T A / (pi d^2). A near patch is
+            # not a point: f / (1 + f) keeps its fraction below 1.
             values.append(share * area[there] / (math.pi + share * area[there]))
             rows.append(here)
             columns.append(there)
@@ -165,8 +168,8 @@ def _exchange(
 
 
 @njit(parallel=True, cache=True)
-def _form(point, normal, first, out):  # type: ignore[no-untyped-def]
-    """Write cos cos T T / d^2 for pairs that face each other, of each the first alone."""
+def _pair_transfer(point, normal, first, out):  # type: ignore[no-untyped-def]
+    """Write cos cos T T / d^2 for mutually facing pairs, one direction of each pair."""
     for n in prange(out.shape[0]):
         i = first + n
         for j in range(i + 1, first + out.shape[1]):
@@ -184,37 +187,37 @@ def _form(point, normal, first, out):  # type: ignore[no-untyped-def]
 
 
 WAVELENGTH_STEPS: Final = (5, 3, 2)
-"""Every how many of the table's wavelengths may be summed at, the most first: the ends stay."""
+"""Steps through the table's wavelengths, largest first; both ends are always included."""
 
 MIN_REFLECTANCE: Final = 1e-6
-"""Reflectance and cover below which a patch has no color."""
+"""Reflectance and coverage below which a patch has no color."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InterreflectionSettings:
-    """How light goes from skin to skin."""
+    """Settings of the interreflection on one face."""
 
     exchange: Interreflection
-    """From patch to patch."""
+    """Exchange between patches."""
     spectral: bool = True
-    """Whether wavelengths are told apart; without, each channel is taken as one."""
+    """Whether wavelengths are summed separately; without, each channel is treated as one band."""
     step: int = 1
-    """Every how many of the table's wavelengths are summed at, 1 or one of `WAVELENGTH_STEPS`."""
+    """Step through the table's wavelengths, 1 or one of `WAVELENGTH_STEPS`."""
     min_bounce_fraction: float = DEFAULT_MIN_BOUNCE_FRACTION
-    """Share of the first bounce below which further ones are left out."""
+    """Fraction of the first bounce below which further bounces are omitted."""
 
 
 class InterreflectionColor:
-    """How light goes from skin to skin on one face in one state, seen by one camera.
+    """Interreflection on one face in one state, in one camera's channels.
 
     Parameters
     ----------
     bounces
-        How light goes from patch to patch.
+        Settings of the interreflection.
     skin
         The face.
     r_d
-        Factor of the diffuse term per channel with what covers the skin, shape (N, N, 3).
+        Factor of the diffuse term per channel, including the skin's covering, shape (N, N, 3).
     reflectance
         White-balanced reflectance of the skin per channel, shape (N, N, 3).
     """
@@ -226,7 +229,7 @@ class InterreflectionColor:
         r_d: Float32Array,
         reflectance: Float32Array,
     ) -> None:
-        self._bounce, self._enough = bounces.exchange, bounces.min_bounce_fraction
+        self._bounce, self._min_bounce_fraction = bounces.exchange, bounces.min_bounce_fraction
         subject = skin.subject
         covered = subject.atlas.covered.astype(np.float32)
         factor = r_d / np.maximum(reflectance, np.float32(MIN_REFLECTANCE))
@@ -244,7 +247,7 @@ class InterreflectionColor:
             self._weights = np.asarray(weights, np.float32)
 
     def indirect_irradiance(self, direct: Float32Array) -> Float32Array:
-        """Return the light that enters by way of other skin.
+        """Return the light that enters after interreflection.
 
         Parameters
         ----------
@@ -254,18 +257,20 @@ class InterreflectionColor:
         Returns
         -------
         ndarray of float32
-            As the coarse texture, shape (n, n, 3), same unit: multiplied by the patch's reflectance
-            in a channel it gives what leaves in that channel.
+            On the coarse texture, shape (n, n, 3), same unit: its product with the patch's
+            reflectance in a channel is the light that leaves in that channel.
         """
         if self._weights is None:
             return self._bounce.indirect_irradiance(
-                direct, self._r_d, min_bounce_fraction=self._enough
+                direct, self._r_d, min_bounce_fraction=self._min_bounce_fraction
             )
         each = self._bounce.indirect_irradiance(
-            direct, self._spectrum, min_bounce_fraction=self._enough
+            direct, self._spectrum, min_bounce_fraction=self._min_bounce_fraction
         )
         covered = self._bounce.atlas.covered
         out = np.zeros((*covered.shape, self._weights.shape[1]), np.float32)
+        # The last reflection is included per wavelength and divided out per channel, so that the
+        # caller's product with the channel's reflectance restores it.
         out[covered] = ((each[covered] * self._spectrum) @ self._weights) / self._channel
         return out
 
@@ -280,9 +285,9 @@ class InterreflectionColor:
 
 
 def channel_approximation_error(skin: ObservedSkin) -> Float64Array:
-    """Return by how much each channel's mean of R^2 is off the square of its mean, shape (3,).
+    """Return the excess of each channel's mean of R^2 over the square of its mean, shape (3,).
 
-    Of typical skin.
+    It is evaluated for typical skin.
     """
     weights = skin.band_weights()
     typical = SkinTable.load().spectra(*(np.median(part) for part in skin.covered_chromophores()))
@@ -290,20 +295,20 @@ def channel_approximation_error(skin: ObservedSkin) -> Float64Array:
 
 
 def wavelength_step_error(skin: ObservedSkin, step: int) -> Float64Array:
-    """Return by how much each channel of light from skin to skin is off at fewer wavelengths.
+    """Return each channel's relative error of interreflection at fewer wavelengths.
 
     Parameters
     ----------
     skin
         The face.
     step
-        Every how many of the table's wavelengths are summed at.
+        Step through the table's wavelengths.
 
     Returns
     -------
     ndarray
-        Relative, shape (3,): the most for light that goes between any two of the face's extremes
-        and middles of melanin and blood, by its mean of products over its mean.
+        Relative, shape (3,): the maximum for light between any two of the face's extremes and
+        centers of melanin and blood, as the mean of products over the mean.
     """
     ends = [[part.min(), np.median(part), part.max()] for part in skin.covered_chromophores()]
     melanin, blood = (axis.ravel() for axis in np.meshgrid(*ends))

@@ -1,15 +1,15 @@
-"""Light that spreads sideways in skin: heat flow over the surface, laid out in its texture.
+"""Scatter light laterally in skin by heat flow over the surface, on its texture.
 
-A Gaussian kernel of standard deviation s over a surface is the flow of heat for the time s^2 / 2.
+Convolution with a Gaussian of standard deviation s on a surface is heat flow for the time s^2 / 2.
 Solved with the surface's own lengths it conserves light on stretched textures and curved faces,
-leaves an even field even, and stops at the texture's borders. A sum of Gaussians is one flow,
-read at several times.
+preserves a uniform field, and stops at the texture's borders. A sum of Gaussians is one flow,
+sampled at several times.
 
 Notes
 -----
-Lengths along u and v are taken as perpendicular (the skew of the texture is left out). Time steps
-are implicit, one direction after the other, each halving the error of splitting by alternating
-the order; the kernel of a stage made of `IMPLICIT_STEPS` of them has an excess kurtosis of 3 /
+Lengths along u and v are treated as perpendicular (the skew of the texture is neglected). Time
+steps are implicit, alternating between directions; alternating also their order halves the
+splitting error. The kernel of a stage of `IMPLICIT_STEPS` steps has an excess kurtosis of 3 /
 STEPS.
 """
 
@@ -27,19 +27,19 @@ IMPLICIT_STEPS: Final = 6
 """Implicit steps between two widths."""
 
 MIN_SIGMA_TEXELS: Final = 0.25
-"""Kernels narrower than this part of the smallest texel leave the field as it is."""
+"""Kernels narrower than this fraction of the smallest texel leave the field unchanged."""
 
 COLUMN_BLOCK: Final = 64
 
 
 class LateralError(ValueError):
-    """The kernel or the field cannot be used."""
+    """An unusable kernel or field."""
 
 
 def scatter_laterally(
     field: Float32Array, atlas: Atlas, sigmas_mm: ArrayLike, weights: ArrayLike
 ) -> Float32Array:
-    """Spread a field over the surface by a sum of Gaussians for each channel.
+    """Convolve a field on the surface with a sum of Gaussians per channel.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def scatter_laterally(
     atlas
         The surface.
     sigmas_mm
-        Standard deviations per axis in mm, increasing, > 0, shape (K,).
+        Light per area, shape (N, N, C); zero where the texture has no surface.
     weights
         Weights, >= 0, shape (C, K), each row summing to 1.
 
@@ -89,7 +89,7 @@ def scatter_laterally(
 
 
 def edge_width_mm(sigmas_mm: ArrayLike, weights: ArrayLike) -> Float64Array:
-    """Return how wide a sum of Gaussians blurs an edge: from 10 to 90 % of the step.
+    """Return the width from 10 to 90 % of an edge blurred by a sum of Gaussians.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def edge_width_mm(sigmas_mm: ArrayLike, weights: ArrayLike) -> Float64Array:
 
 
 def _metric(atlas: Atlas) -> tuple[Float32Array, Float32Array, Float32Array, float]:
-    """Return texel areas, conductances to the right and downward neighbour, and finest texel."""
+    """Return texel areas, conductances to the right and lower neighbors, and the finest texel."""
     a, b = (length.astype(np.float64) for length in atlas.texel_mm())
     covered = atlas.covered & (a > 1e-9) & (b > 1e-9)
     a, b = np.where(covered, a, 1.0), np.where(covered, b, 1.0)
@@ -138,6 +138,9 @@ def _metric(atlas: Atlas) -> tuple[Float32Array, Float32Array, Float32Array, flo
 @njit(parallel=True, cache=True)
 def _flow_rows(field, area, conductance, step):  # type: ignore[no-untyped-def]
     """Solve one implicit step along the rows in place (Thomas's algorithm)."""
+    # Backward Euler of area dF/dt = div(conductance grad F) gives per row the tridiagonal system
+    # (area + s (c_left + c_right)) F_i - s c_left F_(i-1) - s c_right F_(i+1) = area F_i(old).
+    # Its columns sum to the areas, so that the sum of area times F, the light, is conserved.
     rows, columns, channels = field.shape
     for i in prange(rows):
         ratio = np.empty(columns)

@@ -1,8 +1,8 @@
-"""What leaves the inside of a face under one lamp: light that spread sideways, or came from skin.
+"""Compute the subsurface light of a face under one lamp: lateral scattering and interreflection.
 
-The light that enters is gathered in the face's texture; it spreads by the same lateral transport as
-in the flash rig (`rigsim.light.subsurface_radiance.scatter_patterned_light` says how well that
-holds), and comes from other skin by `rigsim.light.interreflection`.
+The light that enters is accumulated in the face's texture. It scatters laterally as in the flash
+rig (`rigsim.light.subsurface_radiance.scatter_patterned_light` states the accuracy); light from
+other skin follows `rigsim.light.interreflection`.
 """
 
 from typing import Final
@@ -23,26 +23,26 @@ from rigsim.render import Caster, visibility
 from rigsim.tissue.skin_layers import ETA
 
 LED_SHADOW_SAMPLES: Final = 4
-"""Points on the lamp that cast shadows on each texel."""
+"""Points on the lamp for the shadows on each texel."""
 
 
 class LateralScattering:
-    """One face, ready to be lit from within.
+    """Subsurface light transport of one face.
 
     Parameters
     ----------
     skin
-        The face; its blood is that of a neutral face.
+        The face, with the blood of its neutral state.
     surface
         Its reflection.
     caster
         Its mesh.
     subsurface
-        Whether light spreads sideways.
+        Whether light scatters laterally.
     bounces
-        How light goes from skin to skin; None leaves that out.
+        Settings of interreflection; None omits it.
     relief
-        What of the texture's relief hides lights; None: nothing.
+        Shadows of the texture's relief; None: none.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class LateralScattering:
             self._inside = self._pigment * clear
 
     def glow(self, lamp: Lamp) -> Float32Array:
-        """Return what leaves the interior before the boundary.
+        """Return the light that leaves the interior, before the boundary.
 
         Parameters
         ----------
@@ -75,9 +75,9 @@ class LateralScattering:
         Returns
         -------
         ndarray of float32
-            pi times radiance, shape (N, N, 3): with lateral transport all light from inside,
-            without it only that which came from other skin; multiplied by the boundary's
-            transmittance it is what a camera sees.
+            pi times radiance, shape (N, N, 3): with lateral scattering all subsurface light,
+            without it only the interreflected part; its product with the boundary's transmittance
+            reaches the camera.
         """
         subject, surface = self._subject, self._surface
         atlas = subject.atlas

@@ -1,4 +1,4 @@
-"""The dome's unit of light: what a camera sees of a perfect white before an LED."""
+"""Define the dome's unit of light: the signal of a perfect white in front of an LED."""
 
 import math
 from typing import Final
@@ -18,7 +18,7 @@ METERING_LED: Final = (1.0, 40.0, 700.0)
 
 
 def white_intensity(light: Light, view: View) -> Float64Array:
-    """Return what a camera sees of a perfect white before an LED, shape (3,).
+    """Return the signal of a perfect white in front of an LED, shape (3,).
 
     A Lambertian white of reflectance 1 that faces the light on its axis at d mm gives
     ``white_intensity / d**2`` of full scale per second in camera RGB.
@@ -33,7 +33,7 @@ def white_intensity(light: Light, view: View) -> Float64Array:
     Raises
     ------
     ValueError
-        The light is no LED.
+        The light is not an LED.
 
     Examples
     --------
@@ -43,9 +43,9 @@ def white_intensity(light: Light, view: View) -> Float64Array:
     [9.3, 12.0, 7.4]
     """
     if light.power_w is None:
-        raise ValueError(f"light {light.name!r}: got no power_w, expected an LED")
+        raise ValueError(f"light {light.name!r}: got no power_w, expected an LED; add power_w")
     power, half_deg, distance_mm = METERING_LED
-    # The lobe cos^n over the half sphere holds 2 pi / (n + 1) of the intensity on the axis.
+    # The lobe cos^n over the half sphere integrates to 2 pi / (n + 1) times its axial value.
     unit = power * (_exponent(half_deg) + 1.0) / distance_mm**2
     strength = light.power_w * (lobe_exponent(light) + 1.0)
     white = spectra.camera_white(view.spectral_sensitivity, light.illuminant)

@@ -1,22 +1,23 @@
-"""What a surface element sends to the camera from a sphere of LEDs, as four moments of the light.
+"""Compute the reflection of a surface element under a sphere of LEDs, as four moments of the light.
 
-Every lighting condition of the sphere weighs LED k by a sum of 1 and the coordinates w_k of its
-direction. So four sums over the LEDs, with weights 1, x, y and z, give all conditions: of the
-surface's reflection as Stokes vectors, which serve any analyser, and of the light that enters.
+Every lighting condition of the sphere weights LED k by a linear combination of 1 and the
+coordinates w_k of its direction. Four sums over the LEDs, with weights 1, x, y and z, therefore
+serve all conditions: of the surface's reflection as Stokes vectors, which serve every analyzer
+angle, and of the light that enters.
 
-The sums are smooth functions of the normal and of the place in the field, and are looked up in a
-table; `sum_led_moments` is the sum itself.
+The sums are smooth functions of the normal and of the position in the field, and are interpolated
+from a table; `sum_led_moments` is the exact sum.
 
 Notes
 -----
-The table's axes are p = n_xy / (1 + n_z), half the tilt's tangent: a facet's reflection turns with
-its half angle, so the lobe is about equally wide everywhere. Between nodes values are interpolated
-with cubics in p (Catmull and Rom 1974) and linearly over the field. Steeper normals than
-`MAX_TILT_DEG` are summed directly.
+The table's axes are p = n_xy / (1 + n_z), the tangent of half the tilt. A facet's reflection
+rotates with its half angle, so that the lobe has about the same width everywhere in p. Values
+between nodes are interpolated with cubics in p (Catmull and Rom 1974) and linearly over the field.
+Steeper normals than `MAX_TILT_DEG` are summed directly.
 
-The LEDs are points here. They stand about 17 degrees apart, so that facets that mirror neighbours
-into the camera differ by 8.5 degrees: a lobe narrower than that resolves them, and the sum over
-the normal shows their lattice. `lattice_ripple` measures it.
+The LEDs are points here. Their spacing is about 17 degrees, so that facets that mirror neighbors
+into the camera differ by 8.5 degrees. A narrower lobe resolves single LEDs, and the sum shows their
+lattice as a function of the normal. `lattice_ripple` measures it.
 """
 
 import math
@@ -34,30 +35,30 @@ from rigsim.as_built.sphere import REFERENCE_DISTANCE_MM, ActualSphere
 from rigsim.light.led_light import lobe_exponent
 
 MAX_TILT_DEG: Final = 70.0
-"""Tilt of normals up to which the table is used."""
+"""Largest tilt of normals in the table, degrees."""
 
 MOMENT_CHANNELS: Final = 16
-"""Numbers in a table's node: 4 moments x 3 Stokes parameters, then 4 moments of entering light."""
+"""Values per node of the table: 4 moments x 3 Stokes parameters, then 4 of entering light."""
 
 
 class MomentError(ValueError):
-    """A table or a sum of moments is asked for wrongly."""
+    """An invalid request for a table or a sum of moments."""
 
 
 @dataclass(frozen=True, slots=True)
 class MicrofacetSurface:
-    """How a surface element reflects, and who looks at it."""
+    """Reflection of a surface element, with the viewing camera."""
 
     alpha: float
     """GGX roughness, 1e-3 to 1."""
     eta: float
     """Refractive index of the interior, > 1."""
     eye_mm: tuple[float, float, float]
-    """Place of the camera, mm, rig frame."""
+    """Position of the camera, mm, rig frame."""
     image_right: tuple[float, float, float]
     """The image's x axis, unit vector."""
     extinction: float
-    """Extinction ratio of the LEDs' films, > 1."""
+    """Extinction ratio of the LEDs' polarizers, > 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,13 +80,13 @@ class LightMoments:
 def irradiance_per_led(
     sphere: ActualSphere, positions_mm: ArrayLike, led: int
 ) -> tuple[Float64Array, Float64Array]:
-    """Return where an LED is seen, and its irradiance across the beam, its film aside.
+    """Return the direction of an LED and its irradiance across the beam, without its polarizer.
 
     Parameters
     ----------
     sphere
         The LEDs; their lobes point at the origin.
-    places_mm
+    positions_mm
         Points, shape (N, 3).
     led
         Index of the LED.
@@ -115,18 +116,18 @@ def led_moments(
     *,
     alpha: ArrayLike | None = None,
 ) -> tuple[Float32Array, Float32Array]:
-    """Return what one LED adds, before its weights: Stokes vectors (N, 3) and entering light (N,).
+    """Return one LED's unweighted Stokes vectors (N, 3) and entering light (N,).
 
     Parameters
     ----------
-    normals, places_mm
+    normals, positions_mm
         Unit normals, and points in mm, shape (N, 3).
     sphere, led
         The LED.
     surface
-        How it is reflected.
+        Reflection of the surface.
     alpha
-        Roughness of each, shape (N,); None takes the surface's.
+        Roughness of each point, shape (N,); None takes the surface's.
     """
     points = np.asarray(positions_mm, np.float64)
     to_light, share = irradiance_per_led(sphere, points, led)
@@ -164,26 +165,26 @@ def sum_led_moments(
     leds: Sequence[int] | None = None,
     alpha: ArrayLike | None = None,
 ) -> LightMoments:
-    """Sum over the LEDs one by one.
+    """Sum the moments over the LEDs directly.
 
     Parameters
     ----------
     normals
         Unit normals, shape (N, 3), rig frame.
-    places_mm
+    positions_mm
         Points, mm, shape (N, 3) or (3,).
     sphere
         The LEDs.
     surface
-        How the surface reflects.
+        Reflection of the surface.
     leds
-        Which LEDs; None takes all.
+        Indices of the LEDs; None takes all.
     alpha
-        Roughness of each, shape (N,); None takes the surface's.
+        Roughness of each point, shape (N,); None takes the surface's.
 
     Returns
     -------
-    Moments
+    LightMoments
     """
     n = np.asarray(normals, np.float32)
     points = np.broadcast_to(np.asarray(positions_mm, np.float64), n.shape)
@@ -201,20 +202,20 @@ def sum_led_moments(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MomentTable:
-    """Moments over normal and place in the field."""
+    """Moments as a function of the normal and the position in the field."""
 
     values: Float32Array
     """Shape (alphas, fields, fields, size, size, `MOMENT_CHANNELS`): y, x, then p_y, p_x, all
-    upwards."""
+    ascending."""
     alphas: Float64Array
-    """Roughnesses, evenly spaced, 1 or 3 of them; in between by a parabola."""
+    """Roughnesses, evenly spaced, 1 or 3 of them; interpolated by a parabola."""
     half_field_mm: float
-    """The field's nodes go from minus to plus this."""
+    """The field's nodes range from minus to plus this, mm."""
     reach: float
-    """The nodes of p go from minus to plus this."""
+    """The nodes of p range from minus to plus this."""
 
     def covers(self, normals: Float32Array) -> BoolArray:
-        """Return which normals the table holds, shape (N,)."""
+        """Return which normals are within the table, shape (N,)."""
         return np.asarray(normals[:, 2] >= np.float32(math.cos(math.radians(MAX_TILT_DEG))))
 
     def lookup(
@@ -224,16 +225,16 @@ class MomentTable:
         y_mm: Float32Array,
         alpha: Float32Array | None = None,
     ) -> Float32Array:
-        """Return the moments of normals within `MAX_TILT_DEG`, shape (N, `MOMENT_CHANNELS`).
+        """Interpolate the moments of normals within `MAX_TILT_DEG`, shape (N, `MOMENT_CHANNELS`).
 
         Parameters
         ----------
         normals
-            Unit normals, shape (N, 3); steeper ones get zeros.
+            Unit normals, shape (N, 3); steeper ones yield zeros.
         x_mm, y_mm
-            Places, shape (N,); beyond the field that of its border.
+            Positions, shape (N,); those beyond the field are clamped to its border.
         alpha
-            Roughness, shape (N,), within that of the table; None takes the middle one.
+            Roughness, shape (N,), within the table's range; None takes the middle one.
         """
         nodes = len(self.alphas)
         share = np.zeros((len(normals), nodes), np.float32)
@@ -259,7 +260,7 @@ def tabulate_moments(
     fields: int = 3,
     leds: Sequence[int] | None = None,
 ) -> MomentTable:
-    """Tabulate the moments.
+    """Tabulate the moments over normals, field and roughness.
 
     Parameters
     ----------
@@ -268,7 +269,7 @@ def tabulate_moments(
     half_field_mm
         Half the side of the field, mm, > 0.
     alpha_range
-        Least and largest roughness; None takes that of the surface alone.
+        Smallest and largest roughness; None takes that of the surface only.
     size
         Nodes along each axis of the normals, >= 9.
     fields
@@ -287,11 +288,13 @@ def tabulate_moments(
         raise MomentError(f"size, fields: got {size}, {fields}, expected at least 9 and 2")
     if not half_field_mm > 0.0:
         raise MomentError(f"half_field_mm: got {half_field_mm}, expected > 0")
-    # one node more than the cubic needs beyond the steepest normal
+    # the cubic needs one node beyond the steepest normal
     edge = math.tan(0.5 * math.radians(MAX_TILT_DEG))
     reach = edge * (size - 1) / (size - 1 - 4)
     axis = np.linspace(-reach, reach, size)
     py, px = np.meshgrid(axis, axis, indexing="ij")
+    # p is the stereographic projection of the normal, with the inverse n = (2 p, 1 - p^2) / (1 +
+    # p^2).
     square = px**2 + py**2
     inside = square <= (edge + 2.1 * math.sqrt(2.0) * (axis[1] - axis[0])) ** 2
     normals = (np.stack([2 * px, 2 * py, 1 - square], axis=-1) / (1 + square)[..., None])[inside]
@@ -299,7 +302,7 @@ def tabulate_moments(
     low, high = alpha_range or (surface.alpha, surface.alpha)
     alphas = np.array([low]) if high <= low else np.linspace(low, high, 3)
     values = np.zeros((len(alphas), fields, fields, size, size, MOMENT_CHANNELS), np.float32)
-    # few long sums: one for each LED, over all nodes
+    # few long sums: one per LED, over all nodes
     k, row, column, node = np.meshgrid(
         np.arange(len(alphas)),
         np.arange(fields),
@@ -318,19 +321,19 @@ def tabulate_moments(
 def lattice_ripple(
     sphere: ActualSphere, surface: MicrofacetSurface, *, max_slope_deg: float = 25.0
 ) -> float:
-    """Return how much the lattice of LEDs shows in the reflection of light from everywhere.
+    """Return the ripple of the LED lattice in the reflection under all LEDs.
 
     Parameters
     ----------
     sphere, surface
         As for `sum_led_moments`.
-    steepest_deg
-        Tilt up to which normals are tried.
+    max_slope_deg
+        Largest tilt of the evaluated normals.
 
     Returns
     -------
     float
-        Standard deviation of S0 under all LEDs over its mean, about its smooth trend (a parabola).
+        Standard deviation of S0 under all LEDs about its smooth trend (a parabola), over its mean.
     """
     count = 2500
     k = np.arange(count) + 0.5

@@ -1,4 +1,4 @@
-"""The skin of a face as a camera sees it: its colors, and how light spreads in it."""
+"""Describe the skin of a face for one camera: its colors, and its lateral scattering."""
 
 from dataclasses import dataclass
 
@@ -14,24 +14,24 @@ from rigsim.tissue.skin_table import SkinTable
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObservedSkin:
-    """A face in a state, before a camera and under a light."""
+    """A face in a state, for one camera and one light."""
 
     subject: SimulatedSubject
     state: str
     """State of its blood."""
     camera: str
-    """Name of the camera's sensitivity, known to `model.spectra`."""
+    """Name of the camera's sensitivity in `model.spectra`."""
     illuminant: str
-    """Name of the light's spectrum, known to `model.spectra`."""
+    """Name of the light's spectrum in `model.spectra`."""
 
     @property
     def color(self) -> SkinColor:
-        """How skin of any pigment looks to the camera."""
+        """Colors of skin of any pigment in the camera's channels."""
         return skin_color(self.camera, self.illuminant)
 
     @property
     def blood_volume_fraction(self) -> Float32Array:
-        """Fraction of hemoglobin, shape (N, N)."""
+        """Blood volume fraction, shape (N, N)."""
         return self.subject.hemoglobin(self.state)
 
     def reflectance(self) -> Float32Array:
@@ -39,21 +39,21 @@ class ObservedSkin:
         return self.color.rgb(self.subject.melanin, self.blood_volume_fraction)
 
     def reflectance_without_melanin(self) -> Float32Array:
-        """Return the reflectance that it would have without melanin, shape (N, N, 3)."""
+        """Return the reflectance of the same skin without melanin, shape (N, N, 3)."""
         return self.color.rgb(np.zeros_like(self.subject.melanin), self.blood_volume_fraction)
 
     def covered_chromophores(self) -> tuple[Float32Array, Float32Array]:
-        """Return melanin and hemoglobin where the texture holds skin, shape (n,) each."""
+        """Return melanin and hemoglobin where the texture covers skin, shape (n,) each."""
         covered = self.subject.atlas.covered
         return self.subject.melanin[covered], self.blood_volume_fraction[covered]
 
     def band_weights(self, step: int = 1) -> Float64Array:
-        """Return each channel's weights of every so many wavelengths of the skin's table."""
+        """Return each channel's weights at every ``step``-th wavelength of the skin's table."""
         wavelength_nm = SkinTable.load().wavelength_nm[::step]
         return spectra.band_weights(self.camera, self.illuminant, wavelength_nm)
 
     def lateral_kernels(self) -> GaussianSum:
-        """Return the lateral profile of its median melanin and hemoglobin, per channel."""
+        """Return the lateral profile at the median melanin and hemoglobin, per channel."""
         melanin, blood = (float(np.median(part)) for part in self.covered_chromophores())
         table = SkinTable.load()
         return table.lateral_kernels(melanin, blood, self.band_weights()).gaussians(SIGMAS_MM)

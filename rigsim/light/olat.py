@@ -1,7 +1,7 @@
-"""One light at a time on what one camera sees: geometry found once, then shadow rays and shading.
+"""Render one light at a time (OLAT) for one camera: trace once, then shadow rays and shading.
 
-Camera rays are traced once for a view. What they meet is kept as compact rows, sorted by pixel;
-for every light, rays that face it are tested against the mesh, and what arrives is shaded and
+Camera rays are traced once per view. Their hits are stored as compact rows, sorted by pixel. For
+each light, the rows that face it are tested against the mesh, and the arriving light is shaded and
 summed into the pixels.
 """
 
@@ -28,18 +28,18 @@ from rigsim.render import RAY_OFFSET_MM, Caster, GBuffer, g_buffer
 from rigsim.render.depth_of_field import LensImage, depth_before_focus, tabulate_defocus
 
 SurfaceLookup = Callable[[GBuffer, Int32Array], tuple[Float32Array, Float32Array]]
-"""Gives the shading normals, shape (n, 3), and the surfaces of a G-buffer's rays, shape (n, 7) or
+"""Returns the shading normals, shape (n, 3), and the surfaces of a G-buffer's rays, shape (n, 7) or
 with a coating (n, 11)."""
 
 RAYS_PER_BAND: Final = 1 << 20
-"""Camera rays worked on at a time; bounds memory at full resolution."""
+"""Camera rays per batch; bounds memory at full resolution."""
 
 
 INVERSE_PLASTIC_NUMBER: Final = 0.7548776662466927
 """Inverse of the plastic number, the root of x^3 = x + 1."""
 
 DISC_POINTS: Final = 1 << 12
-"""Points on a light's disc that rows take in turn."""
+"""Points on a light's disc, assigned to rows cyclically."""
 
 
 NORMAL_SCALE: Final = 32767.0
@@ -50,11 +50,11 @@ class Lamp:
     """A light in the frame of the mesh."""
 
     position_mm: Float64Array
-    """Centre of the emitting disc, shape (3,)."""
+    """Center of the emitting disc, shape (3,)."""
     axis: Float64Array
-    """Unit vector in which the disc shines, shape (3,)."""
+    """Unit vector of the emission axis, shape (3,)."""
     exponent: float
-    """Exponent of the cosine off the axis that the intensity follows; nothing shines backwards."""
+    """Exponent of the intensity's cosine off the axis; nothing is emitted backwards."""
     radius_mm: float
     """Radius of the disc, 0 for a point."""
 
@@ -69,7 +69,7 @@ class Lamp:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """What a camera's rays meet, as rows sorted by pixel."""
+    """Hits of a camera's rays, as rows sorted by pixel."""
 
     shape: tuple[int, int]
     """Rows and columns of the image."""
@@ -86,20 +86,20 @@ class Hits:
     prim: Int32Array
     """Triangles, shape (n,)."""
     slot: UInt8Array
-    """Place in the pixel, row by row, below subpixels^2, shape (n,)."""
+    """Position in the pixel, row by row, below subpixels^2, shape (n,)."""
     uv: UInt16Array
     """Texture coordinates times `UINT16_FULL_SCALE`, shape (n, 2)."""
     surface: UInt16Array
     """Square roots of r_d over its limit (3), roughness, oil, fuzz over its limit, bare; with a
     coating also film, its alpha, its index - 1, powder; times `UINT16_FULL_SCALE`; shape (n, 7) or
-    (n, 11). Matt rows hold their reflectance as r_d, metal ones too and their alpha as
+    (n, 11). Matt rows store their reflectance as r_d; metal rows also store their alpha as
     roughness."""
     camera_mm: Float64Array
-    """Centre of projection, shape (3,)."""
+    """Center of projection, shape (3,)."""
     kind: int
     """`SKIN_ROWS`, `MATT_ROWS` or `METAL_ROWS`."""
     lens: LensImage | None = None
-    """How the lens spreads the rows' light; None: it is sharp everywhere."""
+    """Lens blur of the rows' light; None: sharp everywhere."""
 
     def scatter(self, rows: Float32Array) -> Float32Array:
         """Average rows over each pixel's covered part, shape (H, W, C); zero elsewhere."""
@@ -111,7 +111,7 @@ class Hits:
         return out.reshape(*self.shape, rows.shape[1])
 
     def coverage(self) -> Float32Array:
-        """Return the share of each pixel that is covered, shape (H, W)."""
+        """Return the covered fraction of each pixel, shape (H, W)."""
         out = np.zeros(self.shape[0] * self.shape[1], np.float32)
         out[self.pixel] = np.diff(self.first) / np.float32(self.subpixels**2)
         return out.reshape(self.shape)
@@ -151,7 +151,7 @@ def unpack_surface(surface: UInt16Array) -> Float32Array:
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """How cameras look."""
+    """Settings of camera rays and lens."""
 
     subpixels: int
     """Rays along each side of a pixel."""
@@ -169,7 +169,7 @@ def find_hits(
     kind: int = SKIN_ROWS,
     distortion: ArrayLike | None = None,
 ) -> Hits:
-    """Trace a camera's rays and keep what they meet.
+    """Trace a camera's rays and store their hits.
 
     Parameters
     ----------
@@ -178,13 +178,13 @@ def find_hits(
     view
         The camera, in the frame of the mesh.
     look_up
-        Gives shading normals (n, 3) and surfaces, (n, 7) or (n, 11), for a G-buffer's rows.
-    how
-        How the camera looks.
+        Returns shading normals (n, 3) and surfaces, (n, 7) or (n, 11), for a G-buffer's rows.
+    settings
+        Settings of the camera.
     kind
-        How rows reflect.
+        Kind of the rows' reflection.
     distortion
-        Of the lens, see `rigsim.render.camera_rays`.
+        Distortion of the lens, see `rigsim.render.camera_rays`.
 
     Returns
     -------
@@ -232,12 +232,12 @@ def find_hits(
 def pixel_order(
     mask: BoolArray, subpixels: int
 ) -> tuple[Int32Array, Int32Array, Int32Array, UInt8Array]:
-    """Return the samples that meet something, those of one pixel together.
+    """Return the samples with a hit, sorted by pixel.
 
     Parameters
     ----------
     mask
-        Samples that do, shape (H k, W k).
+        Samples with a hit, shape (H k, W k).
     subpixels
         The k above.
 
@@ -246,10 +246,10 @@ def pixel_order(
     order : ndarray of int32
         Index into the flat mask, shape (n,).
     pixel, first : ndarray of int32
-        Pixels with at least one, index into the flat picture, shape (P,), and the first of each,
+        Pixels with at least one, index into the flat image, shape (P,), and the first of each,
         shape (P + 1,).
     slot : ndarray of uint8
-        Place in the pixel, row by row, shape (n,).
+        Position in the pixel, row by row, shape (n,).
 
     Examples
     --------
@@ -268,7 +268,7 @@ def pixel_order(
 
 
 def _rows_of(caster: Caster, view: View, *, bent: bool) -> tuple[int, int]:
-    """Return the first row of the image that the mesh can reach, and the one after the last."""
+    """Return the first image row that the mesh can reach, and the one after the last."""
     offset = caster.mesh.vertices_mm - np.asarray(view.position_mm, np.float32)
     _, up, back = (np.asarray(axis, np.float32) for axis in view.axes)
     depth = -(offset @ back)
@@ -281,11 +281,11 @@ def _rows_of(caster: Caster, view: View, *, bent: bool) -> tuple[int, int]:
 
 
 def is_lamp_visible(hits: Hits, caster: Caster, lamp: Lamp) -> BoolArray:
-    """Tell which rows see their point of a light.
+    """Return which rows have an unoccluded ray to their point on a light.
 
-    Every row has its own point on the disc; neighbours' points are spread evenly over it. Only
-    shadows depend on it: shading takes the disc's centre, which errs by the square of radius over
-    distance, 2e-4 in the dome, and adds no noise.
+    Every row has its own point on the disc, and neighbors' points are distributed evenly over it.
+    Only shadows depend on these points. Shading uses the disc's center, whose error is the square
+    of radius over distance, 2e-4 in the dome, and adds no noise.
 
     Parameters
     ----------
@@ -323,7 +323,7 @@ def is_lamp_visible(hits: Hits, caster: Caster, lamp: Lamp) -> BoolArray:
 
 
 def shadow_ray_origins(hits: Hits, caster: Caster) -> Float32Array:
-    """Return where the rows' shadow rays start, above their triangles, shape (n, 3)."""
+    """Return the origins of the rows' shadow rays, above their triangles, shape (n, 3)."""
     offset = np.float32(RAY_OFFSET_MM) * caster.face_normals[hits.prim]
     return np.asarray(hits.position_mm + offset, np.float32)
 
@@ -331,7 +331,7 @@ def shadow_ray_origins(hits: Hits, caster: Caster) -> Float32Array:
 def sum_rows(
     hits: Hits, red: Float32Array, green: Float32Array, blue: Float32Array, color: Float32Array
 ) -> Float32Array:
-    """Sum what rows send, shape (n,) each, times a color, into whole pixels, shape (H, W, 3)."""
+    """Sum the light of rows, shape (n,) each, times a color, into whole pixels, shape (H, W, 3)."""
     if hits.lens is not None:
         return hits.lens.render(np.stack([red, green, blue], axis=1)) * np.asarray(
             color, np.float32
@@ -361,16 +361,16 @@ def shade_rows(
     lamp
         The light.
     visible
-        Rows that see it, see `is_lamp_visible`.
+        Rows to which it is visible, see `is_lamp_visible`.
     color
         Intensity on the light's axis, shape (3,), see `rigsim.light.led_light`.
     glow
-        What else leaves the interior of skin, before the boundary: pi times radiance for an
+        Additional subsurface light of skin, before the boundary: pi times radiance for an
         intensity of 1 mm^2, shape (n, 3).
     diffuse
-        False leaves out skin's own diffuse term, for a glow that holds it.
+        False omits skin's own diffuse term, for a glow that includes it.
     relief
-        Part of the light that the texture's relief leaves to each row, shape (n,); None: all.
+        Fraction of the light that the texture's relief leaves to each row, shape (n,); None: 1.
 
     Returns
     -------
@@ -389,9 +389,10 @@ def shade_rows(
 
 
 def disc_points(count: int) -> tuple[Float32Array, Float32Array]:
-    """Return points of the unit disc, shape (count,) each; neighbours are spread evenly over it.
+    """Return points of the unit disc, shape (count,) each, in a low-discrepancy order.
 
-    The additive sequence of the plastic number, mapped to the disc with even density.
+    The additive sequence of the plastic number is mapped to the disc with uniform density: the
+    radius is the square root of one coordinate, so that equal areas receive equal numbers.
     """
     index = np.arange(count)
     u, v = (

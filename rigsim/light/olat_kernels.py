@@ -1,4 +1,4 @@
-"""Kernels of `rigsim.light.olat`: who faces a light, where shadow rays go, what rows send."""
+"""Kernels of `rigsim.light.olat`: rows that face a light, shadow rays, and shading."""
 
 import math
 from typing import Final
@@ -17,26 +17,26 @@ from rigsim.light.surface_brdf import (
 from rigsim.render import RAY_OFFSET_MM
 
 ROWS_PER_CHUNK: Final = 1 << 13
-"""Rows that one thread works on at a time."""
+"""Rows per thread at a time."""
 
 SKIN_ROWS, MATT_ROWS, METAL_ROWS = 0, 1, 2
-"""How rows reflect: skin of `rigsim.light.surface_brdf`, Lambertian, GGX facets of a metal."""
+"""Kinds of reflection: skin of `rigsim.light.surface_brdf`, Lambertian, GGX facets of a metal."""
 
 UINT16_FULL_SCALE: Final = 65535.0
 
 MAX_FUZZ: Final = 0.01
-"""Largest optical depth of vellus hair that a row can hold."""
+"""Largest optical depth of vellus hair that a row can store."""
 
 BARE_COLUMNS: Final = 7
 """Columns of a surface without a coating."""
 
 ETA_COLUMN: Final = 9
-"""The column that holds the index of a coating's film."""
+"""Column of the index of a coating's film."""
 
 
-@njit(cache=True)  # a few ms at most: waiting for a second thread would take longer
+@njit(cache=True)  # a few ms at most: starting a second thread would take longer
 def sum_rows(pixel, first, red, green, blue, weight, out):  # type: ignore[no-untyped-def]
-    """Sum what rows send into whole pixels, times a share per channel."""
+    """Sum the light of rows into whole pixels, with a weight per channel."""
     for p in range(pixel.shape[0]):
         r = g = b = np.float32(0.0)
         for i in range(first[p], first[p + 1]):
@@ -94,7 +94,7 @@ def aim_shadow_rays(  # type: ignore[no-untyped-def]
             f2 = float(vertices[c, 2]) - vertices[a, 2]
             n0, n1, n2 = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0
             norm = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
-            # Rays start above the triangle, on the side that the light is on if it is in front.
+            # Rays start above the triangle, on the light's side if the light is in front.
             lift = RAY_OFFSET_MM / norm if norm > 0.0 else 0.0
             p0, p1, p2 = p0 + lift * n0, p1 + lift * n1, p2 + lift * n2
             w0, w1, w2 = x - p0, y - p1, z - p2
@@ -108,16 +108,16 @@ def aim_shadow_rays(  # type: ignore[no-untyped-def]
 
 @njit(parallel=True, cache=True)
 def shade_rows(samples, light, visible, glow, diffuse, relief, out):  # type: ignore[no-untyped-def]
-    """Add what rows send to a camera under one light.
+    """Add the light of rows toward a camera under one light.
 
     Parameters
     ----------
     samples
-        Position in mm, normal, surface, place of the camera and kind of the rows.
+        Position in mm, normal, surface, position of the camera and kind of the rows.
     light
-        Middle of the light in mm, its axis, and the exponent of its lobe.
+        Center of the light in mm, its axis, and the exponent of its lobe.
     visible, glow, diffuse, relief, out
-        As in `rigsim.light.olat.shade_rows`; ``glow`` and ``relief`` without a row are none.
+        As in `rigsim.light.olat.shade_rows`; ``glow`` and ``relief`` without rows are ignored.
     """
     position, normal, surface, camera, kind = samples
     center, axis, exponent = light

@@ -1,8 +1,8 @@
-"""The same as `rigsim.light.olat` for skin, in one vectorized kernel: rays, shading, all at once.
+"""Shade skin as `rigsim.light.olat` does, in one vectorized Dr.Jit kernel of rays and shading.
 
-The kernel is compiled once by Dr.Jit; lights come in as numbers it does not know beforehand. It
-needs Mitsuba's LLVM variants; without them, and for targets, `rigsim.light.olat` does the work.
-The reflection is written a second time here, from the same formulas; a test holds both together.
+The kernel is compiled once; lights are runtime parameters. It requires Mitsuba's LLVM variants;
+without them, and for targets, `rigsim.light.olat` is used. The reflection is implemented a second
+time here, from the same formulas; a test compares both.
 """
 
 import math
@@ -19,7 +19,7 @@ from rigsim.tissue.skin_layers import ETA
 
 
 class VectorizedShader:
-    """Rows of skin, ready to be lit.
+    """Shader of rows of skin.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class VectorizedShader:
         self.hits = hits
         mi = load_mitsuba(self._choice)
         self._start = mi.Point3f(*_columns(shadow_ray_origins(hits, caster)))
-        # Normal and surface as ten half words, or fourteen: a dome holds sixteen views.
+        # Normal and surface as ten or fourteen half words, for a dome's sixteen views.
         halves = np.concatenate([hits.normal.view(np.uint16), hits.surface], axis=1)
         words = np.ascontiguousarray(halves).view(np.uint32)
         self._words = [mi.UInt32(pad_memory(words[:, k])) for k in range(words.shape[1])]
@@ -100,7 +100,7 @@ class VectorizedShader:
         half = to_light + to_camera
         length = dr.norm(half)
         nh, lh = dr.minimum((nl + nv) / length, 1.0), 0.5 * length
-        # Cosines below zero are masked out; keep their square roots real.
+        # Cosines below zero are masked; clamping keeps their square roots real.
         cl, cv = dr.maximum(nl, 1e-6), dr.maximum(nv, 1e-6)
         surface = (1.0 - oil) * _fresnel(dr, lh, ETA) * _beckmann(dr, cl, cv, nh, roughness)
         surface += (
@@ -117,7 +117,7 @@ class VectorizedShader:
         if coating:
             powder = coating[3]
             surface = (1.0 - powder) * surface + powder * _grains(cl, cv, lh)
-        # Where not both are above, the half vector may lie in the surface: 0 * inf.
+        # Unless both are above the surface, n.h may be 0: avoid 0 * inf.
         gloss = dr.select(active, math.pi * strength * bare * surface, 0.0)
         leaving = 1.0 - _fresnel(dr, cv, ETA)
         rows = [gloss] * 3

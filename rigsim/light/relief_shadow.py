@@ -1,21 +1,19 @@
-"""Shadows of relief: horizons of a height field, and of wrinkles that a mesh does not hold.
+"""Compute shadows of relief: horizons of a height field, and of wrinkles above a mesh.
 
-A line in each direction is swept from the light's side; the upper convex hull of what was passed
-gives the horizon of the next point in constant time on average (Timonen and Westerholm 2010,
-doi:10.1111/j.1467-8659.2009.01642.x). Lines lie a pixel apart; heights between pixels are linear.
-
-For each direction over the texture the elevation of its own horizon is found once
+Each line is swept along its direction from the light's side. The upper convex hull of the passed
+points gives the horizon of the next point in constant time on average (Timonen and Westerholm 2010,
+doi:10.1111/j.1467-8659.2009.01642.x). Lines are one pixel apart; heights between pixels are linear.
+For each direction over the texture the elevation of its horizon is computed once
 (`horizon_tangent`); a light below it is hidden from that texel. Horizons are those of the
-relief over the mesh as if that were flat over a few millimeters; what the mesh hides, rays tell.
+relief over the mesh as if the mesh were flat over a few millimeters; rays test occlusion by the
+mesh.
 
-Light that goes from the walls of furrows to other walls, by how much of the sky they hide.
-
-A point of a relief sees other skin wherever it does not see the sky. What that skin sends out has
-spread inside over more than a furrow's width, so that all of it near by is taken as equally
-bright; then the light it sends to a point is that brightness times the share of the point's
-hemisphere that is hidden, less what the boundary sends back. On skin's shallow relief what hides
-the sky stands low, and light goes from wall to wall nearly along the surface, where the boundary
-lets little through.
+Interreflection between walls of grooves follows from the hidden fraction of their sky. Each
+point of a relief receives light from other skin wherever the sky is hidden. That skin's light has
+scattered laterally over more than a groove's width, so that its brightness is uniform nearby. The
+light it sends to a point is that brightness times the hidden fraction of the point's hemisphere,
+times the boundary's transmittance. On skin's shallow relief the hidden sky is near the horizon, and
+light between walls is nearly parallel to the surface, where the boundary transmits little.
 """
 
 import math
@@ -30,14 +28,14 @@ from rigsim.light.surface_brdf import transmittance
 from rigsim.subject import SimulatedSubject
 
 HORIZON_DIRECTIONS: Final = 24
-"""Directions in which horizons are found; between them they are blended."""
+"""Number of directions with horizons; they are interpolated in between."""
 
 HORIZON_SOFTNESS_RAD: Final = 0.02
-"""Least half width of a shadow's edge in elevation: a texel is no point."""
+"""Smallest half width of a shadow's edge in elevation: a texel is not a point."""
 
 
 class HorizonError(ValueError):
-    """A height field or a direction cannot be used."""
+    """An unusable height field or direction."""
 
 
 def horizon_tangent(
@@ -48,32 +46,34 @@ def horizon_tangent(
     Parameters
     ----------
     height_um
-        Heights, um, shape (H, W); row 0 is the top. Around the field the relief is taken as level
-        and too low to hide anything.
+        Heights, um, shape (H, W); row 0 is the top. Around the field the relief is level and too
+        low to hide anything.
     pixel_um
-        Distance of neighbours, um, > 0.
+        Distance of neighbors, um, > 0.
     azimuth_rad
         Direction of the light over the field, from +x towards the top.
 
     Returns
     -------
     ndarray of float32
-        Shape (H, W), >= 0; 0 where nothing stands higher.
+        Shape (H, W), >= 0; 0 where nothing is higher.
     """
     height = np.ascontiguousarray(height_um, np.float32)
     if height.ndim != 2 or not np.isfinite(height).all():
         raise HorizonError(f"height_um: got shape {height.shape}, expected finite (H, W)")
     if not (0.0 < pixel_um < math.inf and math.isfinite(azimuth_rad)):
-        raise HorizonError(f"pixel_um, azimuth_rad: got {pixel_um}, {azimuth_rad}")
+        raise HorizonError(
+            f"pixel_um, azimuth_rad: got {pixel_um}, {azimuth_rad}, expected > 0 and finite"
+        )
     right, down = math.cos(azimuth_rad), -math.sin(azimuth_rad)
-    # sweep along the axis that the direction follows most; away from the light
+    # sweep along the dominant axis of the direction, away from the light
     steep = abs(down) > abs(right)
     field = height.T if steep else height
     along, across = (down, right) if steep else (right, down)
     backwards = along < 0.0
-    # the light is at +along: begin at the far end and walk towards smaller coordinates
+    # the light is at +along: start at the far end and proceed to smaller coordinates
     field = np.ascontiguousarray(field if backwards else field[:, ::-1])
-    slope = across / abs(along)  # drift across per step towards the light
+    slope = across / abs(along)  # drift across per step toward the light
     out = np.zeros_like(field)
     _sweep(field, np.float32(pixel_um * math.hypot(1.0, slope)), -slope, out)
     out = out if backwards else out[:, ::-1]
@@ -81,7 +81,7 @@ def horizon_tangent(
 
 
 class ReliefShadow:
-    """One face's relief, ready to hide lights.
+    """Shadows of one face's relief.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class ReliefShadow:
         self._du, self._dv = atlas.dp_du_mm, atlas.dp_dv_mm
         self._size = atlas.size
         height = np.where(atlas.covered, subject.height_um, np.float32(0.0)).astype(np.float32)
-        # um a texel; what a texel measures along each direction, its own frame says
+        # um per texel; each texel's own frame gives its length along each direction
         self._horizon = np.stack(
             [
                 horizon_tangent(
@@ -112,7 +112,7 @@ class ReliefShadow:
         *,
         radius_mm: float = 0.0,
     ) -> Float32Array:
-        """Return which part of a light the relief leaves to each point.
+        """Return the fraction of a light that the relief leaves to each point.
 
         Parameters
         ----------
@@ -121,9 +121,9 @@ class ReliefShadow:
         position_mm
             The points, frame of the mesh, shape (n, 3).
         light_mm
-            Middle of the light, same frame, shape (3,).
+            Center of the light, same frame, shape (3,).
         radius_mm
-            Of its disc, which makes edges soft.
+            Radius of its disc, which makes edges soft.
 
         Returns
         -------
@@ -150,7 +150,11 @@ class ReliefShadow:
 
 @njit(parallel=True, cache=True)
 def _sweep(field, step, drift, out):  # type: ignore[no-untyped-def]
-    """Walk over the columns, from the light's side; each line drifts over the rows."""
+    """Sweep over the columns, from the light's side; each line drifts over the rows."""
+    # The stack holds the upper convex hull of the points between the light and the current column.
+    # A point below the segment from its predecessor to the current point can never again be a
+    # horizon,
+    # so it is removed for good: each point enters and leaves once, hence constant time on average.
     rows, columns = field.shape
     most = math.ceil(abs(drift) * (columns - 1))
     first = -most if drift > 0.0 else 0
@@ -171,7 +175,7 @@ def _sweep(field, step, drift, out):  # type: ignore[no-untyped-def]
             above = min(max(low + 1, 0), rows - 1)
             own = (np.float32(1.0) - part) * field[below, column] + part * field[above, column]
             here = np.float32(column) * step
-            # points of the hull that the next one hides from here are never seen again
+            # points of the hull that the next one hides from here never become a horizon again
             while top > 0:
                 rise = (level[top - 1] - own) / (here - place[top - 1])
                 if top > 1:
@@ -210,7 +214,7 @@ def _visible_fraction(uv, position, light, radius, du, dv, horizon, out):  # typ
             continue
         up = (w0 * n0 + w1 * n1 + w2 * n2) / (area * far)
         if up <= 0.0:
-            continue  # behind the mesh, which rays tell
+            continue  # behind the mesh; rays test that occlusion
         # the direction over the texture: w = a du + b dv + c n
         p, q = w0 * a0 + w1 * a1 + w2 * a2, w0 * b0 + w1 * b1 + w2 * b2
         aa, bb = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2
@@ -233,7 +237,7 @@ def _visible_fraction(uv, position, light, radius, du, dv, horizon, out):  # typ
 
 
 ELEVATION_NODES: Final = 6
-"""Elevations at which what passes two boundaries is summed."""
+"""Number of elevations for the quadrature with two boundaries."""
 
 _ELEVATION_QUADRATURE: Final = np.polynomial.legendre.leggauss(ELEVATION_NODES)
 
@@ -247,7 +251,7 @@ def hidden_sky_fraction(
     sectors: int,
     boundaries: bool = False,
 ) -> Float32Array:
-    """Return which share of its sky the relief hides from each point, weighted with the cosine.
+    """Return the fraction of each point's sky that the relief hides, weighted with the cosine.
 
     Parameters
     ----------
@@ -256,14 +260,14 @@ def hidden_sky_fraction(
     normals
         Unit normals, shape (H, W, 3); +z is up.
     margin
-        See there, >= 0.
+        Number of those samples, >= 0.
     pixel_um
         Distance of samples, um, > 0.
     sectors
-        Directions in which horizons are found, >= 1.
+        Number of directions with horizons, >= 1.
     boundaries
-        Whether directions are weighed with what passes out of one wall and into the other: the
-        square of the transmittance at the point's own angle, which stands for both.
+        Whether directions are weighted with the transmittance out of one wall and into the other:
+        the square of the transmittance at the point's own angle, which represents both.
 
     Returns
     -------
@@ -275,11 +279,11 @@ def hidden_sky_fraction(
     In a direction with the normal's part n_t along it and n_z up, between the point's own tangent
     plane at elevation a and the horizon at b, ``int (n_t cos e + n_z sin e) cos e de`` is
     ``n_t (e / 2 + sin 2e / 4) + n_z sin^2 e / 2`` from a to b; with boundaries it is summed at
-    `ELEVATION_NODES` elevations. Level skin around the field closes the sky below the horizontal.
+    `ELEVATION_NODES` elevations. Level skin around the field hides the sky below the horizontal.
 
     Examples
     --------
-    A wall that leans by 60 degrees hides (1 - cos 60) / 2 of its sky below the horizontal:
+    A wall tilted by 60 degrees hides (1 - cos 60) / 2 of its sky below the horizontal:
 
     >>> tilt = math.radians(60.0)
     >>> lean = np.zeros((1, 1, 3), np.float32) + np.float32([math.sin(tilt), 0.0, math.cos(tilt)])
@@ -304,7 +308,7 @@ def hidden_sky_fraction(
 
 @njit(parallel=True, cache=True)
 def _add(out, normals, tangent, angle, share):  # type: ignore[no-untyped-def]
-    """Add one sector's hidden part; ``share`` is its width over pi."""
+    """Add one sector's hidden fraction; ``share`` is its width over pi."""
     right, up = math.cos(angle), math.sin(angle)
     for i in prange(out.shape[0]):
         for j in range(out.shape[1]):
@@ -321,7 +325,7 @@ def _add(out, normals, tangent, angle, share):  # type: ignore[no-untyped-def]
 
 @njit(parallel=True, cache=True)
 def _add_through(out, normals, tangent, angle, share, nodes, weights):  # type: ignore[no-untyped-def]
-    """Add one sector's hidden part as it passes two boundaries."""
+    """Add one sector's hidden fraction with the transmittance of two boundaries."""
     right, up = math.cos(angle), math.sin(angle)
     for i in prange(out.shape[0]):
         for j in range(out.shape[1]):

@@ -1,4 +1,4 @@
-"""Light that a relief keeps from its own points, taken away from the sum over all LEDs."""
+"""Subtract light that a relief hides from its own points from the sum over all LEDs."""
 
 import math
 from typing import Protocol
@@ -14,15 +14,15 @@ from rigsim.shading_kernels import entry_transmittance_element, specular_stokes_
 
 
 class SurfaceElements(Protocol):
-    """Surface elements of a picture."""
+    """Surface elements of an image."""
 
     @property
     def x_mm(self) -> Float32Array:
-        """Place, shape (H, W)."""
+        """Position, shape (H, W)."""
 
     @property
     def y_mm(self) -> Float32Array:
-        """Place, shape (H, W)."""
+        """Position, shape (H, W)."""
 
     @property
     def normals(self) -> Float32Array:
@@ -34,7 +34,7 @@ class SurfaceElements(Protocol):
 
     @property
     def skin(self) -> BoolArray:
-        """Where light is taken away, shape (H, W)."""
+        """Where light is subtracted, shape (H, W)."""
 
 
 def subtract_hidden_led(
@@ -45,9 +45,9 @@ def subtract_hidden_led(
     led: int,
     surface: MicrofacetSurface,
 ) -> None:
-    """Take an LED away from where it stands behind the horizon, in place.
+    """Subtract an LED, in place, where the horizon hides it.
 
-    The part of its disc below the horizon is taken as linear in the horizon's elevation.
+    The part of its disc below the horizon is modeled as linear in the horizon's elevation.
 
     Parameters
     ----------
@@ -56,12 +56,12 @@ def subtract_hidden_led(
     elements
         The surface.
     horizon
-        Tangents of the horizon's elevation in two directions beside the LED's, shape (H, W), and
-        how far from the first to the second that is.
+        Tangents of the horizon's elevation in the two directions adjacent to the LED's, shape
+        (H, W), and the LED's fractional position from the first to the second.
     sphere, led
-        The LED; it stands above the plane of the patch.
+        The LED, above the plane of the patch.
     surface
-        How the surface reflects.
+        Reflection of the surface.
     """
     place = sphere.position_mm[led]
     distance = float(np.linalg.norm(place))
@@ -93,6 +93,8 @@ def _remove(packed, elements, edge, led, look):  # type: ignore[no-untyped-def]
         tangent = first[i] + between * (second[i] - first[i])
         if tangent <= low or not skin[i]:
             continue
+        # Linear in elevation: 0 where the horizon touches the disc's lower edge, 1 at its upper
+        # edge.
         part = min(0.5 + 0.5 * (math.atan(tangent) - elevation) / radius, 1.0)
         n0, n1, n2 = float(normals[i, 0]), float(normals[i, 1]), float(normals[i, 2])
         l0, l1, l2 = place[0] - x[i], place[1] - y[i], place[2]

@@ -1,4 +1,4 @@
-"""Light that comes back from inside the skin, laid out in the texture of a face."""
+"""Compute the subsurface light of a face in its texture."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -21,41 +21,42 @@ from rigsim.tissue.lateral_kernels import GaussianSum
 from rigsim.tissue.skin_layers import ETA
 
 PIGMENT_BLUR_MM: Final = 0.12
-"""Width of the blur of melanin's absorbance; fitted to photons that walk through patterned skin,
+"""Width of the blur of melanin's absorbance; fitted to photon transport through patterned skin,
 see `scatter_patterned_light`."""
 
 FLASH_SHADOW_SAMPLES: Final = 8
-"""Points on each flash that cast shadows."""
+"""Points on each flash for its shadows."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceIllumination:
-    """Light on a face, whatever its skin is made of; textures of shape (N, N[, L])."""
+    """Light on a face, independent of its skin; textures of shape (N, N[, L])."""
 
     visible: Float32Array
-    """Part of each light's disc that is seen, shape (N, N, L), 0 to 1."""
+    """Visible fraction of each light's disc, shape (N, N, L), 0 to 1."""
     irradiance: Float32Array
-    """Light that falls on the surface relative to what a plate at the rig's origin gets that faces
-    the camera, without any film, shape (N, N)."""
+    """Irradiance of the surface over that of a plate at the rig's origin that faces the camera,
+    without polarizers, shape (N, N)."""
     entered: Float32Array
     """Filtered light that enters, in the same unit, shape (N, N)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SubsurfaceRadiance:
-    """Light on and out of a face; textures of shape (N, N[, C])."""
+    """Light on and from a face; textures of shape (N, N[, C])."""
 
     surface: SurfaceIllumination
-    """Light on it."""
+    """Light on the face."""
     reflectance: Float32Array
     """Sharp white-balanced diffuse reflectance of the skin, shape (N, N, 3)."""
     unscattered: Float32Array
-    """Light that would leave where it entered, before the surface's exit: what entered, from
-    flashes and from other skin, times reflectance and the interior's scale, shape (N, N, 3)."""
+    """Light that would leave where it entered, before the surface's exit: the light that entered,
+    from flashes and from other skin, times reflectance and the interior's scale, shape (N, N,
+    3)."""
     scattered: Float32Array
-    """The same with lateral transport unless it is left out, and behind hair."""
+    """The same with lateral scattering unless omitted, and behind hair."""
     kernels: GaussianSum
-    """Lateral profile of each channel at the face's typical skin."""
+    """Lateral profile of each channel for the face's typical skin."""
 
 
 def illuminate_surface(
@@ -67,27 +68,27 @@ def illuminate_surface(
     caster: Caster,
     relief: ReliefShadow | None = None,
 ) -> SurfaceIllumination:
-    """Light the surface of a face.
+    """Compute the illumination of a face's surface.
 
     Parameters
     ----------
     subject
-        Whose face, as its geometry stands.
+        The face in its present pose.
     lights
         The flashes; all of one spectrum.
     weights
-        Energy of each light over the sum that a plate at the origin gets, mm^2, shape (L,).
-    films
-        The lights' films.
+        Energy of each light over the total of a plate at the origin, mm^2, shape (L,).
+    polarizers
+        The lights' polarizers.
     caster
         The face's mesh.
     relief
-        What of the texture's relief hides lights; None: nothing.
+        Shadows of the texture's relief; None: none.
 
     Returns
     -------
-    SurfaceLight
-        Textures that no state of the blood changes.
+    SurfaceIllumination
+        Textures that are independent of the blood.
     """
     atlas = subject.atlas
     size = atlas.size
@@ -138,18 +139,18 @@ def render_subsurface_radiance(
     lateral_transport: bool,
     interreflection: InterreflectionSettings | None,
 ) -> SubsurfaceRadiance:
-    """Let the light on a face into its skin and out again.
+    """Compute the subsurface light of an illuminated face.
 
     Parameters
     ----------
     skin
         The face.
     surface
-        Light on it.
+        Light on the face.
     lateral_transport
-        Whether light spreads inside the skin.
-    bounces
-        How light goes from skin to skin; None leaves that out.
+        Whether light scatters laterally in the skin.
+    interreflection
+        Settings of interreflection; None omits it.
 
     Returns
     -------
@@ -176,7 +177,7 @@ def render_subsurface_radiance(
     spread = sharp
     if lateral_transport:
         spread = scale * scatter_through_pigment(skin, reflectance, within, kernels)
-    # Hair is dark and matt, and lets no light into the skin below it.
+    # Hair is dark and matt, and transmits no light to the skin below it.
     spread = (1.0 - hair) * spread + scale * within * covering
     return SubsurfaceRadiance(surface, reflectance, sharp, spread, kernels)
 
@@ -184,7 +185,7 @@ def render_subsurface_radiance(
 def scatter_through_pigment(
     skin: ObservedSkin, reflectance: Float32Array, entered: Float32Array, kernels: GaussianSum
 ) -> Float32Array:
-    """Return the light that leaves after it has spread, per unit of the interior's scale.
+    """Return the light that leaves after lateral scattering, per unit of the interior's scale.
 
     Parameters
     ----------
@@ -204,7 +205,7 @@ def scatter_through_pigment(
 
     See Also
     --------
-    spread_pattern : what is done, and how well it holds.
+    scatter_patterned_light : the method and its accuracy.
     """
     without = skin.reflectance_without_melanin()
     return scatter_patterned_light(reflectance, without, entered, skin.subject.atlas, kernels)
@@ -217,7 +218,7 @@ def scatter_patterned_light(
     atlas: Atlas,
     kernels: GaussianSum,
 ) -> Float32Array:
-    """Return the light that leaves patterned skin.
+    """Return the light that leaves patterned skin after lateral scattering.
 
     Parameters
     ----------
@@ -239,13 +240,13 @@ def scatter_patterned_light(
 
     Notes
     -----
-    Melanin lies above the scattering dermis, so light passes it where it enters and again where it
-    leaves: its pattern acts once before and once after the spreading, as m = sqrt(R / R without
-    melanin) each time, with log m blurred by `PIGMENT_BLUR_MM` since light crosses the epidermis
-    aslant. Blood acts inside, before the spreading. Against photons that walk through patterned
-    skins at two wavelengths (`rigsim.tissue.patterned_tissue`) this errs by 1.4 % rms over six
-    edges and spots, to which the width was fitted, and by 3 to 4 % on stripes of 0.75 mm, to which
-    it was not; leaving transport out errs by 6.3 % on the six, blurring the reflectance by 3.7 %.
+    Melanin lies above the scattering dermis, so light passes it on entry and on exit: its pattern
+    acts once before and once after the lateral scattering, as m = sqrt(R / R without melanin) each
+    time, with log m blurred by `PIGMENT_BLUR_MM` since light crosses the epidermis obliquely. Blood
+    acts inside, before the scattering. Against photon transport through patterned skins at two
+    wavelengths (`rigsim.tissue.patterned_tissue`) the error is 1.4 % rms over six edges and spots,
+    to which the width was fitted, and 3 to 4 % on stripes of 0.75 mm, to which it was not; without
+    lateral scattering it is 6.3 % on the six, with a blurred reflectance 3.7 %.
     """
     pigment = pigment_transmittance(reflectance, without_melanin, atlas)
     light = entered if entered.ndim == 3 else entered[..., None]
@@ -256,9 +257,9 @@ def scatter_patterned_light(
 def pigment_transmittance(
     reflectance: Float32Array, without_melanin: Float32Array, atlas: Atlas
 ) -> Float32Array:
-    """Return which part of light the pigment above the place where it enters or leaves lets pass.
+    """Return the transmittance of the pigment above each point of entry or exit, shape (N, N, C).
 
-    Light crosses the epidermis twice, each time where it is a little blurred; shape (N, N, C).
+    Light crosses the epidermis twice, and each crossing is slightly blurred.
     """
     log_m = np.log(reflectance / without_melanin) * np.float32(0.5)
     channels = np.ones((reflectance.shape[-1], 1))

@@ -1,16 +1,16 @@
-"""How skin reflects at a point: light from inside through the boundary, facets, oil and fine hair.
+"""Model the reflection of skin: subsurface light through the boundary, facets, oil and vellus hair.
 
 f_r = T(n.l) T(n.v) R_d / pi
       + (1 - oil) F(h.l; 1.4) D G / (4 n.l n.v)     facets of skin, Beckmann, roughness m
       + oil F(h.l; 1.47) D G / (4 n.l n.v)          film of oil, GGX, alpha = m / 2
-      + single scattering in a thin layer of vellus hair, which glows at grazing angles
+      + single scattering in a thin layer of vellus hair, strongest at grazing angles
 
 T is the transmittance of a smooth boundary of index 1.4. The surface part has two distributions,
-two indices and a layer, so no single analytic lobe and no mixture of lobes of one index holds it.
-Every term is reciprocal; together they send back less than they get (tests integrate it).
+two indices and a layer, so that neither a single analytic lobe nor a mixture of lobes of one index
+represents it. Every term is reciprocal; the sum conserves energy (tests integrate it).
 
-What lies on skin (`Coating`: water, lotion, foundation, powder) replaces part of the facets by a
-film and covers part of it all with grains::
+A layer on the skin (`Coating`: water, lotion, foundation, powder) replaces a fraction of the facets
+by a film and covers a fraction of everything with grains::
 
     facets -> (1 - film) facets + film F(h.l; eta) D G / (4 n.l n.v)      GGX, alpha of its own
     surface -> (1 - powder) surface + powder w p(-l.v) / (4 pi (n.l + n.v))
@@ -19,12 +19,12 @@ the latter a thick layer of grains that scatter once, backwards (p: Henyey and G
 
 Notes
 -----
-R_d is the factor in the first term, which is what eq. (6) of Weyrich et al. takes the minimum of
-pi f_r / (T T) for: the share of the light that has entered which would leave through an open
-boundary. It is not the reflectance for light at normal incidence R, which also lost light at the
+R_d is the factor in the first term, for which eq. (6) of Weyrich et al. takes the minimum of
+pi f_r / (T T): the fraction of the entered light that would leave through an open boundary. It
+differs from the reflectance R for light at normal incidence, which includes losses at the
 boundary: R_d = R / (T(0) T_average) = 1.114 R for an index of 1.4, see
-`rigsim.shading.interior_scale`. The surface terms are nowhere exactly zero, so even without noise
-the minimum lies above R_d by the smallest surface term in the directions that were measured, see
+`rigsim.shading.interior_scale`. The surface terms are exactly zero nowhere, so even without noise
+the minimum exceeds R_d by the smallest surface term in the measured directions, see
 `min_surface_reflection`.
 
 References
@@ -52,57 +52,57 @@ from rigsim.tissue.skin_color import skin_color
 from rigsim.tissue.skin_layers import ETA
 
 HAIR_REFLECTANCE: Final = (0.016, 0.011, 0.008)
-"""White-balanced reflectance of dark brown hair, seen as a matt cover."""
+"""White-balanced reflectance of dark brown hair, modeled as a matt cover."""
 ETA_OIL: Final = 1.47
 """Refractive index of sebum, that of its triglycerides and wax esters."""
 
 OIL_SMOOTHING: Final = 0.5
-"""Roughness of the film of oil over that of the skin below."""
+"""Roughness of the oil film over that of the skin below."""
 
 FUZZ_ALBEDO: Final = 0.5
-"""Share of the light that vellus hair scatters rather than absorbs."""
+"""Fraction of the light that vellus hair scatters rather than absorbs."""
 
 FUZZ_DEPTH: Final = 0.0015
-"""Optical depth of vellus hair where it is densest, seen from above."""
+"""Optical depth of vellus hair where it is densest, along the normal."""
 
 OIL_RANGE: Final = (0.02, 0.6)
-"""Share of the surface that oil covers."""
+"""Range of the surface fraction covered by oil."""
 
 STUBBLE_ABSORPTION: Final = (0.62, 0.56, 0.47)
-"""Share of the light from inside (R, G, B) that stubble below the surface takes where it is
+"""Fraction of the subsurface light (R, G, B) that stubble below the surface absorbs where it is
 densest: dark, and less so in blue, which comes from above it; chosen."""
 
 POWDER_ALBEDO: Final = 0.4
-"""Share of the light that grains of powder send back after scattering once; chosen. What they
-scatter more often is matte, and part of R_d."""
+"""Fraction of the light that grains of powder reflect after single scattering; chosen. Multiple
+scattering is matt, and part of R_d."""
 
 POWDER_ASYMMETRY: Final = -0.35
 """Mean cosine of single scattering by grains of powder: backwards, as large rough grains do
 (Hapke 1981, doi:10.1029/JB086iB04p03039); the value is chosen."""
 
 LOBE_CHANNELS: Final = (7, 11)
-"""What the lobes depend on: of bare skin, and with a coating."""
+"""Number of lobe parameters: of bare skin, and with a coating."""
 
 MAX_R_D: Final = 1.25
-"""No R_d is above this; skin stays below 0.9."""
+"""Upper limit of R_d; skin stays below 0.9."""
 
 
 class SurfaceError(ValueError):
-    """A surface or a direction is described wrongly."""
+    """A surface or a direction with an invalid description."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coating:
-    """What lies on skin; textures of shape (N, N)."""
+    """Layer on the skin; textures of shape (N, N)."""
 
     film: Float32Array
-    """Share of the surface under a film, 0 to 1; there it replaces facets of skin and oil."""
+    """Fraction of the surface under a film, 0 to 1; there it replaces facets of skin and oil."""
     film_alpha: Float32Array
     """GGX alpha of the film, 0.05 to 0.6."""
     film_eta: Float32Array
     """Refractive index of the film, 1.2 to 1.7."""
     powder: Float32Array
-    """Share of the surface under grains of powder, 0 to 1; they cover film and skin."""
+    """Fraction of the surface under grains of powder, 0 to 1; they cover film and skin."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -124,7 +124,7 @@ class Coating:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SkinSurface:
-    """Reflection of a face seen by one kind of camera; textures of shape (N, N[, C])."""
+    """Reflection of a face for one kind of camera; textures of shape (N, N[, C])."""
 
     r_d: Float32Array
     """Factor of the diffuse term, white-balanced camera RGB, shape (N, N, 3); brows included."""
@@ -133,18 +133,18 @@ class SkinSurface:
     roughness: Float32Array
     """Beckmann roughness of the skin."""
     oil: Float32Array
-    """Share that oil covers, 0 to 1."""
+    """Fraction covered by oil, 0 to 1."""
     fuzz: Float32Array
     """Optical depth of vellus hair, 0 to `FUZZ_DEPTH`."""
     bare: Float32Array
-    """Share that is not behind hair of brows and lashes; it scales the surface terms."""
+    """Fraction not behind hair of brows and lashes; it scales the surface terms."""
     normal: Float32Array
     """Unit normals of mesh and relief, shape (N, N, 3)."""
     coating: Coating | None = None
-    """What lies on the skin; ``None``: nothing."""
+    """Layer on the skin; ``None``: none."""
 
     def packed(self) -> Float32Array:
-        """Return what the lobes depend on.
+        """Return the lobe parameters.
 
         Returns
         -------
@@ -162,21 +162,21 @@ class SkinSurface:
 def skin_surface(
     subject: SimulatedSubject, camera: str, light: str, *, state: str = "neutral"
 ) -> SkinSurface:
-    """Describe how a face reflects.
+    """Return the reflection of a face.
 
     Parameters
     ----------
     subject
         The face.
     camera, light
-        Names known to `model.spectra`.
+        Names in `model.spectra`.
     state
         State of the face's blood.
 
     Returns
     -------
     SkinSurface
-        Textures; oil gathers on forehead, nose and chin, vellus hair on cheeks, temples and jaw.
+        Textures; oil is most on forehead, nose and chin, vellus hair on cheeks, temples and jaw.
     """
     points, regions = subject.perfusion.points_mm, subject.perfusion.regions
     reflectance = skin_color(camera, light).rgb(subject.melanin, subject.hemoglobin(state))
@@ -244,20 +244,20 @@ def evaluate_brdf(
     if len(count) > 1:
         raise SurfaceError(f"points: got leading axes {count}, expected one")
     rows = count[0] if count else 1
-    # copies: views are read-only, which is another type to the compiler
+    # copies: broadcast views are read-only, which is a different type for the compiler
     full = [np.array(np.broadcast_to(a, (rows, a.shape[-1])), order="C") for a in arrays]
     return _evaluate(*full)
 
 
 def min_surface_reflection(packed: ArrayLike, *, max_slope_deg: float = 70.0) -> Float32Array:
-    """Return the least of pi f_surface / (T T): how far eq. (6)'s minimum lies above R_d.
+    """Return the minimum of pi f_surface / (T T): the excess of eq. (6)'s minimum over R_d.
 
     Parameters
     ----------
     packed
         As for `evaluate_brdf`, shape (n, 7) or (n, 11).
-    steepest_deg
-        Light and camera are taken no more aslant than this, degrees.
+    max_slope_deg
+        Largest angle of light and camera to the normal, degrees.
 
     Returns
     -------
@@ -309,7 +309,7 @@ def beckmann_brdf(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
 @njit(cache=True, inline="always")
 def _beckmann_g1(c, alpha):  # type: ignore[no-untyped-def]
     tan = math.sqrt(max(1.0 - c * c, 0.0)) / c
-    if alpha * tan < 0.625:  # a > 1.6
+    if alpha * tan < 0.625:  # a > 1.6, beyond the range of Walter et al.'s rational fit of G1
         return 1.0
     a = 1.0 / (alpha * tan)
     return (3.535 * a + 2.181 * a * a) / (1.0 + 2.276 * a + 2.577 * a * a)
@@ -332,7 +332,7 @@ def surface_terms(nl, nv, nh, lh, roughness, oil, fuzz):  # type: ignore[no-unty
     """Return the surface terms of f_r for cosines above zero."""
     total = _facets(nl, nv, nh, lh, roughness, oil)
     if fuzz > 0.0:
-        total += _down(nl, nv, fuzz)
+        total += _vellus_scattering(nl, nv, fuzz)
     return total
 
 
@@ -347,7 +347,7 @@ def coated_terms(  # type: ignore[no-untyped-def]
     if film > 0.0:
         total += film * _fresnel(lh, film_eta) * ggx_brdf(nl, nv, nh, film_alpha)
     if fuzz > 0.0:
-        total += _down(nl, nv, fuzz)
+        total += _vellus_scattering(nl, nv, fuzz)
     if powder > 0.0:
         total = (1.0 - powder) * total + powder * powder_scattering(nl, nv, lh)
     return total
@@ -357,7 +357,7 @@ def coated_terms(  # type: ignore[no-untyped-def]
 def powder_scattering(nl, nv, lh):  # type: ignore[no-untyped-def]
     """Return the single scattering of a thick layer of grains."""
     g = POWDER_ASYMMETRY
-    turned = 1.0 - 2.0 * lh * lh  # cosine between the way in and the way out
+    turned = 1.0 - 2.0 * lh * lh  # cosine between -l and v: -cos(2 x) with cos x = l.h
     phase = (1.0 - g * g) / (1.0 + g * g - 2.0 * g * turned) ** 1.5
     return POWDER_ALBEDO / (4.0 * math.pi) * phase / (nl + nv)
 
@@ -371,7 +371,9 @@ def _facets(nl, nv, nh, lh, roughness, oil):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def _down(nl, nv, fuzz):  # type: ignore[no-untyped-def]
+def _vellus_scattering(nl, nv, fuzz):  # type: ignore[no-untyped-def]
+    # Chandrasekhar's isotropic single scattering of a layer of optical depth tau: w / (4 pi) (1 -
+    # exp(-tau (1 / nl + 1 / nv))) / (nl + nv).
     through = 1.0 - math.exp(-fuzz * (1.0 / nl + 1.0 / nv))
     return FUZZ_ALBEDO / (4.0 * math.pi) * through / (nl + nv)
 

@@ -1,4 +1,4 @@
-"""What the dome's pictures of a face or a target must hold, and what they need not."""
+"""Select the effects of light that the dome's images of a face or a target require."""
 
 import math
 
@@ -25,21 +25,21 @@ def select_dome_effects(
     movement: bool,
     motion: HeadMotion | None,
 ) -> EffectSelection:
-    """Decide what a scene in the dome builds.
+    """Select the effects that a scene in the dome builds.
 
     Parameters
     ----------
     rig
-        The dome; of its cameras the first decides.
+        The dome; its first camera decides.
     subject, state
-        Who stands there, in which state.
+        The subject or target, and its state.
     scenery
-        What the first camera looks at and with; the noise is that of the least noisy one.
+        Viewing conditions of the first camera; the noise is that of the least noisy camera.
     white_rgb
-        What a white plate in the origin gets in the plan's longest exposure from the brightest
-        light, full scales, shape (3,); None: the brightest skin is taken as full.
+        Signal of a white plate at the origin in the plan's longest exposure from the brightest
+        light, full scales, shape (3,); None: the brightest skin is at full scale.
     movement, motion
-        Whether the face moves with its state, and how the head does.
+        Whether the face moves with its state, and the movement of the head.
     """
     view = scenery.view
     made = [face.polarization_effect(rig, view), face.band_effect(view)]
@@ -80,7 +80,7 @@ def _movement(
     made = face.movement_effect(subject, movement, "movement of the face with the state")
     head = "movement of the head"
     if motion is None:
-        return [made, Effect(head, "absent", "motion=None: the head is held", switch="motion")]
+        return [made, Effect(head, "absent", "motion=None: the head is fixed", switch="motion")]
     moved = Effect(head, "built", "the head drifts and twitches", switch="motion")
     small = f"0.06 s move 0.05 mm, a pixel {view.distance_mm / view.focal_px:.2f} mm"
     blur = Effect("blur by movement within an exposure", "unmodeled", small)
@@ -88,13 +88,13 @@ def _movement(
 
 
 def _max_brightness_gain(caster: Caster, position_mm: Vector) -> float:
-    """Return how much brighter a light shines on a mesh than in the origin at most, >= 1."""
+    """Return the largest gain of a light's irradiance on a mesh over that at the origin, >= 1."""
     squared = math.hypot(*position_mm) ** 2
     return max(max_irradiance(caster.mesh, [position_mm], [squared]), 1.0)
 
 
 def min_noise(sensors: list[PixelNoise]) -> PixelNoise:
-    """Return the least noise of some sensors.
+    """Return the least noise of several sensors.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-"""How much effects of light can change a pixel, told before anything is rendered.
+"""Bound the sizes of effects of light on a pixel before anything is rendered.
 
-Each is a bound or a worst case, since what it decides is whether a scene must hold the effect: it
-may be too large, which costs time, but not too small, which would cost truth.
+Each size is a bound or a worst case, since it decides whether a scene must build the effect: a size
+that is too large costs time; one that is too small would bias the ground truth.
 """
 
 import math
@@ -21,12 +21,12 @@ EXCHANGE_PATCHES = 32
 
 
 def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> Float64Array:
-    """Return how much of a lit pixel's light spreads out of it across the edge of a shadow.
+    """Return the fraction of a lit pixel's light that scatters across the edge of a shadow.
 
     Parameters
     ----------
     sigmas_mm, weights
-        Gaussians that stand for the lateral profile: standard deviations along an axis in mm,
+        Gaussians that approximate the lateral profile: standard deviations along an axis in mm,
         shape (K,), and their weights, shape (C, K), rows summing to 1.
     pixel_mm
         Side of a pixel on the subject, mm, > 0. The edge lies along one side of the pixel.
@@ -34,13 +34,13 @@ def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> Floa
     Returns
     -------
     ndarray
-        Part of the pixel's light in each channel, shape (C,), 0 to 0.5.
+        Fraction of the pixel's light in each channel, shape (C,), 0 to 0.5.
 
     Notes
     -----
     For one Gaussian the mean of ``Q(x / sigma)`` over ``0 < x < p``; for ``p`` far above ``sigma``
-    this is ``sigma / (p sqrt(2 pi))``: it falls with the pixel's size and no faster, so that a
-    pixel has to be hundreds of mean free paths wide before it forgets them.
+    this is ``sigma / (p sqrt(2 pi))``. The loss is only inversely proportional to the pixel's
+    size, so that it vanishes only for pixels hundreds of mean free paths wide.
 
     Examples
     --------
@@ -56,7 +56,8 @@ def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> Floa
     if sigma.size == 0:
         return np.zeros(len(weight))
     q = pixel_mm / sigma
-    # int_0^q Q(t) dt / q with Q the upper tail of the normal distribution
+    # With q = p / sigma, integrate by parts, where phi is the normal density (Q' = -phi):
+    # int_0^q Q(t) dt / q = Q(q) + (1 / sqrt(2 pi) - phi(q)) / q.
     tail = np.array([0.5 * math.erfc(t / math.sqrt(2.0)) for t in q])
     density = np.exp(-0.5 * q * q) / math.sqrt(2.0 * math.pi)
     mean = tail + (1.0 / math.sqrt(2.0 * math.pi) - density) / q
@@ -64,22 +65,22 @@ def edge_loss(sigmas_mm: ArrayLike, weights: ArrayLike, pixel_mm: float) -> Floa
 
 
 def scattering_over_noise(lost: ArrayLike, level: ArrayLike, noise: PixelNoise) -> Float64Array:
-    """Return how much spreading across a shadow's edge changes a pixel, over its noise.
+    """Return the change of a pixel by lateral scattering across a shadow's edge, over its noise.
 
     Parameters
     ----------
     lost
-        What a lit pixel loses across the edge, of its light, see `edge_loss`, shape (C,).
+        Fraction of a lit pixel's light lost across the edge, see `edge_loss`, shape (C,).
     level
-        The brightest pixel's signal, full scales, shape (C,); it may be over-full.
+        The brightest pixel's signal, full scales, shape (C,); it may exceed 1.
     noise
-        Of the sensor.
+        Noise of the sensor.
 
     Returns
     -------
     ndarray
-        Shape (C,). The pixel beyond the edge gains as much as the lit one loses, and where nothing
-        else shines on it, all that it has is this gain: its noise is the least.
+        Shape (C,). The pixel beyond the edge gains the lit pixel's loss. Where no other light
+        reaches it, this gain is its whole signal, and its noise is the least.
 
     Examples
     --------
@@ -91,7 +92,7 @@ def scattering_over_noise(lost: ArrayLike, level: ArrayLike, noise: PixelNoise) 
 
 
 def max_exchange_fraction(caster: Caster) -> float:
-    """Return which part of the light that leaves a surface falls back onto its hollows at most.
+    """Bound the fraction of the light leaving a surface that falls back onto its hollows.
 
     Parameters
     ----------
@@ -102,7 +103,7 @@ def max_exchange_fraction(caster: Caster) -> float:
     -------
     float
         The largest sum over patches of the exchange with one patch for a reflectance of 1, 0 to 1;
-        0 for what is flat or bulges outwards.
+        0 for a flat or convex surface.
     """
     if is_flat(caster.mesh):
         return 0.0
@@ -112,18 +113,18 @@ def max_exchange_fraction(caster: Caster) -> float:
 
 
 def is_flat(mesh: Mesh) -> bool:
-    """Return whether all of a mesh lies in one plane: then it neither shades nor lights itself."""
+    """Return whether a mesh is planar: a planar mesh neither shades nor lights itself."""
     points = np.asarray(mesh.vertices_mm, np.float64)
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(spread[-1] <= 1e-6 * max(spread[0], 1e-300))
 
 
 def interreflection_over_direct(exchange_fraction: float, reflectance: float) -> float:
-    """Return the light that comes by way of other skin over the brightest direct light.
+    """Return interreflected light over the brightest direct light.
 
     Parameters
     ----------
-    share
+    exchange_fraction
         See `max_exchange_fraction`, 0 to below 1.
     reflectance
         The largest diffuse reflectance, 0 to 1.
@@ -136,14 +137,14 @@ def interreflection_over_direct(exchange_fraction: float, reflectance: float) ->
     once = exchange_fraction * reflectance
     if not 0.0 <= once < 1.0:
         raise ValueError(
-            f"exchange_fraction, reflectance: got {exchange_fraction}, {reflectance},"
-            " expected 0 to 1"
+            f"exchange_fraction, reflectance: got {exchange_fraction}, {reflectance}, "
+            "expected 0 to 1"
         )
     return once / (1.0 - once)
 
 
 def max_slope(slope_x: FloatArray, slope_y: FloatArray) -> float:
-    """Return the steepest slope of a relief: a light above that elevation shines everywhere.
+    """Return the steepest slope of a relief; lights above that elevation are not shadowed.
 
     Examples
     --------
@@ -154,23 +155,24 @@ def max_slope(slope_x: FloatArray, slope_y: FloatArray) -> float:
 
 
 def max_irradiance(mesh: Mesh, positions_mm: ArrayLike, weights_mm2: ArrayLike) -> float:
-    """Return a bound on the light that lights together send to any point of a mesh.
+    """Bound the irradiance at any point of a mesh under all lights together.
 
     Parameters
     ----------
     mesh
         The mesh.
-    places_mm
+    positions_mm
         The lights, shape (L, 3).
     weights_mm2
-        Energy of each over what a plate in the origin gets in all that faces the camera, mm^2,
-        shape (L,): a surface that faces light k from a distance d gets ``weight / d^2`` of that.
+        Energy of each light over that of a plate at the origin in all lights that face the camera,
+        mm^2, shape (L,): a surface facing light k at distance d receives ``weight / d^2`` of it.
 
     Returns
     -------
     float
-        Over the plate's light: of all lights as if each point faced each of them from as near as
-        any point is. Lights that graze the plate shine many times brighter on what faces them.
+        Relative to the plate's irradiance: the sum over lights as if each point faced each light at
+        the distance of its nearest point. Lights that graze the plate irradiate facing surfaces
+        many times more.
 
     Examples
     --------
@@ -192,25 +194,25 @@ def max_irradiance(mesh: Mesh, positions_mm: ArrayLike, weights_mm2: ArrayLike) 
 def max_highlight(
     mesh: Mesh, positions_mm: ArrayLike, weights_mm2: ArrayLike, camera_mm: ArrayLike, alpha: float
 ) -> float:
-    """Return a bound on what a surface's facets reflect, over the light of a white plate.
+    """Bound the specular reflection of a surface over the light of a white plate.
 
     Parameters
     ----------
     mesh
         The surface.
-    places_mm, weights_mm2
-        Lights, as of `max_irradiance`.
+    positions_mm, weights_mm2
+        Lights, see `max_irradiance`.
     camera_mm
         The camera, shape (3,).
     alpha
-        The least GGX roughness, 0 to 1.
+        The smallest GGX roughness, 0 to 1.
 
     Notes
     -----
-    Of the facets' ``F D G(l) G(v) / (4 n.v)`` with GGX's ``D <= 1 / (pi a^2)``, ``G(l) <= 1`` and
+    For the facets' ``F D G(l) G(v) / (4 n.v)`` with GGX's ``D <= 1 / (pi a^2)``, ``G(l) <= 1`` and
     ``G(v) / n.v <= 2 / a``: pi times it is at most ``F / (2 a^3)``. F is that of light polarized
-    across the plane of incidence, at half the largest angle between light and camera; an analyser
-    passes all of such light, and half of a plate's.
+    perpendicular to the plane of incidence, at half the largest angle between light and camera; an
+    analyzer transmits all of such light, and half of a plate's.
 
     Examples
     --------
@@ -230,7 +232,9 @@ def max_highlight(
         to_light = place - points
         to_light /= np.linalg.norm(to_light, axis=1, keepdims=True)
         between = float(np.einsum("ij,ij->i", to_light, to_camera).min())
-        cosine = math.sqrt(max(0.5 * (1.0 + between), 0.0))  # of half the angle
+        # The angle of incidence is half the angle between light and camera:
+        # cos^2(x / 2) = (1 + cos x) / 2.
+        cosine = math.sqrt(max(0.5 * (1.0 + between), 0.0))
         inside = math.sqrt(ETA**2 - 1.0 + cosine**2)
         across = ((cosine - inside) / (cosine + inside)) ** 2
         total += 2.0 * across * max_irradiance(mesh, [place], [weight])

@@ -1,9 +1,9 @@
-"""What a scene must hold: every effect of light with what became of it and why.
+"""Record the effects of light in a scene, each with its verdict and reason.
 
-A scene builds what changes a picture and nothing else. Whether an effect does is asked for the
-plan's sensor and for the subject: its largest change of any pixel against that pixel's noise.
-What is below `NEGLIGIBLE_NOISE_RATIO` may be left out; `skinrig bench --stage omissions` renders
-scenes with and without to check that.
+A scene builds only the effects that change an image. The criterion, for the plan's sensor and the
+subject, is an effect's largest change of any pixel relative to that pixel's noise. Effects below
+`NEGLIGIBLE_NOISE_RATIO` may be omitted; `skinrig bench --stage omissions` renders scenes with and
+without them to check that.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from rigsim.sensor import Sensor
 Verdict: TypeAlias = Literal["built", "negligible", "absent", "asked", "unmodeled"]
 
 NEGLIGIBLE_NOISE_RATIO: Final = 0.1
-"""Largest change of a pixel over its noise that may be left out."""
+"""Largest change of a pixel over its noise that may be omitted."""
 
 VERDICT_MEANINGS: Final[dict[str, str]] = {
-    "built": "it changes pixels, and is in the picture",
-    "negligible": f"it changes no pixel by {NEGLIGIBLE_NOISE_RATIO:g} of its noise",
-    "absent": "the simulated world has none: rig, plan or subject say so",
-    "asked": "it would change pixels, but was asked to be left out",
-    "unmodeled": "a real rig has it and it may change pixels: the simulator cannot build it",
+    "built": "it changes pixels and is in the image",
+    "negligible": f"its change of any pixel is below {NEGLIGIBLE_NOISE_RATIO:g} of its noise",
+    "absent": "the simulated world has none: by rig, plan or subject",
+    "asked": "it would change pixels, but its omission was requested",
+    "unmodeled": "a real rig has it and it may change pixels: the simulator does not model it",
 }
-"""What each verdict says."""
+"""Meaning of each verdict."""
 
 SWITCH_FIELDS: Final[dict[str, str]] = {"subsurface": "lateral", "shadows": "relief_shadows"}
-"""Fields of `SceneEffects` for the switches that a rig names otherwise."""
+"""Fields of `SceneEffects` for switches whose rigs use another name."""
 
 
 class NeedsError(ValueError):
@@ -45,7 +45,7 @@ class NeedsError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class PixelNoise:
-    """Noise of one exposure of one pixel, where 1 is full scale."""
+    """Noise variance of one pixel in one exposure, in units of full scale."""
 
     scale: float
     """Variance per signal, > 0: shot noise."""
@@ -88,13 +88,13 @@ class PixelNoise:
         Parameters
         ----------
         change
-            Relative to the signal.
+            Change relative to the signal.
         level
-            The signal, full scales. At 1, the brightest, a relative change shows most.
+            The signal, full scales. At 1, the brightest, a relative change is largest over noise.
 
         Examples
         --------
-        >>> round(PixelNoise(1e-4, 0.0).share(0.002), 3)
+        >>> round(PixelNoise(1e-4, 0.0).change_over_noise(0.002), 3)
         0.2
         """
         return abs(change) * level / float(self.sigma(level))
@@ -102,9 +102,9 @@ class PixelNoise:
 
 @dataclass(frozen=True, slots=True)
 class SceneEffects:
-    """Effects of light that a scene is asked to build: True, False, or None by their sizes.
+    """Requested effects of light: True, False, or None to decide by their sizes.
 
-    A scene ignores the fields that its rig does not have.
+    A scene ignores the fields that do not apply to its rig.
 
     Examples
     --------
@@ -113,48 +113,47 @@ class SceneEffects:
     """
 
     lateral: bool | None = None
-    """Light that spreads sideways inside the skin."""
+    """Lateral scattering of light in the skin."""
     interreflections: bool | None = None
-    """Light that goes from skin to skin."""
+    """Interreflection between parts of the skin."""
     spectral: bool | None = None
-    """That light reflected wavelength by wavelength."""
+    """Interreflection per wavelength instead of per channel."""
     optics: bool | None = None
     """Blur and diffraction of the lens."""
     relief_shadows: bool | None = None
-    """Shadows that the relief casts on itself; of a face, its wrinkles' after it has moved."""
+    """Shadows of the relief on itself; on a face, those of the wrinkles after movement."""
     spectral_step: int | None = None
-    """Interreflections use every n-th of the table's wavelengths; None: as the needs decide."""
+    """Interreflection uses every n-th of the table's wavelengths; None: by the selection's rule."""
     last_bounce: float | None = None
-    """Share of the first bounce at which summing ends; None: as the needs decide."""
+    """Fraction of the first bounce at which the sum ends; None: by the selection's rule."""
 
     @classmethod
     def from_switches(cls, switches: Mapping[str, Any]) -> SceneEffects:
-        """Return the effects that switches ask for, see `Effect.switch`."""
+        """Return the effects requested by switches, see `Effect.switch`."""
         return cls(**{SWITCH_FIELDS.get(name, name): asked for name, asked in switches.items()})
 
 
 AUTOMATIC_EFFECTS: Final = SceneEffects()
-"""Every effect that is large enough to change pixels, and no other."""
+"""All effects that are large enough to change pixels, and no others."""
 
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """One effect of light on a picture."""
+    """One effect of light on an image."""
 
     name: str
-    """In words."""
+    """Name, in words."""
     verdict: Verdict
-    """What became of it, see `VERDICT_MEANINGS`."""
+    """Decision, see `VERDICT_MEANINGS`."""
     reason: str
-    """Why, in words."""
+    """Reason, in words."""
     over_noise: float | None = None
-    """Largest change of a pixel over its noise as the scene's rule tells it; None: the rule needs
-    no number."""
+    """Largest change of a pixel over its noise by the scene's rule; None: the rule needs none."""
     switch: str = ""
-    """Name for `SceneEffects.from_switches`, which is how it is checked; empty: none."""
+    """Argument of `SceneEffects.from_switches` that switches the effect; empty: none."""
 
     def __post_init__(self) -> None:
-        """Refuse a verdict that the number contradicts."""
+        """Refuse a verdict that contradicts the size."""
         if self.verdict not in get_args(Verdict):
             expected = ", ".join(get_args(Verdict))
             raise NeedsError(
@@ -171,11 +170,11 @@ class Effect:
 
     @property
     def is_built(self) -> bool:
-        """Whether it is in the picture."""
+        """Whether it is in the image."""
         return self.verdict == "built"
 
     def document(self) -> dict[str, str | float | None]:
-        """Return this as JSON values.
+        """Return the effect as JSON values.
 
         Examples
         --------
@@ -193,12 +192,12 @@ class Effect:
 
 @dataclass(frozen=True, slots=True)
 class EffectSelection:
-    """All effects that a scene knows of.
+    """All effects that a scene considers.
 
     Examples
     --------
     >>> needs = EffectSelection((
-    ...     Effect("polarization", "built", "films before lights and camera"),
+    ...     Effect("polarization", "built", "polarizers before lights and camera"),
     ...     Effect("ambient light", "absent", "the room is dark"),
     ... ))
     >>> needs.builds("polarization"), needs.omitted
@@ -208,7 +207,7 @@ class EffectSelection:
     effects: tuple[Effect, ...]
 
     def __post_init__(self) -> None:
-        """Refuse the same effect twice."""
+        """Refuse duplicate effects."""
         names = [effect.name for effect in self.effects]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
@@ -231,21 +230,21 @@ class EffectSelection:
 
     @property
     def omitted(self) -> list[tuple[str, str]]:
-        """Return what is not built, with the reasons."""
+        """Return the effects that are not built, with the reasons."""
         return [(effect.name, effect.reason) for effect in self.effects if not effect.is_built]
 
     def document(self) -> list[dict[str, str | float | None]]:
-        """Return this as JSON values."""
+        """Return the effects as JSON values."""
         return [effect.document() for effect in self.effects]
 
 
 def merge_selections(selections: Sequence[EffectSelection]) -> EffectSelection:
-    """Return what a scene must hold that several cameras look at: what any of them needs.
+    """Merge the selections of several cameras: a scene builds what any of them requires.
 
     Parameters
     ----------
-    each
-        One a camera, at least one.
+    selections
+        One per camera, at least one.
 
     Examples
     --------
@@ -271,20 +270,20 @@ def _priority(effect: Effect) -> tuple[bool, float]:
 def decide_effect(
     name: str, over_noise: float, requested: bool | None, *, switch: str, reason: str
 ) -> Effect:
-    """Decide on an effect that a scene can build: as it was asked for, or by its size.
+    """Decide whether a scene builds an effect: as requested, or by its size.
 
     Parameters
     ----------
     name
-        Of the effect.
+        Name of the effect.
     over_noise
-        Largest change of a pixel over its noise, as a rule tells it, >= 0.
-    asked
-        True builds it, False leaves it out, None decides by its size.
+        Largest change of a pixel over its noise by the scene's rule, >= 0.
+    requested
+        True builds it, False omits it, None decides by its size.
     switch
         See `Effect.switch`.
-    because
-        What the size follows from.
+    reason
+        Source of the size.
 
     Examples
     --------
@@ -293,7 +292,7 @@ def decide_effect(
     >>> decide_effect("bounces", 0.0, None, switch="bounces", reason="all is flat").verdict
     'negligible'
     >>> decide_effect("bounces", 3.0, False, switch="bounces", reason="hollows").reason
-    'bounces=False asks for it; hollows: up to 3 times the noise'
+    'bounces=False requests it; hollows: up to 3 times the noise'
     """
     if not over_noise >= 0.0:
         raise NeedsError(f"{name}: over_noise: got {over_noise}, expected >= 0")
@@ -303,22 +302,22 @@ def decide_effect(
         return Effect(name, verdict, size, over_noise, switch)
     if requested:
         text = (
-            size if over_noise >= NEGLIGIBLE_NOISE_RATIO else f"{switch}=True asks for it; {size}"
+            size if over_noise >= NEGLIGIBLE_NOISE_RATIO else f"{switch}=True requests it; {size}"
         )
         return Effect(name, "built", text, over_noise, switch)
     if over_noise < NEGLIGIBLE_NOISE_RATIO:
         return Effect(name, "negligible", size, over_noise, switch)
-    return Effect(name, "asked", f"{switch}=False asks for it; {size}", over_noise, switch)
+    return Effect(name, "asked", f"{switch}=False requests it; {size}", over_noise, switch)
 
 
 def max_on_time_s(plan: Plan) -> float | None:
-    """Return how long lights are on at most in one exposure of a plan, s; None: they never are.
+    """Return the longest on-time of lights in one exposure of a plan, s; None: they are never on.
 
     Parameters
     ----------
     plan
-        Of LEDs; an on-time counts by its level, 0 to 1, and of LEDs that a step names by how many
-        they are: together they give more light than one.
+        Plan of LEDs. An on-time is weighted by its level, 0 to 1, and by the number of LEDs that a
+        step names, which together emit more light than one.
 
     Examples
     --------
@@ -338,7 +337,7 @@ def max_on_time_s(plan: Plan) -> float | None:
 
 
 def omitted_effects(*images: str) -> list[Effect]:
-    """Return effects that images leave out in every case, by the tables of ``left_out.toml``."""
+    """Return the effects that images always omit, from the tables of ``left_out.toml``."""
     tables = package_table("left_out")
     verdicts: tuple[Verdict, ...] = ("absent", "unmodeled")
     return [

@@ -1,4 +1,4 @@
-"""What pictures of a face must hold whichever rig takes them, and what they need not."""
+"""Select the effects of light that images of a face require in every rig."""
 
 import math
 from dataclasses import dataclass
@@ -25,11 +25,11 @@ from rigsim.render import Caster
 from rigsim.render.depth_of_field import depth_range, tabulate_defocus
 from rigsim.subject import SimulatedSubject
 
-LATERAL_EFFECT = "light spreading sideways in skin"
-INTERREFLECTION_EFFECT = "light from skin to skin"
-SPECTRAL_EFFECT = "color of light from skin to skin, wavelength by wavelength"
-WAVELENGTH_STEP_EFFECT = "wavelengths between those at which light from skin to skin is summed"
-FURTHER_BOUNCES_EFFECT = "bounces after the last that is summed"
+LATERAL_EFFECT = "lateral scattering in skin"
+INTERREFLECTION_EFFECT = "interreflection"
+SPECTRAL_EFFECT = "spectral interreflection"
+WAVELENGTH_STEP_EFFECT = "wavelength step of interreflection"
+FURTHER_BOUNCES_EFFECT = "bounces beyond the sum"
 POLARIZATION_EFFECT = "polarization"
 SHADOW_EFFECT = "shadows"
 LENS_EFFECT = "depth of field and lens blur"
@@ -39,40 +39,40 @@ PIGMENT_EFFECT = "pattern of pigment"
 WRINKLE_SHADOW_EFFECT = "shadows of wrinkles"
 
 TEXEL_STEP = 16
-"""Of the texels whose reflectance is looked at."""
+"""Every n-th texel's reflectance is evaluated."""
 
 MAX_LAST_BOUNCE = 1e-3
-"""The last bounce that is summed is at most this share of the first."""
+"""Upper limit of the last summed bounce relative to the first."""
 
 MIN_PIGMENT_CONTRAST = 1e-5
 MIN_RELIEF_TILT_DEG = 1e-3
-"""Relative change of reflectance, and tilt of normals, that no sensor tells: full scale is at most
-some thousand times its noise, of which a tenth counts."""
+"""Relative change of reflectance, and tilt of normals, below every sensor's resolution: full scale
+is at most a few thousand times the noise, of which a tenth counts."""
 
 MAX_REMAINING_NOISE_RATIO = 0.05
-"""Of the noise: what further bounces may add at most, about."""
+"""Approximate limit of the remaining bounces, relative to the noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewingConditions:
-    """What a camera looks at and with, and what of it is asked for."""
+    """Camera, light, mesh and requested effects of one view."""
 
     view: View
     illuminant: str
     """Spectrum of the lights."""
     caster: Caster
-    """The mesh."""
+    """Caster of the mesh."""
     exchange_fraction: float
     """`max_exchange_fraction` of the mesh."""
     noise: PixelNoise
-    """Of the sensor."""
+    """Noise of the sensor."""
     effects: SceneEffects
-    """What is asked for."""
+    """Requested effects."""
     subpixels: int
     """Rays along each side of a pixel."""
 
     def observe_skin(self, subject: SimulatedSubject, state: str) -> ObservedSkin:
-        """Return a face as the camera sees it."""
+        """Return a face under this camera and light."""
         return ObservedSkin(subject, state, self.view.spectral_sensitivity, self.illuminant)
 
 
@@ -86,22 +86,22 @@ def select_face_effects(
     finer: bool,
     lateral_switch: str = "lateral",
 ) -> list[Effect]:
-    """Return what every picture of a face holds, or not.
+    """Return the effects that images of a face build or omit in every rig.
 
     Parameters
     ----------
     skin, scenery
-        The face, and the camera that looks at it.
-    brightest
+        The face, and the viewing conditions of its camera.
+    peak_reflectance
         Its `max_reflectance_rgb`.
     level
-        What its brightest skin gives, full scales, shape (3,).
+        Signal of its brightest skin, full scales, shape (3,).
     peak
-        What its brightest highlight gives, full scales.
+        Signal of its brightest highlight, full scales.
     finer
-        Whether the wavelengths can be thinned out at which light from skin to skin is summed.
+        Whether the wavelengths of interreflection can be thinned out.
     lateral_switch
-        What switches lateral transport.
+        Name of the switch of lateral scattering.
     """
     noise, share, effects = scenery.noise, scenery.exchange_fraction, scenery.effects
     pixel_mm = scenery.view.distance_mm / scenery.view.focal_px
@@ -111,17 +111,17 @@ def select_face_effects(
         interreflection_over_direct(share, float(reflectance)) for reflectance in peak_reflectance
     ]
     more = np.minimum(more, 1.0)
-    unseen = more / noise.sigma(more)  # where nothing else shines
+    unseen = more / noise.sigma(more)  # where no direct light arrives, the noise is least
     bounces = decide_effect(
         INTERREFLECTION_EFFECT,
         float(unseen.max()),
         effects.interreflections,
         switch="interreflections",
-        reason=f"hollows get {100 * share:.0f} % of what their surroundings send out",
+        reason=f"hollows receive {100 * share:.0f} % of what their surroundings send out",
     )
     off = float((unseen * channel_approximation_error(skin)).max()) if bounces.is_built else 0.0
-    why = "a channel's mean of squares is not the square of its mean"
-    why = why if bounces.is_built else "there is no such light"
+    why = "a channel's mean of squares differs from the square of its mean"
+    why = why if bounces.is_built else "interreflection is absent"
     asked = effects.spectral
     spectral = off >= NEGLIGIBLE_NOISE_RATIO if asked is None else asked
     thinned = (
@@ -156,7 +156,7 @@ def select_face_effects(
 def movement_effect(subject: SimulatedSubject, requested: bool, name: str) -> Effect:
     """Return whether the face moves with its state."""
     if not requested:
-        return Effect(name, "asked", "movement=False asks for it", switch="movement")
+        return Effect(name, "asked", "movement=False requests it", switch="movement")
     if subject.pose is None:
         return Effect(name, "absent", "at rest nothing moves", switch="movement")
     return Effect(name, "built", "the state moves the face", switch="movement")
@@ -165,10 +165,10 @@ def movement_effect(subject: SimulatedSubject, requested: bool, name: str) -> Ef
 def wrinkle_shadow_effect(
     subject: SimulatedSubject, scenery: ViewingConditions, level: float
 ) -> Effect:
-    """Return whether the relief of a face that has moved hides lights from itself.
+    """Return whether the relief of a moved face shadows itself.
 
-    Pores of a face at rest tilt less than 4 degrees and are not built: under a light that grazes
-    the skin they would take up to a tenth of its cosine away, see docs/concepts/omissions.md.
+    Pores of a face at rest tilt less than 4 degrees and are not built: under grazing light they
+    would reduce its cosine by up to a tenth, see docs/concepts/omissions.md.
     """
     if subject.pose is None:
         return Effect(
@@ -180,7 +180,9 @@ def wrinkle_shadow_effect(
         np.asarray(slope)[covered] for slope in np.gradient(subject.height_um.astype(np.float64))
     )
     steepest = 1e-3 * float(np.hypot(right / across, down / along).max(initial=0.0))
-    # a light as low as the relief is steep shines with that sine, and may be hidden
+    # Light at the elevation of the steepest slope has irradiance sin(elevation) = s / sqrt(1 +
+    # s^2),
+    # and a wrinkle may hide all of it.
     most = min(1.0, steepest / math.hypot(1.0, steepest) * level)
     return decide_effect(
         WRINKLE_SHADOW_EFFECT,
@@ -192,21 +194,21 @@ def wrinkle_shadow_effect(
 
 
 def lens_effect(scenery: ViewingConditions, level: float) -> Effect:
-    """Return whether a camera's lens blurs: what a pixel loses to its neighbors where it is worst.
+    """Return whether the lens blurs: the largest light loss of a pixel to its neighbors.
 
     Parameters
     ----------
     scenery
-        Where its mesh faces the camera decides how far it is out of focus.
+        Viewing conditions; the depth range of the mesh sets its distance from the plane in focus.
     level
-        The brightest pixel, full scales; it may be over-full.
+        The brightest pixel, full scales; it may exceed 1.
     """
     view, noise, subpixels = scenery.view, scenery.noise, scenery.subpixels
     depths = depth_range(view, scenery.caster.mesh)
     spread = tabulate_defocus(view, scenery.illuminant, subpixels=subpixels, depths_mm=depths)
     spilled = spread.max_spilled_fraction(depths)
     far = max(abs(depth) for depth in depths)
-    gained = min(1.0, level * spilled)  # by a black pixel amid bright ones, where noise is least
+    gained = min(1.0, level * spilled)  # by a black pixel among bright ones, where noise is least
     return decide_effect(
         LENS_EFFECT,
         gained / float(noise.sigma(gained)),
@@ -218,27 +220,27 @@ def lens_effect(scenery: ViewingConditions, level: float) -> Effect:
 
 
 def polarization_effect(rig: Rig, view: View) -> Effect:
-    """Return whether light is kept as Stokes vectors: films alone tell polarized light apart."""
+    """Return whether light is kept as Stokes vectors: only polarizers make polarization visible."""
     films = [light.name for light in rig.lights if light.polarizer_axis_deg is not None]
     if films or view.analyser_axis_deg is not None:
-        reason = (
-            f"films before {len(films)} of {len(rig.lights)} lights, an analyser before {view.name}"
-        )
+        reason = f"polarized: {len(films)} of {len(rig.lights)} lights, analyzer before {view.name}"
         return Effect(POLARIZATION_EFFECT, "built", reason)
     return Effect(
-        POLARIZATION_EFFECT, "absent", "the rig has no polarizing film, and sensors see none"
+        POLARIZATION_EFFECT,
+        "absent",
+        "the rig has no polarizer, and sensors do not detect polarization",
     )
 
 
 def band_effect(view: View) -> Effect:
-    """Return how many colors are kept."""
+    """Return the number of color bands."""
     if view.cfa == "MONO":
         return Effect(BAND_EFFECT, "built", "one: the sensor has no filters")
     return Effect(BAND_EFFECT, "built", "three: those of the sensor's filters")
 
 
 def texture_effects(skin: ObservedSkin) -> list[Effect]:
-    """Return whether a face needs its relief and its map of pigment."""
+    """Return whether a face requires its relief and its pigment map."""
     subject = skin.subject
     covered = subject.atlas.covered
     cosine = np.einsum("ij,ij->i", subject.normal[covered], subject.atlas.normal[covered])
@@ -268,7 +270,7 @@ def max_reflectance_rgb(skin: ObservedSkin) -> Float64Array:
 
 
 def choose_min_bounce_fraction(over_noise: float) -> float:
-    """Return the share of the first bounce at which summing ends, by what bounces change at most.
+    """Return the fraction of the first bounce at which the sum ends, from the bounces' size.
 
     Examples
     --------
@@ -279,13 +281,14 @@ def choose_min_bounce_fraction(over_noise: float) -> float:
 
 
 def choose_spectral_step(skin: ObservedSkin, bounces: Effect) -> tuple[int, float]:
-    """Return at which of the table's wavelengths light from skin to skin is summed: every n-th.
+    """Return the largest wavelength step of interreflection that changes no pixel.
 
     Returns
     -------
     step, over_noise
-        The largest that changes no pixel, and how much it changes one at most over its noise; 1
-        and what the least larger one would change, where each does.
+        The step, as every n-th of the table's wavelengths, with its largest change of a pixel over
+        the noise; 1 and the change of the smallest larger step, where every larger step changes a
+        pixel.
     """
     size = float(bounces.over_noise or 0.0)
     change = math.inf
@@ -297,10 +300,10 @@ def choose_spectral_step(skin: ObservedSkin, bounces: Effect) -> tuple[int, floa
 
 
 def _wavelength_step_effect(bounces: Effect, spectral: bool, found: tuple[int, float]) -> Effect:
-    """Return whether all of the table's wavelengths are needed for light from skin to skin."""
+    """Return whether interreflection requires all of the table's wavelengths."""
     step, over_noise = found
     if not (bounces.is_built and spectral):
-        why = "there is no such light" if not bounces.is_built else "channels are taken whole"
+        why = "interreflection is absent" if not bounces.is_built else "channels are taken whole"
         return Effect(WAVELENGTH_STEP_EFFECT, "negligible", why, 0.0, "spectral_step")
     nm = f"each {10 * step} nm are enough" if step > 1 else "each 20 nm would not be enough"
     return decide_effect(
@@ -309,20 +312,23 @@ def _wavelength_step_effect(bounces: Effect, spectral: bool, found: tuple[int, f
 
 
 def further_bounces_effect(bounces: Effect, bounce_fraction: float) -> Effect:
-    """Return the effect of bounces after the first; ``bounce_fraction`` of light bounces on."""
+    """Return the effect of bounces after the last summed one.
+
+    ``bounce_fraction`` is the fraction of light per further bounce.
+    """
     if not bounces.is_built:
         return Effect(
-            FURTHER_BOUNCES_EFFECT, "negligible", "there is no such light", 0.0, "last_bounce"
+            FURTHER_BOUNCES_EFFECT, "negligible", "interreflection is absent", 0.0, "last_bounce"
         )
     over_noise = float(bounces.over_noise or 0.0)
     last = choose_min_bounce_fraction(over_noise)
-    because = f"summing ends at {last:.1g} of the first"
+    because = f"the sum ends at {last:.1g} of the first"
     left = over_noise * last / (1.0 - bounce_fraction)
     return decide_effect(FURTHER_BOUNCES_EFFECT, left, None, switch="last_bounce", reason=because)
 
 
 def target_interreflection_size(scenery: ViewingConditions) -> tuple[float, str]:
-    """Return the size of light from one part of a target to another, over noise, and why."""
+    """Return the size of interreflection within a target over noise, with its reason."""
     if scenery.exchange_fraction == 0.0:
         return 0.0, "the target is flat"
     return math.inf, "the target has hollows"

@@ -1,4 +1,4 @@
-"""What the flash rig's pictures of a face or a target must hold, and what they need not."""
+"""Select the effects of light that the flash rig's images of a face or a target require."""
 
 from capture.rig import Rig
 from rigsim import shading
@@ -19,39 +19,39 @@ def select_flash_effects(
     weights_mm2: FloatArray,
     movement: bool,
 ) -> EffectSelection:
-    """Decide what a scene before the flash rig builds.
+    """Select the effects that a scene in the flash rig builds.
 
     Parameters
     ----------
     rig
         The rig.
     subject, state
-        Who stands there, in which state.
+        The subject or target, and its state.
     scenery
-        What a camera looks at and with; of several see `rigsim.needs.effects.merge_selections`.
+        Viewing conditions of a camera; for several see `rigsim.needs.effects.merge_selections`.
     white_rgb
-        What a white plate in the origin gives at the plan's highest power, full scales, shape (3,).
+        Signal of a white plate at the origin at the plan's highest power, full scales, shape (3,).
     weights_mm2
-        Each light's energy over the sum that such a plate gets, mm^2, shape (L,).
+        Each light's energy over the total of such a plate, mm^2, shape (L,).
     movement
         Whether the face moves with its state.
     """
     view, mesh = scenery.view, scenery.caster.mesh
     made = [face.polarization_effect(rig, view), face.band_effect(view)]
     if isinstance(subject, Target):
-        made += _of_target(subject, scenery)
+        made += _target_effects(subject, scenery)
         if subject.kind not in ("source", "cap"):
             made += [face.lens_effect(scenery, float(white_rgb.max())), *omitted_effects("glare")]
         else:
             made.append(
-                Effect(face.LENS_EFFECT, "negligible", "all of the picture is alike", 0.0, "optics")
+                Effect(face.LENS_EFFECT, "negligible", "the image is uniform", 0.0, "optics")
             )
         made.append(Effect(face.WRINKLE_SHADOW_EFFECT, "absent", f"{subject.name} has none"))
         return EffectSelection((*made, *omitted_effects("flash")))
     skin = scenery.observe_skin(subject, state)
     brightest = face.max_reflectance_rgb(skin)
     places = [light.position_mm for light in rig.lights]
-    # not cut at full scale: light of pixels that are full goes on to others all the same
+    # not clipped at full scale: the light of saturated pixels reaches others unclipped
     level = max_irradiance(mesh, places, weights_mm2) * white_rgb * brightest
     rough = max(float(subject.roughness[subject.atlas.covered].min()), shading.ALPHA_RANGE[0])
     shine = max_highlight(mesh, places, weights_mm2, view.position_mm, rough)
@@ -61,8 +61,8 @@ def select_flash_effects(
     return EffectSelection((*made, *omitted_effects("flash", "flash_face")))
 
 
-def _of_target(target: Target, scenery: face.ViewingConditions) -> list[Effect]:
-    """Return what flat targets need: no effect of depth."""
+def _target_effects(target: Target, scenery: face.ViewingConditions) -> list[Effect]:
+    """Return the effects of flat targets, which have none of depth."""
     size, because = face.target_interreflection_size(scenery)
     return [
         decide_effect(face.SHADOW_EFFECT, size, None, switch="", reason=because),

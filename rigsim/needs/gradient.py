@@ -1,4 +1,4 @@
-"""What the gradient sphere's pictures of a patch of skin must hold, and what they need not."""
+"""Select the effects of light that the gradient sphere's images of a skin patch require."""
 
 import math
 from typing import Final
@@ -28,10 +28,10 @@ from rigsim.tissue.skin_layers import ETA
 OPTICS_EFFECT: Final = "diffraction and defocus"
 
 MAX_SLOPE_GAIN: Final = 1.6
-"""How much compression steepens the relief at most: the skin buckles at 0.66 of its length."""
+"""Largest steepening of the relief by compression: the skin buckles at 0.66 of its length."""
 
 ANALYZED_TEXELS: Final = 384
-"""Texels along one side of the part of the patch that is looked at."""
+"""Texels along each side of the evaluated part of the patch."""
 
 HORIZON_SECTORS: Final = 8
 
@@ -46,23 +46,23 @@ def select_gradient_effects(
     is_moving: bool,
     effects: SceneEffects,
 ) -> EffectSelection:
-    """Decide what a scene in the gradient sphere builds.
+    """Select the effects that a scene in the gradient sphere builds.
 
     Parameters
     ----------
     rig, sphere, lens
-        The rig, its LEDs as they stand, and the lens.
+        The rig, its actual LEDs, and the lens.
     subject
         A patch of skin, or the name of a target.
     noise
-        Of the sensor. Highlights are taken as full.
+        Noise of the sensor. Highlights count as saturated.
     white
-        What a white patch gets under all LEDs in the plan's longest exposure, full scales; inf:
-        so much that the brightest skin is full.
-    moving
+        Signal of a white patch under all LEDs in the plan's longest exposure, full scales; inf: the
+        brightest skin is at full scale.
+    is_moving
         Whether the patch moves.
     effects
-        What is asked for.
+        Requested effects.
     """
     view = rig.views[0]
     made = [
@@ -77,9 +77,9 @@ def select_gradient_effects(
             (face.INTERREFLECTION_EFFECT, "interreflections"),
         ):
             made.append(decide_effect(name, 0.0, None, switch=switch, reason=flat))
-        made.append(Effect(face.LATERAL_EFFECT, "absent", f"{subject} is glass, gray or nothing"))
+        made.append(Effect(face.LATERAL_EFFECT, "absent", f"{subject} is glass, gray or absent"))
         return EffectSelection((*made, *omitted_effects("gradient")))
-    made += _of_skin(subject, sphere, lens, noise, white, effects)
+    made += _skin_effects(subject, sphere, lens, noise, white, effects)
     still = Effect("movement of the patch", "absent", "motion=None", switch="motion")
     if not is_moving:
         return EffectSelection((*made, still, *omitted_effects("gradient", "gradient_skin")))
@@ -98,11 +98,11 @@ def _optics(lens: Lens, asked: bool | None, noise: PixelNoise) -> Effect:
         noise.change_over_noise(1.0 - kept),
         asked,
         switch="optics",
-        reason=f"the lens passes {100 * kept:.0f} % of a pattern as fine as the pixels",
+        reason=f"the lens transfers {100 * kept:.0f} % of a pattern at the pixel pitch",
     )
 
 
-def _of_skin(
+def _skin_effects(
     skin: MicroSkin,
     sphere: ActualSphere,
     lens: Lens,
@@ -130,9 +130,9 @@ def _of_skin(
         boundaries=True,
     )
     sigmas, weights = lateral_kernel(skin)
-    if effects.lateral is not False:  # what comes from other walls spreads as all light does
+    if effects.lateral is not False:  # light from other walls scatters laterally, as all light does
         hidden = _scatter_hidden_light(hidden, sigmas, weights, 1e-3 * skin.texel_um)
-    # light that goes along the surface grows with the square of slopes
+    # to second order, the hidden part of the sky grows with the square of the slopes
     share = min(MAX_SLOPE_GAIN**2 * float(np.quantile(hidden, 0.999)), 0.9)
     brightest = float(skin.albedo.max())
     more = interreflection_over_direct(share, brightest)
@@ -161,7 +161,7 @@ def _of_skin(
             noise.change_over_noise(more, level),
             effects.interreflections,
             switch="interreflections",
-            reason=f"walls of furrows get up to {100 * share:.1f} % of what others send out",
+            reason=f"walls of grooves receive up to {100 * share:.1f} % of the light from others",
         ),
     ]
 
@@ -169,7 +169,7 @@ def _of_skin(
 def _scatter_hidden_light(
     hidden: FloatArray, sigmas_mm: Float64Array, weights: Float64Array, texel_mm: float
 ) -> Float64Array:
-    """Return the light of a part of the patch after it has spread; beyond it goes on mirrored."""
+    """Return the light of a part of the patch after lateral scattering, mirrored at its border."""
     axis = np.arange(len(hidden)) / (2.0 * len(hidden) * texel_mm)
     square = 2.0 * np.pi**2 * (axis[:, None] ** 2 + axis[None, :] ** 2)
     kernel = np.tensordot(weights, np.exp(-(sigmas_mm**2)[:, None, None] * square), axes=1)

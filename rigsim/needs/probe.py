@@ -1,4 +1,4 @@
-"""What the fibre probe's pictures must hold, and what they need not."""
+"""Select the effects that the fiber probe's images require."""
 
 from typing import Final
 
@@ -10,10 +10,10 @@ from rigsim.fiber.probe_tissue import HomogeneousTissue, ProbedTissue
 from rigsim.needs.effects import Effect, EffectSelection, PixelNoise, omitted_effects
 from rigsim.needs.face import band_effect, polarization_effect
 
-TRANSPORT_EFFECT: Final = "paths of photons between source and fibres"
-CROSSTALK_EFFECT: Final = "light that fibres pass to each other"
-WINGS_EFFECT: Final = "light beyond the spots, from the lens"
-COLOR_EFFECT: Final = "tissue traced color by color"
+TRANSPORT_EFFECT: Final = "paths of photons between source and fibers"
+CROSSTALK_EFFECT: Final = "crosstalk between fibers"
+WINGS_EFFECT: Final = "light around the spots, from the lens"
+COLOR_EFFECT: Final = "tissue traced per color band"
 LAYERS_EFFECT: Final = "layers of the tissue"
 DARK_CURRENT_EFFECT: Final = "dark current and hot pixels"
 
@@ -21,18 +21,18 @@ DARK_CURRENT_EFFECT: Final = "dark current and hot pixels"
 def select_probe_effects(
     rig: Rig, tissue: ProbedTissue, build: ActualProbe, *, noise: PixelNoise, hot: float
 ) -> EffectSelection:
-    """Decide what a scene under the probe builds.
+    """Select the effects that a scene under the probe builds.
 
     Parameters
     ----------
     rig
         The probe's rig.
     tissue
-        What the head sits on.
+        The tissue below the head.
     build
-        The probe as it was built.
+        The actual probe.
     noise
-        Of the sensor, without dark current.
+        Noise of the sensor, without dark current.
     hot
         Signal of the hottest pixel in the longest exposure, full scales.
     """
@@ -46,7 +46,7 @@ def select_probe_effects(
         Effect(
             TRANSPORT_EFFECT,
             "built",
-            "photons are followed: all light in the fibres has been inside",
+            "photons are followed: all light in the fibers has crossed the tissue",
         ),
         _always_built_effect(
             CROSSTALK_EFFECT, leaked, noise, f"up to {100 * leaked:.2g} % of a neighbor's light"
@@ -72,16 +72,14 @@ def select_probe_effects(
 
 
 def _always_built_effect(name: str, change: float, noise: PixelNoise, because: str) -> Effect:
-    """Return an effect of the probe as built that is there at any size."""
+    """Return an effect of the actual probe that is built at any size."""
     over = change / float(noise.sigma(change))
     return Effect(name, "built", f"{because}: up to {over:.3g} times the noise", over)
 
 
 def _color(tissue: ProbedTissue) -> Effect:
     if tissue.kind == "anisotropic":
-        return Effect(
-            COLOR_EFFECT, "absent", "its direction is what is looked for; one color is traced"
-        )
+        return Effect(COLOR_EFFECT, "absent", "its direction is the measurand; one color is traced")
     if isinstance(tissue, HomogeneousTissue) and not tissue.wavelength_nm:
         return Effect(
             COLOR_EFFECT, "negligible", "the tissue is gray: one color serves all bands", 0.0

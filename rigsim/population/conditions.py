@@ -1,34 +1,34 @@
-"""What cold, heat, sweat, lotion, makeup and powder do to a face.
+"""Apply cold, heat, sweat, lotion, makeup and powder to a face.
 
-A condition changes what carries the appearance, never pictures: the radius of the vessels, the oil,
-the facets, and what lies on the skin (`rigsim.light.surface_brdf.Coating`). Amounts run from 0,
-which changes nothing at all, to 1.
+A condition changes the causes of the appearance, never images: the radius of the vessels, the oil,
+the facets, and the layers on the skin (`rigsim.light.surface_brdf.Coating`). Amounts range from 0,
+which changes nothing, to 1.
 
 ======== ========================================================================================
-normal   nothing
+normal   no change
 cold     vessels narrow by 25 %, most in the cheeks and nose; half of the oil; facets 6 % rougher
 hot      vessels widen by 28 %, most in the cheeks; oil 1.6 times; a thin film of sweat on forehead,
          nose and upper lip
 sweat    water (index 1.333) on 70 % of forehead and nose and on patches of the rest, very smooth
-lotion   an oily emulsion (index 1.45) on 75 %, smooth; facets 15 % smoother; vellus hair lies down
-makeup   pigment that covers 70 % of the diffuse color and evens it out, a satin film on 45 %, half
+lotion   an oily emulsion (index 1.45) on 75 %, smooth; facets 15 % smoother; vellus hair flattened
+makeup   pigment that covers and equalizes 70 % of the diffuse color, a satin film on 45 %, half
          of the oil
 powder   grains on 45 %, which scatter back; a matte white part below them; a fifth of the oil
 ======== ========================================================================================
 
-What grains scatter once goes every way, and eq. (6) takes the least of it for diffuse light: under
-powder the minimum lies some 13 % above R_d (`rigsim.light.surface_brdf.min_surface_reflection`,
-the truth's map ``r_d_floor``).
+Single scattering by grains goes in all directions, and eq. (6) attributes its minimum to diffuse
+light: under powder the minimum is about 13 % above R_d
+(`rigsim.light.surface_brdf.min_surface_reflection`, the ground truth's map ``r_d_floor``).
 
-All these amounts are chosen; what is known is their direction and order of size:
+All these amounts are chosen; their direction and order of magnitude are known:
 
-- Sebum flows by 10 % less for each degree that the skin is colder (Cunliffe, Burton and Shuster
+- The flow of sebum falls by 10 % per degree of skin temperature (Cunliffe, Burton and Shuster
   1970, British Journal of Dermatology 83, 650-654).
-- Vessels of the face narrow in cold and widen in heat; a vessel's blood goes with the square of its
-  radius (`rigsim.subject.perfusion`).
+- Vessels of the face narrow in cold and widen in heat; a vessel's blood is proportional to the
+  square of its radius (`rigsim.subject.perfusion`).
 - Water: index 1.333 (Hale and Querry 1973, doi:10.1364/AO.12.000555). Oils and emulsifiers of
   lotions: 1.44 to 1.48; binders and esters of foundations: about 1.5 (handbook values).
-- Powder kills gloss and scatters back: Hapke 1981, doi:10.1029/JB086iB04p03039 for grains.
+- Powder suppresses specular reflection and backscatters: Hapke 1981, doi:10.1029/JB086iB04p03039.
 - Dataset A of Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 10, has these seven.
 """
 
@@ -51,14 +51,14 @@ CONDITION_NAMES: Final = ("normal", "cold", "hot", "sweat", "lotion", "makeup", 
 """The seven conditions of dataset A."""
 
 POWDER_COLOR: Final = np.array([0.55, 0.54, 0.52], np.float32)
-"""What grains scatter more than once, in the unit of R_d; with `POWDER_ALBEDO` below 1."""
+"""Multiple scattering of the grains, in the unit of R_d; with `POWDER_ALBEDO` below 1."""
 
 MAX_OIL: Final = 0.95
 ROUGHNESS_RANGE: Final = (0.1, 0.6)
 
 
 class ConditionError(ValueError):
-    """There is no such condition, or no such amount of it."""
+    """Unknown name or amount of a condition."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,11 +67,11 @@ class _Film:
     alpha: float
     eta: float
     shiny: float
-    """How much more of it lies where oil gathers and skin sweats, 0 (even) to 1."""
+    """Excess of the film where oil and sweat are most, 0 (uniform) to 1."""
     broken: float
-    """How much it breaks up into drops and patches, 0 (whole) to 1."""
+    """Fragmentation into drops and patches, 0 (closed) to 1."""
     cell_mm: float
-    """Size of its patches."""
+    """Size of its patches, mm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +97,7 @@ _CONDITION_CHANGES: Final[Mapping[str, _Change]] = {
 
 
 def validate_conditions(conditions: Mapping[str, float]) -> dict[str, float]:
-    """Return conditions in the order in which they come upon a face.
+    """Validate conditions and sort them in the order of their application.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def validate_conditions(conditions: Mapping[str, float]) -> dict[str, float]:
 def condition_subject(
     subject: SimulatedSubject, conditions: Mapping[str, float]
 ) -> SimulatedSubject:
-    """Return a face whose vessels answer to conditions; its surface stays.
+    """Return a face whose vessels respond to conditions; its surface is unchanged.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def condition_subject(
 
     Returns
     -------
-    Subject
+    SimulatedSubject
         The same object where nothing changes.
     """
     change = sum(
@@ -164,19 +164,19 @@ def apply_condition(
     foundation: ArrayLike | None = None,
     seed: int = 0,
 ) -> SkinSurface:
-    """Return a surface under a condition; its blood stays, see `condition_subject`.
+    """Return a surface under a condition; for its blood see `condition_subject`.
 
     Parameters
     ----------
     surface
-        The surface before; what lies on it already stays below, as a mean film.
+        The surface before; its coating stays below, as a mean film.
     condition
         One of `CONDITION_NAMES`.
     amount
         0 to 1; 0 returns the surface itself.
     points_mm
-        The texels on the mean head, shape (N, N, 3): films gather and break up into patches, lips
-        keep their color. ``None`` spreads all evenly.
+        The texels on the mean head, shape (N, N, 3): films accumulate and break up into patches,
+        lips keep their color. ``None`` applies everything uniformly.
     foundation
         R_d of the makeup, shape (3,); ``None`` takes the median of the face.
     seed
@@ -225,14 +225,14 @@ def apply_condition(
 def conditioned_surface(
     subject: SimulatedSubject, camera: str, light: str, conditions: Mapping[str, float]
 ) -> SkinSurface:
-    """Return how a face reflects under conditions: its vessels, its surface, what lies on it.
+    """Return the reflection of a face under conditions: vessels, surface and coating.
 
     Parameters
     ----------
     subject
-        The face, as it is without.
+        The face without conditions.
     camera, light
-        Names known to `model.spectra`.
+        Names in `model.spectra`.
     conditions
         Name to amount, 0 to 1.
     """
@@ -265,7 +265,7 @@ def _apply_foundation(
     regions: Mapping[str, Float32Array] | None,
     foundation: ArrayLike | None,
 ) -> SkinSurface:
-    """Cover the diffuse color by a pigment; hair and, where they are known, lips stay."""
+    """Cover the diffuse color by a pigment, except on hair and, where known, on lips."""
     if foundation is None:
         skin = (surface.bare > 0.98) & (np.linalg.norm(surface.normal, axis=-1) > 0.5)
         if not skin.any():
@@ -282,7 +282,7 @@ def _apply_foundation(
 
 
 def _mix_color(surface: SkinSurface, fraction: Float32Array, color: Float32Array) -> SkinSurface:
-    """Return a surface of which a share has another diffuse color."""
+    """Return a surface with a fraction of another diffuse color."""
     part, scale = fraction[..., None], np.float32(interior_scale(ETA))
     reflectance = (1.0 - part) * surface.reflectance + part * color / scale
     return dataclasses.replace(
@@ -299,7 +299,7 @@ def _film_coverage(
     regions: Mapping[str, Float32Array] | None,
     seed: int,
 ) -> Float32Array:
-    """Return the share that a film covers, shape (N, N), 0 to 1."""
+    """Return the fraction covered by a film, shape (N, N), 0 to 1."""
     share = np.full(surface.oil.shape, film.share, np.float32)
     if points_mm is None or regions is None:
         return share
@@ -312,7 +312,7 @@ def _film_coverage(
 
 
 def _add_film(below: Coating, film: _Film, fraction: Float32Array) -> Coating:
-    """Lay a film over a coating; where both lie, alpha and index are the mean by their shares."""
+    """Add a film to a coating; alpha and index of overlapping films are weighted means."""
     total = below.film + fraction
     weight = np.where(total > 0.0, fraction / np.maximum(total, np.float32(1e-6)), 1.0)
     return Coating(

@@ -1,22 +1,22 @@
-"""A simulated person by a preset or a file: one text for all rigs, read and checked here.
+"""Read and validate a simulated person from a preset or a file, which serves all rigs.
 
-A file is TOML; every key may be left out, and unknown ones are errors:
+A file is TOML; every key is optional, and unknown keys are errors:
 
 ================ ==================================================================================
 schema           "skinrig.subject/1"
 preset           pigment, "I" to "VI", "palest" or "darkest"; "III"
-melanin          volume fraction of melanosomes around which skin varies, 0.005 to 0.45, instead
+melanin          volume fraction of melanosomes around which skin varies, 0.005 to 0.45; replaces it
 blood            factor of all blood, 0.1 to 4
-freckles         0 to 1; drawn by the seed where it is left out
-oil              factor of the share of the surface that oil covers, 0 to 3
+freckles         0 to 1; drawn from the seed if omitted
+oil              factor of the surface fraction covered by oil, 0 to 3
 mesh             file of the face's geometry, .npz or .obj
 melanin_map      texture of melanin, volume fraction of the epidermis, 0.0005 to 0.5
 hemoglobin_map   texture of blood at rest, volume fraction of the dermis, 0 to 0.31
 ================ ==================================================================================
 
-Files are named from the file's own folder. Textures are square, .npy or .exr of one channel, row 0
+Paths are relative to the file's own folder. Textures are square, .npy or .exr of one channel, row 0
 is the top (v = 1), on the texture coordinates of the mesh, or of the procedural head without one.
-What is left to chance is drawn by the seed, as for a preset.
+All random properties are drawn from the seed, as for a preset.
 """
 
 import dataclasses
@@ -42,18 +42,18 @@ from rigsim.subject.perfusion import MAX_HEMOGLOBIN
 SCHEMA: Final = "skinrig.subject/1"
 SUBJECT_SUFFIX: Final = ".toml"
 PRESET_MELANIN_RANGE: Final = (0.005, 0.45)
-"""That of the presets: what tables of light in skin are made for."""
+"""Range of the presets, for which tables of light in skin exist."""
 _FILE_KEYS: Final = ("mesh", *MAP_RANGES)
 _UNUSED_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
     "gradient": ("blood", "freckles", "oil", *_FILE_KEYS),
     "probe": ("freckles", "oil", *_FILE_KEYS),
 }
-"""Keys that say nothing of what a rig sees: a patch of plain skin, and skin by its layers."""
+"""Keys without effect in a rig: a patch of plain skin, and skin by its layers."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SubjectFile(Document):
-    """What a simulated person is made of, but for the seed; see the module's text."""
+    """Description of a simulated person except for the seed; see the module's text."""
 
     schema: str = SCHEMA
     preset: str = "III"
@@ -71,7 +71,7 @@ class SubjectFile(Document):
     """Path; None: drawn."""
 
     def __post_init__(self) -> None:
-        """Check ranges, and that nothing is said twice."""
+        """Check ranges, and that no property is set twice."""
         checks = FaultCollector("the subject", SubjectFileError)
         checks.check("schema", self.schema, self.schema == SCHEMA, repr(SCHEMA))
         known = ", ".join(PRESET_NAMES)
@@ -88,11 +88,14 @@ class SubjectFile(Document):
         if self.melanin_map is not None:
             drawn = self.melanin is None and self.freckles is None
             checks.check(
-                "melanin_map", self.melanin_map, drawn, "no melanin and freckles beside it"
+                "melanin_map", self.melanin_map, drawn, "no melanin or freckles together with it"
             )
         if self.hemoglobin_map is not None:
             checks.check(
-                "hemoglobin_map", self.hemoglobin_map, self.blood == 1.0, "no blood beside it"
+                "hemoglobin_map",
+                self.hemoglobin_map,
+                self.blood == 1.0,
+                "no blood together with it",
             )
         checks.close()
 
@@ -103,7 +106,7 @@ class SubjectFile(Document):
 
     @property
     def nearest_preset(self) -> str:
-        """Name of the preset whose melanin is nearest, by its logarithm."""
+        """Name of the preset with the nearest melanin, by its logarithm."""
         presets = pigment.MELANIN_PRESETS
         return min(
             presets, key=lambda name: abs(math.log(presets[name] / self.melanosome_fraction))
@@ -112,27 +115,27 @@ class SubjectFile(Document):
     def face(
         self, *, seed: int, size: int = 512, mesh: Mesh | str | Path | None = None
     ) -> SimulatedSubject:
-        """Return the face.
+        """Return the simulated face.
 
         Parameters
         ----------
         seed
-            Of everything that is drawn, >= 0.
+            Seed of all random draws, >= 0.
         size
-            Texels along one side of the maps, 64 to 8192.
+            Texels along each side of the maps, 64 to 8192.
         mesh
-            Geometry where the file names none.
+            Geometry where the file has none.
 
         Raises
         ------
         SubjectFileError
-            A texture cannot be used, or two meshes are named.
+            An unusable texture, or two meshes.
         rigsim.subject.SubjectError, rigsim.geometry.mesh.MeshError
             See `rigsim.subject.make_subject`.
         """
         if mesh is not None and self.mesh is not None:
             raise SubjectFileError(
-                f"mesh: the subject's file names {self.mesh}; leave the other out"
+                f"mesh: the subject's file sets {self.mesh}; omit the other mesh"
             )
         found = make_subject(
             self.nearest_preset, seed=seed, size=size, mesh=mesh or self.mesh, blood=self.blood
@@ -152,7 +155,8 @@ class SubjectFile(Document):
             )
         if self.hemoglobin_map is not None:
             blood = resample_texture("hemoglobin_map", self.hemoglobin_map, size).astype(np.float64)
-            # the fold of `Perfusion.blood`, backwards: compartments keep their shares
+            # The fold b = t / (1 + (t / m)^4)^(1/4) of `Perfusion.blood` has the inverse
+            # t = b / (1 - (b / m)^4)^(1/4); compartments keep their fractions.
             wanted = blood / (1.0 - (blood / MAX_HEMOGLOBIN) ** 4) ** 0.25
             factor = wanted / perfusion.compartments.sum(axis=-1)
             perfusion = dataclasses.replace(
@@ -162,23 +166,23 @@ class SubjectFile(Document):
         return dataclasses.replace(found, melanin=melanin, perfusion=perfusion, oiliness=self.oil)
 
     def patch(self, site: str, *, seed: int, size_mm: float) -> MicroSkin:
-        """Return a patch of skin before the gradient sphere, see `make_micro_skin`."""
+        """Return a patch of skin for the gradient sphere, see `make_micro_skin`."""
         return make_micro_skin(
             site, seed=seed, size_mm=size_mm, preset=self.nearest_preset, melanin=self.melanin
         )
 
     def tissue(self, *, seed: int) -> SkinTissue:
-        """Return the skin under the fibre probe, see `SkinTissue`."""
+        """Return the skin below the fiber probe, see `SkinTissue`."""
         return SkinTissue(self.nearest_preset, seed=seed, melanin=self.melanin, blood=self.blood)
 
     def unused_keys(self, rig: str) -> tuple[str, ...]:
-        """Return the keys that were given and say nothing of what a rig sees."""
+        """Return the given keys that have no effect in a rig."""
         usual = SubjectFile()
         return tuple(k for k in _UNUSED_KEYS.get(rig, ()) if getattr(self, k) != getattr(usual, k))
 
 
 def is_subject_file(text: str) -> bool:
-    """Return whether a subject's text names a file.
+    """Return whether a subject's text is the path of a file.
 
     Examples
     --------
@@ -189,7 +193,7 @@ def is_subject_file(text: str) -> bool:
 
 
 def load_subject(text: str) -> SubjectFile:
-    """Return the subject that a text names.
+    """Load the subject of a text: a preset or a file.
 
     Parameters
     ----------
@@ -199,7 +203,7 @@ def load_subject(text: str) -> SubjectFile:
     Raises
     ------
     SubjectFileError
-        It is neither, or the file cannot be used: every fault is named.
+        It is neither, or the file is unusable; every fault is listed.
 
     Examples
     --------
@@ -217,32 +221,32 @@ def load_subject(text: str) -> SubjectFile:
 
 
 def load_tissue(text: str, *, seed: int) -> ProbedTissue:
-    """Return the tissue under the fibre probe that a text names.
+    """Load the tissue below the fiber probe from a text.
 
     Parameters
     ----------
     text
-        A file, or what `rigsim.fiber.probe_tissue.parse_tissue` takes.
+        A file, or an argument of `rigsim.fiber.probe_tissue.parse_tissue`.
     seed
-        Of what differs between subjects.
+        Seed of the variation between subjects.
     """
     if is_subject_file(text):
         return load_subject(text).tissue(seed=seed)
     try:
         return parse_tissue(text, seed=seed)
     except TissueError as error:
-        if ":" in text:  # a medium whose numbers are wrong
+        if ":" in text:  # a medium with wrong numbers
             raise
         raise TissueError(f"{error}, or a file NAME{SUBJECT_SUFFIX}") from error
 
 
 def read_subject_file(path: str | Path) -> SubjectFile:
-    """Read a subject's file; the files that it names get its folder before them.
+    """Read a subject's file; its paths become relative to the file's folder.
 
     Raises
     ------
     SubjectFileError
-        It cannot be read, or holds what it must not: every fault is named.
+        It cannot be read or is invalid; every fault is listed.
     """
     place = Path(path)
     document = read_toml(place, error=SubjectFileError)
@@ -257,7 +261,7 @@ def read_subject_file(path: str | Path) -> SubjectFile:
     }
     for key, name in files.items():
         if not Path(name).is_file():
-            faults.append(Fault(key, name, "a file that is there"))
+            faults.append(Fault(key, name, "an existing file"))
     if faults:
         number = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
         raise SubjectFileError(number, where=str(path), faults=faults)
@@ -270,10 +274,10 @@ def read_subject_file(path: str | Path) -> SubjectFile:
 
 
 def _parse_document(document: Mapping[str, Any], where: str, faults: list[Fault]) -> SubjectFile:
-    """Return what the right keys of a document say, the others' faults added to a list.
+    """Return the valid keys of a document, and add the faults of the others to a list.
 
-    Ranges are looked at only when all types are right: so that both are told at once, keys with
-    faults are taken out, and the rest is looked at again.
+    Ranges are checked only when all types are valid. To report both kinds at once, faulty keys are
+    removed and the rest is checked again.
     """
     rest = dict(document)
     while True:
@@ -282,14 +286,14 @@ def _parse_document(document: Mapping[str, Any], where: str, faults: list[Fault]
         except SubjectFileError as error:
             faults += error.faults
             wrong = {re.split(r"[.\[]", fault.path)[0] for fault in error.faults}
-            if not wrong & rest.keys():  # a name that is no key of ours, such as "a.b"
+            if not wrong & rest.keys():  # an unknown key, such as "a.b"
                 raise SubjectFileError(error.what, where=where, faults=faults) from error
             rest = {key: value for key, value in rest.items() if key not in wrong}
 
 
 @functools.lru_cache(maxsize=8)
 def _check_mesh(where: str, path: str, changed_ns: int) -> None:
-    """Raise where a mesh cannot be used; one is read once as long as it is not changed."""
+    """Raise if a mesh is unusable; a mesh is read once as long as it is unchanged."""
     try:
         load_mesh(path)
     except MeshError as error:
@@ -297,28 +301,28 @@ def _check_mesh(where: str, path: str, changed_ns: int) -> None:
 
 
 def record_subject(text: str) -> str | dict[str, Any]:
-    """Return what a manifest or a truth records of a subject: a preset, or all that a file says.
+    """Return the record of a subject for manifest and ground truth: a preset, or a file's content.
 
     Parameters
     ----------
     text
-        As the command line has it; what is no file is returned as it is.
+        Text from the command line; other text than a file's path is returned unchanged.
 
     Returns
     -------
     str or dict
-        Of a file its name and the keys that it sets; of the files that it names the name and the
-        SHA-256, so that others of the same name are told apart.
+        For a file, its name and the keys that it sets; for the files that it lists, name and
+        SHA-256, which distinguishes files of the same name.
     """
     if not is_subject_file(text):
         return text
     found, usual = read_subject_file(text), SubjectFile()
-    said: dict[str, Any] = {"file": Path(text).name, "preset": found.preset}
+    record: dict[str, Any] = {"file": Path(text).name, "preset": found.preset}
     for key in (field.name for field in dataclasses.fields(found)):
         value = getattr(found, key)
         if key in _FILE_KEYS and value is not None:
             digest = hashlib.sha256(Path(value).read_bytes()).hexdigest()
-            said[key] = {"file": Path(value).name, "sha256": digest}
+            record[key] = {"file": Path(value).name, "sha256": digest}
         elif value != getattr(usual, key):
-            said[key] = value
-    return said
+            record[key] = value
+    return record

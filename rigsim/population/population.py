@@ -1,25 +1,25 @@
-"""A simulated population: 87 members in the groups of table 1 of Weyrich et al. 2006.
+"""Draw a simulated population: 87 members in the groups of table 1 of Weyrich et al. 2006.
 
 Members are draws from distributions of melanin, blood, oil, freckles, age and beard. The groups
-differ by nothing but the distributions below. **All of these are chosen** so that an analysis has
-something to find; they are no measurement, and nothing here is a statement about people.
+differ only in the distributions below. **All of these are chosen** so that an analysis has
+something to find; they are not measurements, and nothing here is a statement about people.
 
 ================= =========================================================================
-age               as the paper states each group's range; both ends occur, else even
+age               the paper's range of each group; both ends occur, otherwise uniform
 melanin           log-normal: median 0.016 (caucasian) or 0.032 (asian), sigma 0.35 or 0.30,
                   drawn again outside 0.006 to 0.05 or 0.012 to 0.1; times 0.92 in women
 blood             log-normal, median 1, sigma 0.15; times 0.93 in women
 oil               log-normal, median 1, sigma 0.25; times 0.9 in women, less with age
-freckles          even from 0 to 0.9 (caucasian) or 0 to 0.35 (asian); fewer on dark skin
-beard             men of 17 and older: even from 0.05 to 1 (caucasian) or 0.05 to 0.65 (asian)
+freckles          uniform, 0 to 0.9 (caucasian) or 0 to 0.35 (asian); fewer on dark skin
+beard             men of 17 and older: uniform, 0.05 to 1 (caucasian) or 0.05 to 0.65 (asian)
 age spots         from 35 years on, up to 0.8 at 75
 mottle            uneven melanin: 0.03 at 15 to 0.12 at 75
-relief, roughness depth of furrows 0.7 to 1.45 times, roughness 0.95 to 1.12 times, 15 to 75 years
-conditions        none, or lotion, makeup or both in the groups that wear them, amounts 0.6 to 1
+relief, roughness depth of grooves 0.7 to 1.45 times, roughness 0.95 to 1.12 times, 15 to 75 years
+conditions        none, or lotion, makeup or both in the groups that use them, amounts 0.6 to 1
 ================= =========================================================================
 
-Members share `HEAD_SHAPES` shapes of head, so that many faces are drawn quickly; everything else is
-each member's own. Their textures share one layout, and their landmarks differ with the head.
+Members share `HEAD_SHAPES` head shapes, so that many faces are drawn quickly; everything else is
+individual. Their textures share one layout, and their landmarks differ with the head.
 
 References
 ----------
@@ -46,17 +46,17 @@ from rigsim.subject.perfusion import draw_perfusion
 from rigsim.subject.person import SIZE_RANGE
 
 HEAD_SHAPES: Final = 6
-"""Shapes of head that the members share."""
+"""Number of head shapes that the members share."""
 
 MAX_KEPT_HEADS: Final = 6
-"""Heads that are kept laid out."""
+"""Number of cached heads with their texture layout."""
 
 MAX_SKIN_HAIR: Final = 0.02
-"""Texels with more hair than this part are not skin."""
+"""Texels with a larger fraction of hair are not skin."""
 
 POPULATION_MELANIN_RANGE: Final = (0.004, 0.3)
 MIN_LABELED_STUBBLE: Final = 0.35
-"""Members with at least this much stubble are labelled "beard"."""
+"""Members with at least this much stubble are labeled "beard"."""
 MIN_LABELED_FRECKLES: Final = 0.45
 
 Sex = Literal["male", "female"]
@@ -64,7 +64,7 @@ Ethnicity = Literal["caucasian", "asian"]
 
 
 class PopulationError(ValueError):
-    """A member or a shift of a population is described wrongly."""
+    """A member or a shift of a population with an invalid description."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,19 +82,19 @@ class Member:
     blood: float
     """Factor of all blood, 0.1 to 4."""
     oil: float
-    """Factor of the share that oil covers, 0 to 3."""
+    """Factor of the surface fraction covered by oil, 0 to 3."""
     freckles: float
     """0 to 1."""
     beard: float
     """Stubble, 0 to 1."""
     seed: int
-    """Seed of everything that is drawn on the face."""
+    """Seed of all random draws of the face."""
     head: int
     """Shape of the head, 0 to `HEAD_SHAPES` - 1."""
     applied: tuple[tuple[str, float], ...] = ()
     """Conditions of `rigsim.population.conditions.CONDITION_NAMES` with their amounts."""
     marks: frozenset[str] = frozenset()
-    """Names of traits that were added, see `shift_trait`."""
+    """Names of added traits, see `shift_trait`."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -105,19 +105,21 @@ class Member:
                     f"{field} of {self.name}: got {value}, expected {low} to {high}"
                 )
         if len({name for name, _ in self.applied}) < len(self.applied):
-            raise PopulationError(f"applied to {self.name}: got {self.applied}, one of them twice")
+            raise PopulationError(
+                f"applied to {self.name}: got {self.applied}, expected each condition once"
+            )
         validate_conditions(dict(self.applied))
 
     @property
     def conditions(self) -> frozenset[str]:
-        """Names of the conditions that are not of amount 0."""
+        """Names of the conditions with an amount above 0."""
         return frozenset(name for name, amount in self.applied if amount > 0.0)
 
     @property
     def labels(self) -> frozenset[str]:
-        """What a user would say of this face.
+        """Labels that an observer would assign to this face.
 
-        Sex, ethnicity, "beard" and "freckles" where there is much of either, conditions, marks.
+        Sex, ethnicity, "beard" and "freckles" above their thresholds, conditions, marks.
         """
         seen = {self.sex, self.ethnicity, *self.conditions, *self.marks}
         seen |= {"beard"} if self.beard >= MIN_LABELED_STUBBLE else set()
@@ -130,7 +132,7 @@ class Member:
         Parameters
         ----------
         size
-            Texels along one side, 64 to 8192.
+            Texels along each side, 64 to 8192.
         """
         flat = self._flat(size)
         points, regions = flat.perfusion.points_mm, flat.perfusion.regions
@@ -149,7 +151,7 @@ class Member:
         )
 
     def _flat(self, size: int) -> SimulatedSubject:
-        """Return the face without relief and of even roughness: all that its color needs."""
+        """Return the face without relief and with uniform roughness, for its color."""
         mesh, atlas, points, regions = _lay_out_head(self.head, size)
         even = np.zeros((size, size), np.float32)
         return SimulatedSubject(
@@ -170,14 +172,14 @@ class Member:
         )
 
     def surface(self, size: int, camera: str, light: str) -> SkinSurface:
-        """Return how the face reflects under its conditions.
+        """Return the face's reflection under its conditions.
 
         Parameters
         ----------
         size
-            Texels along one side, 64 to 8192.
+            Texels along each side, 64 to 8192.
         camera, light
-            Names known to `model.spectra`.
+            Names in `model.spectra`.
         """
         return conditioned_surface(self.face(size), camera, light, dict(self.applied))
 
@@ -187,9 +189,9 @@ class Member:
         Parameters
         ----------
         size
-            Texels along one side, 64 to 8192.
+            Texels along each side, 64 to 8192.
         camera, light
-            Names known to `model.spectra`.
+            Names in `model.spectra`.
 
         Returns
         -------
@@ -220,7 +222,7 @@ class Member:
             seed=self.seed + 502,
             softness=6.0,
         )
-        # Steps of log-odds against the limit, as those of the map itself.
+        # Steps of log-odds relative to the limit, as in the map itself.
         odds = drawn / (pigment.MAX_MELANIN - drawn) * np.exp(step)
         return np.asarray(pigment.MAX_MELANIN * odds / (1.0 + odds), np.float32)
 
@@ -247,7 +249,7 @@ class Group:
     ethnicity: Ethnicity
     age_years: tuple[int, int]
     wears: bool = False
-    """Whether its members wear lotion or makeup."""
+    """Whether its members use lotion or makeup."""
 
 
 POPULATION_GROUPS: Final = (
@@ -300,7 +302,7 @@ def get_member(name: str) -> Member:
     Raises
     ------
     PopulationError
-        There is none of that name.
+        Unknown name.
 
     Examples
     --------
@@ -333,24 +335,24 @@ def shift_trait(
         Name of the trait, which becomes a label of the changed members.
     melanin, blood
         Factors of the changed members' melanin and blood: a tan is ``melanin=1.5``.
-    apply
-        Conditions with their amounts, 0 to 1, that the changed members get (instead of what
-        they had of the same).
-    share
-        Part of the population that is changed, 0 to 1; rounded to whole members.
+    products
+        Conditions with their amounts, 0 to 1, of the changed members; they replace previous amounts
+        of the same conditions.
+    fraction
+        Fraction of the population that is changed, 0 to 1; rounded to whole members.
     rng
-        Chooses who.
+        Selects the changed members.
 
     Returns
     -------
     tuple of Member
-        The same people in the same order; nothing else about them changes, so the true trait of
-        each is the difference to the member of the same index.
+        The same people in the same order; nothing else about them changes, so the ground truth of
+        the trait is each one's difference from the member of the same index.
 
     Raises
     ------
     PopulationError
-        The share, or a changed member, is out of range.
+        The fraction, or a changed member, is out of range.
 
     Examples
     --------
@@ -425,7 +427,7 @@ def _head_mesh(head: int) -> Mesh:
 def _lay_out_head(
     head: int, size: int
 ) -> tuple[Mesh, Atlas, Float32Array, Mapping[str, Float32Array]]:
-    """Return a head, its texture, the texels on the mean head and its regions.
+    """Return a head, its texture layout, the texels on the mean head and its regions.
 
     A head takes 8 MB at 256 texels, 120 MB at 1024.
     """

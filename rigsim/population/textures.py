@@ -1,4 +1,4 @@
-"""Textures that a subject's file names: read, checked, and brought to a scene's texels."""
+"""Read, validate and resample the textures of a subject's file."""
 
 import math
 from collections.abc import Mapping
@@ -20,16 +20,16 @@ MAP_RANGES: Final[Mapping[str, tuple[float, float]]] = {
     "melanin_map": (0.0005, pigment.MAX_MELANIN),
     "hemoglobin_map": (0.0, 0.31),
 }
-"""Of blood just below the limit that vessels fill at most, where the compartments would be
-without end."""
+"""Range of each map; that of blood is just below the maximum filling of the vessels, where the
+inverse of the fold diverges."""
 
 
 class SubjectFileError(InputError):
-    """A subject that is neither a preset nor a file that can be used."""
+    """A subject that is neither a preset nor a usable file."""
 
 
 def load_texture(key: str, path: str) -> Float32Array:
-    """Return a texture as its file has it.
+    """Load a texture in the file's own size.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def load_texture(key: str, path: str) -> Float32Array:
     Raises
     ------
     SubjectFileError
-        It is no such file, of another shape, or out of range.
+        Wrong file type or shape, or values out of range.
     """
     low, high = MAP_RANGES[key]
     where = f"{key}: {path}"
@@ -59,7 +59,7 @@ def load_texture(key: str, path: str) -> Float32Array:
             raise SubjectFileError(f"{key}: {error}") from error
         _check_shape(where, values.dtype, values.shape)
     else:
-        raise SubjectFileError(f"{where}: expected a file .npy or .exr")
+        raise SubjectFileError(f"{where}: got another file type, expected .npy or .exr")
     if not (np.isfinite(values).all() and values.min() >= low and values.max() <= high):
         raise SubjectFileError(
             f"{where}: got {values.min():g} to {values.max():g}, expected finite volume fractions "
@@ -69,10 +69,10 @@ def load_texture(key: str, path: str) -> Float32Array:
 
 
 def _npy(key: str, path: str) -> NDArray[Any]:
-    """Return the array of a .npy file, of which nothing is read before its header is right."""
+    """Return the array of a .npy file, after its header has been checked."""
     where = f"{key}: {path}"
     try:
-        with Path(path).open("rb") as stream:  # np.load takes archives of arrays, too
+        with Path(path).open("rb") as stream:  # np.load also accepts archives of arrays
             version = np.lib.format.read_magic(stream)
             header = np.lib.format.read_array_header_1_0
             if version[0] != 1:
@@ -81,7 +81,7 @@ def _npy(key: str, path: str) -> NDArray[Any]:
             _check_shape(where, dtype, shape)
             wanted = math.prod(shape) * dtype.itemsize
             there = Path(path).stat().st_size - stream.tell()
-            if there < wanted:  # NumPy would first make room for all that the header tells of
+            if there < wanted:  # NumPy would allocate all that the header declares
                 raise SubjectFileError(
                     f"{where}: got {there} bytes of data, expected {wanted} for {dtype} of shape "
                     f"{shape}; the file was cut short"
@@ -91,11 +91,13 @@ def _npy(key: str, path: str) -> NDArray[Any]:
     except SubjectFileError:
         raise
     except (ValueError, EOFError, OSError) as error:
-        raise SubjectFileError(f"{where}: is no .npy file ({error})") from error
+        raise SubjectFileError(
+            f"{where}: got no valid .npy file ({error}), expected one written by numpy.save"
+        ) from error
 
 
 def _check_shape(where: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
-    """Raise where an array is not square, too small or large, or not of real numbers."""
+    """Raise if an array is not square, too small or large, or not of real numbers."""
     low, high = SIZE_RANGE
     square = len(shape) == 2 and shape[0] == shape[1]
     if dtype.kind not in "fiu" or not square or not low <= shape[0] <= high:
@@ -106,17 +108,17 @@ def _check_shape(where: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> No
 
 
 def resample_texture(key: str, path: str, size: int) -> Float32Array:
-    """Return a texture of so many texels a side.
+    """Resample a texture to a number of texels per side.
 
-    Where they are fewer than the file's, each is the mean of the area that it covers, so that
-    nothing finer than it folds back as a pattern; where they are more, they are interpolated.
+    Downsampling averages over the area of each texel, which prevents aliasing; upsampling
+    interpolates.
 
     Parameters
     ----------
     key, path
         See `load_texture`.
     size
-        Texels a side.
+        Texels per side.
 
     Returns
     -------
@@ -133,14 +135,14 @@ def resample_texture(key: str, path: str, size: int) -> Float32Array:
 
 
 def average_areas(values: Float32Array, size: int) -> Float32Array:
-    """Return the means of a square image over fewer, larger texels, whose edges may cut its own.
+    """Average a square image over fewer, larger texels, whose edges may cut its own.
 
     Parameters
     ----------
     values
         Shape (N, N).
     size
-        Texels a side of the result, up to N.
+        Texels per side of the result, up to N.
 
     Returns
     -------
@@ -153,7 +155,7 @@ def average_areas(values: Float32Array, size: int) -> Float32Array:
     1.7777777910232544
     """
     many = values.shape[0]
-    # row i holds the share of each of the file's texels in texel i of the result
+    # row i holds the weight of each of the file's texels in texel i of the result
     edges = np.linspace(0.0, many, size + 1)
     first = np.floor(edges[:-1]).astype(int)
     width = math.ceil(many / size) + 1
@@ -164,5 +166,5 @@ def average_areas(values: Float32Array, size: int) -> Float32Array:
     at = (row, np.minimum(column, many - 1).ravel())
     weights = csr_array((share.ravel().astype(np.float32), at), shape=(size, many))
     means = (weights @ (weights @ values).T).T
-    # a mean lies between what it is of; in single precision it may come out a digit beyond
+    # a mean is within the range of its values; in single precision it may exceed it slightly
     return np.asarray(np.clip(means, values.min(), values.max()), np.float32)

@@ -1,6 +1,6 @@
-"""A mesh that rays are cast on, by one of two tracers.
+"""Cast rays on a mesh, by one of two ray tracers.
 
-Mitsuba's LLVM variants trace where they work, else Embree through embreex, which needs no LLVM.
+Mitsuba's LLVM variants trace where they work, otherwise Embree by embreex, which needs no LLVM.
 """
 
 from typing import Any, Final, TypeAlias
@@ -14,11 +14,11 @@ from rigsim.render.renderer import load_mitsuba, pad_memory
 from rigsim.render.variant import VariantChoice, choose_variant
 
 RAYS_PER_CALL: Final = 1 << 22
-"""Rays traced in one call; bounds the memory that a ray batch takes."""
+"""Rays per call; bounds the memory of a ray batch."""
 
 
 RayHits: TypeAlias = tuple[Int32Array, Float32Array]
-"""The triangle that each ray meets, -1 for none, and weights of its corners 1 and 2, (N, 2)."""
+"""Triangle that each ray hits, -1 for none, and weights of its corners 1 and 2, (N, 2)."""
 
 
 class Caster:
@@ -42,7 +42,7 @@ class Caster:
 
     @property
     def face_normals(self) -> Float32Array:
-        """Unit normals of the triangles, shape (F, 3); zero where one has no area."""
+        """Unit normals of the triangles, shape (F, 3); zero for a triangle without area."""
         if self._face_normals is None:
             corners = self.mesh.vertices_mm[self.mesh.faces]
             edges = corners[:, 1:] - corners[:, :1]
@@ -51,7 +51,7 @@ class Caster:
 
     @property
     def scene(self) -> Any:
-        """Mitsuba's scene of the mesh, for kernels that trace and shade at once, or None."""
+        """Mitsuba's scene of the mesh, for kernels that trace and shade in one pass, or None."""
         return self._tracer.scene
 
     def first_hit(self, origins: ArrayLike, directions: ArrayLike) -> RayHits:
@@ -67,7 +67,7 @@ class Caster:
         Returns
         -------
         prim : ndarray of int32
-            Triangle met, shape (N,), -1 for none.
+            Triangle that was hit, shape (N,), -1 for none.
         weight : ndarray of float32
             Weights of the triangle's second and third corner, shape (N, 2).
         """
@@ -81,7 +81,7 @@ class Caster:
     def is_blocked(
         self, origins: ArrayLike, directions: ArrayLike, length_mm: ArrayLike
     ) -> BoolArray:
-        """Tell which rays meet a triangle before their end.
+        """Return which rays hit a triangle before their end.
 
         Parameters
         ----------
@@ -132,7 +132,7 @@ class _MitsubaTracer:
 
         ray = self._ray(mi, origins, directions)
         hit = self.scene.ray_intersect_preliminary(ray, coherent=True)
-        dr.eval(hit)  # else each of the reads below would trace anew
+        dr.eval(hit)  # otherwise each of the reads below would trace again
         valid = np.array(hit.is_valid())
         prim = np.where(valid, np.array(hit.prim_index).astype(np.int64), -1).astype(np.int32)
         weight = np.stack([np.array(hit.prim_uv.x), np.array(hit.prim_uv.y)], axis=-1)

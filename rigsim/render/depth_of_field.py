@@ -1,19 +1,19 @@
-"""What a lens does to points at many depths: each spreads over pixels by how far off focus it is.
+"""Render depth of field: spread the light of points over pixels by their defocus.
 
-Rays through the middle of the pupil find the surface; here the light that they would see goes
-through the whole of the pupil. A point's light falls on pixels as diffraction and its own circle of
-confusion say, all of it; where near skin stands before far skin, the near covers the far.
+Rays through the center of the pupil find the surface; this module distributes their light over the
+whole pupil. All light of a point falls on pixels by diffraction and its circle of confusion. Near
+skin occludes the far skin behind it.
 
 Notes
 -----
 Weights come from the OTF of a defocused circle (`rigsim.render.lens_blur.Lens`), times those of a
-pixel and of the square that a sample stands for: without blur they are what averaging over a pixel
-is. A pixel that sees nothing but one smooth surface gets weights of sum 1, since radiance does not
-change along rays: what the spreading alone would miss is the change of the circle along a slope,
-1e-4 on a face. At an edge two layers are told apart by the widest gap in depth; the far one gets
-what the near one leaves free, also of what it hides from the pupil's middle, which looks as the
-rest does. Light further out than `DefocusKernels.radius` pixels is put back: the far rings of
-diffraction, and the glare of real lenses, are not in the picture.
+pixel and of the square around each sample: without blur they are the weights of the mean over a
+pixel. The weights of a pixel that views a single smooth surface are normalized to sum 1, since
+radiance is constant along rays; plain spreading would have an error of 1e-4 on a face, as the
+circle changes along a slope. At an edge two layers are separated at the widest gap in depth. The
+far layer gets the weight that the near one leaves, also for its part hidden from the center of the
+pupil, which is extrapolated from the rest. Light beyond `DefocusKernels.radius` pixels is returned
+to the kernel: the far rings of diffraction, and the glare of real lenses, are not modeled.
 """
 
 import dataclasses
@@ -33,63 +33,65 @@ from rigsim.render.lens_blur import BlurError, Lens, focused_lens
 
 DEFOCUS_STEP_PX: Final = 0.1
 MAX_WEIGHT_DEPTHS: Final = 33
-"""Between depths at which weights are computed they are blended; those are so much blur apart, in
-pixels' diameters, or so many."""
+"""Spacing of the depths with computed weights in pixels of blur diameter, and their maximum
+number; weights in between are interpolated."""
 
 DEPTH_SLICES: Final = 256
-"""Depths that are told apart."""
+"""Number of depth levels."""
 
 DIFFRACTION_MARGIN: Final = 4.0
-"""Wavelengths times f-number that the picture holds around a circle of confusion."""
+"""Margin around a circle of confusion, in wavelengths times f-number."""
 
 SPECTRUM_NODES: Final = 3
-"""Wavelengths that stand for the spectrum."""
+"""Number of wavelengths that sample the spectrum."""
 
 DEPTH_GAP_MM: Final = 3.0
 DEPTH_GAP_PX: Final = 3.0
-"""Gap in depth, the wider of the two, at which one surface stands before another."""
+"""Gap in depth, the wider of the two, from which one surface counts as in front of another."""
 
 DEPTH_RANGE_FACTOR: Final = 1.2
-"""Step of the ranges of depth for which tables are made."""
+"""Step of the depth ranges of tables."""
 
 DEPTH_GAP_BINS: Final = 64
-"""Depths that are told apart when a gap is looked for."""
+"""Number of depth bins in the search for a gap."""
 
 MAX_FREQUENCY: Final = 6.0
-"""Highest frequency in cycles per sample that weights are summed over; squares pass 0.2 % of it."""
+"""Highest frequency of the sum, in cycles per sample; squares transmit 0.2 % of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DefocusKernels:
-    """Shares of a sample's light that fall on the pixels around it, by depth."""
+    """Fractions of a sample's light on the pixels around it, by depth."""
 
     radius: int
-    """Pixels on each side that are reached."""
+    """Reach in pixels on each side."""
     subpixels: int
     """Samples along each side of a pixel."""
     table: Float32Array
-    """Shape (`DEPTH_SLICES`, (2 radius + 1)^2, subpixels^2): by depth, by the sample's pixel seen
-    from the one that gets the light, row by row, and by its place in its pixel, row by row. Over
-    all samples the sum is 1."""
+    """Shape (`DEPTH_SLICES`, (2 radius + 1)^2, subpixels^2): by depth, by the offset of the
+    sample's pixel from the receiving one, row by row, and by its position in its pixel, row by row.
+    The sum over all samples is 1."""
     distance_mm: float
     """From the pupil to the plane in focus, mm."""
     furthest: float
     """Largest `defocus` in the table."""
     gap_mm: float
-    """Gap in depth at which one surface stands before another."""
+    """Gap in depth from which one surface counts as in front of another."""
 
     def defocus(self, toward_mm: ArrayLike) -> Float64Array:
-        """Return what the circle of confusion goes with, of points so far before the focus."""
+        """Return the relative circle of confusion by depths before the plane in focus, mm."""
+        # A point at distance z = distance - depth has a blur diameter proportional to distance / z
+        # - 1.
         depth = np.asarray(toward_mm, np.float64)
         return depth / (self.distance_mm - depth)
 
     def slices(self, toward_mm: ArrayLike) -> UInt8Array:
-        """Return the rows of the table for points so far before the plane in focus, mm."""
+        """Return the rows of the table for depths before the plane in focus, mm."""
         place = np.abs(self.defocus(toward_mm)) * ((DEPTH_SLICES - 1) / max(self.furthest, 1e-12))
         return np.asarray(np.clip(np.rint(place), 0, DEPTH_SLICES - 1), np.uint8)
 
     def max_spilled_fraction(self, toward_mm: ArrayLike) -> float:
-        """Return which share of a pixel's light falls on others, at the worst of some depths.
+        """Return the largest fraction of a pixel's light on other pixels over some depths.
 
         Parameters
         ----------
@@ -98,14 +100,14 @@ class DefocusKernels:
         """
         own = self.table.shape[1] // 2
         rows = np.unique(self.slices(toward_mm))
-        # a row's samples are weighed for all pixels: those of the own pixel sum to what it keeps
+        # the weights of a sample's own pixel sum to the fraction that it keeps
         return float(1.0 - self.table[rows, own].sum(axis=1).min())
 
 
 def tabulate_defocus(
     view: View, illuminant: str, *, subpixels: int, depths_mm: ArrayLike
 ) -> DefocusKernels:
-    """Return how a camera's lens spreads light of points between some depths.
+    """Tabulate the lens blur of points in a range of depths.
 
     Parameters
     ----------
@@ -116,12 +118,12 @@ def tabulate_defocus(
     subpixels
         Samples along each side of a pixel.
     depths_mm
-        Places along the optical axis that the subject reaches, from the plane in focus towards the
+        Depths along the optical axis that the subject reaches, from the plane in focus toward the
         camera, mm, any shape; only the extremes matter.
 
     Returns
     -------
-    LensSpread
+    DefocusKernels
 
     Examples
     --------
@@ -137,12 +139,12 @@ def tabulate_defocus(
 
 
 def tabulate_lens_defocus(lens: Lens, *, subpixels: int, depths_mm: ArrayLike) -> DefocusKernels:
-    """Return how a lens spreads light; see `tabulate_defocus`.
+    """Tabulate the blur of a lens; see `tabulate_defocus`.
 
     Raises
     ------
     BlurError
-        Depths are none, not finite or behind the camera, or there are no samples.
+        No depths, depths that are not finite or are behind the camera, or no samples.
     """
     depths = np.asarray(depths_mm, np.float64)
     if subpixels < 1:
@@ -153,12 +155,12 @@ def tabulate_lens_defocus(lens: Lens, *, subpixels: int, depths_mm: ArrayLike) -
             f"{lens.distance_mm:g} mm before the plane in focus"
         )
     furthest = float(np.abs(depths / (lens.distance_mm - depths)).max())
-    if furthest > 0.0:  # in steps, so that cameras and faces that are alike share a table
+    if furthest > 0.0:  # in steps, so that similar cameras and faces share a table
         furthest = DEPTH_RANGE_FACTOR ** math.ceil(math.log(furthest, DEPTH_RANGE_FACTOR) - 1e-9)
     return _spread(_few_colors(lens), subpixels, furthest)
 
 
-@lru_cache(maxsize=8)  # a dome's cameras are alike, and the faces before them
+@lru_cache(maxsize=8)  # a dome's cameras, and the faces in it, are similar
 def _spread(lens: Lens, subpixels: int, furthest: float) -> DefocusKernels:
     pixel_mm = 1e-3 * lens.pixel_on_subject_um
     pupil_mm = 0.5 * lens.magnification * lens.distance_mm / lens.working_f_number
@@ -207,8 +209,10 @@ def _weights(lens: Lens, depth_mm: float, radius: int, subpixels: int) -> Float6
     cutoff = 1e6 * lens.magnification / (min(lens.wavelengths_nm) * lens.working_f_number)
     most = min(cutoff * pixel_mm, MAX_FREQUENCY * subpixels)
     frequency = np.arange(math.ceil(most * period) + 1) / period  # cycles per pixel
+    # The weights are the inverse Fourier transform of the OTF times the sincs of pixel and sample.
+    # The sum over frequencies repeats after a period that keeps the copies apart.
     squares = np.sinc(frequency) * np.sinc(frequency / subpixels)
-    squares *= np.where(frequency > 0.0, 2.0, 1.0)  # those below 0 are the same
+    squares *= np.where(frequency > 0.0, 2.0, 1.0)  # negative frequencies contribute equally
     waves = np.cos(2.0 * np.pi * offset[:, None] * frequency) * squares
     radial = np.hypot(frequency[:, None], frequency) / pixel_mm
     otf = lens.otf(radial, depth_mm=depth_mm)
@@ -219,14 +223,14 @@ def _weights(lens: Lens, depth_mm: float, radius: int, subpixels: int) -> Float6
 
 
 def depth_before_focus(view: View, points_mm: Float32Array) -> Float32Array:
-    """Return how far points stand before a camera's plane in focus, mm, shape (n,) of (n, 3)."""
+    """Return the distance of points before a camera's plane in focus, mm, (n, 3) to (n,)."""
     back = np.asarray(view.axes[2])
     focus = float(np.asarray(view.position_mm) @ back) - view.focus_distance_mm
     return np.asarray(points_mm @ back.astype(np.float32) - np.float32(focus), np.float32)
 
 
 def depth_range(view: View, mesh: Mesh) -> tuple[float, float]:
-    """Return between which depths before the plane in focus a mesh faces the camera, mm."""
+    """Return the range of depths before the plane in focus where a mesh faces the camera, mm."""
     way = np.asarray(view.position_mm, np.float32) - mesh.vertices_mm
     facing = np.einsum("ij,ij->i", way, mesh.normals) > 0.0
     depths = depth_before_focus(view, mesh.vertices_mm[facing])
@@ -234,22 +238,22 @@ def depth_range(view: View, mesh: Mesh) -> tuple[float, float]:
 
 
 class LensImage:
-    """The samples of one picture, ready to be seen through a lens with any light on them.
+    """Samples of one image, to be rendered through a lens with any light on them.
 
     Parameters
     ----------
     spread
-        The lens.
+        Kernels of the lens.
     shape
-        Rows and columns of the picture.
+        Rows and columns of the image.
     pixel
-        Pixels that hold samples, index into the flat picture, ascending, shape (P,).
+        Pixels with samples, index into the flat image, ascending, shape (P,).
     first
         First sample of each of these, shape (P + 1,).
     slot
-        Each sample's place in its pixel, row by row, below subpixels^2, shape (n,).
+        Each sample's position in its pixel, row by row, below subpixels^2, shape (n,).
     toward_mm
-        How far each sample stands before the plane in focus, mm, shape (n,).
+        Distance of each sample before the plane in focus, mm, shape (n,).
     """
 
     def __init__(
@@ -273,7 +277,7 @@ class LensImage:
         _layers(*self._samples, np.float32(spread.gap_mm), self._cut, self._far)
 
     def render(self, rows: Float32Array) -> Float32Array:
-        """Return the picture of samples of some radiance.
+        """Return the image of samples with given radiance.
 
         Parameters
         ----------
@@ -283,7 +287,7 @@ class LensImage:
         Returns
         -------
         ndarray of float32
-            Shape (H, W, C); nothing but the samples shines.
+            Shape (H, W, C); only the samples emit light.
         """
         out = np.zeros((*self.shape, rows.shape[1]), np.float32)
         if len(rows):
@@ -296,7 +300,7 @@ class LensImage:
 def _layers(  # type: ignore[no-untyped-def]
     lookup, first, slot, slices, toward, table, radius, gap, cut, far
 ):
-    """Find for each pixel which depths are far, and what their weights are multiplied with."""
+    """Find each pixel's far depths and the factors of the weights of both layers."""
     height, width = lookup.shape
     wide = 2 * radius + 1
     per_pixel = table.shape[2]
@@ -311,7 +315,7 @@ def _layers(  # type: ignore[no-untyped-def]
             for b in range(wide * wide):
                 v, u = y + b // wide - radius, x + b % wide - radius
                 if v < 0 or v >= height or u < 0 or u >= width:
-                    continue  # beyond the picture it goes on as here
+                    continue  # beyond its border the image is extrapolated
                 for s in range(per_pixel):
                     inside += table[0, b, s]
                 q = lookup[v, u]
@@ -329,7 +333,7 @@ def _layers(  # type: ignore[no-untyped-def]
                 continue
             near = np.float32(0.0)
             if high - low > gap:
-                # the widest run of empty bins is the gap, to the width of a bin
+                # the widest run of empty bins is the gap, up to the width of a bin
                 filled[:] = 0
                 per_mm = np.float32(DEPTH_GAP_BINS - 1) / (high - low)
                 for k in range(count):
@@ -345,13 +349,13 @@ def _layers(  # type: ignore[no-untyped-def]
                     for k in range(count):
                         if depth[k] >= cut[y, x]:
                             near += share[k]
-                    if near > inside:  # one steep slope: nothing is behind it
+                    if near > inside:  # one steep slope: no second layer
                         cut[y, x], near = np.float32(np.inf), np.float32(0.0)
             rest = total - near
             free = max(inside - near, np.float32(0.0))
             if rest <= np.float32(1e-9):
                 far[y, x] = np.float32(0.0)
-            elif missing > 0:  # nothing shines there
+            elif missing > 0:  # no light there
                 far[y, x] = min(np.float32(1.0), free / rest) / inside
             else:
                 far[y, x] = free / rest / inside

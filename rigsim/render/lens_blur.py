@@ -1,7 +1,7 @@
-"""What a perfect lens takes away: diffraction, defocus and the size of the pixels, as an OTF.
+"""Blur images by a perfect lens: diffraction, defocus and the pixel aperture, as an OTF.
 
-The pupil is a circle, light of each wavelength is incoherent, and the spectrum is that of lamp and
-camera together. Aberrations are none: a real macro lens at f/16 is near that in the middle.
+The pupil is a circle, light of each wavelength is incoherent, and the spectrum combines lamp and
+camera. Aberrations are not modeled: a real macro lens at f/16 is nearly free of them in the center.
 
 References
 ----------
@@ -22,13 +22,13 @@ from model import spectra
 from rigsim.arrays import Float32Array, Float64Array
 
 SPECTRUM_NODES: Final = 9
-"""Wavelengths that stand for the spectrum."""
+"""Number of wavelengths that sample the spectrum."""
 
 DEPTH_SLICE_MM: Final = 0.25
-"""Distance of the depths at which the OTF is exact; between them pictures are blended."""
+"""Distance of the depths with an exact OTF; images in between are interpolated."""
 
 MAX_FLAT_DEPTH_RANGE_MM: Final = 0.15
-"""Range of depths that one slice stands for."""
+"""Largest range of depths that one slice represents."""
 
 OTF_NODES: Final = 513
 """Nodes of the radial OTF."""
@@ -37,12 +37,12 @@ FFT_WORKERS: Final = 2
 
 
 class BlurError(ValueError):
-    """A lens or a picture cannot be used."""
+    """An unusable lens or image."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """A perfect lens with its sensor, and the light that it is used with."""
+    """A perfect lens with its sensor, and the spectrum of its light."""
 
     working_f_number: float
     """Image distance over the diameter of the pupil, > 0."""
@@ -51,11 +51,11 @@ class Lens:
     magnification: float
     """Size of the image over that of the subject, > 0."""
     pixel_um: float
-    """Side of a pixel, all of which collects light, um, > 0."""
+    """Side of a pixel with full fill factor, um, > 0."""
     wavelengths_nm: tuple[float, ...]
-    """Wavelengths that stand for the spectrum."""
+    """Wavelengths that sample the spectrum."""
     weights: tuple[float, ...]
-    """Their shares in the signal, sum 1."""
+    """Their weights in the signal, sum 1."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -82,11 +82,11 @@ class Lens:
 
     @property
     def cutoff_period_um(self) -> float:
-        """Period on the subject below which the mean wavelength carries nothing, um."""
+        """Cutoff period of the lens on the subject at the mean wavelength, um."""
         return self.mean_wavelength_nm * 1e-3 * self.working_f_number / self.magnification
 
     def aberration_um(self, depth_mm: float) -> float:
-        """Return the wavefront's error at the pupil's rim for a subject off focus, um."""
+        """Return the wavefront error at the pupil's rim for a subject off focus, um."""
         aperture = self.working_f_number / self.magnification
         return 1e3 * depth_mm / (8.0 * aperture**2)
 
@@ -103,7 +103,7 @@ class Lens:
         Returns
         -------
         ndarray
-            Same shape, 1 at frequency 0; negative where defocus turns black into white.
+            Same shape, 1 at frequency 0; negative where defocus reverses the contrast.
         """
         frequency = np.abs(np.asarray(per_mm, np.float64))
         total = np.zeros(frequency.shape)
@@ -117,7 +117,7 @@ class Lens:
 
 
 def focused_lens(view: View, illuminant: str) -> Lens:
-    """Return the lens of a view, focused as the view says.
+    """Return the lens of a view, focused at the view's distance.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def focused_lens(view: View, illuminant: str) -> Lens:
     signal = spectra.camera_sensitivity(view.spectral_sensitivity).mean(axis=1)
     signal = np.maximum(signal * spectra.illuminant(illuminant), 0.0)
     share = np.cumsum(signal) / signal.sum()
-    # wavelengths at the middles of equal parts of the signal
+    # wavelengths at the centers of equal parts of the signal
     nodes = np.interp((np.arange(SPECTRUM_NODES) + 0.5) / SPECTRUM_NODES, share, wavelength)
     return Lens(
         view.f_number * (1.0 + magnification),
@@ -163,13 +163,13 @@ def blur_images(
     subpixels: int = 1,
     averaged: bool = False,
 ) -> Float32Array:
-    """Blur pictures as the lens and the pixels do.
+    """Blur images by the lens and the pixel aperture.
 
     Parameters
     ----------
     images
-        Point samples on the subject, shape (K, H s, W s): s in each pixel's row and column, evenly
-        spaced about its middle. Beyond the border the picture goes on mirrored.
+        Point samples on the subject, shape (K, H s, W s): s per pixel's row and column, evenly
+        spaced about its center. The image is mirrored at its border.
     lens
         The lens.
     depth_mm
@@ -205,7 +205,7 @@ def blur_images(
     pixel = np.sinc(fy * pixel_mm)[:, None] * np.sinc(fx * pixel_mm)[None, :]
     if averaged:
         pixel = np.ones_like(pixel)
-    # the samples' grid begins so many pixels before the pixels' middles
+    # offset of the samples' grid before the pixels' centers, in pixels
     offset = 0.5 * (1.0 - 1.0 / subpixels)
     turn = np.exp(2j * np.pi * offset * pixel_mm * fy)[:, None] * np.exp(
         2j * np.pi * offset * pixel_mm * fx
@@ -230,13 +230,13 @@ def blur_images(
 
 
 BORDER_PX: Final = 12
-"""Mirrored pixels around a picture while it is blurred; the lens spreads light over fewer."""
+"""Mirrored pixels around an image while it is blurred; the lens's reach is shorter."""
 
 
 def _fold_spectrum(
     spectrum: NDArray[np.complex64], shape: tuple[int, int]
 ) -> NDArray[np.complex64]:
-    """Return the frequencies that pixels can carry; the lens lets no others pass."""
+    """Return the frequencies that pixels can represent; the lens transmits no others."""
     rows, columns = shape
     if spectrum.shape == (rows, columns // 2 + 1):
         return spectrum
@@ -248,7 +248,7 @@ def _fold_spectrum(
 
 
 def _slices(depth_mm: Float32Array | None) -> list[tuple[float, Float32Array | None]]:
-    """Return depths, and each sample's share in them; None is all of it."""
+    """Return depths with each sample's weight in them; None is a weight of 1."""
     if depth_mm is None:
         return [(0.0, None)]
     low, high = float(depth_mm.min()), float(depth_mm.max())
@@ -267,10 +267,14 @@ def _slices(depth_mm: Float32Array | None) -> list[tuple[float, Float32Array | N
 
 def _defocused_circle(nodes: Float64Array, waves: float) -> Float64Array:
     """Return the OTF of a circle at frequencies 0 to 2 (cutoff) with a defocus in waves."""
+    # Hopkins 1955: the OTF is the integral of the phase difference cos(b x) over the overlap of two
+    # unit pupils whose centers are one frequency apart. Over x from 0 to the overlap's half width
+    # at
+    # height y it is sin(b width) / b = width sinc(b width / pi).
     x, w = np.polynomial.legendre.leggauss(96)
     half = 0.5 * nodes
     edge = np.sqrt(np.maximum(1.0 - half**2, 0.0))
-    # y = edge sin(t) takes the square root's end out of the integral
+    # the substitution y = edge sin(t) removes the square-root endpoint singularity
     t = 0.25 * np.pi * (x + 1.0)
     y = edge[:, None] * np.sin(t)
     width = np.maximum(np.sqrt(np.maximum(1.0 - y**2, 0.0)) - half[:, None], 0.0)

@@ -1,4 +1,4 @@
-"""What a camera's rays meet first on a mesh, and which part of a light a point of it sees."""
+"""Trace a camera's rays on a mesh, and the visible fraction of a light from its points."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -19,14 +19,14 @@ RAY_OFFSET_MM: Final = 0.02
 
 @dataclass(frozen=True, slots=True)
 class GBuffer:
-    """What each camera ray meets first; shapes (H, W[, C]), row 0 is the top."""
+    """First hit of each camera ray; shapes (H, W[, C]), row 0 is the top."""
 
     mask: BoolArray
-    """Rays that meet the mesh."""
+    """Rays that hit the mesh."""
     prim: Int32Array
-    """Triangle met, -1 for none."""
+    """Triangle that was hit, -1 for none."""
     position_mm: Float32Array
-    """Point met, rig frame, zeros where nothing is met."""
+    """Hit point, rig frame; zeros for rays without a hit."""
     normal: Float32Array
     """Unit interpolated shading normal."""
     face_normal: Float32Array
@@ -39,7 +39,7 @@ class GBuffer:
     def hit_samples(
         self,
     ) -> tuple[NDArray[np.int_], Float32Array, Float32Array, Float32Array, Float32Array]:
-        """Return index, uv, position, normal and way to the camera of samples that meet the mesh.
+        """Return index, uv, position, normal and direction to the camera of samples on the mesh.
 
         Shapes (n,), (n, 2), and (n, 3) thrice; the index is into the flat mask.
         """
@@ -78,7 +78,7 @@ def camera_rays(
         raise ValueError(f"subpixels: got {subpixels}, expected at least 1")
     k = subpixels
     right, up, back = (np.array(axis) for axis in view.axes)
-    # Pixel (0, 0)'s centre is (0, 0); the optical axis meets the middle of the sensor.
+    # The center of pixel (0, 0) is (0, 0); the optical axis passes the sensor's center.
     x = (np.arange(view.width_px * k) + 0.5) / k - 0.5 - 0.5 * (view.width_px - 1)
     first, last = (0, view.height_px) if rows is None else rows
     y = (np.arange(first * k, last * k) + 0.5) / k - 0.5 - 0.5 * (view.height_px - 1)
@@ -105,7 +105,7 @@ def g_buffer(
     rows: tuple[int, int] | None = None,
     distortion: ArrayLike | None = None,
 ) -> GBuffer:
-    """Look at a mesh through a camera.
+    """Trace a camera's rays on a mesh into a G-buffer.
 
     Parameters
     ----------
@@ -123,26 +123,26 @@ def g_buffer(
     Returns
     -------
     GBuffer
-        Point samples; nothing is averaged over a pixel.
+        Point samples, not averages over a pixel.
     """
     origins, directions = camera_rays(view, subpixels=subpixels, rows=rows, distortion=distortion)
     return trace(caster, origins, directions)
 
 
 def trace(caster: Caster, origins: Float32Array, directions: Float32Array) -> GBuffer:
-    """Look at a mesh along a grid of rays; see `g_buffer`, which makes them for a rig's camera.
+    """Trace a grid of rays on a mesh; see `g_buffer`, which generates them for a rig's camera.
 
     Parameters
     ----------
     caster
         The mesh.
     origins, directions
-        Start points in mm and unit vectors, shape (H, W, 3), neighbours beside each other.
+        Start points in mm and unit vectors, shape (H, W, 3), in image order.
 
     Returns
     -------
     GBuffer
-        What each ray meets first.
+        First hit of each ray.
     """
     shape = directions.shape[:2]
     prim, weight = caster.first_hit(origins.reshape(-1, 3), directions.reshape(-1, 3))
@@ -176,9 +176,9 @@ def _close_cracks(
     prim: Int32Array,
     weight: Float32Array,
 ) -> None:
-    """Trace rays again, a little aside, that slipped between triangles, in place.
+    """Retrace rays that slipped between triangles, slightly shifted, in place.
 
-    Ray tracers in single precision miss a shared edge now and then: one ray without a hit amid
+    Ray tracers in single precision occasionally miss a shared edge: one ray without a hit among
     eight that have one.
     """
     hit = np.pad(prim.reshape(directions.shape[:2]) >= 0, 1)
@@ -203,7 +203,7 @@ def visibility(
     radius_mm: float = 0.0,
     samples: int = 1,
 ) -> Float32Array:
-    """Return which part of a round light each surface point sees.
+    """Return the fraction of a round light that is visible from each surface point.
 
     Parameters
     ----------
@@ -212,20 +212,20 @@ def visibility(
     position_mm
         Surface points, shape (..., 3), rig frame.
     normal
-        Unit normals, shape (..., 3); rays start that side of the surface.
+        Unit normals, shape (..., 3); rays start on that side of the surface.
     light_mm
-        Centre of the light, shape (3,); its disc faces the rig's origin.
+        Center of the light, shape (3,); its disc faces the rig's origin.
     radius_mm
         Radius of the disc, 0 for a point.
     samples
-        Points on the disc; the same golden spiral for every surface point, turned by an angle
+        Points on the disc; the same golden spiral for every surface point, rotated by an angle
         that depends on the point's index only.
 
     Returns
     -------
     ndarray of float32
-        Shape (...), 0 to 1. Points whose normal looks away from the light's centre by more than
-        the disc can reach get 0 without a ray.
+        Shape (...), 0 to 1. Points whose normal is turned away from the light's center by more than
+        the disc's extent get 0 without a ray.
     """
     if samples < 1 or radius_mm < 0.0:
         raise ValueError(f"samples, radius_mm: got {samples}, {radius_mm}, expected >= 1, >= 0")
@@ -244,7 +244,8 @@ def visibility(
     other = np.cross(axis, side)
     start = points[index] + np.float32(RAY_OFFSET_MM) * normals[index]
     golden = np.pi * (3.0 - np.sqrt(5.0))
-    turn = (index * 0.754877666) % 1.0 * 2.0 * np.pi  # inverse of the plastic number: well spread
+    # Multiples of the inverse plastic number modulo 1 are a low-discrepancy sequence.
+    turn = (index * 0.754877666) % 1.0 * 2.0 * np.pi
     for k in range(samples):
         r = radius_mm * np.sqrt((k + 0.5) / samples) if samples > 1 else 0.0
         angle = turn + k * golden

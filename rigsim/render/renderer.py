@@ -1,4 +1,4 @@
-"""The only module that imports Mitsuba: its start, its threads, and memory that it may read."""
+"""Import Mitsuba, in this module only: startup, threads, and memory that it may read."""
 
 import os
 from functools import cache
@@ -11,7 +11,7 @@ from rigsim.render.variant import VariantChoice
 
 
 class RenderError(RuntimeError):
-    """Mitsuba gave an image that cannot be used, or cannot be started."""
+    """Mitsuba returned an unusable image, or cannot be started."""
 
 
 def load_mitsuba(choice: VariantChoice) -> Any:
@@ -33,7 +33,9 @@ def load_mitsuba(choice: VariantChoice) -> Any:
         try:
             mi.set_variant(choice.name)
         except ImportError as error:
-            raise RenderError(f"Mitsuba's variant {choice.name} is missing: {error}") from error
+            raise RenderError(
+                f"Mitsuba's variant {choice.name} is missing: {error}; reinstall mitsuba"
+            ) from error
     return mi
 
 
@@ -45,14 +47,14 @@ def _import_mitsuba(library: str) -> Any:
         import drjit as dr
         import mitsuba as mi
     except ImportError as error:
-        raise RenderError(f"Mitsuba cannot be imported: {error}") from error
+        raise RenderError(f"Mitsuba cannot be imported: {error}; reinstall mitsuba") from error
     dr.set_thread_count(thread_count())
     mi.set_log_level(mi.LogLevel.Error)
     return mi
 
 
 def thread_count() -> int:
-    """Return how many threads rendering may use: this process's cores, at most 16."""
+    """Return the number of threads for rendering: this process's cores, at most 16."""
     try:
         cores = len(os.sched_getaffinity(0))
     except AttributeError:  # not on every system
@@ -64,11 +66,11 @@ PADDING_VALUES: Final = 64
 
 
 def pad_memory(values: NDArray[np.generic]) -> NDArray[Any]:
-    """Return a copy of a row of numbers whose memory goes on beyond its end.
+    """Return a copy of a row of numbers with padding behind its end.
 
-    The renderer works on NumPy's memory itself, in whole vectors of up to 16 numbers, and Embree
-    reads 16 bytes at a mesh's last corner: at the end of a page of memory either would read what
-    is not the process's, and end it.
+    The renderer reads NumPy's memory directly, in whole vectors of up to 16 numbers, and Embree
+    reads 16 bytes at a mesh's last corner. At the end of a memory page either would read beyond the
+    process's memory and crash it.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What is rendered: radiance of described scenes, by the renderer's own materials and sampling."""
+"""Render the radiance of described scenes by the renderer's own materials and sampling."""
 
 import dataclasses
 import math
@@ -41,8 +41,8 @@ def radiance(
     Raises
     ------
     RenderError
-        A light's radiance is negative or not finite, which Mitsuba would render, or the image
-        holds values that are not finite.
+        A light's radiance is negative or not finite, which Mitsuba would accept, or the image
+        has values that are not finite.
     """
     _refuse_negative_light(description)
     mi = load_mitsuba(choose_variant(kind))
@@ -76,10 +76,10 @@ def _refuse_negative_light(description: Mapping[str, Any], where: str = "") -> N
 
 
 class MovableLightScene:
-    """A described scene whose one point light is moved from render to render.
+    """A described scene whose single point light is moved between renders.
 
-    Nothing is compiled or parsed anew when the light moves, so that the time of a call is the time
-    of rendering.
+    Moving the light neither compiles nor parses, so that the time of a call is the time of
+    rendering.
 
     Parameters
     ----------
@@ -96,12 +96,12 @@ class MovableLightScene:
         self._parameters = mi.traverse(self._scene)
 
     def radiance(self, light_mm: ArrayLike, *, samples: int, seed: int = 0) -> Float32Array:
-        """Render with the light at a place, shape (H, W, channels).
+        """Render with the light at a position, shape (H, W, channels).
 
         Parameters
         ----------
         light_mm
-            Where it stands, shape (3,).
+            Position of the light, shape (3,).
         samples, seed
             As for `radiance`.
         """
@@ -118,19 +118,19 @@ class MovableLightScene:
 
 
 def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> Float64Array:
-    """Return the transform that puts a sensor or a rectangle somewhere, facing somewhere.
+    """Return the transform that places a sensor or a rectangle and orients it toward a target.
 
     Parameters
     ----------
     origin, target
-        Where it stands and what it faces (with its local +z), shape (3,).
+        Its position and its target (in the direction of its local +z), shape (3,).
     up
         Direction of its local +y, as far as possible, shape (3,).
 
     Returns
     -------
     ndarray
-        Shape (4, 4), for ``to_world``; Mitsuba's local +x points to the left seen from behind.
+        Shape (4, 4), for ``to_world``; Mitsuba's local +x points to the left in a view from behind.
     """
     place = np.asarray(origin, np.float64)
     forward = np.asarray(target, np.float64) - place
@@ -156,7 +156,7 @@ def perspective(
     up
         Direction of its local +y, shape (3,); None takes the view's.
     sampler
-        Mitsuba's; empty takes its default.
+        Mitsuba's sampler; empty takes its default.
     """
     description = {
         "type": "perspective",
@@ -177,7 +177,7 @@ def perspective(
 
 
 def point_light_rig(rig: Rig) -> Rig:
-    """Return a rig whose lights are points that shine evenly, as Mitsuba's point light does."""
+    """Return a rig with uniform point lights, as Mitsuba's point light is."""
     lights = tuple(
         dataclasses.replace(light, half_intensity_deg=None, radius_mm=1e-3) for light in rig.lights
     )
@@ -185,7 +185,7 @@ def point_light_rig(rig: Rig) -> Rig:
 
 
 def rough_metal(distribution: str, eta: float, alpha: Any) -> dict[str, Any]:
-    """Return the description of facets: without absorption, a metal reflects as a dielectric."""
+    """Return the description of facets: a metal without absorption reflects as a dielectric."""
     return {
         "type": "roughconductor",
         "distribution": distribution,
@@ -196,7 +196,7 @@ def rough_metal(distribution: str, eta: float, alpha: Any) -> dict[str, Any]:
 
 
 def matte_plastic(eta: float, reflectance: Any) -> dict[str, Any]:
-    """Return the description of an interior behind a smooth boundary that does not shine."""
+    """Return the description of an interior behind a smooth boundary without a highlight."""
     return {
         "type": "plastic",
         "int_ior": eta,
@@ -207,7 +207,7 @@ def matte_plastic(eta: float, reflectance: Any) -> dict[str, Any]:
 
 
 def plastic_scale(eta: float) -> float:
-    """Return eta^2 (1 - F_inner) with the polynomial that Mitsuba takes for the latter.
+    """Return eta^2 (1 - F_inner) with Mitsuba's polynomial for F_inner.
 
     References
     ----------

@@ -1,9 +1,9 @@
-"""Which Mitsuba variant can run here, found out before it could crash this process.
+"""Choose the Mitsuba variant for this machine, without risk of a crash of this process.
 
 Dr.Jit compiles its kernels with the LLVM library it finds. Libraries before version 17 abort
-the process when a kernel is compiled (15, 16) or are refused (14), so a library is first judged
-by the version in its file name, then by rendering eight by eight pixels in another process. The
-verdict is kept in the user's cache folder by the library's real path and its time of change.
+the process when a kernel is compiled (15, 16) or are refused (14). A library is therefore checked
+first by the version in its file name, then by rendering eight by eight pixels in another process.
+The verdict is cached in the user's cache folder by the library's real path and modification time.
 """
 
 import contextlib
@@ -25,10 +25,10 @@ logger = logging.getLogger(__name__)
 Kind = Literal["rgb", "mono", "mono_polarized", "spectral", "spectral_polarized"]
 
 MIN_LLVM_VERSION: Final = 17
-"""Oldest major version of LLVM that has the intrinsics Dr.Jit's kernels need."""
+"""Oldest major version of LLVM with the intrinsics of Dr.Jit's kernels."""
 
 PROBE_TIMEOUT_S: Final = 120.0
-"""A probe that takes longer counts as failed; it takes one second on an idle machine."""
+"""Time after which a probe counts as failed; it takes one second on an idle machine."""
 
 # The scalar variants that are built into Mitsuba's wheels; a mono kind has no scalar twin.
 _SCALAR_VARIANTS: Final[Mapping[Kind, str]] = {
@@ -51,7 +51,7 @@ _LLVM_FOLDERS: Final = (
     f"{sys.prefix}/lib",
 )
 
-_NOT_RUN: Final = "the probe did not run to its end"
+_NOT_RUN: Final = "the probe did not finish"
 
 _PROBE_SCRIPT: Final = """
 import drjit as dr, drjit.llvm
@@ -74,24 +74,24 @@ print("LLVM " + ".".join(map(str, version)))
 
 @dataclass(frozen=True, slots=True)
 class LibraryCheck:
-    """What was found out about one LLVM library."""
+    """Result of the check of one LLVM library."""
 
     path: str
     """Path of the library file, links resolved."""
     usable: bool
     """Whether kernels can be compiled with it."""
     why: str
-    """Version when usable, else the reason in words."""
+    """Version when usable, otherwise the reason in words."""
 
 
 @dataclass(frozen=True, slots=True)
 class VariantChoice:
-    """The Mitsuba variant that will be used, and why."""
+    """The selected Mitsuba variant, with the reason."""
 
     name: str
-    """Mitsuba's name of the variant, as in ``llvm_ad_rgb``."""
+    """Mitsuba's name of the variant, such as ``llvm_ad_rgb``."""
     why: str
-    """The reason in words, for people."""
+    """Reason in words, for users."""
     library: str
     """Path of the LLVM library; empty for scalar variants."""
 
@@ -102,17 +102,17 @@ class VariantChoice:
 
 
 def find_llvm_libraries(environment: Mapping[str, str] | None = None) -> tuple[Path, ...]:
-    """Return the LLVM libraries of this machine, the newest version first.
+    """Return the LLVM libraries of this machine, newest version first.
 
     Parameters
     ----------
     environment
-        Environment variables; ``DRJIT_LIBLLVM_PATH`` there names a file that is put first.
+        Environment variables; the file in its ``DRJIT_LIBLLVM_PATH`` comes first.
 
     Returns
     -------
     tuple of Path
-        Real paths without duplicates. Libraries whose name tells no version come last.
+        Real paths without duplicates. Libraries without a version in their name come last.
     """
     environment = os.environ if environment is None else environment
     found: dict[Path, None] = {}
@@ -131,7 +131,7 @@ def find_llvm_libraries(environment: Mapping[str, str] | None = None) -> tuple[P
 
 
 def major_version(path: Path) -> int:
-    """Return the major version that an LLVM library's file name tells, 0 when it tells none.
+    """Return the major version in an LLVM library's file name, 0 without one.
 
     Examples
     --------
@@ -145,18 +145,18 @@ def major_version(path: Path) -> int:
 
 
 def check_library(path: Path, *, cache: Path | None = None) -> LibraryCheck:
-    """Find out, without risk to this process, whether an LLVM library can be used.
+    """Check, without risk to this process, whether an LLVM library is usable.
 
     Parameters
     ----------
     path
         The library file.
     cache
-        Folder that keeps verdicts; ``None`` stands for the user's cache folder.
+        Folder of cached verdicts; ``None``: the user's cache folder.
 
     Returns
     -------
-    LibraryVerdict
+    LibraryCheck
         Usable or not, with the reason.
     """
     path = path.resolve()
@@ -164,7 +164,7 @@ def check_library(path: Path, *, cache: Path | None = None) -> LibraryCheck:
     if 0 < version < MIN_LLVM_VERSION:
         return LibraryCheck(str(path), False, f"LLVM {version} is older than {MIN_LLVM_VERSION}")
     if not path.is_file():
-        return LibraryCheck(str(path), False, "there is no such file")
+        return LibraryCheck(str(path), False, "file not found")
     folder = user_cache_dir() if cache is None else cache
     key = f"{path}|{path.stat().st_mtime_ns}|{sys.executable}"
     known = _read_cache(folder)
@@ -172,7 +172,7 @@ def check_library(path: Path, *, cache: Path | None = None) -> LibraryCheck:
         usable, why = known[key]
         return LibraryCheck(str(path), usable, why)
     verdict = probe_library(path)
-    if _NOT_RUN not in verdict.why:  # a busy machine is no verdict on the library
+    if _NOT_RUN not in verdict.why:  # a busy machine is not evidence against the library
         known[key] = (verdict.usable, verdict.why)
         _write_cache(folder, known)
     return verdict
@@ -190,7 +190,7 @@ def probe_library(path: Path, *, timeout_s: float = PROBE_TIMEOUT_S) -> LibraryC
 
     Returns
     -------
-    LibraryVerdict
+    LibraryCheck
         Usable when the other process ended well; a crash there is a verdict here.
     """
     environment = dict(os.environ, DRJIT_LIBLLVM_PATH=str(path))
@@ -207,10 +207,10 @@ def probe_library(path: Path, *, timeout_s: float = PROBE_TIMEOUT_S) -> LibraryC
         return LibraryCheck(str(path), False, f"{_NOT_RUN}: {error}")
     if done.returncode == 0 and done.stdout.strip():
         return LibraryCheck(str(path), True, done.stdout.strip().splitlines()[-1])
-    said = (done.stderr.strip().splitlines() or ["no message"])[-1]
+    message = (done.stderr.strip().splitlines() or ["no message"])[-1]
     if done.returncode < 0:
-        said = f"it ended the probe by signal {-done.returncode}"
-    return LibraryCheck(str(path), False, said)
+        message = f"it ended the probe by signal {-done.returncode}"
+    return LibraryCheck(str(path), False, message)
 
 
 def choose_variant(
@@ -225,14 +225,14 @@ def choose_variant(
     Parameters
     ----------
     kind
-        What the variant must compute: ``rgb``, ``mono``, ``mono_polarized``, ``spectral`` or
+        Required kind of variant: ``rgb``, ``mono``, ``mono_polarized``, ``spectral`` or
         ``spectral_polarized``.
     environment
-        Environment variables; ``SKINRIG_MITSUBA=scalar`` asks for a scalar variant.
+        Environment variables; ``SKINRIG_MITSUBA=scalar`` requests a scalar variant.
     libraries
-        LLVM libraries to consider, in this order; ``None`` looks for them.
+        LLVM libraries to consider, in this order; ``None`` searches for them.
     cache
-        Folder that keeps verdicts; ``None`` stands for the user's cache folder.
+        Folder of cached verdicts; ``None``: the user's cache folder.
 
     Returns
     -------
@@ -242,7 +242,7 @@ def choose_variant(
     Raises
     ------
     ValueError
-        The kind is unknown, or the environment asks for something else than ``scalar``.
+        The kind is unknown, or the environment requests something else than ``scalar``.
 
     Examples
     --------
@@ -254,7 +254,7 @@ def choose_variant(
     environment = os.environ if environment is None else environment
     asked = environment.get("SKINRIG_MITSUBA", "")
     if asked == "scalar":
-        return VariantChoice(_SCALAR_VARIANTS[kind], "SKINRIG_MITSUBA=scalar asks for it", "")
+        return VariantChoice(_SCALAR_VARIANTS[kind], "requested by SKINRIG_MITSUBA=scalar", "")
     if asked not in ("", "llvm"):
         raise ValueError(f"SKINRIG_MITSUBA: got {asked!r}, expected scalar, llvm or nothing")
     refused = []
@@ -269,7 +269,7 @@ def choose_variant(
 
 
 def user_cache_dir() -> Path:
-    """Return the folder in which verdicts are kept, by the XDG convention."""
+    """Return the folder of cached verdicts, by the XDG convention."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     return (Path(base) if base else Path.home() / ".cache") / "skinrig"
 
@@ -279,11 +279,11 @@ def _read_cache(folder: Path) -> dict[str, tuple[bool, str]]:
         document = json.loads((folder / "llvm.json").read_text(encoding="utf-8"))
         return {str(key): (bool(usable), str(why)) for key, (usable, why) in document.items()}
     except (OSError, ValueError, TypeError, AttributeError):
-        return {}  # absent or damaged: the probe is simply run again
+        return {}  # absent or damaged: the probe runs again
 
 
 def _write_cache(folder: Path, known: Mapping[str, tuple[bool, str]]) -> None:
-    # A folder that cannot be written costs a probe each time, not the run.
+    # A read-only folder costs a probe each time, but does not fail the run.
     with contextlib.suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=folder, suffix=".json")

@@ -1,1 +1,1 @@
-"""Rig, plan and subject to a scene that holds only what it needs."""
+"""Scenes of the rigs: rig, plan and subject to images with the required effects only."""

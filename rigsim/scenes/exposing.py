@@ -1,4 +1,4 @@
-"""What scenes share: views, sensors, the light of their exposures, and what is kept of it."""
+"""Base classes of scenes: views, sensors, exposures, and caches of their light."""
 
 from collections.abc import Callable, Sequence
 from typing import TypeVar
@@ -19,18 +19,18 @@ PopT = TypeVar("PopT")
 
 
 class SceneError(ValueError):
-    """A scene is asked for something that it does not hold."""
+    """A request that a scene cannot fulfill."""
 
 
 def full_power_duration_s(light: SwitchedLight, name: str) -> float:
-    """Return for how long full power would give the light of a stretch, s.
+    """Return the time for which full power would emit the light of an interval, s.
 
     Parameters
     ----------
     light
-        The stretch.
+        Interval of light.
     name
-        What shone, for the error.
+        Name of the light, for the error.
 
     Returns
     -------
@@ -59,19 +59,19 @@ def full_power_duration_s(light: SwitchedLight, name: str) -> float:
 
 
 class RigScene:
-    """What scenes of every rig have."""
+    """Base class of the scenes of all rigs."""
 
     rig: Rig
     seed: int
-    """Seeds what differs from exposure to exposure."""
+    """Seeds the variation between exposures."""
     channels: tuple[int, ...] = (3,)
     """Shape of the light on a pixel: camera RGB, or () for the one band of a camera."""
     needs: EffectSelection
-    """What is built, what is not, and why."""
+    """Effects with their verdicts and reasons."""
 
     @property
     def omitted(self) -> list[tuple[str, str]]:
-        """What the scene does not build, with the reason."""
+        """Effects that the scene omits, with the reasons."""
         return self.needs.omitted
 
     def _camera(self, name: str | None) -> View:
@@ -98,7 +98,7 @@ class RigScene:
         exposure_s: float,
         seed: int,
     ) -> UInt16Array:
-        """Return the DN, (H, W), of a camera on which lights shone, each a little off its energy.
+        """Return the DN, (H, W), of a camera under several lights, each with an energy deviation.
 
         Parameters
         ----------
@@ -107,7 +107,7 @@ class RigScene:
         energy_of
             Energy of a light relative to that of its image.
         image_of
-            What a light sends to the camera, shape (H, W, *channels).
+            Light from one source on the camera, shape (H, W, *channels).
         deviation
             Relative standard deviation of the energy.
         exposure_s, seed
@@ -123,7 +123,7 @@ class RigScene:
 
 
 class FaceScene(RigScene):
-    """A face or a target, lit by lights of one spectrum, before cameras."""
+    """A face or a target under lights of one spectrum, in front of cameras."""
 
     def __init__(
         self,
@@ -156,7 +156,7 @@ class FaceScene(RigScene):
         return self._sensors[self._camera(view_name).name]
 
     def _face(self, quantity: str = "truth") -> SimulatedSubject:
-        """Return the face, or say what of a target was asked for."""
+        """Return the face; raise `SceneError` with the requested quantity for a target."""
         if not isinstance(self.subject, SimulatedSubject):
             raise SceneError(f"{quantity}: got the target {self.subject.name!r}, expected a face")
         return self.subject
@@ -169,13 +169,13 @@ class FaceScene(RigScene):
         noise: PixelNoise,
         effects: SceneEffects,
     ) -> ViewingConditions:
-        """Return what a camera looks at and with."""
+        """Return the viewing conditions of a camera."""
         return ViewingConditions(
             view, self._illuminant, caster, exchange_fraction, noise, effects, self.subpixels
         )
 
     def _last_bounce(self, effects: SceneEffects) -> float:
-        """Return the share of the first bounce below which further ones are left out."""
+        """Return the fraction of the first bounce below which further bounces are omitted."""
         if effects.last_bounce is not None:
             return effects.last_bounce
         return choose_min_bounce_fraction(self.needs[INTERREFLECTION_EFFECT].over_noise or 0.0)

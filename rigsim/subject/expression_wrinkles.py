@@ -1,19 +1,19 @@
-"""Wrinkles that rise where an expression shortens the skin, by buckling along fixed lines.
+"""Form wrinkles where an expression shortens the skin, by buckling along fixed lines.
 
-Skin is a stiff layer on a soft one and rests under tension. Shortening first spends the tension;
-from then on the layer buckles across the shortening, and the length that finds no more room in the
-surface goes into the wrinkle: what is measured along a wrinkled line stays the skin's slack length.
-Where wrinkles can rise is drawn once for a person, so every expression that shortens a zone raises
-the same lines.
+Skin is a stiff layer on a soft one and rests under tension. Shortening first relaxes the tension;
+beyond that the layer buckles across the shortening, and the excess length goes into the wrinkle:
+the length along a wrinkled line stays the skin's slack length. The positions of possible wrinkles
+are drawn once per person, so every expression that shortens a zone raises the same lines.
 
-Zones of a face in which the skin wrinkles along one family of lines, with their wavelengths.
+Zones are areas of a face in which the skin wrinkles along one family of lines, with their
+wavelengths.
 
 Notes
 -----
 The wavelength of the buckles is 2 pi h (E / 3 E_s)^(1/3) for a layer of thickness h and modulus E
 on a base of modulus E_s (Genzer and Groenewold 2006, doi:10.1039/b516741h). `MODULUS_RATIO` and the
-zones' thicknesses are chosen to give the distances between furrows that faces show, 2.5 mm beside
-the eyes to 8 mm on the forehead; the furrows are narrower than the ridges between them.
+zones' thicknesses are chosen to give the distances between grooves that faces show, 2.5 mm next to
+the eyes to 8 mm on the forehead; the grooves are narrower than the ridges between them.
 """
 
 import dataclasses
@@ -31,52 +31,52 @@ from rigsim.geometry.surface_noise import smooth_noise
 from rigsim.subject.face_regions import soft_step
 
 TENSION_RANGE: Final = (0.05, 0.10)
-"""Part of its length by which a person's skin at rest is stretched."""
+"""Relative stretch of a person's skin at rest."""
 
 GROOVE_NARROWING: Final = 1.2
-"""How much narrower furrows are than ridges; 0 is a cosine."""
+"""Narrowing of grooves relative to ridges; 0 is a cosine."""
 
 MIN_TEXELS_PER_WAVE: Final = 3.0
-"""Texels that a wave needs; finer wrinkles are left out."""
+"""Texels per wave; finer wrinkles are omitted."""
 
 SEAM_STEPS: Final = 6.0
-"""Texels that lie farther from each other than so many usual ones have a seam between them."""
+"""Neighboring texels farther apart than this number of usual distances are across a seam."""
 
 _PHASE_STEPS: Final = 2048
 
 
 MODULUS_RATIO: Final = 100.0
-"""Stiffness of the layer that buckles over that of what lies below it."""
+"""Stiffness of the buckling layer over that of the base below."""
 
 
 @dataclass(frozen=True, slots=True)
 class WrinkleZone:
-    """A part of the face whose wrinkles run along one family of lines."""
+    """An area of the face whose wrinkles follow one family of lines."""
 
     name: str
     thickness_mm: float
-    """Thickness of the layer that buckles."""
+    """Thickness of the buckling layer."""
     across_mm: Callable[[Float64Array], Float64Array]
     """Distance across the lines, of points on the mean head with x >= 0, mm."""
     wrinkling_fraction: Callable[[Float64Array], Float64Array]
-    """Part of the shortening beyond the tension that goes into wrinkles, 0 to 1."""
+    """Fraction of the shortening beyond the tension that goes into wrinkles, 0 to 1."""
     mirrored: bool = True
-    """Whether both halves of the face have lines of their own kind; else lines cross the middle."""
+    """Whether both halves of the face have their own lines; otherwise lines cross the midline."""
     tension: float = 1.0
-    """Part of the person's tension that must be spent here; folds that are tethered need little."""
+    """Fraction of the person's tension to be relaxed first; tethered folds need little."""
     single: bool = False
-    """Whether there is one furrow, where ``across_mm`` is 0, instead of a family."""
+    """Whether there is one groove, where ``across_mm`` is 0, instead of a family."""
 
     @property
     def wavelength_mm(self) -> float:
-        """Distance from furrow to furrow at rest, mm."""
+        """Distance between grooves at rest, mm."""
         return 2.0 * math.pi * self.thickness_mm * (MODULUS_RATIO / 3.0) ** (1.0 / 3.0)
 
 
 def _plateau(
     center: tuple[float, ...], reach: tuple[float, ...], height: float = 1.0
 ) -> Callable[[Float64Array], Float64Array]:
-    """Return what is ``height`` well inside a ball of unequal radii, and 0 well outside."""
+    """Return a function that is ``height`` well inside an ellipsoid, and 0 well outside."""
 
     def share(points: Float64Array) -> Float64Array:
         q = (points - np.array(center)) / np.array(reach)
@@ -104,7 +104,7 @@ _FOLD_WAY = (_FOLD_ENDS_MM[1] - _FOLD_ENDS_MM[0]) / np.linalg.norm(
 
 def _off_fold(p: Float64Array) -> Float64Array:
     along = (p[..., :2] - _FOLD_ENDS_MM[0]) @ _FOLD_WAY
-    # a slight bow towards the cheek
+    # a slight bow toward the cheek
     side = (p[..., :2] - _FOLD_ENDS_MM[0]) @ np.array([-_FOLD_WAY[1], _FOLD_WAY[0]])
     return np.asarray(side - 2.5 * np.sin(np.pi * np.clip(along / 34.0, 0.0, 1.0)))
 
@@ -116,7 +116,7 @@ def _near_fold(p: Float64Array) -> Float64Array:
 
 
 def _fan(p: Float64Array) -> Float64Array:
-    """Return the distance along circles about the corner of the eye, counted at 12 mm from it."""
+    """Return the arc length on circles about the corner of the eye, measured at 12 mm from it."""
     return np.asarray(12.0 * np.arctan2(p[..., 1] - 24.0, np.maximum(p[..., 0] - 42.0, 1.0)))
 
 
@@ -171,47 +171,47 @@ WRINKLE_ZONES: Final = (
         mirrored=False,
     ),
 )
-"""The zones of a face; where they overlap they share the shortening."""
+"""The zones of a face; overlapping zones share the shortening."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ZoneLines:
-    """Where a person's skin can buckle in one zone, at n texels of the face's texture."""
+    """Lines of possible buckling of a person's skin in one zone, at n texels of the texture."""
 
     zone: WrinkleZone
     texel: NDArray[np.intp]
     """Flat indices of the texels, shape (n,)."""
     phase_rad: Float64Array
-    """2 pi times the number of waves across the lines, shape (n,); 0 in a furrow."""
+    """2 pi times the number of waves across the lines, shape (n,); 0 in a groove."""
     slope: Float64Array
-    """Its change along u and v, rad per unit of u and v, shape (n, 2)."""
+    """Gradient of the phase, rad per unit of u and v, shape (n, 2)."""
     wrinkling_fraction: Float64Array
-    """Part of the excess length that goes into the zone's wrinkles, shape (n,)."""
+    """Fraction of the excess length that goes into the zone's wrinkles, shape (n,)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class WrinkleLines:
-    """Where a person's skin can buckle."""
+    """Lines of possible buckling of a person's skin."""
 
     zones: tuple[ZoneLines, ...]
     tension: float
-    """Part of its length by which the skin at rest is stretched."""
+    """Relative stretch of the skin at rest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Wrinkles:
-    """What an expression raises; maps of shape (N, N), row 0 is the top."""
+    """Wrinkles of an expression; maps of shape (N, N), row 0 is the top."""
 
     height_um: Float32Array
     """Height added to the relief, um; zero on average over a wave."""
     excess: Float32Array
-    """Length that the wrinkles take in, relative to the surface they lie on; 0 where smooth."""
+    """Excess length in the wrinkles, relative to the surface below; 0 where smooth."""
     omitted: tuple[str, ...]
     """Zones whose waves are too short for the texture."""
 
 
 def draw_wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int) -> WrinkleLines:
-    """Draw where a person's skin can buckle.
+    """Draw the lines along which a person's skin can buckle.
 
     Parameters
     ----------
@@ -246,11 +246,11 @@ def draw_wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int
         share = zone.wrinkling_fraction(folded)
         near = np.flatnonzero(share > 0.01)
         share = share[near]
-        # the texel, its neighbours at larger and smaller u, at larger and smaller v
+        # the texel, its neighbors at larger and smaller u, at larger and smaller v
         around = texel[near] + np.array([0, 1, -1, -size, size])[:, None]
         points = flat[around].astype(np.float64)
         away = np.linalg.norm(points[1:] - points[0], axis=-1)
-        # beyond a seam of the texture there is nothing, or skin from elsewhere
+        # texels beyond a seam have no skin, or skin from elsewhere
         known = covered.reshape(-1)[around[1:]] & (away < SEAM_STEPS * step_mm)
         steps = np.maximum(known[0::2].astype(np.float64) + known[1::2], 1.0)
         points[1:] = np.where(known[..., None], points[1:], points[0])
@@ -261,11 +261,11 @@ def draw_wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int
         across = zone.across_mm(points) / wave + 0.07 * wobble
         phase = 2.0 * math.pi * across
         if zone.single:
-            # one wave with its furrow on the line; beside it the skin is smooth
+            # one wave with its groove on the line; outside the skin is smooth
             lone = np.abs(across[0]) < 0.5
             share = share * np.where(lone, np.cos(math.pi * across[0]) ** 2, 0.0)
         elif zone.name == "glabella":
-            phase -= 2.0 * math.pi * 0.55  # furrows on both sides of the middle, a little off it
+            phase -= 2.0 * math.pi * 0.55  # grooves on both sides of the midline, slightly off it
         else:
             phase += offset[right] if zone.mirrored else offset[0]
         slope = size * np.stack(
@@ -273,7 +273,7 @@ def draw_wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int
         )
         share = share * (lifts[right] if zone.mirrored else lifts[0])
         drawn.append(ZoneLines(zone, texel[near], phase[0], slope, share))
-    # zones that overlap divide the shortening among them
+    # overlapping zones share the shortening
     together = np.zeros(size * size)
     for lines in drawn:
         together[lines.texel] += lines.wrinkling_fraction
@@ -288,20 +288,19 @@ def draw_wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int
 
 
 def form_wrinkles(lines: WrinkleLines, rest: Atlas, posed: Atlas) -> Wrinkles:
-    """Raise the wrinkles of a face whose surface has moved.
+    """Form the wrinkles of a face whose surface has moved.
 
     Parameters
     ----------
     lines
-        Where the skin can buckle.
+        Lines of possible buckling.
     rest, posed
         The surface before and after, on the same texture.
 
     Returns
     -------
     Wrinkles
-        Smooth where the lines of a zone have not come nearer to each other by more than the
-        tension.
+        Smooth where the lines of a zone have not approached each other by more than the tension.
     """
     size = rest.size
     height = np.zeros(size * size)
@@ -316,6 +315,8 @@ def form_wrinkles(lines: WrinkleLines, rest: Atlas, posed: Atlas) -> Wrinkles:
         before = _density(_metric(rest, one.texel), one.slope)
         after = _density(_metric(posed, one.texel), one.slope)
         steady = (before > 1e-6) & (after > 1e-6)
+        # A length L at rest spans stretch L after the movement; its slack length is (1 - tension)
+        # L. What exceeds the span goes into the wrinkle.
         stretch = np.where(steady, before / np.maximum(after, 1e-9), 1.0)
         slack = (1.0 - one.zone.tension * lines.tension) / np.maximum(stretch, 1e-3) - 1.0
         excess = one.wrinkling_fraction * np.maximum(slack, 0.0)
@@ -334,7 +335,7 @@ def form_wrinkles(lines: WrinkleLines, rest: Atlas, posed: Atlas) -> Wrinkles:
 
 
 def wave_depth(excess: ArrayLike) -> Float64Array:
-    """Return how deep a wave is that takes in an excess of length.
+    """Return the depth of a wave from its excess length.
 
     Parameters
     ----------
@@ -344,7 +345,7 @@ def wave_depth(excess: ArrayLike) -> Float64Array:
     Returns
     -------
     ndarray
-        From furrow to ridge, over the wavelength.
+        From groove to ridge, over the wavelength.
 
     Examples
     --------
@@ -355,7 +356,7 @@ def wave_depth(excess: ArrayLike) -> Float64Array:
 
 
 def _profile(phase: Float64Array) -> Float64Array:
-    """Return the height of a wave of depth 1, with zero mean and its furrow at phase 0."""
+    """Return the height of a wave of depth 1, with zero mean and its groove at phase 0."""
     low, high = math.exp(-2.0 * GROOVE_NARROWING), 1.0
     return np.asarray(
         (_BELL_MEAN - np.exp(GROOVE_NARROWING * (np.cos(phase) - 1.0))) / (high - low)
@@ -363,7 +364,7 @@ def _profile(phase: Float64Array) -> Float64Array:
 
 
 def _waves() -> tuple[float, Float64Array, Float64Array]:
-    """Return the mean of the furrow's bell, and excess of length against depth."""
+    """Return the mean of the groove's bell, and the table of excess length against depth."""
     phase = 2.0 * math.pi * (np.arange(_PHASE_STEPS) + 0.5) / _PHASE_STEPS
     bell = np.exp(GROOVE_NARROWING * (np.cos(phase) - 1.0))
     slope = (
@@ -375,6 +376,7 @@ def _waves() -> tuple[float, Float64Array, Float64Array]:
         / (1.0 - math.exp(-2.0 * GROOVE_NARROWING))
     )
     depth = np.concatenate([[0.0], np.geomspace(1e-4, 3.0, 400)])
+    # Arc length of one period of unit wavelength: the mean of sqrt(1 + (depth h')^2).
     length = np.sqrt(1.0 + (depth[:, None] * slope) ** 2).mean(axis=1)
     return float(bell.mean()), length - 1.0, depth
 
@@ -394,6 +396,7 @@ def _metric(atlas: Atlas, texel: NDArray[np.intp]) -> Float64Array:
 
 def _density(inverse: Float64Array, slope: Float64Array) -> Float64Array:
     """Return the length of a phase's gradient on the surface, rad/mm."""
+    # |grad phase|^2 = g^ij d_i d_j with the inverse of the first fundamental form.
     u, v = slope[:, 0], slope[:, 1]
     squared = inverse[:, 0] * u * u + 2.0 * inverse[:, 1] * u * v + inverse[:, 2] * v * v
     return np.sqrt(np.maximum(squared, 0.0))

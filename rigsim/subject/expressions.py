@@ -1,14 +1,13 @@
-"""How a face moves in an expression: action units that pull the skin, and states made of them.
+"""Move a face in an expression: action units that pull the skin, and the states they form.
 
-Each action is a smooth field on the mean head, so any mesh that
-`rigsim.subject.face_regions.to_mean_head` places can wear it; a mesh that brings blend shapes of
-the common names moves by its own. Eyes and mouth stay closed: a jaw that drops stretches the lips
-in place of parting them.
+Each action is a smooth field on the mean head, so that it applies to every mesh that
+`rigsim.subject.face_regions.to_mean_head` maps. A mesh with blend shapes of the common names moves
+by its own. Eyes and mouth stay closed: a dropping jaw stretches the lips instead of parting them.
 
 References
 ----------
-Actions and what emotions are made of: Ekman, Friesen and Hager 2002, "Facial action coding system:
-the manual"; Ekman and Friesen 1983, "EMFACS-7". How far skin goes is chosen here: the corners of
+Actions and the components of emotions: Ekman, Friesen and Hager 2002, "Facial action coding system:
+the manual"; Ekman and Friesen 1983, "EMFACS-7". The displacements are chosen here: the corners of
 the mouth by 6 to 10 mm in a smile.
 """
 
@@ -27,25 +26,25 @@ from rigsim.subject.perfusion import STATE_NAMES
 Vector = tuple[float, float, float]
 
 AMOUNT_RANGE: Final = (0.0, 1.5)
-"""How far an expression may go: 0 is rest, 1 the full expression, 1.5 an extreme one."""
+"""Range of an expression's strength: 0 is rest, 1 the full expression, 1.5 an extreme one."""
 
 
 class ExpressionError(ValueError):
-    """An expression is asked for that a face cannot make."""
+    """An expression that a face cannot form."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Pull:
-    """A pull on the skin, strongest at a centre and falling as a Gaussian."""
+    """A pull on the skin, strongest at a center and falling as a Gaussian."""
 
     center: Vector
-    """Where, mm on the mean head, on the image's right."""
+    """Position, mm on the mean head, on the image's right."""
     reach: Vector
-    """Where the pull has fallen to 1 / e, mm along x, y, z."""
+    """Distance at which the pull has fallen to 1 / e, mm along x, y, z."""
     way: Vector
-    """How far the centre moves at strength 1, mm."""
+    """Displacement of the center at strength 1, mm."""
     pair: bool = True
-    """Whether the same happens mirrored on the image's left."""
+    """Whether the same pull acts mirrored on the image's left."""
 
 
 _ACTION_PULLS: Final[Mapping[str, tuple[_Pull, ...]]] = {
@@ -55,7 +54,7 @@ _ACTION_PULLS: Final[Mapping[str, tuple[_Pull, ...]]] = {
 
 _JAW_ACTION: Final = "jaw drop"
 _JAW_TURN_RAD: Final = 0.075
-"""Turn of the lower jaw about its joints at strength 1: 7 mm at the chin."""
+"""Rotation of the lower jaw about its joints at strength 1: 7 mm at the chin."""
 _JAW_JOINT_MM: Final = (0.0, 10.0, -90.0)
 
 ACTION_NAMES: Final = (*_ACTION_PULLS, _JAW_ACTION)
@@ -64,7 +63,7 @@ ACTION_NAMES: Final = (*_ACTION_PULLS, _JAW_ACTION)
 EXPRESSION_STRENGTHS: Final[Mapping[str, Mapping[str, float]]] = package_table("face")[
     "expression_strengths"
 ]
-"""Strength of each action in each expression; states that are none do not move the face."""
+"""Strength of each action in each expression; other states do not move the face."""
 
 _OWN_SHAPES: Final[Mapping[str, Mapping[str, float]]] = package_table("face")["own_shapes"]
 
@@ -75,7 +74,7 @@ MAX_ASYMMETRY: Final = 0.06
 
 
 def is_moving_state(state: str) -> bool:
-    """Tell whether a state moves the face.
+    """Return whether a state moves the face.
 
     Raises
     ------
@@ -93,19 +92,19 @@ def is_moving_state(state: str) -> bool:
 
 
 def displacement_mm(mesh: Mesh, state: str, *, amount: float = 1.0, seed: int = 0) -> Float32Array:
-    """Return how the vertices of a face move.
+    """Return the displacement of a face's vertices in a state.
 
     Parameters
     ----------
     mesh
-        The face at rest, mm, rig frame; its own blend shapes are taken for the actions that they
+        The face at rest, mm, rig frame; its own blend shapes are used for the actions that they
         name, see `Mesh.shapes`.
     state
         One of `rigsim.subject.perfusion.STATE_NAMES`.
     amount
         0 (rest) to 1.5 (an extreme).
     seed
-        Seed of the person, >= 0, who has an own strength and asymmetry in each action.
+        Seed of the person, >= 0, which sets the strength and asymmetry of each action.
 
     Returns
     -------
@@ -124,7 +123,7 @@ def displacement_mm(mesh: Mesh, state: str, *, amount: float = 1.0, seed: int = 
         return total.astype(np.float32)
     points = to_mean_head(mesh.vertices_mm, mesh).astype(np.float64)
     scale = mean_head_scale(mesh)
-    sides = _sides(seed)
+    sides = _side_strengths(seed)
     for action, strength in EXPRESSION_STRENGTHS[state].items():
         left, right = (amount * strength * side for side in sides[action])
         own = _own_shapes(mesh.shapes, action, left, right)
@@ -136,24 +135,24 @@ def displacement_mm(mesh: Mesh, state: str, *, amount: float = 1.0, seed: int = 
 
 
 def blend_shapes(mesh: Mesh, *, seed: int = 0) -> dict[str, Float32Array]:
-    """Return the movement of every state that moves the face, {state: (V, 3) in mm}."""
+    """Return the displacement of every moving state, {state: (V, 3) in mm}."""
     return {state: displacement_mm(mesh, state, seed=seed) for state in EXPRESSION_STRENGTHS}
 
 
 def displace_mesh(mesh: Mesh, deltas_mm: Float32Array) -> Mesh:
-    """Return a mesh whose vertices have moved; triangles and texture coordinates stay.
+    """Return a mesh with displaced vertices; triangles and texture coordinates stay.
 
     Parameters
     ----------
     mesh
         The face at rest.
     deltas_mm
-        Movement, shape (V, 3), mm.
+        Displacement, shape (V, 3), mm.
 
     Returns
     -------
     Mesh
-        Its shading normals are turned as its surface is.
+        Its shading normals rotate with its surface.
     """
     vertices = mesh.vertices_mm + deltas_mm
     turned = vertex_normals(vertices, mesh.faces) - vertex_normals(mesh.vertices_mm, mesh.faces)
@@ -162,7 +161,7 @@ def displace_mesh(mesh: Mesh, deltas_mm: Float32Array) -> Mesh:
     return build_mesh(vertices, mesh.faces, mesh.uv, normals)
 
 
-def _sides(seed: int) -> dict[str, tuple[float, float]]:
+def _side_strengths(seed: int) -> dict[str, tuple[float, float]]:
     """Return a person's strength in each action, on the image's left and right."""
     rng = np.random.default_rng([seed, 21])
     own = rng.uniform(*STRENGTH_RANGE, len(ACTION_NAMES))
@@ -176,7 +175,7 @@ def _sides(seed: int) -> dict[str, tuple[float, float]]:
 def _own_shapes(
     shapes: Mapping[str, Float32Array], action: str, left: float, right: float
 ) -> Float64Array | None:
-    """Return an action made of a mesh's own shapes, or None where it has none.
+    """Return an action composed of a mesh's own shapes, or None where it has none.
 
     The names' ``_L`` and ``_R`` are the person's left and right, the image's right and left.
     """
@@ -194,7 +193,7 @@ def _own_shapes(
 
 
 def _field(points: Float64Array, action: str, left: float, right: float) -> Float64Array:
-    """Return an action's movement at points of the mean head, mm, shape (..., 3)."""
+    """Return an action's displacement at points of the mean head, mm, shape (..., 3)."""
     if action == _JAW_ACTION:
         return 0.5 * (left + right) * _jaw(points)
     total = np.zeros_like(points)
@@ -215,7 +214,7 @@ def _bump(
 
 
 def _jaw(points: Float64Array) -> Float64Array:
-    """Turn the chin and the lower lip about the joints of the jaw; the neck stays."""
+    """Rotate the chin and the lower lip about the joints of the jaw; the neck stays."""
     below = 0.5 * (1.0 + np.tanh((-44.0 - points[..., 1]) / 8.0))
     above_neck = 0.5 * (1.0 + np.tanh((points[..., 1] + 94.0) / 12.0))
     arm = points - np.array(_JAW_JOINT_MM)

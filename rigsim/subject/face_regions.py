@@ -40,19 +40,19 @@ _BALL_CENTERS_MM: Final = dict(LANDMARKS_MM) | {
 
 
 def to_mean_head(points_mm: Float32Array, mesh: Mesh) -> Float32Array:
-    """Move points of a face mesh to where they would lie on the mean head.
+    """Map points of a face mesh to the mean head.
 
     Parameters
     ----------
     points_mm
         Positions on the mesh, shape (..., 3), rig frame.
     mesh
-        A face that looks towards +z.
+        A face that looks toward +z.
 
     Returns
     -------
     ndarray of float32
-        Shape (..., 3): scaled so that the face is as wide, moved so that the tips of the noses
+        Shape (..., 3): scaled to equal width of the face, translated so that the tips of the noses
         coincide.
     """
     tip, scale = _tip_and_scale(mesh)
@@ -61,14 +61,14 @@ def to_mean_head(points_mm: Float32Array, mesh: Mesh) -> Float32Array:
 
 
 def from_mean_head(points_mm: FloatArray, mesh: Mesh) -> Float64Array:
-    """Move points of the mean head to a face mesh, the inverse of `to_mean_head`.
+    """Map points of the mean head to a face mesh, the inverse of `to_mean_head`.
 
     Parameters
     ----------
     points_mm
         Positions on the mean head, shape (..., 3).
     mesh
-        A face that looks towards +z.
+        A face that looks toward +z.
 
     Returns
     -------
@@ -81,7 +81,7 @@ def from_mean_head(points_mm: FloatArray, mesh: Mesh) -> Float64Array:
 
 
 def mean_head_scale(mesh: Mesh) -> float:
-    """Return mm on the mean head for each mm on a face mesh."""
+    """Return the mm on the mean head per mm on a face mesh."""
     return _tip_and_scale(mesh)[1]
 
 
@@ -121,7 +121,7 @@ def _balls(
     total = np.zeros(points.shape[:-1], np.float32)
     axes = [np.ascontiguousarray(points[..., k]) for k in range(3)]
     for name, radii in balls:
-        # sums over an axis of three elements are the slow way to the same numbers
+        # explicit sums of three terms are faster than a sum over an axis of three elements
         x, y, z = (
             (axis - np.float32(middle)) / np.float32(radius)
             for axis, middle, radius in zip(axes, _BALL_CENTERS_MM[name], radii, strict=True)
@@ -146,7 +146,7 @@ def _lips_within(points: Float32Array) -> Float32Array:
 
 
 def soft_step(t: FloatArray) -> FloatArray:
-    """Return how far each place lies inside a border: 0 far below 0, 1 far above, smooth between.
+    """Return the soft membership of a border: 0 far below 0, 1 far above, smooth between.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""A seeded, face-like head: blended solids, met by rays from inside, on a regular texture grid.
+"""Generate a seeded, face-like head: blended solids, sampled by rays on a regular texture grid.
 
-The head is the zero set of a signed distance bound made of ellipsoids and capsules joined by
-smooth minima, so its shape and its normals are smooth and known without a mesh. Eyes are
+The head is the zero set of a signed distance bound of ellipsoids and capsules joined by
+smooth minima, so that its shape and its normals are smooth and independent of a mesh. Eyes are
 closed. Dimensions are near the means of adults in
 Young 1993 (head and face anthropometry, DOT/FAA/AM-93/10).
 """
@@ -23,20 +23,20 @@ Point = tuple[float, float, float]
 MAX_PHI_RAD: Final = 2.0
 """Half of the angle about the vertical axis that the texture covers."""
 CENTER_LINEAR_FRACTION: Final = 0.6
-"""Part of PHI_MAX_RAD per unit of u at the middle; the rest grows with the third power."""
+"""Fraction of `MAX_PHI_RAD` per unit of u at the center; the rest grows with the third power."""
 AXIS_Z_MM: Final = -70.0
-"""Depth of the vertical axis from which rays leave."""
+"""Depth of the vertical axis that is the origin of the rays."""
 Y_RANGE_MM: Final = (-125.0, 45.0)
-"""Heights between which rays leave horizontally; above, they fan out over the crown."""
+"""Heights of horizontal rays; above, rays fan out over the crown."""
 CROWN_ANGLE_RAD: Final = 1.4
 GROOVE_DEPTH_MM: Final = -25.0
-"""Furrows drawn from the front are left out behind this z."""
+"""Grooves drawn from the front are omitted behind this z."""
 LIP_HALF_WIDTH_MM: Final = 25.0
 SHAPE_DEVIATION: Final = 0.045
-"""Relative standard deviation of the solids' sizes from seed to seed."""
+"""Relative standard deviation of the solids' sizes between seeds."""
 
 LANDMARKS_MM: Final[Mapping[str, Point]] = package_table("face")["landmarks_mm"]
-"""Points of the mean head in mm, rig frame; left and right as seen in the image."""
+"""Points of the mean head in mm, rig frame; left and right as in the image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class _Solid:
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """Solids that are joined sharply among themselves and smoothly to what stands before them."""
+    """Solids with sharp unions among themselves and a smooth union with the preceding parts."""
 
     solids: tuple[_Solid, ...]
     blend_mm: float
@@ -60,7 +60,7 @@ class _Part:
 
 @dataclass(frozen=True, slots=True)
 class _Groove:
-    """A furrow (or, with negative depth, a ridge) along a line seen from the front."""
+    """A groove (or, with negative depth, a ridge) along a line in the front view."""
 
     line: tuple[tuple[float, float], ...]
     depth_mm: float
@@ -75,18 +75,18 @@ def build_head(rng: np.random.Generator, *, columns: int = 168, rows: int = 178)
     rng
         Source of the shape's deviations from the mean.
     columns, rows
-        Quads along u and v; each gives two triangles.
+        Quads along u and v; each yields two triangles.
 
     Returns
     -------
     Mesh
-        About 2 columns rows triangles in mm; u runs with +x, v with +y.
+        About 2 columns rows triangles in mm; u increases along +x, v along +y.
     """
     model = _pack(*_anatomy(rng))
     u = np.linspace(0.0, 1.0, columns + 1)
     v = np.linspace(0.0, 1.0, rows + 1)
     start, way = _rays(u[None, :], v[:, None])
-    points, normals = _meet(start.reshape(-1, 3), way.reshape(-1, 3), *model)
+    points, normals = _march_rays(start.reshape(-1, 3), way.reshape(-1, 3), *model)
     uv = np.stack(np.broadcast_arrays(u[None, :], v[:, None]), axis=-1)
     at = np.arange((rows + 1) * (columns + 1)).reshape(rows + 1, columns + 1)
     a, b, c, d = at[:-1, :-1], at[:-1, 1:], at[1:, :-1], at[1:, 1:]
@@ -100,7 +100,7 @@ def _rays(u: Float64Array, v: Float64Array) -> tuple[Float64Array, Float64Array]
     s = 2.0 * u - 1.0
     phi = MAX_PHI_RAD * (CENTER_LINEAR_FRACTION * s + (1.0 - CENTER_LINEAR_FRACTION) * s**3)
     low, high = Y_RANGE_MM
-    # The last part of v fans out over the crown; the speed along the surface stays even.
+    # The last part of v fans out over the crown; the speed along the surface stays uniform.
     bend = 0.77
     y = low + (high - low) * np.minimum(v / bend, 1.0)
     lift = CROWN_ANGLE_RAD * np.maximum(v - bend, 0.0) / (1.0 - bend)
@@ -112,7 +112,7 @@ def _rays(u: Float64Array, v: Float64Array) -> tuple[Float64Array, Float64Array]
 
 def _anatomy(rng: np.random.Generator) -> tuple[list[_Part], list[_Groove]]:
     def s(scale: float = 1.0) -> float:
-        """Draw a factor near 1, within two and a half deviations."""
+        """Draw a factor near 1, within two and a half standard deviations."""
         return float(1.0 + scale * SHAPE_DEVIATION * np.clip(rng.standard_normal(), -2.5, 2.5))
 
     def ball(center: Point, radii: Point) -> _Solid:
@@ -185,7 +185,7 @@ def _anatomy(rng: np.random.Generator) -> tuple[list[_Part], list[_Groove]]:
 
 
 def lip_outline(x_mm: FloatArray) -> tuple[Float64Array, Float64Array]:
-    """Return the heights of the lips' upper and lower border on the mean head.
+    """Return the heights of the upper and lower border of the lips on the mean head.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ def lip_outline(x_mm: FloatArray) -> tuple[Float64Array, Float64Array]:
     Returns
     -------
     top, bottom : ndarray
-        Heights y in mm; beyond the corners of the mouth top lies below bottom.
+        Heights y in mm; beyond the corners of the mouth top is below bottom.
     """
     across = np.asarray(x_mm, np.float64) / LIP_HALF_WIDTH_MM
     (upper, above), (lower, below) = _lip_arcs(np.clip(across, -1.0, 1.0))
@@ -204,7 +204,7 @@ def lip_outline(x_mm: FloatArray) -> tuple[Float64Array, Float64Array]:
 
 
 def _lip_arcs(across: Float64Array) -> tuple[tuple[Float64Array, Float64Array], ...]:
-    """Return middle line and half thickness of both lips, across the mouth from -1 to 1."""
+    """Return center line and half thickness of both lips, across the mouth from -1 to 1."""
     bow = np.exp(-((np.abs(across) - 0.28) ** 2) / 0.045)
     full = np.maximum(1.0 - across**2, 0.0) ** 0.6
     depth = 13.5 * np.abs(across) ** 2.3
@@ -231,8 +231,9 @@ def _pack(
 ) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
     """Return the anatomy as arrays: solids, parts, segments of grooves, grooves.
 
-    A part's row holds blend, carve, first and last solid, centre and radius of a ball around it; a
-    groove's row holds depth, width, first and last segment, and the box outside which it is flat.
+    A part's row contains blend, carve, first and last solid, center and radius of its bounding
+    ball; a groove's row contains depth, width, first and last segment, and the box outside which it
+    is flat.
     """
     solids: list[tuple[float, ...]] = []
     segments: list[tuple[float, ...]] = []
@@ -255,7 +256,7 @@ def _pack(
         first = len(segments)
         line = np.array(groove.line)
         segments += [(*line[k], *line[k + 1]) for k in range(len(line) - 1)]
-        # Beyond 3.5 widths a furrow is shallower than a nanometre.
+        # Beyond 3.5 widths a groove is shallower than a nanometer.
         low, high = (
             line.min(axis=0) - 3.5 * groove.width_mm,
             line.max(axis=0) + 3.5 * groove.width_mm,
@@ -269,9 +270,10 @@ def _pack(
 def _solid_distance(x, y, z, s):  # type: ignore[no-untyped-def]
     px, py, pz = x - s[0], y - s[1], z - s[2]
     if s[6] > 0.0:
+        # First-order distance to the level set k0 = 1: (k0 - 1) over its gradient's length k1 / k0.
         k0 = math.sqrt((px / s[6]) ** 2 + (py / s[7]) ** 2 + (pz / s[8]) ** 2)
         k1 = math.sqrt((px / s[6] ** 2) ** 2 + (py / s[7] ** 2) ** 2 + (pz / s[8] ** 2) ** 2)
-        # At the centre k1 = 0; the nearest surface is the shortest radius away.
+        # At the center k1 = 0; the nearest surface is at the shortest radius.
         return k0 * (k0 - 1.0) / k1 if k1 > 1e-12 else -min(s[6], s[7], s[8])
     ax, ay, az = s[3] - s[0], s[4] - s[1], s[5] - s[2]
     t = (px * ax + py * ay + pz * az) / (ax * ax + ay * ay + az * az)
@@ -287,14 +289,15 @@ def _distance(x, y, z, solids, parts, segments, grooves):  # type: ignore[no-unt
     for p in range(parts.shape[0]):
         k, carve = parts[p, 0], parts[p, 1] > 0.0
         away = math.sqrt((x - parts[p, 4]) ** 2 + (y - parts[p, 5]) ** 2 + (z - parts[p, 6]) ** 2)
-        # Parts out of reach change nothing; two more millimetres, as bounds are not distances.
+        # Distant parts have no effect; 2 mm of margin, since bounds are not exact distances.
         beyond = 0.7 * (away - parts[p, 7]) - k - 2.0
         if p > 0 and (beyond > -total if carve else beyond > total):
             continue
         own = 1e9
         for i in range(int(parts[p, 2]), int(parts[p, 3])):
             own = min(own, _solid_distance(x, y, z, solids[i]))
-        # Polynomial smooth minimum, or smooth maximum with the complement when carved.
+        # Polynomial smooth minimum min(a, b) - k h^2 / 4 with h = max(k - |a - b|, 0) / k; carved
+        # parts are a smooth maximum with their complement.
         if p == 0:
             total = own
         elif carve:
@@ -303,7 +306,7 @@ def _distance(x, y, z, solids, parts, segments, grooves):  # type: ignore[no-unt
         else:
             h = max(k - abs(total - own), 0.0) / k
             total = min(total, own) - 0.25 * k * h * h
-    # Furrows count where the face looks to the front.
+    # Grooves apply where the face looks to the front.
     if z > GROOVE_DEPTH_MM:
         fade = min((z - GROOVE_DEPTH_MM) / 10.0, 1.0)
         for q in range(grooves.shape[0]):
@@ -322,8 +325,8 @@ def _distance(x, y, z, solids, parts, segments, grooves):  # type: ignore[no-unt
 
 
 @njit(parallel=True, cache=True)
-def _meet(start, way, solids, parts, segments, grooves):  # type: ignore[no-untyped-def]
-    """Walk each ray inwards to the outermost surface point; return points and normals."""
+def _march_rays(start, way, solids, parts, segments, grooves):  # type: ignore[no-untyped-def]
+    """March each ray inwards to the outermost surface point; return points and normals."""
     points, normals = np.empty_like(start), np.empty_like(start)
     step = 0.1
     for i in prange(start.shape[0]):

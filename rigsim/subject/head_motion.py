@@ -1,7 +1,7 @@
-"""A subject who cannot sit quite still: a slow drift of the head, and a twitch at the mouth.
+"""Model the motion of a subject's head: a slow drift, and a twitch at the mouth.
 
-Both are functions of the world's time alone, and both are zero at time zero, where the truth maps
-are taken.
+Both are functions of the world's time only, and both are zero at time zero, where the ground-truth
+maps are taken.
 """
 
 import math
@@ -21,23 +21,23 @@ TWITCH_WINDOW_S: Final = 25.0
 
 DRIFT_RANGE_MM: Final = (0.3, 3.0)
 DRIFT_RANGE_DEG: Final = (0.1, 1.0)
-"""Ranges from which the greatest shift and turn are drawn."""
+"""Ranges of the largest translation and rotation."""
 
 SWAY_WAVES: Final = 5
 SWAY_BAND_HZ: Final = (0.02, 0.4)
-"""Waves of sway that make up the drift, and their frequencies; heads in rests sway below 0.5 Hz."""
+"""Number of sway waves in the drift, and their frequencies; heads in rests sway below 0.5 Hz."""
 
 PIVOT_MM: Final = (0.0, 0.0, -70.0)
-"""Middle of the head, about which it turns; the shift is that of this point."""
+"""Center of rotation of the head; the translation is that of this point."""
 
 TWITCH_DURATION_S: Final = 0.5
 TWITCH_RANGE_MM: Final = (0.8, 2.0)
 TWITCH_RADIUS_MM: Final = 14.0
-"""Length of the twitch, range of its size, and how far it reaches from the corner of the mouth."""
+"""Duration of the twitch, range of its size, and its reach from the corner of the mouth."""
 
 
 class HeadMotionError(ValueError):
-    """A motion is described wrongly."""
+    """A motion with an invalid description."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,17 +45,17 @@ class HeadMotion:
     """Drift and twitch of one capture; see `draw_head_motion`."""
 
     amplitude: Float64Array
-    """Waves of shift x, y, z in mm and of turn about x, y, z in rad, shape (WAVES, 6)."""
+    """Waves of translation x, y, z in mm and rotation about x, y, z in rad, shape (WAVES, 6)."""
     frequency_hz: Float64Array
     """Shape (WAVES, 6)."""
     phase_rad: Float64Array
     """Shape (WAVES, 6)."""
     twitch_start_s: float
-    """When the twitch begins; inf for none."""
+    """Start of the twitch; inf for none."""
     twitch_mm: float
-    """How far the corner of the mouth moves."""
+    """Displacement of the corner of the mouth."""
     twitch_side: str
-    """"left" or "right", as seen in the image."""
+    """"left" or "right", as in the image."""
 
     def __post_init__(self) -> None:
         """Check shapes and ranges."""
@@ -69,7 +69,7 @@ class HeadMotion:
             raise HeadMotionError(f"twitch_side: got {self.twitch_side!r}, expected left or right")
 
     def pose(self, t_s: float) -> tuple[Float64Array, Float64Array]:
-        """Return where the head is.
+        """Return the pose of the head.
 
         Parameters
         ----------
@@ -79,7 +79,7 @@ class HeadMotion:
         Returns
         -------
         rotation, shift_mm : ndarray
-            Shapes (3, 3) and (3,): a point p of the still head is at rotation @ p + shift_mm.
+            Shapes (3, 3) and (3,): a point p of the fixed head is at rotation @ p + shift_mm.
         """
         at = 2.0 * math.pi * self.frequency_hz * t_s + self.phase_rad
         state = np.sum(self.amplitude * (np.sin(at) - np.sin(self.phase_rad)), axis=0)
@@ -88,7 +88,7 @@ class HeadMotion:
         return rotation, pivot - rotation @ pivot + state[:3]
 
     def twitch_amount(self, t_s: float) -> float:
-        """Return how far the twitch has gone, 0 (rest) to 1."""
+        """Return the amount of the twitch, 0 (rest) to 1."""
         phase = (t_s - self.twitch_start_s) / TWITCH_DURATION_S
         return math.sin(math.pi * phase) ** 2 if 0.0 < phase < 1.0 else 0.0
 
@@ -98,14 +98,14 @@ class HeadMotion:
         Parameters
         ----------
         mesh
-            The still face.
+            The fixed face.
         amount
             Result of `twitch_amount`.
 
         Returns
         -------
         Mesh
-            The same triangles; normals are turned as the surface is.
+            The same triangles; normals rotate with the surface.
         """
         points = to_mean_head(mesh.vertices_mm, mesh)
         corner = np.array(LANDMARKS_MM[f"mouth corner {self.twitch_side}"])
@@ -127,7 +127,7 @@ def draw_head_motion(
     seed
         Seed, >= 0; the same gives the same motion.
     drift_mm, drift_deg
-        Greatest shift of `PIVOT_MM` and greatest turn within 25 s, 0 to 10 mm and degrees;
+        Largest translation of `PIVOT_MM` and largest rotation within 25 s, 0 to 10 mm and degrees;
         None draws 0.3 to 3 mm and 0.1 to 1 degree.
     twitch
         Whether the mouth twitches once, between 20 and 80 % of the 25 s.
@@ -135,7 +135,7 @@ def draw_head_motion(
     Returns
     -------
     HeadMotion
-        The motion; at time 0 the head is where its mesh is.
+        The motion; at time 0 the head is at its mesh.
 
     Examples
     --------

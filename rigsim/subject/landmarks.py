@@ -1,4 +1,4 @@
-"""Named points of a face, tied to its surface, so that they move with the skin."""
+"""Named points of a face, bound to its surface, so that they move with the skin."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -31,25 +31,25 @@ POINTS_MM: Final[Mapping[str, tuple[float, float]]] = {
     **{f"{name} left": (-p[0], p[1]) for name, p in _PAIRED_POINTS_MM.items()},
     **_MIDLINE_POINTS_MM,
 }
-"""Where the points lie on the mean head seen from the front, (x, y) in mm; left and right as seen
-in the image. On the skin they are where a look along -z meets it."""
+"""Positions of the points in the front view of the mean head, (x, y) in mm; left and right as in
+the image. On the skin they are where a ray along -z meets it."""
 
 OCCLUSION_TOLERANCE_MM: Final = 0.5
-"""Surface nearer than this to a point does not hide it."""
+"""A surface nearer than this to a point does not occlude it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfacePoints:
-    """Points on a mesh, that go with it when its vertices move."""
+    """Points on a mesh that follow its vertices."""
 
     names: tuple[str, ...]
     corners: Int32Array
     """Vertices of each point's triangle, shape (n, 3)."""
     weights: Float64Array
-    """Their weights, shape (n, 3)."""
+    """Barycentric weights, shape (n, 3)."""
 
     def positions_on(self, mesh: Mesh) -> Float64Array:
-        """Return where the points are on a mesh of the same triangles, shape (n, 3), mm."""
+        """Return the points' positions on a mesh of the same triangles, shape (n, 3), mm."""
         corners = mesh.vertices_mm[self.corners].astype(np.float64)
         return np.einsum("nk,nkc->nc", self.weights, corners)
 
@@ -59,17 +59,17 @@ class SurfacePoints:
 
 
 def find_landmarks(mesh: Mesh) -> SurfacePoints:
-    """Find the named points on a face at rest.
+    """Locate the named points on a face at rest.
 
     Parameters
     ----------
     mesh
-        A face that looks towards +z.
+        A face that looks toward +z.
 
     Returns
     -------
     SurfacePoints
-        Those of `POINTS_MM` below which there is skin.
+        Those of `POINTS_MM` with skin below.
     """
     targets = np.array([(*xy, 0.0) for xy in POINTS_MM.values()])
     at = from_mean_head(targets, mesh)[:, :2]
@@ -96,7 +96,7 @@ def find_landmarks(mesh: Mesh) -> SurfacePoints:
 
 
 def project_points(points_mm: Float64Array, view: View) -> Float64Array:
-    """Return where a camera sees points, px.
+    """Return the image positions of points, px.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def project_points(points_mm: Float64Array, view: View) -> Float64Array:
     Returns
     -------
     ndarray
-        Shape (n, 2): x to the right, y down; the centre of pixel (0, 0) is (0, 0).
+        Shape (n, 2): x to the right, y down; the center of pixel (0, 0) is (0, 0).
     """
     right, up, back = (np.asarray(axis) for axis in view.axes)
     way = points_mm - np.asarray(view.position_mm)
@@ -119,7 +119,7 @@ def project_points(points_mm: Float64Array, view: View) -> Float64Array:
 
 
 def is_visible(points_mm: Float64Array, view: View, caster: Caster) -> BoolArray:
-    """Tell which points a camera sees, shape (n,).
+    """Return which points are visible to a camera, shape (n,).
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def is_visible(points_mm: Float64Array, view: View, caster: Caster) -> BoolArray
     view
         The camera.
     caster
-        The mesh that may stand before them.
+        Mesh that may occlude them.
     """
     pixels = project_points(points_mm, view)
     inside = (pixels > -0.5) & (pixels < np.array([view.width_px, view.height_px]) - 0.5)

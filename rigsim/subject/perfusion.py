@@ -1,9 +1,9 @@
-"""Blood in the skin of a face: three compartments of vessels, and states that dilate them.
+"""Model the blood in the skin of a face: three vessel compartments, and states that dilate them.
 
-The blood of a point is that of a capillary bed, of the loops that rise from it, and of the
-vessels of the plexus. A state changes the radius of the vessels, region by region; a vessel's
-volume goes with the square of its radius. Since the compartments have patterns of their own and
-answer unequally, a state is not a scaling and shifting of the neutral map.
+The blood at each point is that of a capillary bed, of the loops that rise from it, and of the
+vessels of the plexus. States change the radius of the vessels, region by region; a vessel's
+volume is proportional to the square of its radius. Since the compartments have separate patterns
+and responses, a state is not a scaled and shifted neutral map.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ usual, Jacques 1998, "Skin optics summary", Oregon Medical Laser Center."""
 _REGION_GAIN: Final[Mapping[str, float]] = package_table("face")["region_gain"]
 
 _COMPARTMENT_FRACTIONS: Final = (0.56, 0.28, 0.16)
-"""Parts of the blood in bed, loops and plexus."""
+"""Fractions of the blood in bed, loops and plexus."""
 
 _COMPARTMENT_RESPONSES: Final = (0.45, 1.0, 0.8)
-"""How far each compartment's vessels follow a change of radius: loops are muscular and answer
-most, the bed is mostly filled by what reaches it."""
+"""Response of each compartment's vessels to a change of radius: loops are muscular and respond
+most; the bed mostly fills passively."""
 
 _STATE_CHANGES: Final[Mapping[str, Mapping[str, float]]] = package_table("face")["state_changes"]
 
@@ -42,7 +42,7 @@ STATE_NAMES: Final = tuple(_STATE_CHANGES)
 
 
 class StateError(KeyError, ValueError):
-    """There is no state of that name."""
+    """Unknown name of a state."""
 
     def __str__(self) -> str:
         return str(self.args[0])
@@ -59,7 +59,7 @@ class Perfusion:
     regions: Mapping[str, Float32Array]
     """Masks of `rigsim.subject.face_regions.region_masks`."""
     seed: int
-    """Seed of the person's answers to the states."""
+    """Seed of the person's responses to the states."""
 
     def dilation(self, state: str) -> Float32Array:
         """Return the relative change of the vessels' radius in a state, shape (...).
@@ -76,13 +76,13 @@ class Perfusion:
             return change
         for name, gain in _STATE_CHANGES[state].items():
             change += np.float32(gain) * (1.0 if name == "all" else self.regions[name])
-        # Each person has an own pattern of how strongly the vessels answer (observation 3).
+        # Each person has an own pattern of vessel response (observation 3).
         salt = self.seed + 60 + STATE_NAMES.index(state)
         own = 1.0 + 0.25 * smooth_noise(self.points_mm, (35.0, 15.0), seed=salt)
         return np.asarray(change * np.maximum(own, 0.0), np.float32)
 
     def blood(self, state: str = "neutral") -> Float32Array:
-        """Return the volume fraction of blood in the dermis.
+        """Return the blood volume fraction in the dermis.
 
         Parameters
         ----------
@@ -104,7 +104,7 @@ class Perfusion:
         for index, answer in enumerate(_COMPARTMENT_RESPONSES):
             radius = np.maximum(1.0 + answer * change, 0.0)
             total += self.compartments[..., index] * radius * radius
-        # Vessels fill the dermis at most up to the limit; the fold keeps the order of values.
+        # Vessels fill the dermis at most up to the limit; the fold is monotonic.
         return np.asarray(total / (1.0 + (total / MAX_HEMOGLOBIN) ** 4) ** 0.25, np.float32)
 
     def dilate(self, change: ArrayLike) -> Perfusion:
@@ -113,8 +113,8 @@ class Perfusion:
         Parameters
         ----------
         change
-            Relative change of the radius of vessels that follow it fully, shape (...) or a number,
-            above -1; the compartments follow unequally.
+            Relative change of the radius of vessels with full response, shape (...) or a number,
+            above -1; the compartments respond differently.
         """
         by = np.asarray(change, np.float32)
         if not np.all(by > -1.0):
@@ -127,7 +127,7 @@ class Perfusion:
 def draw_perfusion(
     points_mm: Float32Array, regions: Mapping[str, Float32Array], *, seed: int, amount: float = 1.0
 ) -> Perfusion:
-    """Draw the vessels of a face and what each state does to them.
+    """Draw the vessels of a face and their response to each state.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def draw_perfusion(
     Returns
     -------
     Perfusion
-        Neutral compartments, and what is needed to dilate them.
+        Neutral compartments with their responses.
     """
     if not 0.1 <= amount <= 4.0:
         raise ValueError(f"amount: got {amount}, expected 0.1 to 4")

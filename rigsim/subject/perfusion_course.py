@@ -1,9 +1,10 @@
-"""How blood follows what a person does: prompts, exercise, alcohol; known at every time.
+"""Model the course of blood in time after prompts, exercise and alcohol.
 
-A state's vessels are dilated by a part of what `rigsim.subject.perfusion` says, the state's level:
-0 at rest, 1 in full. Vessels relax towards what is asked of them, rise and fall with time constants
-of their own. A prompt is answered after the person's reaction time, each a little otherwise.
-Exercise is at its height when it ends, and fades; alcohol is absorbed after it was drunk.
+A state's vessels are dilated by a fraction of the dilation in `rigsim.subject.perfusion`, the
+state's level: 0 at rest, 1 in full. The level relaxes toward its target, with separate time
+constants of rise and fall. The person responds to a prompt after a reaction time that varies
+between prompts. The flush of exercise is largest when it ends, and decays; alcohol is absorbed
+after the drink.
 """
 
 import bisect
@@ -19,8 +20,8 @@ from rigsim.subject.perfusion import STATE_NAMES, Perfusion, StateError
 from rigsim.subject.person import SimulatedSubject
 
 EXPRESSION_TAU_S: Final = 0.02
-"""Time constant of the blood of an expression, s. Jimenez et al. 2010, section 3.1, saw no phase
-between two states at samples 0.25 s apart: mostly, the moving face squeezes its skin."""
+"""Time constant of the blood of an expression, s. Jimenez et al. 2010, section 3.1, observed no
+phase between two states at samples 0.25 s apart: mostly, the moving face squeezes its skin."""
 
 REACTION_TIME_S: Final = 0.16
 """Time from a sound to the movement, s; simple reactions to sounds take about 0.16 s."""
@@ -36,21 +37,21 @@ ALCOHOL_TAU_S: Final = 1200.0
 
 
 class CourseError(ValueError):
-    """A course of blood that cannot be made."""
+    """An invalid course of blood."""
 
 
 class PerfusionCourse(Protocol):
-    """What a state's blood does in time."""
+    """Interface of a state's blood in time."""
 
     @property
     def state(self) -> str:
-        """Which state of `rigsim.subject.perfusion.STATE_NAMES`."""
+        """State, one of `rigsim.subject.perfusion.STATE_NAMES`."""
 
     def prompt(self, now_s: float, state: str) -> None:
-        """Let the person hear, at a world time in s, what is asked of him."""
+        """Prompt the person to show a state, at a world time in s."""
 
     def level(self, t_s: float) -> float:
-        """Return how much of the state's dilation the vessels have at a world time, 0 to 1."""
+        """Return the fraction of the state's dilation at a world time, 0 to 1."""
 
     def pose(self, t_s: float) -> str:
         """Return the state that the face shows by its movement at a world time."""
@@ -58,25 +59,25 @@ class PerfusionCourse(Protocol):
 
 @dataclass(slots=True)
 class PromptedCourse:
-    """Blood of an expression that a person makes and drops at prompts.
+    """Blood of an expression that a person starts and ends at prompts.
 
     Parameters
     ----------
     state
-        The expression; any other prompt asks for rest.
+        The expression; any other prompt requests rest.
     rise_s, fall_s
         Time constants of filling and emptying, s, > 0.
     reaction_s
         Mean time from prompt to movement, s, >= 0.
     reaction_spread_s
-        Its standard deviation, s, >= 0; no reaction comes before its prompt.
+        Its standard deviation, s, >= 0; no reaction precedes its prompt.
     seed
-        Of the reaction times.
+        Seed of the reaction times.
 
     Examples
     --------
     >>> course = PromptedCourse("smile", rise_s=2.0, reaction_s=0.5, reaction_spread_s=0.0)
-    >>> course.tell(10.0, "smile")
+    >>> course.prompt(10.0, "smile")
     >>> [round(course.level(t), 3) for t in (10.4, 12.5, 100.0)]
     [0.0, 0.632, 1.0]
     >>> course.pose(10.4), course.pose(10.6)
@@ -90,7 +91,7 @@ class PromptedCourse:
     reaction_spread_s: float = REACTION_STD_S
     seed: int = 0
     _moves: list[tuple[float, float, float]] = dataclasses.field(default_factory=list)
-    """World time of each movement, s; the level then; the level that is gone to."""
+    """World time of each movement, s; the level at that time; the target level."""
 
     def __post_init__(self) -> None:
         _check_state(self.state)
@@ -100,7 +101,7 @@ class PromptedCourse:
             _require(0 <= getattr(self, name) < math.inf, name, getattr(self, name), "seconds >= 0")
 
     def prompt(self, now_s: float, state: str) -> None:
-        """Let the person hear a prompt at a world time, s."""
+        """Prompt the person at a world time, s."""
         number = len(self._moves)
         rng = np.random.default_rng([self.seed, 90, number])
         late_s = max(0.0, self.reaction_s + self.reaction_spread_s * rng.standard_normal())
@@ -110,7 +111,7 @@ class PromptedCourse:
         self._moves.append((moved_s, self.level(moved_s), float(state == self.state)))
 
     def level(self, t_s: float) -> float:
-        """Return how much of the expression's blood is there at a world time, s: 0 to 1."""
+        """Return the level of the expression's blood at a world time, s: 0 to 1."""
         number = bisect.bisect_right(self._moves, t_s, key=lambda move: move[0]) - 1
         if number < 0:
             return 0.0
@@ -119,27 +120,27 @@ class PromptedCourse:
         return to_level + (from_level - to_level) * math.exp(-(t_s - since_s) / constant_s)
 
     def pose(self, t_s: float) -> str:
-        """Return what the face shows at a world time, s: the movement itself is taken as quick."""
+        """Return the state that the face shows at a world time, s; movements are instant."""
         number = bisect.bisect_right(self._moves, t_s, key=lambda move: move[0]) - 1
         return self.state if number >= 0 and self._moves[number][2] > 0 else "neutral"
 
 
 @dataclass(slots=True)
 class EventCourse:
-    """Blood after something that happens once: the event is over when the person is told so.
+    """Blood after a single event, whose end is the prompt.
 
     Parameters
     ----------
     state
-        "exercise", which is at its height then and fades, or "alcohol", which comes up; of the
-        other states those that are held fade.
+        "exercise", which is largest at the prompt and decays, or "alcohol", which rises; the
+        held ones of the other states decay.
     constant_s
-        Time constant, s, > 0; None: of the state.
+        Time constant, s, > 0; None: that of the state.
 
     Examples
     --------
     >>> course = EventCourse("exercise", constant_s=30.0)
-    >>> course.tell(100.0, "exercise")
+    >>> course.prompt(100.0, "exercise")
     >>> [round(course.level(t), 3) for t in (99.0, 100.0, 130.0)]
     [0.0, 1.0, 0.368]
     """
@@ -155,36 +156,36 @@ class EventCourse:
 
     @property
     def relaxation_s(self) -> float:
-        """The time constant, s."""
+        """Time constant, s."""
         if self.constant_s is not None:
             return self.constant_s
         return ALCOHOL_TAU_S if self.state == "alcohol" else EXERCISE_TAU_S
 
     def prompt(self, now_s: float, state: str) -> None:
-        """Let the event end at a world time, s; may lie before 0 where a world began later."""
+        """End the event at a world time, s; it may be before 0 where a world began later."""
         if state == self.state and math.isinf(self._over_s):
             self._over_s = now_s
 
     def level(self, t_s: float) -> float:
-        """Return how much of the state's blood is there at a world time, s: 0 to 1."""
+        """Return the level of the state's blood at a world time, s: 0 to 1."""
         if t_s < self._over_s:
             return 0.0
         left = math.exp(-(t_s - self._over_s) / self.relaxation_s)
         return 1.0 - left if self.state == "alcohol" else left
 
     def pose(self, t_s: float) -> str:
-        """Return "neutral": neither exercise nor alcohol moves the face for a picture."""
+        """Return "neutral": neither exercise nor alcohol moves the face in an image."""
         return "neutral"
 
 
 @dataclass(frozen=True, slots=True)
 class FixedPerfusion(Perfusion):
-    """Vessels that are dilated by a part of what one state asks for, whatever the face shows."""
+    """Vessels dilated by a fraction of one state's dilation, independent of the displayed state."""
 
     base: str = "neutral"
     """State of the blood."""
     level: float = 0.0
-    """Part of its dilation, 0 to 1."""
+    """Fraction of its dilation, 0 to 1."""
 
     def dilation(self, state: str) -> Float32Array:
         """Return the relative change of the vessels' radius, shape (...); ``state`` is not used."""
@@ -192,7 +193,7 @@ class FixedPerfusion(Perfusion):
 
 
 def fix_blood_level(subject: SimulatedSubject, state: str, level: float) -> SimulatedSubject:
-    """Return a face whose blood stays at a level of one state in whatever state it is shown.
+    """Return a face whose blood stays at a level of one state in every displayed state.
 
     Parameters
     ----------
@@ -201,7 +202,7 @@ def fix_blood_level(subject: SimulatedSubject, state: str, level: float) -> Simu
     state
         State of the blood, one of `rigsim.subject.perfusion.STATE_NAMES`.
     level
-        Part of the state's dilation of the vessels, 0 to 1.
+        Fraction of the state's dilation of the vessels, 0 to 1.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A simulated person's face: geometry with its truth maps of melanin, blood and surface."""
+"""Simulate a person's face: geometry with its ground-truth maps of melanin, blood and surface."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ PRESET_NAMES: Final = tuple(pigment.MELANIN_PRESETS)
 """Names of the presets, pale to dark."""
 
 SIZE_RANGE: Final = (64, 8192)
-"""Texels along one side of the truth maps."""
+"""Texels along each side of the ground-truth maps."""
 
 
 class SubjectError(ValueError):
-    """A subject is asked for that cannot be made."""
+    """A subject with invalid arguments."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
@@ -43,17 +43,17 @@ class ExpressionPose:
     state: str
     """Name of the expression."""
     amount: float
-    """How far it goes, 0 to 1.5."""
+    """Strength, 0 to 1.5."""
     origin: tuple[Mesh, Float32Array]
     """Mesh and relief of the face at rest."""
     lines: expression_wrinkles.WrinkleLines
-    """Where this person's skin can buckle."""
+    """Lines of possible buckling of this person's skin."""
     mesh: Mesh
-    """The face moved; the same triangles and texture coordinates."""
+    """The moved face; the same triangles and texture coordinates."""
     atlas: Atlas
     """Its surface under each texel."""
     wrinkles: expression_wrinkles.Wrinkles
-    """What rises where the skin is shortened."""
+    """Wrinkles where the skin is shortened."""
     height_um: Float32Array
     """Relief at rest and wrinkles, um, shape (N, N)."""
     normal: Float32Array
@@ -67,7 +67,7 @@ class SimulatedSubject:
     preset: str
     """Name of the preset of melanin."""
     seed: int
-    """Seed of everything that is drawn."""
+    """Seed of all random draws."""
     mesh: Mesh
     """Geometry in mm, rig frame, facing +z."""
     atlas: Atlas
@@ -75,33 +75,33 @@ class SimulatedSubject:
     melanin: Float32Array
     """Volume fraction of melanosomes in the epidermis, 0 to 0.5."""
     perfusion: Perfusion
-    """Blood by compartment, and what the states do to it."""
+    """Blood by compartment, with its response to the states."""
     roughness: Float32Array
     """GGX alpha of the surface, 0.15 to 0.5."""
     height_um: Float32Array
     """Pores and wrinkles over the mesh, um."""
     hair: Float32Array
-    """Part of each texel that brows and lashes cover, 0 to 1."""
+    """Fraction of each texel that brows and lashes cover, 0 to 1."""
     normal: Float32Array
     """Unit normals of mesh and relief, shape (N, N, 3), rig frame."""
     pose: ExpressionPose | None = None
-    """The expression that the geometry is in; ``None`` at rest."""
+    """Expression of the geometry; ``None`` at rest."""
     rest: SimulatedSubject | None = None
     """The same face at rest; ``None`` for a face that is at rest itself."""
     beard: Float32Array | None = None
-    """How much stubble lies below the surface, shape (N, N), 0 to 1; ``None``: none."""
+    """Amount of stubble below the surface, shape (N, N), 0 to 1; ``None``: none."""
     oiliness: float = 1.0
-    """Factor of the share of the surface that oil covers."""
+    """Factor of the surface fraction covered by oil."""
     offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """How far the whole face was moved from where it was made, rig frame, see `translate`."""
+    """Translation of the whole face from its original position, rig frame, see `translate`."""
 
     @property
     def size(self) -> int:
-        """Texels along one side of the maps."""
+        """Texels along each side of the maps."""
         return self.atlas.size
 
     def hemoglobin(self, state: str = "neutral") -> Float32Array:
-        """Return the volume fraction of blood in the dermis in a state, shape (N, N), 0 to 0.32.
+        """Return the blood volume fraction of the dermis in a state, shape (N, N), 0 to 0.32.
 
         Raises
         ------
@@ -111,21 +111,21 @@ class SimulatedSubject:
         return self.perfusion.blood(state)
 
     def with_expression(self, state: str, amount: float = 1.0) -> SimulatedSubject:
-        """Return this face in an expression: moved, with its wrinkles.
+        """Return this face in an expression, with its wrinkles.
 
         Parameters
         ----------
         state
-            One of `rigsim.subject.perfusion.STATE_NAMES`; those that are no expression do not move
-            the face.
+            One of `rigsim.subject.perfusion.STATE_NAMES`; those that are not expressions do not
+            move the face.
         amount
             0 (rest) to 1 (full) and 1.5 (an extreme).
 
         Returns
         -------
-        Subject
+        SimulatedSubject
             The same person with another mesh, atlas, relief and normals; triangles, texture
-            coordinates and what the skin is made of stay. A posed face is posed from its rest. The
+            coordinates and the skin's composition stay. A posed face is posed from its rest. The
             blood stays that of every state, see `hemoglobin`.
 
         Raises
@@ -155,16 +155,16 @@ class SimulatedSubject:
         )
 
     def translate(self, offset_mm: tuple[float, float, float]) -> SimulatedSubject:
-        """Return this face standing elsewhere, as a whole.
+        """Return this face at another position.
 
         Parameters
         ----------
         offset_mm
-            How far it moves, mm, rig frame; without any the same object is returned.
+            Translation, mm, rig frame; for zero the same object is returned.
 
         Returns
         -------
-        Subject
+        SimulatedSubject
             The same person, in the same pose, with another mesh and atlas; all else stays.
 
         Raises
@@ -172,7 +172,7 @@ class SimulatedSubject:
         SubjectError
             The offset is not three finite numbers.
         """
-        x, y, z = _three(offset_mm)
+        x, y, z = _validate_offset(offset_mm)
         if (x, y, z) == (0.0, 0.0, 0.0):
             return self
         rest = self if self.rest is None else self.rest
@@ -188,7 +188,7 @@ class SimulatedSubject:
         )
 
     def blend_shapes(self) -> dict[str, Float32Array]:
-        """Return how each expression moves the vertices, {state: (V, 3) in mm}, rig frame."""
+        """Return each expression's vertex displacements, {state: (V, 3) in mm}, rig frame."""
         rest = self if self.rest is None else self.rest
         return expressions.blend_shapes(rest.mesh, seed=self.seed)
 
@@ -198,14 +198,14 @@ class SimulatedSubject:
         Returns
         -------
         ndarray of float32
-            Unit vectors, shape (N, N, 3): relief and wrinkles without the mesh's own bends.
+            Unit vectors, shape (N, N, 3): relief and wrinkles without the mesh's own curvature.
         """
         return relief.tangent_normals(self.atlas, self.normal)
 
     def landmarks_mm(self) -> dict[str, tuple[float, float, float]]:
-        """Return named points of the mean head, moved to this face, mm in the rig frame.
+        """Return named points of the mean head, mapped to this face, mm in the rig frame.
 
-        They move with the expression as the skin nearest to them does.
+        They move with the expression as the nearest skin does.
         """
         rest = self.mesh if self.rest is None else self.rest.mesh
         points = face_regions.from_mean_head(np.array(list(LANDMARKS_MM.values())), rest)
@@ -219,11 +219,11 @@ class SimulatedSubject:
         }
 
     def surface_landmarks(self) -> landmarks.SurfacePoints:
-        """Return named points of the skin itself; ``.on(mesh)`` says where they are."""
+        """Return named points of the skin; `SurfacePoints.positions_on` gives their positions."""
         return landmarks.find_landmarks(self.mesh if self.rest is None else self.rest.mesh)
 
 
-def _three(offset_mm: tuple[float, float, float]) -> tuple[float, float, float]:
+def _validate_offset(offset_mm: tuple[float, float, float]) -> tuple[float, float, float]:
     given = np.asarray(offset_mm, np.float64)
     if given.shape != (3,) or not np.isfinite(given).all():
         raise SubjectError(f"offset_mm: got {offset_mm!r}, expected three finite numbers")
@@ -233,8 +233,8 @@ def _three(offset_mm: tuple[float, float, float]) -> tuple[float, float, float]:
 _poses: WeakValueDictionary[tuple[int, int, int, str, float], ExpressionPose] = (
     WeakValueDictionary()
 )
-"""Poses that somebody holds, by what they are made of; a pose holds its origin, so that an id
-stays that of the same object."""
+"""Poses in use, by their ingredients; a pose holds its origin, so that an id stays that of the
+same object."""
 _lines: WeakValueDictionary[tuple[int, int, int], expression_wrinkles.WrinkleLines] = (
     WeakValueDictionary()
 )
@@ -242,7 +242,7 @@ _lines: WeakValueDictionary[tuple[int, int, int], expression_wrinkles.WrinkleLin
 
 
 def _pose(rest: SimulatedSubject, state: str, amount: float) -> ExpressionPose:
-    """Return a pose of a face at rest; the same object as long as anybody holds it."""
+    """Return a pose of a face at rest; the same object as long as any caller holds it."""
     key = (id(rest.mesh), id(rest.height_um), rest.seed, state, amount)
     pose = _poses.get(key)
     if pose is None:
@@ -281,7 +281,7 @@ def make_subject(
     mesh: Mesh | str | Path | None = None,
     blood: float = 1.0,
 ) -> SimulatedSubject:
-    """Make a face.
+    """Build a face.
 
     Parameters
     ----------
@@ -290,17 +290,17 @@ def make_subject(
     seed
         Seed of shape and patterns, >= 0; the same arguments give the same face.
     size
-        Texels along one side of the maps, 64 to 8192; a face of 512 has texels of about 0.5 mm.
+        Texels along each side of the maps, 64 to 8192; a face of 512 has texels of about 0.5 mm.
     mesh
         Geometry in mm, or its file (.npz, .obj), instead of the procedural head; the tip of its
-        nose must be its foremost point. A file's mesh is moved to the rig's centre.
+        nose must be its foremost point. The mesh of a file is moved to the rig's center.
     blood
         Factor of all blood, 0.1 to 4.
 
     Returns
     -------
-    Subject
-        The face with its truth maps.
+    SimulatedSubject
+        The face with its ground-truth maps.
 
     Raises
     ------

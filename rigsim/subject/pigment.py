@@ -1,4 +1,4 @@
-"""Melanin of a face: base, slow variation, sun, freckles, moles."""
+"""Generate the melanin of a face: base, slow variation, sun, freckles, moles."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -22,9 +22,9 @@ MELANIN_PRESETS: Final[Mapping[str, float]] = {
     "VI": 0.17,
     "darkest": 0.45,
 }
-"""Volume fraction of melanosomes of each preset, for an epidermis of 0.25 mm. The ranges that
-Jacques 1998 ("Skin optics summary", Oregon Medical Laser Center) gives for lightly (1.3-6.3 %),
-moderately (11-16 %) and darkly (18-43 %) pigmented adults belong to a real epidermis of about
+"""Volume fraction of melanosomes of each preset, for an epidermis of 0.25 mm. The ranges of
+Jacques 1998 ("Skin optics summary", Oregon Medical Laser Center) for lightly (1.3-6.3 %),
+moderately (11-16 %) and darkly (18-43 %) pigmented adults apply to a real epidermis of about
 0.07 mm, so they are divided by 3.5 here; the two ends are those of the range to be covered, and
 the darkest reflects less than real skin does."""
 
@@ -48,9 +48,9 @@ def draw_melanin_map(
     base
         Volume fraction of melanosomes around which the map varies, 0.001 to 0.45.
     seed
-        Any integer; it also decides where the sun did not reach.
+        Any integer; it also determines the areas without sun.
     freckles
-        How many freckles there are, 0 to 1, fewer on dark skin; ``None`` draws it, 0.2 to 0.8.
+        Amount of freckles, 0 to 1, fewer on dark skin; ``None`` draws it, 0.2 to 0.8.
 
     Returns
     -------
@@ -75,11 +75,11 @@ def draw_melanin_map(
 
 
 def _suntan(points: Float32Array, base: float, rng: np.random.Generator) -> FloatArray:
-    """Sun everywhere but under a cap or behind glasses; half a tan is in the base already."""
+    """Return the suntan except under a cap or behind glasses; half a tan is in the base already."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     gain = float(rng.uniform(0.25, 0.5)) * (0.4 + 0.6 * float(np.exp(-base / 0.1)))
     if rng.random() < 0.5:
-        edge = float(rng.uniform(56.0, 70.0))  # a cap down to this height
+        edge = float(rng.uniform(56.0, 70.0))  # lower edge of a cap
         hidden = soft_step((y - edge - 0.0025 * x * x) / 1.5)
     else:
         half_width, half_height = rng.uniform(22.0, 25.0), rng.uniform(13.0, 17.0)
@@ -99,8 +99,8 @@ def _freckles(
 ) -> FloatArray:
     where = 0.9 * regions["cheeks"] + 0.9 * regions["nose"] + 0.25 * regions["forehead"] + 0.03
     where = where * (1.0 - regions["lips"])
-    # Freckles belong to pale skin.
-    drawn = float(rng.uniform(0.2, 0.8))  # drawn anyway, so that moles stay where they are
+    # Freckles fade on dark skin.
+    drawn = float(rng.uniform(0.2, 0.8))  # drawn in every case, so that moles keep their positions
     density = (drawn if amount is None else amount) * float(np.exp(-base / 0.05))
     spots = random_spots(
         points, density * where, cell_mm=3.6, radius_mm=(0.4, 1.1), seed=seed + 21, softness=5.0
@@ -117,5 +117,5 @@ def _moles(points: Float32Array, base: float, *, seed: int, rng: np.random.Gener
         seed=seed + 31,
         softness=8.0,
     )
-    # Nevi hold several times the melanin of the skin around them.
+    # Nevi have several times the melanin of the surrounding skin.
     return float(rng.uniform(1.4, 2.0)) * (1.0 + 0.6 * float(np.exp(-base / 0.05))) * spots

@@ -1,4 +1,4 @@
-"""Fine geometry of the skin's surface: pores, wrinkles, and how rough and oily it is."""
+"""Generate the fine geometry of the skin's surface: pores, wrinkles, roughness and oil."""
 
 from collections.abc import Mapping
 
@@ -22,7 +22,7 @@ def height_um(
     regions
         Masks of `rigsim.subject.face_regions.region_masks`.
     texel_mm
-        Size of a texel; what is finer than two texels is left out or widened at less depth.
+        Size of a texel; details finer than two texels are omitted or widened at less depth.
     seed
         Any integer.
 
@@ -44,14 +44,14 @@ def height_um(
         min_radius_mm=0.8 * texel_mm,
     )
     height -= 60.0 * pores * (0.5 + 0.5 * porous)
-    # Lines of expression: horizontal on the forehead, fans beside the eyes, upright on the lips.
+    # Lines of expression: horizontal on the forehead, fans next to the eyes, upright on the lips.
     stretched = points_mm * np.array([0.12, 1.0, 0.4], np.float32)
     height -= _grooves(stretched, 9.0, 0.9, texel_mm, 45.0, seed + 72) * regions["forehead"]
     fans = points_mm * np.array([0.25, 1.0, 0.25], np.float32)
     height -= _grooves(fans, 4.0, 0.6, texel_mm, 45.0, seed + 73) * regions["crow"]
     upright = points_mm * np.array([1.0, 0.15, 0.3], np.float32)
     height -= _grooves(upright, 2.4, 0.45, texel_mm, 60.0, seed + 74) * regions["lips"]
-    # The net of primary lines, a quarter of a millimetre apart, where texels can show it.
+    # The net of primary lines, a quarter of a millimeter apart, where texels resolve it.
     if texel_mm < 0.2:
         net = vessel_network(points_mm, 0.6, max(0.1, texel_mm), seed=seed + 75)
         height -= 18.0 * net
@@ -73,7 +73,7 @@ def hair_map(points_mm: Float32Array, *, seed: int) -> Float32Array:
     Returns
     -------
     ndarray of float32
-        Part that hair covers, shape (...), 0 to 1; zero on bare skin.
+        Fraction covered by hair, shape (...), 0 to 1; zero on bare skin.
     """
     rng = np.random.default_rng([seed, 4])
     x, y = np.abs(points_mm[..., 0]), points_mm[..., 1]
@@ -84,13 +84,13 @@ def hair_map(points_mm: Float32Array, *, seed: int) -> Float32Array:
     thick = (1.0 - 0.65 * along) * float(rng.uniform(3.0, 4.2))
     brow = np.exp(-(((y - arch) / thick) ** 4))
     brow *= soft_step((x - 10.5) / 2.5) * soft_step((49.0 - x) / 2.5)
-    # Strands run outwards and slightly up.
+    # Strands point outwards and slightly up.
     strands = np.stack(
         [0.16 * x, y - 0.35 * x, 0.3 * points_mm[..., 2] + 40.0 * np.sign(points_mm[..., 0])],
         axis=-1,
     )
     brow *= np.clip(0.68 + 0.3 * smooth_noise(strands, (0.9, 0.45), seed=seed + 91), 0.25, 1.0)
-    # The lashes of closed eyes lie along the line between the lids.
+    # The lashes of closed eyes follow the line between the lids.
     line = 16.6 + 0.011 * (x - 31.0) ** 2
     lash = 0.85 * np.exp(-(((y - line) / 0.9) ** 2)) * soft_step((x - 17.0) / 1.5)
     lash *= soft_step((46.0 - x) / 1.5)
@@ -101,7 +101,7 @@ def hair_map(points_mm: Float32Array, *, seed: int) -> Float32Array:
 def roughness_map(
     points_mm: Float32Array, regions: Mapping[str, Float32Array], *, seed: int
 ) -> Float32Array:
-    """Draw how rough the surface is; oil on forehead, nose and chin smooths it.
+    """Draw the roughness of the surface; oil on forehead, nose and chin smooths it.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def relief_normals(atlas: Atlas, height: FloatArray) -> Float32Array:
 
 
 def _slope(h: Float64Array, valid: BoolArray) -> Float64Array:
-    """Return the change per column: central, at borders of what is valid one-sided, else 0."""
+    """Return the change per column: central, one-sided at borders of valid texels, else 0."""
     step = np.where(valid[:, 1:] & valid[:, :-1], h[:, 1:] - h[:, :-1], 0.0)
     total, count = np.zeros_like(h), np.zeros(h.shape)
     has = (valid[:, 1:] & valid[:, :-1]).astype(np.float64)
@@ -177,7 +177,7 @@ def _slope(h: Float64Array, valid: BoolArray) -> Float64Array:
 
 
 def tangent_normals(atlas: Atlas, normal: Float32Array) -> Float32Array:
-    """Turn normals into the frame of the texture.
+    """Rotate normals into the frame of the texture.
 
     Parameters
     ----------
@@ -189,9 +189,9 @@ def tangent_normals(atlas: Atlas, normal: Float32Array) -> Float32Array:
     Returns
     -------
     ndarray of float32
-        Unit normals, shape (N, N, 3): +x runs along u on the surface, +z is the surface's own
-        shading normal, +y is across both on the side of growing v; (0, 0, 1) where the texture has
-        no surface.
+        Unit normals, shape (N, N, 3): +x points along u on the surface, +z is the surface's own
+        shading normal, +y is perpendicular to both on the side of growing v; (0, 0, 1) where the
+        texture has no surface.
     """
     up = atlas.normal.astype(np.float64)
     along = atlas.dp_du_mm.astype(np.float64)
@@ -233,7 +233,7 @@ def stubble_map(
     if amount == 0.0:
         return None
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
-    # The border runs from the ears down the cheeks to the corners of the mouth.
+    # The border extends from the ears down the cheeks to the corners of the mouth.
     reach = np.clip((np.abs(x) - 24.0) / 34.0, 0.0, 1.0)
     upper = -34.0 + 22.0 * reach**1.5 - y
     moustache = np.exp(-((x / 26.0) ** 4) - ((y + 29.0) / 7.0) ** 4)
@@ -252,5 +252,5 @@ def stubble_map(
         softness=4.0,
         min_radius_mm=0.7 * texel_mm,
     )
-    # Half of the shadow is blurred: light spreads in skin further than between two follicles.
+    # Half of the shadow is blurred: lateral scattering in skin exceeds the distance of follicles.
     return np.asarray(np.clip(0.45 * dense + 0.55 * dots, 0.0, 1.0), np.float32)

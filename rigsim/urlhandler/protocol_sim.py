@@ -1,10 +1,10 @@
-"""Pyserial port on a simulated box: ``sim://BOX?seed=1&clock=virtual&drop=0.001&...``.
+"""Implement the pyserial port of a simulated box: ``sim://BOX?seed=1&clock=virtual&drop=0.001``.
 
-``sim://flash?world=NAME`` is the box of a registered world; where no world has that name, one is
-made and registered under it; ``name=NAME`` says the same. Without a name the whole URL is the name:
-the same URL is the same box, which keeps its state while its port is closed, and its cameras are
-``sim://flash/VIEW``. ``seed``, ``clock`` (virtual or real) and the
-switches of `rigsim.boxes.faults.Faults` say how a new world is made.
+``sim://flash?world=NAME`` is the controller of a registered world; an unknown name builds a world
+and registers it. ``name=NAME`` is equivalent. Without a name the whole URL is the name: the same
+URL is the same controller, which keeps its state while its port is closed, and its cameras are
+``sim://flash/VIEW``. ``seed``, ``clock`` (virtual or real) and the switches of
+`rigsim.boxes.faults.Faults` configure a new world.
 
 The port fails as real ones do: a pulled cable is a SerialException in read and write, an OSError in
 ``in_waiting`` and a ``termios.error`` in ``reset_input_buffer``.
@@ -26,22 +26,22 @@ from rigsim.world.link import Link, LinkStalled, LinkUnplugged
 from rigsim.world.rig_boxes import BOXES
 
 REAL_POLL_S = 0.002
-"""How often a port on the real clock looks whether another thread did something."""
+"""Interval at which a port on the real clock checks for actions of other threads, s."""
 
 
 def world_from_url(url: str) -> tuple[World, str]:
-    """Return the world of a ``sim://`` URL, made if need be, and the name of the box.
+    """Return the world of a ``sim://`` URL, built if necessary, and the name of the controller.
 
     Raises
     ------
     ValueError
-        When the URL says something that no world understands.
+        When the URL has an invalid or a contradictory setting.
     """
     parts = urlsplit(url)
     pairs = parse_qsl(parts.query, keep_blank_values=True, strict_parsing=bool(parts.query))
     settings = dict(pairs)
     if len(settings) != len(pairs):
-        raise ValueError(f"{url}: a setting stands twice")
+        raise ValueError(f"{url}: got a setting twice, expected each once")
     box = parts.netloc
     if "name" in settings and "world" in settings:
         raise ValueError(f"{url}: got world and name, which mean the same; give one")
@@ -74,7 +74,7 @@ def _with_box(world: World, box: str, url: str) -> World:
 
 
 class Serial(SerialBase):
-    """The host's end of a simulated line."""
+    """Host end of a simulated line."""
 
     BAUDRATES = (9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600, 1_000_000)
     is_open: bool
@@ -85,7 +85,7 @@ class Serial(SerialBase):
         super().__init__(*args, **kwargs)
 
     def open(self) -> None:
-        """Open the port; fail when another one has it."""
+        """Open the port; fail when another one has opened it."""
         if self._port is None:
             raise SerialException("Port must be configured before it can be used.")
         if self.is_open:
@@ -104,7 +104,7 @@ class Serial(SerialBase):
         self.is_open = True
 
     def close(self) -> None:
-        """Close the port; the box lives on."""
+        """Close the port; the controller's state persists."""
         if self.is_open and self._link is not None and self._world is not None:
             with self._world.lock:
                 self._world.advance(self._world.now)
@@ -121,7 +121,7 @@ class Serial(SerialBase):
 
     @property
     def in_waiting(self) -> int:
-        """Bytes that have arrived."""
+        """Number of bytes that have arrived."""
         world, link = self._ends()
         with world.lock:
             world.advance(world.now)
@@ -152,7 +152,7 @@ class Serial(SerialBase):
             world.wait(min(due, until, math.inf if world.virtual else world.now + REAL_POLL_S))
 
     def write(self, data: bytes) -> int:
-        """Send bytes to the box."""
+        """Send bytes to the controller."""
         world, link = self._ends()
         data = bytes(data)
         until = math.inf if self._write_timeout is None else world.now + self._write_timeout
@@ -171,11 +171,11 @@ class Serial(SerialBase):
                     return len(data)
                 due = world.deadline()
             if math.isinf(min(due, until)):
-                raise SerialException("the box will never take bytes; set a write timeout")
+                raise SerialException("the controller never takes bytes; set a write timeout")
             world.wait(min(due, until))
 
     def reset_input_buffer(self) -> None:
-        """Drop what has arrived."""
+        """Drop the bytes that have arrived."""
         world, link = self._ends()
         with world.lock:
             world.advance(world.now)

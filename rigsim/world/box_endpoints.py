@@ -1,4 +1,4 @@
-"""Where the bytes of a served box go in and out: a pseudo-terminal, or a TCP port."""
+"""Connect served controllers to pseudo-terminals or TCP ports."""
 
 import contextlib
 import logging
@@ -19,7 +19,7 @@ CHUNK_BYTES = 4096
 
 
 class BoxEndpoint(ABC):
-    """Where the bytes of one box go in and out; those that it would not take yet wait here."""
+    """Byte stream of one controller; bytes that it does not accept yet wait here."""
 
     address: str
 
@@ -35,15 +35,15 @@ class BoxEndpoint(ABC):
 
     @abstractmethod
     def start(self, selector: selectors.BaseSelector) -> None:
-        """Begin to serve; `selector` calls back when bytes come."""
+        """Begin to serve; `selector` calls back when bytes arrive."""
 
     @abstractmethod
     def pump(self) -> None:
-        """Pass on what the box has said."""
+        """Pass on the controller's output."""
 
     @abstractmethod
     def stop(self) -> None:
-        """Stop serving; doing so twice is allowed."""
+        """Stop serving; a second call is allowed."""
 
     def _forget(self) -> None:
         self._unsent = b""
@@ -68,7 +68,7 @@ class BoxEndpoint(ABC):
                     self._world.advance(now)
 
     def _take(self) -> bytes:
-        """Return what the box said; raise `LinkUnplugged`."""
+        """Return the controller's output; raise `LinkUnplugged`."""
         if self._unsent:
             self._send(b"")
         with self._world.lock:
@@ -77,11 +77,11 @@ class BoxEndpoint(ABC):
 
 
 class PtyEndpoint(BoxEndpoint):
-    """A box behind a pseudo-terminal."""
+    """A controller behind a pseudo-terminal."""
 
     def __init__(self, world: World, link: Link) -> None:
         super().__init__(world, link)
-        # the slave stays open here: else the master fails when a client closes
+        # the slave stays open here: otherwise the master fails when a client closes
         self._master, self._slave = pty.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -89,7 +89,7 @@ class PtyEndpoint(BoxEndpoint):
         self._open = True
 
     def start(self, selector: selectors.BaseSelector) -> None:
-        """Begin to serve; `selector` calls back when bytes come."""
+        """Begin to serve; `selector` calls back when bytes arrive."""
         self._selector = selector
         selector.register(self._master, selectors.EVENT_READ, self._readable)
         self._attach()
@@ -100,11 +100,11 @@ class PtyEndpoint(BoxEndpoint):
                 self._guarded(lambda: self._send(os.read(self._master, CHUNK_BYTES)))
 
     def pump(self) -> None:
-        """Pass on what the box has said."""
+        """Pass on the controller's output."""
 
         def write() -> None:
             data = self._take()
-            # nobody reads and the terminal is full: what the box says is lost, as on a real line
+            # no reader and a full terminal: the output is lost, as on a real line
             with contextlib.suppress(BlockingIOError):
                 while data:
                     data = data[os.write(self._master, data) :]
@@ -119,7 +119,7 @@ class PtyEndpoint(BoxEndpoint):
             self.stop()
 
     def stop(self) -> None:
-        """Stop serving; doing so twice is allowed."""
+        """Stop serving; a second call is allowed."""
         if self._open:
             self._open = False
             self._selector.unregister(self._master)
@@ -129,7 +129,7 @@ class PtyEndpoint(BoxEndpoint):
 
 
 class TcpEndpoint(BoxEndpoint):
-    """A box behind a TCP port, for one client at a time."""
+    """A controller behind a TCP port, for one client at a time."""
 
     def __init__(self, world: World, link: Link, host: str, port: int) -> None:
         super().__init__(world, link)
@@ -146,7 +146,7 @@ class TcpEndpoint(BoxEndpoint):
         return super().is_stalled or bool(self._unwritten)
 
     def start(self, selector: selectors.BaseSelector) -> None:
-        """Begin to serve; `selector` calls back when bytes come."""
+        """Begin to serve; `selector` calls back when bytes arrive."""
         self._selector = selector
         selector.register(self._listener, selectors.EVENT_READ, self._acceptable)
 
@@ -155,15 +155,15 @@ class TcpEndpoint(BoxEndpoint):
             client, peer = self._listener.accept()
         except OSError:
             return  # gone again
-        self._readable()  # a client that was killed may not have been noticed yet
+        self._readable()  # detects a client that was killed
         if self._client is not None:
-            log.warning("%s: refused %s, another host has the box", self.address, peer)
-            self._see_out(client)
+            log.warning("%s: refused %s, another host is connected", self.address, peer)
+            self._close_gracefully(client)
             return
         try:
             self._attach()
         except LinkUnplugged:
-            self._see_out(client)
+            self._close_gracefully(client)
             return
         client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -181,32 +181,32 @@ class TcpEndpoint(BoxEndpoint):
         except BlockingIOError:
             return
         except (OSError, LinkUnplugged):
-            self._hang_up()
+            self._disconnect()
 
     def pump(self) -> None:
-        """Pass on what the box has said."""
+        """Pass on the controller's output."""
         if self._client is None:
             return
         try:
-            # a client that never reads loses what does not fit, as on a real line
+            # a client that never reads loses the overflow, as on a real line
             self._unwritten = (self._unwritten + self._take())[-(2**20) :]
             if self._unwritten:
                 self._unwritten = self._unwritten[self._client.send(self._unwritten) :]
         except BlockingIOError:
             return
         except (OSError, LinkUnplugged):
-            self._hang_up()
+            self._disconnect()
 
-    def _hang_up(self) -> None:
+    def _disconnect(self) -> None:
         client, self._client = self._client, None
         if client is not None:
             self._selector.unregister(client)
-            self._see_out(client)
+            self._close_gracefully(client)
             self._unwritten = b""
             self._forget()
 
-    def _see_out(self, client: socket.socket) -> None:
-        """Tell a client that it is over, and wait for its own end: closing at once is a reset."""
+    def _close_gracefully(self, client: socket.socket) -> None:
+        """Shut a connection down and wait for the client's own end: closing at once is a reset."""
 
         def drain() -> None:
             with contextlib.suppress(BlockingIOError):
@@ -229,8 +229,8 @@ class TcpEndpoint(BoxEndpoint):
         self._selector.register(client, selectors.EVENT_READ, drain)
 
     def stop(self) -> None:
-        """Stop serving; doing so twice is allowed."""
-        self._hang_up()
+        """Stop serving; a second call is allowed."""
+        self._disconnect()
         for client in self._leaving:
             client.close()
         self._listener.close()

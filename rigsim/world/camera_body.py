@@ -1,8 +1,8 @@
-"""A simulated camera: shots, exposures and sensor.
+"""Simulate a camera: shots, exposures and sensor.
 
-It opens its shutter when it is fired, or on the edge that the flash box puts on the camera line. It
-sees the light that pops while the shutter is open, is busy until the frame is read out, and misses
-edges meanwhile. Its pixels are made when somebody asks for the frame.
+The camera opens its shutter when it is fired, or on the edge that the flash controller puts on the
+camera line. It integrates the light that pops while the shutter is open, is busy until the frame is
+read out, and misses edges meanwhile. The pixels are computed when a client requests the frame.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ FOREIGN_SERIAL = "SR-9999"
 
 @dataclass(frozen=True, slots=True)
 class _Shot:
-    """An exposure whose pixels are not made yet."""
+    """An exposure whose pixels are not computed yet."""
 
     number: int
     seq: int
@@ -45,7 +45,7 @@ class _Shot:
 
 
 class CameraWorld(Protocol):
-    """What a camera asks of the world that it stands in."""
+    """Interface of the world that a camera requires."""
 
     faults: Faults
     lock: threading.RLock
@@ -59,13 +59,13 @@ class CameraWorld(Protocol):
         """Return the random generator of these names."""
 
     def advance(self, now: float) -> float:
-        """Bring every controller to this time; return when the next event is due, s."""
+        """Advance every controller to this time; return when the next event is due, s."""
 
     def wait(self, until: float) -> None:
-        """Let time pass until this moment, s."""
+        """Advance time to this moment, s."""
 
     def light_between(self, start: float, end: float) -> tuple[Light, ...]:
-        """Return the light of a span of time."""
+        """Return the light of a time interval."""
 
     def expose(
         self,
@@ -85,17 +85,17 @@ class CameraBody:
     Parameters
     ----------
     world
-        Where it stands.
+        The camera's world.
     view
-        What it is.
+        Its view in the rig.
     first_shot
         Number of its next shot, >= 0. It seeds the noise, so that no two shots may share one: a
-        camera that goes on where another world's ended goes on counting, too.
+        camera that continues another world's sequence continues its count, too.
 
     Attributes
     ----------
     missed_edges : int
-        Triggers that came while it was not armed or busy.
+        Triggers that arrived while it was not armed or busy.
     """
 
     def __init__(self, world: CameraWorld, view: View, *, first_shot: int = 0) -> None:
@@ -123,14 +123,14 @@ class CameraBody:
         self._previous: _Shot | None = None
 
     def clock_s(self) -> float:
-        """Return the camera's own clock, in s; it drifts as the world's faults say."""
+        """Return the camera's own clock, in s; it drifts by the world's fault settings."""
         return self._stamp(self.world.now)
 
     def _stamp(self, now: float) -> float:
         return now * (1.0 + self.world.faults.drift_ppm * 1e-6)
 
     def configure(self, want: Exposure) -> Exposure:
-        """Set an exposure within what the camera can do, and return it."""
+        """Set an exposure, limited to the camera's ranges, and return it."""
         self.exposure = Exposure(
             min(max(want.exposure_s, EXPOSURE_RANGE_S[0]), EXPOSURE_RANGE_S[1]),
             min(max(want.iso, ISO_RANGE[0]), ISO_RANGE[1]),
@@ -138,11 +138,11 @@ class CameraBody:
         return self.exposure
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """Make ready for `count` exposures and drop what waits."""
+        """Prepare `count` exposures and drop pending frames."""
         if count < 1:
             raise CameraError(f"count: got {count}, expected 1 or more")
         if trigger not in self.info.triggers:
-            raise CameraError(f"camera {self.info.serial}: knows no {trigger} trigger")
+            raise CameraError(f"camera {self.info.serial}: does not support {trigger} triggers")
         with self.world.lock:
             self._waiting.clear()
             if self._previous is not None and self._rng.random() < self.world.faults.stale:
@@ -150,17 +150,17 @@ class CameraBody:
             self._armed, self._trigger, self._seq = count, trigger, 0
 
     def abort(self) -> None:
-        """Give up what was armed; an exposure that has begun is dropped."""
+        """Cancel armed exposures; an exposure that has begun is dropped."""
         with self.world.lock:
             self._armed = 0
             self._waiting.clear()
 
     def close(self) -> None:
-        """Let go of the camera, which lives on."""
+        """Release the camera; its state persists."""
         self.abort()
 
     def edge(self, now: float) -> None:
-        """Notice a pulse on the camera line."""
+        """Handle a pulse on the camera line."""
         if self._trigger is Trigger.EDGE and self._armed and now >= self._busy_until:
             self._open_shutter(now)
         else:
@@ -168,7 +168,7 @@ class CameraBody:
 
     @property
     def is_exposing(self) -> bool:
-        """Whether an exposure or its read-out is under way."""
+        """Whether an exposure or its read-out is in progress."""
         return self.world.now < self._busy_until
 
     def fire(self) -> None:
@@ -177,9 +177,11 @@ class CameraBody:
             self.world.advance(self.world.now)
             now = self.world.now
             if self._trigger is not Trigger.SOFTWARE or not self._armed:
-                raise CameraError(f"camera {self.view.serial}: is not armed for software triggers")
+                raise CameraError(
+                    f"camera {self.view.serial}: not armed for software triggers; arm it"
+                )
             if now < self._busy_until:
-                raise CameraError(f"camera {self.view.serial}: is still reading out")
+                raise CameraError(f"camera {self.view.serial}: still reading out; retry later")
             self._open_shutter(now)
 
     def _open_shutter(self, now: float) -> None:
@@ -192,7 +194,7 @@ class CameraBody:
             self._waiting.append(shot)
 
     def next_shot(self, timeout_s: float) -> _Shot:
-        """Wait until the next frame is read out."""
+        """Wait until the next frame has been read out."""
         world = self.world
         until = world.now + timeout_s
         while True:
@@ -214,7 +216,7 @@ class CameraBody:
         return self.develop(self.next_shot(timeout_s))
 
     def develop(self, shot: _Shot) -> Frame:
-        """Make the pixels of an exposure and say what the camera says of it."""
+        """Compute the pixels of an exposure and return them with the camera's metadata."""
         faults = self.world.faults
         rng = self.world.rng_for("frame", self.view.name, str(shot.number))
         foreign = rng.random() < faults.wrong_camera

@@ -19,18 +19,18 @@ log = logging.getLogger(__name__)
 
 MAX_WAIT_S = 600.0
 CLIENT_POLL_S = 0.2
-"""How often the wait for a frame looks whether its client is still there, s."""
+"""Interval at which a wait for a frame checks that its client is still connected, s."""
 
 
 class CameraService:
-    """Threads that answer for the cameras of a world.
+    """Threads that serve the cameras of a world.
 
     Parameters
     ----------
     world
-        Whose cameras.
+        World of the cameras.
     host, port
-        Where to listen; port 0 takes a free one.
+        Listening address; port 0 takes a free one.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class CameraService:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop listening and hang up."""
+        """Stop listening and close the connections."""
         self._server.shutdown()
         self._thread.join()
         with self._lock:
@@ -75,7 +75,7 @@ class CameraService:
         self._server.server_close()
 
     def serve_client(self, connection: socket.socket) -> None:
-        """Answer one client until it hangs up."""
+        """Answer one client until it disconnects."""
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         with self._lock:
             self._connections.add(connection)
@@ -94,7 +94,7 @@ class CameraService:
                 self._connections.discard(connection)
                 held = view is not None and self._holders.get(view) is connection
                 if view is not None and held:
-                    # still locked: nobody may have armed it meanwhile
+                    # still locked: another client could have armed it meanwhile
                     self.world.camera(view).abort()
                     del self._holders[view]
 
@@ -110,18 +110,20 @@ class CameraService:
                 fault = f"version: got {got!r}, expected {expected}"
             elif name not in self.addresses:
                 fault = f"view: got {name!r}, expected one of {', '.join(self.addresses)}"
-            elif current is not None or (holder is not None and not _hung_up(holder)):
-                fault, error = f"view {name!r}: another program has this camera", "CameraBusy"
+            elif current is not None or (holder is not None and not _is_disconnected(holder)):
+                fault = f"view {name!r}: another program has this camera; close it there"
+                error = "CameraBusy"
             elif self.world.camera(name).is_exposing:
-                # armed now, it would miss its trigger
-                fault, error = f"view {name!r}: is reading out a frame of before", "CameraBusy"
+                # a camera armed now would miss its trigger
+                fault = f"view {name!r}: still reading out a frame; retry later"
+                error = "CameraBusy"
             else:
-                # a client that died while its frame was awaited or made loses the camera at once
+                # a client that died while its frame was pending loses the camera at once
                 self._holders[name] = connection
         if fault:
             _send(connection, request, ok=False, error=error, text=fault)
             return current
-        with self._waits[name]:  # a wait of that client's has ended: it takes no frame of ours
+        with self._waits[name]:  # that client's wait has ended: it takes no frame of this one
             camera = self.world.camera(name)
             if holder is not None:
                 camera.abort()
@@ -133,18 +135,18 @@ class CameraService:
     ) -> None:
         try:
             if view is None:
-                raise CameraError("no camera was opened on this connection")
+                raise CameraError("no camera is open on this connection; open one first")
             with self._lock:
                 if self._holders.get(view) is not connection:
                     raise ConnectionResetError("the camera has gone to another client")
-            fields, blob = self._do(connection, self.world.camera(view), request)
+            fields, blob = self._run_command(connection, self.world.camera(view), request)
         except (CameraError, KeyError, TypeError, ValueError) as exc:
             kind = "FrameTimeout" if isinstance(exc, FrameTimeout) else "CameraError"
             _send(connection, request, ok=False, error=kind, text=str(exc))
         else:
             _send(connection, request, blob=blob, ok=True, **fields)
 
-    def _do(
+    def _run_command(
         self, connection: socket.socket, camera: CameraBody, request: Mapping[str, Any]
     ) -> tuple[dict[str, Any], bytes | None]:
         match request.get("do"):
@@ -170,15 +172,17 @@ class CameraService:
                 camera.abort()
                 return {}, None
             case other:
-                raise CameraError(f"do: got {other!r}, which no camera understands")
+                raise CameraError(f"do: got {other!r}, expected a command of the camera protocol")
 
     def _next_shot(self, connection: socket.socket, body: CameraBody, timeout_s: float) -> Any:
-        """Wait for a frame, but not for a client that is gone."""
+        """Wait for a frame while the client is connected."""
         until = time.monotonic() + timeout_s
         while True:
             left_s = max(0.0, until - time.monotonic())
             with self._waits[body.view.name]:
-                if self._holders.get(body.view.name) is not connection or _hung_up(connection):
+                if self._holders.get(body.view.name) is not connection or _is_disconnected(
+                    connection
+                ):
                     raise ConnectionResetError("the client is gone")
                 with contextlib.suppress(FrameTimeout):
                     return body.next_shot(min(left_s, CLIENT_POLL_S))
@@ -186,8 +190,8 @@ class CameraService:
                 raise FrameTimeout(f"camera {body.view.serial}: no frame in {timeout_s:g} s")
 
 
-def _hung_up(connection: socket.socket) -> bool:
-    """Tell whether the other end has closed a connection."""
+def _is_disconnected(connection: socket.socket) -> bool:
+    """Return whether the peer has closed a connection."""
     try:
         return not connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
     except BlockingIOError:
@@ -201,10 +205,10 @@ def _request(stream: Any) -> dict[str, Any] | None:
     if not line:
         return None
     if not line.endswith(b"\n"):
-        raise BadMessage("header: too long, or cut")
+        raise BadMessage("header: got one that is too long or cut, expected one line of JSON")
     fields = camera_wire.decode_header(line[:-1])
     if camera_wire.blob_size(fields):
-        raise BadMessage("blob_bytes: a request has none")
+        raise BadMessage("blob_bytes: got some in a request, expected none")
     return fields
 
 

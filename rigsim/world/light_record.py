@@ -1,4 +1,4 @@
-"""Light that came out of a world's boxes: what has ended, and what still shines."""
+"""Record light that a world's controllers emitted: ended intervals and light in progress."""
 
 from bisect import bisect_right
 from collections.abc import Sequence
@@ -14,14 +14,14 @@ Light = FlashPop | SwitchedLight
 
 
 class LightRecord:
-    """All light so far, in the order in which it ended.
+    """All light so far, ordered by end time.
 
     Attributes
     ----------
     pops : list of FlashPop
         All pops.
     switched : list of SwitchedLight
-        Stretches of light that have ended; a rig has one kind of box that switches light.
+        Intervals of light that have ended; a rig has one kind of controller that switches light.
     """
 
     def __init__(self) -> None:
@@ -29,7 +29,7 @@ class LightRecord:
         self.switched: list[SwitchedLight] = []
 
     def add(self, light: Light) -> None:
-        """Keep a pop, or a stretch of light that has ended."""
+        """Record a pop, or an interval of light that has ended."""
         if isinstance(light, FlashPop):
             self.pops.append(light)
         else:
@@ -44,8 +44,8 @@ class LightRecord:
         ----------
         start, end
             World times, s.
-        going_on
-            Stretches of light that have not ended, as given so far.
+        ongoing
+            Intervals of light that have not ended, as emitted so far.
         """
         first = bisect_right(self.switched, start, key=lambda light: light.t_off_s)
         clipped = (

@@ -1,8 +1,8 @@
-"""The line between a host and a box: delay, order, and everything that can happen to bytes on it.
+"""Simulate the line between a host and a controller: delay, order, and faults on its bytes.
 
-A `Link` is sans-I/O like the box behind it: what either side sends is queued with the time at which
-it arrives, and `advance` delivers what is due. The line keeps its order; late means late for all
-that follows.
+A `Link` is sans-I/O like the controller behind it: bytes from either side are queued with their
+arrival times, and `advance` delivers the due ones. The line keeps its order: a late answer delays
+all that follow.
 """
 
 import math
@@ -15,33 +15,34 @@ from rigsim.boxes.controller import Controller
 from rigsim.boxes.faults import Faults
 
 STALL_BUFFER_BYTES = 256
-"""What the line holds while a stalled box takes nothing."""
+"""Capacity of the line while a stalled controller takes nothing, bytes."""
 BOOT_BANNER = b"\r\nrst:0x1 (POWERON),boot:0x13\r\nheap 203412 free\r\n"
 
 RecordBytes = Callable[[float, str, bytes], None]
 
 
 class LinkUnplugged(Exception):
-    """The cable is out."""
+    """The cable is unplugged."""
 
 
 class LinkStalled(Exception):
-    """The box takes no bytes and the buffer of the line is full."""
+    """The controller takes no bytes and the buffer of the line is full."""
 
 
 class Link:
-    """One box and the line to it.
+    """One controller and the line to it.
 
     Parameters
     ----------
     box
-        At the far end.
+        Controller at the far end.
     faults
         Switches, see `rigsim.boxes.faults.Faults`.
     rng
-        Decides when they strike.
+        Determines when the faults strike.
     record
-        Called with (time in s, direction, bytes) for the transcript: ``>`` arrives at the box,
+        Called with (time in s, direction, bytes) for the transcript: ``>`` arrives at the
+        controller,
         ``<`` arrives at the host.
     """
 
@@ -60,14 +61,14 @@ class Link:
         self._opened_at = math.inf
         self._byte_s = 10.0 / faults.baud if faults.baud else 0.0
         self._reset_at = faults.reset_after
-        # when the last byte under way each way arrives: the line is first in, first out
+        # arrival time of the last byte in each direction: the line is first in, first out
         self._box_free = 0.0
         self._host_free = 0.0
 
     # the host's end ---------------------------------------------------------------------------
 
     def attach(self, now: float) -> None:
-        """Open the port; raise `LinkUnplugged` when nothing is there."""
+        """Open the port; raise `LinkUnplugged` when the cable is out."""
         self._first_open = min(self._first_open, now)
         self._opened_at = now
         self.check(now)
@@ -76,25 +77,25 @@ class Link:
             self.box.power_cycle(now, boot_s=self._faults.boot_s, announce=True)
 
     def detach(self) -> None:
-        """Close the port; what the box says from now on is lost."""
+        """Close the port; later output of the controller is lost."""
         self.attached = False
         self._to_host.clear()
         self._received.clear()
 
     def check(self, now: float) -> None:
-        """Raise `LinkUnplugged` while the cable is out; a port opened before stays dead after."""
+        """Raise `LinkUnplugged` while the cable is out; an earlier port stays dead."""
         out = self._first_open + self._faults.unplug_after
         if now >= out and (now < out + self._faults.replug_after or self._opened_at < out):
             raise LinkUnplugged
 
     def send(self, data: bytes, now: float) -> None:
-        """Send bytes to the box; raise `LinkStalled` when they do not fit."""
+        """Send bytes to the controller; raise `LinkStalled` when they do not fit."""
         self.check(now)
         waiting = sum(len(chunk) for _, chunk in self._to_box)
         if self._stall_end(now) > now and waiting + len(data) > STALL_BUFFER_BYTES:
             raise LinkStalled
         for line in data.splitlines(keepends=True):
-            for copy in self._mangled(line):
+            for copy in self._apply_faults(line):
                 self._box_free = max(now, self._box_free) + len(copy) * self._byte_s
                 self._to_box.append((self._box_free + self._faults.latency, copy))
 
@@ -106,24 +107,24 @@ class Link:
 
     @property
     def waiting(self) -> int:
-        """Bytes that have arrived and were not taken."""
+        """Number of bytes that have arrived and were not taken."""
         return len(self._received)
 
     def flush(self) -> None:
-        """Drop what has arrived."""
+        """Drop the bytes that have arrived."""
         self._received.clear()
 
     # time -------------------------------------------------------------------------------------
 
     def deadline(self, now: float) -> float:
-        """Return when something will next happen on the line, in s; inf for never."""
+        """Return the time of the next event on the line, in s; inf for never."""
         due = self._to_host[0][0] if self._to_host else math.inf
         if self._to_box:
             due = min(due, max(self._to_box[0][0], self._stall_end(now)))
         return min(due, self._reset_at, self.box.deadline())
 
     def advance(self, now: float) -> None:
-        """Deliver what is due at `now`, in s."""
+        """Deliver the bytes due at `now`, in s."""
         if self._reset_at <= now:
             self._reset_at = math.inf
             self.box.power_cycle(now, boot_s=self._faults.boot_s, announce=False)
@@ -131,7 +132,7 @@ class Link:
         while self._to_box and self._to_box[0][0] <= now and self._stall_end(now) <= now:
             _, data = self._to_box.popleft()
             self._record(now, ">", data)
-            if self._strikes(self._faults.brownout):
+            if self._occurs(self._faults.brownout):
                 self.box.power_cycle(now, boot_s=self._faults.boot_s, announce=False)
             self._answer(self.box.feed(data, now), now)
         while self._to_host and self._to_host[0][0] <= now:
@@ -141,13 +142,13 @@ class Link:
 
     def _answer(self, data: bytes, now: float) -> None:
         for line in data.splitlines(keepends=True):
-            if not self.attached or self._strikes(self._faults.lose_answer):
+            if not self.attached or self._occurs(self._faults.lose_answer):
                 continue
-            said = [BOOT_BANNER] if self._strikes(self._faults.babble) else []
+            output = [BOOT_BANNER] if self._occurs(self._faults.babble) else []
             delay_s = self._faults.latency
-            if self._strikes(self._faults.late):
+            if self._occurs(self._faults.late):
                 delay_s += self._faults.late_s
-            for copy in [*said, *self._mangled(line)]:
+            for copy in [*output, *self._apply_faults(line)]:
                 start = max(now + delay_s, self._host_free)
                 self._host_free = start + len(copy) * self._byte_s
                 self._to_host.append((self._host_free, copy))
@@ -156,21 +157,21 @@ class Link:
         start = self._first_open + self._faults.stall_after
         return start + self._faults.stall_s if start <= now < start + self._faults.stall_s else now
 
-    # what happens to bytes --------------------------------------------------------------------
+    # faults on bytes --------------------------------------------------------------------
 
-    def _strikes(self, probability: float) -> bool:
+    def _occurs(self, probability: float) -> bool:
         return probability > 0.0 and bool(self._rng.random() < probability)
 
-    def _mangled(self, line: bytes) -> list[bytes]:
+    def _apply_faults(self, line: bytes) -> list[bytes]:
         faults = self._faults
-        copies = 1 + self._strikes(faults.duplicate)
-        return [damaged for _ in range(copies) if (damaged := self._damaged(line))]
+        copies = 1 + self._occurs(faults.duplicate)
+        return [damaged for _ in range(copies) if (damaged := self._corrupt(line))]
 
-    def _damaged(self, line: bytes) -> bytes:
+    def _corrupt(self, line: bytes) -> bytes:
         faults = self._faults
-        if self._strikes(faults.glue):
+        if self._occurs(faults.glue):
             line = line.removesuffix(b"\n")
-        if self._strikes(faults.cut):
+        if self._occurs(faults.cut):
             line = line[: int(self._rng.integers(0, len(line) + 1))]
         if not (faults.drop or faults.flip):
             return line

@@ -1,4 +1,4 @@
-"""The boxes of a rig, made as its drawing says, with what is wrong with them."""
+"""Build the controllers of a rig from its description, with their faults."""
 
 from collections.abc import Callable
 from typing import Final, NamedTuple
@@ -13,7 +13,7 @@ from rigsim.boxes.probe import ProbeUnit
 
 
 class BoxKind(NamedTuple):
-    """An emulated controller, its serial number, and which rig that ships has it."""
+    """An emulated controller, its serial number, and the shipped rig that has it."""
 
     unit: Callable[[Wiring], Device]
     serial: str
@@ -30,19 +30,19 @@ BOXES: Final = {
 
 
 def make_box(name: str, wiring: Wiring) -> Controller:
-    """Return a box of the rig.
+    """Build a controller of the rig.
 
     Parameters
     ----------
     name
-        Which: one of `BOXES`.
+        Name of the controller: one of `BOXES`.
     wiring
-        What it is wired to.
+        Its connections.
 
     Raises
     ------
     ValueError
-        Unknown name, or the rig does not describe what the box moves.
+        Unknown name, or the rig does not describe the hardware that the controller drives.
     """
     if name not in BOXES:
         raise ValueError(f"boxes: got {name!r}, expected one of {', '.join(BOXES)}")

@@ -1,10 +1,10 @@
-"""A world's boxes on a pty or a TCP port, and its cameras on a TCP port, in real time.
+"""Serve a world's controllers on a pty or a TCP port, and its cameras on TCP, in real time.
 
-One thread moves the bytes of the boxes and lets the world's time pass; each camera connection has
-a thread of its own, because making pixels takes time and no lamp may wait for it. The same boxes,
-lines and faults as behind ``sim://`` are used, so any client in any language sees what a driver
-sees. Whoever reaches a port can fire the lights: ports listen on this machine only, unless asked
-otherwise.
+One thread moves the controllers' bytes and advances the world's time. Each camera connection has a
+thread of its own, because computing pixels takes time and no lamp may wait for it. Controllers,
+lines and faults are those behind ``sim://``, so that a client in any language observes the same as
+a driver. Every client that reaches a port can fire the lights: ports listen on this machine only,
+unless remote access is permitted.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from rigsim.world.world import Scene, World
 log = logging.getLogger(__name__)
 
 MAX_IDLE_S = 0.5
-"""Longest sleep of the thread that serves the boxes."""
+"""Longest sleep of the thread that serves the controllers, s."""
 STALL_POLL_S = 0.02
 
 
 class ServeError(ValueError):
-    """An address that cannot be served on."""
+    """An address that cannot be served."""
 
 
 def serve_world(
@@ -47,34 +47,34 @@ def serve_world(
     shots_made: Mapping[str, int] | None = None,
     world: World | None = None,
 ) -> ServedWorld:
-    """Serve the boxes and cameras of a rig until the result is closed.
+    """Serve the controllers and cameras of a rig until the result is closed.
 
     Parameters
     ----------
     rig_name
         Name, path, or the rig itself.
     pty
-        Boxes on pseudo-terminals instead of TCP; cameras are on TCP in either case.
+        Controllers on pseudo-terminals instead of TCP; cameras are on TCP in either case.
     tcp
-        ``HOST:PORT``; port 0 takes free ones. Otherwise the boxes get ports upwards from it, in the
-        order of the rig, then all cameras one.
+        ``HOST:PORT``; port 0 takes free ones. Otherwise the controllers get ports upwards from it,
+        in the order of the rig, then all cameras one.
     allow_remote
         Permit an address that other machines can reach.
     seed, scene, faults, shots_made
-        Of the world that is made, see `World`; without `faults`, bytes take no time beyond that
+        Arguments of the new world, see `World`; without `faults`, bytes take no time beyond that
         of the pty or the network.
     world
-        Serve this one instead; its clock must be the real one.
+        Serve this world instead; its clock must be the real one.
 
     Returns
     -------
     Served
-        Already being served; ``served.addresses`` are the URLs, boxes first.
+        Running service; ``served.addresses`` are the URLs, controllers first.
 
     Raises
     ------
     ServeError
-        When the address is taken, is no address, or is reachable from elsewhere without
+        When the address is in use, is malformed, or is reachable from elsewhere without
         `allow_remote`.
 
     Examples
@@ -90,7 +90,7 @@ def serve_world(
             rig, seed=seed, clock="real", scene=scene, faults=faults, shots_made=shots_made
         )
     if world.virtual:
-        raise ServeError("clock: got a virtual one, expected 'real': other programs share our time")
+        raise ServeError("clock: got a virtual one, expected 'real' for other programs")
     return ServedWorld(world, pty=pty, host_port=_host_port(tcp, allow_remote))
 
 
@@ -104,24 +104,24 @@ def _host_port(text: str, allow_remote: bool) -> tuple[str, int]:
         local = False
     if not local and not allow_remote:
         raise ServeError(
-            f"tcp: got {host!r}, expected an address of this machine only, such as 127.0.0.1: "
-            "whoever reaches the port can fire the lights; permit it with allow_remote "
-            "(--allow-remote) if that is wanted"
+            f"tcp: got {host!r}, expected an address of this machine only, such as 127.0.0.1. "
+            "Any client of the port can fire the lights; permit it with allow_remote "
+            "(--allow-remote)"
         )
     if not local:
-        log.warning("%s: other machines can reach the boxes and fire the lights", text)
+        log.warning("%s: other machines can reach the controllers and fire the lights", text)
     return host, int(port)
 
 
 class ServedWorld:
-    """Boxes and cameras being served; close it to stop.
+    """Running service of controllers and cameras; close it to stop.
 
     Attributes
     ----------
     world : World
-        What is served.
+        The served world.
     addresses : dict of str to str
-        URL of each box, then of each camera, by name.
+        URL of each controller, then of each camera, by name.
     """
 
     def __init__(self, world: World, *, pty: bool, host_port: tuple[str, int]) -> None:
@@ -166,7 +166,7 @@ class ServedWorld:
         self._closing.wait(timeout_s)
 
     def close(self) -> None:
-        """Stop serving; doing so twice is allowed."""
+        """Stop serving; a second call is allowed."""
         if self._closing.is_set():
             return
         self._closing.set()

@@ -1,17 +1,17 @@
-"""What a contact probe's head does on the skin: cup, pump, leaks, and the skin under it.
+"""Simulate a contact probe's head on the skin: cup, pump, leaks, and the skin below.
 
-Pressures are suction: mbar below the air's, > 0. Air is counted in mL at the air's own pressure.
-The cup between head and skin, and the skin that rises into it, are one volume,
+Pressures are suction: mbar below the ambient pressure, > 0. Air is counted in mL at ambient
+pressure. The cup between head and skin, and the skin that rises into it, form one volume,
 
-    C dp/dt = pump - L p,    C = volume / 1013.25 mbar + what skin gives way per mbar,
+    C dp/dt = pump - L p,    C = volume / 1013.25 mbar + skin compliance in mL/mbar,
 
-with all leaks along its rim in L. The pump has a regulator: it takes ``K (wanted - p)``, but never
-more than it can, which falls from its free flow to nothing at its dead head. A leak therefore makes
-the suction settle lower than asked, at K / (K + L) of it, and a large one keeps it down; the box
-only sees its gauge. Vented, the cup fills through a wide hole. Between two changes p is a single
-exponential, so that a head can be asked for any time, in steps of any length.
+with all leaks along its rim in L. The pump has a regulator: it takes ``K (wanted - p)``, limited by
+the pump's flow, which falls linearly from its free flow to zero at its dead head. A leak therefore
+makes the suction settle lower than requested, at K / (K + L) of it, and a large one keeps it down;
+the controller reads the gauge only. When vented, the cup fills through a wide hole. Between two
+changes p is a single exponential, so that the state can be evaluated at any time.
 
-The skin's giving way is the quick, elastic one; that it creeps on for some seconds is left out.
+The skin's compliance is the fast, elastic one; its creep over some seconds is not modeled.
 """
 
 import dataclasses
@@ -26,55 +26,56 @@ import numpy as np
 ATMOSPHERE_MBAR: Final = 1013.25
 """Standard atmosphere, mbar (ISO 2533:1975)."""
 OPEN_RIM_LEAK_ML_PER_S_MBAR: Final = 1.0
-"""Leak of a head that touches nothing, mL/s per mbar: about a hundred pumps."""
+"""Leak of a head without contact, mL/s per mbar: about a hundred pumps."""
 SKIN_COMPLIANCE_ML_PER_MBAR: Final = {
     "forehead": 4e-4,
     "cheek": 8e-4,
     "chin": 6e-4,
     "abdomen": 1e-3,
 }
-"""What skin rises into the cup per suction, mL/mbar: tenths of a millimetre over the rim's area at
-tens of mbar, more where it is loose. This project's choice; other sites are as the chin."""
+"""Volume of skin that rises into the cup per suction, mL/mbar: tenths of a millimeter over the
+rim's area at tens of mbar, more at loose skin. This project's choice; other sites are as the
+chin."""
 ROOM_TEMPERATURE_C: Final = 24.0
-"""Temperature that a camera without cooling comes to, degrees Celsius."""
+"""Final temperature of a camera without cooling, degrees Celsius."""
 CAMERA_WARMING_TAU_S: Final = 120.0
 """Time constant of a camera's warming, s."""
 
 
 class SuctionError(ValueError):
-    """A head or a pump that is described or used wrongly."""
+    """A head or a pump with an invalid description or use."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeadState:
-    """What a contact probe's head touches at one time, and how cold its camera is."""
+    """Contact of a contact probe's head, and its camera's temperature, at one time."""
 
     site: str
-    """Where it sits: a site of the skin, "phantom", or empty: in the air."""
+    """Its location: a site of the skin, "phantom", or empty: in the air."""
     angle_deg: float
-    """Turn of the head about its own axis, degrees, 0 <= angle < 360."""
+    """Rotation of the head about its own axis, degrees, 0 <= angle < 360."""
     placed: bool
-    """Whether it touches what it was placed on."""
+    """Whether it touches the surface on which it was placed."""
     suction_mbar: float
-    """Suction under it, mbar below the air's pressure, >= 0."""
+    """Suction below it, mbar below the ambient pressure, >= 0."""
     camera_c: float
     """Temperature of the camera's sensor, degrees Celsius."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SuctionMechanics:
-    """One cup, one pump, and what they are held against."""
+    """One cup and one pump on one surface."""
 
     cup_ml: float = 2.0
     """Volume of cup and tube, mL, > 0."""
     skin_ml_per_mbar: float = 6e-4
     """Volume that rises into the cup per suction, mL/mbar, >= 0; 0 is a rigid block."""
     regulator_ml_per_s_mbar: float = 8e-3
-    """What the pump takes per missing suction, mL/s per mbar, > 0."""
+    """Flow of the pump per missing suction, mL/s per mbar, > 0."""
     free_flow_ml_per_s: float = 0.8
-    """The most that it takes, at no suction, mL/s, > 0."""
+    """Maximum flow, at zero suction, mL/s, > 0."""
     dead_head_mbar: float = 300.0
-    """Suction at which it takes nothing more, mbar, > 0."""
+    """Suction at which the flow is zero, mbar, > 0."""
     leak_ml_per_s_mbar: float = 1e-4
     """Leaks along the rim, mL/s per mbar, >= 0."""
     vent_ml_per_s_mbar: float = 0.05
@@ -94,12 +95,12 @@ class SuctionMechanics:
 
     @property
     def compliance_ml_per_mbar(self) -> float:
-        """Air to be taken per suction, mL/mbar."""
+        """Volume of air to be removed per suction, mL/mbar."""
         return self.cup_ml / ATMOSPHERE_MBAR + self.skin_ml_per_mbar
 
     @property
     def time_constant_s(self) -> float:
-        """Time constant with which the regulated pump comes to its end, s.
+        """Time constant with which the regulated pump settles, s.
 
         Examples
         --------
@@ -113,7 +114,7 @@ class SuctionMechanics:
 
 @dataclass(frozen=True, slots=True)
 class CameraCooler:
-    """Keeps the camera at one temperature until it fails."""
+    """Camera cooler that keeps one temperature until it fails."""
 
     setpoint_c: float
     """Degrees Celsius."""
@@ -139,7 +140,7 @@ class CameraCooler:
 
 @dataclass(frozen=True, slots=True)
 class _Phase:
-    """A stretch of time in which nothing is switched: p relaxes as one exponential."""
+    """An interval without switching: p relaxes as one exponential."""
 
     t_s: float
     site: str
@@ -151,6 +152,7 @@ class _Phase:
 
     def suction_mbar(self, t_s: float) -> float:
         """Return the suction at a time of this phase, mbar."""
+        # dp/dt = drive - rate p has the solution p0 + (drive - rate p0) (1 - exp(-rate t)) / rate.
         passed_s = max(0.0, t_s - self.t_s)
         slope = self.drive_mbar_per_s - self.rate_per_s * self.from_mbar
         if self.rate_per_s == 0.0:
@@ -158,7 +160,7 @@ class _Phase:
         return self.from_mbar - slope * math.expm1(-self.rate_per_s * passed_s) / self.rate_per_s
 
     def reaches_s(self, mbar: float) -> float:
-        """Return when the rising suction comes to `mbar`, world s; inf for never."""
+        """Return when the rising suction reaches `mbar`, world s; inf for never."""
         slope = self.drive_mbar_per_s - self.rate_per_s * self.from_mbar
         if self.rate_per_s == 0.0:
             return self.t_s + (mbar - self.from_mbar) / slope if slope > 0.0 else math.inf
@@ -167,22 +169,22 @@ class _Phase:
 
 
 class ProbeHead:
-    """The probe's head on, or off, the skin; all that happens to it goes forward in time.
+    """The probe's head on, or off, the skin; its time only moves forward.
 
     Parameters
     ----------
     cooler
-        Of the camera behind it.
+        Cooler of the camera behind it.
     seed
-        Of rim and skin at each site, >= 0: leaks of 0.5 to 2 % of the regulator's flow on skin, a
-        tenth of that on a phantom, and the skin's giving way within a fifth of the site's own.
+        Seed of rim and skin at each site, >= 0: leaks of 0.5 to 2 % of the regulator's flow on
+        skin, a tenth of that on a phantom, and a skin compliance within a fifth of the site's own.
     leak
         A further leak, relative to the regulator's flow, >= 0: the suction settles at no more than
-        1 / (1 + leak) of what is asked.
+        1 / (1 + leak) of the requested one.
     pump_dead
         The pump's motor does not turn.
     lifts_after_s
-        The head comes off so long after the pump was first switched on, s, once.
+        The head detaches, once, at this time after the pump was first switched on, s.
     mechanics
         The same cup, pump, rim and skin everywhere, instead of drawn ones.
 
@@ -190,7 +192,7 @@ class ProbeHead:
     --------
     >>> head = ProbeHead(CameraCooler(5.0), seed=1)
     >>> head.place("cheek", 45.0, 0.0)
-    >>> head.draw(60.0, 1.0)
+    >>> head.start_suction(60.0, 1.0)
     >>> round(head.suction_mbar(1.3)), round(head.suction_mbar(4.0))
     (35, 59)
     >>> head.state_at(0.5)
@@ -216,7 +218,7 @@ class ProbeHead:
         self._lifts_after_s = lifts_after_s
         self._fixed = mechanics
         self._lifts_at_s = math.inf
-        self._switch_s = math.inf  # when a pump at full speed comes to its regulator's range
+        self._switch_s = math.inf  # when a pump at full speed enters its regulator's range
         self._wanted_mbar: float | None = None
         self._vented = True
         self.mechanics = self._mechanics("")
@@ -235,27 +237,27 @@ class ProbeHead:
         leak = plain.regulator_ml_per_s_mbar * (rim + self._leak)
         return dataclasses.replace(plain, skin_ml_per_mbar=give * skin, leak_ml_per_s_mbar=leak)
 
-    # what happens to it -----------------------------------------------------------------------
+    # events -----------------------------------------------------------------------
 
     def place(self, site: str, angle_deg: float, now: float) -> None:
-        """Be put somewhere by a person; `site` "" is in the air."""
+        """Place the head at a site; `site` "" is in the air."""
         if not 0.0 <= angle_deg < 360.0:
             raise SuctionError(f"angle_deg: got {angle_deg}, expected 0 <= degrees < 360")
         self.advance(now)
         if not self._vented:
-            raise SuctionError(f"site: got {site!r}, expected the head to be vented first")
+            raise SuctionError(f"site: got {site!r}, expected a vented head; vent it first")
         self.mechanics = self._mechanics(site)
         self._begin(now, site=site, angle_deg=angle_deg, placed=bool(site))
 
     def remove(self, now: float) -> None:
-        """Be taken off, or come off."""
+        """Take the head off, or detach it by a fault."""
         self.advance(now)
         last = self._phases[-1]
         if last.placed:
             self._begin(now, site="", angle_deg=last.angle_deg, placed=False)
 
     def start_suction(self, target_mbar: float, now: float) -> None:
-        """Have the vent closed and the pump switched on."""
+        """Close the vent and switch the pump on."""
         if not 0.0 < target_mbar < math.inf:
             raise SuctionError(f"target_mbar: got {target_mbar}, expected mbar > 0")
         self.advance(now)
@@ -265,7 +267,7 @@ class ProbeHead:
         self._renew(now)
 
     def vent(self, now: float) -> None:
-        """Have the pump switched off and the vent opened."""
+        """Switch the pump off and open the vent."""
         self.advance(now)
         if not self._vented:
             self._vented, self._wanted_mbar = True, None
@@ -274,7 +276,7 @@ class ProbeHead:
     # time -------------------------------------------------------------------------------------
 
     def advance(self, now: float) -> None:
-        """Let time pass up to `now`, in s."""
+        """Advance time to `now`, in s."""
         while (due := min(self._switch_s, self._lifts_at_s)) <= now:
             if self._lifts_at_s <= due:
                 self._lifts_at_s = self._lifts_after_s = math.inf
@@ -294,7 +296,7 @@ class ProbeHead:
         return self._cooler.camera_c(now)
 
     def state_at(self, t_s: float) -> HeadState:
-        """Return what it touched at a time up to now, world s."""
+        """Return the head's state at a time up to now, world s."""
         first = bisect_right(self._phases, t_s, key=lambda phase: phase.t_s)
         phase = self._phases[max(first - 1, 0)]
         suction_mbar = max(0.0, phase.suction_mbar(t_s))
@@ -303,7 +305,7 @@ class ProbeHead:
 
     @property
     def change_times_s(self) -> tuple[float, ...]:
-        """World times at which something was switched or changed, s, rising."""
+        """World times at which something was switched or changed, s, ascending."""
         return tuple(phase.t_s for phase in self._phases)
 
     def _renew(self, now: float) -> None:
@@ -311,7 +313,7 @@ class ProbeHead:
         self._begin(now, site=last.site, angle_deg=last.angle_deg, placed=last.placed)
 
     def _begin(self, now: float, *, site: str, angle_deg: float, placed: bool) -> None:
-        """Begin another phase with what is switched on now."""
+        """Begin a phase with the present switching state."""
         law = self.mechanics
         from_mbar = self._phases[-1].suction_mbar(now) if self._phases else 0.0
         share = 1.0 / law.compliance_ml_per_mbar
@@ -322,7 +324,8 @@ class ProbeHead:
         elif self._wanted_mbar is not None and not self._pump_dead:
             falls = law.free_flow_ml_per_s / law.dead_head_mbar
             gain = law.regulator_ml_per_s_mbar
-            # below this suction the regulator asks for more than the pump can give
+            # The regulator requests K (wanted - p), the pump's maximum is F - falls p. Below the
+            # suction at which both are equal the pump runs at its maximum.
             regulated_mbar = (gain * self._wanted_mbar - law.free_flow_ml_per_s) / (gain - falls)
             if from_mbar >= regulated_mbar - 1e-9:
                 drive, rate = gain * self._wanted_mbar, rate + gain

@@ -1,14 +1,14 @@
-"""What is between the jaws of a caliper: living skin, and the tape that holds it.
+"""Simulate living skin and the tape that holds it between the jaws of a caliper.
 
-The skin is a spring whose stiffness grows as it is stretched (a J-shaped curve, Fung 1967 [1]_),
-stiffer along one direction of the body than across (Flynn et al. 2011 [2]_ on forearms), that
-buckles when it is shortened too much: from there on it resists no more than it did. Double-sided
-tape gives way elastically, and beyond a shear force it slips and hardens as it does: the skin
-stretches by less than the jaws move, and bringing the jaws back does not bring the skin back to
-exactly where it was. Stretched too far, the tape lets go.
+The skin is a spring whose stiffness grows with stretch (a J-shaped curve, Fung 1967 [1]_). It is
+stiffer along one direction of the body than across (Flynn et al. 2011 [2]_ on forearms), and it
+buckles at a shortening limit, beyond which its resistance no longer grows. Double-sided tape
+deforms elastically; beyond a shear force it slips and hardens. The skin therefore stretches by less
+than the jaws move, and it does not return exactly when the jaws do. Beyond a stretch limit the tape
+detaches.
 
-The mechanics know no time: how fast the jaws move changes nothing, and neither do pauses. A move in
-one go and the same move in pieces end alike.
+The mechanics are independent of time: neither the jaws' speed nor pauses matter. A move in one step
+and the same move in parts end alike.
 
 References
 ----------
@@ -28,25 +28,25 @@ import numpy as np
 from capture.rig import Caliper
 
 MIN_STRETCH, MAX_STRETCH = 0.2, 2.5
-"""Between them the skin's stretch is sought; jaws that ask for more are no caliper's."""
+"""Range in which the skin's stretch is sought; no caliper's jaws reach beyond."""
 
 
 class TapedSkinError(ValueError):
-    """Skin, tape or a move that is described wrongly."""
+    """Skin, tape or a move with an invalid description."""
 
 
 @dataclass(frozen=True, slots=True)
 class GripState:
-    """What the caliper holds at one time."""
+    """State of the caliper's grip at one time."""
 
     angle_deg: float
     """Direction of the jaws' axis, from +x towards +y, degrees, 0 <= angle < 180."""
     step: int
-    """Step that the jaws are nearest to; 0 is neutral."""
+    """Nearest step of the jaws; 0 is neutral."""
     aperture_mm: float
-    """Distance of the jaws, mm: what the caliper reads."""
+    """Distance of the jaws, mm: the caliper's reading."""
     stretch: float
-    """The skin's own length along the jaws' axis over its length at rest; 1 is neutral."""
+    """Length of the skin along the jaws' axis over its length at rest; 1 is neutral."""
     attached: bool
     """Whether the tape holds."""
     buckled: bool
@@ -55,7 +55,7 @@ class GripState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TapeMechanics:
-    """One skin and one piece of tape under each jaw, along one direction."""
+    """Skin and the tape under each jaw, along one direction."""
 
     stiffness_n: float
     """Force per stretch of skin at rest, N, > 0: modulus times thickness times the jaws' width."""
@@ -64,13 +64,13 @@ class TapeMechanics:
     buckles_at: float
     """Stretch at which skin buckles, 0 < r < 1."""
     detaches_at: float
-    """Stretch at which the tape lets go, > 1."""
+    """Stretch at which the tape detaches, > 1."""
     tape_n_per_mm: float
-    """Elastic stiffness of the tape under both jaws in shear, N/mm, > 0; inf gives no way."""
+    """Elastic stiffness of the tape under both jaws in shear, N/mm, > 0; inf is rigid."""
     slips_at_n: float
     """Shear force from which the tape slips, N, > 0; inf never slips."""
     hardening_n_per_mm: float
-    """How much the force grows per slip, N/mm, > 0."""
+    """Increase of the force per slip, N/mm, > 0."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -97,6 +97,7 @@ class TapeMechanics:
         >>> skin.force_n(1.2) - skin.force_n(1.1) > skin.force_n(1.1) > 0.0
         True
         """
+        # Fung: dF/dr = k exp(a (r - 1)) integrates to F = k (exp(a (r - 1)) - 1) / a from r = 1.
         strain = max(stretch, self.buckles_at) - 1.0
         if strain <= 0.0 or self.stiffening == 0.0:
             return self.stiffness_n * strain
@@ -104,7 +105,7 @@ class TapeMechanics:
 
 
 def draw_mechanics(seed: int, *, angle_deg: float, stiffness: float = 1.0) -> TapeMechanics:
-    """Return skin and tape of a subject along one direction.
+    """Draw the mechanics of a subject's skin and tape along one direction.
 
     Parameters
     ----------
@@ -113,16 +114,16 @@ def draw_mechanics(seed: int, *, angle_deg: float, stiffness: float = 1.0) -> Ta
     angle_deg
         Direction of the jaws, degrees.
     stiffness
-        How many times stiffer than usual the skin is, > 0.
+        Stiffness of the skin relative to normal, > 0.
 
     Notes
     -----
-    Ranges, drawn evenly: 0.5 to 0.9 N per unit of stretch at rest (10 mm wide jaws on 1.5 mm of
-    skin of 30 to 60 kPa, in the range that in-vivo tests give for small strain); 10 to 35 % more or
+    Ranges, drawn uniformly: 0.5 to 0.9 N per unit of stretch at rest (10 mm wide jaws on 1.5 mm of
+    skin of 30 to 60 kPa, in the range of in-vivo tests at small strain); 10 to 35 % more or
     less along and across the skin's own direction; stiffening 4 to 6; buckling at r = 0.70 to 0.76
     and detachment at 1.25 to 1.35, the ends of the range that Nagano et al. 2015
-    (doi:10.1145/2766894) reached. Of the tape, this project's choice: 4 to 8 N/mm in shear, slip
-    from 0.06 to 0.12 N on, hardening by 1.5 to 3 N/mm: a few per cent of 8 mm at large steps.
+    (doi:10.1145/2766894) reached. The tape is this project's choice: 4 to 8 N/mm in shear, slip
+    from 0.06 to 0.12 N on, hardening by 1.5 to 3 N/mm: a few percent of 8 mm at large steps.
     """
     if not stiffness > 0.0:
         raise TapedSkinError(f"stiffness: got {stiffness}, expected more than 0")
@@ -150,11 +151,11 @@ class TapedSkin:
     Parameters
     ----------
     caliper
-        Whose jaws; its aperture at step 0 is where they are taped to the skin.
+        Caliper of the jaws; its aperture at step 0 is where they are taped to the skin.
     seed
         The subject, see `draw_mechanics`.
     stiffness
-        How many times stiffer than usual the skin is, > 0.
+        Stiffness of the skin relative to normal, > 0.
     mechanics
         The same mechanics along every direction instead of drawn ones.
 
@@ -201,12 +202,12 @@ class TapedSkin:
 
     @property
     def slip_mm(self) -> float:
-        """How far the tape has slipped for good, mm; > 0 after stretching."""
+        """Permanent slip of the tape, mm; > 0 after stretching."""
         return self._slip_mm
 
     @property
     def state(self) -> GripState:
-        """What is held now."""
+        """Present state of the grip."""
         caliper = self._caliper
         return GripState(
             angle_deg=self._angle_deg,
@@ -228,20 +229,20 @@ class TapedSkin:
         self._attached = True
 
     def turn(self, angle_deg: float) -> None:
-        """Turn the jaws, which must hold nothing."""
+        """Turn the empty jaws."""
         if self._attached:
             raise TapedSkinError(
-                f"angle_deg: got {angle_deg}, expected the skin to be let go first"
+                f"angle_deg: got {angle_deg}, expected empty jaws; release the skin first"
             )
         self._angle_deg = angle_deg
 
     def release(self) -> None:
-        """Let the skin go: it returns to rest."""
+        """Release the skin, which returns to rest."""
         self._attached = False
         self._stretch, self._force_n, self._slip_mm = 1.0, 0.0, 0.0
 
     def move(self, aperture_mm: float) -> None:
-        """Move the jaws to a distance; the skin follows as far as the tape makes it."""
+        """Move the jaws to a distance; the skin follows as far as the tape holds."""
         if not aperture_mm > 0.0:
             raise TapedSkinError(f"aperture_mm: got {aperture_mm}, expected more than 0")
         self._aperture_mm = aperture_mm
@@ -251,7 +252,8 @@ class TapedSkin:
         stretch, force_n = self._balance(self._slip_mm, 0.0)
         excess_n = force_n - law.hardening_n_per_mm * self._slip_mm
         if abs(excess_n) > law.slips_at_n:
-            # the tape slips until its hardening holds the force
+            # The tape slips until its hardening balances the force: |F| = slips_at + hardening |s|,
+            # so the slip s = soft F - soft yields is linear in F with soft = 1 / hardening.
             yields_n = math.copysign(law.slips_at_n, excess_n)
             soft = 1.0 / law.hardening_n_per_mm
             stretch, force_n = self._balance(-yields_n * soft, soft)
@@ -263,7 +265,7 @@ class TapedSkin:
     def _balance(self, offset_mm: float, soft_mm_per_n: float) -> tuple[float, float]:
         """Return stretch and force at which skin, tape and a slip of offset + soft F fill the jaws.
 
-        The length that they take grows with the stretch, so that halving finds the only balance.
+        The total length grows with the stretch, so that bisection finds the only equilibrium.
         """
         law, gap_mm = self.mechanics, self._aperture_mm - offset_mm
         soft = soft_mm_per_n + 1.0 / law.tape_n_per_mm

@@ -1,8 +1,8 @@
-"""One simulated world: its clock, its boxes and cameras, its light.
+"""Simulate one world: its clock, controllers, cameras and light.
 
-`World.advance` is the only door through which time passes, for ports, cameras and servers alike,
-so that everyone who looks sees the same lamps. A world has a virtual clock, which jumps to whatever
-comes next, or the real one. Boxes live as long as their world, not as long as the port to them.
+`World.advance` is the only way in which time passes, for ports, cameras and servers alike, so that
+all observers see the same lamps. A world has a virtual clock, which jumps to the next event, or the
+real one. Controllers live as long as their world, not as long as the port to them.
 """
 
 from __future__ import annotations
@@ -37,15 +37,16 @@ TRANSCRIPT_LINES = 4096
 
 
 class Scene(Protocol):
-    """What stands before the rig."""
+    """Interface of the scene in front of the rig."""
 
     @property
     def exposure(self) -> Callable[..., UInt16Array]:
         """Return the DN, shape (H, W), of an exposure.
 
-        It takes the camera's name and ``pops``, the light that was seen; ``exposure_s``; ``seed``,
-        of the sensor's noise; before a caliper ``grip``, a `rigsim.world.taped_skin.GripState`, and
-        under a contact probe ``head``, a `rigsim.world.suction.HeadState`.
+        It takes the camera's name and ``pops``, the light during the exposure; ``exposure_s``;
+        ``seed`` of the sensor's noise; for a caliper ``grip``, a
+        `rigsim.world.taped_skin.GripState`; and for a contact probe ``head``, a
+        `rigsim.world.suction.HeadState`.
         """
 
 
@@ -60,28 +61,28 @@ class WorldClock:
         return self._world.now
 
     def sleep(self, seconds: float) -> None:
-        """Let `seconds` of the world's time pass."""
+        """Advance the world's time by `seconds`."""
         self._world.wait(self._world.now + seconds)
 
 
 class World:
-    """A rig made of physics.
+    """A rig with simulated physics.
 
     Parameters
     ----------
     rig
-        What stands there; by default the flash rig that ships.
+        The rig; by default the shipped flash rig.
     seed
-        Seeds boxes, faults and sensors: same seed, same bytes.
+        Seeds controllers, faults and sensors: same seed, same bytes.
     clock
-        ``"virtual"``: time passes when somebody waits; ``"real"``: by itself.
+        ``"virtual"``: time passes when a client waits; ``"real"``: it passes continuously.
     scene
-        What the cameras see; without one, frames hold black level and read noise.
+        Scene of the cameras; without one, frames contain black level and read noise.
     faults
-        What goes wrong; by default nothing.
+        Faults; by default none.
     shots_made
-        How many shots cameras have made before, by view, in another world of the same seed: their
-        noise must not come again.
+        Number of earlier shots by view, made in another world of the same seed: their noise must
+        not repeat.
 
     Attributes
     ----------
@@ -90,13 +91,13 @@ class World:
     pops : list of FlashPop
         All pops so far.
     switched : list of LedPulse, PatternLight or SourceLight
-        All other light that has ended, in the order in which it did.
+        All other light that has ended, ordered by end time.
     grips : list of (float, GripState)
-        What the caliper has held, from each world time in s on; empty where the rig has none.
+        State of the caliper's grip from each world time in s on; empty where the rig has none.
     skin : TapedSkin or None
-        What the caliper acts upon; None where the rig has none.
-    head : SuckedHead or None
-        The contact probe's head and what is under it; None where the rig has none.
+        Load on the caliper's jaws; None where the rig has none.
+    head : ProbeHead or None
+        The contact probe's head and the surface below it; None where the rig has none.
     """
 
     def __init__(
@@ -172,19 +173,19 @@ class World:
 
     @property
     def now(self) -> float:
-        """The world's time, in s since it was made."""
+        """Time of the world since its construction, in s."""
         return self._now if self.virtual else time.monotonic() - self._started
 
     def deadline(self) -> float:
-        """Return when something will next happen, in s; inf for never."""
+        """Return the time of the next event, in s; inf for never."""
         with self.lock:
             dues = [link.deadline(self._now) for link in self._links.values()]
             return min(dues, default=math.inf)
 
     def advance(self, now: float) -> float:
-        """Let time pass up to `now`, in s; everything due before happens at its own time.
+        """Advance time to `now`, in s; everything due before happens at its own time.
 
-        Return when something will next happen, in s, as far as is known now; inf for never.
+        Return the time of the next event, in s, as known at present; inf for never.
         """
         with self.lock:
             while (due := self.deadline()) <= now:
@@ -195,7 +196,7 @@ class World:
             return due
 
     def wait(self, until: float) -> None:
-        """Let the world's time come to `until`, in s: at once, or by waiting."""
+        """Advance the world's time to `until`, in s: at once, or by waiting."""
         if self.virtual:
             self.advance(until)
             return
@@ -204,16 +205,16 @@ class World:
             time.sleep(min(remaining, max(0.0, self.deadline() - self.now)))
         self.advance(self.now)
 
-    # boxes ------------------------------------------------------------------------------------
+    # controllers ------------------------------------------------------------------------------
 
     def link(self, name: str) -> Link:
-        """Return the line to the box called `name`."""
+        """Return the line to the controller `name`."""
         if name not in self._links:
             raise KeyError(f"box: got {name!r}, expected one of {', '.join(self._links)}")
         return self._links[name]
 
     def box(self, name: str) -> Controller:
-        """Return the box called `name`."""
+        """Return the controller `name`."""
         return self.link(name).box
 
     def _record_bytes(self, now: float, direction: str, data: bytes) -> None:
@@ -223,7 +224,7 @@ class World:
 
     @property
     def transcript_sha256(self) -> str:
-        """Hash of everything that went over the lines, with its times."""
+        """Hash of all bytes on the lines, with their times."""
         return self._digest.hexdigest()
 
     # cameras ----------------------------------------------------------------------------------
@@ -257,7 +258,7 @@ class World:
             return self._light.pops_between(start, end)
 
     def grip_at(self, t_s: float) -> GripState:
-        """Return what the caliper held at a world time, s.
+        """Return the state of the caliper's grip at a world time, s.
 
         Raises
         ------
@@ -271,7 +272,7 @@ class World:
             return self.grips[max(first - 1, 0)][1]
 
     def head_at(self, t_s: float) -> HeadState:
-        """Return what the contact probe's head touched at a world time, s.
+        """Return the state of the contact probe's head at a world time, s.
 
         Raises
         ------
@@ -286,9 +287,9 @@ class World:
 
     @property
     def head_history(self) -> list[tuple[float, HeadState]]:
-        """World times, s, at which something changed under the probe's head, and its states then.
+        """World times, s, of changes under the probe's head, with the states.
 
-        Between them the suction relaxes; `head_at` tells it for any time.
+        In between the suction relaxes; `head_at` evaluates it at any time.
         """
         with self.lock:
             times = () if self.head is None else self.head.change_times_s
@@ -319,11 +320,11 @@ class World:
         exposure
             Its settings.
         t_start
-            World time of the shutter's opening, s.
+            World time at which the shutter opened, s.
         seed
-            Of the sensor's noise.
+            Seed of the sensor's noise.
         pops
-            Light that was seen; by default what came while the shutter was open.
+            Light of the exposure; by default that emitted while the shutter was open.
         """
         end = t_start + exposure.exposure_s
         seen = self.light_between(t_start, end) if pops is None else tuple(pops)
@@ -343,12 +344,12 @@ class World:
         """Make the world reachable as ``sim://flash?world=NAME`` and return `name`."""
         other = _WORLDS.setdefault(name, self)
         if other is not self:
-            raise ValueError(f"name: got {name!r}, which another world has; unregister it first")
+            raise ValueError(f"name: got {name!r}, used by another world; unregister it first")
         self._name = name
         return name
 
     def unregister(self) -> None:
-        """Take the world's name away; doing so twice is allowed."""
+        """Unregister the world's name; a second call is allowed."""
         if _WORLDS.get(self._name) is self:
             del _WORLDS[self._name]
         self._name = ""
@@ -372,18 +373,18 @@ def get_world(name: str) -> World:
 
 
 def find_world(name: str) -> World:
-    """Return the registered world called `name`, or the only one without a name of that box.
+    """Return the registered world `name`, or the only unnamed one with that controller.
 
     Parameters
     ----------
     name
-        As it was registered; or the box ``BOX`` of a world that ``sim://BOX`` or ``sim://BOX?...``
-        made without a name of its own.
+        Registered name; or the controller ``BOX`` of a world that ``sim://BOX`` or
+        ``sim://BOX?...`` built without a name of its own.
 
     Raises
     ------
     KeyError
-        When there is none, or several worlds without a name have that box.
+        When there is none, or several unnamed worlds have that controller.
     """
     unnamed = [url for url in _WORLDS if url.partition("?")[0] == f"sim://{name}"]
     if name in _WORLDS or not unnamed:

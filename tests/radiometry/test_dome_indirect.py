@@ -49,7 +49,7 @@ def matt_image(
         Of Mitsuba.
     """
     subject = dome_reference._face(scene)
-    description = dome_reference._look(view) | {
+    description = dome_reference._camera_and_light(view) | {
         "integrator": {"type": "path", "max_depth": depth, "rr_depth": depth + 1},
         "face": {
             "type": "mesh",
@@ -134,7 +134,7 @@ def test_interreflection_adds_little_and_most_in_concavities(small, face):
     assert extra.min() > -1e-5 * one.max()
     assert 0.002 < extra.sum() / one.sum() < 0.03
     names = {name for name, _ in bounced.omitted}
-    assert "light from skin to skin" not in names
+    assert "interreflection" not in names
     assert "highlights of skin on skin" in names
 
 
@@ -148,7 +148,7 @@ def test_subsurface_scattering_reddens_hard_shadow(small, face):
     assert dark.sum() > 10
     into_shadow, lit = two[dark].sum(axis=0), one.sum(axis=(0, 1))
     assert into_shadow[0] / into_shadow[2] > 1.3 * lit[0] / lit[2]
-    assert "light spreading sideways in skin" not in {name for name, _ in soft.omitted}
+    assert "lateral scattering in skin" not in {name for name, _ in soft.omitted}
 
 
 def test_plain_kernel_adds_the_same_subsurface_light(small, face):

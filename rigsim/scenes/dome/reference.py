@@ -1,8 +1,8 @@
-"""The dome by Mitsuba's own integrators, one light after the other, to judge `DomeScene` by.
+"""Render the dome by Mitsuba's own integrators, one light at a time, as a reference.
 
-Mitsuba has no lobe for vellus hair, and knows relief only as a texture in another frame, so the
-face that both sides render has neither; everything else (diffuse term behind the boundary,
-Beckmann facets and GGX oil, all from textures) is put together from Mitsuba's own materials.
+Mitsuba has no lobe for vellus hair, and supports relief only as a texture in another frame, so the
+face that both sides render has neither. Everything else (diffuse term behind the boundary, Beckmann
+facets and GGX oil, all from textures) is composed of Mitsuba's own materials.
 """
 
 import dataclasses
@@ -35,35 +35,35 @@ Integrator = Literal["path", "direct"]
 
 @dataclass(frozen=True, slots=True)
 class RenderTiming:
-    """One way to render the dome's lights one by one."""
+    """Time and error of one method that renders the dome's lights one at a time."""
 
     seconds: float
-    """A light, s; of ours with its share of the first look, which serves all lights of the rig."""
+    """Time per light, s; for ours with its fraction of the camera rays, which serve all lights."""
     error: float
     """Root mean square error over all images, relative to their mean."""
     mean_ratio: float
     """Mean of its images over that of the reference."""
     squared_by_tile: Float64Array
-    """Squared relative error of each tile of 16 x 16 pixels that shows skin, for its scatter."""
+    """Squared relative error per tile of 16 x 16 pixels that shows skin, for its standard error."""
 
 
 @dataclass(frozen=True, slots=True)
 class IntegratorComparison:
-    """Three ways to render one view of the dome, with as many rays in a pixel."""
+    """Three methods for one view of the dome, with the same number of rays per pixel."""
 
     ours: RenderTiming
     path: RenderTiming
-    """Mitsuba's path tracer, direct light alone."""
+    """Mitsuba's path tracer, direct light only."""
     direct: RenderTiming
-    """Mitsuba's direct integrator, which samples the light alone."""
+    """Mitsuba's direct integrator, which samples the light only."""
 
     def speed_up(self, timing: RenderTiming) -> float:
-        """How many times faster ours is for no more noise; noisier is counted by its square."""
+        """Speed-up of ours at equal noise; the square of the noise ratio counts as time."""
         return timing.seconds / self.ours.seconds * min(1.0, (timing.error / self.ours.error) ** 2)
 
 
 def plain_face(preset: str = "III", *, size: int = 512) -> SimulatedSubject:
-    """Return a face whose normals are those of its mesh: without pores and wrinkles."""
+    """Return a face whose normals are those of its mesh, without pores and wrinkles."""
     face = make_subject(preset, size=size)
     return dataclasses.replace(face, normal=face.atlas.normal)
 
@@ -72,14 +72,14 @@ DIRECT_LIGHT_EFFECTS: Final = SceneEffects(lateral=False, interreflections=False
 
 
 class DirectScene(DomeScene):
-    """A dome where light goes from an LED to the skin and to the camera, unless asked otherwise."""
+    """A dome with direct light only, unless requested otherwise."""
 
     def __init__(self, rig: Rig, subject: SimulatedSubject, **settings: Any) -> None:
         super().__init__(rig, subject, **({"effects": DIRECT_LIGHT_EFFECTS} | settings))
 
 
 class PlainScene(DirectScene):
-    """A dome whose skin has no vellus hair and no brows."""
+    """A dome whose skin has neither vellus hair nor brows."""
 
     def _surface(self, camera: str) -> SkinSurface:
         surface = super()._surface(camera)
@@ -96,28 +96,28 @@ def compare_integrators(
     rounds: int = 2,
     sampler: str = "stratified",
 ) -> IntegratorComparison:
-    """Render one view of the dome in three ways, light after light.
+    """Render one view of the dome by three methods, one light at a time.
 
     Parameters
     ----------
     width_px
         Width of the images.
     lights
-        How many of the dome's lights are rendered, spread over the dome.
+        Number of rendered lights, distributed over the dome.
     subpixels
         Rays along each side of our pixels; Mitsuba gets as many samples.
-    fine
+    reference_subpixels
         Rays along each side of the reference's pixels.
     rounds
-        Times that everything is rendered; the fastest counts.
+        Number of repetitions; the fastest counts.
     sampler
         Mitsuba's; "stratified" is its least noisy one here, "independent" its default.
 
     Returns
     -------
-    Comparison
-        All three take turns at each light. Compiling, parsing and building of meshes are done
-        before and not counted; tracing our camera rays is.
+    IntegratorComparison
+        The three methods alternate at each light. Compilation, parsing and the construction of
+        meshes are not timed; tracing our camera rays is.
     """
     rig = point_light_rig(load_rig("dome").resized(width_px).subset(views=["C02"]))
     view, face = rig.views[0], plain_face()
@@ -170,7 +170,7 @@ def compare_integrators(
 def _mean_square_by_tile(
     difference: Float64Array, shown: BoolArray, side: int = 16
 ) -> Float64Array:
-    """Return the mean square of each tile of images (L, H, W, 3), those without skin left out."""
+    """Return the mean square per tile of images (L, H, W, 3), without tiles that show no skin."""
     squared = np.mean(difference**2, axis=(0, 3))
     seen = np.asarray(shown.any(axis=(0, 3)))
     rows, columns = (n // side * side for n in squared.shape)
@@ -188,7 +188,7 @@ def _per_steradian(scene: PlainScene, light: int) -> Float32Array:
 def render_with_mitsuba(
     scene: PlainScene, view: View, light: dict[str, Any], *, samples: int, seed: int
 ) -> Float32Array:
-    """Return one image by Mitsuba's path tracer, shape (H, W, 3), for any described light."""
+    """Render one image by Mitsuba's path tracer, shape (H, W, 3), for any described light."""
     description = describe_dome(scene, view, "path") | {"light": light}
     return radiance(description, kind="rgb", samples=samples, seed=seed)[..., :3]
 
@@ -204,13 +204,13 @@ def describe_dome(
 ) -> dict[str, Any]:
     """Return Mitsuba's scene of a face in the dome, lit by a point of intensity 1 per steradian."""
     subject = _face(scene)
-    return _look(view, sampler) | {
+    return _camera_and_light(view, sampler) | {
         "integrator": _INTEGRATOR_SETTINGS[integrator],
         "face": {"type": "mesh", "mesh": subject.mesh, "bsdf": _skin(scene.surface(view), subject)},
     }
 
 
-def _look(view: View, sampler: str = "independent") -> dict[str, Any]:
+def _camera_and_light(view: View, sampler: str = "independent") -> dict[str, Any]:
     """Return a scene with a camera and a point of intensity 1 per steradian."""
     return {
         "type": "scene",
@@ -232,8 +232,8 @@ def _face(scene: DomeScene) -> SimulatedSubject:
 def _skin(surface: SkinSurface, subject: SimulatedSubject) -> dict[str, Any]:
     """Return our reflection as a blend of Mitsuba's materials, at half its strength.
 
-    Its ``plastic`` divides by 1 minus the inner diffuse reflectance and by the index squared; the
-    face is rendered with R_d of twice as much as here times that factor, since a blend averages.
+    Mitsuba's ``plastic`` divides by 1 minus the inner diffuse reflectance and by the index squared.
+    The R_d of the rendered face is twice ours times that factor, since a blend averages.
     """
     covered = subject.atlas.covered
     rough = surface.roughness
@@ -252,7 +252,7 @@ def _skin(surface: SkinSurface, subject: SimulatedSubject) -> dict[str, Any]:
 
 
 def _matte_material(surface: SkinSurface, subject: SimulatedSubject) -> dict[str, Any]:
-    """Return the diffuse term behind the boundary, without the mirror that stands on it."""
+    """Return the diffuse term behind the boundary, without the specular lobe above it."""
     r_d = surface.r_d * np.float32(plastic_scale(ETA))
     return matte_plastic(ETA, _texture(r_d, subject.atlas.covered))
 

@@ -1,4 +1,4 @@
-"""What the dome's cameras see of a subject that may move, as rows that any light can light."""
+"""Visible points of a subject in the dome, as rows that any light can illuminate."""
 
 import dataclasses
 from collections.abc import Callable
@@ -26,28 +26,28 @@ from rigsim.targets import Target
 Float16Array = NDArray[np.float16]
 
 SUBSURFACE_CACHE_BYTES: Final = 2**29
-"""Latest light from inside that is kept: it is the same for all cameras, which ask one after the
-other for many lights."""
+"""Size of the cache of subsurface light: it is the same for all cameras, which request it in turn
+for many lights."""
 
 FLOAT16_SCALE: Final = 1000.0
-"""Its greatest value where it is kept with 11 bits, which resolve 1e-10 of that."""
+"""Maximum of the cached light in float16: 11 bits resolve 1e-10 of full scale there."""
 
 
 class DomeRows:
-    """Cameras' rows of one subject or target; those of a head that holds still are kept.
+    """Cameras' rows of one subject or target, cached for heads that do not move.
 
     Parameters
     ----------
     dome
-        The dome as it stands.
+        The actual dome.
     subject
         A face or a target.
     caster
         Its mesh at rest.
     motion
-        How the head moves; None holds it still. Targets stand still.
+        Movement of the head; None: fixed. Targets are fixed.
     how
-        How cameras look.
+        Settings of the cameras.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class DomeRows:
         self._vector: LruCache[tuple[str, float], VectorizedShader] = LruCache(lambda _: most)
 
     def pose_time_s(self, t_s: float) -> float:
-        """Return the time that decides how the subject stands, s; 0 of one that holds still."""
+        """Return the time that determines the head's pose, s; 0 for a fixed head."""
         return 0.0 if self._motion is None else round(t_s, 4)
 
     def lamp(self, light: int, t_s: float) -> Lamp:
@@ -88,25 +88,25 @@ class DomeRows:
         Parameters
         ----------
         view
-            The camera, of the dome as it stands.
+            The camera of the actual dome.
         t_s
             World time, s.
         texture
-            How the face reflects for a camera's colors, with its normals, (N, N, C); not asked of a
-            target.
+            Returns the face's reflection for a camera's colors with its normals, (N, N, C); not
+            called for a target.
         """
-        return self._hits.get((view.name, t_s), lambda: self._look(view, t_s, texture))
+        return self._hits.get((view.name, t_s), lambda: self._trace_rows(view, t_s, texture))
 
     def vectorized_shader(
         self, view: View, t_s: float, hits: Hits, caster: Caster
     ) -> VectorizedShader:
-        """Return what lights rows of `visible_rows` by compiled loops; kept as long as they are."""
+        """Return the compiled shader of `visible_rows`; cached as long as they are."""
         return self._vector.get((view.name, t_s), lambda: VectorizedShader(hits, caster))
 
     def _pose(self, t_s: float) -> tuple[Float64Array, Float64Array]:
         return (np.eye(3), np.zeros(3)) if self._motion is None else self._motion.pose(t_s)
 
-    def _look(
+    def _trace_rows(
         self, view: View, t_s: float, texture_of: Callable[[str], Float32Array]
     ) -> tuple[Hits, Caster]:
         rotation, shift = self._pose(t_s)
@@ -120,7 +120,9 @@ class DomeRows:
         subject, caster = self._subject, self._caster
         if isinstance(subject, Target):
             if subject.kind == "source":
-                raise SceneError(f"target {subject.name!r}: shines itself, no dome holds it")
+                raise SceneError(
+                    f"target {subject.name!r}: got one that emits light, expected one that reflects"
+                )
             return observe_target(caster, moved, subject, how, distortion), caster
         amount = 0.0 if self._motion is None else self._motion.twitch_amount(t_s)
         texture = texture_of(view.spectral_sensitivity)
@@ -139,12 +141,12 @@ def _vector(values: Float64Array) -> tuple[float, float, float]:
 
 
 class DomeSubsurfaceRadiance:
-    """What leaves the interior of one face besides what its own points send back.
+    """Light from the interior of one face in addition to each point's own reflection.
 
     Parameters
     ----------
     scattering
-        Returns the face, ready to be lit from within, for a camera's colors.
+        Returns the lateral scattering of the face for a camera's colors.
     """
 
     def __init__(self, scattering: Callable[[str], LateralScattering]) -> None:
@@ -154,7 +156,7 @@ class DomeSubsurfaceRadiance:
         )
 
     def on_rows(self, hits: Hits, lamp: Lamp, view: View, light: int, t_s: float) -> Float32Array:
-        """Return the light from inside at a camera's rows.
+        """Return the subsurface light at a camera's rows.
 
         Parameters
         ----------
@@ -163,9 +165,9 @@ class DomeSubsurfaceRadiance:
         lamp
             The light, in the frame of the mesh.
         view
-            The camera; its colors count.
+            The camera; its colors matter.
         light, t_s
-            Number of the light and world time in s, by which it is kept.
+            Number of the light and world time in s, the keys of the cache.
 
         Returns
         -------
@@ -191,7 +193,7 @@ def observe_face(
     settings: CameraSettings,
     distortion: ArrayLike | None,
 ) -> Hits:
-    """Look at a face.
+    """Trace a camera's rows of a face.
 
     Parameters
     ----------
@@ -201,7 +203,7 @@ def observe_face(
         The camera, in the frame of the mesh.
     texture
         Surface and normals with relief in the last three, shape (N, N, 10) or (N, N, 14).
-    how, distortion
+    settings, distortion
         Rays and lens; its distortion, see `rigsim.render.camera_rays`.
     """
 
@@ -220,7 +222,7 @@ def observe_target(
     settings: CameraSettings,
     distortion: ArrayLike | None,
 ) -> Hits:
-    """Look at a target that reflects."""
+    """Trace a camera's rows of a reflecting target."""
     rgb = target.rgb(view.spectral_sensitivity, settings.illuminant)
 
     def look_up(buffers: GBuffer, rows: Int32Array) -> tuple[Float32Array, Float32Array]:
@@ -238,6 +240,6 @@ def observe_target(
 
 
 def normalize(vectors: Float32Array) -> Float32Array:
-    """Return vectors of length 1, shape (..., 3); those of length 0 stay."""
+    """Normalize vectors to length 1, shape (..., 3); those of length 0 stay."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.maximum(length, np.float32(1e-6)), np.float32)

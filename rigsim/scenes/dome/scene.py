@@ -1,4 +1,4 @@
-"""The light dome: LEDs lit one at a time around a face or a target, seen by many cameras.
+"""Render the light dome: a face or a target, one light at a time, in many cameras.
 
 A camera's rays are traced once and serve all lights (see `rigsim.light.olat`). The unit of light
 is fixed by the rig alone, see `rigsim.light.led_light`.
@@ -10,9 +10,9 @@ on-time at level 1::
 
     signal = gain_c I_l lobe_l(off axis) cos(theta) pi f_r / d^2,    I_l = `DomeScene.intensity(l)`
 
-averaged over the pixel, and over the LED's disc where it casts shadows. A dome stands as its
-drawing says, or as it was built (`rigsim.as_built.dome`): with other places and powers, bent
-images, responses that differ, dead LEDs and crossed wires.
+averaged over the pixel, and over the LED's disc where it casts shadows. A dome is nominal, or as it
+was built (`rigsim.as_built.dome`): with other positions and powers, distorted images, different
+responses, dead LEDs and crossed wires.
 """
 
 from collections.abc import Mapping, Sequence
@@ -54,11 +54,11 @@ from rigsim.subject.head_motion import HeadMotion
 from rigsim.targets import Target
 
 LED_POWER_DEVIATION: Final = 0.001
-"""Relative standard deviation of an LED's energy from pulse to pulse."""
+"""Relative standard deviation of an LED's energy between pulses."""
 
 MAX_CACHED_FRAMES: Final = 16
 FRAME_CACHE_BYTES: Final = 2**28
-"""Latest frames that are kept, the more of the two, so that a second exposure costs nothing."""
+"""Cached frames, the larger of both limits, so that a second exposure costs nothing."""
 
 
 class DomeScene(FaceScene):
@@ -67,30 +67,29 @@ class DomeScene(FaceScene):
     Parameters
     ----------
     rig
-        The drawing of the dome; its lights must share one spectrum and be LEDs.
+        The nominal dome; its lights must share one spectrum and be LEDs.
     subject
         A face or a target (for the dome's own targets see `rigsim.scenes.dome.targets`).
     dome
-        The dome as it stands; ``None`` stands as drawn.
+        The actual dome; ``None``: nominal.
     motion
-        How the head moves; ``None`` holds it still. Targets stand still.
+        Movement of the head; ``None``: fixed. Targets are fixed.
     state
-        State of the face, see `rigsim.subject.perfusion.STATE_NAMES`: its blood, and its expression
-        where the state is one; targets have none.
+        Condition of the face, see `rigsim.subject.perfusion.STATE_NAMES`: its blood, and its
+        expression where the state is one; targets have none.
     movement
-        Whether the face moves and wrinkles with the state. A subject that is already posed
-        (`Subject.posed`) stays in its pose.
+        Whether the face moves and wrinkles with the state. An already posed subject
+        (`SimulatedSubject.posed`) keeps its pose.
     conditions
         Conditions of the skin with their amounts, see `rigsim.population.conditions`; targets have
         none.
     seed
-        Seeds what differs from pulse to pulse.
+        Seeds the variation between pulses.
     effects
-        Effects of light that are asked for; the others are decided by how much they change pixels,
-        see `needs`.
+        Requested effects of light; the others are decided by their changes of pixels, see `needs`.
     on_s
-        Longest on-time at full level of one light in the plan's exposures, s, by which sizes are
-        told; ``None``: such that the brightest skin is at full scale.
+        Longest on-time at full level of one light in the plan's exposures, s, for the sizes of
+        effects; ``None``: such that the brightest skin is at full scale.
     subpixels
         Rays along each side of a pixel.
     choice
@@ -115,7 +114,9 @@ class DomeScene(FaceScene):
     ) -> None:
         for light in rig.lights:
             if light.power_w is None:
-                raise SceneError(f"light {light.name!r}: is no LED, it has no power_w")
+                raise SceneError(
+                    f"light {light.name!r}: got no power_w, expected an LED; add power_w"
+                )
         if dome is None:
             dome = ActualDome(rig, rig, np.array([_toward_origin(light) for light in rig.lights]))
         self.dome = dome
@@ -145,14 +146,14 @@ class DomeScene(FaceScene):
                 self._glow = DomeSubsurfaceRadiance(self._scattering)
         how = CameraSettings(subpixels, self._illuminant, self.optics)
         self._rows = DomeRows(dome, self.subject, self._caster, motion, how)
-        # a capture comes back to each light in its next pass
+        # a capture returns to each light in its next pass
         self._frames: LruCache[tuple[str, int, float], Float32Array] = LruCache(
             lambda frame: max(MAX_CACHED_FRAMES, FRAME_CACHE_BYTES // frame.nbytes)
         )
 
     @cached_method
     def _scattering(self, camera: str) -> LateralScattering:
-        """Return the face, ready to be lit from within for a camera's colors."""
+        """Return the lateral scattering of the face for a camera's colors."""
         skin = ObservedSkin(self._face(), "neutral", camera, self._illuminant)
         bounces = None
         if self.interreflections:
@@ -175,7 +176,7 @@ class DomeScene(FaceScene):
 
         See Also
         --------
-        rigsim.light.led_light.white_intensity : the unit; a dead light has none.
+        rigsim.light.led_light.white_intensity : the unit; a dead light emits nothing.
         """
         led = self.rig.lights[light]
         if led.name in self.dome.dead:
@@ -183,7 +184,7 @@ class DomeScene(FaceScene):
         return white_intensity(led, self._camera(view_name)).astype(np.float32)
 
     def _white_level_at_origin(self) -> Float64Array:
-        """Return full scales per second of a white plate that faces the brightest light."""
+        """Return the full scales per second of a white plate that faces the brightest light."""
         each = [
             white_intensity(light, self.rig.views[0]) / float(np.square(light.position_mm).sum())
             for light in self.rig.lights
@@ -193,16 +194,16 @@ class DomeScene(FaceScene):
     def radiance(
         self, view_name: str, lights: Sequence[int] | None = None, *, t_s: float = 0.0
     ) -> Float32Array:
-        """Return the light on a sensor for each LED alone, without noise and vignetting.
+        """Return the light on a sensor per LED, one light at a time, without noise and vignetting.
 
         Parameters
         ----------
         view_name
-            Which camera.
+            Name of the camera.
         lights
             Indices into the rig's lights; ``None`` takes all.
         t_s
-            World time, s; it matters to moving heads only.
+            World time, s; it matters for moving heads only.
 
         Returns
         -------
@@ -222,14 +223,14 @@ class DomeScene(FaceScene):
     def exposure(
         self, view_name: str, *, pops: Sequence[LedPulse], exposure_s: float, seed: int
     ) -> UInt16Array:
-        """Expose a camera once.
+        """Simulate one exposure of a camera.
 
         Parameters
         ----------
         view_name
-            Which camera.
+            Name of the camera.
         pops
-            The pulses of the LEDs, clipped to the exposure; none gives a dark frame.
+            The pulses of the LEDs, clipped to the exposure; none yields a dark frame.
         exposure_s
             Exposure time, s.
         seed
@@ -258,15 +259,15 @@ class DomeScene(FaceScene):
             seed=seed,
         )
 
-    # truth ------------------------------------------------------------------------------------
+    # ground truth ------------------------------------------------------------------------------
 
     def truth(self, view_name: str | None = None) -> dict[str, NDArray[np.generic]]:
-        """Return what an estimator should find, at the sensor's resolution, at time 0.
+        """Return the ground truth for estimators, at the sensor's resolution, at time 0.
 
         Parameters
         ----------
         view_name
-            Which camera; ``None`` takes the first.
+            Name of the camera; ``None`` takes the first.
 
         Returns
         -------
@@ -277,20 +278,20 @@ class DomeScene(FaceScene):
             ``normals``: unit, rig frame, with relief; ``position_mm``: rig frame; ``roughness``,
             ``oil``, ``fuzz``: of the surface terms, under a condition also ``film``,
             ``film_alpha``, ``film_eta``, ``powder`` (`rigsim.light.surface_brdf.Coating`); ``uv``:
-            (H, W, 2); ``hair``: part covered by hair (brows, lashes); ``mask``: bool, pixels wholly
-            on skin.
+            (H, W, 2); ``hair``: fraction covered by hair (brows, lashes); ``mask``: bool, pixels
+            wholly on skin.
 
         Raises
         ------
         SceneError
-            A target stands there; only faces have these maps.
+            For a target; only faces have these maps.
         """
         self._face()
         hits, _ = self._rows.visible_rows(self._camera(view_name), 0.0, self._texture)
         return dome_truth.image_truth_maps(hits)
 
     def truth_appearance(self, view_name: str | None = None) -> SkinAppearance:
-        """Return the truth on the face's own texture, at time 0.
+        """Return the ground truth on the face's own texture, at time 0.
 
         Parameters
         ----------
@@ -301,12 +302,13 @@ class DomeScene(FaceScene):
         -------
         SkinAppearance
             ``position`` in mm and ``normals`` with relief (rig frame), ``r_d``, ``r_d_floor``
-            (`rigsim.light.surface_brdf.min_surface_reflection`: by how much eq. (6)'s minimum lies
-            above r_d even without noise), ``reflectance`` (at normal incidence), ``roughness``,
-            ``oil``, ``fuzz``, ``normals_tangent`` (`Subject.tangent_normal`: texture frame, relief
-            and wrinkles alone; comparable between states texel by texel); of a moved face also
-            ``position_at_rest``, of one under conditions its coating (`Coating`); valid on bare
-            skin. All is that of the skin under its conditions.
+            (`rigsim.light.surface_brdf.min_surface_reflection`: excess of the minimum of eq. (6)
+            over r_d even without noise), ``reflectance`` (at normal incidence), ``roughness``,
+            ``oil``, ``fuzz``, ``normals_tangent`` (`SimulatedSubject.tangent_normal`: texture
+            frame, relief and wrinkles only; comparable between states per texel); for a moved face
+            also
+            ``position_at_rest``, under conditions its coating (`Coating`); valid on bare skin. All
+            maps describe the skin under its conditions.
         """
         surface = self.surface(self._camera(view_name))
         left_out = tuple(self.omitted)
@@ -322,7 +324,7 @@ class DomeScene(FaceScene):
         *,
         view_name: str | None = None,
     ) -> tuple[Float32Array, Float32Array]:
-        """Evaluate the true reflection at points of the face.
+        """Evaluate the ground truth of the reflection at points of the face.
 
         Parameters
         ----------
@@ -352,7 +354,7 @@ class DomeScene(FaceScene):
     # inside -----------------------------------------------------------------------------------
 
     def surface(self, view: View) -> SkinSurface:
-        """Return how the face reflects for a camera, under its conditions."""
+        """Return the face's reflection for a camera, under its conditions."""
         return self._surface(view.spectral_sensitivity)
 
     @cached_method
@@ -390,7 +392,7 @@ class DomeScene(FaceScene):
         return olat.shade_rows(hits, lamp, visible, color, glow, diffuse=diffuse, relief=relief)
 
     def _relief_of(self, hits: Hits, lamp: Lamp) -> Float32Array | None:
-        """Return which part of a light the texture's relief leaves to each row."""
+        """Return the fraction of a light that the texture's relief leaves to each row."""
         if self._relief is None or hits.kind != SKIN_ROWS:
             return None
         uv = hits.texture_uv()

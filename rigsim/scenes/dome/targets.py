@@ -1,9 +1,9 @@
-"""Calibration targets in the dome: a ChArUco board, mirror balls, a white plate.
+"""Render calibration targets in the dome: a ChArUco board, mirror balls, a white plate.
 
-An operator puts the target into one place after the other; `TargetScene.show` is that hand. Places
-are drawn near those of `TARGET_POSES`: nobody holds a board to a tenth of a millimetre. Only the
-first place is exact: a jig holds the board in the rig's origin, facing +z, and so defines the rig
-frame.
+An operator moves the target through several poses, which `TargetScene.set_pose` selects. Poses are
+drawn near those of `TARGET_POSES`, since a board cannot be held to a tenth of a millimeter. Only
+the first pose is exact: a jig holds the board at the rig's origin, facing +z, and so defines the
+rig frame.
 """
 
 import math
@@ -31,45 +31,45 @@ Kind: TypeAlias = Literal["charuco", "mirror", "white"]
 
 BALL_RADIUS_MM: Final = 50.0
 WHITE_SLOPE_DEG: Final = 0.05
-"""RMS slope of the white plate's surface in each direction."""
+"""RMS slope of the white plate's surface in each direction, degrees."""
 MAX_LED_DISC_VARIATION: Final = 2e-4
-"""By how much light of an LED's disc differs from that of its middle, relative, at most."""
+"""Largest relative difference between the light of an LED's disc and that of its center."""
 
 _TargetPose: TypeAlias = tuple[float, float, float, float, float, float]
 BOARD_POSES: Final[tuple[_TargetPose, ...]] = package_table("dome_targets")["board_places"]
-"""Azimuth and elevation of the front's normal, turn in its plane (degrees), middle (mm)."""
+"""Azimuth and elevation of the front's normal, rotation in its plane (degrees), center (mm)."""
 
 PLATE_POSES: Final[tuple[_TargetPose, ...]] = package_table("dome_targets")["plate_places"]
-"""The same of the white plate; the first three face most lights."""
+"""Poses of the white plate, likewise; the first three face most lights."""
 
 BALL_POSITIONS: Final[tuple[tuple[float, float, float], ...]] = package_table("dome_targets")[
     "ball_places"
 ]
-"""Middle of the ball, mm."""
+"""Center of the ball, mm."""
 
 TARGET_POSES: Final[dict[str, int]] = {
     "charuco": len(BOARD_POSES),
     "mirror": len(BALL_POSITIONS),
     "white": len(PLATE_POSES),
 }
-"""How many places each target has."""
+"""Number of poses of each target."""
 
 PLACEMENT_DEVIATION_MM: Final = 3.0
 PLACEMENT_DEVIATION_DEG: Final = 2.0
-"""Standard deviations of where an operator puts a target."""
+"""Standard deviations of the operator's placement of a target."""
 
 
 class TargetScene(RigScene):
-    """A calibration target in the middle of a dome that was built near its drawing.
+    """A calibration target in the center of an actual dome.
 
     Parameters
     ----------
     kind
         "charuco", "mirror" or "white".
     dome
-        The dome as it stands.
+        The actual dome.
     seed
-        Seeds where the operator puts the target, the plate's waves and the noise.
+        Seeds the operator's placement, the plate's waves and the noise.
     slope_deg
         RMS slope of the white plate's surface, degrees.
     """
@@ -104,10 +104,10 @@ class TargetScene(RigScene):
             Effect(
                 "images of the LEDs in the target",
                 "built" if mirror else "absent",
-                "the ball mirrors them" if mirror else "paper is matt",
+                "the ball reflects them" if mirror else "paper is matt",
             ),
             decide_effect(
-                "sizes of the LEDs in the light on plates",
+                "extent of the LEDs in the light on plates",
                 sizes,
                 None,
                 switch="",
@@ -118,7 +118,7 @@ class TargetScene(RigScene):
         return EffectSelection(tuple(effects))
 
     def set_pose(self, pose: int) -> None:
-        """Put the target into its place number ``pose``."""
+        """Move the target to its pose number ``pose``."""
         if not 0 <= pose < TARGET_POSES[self.kind]:
             raise SceneError(f"pose: got {pose}, expected 0 to {TARGET_POSES[self.kind] - 1}")
         self.pose = pose
@@ -126,14 +126,14 @@ class TargetScene(RigScene):
     def exposure(
         self, view_name: str, *, pops: Sequence[LedPulse], exposure_s: float, seed: int
     ) -> UInt16Array:
-        """Expose a camera once.
+        """Simulate one exposure of a camera.
 
         Parameters
         ----------
         view_name
-            Which camera.
+            Name of the camera.
         pops
-            The pulses of the LEDs, clipped to the exposure; none gives a dark frame.
+            The pulses of the LEDs, clipped to the exposure; none yields a dark frame.
         exposure_s
             Exposure time, s.
         seed
@@ -162,9 +162,9 @@ class TargetScene(RigScene):
         Parameters
         ----------
         view_name
-            Which camera.
+            Name of the camera.
         on_s
-            Seconds that each light was on, times its level, shape (L,).
+            On-time of each light in s, times its level, shape (L,).
         """
         view = self._camera(view_name)
         seconds = np.asarray(on_s, np.float64)
@@ -185,9 +185,9 @@ class TargetScene(RigScene):
         return np.asarray(gray[..., None] * color.astype(np.float32))
 
     def plate_pose(self, pose: int | None = None) -> tuple[Float64Array, Float64Array]:
-        """Return how a plate stands: rotation to the rig frame, place of its top left corner, mm.
+        """Return a plate's pose: rotation to the rig frame, position of its top left corner, mm.
 
-        A plate's own axes are x right and y down as seen from its front, z into it.
+        The plate's axes are x right and y down as seen from its front, z into it.
         """
         number = self.pose if pose is None else pose
         places = BOARD_POSES if self.kind == "charuco" else PLATE_POSES
@@ -205,20 +205,20 @@ class TargetScene(RigScene):
         return rotation, values[3:] - rotation @ np.array([width / 2, height / 2, 0.0])
 
     def ball_center_mm(self, pose: int | None = None) -> Float64Array:
-        """Return the middle of the mirror ball."""
+        """Return the center of the mirror ball."""
         number = self.pose if pose is None else pose
         return np.array(BALL_POSITIONS[number]) + PLACEMENT_DEVIATION_MM * self._hand[number, :3]
 
     def truth(self) -> dict[str, Any]:
-        """Return what calibration should find; lengths in mm, rig frame.
+        """Return the ground truth of calibration; lengths in mm, rig frame.
 
         Returns
         -------
         dict
             ``position_mm`` (L, 3), ``axis`` (L, 3), ``exponent`` (L,) of the lights in the order of
             the rig; ``intensity`` (L, 3) in the unit of `rigsim.light.led_light.white_intensity`, 0
-            where dead; ``gain`` by view; ``draw_ball_center_mm`` (places, 3) or ``plate_pose`` (a
-            list of rotation and place).
+            where dead; ``gain`` by view; ``draw_ball_center_mm`` (poses, 3) or ``plate_pose`` (a
+            list of rotation and position).
         """
         view = self.rig.views[0]
         alive = np.array([light.name not in self.dome.dead for light in self.rig.lights])
@@ -287,7 +287,7 @@ class TargetScene(RigScene):
 
 
 EDGE_SUBPIXELS: Final = 8
-"""Rays along each side of pixels that an edge crosses."""
+"""Rays along each side of pixels at an edge."""
 SPOT_SUBPIXELS: Final = 12
 """Rays along each side of pixels near an LED's image."""
 
@@ -295,18 +295,18 @@ SPOT_SUBPIXELS: Final = 12
 def make_target_scene(
     kind: Kind, rig: Rig, *, seed: int, dome: ActualDome | None = None
 ) -> TargetScene:
-    """Return a target in a dome built after a drawing.
+    """Build a target in an actual dome from its nominal description.
 
     Parameters
     ----------
     kind
         "charuco", "mirror" or "white".
     rig
-        The drawing.
+        The nominal dome.
     seed
-        Seeds the dome as built (unless given) and the scene.
+        Seeds the actual dome (unless given) and the scene.
     dome
-        The dome as it stands; None builds one with the usual tolerances.
+        The actual dome; None builds one with the usual tolerances.
 
     Returns
     -------
@@ -316,13 +316,13 @@ def make_target_scene(
 
 
 def plate_normals() -> list[tuple[float, float, float]]:
-    """Return where the white plate's front looks in each place, before the operator's hand."""
+    """Return the normals of the white plate's front in each pose, before the operator's error."""
     turns = np.radians([place[:2] for place in PLATE_POSES])
     return [tuple(_front_normal(azimuth, elevation).tolist()) for azimuth, elevation in turns]
 
 
 def _front_normal(azimuth: float, elevation: float) -> Float64Array:
-    """Return where a plate's front looks that is turned by angles in rad."""
+    """Return the front normal of a plate rotated by angles in rad."""
     x, z = math.sin(azimuth), math.cos(azimuth)
     return np.array([math.cos(elevation) * x, math.sin(elevation), math.cos(elevation) * z])
 

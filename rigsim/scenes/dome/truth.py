@@ -1,4 +1,4 @@
-"""What an estimator should find in the dome: the face's maps as a camera sees them, and its own."""
+"""Assemble the dome's ground truth: the face's maps in a camera's image and on its texture."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -19,7 +19,7 @@ COATING_MAPS: Final = ("film", "film_alpha", "film_eta", "powder")
 
 
 def image_truth_maps(hits: Hits) -> dict[str, NDArray[np.generic]]:
-    """Return the maps of `rigsim.scenes.dome.scene.DomeScene.truth`: means over pixels, no lens."""
+    """Return the maps of `rigsim.scenes.dome.scene.DomeScene.truth`: pixel means, without lens."""
     surface = olat.unpack_surface(hits.surface)
     normals = normalize(hits.scatter(hits.normals()))
     maps = hits.scatter(surface)
@@ -49,7 +49,7 @@ def texture_truth(
     omitted: tuple[tuple[str, str], ...],
     seed: int,
 ) -> SkinAppearance:
-    """Return the truth on a face's own texture, see `rigsim.scenes.dome.scene.DomeScene`."""
+    """Return the ground truth on a face's own texture, see `rigsim.scenes.dome.scene.DomeScene`."""
     valid = subject.atlas.covered & (subject.hair < MAX_SKIN_HAIR)
     floor = np.zeros(valid.shape, np.float32)
     floor[valid] = surface_brdf.min_surface_reflection(surface.packed()[valid])
@@ -58,10 +58,10 @@ def texture_truth(
         "position": (subject.atlas.position_mm, MAP_UNITS["position"], "rig frame"),
         "normals": (surface.normal, MAP_UNITS["normals"], "rig frame, with relief"),
         "r_d": (surface.r_d, "1", f"factor of the diffuse term, {white}"),
-        "r_d_floor": (floor, "1", "least surface term in the unit of r_d, within 70 degrees"),
+        "r_d_floor": (floor, "1", "smallest surface term in the unit of r_d, within 70 degrees"),
         "reflectance": (surface.reflectance, "1", f"at normal incidence, {white}"),
         "roughness": (surface.roughness, MAP_UNITS["roughness"], "Beckmann, skin below the oil"),
-        "oil": (surface.oil, "1", "share covered by oil, GGX of half the roughness"),
+        "oil": (surface.oil, "1", "fraction covered by oil, GGX of half the roughness"),
         "fuzz": (surface.fuzz, "1", "optical depth of vellus hair"),
         "normals_tangent": (
             subject.tangent_normal(),
@@ -72,10 +72,10 @@ def texture_truth(
     if surface.coating is not None:
         on = surface.coating
         maps |= {
-            "film": (on.film, "1", "share of the surface under a film"),
+            "film": (on.film, "1", "fraction of the surface under a film"),
             "film_alpha": (on.film_alpha, "1", "GGX alpha of the film"),
             "film_eta": (on.film_eta, "1", "refractive index of the film"),
-            "powder": (on.powder, "1", "share of the surface under grains"),
+            "powder": (on.powder, "1", "fraction of the surface under grains"),
         }
     if subject.rest is not None:
         where = "rig frame, the same skin before it moved"

@@ -1,8 +1,8 @@
-"""A face before the flash rig whose blood follows a course in time.
+"""Render a face in the flash rig whose blood follows a course in time.
 
-The light of a picture is a smooth function of the level of the blood: it is rendered at three
-levels of each pose, and taken from the parabola through them in between. So a sequence of any
-number of pictures costs three renders, six where the face moves.
+The light of an image is a smooth function of the blood level. It is rendered at three levels of
+each pose and interpolated in between by the parabola through them. A sequence of any number of
+images therefore costs three renders, six where the face moves.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,25 +25,25 @@ from rigsim.subject import SimulatedSubject, landmarks
 from rigsim.subject.perfusion_course import PerfusionCourse, fix_blood_level
 
 BLOOD_LEVELS: Final = (0.0, 0.5, 1.0)
-"""Levels of the blood that are rendered."""
+"""Rendered levels of the blood."""
 
 
 @dataclass(frozen=True, slots=True)
 class FlashEvent:
-    """What a flash met."""
+    """State of the face at a flash."""
 
     token: str
     """Name of the flash."""
     t_s: float
     """World time, s."""
     level: float
-    """Level of the state's blood, 0 to 1."""
+    """Blood level of the state, 0 to 1."""
     pose: str
-    """State that the face showed by its movement."""
+    """State whose movement the face shows."""
 
 
 class FlashCourseScene(RigScene):
-    """A face before the flash rig; see `rigsim.scenes.flash.scene.FlashScene`.
+    """A face in the flash rig; see `rigsim.scenes.flash.scene.FlashScene`.
 
     Parameters
     ----------
@@ -52,13 +52,13 @@ class FlashCourseScene(RigScene):
     subject
         The face at rest.
     course
-        What its blood does.
+        Course of its blood.
     seed
-        Seeds what differs from pop to pop.
+        Seeds the variation between pops.
     movement
         Whether the face moves with the expression, or only its blood changes.
     on_flash
-        Called with each flash that a camera saw.
+        Called with each flash that a camera recorded.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class FlashCourseScene(RigScene):
 
     @cached_property
     def needs(self) -> EffectSelection:  # type: ignore[override]
-        """What is built, what is not, and why."""
+        """Effects with their verdicts and reasons."""
         whole = self.scene_at(self.course.state, 1.0).needs
         return EffectSelection((*whole, *omitted_effects("course")))
 
@@ -118,7 +118,7 @@ class FlashCourseScene(RigScene):
     def exposure(
         self, view_name: str, *, pops: Sequence[FlashPop], exposure_s: float, seed: int
     ) -> UInt16Array:
-        """Expose a camera once, with the blood of the time of each pop; see `FlashScene`."""
+        """Simulate one exposure of a camera, with the blood at each pop; see `FlashScene`."""
 
         def image(pop: FlashPop) -> Float32Array:
             level, pose = self.course.level(pop.t_s), self.course.pose(pop.t_s)
@@ -143,12 +143,12 @@ class FlashCourseScene(RigScene):
         return self.scene_at(pose, level).radiance(polarizer, analyser_deg, view_name=view)
 
     def landmarks_px(self, pose: str = "neutral") -> dict[str, tuple[float, float]]:
-        """Return where named points of the skin are in the first camera's image of a pose.
+        """Return the positions of named skin points in the first camera's image of a pose.
 
         Returns
         -------
         dict
-            Name to (x, y), px of the sensor, also of points that something stands before.
+            Name to (x, y), px of the sensor, including occluded points.
         """
         face = self.scene_at(pose, BLOOD_LEVELS[0]).subject
         if not isinstance(face, SimulatedSubject):
@@ -158,18 +158,20 @@ class FlashCourseScene(RigScene):
         return {n: (float(x), float(y)) for n, (x, y) in zip(points.names, pixels, strict=True)}
 
     def hemoglobin(self, pose: str, levels: Sequence[float]) -> Float32Array:
-        """Return the true blood seen by the first camera, shape (len(levels), H, W), 0 to 0.32."""
+        """Return the first camera's blood volume fraction, (len(levels), H, W), 0 to 0.32."""
         nodes = np.stack([self.scene_at(pose, node).truth()["hemoglobin"] for node in BLOOD_LEVELS])
         weights = np.array([blood_level_weights(level) for level in levels])
         return np.tensordot(weights, nodes, axes=1).astype(np.float32)
 
     def truth(self, pose: str, level: float) -> Mapping[str, NDArray[np.generic]]:
-        """Return the truth maps of a pose at one of `BLOOD_LEVELS`; see `FlashScene.truth`."""
+        """Return `FlashScene.truth` of a pose at one of `BLOOD_LEVELS`."""
         return self.scene_at(pose, level).truth()
 
 
 def blood_level_weights(level: float) -> tuple[float, float, float]:
-    """Return the weights of what is known at `BLOOD_LEVELS` for a level from 0 to 1; they sum to 1.
+    """Return interpolation weights of `BLOOD_LEVELS` for a level from 0 to 1; they sum to 1.
+
+    They are the Lagrange polynomials of the parabola through the three levels.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What a camera of the flash rig sees of a face or a target, with its truth maps."""
+"""Render the flash rig's image of a face or a target, with its ground-truth maps."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -27,11 +27,11 @@ from rigsim.targets import Target
 from rigsim.tissue.skin_layers import ETA
 
 RAYS_PER_BAND: Final = 1 << 21
-"""Camera rays worked on at a time; bounds memory at full resolution."""
+"""Camera rays per batch; bounds memory at full resolution."""
 
 WHITE_SCALE: Final = np.float32(4.0)
-"""Stokes S0 of the white reference is 1 behind an ideal analyser when filtered light is counted in
-units of unfiltered irradiance over pi: the film takes half, the analyser another half."""
+"""Scale for which Stokes S0 of the white reference is 1 behind an ideal analyzer, when filtered
+light is in units of unfiltered irradiance over pi: each polarizer transmits half."""
 
 _LIGHT_NAMES: Final = ("diffuse", "specular", "shading")
 
@@ -40,75 +40,75 @@ ImageLayers = dict[str, Float32Array]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlashImage:
-    """What a camera gets, averaged over each pixel; light in units of the white reference."""
+    """Image of a camera, averaged over each pixel; light in units of the white reference."""
 
     diffuse: Float32Array
-    """Light from inside, shape (H, W, 3 Stokes, 3 RGB), white-balanced, through the lens."""
+    """Subsurface light, shape (H, W, 3 Stokes, 3 RGB), white-balanced, after the lens."""
     specular: Float32Array
-    """Light from the surface, shape (H, W, 3 Stokes), through the lens."""
+    """Surface light, shape (H, W, 3 Stokes), after the lens."""
     shading: Float32Array
-    """Light from inside of a skin of reflectance 1, shape (H, W, 3 Stokes), without the lens."""
+    """Subsurface light of a skin of reflectance 1, shape (H, W, 3 Stokes), without the lens."""
     maps: ImageLayers
-    """Truth maps, averaged over each pixel's covered part."""
+    """Ground-truth maps, averaged over each pixel's covered part."""
     coverage: Float32Array
-    """Part of each pixel that is covered, shape (H, W), without the lens."""
+    """Covered fraction of each pixel, shape (H, W), without the lens."""
     surface_fraction: Float32Array
-    """Part of each pixel's light that comes from where there is a surface, shape (H, W)."""
+    """Fraction of each pixel's light that comes from a surface, shape (H, W)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlashCamera:
-    """One camera of the rig, looking."""
+    """One camera of the rig with its polarizers, lights and lens."""
 
     rig: Rig
     """The rig."""
     view: View
     """The camera."""
     polarizers: Polarizers
-    """The polarizing films."""
+    """The polarizers."""
     weights: Float64Array
-    """Energy of each light over the sum that a plate at the origin gets, mm^2."""
+    """Energy of each light over the total of a plate at the origin, mm^2."""
     subpixels: int
     """Rays along each side of a pixel."""
     defocus: DefocusKernels | None = None
-    """How the lens spreads light; None: it is sharp everywhere."""
+    """Blur kernels of the lens; None: sharp everywhere."""
 
     def observe_face(
         self, caster: Caster, subject: SimulatedSubject, state: str, glow: SubsurfaceRadiance
     ) -> FlashImage:
-        """Look at a face.
+        """Render a face.
 
         Parameters
         ----------
         caster
             The face's mesh.
         subject, state
-            Whose face, in which state.
+            The face, and its state.
         glow
-            Light on and out of the face.
+            Light on and from inside the face.
 
         Returns
         -------
-        Picture
-            With all truth maps but those of `blurred_maps`.
+        FlashImage
+            With all ground-truth maps except those of `blurred_maps`.
         """
         textures = _textures(subject, state, glow)
         return self._in_bands(caster, lambda buffers: self._see_skin(buffers, textures))
 
     def observe_target(self, caster: Caster, target: Target) -> FlashImage:
-        """Look at a target that reflects.
+        """Render a target that reflects.
 
         Parameters
         ----------
         caster
             The target's mesh.
         target
-            A diffuse or a metal one.
+            A diffuse or a metal target.
 
         Returns
         -------
-        Picture
-            Without truth maps.
+        FlashImage
+            Without ground-truth maps.
         """
         return self._in_bands(caster, lambda buffers: self._see_target(buffers, target))
 
@@ -135,7 +135,9 @@ class FlashCamera:
         coverage = np.concatenate([band[1] for band in bands])
         for name, values in maps.items():
             if not np.isfinite(values).all():
-                raise RenderError(f"{name}: rendering gave values that are not finite")
+                raise RenderError(
+                    f"{name}: rendering gave values that are not finite; report this scene"
+                )
         diffuse, specular, white = (maps.pop(name) for name in _LIGHT_NAMES)
         reached = maps.pop("reached")
         return FlashImage(
@@ -145,14 +147,14 @@ class FlashCamera:
     def blurred_maps(
         self, subject: SimulatedSubject, state: str, glow: SubsurfaceRadiance
     ) -> dict[str, Float32Array]:
-        """Return the fractions and the reflectance of even skin that would look as the skin looks.
+        """Return fractions and reflectance of uniform skin with the appearance of the blurred skin.
 
         Parameters
         ----------
         subject, state
-            Whose face, in which state.
+            The face, and its state.
         glow
-            Light on and out of the face, with lateral transport.
+            Light on and from inside the face, with lateral scattering.
 
         Returns
         -------
@@ -175,21 +177,21 @@ class FlashCamera:
     def observe_maps(
         self, caster: Caster, subject: SimulatedSubject, maps: Mapping[str, Float32Array]
     ) -> FlashImage:
-        """Look at maps of a face without light.
+        """Render maps of a face without light.
 
         Parameters
         ----------
         caster
             The face's mesh.
         subject
-            Whose face.
+            The face.
         maps
             Textures of shape (N, N[, C]).
 
         Returns
         -------
-        Picture
-            With these truth maps only; no light.
+        FlashImage
+            With these ground-truth maps only; no light.
         """
         textures = _dilate_textures(maps, subject)
         return self._in_bands(caster, lambda buffers: self._see_maps(buffers, textures))
@@ -213,7 +215,7 @@ class FlashCamera:
         right = self.view.axes[0]
         leaving = shading.exit_stokes(normal, to_camera, eta=ETA, image_right=right)
         alpha = np.clip(seen["roughness"][:, 0], *shading.ALPHA_RANGE)
-        bare = 1.0 - seen["hair"]  # hair hides the skin and its shine
+        bare = 1.0 - seen["hair"]  # hair occludes the skin and its specular reflection
         specular = np.zeros_like(leaving)
         for k, light in enumerate(self.rig.lights):
             to_light, falloff = direction_and_falloff(light, position)
@@ -277,7 +279,7 @@ class FlashCamera:
 def _textures(
     subject: SimulatedSubject, state: str, glow: SubsurfaceRadiance
 ) -> dict[str, Float32Array]:
-    """Return what the camera samples from the face's texture, shape (N, N, C) each."""
+    """Return the texture maps that the camera samples, shape (N, N, C) each."""
     layers = {
         "glow": glow.scattered,
         "visible": glow.surface.visible,
@@ -298,7 +300,7 @@ def _textures(
 def _dilate_textures(
     layers: Mapping[str, Float32Array], subject: SimulatedSubject
 ) -> dict[str, Float32Array]:
-    """Return textures whose borders are filled, so that sampling may blend, (N, N, C) each."""
+    """Return textures with dilated borders, so that sampling may interpolate, (N, N, C) each."""
     covered = subject.atlas.covered
     return {name: dilate_texture(np.atleast_3d(layer), covered) for name, layer in layers.items()}
 
@@ -312,7 +314,7 @@ def _scatter(values: Float32Array, inside: NDArray[np.int_], mask: BoolArray) ->
 def _blur_through_lens(
     parts: ImageLayers, buffers: GBuffer, view: View, spread: DefocusKernels
 ) -> ImageLayers:
-    """Return what of a picture the lens blurs, at the sensor's resolution."""
+    """Return the parts of an image after lens blur, at the sensor's resolution."""
     k = spread.subpixels
     order, pixel, first, slot = pixel_order(buffers.mask, k)
     shape = (buffers.mask.shape[0] // k, buffers.mask.shape[1] // k)

@@ -1,8 +1,8 @@
-"""The flash rig's two images by closed forms and by Mitsuba's own polarizers, timed together.
+"""Compare the flash rig's closed-form polarization with Mitsuba's polarizers, in time and error.
 
-A sphere of polarized plastic stands where the face would be, before two point flashes behind films
-and a camera behind an analyser. Mitsuba traces paths through the films; here one set of rays is
-traced, and both images come from it by closed forms.
+A sphere of polarizing plastic replaces the face, in front of two point flashes behind polarizers
+and a camera behind an analyzer. Mitsuba traces paths through the polarizers; the closed forms
+derive both images from one set of rays.
 """
 
 import dataclasses
@@ -28,15 +28,15 @@ ETA: Final = 1.4
 SPHERE_ALPHA: Final = 0.25
 SPHERE_ALBEDO: Final = 0.5
 FLASH_INTENSITY: Final = 1e6
-"""Radiant intensity of each flash per steradian before its film."""
+"""Radiant intensity of each flash per steradian before its polarizer."""
 
 ANALYZER_AXIS_DEG: Final = {"parallel": 90.0, "crossed": 0.0}
-"""Passing axis of the analyser; both flashes pass vertical light."""
+"""Transmission axis of the analyzer; both flashes emit vertically polarized light."""
 
 
 @dataclass(frozen=True, slots=True)
 class PolarizerComparison:
-    """Time and error of both ways, for the parallel and the crossed image together."""
+    """Time and error of both methods, for the parallel and the crossed image together."""
 
     closed_form_s: float
     """Seconds for both images by closed forms."""
@@ -47,23 +47,23 @@ class PolarizerComparison:
     mitsuba_error: dict[str, float]
     """The same for Mitsuba's images."""
     mean_ratio: dict[str, float]
-    """Mean of Mitsuba's image over that of the reference: 1 but for noise."""
+    """Mean of Mitsuba's image over that of the reference: 1 up to noise."""
 
     @property
     def speed_up(self) -> float:
-        """How many times faster the closed forms are."""
+        """Speed-up of the closed forms."""
         return self.mitsuba_s / self.closed_form_s
 
     @property
     def noise_ratio(self) -> float:
-        """How many times smaller the closed forms' error is; the worse of both images."""
+        """Error of Mitsuba over that of the closed forms; the worse of both images."""
         return min(self.mitsuba_error[k] / self.closed_form_error[k] for k in ANALYZER_AXIS_DEG)
 
 
 def compare_polarizer_models(
     *, width_px: int = 256, samples: int = 64, subpixels: int = 1, seed: int = 0
 ) -> PolarizerComparison:
-    """Render both polarization images of the flash rig in both ways.
+    """Render both polarization images of the flash rig by both methods.
 
     Parameters
     ----------
@@ -78,14 +78,14 @@ def compare_polarizer_models(
 
     Returns
     -------
-    Comparison
-        Best seconds of three alternating runs, and errors. Compilation and the setting up of our
-        rays' mesh are done before and not counted; Mitsuba's scene is parsed in its time. Errors
-        are taken where the sphere covers the whole pixel, against closed forms with twelve rays
-        along each side, on which both ways agree but for noise (see ``mean_ratio``).
+    PolarizerComparison
+        Best times of three alternating runs, and errors. Compilation and the construction of our
+        rays' mesh are not timed; parsing of Mitsuba's scene is. Errors are evaluated where the
+        sphere covers the whole pixel, against closed forms with twelve rays along each side, on
+        which both methods agree up to noise (see ``mean_ratio``).
     """
     rig, view = reference_rig(width_px)
-    # One variant for both, so that no time goes into changing it.
+    # One variant for both, so that no time is spent on switching.
     caster = Caster(sphere_mesh(), choice=choose_variant("mono_polarized"))
     render_closed_forms(rig, view, caster, subpixels=subpixels)
     render_polarized_with_mitsuba(rig, view, "parallel", samples=samples, seed=seed)
@@ -160,7 +160,7 @@ def render_closed_forms(
 def render_polarized_with_mitsuba(
     rig: Rig, view: View, name: str, *, samples: int, seed: int
 ) -> Float32Array:
-    """Return one image by Mitsuba's path tracer through polarizing films, shape (H, W)."""
+    """Render one image by Mitsuba's path tracer through polarizers, shape (H, W)."""
     image = radiance(
         describe_polarized_rig(rig, view, ANALYZER_AXIS_DEG[name]),
         kind="mono_polarized",
@@ -171,7 +171,7 @@ def render_polarized_with_mitsuba(
 
 
 def describe_polarized_rig(rig: Rig, view: View, analyser_deg: float) -> dict[str, Any]:
-    """Return Mitsuba's scene of the rig with films before the lights and the camera."""
+    """Return Mitsuba's scene of the rig with polarizers on the lights and the camera."""
     up = (0.0, 1.0, 0.0)
     place = np.asarray(view.position_mm)
     half = math.tan(0.5 * view.width_px / view.focal_px)
@@ -210,7 +210,7 @@ def describe_polarized_rig(rig: Rig, view: View, analyser_deg: float) -> dict[st
 
 
 def reference_rig(width_px: int) -> tuple[Rig, View]:
-    """Return the flash rig and its camera cut to a square that the sphere fills."""
+    """Return the flash rig and its camera, cropped to a square that the sphere fills."""
     rig = load_rig("flash")
     view = rig.views[0]
     pixel_um = 2.2 * SPHERE_RADIUS_MM / width_px / view.distance_mm * view.focal_mm * 1e3

@@ -1,12 +1,12 @@
-"""The cross-polarized flash rig: two flashes and a camera before a face or a target.
+"""Render the cross-polarized flash rig: two flashes and a camera in front of a face or a target.
 
-Light that enters the skin is gathered in the face's texture, spread there, and seen by the camera
-through the surface; the surface's own reflection is added per pixel. Both are kept as Stokes
-vectors, so that every angle of the analyser is one weighted sum away.
+Light that enters the skin is accumulated in the face's texture, scattered laterally there, and
+transmitted through the surface to the camera; the surface's own reflection is added per pixel. Both
+are Stokes vectors, so that every analyzer angle is one weighted sum.
 
 The unit of light is fixed by the rig alone: a perfect white diffuser at the rig's origin that faces
 the camera gives `METERING_LEVEL` of full scale in the strongest channel at power 1, behind
-parallel as behind crossed films, whatever stands there later.
+parallel as behind crossed polarizers, for every subject.
 """
 
 from collections.abc import Mapping, Sequence
@@ -60,13 +60,13 @@ FLAT_FIELD_LEVEL: Final = 0.9
 """Fraction of full scale of the integrating sphere in its strongest channel at power 1."""
 
 POP_ENERGY_DEVIATION: Final = 0.002
-"""Relative standard deviation of a flash's energy from pop to pop."""
+"""Relative standard deviation of a flash's energy between pops."""
 
 
 class FlashScene(FaceScene):
-    """One subject or target before the flash rig, in one state.
+    """One subject or target in the flash rig, in one state.
 
-    Scenes that differ in the blood alone share what they trace, as long as one of them lives.
+    Scenes that differ in the blood only share traced rays, as long as one of them lives.
 
     Parameters
     ----------
@@ -75,22 +75,21 @@ class FlashScene(FaceScene):
     subject
         A face or a target.
     state
-        State of the face, see `rigsim.subject.perfusion.STATE_NAMES`: its blood, and its expression
-        where the state is one; targets have none.
+        Condition of the face, see `rigsim.subject.perfusion.STATE_NAMES`: its blood, and its
+        expression where the state is one; targets have none.
     movement
-        Whether the face moves and wrinkles with the state; else it stays as it is given. A subject
-        that is already posed (`Subject.posed`) stays in its pose.
+        Whether the face moves and wrinkles with the state; otherwise it stays as given. An already
+        posed subject (`SimulatedSubject.posed`) keeps its pose.
     sensor
-        Sensor of every view; ``None`` takes what each view states.
+        Sensor of every view; ``None`` takes that of each view.
     films
-        The polarizing films; ``None`` takes the rig's own, which its serial numbers decide.
+        The polarizers; ``None`` takes the rig's own, which its serial numbers determine.
     seed
-        Seeds what differs from pop to pop.
+        Seeds the variation between pops.
     effects
-        Effects of light that are asked for; the others are decided by how much they change pixels,
-        see `needs`.
+        Requested effects of light; the others are decided by their changes of pixels, see `needs`.
     power
-        Highest power of a flash in the plan, above 0 to 1, by which sizes are told.
+        Highest power of a flash in the plan, above 0 to 1, for the sizes of effects.
     subpixels
         Rays along each side of a pixel.
     choice
@@ -153,9 +152,9 @@ class FlashScene(FaceScene):
         polarizer
             "parallel" or "crossed".
         analyser_deg
-            Reading of the analyser's rotator in degrees; ``None`` takes that of the state.
+            Reading of the analyzer's rotator in degrees; ``None`` takes that of the stop.
         view_name
-            Which camera; ``None`` takes the first.
+            Name of the camera; ``None`` takes the first.
 
         Returns
         -------
@@ -171,7 +170,7 @@ class FlashScene(FaceScene):
         if isinstance(self.subject, Target) and self.subject.kind == "source":
             level = np.float32(FLAT_FIELD_LEVEL / METERING_LEVEL) * white
             return np.broadcast_to(level, shape).copy()
-        picture = self._picture(view)
+        picture = self._flash_image(view)
         diffuse = self._apply_analyzer(np.moveaxis(picture.diffuse, 2, 3), view, passes_deg)
         specular = self._apply_analyzer(picture.specular, view, passes_deg)
         return np.maximum((diffuse + specular[..., None]) * white, 0.0)
@@ -179,14 +178,14 @@ class FlashScene(FaceScene):
     def exposure(
         self, view_name: str, *, pops: Sequence[FlashPop], exposure_s: float, seed: int
     ) -> UInt16Array:
-        """Expose a camera once.
+        """Simulate one exposure of a camera.
 
         Parameters
         ----------
         view_name
-            Which camera.
+            Name of the camera.
         pops
-            The flashes that fired while the shutter was open; none gives a dark frame.
+            The flashes that fired while the shutter was open; none yields a dark frame.
         exposure_s
             Exposure time, s.
         seed
@@ -208,12 +207,12 @@ class FlashScene(FaceScene):
         )
 
     def truth(self, view_name: str | None = None) -> dict[str, NDArray[np.generic]]:
-        """Return what an estimator should find, at the sensor's resolution.
+        """Return the ground truth for estimators, at the sensor's resolution.
 
         Parameters
         ----------
         view_name
-            Which camera; ``None`` takes the first.
+            Name of the camera; ``None`` takes the first.
 
         Returns
         -------
@@ -221,36 +220,36 @@ class FlashScene(FaceScene):
             Maps of shape (H, W[, 3]), float32, averaged over each pixel's covered part:
 
             ``melanin``, ``hemoglobin``: volume fractions, sharp;
-            ``melanin_blurred``, ``hemoglobin_blurred``: the fractions of even skin that would look
-            as the skin looks after its light has spread, all else known;
+            ``melanin_blurred``, ``hemoglobin_blurred``: the fractions of uniform skin with the
+            appearance of the skin after lateral scattering, all else known;
             ``reflectance``, ``reflectance_blurred``: white-balanced diffuse reflectance, (H, W, 3);
-            ``shading``: what reflectance times `white_rgb` is multiplied with in the crossed image
-            at power 1, without specular leak, spreading of light and light from other skin;
+            ``shading``: factor of reflectance times `white_rgb` in the crossed image at power 1,
+            without specular leak, lateral scattering and interreflection;
             ``irradiance``: light of the flashes on the surface over that on the white reference;
-            ``diffuse``, ``specular``: camera RGB without analyser at power 1 in fraction of full
-            scale, light from inside and from the surface, (H, W, 3), through the lens, which blurs
+            ``diffuse``, ``specular``: camera RGB without analyzer at power 1 in fraction of full
+            scale, subsurface and surface light, (H, W, 3), after the lens, which blurs
             no other map; crossed is about half the first, parallel half the first and the second;
             ``normals``: unit, rig frame, with relief; ``position_mm``: rig frame;
             ``roughness``: GGX alpha; ``uv``: texture coordinates, (H, W, 2);
-            ``hair``: part covered by hair (brows, lashes);
+            ``hair``: fraction covered by hair (brows, lashes);
             ``mask``: bool, pixels wholly on skin, whose light comes from skin within
             `rigsim.scenes.flash.truth.MAX_FOREIGN_LIGHT_FRACTION`.
 
-            All are of the face as it has moved. For a state other than "neutral" there are also
-            ``melanin_at_rest``, ``hemoglobin_at_rest``: the fractions of this state as they would
-            be seen on the face at rest, sharp; ``melanin_blurred_at_rest``,
-            ``hemoglobin_blurred_at_rest``: those of even skin, blurred on the face as it has moved;
-            ``mask_at_rest``: bool, for all four. Where the face has moved also
-            ``position_at_rest_mm``: where the skin in a pixel is at rest, rig frame.
+            All maps are those of the moved face. For a state other than "neutral" there are also
+            ``melanin_at_rest``, ``hemoglobin_at_rest``: the fractions of this state mapped onto the
+            face at rest, sharp; ``melanin_blurred_at_rest``, ``hemoglobin_blurred_at_rest``: those
+            of uniform skin, blurred on the moved face; ``mask_at_rest``: bool, for all four. Where
+            the face has moved also ``position_at_rest_mm``: position at rest of the skin in a
+            pixel, rig frame.
 
         Raises
         ------
         SceneError
-            A target stands there; only faces have these maps.
+            For a target; only faces have these maps.
         """
         self._face()
         view = self._camera(view_name)
-        picture = self._picture(view)
+        picture = self._flash_image(view)
         passes_deg = self.films.analyzer_axis_deg(view, "crossed", None)
         truth = flash_truth.truth_maps(
             picture,
@@ -263,24 +262,24 @@ class FlashScene(FaceScene):
         return truth
 
     def landmarks_px(self, view_name: str | None = None) -> dict[str, tuple[float, float]]:
-        """Return where named points of the skin are in the image.
+        """Return the positions of named skin points in the image.
 
         Parameters
         ----------
         view_name
-            Which camera; ``None`` takes the first.
+            Name of the camera; ``None`` takes the first.
 
         Returns
         -------
         dict
-            Name to (x, y) on the sensor, px: x to the right, y down, the centre of pixel (0, 0) is
-            (0, 0); see `rigsim.subject.landmarks.POINTS_MM`. Points that the camera does not see
-            are missing. They go with the skin from state to state.
+            Name to (x, y) on the sensor, px: x to the right, y down, the center of pixel (0, 0) is
+            (0, 0); see `rigsim.subject.landmarks.POINTS_MM`. Points that are not visible to the
+            camera are missing. The points move with the skin between states.
 
         Raises
         ------
         SceneError
-            A target stands there.
+            For a target.
         """
         face, view = self._face("landmarks"), self._camera(view_name)
         points = face.surface_landmarks()
@@ -299,7 +298,7 @@ class FlashScene(FaceScene):
         return edge_width_mm(glow.kernels.sigmas_mm, glow.kernels.weights)
 
     def _apply_analyzer(self, stokes: Float32Array, view: View, passes_deg: float) -> Float32Array:
-        """Apply the analyser to Stokes vectors of shape (H, W, 3) or (H, W, 3 RGB, 3)."""
+        """Apply the analyzer to Stokes vectors of shape (H, W, 3) or (H, W, 3 RGB, 3)."""
         to_camera = -camera_rays(view)[1]
         right, up, _ = view.axes
         if stokes.ndim == 4:
@@ -351,15 +350,17 @@ class FlashScene(FaceScene):
 
     @cached_method
     def _blurred_maps(self, view: View) -> Mapping[str, Float32Array]:
-        """Return the maps that are blurred as the light is; nothing but the truth needs them."""
+        """Return the maps that are blurred like the light; only the ground truth requires them."""
         if not self.lateral:
-            return flash_truth.unblurred_maps(self._picture(view))
+            return flash_truth.unblurred_maps(self._flash_image(view))
         look = FlashCamera(self.rig, view, self.films, self._weights, self.subpixels)
-        return look.observe_maps(self._stage.caster, self._face(), self._spread(view)).maps
+        return look.observe_maps(
+            self._stage.caster, self._face(), self._blurred_textures(view)
+        ).maps
 
     @cached_method
-    def _spread(self, view: View) -> Mapping[str, Float32Array]:
-        """Return the textures of those maps, of the face as it has moved."""
+    def _blurred_textures(self, view: View) -> Mapping[str, Float32Array]:
+        """Return the textures of those maps, of the moved face."""
         look = FlashCamera(self.rig, view, self.films, self._weights, self.subpixels)
         glow = self._skin_glow(view.spectral_sensitivity)
         return look.blurred_maps(self._face(), self.state, glow)
@@ -367,16 +368,16 @@ class FlashScene(FaceScene):
     def _fractions_at_rest(
         self, view: View, moved: dict[str, NDArray[np.generic]]
     ) -> dict[str, NDArray[np.generic]]:
-        """Return the fractions of this state as seen on the face at rest."""
+        """Return the fractions of this state mapped onto the face at rest."""
         rest = self._face().rest
         if rest is None:
             return flash_truth.rest_maps_of_unmoved_face(moved)
         caster = shared_flash_geometry(rest, self._choice).caster
-        spread = self._spread(view) if self.lateral else None
-        look = self._look(view, rest.mesh)
+        spread = self._blurred_textures(view) if self.lateral else None
+        look = self._flash_camera(view, rest.mesh)
         return flash_truth.truth_maps_at_rest(look, caster, rest, self.state, spread)
 
-    def _look(self, view: View, mesh: Mesh) -> FlashCamera:
+    def _flash_camera(self, view: View, mesh: Mesh) -> FlashCamera:
         spread = None
         if self.optics:
             depths = depth_range(view, mesh)
@@ -386,8 +387,8 @@ class FlashScene(FaceScene):
         return FlashCamera(self.rig, view, self.films, self._weights, self.subpixels, spread)
 
     @cached_method
-    def _picture(self, view: View) -> FlashImage:
-        look, subject = self._look(view, self.subject.mesh), self.subject
+    def _flash_image(self, view: View) -> FlashImage:
+        look, subject = self._flash_camera(view, self.subject.mesh), self.subject
         if isinstance(subject, SimulatedSubject):
             glow = self._skin_glow(view.spectral_sensitivity)
             return look.observe_face(self._caster, subject, self.state, glow)
@@ -402,17 +403,21 @@ def pop_energy(pop: FlashPop) -> float:
 
 
 def _light_weights(rig: Rig) -> Float64Array:
-    """Return each light's energy over the sum that a plate at the origin gets, mm^2."""
+    """Return each light's energy over the total of a plate at the origin, mm^2."""
     energy, share = [], []
     view_axis = np.asarray(rig.views[0].axes[2])
     for light in rig.lights:
         if light.energy_ws is None:
-            raise SceneError(f"light {light.name!r}: is no flash, it has no energy_ws")
+            raise SceneError(
+                f"light {light.name!r}: got no energy_ws, expected a flash; add energy_ws"
+            )
         place = np.asarray(light.position_mm)
         squared = float(place @ place)
         energy.append(light.energy_ws)
         share.append(light.energy_ws * float(place @ view_axis) / squared**1.5)
     total = float(np.sum(share))
     if not total > 0.0:
-        raise SceneError("lights: none shines on a plate at the origin that faces the camera")
+        raise SceneError(
+            "lights: got none that reaches a plate at the origin facing the camera, expected one"
+        )
     return np.asarray(energy) / total

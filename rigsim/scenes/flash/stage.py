@@ -1,4 +1,4 @@
-"""What scenes of one geometry before the flash rig have in common, whatever the blood does."""
+"""Share the traced geometry between flash scenes that differ in the blood only."""
 
 from functools import cached_property
 from weakref import WeakValueDictionary
@@ -14,19 +14,19 @@ from rigsim.targets import Target
 
 
 class FlashGeometry:
-    """One geometry, and what has been traced on it.
+    """One geometry with its traced rays.
 
     Parameters
     ----------
     held
-        The mesh and the normals; while they are held their ids are theirs.
+        The mesh and the normals; holding them keeps their ids unique.
     caster
-        Traces rays against the mesh.
+        Caster of the mesh.
     """
 
     def __init__(self, held: tuple[Mesh, object], caster: Caster) -> None:
         self.held, self.caster = held, caster
-        self.light: dict[object, SurfaceIllumination] = {}  # on the face, by what it comes from
+        self.light: dict[object, SurfaceIllumination] = {}  # on the face, by its source
 
     @cached_property
     def exchange_fraction(self) -> float:
@@ -35,7 +35,7 @@ class FlashGeometry:
 
     @cached_property
     def exchange(self) -> Interreflection:
-        """How light goes from skin to skin."""
+        """Interreflection of the mesh."""
         return interreflection_for(self.caster)
 
 
@@ -45,12 +45,12 @@ _stages: WeakValueDictionary[tuple[object, ...], FlashGeometry] = WeakValueDicti
 def shared_flash_geometry(
     subject: SimulatedSubject | Target, choice: VariantChoice | None
 ) -> FlashGeometry:
-    """Return the stage of a geometry; the same as long as any scene holds it.
+    """Return the shared geometry; the same as long as any scene holds it.
 
     Parameters
     ----------
     subject
-        Whose mesh and, of a face, normals are the geometry.
+        Its mesh and, for a face, its normals are the geometry.
     choice
         Mitsuba variant to trace with; None chooses.
     """

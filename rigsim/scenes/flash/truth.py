@@ -1,4 +1,4 @@
-"""What an estimator should find before the flash rig: the face's maps as its camera sees them.
+"""Assemble the flash rig's ground truth: the face's maps in its camera's image.
 
 The maps are described at `rigsim.scenes.flash.scene.FlashScene.truth`.
 """
@@ -16,10 +16,10 @@ from rigsim.scenes.flash.image import FlashCamera, FlashImage
 from rigsim.subject import SimulatedSubject
 
 MAX_FOREIGN_LIGHT_FRACTION: Final = 0.01
-"""Pixels that get more of their light than this from off the skin, by the lens, are not skin."""
+"""Pixels that receive more than this fraction of their light from off the skin are not skin."""
 
 BLURRED_MAPS: Final = ("reflectance", "melanin", "hemoglobin")
-"""Maps that the spreading of light in the skin blurs."""
+"""Maps that lateral scattering in the skin blurs."""
 
 VOLUME_FRACTIONS: Final = ("melanin", "hemoglobin")
 BLURRED_FRACTIONS: Final = ("melanin_blurred", "hemoglobin_blurred")
@@ -32,16 +32,16 @@ def truth_maps(
     shading: Float32Array,
     white_rgb: Float32Array,
 ) -> dict[str, NDArray[np.generic]]:
-    """Return the maps of a face as it stands.
+    """Return the maps of a face in its present pose.
 
     Parameters
     ----------
-    picture
-        The face as the camera sees it.
+    image
+        Image of the face.
     blurred
-        Maps as light spreads in the skin, by name, see `FlashCamera.blurred_maps`.
+        Maps after lateral scattering in the skin, by name, see `FlashCamera.blurred_maps`.
     shading
-        (H, W[, 3]), the picture's shading through the crossed analyser.
+        (H, W[, 3]), the image's shading through the crossed analyzer.
     white_rgb
         (3,), camera RGB of the white reference, fraction of full scale.
     """
@@ -56,7 +56,7 @@ def truth_maps(
 def unblurred_maps(
     image: FlashImage, names: Sequence[str] = BLURRED_MAPS
 ) -> dict[str, Float32Array]:
-    """Return maps of a face in which light does not spread, under the names of blurred ones."""
+    """Return maps of a face without lateral scattering, under the names of blurred ones."""
     return {f"{name}_blurred": image.maps[name] for name in names}
 
 
@@ -67,21 +67,21 @@ def truth_maps_at_rest(
     state: str,
     blurred: Mapping[str, Float32Array] | None = None,
 ) -> dict[str, NDArray[np.generic]]:
-    """Return the fractions of a state as seen on the face at rest.
+    """Return the fractions of a state mapped onto the face at rest.
 
     Parameters
     ----------
-    look
-        How the face at rest is looked at.
+    camera
+        Camera of the face at rest.
     caster
-        That of its mesh.
+        Caster of its mesh.
     rest
-        The face as it is before it moves.
+        The face at rest.
     state
-        Whose blood it has.
-    spread
-        Textures of the moved face, see `FlashCamera.blurred_maps`: light spreads on that, wherever
-        the skin is then looked for. None: light does not spread.
+        State of its blood.
+    blurred
+        Textures of the moved face, see `FlashCamera.blurred_maps`: light scatters in the moved
+        face, wherever the skin is then mapped. None: without lateral scattering.
     """
     layers = {"melanin": rest.melanin, "hemoglobin": rest.hemoglobin(state), "hair": rest.hair}
     if blurred is not None:
@@ -97,14 +97,14 @@ def truth_maps_at_rest(
 def rest_maps_of_unmoved_face(
     maps: Mapping[str, NDArray[np.generic]],
 ) -> dict[str, NDArray[np.generic]]:
-    """Return the same maps of a face that has not moved, from those of `truth_maps`."""
+    """Return the same maps for a face that has not moved, from those of `truth_maps`."""
     return {
         f"{name}_at_rest": maps[name] for name in (*VOLUME_FRACTIONS, *BLURRED_FRACTIONS, "mask")
     }
 
 
 def fully_skin_pixels(image: FlashImage) -> BoolArray:
-    """Return the pixels, (H, W), that are wholly on skin, and get light from there alone."""
+    """Return the pixels, (H, W), that are wholly on skin and receive light from skin only."""
     whole = (image.coverage > 1.0 - 1e-6) & (
         image.surface_fraction > 1.0 - MAX_FOREIGN_LIGHT_FRACTION
     )

@@ -1,4 +1,4 @@
-"""The analyser before the gradient rig's camera, at the samples of its pixels."""
+"""Apply the analyzer of the gradient rig's camera at the samples of its pixels."""
 
 from typing import Final
 
@@ -15,7 +15,7 @@ MAX_CACHED_FRAMES: Final = 4
 
 
 class GridAnalyzer:
-    """Films before a camera that looks at the plane z = 0."""
+    """Polarizers of a camera that views the plane z = 0."""
 
     def __init__(self, films: Polarizers, view: View) -> None:
         self._films, self._view = films, view
@@ -26,7 +26,7 @@ class GridAnalyzer:
     def analyze(
         self, stokes: Float32Array, reading_deg: float, *, border_px: int = 0
     ) -> Float32Array:
-        """Apply the analyser to Stokes vectors of shape (3, H, W)."""
+        """Apply the analyzer to Stokes vectors of shape (3, H, W)."""
         key = (reading_deg, border_px)
         cos2, sin2 = self._frames.get(key, lambda: self._frame(*key))
         leak = 1.0 / self._films.analyser_extinction

@@ -1,7 +1,7 @@
-"""What the gradient rig's LEDs make of a patch of skin: twelve images for every state.
+"""Light a patch of skin by the gradient rig's LEDs: twelve images per strain step.
 
-For one state the whole picture is made once, as Stokes vectors for each of the four moments of the
-light (see `rigsim.light.lobe_moments`); patterns and analysers are sums of these.
+Per state one full image is computed, as Stokes vectors for each of the four moments of the light
+(see `rigsim.light.lobe_moments`); patterns and analyzer angles are sums of these.
 """
 
 import math
@@ -27,15 +27,15 @@ from rigsim.skin_patch.microrelief import MicroSkin, lateral_kernel
 from rigsim.tissue.skin_layers import ETA
 
 BLOCK_ROWS: Final = 128
-"""Rows that are looked up at once, which bounds memory."""
+"""Rows per lookup, which bounds memory."""
 
 SMOOTH_ALPHA: Final = 0.15
-"""Roughness from which on the smaller of the two default tables errs by less than 0.2 %."""
+"""Roughness from which on the error of the smaller default table is below 0.2 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchLighting:
-    """Everything about the light that does not change with the state."""
+    """Lighting data that do not change with the state."""
 
     sphere: ActualSphere
     surface: MicrofacetSurface
@@ -43,18 +43,18 @@ class PatchLighting:
     leds: tuple[int, ...]
     """LEDs in the table; with shadows only those above the patch's plane."""
     sectors: int
-    """Directions whose horizons are found; between them they are interpolated. 0: no shadows."""
+    """Number of directions with horizons, interpolated in between. 0: no shadows."""
     sigmas_mm: Float64Array
-    """Widths of the lateral kernel of light in skin; none: light leaves where it entered."""
+    """Widths of the lateral kernel of the skin; empty: light leaves where it entered."""
     weights: Float64Array
-    """Their shares, sum 1."""
+    """Their weights, sum 1."""
     groove_sectors: int = 0
-    """Directions in which the sky is looked for, for light from furrow to furrow; 0: none."""
+    """Number of sky directions for interreflection in grooves; 0: none."""
 
     def stokes(
         self, patch: PatchSurface, height_um: Float32Array, *, margin: int, pitch_um: float
     ) -> Float32Array:
-        """Return the picture of a patch, before the lens.
+        """Return the image of a patch before the lens, as Stokes vectors of the moments.
 
         Parameters
         ----------
@@ -63,9 +63,9 @@ class PatchLighting:
         height_um
             Heights with ``margin`` more samples on all sides, which cast shadows.
         margin
-            See there.
+            Number of those samples.
         pitch_um
-            Distance of samples, um.
+            Sample pitch, um.
 
         Returns
         -------
@@ -126,7 +126,7 @@ class PatchLighting:
         pitch_um: float,
         packed: Float32Array,
     ) -> None:
-        """Take away, LED by LED, what stands behind the relief."""
+        """Subtract, per LED, the light that the relief hides."""
         place = self.sphere.position_mm
         azimuth = np.arctan2(place[:, 1], place[:, 0]) % (2.0 * np.pi)
         where = azimuth / (2.0 * np.pi) * self.sectors
@@ -147,7 +147,7 @@ class PatchLighting:
     def _groove_interreflection(
         self, hidden: Float32Array, entering: Float32Array, patch: PatchSurface, pitch_mm: float
     ) -> Float32Array:
-        """Return what enters by way of other walls of the relief, shape (4, H, W)."""
+        """Return the light that enters after interreflection in the relief, shape (4, H, W)."""
         if not patch.skin.any():
             return np.zeros_like(entering)
         once = (
@@ -164,7 +164,7 @@ class PatchLighting:
     def _scatter_laterally(
         self, entering: Float32Array, skin: BoolArray, pitch_mm: float
     ) -> Float32Array:
-        """Spread light inside the skin; beyond the picture it goes on mirrored."""
+        """Scatter light laterally in the skin; the image is mirrored at its border."""
         if not self.sigmas_mm.size:
             return entering
         rows, columns = skin.shape
@@ -176,7 +176,7 @@ class PatchLighting:
             kernel += np.float32(weight) * np.exp(-np.float32(sigma**2) * square)
         out = np.empty_like(entering)
         for m in range(4):
-            # under the jaws no light enters, but what spreads there is lost
+            # no light enters under the jaws, and light scattered there is lost
             field = np.where(skin, entering[m], 0.0)
             spectrum = scipy.fft.dctn(field, type=2, workers=2)
             spectrum *= kernel
@@ -205,18 +205,18 @@ def tabulate_patch_lighting(
     sphere
         The LEDs.
     surface
-        The camera and the films; the roughness is the patch's.
+        The camera and the polarizers; the roughness is the patch's.
     half_field_mm
         Half the side of the field, mm.
     sectors
-        Directions of horizons; 0 leaves shadows out, and then light comes from below the patch's
-        plane too where the relief leans that way.
+        Number of directions of horizons; 0 omits shadows, and light then comes also from below the
+        patch's plane where the relief tilts that way.
     table_size
         Nodes along each axis of the normals; None chooses by roughness.
     lateral
-        Whether light spreads inside the skin.
-    furrow_sectors
-        Directions in which the sky is looked for, for light from furrow to furrow; 0: none.
+        Whether light scatters laterally in the skin.
+    groove_sectors
+        Number of sky directions for interreflection in grooves; 0: none.
     """
     leds = tuple(k for k, (_, _, z) in enumerate(sphere.position_mm) if not sectors or z > 0.0)
     alphas = (float(skin.alpha.min()), float(skin.alpha.max()))

@@ -1,7 +1,7 @@
-"""A patch of skin between the caliper's jaws, where the gradient rig's camera looks in one state.
+"""Sample a patch of skin between the caliper's jaws at the gradient camera's pixels.
 
-Frame: mm, origin at the middle of the patch. The camera's samples are points of the plane z = 0;
-where the skin is higher, what is seen there stands a little nearer the axis.
+Frame: mm, origin at the center of the patch. The camera's samples are points of the plane z = 0;
+where the skin is higher, the visible point is slightly nearer to the axis.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from rigsim.skin_patch.stretch import SurfaceSample
 from rigsim.world.taped_skin import GripState
 
 JAW_REFLECTANCE: Final = 0.03
-"""Of the jaws' matt black."""
+"""Reflectance of the jaws' matt black."""
 
 BULGE_MM: Final = 0.1
-"""How far relaxed skin bulges between the jaws."""
+"""Height of the bulge of relaxed skin between the jaws."""
 
 BULGE_EXPONENT: Final = 4.0
 """The bulge falls as e^(-4 (r - 1)) with the skin's stretch r."""
@@ -39,11 +39,11 @@ FOLD_WIDTH: Final = 0.35
 """Half width of the fold over the aperture."""
 
 SHADOW_MARGIN_PX: Final = 40
-"""Pixels around the picture whose relief casts shadows into it."""
+"""Pixels around the image whose relief casts shadows into it."""
 
 
 class Relief(Protocol):
-    """Skin in one state, see `rigsim.skin_patch.stretch.StretchedSkin`."""
+    """Interface of skin in one state, see `rigsim.skin_patch.stretch.StretchedSkin`."""
 
     def sample(self, x_mm: ArrayLike, y_mm: ArrayLike) -> SurfaceSample:
         """Return the relief at points of the skin's frame."""
@@ -51,16 +51,16 @@ class Relief(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchSurface:
-    """What stands at the camera's samples."""
+    """Surface at the camera's samples."""
 
     x_mm: Float32Array
-    """Place of each sample's point of the surface, mm, rig frame, shape (H, W)."""
+    """Position of each sample's surface point, mm, rig frame, shape (H, W)."""
     y_mm: Float32Array
     """The same, y up."""
     relief_um: Float32Array
     """Height of the relief, um."""
     bulge_um: Float32Array
-    """Height of what bulges or folds below it, um; 0 in the patch's middle without a fold."""
+    """Height of bulge and fold below it, um; 0 in the patch's center without a fold."""
     normals: Float32Array
     """Unit normals of both, rig frame, shape (H, W, 3)."""
     albedo: Float32Array
@@ -68,7 +68,7 @@ class PatchSurface:
     alpha: Float32Array
     """GGX roughness."""
     skin: BoolArray
-    """Skin, neither jaw nor beyond what is known."""
+    """Skin, excluding jaws and points beyond the known patch."""
 
     @property
     def height_mm(self) -> Float32Array:
@@ -101,7 +101,7 @@ def sample_grid(view: View, *, subpixels: int, border_px: int) -> Grid:
 def sample_patch(
     relief: Relief, grip: GripState, pose: PatchPose, grid: Grid, *, eye_mm: float, alpha: float
 ) -> PatchSurface:
-    """Return what the camera's samples meet.
+    """Return the surface at the camera's samples.
 
     Parameters
     ----------
@@ -110,18 +110,19 @@ def sample_patch(
     grip
         The caliper, which moves with the skin.
     pose
-        Where the skin lies.
+        Pose of the skin.
     grid
-        x and y of the samples, as `sample_grid` gives them.
+        x and y of the samples, from `sample_grid`.
     eye_mm
         Distance of the camera, mm.
     alpha
-        Roughness where the relief states none.
+        Roughness where the relief defines none.
     """
     ideal_x, ideal_y = np.meshgrid(*grid)
     cosine, sine = math.cos(pose.rotation_rad), math.sin(pose.rotation_rad)
     x, y = ideal_x, ideal_y
-    # tilts and view angles shrink the step to the surface's point 30-fold: once is enough
+    # A camera ray meets height h at lateral offset h tan(view angle). Slope times tan(view angle)
+    # contracts the fixed-point iteration for the surface point 30-fold, so that one step suffices.
     for last in (False, True):
         own_x = cosine * (x - pose.x_mm) + sine * (y - pose.y_mm)
         own_y = cosine * (y - pose.y_mm) - sine * (x - pose.x_mm)
@@ -155,10 +156,10 @@ def sample_patch(
 def bulge_height_and_slopes(
     grip: GripState, x_mm: Float64Array, y_mm: Float64Array
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return how far skin stands out of its plane in mm, and its slopes in x and y.
+    """Return the skin's height above its plane in mm, and its slopes in x and y.
 
-    Skin between jaws bulges, the more the less it is stretched; buckled skin has a fold besides,
-    beside the middle. The camera is focused on the middle of the patch.
+    Skin between jaws bulges, the more the less it is stretched; buckled skin also has a fold off
+    the center. The camera is focused on the center of the patch.
     """
     angle = math.radians(grip.angle_deg)
     cosine, sine = math.cos(angle), math.sin(angle)

@@ -1,7 +1,7 @@
-"""The gradient rig by other means, to judge `GradientScene` by: traced shadows, and Mitsuba.
+"""Check `GradientScene` by independent means: traced shadow rays, and Mitsuba.
 
-Mitsuba knows no film before each of many lights here, so what is compared is the light of both
-analysers together under LEDs without films. The patch is even in pigment and roughness, its LEDs
+Mitsuba does not support a polarizer on each of many lights here, so the comparison uses the sum of
+both analyzer stops under unpolarized LEDs. The patch is uniform in pigment and roughness, its LEDs
 are points, and light leaves the skin where it entered.
 """
 
@@ -37,17 +37,17 @@ from rigsim.world.taped_skin import GripState
 
 NEUTRAL_GRIP: Final = GripState(0.0, 0, 8.0, 1.0, True, False)
 NO_POLARIZERS: Final = Polarizers(1.0 + 1e-9, math.inf, 0.0)
-"""Films that let everything through; the analyser's other half is the other state's."""
+"""Polarizers that transmit everything; the analyzer's other half is in the other stop."""
 
 PATCH_ALBEDO: Final = 0.2
 MESH_MARGIN_PX: Final = 64
 SHADOW_RAY_OFFSET_MM: Final = 1e-4
-"""How far shadow rays begin above the surface; they begin at corners of its triangles."""
+"""Offset of shadow rays above the surface, since they start at corners of its triangles."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReferenceComparison:
-    """One way to make the pictures."""
+    """Time and error of one method."""
 
     seconds: float
     """Processor time of all conditions of a state, s."""
@@ -60,7 +60,7 @@ class ReferenceComparison:
 
 
 def plain_skin(size_mm: float, *, alpha: float = 0.25, seed: int = 0) -> MicroSkin:
-    """Return a patch of cheek, even in pigment and roughness."""
+    """Return a patch of cheek, uniform in pigment and roughness."""
     skin = make_micro_skin("cheek", size_mm=size_mm, seed=seed)
     even = np.ones_like(skin.height_um)
     return dataclasses.replace(
@@ -78,7 +78,7 @@ def plain_scene(
     shadows: bool = True,
     interreflections: bool = False,
 ) -> GradientScene:
-    """Return the patch under LEDs that are points without films, without lens and spreading."""
+    """Return the patch under unpolarized point LEDs, without lens and lateral scattering."""
     return GradientScene(
         point_light_rig(load_rig("gradient").cropped(width_px)),
         skin,
@@ -105,7 +105,7 @@ def relief_mesh(scene: GradientScene, *, subpixels: int = 2) -> Mesh:
 def trace_pixels(
     scene: GradientScene, pixels: NDArray[np.intp], *, subpixels: int = 4
 ) -> tuple[Float64Array, Float64Array]:
-    """Sum over LEDs one by one, with a shadow ray to each, in some pixels.
+    """Sum over single LEDs, with a shadow ray to each, in some pixels.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def trace_pixels(
     light : ndarray
         Shape (n, 4): S0 of each moment, in the unit of `GradientScene.stokes`.
     hidden : ndarray
-        Part of the LEDs' light that is hidden, of moment 1, shape (n,).
+        Hidden fraction of the LEDs' light, of moment 1, shape (n,).
     """
     view = scene.rig.views[0]
     patch = scene.surface(NEUTRAL_GRIP, subpixels=subpixels)
@@ -161,7 +161,7 @@ def trace_pixels(
 
 
 def scene_pixels(scene: GradientScene, pixels: NDArray[np.intp]) -> Float64Array:
-    """Return `GradientScene`'s own light in some pixels, as `trace_pixels` gives it."""
+    """Return `GradientScene`'s own light in some pixels, in the format of `trace_pixels`."""
     light = scene.stokes(NEUTRAL_GRIP)[:, 0]
     return np.asarray(light.reshape(4, -1)[:, pixels].T, np.float64)
 
@@ -171,8 +171,8 @@ def describe_patch(
 ) -> dict[str, Any]:
     """Return Mitsuba's scene of the patch under a pattern, at half the skin's strength.
 
-    Its blend averages the two parts of the reflection. Without gloss light from inside is all, at
-    full strength, so that light of many bounces is too; a depth of 2 is direct light.
+    Its blend averages the two parts of the reflection. Without specular reflection all light is
+    subsurface light at full strength, also over many bounces; a depth of 2 is direct light.
     """
     view = scene.rig.views[0]
     r_d = PATCH_ALBEDO * shading.interior_scale(ETA) * plastic_scale(ETA)
@@ -190,7 +190,7 @@ def describe_patch(
         },
     }
     shares = scene.sphere.weights @ np.array(PATTERN_WEIGHTS[pattern])
-    name = "light"  # the entry that `MovableLightScene` moves, to where it is
+    name = "light"  # the entry that `MovableLightScene` moves; here it stays in place
     for place, power, share in zip(
         scene.sphere.position_mm, scene.sphere.intensity, shares, strict=True
     ):
@@ -224,8 +224,8 @@ def render_pattern(
     pattern
         A lit pattern.
     samples, seed
-        Of Mitsuba.
-    depth, gloss
+        Mitsuba's settings.
+    depth, specular
         See `describe_patch`.
 
     Returns
@@ -233,7 +233,7 @@ def render_pattern(
     image : ndarray of float32
         Shape (H, W), in the unit of `trace_pixels`.
     seconds : float
-        Processor time of the second rendering: all is built and compiled before.
+        Processor time of the second rendering, without construction and compilation.
     """
     description = describe_patch(scene, pattern, depth=depth, specular=specular)
     light_mm = description["light"]["position"]
@@ -249,7 +249,7 @@ def render_pattern(
 def compare_with_reference(
     image: Float64Array, reference: Float64Array, seconds: float, *, blocks: int = 40
 ) -> ReferenceComparison:
-    """Compare a picture with the reference, both of shape (n,) or (n, k)."""
+    """Compare an image with the reference, both of shape (n,) or (n, k)."""
     difference = image - reference
     error = float(np.sqrt(np.mean(difference**2)) / reference.mean())
     parts = [

@@ -1,8 +1,8 @@
-"""What detail the gradient rig resolves: waves of known slope through the whole simulated chain.
+"""Measure the detail that the gradient rig resolves, by waves through the simulated chain.
 
-Nagano et al. 2015 (doi 10.1145/2766894) state 10 um of detail for 6 um a pixel. A circular pupil at
-the working f-number N' passes no period below N' times the wavelength, here 18 um on the skin in
-green; so 10 um is the pixels' pitch, twice over, but not what the lens resolves.
+Nagano et al. 2015 (doi 10.1145/2766894) state 10 um of detail for 6 um per pixel. A circular pupil
+at the working f-number N' transmits no period below N' times the wavelength, here 18 um on the skin
+in green. The stated 10 um are therefore about two pixel pitches, but not the lens's resolution.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ from rigsim.skin_patch.stretch import SurfaceSample
 from rigsim.world.taped_skin import GripState
 
 REFERENCE_PERIOD_UM: Final = 240.0
-"""Period of waves without lens and pixels that give the scale of the others."""
+"""Period of reference waves without lens and pixels, um; they scale the others."""
 
 FIELD_PX: Final = 96
 
@@ -67,12 +67,12 @@ WAVE_ALPHA: Final = 0.25
 
 
 class SineReliefScene(GradientScene):
-    """The rig with waves instead of skin; set `waves`, then call `set_waves`."""
+    """The rig with waves instead of skin; call `set_waves` before an exposure."""
 
     waves = SineRelief(REFERENCE_PERIOD_UM, 0.05)
 
     def set_waves(self, waves: SineRelief) -> None:
-        """Put other waves into the patch's place."""
+        """Replace the patch's waves."""
         self.waves = waves
         self.clear_caches()
 
@@ -81,8 +81,8 @@ class SineReliefScene(GradientScene):
 
 
 def make_sine_relief_scene(*, optics: bool = True) -> SineReliefScene:
-    """Return the gradient rig with waves, as drawn, two samples along a pixel's side."""
-    skin = make_micro_skin("cheek", size_mm=0.1)  # gives the pigment that spreads light
+    """Return the nominal gradient rig with waves, two samples along a pixel's side."""
+    skin = make_micro_skin("cheek", size_mm=0.1)  # provides the pigment for lateral scattering
     even = np.full_like(skin.height_um, WAVE_ALPHA)
     rig = load_rig("gradient").cropped(FIELD_PX)
     return SineReliefScene(
@@ -91,7 +91,7 @@ def make_sine_relief_scene(*, optics: bool = True) -> SineReliefScene:
 
 
 def slope_transfer(periods_um: Sequence[float], *, slope: float = 0.05) -> Float64Array:
-    """Return which part of a wave's slope the pictures hold.
+    """Return the fraction of a wave's slope that the images retain.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def _amplitude(scene: SineReliefScene, waves: SineRelief) -> float:
     specular = (moments["parallel"] - moments["crossed"]).astype(np.float64)
     ratio = specular[1] / specular[0]
     x = scene.surface(NEUTRAL_GRIP).x_mm[FIELD_PX // 2] * 1e3
-    # whole periods in the middle; the bulge and the view's own tilt are a parabola
+    # whole periods in the center; bulge and view tilt add a parabola
     count = max(int(0.8 * FIELD_PX * 6.0 / waves.period_um), 1)
     inside = np.abs(x) <= 0.5 * count * waves.period_um
     phase = 2.0 * math.pi * x[inside] / waves.period_um

@@ -1,11 +1,11 @@
-"""The gradient rig: a patch of skin in a caliper, or a target, lit by patterns of polarized LEDs.
+"""Render the gradient rig: a skin patch in a caliper, or a target, under polarized LED patterns.
 
-Every state of the skin is pictured once, as Stokes vectors of the light's four moments after the
-lens; patterns and positions of the analyser are sums of these twelve images.
+Each state of the skin is rendered once, as Stokes vectors of the light's four moments after the
+lens; patterns and readings of the analyzer are sums of these twelve images.
 
-The unit of light is fixed by the rig alone: a perfect white diffuser in the patch's place that
+The unit of light is fixed by the rig alone: a perfect white diffuser in place of the patch that
 faces the camera gives `GRADIENT_METER_RATE_PER_S` full scales per second under all LEDs at level 1,
-behind the parallel analyser as behind the crossed one.
+behind the parallel analyzer as behind the crossed one.
 """
 
 import dataclasses
@@ -47,27 +47,27 @@ from rigsim.world.taped_skin import GripState
 TargetName: TypeAlias = Literal["ball", "flat", "dark"]
 
 GRADIENT_METER_RATE_PER_S: Final = 100.0
-"""Full scales per second of white under all LEDs at level 1: in 18 ms pale skin gets 0.4 to 0.8 of
-full scale."""
+"""Full scales per second of white under all LEDs at level 1: in 18 ms pale skin reaches 0.4 to 0.8
+of full scale."""
 
 PATTERN_POWER_DEVIATION: Final = 0.001
-"""Relative standard deviation of the LEDs' common energy from pattern to pattern."""
+"""Relative standard deviation of the LEDs' common energy between patterns."""
 
 DRIFT_MARGIN_PX: Final = 8
-"""Pixels around the picture that may drift into it."""
+"""Pixels around the image that may drift into it."""
 
 IMAGE_CACHE_BYTES: Final = 2**29
-"""Pictures of states that are kept; one at least."""
+"""Size of the cache of states' images; at least one is kept."""
 
 
 MAX_CACHED_LIGHTINGS: Final = 2
-"""Tables of light that are kept: LEDs may change by gains and failures."""
+"""Number of cached lightings: LEDs may change by gains and failures."""
 
 GROOVE_SECTORS: Final = 16
-"""Directions in which the sky is looked for, for light from furrow to furrow."""
+"""Number of sky directions for interreflection in grooves."""
 
 MAX_CACHED_RELIEFS: Final = 4
-"""Stretched patches that are kept."""
+"""Number of cached stretched patches."""
 
 
 class GradientScene(RigScene):
@@ -76,26 +76,26 @@ class GradientScene(RigScene):
     Parameters
     ----------
     rig
-        The drawing.
+        The nominal rig.
     subject
-        A patch of skin, or "ball" (12 mm of black glass), "flat" (a gray diffuser in the
-        patch's place) or "dark" (a cap on the lens).
+        A patch of skin, or "ball" (12 mm of black glass), "flat" (a gray diffuser in place of the
+        patch) or "dark" (a cap on the lens).
     films
-        The polarizing films; None takes the rig's own, which its serial numbers decide.
+        The polarizers; None takes the rig's own, which its serial numbers determine.
     sphere
-        The LEDs as they stand; None: as drawn.
+        The actual LEDs; None: nominal.
     motion
-        How the patch moves; None holds it still.
+        Movement of the patch; None: fixed.
     seed
-        Seeds what differs from exposure to exposure.
+        Seeds the variation between exposures.
     effects
-        Effects of light that are asked for; the others are decided by how much they change pixels,
-        see `needs`. Without optics every pixel is the mean of its samples.
+        Requested effects of light; the others are decided by their changes of pixels, see `needs`.
+        Without optics every pixel is the mean of its samples.
     on_s
-        Longest exposure of the plan, s, by which sizes are told; None: such that the brightest
+        Longest exposure of the plan, s, for the sizes of effects; None: such that the brightest
         skin is at full scale.
     sectors
-        Directions in which horizons are found, a multiple of 4.
+        Number of directions with horizons, a multiple of 4.
     subpixels
         Samples along each side of a pixel.
     table_size
@@ -137,9 +137,9 @@ class GradientScene(RigScene):
         self._lighting: LruCache[tuple[float, ...], PatchLighting] = LruCache(
             lambda _: MAX_CACHED_LIGHTINGS
         )
-        # behind two ideal films, one of which the unit of radiance holds already
+        # behind two ideal polarizers, one of which the unit of radiance includes already
         white = float(diffuser_radiance(nominal_sphere(rig), np.zeros(1), np.zeros(1))[0, 0])
-        # full scales per second for a unit of radiance of `rigsim.light.lobe_moments`
+        # full scales per second per unit of radiance of `rigsim.light.lobe_moments`
         self.unit = GRADIENT_METER_RATE_PER_S / (0.5 * white)
         self._pictures: LruCache[tuple[object, ...], Float32Array] = LruCache(
             lambda picture: IMAGE_CACHE_BYTES // picture.nbytes
@@ -151,7 +151,7 @@ class GradientScene(RigScene):
         level = math.inf if on_s is None else GRADIENT_METER_RATE_PER_S * on_s
         seen = (self.sphere, self.lens, PixelNoise.of(self._sensor), level)
         self.needs = select_gradient_effects(rig, subject, *seen, motion is not None, effects)
-        """What is built, what is not, and why."""
+        """Effects with their verdicts and reasons."""
         self.shadows = self.needs.builds(SHADOW_EFFECT)
         self.optics = self.needs.builds(OPTICS_EFFECT)
         self.lateral = self.needs.builds(LATERAL_EFFECT)
@@ -167,34 +167,34 @@ class GradientScene(RigScene):
         self._camera(view_name)
         return self._sensor
 
-    # pictures -----------------------------------------------------------------------------------
+    # images ---------------------------------------------------------------------------------
 
     def stokes(self, grip: GripState | None = None) -> Float32Array:
-        """Return the light on the sensor for each moment, before the analyser.
+        """Return the light on the sensor per moment, before the analyzer.
 
         Parameters
         ----------
         grip
-            What the caliper holds; targets need none.
+            State of the caliper's grip; targets need none.
 
         Returns
         -------
         ndarray of float32
             Shape (4, 3, H, W): moments 1, x, y, z; Stokes parameters in full scales per second at
-            level 1 (behind an analyser half of it comes through, see `moments`); without drift.
+            level 1 (an analyzer transmits half of it, see `moments`); without drift.
         """
         h, w = self._view.height_px, self._view.width_px
-        wide = self._picture(grip)
+        wide = self._bordered_image(grip)
         border = (wide.shape[1] - h) // 2
         return wide[:, border : border + h, border : border + w].reshape(4, 3, h, w)
 
     def moments(self, grip: GripState | None = None) -> dict[str, Float32Array]:
-        """Return the four moments behind the parallel and the crossed analyser.
+        """Return the four moments behind the parallel and the crossed analyzer.
 
         Parameters
         ----------
         grip
-            What the caliper holds; targets need none.
+            State of the caliper's grip; targets need none.
 
         Returns
         -------
@@ -224,13 +224,13 @@ class GradientScene(RigScene):
         pattern
             One of `rigsim.as_built.sphere.PATTERN_WEIGHTS`.
         grip
-            What the caliper holds; targets need none.
+            State of the caliper's grip; targets need none.
         analyser_deg
-            Reading of the analyser's rotator, degrees.
+            Reading of the analyzer's rotator, degrees.
         t_s
-            World time, s, which decides drift and jumps; None: neither.
+            World time, s, which determines drift and jumps; None: neither.
         led_shares
-            What each LED gives of what the sphere says; empty: all of it.
+            Actual output of each LED relative to its nominal one; empty: 1 for all.
 
         Returns
         -------
@@ -244,7 +244,7 @@ class GradientScene(RigScene):
         jump, drift = (0.0, 0.0), (0.0, 0.0)
         if self.motion is not None and t_s is not None and isinstance(self.subject, MicroSkin):
             jump, drift = self.motion.jump_mm(t_s), self.motion.drift_mm(t_s)
-        wide = self._picture(grip, jump_mm=jump, shares=led_shares)
+        wide = self._bordered_image(grip, jump_mm=jump, shares=led_shares)
         border = (wide.shape[1] - shape[0]) // 2
         reach = border if any(drift) else 0
         part = slice(border - reach, wide.shape[1] - border + reach)
@@ -259,7 +259,7 @@ class GradientScene(RigScene):
         if reach:
             pixel_um = self.lens.pixel_on_subject_um
             image = shift_image(image, drift, pixel_um=pixel_um, border_px=reach)
-        # light taken away LED by LED leaves rounding errors where none is left
+        # subtraction per LED leaves rounding errors where no light remains
         return np.maximum(image, np.float32(0.0))
 
     def exposure(
@@ -271,20 +271,20 @@ class GradientScene(RigScene):
         seed: int,
         grip: GripState | None = None,
     ) -> UInt16Array:
-        """Expose the camera once.
+        """Simulate one exposure of the camera.
 
         Parameters
         ----------
         view_name
-            Which camera.
+            Name of the camera.
         pops
-            The patterns that shone, clipped to the exposure; none gives a dark frame.
+            The lit patterns, clipped to the exposure; none yields a dark frame.
         exposure_s
             Exposure time, s.
         seed
             Seed of this exposure's noise.
         grip
-            What the caliper held when it began; skin needs one.
+            State of the caliper's grip at its beginning; skin needs one.
 
         Returns
         -------
@@ -308,10 +308,10 @@ class GradientScene(RigScene):
         )
 
     def clear_caches(self) -> None:
-        """Drop the pictures that are kept, which the subject's states are made again from."""
+        """Drop the cached images of the subject's states, which are then rendered again."""
         self._pictures.clear()
 
-    # truth --------------------------------------------------------------------------------------
+    # ground truth --------------------------------------------------------------------------------
 
     def surface(
         self,
@@ -321,7 +321,7 @@ class GradientScene(RigScene):
         border_px: int = 0,
         jump_mm: tuple[float, float] = (0.0, 0.0),
     ) -> PatchSurface:
-        """Return what stands at the camera's samples in a state, without drift."""
+        """Return the surface at the camera's samples in a state, without drift."""
         grid = sample_grid(self._view, subpixels=subpixels, border_px=border_px)
         pose, alpha = self.pose(grip), float(np.median(self.skin.alpha))
         moved = PatchPose(pose.x_mm + jump_mm[0], pose.y_mm + jump_mm[1], pose.rotation_rad)
@@ -338,7 +338,7 @@ class GradientScene(RigScene):
         return self.relief(grip)
 
     def pose(self, grip: GripState) -> PatchPose:
-        """Return where the skin lies in a state, drift and jumps aside."""
+        """Return the skin's pose in a state, without drift and jumps."""
         if self.motion is None:
             return PatchPose(0.0, 0.0, 0.0)
         return self.motion.pose(grip.angle_deg, grip.step)
@@ -352,7 +352,7 @@ class GradientScene(RigScene):
             raise SceneError(f"skin: got the target {self.subject!r}, expected a patch of skin")
         return self.subject
 
-    def _picture(
+    def _bordered_image(
         self,
         grip: GripState | None,
         *,
@@ -364,7 +364,7 @@ class GradientScene(RigScene):
             shares = ()
         if isinstance(self.subject, MicroSkin):
             if grip is None:
-                raise SceneError("grip: got none, expected what the caliper holds")
+                raise SceneError("grip: got none, expected the state of the caliper's grip")
             key: tuple[object, ...] = (grip, *jump_mm, shares)
         else:
             key = (self.subject, shares)
@@ -403,12 +403,12 @@ class GradientScene(RigScene):
         return np.asarray(raw.reshape(k, h // s, s, w // s, s).mean(axis=(2, 4)), np.float32)
 
     def lighting(self, led_fractions: tuple[float, ...] = ()) -> PatchLighting:
-        """Return what the light does to this skin in any state.
+        """Return the lighting of this skin, which serves all states.
 
         Parameters
         ----------
-        shares
-            What each LED gives of what the sphere says; empty: all of it.
+        led_fractions
+            Actual output of each LED relative to its nominal one; empty: 1 for all.
         """
 
         def make() -> PatchLighting:
@@ -433,7 +433,7 @@ class GradientScene(RigScene):
         return dataclasses.replace(self.sphere, intensity=self.sphere.intensity * np.array(shares))
 
     def optical_surface(self, alpha: float) -> MicrofacetSurface:
-        """Return how a surface of a roughness reflects, and who looks at it."""
+        """Return the reflection of a surface of a roughness, with the camera."""
         return MicrofacetSurface(
             alpha, ETA, self._view.position_mm, self._view.axes[0], self.films.light_extinction
         )

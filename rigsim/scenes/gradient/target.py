@@ -1,4 +1,4 @@
-"""Targets in the patch's place: what the gradient rig's LEDs make of them."""
+"""Light the gradient rig's targets, which replace the patch of skin."""
 
 from typing import Final
 
@@ -11,7 +11,7 @@ from rigsim.scenes.gradient.patch import sample_grid
 from rigsim.targets.glass_ball import draw_ball_center_mm, render_ball_stokes
 
 FLAT_REFLECTANCE: Final = 0.3
-"""Of the diffuser in the patch's place: 30 ms at level 1 give 0.9 of full scale."""
+"""Reflectance of the diffuser in place of the patch: 30 ms at level 1 give 0.9 of full scale."""
 
 
 def target_moments(
@@ -24,11 +24,11 @@ def target_moments(
     name
         "ball", "flat" or "dark".
     view, sphere
-        The camera, and the LEDs as they stand.
+        The camera, and the actual LEDs.
     extinction
-        Of the films before the LEDs.
+        Extinction ratio of the polarizers on the LEDs.
     seed
-        Decides where the operator puts the ball.
+        Determines the operator's placement of the ball.
 
     Returns
     -------

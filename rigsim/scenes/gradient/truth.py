@@ -1,4 +1,4 @@
-"""What estimators of the gradient rig should find: maps of each state on the camera's pixels."""
+"""Assemble the gradient rig's ground truth: maps of each state on the camera's pixels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def format_state_name(angle_deg: float, step: int) -> str:
-    """Return the name of a state of the caliper.
+    """Format the name of a strain step of the caliper.
 
     Examples
     --------
@@ -33,20 +33,20 @@ def format_state_name(angle_deg: float, step: int) -> str:
 
 
 def gradient_truth(scene: GradientScene, grips: Sequence[GripState]) -> SkinAppearance:
-    """Return the truth of some states.
+    """Return the ground truth of some states.
 
     Parameters
     ----------
     scene
         A patch of skin.
     grips
-        The states; the first with step 0 is the neutral one that the others are told against.
+        The states; the first with step 0 is the neutral reference of the others.
 
     Returns
     -------
     SkinAppearance
-        Maps of each state's pixel middles, without drift: ``height_<state>``, the relief alone in
-        um; ``bulged_height_<state>`` with what bulges or folds below it; ``normals_<state>``, of
+        Maps of each state at pixel centers, without drift: ``height_<state>``, the relief alone in
+        um; ``bulged_height_<state>`` with bulge and fold below it; ``normals_<state>``, of
         both; ``normals_seen_<state>``, their slopes averaged as lens and pixels average light;
         ``albedo_<state>``. The neutral state's are also ``height`` and ``normals``. Valid on skin.
         ``parameters``: ``states``, ``led_truth``, ``lens``.
@@ -115,7 +115,7 @@ def gradient_truth(scene: GradientScene, grips: Sequence[GripState]) -> SkinAppe
 
 
 def _placement(scene: GradientScene, grip: GripState) -> Float64Array:
-    """Return the gradient of the map from relaxed skin to the rig, turn included, (2, 2)."""
+    """Return the gradient of the map from relaxed skin to the rig, rotation included, (2, 2)."""
     turn = scene.pose(grip).rotation_rad
     c, s = np.cos(turn), np.sin(turn)
     return np.asarray(np.array([[c, -s], [s, c]]) @ np.asarray(scene.relief(grip).gradient))
@@ -143,22 +143,23 @@ def _maps(scene: GradientScene, patch: PatchSurface) -> dict[str, SkinMap]:
 
 
 def led_truth(sphere: ActualSphere, surface: MicrofacetSurface) -> list[dict[str, object]]:
-    """Return the LEDs' truth, to judge their calibration by.
+    """Return the ground truth of the LEDs, for the evaluation of their calibration.
 
     Parameters
     ----------
     sphere
-        As it stands.
+        The actual LEDs.
     surface
-        The reflection; its roughness does not matter, as facets that mirror the LED are looked at.
+        The reflection; its roughness does not matter, since only facets that mirror the LED are
+        used.
 
     Returns
     -------
     list of dict
         In the order of the rig: ``name``; ``direction``, unit, from the origin; ``intensity``, the
-        irradiance at the origin over its mean over all LEDs; ``leakage``, what an ideal analyser
-        lets pass at reading 90 over that at 0, of a mirroring facet, with the camera above; NaN is
-        given as None where no facet mirrors the LED.
+        irradiance at the origin over its mean over all LEDs; ``leakage``, the transmittance of an
+        ideal analyzer at reading 90 over that at 0, of a mirroring facet, with the camera above;
+        None instead of NaN where no facet mirrors the LED.
     """
     place = sphere.position_mm
     distance = np.linalg.norm(place, axis=1)

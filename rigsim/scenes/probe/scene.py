@@ -1,11 +1,11 @@
-"""The fibre probe: light from the source fibre through tissue, and the fibres' other ends.
+"""Render the fiber probe: light from the source fiber through tissue to the fibers' far ends.
 
-The unit of light is fixed by the rig alone: fibres of nominal transmission on tissue of R_f = 2
-per mm^2 give 0.8 of full scale in the middle of an even spot, in the strongest channel, in the
+The unit of light is fixed by the rig alone: fibers of nominal transmission on tissue of R_f = 2
+per mm^2 give 0.8 of full scale in the center of a uniform spot, in the strongest channel, in the
 shortest of the usual exposures at full level. The channels' ratio is that of a white under the
 source's LED.
 
-What estimators of the fibre probe should find: profiles, optics, and the probe as built.
+The ground truth for estimators of the fiber probe: profiles, optics, and the actual probe.
 """
 
 import dataclasses
@@ -32,29 +32,29 @@ from rigsim.sensor import Sensor, expose_sensor, make_sensor
 from rigsim.world.suction import HeadState
 
 PROBE_METER_RATE_PER_S: Final = 0.8 / 2.0 / (30.0 * 2.0 ** (-44.0 / 3.0))
-"""Full scales per second in a spot's middle per R_f in 1/mm^2."""
+"""Full scales per second in a spot's center per R_f in 1/mm^2."""
 
 DARK_CURRENT_E_PER_S: Final = 0.3
 """Dark current at `DARK_CURRENT_REFERENCE_C`, electrons per second and pixel."""
 DARK_CURRENT_REFERENCE_C: Final = 5.0
 DARK_CURRENT_DOUBLING_K: Final = 6.5
-"""Warming that doubles the dark current, kelvin; typical of silicon near room temperature."""
+"""Temperature rise that doubles the dark current, kelvin; typical of silicon near 20 C."""
 
 HOT_SHARE, HOT_E_PER_S = 1e-3, 10.0
-"""Share of hot pixels, and the mean of their further dark current at `DARK_CURRENT_REFERENCE_C`."""
+"""Fraction of hot pixels, and the mean of their added dark current at the reference."""
 
 ROOM_LIGHT_R_F_PER_MM2: Final = 1e-3
-"""What the room's light on a head in the air is worth in reflectance at full level."""
+"""Reflectance at full level that is equivalent to the room's light on a head in the air."""
 
 MAX_USUAL_EXPOSURE_S: Final = 30.0
 """The longest of the usual exposures, s."""
 
 DARK_CAP_SITE: Final = "cap"
-"""Site at which the head's fibres look into the dark."""
+"""Site at which the head's fibers are capped."""
 
 LENS_VIGNETTING: Final = 0.1
 PHOTONS_PER_ANGLE: Final = 200_000
-"""Photons for each site and angle."""
+"""Photons per site and angle."""
 
 
 class ProbeScene(RigScene):
@@ -63,18 +63,18 @@ class ProbeScene(RigScene):
     Parameters
     ----------
     rig
-        The drawing.
+        The nominal rig.
     tissue
-        What the probe sits on.
+        The tissue below the probe.
     build
-        The probe as built; None: drawn by the camera's serial number and `seed` 0, so that
+        The actual probe; None: drawn by the camera's serial number and `seed` 0, so that
         sessions of one probe share it.
     sensor
-        The camera's sensor at `DARK_CURRENT_REFERENCE_C`; None takes what the rig states.
+        The camera's sensor at `DARK_CURRENT_REFERENCE_C`; None takes the rig's.
     seed
-        Seeds the photons and what differs from exposure to exposure.
+        Seeds the photons and the variation between exposures.
     photons
-        Photons for each site and angle.
+        Photons per site and angle.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class ProbeScene(RigScene):
         self.build = build_probe(rig, seed=0) if build is None else build
         if len(self.build.gain) != len(rig.probe.fibres):
             raise SceneError(
-                f"build: got {len(self.build.gain)} fibres, expected {len(rig.probe.fibres)}"
+                f"build: got {len(self.build.gain)} fibers, expected {len(rig.probe.fibres)}"
             )
         self._view = rig.views[0]
         dark = {"dark_e_per_s": DARK_CURRENT_E_PER_S, "vignetting": LENS_VIGNETTING}
@@ -103,7 +103,7 @@ class ProbeScene(RigScene):
         images = fiber_unit_images(self.build, self._view)
         self._images = np.ascontiguousarray(images.reshape(len(images), -1).T)
         self.hot_e_per_s = _hot_pixels(self._sensor, images.shape[1:])
-        """What hot pixels add to the dark current at `DARK_CURRENT_REFERENCE_C`, electrons/s,
+        """Added dark current of hot pixels at `DARK_CURRENT_REFERENCE_C`, electrons/s,
         shape (H, W)."""
         full_e = self._sensor.gain_e_per_dn * (self._sensor.white - self._sensor.black)
         self.needs = select_probe_effects(
@@ -113,7 +113,7 @@ class ProbeScene(RigScene):
             noise=PixelNoise.of(self._sensor),
             hot=float(self.hot_e_per_s.max()) * MAX_USUAL_EXPOSURE_S / full_e,
         )
-        """What is built, what is not, and why."""
+        """Effects with their verdicts and reasons."""
 
     def sensor(
         self, view_name: str | None = None, *, camera_c: float = DARK_CURRENT_REFERENCE_C
@@ -126,7 +126,7 @@ class ProbeScene(RigScene):
     # light --------------------------------------------------------------------------------------
 
     def profile(self, head: HeadState) -> BandProfile | None:
-        """Return what the fibres would take at full level; None where they touch nothing.
+        """Return the fibers' signal at full level; None without contact.
 
         Raises
         ------
@@ -141,7 +141,7 @@ class ProbeScene(RigScene):
             raise SceneError(str(error)) from error
 
     def fiber_radiance(self, head: HeadState, *, fiber: int | None = None) -> Float64Array:
-        """Return `transmit_through_fibers` of the touched skin; nothing if the head is in air."""
+        """Return `transmit_through_fibers` of the contacted skin; zeros in the air."""
         profile = self.profile(head)
         if profile is None:
             return np.zeros((len(self.build.gain), 3))
@@ -150,25 +150,25 @@ class ProbeScene(RigScene):
     def transmit_through_fibers(
         self, reflectance_per_mm2: Float64Array, *, fiber: int | None = None
     ) -> Float64Array:
-        """Return the light that comes out of the fibres, in full scales per second at level 1.
+        """Return the light at the fibers' far ends, in full scales per second at level 1.
 
         Parameters
         ----------
         reflectance_per_mm2
             R_f in 1/mm^2, shape (F, 3).
-        fibre
-            The only detection fibre that is not covered; None: none is covered.
+        fiber
+            The only detection fiber that is not covered; None: none is covered.
 
         Returns
         -------
         ndarray
-            Shape (F, 3), camera RGB in the middle of an even nominal spot, with gains and
-            cross-talk.
+            Shape (F, 3), camera RGB in the center of a uniform nominal spot, with gains and
+            crosstalk.
 
         Raises
         ------
         SceneError
-            There is no such fibre.
+            Unknown fiber.
         """
         count = len(self.build.gain)
         open_share = np.ones(count)
@@ -181,7 +181,7 @@ class ProbeScene(RigScene):
         return np.asarray(PROBE_METER_RATE_PER_S * (self.build.crosstalk @ taken) * self.white)
 
     def image(self, fiber_radiance: Float64Array) -> Float32Array:
-        """Return the light on the sensor, shape (H, W, 3), of what comes out of the fibres."""
+        """Return the light on the sensor, shape (H, W, 3), from the light at the fibers' ends."""
         height, width = self._view.height_px, self._view.width_px
         light = self._images @ np.asarray(fiber_radiance, np.float32)
         return np.asarray(light.reshape(height, width, 3))
@@ -195,20 +195,20 @@ class ProbeScene(RigScene):
         seed: int,
         head: HeadState,
     ) -> UInt16Array:
-        """Expose the camera once.
+        """Simulate one exposure of the camera.
 
         Parameters
         ----------
         view_name
-            Which camera.
+            Name of the camera.
         pops
-            The source's light, clipped to the exposure; none gives a dark frame.
+            The source's light, clipped to the exposure; none yields a dark frame.
         exposure_s
             Exposure time, s.
         seed
             Seed of this exposure's noise.
         head
-            What the head touched when it began.
+            State of the head at its beginning.
 
         Returns
         -------
@@ -218,7 +218,7 @@ class ProbeScene(RigScene):
         Raises
         ------
         SceneError
-            Unknown view, site or fibre; light with a wrong level or end.
+            Unknown view, site or fiber; light with a wrong level or end.
         """
         self._check_view(view_name)
         rng = np.random.default_rng([self.seed, seed])
@@ -267,31 +267,30 @@ class ProbePlacement:
     repeat: int
     """Number of the placement there, from 0."""
     angle_deg: float
-    """Turn of the head about its own axis, degrees."""
+    """Rotation of the head about its own axis, degrees."""
     suction_mbar: float
-    """Mean suction while it was lit, mbar below the air's pressure, >= 0."""
+    """Mean suction while it was lit, mbar below ambient pressure, >= 0."""
 
 
 def probe_truth(scene: ProbeScene, placements: Sequence[ProbePlacement]) -> SkinAppearance:
-    """Return the truth of some placements of the head.
+    """Return the ground truth of some placements of the head.
 
     Parameters
     ----------
     scene
-        What the head was on.
-    probings
+        Scene of the head.
+    placements
         The placements.
 
     Returns
     -------
     SkinAppearance
-        No maps. ``parameters``: ``profiles``, one for each placement with ``site``, ``repeat``,
+        No maps. ``parameters``: ``profiles``, one per placement with ``site``, ``repeat``,
         ``angle_deg``, ``suction_mbar``, ``radius_mm``, ``reflectance_per_mm2`` and ``stderr``
-        (fibres x 3, of the Monte Carlo), ``sigma_a_per_mm``, ``sigma_s_prime_per_mm``,
-        ``sigma_tr_per_mm`` (3 each) and ``kind``; of tissue that is not homogeneous and gray the
+        (fibers x 3, of the Monte Carlo), ``sigma_a_per_mm``, ``sigma_s_prime_per_mm``,
+        ``sigma_tr_per_mm`` (3 each) and ``kind``; for tissue that is not homogeneous and gray the
         nearest medium by `rigsim.fiber.homogeneous_fit`, with ``fit_residual``, ``fit_factor`` and
-        ``fit_fibres``; ``spots_px``, ``gain``, ``crosstalk`` of the
-        probe as built.
+        ``fit_fibres``; ``spots_px``, ``gain``, ``crosstalk`` of the actual probe.
     """
     profiles = [_profile(scene, probing) for probing in placements]
     build = scene.build
@@ -326,7 +325,7 @@ def _profile(scene: ProbeScene, probing: ProbePlacement) -> dict[str, object]:
         media = [(sigma_a, scattering, sigma_tr)] * 3
     else:
         kind = probe_fibers(scene.profiles.probe)
-        dimmed = tissue.kind != "anisotropic"  # has no layer on top
+        dimmed = tissue.kind != "anisotropic"  # has no top layer
         fits = [
             fit_homogeneous_medium(band, kind, dimmed=dimmed) for band in made.reflectance_per_mm2.T
         ]

@@ -158,7 +158,7 @@ def test_a_noisier_sensor_needs_less(flash, faces):
     for name in (face_needs.INTERREFLECTION_EFFECT, face_needs.LATERAL_EFFECT):
         assert sharp.builds(name)
         assert coarse[name].verdict == "negligible"
-    assert coarse[face_needs.SPECTRAL_EFFECT].reason.startswith("there is no such light")
+    assert coarse[face_needs.SPECTRAL_EFFECT].reason.startswith("interreflection is absent")
 
 
 def test_requested_effect_is_built_and_reported(flash, faces):
@@ -168,11 +168,11 @@ def test_requested_effect_is_built_and_reported(flash, faces):
     for name in (face_needs.INTERREFLECTION_EFFECT, face_needs.LATERAL_EFFECT):
         effect = asked.needs[name]
         assert effect.verdict == "asked"
-        assert f"{effect.switch}=False asks for it" in effect.reason
+        assert f"{effect.switch}=False requests it" in effect.reason
     assert (asked.lateral, asked.interreflections) == (False, False)
     forced = FlashScene(flash, faces["darkest"], effects=SceneEffects(spectral=True))
     assert forced.needs[face_needs.SPECTRAL_EFFECT].verdict == "built"
-    assert "spectral=True asks for it" in forced.needs[face_needs.SPECTRAL_EFFECT].reason
+    assert "spectral=True requests it" in forced.needs[face_needs.SPECTRAL_EFFECT].reason
 
 
 def grazing(rig, angle_deg=88.0):
@@ -273,10 +273,10 @@ def test_polarizers_alone_require_polarization(flash, faces):
 def test_gray_tissue_is_traced_once_skin_by_color():
     rig = load_rig("probe")
     gray = ProbeScene(rig, HomogeneousTissue(0.04, 1.5)).needs
-    assert gray["tissue traced color by color"].verdict == "negligible"
+    assert gray["tissue traced per color band"].verdict == "negligible"
     assert gray["layers of the tissue"].verdict == "absent"
     skin = ProbeScene(rig, parse_tissue("III", seed=0)).needs
-    assert skin.builds("tissue traced color by color")
+    assert skin.builds("tissue traced per color band")
     assert skin.builds("layers of the tissue")
 
 

@@ -125,25 +125,25 @@ def test_record_distinguishes_files_of_same_name(person, tmp_path):
         ('preset = "VII"', "preset: got 'VII'"),
         ('melanin = "dark"', "melanin"),
         ("melanin = nan", "melanin"),
-        ('mesh = "none.obj"', r"mesh: got .*none\.obj, expected a file that is there"),
+        ('mesh = "none.obj"', r"mesh: got .*none\.obj, expected an existing file"),
         ('mesh = "text.npz"', r"mesh: .*text\.npz: cannot be read as \.npz"),
         ('mesh = "objects.npz"', r"mesh: .*objects\.npz: .*arrays of numbers"),
         ('mesh = "text.obj"', r"mesh: .*text\.obj"),
         ('mesh = "flat.npy"', r"mesh: .*expected \.npz or \.obj"),
-        ('melanin_map = "none.npy"', r"melanin_map: got .*none\.npy, expected a file"),
+        ('melanin_map = "none.npy"', r"melanin_map: got .*none\.npy, expected an existing file"),
         ('melanin_map = "flat.npy"', r"got float64 of shape \(64,\)"),
         ('melanin_map = "much.npy"', r"got 0\.9 to 0\.9, expected finite volume fractions"),
         ('melanin_map = "holes.npy"', "finite volume fractions"),
-        ('melanin_map = "flat.png"', r"expected a file \.npy or \.exr"),
-        ('melanin_map = "several.npy"', r"is no \.npy file"),
-        ('melanin_map = "text.npy"', r"is no \.npy file"),
+        ('melanin_map = "flat.png"', r"expected \.npy or \.exr"),
+        ('melanin_map = "several.npy"', r"no valid \.npy file"),
+        ('melanin_map = "text.npy"', r"no valid \.npy file"),
         ('melanin_map = "header.npy"', r"got float64 of shape \(1000000, 1000000\)"),
         ('melanin_map = "large.npy"', r"got float32 of shape \(8193, 8193\)"),
         ('melanin_map = "cut.npy"', "got 10 bytes of data, expected 32768 "),
         ('melanin_map = "objects.npy"', "got object of shape"),
         ('melanin_map = "text.exr"', "expected an OpenEXR image"),
-        ('melanin = 0.1\nmelanin_map = "flat.npy"', "no melanin and freckles beside it"),
-        ('blood = 2\nhemoglobin_map = "flat.npy"', "no blood beside it"),
+        ('melanin = 0.1\nmelanin_map = "flat.npy"', "no melanin or freckles together with it"),
+        ('blood = 2\nhemoglobin_map = "flat.npy"', "no blood together with it"),
         ("melanin", "is not TOML"),
     ],
 )
@@ -242,5 +242,5 @@ def test_neither_preset_nor_file_is_refused(text):
 def test_a_mesh_is_named_once(person, tmp_path):
     corners = "v 0 0 0\nv 9 0 0\nv 0 9 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
     (tmp_path / "face.obj").write_text(corners, encoding="utf-8")
-    with pytest.raises(SubjectFileError, match="leave the other out"):
+    with pytest.raises(SubjectFileError, match="omit the other mesh"):
         read_subject_file(person('mesh = "face.obj"')).face(seed=0, size=64, mesh="other.obj")

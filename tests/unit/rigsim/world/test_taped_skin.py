@@ -155,7 +155,7 @@ def test_step_is_nearest_to_jaws():
 
 def test_invalid_requests_are_refused():
     skin = held()
-    with pytest.raises(TapedSkinError, match="let go first"):
+    with pytest.raises(TapedSkinError, match="release the skin first"):
         skin.turn(45.0)
     with pytest.raises(TapedSkinError, match="aperture_mm"):
         skin.move(0.0)
