@@ -183,7 +183,7 @@ def test_images_outside_the_tracking_frames_are_not_used():
 
 
 def test_tracking_frames_covering_no_image_are_error():
-    with pytest.raises(InputsError, match="no image lies between two tracking frames"):
+    with pytest.raises(InputsError, match="no image between two tracking frames"):
         follow(Shots(*FAR, times_s=(30.0, 40.0)))
 
 
