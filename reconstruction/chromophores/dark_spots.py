@@ -3,14 +3,14 @@
 Within one person's skin, whose pigment changes slowly, the face distribution separates pigment from
 shade (`reconstruction.chromophores.face`). A mole does not follow that distribution. Shade is far
 more frequent, so the distribution explains a mole as usual skin in little light, with a small
-standard error. Illumination also changes slowly, except at shadow edges. A pixel that is darker
-than its surroundings is therefore a mole or shade with equal probability: its estimate is halfway
-between the face estimate and the single-pixel estimate, and its interval contains both.
+standard error. Illumination also changes slowly, except at shadow edges. Pixels that are darker
+than their surroundings are therefore mole or shade with equal probability: their estimate is
+halfway between the face and the single-pixel estimate, and their interval contains both.
 
 Lips and eyelids have less melanin than the rest of a face. The face distribution explains them as
-usual skin with less blood. Shade makes a single pixel look like darker skin, never lighter. A pixel
-whose single-pixel melanin is below its face estimate by more than the standard error is therefore
-treated in the same way.
+usual skin with less blood. Shade makes a single pixel look like darker skin, never lighter. Pixels
+whose single-pixel melanin is below their face estimate by more than the standard error are
+therefore treated in the same way.
 """
 
 import math

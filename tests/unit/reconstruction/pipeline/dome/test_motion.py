@@ -191,5 +191,5 @@ def test_a_frame_without_a_time_is_named():
     session = Shots(times_s=(0.0, 20.0))
     for record in session.frames("tracking"):
         record.line.t_box_s = None
-    with pytest.raises(InputsError, match=r"T\d-C\d\d: does not say when it was lit"):
+    with pytest.raises(InputsError, match=r"T\d-C\d\d: lacks the time of its light"):
         follow(session)
