@@ -113,7 +113,7 @@ def test_ear_shadowed_texels_do_not_mix_with_ear(frame, faces):
 def test_left_and_right_exchanged_is_refused_by_name(faces, frame):
     wrong = marks(faces[0])
     wrong["p11"], wrong["p12"] = wrong["p12"], wrong["p11"]
-    with pytest.raises(ParameterizationError, match=r"without folds .*'p1"):
+    with pytest.raises(ParameterizationError, match=r"has folds.*'p1"):
         common.fit_correspondence(wrong, frame)
 
 
