@@ -118,9 +118,7 @@ def estimate(
         size = np.trace(normal_matrix, axis1=1, axis2=2)
         solvable = (np.linalg.det(normal_matrix) > 1e-12 * np.square(size)) & valid
         safe = np.where(solvable[:, None, None], normal_matrix, np.eye(2))
-        step = np.where(
-            solvable[:, None], np.linalg.solve(safe, gradient[..., None])[..., 0], 0.0
-        )
+        step = np.where(solvable[:, None], np.linalg.solve(safe, gradient[..., None])[..., 0], 0.0)
         length = np.linalg.norm(step, axis=-1, keepdims=True)
         step *= np.minimum(1.0, MAX_STEP_RAD / np.maximum(length, 1e-300))
         for _ in range(MAX_HALVINGS):
