@@ -294,7 +294,7 @@ def model_covariance(model_error: ArrayLike | None, default_noise: bool) -> Floa
         covariance = np.diag(np.broadcast_to(error, (3,)) ** 2)
     least = np.linalg.eigvalsh(covariance).min()
     good = np.allclose(covariance, covariance.T) and least >= -1e-12
-    check.require(good, "model_error", covariance, "a symmetric covariance without negatives")
+    check.require(good, "model_error", covariance, "symmetric, eigenvalues >= 0; correct it")
     # The floor, single precision of the colors themselves, keeps the weights finite.
     floor = DEFAULT_RELATIVE_NOISE**2 if default_noise else 1e-12
     return np.asarray(covariance + floor * np.eye(3))

@@ -141,7 +141,7 @@ def disc_pixels(
     height, width = shape
     x, y = position
     inside = -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5
-    expected = f"within {width} x {height} px"
+    expected = f"within {width} x {height} px; move it"
     Checks(CurveError).require(inside, name, f"({x:g}, {y:g}) px", expected)
     rows, columns = np.indices((height, width))
     squared = (columns - x) ** 2 + (rows - y) ** 2
@@ -170,7 +170,7 @@ def standard_positions(skin: ArrayLike) -> dict[str, tuple[float, float]]:
     shown = np.asarray(skin, bool)
     Checks(CurveError).require(shown.ndim == 2, "skin", f"shape {shown.shape}", "(H, W)")
     rows, columns = np.nonzero(shown)
-    Checks(CurveError).require(rows.size != 0, "skin", "none", "a face")
+    Checks(CurveError).require(rows.size != 0, "skin", "none", "a face; check the mask")
     left, right = np.percentile(columns, (2, 98))
     top, bottom = np.percentile(rows, (2, 98))
     return {

@@ -74,7 +74,7 @@ class CurveSamples:
             check.shape("stderr", variance, shown.shape)
             good &= np.isfinite(variance) & (variance > 0)
         usable = int(good.sum(axis=1).min(initial=at.size))
-        check.require(usable >= 5, "values", f"{usable} usable", ">= 5")
+        check.require(usable >= 5, "values", f"{usable} usable", ">= 5; record more samples")
         inverse = np.where(good, 1.0 if stderr is None else 1.0 / variance, 0.0)
         count = good.sum(axis=1, keepdims=True)
         scale = count / inverse.sum(axis=1, keepdims=True)

@@ -188,7 +188,7 @@ def compare_states(
     """
     captured = _Captures.of(maps, states, stderr, valid)
     repeated = len(captured.states) > len(captured.groups)
-    expected = "at least one that is repeated"
+    expected = "at least one that is repeated; add repeats"
     Checks(RepeatabilityError).require(repeated, "states", "each once", expected)
     chosen, left_out, limit = captured.regions(regions, correlated_px, false_alarm)
     found = tuple(_compared(region, captured.groups, reference, limit) for region in chosen)
@@ -334,7 +334,7 @@ class _Captures:
             noise = np.maximum(noise, 1e-9 * np.abs(means) + 1e-30)
             chosen.append(_Region(name, count, means, noise))
         got = "no region with pixels that are valid in all captures"
-        check.require(chosen, "valid", got, "some")
+        check.require(chosen, "valid", got, "some; check masks and regions")
         # Sidak correction: the family of regions has the given rate
         return chosen, tuple(left_out), 1.0 - (1.0 - false_alarm) ** (1.0 / len(chosen))
 

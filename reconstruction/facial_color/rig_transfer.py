@@ -57,7 +57,9 @@ def transfer_rig(
     """
     names = sorted(set(landmarks_rig) & set(landmarks_onto))
     got, least = f"{len(names)} names in both tables", MIN_TRANSFER_LANDMARKS
-    Checks(RigTransferError).require(len(names) >= least, "landmarks", got, f"at least {least}")
+    Checks(RigTransferError).require(
+        len(names) >= least, "landmarks", got, f"at least {least}; mark more"
+    )
     onto = np.array([landmarks_onto[name] for name in names], np.float64)
     own = np.array([landmarks_rig[name] for name in names], np.float64)
     try:

@@ -88,7 +88,8 @@ NO_HOLD_OUT = HoldOut()
 
 
 def _found(field: str, asked: Sequence[str], there: Sequence[str]) -> tuple[str, ...]:
-    expected = f"names out of {', '.join(there)} or numbers from 0 to {len(there) - 1}"
+    known_names = f"names out of {', '.join(there)}"
+    expected = f"{known_names} or numbers from 0 to {len(there) - 1}; choose some of these"
     chosen = set()
     for word in asked:
         number = int(word) if word.isascii() and word.isdigit() else len(there)

@@ -88,7 +88,7 @@ def _linear(frame: raw.RawFrame) -> tuple[Float32Array, BoolArray]:
 def _stack(session: Session) -> LightStack:
     records = tuple(session.frames("olat"))
     got = f"{len(records)} frames under one light at a time"
-    Checks(InputsError).require(len(records) >= 3, f"{session.path}", got, "3")
+    Checks(InputsError).require(len(records) >= 3, f"{session.path}", got, "3; add images")
     exposures = [
         float(r.settings.get("exposure_s", 0.0)) * float(r.settings.get("iso", 100.0))
         for r in records

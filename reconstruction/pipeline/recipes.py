@@ -145,7 +145,7 @@ def _require_fitting_options(session: Session, recipe: Recipe, dome: DomeOptions
 
 def _require_known(want: Sequence[str], maps: Sequence[str]) -> None:
     check = Checks(InputsError)
-    check.require(want, "want", "nothing", f"names out of {', '.join(maps)}")
+    check.require(want, "want", "nothing", f"names out of {', '.join(maps)}; give some")
     for name in want:
         check.choice("want", name, maps)
 

@@ -71,7 +71,7 @@ def tangent_frames(
     good = np.asarray(valid, bool)
     check = Checks(TangentSpaceError)
     check.shape("position_mm", points, (*good.shape[:2], 3))
-    check.require(good.any(), "valid", "no texel with a surface", "some")
+    check.require(good.any(), "valid", "no texel with a surface", "some; check the mask")
     check.within("smoothing_mm", smoothing_mm, "[0, inf)")
     along_u, known_u = _slope(points, good, 1)
     along_v, known_v = _slope(points, good, 0)
@@ -79,7 +79,7 @@ def tangent_frames(
     if smoothing_mm > 0.0:
         texel = np.median(np.linalg.norm(along_u[known], axis=1)) if known.any() else 0.0
         got = "neighboring texels on the same point"
-        check.require(texel > 0.0, "position_mm", got, "a surface")
+        check.require(texel > 0.0, "position_mm", got, "a surface; check the map")
         sigma_px = smoothing_mm / float(texel)
         # smooth slopes, not points: smoothed points would move inwards at the rim
         along_u, along_v = (_smoothed(s, known, sigma_px) for s in (along_u, along_v))

@@ -148,9 +148,10 @@ def _require(dome: CalibratedDome) -> None:
     views, lights = len(dome.cameras), int(np.count_nonzero(dome.lights.valid))
     check = Checks(InputsError)
     least = estimates.MIN_VIEWS
-    check.require(views >= least, "views", f"images of {views}", f"at least {least}")
+    check.require(views >= least, "views", f"images of {views}", f"at least {least}; add views")
     least = estimates.MIN_LIGHTS
-    check.require(lights >= least, "lights", f"{lights} that can be used", f"at least {least}")
+    enough = f"at least {least}; capture more lights"
+    check.require(lights >= least, "lights", f"{lights} that can be used", enough)
     place = dome.lights.position_mm[dome.lights.valid]
     photometric_stereo.require_noncoplanar(unit_vectors(place))
 

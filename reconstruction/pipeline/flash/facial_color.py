@@ -158,7 +158,7 @@ def fit_facial_color(
         When the neutral state is the only one, or no other can be aligned to it.
     """
     states = subject.states
-    alone, expected = "the neutral state alone", "at least one other to make a rig of"
+    alone, expected = "the neutral state alone", "at least one other; add its session"
     Checks(FacialColorFitError).require(len(states) > 1, "sessions", alone, expected)
     report = progress or (lambda _: None)
     base = subject.images_of_state(NEUTRAL_STATE)[0]

@@ -190,7 +190,7 @@ def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], FlashImage
     def mean_image(records: Sequence[FrameRecord]) -> FlashImage:
         linear = linear_light(records)
         sizes, name = {image.rgb.shape for image in linear}, f"{records[0].index['polarizer']}"
-        expected = "one camera setting"
+        expected = "one camera setting; choose frames of one"
         Checks(InputsError).require(len(sizes) == 1, f"{name} frames", f"sizes {sizes}", expected)
         power = sum(float(record.settings.get("power", 1.0)) for record in records)
         rgb = total(linear, "rgb") - len(linear) * dark

@@ -126,7 +126,7 @@ def reconstruct_states(
         When a session shows no subject, no state is neutral, or sizes or cameras differ.
     """
     check = Checks(InputsError)
-    check.require(sessions, "sessions", "none", "at least one of the flash rig")
+    check.require(sessions, "sessions", "none", "at least one of the flash rig; give one")
     opened = [Session.open(path) for path in sessions]
     start = min(session.manifest.created_at for session in opened)
     images: list[StateImage] = []
@@ -139,7 +139,7 @@ def reconstruct_states(
     # checked before minutes of computation
     shown, expected = (
         ", ".join(sorted(set(named))),
-        f"{NEUTRAL_STATE!r}, to which the others are aligned",
+        f"{NEUTRAL_STATE!r}, to which the others are aligned; add its session",
     )
     check.require(NEUTRAL_STATE in named, "states of sessions", shown, expected)
     maps = REPEATED_MAPS if len(set(named)) < len(named) else SINGLE_MAPS
@@ -160,9 +160,11 @@ def reconstruct_states(
             spectra = inputs.noted["color_table"]
             table.add((str(spectra["camera"]), str(spectra["illuminant"])))
             has_white = has_white and "calibration white" in inputs.hashes
-    check.require(len(table) == 1, "sessions", f"{len(table)} cameras or lights", "one of each")
+    one_rig = "one of each; choose sessions of one rig"
+    check.require(len(table) == 1, "sessions", f"{len(table)} cameras or lights", one_rig)
     shapes = {image.maps["diffuse"].values.shape for image in images}
-    check.require(len(shapes) == 1, "sessions", f"images of sizes {sorted(shapes)}", "one size")
+    one_size = "one size; choose sessions of one camera setting"
+    check.require(len(shapes) == 1, "sessions", f"images of sizes {sorted(shapes)}", one_size)
     ((camera, illuminant),) = table
     simulated = any(session.source == "simulated" for session in opened)
     return SubjectImages(
@@ -183,7 +185,7 @@ def _pairs(session: Session, path: Path) -> list[tuple[str, int, float]]:
     """Return state, repeat and seconds since the first frame of each crossed image."""
     crossed = session.frames("subject", polarizer="crossed")
     got = "no crossed frame of a subject"
-    Checks(InputsError).require(crossed, f"{path}", got, "a session of the flash rig")
+    Checks(InputsError).require(crossed, f"{path}", got, "a session of the flash rig; give one")
     first = min(record.line.t_host_s for record in session.frames())
     return [
         (str(at["state"]), int(at.get("repeat", 0)), float(line.t_host_s - first))

@@ -137,7 +137,7 @@ def _light_s(record: FrameRecord) -> float:
 def _level(records: list[FrameRecord]) -> float:
     levels = {float(record.settings.get("level", 1.0)) for record in records}
     where, got = f"step {records[0].step_id}", f"levels {sorted(levels)} in one series"
-    Checks(InputsError).require(len(levels) == 1, where, got, "one")
+    Checks(InputsError).require(len(levels) == 1, where, got, "one; capture it again")
     return levels.pop()
 
 
