@@ -394,6 +394,7 @@ def _scatter(means: Float64Array, noise: Float64Array) -> float:
 
 def _correlation_stderr(correlation: float, size: float, kinds: int, count: int) -> float:
     """Return the large-sample standard error of an intraclass correlation (Donner 1986, 3.1)."""
+    # large-sample variance 2 (N - 1) (1 - r)^2 (1 + (n - 1) r)^2 / (n^2 (N - k) (k - 1))
     spread = (1.0 - correlation) * (1.0 + (size - 1.0) * correlation)
     return math.sqrt(2.0 * (count - 1) / ((kinds - 1) * (count - kinds))) * abs(spread) / size
 

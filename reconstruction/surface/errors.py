@@ -94,6 +94,7 @@ def change_per_mm(
     a, b = edges.T
     square = np.square(values[a] - values[b])
     if noise is not None:
+        # independent noise adds var(a) + var(b) to the squared difference of two points
         square = square - np.square(noise[a]) - np.square(noise[b])
     apart = np.linalg.norm(points_mm[a] - points_mm[b], axis=1).astype(np.float64)
     square /= np.square(np.maximum(apart, MIN_SPACING_PX * pixel_mm))[:, None]

@@ -314,6 +314,7 @@ def normals_from_full_model(
     found = model_normals.estimate(select_points(samples, rows), start[rows], r_d_gray, lobes[rows])
     ours = np.square(np.hypot(found.stderr_rad, LOBE_TILT_RAD))
     theirs = np.square(normals.stderr[rows, 0])
+    # inverse-variance mean of the two normals: its variance is the product over the sum
     share = np.where(found.valid, theirs / (theirs + ours), 0.0)[:, None]
     between = share * found.normals + (1.0 - share) * normals.values[rows]
     values, stderr = normals.values.copy(), normals.stderr.copy()

@@ -110,6 +110,7 @@ def estimate(
     for _ in range(N_GAUSS_NEWTON_STEPS):
         first, second = _tangents(n)
         slope = np.stack([fit.slope(n, axis) for axis in (first, second)], axis=-1)
+        # Huber weight: 1 below the limit, limit / |residual| beyond it
         far = HUBER_SIGMAS / np.sqrt(np.maximum(state.misfit2, 1))
         pull = np.where(state.misfit2 < HUBER_SIGMAS**2, 1.0, far)
         weight = np.where(state.use, pull / state.variance, 0.0)

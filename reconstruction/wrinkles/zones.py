@@ -134,6 +134,7 @@ def estimate_amplitudes(
     leading, trace = np.maximum(values[..., -1], 0.0), np.trace(gram, axis1=2, axis2=3)
     direction = np.moveaxis(vectors[..., -1], -1, 0)
     peak = np.take_along_axis(direction, np.abs(direction).argmax(axis=0)[None], axis=0)
+    # gram = energy a a' with the amplitudes a scaled to a largest magnitude of 1
     energy = leading * peak[0] ** 2
     valid = (part > 0.1) & (leading > 0) & (energy >= MIN_ENERGY * energy.max(initial=0.0))
     pixels = np.maximum(part * seen.size / (size[0] * size[1]), 1.0)

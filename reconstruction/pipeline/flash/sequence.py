@@ -270,7 +270,7 @@ def _fit_prompts(
 
 
 def _floor_stderr(stderr: Float64Array) -> Float64Array:
-    """Limit the weight of single frames: raise standard errors far below the usual one."""
+    """Add the median standard error in quadrature, which limits the weight of single frames."""
     finite = stderr[np.isfinite(stderr)]
     usual = float(np.median(finite)) if finite.size else 0.0
     return np.asarray(np.hypot(stderr, usual))

@@ -143,6 +143,7 @@ def _of_place(
         if both.sum() < 2:
             mean[pose] = np.nan
             continue
+        # brightness gives the precise curve within a pose, color the level between poses
         level = float(by_color.mean[0, pose][both].mean() - by_light.mean[0][both].mean())
         mean[pose] = by_light.mean[0] + level
         stderr[pose] = by_light.stderr[0]

@@ -228,6 +228,8 @@ def _separate(
 ) -> Mapping[str, SkinMap]:
     """Separate diffuse and specular reflection, relative to a white reference at the same pixel."""
     white = rig.white
+    # diffuse light is unpolarized: the crossed analyzer transmits half of it and, ideally, no
+    # specular reflection
     diffuse = FlashImage(2 * crossed.rgb, 4 * crossed.variance, crossed.valid)
     specular = specular_error = np.zeros_like(crossed.rgb)
     specular_valid = np.zeros(crossed.valid.shape, bool)

@@ -185,6 +185,8 @@ def site_values(fits: Sequence[ProfileFit]) -> list[SiteValue]:
         known = count > 0
         mean = (weight * np.where(valid, log_tr, 0.0)).sum(axis=0) / np.where(known, total, 1.0)
         scatter = (weight * np.where(valid, log_tr - mean, 0.0) ** 2).sum(axis=0)
+        # inverse-variance mean of the logarithms; its variance 1 / sum(w) is multiplied by the
+        # reduced chi-square where that exceeds 1 (Birge ratio)
         inflation = np.maximum(scatter / np.maximum(count - 1, 1), 1.0)
         shared = np.mean([fit.log_common for fit in own], axis=0)
         with np.errstate(divide="ignore"):
