@@ -125,7 +125,7 @@ def test_too_few_and_collinear_landmarks_are_refused(faces, frame):
     line = {n: (0.0, 10.0 * k, 0.0) for k, n in enumerate(all_marks)}
     with pytest.raises(ParameterizationError, match="one line"):
         common.fit_correspondence(line, frame)
-    with pytest.raises(ParameterizationError, match="'nose tip' is missing"):
+    with pytest.raises(ParameterizationError, match="lacks 'nose tip'"):
         common.average_landmarks([{"chin": (0.0, 0.0, 0.0)}])
 
 

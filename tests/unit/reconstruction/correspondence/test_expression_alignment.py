@@ -245,7 +245,7 @@ def test_arguments_that_do_not_fit_are_named(rng):
             "1 names in both images, expected at least 4",
         ),
         ({"valid_moving": np.ones((3, 3), bool)}, "valid_moving: got shape"),
-        ({"valid_neutral": np.zeros((40, 40), bool)}, "neutral: has no valid pixel"),
+        ({"valid_neutral": np.zeros((40, 40), bool)}, "neutral: got no valid pixel"),
     )
     for given, message in cases:
         with pytest.raises(alignment.AlignmentError, match=message):
