@@ -1,16 +1,16 @@
-"""Pixels that may be no skin of the face's usual kind: moles and shade, lips and eyelids.
+"""Detect pixels that may not be usual skin of the face: moles and shade, lips and eyelids.
 
-One person's skin tells which of both a dark color is where pigment changes slowly
-(`reconstruction.chromophores.face`). A mole is not of that skin, and shade is so much more frequent
-that a face's distribution explains a mole away: as usual skin in little light, with a small
-standard error. But light changes slowly, too, beside an edge of shadow. So a pixel that is darker
-than its surroundings is one of both, and neither is the more probable: the estimate lies halfway
-between that of the face and that of the pixel alone, and its standard error holds both.
+Within one person's skin, whose pigment changes slowly, the face distribution separates pigment from
+shade (`reconstruction.chromophores.face`). A mole does not follow that distribution. Shade is far
+more frequent, so the distribution explains a mole as usual skin in little light, with a small
+standard error. Illumination also changes slowly, except at shadow edges. Pixels that are darker
+than their surroundings are therefore mole or shade with equal probability: their estimate is
+halfway between the face and the single-pixel estimate, and their interval contains both.
 
-Lips and eyelids have less melanin than the rest of a face, and the face explains that away
-likewise: as usual skin with less blood. Shade makes a pixel by itself look like darker skin, never
-like lighter, and so one that by itself has less melanin than by its face, by more than its standard
-error, is one of both, too.
+Lips and eyelids have less melanin than the rest of a face. The face distribution explains them as
+usual skin with less blood. Shade makes a single pixel look like darker skin, never lighter. Pixels
+whose single-pixel melanin is below their face estimate by more than the standard error are
+therefore treated in the same way.
 """
 
 import math
@@ -31,17 +31,17 @@ from reconstruction.chromophores.pixel_checks import (
 from reconstruction.chromophores.posterior import ChromophorePosterior
 
 MIN_LOG_CONTRAST: Final = 0.1
-"""Least difference of log light from the surroundings: 12 % more melanin on skin of 5 %, 31 % more
-on skin of 1 %, which is within or near a face's own spread. Less needs no second look."""
+"""Minimum contrast in log light: 12 % more melanin on skin of 5 %, 31 % more on skin of 1 %, which
+is close to the standard deviation within a face."""
 CONTRAST_SIGMAS: Final = 3.0
-"""The same, in standard deviations of a pixel's noise."""
+"""Minimum contrast in standard deviations of a pixel's noise."""
 WINDOW_DIVISOR: Final = 20
 """The surroundings are a square whose side is the skin's, as a square, over this: 9 mm of
-skin 180 mm across; larger ones hold more that is darker for its slope alone."""
+skin 180 mm across; larger ones contain more skin that is dark only by its slope."""
 MIN_WINDOW_PX: Final = 7
-"""Pixels; fewer have no median that a mole would not move."""
+"""Minimum side of the surroundings in pixels; a mole would shift the median of a smaller one."""
 _MAX_WINDOW_BLOCKS: Final = 11
-"""Odd; finer squares than this are medians of blocks of pixels, or large pictures take minutes."""
+"""Odd; finer squares are replaced by medians of pixel blocks, which keeps large images fast."""
 _WINDOWS_PER_PASS: Final = 1 << 14
 _BAND_ROWS: Final = 128
 
@@ -58,7 +58,7 @@ def is_locally_dark(
     variance
         Noise variance of `colors`, broadcast to its shape. None: none.
     valid
-        Shape (rows, columns): False where a pixel is no skin. None: all are that have light.
+        Shape (rows, columns): False where a pixel is not skin. None: all pixels with light are.
 
     Returns
     -------
@@ -87,14 +87,14 @@ def is_locally_dark(
     whole = None if variance is None else broadcast_to_pixels("variance", variance, light.shape)
     log_light = np.full(good.shape, np.nan, dtype=np.float32)
     least = np.full(good.shape, MIN_LOG_CONTRAST, dtype=np.float32)
-    for start in range(0, len(good), _BAND_ROWS):  # copies of a whole picture need gigabytes
+    for start in range(0, len(good), _BAND_ROWS):  # copies of a whole image need gigabytes
         band = slice(start, start + _BAND_ROWS)
         kept = light[band][good[band]].astype(np.float64)
         log_light[band][good[band]] = np.log(kept).mean(axis=-1)
         if whole is not None:
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                 noise = np.sqrt((whole[band][good[band]] / np.square(kept)).sum(axis=-1))
-            # noise that is no number says nothing; nothing then stands out of it
+            # undefined noise gives no evidence of contrast, so its threshold is infinite
             noise = np.where(noise >= 0.0, noise, np.inf) / light.shape[-1]
             least[band][good[band]] = np.maximum(MIN_LOG_CONTRAST, CONTRAST_SIGMAS * noise)
     with np.errstate(invalid="ignore"):
@@ -104,17 +104,17 @@ def is_locally_dark(
 def is_lighter_than_face_prior(
     by_face: ChromophorePosterior, alone: ChromophorePosterior
 ) -> BoolArray:
-    """Return where a pixel alone has less melanin than by its face, outside its 68 % interval.
+    """Return where single-pixel melanin is below the face estimate, outside its 68 % interval.
 
     Parameters
     ----------
     by_face, alone
-        Estimates of the same pixels, with and without what the face tells.
+        Estimates of the same pixels, with and without the face distribution.
 
     Returns
     -------
     ndarray of bool
-        Of the pixels' shape; False where either is unknown.
+        Of the pixels' shape; False where one of the two is unknown.
 
     Raises
     ------
@@ -129,20 +129,20 @@ def is_lighter_than_face_prior(
 def average_hypotheses(
     by_face: ChromophorePosterior, alone: ChromophorePosterior, equally_likely: ArrayLike
 ) -> ChromophorePosterior:
-    """Return estimates that hold both of two explanations, where they are equally probable.
+    """Average two hypotheses where they are equally probable; their intervals contain both.
 
     Parameters
     ----------
     by_face, alone
-        Estimates of the same pixels, with and without what the face tells.
-    where
-        Of the pixels' shape: where either may be true; elsewhere `by_face` is kept.
+        Estimates of the same pixels, with and without the face distribution.
+    equally_likely
+        Of the pixels' shape: where the hypotheses are equally probable; elsewhere `by_face` stays.
 
     Returns
     -------
-    WeighedChromophores
+    ChromophorePosterior
         Means of both, with the standard deviation of their mixture in equal parts; `valid` where
-        both are. The residual stays that of `by_face`.
+        both are. The residual is that of `by_face`.
 
     Raises
     ------
@@ -200,7 +200,7 @@ def _by_blocks(values: Float32Array, block: int) -> Float32Array:
 
 
 def _medians(values: Float32Array) -> Float32Array:
-    """Return medians along the last axis (n, m) without NaN, in a part of `nanmedian`'s time."""
+    """Return medians along the last axis (n, m) without NaN, faster than `nanmedian`."""
     ordered = np.sort(values, axis=-1)  # NaN last
     count = np.isfinite(ordered).sum(axis=-1)
     row = np.arange(len(values))

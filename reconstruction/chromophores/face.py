@@ -1,8 +1,8 @@
-"""The distribution of one person's melanin and blood, from the colors of the face's pixels.
+"""Estimate the distribution of one person's melanin and blood from the colors of the face.
 
-`reconstruction.chromophores.face_distribution` says what it is and why;
-`reconstruction.chromophores.posterior` weighs each pixel by it, and by itself where it may be a
-mole, shade, lip or lid (`reconstruction.chromophores.dark_spots`).
+`reconstruction.chromophores.face_distribution` defines and fits the distribution.
+`reconstruction.chromophores.posterior` uses it as the prior of each pixel;
+`reconstruction.chromophores.dark_spots` finds the pixels that may be a mole, shade, lip or eyelid.
 """
 
 import math
@@ -37,19 +37,19 @@ from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION, evaluate_table
 
 N_SAMPLE_PIXELS: Final = 1500
-"""Evenly spread over the face: its mean is known to a thirtieth of its spread by them, less than
-what they have in common."""
+"""Sampled evenly over the face. They determine the mean to a thirtieth of the standard deviation,
+less than the errors common to all pixels."""
 MIN_FACE_PIXELS: Final = 200
-"""With fewer, pixels are weighed by themselves."""
+"""With fewer pixels, each is estimated alone."""
 LOG_MELANIN_STEP: Final = 0.02
-"""From place to place in log melanin."""
+"""Grid step in log melanin."""
 N_BLOOD_NODES: Final = 96
 _N_BLOOD_NODES_SUMMED: Final = 3
 MIN_COLOR_ERROR: Final = 0.003
-"""Relative error of colors below which places stand too far apart; smaller ones are taken for this
-much, which of light skin is 3 % of melanin, where a face scatters by 10 to 20 %."""
+"""Relative color error below which the grid is too coarse; smaller errors are raised to it. In
+light skin it corresponds to 3 % of melanin, where a face scatters by 10 to 20 %."""
 LOG_MELANIN_MARGIN: Final = 0.7
-"""Of log melanin that is looked at beyond what 98 % of the pixels have by themselves."""
+"""Margin in log melanin beyond the central 98 % of the single-pixel estimates."""
 
 
 def fit_face_distribution(
@@ -63,26 +63,26 @@ def fit_face_distribution(
     model_error: ArrayLike | None = None,
     valid: ArrayLike | None = None,
 ) -> FaceDistribution | None:
-    """Return how melanin and blood are distributed over a face; None with fewer than 200 pixels.
+    """Fit the distribution of melanin and blood over a face; None with fewer than 200 pixels.
 
     Parameters
     ----------
     rgb
-        Shape (..., 3): light of the pixels over that of a white tile, linear camera RGB; all skin
-        of one person in one picture. Not modified.
+        Shape (..., 3): light of the pixels over that of a white reference, linear camera RGB; all
+        skin of one person in one image. Not modified.
     table
-        Color table of the camera and the light that took the picture.
+        Color table of the camera and the illumination of the image.
     prior
-        How the pixels' shading is distributed, without light that all have in common.
+        Distribution of the pixels' shading, without the error common to all pixels.
     common_light
-        Standard error of log light that all pixels have in common, above 0: how far the face may
-        stand from the white tile's place, or how well the exposure is known.
+        Standard error of log light common to all pixels, above 0: from the face's distance to the
+        white reference's position, or from the uncertainty of the exposure.
     common_color
-        (3, 3): covariance of relative errors of color that all pixels have in common. None: none.
+        (3, 3): covariance of relative color errors common to all pixels. None: 0.
     variance
         Noise variance of `rgb`, broadcast to its shape. None: 1 percent of each channel.
     model_error
-        Covariance of the pixels' relative errors beside noise, shape (3, 3) or (..., 3, 3).
+        Covariance of the pixels' relative errors without noise, shape (3, 3) or (..., 3, 3).
         None: 0.
     valid
         Shape (...): False where a pixel is masked. None: all may be used.
@@ -104,7 +104,7 @@ def fit_face_distribution(
     >>> prior = lognormal_prior(0.7, 0.3)
     >>> found = fit_face_distribution(seen, table, prior=prior, common_light=0.1,
     ...                   variance=(3e-3 * seen) ** 2).melanin
-    >>> bool(abs(np.exp(found.mean) - 0.05) < 0.003), bool(0.1 < found.spread < 0.2)
+    >>> bool(abs(np.exp(found.mean) - 0.05) < 0.003), bool(0.1 < found.sd < 0.2)
     (True, True)
     """
     Checks(ChromophoreError).within("common_light", common_light, "(0, inf)")
@@ -154,17 +154,17 @@ def fit_face_distribution(
 def fit_with_white_reference(
     rgb: ArrayLike, table: ColorTable, *, variance: ArrayLike, model_error: ArrayLike
 ) -> FaceDistribution | None:
-    """Return the distribution over a face before the flash rig, whose white tile was captured.
+    """Fit the distribution over a face before the flash rig, with a captured white reference.
 
     Parameters
     ----------
     rgb, table, variance, model_error
-        As of `fit_face_distribution`.
+        See `fit_face_distribution`.
 
     Returns
     -------
     FaceDistribution or None
-        With what the place of the face and the layered model have wrong in all pixels alike.
+        Includes errors of the face's position and of the layered model common to all pixels.
     """
     return fit_face_distribution(
         rgb,
@@ -179,16 +179,16 @@ def fit_with_white_reference(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceEstimate:
-    """What pixels say with and without each other."""
+    """Estimates of the pixels, with and without the face distribution."""
 
     found: ChromophorePosterior
-    """Each pixel by what it may be."""
+    """Final estimate; an average of hypotheses in `spots`."""
     by_face: ChromophorePosterior
-    """Each as usual skin of the face; the same as `found` without a face."""
+    """Estimate with the face prior everywhere; the same as `found` without a face."""
     face: FaceDistribution | None
-    """None where it is not told."""
+    """None where it was not fitted."""
     spots: BoolArray
-    """Of the pixels' shape: pixels that may be no usual skin."""
+    """Of the pixels' shape: pixels that may not be usual skin."""
 
 
 def estimate_face(
@@ -205,10 +205,10 @@ def estimate_face(
     Parameters
     ----------
     rgb, table, prior, variance, model_error
-        As of `reconstruction.chromophores.posterior.estimate`.
+        See `reconstruction.chromophores.posterior.estimate`.
     has_white
-        Whether a white tile in the face's place says how much light there is: without it pixels
-        together say no more than each by itself.
+        Whether a white reference at the face's position fixes the exposure. Without it the face
+        distribution adds no information.
     """
     errors: dict[str, Any] = {"variance": variance, "model_error": model_error}
     known = partial(chromophore_posterior.estimate, rgb, table, prior=prior, **errors)
@@ -231,7 +231,7 @@ def _sampled(
     model_error: ArrayLike | None,
     valid: ArrayLike | None,
 ) -> tuple[Float32Array, Float64Array, Float64Array]:
-    """Return colors (n, 3), noise (n, 3) and model errors (n, 3, 3) or (3, 3) of some pixels."""
+    """Sample pixels: colors (n, 3), noise (n, 3) and model errors (n, 3, 3) or (3, 3)."""
     colors = check_colors(rgb)
     good = is_usable_color(colors)
     if valid is not None:
@@ -250,7 +250,9 @@ def _sampled(
 
 
 def _weights(relative: Float64Array, errors: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Return weights of color, brightness projected out, and those of the mean that tells light."""
+    """Return weights of color without brightness, and weights of the mean that gives brightness."""
+    # With V = W^-1 and an unknown common log factor t, minimizing (e - t 1)' W (e - t 1) over t
+    # gives t = s' e with s = W 1 / (1' W 1), and leaves the weights W - W 1 1' W / (1' W 1).
     total = (relative + MIN_COLOR_ERROR**2)[:, :, None] * np.eye(3) + errors
     weights = np.linalg.inv(add_brightness_variance(total))
     row = weights.sum(axis=-1)
@@ -260,7 +262,7 @@ def _weights(relative: Float64Array, errors: Float64Array) -> tuple[Float64Array
 
 
 def _covariance_factors(covariance: ArrayLike | None) -> list[Float64Array]:
-    """Return vectors whose outer products sum up to a covariance."""
+    """Return vectors whose outer products sum to a covariance."""
     if covariance is None:
         return []
     given = Checks(ChromophoreError).numbers("common_color", covariance, (3, 3))

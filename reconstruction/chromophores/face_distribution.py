@@ -1,18 +1,18 @@
-"""How melanin and blood are distributed over one face, told by all of its pixels together.
+"""Fit the distribution of melanin and blood over one face to all of its pixels jointly.
 
 A pixel in the shade has the color of darker skin in more light, and of darker skin with more blood.
-By itself it must be taken for what is the more probable of any skin in the usual light. But skin is
-of one person: pixels in good light tell how much melanin and blood it has and how both scatter, and
-the others are weighed by that. The distribution is the one under which the colors of many pixels
-together are the most probable (their marginal likelihood, an empirical Bayes estimate), not that of
-their estimates, whose errors would widen it.
+Alone it is assigned the most probable skin of any person in the usual light. But the pixels are of
+one person: those in good light determine its mean melanin and blood and their standard deviations,
+which then are the prior of the others. The distribution maximizes the marginal likelihood of the
+colors of many pixels (an empirical Bayes estimate). A fit to their estimates would be wider, by the
+errors of those estimates.
 
-What all pixels err by alike does not average out: light (the face may stand off the white tile's
-place) and the layered model. The distribution is fitted again with each of these moved by its
-standard error to both sides; half of what its means move by is their standard error. A mean at the
-end of what there may be cannot move beyond it, which says nothing of how well it is known: there
-the error is what it moves to the other side. Blood that ends at next to none is not told by color
-at all, for all skin that lives has some: any is then as probable.
+Errors common to all pixels do not average out: illumination (the face may be off the white
+reference's position) and the layered model. The distribution is fitted again with each of these
+errors at plus and minus its standard error. Half of the resulting shift of a mean is its standard
+error. A mean at an end of its range can shift to one side only: there the standard error is the
+shift to that side. Blood at the lower end is undetermined by color, because all living skin has
+some: then any value has the same probability.
 """
 
 import math
@@ -28,67 +28,67 @@ from model.checks import FINITE, Checks
 from reconstruction.arrays import Float32Array, Float64Array, FloatArray
 
 MIN_CONTAMINATION: Final = 0.01
-"""Least part of the skin that follows no distribution at all, as of the light
-(`reconstruction.chromophores.shading_prior.CONTAMINATION_PROBABILITY`): moles and lips are not
-pulled to the face's mean."""
+"""Minimum fraction of the skin that is outside the distribution, as for the light
+(`reconstruction.chromophores.shading_prior.CONTAMINATION_PROBABILITY`): it keeps moles and lips
+from being pulled to the face's mean."""
 MAX_CONTAMINATION: Final = 0.5
 MIN_SIGMAS: Final = (0.02, 0.05)
-"""Least standard deviations of log melanin, below which no colors tell it, and of blood's cube
+"""Minimum standard deviations of log melanin, the limit of what colors resolve, and of blood's cube
 root: blood varies by a third to a half over a face, as on simulated subjects of seeds 0 to 7 (0.045
-to 0.050, lips with the rest), less than what pixels err by, from which colors tell it badly."""
+to 0.050, lips included). That is below the error of a pixel, so colors determine it badly."""
 MAX_SIGMAS: Final = (2.0, 0.5)
 _START_SIGMAS: Final = (0.3, 0.1)
 _SEARCH_SCALE: Final = np.array([0.1, 0.3, 0.5, 0.03, 0.3, 0.5])
-"""Of means, logs of spreads and of parts: what the search takes for one."""
+"""Search scale of means, and of logs of standard deviations and of fractions."""
 _DIFFERENCE_STEP: Final = 1e-5
 MIN_LIMIT_DISTANCE: Final = 0.02
-"""Distance from an end, of log melanin and of blood's axis, within which a mean is held by it: the
-last place that a mean may have lies up to 0.016 before the end."""
+"""Distance from an end, in log melanin or on blood's axis, within which a mean counts as limited:
+the outermost grid point is up to 0.016 from the end."""
 _MAX_ROUNDS: Final = 60
 
 
 @dataclass(frozen=True, slots=True)
 class ContaminatedNormal:
-    """A normal distribution over part of the skin, and any value alike over the rest."""
+    """Mixture of a normal distribution and a uniform one."""
 
     mean: float
     sd: float
-    """Standard deviation, without what is not known of the mean."""
+    """Standard deviation, without the standard error of the mean."""
     contamination: float
-    """Part of the skin that may have any value, 0 to 1."""
+    """Fraction of the skin with the uniform distribution, 0 to 1."""
     low: float
     high: float
-    """Ends of what there may be."""
+    """Range of the uniform distribution, ``low`` to ``high``."""
     stderr: float = 0.0
     """Standard error of the mean."""
 
     def __post_init__(self) -> None:
-        """Refuse what is no distribution."""
+        """Refuse invalid parameters."""
         check = Checks()
         check.settings(self, mean=FINITE, sd="(0, inf)", contamination="(0, 1]", low=FINITE)
         check.settings(self, high=f"({self.low}, inf)", stderr="[0, inf)")
 
     @property
     def total_sd(self) -> float:
-        """Standard deviation of one pixel's value from the mean, whose error is part of it."""
+        """Standard deviation of one pixel's value, with the standard error of the mean."""
         return math.hypot(self.sd, self.stderr)
 
     @property
     def peak_density(self) -> float:
-        """Density of the normal part at its mean, over that of any value alike."""
+        """Density of the normal part at its mean, over the uniform density."""
         width = self.total_sd
         inside = ndtr((self.high - self.mean) / width) - ndtr((self.low - self.mean) / width)
         whole = math.sqrt(2.0 * math.pi) * width * max(float(inside), 1e-12)
         return (self.high - self.low) / whole
 
     def relative_density(self, at: Float64Array) -> Float64Array:
-        """Return the density of a pixel's value over that of any value alike, at values (n,).
+        """Return the density of a pixel's value over the uniform density, at values (n,).
 
         Examples
         --------
         >>> bell = ContaminatedNormal(0.0, 1.0, 0.1, -10.0, 10.0)
         >>> at = np.linspace(-10.0, 10.0, 1001)
-        >>> round(float(bell.relative_density(at).mean()), 2), round(bell.height, 3)
+        >>> round(float(bell.relative_density(at).mean()), 2), round(bell.peak_density, 3)
         (1.0, 7.979)
         """
         bell = self.peak_density * np.exp(-0.5 * np.square((at - self.mean) / self.total_sd))
@@ -97,7 +97,7 @@ class ContaminatedNormal:
     def cell_densities(self, edges: Float64Array) -> Float64Array:
         """Return the means of `relative_density` between ascending edges (n + 1,), shape (n,).
 
-        A cell may be wider than the bell.
+        A cell may be wider than the normal distribution.
         """
         below = ndtr((edges - self.mean) / self.total_sd)
         whole = self.peak_density * math.sqrt(2.0 * math.pi) * self.total_sd
@@ -107,12 +107,12 @@ class ContaminatedNormal:
 
 @dataclass(frozen=True, slots=True)
 class FaceDistribution:
-    """What one person's skin may be: melanin and blood, each by itself."""
+    """Independent prior distributions of one person's melanin and blood."""
 
     melanin: ContaminatedNormal
-    """Of the logarithm of the volume fraction in the epidermis."""
+    """Distribution of the logarithm of the volume fraction in the epidermis."""
     blood: ContaminatedNormal
-    """Of the cube root of the volume fraction in the dermis, as a part of the table's end."""
+    """Distribution of the cube root of the volume fraction in the dermis, over the table's end."""
 
 
 AxisPositions = tuple[Float64Array, Float64Array]
@@ -126,18 +126,19 @@ def fit_distribution(
     *,
     initial: FaceDistribution | None = None,
 ) -> FaceDistribution:
-    """Return the distribution under which the colors of many pixels are the most probable.
+    """Fit the distribution that maximizes the marginal likelihood of many pixels' colors.
 
     Parameters
     ----------
     probability
-        (pixels, m, b): of each pixel's color, over log melanin and blood's cube root; to any scale.
-    places
+        (pixels, m, b): likelihood of each pixel's color over log melanin and blood's cube root, in
+        any scale.
+    positions
         (m,) of log melanin and (b,) of blood, equally spaced.
     ends
-        All that there may be of either; the places need not reach as far.
-    begin
-        A distribution near by, if one is known.
+        Full ranges of both; the positions may cover less.
+    initial
+        A similar distribution to start from, if known.
 
     Returns
     -------
@@ -147,7 +148,7 @@ def fit_distribution(
     Raises
     ------
     ValueError
-        When shapes do not fit, or a pixel has no probability.
+        When shapes do not match, or a pixel has zero probability everywhere.
 
     Examples
     --------
@@ -188,9 +189,9 @@ NormalPair = tuple[ContaminatedNormal, ContaminatedNormal]
 
 
 class _Search:
-    """The likelihood of the colors under distributions of melanin and blood.
+    """Likelihood of the colors under distributions of melanin and blood.
 
-    Of six unknowns over `_SEARCH_SCALE`: means, logs of spreads and of parts.
+    The six unknowns, over `_SEARCH_SCALE`: means, logs of standard deviations and of fractions.
     """
 
     def __init__(self, share: Float32Array, places: AxisPositions, ends: AxisLimits) -> None:
@@ -202,7 +203,7 @@ class _Search:
         ]
 
     def start(self) -> NormalPair:
-        """Return where to begin when nothing is known."""
+        """Return the initial distributions without prior knowledge."""
         usual = self.share.mean(axis=0, dtype=np.float64).reshape(self.shape)
         melanin = float(usual.sum(axis=1) @ self.places[0])
         blood = float(usual.sum(axis=0) @ self.places[1])
@@ -224,7 +225,10 @@ class _Search:
         return first.cell_densities(self.edges[0]), second.cell_densities(self.edges[1])
 
     def misfit(self, unknowns: Float64Array) -> tuple[float, Float64Array]:
-        """Return -log likelihood of a pixel on the mean, and its gradient."""
+        """Return the mean -log likelihood per pixel, and its gradient."""
+        # L_p = sum_mb P_p(m, b) f(m) g(b); the loss is -mean_p log L_p. With Q = sum_p P_p / L_p
+        # its gradient is -(Q g) . df for melanin and -(f Q) . dg for blood, over the pixel count;
+        # df and dg are central differences of the cell densities.
         of_melanin, of_blood = self.densities(unknowns)
         both = np.outer(of_melanin, of_blood).astype(np.float32).reshape(-1)
         each = np.maximum((self.share @ both).astype(np.float64), 1e-30)
@@ -241,15 +245,15 @@ class _Search:
 def add_systematic_errors(
     usual: FaceDistribution, moved: Sequence[tuple[FaceDistribution, FaceDistribution]]
 ) -> FaceDistribution:
-    """Return the distribution with its means' standard errors, and any blood where none is told.
+    """Add standard errors to the means; make blood uniform where it is undetermined.
 
     Parameters
     ----------
     usual
         The fitted one.
     moved
-        Those fitted with each error that all pixels have alike, independent of each other, at
-        minus and plus its standard error.
+        Pairs fitted with each error common to all pixels at minus and plus its standard error;
+        the errors are independent of each other.
 
     Examples
     --------
@@ -274,7 +278,7 @@ def add_systematic_errors(
 
 
 def _mean_shift(usual: ContaminatedNormal, minus: float, plus: float) -> float:
-    """Return by how much a mean moves with one standard error of what moved it to both sides."""
+    """Return the shift of a mean per standard error of the common error that moved it."""
     held = any(
         min(mean - usual.low, usual.high - mean) < MIN_LIMIT_DISTANCE
         for mean in (minus, usual.mean, plus)

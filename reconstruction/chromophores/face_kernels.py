@@ -1,4 +1,4 @@
-"""How probable each pixel's color is over a plane of chromophores, one pixel after the other."""
+"""Kernel for the likelihood of each pixel's color over a plane of chromophores."""
 
 import math
 
@@ -8,7 +8,7 @@ from numba import float32, float64, int64, njit, prange, void
 from reconstruction.compiled import PIXEL_KERNEL_OPTIONS, readonly_array_type
 
 NEGLIGIBLE_DEVIANCE = 36.0
-"""-2 log p above the pixel's lowest from which on probability is left out."""
+"""-2 log p above the pixel's minimum beyond which probability is neglected."""
 
 
 @njit(
@@ -19,7 +19,7 @@ NEGLIGIBLE_DEVIANCE = 36.0
         ),  # weights of its errors, brightness projected out (n, 3, 3)
         readonly_array_type(
             float64, 2
-        ),  # weights of its mean that tells shading (n, 3), their sum is 1
+        ),  # weights of the mean that gives log shading (n, 3), their sum is 1
         readonly_array_type(float64, 3),  # log color of the plane (m, b, 3)
         readonly_array_type(float64, 1),  # -2 log probability of log shading
         float64,  # log shading at the first node of it
@@ -32,7 +32,9 @@ NEGLIGIBLE_DEVIANCE = 36.0
 def plane_probability(  # type: ignore[no-untyped-def]
     log_rgb, weights, mean, plane, prior, prior_low, prior_step, summed, probability
 ):
-    """Sum each pixel's probability over the plane, 1 at its greatest."""
+    """Sum each pixel's likelihood over the plane; its maximum is 1."""
+    # -2 log p = e' W e - 2 log prior(s' e): e are residuals of log color, W has brightness
+    # projected out, s' e is the log shading, whose prior is interpolated linearly
     rows, columns = plane.shape[0], plane.shape[1]
     for n in prange(log_rgb.shape[0]):
         cost = np.empty((rows, columns))

@@ -1,6 +1,6 @@
-"""Linear camera RGB to melanin, hemoglobin and shading, with standard errors.
+"""Invert linear camera RGB to melanin, hemoglobin and shading, with standard errors.
 
-Each pixel is fitted by the color table of the two-layer skin model (Jimenez et al. 2010,
+Each pixel is fitted with the color table of the two-layer skin model (Jimenez et al. 2010,
 doi:10.1145/1866158.1866167, eq. 7), in the cube roots of both volume fractions.
 """
 
@@ -33,7 +33,7 @@ Shading = Literal["known"] | ArrayLike | None
 DEFAULT_RELATIVE_NOISE = 0.01
 """Relative noise of each channel that is assumed when no variance is given."""
 MAX_IDENTIFIABLE_STDERR = 1.0
-"""Relative standard error above which a chromophore counts as not seen."""
+"""Relative standard error above which a chromophore counts as not identifiable."""
 _TASK_PIXELS = 8192
 
 
@@ -53,12 +53,12 @@ class ChromophoreMaps:
     stderr_hemoglobin: Float32Array
     """Standard error of `hemoglobin`."""
     residual: Float32Array
-    """Root of the weighted square sum of what the fit leaves, in standard errors. With the shading
-    free three unknowns fit three channels: it is 0 unless the color lies outside the table."""
+    """Root of the weighted square sum of the fit's residuals, in standard errors. A free shading
+    makes three unknowns for three channels: it is 0 unless the color is outside the table."""
     valid: BoolArray
     """Usable input, converged, and not `outside`."""
     gamut_distance: Float32Array
-    """How far the nearest color of the table is: root mean square relative difference."""
+    """Distance to the table's nearest color: root mean square relative difference."""
     outside: BoolArray
     """The color does not belong to the table: more than 4 standard errors and 2 percent away."""
     melanin_identifiable: BoolArray
@@ -70,7 +70,7 @@ class ChromophoreMaps:
 
     @property
     def identifiable(self) -> BoolArray:
-        """Pixels where both chromophores can be told."""
+        """Pixels where both chromophores are identifiable."""
         return np.asarray(self.melanin_identifiable & self.hemoglobin_identifiable)
 
 
@@ -94,21 +94,21 @@ def invert(
         over irradiance, a perfect white is 1). With the shading free any positive factor per
         pixel may be left in. Fitted in float32, whatever its type. Not modified.
     table
-        Color table of the camera and the light that took the picture.
+        Color table of the camera and the illumination of the image.
     shading
         None: a free factor per pixel. "known": the factor is 1. Array of shape (...) or number:
         the known factor.
     variance
         Noise variance of `rgb`, broadcast to its shape. None: 1 percent of each channel.
     model_error
-        Relative error of the table's colors, added to the noise: a standard error, one a channel,
-        or a (3, 3) covariance. A covariance with s^2 in all its cells says that the shading is
-        known to the relative standard error s only; where s is above some 10 percent, skin has
-        two solutions that `reconstruction.chromophores.posterior` weighs. None: 0.
+        Relative error of the table's colors, added to the noise: a standard error, one per channel,
+        or a (3, 3) covariance. A covariance with s^2 in all its cells limits the knowledge of the
+        shading to the relative standard error s; where s is above some 10 percent, skin has two
+        solutions, which `reconstruction.chromophores.posterior` weights. None: 0.
     valid
         Shape (...): False where a pixel is saturated or masked otherwise. None: all may be used.
     shading_max
-        Largest shading that is possible, if it is known; it rules out second solutions. None: any.
+        Largest possible shading, if known; it rules out second solutions. None: any.
     limit
         Relative standard error up to which a chromophore counts as identifiable.
 
@@ -120,19 +120,18 @@ def invert(
     Raises
     ------
     ChromophoreError
-        When shapes do not fit, or the model error is no covariance.
+        When shapes do not match, or the model error is not a covariance.
 
     Notes
     -----
-    NaN, infinite, zero and negative colors are masked; they carry no color at all. Colors outside
-    the table end at its edge or, with the shading known, at the nearest color; `gamut_distance`
-    tells how far that is. With the shading free, skin of more than a few percent melanin turns
-    back towards the colors of lighter skin: `ambiguous` marks both, and the estimate is the
-    lighter one. Errors are those of the linearised fit; at a relative error of half and above
-    they are rough.
+    NaN, infinite, zero and negative colors are masked. Colors outside the table end at its edge or,
+    with the shading known, at the nearest color; `gamut_distance` gives the distance. With the
+    shading free, skin of more than a few percent melanin has the colors of lighter skin:
+    `ambiguous` marks both, and the estimate is the lighter one. Errors are those of the linearized
+    fit; at a relative error of half and above they are rough.
 
-    Maps are float32 for float64 input too: what rounding the colors to it changes is below 1e-4
-    of a standard error, with the shading known and with it free, where noise is 1 percent.
+    Maps are float32 for float64 input too: rounding changes them by less than 1e-4 of a standard
+    error, with the shading known and with it free, where noise is 1 percent.
 
     Examples
     --------
@@ -183,7 +182,7 @@ def invert(
 
 @dataclass(frozen=True, slots=True)
 class Identifiability:
-    """What a camera under a light can tell: Cramer-Rao bounds over the table."""
+    """Cramer-Rao bounds of melanin and hemoglobin over the table, for a camera and a light."""
 
     c_m: Float64Array
     """Volume fractions of melanin, shape (n,)."""
@@ -192,7 +191,7 @@ class Identifiability:
     stderr_melanin: Float64Array
     """Smallest possible relative standard error of melanin, shape (n, n): [c_m, c_hd]."""
     stderr_hemoglobin: Float64Array
-    """The same of hemoglobin."""
+    """The same for hemoglobin."""
     ambiguous: BoolArray
     """Another pair of chromophores has the same color (with the shading free)."""
 
@@ -203,7 +202,7 @@ class Identifiability:
 
     @property
     def hemoglobin_identifiable(self) -> BoolArray:
-        """The same of hemoglobin."""
+        """Where the relative standard error of hemoglobin is up to `MAX_IDENTIFIABLE_STDERR`."""
         return np.asarray((self.stderr_hemoglobin <= MAX_IDENTIFIABLE_STDERR) & ~self.ambiguous)
 
 
@@ -234,8 +233,8 @@ def compute_identifiability(
     Returns
     -------
     Identifiability
-        Relative standard errors that no unbiased estimate can beat, and where estimates mean
-        nothing.
+        Minimum relative standard errors of an unbiased estimate, and where estimates are
+        ambiguous.
 
     Examples
     --------
@@ -282,9 +281,9 @@ def model_covariance(model_error: ArrayLike | None, default_noise: bool) -> Floa
     Parameters
     ----------
     model_error
-        None, a relative standard error, one a channel, or a covariance.
+        None, a relative standard error, one per channel, or a covariance.
     default_noise
-        Whether the 1 percent that stands for an unknown variance is added.
+        Whether to add the 1 percent that replaces an unknown variance.
     """
     error = np.zeros(3) if model_error is None else np.asarray(model_error, dtype=np.float64)
     check = Checks(ChromophoreError)
@@ -295,16 +294,17 @@ def model_covariance(model_error: ArrayLike | None, default_noise: bool) -> Floa
         covariance = np.diag(np.broadcast_to(error, (3,)) ** 2)
     least = np.linalg.eigvalsh(covariance).min()
     good = np.allclose(covariance, covariance.T) and least >= -1e-12
-    check.require(good, "model_error", covariance, "a symmetric covariance without negatives")
-    # Single precision of the colors themselves keeps the weights finite.
+    check.require(good, "model_error", covariance, "symmetric, eigenvalues >= 0; correct it")
+    # The floor, single precision of the colors themselves, keeps the weights finite.
     floor = DEFAULT_RELATIVE_NOISE**2 if default_noise else 1e-12
     return np.asarray(covariance + floor * np.eye(3))
 
 
 def add_brightness_variance(covariance: Float64Array) -> Float64Array:
-    """Add an error common to the channels to a covariance whose weights will leave it out anyway.
+    """Add brightness variance to a covariance whose weights have brightness projected out.
 
-    A covariance of colors without brightness has none, and its inverse would lose all digits.
+    The added variance cancels in those weights. A covariance without it is singular, and its
+    inverse would lose all digits.
 
     Parameters
     ----------
@@ -319,6 +319,7 @@ def _weights(
     relative_variance: Float64Array, covariance: Float64Array, *, free: bool
 ) -> Float64Array:
     """Return the inverse covariance of relative errors, with a free shading projected out."""
+    # minimizing (e - t 1)' W (e - t 1) over the shading t leaves W - W 1 1' W / (1' W 1)
     total = relative_variance[..., None] * np.eye(3) + covariance
     weights = np.linalg.inv(total)
     if free:
@@ -331,7 +332,7 @@ def _weights(
 def _second_solution(
     start: InverseColorTable, color: Float64Array, gradient: Float64Array
 ) -> BoolArray:
-    """Return where skin seen with a shading of 1 has its color from other chromophores too."""
+    """Return where a color at shading 1 also belongs to other chromophores."""
     log_color = np.log(color)
     place = np.rint(log_color @ start.projection[:, :3].T + start.projection[:, 3])
     i, j = np.clip(place, 0, start.twin_log.shape[0] - 1).astype(np.intp).transpose(2, 0, 1)
@@ -352,7 +353,7 @@ def _shading(shading: Shading, shape: tuple[int, ...]) -> tuple[bool, Float32Arr
 
 
 def _variance(variance: ArrayLike | None, shape: tuple[int, ...]) -> Float32Array:
-    """Return the variance of each pixel (n, 3), or of all (1, 3)."""
+    """Return the variance of each pixel (n, 3), or one for all (1, 3)."""
     values = np.zeros(3) if variance is None else np.asarray(variance)
     if values.shape != (3,):
         values = broadcast_to_pixels("variance", values, (*shape, 3))
@@ -360,6 +361,6 @@ def _variance(variance: ArrayLike | None, shape: tuple[int, ...]) -> Float32Arra
 
 
 def _usable(valid: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray:
-    """Return which pixels may be used (n,), or that all may (1,)."""
+    """Return which pixels are usable (n,), or one flag for all (1,)."""
     usable = np.ones(1, np.bool_) if valid is None else check_mask(valid, shape)
     return np.ascontiguousarray(usable).reshape(-1)

@@ -1,6 +1,6 @@
-"""The chromophore fit's inner loop: one damped Newton fit a pixel, all pixels in parallel.
+"""Inner loop of the chromophore fit: one damped Newton fit per pixel, all pixels in parallel.
 
-`reconstruction.chromophores` is the door; its tests do the same in plain NumPy.
+Call it through `reconstruction.chromophores`; its tests repeat it in plain NumPy.
 """
 
 import math
@@ -15,21 +15,21 @@ MAX_FIT_STEPS = 12
 MAX_AXIS_STEP = 0.12
 """Longest step along an axis, as a fraction of it."""
 RELATIVE_STEP_TOL = 4e-3
-"""Step, relative to the place, after which the next one would be below 5e-5."""
+"""Step, relative to the value, after which the next one would be below 5e-5."""
 AXIS_STEP_TOL = 1e-3
 """The same as a fraction of the axis."""
 GAIN_TOL = 1e-3
 """The same as the square of the step in standard errors."""
 MISFIT_GAIN_TOL = 1e-2
-"""What a misfit adds to it, per square of the residual: noise makes more digits worthless."""
+"""Addition to it per squared residual: with a misfit more digits are within the noise."""
 NOISY_STEP_TOL = 3e-2
-"""Step, relative to the place, that is the last one if noise leaves more than it gains."""
+"""Step, relative to the value, that is the last one where the remaining misfit exceeds the gain."""
 CONVERGED_STEP = 2e-2
-"""Step, relative to the place, up to which the last one counts as converged."""
+"""Step, relative to the value, up to which the last one counts as converged."""
 OUTSIDE_SIGMAS = 4.0
-"""Residual, in standard errors, from which on a color does not belong to the table ..."""
+"""Minimum residual, in standard errors, of a color outside the table ..."""
 OUTSIDE_DISTANCE = 0.02
-"""... if it is also this far from it, as a relative difference of color."""
+"""... together with this minimum distance, as a relative difference of color."""
 INVERSION_MAPS = (
     "melanin",
     "hemoglobin",
@@ -47,7 +47,7 @@ INVERSION_MASKS = (
     "ambiguous",
 )
 MAX_FINITE = 1e30
-"""Colors and variances from here on count as infinite."""
+"""Colors and variances from this value on count as infinite."""
 
 _MIN_AXIS_FRACTION = np.float32(MIN_AXIS_FRACTION)
 _ONE = np.float32(1.0)
@@ -87,7 +87,7 @@ def _cell_bend(q, x, y):  # type: ignore[no-untyped-def]
 
 @njit(inline="always", fastmath=FASTMATH_CONTRACT)
 def _solve(haa, hab, hbb, ra, rb):  # type: ignore[no-untyped-def]
-    """Solve the 2 x 2 normal equations; a singular one gets a ridge."""
+    """Solve the 2 x 2 normal equations; a singular matrix gets a ridge."""
     det = float64(haa) * hbb - float64(hab) * hab
     det = 1.0 / (max(det, 1e-9 * float64(haa) * hbb) + 1e-300)
     step_a = np.float32((float64(hbb) * ra - float64(hab) * rb) * det)
@@ -127,7 +127,7 @@ def _weights(a00, a11, a22, a01, a02, a12):  # type: ignore[no-untyped-def]
 
 @njit(inline="always", fastmath=FASTMATH_CONTRACT)
 def _project(rows, l0, l1, l2):  # type: ignore[no-untyped-def]
-    """Take log RGB to the coordinates of a start grid."""
+    """Transform log RGB to the coordinates of a start grid."""
     return (
         rows[0, 0] * l0 + rows[0, 1] * l1 + rows[0, 2] * l2 + rows[0, 3],
         rows[1, 0] * l0 + rows[1, 1] * l1 + rows[1, 2] * l2 + rows[1, 3],
@@ -153,7 +153,7 @@ def _guess(axes, y0, y1):  # type: ignore[no-untyped-def]
 
 @njit(inline="always", fastmath=FASTMATH_CONTRACT)
 def _bounded(a, b, step_a, step_b, aa, ab, bb, ra, rb):  # type: ignore[no-untyped-def]
-    """Stop a step at the table's edge, where the other chromophore is fitted alone."""
+    """Limit a step to the table's edge, where the other chromophore is fitted alone."""
     if a + step_a < _MIN_AXIS_FRACTION or a + step_a > _ONE:
         step_a = (_MIN_AXIS_FRACTION if a + step_a < _MIN_AXIS_FRACTION else _ONE) - a
         step_b = (rb - ab * step_a) / bb
@@ -251,7 +251,8 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                 for m in range(5):
                     masks[m, n] = False
                 continue
-            # Weights of the relative errors; a free shading is projected out of them.
+            # Weights W of the relative errors; a free shading is projected out of them:
+            # W - W 1 1' W / (1' W 1), with t = W 1 / (1' W 1).
             i0, i1, i2 = _ONE / d0, _ONE / d1, _ONE / d2
             a00, a11, a22 = v0 * i0 * i0 + m00, v1 * i1 * i1 + m11, v2 * i2 * i2 + m22
             if plain:
@@ -316,7 +317,8 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                     t = _ONE / s
                     e0, e1, e2 = q0 * t - _ONE, q1 * t - _ONE, q2 * t - _ONE
                 else:
-                    # log(q) to second order: a shading known to 50 percent leaves large factors.
+                    # log(q) = log(mean) + log(q / mean), the second term to first order around the
+                    # mean: a shading known to 50 percent leaves factors q far from 1.
                     mean = (q0 + q1 + q2) / _THREE
                     t = _ONE / mean
                     common = math.log(mean) - _ONE
@@ -326,10 +328,11 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                 ga0, ga1, ga2 = x0 * r0, x1 * r1, x2 * r2
                 gb0, gb1, gb2 = y0_ * r0, y1_ * r1, y2_ * r2
                 facing = (ga1 * gb2 - ga2 * gb1) + (ga2 * gb0 - ga0 * gb2) + (ga0 * gb1 - ga1 * gb0)
-                # Beyond the fold, where gray sees the other side, lies the second solution.
+                # Beyond the fold, where the gray axis meets the surface's other side, is the
+                # second solution.
                 beyond = free and cost_before < MAX_FINITE and facing * light_side < _ZERO
                 if beyond or cost > cost_before * np.float32(1.01) + np.float32(1e-9):
-                    # Overshot: half of the way back to the last good place.
+                    # Overshot: return half of the way to the last accepted point.
                     a, b = _HALF * (a + a_before), _HALF * (b + b_before)
                     step_a, step_b = a - a_before, b - b_before
                     if max(abs(step_a), abs(step_b)) < 1e-5:
@@ -345,8 +348,9 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                 haa, hab, hbb = aa, ab, bb
                 step_a, step_b = _solve(aa, ab, bb, ra, rb)
                 if step > 1 and not free:
-                    # Off the surface Gauss-Newton converges slowly: Newton's Hessian has the
-                    # second derivatives of log f too, weighted by what no step can remove.
+                    # Off the surface Gauss-Newton converges slowly. Newton's Hessian subtracts the
+                    # second derivatives of log f, f''/f - (f'/f)^2, weighted by the residual that
+                    # the linear step leaves.
                     o0 = e0 - ga0 * step_a - gb0 * step_b
                     o1 = e1 - ga1 * step_a - gb1 * step_b
                     o2 = e2 - ga2 * step_a - gb2 * step_b
@@ -394,13 +398,13 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                 ):
                     done = True
                     break
-            # What the last step changed is taken from the linear model.
+            # The linear model gives the change of the residual by the last step.
             e0 -= ga0 * step_a + gb0 * step_b
             e1 -= ga1 * step_a + gb1 * step_b
             e2 -= ga2 * step_a + gb2 * step_b
             residual = math.sqrt(max(_form(w, e0, e1, e2, e0, e1, e2), _ZERO))
-            # The shading's share of what is left: all of the mean when free, else the most
-            # probable part of it given how well it is known.
+            # The part of the residual that shading explains: all of the mean when free, else its
+            # most probable part given the shading's variance.
             shift = s0 * e0 + s1 * e1 + s2 * e2
             if free:
                 s *= _ONE + shift

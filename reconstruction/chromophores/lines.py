@@ -1,4 +1,4 @@
-"""Lines of equal melanin over a color table, which the weighing of chromophores goes along.
+"""Lines of equal melanin over a color table, along which posteriors are integrated.
 
 Both axes run evenly in the cube root of the volume fraction over its largest, from
 `MIN_AXIS_FRACTION` to 1.
@@ -14,13 +14,13 @@ from reconstruction.arrays import Float64Array
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION, evaluate_table
 
 N_LINES = 49
-"""Values of melanin at which there is a line."""
+"""Number of lines, each at one melanin value."""
 N_LINE_NODES = 65
-"""Values of blood that each line's colors are stored at."""
+"""Blood values at which each line's colors are stored."""
 NODES_PER_LINE = 32
-"""Nodes of melanin's probability from line to line."""
+"""Nodes of melanin's probability per line interval."""
 MELANIN_AXIS = np.linspace(float(MIN_AXIS_FRACTION), 1.0, (N_LINES - 1) * NODES_PER_LINE + 1)
-"""Fractions of the melanin axis, its cube root, that they stand at."""
+"""Fractions of the melanin axis, its cube root, at these nodes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,7 +28,7 @@ class EqualMelaninLines:
     """Log colors of skin along lines of equal melanin, each array (LINES, NODES, 3)."""
 
     log_rgb: Float64Array
-    """Natural logarithm of the color over that of a white tile."""
+    """Natural logarithm of the color over that of a white reference."""
     by_a: Float64Array
     """Derivative by the fraction of the melanin axis."""
     by_b: Float64Array
@@ -37,7 +37,7 @@ class EqualMelaninLines:
 
 @lru_cache(maxsize=16)
 def equal_melanin_lines(table: ColorTable) -> EqualMelaninLines:
-    """Return the lines of a table; kept for the tables used last."""
+    """Return the lines of a table, cached for the tables used last."""
     low = float(MIN_AXIS_FRACTION)
     a, b = np.meshgrid(
         np.linspace(low, 1.0, N_LINES), np.linspace(low, 1.0, N_LINE_NODES), indexing="ij"

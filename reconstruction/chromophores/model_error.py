@@ -1,16 +1,16 @@
-"""How far the layered model is from what a camera sees, and how faces are lit.
+"""Model error of skin colors, and the distribution of light on faces.
 
-Three things part the color of a pixel from the model's color of its chromophores, apart from noise:
+Apart from noise, three errors separate a pixel's color from the model's color of its chromophores:
 
-- the layered model is not transport of light (`ColorErrors.transport`);
-- the sites of a color filter array stand beside each other: what is finer than a pixel shows as
-  color. How much there is of it, the picture itself tells: by what neighboring pixels differ after
-  all that is smooth is taken away. So it follows skin and resolution (`ColorErrors.fine`);
-- in hollows skin is lit by skin, whose light has its color. The part is the larger, the lighter
-  skin is (`ColorErrors.bounced`).
+- the layered model is not full light transport (`ColorErrors.transport`);
+- the sites of a color filter array sample different positions, so that structure finer than a pixel
+  appears as color. Its amount is estimated per image from differences between neighboring pixels
+  after smooth parts are removed, so it follows skin and resolution (`ColorErrors.fine`);
+- in hollows, interreflection adds light with the color of skin. It increases with the skin's
+  reflectance (`ColorErrors.interreflection`).
 
 All are relative errors of white-balanced camera RGB, fitted on simulated subjects of seeds 0 to 19
-at two resolutions by ``tools/fit_model_error.py``; judge them on others.
+at two resolutions by ``tools/fit_model_error.py``; evaluate them on other seeds.
 """
 
 import hashlib
@@ -30,9 +30,9 @@ MODEL_ERROR_FILE = "data/chromophore_model_error.json"
 
 
 FOURTH_DIFFERENCE: Final = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
-"""Fourth differences, 1 at the middle: what is cubic over 5 pixels leaves nothing."""
+"""Fourth differences, 1 at the middle: a cubic over 5 pixels gives 0."""
 STRUCTURE_WINDOW_PX: Final = 1.5
-"""Standard deviation of the window that squares of differences are averaged in, px."""
+"""Standard deviation of the window that averages squared differences, px."""
 _WINDOW_REACH_PX: Final = int(4.0 * STRUCTURE_WINDOW_PX + 0.5)
 _BAND_PIXELS: Final = 1 << 16
 
@@ -42,12 +42,12 @@ class ColorErrors:
     """Terms of the relative error of a pixel's color."""
 
     transport: Float64Array
-    """(3, 3): covariance of what every pixel has."""
+    """(3, 3): covariance common to all pixels."""
     fine: Float64Array
     """(3, 3): covariance over the mean square of fine structure."""
     interreflection: float
-    """Standard deviation of the light from other skin, over the light and reflectance of a pixel;
-    the light is that on a white tile."""
+    """Standard deviation of the interreflected light over a pixel's light and reflectance; light is
+    relative to a white reference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,24 +59,24 @@ class ShadingHistogram:
     step: float
     """Width of a bin."""
     counts: tuple[int, ...]
-    """How many fell in each."""
+    """Number of pixels per bin."""
 
 
 @lru_cache(maxsize=1)
 def load_covariance() -> Float64Array:
     """Return the covariance of log color that the model leaves unexplained, (3, 3), of all pixels.
 
-    For where there is no picture to tell fine structure by; elsewhere `image_covariance` knows
-    more. Of the logarithm of white-balanced camera RGB, between what the table predicts for the
-    true chromophores and what a capture shows with its noise taken away; scaled so that with
-    noise 68 % of errors lie inside the 68 % ellipse.
+    Use it without an image; with one, `image_covariance` adds its fine structure. The logarithm is
+    of white-balanced camera RGB, the difference between the table's color of the true chromophores
+    and a noise-free capture. It is scaled so that, with noise, 68 % of errors are inside the 68 %
+    ellipse.
     """
     return np.array(_document()["log_covariance"], np.float64)
 
 
 @lru_cache(maxsize=1)
 def load_error_terms() -> ColorErrors:
-    """Return the terms of a pixel's error."""
+    """Load the terms of a pixel's error from the data file."""
     found = _document()["by_picture"]
     return ColorErrors(
         np.array(found["transport"], np.float64),
@@ -88,22 +88,22 @@ def load_error_terms() -> ColorErrors:
 def image_covariance(
     rgb: FloatArray, variance: FloatArray, valid: BoolArray, *, errors: ColorErrors | None = None
 ) -> Float64Array:
-    """Return the covariance of each pixel's relative error beside noise, (H, W, 3, 3).
+    """Return the covariance of each pixel's relative error without noise, (H, W, 3, 3).
 
     Parameters
     ----------
     rgb
-        (H, W, 3): diffuse reflectance, white-balanced linear camera RGB, a white tile is 1.
+        (H, W, 3): diffuse reflectance, white-balanced linear camera RGB, a white reference is 1.
     variance
-        (H, W, 3): its noise, which is no structure.
+        (H, W, 3): variance of its noise, which is subtracted from the structure.
     valid
-        (H, W): pixels of skin; others count for nothing and get the transport term alone.
+        (H, W): pixels of skin; others are ignored and get the transport term alone.
     errors
-        The terms; None: those of the shipped data.
+        Error terms; None: those of the data file.
 
     Notes
     -----
-    The part common to the channels is left out: it is brightness, which shading leaves open.
+    The brightness part common to the channels is omitted, because shading leaves it free.
 
     Examples
     --------
@@ -126,14 +126,14 @@ def image_covariance(
 
 
 def _bands(shape: tuple[int, ...]) -> Iterator[slice]:
-    """Yield rows of a picture by bands: copies of the whole of it need gigabytes."""
+    """Yield bands of rows: copies of a whole image need gigabytes."""
     count = max(1, _BAND_PIXELS // max(shape[1], 1))
     for start in range(0, shape[0], count):
         yield slice(start, min(start + count, shape[0]))
 
 
 def _with_rim(rows: slice, rim: int, height: int) -> tuple[slice, slice]:
-    """Return a band with `rim` rows more on either side, and where in it the band itself is."""
+    """Return a band with `rim` more rows on either side, and the band's position in it."""
     first = max(rows.start - rim, 0)
     return slice(first, min(rows.stop + rim, height)), slice(rows.start - first, rows.stop - first)
 
@@ -141,13 +141,13 @@ def _with_rim(rows: slice, rim: int, height: int) -> tuple[slice, slice]:
 def usable_pixels(
     rgb: FloatArray, valid: BoolArray, variance: FloatArray | None = None
 ) -> BoolArray:
-    """Return where a picture has a color that has a logarithm, and known noise, (H, W).
+    """Return where the logarithm of the color and the noise are finite, (H, W).
 
     Parameters
     ----------
     rgb, valid, variance
-        As of `image_covariance`; without a variance noise is not asked for. A single pixel whose
-        noise over its color is no number would spoil what is said of all around it.
+        See `image_covariance`; without a variance noise is not checked. One pixel with undefined
+        relative noise would invalidate the average of its whole neighborhood.
     """
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         good = valid & np.isfinite(rgb).all(axis=-1) & (rgb > 0.0).all(axis=-1)
@@ -167,8 +167,8 @@ def fine_structure(rgb: FloatArray, variance: FloatArray, valid: BoolArray) -> F
     Returns
     -------
     ndarray of float64
-        Mean over the channels and over both directions, less what noise gives, not below 0; the
-        picture's mean where no five pixels in a row are valid near by; 0 where not valid.
+        Mean over the channels and over both directions, minus the noise's part, not below 0; the
+        image's mean where five valid pixels in a row are not near; 0 where not valid.
 
     Examples
     --------
@@ -201,7 +201,8 @@ def fine_structure(rgb: FloatArray, variance: FloatArray, valid: BoolArray) -> F
 def _squared_differences(
     rgb: FloatArray, variance: FloatArray, valid: BoolArray
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the sum of log color's squared fourth differences over both axes, and how many."""
+    """Return the sum of log color's squared fourth differences over both axes, and their count."""
+    # noise of variance v in log color adds sum_k w_k^2 v to a squared difference of weights w_k
     safe = np.where(valid[..., None], rgb, 1.0).astype(np.float64)
     log_rgb = np.log(safe)
     noise = np.where(valid, (variance / safe**2).mean(axis=-1), 0.0)
@@ -229,7 +230,7 @@ def _squared_differences(
 
 
 def load_shading_histogram() -> ShadingHistogram:
-    """Return how log shading is distributed over the skin of the same subjects."""
+    """Load the histogram of log shading over the skin of the same subjects."""
     found = _document()["log_shading"]
     return ShadingHistogram(
         float(found["low"]), float(found["step"]), tuple(map(int, found["counts"]))
@@ -237,7 +238,7 @@ def load_shading_histogram() -> ShadingHistogram:
 
 
 def data_hash() -> dict[str, str]:
-    """Return the hash of the data, for the parameters of a stage."""
+    """Return the hash of the data file, for the parameters of a stage."""
     text = json.dumps(_document(), sort_keys=True)
     return {"model_error": hashlib.sha256(text.encode("utf-8")).hexdigest()}
 

@@ -1,7 +1,7 @@
-"""Checks of pixels: of what goes along with them, and of where an estimate exceeds its error.
+"""Check arrays of pixels, and detect where an estimate exceeds its standard error.
 
-Asking each pixel alone whether its estimate exceeds its error keeps the pixels that noise made
-large and drops the others: what is kept is then far too high, with errors that look small.
+Testing each pixel alone would keep the pixels that noise made large and drop the others: the kept
+values would be biased high, with errors that look small. The test therefore uses local means.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ MAX_RELATIVE_STDERR = 0.5
 
 
 class ChromophoreError(ValueError):
-    """Arguments of the chromophore fit that do not fit each other."""
+    """Arguments of the chromophore fit with mismatched shapes or values."""
 
 
 def is_usable_color(colors: FloatArray) -> BoolArray:
@@ -33,13 +33,16 @@ def check_mask(valid: ArrayLike, shape: tuple[int, ...]) -> BoolArray:
 
 
 def broadcast_to_pixels(name: str, array: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    """Return what goes along with pixels broadcast to a shape, or raise `ChromophoreError`."""
+    """Broadcast an array to the pixels' shape, or raise `ChromophoreError`."""
     values = np.asarray(array)
     try:
         return np.broadcast_to(values, shape)
     except ValueError as error:
         expected = f"a number or a shape that broadcasts to {shape}"
-        raise ChromophoreError(f"{name}: got {values.shape}, expected {expected}") from error
+        hint = "give one value per pixel or one for all"
+        raise ChromophoreError(
+            f"{name}: got {values.shape}, expected {expected}; {hint}"
+        ) from error
 
 
 def check_colors(rgb: ArrayLike, *leading: str) -> Float32Array:
@@ -60,16 +63,16 @@ def check_colors(rgb: ArrayLike, *leading: str) -> Float32Array:
 def is_detectable(
     estimate: FloatArray, stderr: FloatArray, valid: BoolArray, *, size_px: int = NEIGHBORHOOD_PX
 ) -> BoolArray:
-    """Return where the mean standard error around is small against the mean estimate around.
+    """Return where the local mean standard error is small against the local mean estimate.
 
-    It is up to `MAX_RELATIVE_STDERR` of it.
+    Its ratio is at most `MAX_RELATIVE_STDERR`.
 
     Parameters
     ----------
     estimate, stderr
         (H, W).
     valid
-        (H, W); other pixels do not count and are not detectable.
+        (H, W); other pixels are ignored and not detectable.
     size_px
         Side of the square neighborhood, odd.
 

@@ -1,11 +1,11 @@
-"""Melanin and hemoglobin of a pixel whose light is known only in distribution.
+"""Posterior of melanin and hemoglobin per pixel, with shading known only in distribution.
 
 Skin of more than a few percent melanin has the color of lighter skin in less light. A fit must
-decide for one of them, and its standard error then knows nothing of the other. Here all pairs of
-chromophores are weighed: by the color, with noise and model error, by how probable the light is
-that they would need, and, where that is known, by how melanin and blood are distributed over the
-face. The estimate is the median of what remains, its standard error reaches as far as 68 % of the
-probability, over both solutions where both are possible.
+choose one of these solutions, and its standard error excludes the other. Here the posterior covers
+all pairs of chromophores: the likelihood of the color, with noise and model error; the prior of the
+shading that they imply; and, where known, the distribution of melanin and blood over the face. The
+estimate is the posterior median. Its 68 % credible half-width covers both solutions where both are
+possible.
 """
 
 from dataclasses import dataclass
@@ -31,34 +31,34 @@ from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 
 MIN_RELATIVE_NOISE = 2e-4
-"""Least relative error of a color that is told apart: smaller noise is taken for this much, with
-which melanin is known to some 0.3 percent."""
+"""Minimum relative error of a color; smaller noise is raised to it. It corresponds to some 0.3
+percent of melanin."""
 _TASK_PIXELS = 1024
 _BAND_PIXELS = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
 class ChromophorePosterior:
-    """Medians and 68 % reaches; every map has the pixels' shape."""
+    """Medians and 68 % credible half-widths; every map has the pixels' shape."""
 
     melanin: Float32Array
     """Volume fraction of melanin in the epidermis: the median; NaN where the input is unusable."""
     hemoglobin: Float32Array
     """Volume fraction of blood in the dermis: the median; NaN where the input is unusable."""
     shading: Float32Array
-    """Light on the pixel over that on a white tile: the mean of its logarithm, as a factor."""
+    """Light on the pixel over that on a white reference: exponential of the mean logarithm."""
     stderr_melanin: Float32Array
-    """Distance from `melanin` within which 68.3 % of the probability lies; of a normal
-    distribution it is the standard deviation."""
+    """68 % credible half-width: distance from `melanin` that contains 68.3 % of the probability;
+    the standard deviation for a normal distribution."""
     stderr_hemoglobin: Float32Array
-    """The same of `hemoglobin`."""
+    """68 % credible half-width of `hemoglobin`."""
     residual: Float32Array
-    """Root of the weighted square sum of what the best color leaves, in standard errors."""
+    """Root of the weighted square sum of the best color's residuals, in standard errors."""
     gamut_distance: Float32Array
-    """How far the nearest color of the table is: root mean square relative difference."""
+    """Distance to the table's nearest color: root mean square relative difference."""
     outside: BoolArray
-    """The color does not belong to the table, see `reconstruction.chromophores`: by the usual model
-    error, or by the pixel's own."""
+    """The color does not belong to the table, see `reconstruction.chromophores`, by the mean model
+    error or by the pixel's own."""
     valid: BoolArray
     """Usable input, and not `outside`."""
 
@@ -73,19 +73,19 @@ def estimate(
     model_error: ArrayLike | None = None,
     valid: ArrayLike | None = None,
 ) -> ChromophorePosterior:
-    """Estimate melanin and hemoglobin of every pixel from all solutions that are possible.
+    """Estimate the posterior of melanin and hemoglobin of every pixel over all solutions.
 
     Parameters
     ----------
     rgb
-        Shape (..., 3): light of the pixel over that of a white tile, linear camera RGB.
+        Shape (..., 3): light of the pixel over that of a white reference, linear camera RGB.
     table
-        Color table of the camera and the light that took the picture.
+        Color table of the camera and the illumination of the image.
     prior
-        How the pixels' shading is distributed.
+        Distribution of the pixels' shading.
     face
-        How melanin and blood are over the face, see `reconstruction.chromophores.face`. None: any
-        are as probable.
+        Distribution of melanin and blood over the face, see `reconstruction.chromophores.face`.
+        None: the priors of the notes.
     variance
         Noise variance of `rgb`, broadcast to its shape. None: 1 percent of each channel.
     model_error
@@ -97,23 +97,22 @@ def estimate(
     Returns
     -------
     ChromophorePosterior
-        Estimates, 68 % reaches and masks of the pixels' shape.
+        Medians, 68 % credible half-widths and masks of the pixels' shape.
 
     Raises
     ------
     ChromophoreError
-        When shapes do not fit, or the model error is no covariance.
+        When shapes do not match, or the model error is not a covariance.
 
     Notes
     -----
-    Beforehand every ratio of melanin is as probable as any other (log-uniform), and so is every
-    cube root of blood, unless a `face` says more. The prior of the shading must be wide against
-    noise and model error: it is taken as constant over the shadings that one pair of chromophores
-    leaves open. Intervals cover 68 % over skin as it is distributed beforehand, not for each skin
-    or each shade by itself; near the ends of the table, where no skin is beyond, they cover more.
-    Along melanin the blood of the best color is followed: without a `face` other blood with the
-    same melanin and color may be passed over (of 12 % melanin a standard error of it may come out
-    a quarter too small).
+    The prior of melanin is log-uniform, and that of blood uniform in its cube root, unless `face`
+    replaces them. The prior of the shading must be wide against noise and model error: it is taken
+    as constant over the shadings that one pair of chromophores leaves open. The coverage of 68 %
+    holds on average over skin drawn from the prior, not for each skin or shade; near the ends of
+    the table the intervals cover more. The integration follows the best blood along melanin:
+    without a `face` it can miss other blood with the same melanin and color (at 12 % melanin a
+    half-width can be a quarter too small).
 
     Examples
     --------
@@ -158,8 +157,8 @@ def estimate(
         _TASK_PIXELS,
     )
     named = dict(zip(ridge.POSTERIOR_MAPS, maps.reshape(len(maps), *shape), strict=True))
-    # the rough fit knew the usual model error alone: of a picture with much else than skin it is
-    # far too large
+    # the start fit used the mean model error, which is far too large in an image with much
+    # background, so the residual is tested again with each pixel's own error
     outside = fitted.outside | (
         (named["residual"] > OUTSIDE_SIGMAS) & (fitted.gamut_distance > OUTSIDE_DISTANCE)
     )
@@ -174,7 +173,7 @@ def estimate(
 def _face_prior_costs(
     face: FaceDistribution | None, table: ColorTable
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the kernel's -2 log probability of melanin, and its four numbers of blood."""
+    """Return the kernel's -2 log prior of melanin, and its four parameters of blood."""
     if face is None:
         return np.zeros(MELANIN_AXIS.size), np.array([0.5, 1.0, 0.0, 1.0])
     density = face.melanin.relative_density(np.log(table.c_m_max * MELANIN_AXIS**3))
@@ -191,9 +190,9 @@ _UPPER_TRIANGLE = np.triu_indices(3)
 def _covariances(
     model_error: ArrayLike | None, shape: tuple[int, ...], default_noise: bool
 ) -> tuple[ArrayLike | None, Float64Array]:
-    """Return the usual model error, and the upper triangles that pixels are weighed by, (m, 6).
+    """Return the mean model error, and the upper triangles of the pixels' covariances, (m, 6).
 
-    A rough fit by the usual one only finds where to begin.
+    The mean error serves only the fit that finds the starting point.
     """
     each = np.asarray(0.0 if model_error is None else model_error, dtype=np.float64)
     if each.ndim < 3:
@@ -205,7 +204,7 @@ def _covariances(
     each = each.reshape(-1, 3, 3)
     floor = (DEFAULT_RELATIVE_NOISE**2 if default_noise else 1e-12) + MIN_RELATIVE_NOISE**2
     triangles = np.empty((len(each), 6))
-    for start in range(0, len(each), _BAND_PIXELS):  # copies of a whole picture need gigabytes
+    for start in range(0, len(each), _BAND_PIXELS):  # copies of a whole image need gigabytes
         band = each[start : start + _BAND_PIXELS]
         diagonal = np.einsum("nii->ni", band)
         check.within("model_error", band)

@@ -1,17 +1,16 @@
-"""Weighs all pairs of chromophores that a color allows, one pixel after the other, in parallel.
+"""Integrate the posterior over all pairs of chromophores, one pixel at a time, in parallel.
 
-For every melanin of a grid the blood that fits best is followed along the ridge of the
-likelihood, over the fold where dark skin takes the colors of lighter skin; between the grid's
-lines the cost is interpolated by its values and slopes. Where it is known how blood and melanin
-are distributed over the face, the ridge is that of the product, and each line is looked at from
-the face's blood too. `reconstruction.chromophores.posterior` is the door;
-its tests sum the same over a dense plane.
+For every melanin of a grid, the integration follows the best blood along the ridge of the
+likelihood, over the fold where dark skin takes the colors of lighter skin. Between the grid's lines
+the cost is interpolated by its values and slopes. With a face distribution, the ridge is that of
+the product, and each line is also searched from the face's blood. Call it through
+`reconstruction.chromophores.posterior`; its tests sum the same over a dense plane.
 
 A pixel goes through `color_weights`, `follow_ridge`, `_min_ridge_cost`, `_evaluate_across_ridge`
-and `_integrate_ridge`. These hand on:
+and `_integrate_ridge`. Their common arguments are:
 
 - `seen`: natural logarithms of the pixel's color;
-- `w`, `s`: of `color_weights`;
+- `w`, `s`: results of `color_weights`;
 - `light`: -2 log probability of log shading at even nodes, the first of them, and their step;
 - `k`: a line of equal melanin; `a`, `b`: fractions of the melanin and the blood axis, cube roots of
   volume fractions over the largest;
@@ -44,23 +43,23 @@ from reconstruction.chromophores.ridge_kernels import (
 from reconstruction.compiled import FASTMATH_CONTRACT, PIXEL_KERNEL_OPTIONS, readonly_array_type
 
 N_PROBES = 8
-"""Places between two lines where the cost is looked at first."""
+"""Positions between two lines at which the cost is first evaluated."""
 N_FINE = 160
-"""Places that the probability is summed at, along melanin, spread over where there is any."""
+"""Positions along melanin at which the probability is summed, where it is not negligible."""
 MIN_NODES = 5
-"""Fewest of them between two lines."""
+"""Minimum number of them between two lines."""
 N_ACROSS = 8
-"""Places in blood, across the ridge, at each of them."""
+"""Positions in blood, across the ridge, at each of them."""
 SHAPE_EXTENT = 0.25
-"""Extent across the ridge, as a fraction of the axis, from which on its shape is looked at."""
+"""Extent across the ridge, as a fraction of the axis, above which its shape is sampled."""
 N_COARSE = 24
-"""Places that it is looked at, over the whole axis."""
+"""Number of these samples, over the whole axis."""
 NEGLIGIBLE_COST = 18.0
-"""Cost above the lowest from which on probability is left out: 1e-4 of the greatest."""
+"""Cost above the minimum beyond which probability is neglected: 1e-4 of the maximum."""
 N_BINS = 128
 """Bins of blood's probability."""
 N_HALVINGS = 20
-"""Halvings of the distance that holds one sigma's probability."""
+"""Bisections of the distance that contains one sigma's probability."""
 ONE_SIGMA_PROBABILITY = 0.682689492137086
 """Probability within one standard error of a normal distribution."""
 POSTERIOR_MAPS = (
@@ -76,23 +75,23 @@ _MAX_NODES = (N_LINES - 1) * MIN_NODES + N_FINE
 
 
 class _CrossRidge(NamedTuple):
-    """How probability spreads over blood on each line, across the ridge."""
+    """Distribution of probability over blood on each line, across the ridge."""
 
     across: Float64Array
-    """(LINES, ACROSS): probability of each place, relative to the ridge's."""
+    """(LINES, ACROSS): probability of each position, relative to the ridge's."""
     low: Float64Array
-    """(LINES,): where the first place begins."""
+    """(LINES,): start of the first position's interval."""
     width: Float64Array
-    """(LINES,): of a place."""
+    """(LINES,): width of the intervals."""
     wide: BoolArray
-    """(LINES,): the curvature says little, see `SHAPE_EXTENT`."""
+    """(LINES,): too wide for the curvature at the ridge, see `SHAPE_EXTENT`."""
     coarse: Float64Array
     """(COARSE,): costs on one wide line."""
 
 
 @njit(fastmath=FASTMATH_CONTRACT)
 def _volume(k, x, end):  # type: ignore[no-untyped-def]
-    """Return the volume fraction of melanin a part x of the way past line k."""
+    """Return the volume fraction of melanin at the fraction x of the way past line k."""
     a = AXIS_START + (k + x) * MELANIN_STEP
     return end * a * a * a
 
@@ -117,7 +116,7 @@ def _interpolate_inverse(values, at, count, wanted):  # type: ignore[no-untyped-
 
 @njit(fastmath=FASTMATH_CONTRACT)
 def _median_and_half_width(edges, total, count):  # type: ignore[no-untyped-def]
-    """Return the median, and the distance from it within which one sigma's probability lies.
+    """Return the median, and the distance from it that contains one sigma's probability.
 
     `total` is the cumulative probability at each of the `edges`, 0 at the first one.
     """
@@ -158,21 +157,23 @@ def _min_ridge_cost(ridge, light, melanin_of_face, between):  # type: ignore[no-
 
 @njit(fastmath=FASTMATH_CONTRACT, error_model="numpy")
 def _evaluate_across_ridge(  # type: ignore[no-untyped-def]
-    log_rgb, by_b, log_color, w, s, light, blood_of_face, between, lowest, ridge, beside_ridge
+    log_rgb, by_b, log_color, w, s, light, blood_of_face, between, lowest, ridge, cross_ridge
 ):
-    """Write how probability spreads over blood on each line that matters; return ends of blood."""
+    """Write the distribution of blood on each relevant line; return the range of blood."""
     cost, shade, blood, second = ridge.cost, ridge.log_shading, ridge.blood, ridge.second_blood
     spread, pull = ridge.blood_sd, ridge.clipped_step
-    across, coarse, wide = beside_ridge.across, beside_ridge.coarse, beside_ridge.wide
-    across_low, across_width = beside_ridge.low, beside_ridge.width
+    across, coarse, wide = cross_ridge.across, cross_ridge.coarse, cross_ridge.wide
+    across_low, across_width = cross_ridge.low, cross_ridge.width
     l0, l1, l2 = log_color
     s0, s1, s2 = s
     b_low, b_high = 1.0, AXIS_START
     for k in range(N_LINES):
-        beside = min(between[max(k - 1, 0)], between[min(k, N_LINES - 2)])
-        if not beside < lowest + NEGLIGIBLE_COST:
+        local_lowest = min(between[max(k - 1, 0)], between[min(k, N_LINES - 2)])
+        if not local_lowest < lowest + NEGLIGIBLE_COST:
             continue
         b = blood[k]
+        # A Gaussian of this standard deviation is sampled to 2.6 sigma; at an end of the axis its
+        # slope decays the density faster, on the scale sigma^2 / step.
         reach = 2.6 * spread[k]
         if pull[k] != 0.0:
             reach = min(reach, 5.0 * spread[k] * spread[k] / abs(pull[k]))
@@ -180,7 +181,7 @@ def _evaluate_across_ridge(  # type: ignore[no-untyped-def]
         high = min(max(b, second[k]) + reach, 1.0)
         wide[k] = high - low > SHAPE_EXTENT
         if wide[k]:
-            # The curvature says little of the far ends: look where probability ends.
+            # The curvature at the ridge does not predict the far ends: sample the whole line.
             width = (1.0 - AXIS_START) / N_COARSE
             least = np.inf
             for i in range(N_COARSE):
@@ -200,7 +201,7 @@ def _evaluate_across_ridge(  # type: ignore[no-untyped-def]
                     high = max(high, AXIS_START + min(i + 1.5, N_COARSE + 0.0) * width)
         width = (high - low) / N_ACROSS
         across_low[k], across_width[k] = low, width
-        if beside < lowest + 10.0:
+        if local_lowest < lowest + 10.0:
             b_low, b_high = min(b_low, low), max(b_high, high)
         here = cost[k] + prior_cost(light, shade[k])
         deepest = 0.0
@@ -214,8 +215,8 @@ def _evaluate_across_ridge(  # type: ignore[no-untyped-def]
             across[k, i] = width * math.exp(-0.5 * max(more, -NEGLIGIBLE_COST))
             deepest = min(deepest, max(more, -NEGLIGIBLE_COST))
         if deepest < -RIDGE_JUMP_COST:
-            # The ridge is not where the probability is; what lines have must not differ by
-            # much more than their neighbors', or the sum between them is of neither.
+            # The probability's maximum is off the ridge. Move the common factor to the line's cost,
+            # because the interpolation needs similar relative values on neighboring lines.
             cost[k] += deepest
             for i in range(N_ACROSS):
                 across[k, i] *= math.exp(0.5 * deepest)
@@ -224,16 +225,16 @@ def _evaluate_across_ridge(  # type: ignore[no-untyped-def]
 
 @njit(fastmath=FASTMATH_CONTRACT, error_model="numpy")
 def _integrate_ridge(  # type: ignore[no-untyped-def]
-    ridge, beside_ridge, between, lowest, light, melanin_of_face, end, blood_ends, sums
+    ridge, cross_ridge, between, lowest, light, melanin_of_face, end, blood_ends, sums
 ):
     """Sum over melanin along the ridge, and over blood across it.
 
-    Returns how many edges there are along melanin, the sum of log shadings, and bins a blood.
+    Returns the number of edges along melanin, the sum of log shadings, and bins per unit of blood.
     """
     cost, slope, shade = ridge.cost, ridge.slope, ridge.log_shading
     blood, blood_slope = ridge.blood, ridge.blood_slope
-    across, wide = beside_ridge.across, beside_ridge.wide
-    across_low, across_width = beside_ridge.low, beside_ridge.width
+    across, wide = cross_ridge.across, cross_ridge.wide
+    across_low, across_width = cross_ridge.low, cross_ridge.width
     edges_a, total_a, bins = sums
     b_low, b_high = blood_ends
     live = 0
@@ -262,7 +263,8 @@ def _integrate_ridge(  # type: ignore[no-untyped-def]
             value += melanin_cost(melanin_of_face, k, x)
             mass = 0.0
             if value < NEGLIGIBLE_COST:
-                # every ratio of melanin is as likely as any other
+                # The log-uniform prior in volume fraction c = c_max a^3 is dc/c = 3 da/a on the
+                # axis fraction a, hence the division by a.
                 weight = math.exp(-0.5 * value) / (each * (AXIS_START + (k + x) * MELANIN_STEP))
                 b = (1.0 - x) * across_low[k] + x * across_low[k + 1]
                 if not (wide[k] or wide[k + 1]):
@@ -275,7 +277,7 @@ def _integrate_ridge(  # type: ignore[no-untyped-def]
                 for i in range(N_ACROSS):
                     part = weight * (across[k, i] + x * (across[k + 1, i] - across[k, i]))
                     mass += part
-                    # one of the places fills as many bins as it is wide
+                    # spread the position's mass evenly over the bins that its interval covers
                     start = min(max(place + i * size, 0.0), N_BINS - 0.001)
                     stop = min(max(place + (i + 1) * size, start + 0.001), float64(N_BINS))
                     density = part / (stop - start)
@@ -333,14 +335,14 @@ def integrate_posteriors(  # type: ignore[no-untyped-def]
     maps,
     block,
 ):
-    """Weigh the chromophores of every pixel; the shapes are in the signature above."""
+    """Integrate the posterior of every pixel; the shapes are in the signature above."""
     pixels = rgb.shape[0]
     each_model = model.shape[0] > 1
     light = prior, prior_low, prior_step
     for task in prange((pixels + block - 1) // block):
         r = np.empty((9, N_LINES))
         ridge = Ridge(r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8])
-        beside = _CrossRidge(
+        cross_ridge = _CrossRidge(
             np.empty((N_LINES, N_ACROSS)),
             np.empty(N_LINES),
             np.empty(N_LINES),
@@ -362,18 +364,26 @@ def integrate_posteriors(  # type: ignore[no-untyped-def]
             follow_ridge(log_rgb, by_a, by_b, seen, w, s, light, blood_of_face, start[n], ridge)
             lowest, color_lowest = _min_ridge_cost(ridge, light, melanin_of_face, between)
             b_low, b_high = _evaluate_across_ridge(
-                log_rgb, by_b, seen, w, s, light, blood_of_face, between, lowest, ridge, beside
+                log_rgb, by_b, seen, w, s, light, blood_of_face, between, lowest, ridge, cross_ridge
             )
             sums = edges_a, total_a, bins
             blood_ends = b_low, b_high
             count, mean_shade, per_b = _integrate_ridge(
-                ridge, beside, between, lowest, light, melanin_of_face, ends[0], blood_ends, sums
+                ridge,
+                cross_ridge,
+                between,
+                lowest,
+                light,
+                melanin_of_face,
+                ends[0],
+                blood_ends,
+                sums,
             )
             edges_b[0], total_b[0] = ends[1] * b_low**3, 0.0
             for m in range(N_BINS):
                 edges_b[m + 1] = ends[1] * (b_low + (m + 1) / per_b) ** 3
                 total_b[m + 1] = total_b[m] + bins[m]
-            if not total_a[count] > 0.0:  # no place along the ridge has any probability
+            if not total_a[count] > 0.0:  # the posterior is 0 along the whole ridge
                 for m in range(6):
                     maps[m, n] = np.nan
                 continue

@@ -1,4 +1,4 @@
-"""Follows, for one pixel, the blood that fits best along the grid of melanin.
+"""Kernels that follow, for one pixel, the best blood along the grid of melanin.
 
 The arguments are those of `reconstruction.chromophores.posterior_kernels`.
 """
@@ -17,25 +17,25 @@ N_NEWTON_STEPS = 4
 MAX_RIDGE_STEP = 0.12
 """Longest step in blood, as a fraction of its axis."""
 STEP_TOL = 0.02
-"""Step, in standard errors of blood, after which the next one would not matter."""
+"""Step, in standard errors of blood, after which the next one is negligible."""
 ACCEPT_TOL = 1.0
-"""The same up to which the last step is taken for granted."""
+"""Step, in standard errors of blood, up to which the last one is accepted."""
 RIDGE_JUMP_COST = 2.0
-"""Cost below the ridge's from which on a place beside it is taken for the ridge."""
+"""Cost below the ridge's from which on another position on the line replaces it."""
 TAIL_COST = 8.0
-"""Cost above the lowest where the ends are set."""
+"""Cost above the minimum that defines the ends."""
 AXIS_START = float(MIN_AXIS_FRACTION)
 MELANIN_STEP = (1.0 - AXIS_START) / (N_LINES - 1)
 BLOOD_STEP = (1.0 - AXIS_START) / (N_LINE_NODES - 1)
 
 
 class Ridge(NamedTuple):
-    """What is found on each line, (LINES,) each: the ridge, where blood fits the color best."""
+    """Ridge of the likelihood, (LINES,) each: the best blood on each line."""
 
     cost: Float64Array
-    """-2 log of the likelihood and of the face's blood there."""
+    """-2 log of the product of the likelihood and the face's prior of blood."""
     slope: Float64Array
-    """Its derivative by the fraction of the melanin axis, along the ridge."""
+    """Derivative of the cost by the fraction of the melanin axis, along the ridge."""
     log_shading: Float64Array
     """Log shading."""
     face_cost: Float64Array
@@ -43,11 +43,11 @@ class Ridge(NamedTuple):
     blood: Float64Array
     blood_slope: Float64Array
     second_blood: Float64Array
-    """Blood of another place on the line that matters, else that of the ridge."""
+    """Blood at the line's second relevant position, else that at the ridge."""
     blood_sd: Float64Array
     """Standard deviation of blood by the curvature."""
     clipped_step: Float64Array
-    """Step that would be left where an end of the axis holds the ridge; else 0."""
+    """Remaining step where an end of the axis limits the ridge; else 0."""
 
 
 @njit(fastmath=FASTMATH_CONTRACT)
@@ -76,7 +76,7 @@ def hermite(v0, v1, d0, d1, x, step):  # type: ignore[no-untyped-def]
 
 @njit(fastmath=FASTMATH_CONTRACT)
 def color_at(log_rgb, by_b, k, b):  # type: ignore[no-untyped-def]
-    """Return the log color and its derivative by blood on line k, the node and the way past it."""
+    """Return line k's log color, its derivative by blood, the node, and the fraction past it."""
     y = (b - AXIS_START) / BLOOD_STEP
     j = min(int(y), N_LINE_NODES - 2)
     x = y - j
@@ -89,7 +89,7 @@ def color_at(log_rgb, by_b, k, b):  # type: ignore[no-untyped-def]
 
 @njit(fastmath=FASTMATH_CONTRACT)
 def prior_cost(light, t):  # type: ignore[no-untyped-def]
-    """Return -2 log p of a log shading; beyond the table its ends go on straight."""
+    """Return -2 log p of a log shading, extrapolated linearly beyond the table."""
     prior, low, step = light
     y = (t - low) / step
     i = min(max(math.floor(y), 0), prior.shape[0] - 2)
@@ -100,8 +100,8 @@ def prior_cost(light, t):  # type: ignore[no-untyped-def]
 def blood_cost(of_face, b):  # type: ignore[no-untyped-def]
     """Return -2 log p of blood over the greatest p, its force on b, and its stiffness, >= 0.
 
-    `face_trials`: mean, spread, height of the bell over that of any blood, part of the skin with
-    any; 1 if there is no face.
+    `of_face`: mean, standard deviation, peak density over the uniform density, and uniform
+    fraction, which is 1 without a face.
     """
     away = (b - of_face[0]) / of_face[1]
     bell = (1.0 - of_face[3]) * of_face[2] * math.exp(-0.5 * away * away)
@@ -113,7 +113,7 @@ def blood_cost(of_face, b):  # type: ignore[no-untyped-def]
 
 @njit(fastmath=FASTMATH_CONTRACT)
 def melanin_cost(of_face, k, x):  # type: ignore[no-untyped-def]
-    """Return -2 log p of melanin over the greatest p, a part x of the way past line k."""
+    """Return -2 log p of melanin over the greatest p, at the fraction x past line k."""
     y = x * NODES_PER_LINE
     i = min(int(y), NODES_PER_LINE - 1)
     i0 = k * NODES_PER_LINE + i
@@ -122,10 +122,10 @@ def melanin_cost(of_face, k, x):  # type: ignore[no-untyped-def]
 
 @njit(fastmath=FASTMATH_CONTRACT)
 def fit_blood(log_rgb, by_b, k, b, log_color, w, of_face):  # type: ignore[no-untyped-def]
-    """Return the blood on line k near which color and face are the most probable.
+    """Return the blood on line k that locally maximizes the product of likelihood and prior.
 
-    Also the last step that would be left, by how much blood is stiff there by the color and in
-    all, the residuals' products with the color's derivative and themselves, and residuals.
+    Also returns the remaining step, the stiffness of blood by the color and in total, the
+    residuals' products with the color's derivative and themselves, and the residuals.
     """
     for turn in range(N_NEWTON_STEPS + 1):
         f0, f1, f2, g0, g1, g2, j, x = color_at(log_rgb, by_b, k, b)
@@ -139,7 +139,7 @@ def fit_blood(log_rgb, by_b, k, b, log_color, w, of_face):  # type: ignore[no-un
             break
         b += moved
     if step * step * (by_color + stiff) > ACCEPT_TOL * ACCEPT_TOL:
-        step = 0.0  # not found: what a parabola says of places that far off is worth nothing
+        step = 0.0  # not converged: the parabola is not valid over such a distance
     return b, step, by_color, by_color + stiff, pushed, e0, e1, e2, g0, g1, g2, j, x
 
 
@@ -147,7 +147,7 @@ def fit_blood(log_rgb, by_b, k, b, log_color, w, of_face):  # type: ignore[no-un
 def final_cost(w, s, found, of_face):  # type: ignore[no-untyped-def]
     """Return blood, cost, the face's part of it and shading after the last step of `fit_blood`.
 
-    Also whether it is held: a place at an end of the axis that would go on stays there.
+    Also returns whether an end of the axis limits blood.
     """
     b, step, by_color, _, pushed, e0, e1, e2, g0, g1, g2 = found[:11]
     held = (b <= AXIS_START and step < 0.0) or (b >= 1.0 and step > 0.0)
@@ -164,10 +164,10 @@ def final_cost(w, s, found, of_face):  # type: ignore[no-untyped-def]
 
 @njit(fastmath=FASTMATH_CONTRACT, error_model="numpy")
 def color_weights(d0, d1, d2, noise, model):  # type: ignore[no-untyped-def]
-    """Return the weights of relative errors of a color, brightness projected out, and its own.
+    """Return color weights with brightness projected out, and the weights of brightness.
 
-    The first is the upper triangle of a matrix of rank 2; the second tells a log brightness from
-    log residuals.
+    The first is the upper triangle of a matrix of rank 2; the second gives log brightness from
+    log residuals: W - W 1 1' W / (1' W 1) and s = W 1 / (1' W 1) for the inverse covariance W.
     """
     a00 = noise[0] / (d0 * d0) + model[0]
     a11 = noise[1] / (d1 * d1) + model[3]
@@ -195,7 +195,7 @@ def color_weights(d0, d1, d2, noise, model):  # type: ignore[no-untyped-def]
 
 @njit(fastmath=FASTMATH_CONTRACT, error_model="numpy")
 def follow_ridge(log_rgb, by_a, by_b, log_color, w, s, light, blood_of_face, begin, ridge):  # type: ignore[no-untyped-def]
-    """Write the ridge, followed to both sides of where the fit ended."""
+    """Follow the ridge from the start fit to both sides, and write it."""
     cost, slope, shade, face_cost = ridge.cost, ridge.slope, ridge.log_shading, ridge.face_cost
     blood, blood_slope, second = ridge.blood, ridge.blood_slope, ridge.second_blood
     spread, pull = ridge.blood_sd, ridge.clipped_step
@@ -211,7 +211,7 @@ def follow_ridge(log_rgb, by_a, by_b, log_color, w, s, light, blood_of_face, beg
             after, least, more, t, held = final_cost(w, s, found, blood_of_face)
             b, second[k] = found[0], after
             if abs(after - blood_of_face[0]) > 2.0 * blood_of_face[1]:
-                # the same melanin may have the color with blood that the face has
+                # the same melanin can also match the color with the face's blood
                 other = fit_blood(log_rgb, by_b, k, blood_of_face[0], log_color, w, blood_of_face)
                 o_after, o_least, o_more, o_t, o_held = final_cost(w, s, other, blood_of_face)
                 better = least + prior_cost(light, t)

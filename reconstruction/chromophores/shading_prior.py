@@ -1,8 +1,8 @@
-"""How much light a pixel of a face may get, before its color is looked at.
+"""Prior distribution of the shading of a face's pixels.
 
-Light on a face over that on a white tile in its place has no bell's shape: skin that faces the
-flashes gets about the tile's light and hardly ever more, and what turns away gets less, down to
-nothing. The prior is therefore the distribution itself, as measured on simulated faces.
+Light on a face over that on a white reference in its place is not normally distributed. Skin that
+faces the flashes gets about the reference's light, rarely more. Skin turned away gets less, down to
+0. The prior is therefore the distribution measured on simulated faces.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from reconstruction.arrays import Float64Array
 from reconstruction.chromophores import model_error
 
 LOG_SHADING_SOFTNESS = 0.1
-"""Spread of log shading that is added to the measured one: a face 5 % of its distance off the
-tile's place gets 10 % more or less light."""
+"""Standard deviation of log shading added to the measured one: a face off the reference's position
+by 5 % of its distance gets 10 % more or less light."""
 CONTAMINATION_PROBABILITY = 0.01
-"""Probability that a pixel does not follow the distribution at all ..."""
+"""Probability that a pixel does not follow the distribution ..."""
 CONTAMINATION_LOG_SIGMA = 1.5
-"""... but a normal one this wide in log shading, about the same mean."""
+"""... but a normal one with this standard deviation of log shading and the same mean."""
 _LOG_LOW, _LOG_HIGH, _LOG_STEP = -8.0, 5.0, 0.05
 MIN_SOFTNESS = _LOG_STEP
-"""Least softness: the bins' and nodes' own width."""
+"""Minimum softness: the width of the bins and of the nodes' spacing."""
 
 
 class ShadingPriorError(ValueError):
-    """A distribution of shading that is none."""
+    """An invalid distribution of shading."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +40,7 @@ class ShadingPrior:
     Attributes
     ----------
     low, step
-        Log shading at the first node, and from node to node.
+        Log shading at the first node, and the nodes' spacing.
     density
         (n,) at the nodes, positive; its sum times ``step`` is 1.
     """
@@ -50,7 +50,7 @@ class ShadingPrior:
     density: Float64Array
 
     def __post_init__(self) -> None:
-        """Refuse what is no density."""
+        """Refuse an invalid density."""
         check, size = Checks(ShadingPriorError), max(np.size(self.density), 2)
         density = check.numbers("density", self.density, (size,), interval="(0, inf)")
         check.within("low", self.low)
@@ -75,12 +75,12 @@ class ShadingPrior:
         return float(np.sqrt(((self.nodes - self.mean) ** 2 * self.density).sum() * self.step))
 
     def broaden(self, log_sd: float) -> ShadingPrior:
-        """Return the prior with an unknown exposure: a normal spread of log shading more.
+        """Convolve the prior with a normal distribution of log shading, for an unknown exposure.
 
         Examples
         --------
         >>> prior = lognormal_prior(0.7, 0.3).broaden(0.4)
-        >>> round(prior.spread, 3)
+        >>> round(prior.sd, 3)
         0.5
         """
         Checks(ShadingPriorError).within("log_sd", log_sd, "(0, 2)")
@@ -93,7 +93,7 @@ class ShadingPrior:
 
 
 def lognormal_prior(center: float, log_sd: float) -> ShadingPrior:
-    """Return a prior without a rig's shape: log shading is normal around log ``center``.
+    """Return a log-normal prior around ``center``, for rigs without a measured distribution.
 
     Examples
     --------
@@ -102,7 +102,7 @@ def lognormal_prior(center: float, log_sd: float) -> ShadingPrior:
     """
     Checks(ShadingPriorError).within("center, spread", (center, log_sd), "(0, inf]")
     step = log_sd / 12.0
-    reach = np.arange(-96, 97)  # 8 spreads
+    reach = np.arange(-96, 97)  # 8 standard deviations
     return ShadingPrior(
         math.log(center) + reach[0] * step, step, np.exp(-0.5 * (reach / 12.0) ** 2)
     )
@@ -111,16 +111,16 @@ def lognormal_prior(center: float, log_sd: float) -> ShadingPrior:
 def prior_from_histogram(
     low: float, step: float, counts: ArrayLike, *, softness: float = LOG_SHADING_SOFTNESS
 ) -> ShadingPrior:
-    """Return the prior that a histogram of log shading gives, a little softened.
+    """Return the prior of a histogram of log shading, slightly smoothed.
 
     Parameters
     ----------
     low, step
         Lower edge and width of the bins, in log shading; between -7 and 4.
     counts
-        (n,) what fell into the bins.
+        (n,) counts of the bins.
     softness
-        Spread of log shading that is added, 0.05 or more: the nodes stand that far apart.
+        Standard deviation of log shading that is added, at least 0.05, the nodes' spacing.
     """
     check = Checks(ShadingPriorError)
     check.within("softness", softness, f"[{_LOG_STEP}, 2)")
@@ -141,17 +141,16 @@ def prior_from_histogram(
 
 
 def face_prior(*, softness: float = LOG_SHADING_SOFTNESS) -> ShadingPrior:
-    """Return the prior of a face before the flash rig, relative to a white tile in its place.
+    """Return the prior of a face before the flash rig, relative to a white reference in place.
 
-    The distribution over the skin of the simulated subjects of seeds 0 to 19, all skin types, in
-    their mean and width and shape; ``tools/fit_model_error.py`` measures it. No other seeds set it.
-    `softness` as of `prior_from_histogram`: as small as it gets for light that a face's pixels do
-    not have in common.
+    Distribution over the skin of the simulated subjects of seeds 0 to 19, all skin types, measured
+    by ``tools/fit_model_error.py``. Other seeds are free for evaluation. `softness` as in
+    `prior_from_histogram`: minimal for light that varies from pixel to pixel.
 
     Examples
     --------
     >>> prior = face_prior()
-    >>> bool(-0.7 < prior.mean < -0.3), bool(0.5 < prior.spread < 0.8)
+    >>> bool(-0.7 < prior.mean < -0.3), bool(0.5 < prior.sd < 0.8)
     (True, True)
     """
     found = model_error.load_shading_histogram()

@@ -1,10 +1,10 @@
-"""Where the chromophore fit starts: the color table turned round, on a grid of log colors.
+"""Start values of the chromophore fit: the color table inverted on a grid of log colors.
 
 With the shading known there is a direction in log RGB along which the table's surface can be
 projected on a plane without folding, so that each point of the plane has one pair of
 chromophores. With the shading free the direction is that of gray, and dark skin folds back over
-lighter skin: the start then lies on the light side of the fold, and the grid remembers how light
-the other solution would be.
+lighter skin. The start is then on the light side of the fold, and the grid stores the brightness of
+the other solution.
 """
 
 from dataclasses import dataclass
@@ -23,20 +23,20 @@ MIN_AXIS_FRACTION = 0.04
 START_GRID_SIZE = 256
 """Nodes along each axis of the start grid."""
 _SAMPLES_PER_AXIS = 384  # colors along each axis of the table that the grid is filled from
-_PLANE_MARGIN = 0.02  # share of the plane's extent around the table's colors
+_PLANE_MARGIN = 0.02  # fraction of the plane's extent around the table's colors
 _POLISH_STEPS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InverseColorTable:
-    """The turned table: from a projected log color to fractions of the table's axes."""
+    """Inverted table: from a projected log color to fractions of the table's axes."""
 
     projection: Float64Array
-    """Shape (2, 4): rows take (log R, log G, log B, 1) to grid units."""
+    """Shape (2, 4): rows transform (log R, log G, log B, 1) to grid units."""
     axes: Float32Array
     """Shape (GRID, GRID, 2): fractions of the melanin and the blood axis, in [LOWEST, 1]."""
     twin_log: Float32Array
-    """Shape (GRID, GRID): largest mean log RGB of a second solution, -inf where there is none."""
+    """Shape (GRID, GRID): largest mean log RGB of a second solution, -inf without one."""
     normal: Float64Array
     """Shape (3,): unit direction in log RGB that is projected away."""
     side: float
@@ -45,7 +45,7 @@ class InverseColorTable:
 
 @lru_cache(maxsize=16)
 def inverse_table_for(table: ColorTable, free_shading: bool) -> InverseColorTable:
-    """Return the turned table; kept for the tables used last."""
+    """Return the inverted table, cached for the tables used last."""
     fraction = np.linspace(MIN_AXIS_FRACTION, 1.0, _SAMPLES_PER_AXIS)
     a, b = np.meshgrid(fraction, fraction, indexing="ij")
     rgb, by_a, by_b = evaluate_table(table, a, b)
@@ -63,7 +63,7 @@ def inverse_table_for(table: ColorTable, free_shading: bool) -> InverseColorTabl
     offset = -(low - margin) * scale
     line = np.arange(START_GRID_SIZE, dtype=np.float64)
     nodes = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1)
-    # Distances in log color, not in grid units: the nearest color is the natural start outside.
+    # Distances are in log color, not grid units: the nearest color is the start outside the table.
     tree = cKDTree(y[chosen])
     _, nearest = tree.query((nodes.reshape(-1, 2) - offset) / scale)
     axes = np.stack([a[chosen][nearest], b[chosen][nearest]], axis=-1)
@@ -99,7 +99,11 @@ def evaluate_table(
 
 
 def _unfolding_direction(across: Float64Array) -> Float64Array:
-    """Return the unit vector most clearly on one side of all the surface's tangent planes."""
+    """Return the unit vector that maximizes the minimum cosine to the surface's normals.
+
+    All facets then project with the same orientation, so that the projection does not fold. As a
+    linear program: maximize m subject to n . d >= m for all unit normals n, |d_i| <= 1.
+    """
     facets = across[::8, ::8].reshape(-1, 3)
     facets = facets / np.linalg.norm(facets, axis=1, keepdims=True)
     result = linprog(
@@ -115,7 +119,7 @@ def _unfolding_direction(across: Float64Array) -> Float64Array:
 def _light_side(facing: Float64Array) -> BoolArray:
     """Return the samples that melanin reaches without a fold, around light skin with some blood.
 
-    Behind the first fold may lie a second one, where skin is dark and faces as light skin does.
+    A second fold can follow the first one; behind it dark skin has the orientation of light skin.
     """
     corner = facing[: _SAMPLES_PER_AXIS // 8, _SAMPLES_PER_AXIS // 4 : _SAMPLES_PER_AXIS // 2]
     same = facing * np.sign(np.median(corner)) > 0.0
@@ -141,7 +145,7 @@ def _polish(
     projection: Float64Array,
     offset: Float64Array,
 ) -> Float64Array:
-    """Move the fractions towards their node's projected color by a few careful Newton steps."""
+    """Move the fractions towards their node's projected color by damped Newton steps."""
     best = axes.copy()
     best_miss = np.full(len(axes), np.inf)
     for _ in range(_POLISH_STEPS + 1):

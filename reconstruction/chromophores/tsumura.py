@@ -1,7 +1,7 @@
 """Melanin and hemoglobin by independent component analysis: the published baseline.
 
-No model of skin and no scale: optical density, freed of the brightness that is common to the
-channels, is unmixed into two independent components.
+It uses neither a skin model nor a scale: optical density without the brightness common to the
+channels is unmixed into two independent components.
 """
 
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 
 MAX_SAMPLES = 20_000
-"""Pixels that the components are found from; the maps are then made for all."""
+"""Pixels that determine the components; the maps then cover all pixels."""
 MIN_SAMPLES = 50
 
 
 class UnmixingError(ValueError):
-    """Colors that hold no two components."""
+    """Colors that do not contain two components."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class PigmentMaps:
     Attributes
     ----------
     melanin, hemoglobin
-        (H, W) float32, without scale: mean 0 and deviation 1 over the valid pixels.
+        (H, W) float32, without scale: mean 0 and standard deviation 1 over the valid pixels.
     valid
         (H, W) bool.
     axes
@@ -66,12 +66,12 @@ def tsumura_ica(rgb: FloatArray, valid: BoolArray) -> PigmentMaps:
 
     Notes
     -----
-    Which component is which, and its sign, is told by how the density of middling skin grows
-    with either pigment.
+    The increase of middling skin's density with each pigment determines the order and signs of
+    the components.
 
     References
     ----------
-    Tsumura, Haneishi, Miyake 1999, doi 10.1364/JOSAA.16.002169; brightness taken out as in
+    Tsumura, Haneishi, Miyake 1999, doi 10.1364/JOSAA.16.002169; brightness removed as in
     Tsumura et al. 2003, doi 10.1145/882262.882344.
     """
     from sklearn.decomposition import FastICA
@@ -88,7 +88,7 @@ def tsumura_ica(rgb: FloatArray, valid: BoolArray) -> PigmentMaps:
     samples = chroma[:: max(1, count // MAX_SAMPLES)]
     spread = np.linalg.svd(samples - center, compute_uv=False, full_matrices=False)
     several = spread[1] > 1e-6 * max(spread[0], 1e-12)
-    check.require(several, "rgb", "colors along one direction", "some that vary beside brightness")
+    check.require(several, "rgb", "colors along one direction", "variation besides brightness")
     with threadpool_limits(1):
         unmix = FastICA(2, whiten="unit-variance", random_state=0, max_iter=1000, tol=1e-3)
         unmix.fit(samples)
@@ -113,7 +113,7 @@ def tsumura_ica(rgb: FloatArray, valid: BoolArray) -> PigmentMaps:
 
 _CHROMA_BASIS = np.array([[1.0, 0.0, -1.0], [-0.5, 1.0, -0.5]])
 _CHROMA_BASIS /= np.linalg.norm(_CHROMA_BASIS, axis=1, keepdims=True)
-"""Two unit vectors across (1, 1, 1): density without brightness."""
+"""Two unit vectors orthogonal to (1, 1, 1): density without brightness."""
 
 
 def _plane(vector: Float64Array) -> Float64Array:
@@ -123,7 +123,7 @@ def _plane(vector: Float64Array) -> Float64Array:
 
 @cache
 def _pigments() -> tuple[Float64Array, Float64Array]:
-    """How density grows with melanin and with blood in middling skin under daylight, (3,) each."""
+    """Return the density increase of middling skin per melanin and per blood, (3,) each."""
     table = color_table.build(spectra.LINEAR_SRGB, "D65", size=32, anisotropy=ANISOTROPY_SKIN)
     growth = -table.jacobian(0.04, 0.03) / table.lookup(0.04, 0.03)[:, None]
     return growth[:, 0], growth[:, 1]

@@ -1,4 +1,4 @@
-"""Where a face's texels lie in the common map: added to its pixels, covered by others."""
+"""Map a face's texels to the common map: accumulate values, and detect covered texels."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ from reconstruction.correspondence.common_parameterization import (
 )
 
 SHADOW_DEPTH_MM: Final = 10.0
-"""Texels this far under the outermost at their place lie in its shadow (under ear or chin)."""
+"""Depth below the outermost texel at the same position beyond which a texel is covered, as under
+an ear or the chin."""
 
 
 def splat_bilinear(
     position_px: Float64Array, values: Float64Array, size: int
 ) -> tuple[Float64Array, Float64Array]:
-    """Add values to the four pixels around each place; return sums (N, N, C) and weights."""
+    """Add values to the four pixels around each position; return sums (N, N, C) and weights."""
     total = np.zeros((size * size, values.shape[1]))
     weight = np.zeros(size * size)
     low = np.floor(position_px).astype(np.int64)
@@ -45,7 +46,7 @@ def splat_bilinear(
 
 
 def close_gaps(covered: BoolArray) -> BoolArray:
-    """Close gaps of up to two pixels, as between texels that lie wider than the map's pixels."""
+    """Close gaps of up to two pixels, as between texels wider apart than the map's pixels."""
     padded = np.pad(covered, 3, mode="edge")
     closed = binary_closing(padded, structure=np.ones((3, 3)), iterations=2)
     return np.asarray(closed[3:-3, 3:-3] | covered, np.bool_)
@@ -54,16 +55,16 @@ def close_gaps(covered: BoolArray) -> BoolArray:
 def is_outermost(
     position: Float64Array, reach: Float64Array, visible: BoolArray, side_mm: float, size: int
 ) -> BoolArray:
-    """Return the texels that lie about as far out as any near their place, on cells of 2 mm.
+    """Return the texels within `SHADOW_DEPTH_MM` of the outermost nearby, on cells of 2 mm.
 
     Parameters
     ----------
-    place
-        (H, W, 2): column and row in a map of ``size`` pixels and ``side_mm`` a side.
+    position
+        (H, W, 2): column and row in a map of ``size`` pixels and ``side_mm`` per side.
     reach
-        (H, W): how far out texels lie, mm.
-    shown
-        (H, W): those that there are.
+        (H, W): distance of the texels from the axis, mm.
+    visible
+        (H, W): texels that exist.
     """
     cells = max(1, math.ceil(side_mm / 2.0))
     at = np.floor((position + 0.5) * (cells / size)).astype(np.int64)
@@ -79,20 +80,20 @@ def is_outermost(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TexelChart:
-    """Where each texel of a face's texture lies in the common map.
+    """Position of each texel of a face's texture in the common map.
 
     Attributes
     ----------
     size
-        Pixels a side of the map.
-    place_px
-        (H, W, 2), column and row; may lie outside the map.
+        Pixels per side of the map.
+    position_px
+        (H, W, 2), column and row; may be outside the map.
     on_surface
-        (H, W): texels that show the surface.
+        (H, W): texels of the surface.
     outermost
-        (H, W): those that no other part of the face covers.
+        (H, W): texels not covered by another part of the face.
     stderr_mm
-        (H, W): of the place; NaN where nothing says it.
+        (H, W): standard error of the position; NaN where it is not known.
     """
 
     size: int
@@ -111,14 +112,14 @@ class TexelChart:
         texture
             (H, W) or (H, W, C).
         valid
-            (H, W), texels that count; by default all of the surface.
+            (H, W), texels to use; by default all of the surface.
 
         Returns
         -------
         values : ndarray of float32, shape (N, N) or (N, N, C)
-            Filled from around where no texel lies.
+            Filled from the neighborhood where the map has no texel.
         valid : ndarray of bool, shape (N, N)
-            Pixels that texels say something about: at most half a texel's distance from one.
+            Pixels at most half a texel's distance from a texel.
         """
         image = np.asarray(texture, np.float64)
         use = self.on_surface & self.outermost
@@ -132,7 +133,7 @@ class TexelChart:
         return filled.astype(np.float32).reshape(known.shape + image.shape[2:]), near
 
     def read(self, common: ArrayLike) -> tuple[Float32Array, BoolArray]:
-        """Read a common map at the texels, linearly.
+        """Read a common map at the texels, by bilinear interpolation.
 
         Parameters
         ----------
@@ -142,7 +143,7 @@ class TexelChart:
         Returns
         -------
         values : ndarray of float32, shape (H, W) or (H, W, C)
-            The nearest pixel's where a texel lies outside the map.
+            The nearest pixel's where a texel is outside the map.
         inside : ndarray of bool, shape (H, W)
             Texels of the surface inside the map.
         """
@@ -168,16 +169,16 @@ def _layers(image: Float64Array) -> Float64Array:
 def chart_texels(
     position_mm: ArrayLike, valid: ArrayLike, correspondence: Correspondence, frame: CommonFrame
 ) -> TexelChart:
-    """Lay a face's texels out in the common map.
+    """Compute the positions of a face's texels in the common map.
 
     Parameters
     ----------
     position_mm
         (H, W, 3), rig frame.
     valid
-        (H, W), texels that show the surface; values elsewhere mean nothing.
+        (H, W), texels of the surface; values elsewhere are ignored.
     correspondence
-        Of this face.
+        Correspondence of this face.
     frame
         The common map.
     """
@@ -186,7 +187,8 @@ def chart_texels(
     Checks(ParameterizationError).shape("position", position, ("H", "W", 3))
     Checks(ParameterizationError).shape("valid", shown, position.shape[:2])
     if not shown.any():
-        raise ParameterizationError("position: no texel is valid")
+        got = "got no valid texel, expected some"
+        raise ParameterizationError(f"position: {got}; check the mask")
     place = np.full((*shown.shape, 2), -2.0)
     error = np.full(shown.shape, np.nan, np.float32)
     uv, off = correspondence.map_points(position[shown])

@@ -1,15 +1,15 @@
-"""One map (u, v) for many faces: a face unrolled, and bent until its landmarks lie on the common.
+"""Common parameterization (u, v) of many faces: a face unrolled, and warped by its landmarks.
 
-A face is unrolled onto a cylinder about a vertical axis behind its nose, which has no seams where a
-face shows, and a thin-plate spline through named landmarks (a radial basis with an affine part)
-takes it to where all faces have them. Texels are averaged into the common map and values read back
-from it by the same coordinates, so that a change made there is continuous over the face, whatever
-islands its own texture consists of.
+A face is unrolled onto a cylinder about a vertical axis behind its nose, without a seam in the
+visible face. A thin-plate spline through named landmarks (a radial basis with an affine part) then
+warps it to their common positions. Texels are averaged into the common map, and values are read
+back at the same coordinates. A change made in the common map is therefore continuous over the face,
+however its own texture is divided into islands.
 
 References
 ----------
 Pighin, Hecker, Lischinski, Szeliski, Salesin 1998, doi:10.1145/280814.280825
-Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 10.2 (20 points a face)
+Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 10.2 (20 points per face)
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from reconstruction.correspondence.landmark_field import LandmarkField, Landmark
 Point = tuple[float, float, float]
 
 CYLINDER_RADIUS_MM: Final = 90.0
-"""Of the cylinder; about that of a head, so that lengths on a cheek stay about what they are."""
+"""Radius of the cylinder, about that of a head, so that lengths on a cheek are about preserved."""
 MIN_SHARED_LANDMARKS: Final = 6
-"""Named landmarks that two faces need in common: three for the affine part, as many again."""
+"""Minimum number of landmarks common to two faces: three for the affine part, three to fit."""
 NOSE_TIP_FRACTION: Final = 1e-3
-"""Foremost texels that stand for the tip of the nose where no landmark names it."""
+"""Fraction of foremost texels whose mean replaces the tip of the nose without its landmark."""
 MIN_CHART_PX, MAX_CHART_PX = 16, 4096
 _TEXELS_PER_BATCH: Final = 40_000
 NOSE_LANDMARK: Final = "nose tip"
 
 
 class ParameterizationError(ValueError):
-    """Landmarks or positions that no common parameterization follows from."""
+    """Landmarks or positions that do not determine a common parameterization."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cylinder:
-    """What a face is unrolled from.
+    """Cylinder onto which a face is unrolled.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Cylinder:
     tip_mm: Point
 
     def unroll(self, position_mm: ArrayLike) -> Float64Array:
-        """Return (u, v), mm: arc to the right of the nose's tip as seen, and height above it.
+        """Return (u, v), mm: arc to the image's right of the nose's tip, and height above it.
 
         Parameters
         ----------
@@ -77,20 +77,20 @@ class Cylinder:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CommonFrame:
-    """The common map: where its landmarks lie, and which part of the plane it shows.
+    """The common map: positions of its landmarks, and the range of the plane that it covers.
 
     Attributes
     ----------
     names
-        Of the landmarks.
+        Names of the landmarks.
     landmarks_mm
         (K, 2), u to the right and v up from the nose's tip.
     center_mm
-        Middle of the map, (u, v).
+        Center of the map, (u, v).
     side_mm
         Length of its sides, above 0.
     size
-        Pixels a side, 16 to 4096.
+        Pixels per side, 16 to 4096.
     """
 
     names: tuple[str, ...]
@@ -108,11 +108,11 @@ class CommonFrame:
 
     @property
     def pixel_mm(self) -> float:
-        """Side of a pixel."""
+        """Side of a pixel, mm."""
         return self.side_mm / self.size
 
     def to_pixel(self, uv_mm: ArrayLike) -> Float64Array:
-        """Return (column, row) of places in the map, (..., 2); pixel (0, 0) is centred at 0, 0."""
+        """Return (column, row) of positions, (..., 2); the center of pixel (0, 0) is at 0, 0."""
         uv = (np.asarray(uv_mm, np.float64) - self.center_mm) / self.pixel_mm
         middle = 0.5 * (self.size - 1)
         return np.stack([middle + uv[..., 0], middle - uv[..., 1]], axis=-1)
@@ -124,7 +124,7 @@ class CommonFrame:
         return np.stack([u, v], axis=-1)
 
     def landmark(self, name: str) -> Float64Array:
-        """Return where a landmark lies, (2,), mm."""
+        """Return a landmark's position, (2,), mm."""
         Checks(ParameterizationError).choice("landmark", name, sorted(self.names))
         return self.landmarks_mm[self.names.index(name)]
 
@@ -141,12 +141,12 @@ class CommonFrame:
 
     @staticmethod
     def from_document(document: Mapping[str, object]) -> CommonFrame:
-        """Return the frame that `to_document` described.
+        """Return the frame of a document by `to_document`.
 
         Raises
         ------
         ParameterizationError
-            Naming what is missing or of another kind.
+            When a value is missing or of another type; the message names it.
         """
         values: Any = document
         try:
@@ -163,14 +163,14 @@ class CommonFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correspondence:
-    """How one face lies in the common map.
+    """Map from one face to the common map.
 
     Attributes
     ----------
     cylinder
-        What it is unrolled from.
+        Cylinder onto which the face is unrolled.
     field
-        Bends its landmarks onto the common ones; None: it is unrolled and no more.
+        Warps its landmarks to the common ones; None: the face is only unrolled.
     """
 
     cylinder: Cylinder
@@ -187,8 +187,8 @@ class Correspondence:
         Returns
         -------
         tuple of ndarray
-            The error along each axis holds how precisely landmarks were placed and what a face
-            may do between them; NaN without landmarks, where nothing says it.
+            The error along each axis contains the landmarks' errors and the variation of faces
+            between them; NaN without landmarks, where it is not known.
         """
         flat = self.cylinder.unroll(position_mm).reshape(-1, 2)
         shape = np.shape(position_mm)[:-1]
@@ -203,7 +203,7 @@ class Correspondence:
 
 
 def find_cylinder(position_mm: ArrayLike, valid: ArrayLike) -> Cylinder:
-    """Find what to unroll a face from by its foremost texels, where no landmark names its nose.
+    """Find a face's cylinder by its foremost texels, without a landmark of the nose.
 
     Parameters
     ----------
@@ -219,7 +219,8 @@ def find_cylinder(position_mm: ArrayLike, valid: ArrayLike) -> Cylinder:
     """
     points = np.asarray(position_mm, np.float64)[np.asarray(valid, np.bool_)]
     if not len(points):
-        raise ParameterizationError("position: no texel is valid")
+        got = "got no valid texel, expected some"
+        raise ParameterizationError(f"position: {got}; check the mask")
     count = max(1, round(NOSE_TIP_FRACTION * len(points)))
     front = points[np.argpartition(points[:, 2], len(points) - count)[-count:]]
     x, y, z = np.median(front, axis=0)
@@ -227,7 +228,7 @@ def find_cylinder(position_mm: ArrayLike, valid: ArrayLike) -> Cylinder:
 
 
 def average_landmarks(faces: Sequence[Mapping[str, Point]]) -> tuple[tuple[str, ...], Float64Array]:
-    """Return the landmarks that all faces have, and their mean places in the unrolled plane.
+    """Return the landmarks common to all faces, and their mean positions in the unrolled plane.
 
     Parameters
     ----------
@@ -238,52 +239,53 @@ def average_landmarks(faces: Sequence[Mapping[str, Point]]) -> tuple[tuple[str, 
     -------
     names : tuple of str
     landmarks_mm : ndarray, shape (K, 2)
-        Mean of the faces, each brought to the mean size about the landmarks' middle first.
+        Mean of the faces, each scaled first to the mean size about the landmarks' center.
 
     Raises
     ------
     ParameterizationError
-        When fewer than `MIN_SHARED_LANDMARKS` are common, or one face lacks the nose's tip.
+        When fewer than `MIN_SHARED_LANDMARKS` are common, or a face lacks the tip of the nose.
     """
     if not faces:
-        raise ParameterizationError("landmarks: got no face")
+        raise ParameterizationError("landmarks: got no face, expected at least one; add a face")
     names = tuple(name for name in faces[0] if all(name in face for face in faces))
     if NOSE_LANDMARK not in names:
         raise ParameterizationError(
-            f"landmarks: {NOSE_LANDMARK!r} is missing of a face, expected it of all"
+            f"landmarks: a face lacks {NOSE_LANDMARK!r}, expected it in all; mark it"
         )
     if len(names) < MIN_SHARED_LANDMARKS:
         raise ParameterizationError(
             f"landmarks: all faces have {len(names)} in common ({', '.join(names) or 'none'}), "
-            f"expected at least {MIN_SHARED_LANDMARKS}, better 20"
+            f"expected at least {MIN_SHARED_LANDMARKS}, better 20; mark more"
         )
     places = np.stack([_unrolled(face, names) for face in faces])
     middle = places.mean(axis=1, keepdims=True)
     spread = np.sqrt(((places - middle) ** 2).sum(axis=2).mean(axis=1))[:, None, None]
     if not np.all(spread > 0):
-        raise ParameterizationError("landmarks: all of a face lie at one point")
+        got = "got one point for all of a face, expected points all over it"
+        raise ParameterizationError(f"landmarks: {got}; mark them again")
     mean = ((places - middle) / spread).mean(axis=0) * float(spread.mean())
     return names, mean - mean[names.index(NOSE_LANDMARK)]
 
 
 def _unrolled(landmarks: Mapping[str, Point], names: Sequence[str]) -> Float64Array:
-    """Return some landmarks of a face unrolled by its nose, (K, 2)."""
+    """Return landmarks of a face unrolled about its nose, (K, 2)."""
     return Cylinder(landmarks[NOSE_LANDMARK]).unroll([landmarks[name] for name in names])
 
 
 def fit_correspondence(
     landmarks: Mapping[str, Point], frame: CommonFrame, *, stderr_mm: float = 1.0
 ) -> Correspondence:
-    """Find how a face's landmarks lie in the common map.
+    """Fit the warp of a face's landmarks to those of the common map.
 
     Parameters
     ----------
     landmarks
-        Name to x, y, z, mm, rig frame; those that the frame knows count.
+        Name to x, y, z, mm, rig frame; only those in the frame are used.
     frame
         The common map.
     stderr_mm
-        Of a landmark's place along each axis, above 0.
+        Standard error of a landmark's position along each axis, above 0.
 
     Returns
     -------
@@ -292,15 +294,15 @@ def fit_correspondence(
     Raises
     ------
     ParameterizationError
-        For too few landmarks, some on one line, or such that the map folds, naming the one that
-        fits the others least.
+        For too few landmarks, landmarks on one line, or a map with folds; the message names the
+        landmark that fits the others least.
     """
     names = [name for name in frame.names if name in landmarks]
     if NOSE_LANDMARK not in names or len(names) < MIN_SHARED_LANDMARKS:
         raise ParameterizationError(
-            f"landmarks: got {len(names)} that the common map knows "
-            f"({', '.join(names) or 'none'}), expected at least {MIN_SHARED_LANDMARKS} and "
-            f"{NOSE_LANDMARK!r} among them"
+            f"landmarks: got {len(names)} of the common map "
+            f"({', '.join(names) or 'none'}), expected at least {MIN_SHARED_LANDMARKS}, "
+            f"{NOSE_LANDMARK!r} among them; mark more"
         )
     cylinder = Cylinder(landmarks[NOSE_LANDMARK])
     own = _unrolled(landmarks, names)
@@ -312,9 +314,9 @@ def fit_correspondence(
     if field.has_folds():
         worst = names[int(np.argmax(field.leave_one_out_px))]
         raise ParameterizationError(
-            f"landmarks: no map without folds goes through them; {worst!r} lies "
-            f"{field.leave_one_out_px.max():.0f} mm from where the others put it: are two of "
-            "them exchanged, or left and right (as seen in the image)?"
+            f"landmarks: the map through them has folds; {worst!r} is "
+            f"{field.leave_one_out_px.max():.0f} mm from where the others put it; check that no "
+            "two of them are exchanged, nor left and right (as seen in the image)"
         )
     return Correspondence(cylinder, field)
 
@@ -326,20 +328,20 @@ def fit_common_frame(
     *,
     size: int,
 ) -> CommonFrame:
-    """Return a square map that shows what most faces show.
+    """Return a square common map that covers the range of most faces.
 
     Parameters
     ----------
     names, landmarks_mm
-        As `average_landmarks` gives them.
-    places_mm
-        Of each face, unrolled places of its texels, (n, 2).
+        See `average_landmarks`.
+    positions_mm
+        Unrolled positions of each face's texels, (n, 2).
     size
-        Pixels a side.
+        Pixels per side.
     """
     low = np.median([np.quantile(at, 0.01, axis=0) for at in positions_mm], axis=0)
     high = np.median([np.quantile(at, 0.99, axis=0) for at in positions_mm], axis=0)
-    # no wider than a quarter turn to either side: beyond it a face shows ears and hair
+    # at most a quarter turn to either side: beyond it are ears and hair
     reach = 0.5 * math.pi * CYLINDER_RADIUS_MM
     low[0], high[0] = max(low[0], -reach), min(high[0], reach)
     middle = 0.5 * (low + high)

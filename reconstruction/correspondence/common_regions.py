@@ -1,4 +1,4 @@
-"""Regions of a face, drawn in the common map between its landmarks.
+"""Regions of a face, defined in the common map by its landmarks.
 
 References
 ----------
@@ -38,14 +38,14 @@ STANDARD_LANDMARKS_MM: Final = MappingProxyType(
         "temple right": (97.0, 55.0),
     }
 )
-"""Twenty points that a face is marked by, left and right as seen in the image, and about where they
-lie when it is unrolled from the tip of its nose, mm; round figures for faces without landmarks."""
+"""Twenty landmarks of a face, left and right as seen in the image, with typical positions when it
+is unrolled from the tip of its nose, mm; rounded, for faces without landmarks."""
 
 REGION_NAMES: Final = ("face", "beard", "no-beard", "skin")
 
 
 class RegionError(ValueError):
-    """A region that there is not."""
+    """An unknown region."""
 
 
 def standard_frame(*, side_mm: float, center_mm: tuple[float, float], size: int) -> CommonFrame:
@@ -65,12 +65,12 @@ def region_mask(name: str, frame: CommonFrame) -> BoolArray:
         (the rest, down to the height of the chin), or "skin" (all but eyes, brows, nostrils and
         lips).
     frame
-        The common map; standard places stand in for landmarks that it lacks.
+        The common map; standard positions replace landmarks that it lacks.
 
     Raises
     ------
     RegionError
-        For another name.
+        For an unknown name.
     """
     Checks(RegionError).choice("region", name, REGION_NAMES)
     grid = frame.grid_mm()
@@ -90,7 +90,7 @@ def region_mask(name: str, frame: CommonFrame) -> BoolArray:
 
 
 def _beard_outline(at: dict[str, Float64Array]) -> Float64Array:
-    """Return the corners of the region where a beard grows, mm, from the left jaw around."""
+    """Return the outline of the region where a beard grows, mm, from the left jaw around."""
     left, right = at["jaw left"], at["jaw right"]
     wing_left, wing_right = at["nose wing left"], at["nose wing right"]
     mouth = 0.5 * (at["mouth corner left"] + at["mouth corner right"])

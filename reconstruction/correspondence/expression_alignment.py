@@ -1,11 +1,11 @@
-"""A picture of an expression laid over the neutral one: landmarks, then every pixel.
+"""Align an image of an expression to the neutral one, by landmarks, then per pixel.
 
-Named landmarks give a thin-plate spline that is as smooth as their uncertainty leaves open; dense
-optical flow refines it where the skin has texture. Both work on local contrast, from which light
-and regional changes of blood are gone: blood that fills or leaves a region is not motion, and the
-vessels it fills stay where they are in the skin.
+Named landmarks define a thin-plate spline, as smooth as their standard errors allow. Dense optical
+flow refines it where the skin has texture. Both use local contrast, from which illumination and
+regional changes of blood are removed: a change of blood in a region is not motion, and the vessels
+keep their positions in the skin.
 
-Without landmarks, points are found by features, and the result says so.
+Without landmarks, matched features replace them, and the result records it.
 """
 
 import math
@@ -32,46 +32,46 @@ from reconstruction.registration import (
 Points = Mapping[str, tuple[float, float]]
 
 LANDMARK_STDERR_PX = 1.0
-"""Of a landmark in one picture along each axis, as placed by hand."""
+"""Standard error of a manually placed landmark in one image along each axis."""
 FEATURE_STDERR_PX = 0.5
 MAX_ALIGNMENT_ERROR_PX = 4.0
-"""Pixels whose estimated error is larger are invalid."""
+"""Maximum estimated error of a valid pixel."""
 MIN_LANDMARKS = 20
-"""Fewer than these leave much of a face to the flow alone."""
+"""Fewer landmarks leave much of a face to the flow alone."""
 MIN_ALIGNED_SIDE_PX = 32
 
 
 class AlignmentError(RegistrationError):
-    """Pictures or landmarks that cannot be aligned."""
+    """Images or landmarks that cannot be aligned."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """Where each pixel of the neutral picture lies in the moving one.
+    """Position of each pixel of the neutral image in the moving one.
 
     Attributes
     ----------
     source_px : ndarray of float32, shape (H, W, 2)
-        Column and row in the moving picture; means nothing where not `valid`.
+        Column and row in the moving image; undefined where not `valid`.
     valid : ndarray of bool, shape (H, W)
-        Inside both pictures and their masks, not folded, and the error is small enough.
+        Inside both images and their masks, not folded, and the error is small enough.
     error_px : ndarray of float32, shape (H, W)
-        Estimated root mean square distance between `source_px` and the truth.
+        Estimated root mean square distance between `source_px` and the true position.
     residual_px : ndarray of float32, shape (H, W)
-        How far a pixel ends from where it began, after the way to the moving picture and back.
+        Distance of a pixel from its start after the flow to the moving image and back.
     followed : ndarray of bool, shape (H, W)
-        The optical flow was believed; elsewhere landmarks and neighbors tell the place.
+        The optical flow was used; elsewhere the position is from landmarks and neighbors.
     landmark_rms_px : float
-        Root mean square distance of the landmarks from where the alignment puts them.
+        Root mean square distance of the landmarks from their aligned positions.
     leave_one_out_px : mapping of str to float
-        How far each landmark lies from where the others put it: a large one is misplaced, or
-        alone in what it moves with.
+        Distance of each landmark from its prediction by the others: a large one is misplaced, or
+        the only landmark in a region of different motion.
     folded_fraction : float
-        Part of the pixels within the masks where the map folds over.
+        Fraction of the pixels within the masks where the map folds over.
     by : str
         "landmarks" or "features".
     moving_shape : (int, int)
-        Rows and columns of the moving picture.
+        Rows and columns of the moving image.
     """
 
     source_px: Float32Array
@@ -86,7 +86,7 @@ class Alignment:
     moving_shape: tuple[int, int]
 
     def __post_init__(self) -> None:
-        """Refuse shapes that do not fit."""
+        """Refuse mismatched shapes."""
         shape = self.valid.shape
         Checks(AlignmentError).shape("source_px", self.source_px, (*shape, 2))
         Checks(AlignmentError).shape("error_px", self.error_px, shape)
@@ -94,22 +94,22 @@ class Alignment:
     def warp(
         self, values: ArrayLike, valid: ArrayLike | None = None
     ) -> tuple[Float32Array, BoolArray]:
-        """Lay a map of the moving picture over the neutral one.
+        """Warp a map of the moving image to the neutral one.
 
         Parameters
         ----------
         values : array_like, shape (h, w) or (h, w, C)
-            Of the moving picture's size.
+            Of the moving image's size.
         valid : array_like of bool, shape (h, w), optional
-            Where `values` mean something.
+            Where `values` are valid.
 
         Returns
         -------
         values : ndarray of float32, shape (H, W) or (H, W, C)
             0 where not valid.
         valid : ndarray of bool, shape (H, W)
-            No pixel that is read is invalid. Between pixels the values are interpolated by cubic
-            polynomials, which keep small contrast, beside masked ones linearly.
+            Where all pixels of the interpolation are valid. It is bicubic, which preserves small
+            contrast, and bilinear next to masked pixels.
         """
         image, good = self._checked(values, valid)
         filled = np.where(_match_channels(good, image), image, 0.0).astype(np.float32)
@@ -128,20 +128,20 @@ class Alignment:
     def warp_stderr(
         self, values: ArrayLike, stderr: ArrayLike, valid: ArrayLike | None = None
     ) -> Float32Array:
-        """Return the standard error of a warped map: its own, and that of the place.
+        """Return the standard error of a warped map, from its own and that of the position.
 
         Parameters
         ----------
         values, stderr : array_like, shape (h, w) or (h, w, C)
-            Map of the moving picture and its standard error.
+            Map of the moving image and its standard error.
         valid : array_like of bool, shape (h, w), optional
 
         Returns
         -------
         ndarray of float32
-            Shape of the warped map, 0 where it is not valid. Interpolation averages some noise
-            away; that is not counted. Where the place is uncertain the value is, by the map's
-            slope (smoothed over 2 px) times the error of the place.
+            Shape of the warped map, 0 where it is not valid. The noise reduction by interpolation
+            is neglected. The position error contributes the map's slope (smoothed over 2 px) times
+            the error of the position.
         """
         image, good = self._checked(values, valid)
         own, _ = self._checked(stderr, valid)
@@ -149,21 +149,21 @@ class Alignment:
         slope = _slope_variance(image, good)
         steep, _ = self.warp(slope, None)
         place = _match_channels(np.square(self.error_px) / 2.0, image)
-        # cubic interpolation may undershoot
+        # bicubic interpolation may undershoot below 0
         total = np.maximum(variance, 0.0) + np.maximum(steep, 0.0) * place
         return np.where(_match_channels(seen, image), np.sqrt(total), 0.0).astype(np.float32)
 
     def warp_map(self, skin_map: SkinMap) -> SkinMap:
-        """Lay a map with its own standard error and mask over the neutral picture.
+        """Warp a map with its own standard error and mask to the neutral image.
 
-        What the error of the place adds is no part of it:
-        `reconstruction.facial_color.registration_error` has it with how the channels go together.
-        What interpolation averages of the noise is taken off.
+        The position error is not included: `reconstruction.facial_color.registration_error`
+        computes it with the correlation between channels. The noise reduction by interpolation is
+        included.
 
         Parameters
         ----------
         skin_map
-            Of the moving picture.
+            Map of the moving image.
         """
         values, seen = self.warp(skin_map.values, skin_map.valid)
         stderr = None
@@ -196,25 +196,25 @@ def align(
     max_error_px: float = MAX_ALIGNMENT_ERROR_PX,
     rounds: int = dense_flow.N_WARP_ROUNDS,
 ) -> Alignment:
-    """Find where each pixel of the neutral picture lies in that of an expression.
+    """Align the image of an expression to the neutral image, per pixel.
 
     Parameters
     ----------
     moving, neutral : array_like, shape (h, w) or (h, w, 3), and (H, W) or (H, W, 3)
-        Linear pictures, best of light from inside the skin (crossed polarizers); of colors the
-        mean of their logarithms is used. Or maps in which the same structure can be seen.
+        Linear images, best of subsurface-scattered light (crossed polarizers); of colors the mean
+        of their logarithms is used. Or maps with the same visible structure.
     landmarks_moving, landmarks_neutral : mapping of str to (x, y), optional
-        Column and row, px; those of the same name are used, at least 4. Neither: points are found
-        by features.
+        Column and row, px; those of the same name are used, at least 4. Without both, features are
+        matched.
     valid_moving, valid_neutral : array_like of bool, optional
-        What is skin in each picture.
+        Skin in each image.
     landmark_stderr_px : float
-        Standard error of a landmark in one picture along each axis, above 0. It sets how smooth
-        the motion between landmarks is.
+        Standard error of a landmark in one image along each axis, above 0. It determines the
+        smoothness of the motion between landmarks.
     max_error_px : float
         Pixels with a larger estimated error are invalid.
     rounds : int
-        How often the dense flow is followed; 0: landmarks or features alone.
+        Number of dense flow rounds; 0: landmarks or features alone.
 
     Returns
     -------
@@ -223,12 +223,12 @@ def align(
     Raises
     ------
     AlignmentError
-        For pictures or landmarks that do not fit, or too few of either to find a motion.
+        For mismatched images or landmarks, or too few of either to estimate a motion.
 
     Notes
     -----
-    A wrinkle that opens, an eye that closes or a lip that turns out has no counterpart: such
-    places are told by the ways forth and back that do not meet, and by folds.
+    A wrinkle that opens, an eye that closes or a lip that turns out has no counterpart. Such pixels
+    are detected by forward and backward flows that disagree, and by folds.
 
     Examples
     --------
@@ -244,7 +244,8 @@ def align(
     """
     if (landmarks_moving is None) != (landmarks_neutral is None):
         missing = "landmarks_moving" if landmarks_moving is None else "landmarks_neutral"
-        raise AlignmentError(f"{missing}: got None, expected landmarks of both pictures or neither")
+        got = f"{missing}: got None, expected landmarks of both images or neither"
+        raise AlignmentError(f"{got}; add or omit them")
     Checks(AlignmentError).within("rounds", rounds, "[0, inf)")
     second, mask_second = _structure("moving", moving, valid_moving)
     first, mask = _structure("neutral", neutral, valid_neutral)
@@ -290,21 +291,22 @@ def align(
 
 
 def _structure(name: str, picture: ArrayLike, valid: ArrayLike | None) -> tuple[Any, BoolArray]:
-    """Return the local contrast of a picture and where it means something."""
+    """Return the local contrast of an image and where it is valid."""
     image = np.asarray(picture, np.float64)
     if image.ndim not in (2, 3) or min(image.shape[:2]) < MIN_ALIGNED_SIDE_PX:
         raise AlignmentError(
-            f"{name}: got shape {image.shape}, expected (H, W) or (H, W, 3), "
-            f"{MIN_ALIGNED_SIDE_PX} x {MIN_ALIGNED_SIDE_PX} or more"
+            f"{name}: got shape {image.shape}, expected (H, W) or (H, W, 3), at least "
+            f"{MIN_ALIGNED_SIDE_PX} x {MIN_ALIGNED_SIDE_PX} px; give a larger image"
         )
     good = np.ones(image.shape[:2], bool) if valid is None else np.asarray(valid, bool)
     Checks(AlignmentError).shape(f"valid_{name}", good, image.shape[:2])
     good = good & _valid_in_all_channels(np.isfinite(image) & (image > 0.0))
     if not good.any():
-        raise AlignmentError(f"{name}: has no valid pixel with light")
+        got = "got no valid pixel with light, expected some"
+        raise AlignmentError(f"{name}: {got}; check its mask")
     shown = np.where(_match_channels(good, image), image, 1.0)
     value = np.exp(np.log(shown).mean(axis=-1)) if image.ndim == 3 else shown
-    # where there is no skin goes on what is beside it: an edge of the mask is no structure
+    # masked pixels are filled from neighboring skin, so that the mask's edge adds no contrast
     weight = good.astype(np.float64)
     share = cv2.GaussianBlur(weight, (0, 0), 8.0)
     around = cv2.GaussianBlur(value * weight, (0, 0), 8.0) / np.maximum(share, 1e-6)
@@ -314,12 +316,12 @@ def _structure(name: str, picture: ArrayLike, valid: ArrayLike | None) -> tuple[
 
 
 def _match_channels(array: NDArray[Any], image: NDArray[Any]) -> NDArray[Any]:
-    """Return an array of pixels (H, W) as it broadcasts beside an image (H, W) or (H, W, C)."""
+    """Expand an array of pixels (H, W) to broadcast with an image (H, W) or (H, W, C)."""
     return array[..., None] if image.ndim == 3 else array
 
 
 def _valid_in_all_channels(good: BoolArray) -> BoolArray:
-    """Return where all channels of (H, W) or (H, W, C) are good, (H, W)."""
+    """Return where all channels of (H, W) or (H, W, C) are valid, (H, W)."""
     return np.asarray(good.all(axis=-1)) if good.ndim == 3 else good
 
 
@@ -327,8 +329,8 @@ def _common(moving: Points, neutral: Points) -> tuple[list[str], Float64Array, F
     names = sorted(set(moving) & set(neutral))
     if len(names) < landmark_field.MIN_FIELD_POINTS:
         raise AlignmentError(
-            f"landmarks: {len(names)} names are in both pictures, expected at least "
-            f"{landmark_field.MIN_FIELD_POINTS}, best {MIN_LANDMARKS} or more"
+            f"landmarks: got {len(names)} names in both images, expected at least "
+            f"{landmark_field.MIN_FIELD_POINTS}, best {MIN_LANDMARKS} or more; mark more"
         )
     return (
         names,
@@ -338,13 +340,14 @@ def _common(moving: Points, neutral: Points) -> tuple[list[str], Float64Array, F
 
 
 def _is_inside(source_px: Float32Array, mask: BoolArray) -> BoolArray:
-    """Return which places are inside a picture, and all pixels around them in its mask."""
+    """Return which positions are inside an image, with all pixels around them in its mask."""
     missing = dense_flow.sample_image((~mask).astype(np.float32), source_px)
     return np.asarray(is_inside_image(source_px, mask.shape) & (missing <= 0.0))
 
 
 def _folded(source_px: Float32Array) -> BoolArray:
-    """Return where the map turns its orientation, by any of a pixel's four triangles."""
+    """Return where the map reverses its orientation, in any of a pixel's four triangles."""
+    # the signed area dx x dy of a triangle's image is positive for a map without a fold
     padded = np.pad(
         source_px.astype(np.float64), ((1, 1), (1, 1), (0, 0)), mode="reflect", reflect_type="odd"
     )

@@ -1,10 +1,10 @@
-"""A smooth displacement through landmarks, as smooth as their uncertainty leaves open.
+"""Fit a smooth displacement field through landmarks, with a smoothness set by their errors.
 
 Thin-plate splines are the most probable fields when displacements are a Gaussian process whose
-generalized covariance is ``strength * r^2 log r`` over an unknown affine map. How strongly a face
-deforms (the strength) is estimated from the landmarks themselves by restricted maximum likelihood,
-given how precisely they were placed; their ratio is the spline's smoothing. The same process says
-how far the field may be off between landmarks.
+generalized covariance is ``strength * r^2 log r`` over an unknown affine map. The strength of the
+deformation is estimated from the landmarks by restricted maximum likelihood, given their standard
+error. The ratio of error variance to strength is the spline's smoothing. The same process gives the
+field's standard error between landmarks.
 
 References
 ----------
@@ -26,37 +26,37 @@ from reconstruction.arrays import Float64Array
 from reconstruction.registration import RegistrationError
 
 MIN_FIELD_POINTS = 4
-"""Fewer points than these leave nothing to tell noise from deformation by."""
+"""Minimum number of points that separates noise from deformation."""
 FIELD_GRID_PX = 8
-"""Distance of the nodes at which a field is evaluated before it is interpolated."""
+"""Spacing of the nodes at which a field is evaluated before it is interpolated."""
 MIN_LANDMARK_STDERR_PX = 1e-3
-"""No landmark is placed more precisely."""
+"""Minimum standard error of a landmark."""
 _MAX_STRENGTH = 1e8
 
 
 class LandmarkFieldError(RegistrationError):
-    """Landmarks that no displacement can be drawn through."""
+    """Landmarks that determine no displacement field."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkField:
-    """Displacement of a picture's points, known at landmarks.
+    """Displacement of an image's points, known at landmarks.
 
     Attributes
     ----------
     points_px : ndarray of float64, shape (K, 2)
-        Landmarks in the first picture, column and row.
+        Landmarks in the first image, column and row.
     moved_px : ndarray of float64, shape (K, 2)
-        The same in the second picture.
+        The same in the second image.
     stderr_px : float
-        Of a landmark's displacement along each axis.
+        Standard error of a landmark's displacement along each axis.
     strength : float
-        Of the deformation: factor of the generalized covariance, px^2, with lengths in units of
-        `scale_px`; 0 when an affine map explains all.
+        Strength of the deformation: factor of the generalized covariance, px^2, with lengths in
+        units of `scale_px`; 0 when an affine map explains all.
     scale_px : float
-        Unit of length: root mean square distance of the landmarks from their middle.
+        Unit of length: root mean square distance of the landmarks from their centroid.
     leave_one_out_px : ndarray of float64, shape (K,)
-        How far each landmark lies from where the others put it.
+        Distance of each landmark from its prediction by the others.
     """
 
     points_px: Float64Array
@@ -78,7 +78,7 @@ class LandmarkField:
         Parameters
         ----------
         shape
-            Rows and columns of the first picture.
+            Rows and columns of the first image.
         """
         rows = np.arange(0.0, shape[0] - 1 + FIELD_GRID_PX, FIELD_GRID_PX)
         columns = np.arange(0.0, shape[1] - 1 + FIELD_GRID_PX, FIELD_GRID_PX)
@@ -95,7 +95,7 @@ class LandmarkField:
         return fine[..., :2], np.maximum(fine[..., 2], 0.0)
 
     def has_folds(self) -> bool:
-        """Return whether it turns anything over, within the landmarks and a fifth around."""
+        """Return whether the field folds, within the landmarks' extent plus a fifth."""
         low, high = self.points_px.min(axis=0), self.points_px.max(axis=0)
         rim = 0.2 * (high - low)
         along = [np.linspace(a - r, b + r, 40) for a, b, r in zip(low, high, rim, strict=True)]
@@ -105,12 +105,12 @@ class LandmarkField:
         return bool(np.any(du[..., 0] * dv[..., 1] - du[..., 1] * dv[..., 0] <= 0.0))
 
     def evaluate(self, points_px: ArrayLike) -> tuple[Float64Array, Float64Array]:
-        """Return displacement (N, 2) and standard error along each axis (N,) at some points, px.
+        """Return displacement (N, 2) and standard error along each axis (N,) at points, px.
 
         Parameters
         ----------
         points_px
-            Shape (N, 2), column and row in the first picture.
+            Shape (N, 2), column and row in the first image.
         """
         points = np.asarray(points_px, np.float64).reshape(-1, 2)
         middle = self.points_px.mean(axis=0)
@@ -124,7 +124,8 @@ class LandmarkField:
         )
         away = np.linalg.norm(at[:, None] - known, axis=-1)
         row = np.hstack([_kernel(away), np.ones((len(at), 1)), at])
-        # kriging: what the process may do besides, with the affine map estimated
+        # universal kriging: with the affine map estimated, the variance is -k' S^-1 k times the
+        # strength, for the bordered system S of kernel and affine terms and its row k at a point
         rest = np.maximum(-np.einsum("ni,ij,nj->n", row, self._inverse, row), 0.0)
         variance = rest * self.stderr_px**2 / self.smoothing
         return np.asarray(spline(at)), np.sqrt(variance)
@@ -133,12 +134,12 @@ class LandmarkField:
 def fit_landmark_field(
     points_px: ArrayLike, moved_px: ArrayLike, *, stderr_px: float
 ) -> LandmarkField:
-    """Draw a smooth displacement through landmarks.
+    """Fit a smooth displacement field to landmarks.
 
     Parameters
     ----------
     points_px, moved_px : array_like, shape (K, 2)
-        Column and row of the same points in two pictures, K at least `MIN_FIELD_POINTS`.
+        Column and row of the same points in two images, K at least `MIN_FIELD_POINTS`.
     stderr_px : float
         Standard error of a displacement along each axis, above 0.
 
@@ -149,13 +150,13 @@ def fit_landmark_field(
     Raises
     ------
     LandmarkFieldError
-        For too few points, points on one line, or something that is not finite.
+        For too few points, points on one line, or non-finite values.
 
     Examples
     --------
     >>> corners = np.array([[0, 0], [0, 90], [90, 0], [90, 90], [40, 50]], float)
     >>> field = fit_landmark_field(corners, 1.1 * corners + 3, stderr_px=0.5)
-    >>> field.at([[45, 45]])[0].round(2).tolist()
+    >>> field.evaluate([[45, 45]])[0].round(2).tolist()
     [[7.5, 7.5]]
     """
     check = Checks(LandmarkFieldError)
@@ -169,7 +170,8 @@ def fit_landmark_field(
     known = (first - middle) / max(scale, 1e-12)
     affine = np.column_stack([np.ones(len(first)), known])
     if scale == 0.0 or np.linalg.svd(affine, compute_uv=False)[-1] < 1e-3:
-        raise LandmarkFieldError("landmarks: lie on one line, expected points all over the face")
+        got = "got points on one line, expected points all over the face"
+        raise LandmarkFieldError(f"landmarks: {got}; mark others")
     kernel = _kernel(np.linalg.norm(known[:, None] - known, axis=-1))
     displacement = second - first
     strength = _likeliest_strength(kernel, affine, displacement, noise)
@@ -179,6 +181,7 @@ def fit_landmark_field(
     system[: len(first), len(first) :] = affine
     system[len(first) :, : len(first)] = affine.T
     inverse: Float64Array = np.asarray(np.linalg.inv(system), np.float64)
+    # leave-one-out residual i of a linear smoother: (S^-1 d)_i / (S^-1)_ii
     own = inverse[: len(first), : len(first)]
     left_out = (own @ displacement) / np.maximum(np.diag(own), 1e-300)[:, None]
     return LandmarkField(
@@ -194,7 +197,9 @@ def _kernel(away: Float64Array) -> Float64Array:
 def _likeliest_strength(
     kernel: Float64Array, affine: Float64Array, displacement: Float64Array, noise: float
 ) -> float:
-    """Return the strength of deformation by restricted maximum likelihood."""
+    """Estimate the strength of the deformation by restricted maximum likelihood."""
+    # contrasts orthogonal to the affine map are independent of it: in the eigenbasis of their
+    # kernel their variances are strength * eigenvalue + noise^2
     count = len(kernel)
     free = np.linalg.qr(affine, mode="complete")[0][:, affine.shape[1] :]
     if not free.shape[1]:
@@ -211,7 +216,7 @@ def _likeliest_strength(
 
     unit = noise**2
     low, high = math.log(unit / _MAX_STRENGTH), math.log(_MAX_STRENGTH * unit)
-    # the likelihood may have more than one hill: begin at the best of a coarse row
+    # the likelihood may have several maxima: start at the best of a coarse grid
     tried = np.linspace(low, high, 2 * count if count < 40 else 80)
     best = int(np.argmin([cost(x) for x in tried]))
     found = minimize_scalar(

@@ -1,4 +1,4 @@
-"""Named points of a picture, as a user writes them down: a table ``name,x,y``."""
+"""Read named points of an image from a user's table ``name,x,y``."""
 
 import csv
 import math
@@ -22,20 +22,20 @@ def read_landmark_table(path: str | Path) -> dict[str, tuple[float, float]]:
     Returns
     -------
     dict
-        Name to (x, y), px: x to the right and y down from the centre of the upper left pixel.
+        Name to (x, y), px: x to the right and y down from the center of the upper left pixel.
 
     Raises
     ------
     LandmarkError
-        For another header, an empty name, a name twice, or something that is no finite number;
-        it names line and column.
+        For another header, an empty or repeated name, or a coordinate that is not a finite number;
+        the message names line and column.
     """
     found: dict[str, tuple[float, float]] = {}
     lines: dict[str, int] = {}
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise LandmarkError(f"{path}: is no UTF-8 text") from error
+        raise LandmarkError(f"{path}: got another encoding, expected UTF-8; save it so") from error
     header = False
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -44,22 +44,24 @@ def read_landmark_table(path: str | Path) -> dict[str, tuple[float, float]]:
         cells = [cell.strip() for cell in next(csv.reader([line]))]
         if not header:
             if cells != list(LANDMARK_COLUMNS):
-                raise LandmarkError(f"{where}: got columns {cells}, expected name, x, y")
+                hint = "correct the header"
+                raise LandmarkError(f"{where}: got columns {cells}, expected name, x, y; {hint}")
             header = True
             continue
         if len(cells) != len(LANDMARK_COLUMNS):
-            raise LandmarkError(f"{where}: got {len(cells)} cells, expected 3: name, x, y")
+            got = f"got {len(cells)} cells, expected 3: name, x, y"
+            raise LandmarkError(f"{where}: {got}; correct the line")
         name = cells[0]
         if not name:
-            raise LandmarkError(f"{where}, column name: got an empty name")
+            raise LandmarkError(f"{where}, column name: got an empty name; fill it in")
         if name in found:
             raise LandmarkError(
-                f"{where}, column name: {name!r} is there twice, first in line {lines[name]}"
+                f"{where}, column name: got {name!r} twice, first in line {lines[name]}; remove one"
             )
         x, y = (_number(cells[k], f"{where}, column {LANDMARK_COLUMNS[k]}") for k in (1, 2))
         found[name], lines[name] = (x, y), number
     if not header:
-        raise LandmarkError(f"{path}: is empty, expected the columns name, x, y")
+        raise LandmarkError(f"{path}: is empty, expected the columns name, x, y; fill it in")
     return found
 
 
@@ -67,7 +69,7 @@ def _number(cell: str, where: str) -> float:
     try:
         value = float(cell)
     except ValueError as error:
-        raise LandmarkError(f"{where}: got {cell!r}, expected a number") from error
+        raise LandmarkError(f"{where}: got {cell!r}, expected a number; correct it") from error
     if not math.isfinite(value):
-        raise LandmarkError(f"{where}: got {cell!r}, expected a finite number")
+        raise LandmarkError(f"{where}: got {cell!r}, expected a finite number; correct it")
     return value

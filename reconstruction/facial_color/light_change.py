@@ -1,4 +1,4 @@
-"""How the light on a face changes from picture to picture, told by the colors of many pixels."""
+"""Estimate changes of the light on a face between images from the colors of many pixels."""
 
 import math
 
@@ -8,12 +8,12 @@ from scipy.ndimage import gaussian_filter
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 
 MIN_LIGHT_CHANGE = 0.002
-"""Least relative change of light from state to state that is allowed for in each pixel: what a
-flash's energy differs by from pop to pop."""
+"""Minimum relative change of light between states that is allowed in each pixel: the variation of a
+flash's energy."""
 OUTLIER_SIGMAS = 3.0
-"""Standard errors from which on a pixel's light is said not to follow its neighbors'."""
+"""Residual, in standard errors, above which a pixel's light counts as an outlier."""
 MAX_LIGHT_CHANGE = 1.0
-"""Most that matters: with more, the brightness tells nothing."""
+"""Maximum change; beyond it, brightness contains no information."""
 
 
 def smooth_light_changes(
@@ -23,24 +23,24 @@ def smooth_light_changes(
     shape: tuple[int, ...],
     window_px: float,
 ) -> tuple[Float32Array, Float32Array]:
-    """Return how the light of each state differs, smoothed, and one over the variance of the rest.
+    """Estimate each state's light change, smoothed, and the stiffness of the residual.
 
     Parameters
     ----------
     log_shading, shading_variance
-        (S, n): log light on the pixels of each state by their colors alone, and its variance.
+        (S, n): log light on the pixels of each state from their colors alone, and its variance.
     good
-        (S, n): where that means something.
+        (S, n): where both are valid.
     shape
         Rows and columns, H W = n.
     window_px
-        Of the Gaussian that changes are averaged by, px.
+        Standard deviation of the Gaussian that averages changes, px.
 
     Returns
     -------
     change, stiffness
-        (S, n): of log light from the mean of the states, and one over the variance that pixels
-        are off it by.
+        (S, n): change of log light from the mean of the states, and one over the variance of
+        single pixels about it.
     """
     known = good & np.isfinite(shading_variance) & (shading_variance > 0.0)
     light = np.where(known, log_shading, 0.0).astype(np.float64)
@@ -48,8 +48,10 @@ def smooth_light_changes(
     share = np.where(known, 1.0 / variance, 0.0)
     share /= np.maximum(share.sum(axis=0), 1e-300)
     change = light - (share * light).sum(axis=0)
+    # change_s = l_s - sum_k p_k l_k with inverse-variance weights p has the variance
+    # (1 - 2 p_s) v_s + sum_k p_k^2 v_k
     scatter = (1.0 - 2.0 * share) * variance + (share**2 * variance).sum(axis=0)
-    # a pixel seen in one state alone tells nothing of changes
+    # a pixel observed in one state alone contains no change
     weight = np.where(known & (share < 1.0 - 1e-9), 1.0 / np.maximum(scatter, 1e-12), 0.0)
 
     def around(values: Float64Array, reach_px: float) -> Float64Array:
@@ -59,16 +61,18 @@ def smooth_light_changes(
 
     total = np.maximum(around(weight, window_px), 1e-9)
     smooth = around(weight * change, window_px) / total
+    # squared Gaussian weights are a Gaussian of sigma / sqrt(2) over 4 pi sigma^2: the variance of
+    # the weighted mean
     area = 4.0 * math.pi * window_px**2
     smooth_variance = around(weight, window_px / math.sqrt(2.0)) / (area * total**2)
     rest = weight * (np.square(change - smooth) - scatter)
     wide = 3.0 * window_px
     squares = np.maximum(around(weight**2, wide), 1e-9)
     excess = around(weight * rest, wide) / squares
-    # by chance alone it is 0 within this
+    # standard deviation of the excess by chance: a weighted square has the variance 2
     chance = np.sqrt(2.0 * around(weight**2, wide / math.sqrt(2.0)) / (4.0 * math.pi))
     chance /= wide * squares
-    # a wrinkle's shadow is narrower than that: a pixel that is clearly off is off by so much
+    # a wrinkle's shadow is narrower than the window: an outlier has its own deviation as error
     apart = np.square(change - smooth)
     alone = np.where(apart > OUTLIER_SIGMAS**2 * scatter, apart, 0.0)
     loose = np.maximum(np.maximum(excess, alone), 0.0) + chance + smooth_variance

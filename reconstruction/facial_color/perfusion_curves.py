@@ -1,10 +1,9 @@
-"""Curves of blood at a few places of a face: against time, and against the phase of a cycle.
+"""Curves of blood at sites of a face, against time and against the phase of a cycle.
 
-A sequence of maps gives each place a value and a standard error a frame. Against the true phase at
-which each frame was taken they show one cycle, sampled finer than the camera could (Jimenez et al.
-2010, section 3.1 and figures 5 and 6). Whether there is anything between the two states is a
-question of statistics, and is answered with a stated rate of false alarms, and with how deep a
-transition would have been seen.
+A sequence of maps gives each site a value and a standard error per frame. Plotted against the true
+phase of each frame, they show one cycle, sampled more finely than by the camera (Jimenez et al.
+2010, section 3.1 and figures 5 and 6). A test decides whether samples exist between the two levels,
+at a given false-alarm rate; its power for a single sample is reported.
 
 References
 ----------
@@ -22,11 +21,11 @@ from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 
 FACE_SITES = ("forehead", "cheek", "nose", "chin", "temple")
-"""Places that are followed."""
+"""Sites of the curves."""
 TRANSITION_FALSE_ALARM_RATE = 0.05
-"""Rate at which a cycle without transition is said to have one."""
+"""Probability of a detected transition in a cycle without one."""
 MAX_PHASE_FRACTION = 0.25
-"""Shots belong to one phase when they lie closer than this part of the sampling interval."""
+"""Maximum gap within one phase, as a fraction of the sampling interval."""
 _FACE_POSITIONS: Mapping[str, tuple[float, float]] = {
     "forehead": (0.50, 0.14),
     "cheek": (0.27, 0.57),
@@ -34,28 +33,28 @@ _FACE_POSITIONS: Mapping[str, tuple[float, float]] = {
     "chin": (0.50, 0.90),
     "temple": (0.17, 0.30),
 }
-"""Where the places lie between left and right, top and bottom of a face that fills the picture's
+"""Positions of the sites between left and right, top and bottom of a face that fills the image's
 height from hairline to chin: Jimenez et al. 2010, figure 7, by eye."""
 
 
 class CurveError(ValueError):
-    """A curve that cannot be made of what is given."""
+    """Samples that a curve cannot be computed from."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscMeans:
-    """What discs of maps hold."""
+    """Means over discs of maps."""
 
     mean: Float64Array
-    """(P, N): mean of each place in each map; NaN where no pixel is valid."""
+    """(P, N): mean of each site in each map; NaN where no pixel is valid."""
     stderr: Float64Array
-    """(P, N): its standard error, of errors that differ from pixel to pixel."""
+    """(P, N): its standard error, from errors independent between pixels."""
     pixels: Int64Array
-    """(P, N): how many valid pixels it is of."""
+    """(P, N): number of valid pixels."""
 
     @property
     def valid(self) -> BoolArray:
-        """(P, N): whether there is a mean."""
+        """(P, N): whether any pixel is valid."""
         return self.pixels > 0
 
 
@@ -72,14 +71,14 @@ def average_discs(
     Parameters
     ----------
     maps : array_like, shape (N, H, W)
-        Aligned maps, such as hemoglobin, one a frame.
+        Aligned maps, such as hemoglobin, one per frame.
     positions : mapping of str to (x, y)
-        Centres, px: x to the right and y down from the centre of the first pixel.
+        Centers, px: x to the right and y down from the center of the first pixel.
     radius_px : float
-        Of the discs, px, > 0; the pixel nearest to the centre always belongs to it.
+        Radius of the discs, px, > 0; the pixel nearest to the center always belongs to it.
     stderr : array_like, shape (N, H, W), optional
         Standard errors of the maps. None: the scatter within each disc, which overestimates them
-        where the skin is not even.
+        on uneven skin.
     valid : array_like of bool, shape (N, H, W), optional
 
     Returns
@@ -89,7 +88,7 @@ def average_discs(
     Raises
     ------
     CurveError
-        For a shape that does not fit, or a disc beyond the maps.
+        For a mismatched shape, or a center outside the maps.
 
     Examples
     --------
@@ -132,17 +131,17 @@ def average_discs(
 def disc_pixels(
     shape: tuple[int, ...], name: str, position: tuple[float, float], radius_px: float
 ) -> tuple[Int64Array, Int64Array]:
-    """Return rows and columns of the pixels of a disc about (x, y), px.
+    """Return rows and columns of the pixels of a disc around (x, y), px.
 
     Raises
     ------
     CurveError
-        Where its centre lies beyond the map.
+        Where the center is outside the map.
     """
     height, width = shape
     x, y = position
     inside = -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5
-    expected = f"within {width} x {height} px"
+    expected = f"within {width} x {height} px; move it"
     Checks(CurveError).require(inside, name, f"({x:g}, {y:g}) px", expected)
     rows, columns = np.indices((height, width))
     squared = (columns - x) ** 2 + (rows - y) ** 2
@@ -151,27 +150,27 @@ def disc_pixels(
 
 
 def standard_positions(skin: ArrayLike) -> dict[str, tuple[float, float]]:
-    """Return where the places are on a face of which only the outline is known, px.
+    """Return the sites' positions on a face, px, from its outline alone.
 
     Parameters
     ----------
     skin : array_like of bool, shape (H, W)
-        Pixels that show skin: a face from the front that fills the picture's height.
+        Pixels of skin: a frontal face that fills the image's height.
 
     Returns
     -------
     dict
-        (x, y) of :data:`FACE_SITES`; by the middle 96 % of the skin in each direction.
+        (x, y) of :data:`FACE_SITES`, relative to the central 96 % of the skin in each direction.
 
     Raises
     ------
     CurveError
-        When there is no skin, or no picture.
+        When the mask is empty or not two-dimensional.
     """
     shown = np.asarray(skin, bool)
     Checks(CurveError).require(shown.ndim == 2, "skin", f"shape {shown.shape}", "(H, W)")
     rows, columns = np.nonzero(shown)
-    Checks(CurveError).require(rows.size != 0, "skin", "none", "a face")
+    Checks(CurveError).require(rows.size != 0, "skin", "none", "a face; check the mask")
     left, right = np.percentile(columns, (2, 98))
     top, bottom = np.percentile(rows, (2, 98))
     return {
@@ -182,25 +181,25 @@ def standard_positions(skin: ArrayLike) -> dict[str, tuple[float, float]]:
 
 @dataclass(frozen=True, slots=True)
 class Reproducibility:
-    """How well a phase is repeated when it is met again."""
+    """Repeatability of a phase over several cycles."""
 
     sd: float
-    """Standard deviation of one shot among those of its phase; NaN without repeats."""
+    """Standard deviation of one sample within its phase; NaN without repeats."""
     repeats: int
-    """How many shots more than phases: degrees of freedom."""
+    """Number of samples minus number of phases: degrees of freedom."""
     longest_s: float
-    """Longest time between two shots of one phase, s; 0 without repeats."""
+    """Longest time between two samples of one phase, s; 0 without repeats."""
 
 
 def estimate_reproducibility(
     time_s: ArrayLike, phase_s: ArrayLike, values: ArrayLike, *, cycle_s: float
 ) -> Reproducibility:
-    """Compare shots of the same phase in different cycles.
+    """Compare samples of the same phase in different cycles.
 
     Parameters
     ----------
     time_s, phase_s : array_like, shape (N,)
-        When each shot was taken, s, and the phase it met, s.
+        Time of each sample, s, and its phase, s.
     values : array_like, shape (N,)
     cycle_s : float
         Length of the cycle, s.
@@ -225,9 +224,9 @@ def estimate_reproducibility(
 
 
 def group_by_phase(phase_s: ArrayLike, *, cycle_s: float) -> Int64Array:
-    """Return a number for each shot that those of one phase share, shape (N,).
+    """Group samples by phase: return the group number of each sample, shape (N,).
 
-    Phases are parted at gaps that are wider than a quarter of the usual interval.
+    Groups are separated at gaps wider than `MAX_PHASE_FRACTION` of the usual interval.
     """
     phase = np.asarray(phase_s, np.float64) % cycle_s
     order = np.argsort(phase, kind="stable")
@@ -236,35 +235,35 @@ def group_by_phase(phase_s: ArrayLike, *, cycle_s: float) -> Int64Array:
     wide = gaps > MAX_PHASE_FRACTION * usual
     groups = np.empty(phase.size, np.int64)
     groups[order] = np.concatenate([[0], np.cumsum(wide)[:-1]])
-    if not wide[-1]:  # the last and the first are one phase, across the cycle's end
+    if not wide[-1]:  # the last group continues in the first, across the cycle's end
         groups[groups == groups.max()] = 0
     return groups
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transition:
-    """Whether any shot shows the blood between its two levels."""
+    """Result of the test for samples between the two levels of blood."""
 
     seen: bool
-    """Whether at least one does."""
+    """Whether at least one sample is between the levels."""
     where: Int64Array
-    """Indices of those shots."""
+    """Indices of those samples."""
     tested: int
-    """How many shots could."""
+    """Number of samples tested."""
     false_alarm: float
-    """Most probability that a cycle without transition is said to have one."""
+    """Maximum probability of a detected transition in a cycle without one."""
     high: float
     """Level towards the end of the expression."""
     low: float
     """Level towards the end of rest."""
     noise: float
-    """Standard deviation of one shot."""
+    """Standard deviation of one sample."""
     power: float
-    """Probability that a single shot half way between the levels would have been noticed."""
+    """Probability of detecting a single sample half way between the levels."""
 
     @property
     def decided(self) -> bool:
-        """Whether the data could have shown a transition: where not, none seen means nothing."""
+        """Whether the test had enough power; if not, a negative result is inconclusive."""
         return self.power >= 0.5
 
 
@@ -276,19 +275,19 @@ def find_transition(
     stderr: ArrayLike | None = None,
     false_alarm: float = TRANSITION_FALSE_ALARM_RATE,
 ) -> Transition:
-    """Test whether there is a shot between the two levels of a cycle.
+    """Test whether a sample is between the two levels of a cycle.
 
     Parameters
     ----------
     phase_s : array_like, shape (N,)
-        Phase of each shot, s; the expression is asked for at 0 and rest after half of the cycle.
+        Phase of each sample, s; the expression is prompted at 0 and rest after half of the cycle.
     values : array_like, shape (N,)
     cycle_s : float
         Length of the cycle, s.
     stderr : array_like, shape (N,), optional
-        Standard errors; no shot's noise is taken for less than its own.
+        Standard errors; lower bounds of the samples' noise.
     false_alarm : float
-        Probability with which a cycle of two levels only is said to have a transition, at most.
+        Maximum probability of a detected transition in a cycle of two levels only.
 
     Returns
     -------
@@ -297,15 +296,15 @@ def find_transition(
     Raises
     ------
     CurveError
-        When fewer than 3 shots fall into the second half of either state.
+        When fewer than 3 samples fall into the second half of either state.
 
     Notes
     -----
-    The levels are the means of the second half of each state; the noise is that of successive
-    differences there, so that a drift does not count as noise. Every other shot is tested for
-    lying above the lower and below the upper level, by Student's t, both at a rate that keeps all
-    of them together below ``false_alarm`` (Sidak). A shot at one of the levels is an alarm only if
-    it seems off it, so the rate is kept whichever level each shot has.
+    The levels are the means of the second half of each state. The noise is that of successive
+    differences there, so that a drift does not count as noise. Every other sample is tested against
+    both levels by Student's t: it must be above the lower and below the upper one. The rate of each
+    test keeps the family below ``false_alarm`` (Sidak). A sample at one level is an alarm only if
+    it deviates from that level, so the rate is kept whichever level each sample has.
     """
     Checks(CurveError).within("false_alarm", false_alarm, "(0, 1)")
     phase = np.asarray(phase_s, np.float64) % cycle_s
@@ -315,14 +314,14 @@ def find_transition(
         _between(phase, value, 0.5 * middle, middle),
         _between(phase, value, 0.5 * (middle + cycle_s), cycle_s),
     ]
-    few, enough = "fewer than 3 shots late in a state", all(part.size >= 3 for part in settled)
-    Checks(CurveError).require(enough, "phases", few, "more to know its level")
+    few, enough = "fewer than 3 samples late in a state", all(part.size >= 3 for part in settled)
+    Checks(CurveError).require(enough, "phases", few, "at least 3; record more cycles")
     steps = np.concatenate([np.diff(value[part]) for part in settled])
     noise2 = float((steps**2).mean() / 2)
     own2 = np.full(value.size, noise2)
     if stderr is not None:
         own2 = np.maximum(own2, np.square(np.asarray(stderr, np.float64)))
-    # neighbouring differences share a shot: two thirds as much is known as by independent ones
+    # successive differences share a sample: they have two thirds of the degrees of freedom
     freedom = max(1.0, 2.0 * steps.size / 3.0)
     means = [float(value[part].mean()) for part in settled]
     counts = [part.size for part in settled]
@@ -333,7 +332,7 @@ def find_transition(
     upper, lower = (0, 1) if means[0] >= means[1] else (1, 0)
 
     def window(variance: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Return between which values a sample of so much noise is off both levels."""
+        """Return the range of values that deviate from both levels, for a sample's variance."""
         reach = [limit * np.sqrt(variance + usual2 / count) for count in counts]
         return means[lower] + reach[lower], means[upper] - reach[upper]
 
@@ -358,7 +357,7 @@ def find_transition(
 
 
 def _between(phase: Float64Array, value: Float64Array, begin: float, end: float) -> Int64Array:
-    """Return the shots of a stretch of phases that have a value, in the order of phase."""
+    """Return the samples of a phase interval that have a value, in the order of phase."""
     order = np.argsort(phase, kind="stable")
     inside = (phase[order] >= begin) & (phase[order] < end) & np.isfinite(value[order])
     return np.asarray(order[inside], np.int64)

@@ -1,12 +1,12 @@
-"""Levels, delay and time constant of blood that relaxes, with what the samples can tell of them.
+"""Fit levels, delay and time constant of relaxing blood, with standard errors and intervals.
 
-The curves of a prompted cycle and of an event are here, and what a fit tells; how likely each delay
-and time constant is, and the intervals of that, are of
-`reconstruction.facial_color.perfusion_likelihood`.
+This module defines the curves of a prompted cycle and of an event, and the result of a fit.
+`reconstruction.facial_color.perfusion_likelihood` computes the likelihood of delays and time
+constants and its intervals.
 
-Where the face moves, what is found of the blood of one pose is off that of the other by an unknown
-step, the same in all samples of a pose. It comes as promptly as the movement and would be taken
-for quick blood; so it is one more level of each curve, with its standard error as prior.
+Where the face moves, the blood of one pose is offset from that of the other by an unknown step, the
+same in all samples of a pose. The step is as prompt as the movement and would look like fast blood.
+It is therefore an additional level of each curve, with its standard error as prior.
 """
 
 from dataclasses import dataclass, replace
@@ -27,11 +27,11 @@ TimeConstantStatus = Literal["estimated", "only below", "only above", "unknown"]
 BOUND_LEVEL = 0.95
 """Confidence of bounds."""
 ONE_SIGMA_LEVEL = 0.6827
-"""Confidence of the interval whose half a standard error is."""
+"""Confidence of the interval whose half-width is the standard error."""
 COVERAGE_FACTOR_95 = 1.959964
-"""Half width of a 95 % interval in standard errors."""
+"""Coverage factor k of a 95 % interval."""
 LEVEL_TEST_P_VALUE = 0.001
-"""Two levels differ when chance would make them differ as much at most so often."""
+"""Maximum probability, by chance, of a difference at which two levels count as different."""
 _GRID_NODES = 97
 _DELAY_NODES = 81
 _POSE_DELAY_NODES = 41
@@ -39,12 +39,12 @@ _POSE_DELAY_NODES = 41
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelaxationFit:
-    """What relaxing curves share, and the levels of each."""
+    """Shared parameters of relaxing curves, and the levels of each."""
 
     start: Float64Array
-    """(P,): level that is left: rest, or that of the event's end."""
+    """(P,): initial level: rest, or that at the event's end."""
     end: Float64Array
-    """(P,): level that is gone to."""
+    """(P,): final level."""
     stderr_start: Float64Array
     """(P,)"""
     stderr_end: Float64Array
@@ -54,30 +54,30 @@ class RelaxationFit:
     stderr_time_constant_s: float
     """Half of its 68 % interval, s; NaN where it is only bounded."""
     interval_s: tuple[float, float]
-    """95 % interval of the time constant, s; 0 or inf where there is no such end."""
+    """95 % interval of the time constant, s; 0 or inf at an unbounded end."""
     interval_68_s: tuple[float, float]
-    """68 % interval of the time constant, s, within the 95 % one: its ends lie as far from the best
-    as the likelihood says of each side, not a standard error to both."""
+    """68 % interval of the time constant, s, within the 95 % one. Its ends follow the likelihood on
+    each side, so the interval can be asymmetric."""
     known: TimeConstantStatus
     """Whether the time constant is estimated, or "only below" the interval's upper end, or "only
-    above" its lower one, or the levels do not differ."""
+    above" its lower one, or "unknown" because the levels do not differ."""
     delay_s: float
-    """Time from prompt to change, s; 0 where none is fitted. With steps of a pose, the mean of what
-    it may be."""
+    """Time from prompt to change, s; 0 where none is fitted. With steps of a pose, the posterior
+    mean."""
     stderr_delay_s: float
     """Half of its 68 % interval, s; with steps of a pose, the standard deviation."""
     delay_interval_s: tuple[float, float]
-    """95 % interval of the delay, s: where the change is quick, the gap between two samples."""
+    """95 % interval of the delay, s; for a fast change, the gap between two samples."""
     stderr_change: Float64Array
-    """(P,): standard error of ``end`` less ``start``, which hang together."""
+    """(P,): standard error of ``end`` minus ``start``, which are correlated."""
     step: Float64Array
-    """(P,): what the samples of a moved face are off the curve by together; 0 where none is."""
+    """(P,): common offset of the samples of a moved face from the curve; 0 without one."""
     stderr_step: Float64Array
     """(P,)"""
     noise: Float64Array
     """(P,): standard deviation of one sample about the curve."""
     chi2: float
-    """Weighted square sum over the degrees of freedom by the given standard errors; NaN without."""
+    """Reduced chi-square by the given standard errors; NaN without."""
 
     def __str__(self) -> str:
         low, high = self.interval_s
@@ -88,7 +88,7 @@ class RelaxationFit:
         if self.known == "only above":
             return f"above {low:.3g} s"
         if np.any(self.stderr_step > 0):
-            return "unknown: the levels do not differ by more than the pose may make"
+            return "unknown: the levels do not differ by more than the pose step allows"
         return "unknown: the levels do not differ"
 
 
@@ -102,26 +102,26 @@ def fit_cycle(
     pose: PoseStep | None = None,
     bend: float = 0.0,
 ) -> RelaxationFit:
-    """Fit blood that relaxes to one level after a prompt and back after the next, again and again.
+    """Fit blood that relaxes to one level after a prompt and back after the next, periodically.
 
     Parameters
     ----------
     phase_s : array_like, shape (N,)
         Phase of each sample, s.
     values : array_like, shape (N,) or (P, N)
-        One curve, or several that share delay and time constant; NaN is left out.
+        One curve, or several that share delay and time constant; NaN is omitted.
     cycle_s : float
-        Length of the cycle, s; the expression is asked for at 0.
+        Length of the cycle, s; the expression is prompted at 0.
     change_s : float, optional
-        When rest is asked for, s; None: after half of the cycle.
+        Time of the prompt of rest, s; None: after half of the cycle.
     stderr : array_like, optional
-        Standard errors of the values, their shape: relative weights, and what ``chi2`` is by.
+        Standard errors of the values, their shape: relative weights, and the basis of ``chi2``.
     pose : PoseStep, optional
-        Which samples are of a moved face, and how well their values are joined to those at rest.
-        Blood is then taken to set out when the face does: without that, a late beginning and a
-        slow course look alike beside a free step. None: all are of one pose.
+        Samples of a moved face, and the standard error of their offset from those at rest. Blood
+        is then assumed to start with the movement: with a free step, a late start and a slow course
+        are indistinguishable. None: all samples are of one pose.
     bend : float
-        As of `fit_course`.
+        See `fit_course`.
 
     Returns
     -------
@@ -131,7 +131,7 @@ def fit_cycle(
     Raises
     ------
     CurveError
-        For fewer than 6 samples, a shape that does not fit, or a cycle without both changes.
+        For fewer than 6 samples, a mismatched shape, or a cycle without both changes.
 
     Examples
     --------
@@ -148,14 +148,14 @@ def fit_cycle(
     check.within("cycle_s", cycle_s, "(0, inf)")
     check.within("change_s", middle, f"(0, {cycle_s})")
     data = CurveSamples.of(phase, values, stderr, pose)
-    phase = np.where(np.isfinite(phase), phase, 0.0)  # of weight 0, but a number
+    phase = np.where(np.isfinite(phase), phase, 0.0)  # weight 0, but a finite number
 
     def straight(delay: Float64Array, constant: Float64Array) -> Float64Array:
-        """Part of the way to the expression's level, of the steady cycle."""
+        """Fraction of the way to the expression's level, in the steady cycle."""
         on, off = middle, cycle_s - middle
         into = (phase - delay) % cycle_s
         up, down = np.exp(-on / constant), np.exp(-off / constant)
-        # level at the beginning of the expression, after infinitely many cycles
+        # level at the start of the expression, after infinitely many cycles
         begin = (1.0 - up) * down / (1.0 - up * down)
         top = 1.0 - (1.0 - begin) * up
         rising = 1.0 - (1.0 - begin) * np.exp(-np.minimum(into, on) / constant)
@@ -179,23 +179,23 @@ def fit_course(time_s: ArrayLike, values: ArrayLike, *, bend: float = 0.0) -> Re
     Parameters
     ----------
     time_s : array_like, shape (N,)
-        s after the event; samples before it are not used.
+        Time after the event, s; samples before it are not used.
     values : array_like, shape (N,) or (P, N)
-        One curve, or several that share the time constant; NaN is left out.
+        One curve, or several that share the time constant; NaN is omitted.
     bend : float
-        Standard error of how the values are bent over the change, in [0, 1): a part s of it
-        shows as s +- bend s (1 - s). The best constant is that of no bend; what both bends move it
-        by is added to its errors in squares.
+        Standard error of the values' curvature over the change, in [0, 1): a fraction s appears as
+        s +- bend s (1 - s). The best time constant is that without bend; its shifts by both signs
+        of the bend are added to its errors in quadrature.
 
     Returns
     -------
     RelaxationFit
-        ``start`` is the level right after the event, ``end`` the one that is approached.
+        ``start`` is the level right after the event, ``end`` the asymptotic one.
 
     Raises
     ------
     CurveError
-        For fewer than 5 samples after the event, a shape that does not fit, or a bend outside.
+        For fewer than 5 samples after the event, a mismatched shape, or a bend out of range.
     """
     Checks(CurveError).within("bend", bend, "[0, 1)")
     time = np.asarray(time_s, np.float64)
@@ -204,7 +204,7 @@ def fit_course(time_s: ArrayLike, values: ArrayLike, *, bend: float = 0.0) -> Re
     data = CurveSamples.of(time, np.atleast_2d(np.asarray(values, np.float64))[:, after], None)
 
     def course(delay: Float64Array, constant: Float64Array) -> Float64Array:
-        """Part of the way to the new level."""
+        """Fraction of the way to the new level."""
         return np.asarray(-np.expm1(-time / constant))
 
     span = float(np.ptp(time))
@@ -214,11 +214,11 @@ def fit_course(time_s: ArrayLike, values: ArrayLike, *, bend: float = 0.0) -> Re
 
 
 def _fit_bent(data: CurveSamples, search: RelaxationGrid, bend: float) -> RelaxationFit:
-    """Return a fit whose time constant is as uncertain as what may have bent the values."""
+    """Fit curves without bend, and add the bend's contribution to the time constant's errors."""
 
     def fit(amount: float) -> RelaxationFit:
         def shape(delay: Float64Array, constant: Float64Array) -> Float64Array:
-            """Return the shape as it shows where values are bent over their change."""
+            """Return the shape s + amount s (1 - s)."""
             part = search.curve(delay, constant)
             return np.asarray(part + amount * part * (1.0 - part)) if amount else part
 
@@ -232,7 +232,7 @@ def _fit_bent(data: CurveSamples, search: RelaxationGrid, bend: float) -> Relaxa
     moved = (min(moved_to), max(moved_to))
 
     def widened(interval: tuple[float, float], sigmas: float) -> tuple[float, float]:
-        """Return an interval of so many standard errors with what bends add to it."""
+        """Widen an interval of ``sigmas`` by the bend, in quadrature of log time constants."""
         low, high = (
             middle * np.exp(sign * np.hypot(np.log(end / middle), sigmas * np.log(by / middle)))
             if 0.0 < end < np.inf
@@ -251,15 +251,15 @@ def _fit_bent(data: CurveSamples, search: RelaxationGrid, bend: float) -> Relaxa
 
 
 def square_levels(fit: RelaxationFit) -> RelaxationFit:
-    """Return the levels of blood of a fit to its square root.
+    """Convert a fit to the square root of blood into levels of blood.
 
-    Blood fills its vessels' cross-section: where their radius relaxes exponentially, so does the
-    root of blood, and blood itself does not.
+    Blood fills its vessels' cross-section. If their radius relaxes exponentially, so does the
+    square root of blood, but not blood itself. The variance of b = r^2 is 4 r^2 times that of r.
 
     Parameters
     ----------
     fit
-        Of roots of blood.
+        Fit to square roots of blood.
 
     Returns
     -------
@@ -291,7 +291,7 @@ def _fit(given: CurveSamples, search: RelaxationGrid) -> RelaxationFit:
     data = given.with_free_step()
     for _ in range(1 + data.has_steps):
         fit = _fit_once(data, search)
-        # how much a step is held by its prior depends on the noise, which a free step leaves
+        # the prior's weight on a step depends on the noise, which a fit with a free step estimates
         data = given.with_prior(np.square(fit.noise))
     return fit
 
@@ -325,7 +325,8 @@ def _fit_once(data: CurveSamples, search: RelaxationGrid) -> RelaxationFit:
         gap, with_constant=known == "estimated", with_delay=delays.size > 1 and not data.has_steps
     )
     if data.has_steps:
-        # beside a step the delay trades with levels, and its end is as likely as its middle
+        # with a step, delay and levels are correlated and the delay's likelihood is flat over its
+        # range: average over all delays by their probability
         weights = landscape.delay_weights()
         shapes = curve(delays[:, None], landscape.constant_at_delays()[:, None])
         levels, gaps = data.levels(shapes)

@@ -1,11 +1,10 @@
-"""How likely each delay and time constant of relaxing blood is: profiles, intervals, errors.
+"""Profile likelihood of the delay and time constant of relaxing blood, with intervals.
 
-Levels enter a curve linearly: for each delay and time constant they are solved for, and what
-remains is a landscape of two numbers, looked at as a whole. So a time constant far below the
-sampling interval is no failure of a search: the landscape is flat there, and what is told is the
-bound. The noise is that of what the best curve leaves. Intervals are of the profile likelihood: all
-values at which the square sum, least over everything else, exceeds the least one by no more than
-Fisher's F allows.
+Levels enter a curve linearly and are solved for at each delay and time constant. The remaining
+function of two parameters is evaluated on a full grid. A time constant far below the sampling
+interval is therefore reported as a bound, because the likelihood is flat there. The noise is that
+of the best curve's residuals. An interval contains all values at which the square sum, minimized
+over all other parameters, exceeds its minimum by at most Fisher's F quantile.
 """
 
 from __future__ import annotations
@@ -21,26 +20,26 @@ from reconstruction.facial_color.perfusion_samples import CurveSamples
 
 Interval = tuple[float, float]
 Shape = Callable[[Float64Array, Float64Array], Float64Array]
-"""Delays and constants of shape (..., 1) to the part of the way, (..., N)."""
+"""Function from delays and constants of shape (..., 1) to the fraction of the way, (..., N)."""
 
 _SLOPE_NODES = np.array([0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.5])
-"""Time constants since the beginning of a change at which samples are tried."""
+"""Time since the start of a change at which a sample is placed, in time constants."""
 _MIN_DELAY_STEPS = 3.0
-"""Constants below so many steps of the delay need delays between them."""
+"""Time constants below this many delay steps get delays of their own."""
 
 
 @dataclass(frozen=True, slots=True)
 class RelaxationGrid:
-    """What is tried for a curve."""
+    """Grid of delays and time constants for a curve."""
 
     curve: Shape
-    """Part of the way that blood has gone."""
+    """Fraction of the way between the levels."""
     delays: Float64Array
-    """(D,): delays that are tried with each constant, s, ascending; one where none is fitted."""
+    """(D,): delays for each constant, s, ascending; one where none is fitted."""
     constants: Float64Array
-    """(C,): time constants that are tried, s, ascending; their logarithms in equal steps."""
+    """(C,): time constants, s, ascending, with equal steps of the logarithm."""
     at: Float64Array
-    """(M,): how long after a prompt samples are, s; () where there are no prompts."""
+    """(M,): times of the samples after a prompt, s; () without prompts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +49,7 @@ class ProfileLikelihood:
     data: CurveSamples
     search: RelaxationGrid
     total: Float64Array
-    """(C, D or more): square sums of the best levels; beyond D are delays of each constant's
+    """(C, D or more): square sums at the best levels; beyond D for delays of each constant's
     own."""
     noise2: Float64Array
     """(P,): variance of one sample of each curve."""
@@ -61,20 +60,20 @@ class ProfileLikelihood:
     time_constant_s: float
     """Most likely time constant, s."""
     min_chi2: float
-    """Least square sum."""
+    """Minimum square sum."""
     chi2: float
-    """Weighted square sum over the degrees of freedom by the given standard errors; NaN without."""
+    """Reduced chi-square by the given standard errors; NaN without."""
 
     @staticmethod
     def evaluate(data: CurveSamples, search: RelaxationGrid) -> ProfileLikelihood:
-        """Look at all delays and constants, and refine the best.
+        """Evaluate all delays and constants, and refine the best.
 
         Parameters
         ----------
         data
             Samples of P curves.
         search
-            What is tried.
+            Grid to evaluate.
         """
         delays, constants = search.delays, search.constants
 
@@ -82,21 +81,21 @@ class ProfileLikelihood:
             """(..., P) square sums for delays and constants that broadcast to (...)."""
             return data.residual(search.curve(delay[..., None], constant[..., None]))
 
-        # by constant: the common delays, and where those are too coarse some that put a sample on a
-        # slope
+        # per constant: the common delays and, where their spacing is too coarse, delays that place
+        # a sample on the slope
         least = _MIN_DELAY_STEPS * (delays[1] - delays[0]) if delays.size > 1 else 0.0
         quick = constants < least
         near = np.array([_near(search.at, constant, delays) for constant in constants[quick]])
         tried = delays.size + (near.shape[1] if quick.any() else 0)
         by_curve = np.full((constants.size, tried, len(data.values)), np.inf)
-        # one constant after the other: all at once would take hundreds of megabytes
+        # one constant at a time limits the memory to megabytes
         for row, constant in enumerate(constants):
             by_curve[row, : delays.size] = residuals(delays, np.full(delays.size, constant))
         for place, some in zip(np.flatnonzero(quick), near, strict=True):
             by_curve[place, delays.size :] = residuals(some, np.full(some.size, constants[place]))
         curves = len(data.values)
         samples = (data.weights > 0).sum(axis=1)
-        # each curve by its own noise, which the best common curve leaves
+        # each curve has its own noise, from the residuals of the best common curve
         freedom = np.maximum(samples - 2.0 - (1.0 + (delays.size > 1)) / curves, 1.0)
         noise2 = np.full(curves, 1.0)
         tiny = np.finfo(float).eps * np.maximum((data.weights * data.values**2).sum(axis=1), 1e-300)
@@ -130,7 +129,7 @@ class ProfileLikelihood:
         )
 
     def constant_interval(self, level: float) -> Interval:
-        """Return the ends of the time constant's interval of a confidence, s; 0, inf: none.
+        """Return the time constant's confidence interval, s; 0, inf: unbounded.
 
         Parameters
         ----------
@@ -143,7 +142,7 @@ class ProfileLikelihood:
         return float(np.exp(low)), float(np.exp(high))
 
     def delay_interval(self, level: float) -> tuple[float, float]:
-        """Return the ends of the delay's interval of a confidence, s, within what is tried.
+        """Return the delay's confidence interval, s, within the grid.
 
         Parameters
         ----------
@@ -155,7 +154,7 @@ class ProfileLikelihood:
         return max(low, float(delays[0])), min(high, float(delays[-1]))
 
     def delay_weights(self) -> Float64Array:
-        """Return the probability of each delay, (D,), all alike before; with its best constant."""
+        """Return the posterior of each delay, (D,), with a uniform prior and its best constant."""
         weights = np.exp(-0.5 * self._along())
         return np.asarray(weights / weights.sum())
 
@@ -169,14 +168,13 @@ class ProfileLikelihood:
     ) -> tuple[Float64Array, ...]:
         """Return standard errors of start, end, their difference, and the step of a pose.
 
-        By the information that the samples hold, and with what delay and constant add where they
-        are known.
+        From the Fisher information of the samples; estimated delays and constants add to it.
 
         Parameters
         ----------
         gap : ndarray, shape (P,)
             Change of level.
-        with_constant, with_delay
+            Change of level, ``end`` minus ``start``.
             Whether they are estimated from the samples.
 
         Returns
@@ -209,7 +207,7 @@ class ProfileLikelihood:
             step = 2 * curves + p
             if self.data.stderr_of_pose[p] > 0 and normal[step, step] > 0:
                 normal[step, step] += 1.0 / self.data.stderr_of_pose[p] ** 2
-            else:  # no step: not a number of this fit
+            else:  # without a step, its row is removed from the normal equations
                 normal[step, :] = normal[:, step] = 0.0
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         covariance = np.linalg.pinv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
@@ -224,7 +222,7 @@ class ProfileLikelihood:
         )
 
     def _along(self) -> Float64Array:
-        """Return the excess of the square sum over its least, by delay, (D,)."""
+        """Return the excess of the square sum over its minimum, by delay, (D,)."""
         least = self.total[:, : self.search.delays.size].min(axis=0)
         return np.asarray(least - self.min_chi2)
 
@@ -233,9 +231,9 @@ class ProfileLikelihood:
 
 
 def _near(since: Float64Array, constant: float, delays: Float64Array) -> Float64Array:
-    """Return delays that leave a sample, so long after a prompt, on the slope of the change, s.
+    """Return delays that place a sample on the slope of the change, s.
 
-    Their number is the same for each constant; those beyond the range are put into it.
+    Their number is the same for each constant; those beyond the range are clipped to it.
     """
     late = since[np.isfinite(since) & (since <= 2 * delays[-1])]
     return np.clip((late[:, None] - constant * _SLOPE_NODES).ravel(), delays[0], delays[-1])
@@ -248,7 +246,7 @@ def _refined(
     logs: Float64Array,
     at_start: float,
 ) -> tuple[float, float, float]:
-    """Return delay, logarithm of the constant, and height of the lowest point near the start."""
+    """Return delay, logarithm of the constant, and square sum at the minimum near the start."""
 
     def around(grid: Float64Array, at: float) -> tuple[float, float]:
         step = float(grid[1] - grid[0])
@@ -277,7 +275,7 @@ def _refined(
 
 
 def _crossings(grid: Float64Array, profile: Float64Array, best: float, excess: float) -> Interval:
-    """Return where a profile first rises by ``excess`` on both sides of its best; inf: nowhere."""
+    """Return where a profile first rises by ``excess`` on both sides of its minimum, or inf."""
     ends: list[float] = []
     for sign in (-1, 1):
         side = grid[sign * (grid - best) > 0][::sign]
@@ -288,7 +286,7 @@ def _crossings(grid: Float64Array, profile: Float64Array, best: float, excess: f
             continue
         k = int(above[0])
         inner, level = (best, 0.0) if k == 0 else (float(side[k - 1]), float(height[k - 1]))
-        # square roots of a parabola's heights are straight
+        # the square root of a parabola is linear, so interpolate square roots
         a, b, c = (np.sqrt(max(v, 0.0)) for v in (level, float(height[k]), excess))
         ends.append(inner + (float(side[k]) - inner) * float((c - a) / max(b - a, 1e-12)))
     return ends[0], ends[1]

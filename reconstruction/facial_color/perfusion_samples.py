@@ -1,9 +1,9 @@
-"""Samples of curves that are fitted by levels and a shape, and the step between poses in them.
+"""Samples of curves with linear levels, and the step between the poses of a moving face.
 
-A curve is a level, a gap times a shape, and in samples of a moved face a step. Of the step a
-normal prior is known, so it is integrated out: the samples' covariance has one more term of rank
-one, and its inverse is that of independent samples once a part of the moved samples' mean is taken
-from them. All of it is taken where the step is free, nothing where there is none.
+A curve is a level, plus a gap times a shape, plus a step in samples of a moved face. The step has a
+normal prior and is integrated out, which adds a term of rank one to the samples' covariance. The
+inverse is that of independent samples after a fraction of the moved samples' mean is subtracted
+from them: 1 for a free step, 0 without a step.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from reconstruction.facial_color.perfusion_curves import CurveError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseStep:
-    """What is known of the step that a moved face makes in curves."""
+    """Prior of the step that a moved face adds to curves."""
 
     moved: BoolArray
     """(N,): samples in which the face has moved."""
     stderr: Float64Array
-    """(P,): standard error of the level of those samples against the others, >= 0."""
+    """(P,): standard error of the level of those samples relative to the others, >= 0."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,22 +39,22 @@ class CurveSamples:
     moved: Float64Array
     """(N,): 1 where the face has moved, else 0."""
     stderr_of_pose: Float64Array
-    """(P,): prior of the step; 0 where there is none, and where all samples are of one pose."""
+    """(P,): prior of the step; 0 without a step, and where all samples are of one pose."""
     removed_fraction: Float64Array
-    """(P,): part of the moved samples' mean that is taken from them, 0 to 1."""
+    """(P,): fraction of the moved samples' mean that is subtracted from them, 0 to 1."""
 
     @staticmethod
     def of(
         at: Float64Array, values: ArrayLike, stderr: ArrayLike | None, pose: PoseStep | None = None
     ) -> CurveSamples:
-        """Return the samples of curves, without steps yet.
+        """Return the samples of curves, before steps are applied.
 
         Parameters
         ----------
         at : ndarray, shape (N,)
             Time or phase, s.
         values : array_like, shape (N,) or (P, N)
-            NaN is left out.
+            NaN is omitted.
         stderr : array_like, optional
             Standard errors, the values' shape.
         pose : PoseStep, optional
@@ -62,7 +62,7 @@ class CurveSamples:
         Raises
         ------
         CurveError
-            For fewer than 5 samples of a curve, or a shape that does not fit.
+            For fewer than 5 samples of a curve, or a mismatched shape.
         """
         shown = np.atleast_2d(np.asarray(values, np.float64))
         check = Checks(CurveError)
@@ -74,7 +74,7 @@ class CurveSamples:
             check.shape("stderr", variance, shown.shape)
             good &= np.isfinite(variance) & (variance > 0)
         usable = int(good.sum(axis=1).min(initial=at.size))
-        check.require(usable >= 5, "values", f"{usable} usable", ">= 5")
+        check.require(usable >= 5, "values", f"{usable} usable", ">= 5; record more samples")
         inverse = np.where(good, 1.0 if stderr is None else 1.0 / variance, 0.0)
         count = good.sum(axis=1, keepdims=True)
         scale = count / inverse.sum(axis=1, keepdims=True)
@@ -93,40 +93,43 @@ class CurveSamples:
     def pose_change_interval(
         self, phase: Float64Array, middle: float, longest: float
     ) -> tuple[float, float]:
-        """Return between which delays the face moves: when it last had not, and first had.
+        """Return the range of the movement's delay: last sample before it, and first after it.
 
         Parameters
         ----------
         phase : ndarray, shape (N,)
-            Since the prompt of the expression, in [0, cycle), s.
+            Phase since the prompt of the expression, in [0, cycle), s.
         middle
-            When rest is asked for, s.
+            Time of the prompt of rest, s.
         longest
-            Longest delay that is looked at, s.
+            Longest delay that is considered, s.
         """
         since = np.where(phase < middle, phase, phase - middle)
-        done = (self.moved > 0.0) == (phase < middle)  # shows what was asked for last
+        done = (self.moved > 0.0) == (phase < middle)  # the face follows the last prompt
         soon = since <= longest
         not_yet = float(since[soon & ~done].max(initial=0.0))
         already = float(since[soon & done].min(initial=longest))
-        # reactions differ: between the earliest that has and the latest that has not, where they
-        # cross
+        # reaction times vary: where the ranges overlap, between the earliest sample after the
+        # movement and the latest before it
         low, high = min(not_yet, already), max(not_yet, already)
         return (low, high) if high > low else (0.0, longest)
 
     def with_free_step(self) -> CurveSamples:
-        """Return these with steps of which nothing is known, where there are any."""
+        """Return the samples with free steps, where any step exists."""
         return replace(self, removed_fraction=np.where(self.stderr_of_pose > 0, 1.0, 0.0))
 
     def with_prior(self, noise2: Float64Array) -> CurveSamples:
-        """Return these with steps of their prior, for noise of these variances (P,)."""
+        """Return the samples with steps under their prior, for noise variances (P,)."""
+        # a step of prior variance t^2 in samples of total weight M has the fraction
+        # held = M t^2 / (noise2 + M t^2) of its estimate
         many = (self.weights * self.moved).sum(axis=-1) * self.stderr_of_pose**2
         held = many / np.maximum(noise2 + many, 1e-300)
-        # B = 1 - c m m'W / m'Wm has B'WB = W - (2c - c^2) W m m'W / m'Wm: W less the step's part
+        # with m = moved: B = 1 - c m m'W / m'Wm has B'WB = W - (2c - c^2) W m m'W / m'Wm, so that
+        # held = 2c - c^2 and c = 1 - sqrt(1 - held)
         return replace(self, removed_fraction=1.0 - np.sqrt(np.maximum(1.0 - held, 0.0)))
 
     def residual(self, shape: Float64Array) -> Float64Array:
-        """Return the weighted square sum of the best levels, (..., P), of shapes (..., N)."""
+        """Return the weighted square sum at the best levels, (..., P), of shapes (..., N)."""
         level, gap = self.levels(shape)
         ones, values, curve = self._without_step(shape)
         left = values - level[..., None] * ones - gap[..., None] * curve
@@ -152,7 +155,7 @@ class CurveSamples:
         return np.asarray((1.0 - (1.0 - self.removed_fraction) ** 2) * self._of_moved(left))
 
     def _without_step(self, shape: Float64Array) -> tuple[Float64Array, Float64Array, Float64Array]:
-        """Return ones, values and shape with the moved samples' mean taken from them."""
+        """Return ones, values and shape with the step's part of the moved samples subtracted."""
         curve = shape[..., None, :]
         if not self.removed_fraction.any():
             return np.ones_like(self.values), self.values, curve

@@ -1,13 +1,12 @@
-"""What the color of a picture errs by because it was laid over another one.
+"""Color error of an image that its registration to another image causes.
 
-A picture of an expression is laid over the neutral one with an error of place
-(`reconstruction.correspondence.expression_alignment`), so that a pixel shows the color of skin
-beside it. That is the picture's own error, where a face that holds still has errors that its
-pictures share.
+An image of an expression is warped to the neutral one with a position error
+(`reconstruction.correspondence.expression_alignment`), so that a pixel shows the color of
+neighboring skin. This error belongs to one image; images of a still face share their errors.
 
-Light that slopes evenly makes a misplaced picture brighter or darker all around alike. Who follows
-how the light changes from picture to picture (`reconstruction.facial_color.light_change`) has taken
-that off: what is left is the slopes that are finer than the window in which it is followed.
+A uniform slope of illumination makes a misregistered image uniformly brighter or darker.
+`reconstruction.facial_color.light_change` removes such changes: the slopes that remain are finer
+than its window.
 """
 
 from typing import Final
@@ -21,15 +20,15 @@ from reconstruction.chromophores import model_error
 from reconstruction.correspondence.expression_alignment import Alignment
 
 SLOPE_WINDOW_PX: Final = 1.0
-"""Standard deviation of the window that squares of slopes are averaged in, px: over single pixels
-noise would count as slope."""
+"""Standard deviation of the window that averages squared slopes, px; single pixels would count
+noise as slope."""
 MOTION_VARIANCE_SCALE: Final = 3.3
-"""Variance of what moved faces' colors differ by from still ones' over what place and slope give:
-so that, with noise, 68 % lie in the 68 % ellipse. Sites of the color filter array stand elsewhere
-on the skin's texture, and pixels are interpolated. Of 13 moved subjects of seeds 0 to 16, maps 192
-px across, each alone holds 64 to 72 %."""
+"""Ratio of the color variance between moved and still faces to the one that position error and
+slope predict. With it and noise, the 68 % ellipse contains 68 %. Sites of the color filter array
+sample other positions of the skin's texture, and pixels are interpolated. For each of 13 moved
+subjects of seeds 0 to 16, maps 192 px across, the coverage is 64 to 72 %."""
 BRIGHTNESS_REMOVAL: Final = np.eye(3) - 1.0 / 3.0
-"""Takes the mean of the channels away."""
+"""Projection that removes the mean of the channels."""
 
 
 def registration_covariance(
@@ -40,31 +39,31 @@ def registration_covariance(
     *,
     light_window_px: float | None = None,
 ) -> Float64Array:
-    """Return the covariance of each pixel's relative error by its place, (H, W, 3, 3).
+    """Return the covariance of each pixel's relative error by registration, (H, W, 3, 3).
 
     Parameters
     ----------
     rgb, variance
-        (H, W, 3): the picture as it was laid over the neutral one, linear camera RGB, and its
-        noise, which is no slope.
+        (H, W, 3): the warped image, linear camera RGB, and its noise variance, which is subtracted
+        from the slopes.
     valid
-        (H, W): where it means something; 0 elsewhere.
+        (H, W): where the image is valid; the result is 0 elsewhere.
     alignment
-        How it was laid over.
+        Warp to the neutral image.
     light_window_px
-        Standard deviation of the window, px, in which changes of light are followed and so are no
-        error, above 0. None: they are not followed.
+        Standard deviation of the window, px, above 0, in which changes of light are removed. None:
+        they are not removed.
 
     Returns
     -------
     ndarray of float64
-        With the brightness that skin and its shading have beside the pixel, but for what changes
-        as slowly as the window.
+        Includes the brightness of neighboring skin and its shading, without changes slower than
+        the window.
 
     Notes
     -----
-    A pixel that is off by d, of variance `error_px`^2 / 2 along each axis, errs by the slope of
-    log color times d; `MOTION_VARIANCE_SCALE` is what it is short of.
+    A position error d, of variance `error_px`^2 / 2 along each axis, gives an error of the slope of
+    log color times d; `MOTION_VARIANCE_SCALE` corrects its variance.
 
     Examples
     --------
@@ -99,7 +98,7 @@ def _slopes(
     outer = np.zeros((*good.shape, 3, 3))
     count = np.zeros(good.shape)
     for axis in (0, 1):
-        # neighbors themselves: differences over two pixels leave out what is as fine as one
+        # differences of direct neighbors: central differences over two pixels miss fine detail
         here, after = (
             tuple(part if a == axis else slice(None) for a in (0, 1))
             for part in (slice(None, -1), slice(1, None))
@@ -121,7 +120,7 @@ def _slopes(
         for j in range(i, 3):
             smooth = gaussian_filter(outer[..., i, j], SLOPE_WINDOW_PX, mode="constant")
             outer[..., i, j] = outer[..., j, i] = 2.0 * smooth / known
-    # slopes that noise hides are 0, in each direction of color
+    # slopes below the noise are set to 0, in each principal direction of color
     values, vectors = np.linalg.eigh(outer)
     return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ vectors.swapaxes(-1, -2))
 
@@ -129,7 +128,7 @@ def _slopes(
 def _average_brightness_slope(
     slope: Float64Array, known: BoolArray, window_px: float
 ) -> Float64Array:
-    """Return the slope of brightness averaged over a window, (..., 1), for all channels alike."""
+    """Return the brightness slope averaged over a window, (..., 1), the same for all channels."""
     weight = gaussian_filter(known.astype(np.float64), window_px, mode="constant")
     total = gaussian_filter(slope.mean(axis=-1), window_px, mode="constant")
     return np.asarray(total / np.maximum(weight, 1e-6))[..., None]

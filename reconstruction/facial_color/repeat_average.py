@@ -1,9 +1,8 @@
-"""The mean picture of repeats, and how far it errs: by noise, or by what repeats differ more.
+"""Average repeated images, with the variance of the mean by noise or by their scatter.
 
-Repeats that differ by more than their noise say how far skin or pose repeat. What counts is their
-color: flashes repeat to some thousandths of their energy, which makes a whole picture brighter or
-darker, and how bright a pixel is is left open by those who take chromophores from it
-(`reconstruction.facial_color.shared_melanin`).
+A scatter of repeats above their noise measures how well skin and pose repeat. Only their color
+counts: the energy of flashes varies by some thousandths, which scales a whole image, and the
+chromophore fit leaves a pixel's brightness free (`reconstruction.facial_color.shared_melanin`).
 """
 
 import numpy as np
@@ -13,20 +12,20 @@ from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, FloatArray
 
 _MAX_MEDIAN_PIXELS = 200_000
-"""Pixels that tell a median to a quarter of a percent."""
+"""Pixels that determine a median to a quarter of a percent."""
 
 
 def average_repeats(
     rgb: FloatArray, variance: FloatArray, valid: BoolArray
 ) -> tuple[Float32Array, Float32Array, BoolArray]:
-    """Return the mean of repeats where any is valid, and the variance of the mean.
+    """Average repeats where any is valid, and return the variance of the mean.
 
     Parameters
     ----------
     rgb
         (R, H, W, 3): linear camera RGB of R repeats, aligned; finite, and positive where valid.
     variance
-        (R, H, W, 3): its noise.
+        (R, H, W, 3): variance of its noise.
     valid
         (R, H, W).
 
@@ -35,14 +34,14 @@ def average_repeats(
     mean : ndarray of float32, shape (H, W, 3)
         0 where no repeat is valid.
     variance : ndarray of float32, shape (H, W, 3)
-        That of noise, larger by `overdispersion` where repeats differ by more than that.
+        Variance by noise, multiplied by `overdispersion` where repeats scatter more.
     valid : ndarray of bool, shape (H, W)
-        Any repeat is.
+        Where any repeat is valid.
 
     Raises
     ------
     ValueError
-        When shapes do not fit.
+        When shapes do not match.
 
     Examples
     --------
@@ -67,16 +66,16 @@ def average_repeats(
 
 
 def overdispersion(rgb: FloatArray, variance: FloatArray, valid: BoolArray) -> float:
-    """Return the variance of what colors of repeats differ by over that of noise, at least 1.
+    """Return the variance of repeats' colors over that of noise, at least 1.
 
-    Of the whole picture: what one pixel's few repeats scatter by is known poorly. It is the median
-    pixel's, so that the few that were laid over others wrongly, which have an error of their own
-    (`reconstruction.facial_color.registration_error`), do not count for all.
+    One factor for the whole image, because the scatter of one pixel's few repeats is imprecise. It
+    is that of the median pixel, so that a few misregistered pixels, which have an error of their
+    own (`reconstruction.facial_color.registration_error`), do not affect all.
 
     Parameters
     ----------
     rgb, variance, valid
-        As of `average_repeats`.
+        See `average_repeats`.
 
     Examples
     --------
@@ -97,10 +96,10 @@ def overdispersion(rgb: FloatArray, variance: FloatArray, valid: BoolArray) -> f
     seen = rgb.reshape(repeats, -1, 3)[:, some].astype(np.float64)  # (R, n, 3)
     off = seen / seen.mean(axis=0) - 1.0
     weight = np.square(seen) / variance.reshape(repeats, -1, 3)[:, some]
-    # what each repeat and each channel have of their own, by least squares; exact where noise is a
-    # factor of the repeat times one of the channel
+    # subtract least-squares offsets of each repeat and each channel; exact where the noise is a
+    # factor per repeat times one per channel
     off -= ((weight * off).sum(axis=-1) / weight.sum(axis=-1))[..., None]
     off -= (weight * off).sum(axis=0) / weight.sum(axis=0)
     squares = (weight * np.square(off)).sum(axis=(0, -1))
-    free = 2 * (repeats - 1)  # of three channels one is brightness, of all repeats one is the mean
+    free = 2 * (repeats - 1)  # three channels minus brightness, R repeats minus their mean
     return max(1.0, float(np.median(squares) / chi2.median(free)))

@@ -1,10 +1,10 @@
-"""How well states repeat: within states against between them, and melanin over the hour.
+"""Repeatability of expressions: variation within states against between them, and melanin drift.
 
-A subject makes each expression several times, with others in between. Per region of the face the
-mean of a map is taken from each picture. What pictures of one state differ by is set against noise
-(a chi-square test) and against what states differ by (the intraclass correlation). Melanin should
-stay: its drift over the order of capture is fitted with the states' own levels left free, so that
-blood mistaken for melanin is no drift.
+A subject makes each expression several times, with others in between. The mean of a map over each
+region of the face is computed per image. The scatter within a state is compared with noise (a
+chi-square test) and with the differences between states (the intraclass correlation). Melanin
+should stay constant: its drift over the time of capture is fitted with a free level per state, so
+that blood mistaken for melanin does not count as drift.
 
 References
 ----------
@@ -27,7 +27,7 @@ from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float64Array
 
 SCATTER_FALSE_ALARM_RATE = 0.01
-"""Chance that any of the regions is said to scatter, or to drift, when none does."""
+"""Probability of a reported scatter or drift in any region when there is none."""
 MIN_REGION_PIXELS = 16
 WHOLE_REGION = "whole face"
 """Name of the region of all valid pixels."""
@@ -45,25 +45,26 @@ class RegionRepeatability:
     ----------
     name : str
     pixels : int
-        Valid in all captures.
+        Number of pixels valid in all captures.
     means : ndarray of float64, shape (N,)
         Mean of the map in each capture.
     within : float
-        Standard deviation of repeats about their state.
+        Standard deviation of repeats about their state's mean.
     between : float
-        Standard deviation of the states' levels, noise and repeats taken away; 0 when they do not
-        differ by more.
+        Standard deviation of the states' levels, corrected for noise and repeats; 0 where the
+        states do not differ by more.
     correlation, correlation_stderr : float
-        Intraclass correlation: part of the variance that is the states', at most 1, and its
-        standard error for levels drawn from a normal distribution.
+        Intraclass correlation: fraction of the variance that is between states, at most 1, and its
+        standard error for normally distributed levels.
     chi_square : float
-        Of repeats about their state, in standard errors of noise.
+        Chi-square of repeats about their state, by standard errors of noise.
+        Probability of such scatter by noise alone.
     p_value : float
         Chance of so much scatter by noise alone.
     scatters : bool
-        The p-value is below the false-alarm rate, shared among the regions.
+        Whether the p-value is below the false-alarm rate, corrected for the number of regions.
     change_to_scatter : float
-        Largest change of a state from the reference over `within`.
+        Largest change of a state from the reference, divided by `within`.
     """
 
     name: str
@@ -81,18 +82,18 @@ class RegionRepeatability:
 
 @dataclass(frozen=True, slots=True)
 class Repeatability:
-    """All regions.
+    """Comparison of all regions.
 
     Attributes
     ----------
     states : tuple of str
         State of each capture.
     regions : tuple of RegionRepeatability
-        The whole face is the last one.
+        Regions; the whole face is the last one.
     false_alarm : float
-        Chance that any region is said to scatter when there is noise alone.
+        Probability of a reported scatter in any region by noise alone.
     omitted : tuple of (str, str)
-        Regions with too few valid pixels, and how many they have.
+        Regions with too few valid pixels, and their number.
     """
 
     states: tuple[str, ...]
@@ -106,23 +107,23 @@ class Repeatability:
             if found.name == name:
                 return found
         names = ", ".join(found.name for found in self.regions)
-        raise RepeatabilityError(f"region: got {name!r}, expected one of {names}")
+        raise RepeatabilityError(f"region: got {name!r}, expected one of {names}; choose one")
 
 
 @dataclass(frozen=True, slots=True)
 class MapDrift:
-    """How a map changes over the order of capture.
+    """Change of a map over the time of capture.
 
     Attributes
     ----------
     name : str
-        Of the region.
+        Name of the region.
     slope_per_minute, slope_stderr : float
-        In units of the map a minute, and its standard error.
+        In units of the map per minute, and its standard error.
     p_value : float
-        Chance of such a slope without drift.
+        Probability of such a slope without drift.
     drifts : bool
-        The p-value is below the false-alarm rate, shared among the regions.
+        Whether the p-value is below the false-alarm rate, corrected for the number of regions.
     """
 
     name: str
@@ -143,7 +144,7 @@ def compare_states(
     correlated_px: float = 1.0,
     false_alarm: float = SCATTER_FALSE_ALARM_RATE,
 ) -> Repeatability:
-    """Compare repeats of states with each other, and states with repeats.
+    """Compare the variation within states with that between states.
 
     Parameters
     ----------
@@ -152,18 +153,18 @@ def compare_states(
     states : sequence of str
         State of each capture, N; at least one of them twice.
     stderr : array_like, shape (N, H, W)
-        Standard error by noise alone, such as `hemoglobin_noise_stderr`: what all captures have in
-        common must not be in it.
+        Standard error by noise alone, such as `hemoglobin_noise_stderr`, without errors common to
+        all captures.
     valid : array_like of bool, shape (N, H, W), optional
     regions : mapping of str to array_like of bool (H, W), optional
         By default a grid of 3 x 3 over the valid pixels.
     reference : str
-        State that changes are taken from; when it was not captured, the mean of the states.
+        State that changes refer to; if it was not captured, the mean of the states.
     correlated_px : float
-        Pixels whose noise goes together, at least 1: a region has so many times fewer independent
-        ones. Interpolation and demosaicing make it some 2 to 4.
+        Number of pixels with common noise, at least 1: divides the number of independent pixels
+        of a region. Interpolation and demosaicing make it some 2 to 4.
     false_alarm : float
-        Chance that any region is said to scatter when there is noise alone.
+        Probability of a reported scatter in any region by noise alone.
 
     Returns
     -------
@@ -172,7 +173,7 @@ def compare_states(
     Raises
     ------
     RepeatabilityError
-        For shapes that do not fit, no state with repeats, or no region with pixels.
+        For mismatched shapes, states without repeats, or regions without pixels.
 
     Examples
     --------
@@ -187,7 +188,7 @@ def compare_states(
     """
     captured = _Captures.of(maps, states, stderr, valid)
     repeated = len(captured.states) > len(captured.groups)
-    expected = "at least one that is repeated"
+    expected = "at least one that is repeated; add repeats"
     Checks(RepeatabilityError).require(repeated, "states", "each once", expected)
     chosen, left_out, limit = captured.regions(regions, correlated_px, false_alarm)
     found = tuple(_compared(region, captured.groups, reference, limit) for region in chosen)
@@ -205,26 +206,26 @@ def fit_drift(
     correlated_px: float = 1.0,
     false_alarm: float = SCATTER_FALSE_ALARM_RATE,
 ) -> tuple[MapDrift, ...]:
-    """Fit how a map, such as melanin, drifts over the time of capture.
+    """Fit the drift of a map, such as melanin, over the time of capture.
 
     Parameters
     ----------
     maps, states, stderr, valid, regions, correlated_px, false_alarm
-        As of `compare_states`; states that were captured once tell nothing of drift.
+        See `compare_states`; states captured once do not contribute.
     times_s : array_like, shape (N,)
-        When each was captured, s.
+        Time of each capture, s.
 
     Returns
     -------
-    tuple of Drift
-        By region, the whole face last. Each state has a level of its own, so that what states
-        differ by is no drift when they are interleaved; the error is by the scatter about the
-        line, or by noise where that is larger.
+    tuple of MapDrift
+        By region, the whole face last. Each state has a free level, so that differences between
+        interleaved states do not count as drift. The error is from the scatter about the line, or
+        from noise where that is larger.
 
     Raises
     ------
     RepeatabilityError
-        When captures less states leave no degree of freedom, or times do not differ within
+        When captures minus states leave no degree of freedom, or times do not differ within
         states.
 
     Examples
@@ -244,7 +245,7 @@ def fit_drift(
     if degrees < 1 or not square > 0:
         raise RepeatabilityError(
             f"states: {len(names)} captures of {len(groups)} states leave no repeats over time; "
-            "expected at least two more captures than states"
+            "expected at least two more captures than states; capture repeats"
         )
     chosen, _, limit = captured.regions(regions, correlated_px, false_alarm)
     found = []
@@ -274,7 +275,7 @@ class _Region:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Captures:
-    """Checked maps of captures, (N, H, W), and what pixels all of them know, (H, W)."""
+    """Checked maps of captures, (N, H, W), and the pixels valid in all of them, (H, W)."""
 
     values: Float64Array
     stderr: Float64Array
@@ -303,7 +304,7 @@ class _Captures:
         return _Captures(values, error, known, tuple(states), groups)
 
     def within_states(self, values: Float64Array) -> Float64Array:
-        """Return values of the captures (N,) less their state's mean."""
+        """Subtract their state's mean from values of the captures (N,)."""
         rest = values.copy()
         for members in self.groups.values():
             rest[members] -= values[members].mean()
@@ -312,7 +313,7 @@ class _Captures:
     def regions(
         self, regions: Mapping[str, ArrayLike] | None, correlated_px: float, false_alarm: float
     ) -> tuple[list[_Region], tuple[tuple[str, str], ...], float]:
-        """Return the regions with pixels, those without, and the p-value of an alarm of one."""
+        """Return the regions with pixels, those without, and the p-value limit of one region."""
         check = Checks(RepeatabilityError)
         check.within("false_alarm", false_alarm, "(0, 1)")
         check.within("correlated_px", correlated_px, "[1, inf]")
@@ -329,12 +330,12 @@ class _Captures:
             means = self.values[:, seen].mean(axis=1)
             squares = (self.stderr[:, seen] ** 2).sum(axis=1)
             noise = np.sqrt(squares * min(correlated_px, count)) / count
-            # rounding of float32 maps is noise too
+            # include the rounding of float32 maps in the noise
             noise = np.maximum(noise, 1e-9 * np.abs(means) + 1e-30)
             chosen.append(_Region(name, count, means, noise))
         got = "no region with pixels that are valid in all captures"
-        check.require(chosen, "valid", got, "some")
-        # Sidak: all of them together alarm at the stated rate
+        check.require(chosen, "valid", got, "some; check masks and regions")
+        # Sidak correction: the family of regions has the given rate
         return chosen, tuple(left_out), 1.0 - (1.0 - false_alarm) ** (1.0 / len(chosen))
 
 
@@ -358,7 +359,8 @@ def _compared(
         square_between = sum(
             size * (levels[state] - grand) ** 2 for size, state in zip(sizes, groups, strict=True)
         )
-        # captures a state, unequal ones averaged as the variance needs it
+        # effective number of captures per state, which makes E[MS_between] =
+        # within^2 + typical * between^2 for unequal sizes
         typical = (count - float((sizes**2).sum()) / count) / (kinds - 1)
         ms_between, ms_within = square_between / (kinds - 1), square_within / degrees
         variance = (ms_between - ms_within) / typical
@@ -392,12 +394,13 @@ def _scatter(means: Float64Array, noise: Float64Array) -> float:
 
 def _correlation_stderr(correlation: float, size: float, kinds: int, count: int) -> float:
     """Return the large-sample standard error of an intraclass correlation (Donner 1986, 3.1)."""
+    # large-sample variance 2 (N - 1) (1 - r)^2 (1 + (n - 1) r)^2 / (n^2 (N - k) (k - 1))
     spread = (1.0 - correlation) * (1.0 + (size - 1.0) * correlation)
     return math.sqrt(2.0 * (count - 1) / ((kinds - 1) * (count - kinds))) * abs(spread) / size
 
 
 def _grid(known: BoolArray) -> dict[str, BoolArray]:
-    """Return 3 x 3 cells over the valid pixels, named as seen in the picture."""
+    """Return 3 x 3 cells over the valid pixels, named by their position in the image."""
     places = np.argwhere(known)
     out: dict[str, BoolArray] = {}
     if not len(places):

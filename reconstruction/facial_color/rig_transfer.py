@@ -1,7 +1,7 @@
-"""A hemoglobin rig carried from one face's picture to another's by landmarks.
+"""Transfer a hemoglobin rig from one face's image to another's by landmarks.
 
-Two faces that were not photographed alike share no map space: where the rig's stored maps lie on
-the other face is told by points that have the same name on both.
+Faces photographed differently have no common map space. Points with the same name on both faces
+determine the positions of the rig's stored maps on the other face.
 """
 
 from collections.abc import Mapping
@@ -18,24 +18,25 @@ from reconstruction.correspondence import landmark_field
 Points = Mapping[str, tuple[float, float]]
 
 TRANSFER_LANDMARK_STDERR_PX = 2.0
-"""Of landmarks on two different people, along each axis: what corresponds is not sharp."""
+"""Standard error of landmarks on two different people, along each axis: their correspondence is
+not exact."""
 MIN_TRANSFER_LANDMARKS = 4
 _MAP_NAMES = ("scale", "bias", "scale_stderr", "bias_stderr", "misfit")
 
 
 class RigTransferError(ValueError):
-    """Landmarks that tell nothing of where one face lies on another."""
+    """Landmarks that do not determine the warp between two faces."""
 
 
 def transfer_rig(
     rig: HemoglobinRig, shape: tuple[int, int], *, landmarks_rig: Points, landmarks_onto: Points
 ) -> HemoglobinRig:
-    """Return a rig as it lies on another face's picture, to be applied to that face's blood.
+    """Warp a rig to another face's image, to be applied to that face's blood.
 
     Parameters
     ----------
     rig
-        In the map space of its own face.
+        Rig in the map space of its own face.
     shape
         Rows and columns of the other face's maps.
     landmarks_rig, landmarks_onto
@@ -44,10 +45,10 @@ def transfer_rig(
     Returns
     -------
     HemoglobinRig
-        Of the other face's size; its neutral map is the smooth mean of the rig's. Use
-        `HemoglobinRig.applied_to` with the other face's blood. Valid where the rig's own maps
-        are, and where the landmarks tell the place to within the rig's radius; within it the
-        statistics hardly change, so that the error of place adds nothing to theirs.
+        Rig of the other face's size; its neutral map is the smooth mean of the rig's. Use
+        `HemoglobinRig.applied_to` with the other face's blood. Valid where the rig's own maps are
+        and where the standard error of the position is within the rig's radius. Within the radius
+        the statistics hardly change, so the position error does not add to theirs.
 
     Raises
     ------
@@ -56,7 +57,9 @@ def transfer_rig(
     """
     names = sorted(set(landmarks_rig) & set(landmarks_onto))
     got, least = f"{len(names)} names in both tables", MIN_TRANSFER_LANDMARKS
-    Checks(RigTransferError).require(len(names) >= least, "landmarks", got, f"at least {least}")
+    Checks(RigTransferError).require(
+        len(names) >= least, "landmarks", got, f"at least {least}; mark more"
+    )
     onto = np.array([landmarks_onto[name] for name in names], np.float64)
     own = np.array([landmarks_rig[name] for name in names], np.float64)
     try:
@@ -67,13 +70,13 @@ def transfer_rig(
     place = _centres(shape, stored)
     moved, unsure_px = field.evaluate(place.reshape(-1, 2))
     source = place + moved.reshape(place.shape)
-    told = unsure_px.reshape(stored) <= rig.radius_px
+    located = unsure_px.reshape(stored) <= rig.radius_px
     sides = zip(
         rig.neutral_mean.shape, rig.neutral.shape, (source[..., 1], source[..., 0]), strict=True
     )
     cell = np.stack([(at + 0.5) * few / full - 0.5 for few, full, at in sides])
     mean, seen = _sampled(rig.neutral_mean, rig.neutral_mean_valid, cell)
-    here = seen & told
+    here = seen & located
     states: dict[str, StateMaps] = {}
     for name, state in rig.states.items():
         sampled = {part: _sampled(getattr(state, part), state.valid, cell) for part in _MAP_NAMES}
@@ -102,7 +105,7 @@ def transfer_rig(
 
 
 def _centres(shape: tuple[int, int], stored: tuple[int, int]) -> Float64Array:
-    """Return where the cells' centres lie on the map, (h, w, 2) as (x, y) px."""
+    """Return the positions of the cells' centers on the map, (h, w, 2) as (x, y) px."""
     rows, columns = (
         (np.arange(few) + 0.5) * full / few - 0.5 for full, few in zip(shape, stored, strict=True)
     )
@@ -112,7 +115,7 @@ def _centres(shape: tuple[int, int], stored: tuple[int, int]) -> Float64Array:
 def _sampled(
     values: Float64Array, valid: BoolArray, cell: Float64Array
 ) -> tuple[Float64Array, BoolArray]:
-    """Return a stored map at places (2, h, w), rows first, and where it is known there."""
+    """Interpolate a stored map at positions (2, h, w), rows first; return also its validity."""
     share = ndimage.map_coordinates(valid.astype(np.float64), cell, order=1, cval=0.0)
     total = ndimage.map_coordinates(np.where(valid, values, 0.0), cell, order=1, cval=0.0)
     known = share > 0.5

@@ -1,18 +1,17 @@
-"""One melanin for all states of a face, and each state's blood under it.
+"""Estimate one melanin map for all states of a face, and each state's blood given it.
 
-Expressions change the blood of skin, not its melanin (Jimenez et al. 2010, section 3.1). A state's
-picture alone leaves melanin and blood with errors that hang together: where melanin is taken too
-high, blood is too low. Seen together, the states have one melanin, whose noise goes down with
-their number, and changes of blood no longer carry the difference of two melanins.
+Expressions change the blood of skin, not its melanin (Jimenez et al. 2010, section 3.1). From one
+image, the errors of melanin and blood are anticorrelated. Estimated jointly, the states have one
+melanin, whose noise decreases with their number, and changes of blood no longer contain the
+difference of two melanin estimates.
 
-How it is done. The shading of each state is free, so that a color has two numbers left. All colors
-of a pixel, each taken back to the states' mean blood, are averaged; that color goes through the
-same weighing of all solutions as a single picture (`reconstruction.chromophores.posterior`), with
-the prior of the light and the model's error counted once. Given melanin, each state's blood is
-fitted to its own color. Where the light changes smoothly from state to state the colors of many
-pixels tell how, and a pixel's brightness then tells its blood too. The model's error is nearly the
-same in all states of a pixel: averaging does not reduce it, and differences are nearly free of it.
-Standard errors carry both.
+Method. The shading of each state is free, so that a color has two degrees of freedom left. All
+colors of a pixel, each transformed to the states' mean blood, are averaged. The posterior of that
+color (`reconstruction.chromophores.posterior`) uses the prior of the light and the model error
+once. Given melanin, each state's blood is fitted to its own color. Where the light changes smoothly
+between states, the colors of many pixels determine the change, and a pixel's brightness then
+constrains its blood. The model error is nearly the same in all states of a pixel: averaging does
+not reduce it, and it nearly cancels in differences. Standard errors include both.
 
 References
 ----------
@@ -49,51 +48,51 @@ from reconstruction.facial_color import light_change
 from reconstruction.facial_color import shared_melanin_kernels as kernels
 
 STATE_VARIANCE_FRACTION = 0.01
-"""Part of the model error's variance that is each state's own: 0.0001 to 0.007 between simulated
-pictures of the same unmoved face in neutral, smile, fear and exercise, seeds 0 to 3."""
+"""Fraction of the model error's variance that is independent between states: 0.0001 to 0.007 in
+simulated images of the same unmoved face in neutral, smile, fear and exercise, seeds 0 to 3."""
 SHADING_WINDOW_PX = 3.0
-"""Window for the light's changes on moving faces: wider ones blur the shadows that move with them,
+"""Window for changes of light on moving faces: wider ones blur the shadows that move with the face,
 narrower ones average less."""
 MISFIT_SIGMAS = 4.0
-"""Standard errors from which on a state's color does not belong to the pixel's melanin."""
+"""Standard errors above which a state's color does not belong to the pixel's melanin."""
 _TASK_PIXELS = 2048
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedMelanin:
-    """One melanin and S bloods; maps have the pixels' shape (...), those of states (S, ...)."""
+    """One melanin and S blood fractions; maps have the pixels' shape (...), of states (S, ...)."""
 
     melanin: Float32Array
     """Volume fraction of melanin in the epidermis; NaN where no state is usable."""
     stderr_melanin: Float32Array
-    """Its standard error, with noise, model error and second solutions."""
+    """Its 68 % credible half-width, with noise, model error and second solutions."""
     noise_stderr_melanin: Float32Array
-    """The part of noise alone: what another set of pictures would differ by."""
+    """Part by noise alone: the difference to be expected in another set of images."""
     hemoglobin: Float32Array
     """(S, ...): volume fraction of blood in the dermis; NaN where the state is not usable."""
     stderr_hemoglobin: Float32Array
     """(S, ...): its standard error."""
     noise_stderr_hemoglobin: Float32Array
-    """(S, ...): the part of noise alone."""
+    """(S, ...): part by noise alone."""
     change: Float32Array
-    """(S, ...): blood less that of the reference state."""
+    """(S, ...): blood minus that of the reference state."""
     stderr_change: Float32Array
-    """(S, ...): its standard error; what the two have in common is left out of it."""
+    """(S, ...): its standard error, without errors common to both states."""
     shading: Float32Array
-    """(S, ...): light on the pixel over that on a white tile."""
+    """(S, ...): light on the pixel over that on a white reference."""
     residual: Float32Array
-    """(S, ...): root of the weighted square sum of what the color leaves, in standard errors of the
-    state's own noise: of one number with free light, of two with light that changes smoothly."""
+    """(S, ...): root of the weighted square sum of the color's residuals, in standard errors of the
+    state's own noise: one degree of freedom with free light, two with smoothly changing light."""
     valid: BoolArray
     """At least one state is usable, and the mean color belongs to the table."""
     valid_states: BoolArray
     """(S, ...): usable, and `valid`."""
     reference: int
-    """State that changes are taken from."""
+    """State that changes refer to."""
 
     @property
     def is_misfit(self) -> BoolArray:
-        """(S, ...): the color does not belong to the pixel's melanin: misplaced, or a highlight."""
+        """(S, ...): the color is outside the pixel's melanin line: misregistered, or specular."""
         with np.errstate(invalid="ignore"):
             return np.asarray(self.valid_states & (self.residual > MISFIT_SIGMAS))
 
@@ -117,35 +116,35 @@ def estimate_shared_melanin(
     Parameters
     ----------
     rgb : array_like, shape (S, ..., 3)
-        Diffuse light of S states over that of a white tile, linear camera RGB, aligned.
+        Diffuse light of S states over that of a white reference, linear camera RGB, aligned.
     table : ColorTable
-        Of the camera and the light that took the pictures.
+        Color table of the camera and the illumination of the images.
     prior : ShadingPrior
-        How the pixels' shading is distributed; of a pixel's mean over the states.
+        Distribution of a pixel's mean shading over the states.
     variance : array_like, optional
-        Noise variance of `rgb`, broadcast to its shape. None: 1 percent. A misplaced pixel is
-        brighter or darker rather than of another color: that is the light's, not the noise's.
+        Noise variance of `rgb`, broadcast to its shape. None: 1 percent. A misregistered pixel
+        differs in brightness more than in color, which the free light absorbs.
     model_error : array_like, optional
-        Relative error of the table's colors, as of `reconstruction.chromophores.invert`; or a
+        Relative error of the table's colors, see `reconstruction.chromophores.invert`; or a
         covariance for each pixel, shape (..., 3, 3).
     valid : array_like of bool, shape (S, ...), optional
-        Where each state may be used; a state that is not leaves out.
+        Where each state is usable; others are omitted.
     reference : int
-        State that changes are taken from, such as neutral.
+        State that changes refer to, such as neutral.
     shading_window_px : float, optional
-        How smoothly the light on a pixel changes between states: it is taken from colors, averaged
-        by a Gaussian of so many px, best `SHADING_WINDOW_PX`; pixels may be off it by as much as
-        their colors and their neighbors' show. Pixels must be (H, W) then. None: the light is free
-        in each pixel and state.
+        Correlation length of the light's changes between states, px, best `SHADING_WINDOW_PX`:
+        changes are estimated from colors, averaged by a Gaussian; a pixel may deviate by as much as
+        its color and its neighbors indicate. Pixels must be (H, W) then. None: the light is free in
+        each pixel and state.
     state_variance_fraction : float
-        Part of the model error's variance that is each state's own, 0...1.
+        Fraction of the model error's variance that is independent between states, 0...1.
     state_covariance : array_like, shape (S, ..., 3, 3), optional
-        Covariance of what each state's relative color errs by beside all that, such as where it
-        was misplaced (`reconstruction.facial_color.registration_error`). None: nothing.
+        Covariance of each state's further relative color errors, such as those by registration
+        (`reconstruction.facial_color.registration_error`). None: 0.
     one_face : bool
-        Whether the pixels are one person's skin whose light a white tile told, but for where the
-        face stands: each is then weighed by what all of them tell together of its melanin and
-        blood (`reconstruction.chromophores.face`).
+        Whether the pixels are one person's skin whose light is known from a white reference, except
+        for the face's position: the prior of each is then the distribution of melanin and blood
+        over all of them (`reconstruction.chromophores.face`).
 
     Returns
     -------
@@ -154,7 +153,7 @@ def estimate_shared_melanin(
     Raises
     ------
     reconstruction.chromophores.ChromophoreError
-        When shapes do not fit.
+        When shapes do not match.
 
     Examples
     --------
@@ -267,7 +266,7 @@ class _BloodFit:
         self.good: BoolArray = np.asarray(seen.usable & np.isfinite(melanin))
         ends = np.array([table.c_m_max, table.c_hd_max])
         begin = _fractions(np.stack([melanin, found.hemoglobin.reshape(-1)], axis=-1), ends)
-        # dm = 3 end a^2 da
+        # m = end a^3, hence dm = 3 end a^2 da
         stderr = stderr / (3.0 * ends[0] * np.maximum(begin[:, 0], MIN_AXIS_FRACTION) ** 2)
         self._fixed = (
             np.ascontiguousarray(begin, np.float32),
@@ -302,7 +301,7 @@ def _model_errors(
 ) -> tuple[Float64Array, Float64Array]:
     """Return covariances of the pixels (n or 1, 3, 3), and the usual variances of channels (3,).
 
-    Usual is the median: where a picture is finer than its pixels, errors are many times as large.
+    The usual variance is the median: detail below the pixel size makes errors many times as large.
     """
     given = np.asarray(0.0 if model_error is None else model_error, np.float64)
     if given.ndim < 3:
@@ -339,13 +338,13 @@ def _state_covariances(
 
 
 def _mean_color_covariance(owns: Float64Array, seen: _States, common: Float64Array) -> Float64Array:
-    """Return what the mean color of the states errs by beside noise, (3, 3) or (n, 3, 3)."""
+    """Return the error covariance of the states' mean color without noise, (3, 3) or (n, 3, 3)."""
     if owns.shape[1] == 1:
         own = np.zeros((3, 3))
         own[_UPPER_TRIANGLE] = owns[0, 0]
         most = max(int(seen.usable.sum(axis=0).max(initial=0)), 1)
         return np.asarray((common if len(common) > 1 else common[0]) + own / most)
-    # each state's part in the mean, as `shared_melanin_kernels.mean_color` takes it
+    # weight of each state in the mean, as in `shared_melanin_kernels.average_state_colors`
     share = seen.usable / (seen.relative.sum(axis=-1) + owns[..., [0, 3, 5]].sum(axis=-1))
     share /= np.maximum(share.sum(axis=0), 1e-300)
     mean = (np.square(share)[..., None] * owns).sum(axis=0)
@@ -358,7 +357,7 @@ def _mean_color_covariance(owns: Float64Array, seen: _States, common: Float64Arr
 def _mean_color(
     seen: _States, table: ColorTable, owns: Float64Array
 ) -> tuple[Float32Array, Float32Array]:
-    """Return the states' mean log color, as of skin with their mean blood, and its variance."""
+    """Return the states' mean log color, transformed to their mean blood, and its variance."""
     count = np.maximum(seen.usable.sum(axis=0), 1)[:, None]
     keep = seen.usable[..., None]
     plain = np.where(keep, seen.log_rgb, 0.0).sum(axis=0) / count

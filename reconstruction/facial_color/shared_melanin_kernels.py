@@ -1,7 +1,7 @@
-"""The blood of several states of one pixel under one melanin: all pixels in parallel.
+"""Kernels for the blood of several states of one pixel given one melanin, parallel over pixels.
 
-`reconstruction.facial_color.shared_melanin` is the door and says what is computed; a plain NumPy
-twin is in its tests.
+`reconstruction.facial_color.shared_melanin` calls them and documents the method; its tests contain
+a plain NumPy equivalent.
 """
 
 import math
@@ -56,8 +56,8 @@ def _weights(each, model, stiffness, w):  # type: ignore[no-untyped-def]
     """Write the inverse of each + model + brightness / stiffness, (3, 3), to `w`.
 
     `each` and `model` are covariances of log color; 1 / stiffness is the variance of an error
-    common to the channels. At 0 the brightness is free, and `w` of rank 2. Returns how the channels
-    tell the brightness.
+    common to the channels. At 0 the brightness is free, and `w` has rank 2. Returns the channels'
+    weights in the brightness.
     """
     a00, a11, a22 = each[0, 0] + model[0, 0], each[1, 1] + model[1, 1], each[2, 2] + model[2, 2]
     a01, a02, a12 = each[0, 1] + model[0, 1], each[0, 2] + model[0, 2], each[1, 2] + model[1, 2]
@@ -121,7 +121,7 @@ def _dot(p, q):  # type: ignore[no-untyped-def]
 
 @njit(fastmath=FASTMATH_CONTRACT)
 def _blood(cells, w, log_rgb, a, b, color):  # type: ignore[no-untyped-def]
-    """Return the blood, as a fraction of its axis, that fits a log color under a melanin.
+    """Return the blood, as a fraction of its axis, that fits a log color at a given melanin.
 
     On return `color` holds value and derivatives there.
     """
@@ -135,7 +135,7 @@ def _blood(cells, w, log_rgb, a, b, color):  # type: ignore[no-untyped-def]
         weighted = _times(w, color[2])
         cost = _dot(rest, _times(w, rest))
         if cost > cost_before * (1.0 + 1e-9):
-            # overshot: half of the way back
+            # overshot: return half of the way
             b = 0.5 * (b + before)
             if abs(b - before) < SHARED_STEP_TOL:
                 b = before
@@ -172,7 +172,7 @@ def _blood(cells, w, log_rgb, a, b, color):  # type: ignore[no-untyped-def]
 def average_state_colors(  # type: ignore[no-untyped-def]
     log_rgb, variance, usable, begin, owns, cells, mean, mean_variance, block
 ):
-    """Average the states' colors as if all had the mean blood; shapes are in the signature."""
+    """Average the states' colors at the mean blood; shapes are in the signature."""
     states, pixels = usable.shape
     for task in prange((pixels + block - 1) // block):
         w = np.empty((3, 3))
@@ -265,11 +265,11 @@ def fit_state_blood(  # type: ignore[no-untyped-def]
     state_maps,
     block,
 ):
-    """Fit the blood of every state under the shared melanin; shapes are in the signature.
+    """Fit the blood of every state given the shared melanin; shapes are in the signature.
 
-    Errors are linear in the noise n_s of each state, their mean n, and the model's error e that
-    all states share. Of the mean color: melanin B (n + e), brightness T (n + e) given melanin. Of
-    a state: blood A_s (n_s + e - melanin's and brightness' errors).
+    Errors are linear in the noise n_s of each state, in their mean n, and in the model error e that
+    all states share. For the mean color: melanin B (n + e), and brightness T (n + e) given melanin.
+    For a state: blood A_s (n_s + e - errors of melanin and brightness).
     """
     states, pixels = usable.shape
     for task in prange((pixels + block - 1) // block):
@@ -281,12 +281,12 @@ def fit_state_blood(  # type: ignore[no-untyped-def]
         rest = np.empty(3)
         each = np.empty((states, 3, 3))  # E_s: own covariance of a state, without brightness
         level = np.empty(states)  # variance of its brightness
-        share = np.empty(states)  # part in the mean
-        own_row = np.empty((states, 3))  # blood's answer to the state's own color
-        mean_row = np.empty((states, 3))  # and to the mean color
-        beside = np.empty(states)  # and to what melanin is off besides
+        share = np.empty(states)  # weight in the mean
+        own_row = np.empty((states, 3))  # derivative of blood by the state's own color
+        mean_row = np.empty((states, 3))  # derivative by the mean color
+        extra_row = np.empty(states)  # derivative by the further error of melanin
         by_melanin = np.empty(3)  # B
-        by_blood = np.empty(3)  # of the mean blood, at fixed melanin
+        by_blood = np.empty(3)  # derivative of the mean blood at fixed melanin
         by_brightness = np.empty(3)  # T
         one = np.empty(3)
         two = np.empty(3)
@@ -320,10 +320,10 @@ def fit_state_blood(  # type: ignore[no-untyped-def]
                             noise[c, k] += share[s] * share[s] * each[s, c, k]
                     noise_level += share[s] * share[s] * level[s]
                     usual_change += share[s] * log_change[s, n]
-            # the mean color: its blood and brightness under the melanin, and how they err
+            # the mean color: blood and brightness given the melanin, and their linear errors
             for c in range(3):
                 here[c] = mean[n, c]
-            tell = _weights(noise, common, 0.0, w)
+            bright = _weights(noise, common, 0.0, w)
             middle = _blood(cells, w, here, a, float64(begin[n, 1]), color)
             u, v = _times(w, color[1]), _times(w, color[2])
             aa, ab, bb = _dot(u, color[1]), _dot(u, color[2]), max(_dot(v, color[2]), 1e-12)
@@ -332,13 +332,13 @@ def fit_state_blood(  # type: ignore[no-untyped-def]
                 rest[c] = here[c] - color[0, c]
                 by_melanin[c] = (bb * u[c] - ab * v[c]) / determinant
                 by_blood[c] = v[c] / bb
-            brightness = _dot(tell, rest)
-            reddening = _dot(tell, color[2])
+            brightness = _dot(bright, rest)
+            reddening = _dot(bright, color[2])
             for c in range(3):
-                by_brightness[c] = tell[c] - reddening * by_blood[c]
+                by_brightness[c] = bright[c] - reddening * by_blood[c]
             darkening = _dot(by_brightness, color[1])
-            # what the posterior says goes before the linear estimate: a prior shrinks it, a
-            # second solution adds to it
+            # the posterior's half-width replaces the linear estimate: a prior shrinks it, a second
+            # solution adds `extra` to it
             linear = _dot(by_melanin, _times(common, by_melanin))
             linear += _form(noise, noise_level, by_melanin, by_melanin)
             wanted = float64(melanin_stderr[n]) ** 2
@@ -355,7 +355,7 @@ def fit_state_blood(  # type: ignore[no-untyped-def]
                 moved = brightness + log_change[s, n] - usual_change
                 for c in range(3):
                     here[c] = log_rgb[s, n, c] - moved
-                tell = _weights(each[s], nothing, float64(stiffness[s, n]), w)
+                bright = _weights(each[s], nothing, float64(stiffness[s, n]), w)
                 b = _blood(cells, w, here, a, middle, color)
                 weighted = _times(w, color[2])
                 information = max(_dot(weighted, color[2]), 1e-12)
@@ -368,14 +368,14 @@ def fit_state_blood(  # type: ignore[no-untyped-def]
                 for c in range(3):
                     own_row[s, c] = axis * weighted[c] / information
                     mean_row[s, c] = -axis * (dark * by_melanin[c] + gray * by_brightness[c])
-                beside[s] = -axis * (dark - gray * darkening)
+                extra_row[s] = -axis * (dark - gray * darkening)
                 state_maps[0, s, n] = end * b * b * b
                 state_maps[5, s, n] = math.sqrt(max(misfit, 0.0))
-                state_maps[6, s, n] = moved + _dot(tell, rest)
-                # brightness by this state's color alone
-                reddening = _dot(tell, color[2])
+                state_maps[6, s, n] = moved + _dot(bright, rest)
+                # variance of the brightness by this state's color alone
+                reddening = _dot(bright, color[2])
                 for c in range(3):
-                    one[c] = tell[c] - reddening * weighted[c] / information
+                    one[c] = bright[c] - reddening * weighted[c] / information
                 state_maps[7, s, n] = _form(each[s], 0.0, one, one)
             for s in range(states):
                 if share[s] == 0.0:
@@ -386,7 +386,7 @@ def fit_state_blood(  # type: ignore[no-untyped-def]
                 by_noise = max(by_noise, 0.0)
                 for c in range(3):
                     one[c] = own_row[s, c] + mean_row[s, c]
-                whole = by_noise + _dot(one, _times(common, one)) + beside[s] ** 2 * extra
+                whole = by_noise + _dot(one, _times(common, one)) + extra_row[s] ** 2 * extra
                 state_maps[1, s, n] = math.sqrt(max(whole, 0.0))
                 state_maps[2, s, n] = math.sqrt(by_noise)
                 r = reference
@@ -405,5 +405,5 @@ def fit_state_blood(  # type: ignore[no-untyped-def]
                 changed += 2.0 * share[s] * _form(each[s], level[s], own_row[s], two)
                 changed -= 2.0 * share[r] * _form(each[r], level[r], own_row[r], two)
                 changed += _dot(one, _times(common, one))
-                changed += (beside[s] - beside[r]) ** 2 * extra
+                changed += (extra_row[s] - extra_row[r]) ** 2 * extra
                 state_maps[4, s, n] = math.sqrt(max(changed, 0.0))

@@ -1,7 +1,7 @@
-"""What the skin's boundary lets in and out again, for each sample of a surface, compiled.
+"""Compiled Fresnel transmittance of the skin's boundary for light and view of each sample.
 
-`model.fresnel.reflectance` is the plain twin, equal to the last bit; it needs a dozen passes over
-arrays of millions of samples where one is enough.
+`model.fresnel.reflectance` is the NumPy equivalent, equal to the last bit; it needs a dozen passes
+over arrays of millions of samples instead of one.
 """
 
 import math
@@ -22,19 +22,19 @@ def boundary_transmittance(
     Parameters
     ----------
     cos_light, cos_view
-        Cosines of light and view, of the same shape; those outside 0 to 1 count as the nearer end.
+        Cosines of light and view, of the same shape; values outside 0 to 1 are clamped.
     eta
         Refractive index behind the surface over that before it, finite and above 0.
 
     Returns
     -------
     ndarray of float64
-        Of that shape, in [0, 1]; NaN where a cosine is.
+        Transmittance of that shape, in [0, 1]; NaN where a cosine is NaN.
 
     Raises
     ------
     ValueError
-        For cosines of different shapes, or an index that is none.
+        For cosines of different shapes, or an invalid index.
 
     Examples
     --------
@@ -55,7 +55,8 @@ def boundary_transmittance(
 
 @njit(inline="always")
 def _reflectance(cosine, eta):  # type: ignore[no-untyped-def]
-    # comparisons that NaN fails leave it as it is
+    # Fresnel: r_s = (mu_i - eta mu_t) / (mu_i + eta mu_t), r_p = (eta mu_i - mu_t) / (eta mu_i +
+    # mu_t), R = (r_s^2 + r_p^2) / 2 for unpolarized light; NaN passes both comparisons unchanged
     mu_i = 0.0 if cosine < 0.0 else (1.0 if cosine > 1.0 else cosine)
     sin2_t = (1.0 - mu_i * mu_i) / eta / eta
     if sin2_t >= 1.0:

@@ -1,4 +1,4 @@
-"""Rays against a triangle mesh, by Embree: what a ray meets first, and whether anything bars it."""
+"""Trace rays against a triangle mesh with Embree: first hits and occlusion."""
 
 from typing import Any, Final
 
@@ -9,7 +9,7 @@ from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 
 RAYS_PER_CALL: Final = 1 << 20
-"""Rays traced in one call; bounds the memory that a batch takes."""
+"""Rays traced in one call; limits the memory of a batch."""
 
 
 class RayCaster:
@@ -25,7 +25,7 @@ class RayCaster:
     Raises
     ------
     ValueError
-        Where there is no triangle, an index is out of range, or a position is not finite.
+        When triangles are missing, an index is out of range, or a position is not finite.
 
     Examples
     --------
@@ -49,7 +49,7 @@ class RayCaster:
     def first_hit(
         self, origins_mm: ArrayLike, directions: ArrayLike
     ) -> tuple[Int32Array, Float32Array]:
-        """Return the triangle that each ray meets first, and how far away.
+        """Return the first triangle that each ray hits, and its distance.
 
         Parameters
         ----------
@@ -76,7 +76,7 @@ class RayCaster:
     def is_blocked(
         self, origins_mm: ArrayLike, directions: ArrayLike, length_mm: ArrayLike
     ) -> BoolArray:
-        """Return which rays meet a triangle before their end.
+        """Return which rays hit a triangle before their end.
 
         Parameters
         ----------

@@ -1,7 +1,8 @@
-"""Lumitexels: all that was seen of one surface point, over views and lights.
+"""Lumitexels: samples of one surface point over views and lights.
 
-The samples of a point are BRDF values with their variances, their directions to light and camera,
-and a mask of those that count: the point faces both, nothing stands between, the pixel is good.
+The samples of a point are BRDF values with their variances and their directions to light and
+camera. A mask selects the usable ones: the point faces both, is not occluded, and the pixel is
+valid.
 """
 
 from dataclasses import dataclass
@@ -15,40 +16,40 @@ from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatAr
 from reconstruction.lumitexels.ray_casting import RayCaster
 
 MIN_VISIBLE_COSINE: Final = 0.1
-"""A point seen or lit at a flatter angle gives no sample: 84 degrees."""
+"""Minimum cosine of view and light of a sample: 84 degrees."""
 SHADOW_RAY_OFFSET_MM: Final = 0.1
-"""Shadow rays start so far above the surface."""
+"""Height above the surface at which shadow rays start."""
 
 
 class CameraProjection(Protocol):
-    """What is needed of a calibrated camera."""
+    """Interface of a calibrated camera."""
 
     @property
     def center_mm(self) -> Float64Array:
-        """Centre of projection, shape (3,), mm."""
+        """Center of projection, shape (3,), mm."""
 
     def project(self, points_mm: ArrayLike) -> Float64Array:
         """Return columns and rows, shape (N, 2), px; NaN behind the camera."""
 
 
 class LightSources(Protocol):
-    """What is needed of calibrated lights."""
+    """Interface of calibrated lights."""
 
     @property
     def position_mm(self) -> Float64Array:
         """Positions, shape (L, 3), mm."""
 
     def irradiance(self, points_mm: ArrayLike) -> tuple[Float64Array, Float64Array]:
-        """Return unit directions to the lights and the signal of a white that faces them.
+        """Return unit directions to the lights, and the signal of a white surface facing them.
 
-        Both of shape (L, P, 3); the second is the irradiance across the direction over pi, in the
-        unit of the images.
+        Both of shape (L, P, 3); the second is the irradiance normal to the direction over pi, in
+        the unit of the images.
         """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampledSurface:
-    """Points that samples are gathered for."""
+    """Points at which samples are collected."""
 
     points_mm: Float32Array
     """Shape (P, 3), rig frame, mm."""
@@ -77,7 +78,7 @@ class Lumitexels:
     """BRDF samples, shape (P, M, 3), 1/sr: radiance / (normal irradiance cos theta); 0 where not
     valid."""
     variance: Float32Array
-    """Of `f`, shape (P, M, 3), 1/sr^2; infinite where not valid."""
+    """Variance of `f`, shape (P, M, 3), 1/sr^2; infinite where not valid."""
     light_dir: Float32Array
     """Unit vectors from point to light, shape (P, M, 3), in the frame of the points."""
     view_dir: Float32Array
@@ -91,17 +92,17 @@ class Lumitexels:
     view: Int32Array
     """Index of the view of each sample, shape (M,)."""
     valid: BoolArray
-    """Samples that count, shape (P, M)."""
+    """Usable samples, shape (P, M)."""
 
     @property
     def counts(self) -> NDArray[np.intp]:
-        """Valid samples of each point, shape (P,)."""
+        """Number of valid samples of each point, shape (P,)."""
         return np.count_nonzero(self.valid, axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Visibility:
-    """Which points face, and are not hidden from, each light and each camera."""
+    """Visibility of points from each light and each camera."""
 
     light: BoolArray
     """Shape (L, P)."""
@@ -119,21 +120,21 @@ def compute_visibility(
     offset_mm: float = SHADOW_RAY_OFFSET_MM,
     min_cosine: float = MIN_VISIBLE_COSINE,
 ) -> Visibility:
-    """Find by rays which points see which cameras and lights.
+    """Trace rays to find the points visible from each camera and light.
 
     Parameters
     ----------
-    surface : Surface
+    surface : SampledSurface
     caster : RayCaster
-        What may stand in between, as a rule the whole mesh.
+        Occluding geometry, usually the whole mesh.
     cameras_mm, lights_mm : array_like, shape (V, 3), (L, 3)
     light_radius_mm : float
-        With a radius > 0, four points of a light's rim must be seen: samples in half shadow do
-        not count.
+        With a radius > 0, four points of a light's rim must be visible: samples in penumbra are
+        invalid.
     offset_mm : float
         Height above the surface at which rays start.
     min_cosine : float
-        Least cosine to the normal.
+        Minimum cosine to the normal.
     """
 
     def seen(target: FloatArray) -> BoolArray:
@@ -157,7 +158,7 @@ def compute_visibility(
 
 
 def _rim(center: FloatArray, radius: float) -> list[FloatArray]:
-    """Return four points of the rim of a disc that faces the origin."""
+    """Return four points on the rim of a disc that faces the origin."""
     axis = center / np.linalg.norm(center)
     side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     side /= np.linalg.norm(side)

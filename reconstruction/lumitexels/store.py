@@ -1,9 +1,9 @@
-"""Samples of many surface points, written image by image and read point by point.
+"""Store samples of many surface points, written image by image and read point by point.
 
-Each image is read once. What it shows of the points that its camera sees is one row of that
-camera's table, on disk where a folder is given; a chunk of points reads its columns of all rows.
-Memory holds one image, one row and one chunk, however many points there are. Without a folder the
-tables are in memory, and so are the chunks of a small surface, which every estimate asks for.
+Each image is read once. Its samples of the points are one row of its camera's table, on disk where
+a folder is given; a chunk of points reads its columns of all rows. Memory contains one image, one
+row and one chunk, however many points there are. Without a folder the tables are in memory, as are
+the chunks of a small surface, which every estimate reads.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -29,27 +29,26 @@ from reconstruction.lumitexels.samples import (
 )
 
 BYTES_PER_SAMPLE: Final = 57
-"""Of one sample of `Lumitexels`."""
+"""Bytes of one sample of `Lumitexels`."""
 MAX_CACHED_BYTES: Final = 2**28
-"""Up to this size chunks are kept for the next estimate, unless the tables are on disk."""
-"""Signal and its variance, shape (H, W, 3), and the pixels that are good or None for all."""
+"""Up to this size chunks are cached for the next estimate, unless the tables are on disk."""
 
 
 class LumitexelStore:
-    """Lumitexels of a surface while its images come in, and after.
+    """Lumitexels of a surface, filled image by image.
 
     Parameters
     ----------
-    surface : Surface
+    surface : SampledSurface
         Points in the frame of the reconstruction.
-    cameras : sequence of Camera
-    lights : Lights
+    cameras : sequence of CameraProjection
+    lights : LightSources
     caster : RayCaster
-        What may cast shadows.
+        Geometry that casts shadows.
     poses : array_like, shape (L, 4, 4) or (V L, 4, 4), optional
-        Motion of the subject: takes the points to where they were, by light (all cameras expose
-        together) or by frame. Needs `lights` to be a dataclass with ``position_mm`` and, where
-        the lights have one, ``axis``. Shadows are those of the pose at rest.
+        Motion of the subject: transforms the points to their positions, by light (all cameras
+        expose together) or by frame. Needs `lights` to be a dataclass with ``position_mm`` and,
+        where the lights have one, ``axis``. Shadows are those of the pose at rest.
     binning : int
         Camera pixels along each side of an image pixel: 2 for images of 2 x 2 cells.
     light_radius_mm, offset_mm : float
@@ -57,8 +56,8 @@ class LumitexelStore:
     folder : Path, optional
         Existing folder for the tables; in memory by default.
     dtype : dtype
-        Of the tables. float16 holds 0.05 %, well below the noise of a sample, of values that are
-        scaled row by row.
+        Type of the tables. float16 resolves 0.05 %, well below the noise of a sample, of values
+        that are scaled row by row.
     """
 
     def __init__(
@@ -113,7 +112,7 @@ class LumitexelStore:
         *,
         response: Callable[[FloatArray], FloatArray] | None = None,
     ) -> None:
-        """Take what one image shows of the points.
+        """Sample one image at the points.
 
         Parameters
         ----------
@@ -122,10 +121,10 @@ class LumitexelStore:
         signal, variance : ndarray, shape (H, W, 3)
             In the unit of the lights' irradiance, and its square.
         good : ndarray of bool, shape (H, W), optional
-            Pixels that may be used; all by default. What is not finite is never used.
+            Usable pixels; all by default. Non-finite pixels are never used.
         response : callable, optional
-            Returns the camera's own gain, shape (N, 3), at camera pixels, shape (N, 2); the
-            signal is divided by it.
+            Returns the camera's relative response, shape (N, 3), at camera pixels, shape (N, 2);
+            the signal is divided by it.
         """
         Checks().shape("signal", signal, ("H", "W", 3))
         Checks().shape("variance", variance, signal.shape)
@@ -155,14 +154,14 @@ class LumitexelStore:
         self._tables[view][light] = row / self._scale[view, light, :, None, None]
 
     def chunks(self, size: int) -> Iterator[tuple[slice, Lumitexels]]:
-        """Yield the lumitexels of all points, at most `size` at a time (about 60 B a sample)."""
+        """Yield the lumitexels of all points, at most `size` at a time (about 60 B per sample)."""
         Checks().within("size", size, "[1, inf)")
         for start in range(0, len(self.surface), size):
             stop = min(start + size, len(self.surface))
             yield slice(start, stop), self.chunk(start, stop)
 
     def chunk(self, start: int, stop: int) -> Lumitexels:
-        """Return the lumitexels of the points from `start` to before `stop`, not to be changed."""
+        """Return the lumitexels of the points in [start, stop); do not modify them."""
         part = (start, stop)
         if part in self._kept:
             return self._kept[part]
@@ -247,7 +246,7 @@ def _table(
     table = np.lib.format.open_memmap(
         folder / f"view{view:03d}.npy", mode="w+", dtype=dtype, shape=shape
     )
-    # a row that never comes has scale 0, which _assemble takes for no sample
+    # a row that is never written has scale 0, which _assemble masks
     return table
 
 
@@ -261,24 +260,27 @@ def _checked_poses(poses: ArrayLike | None, views: int, lights: int) -> Float64A
         given = given.reshape(views, lights, 4, 4)
     else:
         raise ValueError(
-            f"poses: got shape {given.shape}, expected ({lights}, 4, 4) or ({views * lights}, 4, 4)"
+            f"poses: got shape {given.shape}, expected ({lights}, 4, 4) or "
+            f"({views * lights}, 4, 4); give one pose per light or per frame"
         )
     turn = given[..., :3, :3]
     if not np.allclose(turn @ np.swapaxes(turn, -1, -2), np.eye(3), atol=1e-6):
-        raise ValueError("poses: got matrices that are no rigid motions")
+        raise ValueError("poses: got matrices that are not rigid; normalize their rotations")
     return given
 
 
 def _back(poses: Float64Array, point: FloatArray) -> Float64Array:
-    """Return where a fixed point of the rig lies for the subject, shape (L, 3)."""
+    """Return the position of a fixed rig point in the subject's frames, shape (L, 3)."""
+    # a pose x = R p + t has the inverse p = R' (x - t)
     return np.asarray(np.einsum("lji,lj->li", poses[:, :3, :3], point - poses[:, :3, 3]))
 
 
 def _moved(lights: LightSources, poses: Float64Array) -> LightSources:
-    """Return the lights as they stand for the subject in each one's own frame."""
+    """Return the lights in the subject's frame at each light's pose."""
     names = getattr(lights, "__dataclass_fields__", {})
     if "position_mm" not in names:
-        raise TypeError(f"lights: got {type(lights).__name__}, expected a dataclass, to move them")
+        got = f"got {type(lights).__name__}, expected a dataclass"
+        raise TypeError(f"lights: {got}; give a table with position_mm")
     held: Any = lights
     turn, shift = poses[:, :3, :3], poses[:, :3, 3]
     changes: dict[str, Any] = {
@@ -292,12 +294,12 @@ def _moved(lights: LightSources, poses: Float64Array) -> LightSources:
 
 @njit(cache=True, nogil=True)
 def _sample(signal, variance, good, xy, row):  # type: ignore[no-untyped-def]
-    """Sample an image bilinearly at xy; NaN where one of the pixels is missing or bad."""
+    """Sample an image bilinearly at xy; NaN where one of the pixels is missing or invalid."""
     height, width = good.shape
     for p in range(xy.shape[0]):
         x, y = xy[p, 0], xy[p, 1]
         inside = x >= 0.0 and y >= 0.0 and x <= width - 1 and y <= height - 1
-        if not inside:  # NaN too
+        if not inside:  # also False for NaN
             row[:, p] = np.nan
             continue
         i, j = min(int(y), height - 2), min(int(x), width - 2)
@@ -321,7 +323,7 @@ def _sample(signal, variance, good, xy, row):  # type: ignore[no-untyped-def]
 def _assemble(  # type: ignore[no-untyped-def]
     table, scale, rows, lit, light_dir, white, view_dir, normals, out, cosines, valid
 ):
-    """Divide the samples of one view by irradiance and cosine, and mask those that do not count."""
+    """Divide the samples of one view by irradiance and cosine, and mask the invalid ones."""
     f, variance, light_out, view_out = out
     cos_light, cos_view = cosines
     lights, points = lit.shape

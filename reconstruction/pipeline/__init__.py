@@ -1,1 +1,1 @@
-"""The pipeline: recipes that turn a session into an appearance."""
+"""Recipes that compute an APPEARANCE/ folder from a session."""

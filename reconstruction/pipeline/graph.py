@@ -1,4 +1,4 @@
-"""A graph of stages: compute only what is wanted, reuse what is current, say what was left out."""
+"""Run a graph of stages: compute the wanted products, reuse current ones, record omissions."""
 
 import hashlib
 import json
@@ -11,28 +11,28 @@ import numpy as np
 
 
 class StageError(ValueError):
-    """What is wanted cannot be computed."""
+    """Wanted products that the graph cannot compute."""
 
 
 @dataclass(frozen=True, slots=True)
 class PipelineStage:
-    """One step of a reconstruction.
+    """One stage of a reconstruction.
 
     Attributes
     ----------
     name
-        Unique.
+        Unique name.
     needs
-        Names of products that it reads.
+        Names of the products that the stage reads.
     makes
-        Names of products that it writes; no two stages make the same.
+        Names of the products that the stage writes; two stages never make the same product.
     run
-        Called with the products needed, by name; returns the products made.
+        Called with the needed products by name; returns the products made.
     parameters
-        What else its result depends on, as JSON values: settings, hashes of the inputs that
-        are no products, and a number that grows when the code changes its result.
+        Further dependencies of the result as JSON values: settings, hashes of inputs that are
+        not products, and a revision that grows when the code changes its result.
     refused
-        Why it cannot run, where that is known beforehand; empty: it can.
+        Reason why the stage cannot run, if known beforehand; empty: the stage can run.
     """
 
     name: str
@@ -44,11 +44,11 @@ class PipelineStage:
 
 
 def make_stage_factory(base: Mapping[str, Any]) -> Callable[..., PipelineStage]:
-    """Return what makes the stages of one graph, whose parameters begin with those of ``base``.
+    """Return a factory for the stages of one graph, whose parameters begin with ``base``.
 
-    It takes a stage's name, its needs and what it makes as names parted by spaces, and what runs
-    it; then why it is refused, and more parameters by name. What makes a single product returns
-    that, what makes several a mapping.
+    The factory takes a stage's name, its needs and its products as names separated by spaces, and
+    the function to run; then the reason for a refusal, and more parameters by name. The function
+    returns the product itself if there is one, else a mapping of products.
 
     Examples
     --------
@@ -73,24 +73,24 @@ def make_stage_factory(base: Mapping[str, Any]) -> Callable[..., PipelineStage]:
 
 @dataclass(frozen=True, slots=True)
 class RunResult:
-    """What a run of the graph did."""
+    """Result of one run of the graph."""
 
     products: Mapping[str, Any]
     """The wanted products, by name."""
     ran: tuple[str, ...]
     reused: tuple[str, ...]
     omitted: tuple[tuple[str, str], ...]
-    """Stages that nothing wanted needs, each with the reason."""
+    """Stages that no wanted product needs, each with the reason."""
     keys: Mapping[str, str]
     """Input hash of each stage that was needed."""
     assumed: tuple[str, ...] = ()
-    """What was taken for granted for want of a calibration."""
+    """Assumptions that replaced missing calibrations."""
     work: tuple[Mapping[str, str], ...] = ()
-    """What became of each stage and why, see `record_run`."""
+    """Outcome of each stage with the reason, see `record_run`."""
 
 
 def order_stages(stages: Sequence[PipelineStage], want: Iterable[str]) -> list[PipelineStage]:
-    """Return the stages that ``want`` depends on, each after those it needs.
+    """Order the stages that ``want`` depends on, each after those it needs.
 
     Parameters
     ----------
@@ -102,8 +102,8 @@ def order_stages(stages: Sequence[PipelineStage], want: Iterable[str]) -> list[P
     Raises
     ------
     StageError
-        When a wanted or needed product is made by no stage, two stages make the same
-        product, or stages need each other in a circle.
+        When no stage makes a wanted or needed product, two stages make the same product, or
+        stages need each other in a circle.
 
     Examples
     --------
@@ -116,8 +116,8 @@ def order_stages(stages: Sequence[PipelineStage], want: Iterable[str]) -> list[P
     for stage in stages:
         for product in stage.makes:
             if product in maker:
-                both = f"{maker[product].name!r} and {stage.name!r}"
-                raise StageError(f"product {product!r}: made by {both}")
+                both = f"stages {maker[product].name!r} and {stage.name!r}, expected one of them"
+                raise StageError(f"product {product!r}: made by {both}; rename one product")
             maker[product] = stage
     ordered: list[PipelineStage] = []
     visiting: list[str] = []
@@ -126,13 +126,14 @@ def order_stages(stages: Sequence[PipelineStage], want: Iterable[str]) -> list[P
         if product not in maker:
             raise StageError(
                 f"{by}: {product!r} is not a map that can be made here; "
-                f"got {product!r}, expected one of {', '.join(sorted(maker))}"
+                f"expected one of {', '.join(sorted(maker))}"
             )
         stage = maker[product]
         if stage in ordered:
             return
         if stage.name in visiting:
-            raise StageError(f"stages need each other: {' -> '.join([*visiting, stage.name])}")
+            chain = " -> ".join([*visiting, stage.name])
+            raise StageError(f"stages need each other: {chain}; remove one of these needs")
         visiting.append(stage.name)
         for needed in stage.needs:
             visit(needed, f"stage {stage.name}")
@@ -145,7 +146,7 @@ def order_stages(stages: Sequence[PipelineStage], want: Iterable[str]) -> list[P
 
 
 def input_hashes(ordered: Iterable[PipelineStage]) -> dict[str, str]:
-    """Return the hash of all that a stage's products depend on, by the name of the stage.
+    """Hash everything that each stage's products depend on, by the name of the stage.
 
     Parameters
     ----------
@@ -168,10 +169,10 @@ def run_stages(
     cache: MutableMapping[str, Mapping[str, Any]] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> RunResult:
-    """Compute the wanted products and nothing else.
+    """Compute the wanted products, and only the stages that they need.
 
-    A stage whose input hash is in the cache is not run; neither are the stages that only it
-    needed.
+    A stage is skipped when its input hash is in the cache; stages that only it needs are skipped
+    too.
 
     Parameters
     ----------
@@ -180,20 +181,21 @@ def run_stages(
     want
         Names of products, in any order.
     cache
-        Products kept from earlier runs, by the input hash of their stage: all of a stage or some.
-        What is made is added.
+        Products kept from earlier runs, by the input hash of their stage; all of a stage's
+        products or some. New products are added.
     progress
         Called with a line of text before each stage that runs.
 
     Returns
     -------
-    Outcome
+    RunResult
+        Products, with the stages that ran, were reused or were omitted.
     """
     needed = order_stages(stages, want)
     made_by = {product: stage for stage in needed for product in stage.makes}
     keys = input_hashes(needed)
     cache = {} if cache is None else cache
-    for stage in needed:  # before anything is computed in vain
+    for stage in needed:  # refuse before any stage runs
         if stage.refused and keys[stage.name] not in cache:
             raise StageError(stage.refused)
     products: dict[str, Any] = {}
@@ -217,18 +219,19 @@ def run_stages(
         made = stage.run(**{product: products[product] for product in stage.needs})
         if set(made) != set(stage.makes):
             both = f"made {sorted(made)}, expected {sorted(stage.makes)}"
-            raise StageError(f"stage {stage.name}: {both}")
+            raise StageError(f"stage {stage.name}: {both}; correct its makes or its run")
         products.update(made)
         ran.append(stage.name)
-        if stage.name in reused:  # its maps were at hand, but not what only other stages need
+        # the cache can hold a stage's maps but lack the products that only other stages need
+        if stage.name in reused:
             reused.remove(stage.name)
         cache[keys[stage.name]] = made
 
     for product in want:
         provide(product)
-    left_out = [(s.name, "nothing wanted depends on it") for s in stages if s not in needed]
+    left_out = [(s.name, "no wanted product depends on it") for s in stages if s not in needed]
     idle = [s.name for s in needed if s.name not in ran and s.name not in reused]
-    left_out += [(name, "what depends on it was reused") for name in idle]
+    left_out += [(name, "the stages that depend on it were reused") for name in idle]
     wanted = {product: products[product] for product in want}
     return RunResult(wanted, tuple(ran), tuple(reused), tuple(left_out), keys)
 
@@ -236,22 +239,22 @@ def run_stages(
 def record_run(
     graph: Sequence[PipelineStage], outcome: RunResult, before: Mapping[str, str]
 ) -> tuple[dict[str, str], ...]:
-    """Return what a run did, stage by stage in the order of the graph.
+    """Describe a run, stage by stage in the order of the graph.
 
     Parameters
     ----------
     graph
         All stages.
     outcome
-        What a run of it did.
+        Result of one run of it.
     before
-        Input hash of each stage of the run before, by name; empty: there was none.
+        Input hash of each stage in the previous run, by name; empty: there was none.
 
     Returns
     -------
     tuple of dict
-        ``stage``; ``done``: "run", "reused" or "skipped"; ``why``; ``inputs``: the hash of all that
-        the stage's products depend on, empty where nothing needed it.
+        ``stage``; ``done``: "run", "reused" or "skipped"; ``why``; ``inputs``: the stage's input
+        hash, see `input_hashes`, empty where no stage needed it.
 
     Examples
     --------
@@ -264,11 +267,11 @@ def record_run(
 
     def entry(name: str) -> dict[str, str]:
         key = outcome.keys.get(name, "")
-        done, why = "skipped", skipped.get(name, "nothing wanted depends on it")
+        done, why = "skipped", skipped.get(name, "no wanted product depends on it")
         if name in outcome.reused:
             done, why = "reused", "its inputs are the same"
         elif name in outcome.ran:
-            done, why = "run", "what it made is not kept, or not all of it"
+            done, why = "run", "its products are not all in the cache"
             if before.get(name) != key:
                 why = "its inputs have changed" if name in before else "it was not made before"
         return {"stage": name, "done": done, "why": why, "inputs": key}
@@ -277,7 +280,7 @@ def record_run(
 
 
 def select_attributes(record: Any, names: str) -> dict[str, Any]:
-    """Return attributes of a record by their names, which are parted by spaces.
+    """Return attributes of a record by their names, which are separated by spaces.
 
     Examples
     --------
@@ -288,7 +291,7 @@ def select_attributes(record: Any, names: str) -> dict[str, Any]:
 
 
 def serialize_document(document: Mapping[str, Any]) -> bytes:
-    """Return a document as JSON text, UTF-8; arrays become lists, what is not finite null.
+    """Encode a document as JSON text, UTF-8; arrays become lists, non-finite numbers null.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Lights and views that a fit must not see, so that it can be judged by them."""
+"""Parse and resolve the held-out lights and views that evaluate a fit."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ FIELD_NAMES = ("lights", "views")
 
 
 class HoldOutError(ValueError):
-    """What is to be held out cannot be."""
+    """Held-out names that are malformed or not in the session."""
 
 
 @dataclass(frozen=True, slots=True)
 class HoldOut:
-    """Names of lights and views whose frames stay out of every fit.
+    """Names of lights and views whose frames are excluded from every fit.
 
     Attributes
     ----------
     lights, views
-        Names or, before `resolve`, places in the session's order, counted from 0.
+        Names or, before `resolve`, indices in the session's order, counted from 0.
     """
 
     lights: tuple[str, ...] = ()
@@ -29,12 +29,12 @@ class HoldOut:
 
     @staticmethod
     def parse(text: str) -> HoldOut:
-        """Read ``lights=L007,L023,views=C03``: a word without = goes on with the list before it.
+        """Parse ``lights=L007,L023,views=C03``; a word without = continues the list before it.
 
         Raises
         ------
         HoldOutError
-            For anything but these two lists, and for empty ones.
+            For any other field, and for empty lists.
 
         Examples
         --------
@@ -56,39 +56,40 @@ class HoldOut:
         return HoldOut(tuple(lists.get("lights", ())), tuple(lists.get("views", ())))
 
     def resolve(self, lights: Sequence[str], views: Sequence[str]) -> HoldOut:
-        """Return the names, in the session's order, that these names and places mean.
+        """Resolve names and indices to names in the session's order.
 
         Parameters
         ----------
         lights, views
-            Names that the session holds frames of.
+            Names of lights and views with frames in the session.
 
         Raises
         ------
         HoldOutError
-            For what the session does not hold.
+            For names and indices that the session lacks.
         """
         return HoldOut(_found("lights", self.lights, lights), _found("views", self.views, views))
 
     def __bool__(self) -> bool:
-        """Return whether anything is held out."""
+        """Return whether any light or view is held out."""
         return bool(self.lights or self.views)
 
     def is_held_out(self, light: str, view: str) -> bool:
-        """Return whether a frame of this light and view stays out of the fits."""
+        """Return whether a frame of this light and view is excluded from the fits."""
         return light in self.lights or view in self.views
 
     def record(self) -> dict[str, list[str]]:
-        """Return this as JSON values."""
+        """Return the held-out names as JSON values."""
         return {"lights": list(self.lights), "views": list(self.views)}
 
 
 NO_HOLD_OUT = HoldOut()
-"""Every frame may be fitted to."""
+"""All frames enter the fits."""
 
 
 def _found(field: str, asked: Sequence[str], there: Sequence[str]) -> tuple[str, ...]:
-    expected = f"names out of {', '.join(there)} or numbers from 0 to {len(there) - 1}"
+    known_names = f"names out of {', '.join(there)}"
+    expected = f"{known_names} or numbers from 0 to {len(there) - 1}; choose some of these"
     chosen = set()
     for word in asked:
         number = int(word) if word.isascii() and word.isdigit() else len(there)

@@ -1,4 +1,4 @@
-"""What a reconstruction stands on: a session, its calibrations, what is assumed without them."""
+"""Inputs of a reconstruction: session, calibrations, options, and assumptions made instead."""
 
 from __future__ import annotations
 
@@ -19,57 +19,56 @@ from reconstruction.pipeline.graph import PipelineStage, make_stage_factory
 from reconstruction.pipeline.hold_out import NO_HOLD_OUT, HoldOut
 
 PROGRESS_INTERVAL_S = 5.0
-"""Seconds between two lines about the same stage."""
+"""Seconds between two progress lines of the same stage."""
 
 
 class InputsError(ValueError):
-    """A session that cannot be reconstructed as asked."""
+    """A session that cannot be reconstructed with the given options."""
 
 
 @dataclass(frozen=True, slots=True)
 class DomeOptions:
-    """What only sessions of the dome take."""
+    """Options that only sessions of the dome take."""
 
     scan: str | Path | None = None
-    """PLY of the face in mm that takes the place of the session's own; None: the session's."""
+    """PLY mesh of the face in mm that replaces the session's own; None: the session's."""
     basis: str | Path | None = None
-    """Folder of MERL ``.binary`` tables to fit surface lobes with; None: the generated
-    dielectrics."""
+    """Folder of MERL ``.binary`` tables as basis BRDFs; None: the generated dielectrics."""
     hold_out: HoldOut | str | None = None
-    """Lights and views whose frames no fit sees, as "lights=L007,L023,views=C03" or as parsed;
-    what `skinrig render --against` compares with."""
+    """Lights and views whose frames are excluded from every fit, as "lights=L007,L023,views=C03"
+    or as parsed; `skinrig render --against` compares with them."""
     rank: int | None = None
-    """Lobes that the points share, 1 to 59; None: 4."""
+    """Number of basis BRDFs, 1 to 59; None: 4."""
 
 
 @dataclass(slots=True)
 class Inputs:
-    """A session and a folder of calibrations; keeps account of what was read and what assumed.
+    """A session and a folder of calibrations, with a record of files read and assumptions made.
 
     Attributes
     ----------
     session
-        Open for reading.
+        Session, open for reading.
     calibration
-        CALIBRATION/ folder; None: everything is assumed.
+        CALIBRATION/ folder; None: assumptions replace every calibration.
     state
-        Which state of the subject.
+        Name of the subject's expression or condition.
     on_date
-        The date that calibrations must be valid on.
+        Date on which calibrations must be valid.
     scan, basis, hold_out, rank
-        As of `DomeOptions`, the scan as it was read.
+        See `DomeOptions`; the scan as bytes.
     landmarks
-        Table of places on the face's texture; None: those that are known.
+        Table of positions on the face's texture; None: the built-in ones.
     repeat
-        Which of the state's repeats; None: all of them together.
+        Number of one repeat of the state; None: all repeats together.
     assumed
-        What was taken for granted for want of a calibration, one line each.
+        Assumptions that replace missing calibrations, one line each.
     hashes
-        SHA-256 of everything that was read, by what it is.
+        SHA-256 of everything that was read, by role.
     noted
-        JSON values that belong into the record of the maps.
+        JSON values for the record of the maps.
     progress
-        Called with a line of text now and then while a stage runs.
+        Called with a line of text while a stage runs.
     """
 
     session: Session
@@ -89,7 +88,7 @@ class Inputs:
     _reported_at: float = 0.0
 
     def report_progress(self, stage: str, done: float) -> None:
-        """Say how far a stage is, 0 to 1, every few seconds at most."""
+        """Report a stage's progress, 0 to 1, at most once per `PROGRESS_INTERVAL_S`."""
         now = time.monotonic()
         if self.progress is not None and now - self._reported_at >= PROGRESS_INTERVAL_S:
             self._reported_at = now
@@ -105,13 +104,13 @@ class Inputs:
         landmarks: str | Path | None = None,
         dome: DomeOptions | None = None,
     ) -> Inputs:
-        """Begin with what the session itself says that it assumed.
+        """Collect a session's inputs; the session's own assumptions come first.
 
         Raises
         ------
         InputsError
-            When ``calibration`` or ``basis`` is no folder, the first holds no calibration or
-            those of other rigs alone, or ``scan`` is no PLY.
+            When ``calibration`` or ``basis`` is not a folder, the folder of calibrations is empty
+            or of other rigs only, or ``scan`` is not a PLY mesh.
         """
         dome = dome or DomeOptions()
         found = Inputs(
@@ -128,8 +127,8 @@ class Inputs:
         if dome.scan is not None:
             found.scan = Path(dome.scan).read_bytes()
             if not found.scan.startswith(b"ply"):
-                hint = "`skinrig import mesh` takes .obj and .ply"
-                raise InputsError(f"scan: got no PLY mesh in {dome.scan}; {hint}")
+                hint = "convert it with `skinrig import mesh`, which takes .obj and .ply"
+                raise InputsError(f"scan: got {dome.scan}, expected a PLY mesh; {hint}")
             found.hashes["scan"] = hashlib.sha256(found.scan).hexdigest()
         if dome.basis is not None:
             found.basis = Path(dome.basis)
@@ -143,12 +142,12 @@ class Inputs:
         return found
 
     def stage_maker(self, revision: int) -> Callable[..., PipelineStage]:
-        """Return `graph.stage_maker` for stages of a revision of their code and all that was read.
+        """Return a `graph.make_stage_factory` that hashes this revision and all files read.
 
         Parameters
         ----------
         revision
-            Grows when the code of a stage changes its result, so that older maps are made again.
+            Grows when the code of a stage changes its result, so that older maps are recomputed.
         """
         return make_stage_factory(
             {"revision": revision, "inputs": dict(sorted(self.hashes.items()))}
@@ -157,21 +156,21 @@ class Inputs:
     def load(
         self, kind: str, serials: Sequence[str], otherwise: str
     ) -> calibration_store.Calibration | None:
-        """Return the calibration of a kind, or None and note what is assumed instead.
+        """Load the calibration of a kind; without one, return None and record the assumption.
 
         Parameters
         ----------
         kind
             "white", "color", "geometry", ...
         serials
-            Devices that it must be of.
+            Serials of the devices that it must belong to.
         otherwise
-            What is assumed where the folder holds none of that kind.
+            Assumption to record if the folder lacks that kind.
 
         Raises
         ------
         CalibrationError
-            When it is damaged, of another rig or device, or out of date.
+            When the calibration is damaged, of another rig or device, or out of date.
         """
         if self.calibration is not None:
             with suppress(calibration_store.CalibrationMissing):
@@ -188,32 +187,34 @@ class Inputs:
 
 
 def _require_some(folder: Path, rig: str) -> None:
-    """Refuse a folder without a calibration of a rig: else everything would be assumed."""
+    """Refuse a folder without a calibration of a rig: every quantity would be assumed."""
     if not folder.is_dir():
-        raise InputsError(f"calibration: {folder} is no folder; `skinrig calibrate` makes one")
+        got = f"got {folder}, expected a CALIBRATION/ folder"
+        raise InputsError(f"calibration: {got}; make one with `skinrig calibrate`")
     files = [path for kind in CALIBRATION_KINDS if (path := folder / f"{kind}.json").is_file()]
     if not files:
         raise InputsError(
             f"calibration: {folder} holds none, expected {', '.join(CALIBRATION_KINDS)} or some of "
-            "them (.json); `skinrig calibrate` makes them"
+            "them (.json); make them with `skinrig calibrate`"
         )
     rigs = set()
     for path in files:
         try:
             rigs.add(str(json.loads(path.read_bytes())["rig"]))
         except (ValueError, KeyError, TypeError):
-            return  # what is wrong with it is said where it is needed
+            return  # `load` reports a damaged file when a stage needs it
     if rig not in rigs:
         raise InputsError(
-            f"calibration: those in {folder} were made on rig {', '.join(sorted(rigs))}, the "
-            f"session is of rig {rig}; leave --calibration out, or give that rig's folder"
+            f"calibration: those in {folder} were made on rig {', '.join(sorted(rigs))}, expected "
+            f"the session's rig {rig}; omit --calibration, or give that rig's folder"
         )
 
 
 def _digest_of(folder: Path) -> str:
-    """Return the hash of a folder's tables, their names and contents."""
+    """Hash a folder's MERL tables, names and contents."""
     if not folder.is_dir():
-        raise InputsError(f"basis: {folder} is no folder; give one with MERL .binary files")
+        got = f"got {folder}, expected a folder"
+        raise InputsError(f"basis: {got}; give one with MERL .binary files")
     digest = hashlib.sha256()
     for path in sorted(folder.glob("*.binary")):
         digest.update(path.name.encode() + b"\0")

@@ -1,4 +1,4 @@
-"""Stages of pictures under listed lights, without a calibrated rig: normals and albedo."""
+"""Stages of images under listed lights, without a calibrated rig: normals and albedo."""
 
 import tempfile
 from collections.abc import Mapping
@@ -23,21 +23,21 @@ from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.masked_map import masked_map
 
 STAGE_REVISION = 2
-"""Grows when the code of a stage changes its result, so that older maps are computed again."""
+"""Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = ("normals", "albedo", "residual")
-"""Maps that can be made of pictures with a light list."""
+"""Maps of a session with a light list."""
 
 MEMORY_BYTES = 2**30
-"""Size of a stack from which on it lies in a file and not in memory."""
+"""Stacks above this size are stored in a file, not in memory."""
 MAX_STRENGTH_DEVIATION = 0.2
-"""Relative strength that a light may be off before it is named."""
+"""Relative deviation of a light's strength from the median above which it is reported."""
 OUTLIER_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, slots=True)
 class LightStack:
-    """Gray pictures under each light, over exposure and strength of the light."""
+    """Gray images under each light, over exposure and strength of the light."""
 
     gray: Float32Array
     """(N, H, W)."""
@@ -47,14 +47,14 @@ class LightStack:
     """(H, W)."""
     records: tuple[FrameRecord, ...]
     gain: Float64Array
-    """(N, 3): what the values of each frame were multiplied with, per channel."""
+    """(N, 3): factor on the values of each frame, per channel."""
     folder: Any
-    """Keeps the file of a large stack alive."""
+    """Keeps the temporary folder of a large stack alive."""
 
 
 @dataclass(frozen=True, slots=True)
 class StackLights:
-    """Lights that agree with the shading."""
+    """Lights in the order that agrees with the shading."""
 
     vectors: Float64Array
     """(N, 3) in the order of the stack: directions, or positions in mm where near."""
@@ -64,7 +64,7 @@ class StackLights:
 
 
 def graph(inputs: Inputs) -> list[stages.PipelineStage]:
-    """Return the stages that a session with a light list can go through; see `stages.run`."""
+    """Return the stages of a session with a light list; see `graph.run_stages`."""
     stage = inputs.stage_maker(STAGE_REVISION)
     known = "stack lights normals gray_albedo"
     return [
@@ -76,7 +76,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
 
 
 def _linear(frame: raw.RawFrame) -> tuple[Float32Array, BoolArray]:
-    """Return values (H, W, C) over the range, and which are not saturated (H, W)."""
+    """Return values (H, W, C) as fractions of the range, and which are not saturated (H, W)."""
     if frame.pattern == "MONO":
         (black,) = frame.black
         values = (frame.cfa.astype(np.float32) - black) / np.float32(frame.white - black)
@@ -87,8 +87,8 @@ def _linear(frame: raw.RawFrame) -> tuple[Float32Array, BoolArray]:
 
 def _stack(session: Session) -> LightStack:
     records = tuple(session.frames("olat"))
-    got = f"{len(records)} frames under a light each"
-    Checks(InputsError).require(len(records) >= 3, f"{session.path}", got, "3")
+    got = f"{len(records)} frames under one light at a time"
+    Checks(InputsError).require(len(records) >= 3, f"{session.path}", got, "3; add images")
     exposures = [
         float(r.settings.get("exposure_s", 0.0)) * float(r.settings.get("iso", 100.0))
         for r in records
@@ -123,17 +123,19 @@ def _stack(session: Session) -> LightStack:
         data = np.frombuffer(session.attachment("mask.png"), np.uint8)
         mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
         if mask is None or mask.shape != inside.shape:
-            raise InputsError(f"{session.path}: its mask does not fit its pictures")
+            hint = "give a mask of the images' size"
+            raise InputsError(f"{session.path}: its mask does not fit its images; {hint}")
         inside = np.asarray(mask > 127)
     return LightStack(gray, usable, inside, records, gain, folder)
 
 
 def _lights(inputs: Inputs, stack: LightStack) -> StackLights:
-    """Take the list's lights if the shading agrees, else the order that it agrees with."""
+    """Check the list's lights against the shading; use another order if only that one agrees."""
     session = inputs.session
     listed = session.manifest.extra["light_list"]
     if not isinstance(listed, dict):
-        raise InputsError(f"{session.path}: its light list is no table")
+        got = f"got a light list of type {type(listed).__name__}, expected a table"
+        raise InputsError(f"{session.path}: {got}; import the images with their light list again")
     vectors = np.array(
         [session.rig.light(str(r.index["light"])).position_mm for r in stack.records], np.float64
     )
@@ -146,31 +148,31 @@ def _lights(inputs: Inputs, stack: LightStack) -> StackLights:
             stack.gray, unit, valid=stack.usable & stack.inside, rng=np.random.default_rng(0)
         )
     except PhotometricStereoError as error:
-        inputs.assumed.append(f"the lights belong to their pictures ({error})")
+        inputs.assumed.append(f"the lights belong to their images ({error})")
         return StackLights(vectors, near, scale, alive)
     best = f"{100 * min(found.misfit.values()):.1f} %"
     as_listed = f"{100 * found.misfit['as listed']:.1f} %"
     if found.order == "unknown":
         inputs.assumed.append(
             "the light list is right, though no order of it explains the shading"
-            f" (misfit {as_listed}): the object shines, or these are not its lights"
+            f" (misfit {as_listed}): the object is glossy, or the list is of other lights"
         )
     elif found.order != "as listed":
         vectors = vectors[found.permutation]
         inputs.assumed.append(
             f"the light list is {found.order}: the shading's misfit is {as_listed} as listed and"
-            f" {best} so; it was used so"
+            f" {best} in that order, which was used"
         )
     alive = ~found.dead
     for number in np.flatnonzero(found.dead):
-        inputs.assumed.append(f"light {number + 1} of the list gave no light and is left out")
+        inputs.assumed.append(f"light {number + 1} of the list gave no light and is omitted")
     off = np.flatnonzero(alive & (np.abs(found.strength - 1) > MAX_STRENGTH_DEVIATION))
     if off.size and found.order != "unknown":
         worst = off[np.argmax(np.abs(found.strength[off] - 1))]
         inputs.assumed.append(
             f"lights are of one strength, though {off.size} differ by more than "
             f"{MAX_STRENGTH_DEVIATION:.0%}, most"
-            f" light {worst + 1} with {found.strength[worst]:.2f} of the middle one"
+            f" light {worst + 1} with {found.strength[worst]:.2f} of the median"
         )
     inputs.noted["light_check"] = {
         "order": found.order,
@@ -181,7 +183,7 @@ def _lights(inputs: Inputs, stack: LightStack) -> StackLights:
 
 
 def _points_mm(shape: tuple[int, int], mm_per_px: float) -> Float64Array:
-    """Return the places of pixels on the plane through the object's middle, (H, W, 3)."""
+    """Return the positions of pixels on the plane through the object's middle, (H, W, 3)."""
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(np.float64)
     x, y = x - (shape[1] - 1) / 2, (shape[0] - 1) / 2 - y
     return np.stack([mm_per_px * x, mm_per_px * y, np.zeros(shape)], axis=-1)
@@ -199,7 +201,10 @@ def _estimate(stack: LightStack, lights: StackLights, *, robust: bool) -> Normal
 
 
 def _roughness_of_field(found: NormalMaps, both: BoolArray) -> float:
-    """Return how little the normals are those of a surface: the median curl of their slopes."""
+    """Measure how far the normals are from a surface's: the median curl of their slopes.
+
+    A height z(x, y) has slopes p = dz/dx, q = dz/dy with dp/dy = dq/dx, hence curl 0.
+    """
     z = np.maximum(found.normals[..., 2], 0.1)
     p, q = -found.normals[..., 0] / z, -found.normals[..., 1] / z
     curl = np.abs(np.diff(p, axis=0)[:, :-1] + np.diff(q, axis=1)[:-1])
@@ -208,7 +213,7 @@ def _roughness_of_field(found: NormalMaps, both: BoolArray) -> float:
 
 
 def _normals(inputs: Inputs, stack: LightStack, lights: StackLights) -> Mapping[str, Any]:
-    """Estimate normals both ways and keep those that are more of a surface's."""
+    """Estimate normals robustly and by least squares; keep the field with the smaller curl."""
     found = {robust: _estimate(stack, lights, robust=robust) for robust in (True, False)}
     both = found[True].valid & found[False].valid
     curl = {robust: _roughness_of_field(maps, both) for robust, maps in found.items()}
@@ -220,10 +225,10 @@ def _normals(inputs: Inputs, stack: LightStack, lights: StackLights) -> Mapping[
     best = found[robust]
     valid = best.valid
     n = np.where(valid[..., None], best.normals, 0.0)
-    # isotropic across the normal: each component has its share of the angle's error
+    # the angle's error is isotropic across the normal: half its variance per tangential axis
     each = best.stderr_rad[..., None] / np.sqrt(2.0) * np.sqrt(np.maximum(1.0 - n**2, 0.0))
     relative = best.residual / np.where(valid, best.albedo, 1.0)
-    frame = "picture frame: x right, y up, z towards the camera"
+    frame = "image frame: x right, y up, z towards the camera"
     misfit = "root mean square misfit over albedo"
     return {
         "normals": masked_map(n, each, valid, MAP_UNITS["normals"], frame),
@@ -239,7 +244,7 @@ def _albedo(
     normals: SkinMap,
     gray_albedo: NormalMaps,
 ) -> SkinMap:
-    """Fit each channel's albedo to the samples that agree with the gray fit."""
+    """Fit each channel's albedo to the samples that are inliers of the gray fit."""
     n, gray = normals.values, gray_albedo
     above, below = np.zeros((), np.float64), np.zeros(stack.inside.shape)
     spread = OUTLIER_SIGMAS * gray.residual + 1e-6 * gray.albedo

@@ -1,4 +1,4 @@
-"""Maps of what stages estimate, 0 where it means nothing."""
+"""Maps with value 0 where they are invalid."""
 
 import numpy as np
 
@@ -13,16 +13,16 @@ def masked_map(
     unit: str = "1",
     description: str = "",
 ) -> SkinMap:
-    """Return a map whose values and standard errors are 0 where not valid.
+    """Return a map whose values and standard errors are 0 where not ``valid``.
 
     Parameters
     ----------
     values, stderr
-        (H, W) or (H, W, C), of any numbers where not ``valid``.
+        (H, W) or (H, W, C); arbitrary numbers where not ``valid``.
     valid
         (H, W).
     unit, description
-        Of the map.
+        Unit and description of the map.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What the sessions of one kind of rig can be made into."""
+"""Recipe of a rig kind: its maps, files and graph of stages."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,21 +10,21 @@ from reconstruction.pipeline.inputs import Inputs
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """What sessions of one kind can be made into."""
+    """Maps, files and stages of the sessions of one rig kind."""
 
     maps: tuple[str, ...]
     """Names of the maps."""
     graph: Callable[[Inputs], list[stages.PipelineStage]]
     files: tuple[str, ...] = ()
-    """Names of what is no map and goes along: meshes, tables."""
+    """Names of the other products: meshes, tables."""
     required: tuple[str, ...] = ()
-    """What the other maps mean nothing without."""
+    """Products that the interpretation of the other maps requires."""
     products: Callable[[Session], Mapping[str, tuple[str, ...]]] | None = None
-    """Where a name stands for more than itself, as for a map of each state: what for, by name."""
+    """Products by name, where a name means several, as one map for each state."""
     maps_of_rank: Callable[[int], tuple[str, ...]] | None = None
-    """Names of the maps where the number of lobes is chosen; None: this kind fits none."""
+    """Names of the maps for a number of basis BRDFs; None: this rig kind fits none."""
 
     def expand(self, session: Session, want: Sequence[str]) -> list[str]:
-        """Return the maps and files that the wanted names stand for."""
+        """Expand the wanted names to the maps and files that they mean."""
         meant = {} if self.products is None else self.products(session)
         return [product for name in want for product in meant.get(name, (name,))]

@@ -1,4 +1,4 @@
-"""Sessions and calibrations to maps: computes what is wanted, and records what it assumed."""
+"""Reconstruct maps from a session and calibrations, and record the assumptions."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from reconstruction.pipeline.recipe import Recipe
 
 
 def light_list_recipe() -> Recipe:
-    """Return the recipe of images under listed lights, imported without a rig."""
+    """Return the recipe of imported images under listed lights, without a rig."""
     from reconstruction.pipeline import light_stack
 
     return Recipe(light_stack.MAP_NAMES, light_stack.graph)
 
 
 def recipe_for_session(session: Session) -> Recipe:
-    """Return what can be made of a session.
+    """Return the recipe for a session's rig kind.
 
     Raises
     ------
     InputsError
-        When no step of its plan shows a subject.
+        When its plan has no step that shows a subject.
     """
     if "light_list" in session.manifest.extra:
         return light_list_recipe()
     kinds = {step.kind for step in session.plan.steps}
     for rig, kind in RIG_KINDS.items():
         if kind.subject_step in kinds:
-            # kernels are compiled when a module is first imported: each rig imports its own only
+            # importing a module compiles its kernels: each rig imports only its own
             recipe: Recipe = import_module(f"reconstruction.pipeline.{rig}.recipe").RECIPE
             return recipe
     shown = " or ".join(kind.subject_step for kind in RIG_KINDS.values())
     raise InputsError(
-        f"{session.path}: shows {', '.join(sorted(kinds))}, expected steps of kind "
-        f"{shown}; `skinrig calibrate` takes sessions of targets"
+        f"{session.path}: got steps of kind {', '.join(sorted(kinds))}, expected "
+        f"{shown}; use `skinrig calibrate` for sessions of targets"
     )
 
 
@@ -61,37 +61,36 @@ def reconstruct(
     truth: str = "",
     progress: Callable[[str], None] | None = None,
 ) -> stages.RunResult:
-    """Make the wanted maps of a session and write them to an APPEARANCE/ folder.
+    """Compute the wanted maps of a session and write them to an APPEARANCE/ folder.
 
     Parameters
     ----------
     session
         SESSION/ folder.
     want
-        Names of maps; which there are depends on the rig, see docs/reference/maps.md.
+        Names of maps, which depend on the rig, see docs/reference/maps.md.
     out
-        The folder. Maps in it that are still current, by the hash of all that they depend on,
-        are kept and not computed again.
+        APPEARANCE/ folder. Maps in it whose input hash is unchanged are kept.
     calibration
-        CALIBRATION/ folder; without it assumptions take its place and are recorded.
+        CALIBRATION/ folder; without it assumptions replace the calibrations and are recorded.
     state
-        Which state of the subject.
+        Name of the subject's expression or condition.
     on_date
-        The date the calibrations must be valid on; None: that of the session.
+        Date on which the calibrations must be valid; None: that of the session.
     landmarks
-        Table "name,x,y" of places on a probe's translucency map, pixels from its top left; None:
+        Table "name,x,y" of positions on a probe's translucency map, pixels from its top left; None:
         forehead, cheek and chin of the simulated heads' texture.
     dome
-        What only sessions of the dome take; None: nothing of it.
+        Options that only sessions of the dome take; None: none of them.
     truth
-        Name of the TRUTH/ folder beside ``out``, for the report.
+        Name of the TRUTH/ folder in the same parent folder as ``out``, for the report.
     progress
         Called with one line before each stage that runs.
 
     Returns
     -------
-    stages.Outcome
-        With what ran, what was reused, and what was left out and why.
+    RunResult
+        Stages that ran, were reused or were omitted, each with the reason.
 
     Raises
     ------
@@ -106,7 +105,7 @@ def reconstruct(
     _require_fitting_options(opened, recipe, options)
     for name, file in {"scan": options.scan, "landmarks": landmarks}.items():
         if file is not None and not Path(file).is_file():
-            raise InputsError(f"{name}: {file} is no file")
+            raise InputsError(f"{name}: got {file}, expected a file; correct the path")
     if options.rank is not None and recipe.maps_of_rank is not None:
         recipe = replace(recipe, maps=recipe.maps_of_rank(options.rank))
     _require_known(want, recipe.maps)
@@ -122,7 +121,7 @@ def reconstruct(
     outcome = stages.run_stages(graph, products, cache=kept, progress=progress)
     work = stages.record_run(graph, outcome, {name: previous.keys[name] for name in held})
     outcome = replace(outcome, assumed=tuple(inputs.assumed), work=work)
-    # what the subject agreed to goes wherever the maps go
+    # consent must go with the maps wherever they are copied
     consent = [opened.manifest.to_json()["subject"]] if opened.source == "measured" else []
     current = previous.exists and previous.parameters.get("consent", []) == consent
     if not outcome.ran and current and set(products) <= set(previous.contents):
@@ -139,14 +138,14 @@ def _require_fitting_options(session: Session, recipe: Recipe, dome: DomeOptions
     options = {"hold-out": dome.hold_out, "rank": dome.rank, "scan": dome.scan, "basis": dome.basis}
     given = [name for name, value in options.items() if value is not None]
     if given and recipe.maps_of_rank is None:
-        hint = "leave out what only it takes"
-        raise InputsError(f"{', '.join(given)}: {session.path} is no session of the dome; {hint}")
+        got = f"{', '.join(given)}: got a session of another rig, {session.path}"
+        raise InputsError(f"{got}, expected one of the dome; omit the options of the dome")
     Checks(InputsError).within("rank", 1 if dome.rank is None else dome.rank, "[1, inf)")
 
 
 def _require_known(want: Sequence[str], maps: Sequence[str]) -> None:
     check = Checks(InputsError)
-    check.require(want, "want", "nothing", f"names out of {', '.join(maps)}")
+    check.require(want, "want", "nothing", f"names out of {', '.join(maps)}; give some")
     for name in want:
         check.choice("want", name, maps)
 
@@ -154,9 +153,9 @@ def _require_known(want: Sequence[str], maps: Sequence[str]) -> None:
 def _planned_products(
     graph: Sequence[stages.PipelineStage], recipe: Recipe, session: Session, want: Sequence[str]
 ) -> list[str]:
-    """Return the products of all stages that make something wanted.
+    """Return all products of the stages that make a wanted one.
 
-    A stage's other maps cost nothing more, and only whole stages can be reused.
+    The other maps of such a stage add no cost, and only whole stages can be reused.
     """
     kept_names = recipe.expand(session, (*recipe.maps, *recipe.files))
     wanted = set(recipe.expand(session, (*want, *recipe.required)))
@@ -172,7 +171,7 @@ def _appearance(
     previous: _Previous,
     parameters: Mapping[str, object],
 ) -> SkinAppearance:
-    """Return what was made, with what an older folder holds that is still current."""
+    """Merge new products with those of an older folder that are still current."""
     keys = stages.input_hashes(stages.order_stages(graph, [p for s in graph for p in s.makes]))
     kept = dict(made)
     for stage, held in previous.current_products(graph).items():
@@ -204,7 +203,7 @@ def _appearance(
 
 @dataclass(frozen=True, slots=True)
 class _Previous:
-    """An older APPEARANCE/ folder; empty where there is none."""
+    """Older APPEARANCE/ folder; empty where there is none."""
 
     exists: bool
     contents: Mapping[str, SkinMap | bytes]
@@ -222,7 +221,7 @@ class _Previous:
             found = store.read(out)
         except store.StoreError as error:
             raise InputsError(
-                f"{error}; nothing was written: remove {out}, or name another, to make all anew"
+                f"{error}; nothing was written: remove {out} or choose another folder to recompute"
             ) from error
         recorded = found.parameters.get("stages", {})
         keys = recorded.items() if isinstance(recorded, dict) else ()
@@ -237,7 +236,7 @@ class _Previous:
     def current_products(
         self, graph: Sequence[stages.PipelineStage]
     ) -> dict[str, Mapping[str, SkinMap | bytes]]:
-        """Return what the folder holds of each stage that it has the input hash of."""
+        """Return the folder's products of each stage whose input hash is unchanged."""
         of_stages: dict[str, Mapping[str, SkinMap | bytes]] = {}
         for stage in graph:
             held = {name: self.contents[name] for name in stage.makes if name in self.contents}

@@ -1,4 +1,4 @@
-"""Sensor noise of a camera, as the stages of every rig use it."""
+"""Sensor noise of a camera, for the stages of every rig."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class ElectronNoise:
 
     @staticmethod
     def of(frame: raw.RawFrame) -> ElectronNoise:
-        """Read them off the frame's own noise profile.
+        """Read gain and read noise from the frame's own noise profile.
 
         Raises
         ------
@@ -27,8 +27,8 @@ class ElectronNoise:
             Where the frame has none.
         """
         if frame.noise_profile is None:
-            what = "does not say how noisy the sensor is; calibrate the sensor"
-            raise InputsError(f"{frame.path}: {what}")
+            hint = "calibrate the sensor"
+            raise InputsError(f"{frame.path}: got no noise profile, expected one; {hint}")
         scale, offset = frame.noise_profile
         span = frame.white - float(np.mean(frame.black))
         gain = 1.0 / max(scale * span, 1e-12)

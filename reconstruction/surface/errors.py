@@ -1,10 +1,9 @@
-"""Errors of estimates at surface points that are no noise: what a point's neighbors tell of them.
+"""Estimate errors other than noise at surface points from the change between neighboring points.
 
-Scan, registration and cameras together place a sample within a fraction of an image's pixel, and
-within a pixel the surface is averaged. What that does to an estimate goes by how much the estimated
-quantity itself changes from a point to the next: much for the albedo of freckled or dark skin and
-for the normals of a wrinkle, hardly for smooth skin. One number each, common to all faces, says how
-much of that change is error.
+Scan, registration and cameras together position a sample within a fraction of an image's pixel, and
+a pixel averages the surface within it. The resulting error is proportional to the local change of
+the estimated quantity: large for the albedo of freckled or dark skin and for the normals of a
+wrinkle, small for smooth skin. The factors of proportionality are common to all faces.
 """
 
 from typing import Final
@@ -17,31 +16,32 @@ from reconstruction.scan.mesh import RefinedScan
 from reconstruction.surface.estimates import PointValues
 
 POSITION_SIGMA_PX: Final = 0.27
-"""Standard deviation of where a sample is on the surface, over the size of a pixel."""
+"""Standard deviation of a sample's position on the surface, over the size of a pixel."""
 UNRESOLVED_RELIEF_RAD: Final = np.radians(0.27)
-"""Standard deviation, in each direction, of relief that is too fine for the points.
+"""Standard deviation, in each direction, of surface topography too fine for the points.
 
-This and the one above bring intervals to their nominal coverage on simulated faces of seeds 0 to 2,
-seen at 2.1 mm a pixel; see docs/decisions."""
+This value and the one above give intervals their nominal coverage on simulated faces of seeds 0 to
+2 at 2.1 mm per pixel; see docs/decisions."""
 UNRESOLVED_R_D_PX: Final = 1.55
-"""Standard error of the albedo over what it changes by in a pixel: misplaced samples, and albedo
-that is too fine for the pixels and the more of it, the more there is that is just not."""
+"""Standard error of the albedo over its change per pixel: from misregistered samples, and from
+albedo detail below the pixel size, whose amount is proportional to the detail just above it."""
 SHARED_DETAIL_FRACTION: Final = 0.8
-"""Share of the face's typical mean square change in that of a point, the rest is its neighbors'.
+"""Fraction of the face's median mean square change in that of a point; the rest is local.
 
-A few edges tell little of how much is finer than they are: where neighbors happen to look alike,
-the albedo within a pixel goes on changing as elsewhere on the face."""
+The few edges at a point estimate its fine detail badly: where neighbors have the same albedo by
+chance, the albedo within a pixel still varies as elsewhere on the face."""
 SHARED_R_D_ERROR: Final = 0.007
-"""Relative error of the albedo that all points of a face share, of calibration and of relief within
-pixels. Faces of seeds 1 to 3 lay 0.4 to 0.6 % below the truth blurred as by their pixels.
+"""Relative error of the albedo common to all points of a face, from calibration and from surface
+topography within pixels. On faces of seeds 1 to 3 the albedo was 0.4 to 0.6 % below the ground
+truth blurred by their pixels.
 
-This and the two above were set on these faces (types V, I and II, 2.1 mm a pixel)."""
+This value and the two above were fitted on these faces (types V, I and II, 2.1 mm per pixel)."""
 R_D_ERROR_PER_RAD: Final = 0.5
-"""Relative error of the albedo by that of the normal, 1/rad: lights all around leave so much."""
+"""Relative error of the albedo by that of the normal, 1/rad, with lights in all directions."""
 N_NEIGHBOR_RINGS: Final = 2
-"""Rings of neighbors that the albedo's change is averaged over: one point's edges are few."""
+"""Rings of neighbors over which the albedo's change is averaged, as one point has few edges."""
 MIN_SPACING_PX: Final = 0.25
-"""Points closer than this count as so far apart: noise is no slope."""
+"""Minimum distance of points in the slope; at smaller distances noise would count as slope."""
 
 
 def change_per_mm(
@@ -54,12 +54,12 @@ def change_per_mm(
     noise: Float64Array | None = None,
     rings: int = 0,
 ) -> Float64Array:
-    """Return how fast a quantity changes over a surface about each of its points.
+    """Return the root mean square change per mm of a quantity at each point of a surface.
 
     Parameters
     ----------
     values
-        (P, C) float64, of any unit; where not valid they are not read.
+        (P, C) float64, of any unit; ignored where not valid.
     points_mm
         (P, 3).
     faces
@@ -69,9 +69,9 @@ def change_per_mm(
     pixel_mm
         Size of an image's pixel on the subject.
     noise
-        (P, C): standard error of `values`, the share of the change that is noise.
+        (P, C): standard error of `values`, whose part of the change is subtracted.
     rings
-        How often the mean square over a point's edges is averaged with its neighbors'.
+        Number of times that the mean square is averaged over a point's neighbors.
 
     Returns
     -------
@@ -94,6 +94,7 @@ def change_per_mm(
     a, b = edges.T
     square = np.square(values[a] - values[b])
     if noise is not None:
+        # independent noise adds var(a) + var(b) to the squared difference of two points
         square = square - np.square(noise[a]) - np.square(noise[b])
     apart = np.linalg.norm(points_mm[a] - points_mm[b], axis=1).astype(np.float64)
     square /= np.square(np.maximum(apart, MIN_SPACING_PX * pixel_mm))[:, None]
@@ -108,21 +109,21 @@ def change_per_mm(
         for here, there in ((a, b), (b, a)):
             np.add.at(total, here, mean[there])
         mean = total / (1.0 + count)[:, None]
-    # noise taken off a mean of few edges can leave less than nothing
+    # subtracting noise from a mean of few edges can give a negative value
     return np.sqrt(np.maximum(mean, 0.0))
 
 
 def add_normal_errors(normals: PointValues, surface: RefinedScan, pixel_mm: float) -> PointValues:
-    """Add to the standard errors of normals what misplaced samples do to them.
+    """Add the error of misregistered samples to the standard errors of normals.
 
     Parameters
     ----------
     normals
         At the surface's points.
     surface
-        With its triangles: they say how fast the normals turn.
+        Its triangles define the edges over which the normals' change is measured.
     pixel_mm
-        Size of an image's pixel on the subject: scan, registration and cameras together place a
+        Size of an image's pixel on the subject: scan, registration and cameras together position a
         sample within about `POSITION_SIGMA_PX` of it, and within it normals are averaged.
     """
     change = change_per_mm(
@@ -137,25 +138,24 @@ def add_normal_errors(normals: PointValues, surface: RefinedScan, pixel_mm: floa
 def add_albedo_errors(
     r_d: PointValues, normals: PointValues, surface: RefinedScan, pixel_mm: float
 ) -> PointValues:
-    """Add to the standard errors of the albedo what normals, misplaced samples and pixels do to it.
+    """Add errors by normals, misregistered samples and pixel size to those of the albedo.
 
     Parameters
     ----------
     r_d
-        At the surface's points, with the error that noise leaves.
+        At the surface's points, with the standard error by noise.
     normals
-        Of the same points: neighbors' errors are alike, and no noise of the albedo's change.
+        Of the same points; their errors are correlated between neighbors.
     surface
-        With its triangles: they say how fast the albedo changes.
+        Its triangles define the edges over which the albedo's change is measured.
     pixel_mm
         Size of an image's pixel on the subject.
 
     Notes
     -----
-    A pixel averages what is finer. The albedo of skin goes on to finer scales as it comes down to
-    the pixel's, so what is lost is in proportion to what still shows between neighbors: between a
-    point's own by a part, and by `SHARED_DETAIL_FRACTION` between those of the whole face (their
-    median).
+    A pixel averages finer detail. The spectrum of skin albedo continues below the pixel size, so
+    the lost variation is proportional to the change between neighboring points: a mixture of the
+    point's own change and, by `SHARED_DETAIL_FRACTION`, the face's median change.
     """
     change = change_per_mm(
         r_d.values,

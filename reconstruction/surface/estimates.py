@@ -1,4 +1,4 @@
-"""Estimators run over all points of a surface, a bounded chunk of lumitexels at a time."""
+"""Run estimators over all points of a surface, a bounded chunk of lumitexels at a time."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from reconstruction.surface.model_normals import (
 
 MIN_LIGHTS: Final = 10
 MIN_VIEWS: Final = 2
-"""A point lit or seen by fewer has no estimate."""
+"""A point with samples of fewer lights or views has no estimate."""
 GRAZING_COS: Final = 0.05
-"""Light lower than this over the estimated surface is as good as none."""
+"""Minimum cosine of a usable light over the estimated surface."""
 MIN_STRIP_COSINE: Final = 0.05
-"""Flatter views count as if they were so flat; the albedo's fit leaves them out."""
+"""Cosine at which views are clamped; the albedo's fit omits them."""
 HIGHLIGHT_HALF_ANGLE_RAD: Final = np.radians(35.0)
-"""Samples whose half vector lies nearer to the normal hold too much of the highlight: skin's
-facets have a Beckmann slope of about 0.3 (Weyrich et al. 2005), of which 98 % lie below this."""
+"""Samples whose half vector is nearer to the normal contain too much of the highlight: skin's
+facets have a Beckmann slope of about 0.3 (Weyrich et al. 2005), of which 98 % are below this."""
 PEAK_HALF_ANGLE_RAD: Final = np.radians(25.0)
-"""The same where the lobes are known and taken off: only their peaks are left out."""
+"""The same after fitted lobes are subtracted: only their peaks are omitted."""
 LOBE_SCALE_ERROR_RATIO: Final = 3.8
-"""Standard error of lobes' scale over what it were if every sample erred by itself. Samples of a
-point err alike: by the lobes' shape, the normal and the light from inside that was taken off. On
-simulated faces of seeds 0, 1 and 1 (types III, V and II) it was 3.5, 3.5 and 4.3."""
+"""Ratio of the standard error of the lobes' scale to that of independent samples. Errors of one
+point's samples are correlated: by the lobes' shape, the normal and the subtracted subsurface
+scattering. On simulated faces of seeds 0, 1 and 1 (types III, V and II) it was 3.5, 3.5 and 4.3."""
 LOBE_TILT_RAD: Final = np.radians(0.3)
-"""Standard error, in each direction, of normals by highlights: lobes are known no better."""
+"""Standard error, in each direction, of normals by highlights, from the error of the lobes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +52,7 @@ class PointValues:
     values
         (P, C) float64; 0 where not valid.
     stderr
-        (P, C); of a normal the angle in each of two directions across it, rad, in all three.
+        (P, C); for a normal the angle in each of two tangential directions, rad, in all three.
     valid
         (P,) bool.
     """
@@ -63,7 +63,7 @@ class PointValues:
 
     @staticmethod
     def masked(values: FloatArray, stderr: FloatArray, valid: BoolArray) -> PointValues:
-        """Return estimates of which only those that are valid count, others are 0."""
+        """Return estimates that are 0 where not valid."""
         keep = valid[:, None]
         return PointValues(np.where(keep, values, 0.0), np.where(keep, stderr, 0.0), valid)
 
@@ -85,7 +85,7 @@ def has_enough_samples(samples: Lumitexels) -> BoolArray:
 
 
 def normals_from_half_vectors(samples: Lumitexels) -> PointValues:
-    """Return the published estimate: half vectors of each view's four brightest samples."""
+    """Estimate normals as published: half vectors of each view's four brightest samples."""
     ways = samples.light_dir, samples.view_dir, samples.view
     found = half_vector_normals.estimate(samples.f.mean(axis=-1), *ways, valid=samples.valid)
     good = has_enough_samples(samples) & found.valid
@@ -99,27 +99,27 @@ def normals_from_shading(
     rounds: int = 3,
     highlight_rad: float = HIGHLIGHT_HALF_ANGLE_RAD,
 ) -> PointValues:
-    """Return normals by robust photometric stereo of the light from inside the skin.
+    """Estimate normals by robust photometric stereo of subsurface-scattered light.
 
     Parameters
     ----------
     samples
         Of P points.
     normals
-        (P, 3) to begin with, as a rule the scan's: they tell which samples hold highlights, and
-        how much the boundary lets through.
+        (P, 3) initial normals, usually the scan's: they define the samples in highlights and the
+        transmittance of the boundary.
     rounds
-        Of estimating, each with the normals of the one before.
+        Number of estimates, each with the normals of the previous one.
     highlight_rad
-        Samples whose half vector lies nearer to the normal are left out.
+        Samples whose half vector is nearer to the normal are omitted.
 
     Notes
     -----
-    What has been inside is f_r = R_d F_t F_t / pi, so f_r cos(theta) pi / (F_t F_t) is R_d times
-    n . l, linear in n.
+    Subsurface-scattered light has f_r = R_d F_t F_t / pi, so f_r cos(theta) pi / (F_t F_t) is R_d
+    times n . l, linear in n.
     """
     gray = samples.f.mean(axis=-1).astype(np.float64)
-    # samples that do not count have no finite variance
+    # invalid samples have infinite variance
     spread = np.where(samples.valid, samples.variance.mean(axis=-1), 0.0).astype(np.float64) / 3.0
     half = samples.light_dir + samples.view_dir
     half /= np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-6)
@@ -136,7 +136,7 @@ def normals_from_shading(
             & (cos_view > MIN_NORMAL_COS_VIEW)
             & (np.einsum("pmk,pk->pm", half, start) < np.cos(highlight_rad))
         )
-        # the cosine that made f from the radiance is the scan's, not that of this round
+        # f was computed from the radiance with the scan's cosine, not that of this round
         passed = boundary_kernels.boundary_transmittance(cos_light, cos_view)
         scale = np.pi * samples.cos_light / np.maximum(passed, 1e-3)
         found = photometric_stereo.estimate_normals(
@@ -146,7 +146,7 @@ def normals_from_shading(
             valid=np.ascontiguousarray(use.T),
         )
         start = np.where(found.valid[:, None], found.normals, start).astype(np.float64)
-        # of the angle; in each of two directions across the normal it is less by the root of two
+        # the angle's error; in each of two tangential directions it is smaller by sqrt(2)
         stderr = np.where(found.valid, found.stderr_rad / np.sqrt(2.0), np.pi)
         good &= found.valid
     return _of_normals(start, stderr, good)
@@ -158,18 +158,18 @@ def _of_normals(normals: FloatArray, stderr_rad: FloatArray, good: BoolArray) ->
 
 
 def reproject_samples(samples: Lumitexels, normals: PointValues) -> Lumitexels:
-    """Return samples whose f_r is that of a surface with these normals, and not of the scan's.
+    """Convert samples from the scan's normals to the given ones.
 
-    A sample's radiance was divided by the cosine at the scan's normal, degrees off the true one:
-    by the cosine that the light had, f_r does not change with the light as 1 / cos does.
+    A sample's radiance was divided by the cosine at the scan's normal, which is degrees off: its
+    f_r = L / (E cos) is multiplied by cos_scan / cos_normal.
 
     Parameters
     ----------
     samples
         Of P points.
     normals
-        Of the same points; samples of those not valid, and of light below `GRAZING_COS`, are not
-        valid.
+        Of the same points; samples of invalid normals, and of light below `GRAZING_COS`, become
+        invalid.
     """
     cos_light, cos_view = (
         np.einsum("pmk,pk->pm", way, normals.values.astype(np.float32))
@@ -189,7 +189,7 @@ def reproject_samples(samples: Lumitexels, normals: PointValues) -> Lumitexels:
 
 
 def estimate_albedo(samples: Lumitexels, normals: PointValues, *, stderr_rad: float) -> PointValues:
-    """Return R_d of three channels by eq. (6) of Weyrich et al. 2005, see `diffuse_albedo`.
+    """Estimate R_d of three channels by eq. (6) of Weyrich et al. 2005, see `diffuse_albedo`.
 
     Parameters
     ----------
@@ -202,11 +202,10 @@ def estimate_albedo(samples: Lumitexels, normals: PointValues, *, stderr_rad: fl
 
     Notes
     -----
-    The standard errors hold noise alone: see `surface_errors.of_albedo` for the rest.
+    The standard errors contain noise alone: see `errors.add_albedo_errors` for the rest.
 
-    A pixel that sees the surface aslant averages a strip of it that is 1 / cos(view) long, and near
-    a rim what lies behind the face as well: its deviation from the point's own light counts in
-    proportion to that length.
+    A pixel in an oblique view averages a strip of surface of length 1 / cos(view), and near a rim
+    also what is behind the face: its standard error is scaled by that length.
     """
     samples = reproject_samples(samples, normals)
     strip = 1.0 / np.maximum(samples.cos_view, MIN_STRIP_COSINE)[..., None]
@@ -227,7 +226,7 @@ def estimate_albedo(samples: Lumitexels, normals: PointValues, *, stderr_rad: fl
 def specular_samples(
     samples: Lumitexels, normals: PointValues, r_d: PointValues
 ) -> brdf_basis.SurfaceSamples:
-    """Return what is left of the samples when the light from inside is taken off."""
+    """Subtract subsurface scattering from the samples; return their specular part."""
     samples = reproject_samples(samples, normals)
     return brdf_basis.surface_samples(
         samples.f,
@@ -244,9 +243,9 @@ def specular_samples(
 def fit_lobe_weights(
     samples: Lumitexels, normals: PointValues, r_d: PointValues, basis: BrdfBasis
 ) -> PointValues:
-    """Return the shares of a basis at each point, and in the last column the fit's residual.
+    """Fit a basis's weights at each point; the last column is the fit's residual.
 
-    The standard error of the shares is that of the lobe's overall scale: single shares of nearly
+    The weights' standard error is that of the lobe's overall scale: single weights of nearly
     dependent lobes are not determined.
     """
     found = brdf_basis.fit_weights(specular_samples(samples, normals, r_d), basis)
@@ -260,9 +259,9 @@ def fit_lobe_weights(
 def normals_from_remainder(
     samples: Lumitexels, normals: PointValues, r_d: PointValues, lobes: PointLobes
 ) -> PointValues:
-    """Return normals by photometric stereo of what fitted lobes leave of the samples.
+    """Estimate normals by photometric stereo of the samples minus the fitted lobes.
 
-    With the highlights taken off, samples near the mirror direction count too.
+    Without the highlights, samples near the mirror direction are usable too.
 
     Parameters
     ----------
@@ -274,7 +273,7 @@ def normals_from_remainder(
     known = normals.valid & r_d.valid
     samples = reproject_samples(samples, normals)
     shine = lobes.where(known).evaluate(samples, normals.values)
-    # a lobe is known no better than a few percent: where it is strong a sample says less
+    # the relative error of a fitted lobe adds to the variance of its samples
     bare = dataclasses.replace(
         samples,
         f=samples.f - shine[..., None],
@@ -293,19 +292,19 @@ def normals_from_full_model(
     *,
     initial_normals: Float64Array | None = None,
 ) -> PointValues:
-    """Return normals that hold what highlights say, where light from inside says too little.
+    """Refine normals by highlights where subsurface scattering alone leaves a large error.
 
-    Points whose standard error is below `LOBE_TILT_RAD` stay as they are. Those above it are moved
-    to where the whole model fits best, and lie between the two by the weights of their errors.
+    Points whose standard error is below `LOBE_TILT_RAD` are kept. The others are fitted to the full
+    model and averaged with the initial normals by inverse variance.
 
     Parameters
     ----------
     samples, r_d, lobes
-        As in `normals_from_remainder`.
+        See `normals_from_remainder`.
     normals
-        By the light from inside alone.
-    now
-        Normals to begin from, (P, 3); `normals` by default.
+        Estimated from subsurface-scattered light alone.
+    initial_normals
+        Start values, (P, 3); `normals` by default.
     """
     rows = np.flatnonzero(normals.valid & r_d.valid & (normals.stderr[:, 0] > LOBE_TILT_RAD))
     if not len(rows):
@@ -315,6 +314,7 @@ def normals_from_full_model(
     found = model_normals.estimate(select_points(samples, rows), start[rows], r_d_gray, lobes[rows])
     ours = np.square(np.hypot(found.stderr_rad, LOBE_TILT_RAD))
     theirs = np.square(normals.stderr[rows, 0])
+    # inverse-variance mean of the two normals: its variance is the product over the sum
     share = np.where(found.valid, theirs / (theirs + ours), 0.0)[:, None]
     between = share * found.normals + (1.0 - share) * normals.values[rows]
     values, stderr = normals.values.copy(), normals.stderr.copy()
@@ -326,7 +326,7 @@ def normals_from_full_model(
 
 
 def count_samples(part: slice, samples: Lumitexels) -> PointValues:
-    """Return how many samples each point has; valid where they are enough for an estimate."""
+    """Return the number of samples of each point; valid where an estimate is possible."""
     counts = samples.counts[:, None].astype(np.float64)
     return PointValues(counts, np.zeros_like(counts), has_enough_samples(samples))
 

@@ -1,10 +1,10 @@
-"""Normals from all light at a point, highlights included, by the whole fitted model.
+"""Estimate normals from all light at a point, highlights included, with the full fitted model.
 
-Light from inside says where a surface looks by its slow cosine; a highlight says it by where it
-stands, and on dark or glossy skin it is most of the light. Given R_d and the shares of the lobes,
-the normal of each point is moved to where the model's samples fit the measured ones best: steps of
-Gauss and Newton on two tilts, with weights that hold how well lobes are known and that let
-outliers pull with constant force, halved while they do not lower the misfit.
+Subsurface-scattered light constrains a normal by its slowly varying cosine; a highlight constrains
+it by its position, and on dark or glossy skin it is most of the light. Given R_d and the weights of
+the basis BRDFs, the normal of each point minimizes the misfit of the model to the samples. The
+minimization uses Gauss-Newton steps on two tilts. The weights include the error of the lobes,
+outliers have Huber's constant influence, and steps are halved until they lower the misfit.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from reconstruction.brdf_basis import mixture_kernels
 from reconstruction.lumitexels import Lumitexels, boundary_kernels
 
 N_GAUSS_NEWTON_STEPS: Final = 2
-"""Of Gauss and Newton; R_d and the lobes are fitted anew in between calls."""
+"""Gauss-Newton steps per call; R_d and the lobes are refitted between calls."""
 MAX_HALVINGS: Final = 3
 DIFFERENCE_RAD: Final = np.radians(0.5)
-"""Tilt of the differences: about what a node of the tables spans at a highlight's flank."""
+"""Tilt of the finite differences: about a node spacing of the tables at a highlight's flank."""
 MAX_STEP_RAD: Final = np.radians(3.0)
-"""Longest step: lobes turn faster than their slope says."""
+"""Longest step: lobes are too nonlinear for longer ones."""
 HUBER_SIGMAS: Final = 3.0
 SAMPLE_RELATIVE_ERROR: Final = 0.02
-"""Relative error that every sample of the model has, for its weight."""
+"""Relative error of every sample of the model, for its weight."""
 LOBE_RELATIVE_ERROR: Final = 0.1
 """Relative error of a fitted lobe, for the weight of samples in it."""
 MIN_NORMAL_COS_LIGHT: Final = 0.15
 MIN_NORMAL_COS_VIEW: Final = 0.2
-"""Normals are not estimated from flatter samples: the boundary's transmittance bends there."""
+"""Flatter samples are not used for normals: there the boundary's transmittance is nonlinear."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointLobes:
-    """What the surface at each point reflects: shares of a basis, (P, K)."""
+    """Reflection lobes of the surface at each point: weights of basis BRDFs, (P, K)."""
 
     weights: Float64Array
     basis: BrdfBasis
@@ -49,7 +49,7 @@ class PointLobes:
         return PointLobes(self.weights[rows], self.basis)
 
     def where(self, known: BoolArray) -> PointLobes:
-        """Return these lobes with none at points that are not known, (P,)."""
+        """Return the lobes with weight 0 at points that are not known, (P,)."""
         return PointLobes(np.where(known[:, None], self.weights, 0.0), self.basis)
 
     def evaluate(self, samples: Lumitexels, normals: Float64Array) -> Float32Array:
@@ -60,18 +60,18 @@ class PointLobes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelNormals:
-    """Normals moved to where the model fits best.
+    """Normals at the best fit of the model.
 
     Attributes
     ----------
     normals : ndarray of float64, shape (P, 3)
         Unit vectors; as given where not `valid`.
     stderr_rad : ndarray of float64, shape (P,)
-        Of each of two tilts, by the misfit's curvature and size; pi where not `valid`.
+        Of each of two tilts, from the misfit's curvature and size; pi where not `valid`.
     moved_rad : ndarray of float64, shape (P,)
-        From the normals given.
+        Angle to the given normals.
     valid : ndarray of bool, shape (P,)
-        At least three samples, and a misfit that determines both tilts.
+        At least four samples, and a misfit that determines both tilts.
     """
 
     normals: Float64Array
@@ -83,16 +83,16 @@ class ModelNormals:
 def estimate(
     samples: Lumitexels, normals: Float64Array, r_d: Float64Array, lobes: PointLobes
 ) -> ModelNormals:
-    """Move normals to where the model's samples fit the measured ones best.
+    """Move normals to where the model fits the measured samples best.
 
     Parameters
     ----------
     samples : Lumitexels
-        Of P points; f is that of the scan's cosine.
+        Of P points; f is computed with the scan's cosine.
     normals : ndarray, shape (P, 3)
-        Unit normals to begin from.
+        Initial unit normals.
     r_d : ndarray, shape (P,)
-        Mean of the channels.
+        Mean R_d of the channels.
     lobes : PointLobes
         Of the same points.
     """
@@ -110,15 +110,16 @@ def estimate(
     for _ in range(N_GAUSS_NEWTON_STEPS):
         first, second = _tangents(n)
         slope = np.stack([fit.slope(n, axis) for axis in (first, second)], axis=-1)
+        # Huber weight: 1 below the limit, limit / |residual| beyond it
         far = HUBER_SIGMAS / np.sqrt(np.maximum(state.misfit2, 1))
         pull = np.where(state.misfit2 < HUBER_SIGMAS**2, 1.0, far)
         weight = np.where(state.use, pull / state.variance, 0.0)
         normal_matrix = np.einsum("pm,pmi,pmj->pij", weight, slope, slope)
         gradient = np.einsum("pm,pmi,pm->pi", weight, slope, fit.gray - state.value)
         size = np.trace(normal_matrix, axis1=1, axis2=2)
-        told = (np.linalg.det(normal_matrix) > 1e-12 * np.square(size)) & valid
-        safe = np.where(told[:, None, None], normal_matrix, np.eye(2))
-        step = np.where(told[:, None], np.linalg.solve(safe, gradient[..., None])[..., 0], 0.0)
+        solvable = (np.linalg.det(normal_matrix) > 1e-12 * np.square(size)) & valid
+        safe = np.where(solvable[:, None, None], normal_matrix, np.eye(2))
+        step = np.where(solvable[:, None], np.linalg.solve(safe, gradient[..., None])[..., 0], 0.0)
         length = np.linalg.norm(step, axis=-1, keepdims=True)
         step *= np.minimum(1.0, MAX_STEP_RAD / np.maximum(length, 1e-300))
         for _ in range(MAX_HALVINGS):
@@ -128,7 +129,7 @@ def estimate(
             n = np.where(better[:, None], tried, n)
             state = fit.at(n)
             step = np.where(better[:, None], 0.0, 0.5 * step)
-        valid = valid & told
+        valid = valid & solvable
     count = np.count_nonzero(state.use, axis=1)
     valid = valid & (count > 3)
     size = np.sum(np.where(state.use, np.minimum(state.misfit2, HUBER_SIGMAS**2), 0.0), axis=1)
@@ -146,7 +147,7 @@ def estimate(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _State:
-    """The model at some normals."""
+    """The model at the current normals."""
 
     value: Float64Array
     variance: Float64Array
@@ -157,7 +158,7 @@ class _State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
-    """The samples of points, and the model of them as a function of the normals."""
+    """Samples of points, and their model as a function of the normals."""
 
     samples: Lumitexels
     r_d: Float64Array
@@ -174,7 +175,8 @@ class _Fit:
         misfit2 = np.square(self.gray - value) / variance
         far = 2 * HUBER_SIGMAS * np.sqrt(misfit2) - HUBER_SIGMAS**2
         huber = np.where(misfit2 < HUBER_SIGMAS**2, misfit2, far)
-        # the weights move with the model: without their logarithm brighter lobes would cost less
+        # the variance depends on the model: the Gaussian -2 log p includes log(variance), without
+        # which brighter lobes would always cost less
         cost = np.where(use, huber + np.log(variance), 0.0).sum(axis=1)
         return _State(value, variance, misfit2, use, cost / np.maximum(use.sum(axis=1), 1))
 
@@ -193,7 +195,7 @@ class _Fit:
         cos_view = np.einsum("pmk,pk->pm", s.view_dir, normals)
         lobes = self.lobes.evaluate(s, normals)
         through = boundary_kernels.boundary_transmittance(cos_light, cos_view)
-        # the cosine that made f from the radiance is the scan's
+        # f was computed from the radiance with the scan's cosine
         ratio = np.clip(cos_light, 0.0, None) / s.cos_light
         value = (self.r_d[:, None] * through / np.pi + lobes) * ratio
         return value, lobes * ratio, cos_light, cos_view

@@ -1,8 +1,8 @@
-"""Normals of a face's texture in the texture's own frame, over the face's smooth shape.
+"""Transform normals of a face's texture to the tangent frame of the smoothed face.
 
-Dome and photometric stereo give normals in the rig's frame, on a texture that a mesh unwraps to.
-What wrinkles add is seen against the shape without them: the position map, smoothed until
-wrinkles are gone, gives the frame at each texel.
+Dome and photometric stereo give normals in the rig's frame, on the texture of a mesh. Wrinkles are
+deviations from the shape without them: the position map, smoothed until wrinkles vanish, defines
+the tangent frame at each texel.
 """
 
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ SMOOTHING_MM = 6.0
 
 
 class TangentSpaceError(ValueError):
-    """Maps that give no frames."""
+    """Maps that define no tangent frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class TangentNormals:
-    """Normals over the smooth shape.
+    """Normals in the tangent frame of the smooth shape.
 
     Attributes
     ----------
@@ -32,8 +32,7 @@ class TangentNormals:
         Unit vectors: +X along u (to the right), +Y across it on the side of growing v (up), +Z
         the smooth shape's normal; (0, 0, 1) where not `valid`.
     stderr : ndarray of float32, shape (H, W, 3) or None
-        Standard error of the components, those of the input turned into the frame as if they
-        were independent.
+        Standard error of the components, rotated from the input's as if those were independent.
     valid : ndarray of bool, shape (H, W)
     """
 
@@ -45,7 +44,7 @@ class TangentNormals:
 def tangent_frames(
     position_mm: ArrayLike, valid: ArrayLike, *, smoothing_mm: float = SMOOTHING_MM
 ) -> tuple[Float64Array, BoolArray]:
-    """Return the axes of the texture on the smoothed shape.
+    """Return the tangent frame of the texture on the smoothed shape.
 
     Parameters
     ----------
@@ -54,7 +53,7 @@ def tangent_frames(
     valid : array_like of bool, shape (H, W)
         Texels with a surface.
     smoothing_mm : float
-        Standard deviation of the Gaussian, mm on the surface, >= 0, by the median texel's size.
+        Standard deviation of the Gaussian, mm on the surface, >= 0, converted by the median texel.
 
     Returns
     -------
@@ -66,13 +65,13 @@ def tangent_frames(
     Raises
     ------
     TangentSpaceError
-        For shapes that do not fit, or a texture without surface.
+        For mismatched shapes, or a texture without surface.
     """
     points = np.asarray(position_mm, np.float64)
     good = np.asarray(valid, bool)
     check = Checks(TangentSpaceError)
     check.shape("position_mm", points, (*good.shape[:2], 3))
-    check.require(good.any(), "valid", "no texel with a surface", "some")
+    check.require(good.any(), "valid", "no texel with a surface", "some; check the mask")
     check.within("smoothing_mm", smoothing_mm, "[0, inf)")
     along_u, known_u = _slope(points, good, 1)
     along_v, known_v = _slope(points, good, 0)
@@ -80,9 +79,9 @@ def tangent_frames(
     if smoothing_mm > 0.0:
         texel = np.median(np.linalg.norm(along_u[known], axis=1)) if known.any() else 0.0
         got = "neighboring texels on the same point"
-        check.require(texel > 0.0, "position_mm", got, "a surface")
+        check.require(texel > 0.0, "position_mm", got, "a surface; check the map")
         sigma_px = smoothing_mm / float(texel)
-        # slopes are smoothed, not points: a smoothed point is drawn inwards at the rim
+        # smooth slopes, not points: smoothed points would move inwards at the rim
         along_u, along_v = (_smoothed(s, known, sigma_px) for s in (along_u, along_v))
     up = np.cross(along_u, -along_v)  # rows grow downwards, v grows upwards
     x, z = _unit(along_u), _unit(up)
@@ -99,7 +98,7 @@ def tangent_normals(
     stderr: ArrayLike | None = None,
     smoothing_mm: float = SMOOTHING_MM,
 ) -> TangentNormals:
-    """Turn normals into the frame of the texture on the smooth shape.
+    """Rotate normals to the tangent frame of the texture on the smooth shape.
 
     Parameters
     ----------
@@ -117,12 +116,12 @@ def tangent_normals(
     Raises
     ------
     TangentSpaceError
-        For shapes that do not fit.
+        For mismatched shapes.
 
     Examples
     --------
     >>> rows, columns = np.mgrid[0:32, 0:32] * 1.0
-    >>> flat = np.stack([columns, -rows, 0 * rows], axis=2)  # 1 mm a texel, seen from +z
+    >>> flat = np.stack([columns, -rows, 0 * rows], axis=2)  # 1 mm per texel, seen from +z
     >>> found = tangent_normals(np.full((32, 32, 3), [0.6, 0, 0.8]), flat, np.ones((32, 32), bool))
     >>> found.normals[16, 16].round(3).tolist()
     [0.6000000238418579, 0.0, 0.800000011920929]
@@ -143,7 +142,7 @@ def tangent_normals(
 
 
 def _slope(points: Float64Array, good: BoolArray, axis: int) -> tuple[Float64Array, BoolArray]:
-    """Return the difference to the next texel along an axis, by both sides where both are there."""
+    """Return the difference to the next texel along an axis, central where both sides exist."""
     sides = [(slice(None),) * axis + (part,) for part in (slice(-1), slice(1, None))]
     pair = good[sides[0]] & good[sides[1]]
     step = np.where(pair[..., None], points[sides[1]] - points[sides[0]], 0.0)

@@ -1,4 +1,4 @@
-"""Estimates at the points of a surface as textures, and the mesh that wears them."""
+"""Convert estimates at surface points to textures, and export the textured mesh."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from reconstruction.surface.estimates import PointValues
 from reconstruction.surface.texture_fill import TexelMap
 
 MIN_MEASURED_WEIGHT: Final = 0.99
-"""A texel counts as measured where its triangle's corners are, all of them."""
+"""Minimum weight of a measured texel: all corners of its triangle must be measured."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,7 +29,7 @@ class SurfaceTexture:
     surface
         Points, triangles and texture coordinates.
     texels
-        Which triangle each texel lies in.
+        Triangle of each texel.
     """
 
     surface: RefinedScan
@@ -37,7 +37,7 @@ class SurfaceTexture:
 
     @staticmethod
     def of(surface: RefinedScan, *, size: int) -> SurfaceTexture:
-        """Lay a surface out in a texture of ``size`` texels along each side."""
+        """Lay out a surface in a texture of ``size`` texels along each side."""
         return SurfaceTexture(surface, texture_fill.rasterize(surface.corner_uv, size))
 
     def map(
@@ -48,7 +48,7 @@ class SurfaceTexture:
         unit: str,
         description: str,
     ) -> SkinMap:
-        """Return a map of values at the points.
+        """Interpolate values at the points to a map.
 
         Parameters
         ----------
@@ -57,12 +57,12 @@ class SurfaceTexture:
         valid
             (P,).
         unit, description
-            Of the map.
+            Unit and description of the map.
 
         Returns
         -------
         SkinMap
-            Texels that are not valid are filled from those around them.
+            Invalid texels are filled from their neighborhood.
         """
         trust = np.asarray(valid, np.float32)
         drawn = partial(texture_fill.texels_from_points, self.texels, self.surface.faces)
@@ -79,7 +79,7 @@ class SurfaceTexture:
         )
 
     def normals(self, found: PointValues, description: str) -> SkinMap:
-        """Return a map of unit normals, with angles in rad as standard errors."""
+        """Interpolate unit normals to a map, with angles in rad as standard errors."""
         drawn = self.map(found.values, found.stderr, found.valid, MAP_UNITS["normals"], description)
         length = np.linalg.norm(drawn.values, axis=-1, keepdims=True)
         unit = np.where(length > 0, drawn.values / np.maximum(length, 1e-9), (0.0, 0.0, 1.0))

@@ -1,8 +1,9 @@
-"""Values at surface points made into dense texture maps, each texel with its confidence.
+"""Interpolate values at surface points to dense texture maps with a confidence per texel.
 
-Texels that a triangle covers take the values of its corners; what is left is filled by push-pull:
-means over ever coarser pixels, weighed by confidence, then taken back where finer ones know less,
-and relaxed on the way towards a membrane: a constant stays constant, a gap in a ramp becomes ramp.
+Texels inside a triangle interpolate the values of its corners; the rest is filled by push-pull. The
+pull averages ever coarser pixels, weighted by confidence. The push fills finer levels from coarser
+ones where their confidence is low, and relaxes them towards a membrane: a constant stays constant,
+and a gap in a ramp becomes a ramp.
 
 References
 ----------
@@ -21,23 +22,23 @@ from reconstruction.arrays import BoolArray, Float32Array, Int32Array
 
 FILL_SIZE_RANGE_PX: Final = (8, 8192)
 N_RELAXATION_SWEEPS: Final = 5
-"""Of relaxation on each level, which bend the filled texels into a membrane (no kinks)."""
+"""Relaxation sweeps on each level, which bend the filled texels into a membrane (no kinks)."""
 _OVERRELAXATION_FACTOR: Final = np.float32(1.5)
-"""Over-relaxation; below 2 it converges."""
+"""Factor of successive over-relaxation; it converges below 2."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TexelMap:
-    """Which triangle lies under each texel of a square texture, and where in it."""
+    """Triangle under each texel of a square texture, with barycentric coordinates."""
 
     face: Int32Array
-    """Triangle under the texel's centre, shape (N, N), row 0 at the top; -1 for none."""
+    """Triangle under the texel's center, shape (N, N), row 0 at the top; -1 for none."""
     weight: Float32Array
-    """Shares of the triangle's second and third corner, shape (N, N, 2)."""
+    """Barycentric weights of the triangle's second and third corner, shape (N, N, 2)."""
 
     @property
     def covered(self) -> BoolArray:
-        """Texels with a surface under their centre, shape (N, N)."""
+        """Texels with a surface under their center, shape (N, N)."""
         return self.face >= 0
 
 
@@ -48,13 +49,13 @@ class FilledTexture:
     values: Float32Array
     """Shape (N, N, C); 0 where `valid` is False."""
     confidence: Float32Array
-    """1 for measured texels of full weight, falling with the distance to them, shape (N, N)."""
+    """1 for measured texels of full weight, decreasing with the distance to them, shape (N, N)."""
     valid: BoolArray
-    """Texels that hold a value, shape (N, N)."""
+    """Texels with a value, shape (N, N)."""
 
 
 def rasterize(corner_uv: ArrayLike, size: int) -> TexelMap:
-    """Lay triangles out in a texture.
+    """Rasterize triangles in a texture.
 
     Parameters
     ----------
@@ -66,7 +67,7 @@ def rasterize(corner_uv: ArrayLike, size: int) -> TexelMap:
     Returns
     -------
     TexelMap
-        Where triangles overlap in the texture, the one of the lowest index counts.
+        Where triangles overlap in the texture, the one of the lowest index is used.
     """
     uv = np.ascontiguousarray(corner_uv, np.float64)
     Checks().numbers("corner_uv", uv.reshape(-1, *uv.shape[-2:]), (len(uv), 3, 2))
@@ -77,7 +78,7 @@ def rasterize(corner_uv: ArrayLike, size: int) -> TexelMap:
 def texels_from_points(
     texels: TexelMap, faces: ArrayLike, values: ArrayLike, weight: ArrayLike | None = None
 ) -> tuple[Float32Array, Float32Array]:
-    """Interpolate values at points over the triangles, leaving out points without weight.
+    """Interpolate values at points over the triangles, without points of weight 0.
 
     Parameters
     ----------
@@ -86,12 +87,12 @@ def texels_from_points(
         Points at the corners of the triangles that were rasterized.
     values : array_like, shape (P,) or (P, C)
     weight : array_like, shape (P,), optional
-        Confidence of each point, 0 to 1; 1 by default. What is not finite has none.
+        Confidence of each point, 0 to 1; 1 by default. Non-finite values have confidence 0.
 
     Returns
     -------
     values : ndarray of float32, shape (N, N, C)
-        0 where nothing is known.
+        0 where not known.
     weight : ndarray of float32, shape (N, N)
         Confidence, 0 for none.
     """
@@ -117,16 +118,16 @@ def push_pull(
     Parameters
     ----------
     values : array_like, shape (H, W) or (H, W, C)
-        Any numbers where `weight` is 0.
+        Arbitrary numbers where `weight` is 0.
     weight : array_like, shape (H, W)
-        Confidence, 0 to 1; texels of weight 1 keep their values. What is not finite has none.
+        Confidence, 0 to 1; texels of weight 1 keep their values. Non-finite values have 0.
     mask : array_like of bool, shape (H, W), optional
-        Texels to fill; all by default. Values outside take no part.
+        Texels to fill; all by default. Values outside are ignored.
 
     Returns
     -------
     FilledTexture
-        Without any measured texel nothing is valid.
+        Without any measured texel, all texels are invalid.
     """
     image = np.asarray(values, np.float32)
     layers = image if image.ndim == 3 else image[..., None]
@@ -155,7 +156,7 @@ def push_pull(
 def densify(
     texels: TexelMap, faces: ArrayLike, values: ArrayLike, weight: ArrayLike | None = None
 ) -> FilledTexture:
-    """Make a dense texture of values at points: `texels_from_points`, then `push_pull`.
+    """Interpolate values at points to a dense texture: `texels_from_points`, then `push_pull`.
 
     Texels outside the charts are filled too, so that bilinear sampling at seams finds values.
     """
@@ -164,7 +165,7 @@ def densify(
 
 def _checked_weight(weight: Float32Array, usable: BoolArray) -> Float32Array:
     good = np.isfinite(weight) & usable
-    # laid out by rows, however the weight was: the kernels are compiled for one layout
+    # in row-major order, whatever the input's: the kernels are compiled for one layout
     known = np.where(good, weight, np.float32(0.0)).astype(np.float32, order="C")
     Checks().within("weight", known, "[0, 1]")
     return known
@@ -172,11 +173,11 @@ def _checked_weight(weight: Float32Array, usable: BoolArray) -> Float32Array:
 
 @njit(cache=True)
 def _rasterize(uv, size):  # type: ignore[no-untyped-def]
-    """Write the triangle whose inside holds each texel's centre; serial, for triangles overlap."""
+    """Write the triangle that contains each texel's center; serial, because triangles overlap."""
     face = np.full((size, size), -1, np.int32)
     weight = np.zeros((size, size, 2), np.float32)
     for f in range(len(uv)):
-        # in texels: column to the right, row down, centres at whole numbers
+        # in texels: column to the right, row down, centers at whole numbers
         x0, y0 = uv[f, 0, 0] * size - 0.5, (1.0 - uv[f, 0, 1]) * size - 0.5
         x1, y1 = uv[f, 1, 0] * size - 0.5, (1.0 - uv[f, 1, 1]) * size - 0.5
         x2, y2 = uv[f, 2, 0] * size - 0.5, (1.0 - uv[f, 2, 1]) * size - 0.5
@@ -191,7 +192,7 @@ def _rasterize(uv, size):  # type: ignore[no-untyped-def]
             for j in range(left, right + 1):
                 b = ((j - x0) * (y2 - y0) - (x2 - x0) * (i - y0)) / area
                 c = ((x1 - x0) * (i - y0) - (j - x0) * (y1 - y0)) / area
-                # a centre on an edge belongs to both sides
+                # a center on an edge belongs to both sides
                 if b >= -1e-9 and c >= -1e-9 and b + c <= 1.0 + 1e-9 and face[i, j] < 0:
                     face[i, j] = f
                     weight[i, j, 0] = b
@@ -249,14 +250,15 @@ def _pull(fine, weight):  # type: ignore[no-untyped-def]
             if total > 0.0:
                 for c in range(channels):
                     out[i, j, c] /= total
-                # a pixel that a quarter of its texels fill is known as well as they are
+                # a pixel with a quarter of its texels known has their full confidence
                 known[i, j] = min(np.float32(4.0) * total, np.float32(1.0))
     return out, known
 
 
 @njit(cache=True, parallel=True)
 def _push(fine, weight, coarse, coarse_weight):  # type: ignore[no-untyped-def]
-    """Return the finer level with what it lacks taken from the coarser one, bilinearly."""
+    """Return the finer level, its missing part filled bilinearly from the coarser one."""
+    # bilinear weights for centers at quarter positions: 3/4 for the nearer coarse pixel, 1/4 else
     height, width, channels = fine.shape
     rows, columns = coarse_weight.shape
     out = np.empty_like(fine)
@@ -286,7 +288,7 @@ def _push(fine, weight, coarse, coarse_weight):  # type: ignore[no-untyped-def]
                     trust += a * b * coarse_weight[y, x]
                     for c in range(channels):
                         out[i, j, c] += a * b * coarse[y, x, c]
-            # what comes from a level further up is trusted half as much
+            # values from each coarser level have half its confidence
             from_coarse = np.float32(0.5) * trust * (np.float32(1.0) - w)
             for c in range(channels):
                 blurred = out[i, j, c] / total if total > 0.0 else np.float32(0.0)
@@ -299,7 +301,7 @@ def _push(fine, weight, coarse, coarse_weight):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, parallel=True)
 def _relax(filled, fine, weight, known, sweeps):  # type: ignore[no-untyped-def]
-    """Move what is not measured towards the mean of its neighbours, black and white in turn."""
+    """Move unmeasured texels towards the mean of their neighbors, in checkerboard order."""
     height, width, channels = filled.shape
     for sweep in range(2 * sweeps):
         for i in prange(height):

@@ -1,10 +1,10 @@
-"""Wrinkle maps and zones' weights fitted to normals of a neutral face and of its expressions.
+"""Fit wrinkle maps and zone weights to normals of a neutral face and of its expressions.
 
-The model says that an expression e adds D_e(x) = (sum_z w_ez m_z(x)) W(x) to the neutral
-derivatives: one wrinkle map W, shown by masks m_z with weights w_ez. Given masks, W is linear in
-the data and so are the weights, each with the other fixed; :func:`fit_wrinkle_map` takes them in
-turn. Weights and map are determined up to a scale of each zone (and its sign): a fit begins with a
-largest weight of 1 in each, overlapping zones settle theirs, and none ends above 1.
+In the model an expression e adds D_e(x) = (sum_z w_ez m_z(x)) W(x) to the neutral derivatives: one
+wrinkle map W, blended by masks m_z with weights w_ez. Given masks, W is linear in the data and so
+are the weights, each with the other fixed; :func:`fit_wrinkle_map` alternates between them. Weights
+and map are determined up to a scale of each zone (and its sign). A fit starts with a largest weight
+of 1 in each zone, overlapping zones determine their ratio, and the final weights are at most 1.
 
 References
 ----------
@@ -46,9 +46,9 @@ Measured: TypeAlias = ArrayLike | NormalMaps | Derivatives
 
 FIT_ROUNDS = 20
 COARSE_SIDE = 256
-"""Texels a side of the map with which weights are sought."""
+"""Texels per side of the map at which weights are estimated."""
 MISFIT_TOL = 1e-5
-"""Fall of the misfit in a round, relative to the differences, at which the fit ends."""
+"""Decrease of the misfit per round, relative to the differences, at which the fit stops."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,18 +58,17 @@ class WrinkleFit:
     Attributes
     ----------
     layer : Layer
-        Map, masks and table, to be evaluated; with standard error and valid mask.
+        Map, masks and table for evaluation; with standard error and valid mask.
     expressions : mapping of str to ZoneWeights
-        The weights that the data ask for, with what is known about them: the rows of the layer's
-        table, unless that was given.
+        Estimated weights with their errors: the rows of the layer's table, unless that was given.
     base : Derivatives
-        Of the neutral face.
+        Derivatives of the neutral face.
     explained : float
         1 - |misfit|^2 / |differences|^2 with the table's weights, all expressions together.
     rounds : int
-        Of map and weights in turn; 0 where the weights were given.
+        Alternations of map and weights; 0 where the weights were given.
     converged : bool
-        The last round explained no more than `MISFIT_TOL` of the differences in addition.
+        The last round increased `explained` by at most `MISFIT_TOL`.
     clamp : {"unit", "signed"}
         Range of the weights.
     """
@@ -83,7 +82,7 @@ class WrinkleFit:
     clamp: Clamp
 
     def model(self) -> WrinkleModel:
-        """Return the face with its wrinkles, ready to be evaluated and stored."""
+        """Return the face with its wrinkles, for evaluation and export."""
         stderr = np.sqrt(self.base.variance)
         errors = {name: tuple(one.stderr) for name, one in self.expressions.items()}
         return WrinkleModel(
@@ -94,7 +93,7 @@ class WrinkleFit:
 def fit_weights(
     layer: WrinkleLayer, neutral: Measured, expression: Measured, *, clamp: Clamp = "unit"
 ) -> ZoneWeights:
-    """Return the weights of zones with which a wrinkle map shows a new expression best.
+    """Estimate the zone weights with which a wrinkle map fits a new expression best.
 
     Parameters
     ----------
@@ -127,7 +126,7 @@ def fit_wrinkle_map(
     table: ExpressionTable | None = None,
     clamp: Clamp = "unit",
 ) -> WrinkleFit:
-    """Fit one wrinkle map, and the weights of expressions where no table gives them.
+    """Fit one wrinkle map, and the weights of expressions that no table gives.
 
     Parameters
     ----------
@@ -142,10 +141,10 @@ def fit_wrinkle_map(
     zones : tuple of str, optional
         Names of the zones; the paper's for eight, numbers otherwise.
     table : ExpressionTable, optional
-        Known weights with a row an expression: then only the map is fitted with them.
+        Known weights with one row per expression: only the map is fitted.
     clamp : {"unit", "signed"}
-        Range of the weights, as the face will be evaluated: [0, 1], or [-1, 1] in which an
-        expression may flatten what others wrinkle, as anger does the forehead in table 1.1.
+        Range of the weights in later evaluation: [0, 1], or [-1, 1], where an expression may
+        flatten what others wrinkle, as anger does the forehead in table 1.1.
 
     Returns
     -------
@@ -154,15 +153,16 @@ def fit_wrinkle_map(
     Raises
     ------
     WrinkleError
-        For sizes that do not fit, or no expression.
+        For mismatched sizes, or without expressions.
     """
     Checks(WrinkleError).choice("clamp", clamp, ZONE_SUM_LIMITS)
     if not expressions:
-        raise WrinkleError("expressions: got none, expected at least one")
+        raise WrinkleError("expressions: got none, expected at least one; add one")
     stack = mask_stack(masks).astype(np.float64)
     names = zones if zones is not None else _zone_names(len(stack))
     if len(names) != len(stack):
-        raise WrinkleError(f"zones: got {len(names)} names, expected {len(stack)}")
+        hint = "give one name per mask"
+        raise WrinkleError(f"zones: got {len(names)} names, expected {len(stack)}; {hint}")
     base = measure_derivatives(neutral)
     data = differences(base, expressions)
     rounds, settled = 0, True
@@ -203,14 +203,14 @@ def _alternate(
     size: tuple[int, int],
     clamp: Clamp,
 ) -> tuple[dict[str, Float64Array], int, bool]:
-    """Return weights that map and weights in turn lead to, the rounds, and whether they settled.
+    """Alternate map and weights; return weights, number of rounds, and whether they converged.
 
-    Weights hardly depend on detail: they are sought at a resolution that two pixels a texel of
-    map or masks suffice for.
+    Weights hardly depend on fine detail: they are estimated at a resolution of two pixels per texel
+    of map or masks.
     """
     rows = _initial_weights(masks, data, base)
     if len(data) == 1:
-        return rows, 0, True  # every weight is 1
+        return rows, 0, True  # all weights are 1
     shape = base.valid.shape
     rough = min(size[0], COARSE_SIDE), min(size[1], COARSE_SIDE)
     texels = max(rough[0], masks.shape[1]), max(rough[1], masks.shape[2])
@@ -231,7 +231,7 @@ def _alternate(
 
 
 def _reduced(difference: Difference, shape: tuple[int, int]) -> Difference:
-    """Return a difference averaged to fewer pixels, by its weights."""
+    """Return a difference averaged to fewer pixels, weighted by its pixel weights."""
     height, width = difference.weight.shape
     if shape == (height, width):
         return difference
@@ -255,7 +255,7 @@ def _reduced(difference: Difference, shape: tuple[int, int]) -> Difference:
 
 
 def differences(base: Derivatives, expressions: Mapping[str, Measured]) -> dict[str, Difference]:
-    """Return expressions less the neutral face, on pixels that are valid in both."""
+    """Return expressions minus the neutral face, on pixels that are valid in both."""
     data = {}
     for name, given in expressions.items():
         one = measure_derivatives(given)
@@ -269,7 +269,7 @@ def differences(base: Derivatives, expressions: Mapping[str, Measured]) -> dict[
 
 
 def _pixel_weights(variance: FloatArray, good: BoolArray) -> Float32Array:
-    """Return 1/variance relative to its median; 1 where no variance is known; 0 where invalid."""
+    """Return 1/variance relative to its median; 1 where it is not known; 0 where invalid."""
     mean = variance.mean(axis=2)
     known = good & (mean > 0)
     if not known.any():
@@ -296,7 +296,9 @@ def _solve_map(
     *,
     tolerance: float = SOLVER_TOL,
 ) -> Texels:
-    """Return the map that expressions with known weights show best."""
+    """Solve for the map that fits expressions with known weights best."""
+    # normal equations of sum_e v (s_e W - D_e)^2: weight sum v s^2, right side sum v s D, whose
+    # variance is sum (v s)^2 var(D)
     shape = next(iter(data.values())).weight.shape
     weight, covered = np.zeros(shape), np.zeros(shape)
     product, noise = np.zeros((*shape, 2)), np.zeros((*shape, 2))
@@ -321,10 +323,11 @@ def _equations(
 def _initial_weights(
     masks: Float64Array, data: Mapping[str, Difference], base: Derivatives
 ) -> dict[str, Float64Array]:
-    """Return first weights: in each zone, the leading direction of the expressions' products.
+    """Return initial weights: in each zone, the leading eigenvector of the expressions' products.
 
-    With one zone at a pixel, sum_x m_z D_e . D_f is w_e w_f times the zone's energy; errors add
-    to it on the diagonal, and those of the shared neutral everywhere.
+    With one zone at a pixel, sum_x m_z D_e . D_f is w_e w_f times the zone's energy. The noise of
+    an expression adds to the diagonal, and that of the shared neutral image to all entries: both
+    are subtracted.
     """
     names = list(data)
     texels, shape = masks.shape[1:], base.valid.shape
@@ -350,13 +353,13 @@ def _initial_weights(
 
 
 def _limited(rows: Mapping[str, Float64Array]) -> dict[str, Float64Array]:
-    """Return weights divided by the largest of all, by size, where that is above 1."""
+    """Return weights divided by their largest magnitude, where that is above 1."""
     largest = max(1.0, *(float(np.abs(row).max()) for row in rows.values()))
     return {name: row / largest for name, row in rows.items()}
 
 
 def _scaled(rows: Mapping[str, Float64Array]) -> dict[str, Float64Array]:
-    """Return weights whose largest, by size, is 1 in each zone; zones of zeros stay."""
+    """Return weights with a largest magnitude of 1 in each zone; zones of zeros stay."""
     table = np.stack(list(rows.values()))
     largest = np.take_along_axis(table, np.abs(table).argmax(axis=0)[None], axis=0)[0]
     table = table / np.where(largest == 0, 1.0, largest)

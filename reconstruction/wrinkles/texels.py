@@ -1,9 +1,8 @@
-"""Wrinkle maps from full-resolution derivatives: texels whose bilinear reading fits best.
+"""Fit the texels of wrinkle maps, read bilinearly, to full-resolution derivatives.
 
-A wrinkle map is read bilinearly and multiplied by each expression's strength; its texels solve
-the normal equations of that reading, a matrix of nine neighbours. Where everything is measured
-and strengths are 1 this is the low-pass of the map to its resolution, and the best one for that
-reading.
+A wrinkle map is interpolated bilinearly and multiplied by each expression's strength. Its texels
+solve the normal equations of that interpolation, a matrix of nine neighbors. With complete data and
+strengths of 1 the result is the least-squares low-pass of the map at its resolution.
 """
 
 import math
@@ -23,30 +22,30 @@ from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatAr
 from reconstruction.normal_maps import NormalMaps
 
 MAX_DERIVATIVE = 4.0
-"""Derivatives beyond this, slopes of 76 degrees, are measured by too grazing light to count."""
+"""Derivatives beyond this, slopes of 76 degrees, are measured in too oblique views to be used."""
 MIN_COVERAGE = 0.1
-"""Part of a texel's weight that must be measured."""
+"""Minimum measured fraction of a texel's weight."""
 MIN_STRENGTH = 1e-3
 """Sum of squared strengths, relative to the largest, below which a texel is not determined."""
 SOLVER_TOL = 1e-12
 RELATIVE_DAMPING = 1e-10
 MIN_DIAGONAL = 1e-9
-"""Diagonal of the normal matrix, relative to the largest, below which a texel is left at 0."""
+"""Diagonal of the normal matrix, relative to the largest, below which a texel stays at 0."""
 
 
 @dataclass(frozen=True, slots=True)
 class Derivatives:
-    """Measured partial derivatives of one state of a face.
+    """Measured partial derivatives of the face in one expression.
 
     Attributes
     ----------
     values : ndarray, shape (H, W, 2), float32
         n_x/n_z and n_y/n_z; 0 where not valid.
     variance : ndarray, shape (H, W, 2), float32
-        Of `values`; 0 everywhere when no error is known.
+        Variance of `values`; 0 everywhere without errors.
     valid : ndarray of bool, shape (H, W)
     too_steep_fraction : float
-        Of the pixels that were valid as normals.
+        Fraction of the pixels with valid normals.
     """
 
     values: Float32Array
@@ -61,15 +60,15 @@ def measure_derivatives(
     stderr_rad: ArrayLike | None = None,
     valid: ArrayLike | None = None,
 ) -> Derivatives:
-    """Return derivatives of measured normals with their variance.
+    """Compute derivatives of measured normals with their variance.
 
     Parameters
     ----------
     normals : array_like (H, W, 3), or NormalMaps
-        Tangent-space normals, +X right, +Y up; NormalMaps bring errors and mask with them.
+        Tangent-space normals, +X right, +Y up; NormalMaps contain errors and mask.
     stderr_rad : array_like, shape (H, W), optional
         Root mean square angle to the truth, rad, as `NormalMaps.stderr_rad`; half its square
-        lies along each direction.
+        is the variance along each direction.
     valid : array_like of bool, shape (H, W), optional
 
     Returns
@@ -100,7 +99,8 @@ def measure_derivatives(
     if stderr_rad is not None:
         s = np.asarray(stderr_rad, np.float64)
         good &= np.isfinite(s) & (s >= 0)
-        # the gradient of n_x/n_z on the sphere has squared length (1 + d_x^2)(1 + |d|^2)
+        # the gradient of n_x/n_z on the sphere has squared length (1 + d_x^2)(1 + |d|^2), and each
+        # tangential direction has half of the squared angle error
         d2 = report.derivatives**2
         scale = 0.5 * (1.0 + d2) * (1.0 + d2.sum(axis=2, keepdims=True))
         variance[good] = (s[good] ** 2)[:, None] * scale[good]
@@ -117,10 +117,10 @@ class Texels:
     values : ndarray, shape (h, w, 2)
         0 where not valid.
     stderr : ndarray, shape (h, w, 2)
-        From the variances of the derivatives, taken as independent from pixel to pixel and as
-        even over a texel; infinite where not valid, 0 when no variance was given.
+        From the variances of the derivatives, assumed independent between pixels and uniform over
+        a texel; infinite where not valid, 0 when no variance was given.
     valid : ndarray of bool, shape (h, w)
-        Enough of the texel's weight was measured, by expressions that show it.
+        Enough of the texel's weight was measured, by expressions with its wrinkles.
     """
 
     values: Float64Array
@@ -137,7 +137,7 @@ def fit_texels(
     *,
     tolerance: float = SOLVER_TOL,
 ) -> Texels:
-    """Return texels t whose bilinear reading B t makes sum_x weight (B t)^2 - 2 product B t least.
+    """Return texels t that minimize sum_x weight (B t)^2 - 2 product B t; B is bilinear reading.
 
     Parameters
     ----------
@@ -148,15 +148,16 @@ def fit_texels(
     noise : ndarray, shape (H, W, 2)
         Variance of `product`.
     covered : ndarray, shape (H, W)
-        Part of the pixel that was measured, 0 or 1.
+        Measured fraction of the pixel, 0 or 1.
     shape : (int, int)
         Rows and columns of texels, at most those of the pixels.
     tolerance : float
-        Relative error at which conjugate gradients end.
+        Relative error at which conjugate gradients stop.
     """
     height, width = weight.shape
     if shape[0] > height or shape[1] > width or min(shape) < 1:
-        raise WrinkleError(f"size: got {shape}, expected 1 to {(height, width)} texels")
+        hint = "choose another size"
+        raise WrinkleError(f"size: got {shape}, expected 1 to {(height, width)} texels; {hint}")
     by, bx = (resampling.reading_matrix(t, p) for t, p in zip(shape, (height, width), strict=True))
     A = normal_matrix(by, bx, np.asarray(weight, np.float64), shape)
     summed = gather_texels(by, bx, weight)
@@ -189,12 +190,12 @@ def fit_texels(
 
 
 def gather_texels(by: Any, bx: Any, image: FloatArray) -> Float64Array:
-    """Return what each texel's weights gather from an image: B^T image.
+    """Return B^T image: the sum of an image over each texel's bilinear weights.
 
     Parameters
     ----------
     by, bx : sparse (H, h) and (W, w)
-        Of `texture_resampling.reading_matrix`.
+        Matrices of `texture_resampling.reading_matrix`.
     image : ndarray, shape (H, W)
 
     Returns
@@ -206,7 +207,7 @@ def gather_texels(by: Any, bx: Any, image: FloatArray) -> Float64Array:
 
 
 def normal_matrix(by: Any, bx: Any, weight: Float64Array, shape: tuple[int, int]) -> Any:
-    """Return the sparse (h w, h w) matrix B^T diag(weight) B: texels meet neighbours only."""
+    """Return the sparse (h w, h w) matrix B^T diag(weight) B: texels overlap neighbors only."""
     h, w = shape
     total = sparse.csr_array((h * w, h * w))
     index = np.arange(h * w).reshape(h, w)
@@ -240,10 +241,11 @@ def _overlap(b: Any, step: int) -> Any:
 def _inverse_diagonal(b: Any) -> float:
     """Return a texel's variance over that of the mean of its weights, away from borders.
 
-    B^T B has a on its diagonal and b beside it; its inverse has 1/sqrt(a^2 - 4 b^2) there.
+    B^T B is tridiagonal with a on its diagonal and b next to it. The inverse of the infinite matrix
+    has (1 / 2 pi) integral dk / (a + 2 b cos k) = 1 / sqrt(a^2 - 4 b^2) on its diagonal.
     """
     middle = slice(b.shape[1] // 4, max(3 * b.shape[1] // 4, 1))
     a = float(np.mean(_overlap(b, 0).sum(axis=0)[middle]))
-    beside = float(np.mean(_overlap(b, 1).sum(axis=0))) if b.shape[1] > 1 else 0.0
+    next_to = float(np.mean(_overlap(b, 1).sum(axis=0))) if b.shape[1] > 1 else 0.0
     summed = float(np.mean(b.sum(axis=0)[middle]))
-    return summed / math.sqrt(max(a * a - 4.0 * beside * beside, 1e-30))
+    return summed / math.sqrt(max(a * a - 4.0 * next_to * next_to, 1e-30))

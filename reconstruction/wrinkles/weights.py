@@ -1,7 +1,7 @@
-"""Weights of zones that show an expression best: eight unknowns, bounded, with their errors.
+"""Estimate the zone weights of an expression: eight bounded unknowns, with standard errors.
 
-With the wrinkle map W read at full resolution, an expression's difference from neutral is linear
-in the weights, and masks are read bilinearly: the normal equations of all weights follow from one
+With the wrinkle map W at full resolution, an expression's difference from neutral is linear in the
+weights, and masks are read bilinearly. The normal equations of all weights then follow from one
 scalar image, |W|^2, gathered at the masks' resolution.
 """
 
@@ -17,23 +17,23 @@ from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatAr
 from reconstruction.wrinkles.texels import gather_texels, normal_matrix
 
 MAX_STDERR = 0.5
-"""A weight that is known no better tells nothing about [0, 1]."""
+"""Maximum standard error of a valid weight; larger ones do not restrict it within [0, 1]."""
 BLOCKS_PER_SIDE = 16
-"""Squares a side into which the face is cut to see how misfit scatters."""
+"""Blocks per side of the face over which the scatter of the misfit is measured."""
 MIN_EIGENVALUE = 1e-9
 """Eigenvalues of the scaled normal matrix below this leave a weight undetermined."""
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """An expression's derivatives less the neutral ones.
+    """Derivatives of an expression minus the neutral ones.
 
     Attributes
     ----------
     values, variance : ndarray, shape (H, W, 2), float32
-        0 where not valid; variance 0 everywhere when no error is known.
+        0 where not valid; variance 0 everywhere without errors.
     weight : ndarray, shape (H, W), float32
-        Of the pixel in sums of squares; 0 where not valid.
+        Weight of the pixel in sums of squares; 0 where not valid.
     """
 
     values: Float32Array
@@ -43,21 +43,21 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class ZoneWeights:
-    """Weights of zones that show one expression best, given wrinkle map and masks.
+    """Zone weights that fit one expression best, given wrinkle map and masks.
 
     Attributes
     ----------
     weights : ndarray, shape (Z,)
         Within the bounds; 0 where not valid.
     stderr : ndarray, shape (Z,)
-        As without bounds: the larger of what the normals' stated errors and what the scatter of
-        the misfit over the face lead to. Infinite where nothing determines the weight. The
-        wrinkle map counts as known.
+        As without bounds: the larger of the error by the normals' standard errors and that by the
+        scatter of the misfit over the face. Infinite for undetermined weights. The wrinkle map's
+        error is neglected.
     valid : ndarray of bool, shape (Z,)
         Determined, with a standard error below `MAX_STDERR`.
     at_bound : ndarray of bool, shape (Z,)
     covariance : ndarray, shape (Z, Z)
-        Of the normals' stated errors alone; 0 for weights that are not determined.
+        By the normals' standard errors alone; 0 for weights that are not determined.
     explained : float
         1 - |misfit|^2 / |difference from neutral|^2 over the valid pixels; 0 where there is no
         difference. Noise is not explained.
@@ -79,7 +79,7 @@ class ZoneEquations:
     ----------
     matrix, vector : ndarray, shapes (Z, Z) and (Z,)
     noise : ndarray, shape (Z, Z)
-        Covariance of `vector` by the stated errors.
+        Covariance of `vector` by the normals' standard errors.
     total : float
         Weighted sum of squared differences.
     """
@@ -90,12 +90,13 @@ class ZoneEquations:
     total: float
 
     def misfit(self, weights: Float64Array) -> float:
-        """Return the weighted sum of squares that weights leave, at least 0."""
+        """Return the weighted sum of squared residuals, at least 0."""
         left = self.total - 2.0 * weights @ self.vector + weights @ self.matrix @ weights
         return max(float(left), 0.0)
 
     def determined(self) -> BoolArray:
-        """Return which weights the equations hold fast, (Z,)."""
+        """Return which weights the equations determine, (Z,)."""
+        # a weight is undetermined if it has a part in an eigenvector of eigenvalue about 0
         diagonal = np.diag(self.matrix)
         some = diagonal > MIN_EIGENVALUE * diagonal.max(initial=0.0)
         if not some.any():
@@ -112,7 +113,7 @@ class ZoneEquations:
         return part / np.outer(root, root)
 
     def inverse(self) -> Float64Array:
-        """Return the pseudo-inverse of the matrix; rows of undetermined weights mean nothing."""
+        """Return the pseudo-inverse of the matrix; ignore rows of undetermined weights."""
         diagonal = np.diag(self.matrix)
         root = np.sqrt(
             np.where(diagonal > MIN_EIGENVALUE * diagonal.max(initial=0.0), diagonal, np.inf)
@@ -121,7 +122,8 @@ class ZoneEquations:
         return np.linalg.pinv(scaled, rcond=MIN_EIGENVALUE, hermitian=True) / np.outer(root, root)
 
     def solve_bounded(self, bounds: tuple[float, float]) -> Float64Array:
-        """Return the weights within bounds that leave least; 0 for zones without a wrinkle."""
+        """Return the weights within bounds that minimize the misfit; 0 without a wrinkle."""
+        # with N = V L V', |L^1/2 V' w - L^-1/2 V' b|^2 is the misfit up to a constant
         diagonal = np.diag(self.matrix)
         some = diagonal > MIN_EIGENVALUE * diagonal.max(initial=0.0)
         weights = np.zeros(len(diagonal))
@@ -157,7 +159,7 @@ def build_equations(
         Derivatives to add, read at the pixels of the differences.
     data : mapping of str to Difference
     with_noise : bool
-        False leaves `noise` at 0, which weights do not need.
+        False leaves `noise` at 0; weights alone do not need it.
     """
     shape = next(iter(data.values())).weight.shape
     masks = resampling.resample(
@@ -198,7 +200,7 @@ def fit_zone_weights(
     Parameters
     ----------
     masks, wrinkle
-        As of :func:`build_equations`.
+        See :func:`build_equations`.
     difference : Difference
     bounds : (float, float)
     """
@@ -228,10 +230,10 @@ def fit_zone_weights(
 def _scatter(
     masks: Float64Array, wrinkle: FloatArray, difference: Difference, weights: Float64Array
 ) -> Float64Array:
-    """Return the covariance of the equations' right side that the misfit shows, block by block.
+    """Return the covariance of the equations' right side, from the misfit's sums over blocks.
 
-    Misfit of a model is even over furrows, not independent from pixel to pixel; its sums over
-    squares of the face nearly are.
+    The misfit of a model is correlated along grooves, not independent between pixels; its sums over
+    blocks of the face are nearly independent.
     """
     shape = difference.weight.shape
     size = (shape[0], shape[1])

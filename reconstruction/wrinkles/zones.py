@@ -1,10 +1,10 @@
-"""Zones of wrinkles found in the data: where expressions raise wrinkles in the same proportions.
+"""Find zones of wrinkles: regions where expressions raise wrinkles in the same proportions.
 
-Within a texel of the masks, eq. D_e(x) = a_e W(x) says that the expressions' differences are one
-pattern times a number each: their matrix of products has rank one. Its leading direction is the
+Within a texel of the masks, by eq. D_e(x) = a_e W(x), the expressions' differences are one pattern
+times a factor each: their matrix of products has rank one. Its leading eigenvector gives the
 texel's amplitudes a_e, up to a common scale and sign; texels with the same amplitudes form a zone.
-What the data cannot tell: the scale of a zone against its wrinkle map, and two zones whose weights
-are proportional (left and right of a face), which only their places or a first layout keep apart.
+Two quantities are undetermined: the scale of a zone against its wrinkle map, and the border of
+zones with proportional weights (left and right of a face), which positions or a layout separate.
 
 References
 ----------
@@ -27,34 +27,34 @@ from reconstruction.wrinkles.fit import Measured, differences
 from reconstruction.wrinkles.texels import measure_derivatives
 
 MIN_SIGNAL = 3.0
-"""A texel's pattern counts when its energy is so many times the scatter that stated errors lead
-to: their variance over the square root of pixels an expression."""
+"""Minimum energy of a texel's pattern over its scatter by the standard errors: their variance over
+the square root of pixels per expression."""
 MIN_ENERGY = 1e-3
-"""And so large a part of the strongest texel's."""
+"""Minimum energy of a texel's pattern, relative to the strongest texel's."""
 ZONE_ROUNDS = 40
 GRADIENT_STEPS = 60
 LAYOUT_WEIGHT = 0.03
-"""Weight of the first layout, against the data of a texel well above noise."""
+"""Weight of the initial layout, against the data of a texel well above noise."""
 PROPORTIONAL_COSINE = 0.98
 """Cosine above which two zones' weights count as proportional."""
 
 
 @dataclass(frozen=True, slots=True)
 class Amplitudes:
-    """How strongly each expression shows a texel's wrinkles.
+    """Amplitudes of the expressions' wrinkles in each texel.
 
     Attributes
     ----------
     values : ndarray, shape (E, h, w)
-        Largest by size 1 in each texel; 0 where not valid.
+        Largest magnitude 1 in each texel; 0 where not valid.
     energy : ndarray, shape (h, w)
-        Mean square of the pattern at amplitude 1, errors taken off.
+        Mean square of the pattern at amplitude 1, minus the noise.
     rank_one_fraction : ndarray, shape (h, w)
-        Part of the expressions' squares in the texel that one pattern explains; 0 where not valid.
+        Fraction of the texel's sum of squares that one pattern explains; 0 where not valid.
     valid : ndarray of bool, shape (h, w)
-        Some expression moves the texel beyond its errors.
+        At least one expression changes the texel by more than its errors.
     names : tuple of str
-        The expressions.
+        Names of the expressions.
     """
 
     values: Float64Array
@@ -66,23 +66,23 @@ class Amplitudes:
 
 @dataclass(frozen=True, slots=True)
 class ZoneFit:
-    """Masks found in the data.
+    """Masks estimated from the data.
 
     Attributes
     ----------
     masks : ndarray, shape (Z, h, w), float32
         At least 0, with a sum of 1 in every texel.
     weights : mapping of str to tuple of float
-        A row an expression; the scale of a zone is that of its amplitudes.
+        One row per expression; the scale of a zone is that of its amplitudes.
     valid : ndarray of bool, shape (h, w)
-        The data speak for the texel's mask; elsewhere it is the layout's.
+        The data determine the texel's mask; elsewhere it is the layout's.
     rank_one_fraction : float
-        Part of all squares that one pattern a texel explains: how far the premise of one wrinkle
-        map holds at all.
+        Fraction of the sum of squares that one pattern per texel explains: a test of the assumption
+        of one wrinkle map.
     explained : float
-        Part of the amplitudes' squares that the masks explain, by energy.
+        Fraction of the amplitudes' squares that the masks explain, weighted by energy.
     distinct : int
-        Zones whose weights are not proportional to another's: what the data alone tell apart.
+        Number of zones with weights not proportional to another's, which the data can separate.
     """
 
     masks: Float32Array
@@ -96,7 +96,7 @@ class ZoneFit:
 def estimate_amplitudes(
     neutral: Measured, expressions: Mapping[str, Measured], *, size: tuple[int, int] = (64, 64)
 ) -> Amplitudes:
-    """Return the rank-one amplitudes of expressions in each texel of the masks.
+    """Estimate the rank-one amplitudes of expressions in each texel of the masks.
 
     Parameters
     ----------
@@ -107,11 +107,12 @@ def estimate_amplitudes(
         Rows and columns of texels, at most those of the normals.
     """
     if not expressions:
-        raise WrinkleError("expressions: got none, expected at least one")
+        raise WrinkleError("expressions: got none, expected at least one; add one")
     base = measure_derivatives(neutral)
     shape = base.valid.shape
     if size[0] > shape[0] or size[1] > shape[1] or min(size) < 1:
-        raise WrinkleError(f"size: got {size}, expected 1 to {shape} texels")
+        hint = "choose another size"
+        raise WrinkleError(f"size: got {size}, expected 1 to {shape} texels; {hint}")
     data = differences(base, expressions)
     names = tuple(data)
     ay, ax = averaging_matrix(shape[0], size[0]), averaging_matrix(shape[1], size[1])
@@ -121,6 +122,8 @@ def estimate_amplitudes(
     gram, noise = np.zeros((*size, count, count)), np.zeros(size)
     for i, first in enumerate(names):
         for j, second in enumerate(names[: i + 1]):
+            # E[D_e . D_f] contains the noise of the neutral image, common to all differences, and
+            # for e = f also that of the expression
             a, b = data[first], data[second]
             shared = a.variance if i == j else base.variance
             dot = (a.values.astype(np.float64) * b.values - shared).sum(axis=2) * seen
@@ -131,6 +134,7 @@ def estimate_amplitudes(
     leading, trace = np.maximum(values[..., -1], 0.0), np.trace(gram, axis1=2, axis2=3)
     direction = np.moveaxis(vectors[..., -1], -1, 0)
     peak = np.take_along_axis(direction, np.abs(direction).argmax(axis=0)[None], axis=0)
+    # gram = energy a a' with the amplitudes a scaled to a largest magnitude of 1
     energy = leading * peak[0] ** 2
     valid = (part > 0.1) & (leading > 0) & (energy >= MIN_ENERGY * energy.max(initial=0.0))
     pixels = np.maximum(part * seen.size / (size[0] * size[1]), 1.0)
@@ -143,28 +147,31 @@ def estimate_amplitudes(
 def fit_zones(
     amplitudes: Amplitudes, *, zones: int = 8, layout: Masks | None = None, rng: np.random.Generator
 ) -> ZoneFit:
-    """Return masks of zones, from a first layout or from amplitudes and places alone.
+    """Estimate masks of zones, from an initial layout or from amplitudes and positions alone.
 
     Parameters
     ----------
     amplitudes : Amplitudes
     zones : int
-        How many, without a layout.
+        Number of zones, without a layout.
     layout : array_like, shape (Z, h, w), optional
-        Rough regions at the resolution of the amplitudes, e.g. an artist's; they are refined, and
-        kept where the data are silent.
+        Approximate regions at the resolution of the amplitudes, e.g. an artist's; they are refined,
+        and kept where the data do not determine them.
     rng
-        Draws the first centres, without a layout.
+        Draws the initial centers, without a layout.
     """
     shape = amplitudes.valid.shape
     if not amplitudes.valid.any():
-        raise WrinkleError("amplitudes: got no texel with a wrinkle, expected some")
+        got = "got no texel with a wrinkle, expected some"
+        raise WrinkleError(f"amplitudes: {got}; add expressions with stronger wrinkles")
     if layout is None:
         start = _clustered(amplitudes, zones, rng)
     else:
         start = mask_stack(layout).astype(np.float64)
         if start.shape[1:] != shape:
-            raise WrinkleError(f"layout: got {start.shape[1:]} texels, expected {shape}")
+            hint = "resample the layout"
+            got = f"got {start.shape[1:]} texels, expected {shape}"
+            raise WrinkleError(f"layout: {got}; {hint}")
         start = np.maximum(start, 0.0)
         total = start.sum(axis=0)
         start = np.where(total > 0, start / np.where(total > 0, total, 1.0), 1.0 / len(start))
@@ -197,9 +204,9 @@ def fit_zones(
 
 
 def _clustered(found: Amplitudes, zones: int, rng: np.random.Generator) -> Float64Array:
-    """Return regions (Z, h, w) by k-means of amplitudes and places; silent texels go to the near.
+    """Cluster amplitudes and positions to regions (Z, h, w) by k-means, the best of 8 starts.
 
-    The best of several seeded starts is taken.
+    Texels without a wrinkle take the region of the nearest one with a wrinkle.
     """
     h, w = found.valid.shape
     y, x = np.mgrid[:h, :w]
@@ -207,7 +214,8 @@ def _clustered(found: Amplitudes, zones: int, rng: np.random.Generator) -> Float
     good = found.valid
     if zones < 1 or zones > np.count_nonzero(good):
         raise WrinkleError(
-            f"zones: got {zones}, expected 1 to {np.count_nonzero(good)} texels with a wrinkle"
+            f"zones: got {zones}, expected 1 to {np.count_nonzero(good)}, the number of texels "
+            "with a wrinkle; choose fewer"
         )
     features = np.concatenate([found.values[:, good].T, 2.0 * places[good]], axis=1)
     best, least = None, np.inf
@@ -225,7 +233,7 @@ def _clustered(found: Amplitudes, zones: int, rng: np.random.Generator) -> Float
 
 
 def _weights_of(masks: Float64Array, target: Float64Array, strength: Float64Array) -> Float64Array:
-    """Return weights (Z, E) by least squares over texels; a little held to plain averages."""
+    """Return weights (Z, E) by least squares over texels, with a small ridge to plain averages."""
     counted = masks * strength[:, None]
     mass = counted.sum(axis=0)
     mean = (counted.T @ target) / np.maximum(mass, 1e-300)[:, None]
@@ -242,9 +250,10 @@ def _on_simplex_fit(
     weights: Float64Array,
     trust: Float64Array,
 ) -> Float64Array:
-    """Return each texel's shares m >= 0 with sum 1: least trust |a - m w|^2 + PRIOR |m - prior|^2.
+    """Fit each texel's mask weights m >= 0 with sum 1.
 
-    Projected gradient; every texel has the same matrix up to its trust.
+    Projected gradient descent on trust |a - m w|^2 + `LAYOUT_WEIGHT` |m - prior|^2. The step is 1
+    over the largest eigenvalue of w w' plus the weight, a bound of the Hessian for trust <= 1.
     """
     gram = weights @ weights.T
     scale = 1.0 / (np.linalg.eigvalsh(gram)[-1] + LAYOUT_WEIGHT)
@@ -256,7 +265,7 @@ def _on_simplex_fit(
 
 
 def _distinct(weights: Float64Array) -> int:
-    """Return how many directions the zones' weights have, proportional ones counted once."""
+    """Return the number of directions of the zones' weights, proportional ones counted once."""
     lengths = np.linalg.norm(weights, axis=1)
     kept: list[Float64Array] = []
     for row in weights[lengths > 1e-6] / lengths[lengths > 1e-6, None]:

@@ -479,7 +479,7 @@ FEW = Shoot(lights=10, views=2, width_px=60)
         (dataclasses.replace(FEW, dead=(4,)), "lights: got 9 that can be used"),
         (dataclasses.replace(FEW, views=1), "views: got images of 1, expected at least 2"),
         (dataclasses.replace(FEW, places="in a plane"), "in one line or plane"),
-        (dataclasses.replace(FEW, places="behind"), "none that can be used stands before the face"),
+        (dataclasses.replace(FEW, places="behind"), "no usable light in front of the face"),
         (dataclasses.replace(FEW, exposure_s=20.0), r"saturated in every exposure"),
         (
             dataclasses.replace(FEW, reflectance=(0.0, 0.0, 0.0), shine=0.0),

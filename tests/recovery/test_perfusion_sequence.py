@@ -71,7 +71,7 @@ def test_published_sequence_shows_frame_blood_without_transition(tmp_path, calib
     if movement:
         # blood that comes and goes with the movement is not to be told from what the pose makes
         assert cheek["known"] == "unknown"
-        assert "the pose may make" in cheek["text"]
+        assert "the pose step allows" in cheek["text"]
     else:
         assert cheek["known"] == "only below"
         assert cheek["interval_s"][1] < 0.5

@@ -176,10 +176,13 @@ def test_reconstruct_refuses_damage_or_is_unaffected(session, damage, capsys, tm
         (["fit", "facial-color", "SESSION", "--radius", "nan"], "radius: got nan px"),
         (["fit", "facial-color", "SESSION", "--stored-size", "0"], "stored size: got 0 cells"),
         (["reconstruct", "SESSION", "--want", "melanin", "--scan", "x.ply"], "scan: "),
-        (["reconstruct", "SESSION", "--want", "melanin", "--rank", "3"], "is no session of the"),
+        (
+            ["reconstruct", "SESSION", "--want", "melanin", "--rank", "3"],
+            "got a session of another rig",
+        ),
         (
             ["reconstruct", "SESSION", "--want", "melanin", "--landmarks", "x.csv"],
-            "landmarks: x.csv is no file",
+            "landmarks: got x.csv, expected a file",
         ),
     ],
 )

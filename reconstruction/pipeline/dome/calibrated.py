@@ -1,4 +1,4 @@
-"""The dome as it is calibrated, or as drawn, with the images it took."""
+"""Calibrated or nominal dome, with its images."""
 
 import dataclasses
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from reconstruction.pipeline.inputs import Inputs
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedDome:
-    """The dome as calibrated, or as drawn, with the images it took."""
+    """Calibrated or nominal dome, with its images."""
 
     images: DomeImages
     cameras: tuple[CameraPose, ...]
@@ -28,9 +28,9 @@ class CalibratedDome:
     response: tuple[Float32Array, ...]
     """Response of each camera at the pixels of its images, (h, w, 3)."""
     absolute: bool
-    """Whether the lights' intensities are known, and so the albedo."""
+    """Whether the lights' intensities are calibrated, so that the albedo has a scale."""
     report_progress: Callable[[str, float], None]
-    """Says how far a stage is."""
+    """Reports a stage's progress, 0 to 1."""
 
     @property
     def pixel_mm(self) -> float:
@@ -42,7 +42,7 @@ class CalibratedDome:
         return float(np.median(sizes))
 
     def image(self, view: int, capture: int) -> DomeImage:
-        """Return what a camera saw in one of ``images.captures``, freed of its own response."""
+        """Return a camera's image for one of ``images.captures``, over the camera's response."""
         light, exposure = self.images.captures[capture]
         image = self.images.image(self.images.views[view], light, exposure)
         response = self.response[view]
@@ -52,7 +52,7 @@ class CalibratedDome:
 def transform_dome(
     dome: CalibratedDome, rotation: Float64Array, shift_mm: Float64Array
 ) -> CalibratedDome:
-    """Return the dome in the frame of a mesh that stands in it at ``rotation @ p + shift_mm``.
+    """Transform the dome to a mesh's frame, whose points are at ``rotation @ p + shift_mm``.
 
     Parameters
     ----------
@@ -78,14 +78,14 @@ def transform_dome(
 
 
 def load_dome(inputs: Inputs, images: DomeImages) -> CalibratedDome:
-    """Return the dome of a session's images; what no calibration says is taken as drawn.
+    """Load the dome of a session's images; uncalibrated quantities take nominal values.
 
     Parameters
     ----------
     inputs
-        Session and calibrations; it notes what is assumed, and which lights are dead.
+        Session and calibrations; it records assumptions and dead lights.
     images
-        Those of the session that are to be used.
+        Images of the session to use.
 
     Raises
     ------
@@ -95,17 +95,17 @@ def load_dome(inputs: Inputs, images: DomeImages) -> CalibratedDome:
     rig = inputs.session.rig
     views = [rig.view(name) for name in images.views]
     serials = [view.serial for view in views]
-    found = inputs.load("geometry", serials, "the cameras stand as the rig's file draws them")
+    found = inputs.load("geometry", serials, "the cameras have the nominal poses of the rig file")
     if found is None:
         cameras = tuple(CameraPose.nominal(view) for view in views)
     else:
         poses = geometry.cameras_from_calibration(found, rig.subset(views=images.views))
         cameras = tuple(poses[view.name] for view in views)
-    drawn = "the lights stand and shine as the rig's file draws them"
+    drawn = "the lights have the nominal positions and intensities of the rig file"
     lit = inputs.load("lights", images.lights, f"{drawn}; the albedo has no absolute scale")
     lights_rig = rig.subset(lights=images.lights)
     lights = LightTable.nominal(lights_rig)
-    # a calibration from spheres alone says nothing of strengths, one from the plate none of places
+    # spheres alone calibrate positions without intensities, the white plate intensities only
     nominal: dict[str, str] = {}
     if lit is not None:
         lights = LightTable.from_calibration(lit, lights_rig)
@@ -122,7 +122,7 @@ def load_dome(inputs: Inputs, images: DomeImages) -> CalibratedDome:
 
 
 def split_exposures(dome: CalibratedDome) -> CalibratedDome:
-    """Return the dome with each exposure an image of its own, as a moving head needs them."""
+    """Return the dome with each exposure as a separate image, as a moving head requires."""
     images = dome.images.split_exposures()
     order = [images.lights.index(light) for light, _ in images.captures]
     names = [f"{name} {exposure}" for name, exposure in images.captures]
@@ -130,7 +130,7 @@ def split_exposures(dome: CalibratedDome) -> CalibratedDome:
 
 
 def reorder_lights(lights: LightTable, order: list[int], names: list[str]) -> LightTable:
-    """Return a table with the rows of another in a given order, also more than once."""
+    """Return a table's rows in the given order; rows may repeat."""
     per_light = (
         "position_mm intensity exponent axis valid position_stderr_mm intensity_stderr "
         "exponent_stderr"

@@ -20,7 +20,7 @@ __all__ = ["DomeImage", "DomeImages", "ElectronNoise"]
 
 @dataclass(frozen=True, slots=True)
 class DomeImage:
-    """What one camera sees by one light.
+    """Image of one camera under one light.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class DomeImage:
         (h, w, 3) float32, camera RGB, fraction of full scale per second of light at level 1;
         one pixel for each 2 x 2 cell of the sensor.
     variance
-        Of ``rgb``.
+        Variance of ``rgb``.
     valid
         (h, w) bool; False where every exposure is saturated.
     """
@@ -39,7 +39,7 @@ class DomeImage:
 
     @staticmethod
     def from_sensor_px(pixels: FloatArray) -> Float64Array:
-        """Return where positions on the sensor, (..., 2) column and row in px, lie in ``rgb``.
+        """Convert sensor positions, (..., 2) column and row in px, to pixels of ``rgb``.
 
         Examples
         --------
@@ -50,34 +50,34 @@ class DomeImage:
 
 
 class DomeImages:
-    """Reads, and merges, the exposures of a dome session when an image is asked for; keeps none.
+    """Reads and merges the exposures of a dome session on request, without a cache.
 
     Parameters
     ----------
     session
         Of the dome, open for reading.
     noise
-        Calibrated gain and read noise by camera serial; a camera that is not named is taken at
-        the word of its own frames.
+        Calibrated gain and read noise by camera serial; for other cameras the noise profile of
+        their frames is used.
     kind
         "olat" for the subject; "white", "mirror" for targets with one light at a time.
     merge
-        Whether the exposures of a light make one image. Those of a subject that moves do not:
-        they were taken seconds apart.
+        Whether to merge the exposures of a light to one image. Not for a moving subject: its
+        exposures were taken seconds apart.
     without
-        Names of lights and views whose frames are left out.
+        Names of lights and views whose frames are excluded.
 
     Attributes
     ----------
     views, lights
-        Names, in the rig's order, of those that the session holds frames of.
+        Names in the rig's order, of lights and views with frames in the session.
     captures
-        The images that each view has: light and exposure, -1 for all of them merged.
+        The images of each view: light and exposure, -1 for all exposures merged.
 
     Raises
     ------
     InputsError
-        When the session holds no such frames.
+        When the session has no frames of that kind.
     """
 
     def __init__(
@@ -98,7 +98,8 @@ class DomeImages:
             if not without.is_held_out(light, view):
                 self._shots.setdefault((view, light), []).append(record)
         if not self._shots:
-            raise InputsError(f"{session.path}: has no frames of kind {kind!r}")
+            hint = "give a session that has them"
+            raise InputsError(f"{session.path}: has no frames of kind {kind!r}; {hint}")
         views = {view for view, _ in self._shots}
         lights = {light for _, light in self._shots}
         self.views = tuple(v.name for v in session.rig.views if v.name in views)
@@ -110,28 +111,28 @@ class DomeImages:
         self._darks: dict[str, tuple[Float32Array, Float32Array] | None] = {}
 
     def split_exposures(self) -> DomeImages:
-        """Return the same images with each exposure one of its own."""
+        """Return the same images with each exposure separate."""
         return DomeImages(
             self._session, noise=self._noise, kind=self._kind, merge=False, without=self._without
         )
 
     def times_s(self, view: str, light: str, exposure: int = -1) -> tuple[float, ...]:
-        """Return when the box lit the frames of an image, s on the box's clock.
+        """Return when the controller lit the frames of an image, s on the controller's clock.
 
-        Frames that no box lit, as imported ones, have NaN.
+        Frames without a controller, such as imported ones, have NaN.
         """
         times = (record.line.t_box_s for record in self._of(view, light, exposure))
         return tuple(math.nan if time is None else time for time in times)
 
     def image(self, view: str, light: str, exposure: int = -1) -> DomeImage:
-        """Return what a camera sees by a light, the darks subtracted.
+        """Return a camera's image under a light, dark frames subtracted.
 
         Parameters
         ----------
         view, light
             Names.
         exposure
-            Which one; -1 merges all.
+            Number of the exposure; -1 merges all.
 
         Raises
         ------
@@ -154,11 +155,12 @@ class DomeImages:
         if exposure >= 0:
             shots = [record for record in shots if record.index.get("exposure", 0) == exposure]
         if not shots:
-            raise InputsError(f"{self._session.path}: lacks camera {view}, light {light}")
+            missing = f"lacks camera {view}, light {light}"
+            raise InputsError(f"{self._session.path}: {missing}; capture it again")
         return shots
 
     def _dark(self, view: str) -> tuple[Float32Array, Float32Array] | None:
-        """Return the rate of what is seen without any LED, and its variance."""
+        """Return the signal rate without any LED, and its variance."""
         if view not in self._darks:
             records = [r for r in self._session.frames("dark") if r.camera == view]
             self._darks[view] = None
@@ -178,14 +180,16 @@ class DomeImages:
         times = []
         for frame, level in zip(frames, levels, strict=True):
             if frame.cfa.shape != first.cfa.shape or frame.pattern != first.pattern:
-                raise InputsError(f"{frame.path}: differs in size or pattern from {first.path}")
+                hint = "use frames of one camera setting"
+                got = f"differs in size or pattern from {first.path}"
+                raise InputsError(f"{frame.path}: {got}; {hint}")
             if frame.exposure_s is None:
-                raise InputsError(f"{frame.path}: does not say its exposure time")
+                raise InputsError(f"{frame.path}: lacks its exposure time; import it with one")
             times.append(frame.exposure_s * level)
         values = np.zeros(first.cfa.shape, np.float32)
         variance = np.zeros_like(values)
         good = np.zeros(values.shape, bool)
-        # one black level for all colors, as a rule: then the mosaic is merged as a whole
+        # with one black level for all colors, the usual case, the mosaic is merged as a whole
         whole = len(set(first.black)) == 1
         for cell, black in enumerate(first.black[:1] if whole else first.black):
             part = slice(cell // 2, None, 2), slice(cell % 2, None, 2)

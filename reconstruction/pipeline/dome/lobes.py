@@ -1,4 +1,4 @@
-"""Basis BRDFs of a dome session, and normals refined by them."""
+"""Basis BRDFs of a dome session, and the refinement of normals with them."""
 
 import dataclasses
 import io
@@ -30,20 +30,20 @@ BASIS_RANK: Final = 4
 """Common mixtures that the basis is reduced to, as many as Weyrich et al. 2005 use for a face."""
 
 MAX_RELATIVE_STRENGTH: Final = 6.0
-"""Times the usual strength from which on a point's mixture is not used to find the common ones."""
+"""Multiple of the median strength above which a point's mixture is not used for the basis."""
 
 RECORDED_RANKS: Final = (1, 2, BASIS_RANK, 2 * BASIS_RANK, 24)
-"""Ranks whose mixtures and errors are recorded, as far as the points hold so many."""
+"""Ranks whose mixtures and errors are recorded, up to the rank that the points support."""
 
 CHUNK_SAMPLES: Final = 3_000_000
-"""Samples of a chunk; about 60 bytes each."""
+"""Samples per chunk; about 60 bytes each."""
 
 BASIS_POINTS: Final = 5_000
-"""Points, drawn at random, that the mixtures are found on."""
+"""Randomly drawn points from which the mixtures are estimated."""
 
 
 def weight_names(rank: int = BASIS_RANK) -> tuple[str, ...]:
-    """Return the names of the maps of shares of so many lobes.
+    """Return the names of the weight maps of ``rank`` basis BRDFs.
 
     Examples
     --------
@@ -54,34 +54,34 @@ def weight_names(rank: int = BASIS_RANK) -> tuple[str, ...]:
 
 
 N_REFINEMENTS = 2
-"""Turns of fitting normals by the lobes, and the lobes at the normals."""
+"""Alternations of fitting normals with the lobes, and lobes with the normals."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceSampleStore:
-    """Lumitexels of the surface, and the folder that holds them where they are many."""
+    """Lumitexels of the surface, and the folder that stores them when they are many."""
 
     store: LumitexelStore
     folder: Any
     lights: int
-    """Lights of the dome: where exposures stay apart, several captures are of one."""
+    """Number of the dome's lights; where exposures are separate, several captures share one."""
     report_progress: Callable[[str, float], None]
-    """Says how far a stage is."""
+    """Reports a stage's progress, 0 to 1."""
 
     def chunks(self) -> Iterator[tuple[slice, Lumitexels]]:
-        """Yield parts of the points with their samples, as many as memory should hold."""
+        """Yield parts of the points with their samples, at most `CHUNK_SAMPLES` each."""
         samples_per_point = max(self.store.light_count * self.store.view_count, 1)
         return self.store.chunks(max(1, CHUNK_SAMPLES // samples_per_point))
 
     def collect(
         self, stage: str, estimate: Callable[[slice, Lumitexels], PointValues]
     ) -> PointValues:
-        """Estimate chunk by chunk and put the results together.
+        """Estimate chunk by chunk and concatenate the results.
 
         Parameters
         ----------
         stage
-            What is estimated, for those who wait.
+            Name of the stage, for progress lines.
         estimate
             Called with the points of a chunk and their samples.
         """
@@ -100,13 +100,14 @@ def fit_lobes(
     point_normals: PointValues,
     point_r_d: PointValues,
 ) -> Mapping[str, Any]:
-    """Fit basis BRDFs to all points, reduce them, and return basis, weights and file."""
+    """Fit basis BRDFs to all points, reduce them to the rank; return basis, weights and file."""
     folder = inputs.basis
     materials = brdf_tables.default_basis() if folder is None else brdf_tables.load(folder)
     rank = inputs.rank or BASIS_RANK
     good = np.flatnonzero(point_r_d.valid)
     if len(good) < rank:
-        raise InputsError(f"lobes: only {len(good)} points have an albedo, expected {rank}")
+        got = f"got {len(good)} points with an albedo, expected at least {rank}"
+        raise InputsError(f"lobes: {got}; choose a lower rank, or capture more lights")
     drawn = np.sort(np.random.default_rng(0).permutation(good)[:BASIS_POINTS])
     fitted = []
     for part, samples in lumitexels.chunks():
@@ -121,7 +122,8 @@ def fit_lobes(
     )
     most = min(shares.shape)
     if rank > most:
-        raise InputsError(f"rank: got {rank}, expected at most {most}; the data hold no more")
+        expected = f"expected at most {most}, the number that the samples determine"
+        raise InputsError(f"rank: got {rank}, {expected}; choose a lower rank")
     mixes = {
         k: brdf_basis.reduce(shares, k, basis=materials)[1:]
         for k in sorted({*RECORDED_RANKS, rank})
@@ -144,16 +146,16 @@ def fit_lobes(
 def _normalize_mixtures(
     shares: Float64Array, materials: BrdfBasis, *, min_points: int
 ) -> Float64Array:
-    """Return mixtures scaled to reflect equally much, without those that no sample holds down.
+    """Scale mixtures to equal reflected energy; omit those that the samples leave undetermined.
 
-    A lobe so narrow that no pair of light and view met it can have any share.
+    A lobe too narrow for any pair of light and view has an arbitrary weight.
     """
     total = shares @ materials.strength()
     some = total[total > 0]
     usual = float(np.median(some)) if len(some) else 0.0
     kept = (total > 0) & (total < MAX_RELATIVE_STRENGTH * usual)
-    got = f"{np.count_nonzero(kept)} of {len(shares)} points that show how the surface reflects"
-    expected = f"at least {min_points}; more lights or views would show it"
+    got = f"{np.count_nonzero(kept)} of {len(shares)} points whose samples determine the lobes"
+    expected = f"at least {min_points}; capture more lights or views"
     Checks(InputsError).require(np.count_nonzero(kept) >= min_points, "lobes", got, expected)
     return shares[kept] / total[kept, None]
 
@@ -161,7 +163,7 @@ def _normalize_mixtures(
 def _basis_bytes(
     materials: BrdfBasis, rank: int, mixes: Mapping[int, tuple[Float64Array, float]]
 ) -> bytes:
-    """Keep the lobes, and of every rank the mixtures of materials that they would be."""
+    """Serialize the lobes, with the mixtures of materials at every recorded rank."""
     mix = mixes[rank][0]
     stream = io.BytesIO()
     np.savez_compressed(
@@ -188,10 +190,10 @@ def refine_normals(
     basis_file: bytes,
     texture: SurfaceTexture,
 ) -> Mapping[str, SkinMap | bytes]:
-    """Refine normals and lobe weights in turn, and return them as maps with the basis's file."""
+    """Refine normals and lobe weights alternately; return them as maps with the basis's file."""
     lobes = PointLobes(weights, basis)
     started = lumitexels.collect(
-        "normals by what lobes leave",
+        "normals from the residual of the lobes",
         lambda part, samples: estimates.normals_from_remainder(
             samples, point_normals[part], point_r_d[part], lobes[part]
         ),
@@ -204,7 +206,7 @@ def refine_normals(
     for turn in range(N_REFINEMENTS):
         of_turn = f"{turn + 1} of {N_REFINEMENTS}"
         found = lumitexels.collect(
-            f"normals by all light, {of_turn}",
+            f"normals from the full model, {of_turn}",
             lambda part, samples, n=found.values, own=lobes: estimates.normals_from_full_model(  # type: ignore[misc]
                 samples, inside[part], point_r_d[part], own[part], initial_normals=n[part]
             ),
@@ -216,11 +218,11 @@ def refine_normals(
             ),
         )
         lobes = PointLobes(fitted.values[:, :rank], basis)
-    maps, good, what = {}, fitted.valid, "share of a common mixture"
+    maps, good, what = {}, fitted.valid, "weight of a common mixture"
     for k, name in enumerate(weight_names(rank)):
         maps[name] = texture.map(fitted.values[:, k], fitted.stderr[:, k], good, "1", what)
     what = "weighted RMS of samples - model"
     maps["lobe_residual"] = texture.map(fitted.values[:, rank], None, good, "1/sr", what)
     found = surface_errors.add_normal_errors(found, surface, dome.pixel_mm)
-    refined = texture.normals(found, "by the whole model, world frame")
+    refined = texture.normals(found, "by the full model, world frame")
     return {BASIS_FILE: basis_file, "normals_refined": refined, **maps}

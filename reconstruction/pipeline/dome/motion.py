@@ -1,4 +1,4 @@
-"""How the head moved during a dome session, and which images that leaves usable."""
+"""Estimate the head's motion during a dome session, and select the usable images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,35 +17,35 @@ from reconstruction.scan.mesh import RefinedScan
 
 TRACKED_POINTS: Final = 6_000
 MAX_STILL_MOTION_PX: Final = 0.15
-"""Motion, in pixels of an image, below which the head counts as still."""
+"""Motion, in image pixels, below which the head counts as still."""
 
 
 class HalfResolutionCamera:
-    """A camera seen through images of one pixel for each 2 x 2 cell of its sensor."""
+    """Camera model for images with one pixel per 2 x 2 cell of the sensor."""
 
     def __init__(self, camera: CameraPose) -> None:
         self._camera = camera
         self.center_mm = camera.center_mm
 
     def project(self, points_mm: FloatArray) -> Float64Array:
-        """Return column and row in pixels of the images."""
+        """Project points to column and row in pixels of the images."""
         return DomeImage.from_sensor_px(self._camera.project(points_mm))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DomeHeadMotion:
-    """Where the head was in each image.
+    """Pose of the head in each image.
 
     Attributes
     ----------
     poses
-        (N, 4, 4): take points from the head's mean place to where they were.
+        (N, 4, 4): transforms points from the head's mean pose to the pose in each image.
     usable
-        (N,) bool; False while the face moved otherwise than as a whole.
+        (N,) bool; False where the face moved non-rigidly.
     head
         The motion in the tracking frames.
     displacement_mm
-        How far the face's points were from their mean place, root mean square, (N,).
+        Root mean square displacement of the face's points from their mean position, (N,).
     """
 
     poses: Float64Array
@@ -53,10 +53,10 @@ class DomeHeadMotion:
     head: head_motion.HeadMotion
     displacement_mm: Float64Array
     still: bool
-    """Whether the head hardly moved: then exposures can be merged and poses ignored."""
+    """Whether the motion is below `MAX_STILL_MOTION_PX`: exposures are merged, poses ignored."""
 
     def record(self) -> dict[str, Any]:
-        """Return what the record of the maps says of the motion, as JSON values."""
+        """Return the motion for the record of the maps, as JSON values."""
         return {
             "tracking_frames": len(self.head.times_s),
             "displacement_mm_max": float(self.displacement_mm.max(initial=0.0)),
@@ -80,19 +80,19 @@ def follow_head(
     session
         Of the dome.
     images
-        Its images, exposures apart.
+        Its images, with separate exposures.
     cameras
         Calibrated, in the order of ``images.views``.
     surface
-        The scan where the head is on average.
+        The scan in the head's mean pose.
     pixel_mm
         Size of an image's pixel on the subject.
 
     Returns
     -------
-    Motion or None
-        One row for each of ``images.captures``; None where fewer than two tracking frames show
-        all views.
+    DomeHeadMotion or None
+        One row for each of ``images.captures``; None where fewer than two tracking frames are
+        complete over all views.
     """
     by_step: dict[str, dict[str, Any]] = {}
     for record in session.frames("tracking"):
@@ -116,10 +116,10 @@ def follow_head(
     when = np.array([np.mean(images.times_s(images.views[0], *key)) for key in images.captures])
     if not found.usable.any():
         raise InputsError(
-            f"{session.path}: no tracking frame tells where the head was; is the scan of "
-            "this subject, and are the cameras calibrated?"
+            f"{session.path}: the head was found in no tracking frame, expected at least one; "
+            "check that the scan is of this subject and that the cameras are calibrated"
         )
-    # the scan was laid onto all images together: it stands where the head was on average
+    # the scan was registered to all images jointly, so it is in the head's mean pose
     turn, shift = found.interpolate(when)
     mean = np.eye(4)
     mean[:3, :3] = head_motion.rotation_matrix(turn.mean(axis=0))
@@ -131,8 +131,8 @@ def follow_head(
     still = bool(usable.all() and apart.max(initial=0.0) < MAX_STILL_MOTION_PX * pixel_mm)
     if not usable.any():
         raise InputsError(
-            f"{session.path}: no image lies between two tracking frames that tell where the "
-            "head was; capture again, with the face at rest"
+            f"{session.path}: got no image between two tracking frames with a known head pose, "
+            "expected at least one; capture again, with the face at rest"
         )
     return DomeHeadMotion(poses, usable, found, apart, still)
 
@@ -140,12 +140,12 @@ def follow_head(
 def _time_s(record: Any) -> float:
     time = record.line.t_box_s
     if time is None:
-        raise InputsError(f"{record.file}: does not say when it was lit")
+        raise InputsError(f"{record.file}: lacks the time of its light; capture it again")
     return float(time)
 
 
 def _gray(session: Session, record: Any) -> Float32Array:
-    """Return a tracking frame over its light: their levels and exposures differ."""
+    """Return a tracking frame over its light, as levels and exposures differ between frames."""
     frame = session.read(record)
     light = float(record.settings.get("level", 1.0)) * float(frame.exposure_s or 1.0)
     image = raw.linear_rgb(frame, demosaic="centered")

@@ -1,4 +1,4 @@
-"""What sessions of the dome can be made into."""
+"""Recipe of the sessions of the dome."""
 
 from reconstruction.pipeline.dome import stages
 from reconstruction.pipeline.recipe import Recipe

@@ -1,4 +1,4 @@
-"""Where a mesh of the face stands in the dome, from its images under one light each."""
+"""Register a mesh of the face to the dome's one-light-at-a-time images."""
 
 from typing import Final
 
@@ -14,25 +14,25 @@ from reconstruction.scan.repair import TriangleMesh
 from reconstruction.scan.rough_normals import ScanRegistrationError
 
 N_REGISTRATION_LIGHTS: Final = 40
-"""Lights whose images say where the mesh is."""
+"""Lights whose images the mesh is registered to."""
 MIN_SIGNAL_TO_NOISE: Final = 5.0
-"""Times its noise from which on a pixel shows something."""
+"""Signal-to-noise ratio from which on a pixel counts as lit."""
 
 
 def register_mesh(dome: CalibratedDome, mesh: TriangleMesh) -> RigidFit:
-    """Lay a mesh onto the images of a dome; see `reconstruction.scan.registration.align_scan`.
+    """Register a mesh to the images of a dome; see `reconstruction.scan.registration.align_scan`.
 
     Parameters
     ----------
     dome
         Calibrated, with its images.
     mesh
-        Clean, within about 10 mm and 5 degrees of where the face is.
+        Clean, within about 10 mm and 5 degrees of the face.
 
     Raises
     ------
     InputsError
-        No light stands before the face, or the mesh is not found in the images.
+        When all usable lights are behind the face, or the mesh is not found in the images.
     """
     chosen = farthest_point_sample(
         dome.lights.position_mm, dome.lights.valid, N_REGISTRATION_LIGHTS
@@ -63,16 +63,18 @@ def register_mesh(dome: CalibratedDome, mesh: TriangleMesh) -> RigidFit:
         lost, seen = 100.0 * np.mean(shares, axis=0)
         raise InputsError(
             f"surface: the scan was not found in the images: {exc}; {lost:.1f} % of their pixels "
-            f"are saturated in every exposure, {seen:.1f} % are brighter than their noise"
+            f"are saturated in every exposure, {seen:.1f} % are brighter than their noise; "
+            "check that the scan is of this subject, or capture again"
         ) from exc
 
 
 def farthest_point_sample(position_mm: Float64Array, usable: BoolArray, count: int) -> list[int]:
-    """Choose lights that light the face, each next one the farthest from those before."""
+    """Choose lights in front of the face, each the farthest from those chosen before."""
     way = unit_vectors(position_mm)
     front = np.flatnonzero(usable & (way[:, 2] > -0.1))
     if not len(front):
-        raise InputsError("lights: none that can be used stands before the face")
+        got = "got no usable light in front of the face, expected at least one"
+        raise InputsError(f"lights: {got}; check the light calibration")
     chosen = [int(front[np.argmax(way[front, 2])])]
     nearest = way[front] @ way[chosen[0]]
     while len(chosen) < min(count, len(front)):

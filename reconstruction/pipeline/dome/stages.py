@@ -40,33 +40,33 @@ from reconstruction.surface.estimates import PointValues
 from reconstruction.surface.texture import SurfaceTexture
 
 STAGE_REVISION = 4
-"""Grows when the code of a stage changes its result, so that older maps are computed again."""
+"""Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 SCAN_FILE: Final = "scan.ply"
 MEMORY_BYTES: Final = 2**30
-"""Size of the table of samples from which on it lies in files and not in memory."""
+"""Sample tables above this size are stored in files, not in memory."""
 FACE_AREA_MM2: Final = 60_000.0
-"""Area of a face; with the size of a pixel on it, it says how many points can be told apart."""
+"""Area of a face; over the area of a pixel on it, this gives the number of resolvable points."""
 POINT_LIMITS: Final = (8_000, 1_000_000)
 TEXTURE_LIMITS: Final = (128, 2048)
 
 
 def map_names(rank: int = BASIS_RANK) -> tuple[str, ...]:
-    """Return the names of the maps that can be made of a dome session."""
+    """Return the names of the maps of a dome session."""
     first = ("position", "half_vector_normals", "normals", "r_d")
     return (*first, *weight_names(rank), "lobe_residual", "normals_refined", "samples")
 
 
 WEIGHT_NAMES = weight_names()
 MAP_NAMES = map_names()
-"""Maps that can be made of a dome session, unless another rank is asked for."""
+"""Maps of a dome session at the default rank."""
 MESH_FILE = "mesh.obj"
 FILE_NAMES = (MESH_FILE, BASIS_FILE)
-"""What goes along with the maps."""
+"""Products of a dome session that are not maps."""
 
 
 def graph(inputs: Inputs) -> list[stages.PipelineStage]:
-    """Return the stages that a dome session can go through; see `stages.run`."""
+    """Return the stages of a dome session; see `graph.run_stages`."""
     dome = _dome(inputs)
     stage = inputs.stage_maker(STAGE_REVISION)
     if inputs.hold_out:
@@ -100,7 +100,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
 
 
 def _dome(inputs: Inputs) -> CalibratedDome:
-    """Return the dome with the images that may be fitted to."""
+    """Return the dome with the images that are not held out."""
     images = DomeImages(inputs.session)
     held = inputs.hold_out = inputs.hold_out.resolve(images.lights, images.views)
     inputs.noted["held_out"] = held.record()
@@ -120,7 +120,7 @@ def _dome(inputs: Inputs) -> CalibratedDome:
 
 
 def _surface(inputs: Inputs, dome: CalibratedDome) -> RefinedScan:
-    """Clean and refine the scan, and lay it onto the dome."""
+    """Clean and refine the scan, and register it to the dome."""
     session = inputs.session
     if inputs.scan is None and SCAN_FILE not in session.attachments():
         hint = "add one with `skinrig import mesh FILE`"
@@ -144,13 +144,14 @@ def _surface(inputs: Inputs, dome: CalibratedDome) -> RefinedScan:
 
 
 def _require(dome: CalibratedDome) -> None:
-    """Refuse fewer views or lights than any point needs, and lights that lie in a plane."""
+    """Refuse fewer views or lights than a point needs, and lights in one plane."""
     views, lights = len(dome.cameras), int(np.count_nonzero(dome.lights.valid))
     check = Checks(InputsError)
     least = estimates.MIN_VIEWS
-    check.require(views >= least, "views", f"images of {views}", f"at least {least}")
+    check.require(views >= least, "views", f"images of {views}", f"at least {least}; add views")
     least = estimates.MIN_LIGHTS
-    check.require(lights >= least, "lights", f"{lights} that can be used", f"at least {least}")
+    enough = f"at least {least}; capture more lights"
+    check.require(lights >= least, "lights", f"{lights} that can be used", enough)
     place = dome.lights.position_mm[dome.lights.valid]
     photometric_stereo.require_noncoplanar(unit_vectors(place))
 
@@ -166,7 +167,7 @@ def _texture(surface: RefinedScan) -> Mapping[str, Any]:
 def _motion(inputs: Inputs, dome: CalibratedDome, surface: RefinedScan) -> DomeHeadMotion | None:
     images = dome.images.split_exposures()
     found = follow_head(inputs.session, images, dome.cameras, surface, dome.pixel_mm)
-    # without tracking frames nobody knows whether the head held still
+    # without tracking frames it is not known whether the head held still
     inputs.noted["motion"] = {"tracking_frames": 0} if found is None else found.record()
     return found
 
@@ -200,7 +201,7 @@ def _lumitexels(
 
 def _counts(lumitexels: SurfaceSampleStore, texture: SurfaceTexture) -> SkinMap:
     found = lumitexels.collect("sample counts", estimates.count_samples)
-    return texture.map(found.values[:, 0], None, found.valid, "1", "samples a point")
+    return texture.map(found.values[:, 0], None, found.valid, "1", "samples per point")
 
 
 def _half_vectors(lumitexels: SurfaceSampleStore, texture: SurfaceTexture) -> SkinMap:

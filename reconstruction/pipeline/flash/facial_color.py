@@ -1,7 +1,7 @@
-"""A hemoglobin rig from a subject's flash sessions: align, invert together, take statistics.
+"""Fit a hemoglobin rig to flash sessions: align images, invert them jointly, take statistics.
 
-Every image is laid over the first neutral one; repeats of a state are averaged; all states share
-one melanin; the blood that is left makes the rig of `model.facial_color`.
+Each image is warped to the first neutral one. Repeats of a state are averaged. All states share
+one melanin map. The remaining blood volume fraction makes the rig of `model.facial_color`.
 
 References
 ----------
@@ -38,33 +38,33 @@ from reconstruction.pipeline.flash.state_images import (
 from reconstruction.pipeline.masked_map import masked_map
 
 NOISE_CORRELATION_PX: Final = 3.0
-"""Pixels whose noise goes together after demosaicing and interpolation."""
+"""Correlation length of the noise after demosaicing and interpolation, in pixels."""
 RADIUS_FRACTION: Final = 1 / 32
-"""Radius of the disc over the larger side of the map, where none is given."""
+"""Default radius of the disc over the larger side of the map."""
 
 
 class FacialColorFitError(ValueError):
-    """Sessions that no hemoglobin rig can be fitted to."""
+    """Sessions that a hemoglobin rig cannot be fitted to."""
 
 
 class UnknownBloodError(FacialColorFitError):
-    """Skin whose colors nowhere tell its blood at rest."""
+    """Skin whose colors leave its blood volume fraction at rest undetermined."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AlignedImage:
-    """One image laid over the neutral one.
+    """One image warped to the neutral one.
 
     Attributes
     ----------
     image
-        Where it comes from.
+        State, repeat and session of the image.
     rgb, variance
         (H, W, 3): diffuse reflectance and its variance; 0 where not ``valid``.
     valid
         (H, W).
     alignment
-        How it was laid over; None for the image that the others are laid over.
+        Warp to the neutral image; None for that image itself.
     """
 
     image: StateImage
@@ -76,14 +76,14 @@ class AlignedImage:
 
 @dataclass(frozen=True, slots=True)
 class Repeats:
-    """How far repeats of states agree, each image inverted by itself.
+    """Repeatability of states, each image inverted alone.
 
     Attributes
     ----------
     hemoglobin
-        Repeats against states.
+        Within-state against between-state variation.
     melanin_drift
-        Of melanin over the time of capture, by region; empty where it cannot be told.
+        Drift of melanin over the time of capture, by region; empty where undetermined.
     """
 
     hemoglobin: Repeatability
@@ -92,26 +92,26 @@ class Repeats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FacialColorFit:
-    """What sessions of one subject give.
+    """Result of a fit to one subject's sessions.
 
     Attributes
     ----------
     rig
-        Of all states.
+        Hemoglobin rig of all states.
     melanin
-        Shared by the states; its standard error holds noise and model error.
+        Shared by the states; its standard error contains noise and model error.
     hemoglobin
-        Blood of each state over the neutral image, with standard errors.
+        Blood volume fraction of each state in the neutral image's frame, with standard errors.
     changes
-        Blood of each state less the neutral, with the standard error of the difference.
+        Blood of each state minus the neutral, with the standard error of the difference.
     aligned
         Every image.
     shared
-        The joint inversion.
+        Result of the joint inversion.
     repeats
-        How far states repeat; None where none was captured twice.
+        Repeatability of the states; None where no state was captured twice.
     omitted
-        What was not used, and why.
+        Images and states that were not used, each with the reason.
     """
 
     rig: HemoglobinRig
@@ -141,12 +141,12 @@ def fit_facial_color(
     radius_px
         Radius of the disc of eq. (1), px of the maps; None: a 32nd of the larger side.
     landmarks
-        Named points of each state's images, px of the maps; None: features are matched. A state
-        without any is laid over by features.
+        Named points of each state's images, px of the maps; None: features are matched, as
+        for states without landmarks.
     stored_size
-        Cells a side of the stored scale and bias maps.
+        Size of the stored scale and bias maps, cells per side.
     progress
-        Called with one line a step.
+        Called with one line per step.
 
     Returns
     -------
@@ -155,16 +155,16 @@ def fit_facial_color(
     Raises
     ------
     FacialColorFitError
-        When there is no state beside the neutral, or none that can be laid over it.
+        When the neutral state is the only one, or no other can be aligned to it.
     """
     states = subject.states
-    alone, expected = "the neutral state alone", "at least one other to make a rig of"
+    alone, expected = "the neutral state alone", "at least one other; add its session"
     Checks(FacialColorFitError).require(len(states) > 1, "sessions", alone, expected)
-    tell = progress or (lambda _: None)
+    report = progress or (lambda _: None)
     base = subject.images_of_state(NEUTRAL_STATE)[0]
     shape = base.maps["diffuse"].values.shape[:2]
     radius = max(shape) * RADIUS_FRACTION if radius_px is None else radius_px
-    aligned, left_out = _align(subject, base, landmarks or {}, tell)
+    aligned, left_out = _align(subject, base, landmarks or {}, report)
     of_state: dict[str, list[AlignedImage]] = {
         state: own
         for state in states
@@ -172,17 +172,19 @@ def fit_facial_color(
     }
     if len(of_state) < 2:
         reasons = "; ".join(f"{what}: {why}" for what, why in left_out)
-        raise FacialColorFitError(f"sessions: no state could be laid over the neutral: {reasons}")
-    tell("one melanin for all states")
+        hint = "capture again, or give landmarks"
+        got = f"no state could be aligned to the neutral one: {reasons}"
+        raise FacialColorFitError(f"sessions: {got}; {hint}")
+    report("one melanin for all states")
     shared = _one_melanin(subject, list(of_state.values()))
     blood = {state: _blood(shared, k) for k, state in enumerate(of_state)}
     if not blood[NEUTRAL_STATE].mask.any():
         raise UnknownBloodError(
-            "blood at rest: expected pixels that tell it, got a standard error of more than half "
-            "of it all over the face, as of very dark skin or little light; take more light, or "
-            "melanin alone: skinrig reconstruct --want melanin"
+            "blood at rest: got a standard error above half of it all over the face, expected "
+            "pixels that determine it; take more light or, for very dark skin, estimate melanin "
+            "alone: skinrig reconstruct --want melanin"
         )
-    tell("scale and bias maps")
+    report("scale and bias maps")
     mask = {state: found.mask for state, found in blood.items()}
     known = {state: np.where(mask[state], blood[state].values, np.nan) for state in blood}
     noise = dict(zip(blood, shared.noise_stderr_hemoglobin, strict=True))
@@ -211,7 +213,7 @@ def fit_facial_color(
 
 
 def _one_melanin(subject: SubjectImages, of_states: list[list[AlignedImage]]) -> SharedMelanin:
-    """Average the images of each state, and fit one melanin to all."""
+    """Average the images of each state, and fit one melanin map to all."""
 
     def average(images: list[AlignedImage]) -> tuple[Float32Array, Float32Array, BoolArray]:
         parts = zip(*((one.rgb, one.variance, one.valid) for one in images), strict=True)
@@ -239,7 +241,7 @@ def _align(
     landmarks: Mapping[str, Landmarks],
     report_progress: Callable[[str], None],
 ) -> tuple[list[AlignedImage], list[tuple[str, str]]]:
-    """Lay every image over the first neutral one."""
+    """Warp every image to the first neutral one."""
     found: list[AlignedImage] = []
     left_out: list[tuple[str, str]] = []
     fixed = base.maps["diffuse"]
@@ -248,7 +250,7 @@ def _align(
         if image is base:
             found.append(_aligned(image, diffuse, None))
             continue
-        report_progress(f"lay {image.name} over the neutral image")
+        report_progress(f"align {image.name} to the neutral image")
         marks = landmarks.get(image.state), landmarks.get(NEUTRAL_STATE)
         both = marks[0] is not None and marks[1] is not None
         try:
@@ -268,7 +270,7 @@ def _align(
 
 
 def _repeats(aligned: list[AlignedImage], *, timed: bool) -> Repeats | None:
-    """Compare repeats; None where no state has any, or too little of the face is known in all."""
+    """Compare repeats; None where no state has any, or their common valid area is too small."""
     states = [one.image.state for one in aligned]
     if len(set(states)) == len(states) or "hemoglobin" not in aligned[0].image.maps:
         return None
@@ -313,7 +315,7 @@ def _aligned(image: StateImage, diffuse: SkinMap, alignment: Alignment | None) -
 
 
 def _model_error(averages: list[tuple[Float32Array, Float32Array, BoolArray]]) -> Float64Array:
-    """Return each pixel's model error: the mean of what those states tell that show it."""
+    """Return each pixel's model error covariance, averaged over the states that observe it."""
     total = np.zeros((*averages[0][2].shape, 3, 3))
     count = np.zeros(averages[0][2].shape)
     for rgb, variance, valid in averages:
@@ -327,9 +329,10 @@ def _model_error(averages: list[tuple[Float32Array, Float32Array, BoolArray]]) -
 
 
 def _own_error(images: list[AlignedImage]) -> Float64Array:
-    """Return what a state's mean color errs by as its images were laid over another.
+    """Return the covariance of a state's mean color that its registration error causes.
 
-    Repeats move alike and err alike: their mean errs as one of them.
+    Repeats move alike, so their registration errors are fully correlated: the covariance of the
+    mean is the mean covariance, without a division by the number of repeats.
     """
     total = np.zeros((*images[0].valid.shape, 3, 3))
     count = np.zeros(images[0].valid.shape)
@@ -357,13 +360,13 @@ def _blood(shared: SharedMelanin, k: int) -> SkinMap:
 def _change(shared: SharedMelanin, k: int) -> SkinMap:
     both = shared.valid_states[k] & shared.valid_states[shared.reference]
     good = both & ~shared.is_misfit[k] & np.isfinite(shared.stderr_change[k])
-    what = "less the neutral state; errors that both share are left out"
+    what = "minus the neutral state; errors common to both cancel"
     change, stderr = shared.change[k], shared.stderr_change[k]
     return masked_map(change, stderr, good, MAP_UNITS["hemoglobin"], what)
 
 
 def alignment_document(fit: FacialColorFit) -> list[dict[str, Any]]:
-    """Return how each image was laid over the neutral one, as JSON values."""
+    """Return the alignment of each image to the neutral one, as JSON values."""
     rows = []
     for one in fit.aligned:
         if (found := one.alignment) is None:
@@ -383,14 +386,14 @@ def alignment_document(fit: FacialColorFit) -> list[dict[str, Any]]:
 
 
 def _number(value: Any) -> Any:
-    """Return a number as JSON takes it: None where it is not finite."""
+    """Convert a number to JSON: None where it is not finite."""
     if isinstance(value, str | bool | int):
         return value
     return float(value) if np.isfinite(value) else None
 
 
 def repeats_document(fit: FacialColorFit) -> dict[str, Any] | None:
-    """Return how far states repeat, as JSON values; None where nothing was repeated."""
+    """Return the repeatability of the states, as JSON values; None without repeats."""
     if fit.repeats is None:
         return None
 

@@ -1,4 +1,4 @@
-"""What sessions of the flash rig can be made into."""
+"""Recipe of the sessions of the flash rig."""
 
 from reconstruction.pipeline.flash import sequence
 from reconstruction.pipeline.recipe import Recipe

@@ -1,8 +1,8 @@
-"""A flash session in time: its stages, and the curves of blood of a sequence.
+"""Stages of a flash session, and the blood curves of a sequence.
 
-Every frame of a sequence is one crossed image at a time of its own. The frames of one subject
-share one melanin, so that only the blood is free from frame to frame; frames in which the face has
-moved are laid over the face at rest. The curves take the times at which the flash really popped.
+Each frame of a sequence is one cross-polarized image with its own time. The frames of one subject
+share one melanin map, so that only blood varies between frames. Frames in which the face has moved
+are warped to the face at rest. The curves use the measured times of the flash.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,33 +30,33 @@ STAGE_REVISION = 6
 CURVES_NAME = "perfusion_curves"
 CURVES_FILE = "perfusion_curves.json"
 MAP_NAMES = (*flash_stages.MAP_NAMES, CURVES_NAME)
-"""What can be made of a flash session."""
+"""Products of a flash session."""
 FILE_NAMES = (CURVES_FILE,)
 RADIUS_FRACTION = 0.02
-"""Radius of a place's disc, of the map's width: 5 mm of a face that fills the picture."""
+"""Radius of a site's disc over the map's width: 5 mm of a face that fills the image."""
 LANDMARK_ALIASES = {"cheek": "cheek left", "nose": "nose tip", "temple": "temple left"}
-"""Landmarks that stand for a place where a table does not have the place itself."""
+"""Landmark that replaces a site's own name in a table without it."""
 MAX_STILL_MOTION_PX = 0.1
-"""A face whose median pixel moves less has not moved."""
+"""Median displacement of the face below which it has not moved."""
 BLOOD_CURVE_STDERR = 0.07
-"""Standard error of how the root of blood is bent over its change: not all vessels follow alike,
-and light that goes from skin to skin, of which the inversion knows nothing, is absorbed twice. Set
-on 14 events of seeds 0 to 19, 192 px across: the least with which 95 % intervals hold 92 % or
-more (93 %); with none they hold 87 %."""
+"""Standard error of the curvature of the square root of blood over its change. Not all vessels
+respond alike, and interreflected light, which the inversion does not model, is absorbed twice.
+Value: the smallest with which 95 % intervals cover 92 % or more (93 %) in 14 events of seeds 0 to
+19, 192 px across; with 0 the coverage is 87 %."""
 
 
 def products(session: Session) -> Mapping[str, tuple[str, ...]]:
-    """Return the files that names stand for."""
+    """Return the products that each name means."""
     return {CURVES_NAME: (CURVES_FILE,)}
 
 
 def graph(inputs: Inputs) -> list[stages.PipelineStage]:
-    """Return the stages that a flash session can go through; see `stages.run`."""
+    """Return the stages of a flash session; see `graph.run_stages`."""
     session = inputs.session
     crossed = session.frames("subject", polarizer="crossed")
     refused = (
-        f"{session.path}: has no frames with a time, expected a sequence, such as "
-        "`skinrig capture flash --sequence smile` makes"
+        f"{session.path}: has no frames with a time, expected a sequence; capture one, as with "
+        "`skinrig capture flash --sequence smile`"
     )
     if any("time_s" in record.line.actual for record in crossed):
         refused = ""
@@ -88,7 +88,7 @@ def _curves(inputs: Inputs) -> bytes:
     means = blood.means
     if not means.valid.any():
         hint = "check the landmarks" if rig.white else "give it a calibration of white"
-        what = f"no place of {', '.join(places)} shows a color of skin in enough frames"
+        what = f"got no skin color at {', '.join(places)} in enough frames"
         raise InputsError(f"{session.path}: {what}; {hint}")
     curves = zip(means.mean, means.stderr, means.pixels, blood.stderr_of_pose, strict=True)
     columns = ("hemoglobin", "stderr", "pixels", "stderr_of_pose")
@@ -118,7 +118,7 @@ def _curves(inputs: Inputs) -> bytes:
 
 
 def _state(records: Sequence[FrameRecord]) -> str:
-    """Return the state of a sequence that is not rest."""
+    """Return the state of a sequence other than rest."""
     names = [str(record.index["state"]) for record in records if "time_s" in record.line.actual]
     return next((name for name in names if name != "neutral"), "neutral")
 
@@ -126,10 +126,10 @@ def _state(records: Sequence[FrameRecord]) -> str:
 def _places(
     inputs: Inputs, maps: Sequence[SkinMap], at_rest: BoolArray
 ) -> dict[str, tuple[float, float]]:
-    """Return where the places lie on the face at rest, px."""
+    """Return the positions of the sites on the face at rest, px."""
     skin = np.mean([m.mask for m, rest in zip(maps, at_rest, strict=True) if rest], axis=0) > 0.5
     if inputs.landmarks is None:
-        outline = "places: by the face's outline; a table of landmarks says where they are"
+        outline = "places: by the face's outline; give a table of landmarks for exact positions"
         inputs.assumed.append(outline)
         return perfusion_curves.standard_positions(skin)
     table, names = landmark_table.read_landmark_table(inputs.landmarks), perfusion_curves.FACE_SITES
@@ -144,7 +144,7 @@ def _places(
 def _align_to_rest(
     maps: Sequence[SkinMap], phase: Float64Array, prompt_s: float, inputs: Inputs
 ) -> tuple[BoolArray, list[SkinMap]]:
-    """Tell in which frames the face has moved, and lay those over the face at rest."""
+    """Detect the frames in which the face has moved, and warp those to the face at rest."""
     settled_on = (phase > 0.5 * prompt_s) & (phase < prompt_s)
     settled_off = phase > 1.5 * prompt_s
     still = np.zeros(len(maps), bool)
@@ -165,8 +165,8 @@ def _align_to_rest(
         return still, list(maps)
     both = on_valid & off_valid
     moved = np.array([_is_more_similar(m, on, off, both) for m in maps])
-    # all moved frames are laid by one alignment: what it is off by is no noise from frame to frame,
-    # but part of the step between poses
+    # one alignment warps all moved frames: its error is constant over them, so it enters the step
+    # between poses and not the noise from frame to frame
     laid = [alignment.warp_map(m) if is_on else m for m, is_on in zip(maps, moved, strict=True)]
     return moved, laid
 
@@ -181,7 +181,7 @@ def _mean(maps: Sequence[SkinMap], chosen: BoolArray) -> tuple[Float32Array, Boo
 def _is_more_similar(
     image: SkinMap, one: Float32Array, other: Float32Array, both: BoolArray
 ) -> bool:
-    """Tell whether a frame is more like one picture than like another, in red: blood's least."""
+    """Return whether a frame is closer to the first template, in red, where blood varies least."""
     good = both & image.mask
     if not good.any():
         return False
@@ -201,7 +201,7 @@ def _cycle_document(
     session: Session,
     names: Sequence[str],
 ) -> dict[str, Any]:
-    """Return the part of the document about a prompted cycle."""
+    """Return the document's part on a prompted cycle."""
     cycle_s = 2 * prompt_s
     known = np.isfinite(phase)
     groups = perfusion_curves.group_by_phase(phase[known], cycle_s=cycle_s)
@@ -252,10 +252,10 @@ def _fit_prompts(
     which: Sequence[int],
     cycle_s: float,
 ) -> perfusion_fit.RelaxationFit:
-    """Fit the radius of the vessels of some places, of which blood is the cross-section."""
+    """Fit the vessel radius of some sites; blood is proportional to its square."""
     means = blood.means.mean[which][:, known]
     root = np.sqrt(np.where(means > 0.0, means, np.nan))
-    slope = 0.5 / root  # of the root over blood
+    slope = 0.5 / root  # d sqrt(b) / db = 1 / (2 sqrt(b))
     stderr = np.array([_floor_stderr(row) for row in blood.means.stderr[which][:, known] * slope])
     of_pose = blood.stderr_of_pose[which] * np.nanmean(slope, axis=1)
     found = perfusion_fit.fit_cycle(
@@ -270,7 +270,7 @@ def _fit_prompts(
 
 
 def _floor_stderr(stderr: Float64Array) -> Float64Array:
-    """Return standard errors that count no frame for much more than the usual one."""
+    """Add the median standard error in quadrature, which limits the weight of single frames."""
     finite = stderr[np.isfinite(stderr)]
     usual = float(np.median(finite)) if finite.size else 0.0
     return np.asarray(np.hypot(stderr, usual))
@@ -279,7 +279,7 @@ def _floor_stderr(stderr: Float64Array) -> Float64Array:
 def _event_document(
     time: Float64Array, means: perfusion_curves.DiscMeans, names: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the part of the document about what follows an event."""
+    """Return the document's part on the response to an event."""
     known = np.isfinite(time)
     usable = [k for k in range(len(names)) if np.isfinite(means.mean[k][known]).sum() >= 5]
     radius = np.sqrt(np.maximum(means.mean, 0.0))  # of vessels, up to a factor
@@ -296,7 +296,7 @@ def _event_document(
 
 
 def _fit_document(fit: perfusion_fit.RelaxationFit, curve: int | None) -> dict[str, Any]:
-    """Return a fit's document, and how many standard errors its levels lie apart."""
+    """Return a fit's document, with the step between its levels in standard errors."""
     names = "time_constant_s stderr_time_constant_s interval_s interval_68_s known delay_s"
     document = stages.select_attributes(fit, f"{names} stderr_delay_s delay_interval_s")
     document["text"] = str(fit)

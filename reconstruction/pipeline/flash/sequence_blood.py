@@ -1,10 +1,10 @@
-"""Blood of places of a face in every frame of a sequence, under one melanin.
+"""Blood volume fraction of sites of a face in every frame of a sequence, with one melanin map.
 
-A pixel's melanin is the same in all frames, so only its blood and its light are free. Light
-changes little between frames of a face that holds still, and smoothly over the skin; then many
-pixels tell it, and the brightness of a pixel tells its blood, too. That is several times less
-noisy than the color alone. Where the face has moved, the light on it has changed with every
-wrinkle: frames of one pose are then compared by their light, poses by color alone.
+A pixel's melanin is constant, so only its blood and its illumination vary. On a still face the
+illumination changes little between frames, and smoothly over the skin. Many pixels then determine
+it, and each pixel's brightness constrains its blood. This is several times less noisy than color
+alone. Where the face has moved, every wrinkle changes the illumination: frames of one pose are
+then compared by brightness, poses by color alone.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from reconstruction.facial_color.perfusion_curves import DiscMeans, average_disc
 from reconstruction.pipeline.flash import stages as flash_stages
 
 LIGHT_RADII, LEAST_LIGHT_PX = 3.0, 6.0
-"""How smoothly the light of a place changes between frames: in radii of its disc, and px."""
+"""Correlation length of illumination changes between frames: in radii of a disc, and in px."""
 POSE_STDERR_FRACTION = 0.10
-"""Standard error, beside noise, of the blood of a moved face against that at rest, of the blood:
-light, shadows and what lies under a pixel change with the pose. Most likely of the cheeks, where
-the expression moves skin most, of 19 smiles of seeds 0 to 18, 192 px across; of noses 0.03, of
-places that hardly move less than 0.02."""
+"""Relative standard error, in addition to noise, of the blood of a moved face against that at rest:
+illumination, shadows and the skin under a pixel change with the pose. Maximum likelihood value for
+the cheeks, where the expression moves skin most, of 19 smiles of seeds 0 to 18, 192 px across; of
+noses 0.03, of sites that hardly move less than 0.02."""
 MIN_VALID_FRAME_FRACTION = 0.9
-"""Part of the frames in which a pixel must be usable."""
+"""Minimum fraction of the frames in which a pixel must be valid."""
 
 
 @dataclass(frozen=True, slots=True)
 class SkinColorModel:
-    """What colors of skin are compared with."""
+    """Model of skin colors that images are inverted with."""
 
     table: ColorTable
     prior: ShadingPrior
@@ -45,7 +45,7 @@ class SkinColorModel:
 
     @staticmethod
     def of(rig: flash_stages.FlashRig) -> SkinColorModel:
-        """Return that of a session."""
+        """Return the model of a session."""
         has_white = rig.white is not None
         colors = flash_stages.load_skin_colors(rig.camera, rig.illuminant, has_white=has_white)
         return SkinColorModel(*colors, np.asarray(model_error.load_covariance()))
@@ -53,13 +53,13 @@ class SkinColorModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteBlood:
-    """Blood of P places in N frames."""
+    """Blood volume fraction of P sites in N frames."""
 
     means: DiscMeans
     """Means and standard errors from frame to frame."""
     stderr_of_pose: Float64Array
     """(P,): standard error that all frames of a moved face share, against those at rest; 0 where
-    nothing has moved."""
+    the face has not moved."""
     moved: BoolArray
     """(N,): frames in which the face has moved."""
 
@@ -72,18 +72,18 @@ def average_disc_blood(
     *,
     moved: BoolArray,
 ) -> SiteBlood:
-    """Return the mean blood of discs in each of some frames.
+    """Average blood over discs in each frame.
 
     Parameters
     ----------
     maps
         Diffuse reflectance of each frame, on the face at rest.
-    places
-        Centres of the discs, px.
+    positions
+        Centers of the discs, px.
     radius_px
         Their radius, px.
     light
-        What colors are compared with.
+        Model of skin colors.
     moved
         (N,): frames in which the face has moved.
     """
@@ -125,7 +125,7 @@ def _of_place(
             shading_window_px=smooth_px,
         )
         good = blood.valid_states & ~blood.is_misfit & np.isfinite(blood.hemoglobin)
-        # a pixel counts in nearly all frames or in none: who is in it would change the mean
+        # a pixel counts in nearly all frames or in none, else the changing set would shift the mean
         good &= good.mean(axis=0) >= MIN_VALID_FRAME_FRACTION
         return average_discs(
             blood.hemoglobin, at, radius_px, stderr=blood.noise_stderr_hemoglobin, valid=good
@@ -143,13 +143,14 @@ def _of_place(
         if both.sum() < 2:
             mean[pose] = np.nan
             continue
+        # brightness gives the precise curve within a pose, color the level between poses
         level = float(by_color.mean[0, pose][both].mean() - by_light.mean[0][both].mean())
         mean[pose] = by_light.mean[0] + level
         stderr[pose] = by_light.stderr[0]
         variances.append(float(np.square(by_color.stderr[0, pose][both]).sum()) / both.sum() ** 2)
     counted = np.where(np.isfinite(mean), by_color.pixels[0], 0)
     found = DiscMeans(mean[None], stderr[None], counted[None])
-    if len(variances) < 2:  # one pose alone: nothing to be joined
+    if len(variances) < 2:  # a single pose needs no combination
         return found, 0.0
     of_light = POSE_STDERR_FRACTION * float(np.nanmean(mean))
     return found, float(np.sqrt(np.sum(variances) + of_light**2))

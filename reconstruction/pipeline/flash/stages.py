@@ -1,4 +1,4 @@
-"""The flash rig's stages: parallel and crossed frames to chromophores and pictures."""
+"""Stages of the flash rig: parallel and crossed frames to chromophores and displayed images."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,13 +34,13 @@ from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.masked_map import masked_map
 
 STAGE_REVISION = 7
-"""Grows when the code of a stage changes its result, so that older maps are computed again."""
+"""Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = tuple(
     "melanin hemoglobin shading residual gamut_distance diffuse specular picture specular_picture "
     "tsumura_melanin tsumura_hemoglobin melanin_noise_stderr hemoglobin_noise_stderr".split()
 )
-"""Maps that can be made of a flash session."""
+"""Maps of a flash session."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class FlashImage:
 
 @dataclass(frozen=True, slots=True)
 class FlashRig:
-    """What the stages read, and what they have to assume for want of a calibration."""
+    """Session, calibrations and assumed values that the stages read."""
 
     inputs: Inputs
     sensor: SensorCalibration | None
@@ -62,9 +62,9 @@ class FlashRig:
     polarization: PolarizationCalibration | None
     color: ColorMatrix | None
     neutral: Float64Array | None
-    """Camera RGB of a white surface, as the color matrix was fitted to."""
+    """Camera RGB of a white surface that the color matrix was fitted with."""
     camera: str
-    """Name of the spectral sensitivities that the color table is built for."""
+    """Name of the spectral sensitivities of the color table."""
     illuminant: str
 
     @property
@@ -74,12 +74,12 @@ class FlashRig:
 
     @property
     def imported(self) -> bool:
-        """Whether the frames are photographs that were imported."""
+        """Whether the frames are imported photographs."""
         return "photographs" in self.session.manifest.extra
 
 
 def graph(inputs: Inputs) -> list[stages.PipelineStage]:
-    """Return the stages that a flash session can go through; see `stages.run`."""
+    """Return the stages of a flash session; see `graph.run_stages`."""
     rig = load_flash_rig(inputs)
     stage = inputs.stage_maker(STAGE_REVISION)
     table = {"camera": rig.camera, "illuminant": rig.illuminant}
@@ -98,7 +98,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
 
 
 def load_flash_rig(inputs: Inputs) -> FlashRig:
-    """Return what the stages of a flash session read, and note what is assumed."""
+    """Load the inputs of a flash session's stages, and record the assumptions."""
     session = inputs.session
     shots = session.frames("subject", state=inputs.state)
     view = session.rig.view(shots[0].camera) if shots else session.rig.views[0]
@@ -106,13 +106,13 @@ def load_flash_rig(inputs: Inputs) -> FlashRig:
     def load(kind: str, otherwise: str) -> Calibration | None:
         return inputs.load(kind, [view.serial], otherwise)
 
-    sensor = load("sensor", "the frames are as noisy as they say of themselves")
-    balance = "a white tile would fill 80 % of the range"
+    sensor = load("sensor", "the frames' noise is that of their own noise profiles")
+    balance = "a white reference would fill 80 % of the range"
     if "photographs" in session.manifest.extra:
-        balance = "white is what the file's own white balance says"
+        balance = "white is the white balance recorded in the file"
     white = load("white", f"the light is even and {balance}")
     malus = load("polarization", "the polarizers are perfect")
-    matrix = load("color", "pictures show balanced camera RGB as if it were linear sRGB")
+    matrix = load("color", "images show balanced camera RGB as if it were linear sRGB")
     illuminant = session.rig.lights[0].illuminant
     inputs.noted["color_table"] = {"camera": view.spectral_sensitivity, "illuminant": illuminant}
     return FlashRig(
@@ -130,14 +130,14 @@ def load_flash_rig(inputs: Inputs) -> FlashRig:
 def load_skin_colors(
     camera: str, illuminant: str, *, has_white: bool
 ) -> tuple[ColorTable, ShadingPrior]:
-    """Return what colors of skin are compared with: the table, and how bright pixels may be.
+    """Load the model of skin colors: the color table, and the prior of pixel brightness.
 
     Parameters
     ----------
     camera, illuminant
         Names of spectra.
     has_white
-        Whether a white tile says how long was exposed.
+        Whether a white reference fixes the exposure.
     """
     table = color_table.build(camera, illuminant, anisotropy=ANISOTROPY_SKIN)
     prior = shading_prior.face_prior()
@@ -145,7 +145,7 @@ def load_skin_colors(
 
 
 def _frames(rig: FlashRig) -> Mapping[str, Any]:
-    """Average the repeats of each polarizer state and subtract the darks."""
+    """Average the repeats of each polarizer state and subtract the dark frames."""
     session, state, repeat = rig.session, rig.inputs.state, rig.inputs.repeat
     mean_image = _image_reader(rig)
     images: dict[str, FlashImage | None] = {}
@@ -158,7 +158,7 @@ def _frames(rig: FlashRig) -> Mapping[str, Any]:
     if images["crossed"] is None:
         crossed = session.frames("subject", polarizer="crossed")
         states = sorted({str(record.index.get("state")) for record in crossed})
-        # nobody was asked for the polarizers of photographs
+        # photographs were imported without a choice of polarizers
         what = "photograph" if rig.imported else "crossed frame"
         there = "none at all: is it finished?"
         if states:
@@ -168,9 +168,9 @@ def _frames(rig: FlashRig) -> Mapping[str, Any]:
 
 
 def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], FlashImage]:
-    """Return what averages frames of one polarizer state and subtracts the darks."""
+    """Return a function that averages frames of one polarizer state and subtracts dark frames."""
     session = rig.session
-    # the cells of an imported picture are its pixels; a sensor's sites stand beside each other
+    # an imported image has one cell per pixel; a sensor mosaic has one per 2 x 2 sites
     demosaic: raw.Demosaic = "superpixel" if rig.imported else "centered"
     gain, read_noise = _noise(rig.sensor)
 
@@ -190,7 +190,7 @@ def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], FlashImage
     def mean_image(records: Sequence[FrameRecord]) -> FlashImage:
         linear = linear_light(records)
         sizes, name = {image.rgb.shape for image in linear}, f"{records[0].index['polarizer']}"
-        expected = "one camera setting"
+        expected = "one camera setting; choose frames of one"
         Checks(InputsError).require(len(sizes) == 1, f"{name} frames", f"sizes {sizes}", expected)
         power = sum(float(record.settings.get("power", 1.0)) for record in records)
         rgb = total(linear, "rgb") - len(linear) * dark
@@ -205,16 +205,16 @@ def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], FlashImage
 
 
 def separate_each(rig: FlashRig, records: Sequence[FrameRecord]) -> Iterator[SkinMap]:
-    """Yield the diffuse reflectance that each of some crossed frames shows alone."""
+    """Yield the diffuse reflectance of each crossed frame alone."""
     mean_image = _image_reader(rig)
     for record in records:
         yield _separate(rig, None, mean_image([record]))["diffuse"]
 
 
 def _noise(sensor: SensorCalibration | None) -> tuple[float, float] | tuple[None, None]:
-    """Return gain (electrons per DN) and read noise with rounding, electrons; or leave both open.
+    """Return gain (electrons per DN) and read noise with rounding, electrons; or None for both.
 
-    What the camera was measured to do goes before what its frames say of themselves.
+    A calibration overrides the noise profile of the frames.
     """
     if sensor is None:
         return None, None
@@ -226,8 +226,10 @@ def _noise(sensor: SensorCalibration | None) -> tuple[float, float] | tuple[None
 def _separate(
     rig: FlashRig, parallel: FlashImage | None, crossed: FlashImage
 ) -> Mapping[str, SkinMap]:
-    """Split into diffuse and specular light, relative to a white tile in the same place."""
+    """Separate diffuse and specular reflection, relative to a white reference at the same pixel."""
     white = rig.white
+    # diffuse light is unpolarized: the crossed analyzer transmits half of it and, ideally, no
+    # specular reflection
     diffuse = FlashImage(2 * crossed.rgb, 4 * crossed.variance, crossed.valid)
     specular = specular_error = np.zeros_like(crossed.rgb)
     specular_valid = np.zeros(crossed.valid.shape, bool)
@@ -240,11 +242,12 @@ def _separate(
             variance=(parallel.variance, crossed.variance),
         )
         if separated.stderr is None or separated.stderr_specular is None:
-            raise InputsError("separation: gave no standard errors; give it variances")
+            got = "got an estimate without standard errors"
+            raise InputsError(f"separation: {got}, expected some; give it variances")
         specular = separated.specular.astype(np.float32)
         specular_error = separated.stderr_specular.astype(np.float32)
         specular_valid = np.asarray(separated.valid)
-        # a highlight that saturates the parallel image leaves the crossed one usable
+        # a highlight that saturates the parallel image leaves the crossed one valid
         alone = (crossed.valid & ~specular_valid)[..., None]
         rgb = np.where(alone, diffuse.rgb, separated.diffuse)
         variance = np.where(alone, diffuse.variance, np.square(separated.stderr))
@@ -258,17 +261,17 @@ def _separate(
         valid = np.ones(diffuse.valid.shape, bool)
     dim = (reflectance < MIN_SIGNAL_SIGMAS * np.sqrt(variance)).any(axis=-1)
     valid = valid & diffuse.valid & ~dim
-    over, shines = "specular light over that of a white tile", specular_valid & valid
+    over, shines = "specular light over that of a white reference", specular_valid & valid
     return {
-        "diffuse": _map3(reflectance, np.sqrt(variance), valid, "white tile in its place = 1"),
+        "diffuse": _map3(reflectance, np.sqrt(variance), valid, "white reference in place = 1"),
         "specular": _map3(specular / level, specular_error / level, shines, over),
     }
 
 
 MIN_SIGNAL_SIGMAS = 5.0
-"""Signal over noise below which a pixel is background, not skin."""
+"""Signal-to-noise ratio below which a pixel is background, not skin."""
 ASSUMED_WHITE_LEVEL = 0.8
-"""Share of the range that a white tile is taken to fill when no white reference is at hand."""
+"""Fraction of the range that a white reference is assumed to fill without a calibration."""
 
 
 def _assumed_white(rig: FlashRig) -> Float32Array:
@@ -304,7 +307,8 @@ def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     found, by_face = whole.found, whole.by_face
     by_noise = partial(chromophore_posterior.estimate, rgb, table, prior=prior, variance=variance)
     noise_alone = by_noise(face=whole.face)
-    if whole.face is not None:  # moles, lips and lids may be no skin of that face's usual kind
+    # the face's prior does not apply to moles, lips and eyelids, which can be other skin
+    if whole.face is not None:
         noise_alone = dark_spots.average_hypotheses(
             noise_alone, by_noise(valid=whole.spots), whole.spots
         )
@@ -313,18 +317,18 @@ def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     def chromophore(name: str) -> dict[str, SkinMap]:
         error, unit = f"stderr_{name}", MAP_UNITS[name]
         noise = getattr(noise_alone, error)
-        # spots are wide on purpose; they say nothing of what is known of the skin around them
+        # spots have wide intervals by design, so they must not enter their neighborhood's average
         usual, usual_error = getattr(by_face, name), getattr(by_face, error)
         good = is_detectable(usual, usual_error, usable & np.isfinite(noise))
         values, stderr = getattr(found, name), getattr(found, error)
         why = "invalid where noise and model error leave it unknown"
-        alone = "standard error that noise alone would leave, without model error"
+        alone = "standard error by noise alone, without model error"
         return {
             name: masked_map(values, stderr, good, unit, why),
             name + NOISE_STDERR_SUFFIX: masked_map(noise, None, good, unit, alone),
         }
 
-    what = "how far the color lies outside the model's, relative"
+    what = "relative distance of the color from the model's gamut"
     return {
         **chromophore("melanin"),
         **chromophore("hemoglobin"),
@@ -335,9 +339,9 @@ def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap]:
 
 
 NOISE_STDERR_SUFFIX = "_noise_stderr"
-"""Ending of the maps of the standard errors that noise alone would leave."""
+"""Suffix of the maps of standard errors by noise alone."""
 EXPOSURE_LOG_SD = 1.0
-"""Spread of log exposure when no white tile was captured and the exposure is not known."""
+"""Standard deviation of log exposure without a white reference."""
 
 
 def _tsumura(diffuse: SkinMap) -> Mapping[str, SkinMap]:
@@ -351,7 +355,7 @@ def _tsumura(diffuse: SkinMap) -> Mapping[str, SkinMap]:
 
 
 def _pictures(rig: FlashRig, diffuse: SkinMap, specular: SkinMap) -> Mapping[str, SkinMap]:
-    """Show diffuse and specular light in linear sRGB."""
+    """Convert diffuse and specular light to linear sRGB."""
     picture = diffuse.values.astype(np.float64)
     if rig.color is not None and rig.neutral is not None:
         picture = rig.color.to_linear_srgb(picture * rig.neutral)

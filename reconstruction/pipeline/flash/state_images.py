@@ -1,4 +1,4 @@
-"""What flash sessions show of one subject: every state and repeat, reconstructed alike."""
+"""Reconstruct every expression and repeat of one subject's flash sessions alike."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ REPEATED_MAPS = (
     *CHROMOPHORE_NAMES,
     *(name + flash_stages.NOISE_STDERR_SUFFIX for name in CHROMOPHORE_NAMES),
 )
-"""Where states are repeated each image's own chromophores tell how far they repeat."""
+"""Where states are repeated, each image's own chromophores measure their repeatability."""
 
 Landmarks = Mapping[str, tuple[float, float]]
 
@@ -36,13 +36,13 @@ class StateImage:
         Name of the state.
     repeat
         Number of the pair within its session and state.
-    session
+        Number of the pair within its session and state.
         Index of the session among those given.
     captured_s
         When the crossed image was taken, seconds since the first session began.
     maps
-        Diffuse reflectance; where any state is repeated also the chromophores as they follow from
-        this image alone, and their errors by noise.
+        Diffuse reflectance; where any state is repeated also the chromophores estimated from this
+        image alone, and their errors by noise.
     """
 
     state: str
@@ -53,13 +53,13 @@ class StateImage:
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Name in messages."""
         return f"{self.state}, repeat {self.repeat} of session {self.session}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SubjectImages:
-    """All that was captured of one subject.
+    """Images of one subject in all captured states.
 
     Attributes
     ----------
@@ -68,17 +68,17 @@ class SubjectImages:
     inputs
         SHA-256 of everything that was read.
     assumed
-        What was taken for granted for want of a calibration.
+        Assumptions that replace missing calibrations.
     source, seed
         Of the sessions.
     camera, illuminant
-        Names of the spectra that the color table is built for.
+        Names of the spectra of the color table.
     has_white
-        Whether the exposure is known from a white tile.
+        Whether a white reference fixes the exposure.
     consent
-        What the subject of each measured session agreed to, as in its session.json.
+        Consent of the subject of each measured session, as in its session.json.
     timed
-        Whether times are those of capture: of photographs only that of their import is known.
+        Whether times are those of capture; for photographs only the time of import is known.
     """
 
     images: tuple[StateImage, ...]
@@ -126,7 +126,7 @@ def reconstruct_states(
         When a session shows no subject, no state is neutral, or sizes or cameras differ.
     """
     check = Checks(InputsError)
-    check.require(sessions, "sessions", "none", "at least one of the flash rig")
+    check.require(sessions, "sessions", "none", "at least one of the flash rig; give one")
     opened = [Session.open(path) for path in sessions]
     start = min(session.manifest.created_at for session in opened)
     images: list[StateImage] = []
@@ -136,10 +136,10 @@ def reconstruct_states(
     has_white = True
     pairs = [_pairs(session, path) for path, session in zip(sessions, opened, strict=True)]
     named = [state for group in pairs for state, _, _ in group]
-    # told before minutes are spent on images
+    # checked before minutes of computation
     shown, expected = (
         ", ".join(sorted(set(named))),
-        f"{NEUTRAL_STATE!r}, which others are laid over",
+        f"{NEUTRAL_STATE!r}, to which the others are aligned; add its session",
     )
     check.require(NEUTRAL_STATE in named, "states of sessions", shown, expected)
     maps = REPEATED_MAPS if len(set(named)) < len(named) else SINGLE_MAPS
@@ -160,9 +160,11 @@ def reconstruct_states(
             spectra = inputs.noted["color_table"]
             table.add((str(spectra["camera"]), str(spectra["illuminant"])))
             has_white = has_white and "calibration white" in inputs.hashes
-    check.require(len(table) == 1, "sessions", f"{len(table)} cameras or lights", "one of each")
+    one_rig = "one of each; choose sessions of one rig"
+    check.require(len(table) == 1, "sessions", f"{len(table)} cameras or lights", one_rig)
     shapes = {image.maps["diffuse"].values.shape for image in images}
-    check.require(len(shapes) == 1, "sessions", f"images of sizes {sorted(shapes)}", "one size")
+    one_size = "one size; choose sessions of one camera setting"
+    check.require(len(shapes) == 1, "sessions", f"images of sizes {sorted(shapes)}", one_size)
     ((camera, illuminant),) = table
     simulated = any(session.source == "simulated" for session in opened)
     return SubjectImages(
@@ -183,7 +185,7 @@ def _pairs(session: Session, path: Path) -> list[tuple[str, int, float]]:
     """Return state, repeat and seconds since the first frame of each crossed image."""
     crossed = session.frames("subject", polarizer="crossed")
     got = "no crossed frame of a subject"
-    Checks(InputsError).require(crossed, f"{path}", got, "a session of the flash rig")
+    Checks(InputsError).require(crossed, f"{path}", got, "a session of the flash rig; give one")
     first = min(record.line.t_host_s for record in session.frames())
     return [
         (str(at["state"]), int(at.get("repeat", 0)), float(line.t_host_s - first))

@@ -1,4 +1,4 @@
-"""Pictures of a gradient-sphere session: one state of the skin at a time, darks subtracted."""
+"""Read the images of a gradient-sphere session, one state of the skin at a time."""
 
 import dataclasses
 import math
@@ -19,17 +19,17 @@ Key = tuple[str, str]
 
 @dataclass(frozen=True, slots=True)
 class SkinState:
-    """What the caliper was set to while one series of patterns was taken."""
+    """Setting of the caliper during one series of patterns."""
 
     name: str
     angle_deg: float
     """Of the jaws' axis, from +x towards +y."""
     step: int
-    """Of the caliper; 0 neutral, below 0 compressed."""
+    """Step of the caliper; 0 neutral, below 0 compressed."""
     reading_mm: float
-    """Distance of the jaws that the box reports; NaN where it says nothing."""
+    """Distance of the jaws that the controller reports; NaN without a reading."""
     force_n: float
-    """Force on the jaws that the box reports, N; NaN where it says nothing."""
+    """Force on the jaws that the controller reports, N; NaN without a reading."""
 
     @property
     def angle_rad(self) -> float:
@@ -39,14 +39,14 @@ class SkinState:
 
 @dataclass(frozen=True, slots=True)
 class StatePatterns:
-    """The pictures of one state.
+    """Images of one state.
 
     Attributes
     ----------
     values, variance
-        By pattern and polarizer, (H, W) float32, fraction of full scale; darks are subtracted.
+        By pattern and polarizer, (H, W) float32, fraction of full scale; dark frames subtracted.
     valid
-        (H, W) bool; False where a picture is saturated.
+        (H, W) bool; False where an image is saturated.
     """
 
     values: Mapping[Key, Float32Array]
@@ -55,33 +55,34 @@ class StatePatterns:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of the pictures."""
+        """Rows and columns of the images."""
         return self.valid.shape[0], self.valid.shape[1]
 
     def crossed(self) -> Float32Array:
-        """Return the light from inside the skin: all crossed pictures together.
+        """Return the subsurface-scattered light, the sum of all crossed images.
 
         Raises
         ------
         InputsError
-            When there is none.
+            Without a lit crossed image.
         """
         crossed = {key[0]: image for key, image in self.values.items() if key[1] == "crossed"}
         lit = [image for pattern, image in crossed.items() if pattern != "dark"]
         if not lit:
-            raise InputsError("state: has no lit picture with crossed polarizers")
+            got = "got no lit image with crossed polarizers, expected at least one"
+            raise InputsError(f"state: {got}; capture the state again")
         return np.mean(lit, axis=0, dtype=np.float32)
 
 
 class GradientImages:
-    """Reads the states of a session of the gradient sphere, one when it is asked for.
+    """Reads the states of a gradient-sphere session, one per request.
 
     Parameters
     ----------
     session
         Open for reading.
     noise
-        Calibrated gain and read noise; None takes each frame at its own word.
+        Calibrated gain and read noise; None: the noise profile of each frame.
 
     Attributes
     ----------
@@ -91,7 +92,7 @@ class GradientImages:
     Raises
     ------
     InputsError
-        When the session holds no such frames, or no neutral state to compare with.
+        When the session has no frames of that kind, or no neutral state as a reference.
     """
 
     def __init__(self, session: Session, *, noise: ElectronNoise | None = None) -> None:
@@ -110,13 +111,14 @@ class GradientImages:
             key = str(index["pattern"]), str(index["polarizer"])
             self._records.setdefault(name, {}).setdefault(key, []).append(record)
         if not found:
-            raise InputsError(f"{session.path}: has no frames of kind 'gradient'")
+            hint = "give a session of the gradient sphere"
+            raise InputsError(f"{session.path}: has no frames of kind 'gradient'; {hint}")
         states = list(found.values())
         first = next((state for state in states if state.step == 0), None)
         if first is None:
             raise InputsError(
-                f"{session.path}: has no neutral state, caliper step 0, that the others "
-                "could be compared with"
+                f"{session.path}: has no neutral state, caliper step 0, as the reference; "
+                "capture it"
             )
         self.states = (first, *(state for state in states if state is not first))
         self._dark: Float32Array | None = None
@@ -124,11 +126,11 @@ class GradientImages:
 
     @property
     def neutral(self) -> SkinState:
-        """The first neutral state, which all strain is told against."""
+        """The first neutral state, the reference of all strains."""
         return self.states[0]
 
     def of(self, state: SkinState) -> StatePatterns:
-        """Return the pictures of a state.
+        """Return the images of a state.
 
         Frames of one pattern are averaged.
 
@@ -151,14 +153,16 @@ class GradientImages:
             variance[key] = spread + np.float32(self._dark_variance)
             valid = good if valid is None else valid & good
             if mean.shape != next(iter(values.values())).shape:
-                raise InputsError(f"state {state.name}: its frames differ in size")
+                hint = "capture the state again"
+                raise InputsError(f"state {state.name}: its frames differ in size; {hint}")
         if valid is None:
-            raise InputsError(f"state {state.name}: has no lit picture")
+            got = "got no lit image, expected at least one"
+            raise InputsError(f"state {state.name}: {got}; capture the state again")
         return StatePatterns(values, variance, valid)
 
     def _mean(self, records: Sequence[FrameRecord]) -> tuple[Float32Array, Float32Array, BoolArray]:
         if not records:
-            raise InputsError("a pattern has no frame")
+            raise InputsError("a pattern has no frame; capture the state again")
         noise = {} if self._noise is None else dataclasses.asdict(self._noise)
         frames = (raw.linear_mono(self._session.read(record), **noise) for record in records)
         total, variance, valid = next(frames)
@@ -168,7 +172,7 @@ class GradientImages:
         return total / count, variance / count**2, valid
 
     def _darkness(self) -> Float32Array | None:
-        """Return the mean of all frames without light, with the fixed pattern of the sensor."""
+        """Return the mean of all dark frames, with the fixed pattern of the sensor."""
         if self._dark is None:
             taken = [item for by_key in self._records.values() for item in by_key.items()]
             records = [

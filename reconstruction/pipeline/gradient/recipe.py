@@ -1,4 +1,4 @@
-"""What sessions of the gradient sphere can be made into."""
+"""Recipe of the sessions of the gradient sphere."""
 
 from reconstruction.pipeline.gradient import stages
 from reconstruction.pipeline.recipe import Recipe

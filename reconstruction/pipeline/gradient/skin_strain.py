@@ -1,4 +1,4 @@
-"""What strain the skin of each state was under, beside what the caliper says of it."""
+"""Measure the strain of the skin in each state from its images, next to the caliper's reading."""
 
 import math
 from collections.abc import Mapping
@@ -13,17 +13,17 @@ from reconstruction.pipeline.gradient.images import GradientImages, SkinState
 from reconstruction.registration.strain import Strain, measure_strain
 
 SKIN_LEVEL = 0.4
-"""Of the bright part of a crossed picture: what is darker, over some pixels, is no skin."""
+"""Fraction of the bright part of a smoothed crossed image below which a pixel is not skin."""
 SKIN_SIGMA_PX = 8.0
 
 
 def skin_mask(picture: Float32Array) -> BoolArray:
-    """Return where a crossed picture shows skin: jaws and background are dark.
+    """Segment the skin in a crossed image; jaws and background are dark.
 
     Parameters
     ----------
     picture
-        Light from inside the skin, (H, W).
+        Subsurface-scattered light, (H, W).
     """
     even = ndimage.gaussian_filter(picture, SKIN_SIGMA_PX, mode="nearest")
     mask: BoolArray = even > SKIN_LEVEL * np.percentile(even, 90)
@@ -32,11 +32,11 @@ def skin_mask(picture: Float32Array) -> BoolArray:
 
 @dataclass(frozen=True, slots=True)
 class StateStrain:
-    """How the skin of a state was strained, beside what the caliper says."""
+    """Measured strain of the skin in one state, with the caliper's reading."""
 
     state: SkinState
     ratio: float
-    """What the caliper's reading says of the stretch: its distance over that of the neutral."""
+    """Stretch by the caliper: distance of its jaws over that in the neutral state."""
     strain: Strain
 
     @property
@@ -51,11 +51,11 @@ class StateStrain:
 
     @property
     def stretch_t(self) -> tuple[float, float]:
-        """Stretch ratio across them, and its standard error."""
+        """Stretch ratio across the jaws, and its standard error."""
         return self.strain.stretch_along(self.state.angle_rad + math.pi / 2)
 
     def document(self, pixel_um: float) -> dict[str, Any]:
-        """Return this as numbers, texts and arrays, lengths in um."""
+        """Return strain and setting as numbers, texts and arrays, lengths in um."""
         strain, angle = self.strain, self.state.angle_rad
         (r_s, r_s_error), (r_t, r_t_error) = self.stretch_s, self.stretch_t
         shear, shear_error = strain.shear(angle)
@@ -85,8 +85,8 @@ class StateStrain:
 def measure_states(images: GradientImages) -> list[StateStrain]:
     """Measure the strain of every state against the first neutral one.
 
-    The search begins at the strain of the state before, changed as the caliper's reading was; where
-    that leads nowhere, it begins anew from a grid of stretches.
+    The search starts at the strain of the previous state, scaled by the change of the caliper's
+    reading. If it does not converge, it restarts from a grid of stretches.
     """
     neutral = images.neutral
     crossed = images.of(neutral).crossed()

@@ -1,4 +1,4 @@
-"""The gradient sphere's stages: patterns to normals, heights, strain, histograms and kernels."""
+"""Stages of the gradient sphere: patterns to normals, heights, strain, histograms and kernels."""
 
 import dataclasses
 import math
@@ -41,28 +41,28 @@ from reconstruction.pipeline.inputs import Inputs
 from reconstruction.pipeline.sensor_noise import ElectronNoise
 
 STAGE_REVISION = 7
-"""Grows when the code of a stage changes its result, so that older maps are computed again."""
+"""Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = ("normals", "height", "diffuse_normals", "crossed", "strain", "histograms", "kernels")
-"""What can be made of a session of the gradient sphere; see `products` for what it stands for."""
+"""Products of a gradient-sphere session; `products` maps each name to its maps and files."""
 STRAIN_FILE, HISTOGRAM_FILE, KERNEL_FILE = "strain.json", "histograms.json", "kernels.json"
 FILE_NAMES = (STRAIN_FILE, HISTOGRAM_FILE, KERNEL_FILE)
 
 CUTOFF_UM = 1000.0
-"""What is longer is bulge, not relief (Nagano et al. 2015, section 4)."""
+"""Longest wavelength of the surface topography (Nagano et al. 2015, section 4)."""
 SMOOTH_PX = 1.0
-"""Of the pictures before the roughness of facets is estimated: the lens resolves three pixels."""
+"""Blur of the images before facet roughness is estimated: the lens resolves three pixels."""
 CROSSED_SMOOTH_PX = 2.0
-"""Of the crossed pictures, which hold half the noise and less detail."""
+"""Blur of the crossed images, which have half the noise and less detail."""
 DIFFUSE_SMOOTH_PX = 2.0
 WAVELENGTH_UM = 0.535
-"""Of a white LED's light behind a monochrome sensor, its mean."""
+"""Mean wavelength of a white LED's light on a monochrome sensor."""
 STDERR_SAMPLES = 6
 STDERR_SIGMA_PX = 8.0
 
 
 def products(session: Session) -> Mapping[str, tuple[str, ...]]:
-    """Return the maps and files that each name of :data:`MAP_NAMES` stands for in a session."""
+    """Return the maps and files of a session that each name of :data:`MAP_NAMES` means."""
     states = GradientImages(session).states
     neutral = states[0].name
     return {
@@ -78,26 +78,26 @@ def products(session: Session) -> Mapping[str, tuple[str, ...]]:
 
 @dataclass(frozen=True, slots=True)
 class GradientRig:
-    """The session, its camera, and its lights as far as they are known."""
+    """Session, camera and lights, calibrated or nominal."""
 
     images: GradientImages
     pixel_um: float
-    """Of skin, in the middle of the field."""
+    """Size of a pixel on the skin, in the center of the field."""
     focal_px: float
     camera_mm: Float64Array
-    """Centre of projection, shape (3,)."""
+    """Center of projection, shape (3,)."""
     lights: SphereLights
     lens: Aperture
 
     def points_mm(self, shape: tuple[int, int]) -> Float32Array:
-        """Return where the pixels are on the plane z = 0, shape (H, W, 2)."""
+        """Return the pixels' positions on the plane z = 0, shape (H, W, 2)."""
         rows, columns = np.mgrid[0 : shape[0], 0 : shape[1]]
         x = (columns - (shape[1] - 1) / 2) * (self.pixel_um / 1e3)
         y = ((shape[0] - 1) / 2 - rows) * (self.pixel_um / 1e3)
         return np.stack([x, y], axis=-1).astype(np.float32)
 
     def views(self, shape: tuple[int, int]) -> Float32Array:
-        """Return unit vectors from the pixels' places to the camera, shape (H, W, 3)."""
+        """Return unit vectors from the pixels' positions to the camera, shape (H, W, 3)."""
         points = self.points_mm(shape)
         way = np.concatenate([-points, np.zeros((*shape, 1), np.float32)], axis=-1)
         way += self.camera_mm.astype(np.float32)
@@ -109,7 +109,7 @@ class GradientRig:
 
 
 def graph(inputs: Inputs) -> list[stages.PipelineStage]:
-    """Return the stages that a session of the gradient sphere can go through."""
+    """Return the stages of a gradient-sphere session."""
     rig = _rig(inputs)
     stage = inputs.stage_maker(STAGE_REVISION)
     neutral = rig.images.neutral.name
@@ -139,7 +139,7 @@ def _rig(inputs: Inputs) -> GradientRig:
     shots = session.frames("gradient")
     view = session.rig.view(shots[0].camera) if shots else session.rig.views[0]
     sensor = inputs.load(
-        "sensor", [view.serial], "the frames are as noisy as they say of themselves"
+        "sensor", [view.serial], "the frames' noise is that of their own noise profiles"
     )
     noise = None
     if sensor is not None:
@@ -167,15 +167,15 @@ def _rig(inputs: Inputs) -> GradientRig:
 
 
 def _lights(inputs: Inputs, serial: str) -> SphereLights:
-    """Return the sphere's lights as calibrated, or as the rig's file describes them."""
+    """Return the sphere's lights, calibrated or nominal."""
     rig = inputs.session.rig
     names = [light.name for light in rig.lights]
     place = np.array([light.position_mm for light in rig.lights], np.float64)
     nominal = SphereLightTable.nominal(rig)
-    found = inputs.load("lights", names, "the lights stand and shine as the rig file says")
+    found = inputs.load("lights", names, "the lights have the nominal values of the rig file")
     table = nominal if found is None else SphereLightTable.from_calibration(found, rig)
     leak = inputs.load(
-        "polarization", [*names, serial], "crossed polarizers stop all that the surface reflects"
+        "polarization", [*names, serial], "crossed polarizers stop all specular reflection"
     )
     leakage = np.zeros(len(names))
     leakage_stderr = np.zeros(len(names))
@@ -201,7 +201,7 @@ def _strain(inputs: Inputs, rig: GradientRig) -> Mapping[str, Any]:
     found = measure_states(rig.images)
     lost = [each.state.name for each in found if not each.usable]
     if lost:
-        what = "no texture could be followed; these states are left out of histograms and kernels"
+        what = "no texture could be followed; these states are omitted from histograms and kernels"
         inputs.assumed.append(f"strain of {', '.join(lost)}: {what}")
     document = {
         "schema": "skinrig.strain/1",
@@ -216,7 +216,7 @@ def _crossed(rig: GradientRig, state: SkinState) -> SkinMap:
     patterns = rig.images.of(state)
     lit = [key for key in patterns.values if key[1] == "crossed"]
     variance = np.sum([patterns.variance[key] for key in lit], axis=0) / len(lit) ** 2
-    what = "light from inside the skin, mean of all crossed pictures, fraction of full scale"
+    what = "subsurface-scattered light, mean of all crossed images, fraction of full scale"
     return SkinMap(patterns.crossed(), "1", np.sqrt(variance), patterns.valid, what)
 
 
@@ -243,7 +243,7 @@ def _patterns_normals(
 
 
 def _facets(inputs: Inputs, rig: GradientRig) -> Roughness:
-    """Estimate the roughness of facets below a pixel, once: strain turns facets, not their own."""
+    """Estimate facet roughness in the neutral state; strain rotates facets, it keeps the value."""
     patterns = rig.images.of(rig.images.neutral)
     found = estimate_roughness(
         patterns.values,
@@ -258,13 +258,13 @@ def _facets(inputs: Inputs, rig: GradientRig) -> Roughness:
 
 
 def _normals(rig: GradientRig, state: SkinState, _facets: Roughness) -> Mapping[str, Any]:
-    """Return normals as the lens shows them, and the slopes of the surface before the lens."""
+    """Return normals blurred by the lens, and slopes of the surface with the blur removed."""
     patterns = rig.images.of(state)
     skin = skin_mask(patterns.crossed())
     smooth = _patterns_normals(rig, patterns, "specular", smoothing="wiener", alpha=_facets)
     sharp = _patterns_normals(rig, patterns, "specular", alpha=_facets)
-    # noise takes single pixels of steep furrows beyond what a lobe can tell; a hole there would cut
-    # the height, so that the filtered normal stands in
+    # noise moves single pixels of steep grooves outside the range of a lobe; a hole there would cut
+    # the height map, so these pixels take the filtered normal
     normals = np.where(sharp.valid[..., None], sharp.normals, smooth.normals)
     known = (sharp.valid | smooth.valid) & skin
     shown = _normal_map(smooth, skin, "of the surface's reflection", relief=True)
@@ -278,13 +278,13 @@ def _normals(rig: GradientRig, state: SkinState, _facets: Roughness) -> Mapping[
 def _diffuse(rig: GradientRig) -> SkinMap:
     patterns = rig.images.of(rig.images.neutral)
     found = _patterns_normals(rig, patterns, "diffuse", smoothing=DIFFUSE_SMOOTH_PX)
-    what = "of the light from inside the skin, which spreads over tenths of a millimetre"
+    what = "of subsurface-scattered light, which spreads over tenths of a millimeter"
     return _normal_map(found, skin_mask(patterns.crossed()), what)
 
 
 def _normal_map(found: NormalMaps, skin: BoolArray, what: str, *, relief: bool = False) -> SkinMap:
     valid = found.valid & skin
-    # of each of the two directions across the normal, as everywhere
+    # standard error per tangential axis, as in the other normal maps
     stderr = np.where(valid, found.stderr_rad / math.sqrt(2.0), np.pi).astype(np.float32)
     if relief:
         stderr = relief_errors.normal_stderr(found.normals, stderr, valid)
@@ -298,14 +298,14 @@ def _normal_map(found: NormalMaps, skin: BoolArray, what: str, *, relief: bool =
 
 
 def _height(rig: GradientRig, state: SkinState, **made: Any) -> SkinMap:
-    """Integrate what the lens's blur was taken out of; remove what is wider than a millimetre."""
+    """Integrate the deblurred slopes; remove wavelengths above `CUTOFF_UM`."""
     restored: RestoredNormals
     valid: BoolArray
     restored, valid, stderr_rad = made[f"_restored_{state.name}"]
     shape = valid.shape
 
     def relief(normals: FloatArray, known: BoolArray) -> HeightMap:
-        # steep walls of furrows, dim and partly hidden, count less
+        # steep walls of grooves are dim and partly hidden, so they have less weight
         found = integrate_map(
             normals,
             valid=known,
@@ -320,8 +320,8 @@ def _height(rig: GradientRig, state: SkinState, **made: Any) -> SkinMap:
     by_noise = _height_stderr(restored, found.valid, relief)
     stderr = relief_errors.height_stderr(found.height, by_noise, found.valid)
     what = (
-        "height towards the camera, the lens's blur undone as far as noise allows, without "
-        f"what is longer than {CUTOFF_UM / 1e3:g} mm"
+        "height towards the camera, the lens's blur removed as far as noise allows, without "
+        f"wavelengths above {CUTOFF_UM / 1e3:g} mm"
     )
     return SkinMap(found.height.astype(np.float32), "um", stderr, found.valid, what)
 
@@ -331,14 +331,14 @@ def _height_stderr(
     valid: BoolArray,
     relief: Callable[[FloatArray, BoolArray], HeightMap],
 ) -> Float32Array:
-    """Return the standard error of a height by what fields of noise become on the same way."""
+    """Estimate a height's standard error by integrating random noise fields in the same way."""
     rng = np.random.default_rng(0)
     total = np.zeros(valid.shape)
     for _ in range(STDERR_SAMPLES):
         x, y = restored.sample_noise(rng)
         field = np.stack([-x, -y, np.ones_like(x)], axis=-1)
         total += relief(field, valid).height.astype(np.float64) ** 2
-    # the noise is about the same everywhere: its variance varies slowly, borders aside
+    # noise is nearly stationary, so its variance is smooth except at borders
     weight = ndimage.gaussian_filter(valid.astype(float), STDERR_SIGMA_PX)
     even = ndimage.gaussian_filter(total, STDERR_SIGMA_PX) / np.maximum(weight, 1e-3)
     return np.where(valid, np.sqrt(even / STDERR_SAMPLES), np.inf).astype(np.float32)
@@ -359,9 +359,9 @@ def _kernels(
     _histograms: Mapping[str, NormalStatistics],
     **heights: SkinMap,
 ) -> bytes:
-    tell = partial(inputs.report_progress, "kernels")
+    report = partial(inputs.report_progress, "kernels")
     document = fit_kernels(
-        _strains, _by_state(heights), _histograms, pixel_um=rig.pixel_um, report_progress=tell
+        _strains, _by_state(heights), _histograms, pixel_um=rig.pixel_um, report_progress=report
     )
     return stages.serialize_document(document)
 

@@ -1,4 +1,4 @@
-"""Histograms of the normals of strained skin, and the kernels that make them of neutral skin's."""
+"""Histograms of the normals of strained skin, and kernels that map neutral skin's to them."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -28,19 +28,19 @@ from reconstruction.pipeline.gradient.skin_strain import StateStrain
 from reconstruction.pipeline.graph import select_attributes
 
 MIN_SAMPLES = 1000
-"""Fewer pixels make no histogram."""
+"""Minimum number of pixels of a histogram."""
 MIN_STRAIN = 0.01
-"""A state nearer to neutral than this has no kernel of its own: it would be that of the noise."""
+"""Minimum strain of a kernel: below it, the kernel would fit the noise."""
 LINE_POINTS = 61
 MAX_FULL_GRID_PX = 1_000_000
-"""Patches of fewer pixels tell kernels no finer than by `COARSE_GRID_STEP` steps of the paper's
+"""Patches of fewer pixels resolve kernels no finer than `COARSE_GRID_STEP` steps of the paper's
 grid."""
 COARSE_GRID_STEP = 3
 HIDDEN_VARIANCE_RATIO = 0.1
-"""Of a variance, what pictures hide: slopes that do not come back, and those longer than a levelled
-patch. The root mean square over both axes of six patches of 0.8 mm at rest, at r = 0.8 and at 1.19
-(seeds 0 to 5). It is no scatter: states and patches have it alike, and how much it is the pictures
-do not tell (what the lens's transfer takes is given back by then)."""
+"""Fraction of a variance that images hide: slopes that reflect no light back, and those longer than
+a leveled patch. Root mean square over both axes of six patches of 0.8 mm at rest, at r = 0.8 and at
+1.19 (seeds 0 to 5). It is a bias, not scatter: states and patches share it, and its size cannot be
+estimated from the images (the lens's transfer is compensated before)."""
 
 
 def count_normals(
@@ -60,7 +60,7 @@ def count_normals(
     Returns
     -------
     dict
-        By the name of the state; states with too few pixels are missing.
+        By the name of the state; states with too few pixels are omitted.
     """
     found: dict[str, NormalStatistics] = {}
     for each in strains:
@@ -78,9 +78,8 @@ def histogram_document(
 ) -> dict[str, Any]:
     """Return the histograms as a document.
 
-    Standard errors of its variances hold what another patch of the same skin and size would show,
-    and `HIDDEN_VARIANCE_RATIO`; of histograms and variances alike the relief is the one that
-    heights show.
+    Standard errors of its variances include the variation between patches of the same skin and
+    size, and `HIDDEN_VARIANCE_RATIO`. The surface topography is that of the height maps.
     """
     of_samples = "samples outside effective_samples samples_per_bucket aliased"
 
@@ -110,12 +109,12 @@ def histogram_document(
 def _common(
     each: StateStrain, neutral: StateStrain, heights: Mapping[str, SkinMap], *, there: bool
 ) -> BoolArray:
-    """Return which pixels show skin that both the state and the neutral one show.
+    """Return the pixels whose skin is visible in both the state and the neutral one.
 
     Parameters
     ----------
     there
-        Whether pixels of the state are meant; else those of the neutral one.
+        True: pixels of the state; False: pixels of the neutral one.
     """
     both = [heights[one.state.name] for one in (neutral, each)]
     shape = both[0].values.shape[:2]
@@ -123,13 +122,13 @@ def _common(
         return np.ones(shape, bool)
     seen = both[0 if there else 1].mask.astype(np.uint8)
     affine = each.strain.affine_px((shape[0], shape[1]))
-    # a pixel of the state shows what the neutral picture has where the map leads back to
+    # a pixel of the state is common where its inverse-mapped position is valid in the neutral map
     back = affine if not there else _inverse(affine)
     return ndimage.map_coordinates(seen, _moved(back, shape), order=0, cval=0) > 0
 
 
 def _moved(affine: Float64Array, shape: tuple[int, ...]) -> list[Float64Array]:
-    """Return the rows and columns that a map of pixels (column, row) takes each pixel to."""
+    """Return the rows and columns to which an affine map of (column, row) takes each pixel."""
     columns, rows = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
     return [
         affine[1, 0] * columns + affine[1, 1] * rows + affine[1, 2],
@@ -140,7 +139,7 @@ def _moved(affine: Float64Array, shape: tuple[int, ...]) -> list[Float64Array]:
 def _skin_blocks(
     each: StateStrain, height: SkinMap, *, pixel_um: float, there: BoolArray
 ) -> Int64Array:
-    """Count a state's normals in the skin of each block of the neutral map turned to its jaws.
+    """Count a state's normals in each block of the neutral map's skin, rotated to its jaws.
 
     Parameters
     ----------
@@ -158,7 +157,7 @@ def _skin_blocks(
     """
     shape = (there.shape[0], there.shape[1])
     row, column = _moved(_inverse(each.strain.affine_px(shape)), shape)
-    # from the neutral map to the one that `_along_x` has turned
+    # from the neutral map to its rotation by `_along_x`
     c, s = math.cos(each.state.angle_rad), math.sin(each.state.angle_rad)
     middle = (shape[1] - 1) / 2, (shape[0] - 1) / 2
     x, y = column - middle[0], middle[1] - row
@@ -185,7 +184,7 @@ def _inverse(affine: Float64Array) -> Float64Array:
 def _along_x(
     height: Float32Array, valid: BoolArray, angle_rad: float
 ) -> tuple[Float32Array, BoolArray]:
-    """Turn a map so that the jaws' axis lies along its rows."""
+    """Rotate a map so that the jaws' axis is along its rows."""
     if abs(math.sin(angle_rad)) < 1e-9:
         return height, valid
     c, s = math.cos(angle_rad), math.sin(angle_rad)
@@ -194,7 +193,7 @@ def _along_x(
     x, y = columns - middle[0], middle[1] - rows
     places = [middle[1] - (s * x + c * y), middle[0] + (c * x - s * y)]
     turned = ndimage.map_coordinates(height, places, order=3, mode="nearest")
-    # a cubic spline reaches over two pixels, and what it reaches must be valid
+    # a cubic spline has a support of two pixels to each side, all of which must be valid
     solid = ndimage.binary_erosion(valid, iterations=2, border_value=0)
     return turned, ndimage.map_coordinates(solid.astype(np.uint8), places, order=0, cval=0) > 0
 
@@ -215,8 +214,8 @@ def fit_kernels(
         As of `count_normals`.
     statistics
         What it returned.
-    tell
-        Called with the share that is done.
+    report_progress
+        Called with the fraction that is done.
 
     Returns
     -------
@@ -304,7 +303,7 @@ def _table(fits: Sequence[Mapping[str, Any]], angle: float | None) -> dict[str, 
 
 
 def _direction(fits: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Return how kernels depend on the direction of stretch; None where it cannot be told."""
+    """Fit the kernels' dependence on the stretch direction; None where undetermined."""
     chosen = [fit for fit in fits if fit["valid"]]
     names = ("stretch_s", "alpha", "sigma_um", "angle_deg")
     stretch, alpha, sigma, angle_deg = ([fit[name] for fit in chosen] for name in names)

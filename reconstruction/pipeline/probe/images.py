@@ -1,4 +1,4 @@
-"""Frames of a fibre probe's session: darks, and one series of exposures for each placement."""
+"""Read a fiber probe's session: dark frames, and one exposure series per placement."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from reconstruction.pipeline.inputs import InputsError
 
 
 def measurement_name(placement: HeadPlacement) -> str:
-    """Return what the profile of one placement is called.
+    """Return the profile's name for one placement.
 
     Examples
     --------
@@ -27,17 +27,17 @@ def measurement_name(placement: HeadPlacement) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """One placement of the head, with what the box reported while it lasted."""
+    """One placement of the head, with the controller's readings."""
 
     placement: HeadPlacement
     brackets: int
     """Exposures taken."""
     level: float
-    """Of the source."""
+    """Level of the source."""
     suction_mbar: float
-    """Mean over the exposures; NaN where the box says nothing."""
+    """Mean over the exposures; NaN without readings."""
     camera_c: float
-    """The same of the camera's temperature, degrees Celsius."""
+    """Mean camera temperature over the exposures, degrees Celsius; NaN without readings."""
 
     @property
     def name(self) -> str:
@@ -46,16 +46,16 @@ class Measurement:
 
 
 class ProbeImages:
-    """Reads a probe's session, one series when it is asked for.
+    """Reads a probe's session, one series per request.
 
     Parameters
     ----------
     session : Session
         Open for reading.
     noise : CameraNoise
-        Of its camera.
+        Noise of its camera.
     kind : str
-        Of the steps: "fibres" on skin, "phantom".
+        Kind of the steps: "fibres" on skin, "phantom".
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class ProbeImages:
     Raises
     ------
     InputsError
-        When the session holds no such frames.
+        When the session has no frames of that kind.
     """
 
     def __init__(self, session: Session, *, noise: CameraNoise, kind: str = "fibres") -> None:
@@ -77,7 +77,8 @@ class ProbeImages:
             if placement is not None:
                 self._records.setdefault(placement, []).append(record)
         if not self._records:
-            raise InputsError(f"{session.path}: has no frames of kind {kind!r}")
+            hint = "give a session of the fiber probe"
+            raise InputsError(f"{session.path}: has no frames of kind {kind!r}; {hint}")
 
         def measured(placement: HeadPlacement, records: list[FrameRecord]) -> Measurement:
             means = _mean(records, "suction_mbar"), _mean(records, "camera_c")
@@ -110,7 +111,7 @@ class ProbeImages:
         return self._darks
 
     def merged(self, measurement: Measurement) -> MergedSeries:
-        """Return the frames of a measurement merged to light per second, darks subtracted."""
+        """Merge a measurement's frames to light per second, dark frames subtracted."""
         records = self._records[measurement.placement]
         frames: list[NDArray[np.integer]] = [self._session.read(record).cfa for record in records]
         known = not math.isnan(measurement.camera_c)
@@ -128,7 +129,7 @@ def _exposure_s(record: FrameRecord) -> float:
 
 
 def _light_s(record: FrameRecord) -> float:
-    """Return how long the source shone into an exposure, s."""
+    """Return how long the source was on during an exposure, s."""
     exposure_s = _exposure_s(record)
     return min(float(record.actual.get("open_s", exposure_s)), exposure_s)
 
@@ -136,10 +137,10 @@ def _light_s(record: FrameRecord) -> float:
 def _level(records: list[FrameRecord]) -> float:
     levels = {float(record.settings.get("level", 1.0)) for record in records}
     where, got = f"step {records[0].step_id}", f"levels {sorted(levels)} in one series"
-    Checks(InputsError).require(len(levels) == 1, where, got, "one")
+    Checks(InputsError).require(len(levels) == 1, where, got, "one; capture it again")
     return levels.pop()
 
 
 def _mean(records: list[FrameRecord], name: str) -> float:
-    told = [float(record.actual[name]) for record in records if name in record.actual]
-    return float(np.mean(told)) if told else math.nan
+    readings = [float(record.actual[name]) for record in records if name in record.actual]
+    return float(np.mean(readings)) if readings else math.nan

@@ -1,4 +1,4 @@
-"""Optical coefficients of the profiles of a fiber probe, per site."""
+"""Fit optical coefficients to the profiles of a fiber probe, per site."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,16 +17,16 @@ from reconstruction.subsurface import SubsurfaceFit
 from reconstruction.subsurface import nearest as nearest_medium
 
 METHOD_NAMES = ("photon_table", "diffusion", "dipole")
-"""The first is the recommended one; the others stand beside it."""
+"""The first is the recommended one; the others serve for comparison."""
 
 MAX_HOMOGENEOUS_MISFIT = 0.03
-"""Relative misfit from which a bent profile is that of no homogeneous medium, but of layered
-tissue. What each fibre has off by itself, as by dirt on it, bends none."""
+"""Relative misfit above which a bent profile is attributed to layered tissue. Errors of single
+fibers, such as dirt, do not bend a profile."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredProfile:
-    """What the fibres took at one placement."""
+    """Profile measured at one placement."""
 
     measurement: Measurement
     reflectance: FiberReflectance
@@ -34,7 +34,7 @@ class MeasuredProfile:
 
 @dataclass(frozen=True, slots=True)
 class ProfileFit:
-    """Coefficients that one method finds for one profile, in every channel.
+    """Coefficients of one profile by one method, in every channel.
 
     Attributes
     ----------
@@ -42,10 +42,10 @@ class ProfileFit:
     fit : SubsurfaceFit
         Leading axis the channels.
     log_stderr : ndarray, shape (C,)
-        Standard error of log sigma_tr by the readings, the single fibres and the model.
+        Standard error of log sigma_tr by the readings, the single fibers and the model.
     log_common : ndarray, shape (T, C)
-        Change of log sigma_tr for one standard uncertainty of each cause that all fibres and all
-        measurements share: what the phantom's certificate leaves uncertain.
+        Change of log sigma_tr per standard uncertainty of each error that all fibers and all
+        measurements share, namely those of the phantom's certificate.
     log_coefficients : ndarray, shape (2, C)
         Root sum square of such changes of log sigma_a and log sigma_s'.
     """
@@ -58,21 +58,21 @@ class ProfileFit:
 
     @property
     def log_total(self) -> Float64Array:
-        """Standard error of log sigma_tr by all causes, shape (C,)."""
+        """Standard error of log sigma_tr, readings and common errors combined, shape (C,)."""
         return np.asarray(np.sqrt(self.log_stderr**2 + (self.log_common**2).sum(axis=0)))
 
 
 @dataclass(frozen=True, slots=True)
 class SiteValue:
-    """sigma_tr of a site over its placements, by the recommended method.
+    """sigma_tr of a site, averaged over its placements, by the recommended method.
 
     Attributes
     ----------
     site : str
     measurements : ndarray of int, shape (C,)
-        Fits it rests on.
+        Number of fits in the mean.
     sigma_tr_per_mm, stderr_per_mm : ndarray, shape (C,)
-        Mean of the logarithms; NaN and infinite where no fit is valid.
+        From the mean of the logarithms; NaN and infinite where no fit is valid.
     """
 
     site: str
@@ -84,7 +84,7 @@ class SiteValue:
 def fit_profiles(
     profiles: Sequence[MeasuredProfile], probe: Probe, method: Any = METHOD_NAMES[0]
 ) -> list[ProfileFit]:
-    """Fit all profiles and channels, also with each common error at its uncertainty."""
+    """Fit all profiles and channels; repeat with each common error at its standard uncertainty."""
     first = profiles[0].reflectance
     causes = len(first.common_per_mm2)
     # (1 + T, M, C, F): as measured, then with one standard uncertainty of each cause
@@ -92,20 +92,20 @@ def fit_profiles(
     common = np.stack([p.reflectance.common_per_mm2.transpose(0, 2, 1) for p in profiles], axis=1)
     every = np.concatenate([value[None], value[None] + common])
 
-    told: dict[str, Any] = {
+    setup: dict[str, Any] = {
         "variance": np.stack([p.reflectance.variance.T for p in profiles]),
         "valid": np.stack([p.reflectance.valid.T for p in profiles]),
         "collection": "fibre",
         "core_mm": probe.fibres[0].core_mm,
         "source_core_mm": probe.source_core_mm,
     }
-    fit = subsurface.invert(first.radius_mm, every, method=method, **told)
+    fit = subsurface.invert(first.radius_mm, every, method=method, **setup)
     if np.any(unlike := fit.bent[0] & (fit.model_error[0] > MAX_HOMOGENEOUS_MISFIT)):
         if method == METHOD_NAMES[0]:
-            other = subsurface.nearest_medium(first.radius_mm, every, **told)
+            other = subsurface.nearest_medium(first.radius_mm, every, **setup)
         else:
-            told |= {"method": method, "common_error": nearest_medium.LOG_FACTOR_SIGMA}
-            other = subsurface.invert(first.radius_mm, every, **told)
+            setup |= {"method": method, "common_error": nearest_medium.LOG_FACTOR_SIGMA}
+            other = subsurface.invert(first.radius_mm, every, **setup)
         unlike = _layered(profiles, unlike, other.scale[0])
         fit = _merge_fits(fit, other, np.broadcast_to(unlike, fit.valid.shape))
 
@@ -129,11 +129,11 @@ def fit_profiles(
 def _layered(
     profiles: Sequence[MeasuredProfile], unlike: BoolArray, factor: Float64Array
 ) -> BoolArray:
-    """Return which profiles are fitted as those of layers, (M, C); a turn is of one tissue.
+    """Return which profiles are fitted as layered tissue, (M, C), the same for all directions.
 
-    A layer on top dims in all directions. Tissue that scatters by direction is unlike any medium,
-    too, but the factors that it asks for lie on both sides of 1; fitted by some of its directions
-    with a factor and by others without, its sigma_tr would jump between them.
+    An upper layer attenuates all directions. Tissue with directional scattering also differs from
+    every homogeneous medium, but the factors of its directions are on both sides of 1. A factor in
+    some directions only would make sigma_tr jump between directions.
     """
     found = np.array(unlike)
     for group in profile_groups(profiles).values():
@@ -144,7 +144,7 @@ def _layered(
 
 
 def profile_groups(profiles: Sequence[MeasuredProfile]) -> dict[tuple[str, int], list[int]]:
-    """Return the numbers of profiles of each site and repeat, in all directions of the head."""
+    """Return the indices of profiles by site and repeat, over all directions of the head."""
     groups: dict[tuple[str, int], list[int]] = {}
     for number, profile in enumerate(profiles):
         placement = profile.measurement.placement
@@ -153,7 +153,7 @@ def profile_groups(profiles: Sequence[MeasuredProfile]) -> dict[tuple[str, int],
 
 
 def _merge_fits(fit: SubsurfaceFit, other: SubsurfaceFit, there: BoolArray) -> SubsurfaceFit:
-    """Return one batch's fits, but another's where told to."""
+    """Return one batch's fits, replaced by another's where ``there`` is True."""
     merged = {}
     for name in (field.name for field in dataclasses.fields(fit) if field.name != "method"):
         own = getattr(fit, name)
@@ -163,16 +163,16 @@ def _merge_fits(fit: SubsurfaceFit, other: SubsurfaceFit, there: BoolArray) -> S
 
 
 def _select_fits(fit: SubsurfaceFit, index: tuple[int, ...]) -> SubsurfaceFit:
-    """Return some of a batch's fits."""
+    """Select fits of a batch by index."""
     names = [field.name for field in dataclasses.fields(fit) if field.name != "method"]
     return dataclasses.replace(fit, **{name: getattr(fit, name)[index] for name in names})
 
 
 def site_values(fits: Sequence[ProfileFit]) -> list[SiteValue]:
-    """Average the placements of each site; what they share is not averaged away.
+    """Average the placements of each site; common errors are added after the average.
 
-    Placements differ by more than their fits know of, as contact does: where their scatter is
-    larger than their standard errors, it is what counts.
+    Contact varies between placements, which single fits do not include. Where the scatter exceeds
+    the standard errors, the scatter is used.
     """
     found = []
     for site in dict.fromkeys(fit.profile.measurement.placement.site for fit in fits):
@@ -185,6 +185,8 @@ def site_values(fits: Sequence[ProfileFit]) -> list[SiteValue]:
         known = count > 0
         mean = (weight * np.where(valid, log_tr, 0.0)).sum(axis=0) / np.where(known, total, 1.0)
         scatter = (weight * np.where(valid, log_tr - mean, 0.0) ** 2).sum(axis=0)
+        # inverse-variance mean of the logarithms; its variance 1 / sum(w) is multiplied by the
+        # reduced chi-square where that exceeds 1 (Birge ratio)
         inflation = np.maximum(scatter / np.maximum(count - 1, 1), 1.0)
         shared = np.mean([fit.log_common for fit in own], axis=0)
         with np.errstate(divide="ignore"):

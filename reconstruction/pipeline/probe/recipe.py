@@ -1,4 +1,4 @@
-"""What sessions of the fiber probe can be made into."""
+"""Recipe of the sessions of the fiber probe."""
 
 from reconstruction.pipeline.probe import stages
 from reconstruction.pipeline.recipe import Recipe

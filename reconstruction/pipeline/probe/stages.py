@@ -1,4 +1,4 @@
-"""The fibre probe's stages: series of exposures to profiles, coefficients and translucency."""
+"""Stages of the fiber probe: exposure series to profiles, coefficients and translucency."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -34,10 +34,10 @@ from reconstruction.pipeline.probe.profile_fits import (
 from reconstruction.subsurface import probe_sites, translucency
 
 STAGE_REVISION = 7
-"""Grows when the code of a stage changes its result, so that older results are computed again."""
+"""Grows when the code of a stage changes its result, so that older results are recomputed."""
 
 MAP_NAMES = ("profiles", "subsurface", "anisotropy", "translucency")
-"""What can be made of a session of the fibre probe; see `products` for what it stands for."""
+"""Products of a fiber probe's session; `products` maps each name to its maps and files."""
 PROFILE_FILE, SUBSURFACE_FILE = "profiles.json", "subsurface.json"
 ANISOTROPY_FILE = "anisotropy.json"
 FILE_NAMES = (PROFILE_FILE, SUBSURFACE_FILE, ANISOTROPY_FILE)
@@ -45,11 +45,11 @@ FILE_NAMES = (PROFILE_FILE, SUBSURFACE_FILE, ANISOTROPY_FILE)
 CHANNEL_NAMES = ("red", "green", "blue")
 MAP_SHAPE = (256, 256)
 FALSE_ALARM_RATE = 0.01
-"""Chance at which isotropic tissue is called anisotropic, per site and channel."""
+"""Probability that isotropic tissue is reported as anisotropic, per site and channel."""
 
 
 def products(_: Session) -> Mapping[str, tuple[str, ...]]:
-    """Return the maps and files that each name of :data:`MAP_NAMES` stands for."""
+    """Return the maps and files that each name of :data:`MAP_NAMES` means."""
     return {
         "profiles": (PROFILE_FILE,),
         "subsurface": (SUBSURFACE_FILE,),
@@ -59,7 +59,7 @@ def products(_: Session) -> Mapping[str, tuple[str, ...]]:
 
 
 def graph(inputs: Inputs) -> list[stages.PipelineStage]:
-    """Return the stages that a session of the fibre probe can go through.
+    """Return the stages of a fiber probe's session.
 
     Raises
     ------
@@ -68,7 +68,8 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     """
     probe = inputs.session.rig.probe
     if probe is None:
-        raise InputsError(f"{inputs.session.path}: its rig has no probe, expected one with fibres")
+        got = "its rig has no probe, expected one with fibers"
+        raise InputsError(f"{inputs.session.path}: {got}; give a session of the probe")
     view = inputs.session.rig.views[0]
     nominal = "the camera's gain and read noise are those of the rig file"
     sensor = inputs.load("sensor", [view.serial], nominal)
@@ -79,7 +80,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     if sensor is not None:
         noise = CameraNoise.from_sensor(SensorCalibration.from_calibration(sensor, view.serial))
     uncalibrated = (
-        "the fibres are not calibrated: capture a phantom of known optics (`--target phantom`), "
+        "the fibers are not calibrated: capture a phantom of known optics (`--target phantom`), "
         "and give the folder that `skinrig calibrate fibre` makes of it as --calibration"
     )
     profiles = partial(_profiles, inputs, fibres, noise)
@@ -96,9 +97,9 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
 def _fibres(inputs: Inputs) -> FiberCalibration | None:
     rig = inputs.session.rig
     serial = rig.views[0].serial
-    found = inputs.load("fibre", [serial], "nothing of the fibres")
+    found = inputs.load("fibre", [serial], "nothing of the fibers")
     if found is None:
-        inputs.assumed.remove("nothing of the fibres")
+        inputs.assumed.remove("nothing of the fibers")
         return None
     return FiberCalibration.from_calibration(found, rig, serial)
 
@@ -107,13 +108,13 @@ def _profiles(
     inputs: Inputs, fibres: FiberCalibration | None, noise: CameraNoise
 ) -> Mapping[str, Any]:
     if fibres is None:
-        raise InputsError("the fibres are not calibrated")
+        raise InputsError("the fibers are not calibrated; give their calibration")
     images = ProbeImages(inputs.session, noise=noise)
     found = []
     for number, measurement in enumerate(images.measurements):
         inputs.report_progress("profiles", number / len(images.measurements))
         merged = images.merged(measurement)
-        # the camera may have moved against the fibres since they were calibrated
+        # the camera may have moved relative to the fibers since the calibration
         spots, _ = fibres.spots.track(merged, noise.pattern)
         readings = sum_spots(merged, spots, noise=noise)
         found.append(
@@ -180,7 +181,7 @@ def _fit_document(one: ProfileFit, c: int) -> dict[str, Any]:
     shared = one.log_coefficients[:, c]
     names = "correlation coefficients_identified chi2 dof p_value inflation used"
     names += " predicted_per_mm2 residual valid"
-    # the interval of the readings, widened by what all fibres share
+    # the interval by the readings, widened by the errors common to all fibers
     widen = total / float(one.log_stderr[c]) if one.log_stderr[c] > 0 else 1.0
     with np.errstate(invalid="ignore"):
         interval = sigma_tr * (fit.interval_per_mm[c] / sigma_tr) ** widen
@@ -205,7 +206,7 @@ def _fit_document(one: ProfileFit, c: int) -> dict[str, Any]:
 
 
 def _of_channel(record: Any, names: str, c: int) -> dict[str, Any]:
-    """Return one channel of a record's attributes, by their names, parted by spaces."""
+    """Return one channel of a record's attributes, by their names, separated by spaces."""
     return {name: values[c] for name, values in stages.select_attributes(record, names).items()}
 
 
@@ -223,7 +224,7 @@ def _site_document(site: SiteValue, c: int) -> dict[str, Any]:
 
 
 def _anisotropy(_fits: Sequence[ProfileFit]) -> bytes:
-    """Tell the dependence on direction at every site and repeat with enough directions."""
+    """Estimate the anisotropy of every site and repeat with enough directions."""
     rows: list[dict[str, Any]] = []
     skipped: list[str] = []
     for (site, repeat), group in profile_groups([fit.profile for fit in _fits]).items():
@@ -264,7 +265,7 @@ def _anisotropy(_fits: Sequence[ProfileFit]) -> bytes:
 
 
 def _places(inputs: Inputs) -> Mapping[str, tuple[float, float]]:
-    """Return where sites lie on a face's texture, u and v by name; a bad table is told at once."""
+    """Return the sites' texture coordinates, u and v by name; a bad table is refused at once."""
     places = dict(probe_sites.SITE_UV)
     if inputs.landmarks is None:
         return places
@@ -277,12 +278,12 @@ def _places(inputs: Inputs) -> Mapping[str, tuple[float, float]]:
 def _translucency(
     places: Mapping[str, tuple[float, float]], inputs: Inputs, _sites: Sequence[SiteValue]
 ) -> SkinMap:
-    """Spread 1/sigma_tr over a face's texture from the sites whose place is known."""
+    """Interpolate 1/sigma_tr over a face's texture from the sites with known positions."""
     placed = [site for site in _sites if site.site in places]
     unplaced = [site.site for site in _sites if site.site not in places]
     got = f"measurements of {', '.join(unplaced)}"
-    known = f"some of {', '.join(places)}, whose places on a face are known"
-    expected = f"{known}; a table of landmarks may name others"
+    known = f"some of {', '.join(places)}, whose positions on a face are known"
+    expected = f"{known}; give a table of landmarks with the others"
     Checks(InputsError).require(placed, "translucency", got, expected)
     found = translucency.interpolate(
         [places[site.site] for site in placed],
@@ -292,10 +293,10 @@ def _translucency(
         valid=np.stack([site.measurements > 0 for site in placed]),
         names=[site.site for site in placed],
     )
-    left_out = [f"{site}: its place on a face is not known" for site in unplaced]
+    left_out = [f"{site}: its position on a face is not known" for site in unplaced]
     left_out += [f"{site}: {why}" for site, why in found.omitted]
     inputs.noted["translucency_left_out"] = left_out
-    inputs.assumed += [f"translucency goes without {text}" for text in left_out]
+    inputs.assumed += [f"translucency omits {text}" for text in left_out]
     inputs.noted["translucency_conflicts"] = [": ".join(pair) for pair in found.conflicts]
     what = "1/sigma_tr of red, green and blue light, between measured sites by kriging"
     return SkinMap(found.values, "mm", found.stderr, np.asarray(found.valid.all(axis=-1)), what)

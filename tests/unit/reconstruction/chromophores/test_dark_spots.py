@@ -222,5 +222,5 @@ def test_shapes_that_do_not_fit_are_named(call, what):
 def test_estimates_of_other_pixels_are_refused(table):
     rgb = table.lookup(np.full((2, 3), 0.05), np.full((2, 3), 0.02))
     found = estimate(rgb, table, prior=shading_prior.face_prior())
-    with pytest.raises(ChromophoreError, match="where"):
+    with pytest.raises(ChromophoreError, match="equally_likely"):
         average_hypotheses(found, found, np.ones((3, 2), bool))

@@ -47,7 +47,7 @@ def test_means_and_deviations_are_recovered_under_pixel_errors(spread, rng):
         variance = wide**2 + err**2
         assert abs(bell.mean - mean) < 4.0 / np.sqrt((1.0 / variance).sum())
         of_spread = 4.0 / np.sqrt((2.0 * wide**2 / variance**2).sum())
-        assert abs(bell.spread - wide) < of_spread + 0.05 * wide
+        assert abs(bell.sd - wide) < of_spread + 0.05 * wide
         assert bell.contamination < 0.04
 
 
@@ -58,7 +58,7 @@ def test_outlier_skin_is_identified_without_widening_the_rest(rng):
     blood[-240:] = rng.uniform(*BLOOD_ENDS, 240)
     found = fitted(seen(truth, np.full(count, 0.1), blood, np.full(count, 0.03), rng))
     assert abs(found.melanin.mean + 3.5) < 0.03
-    assert abs(found.melanin.spread - 0.15) < 0.03
+    assert abs(found.melanin.sd - 0.15) < 0.03
     assert 0.06 < found.melanin.contamination < 0.2
     assert abs(found.blood.mean - 0.4) < 0.01
     assert 0.04 < found.blood.contamination < 0.12
@@ -75,8 +75,8 @@ def test_pixels_differing_by_errors_alone_have_least_deviations(rng):
             rng,
         )
     )
-    assert MIN_SIGMAS[0] <= found.melanin.spread < 0.04
-    assert found.blood.spread == pytest.approx(MIN_SIGMAS[1], rel=1e-3)
+    assert MIN_SIGMAS[0] <= found.melanin.sd < 0.04
+    assert found.blood.sd == pytest.approx(MIN_SIGMAS[1], rel=1e-3)
     assert found.melanin.contamination == pytest.approx(MIN_CONTAMINATION, abs=0.005)
 
 

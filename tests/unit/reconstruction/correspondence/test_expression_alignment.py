@@ -242,10 +242,10 @@ def test_arguments_that_do_not_fit_are_named(rng):
         ({"landmarks_moving": marks(side=40)}, "landmarks_neutral: got None"),
         (
             {"landmarks_moving": {"a": (1.0, 2.0)}, "landmarks_neutral": {"a": (1.0, 2.0)}},
-            "1 names are in both pictures, expected at least 4",
+            "1 names in both images, expected at least 4",
         ),
         ({"valid_moving": np.ones((3, 3), bool)}, "valid_moving: got shape"),
-        ({"valid_neutral": np.zeros((40, 40), bool)}, "neutral: has no valid pixel"),
+        ({"valid_neutral": np.zeros((40, 40), bool)}, "neutral: got no valid pixel"),
     )
     for given, message in cases:
         with pytest.raises(alignment.AlignmentError, match=message):
@@ -316,7 +316,7 @@ def test_landmark_table_faults_name_line_and_column(tmp_path):
         ("label,x,y\n", "line 1: got columns"),
         ("name,x,y\na,1,2\nb,one,2\n", "line 3, column x: got 'one'"),
         ("name,x,y\na,1,inf\n", "line 2, column y: got 'inf'"),
-        ("name,x,y\na,1,2\n# b\na,3,4\n", "line 4, column name: 'a' is there twice, .* line 2"),
+        ("name,x,y\na,1,2\n# b\na,3,4\n", "line 4, column name: got 'a' twice, .* line 2"),
         ("name,x,y\na,1,2,3\n", "line 2: got 4 cells"),
         ("name,x,y\n,1,2\n", "line 2, column name"),
     )

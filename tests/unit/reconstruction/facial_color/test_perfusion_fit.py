@@ -303,7 +303,7 @@ def test_pose_step_alone_leaves_constant_unknown():
     value = with_step(rng, constant_s=1.0, step=5e-3, gap=0.0)
     found = fit_cycle(PHASE, value, cycle_s=CYCLE_S, pose=PoseStep(MOVED, np.array([4e-3])))
     assert found.known == "unknown"
-    assert "the pose may make" in str(found)
+    assert "the pose step allows" in str(found)
     # six times what a pose may make is blood, and it was quick
     found = fit_cycle(PHASE, value, cycle_s=CYCLE_S, pose=PoseStep(MOVED, np.array([8e-4])))
     assert found.known == "only below"

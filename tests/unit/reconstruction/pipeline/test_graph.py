@@ -37,7 +37,7 @@ def test_only_ancestors_of_requested_products_run():
     outcome = run_stages(graph(calls), ["map"])
     assert calls == ["read", "scale", "invert"]
     assert outcome.products == {"map": 7}
-    assert outcome.omitted == (("other", "nothing wanted depends on it"),)
+    assert outcome.omitted == (("other", "no wanted product depends on it"),)
 
 
 def test_asking_for_nothing_new_does_no_work():
@@ -149,7 +149,7 @@ def test_kept_map_is_not_remade_for_independent_stage():
     outcome = run_stages(surface_graph(calls), ["normals", "weight"], cache=folder)
     assert calls == []
     assert set(outcome.reused) == {"normals", "lobes"}
-    assert outcome.omitted == (("samples", "what depends on it was reused"),)
+    assert outcome.omitted == (("samples", "the stages that depend on it were reused"),)
 
 
 def test_files_accompany_maps_of_their_stage():

@@ -39,7 +39,7 @@ def test_stage_unneeded_by_request_is_skipped():
     outcome = stages.run_stages(graph(), ["melanin"])
     entries = stages.record_run(graph(), outcome, {})
     assert done(entries) == {"frames": "run", "separate": "run", "invert": "run", "draw": "skipped"}
-    assert why(entries)["draw"] == "nothing wanted depends on it"
+    assert why(entries)["draw"] == "no wanted product depends on it"
     assert why(entries)["invert"] == "it was not made before"
     assert [len(entry["inputs"]) for entry in entries] == [64, 64, 64, 0]
 
@@ -56,7 +56,7 @@ def test_repeated_run_is_reused_and_inputs_skipped():
         "invert": "reused",
         "draw": "skipped",
     }
-    assert why(entries)["frames"] == "what depends on it was reused"
+    assert why(entries)["frames"] == "the stages that depend on it were reused"
     assert why(entries)["invert"] == "its inputs are the same"
 
 
@@ -116,7 +116,7 @@ def test_repeated_request_reads_no_frame_and_writes_nothing(tmp_path, monkeypatc
     # a folder that lost a map, or holds another than was written, is neither used nor replaced
     (out / "melanin.exr").write_bytes(b"x" + (out / "melanin.exr").read_bytes()[1:])
     damaged = standing()
-    with pytest.raises(InputsError, match=r"melanin\.exr: was changed .*remove .*make all anew"):
+    with pytest.raises(InputsError, match=r"melanin\.exr: was changed .*remove .*to recompute"):
         pipeline.reconstruct(session, want=["melanin"], out=out)
     assert standing() == damaged
     (out / "melanin.exr").unlink()

@@ -86,4 +86,4 @@ def test_unmeasured_light_positions_are_reported_as_assumed(session, tmp_path):
 def test_whole_calibrations_leave_only_the_cameras_to_assume(session, tmp_path):
     evidence = evidence_with(session, tmp_path / "c", {})
     assert not albedo_of(evidence)
-    assert evidence.assumed == ["the cameras stand as the rig's file draws them"]
+    assert evidence.assumed == ["the cameras have the nominal poses of the rig file"]

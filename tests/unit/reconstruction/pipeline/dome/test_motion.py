@@ -183,7 +183,7 @@ def test_images_outside_the_tracking_frames_are_not_used():
 
 
 def test_tracking_frames_covering_no_image_are_error():
-    with pytest.raises(InputsError, match="no image lies between two tracking frames"):
+    with pytest.raises(InputsError, match="no image between two tracking frames"):
         follow(Shots(*FAR, times_s=(30.0, 40.0)))
 
 
@@ -191,5 +191,5 @@ def test_a_frame_without_a_time_is_named():
     session = Shots(times_s=(0.0, 20.0))
     for record in session.frames("tracking"):
         record.line.t_box_s = None
-    with pytest.raises(InputsError, match=r"T\d-C\d\d: does not say when it was lit"):
+    with pytest.raises(InputsError, match=r"T\d-C\d\d: lacks the time of its light"):
         follow(session)
