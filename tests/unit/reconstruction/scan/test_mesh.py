@@ -54,7 +54,7 @@ def area(mesh):
 def test_sound_surface_is_unchanged():
     before = cap()
     after, report = repair_mesh(before, max_hole_mm=0.0)
-    assert str(report) == "nothing to mend"
+    assert str(report) == "nothing to repair"
     assert len(after.faces) == len(before.faces)
     assert area(after) == pytest.approx(area(before))
 
@@ -144,7 +144,7 @@ def test_nothing_sound_is_an_error():
     with pytest.raises(ScanMeshError, match="crop"):
         crop(cap(), box_mm=((500, 500, 500), (600, 600, 600)))
     for bad in (b"", b"ply\n", b"hello"):
-        with pytest.raises(ScanMeshError, match="no PLY"):
+        with pytest.raises(ScanMeshError, match="expected a PLY"):
             load_ply(bad)
 
 
