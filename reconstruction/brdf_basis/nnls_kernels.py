@@ -293,7 +293,7 @@ def fit_points(  # type: ignore[no-untyped-def]
     """Fit every point; fill ``weights`` (P, K), return weighted RMS residuals and standard errors.
 
     ``reweightings`` 0: weights from the variances alone (1 where a point has none); otherwise so
-    many passes weigh by noise and by cube roots. ``block`` points share their working memory, and
+    many passes weight by noise and by cube roots. ``block`` points share their working memory, and
     start from each other's columns. The standard error is that of the lobe's scale, as a fraction
     of it.
     """

@@ -82,7 +82,7 @@ class Roughness:
 
 
 Smoothing: TypeAlias = float | tuple[float, float] | Literal["wiener"]
-"""How moments are filtered, see :func:`from_patterns`."""
+"""Filter of the moments, see :func:`from_patterns`."""
 
 
 def from_patterns(

@@ -148,14 +148,14 @@ def view_frame(view: ArrayLike) -> Float64Array:
 
 
 def normal_from_disc(position: Float64Array) -> Float64Array:
-    """Return the unit normals (..., 3) at places (..., 2), in the frame of the view.
+    """Return the unit normals (..., 3) at positions (..., 2), in the frame of the view.
 
-    The horizon is at a length of sqrt(2); places beyond it have the normal of the horizon there.
+    The horizon is at a length of sqrt(2); positions beyond it have the normal of the horizon there.
 
     Raises
     ------
     SphereLightsError
-        For places that are not finite.
+        For positions that are not finite.
 
     Examples
     --------
@@ -170,7 +170,7 @@ def normal_from_disc(position: Float64Array) -> Float64Array:
 
 
 def disc_from_normal(normal: Float64Array) -> Float64Array:
-    """Return the places (..., 2) of unit normals (..., 3), in the frame of the view.
+    """Return the positions (..., 2) of unit normals (..., 3), in the frame of the view.
 
     Raises
     ------

@@ -76,7 +76,7 @@ def _averaged(power: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     """Average the half spectrum of a real image over bands of frequencies, periodically."""
     rows, columns = (max(3, side // SPECTRUM_BANDS) | 1 for side in shape)
     half = columns
-    # the missing half is the other one's mirror image, rows turned too
+    # the missing half is the other one's mirror image, with its rows reversed
     turned = np.roll(power[::-1], 1, axis=0)
     last = power.shape[1] - 1 if shape[1] % 2 == 0 else power.shape[1]
     left = turned[:, half:0:-1]

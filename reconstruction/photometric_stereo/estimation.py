@@ -245,7 +245,7 @@ def _of_kind(array: NDArray[Any], kind: Any) -> FloatArray:
 
 
 class _Geometry(NamedTuple):
-    """How light vectors are given, and the arrays that give them."""
+    """Form of the light vectors, and the arrays of that form."""
 
     way: int
     shared: FloatArray = np.zeros((1, 3))

@@ -244,7 +244,7 @@ def _fit_point(  # type: ignore[no-untyped-def]
             x, y, z, v, s, e, m, b0, b1, b2, one, zero, known, False, settings, sums, out
         )
     dark = settings.shadow * bright
-    # samples below zero are noise around a shadow, and as much of it lies above
+    # samples below zero are noise around a shadow, with an equal part above zero
     below, negative = 0, zero
     for k in range(x.size):
         if m[k] > zero and q[k] < zero:

@@ -33,7 +33,7 @@ class TriangleMesh:
     vertices_mm: Float64Array
     """Shape (V, 3)."""
     faces: Int64Array
-    """Shape (F, 3), counter-clockwise seen from outside."""
+    """Shape (F, 3), counter-clockwise from outside."""
     corner_uv: Float64Array | None = None
     """Texture coordinates of each corner, shape (F, 3, 2), (0, 0) bottom left; None: none yet."""
 
