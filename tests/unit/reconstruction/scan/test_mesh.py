@@ -26,7 +26,7 @@ def sphere(subdivisions=3):
 def cap():
     """The front of a sphere: an open surface with a rim."""
     whole = sphere()
-    return whole.kept(whole.vertices_mm[whole.faces].mean(axis=1)[:, 2] > 10.0)
+    return whole.select_faces(whole.vertices_mm[whole.faces].mean(axis=1)[:, 2] > 10.0)
 
 
 def plane(side=9, *, uv=False):
@@ -109,7 +109,7 @@ def test_surfaces_touching_at_single_vertex_are_separated():
 def test_islands_go_and_small_holes_are_filled():
     mesh = cap()
     centers = mesh.vertices_mm[mesh.faces].mean(axis=1)
-    holed = mesh.kept(np.linalg.norm(centers - [0, 0, RADIUS], axis=1) > 12.0)
+    holed = mesh.select_faces(np.linalg.norm(centers - [0, 0, RADIUS], axis=1) > 12.0)
     scrap = np.array([[0, 0, 200.0], [5, 0, 200], [0, 5, 200]])
     scan = TriangleMesh(
         np.concatenate([holed.vertices_mm, scrap]),
