@@ -280,6 +280,7 @@ def _layers(
     vector = each @ axes
     place, slope = direction_from_moments(vector, mirror)
     some = np.maximum(lights.intensities, 1e-300)
+    # relative variance of each light's part; parallel less crossed is proportional to 1 - leakage
     doubt = (lights.intensity_stderr / some) ** 2
     if mirror:
         passing = np.maximum(np.abs(1.0 - lights.leakage), 1e-9)
@@ -289,6 +290,7 @@ def _layers(
     out[:, SCALE] = full
     out[:, CONCENTRATION] = np.linalg.norm(vector, axis=1) / np.maximum(full, 1e-300)
     if doubt.any():
+        # independent lights: sum over them of the outer square of derivative times deviation
         move = np.einsum("pij,lj->pil", slope, axes) * (each * np.sqrt(doubt))[:, None]
         out[:, SYS_XX] = np.sum(move[:, 0] ** 2, axis=1)
         out[:, SYS_XY] = np.sum(move[:, 0] * move[:, 1], axis=1)
@@ -324,6 +326,7 @@ def direction_from_moments(vector: Float64Array, mirror: bool) -> tuple[Float64A
     size = np.where(size > 1e-150, size, short)
     size = np.maximum(size, 1e-300)[:, None]
     n = vector / size
+    # d(v / |v|) / dv = (I - n n') / |v|, chained with the same for n + view in a mirror
     turn = (np.eye(3) - n[:, :, None] * n[:, None, :]) / size[:, :, None]
     if mirror:
         half = n + np.array([0.0, 0.0, 1.0])
@@ -331,6 +334,7 @@ def direction_from_moments(vector: Float64Array, mirror: bool) -> tuple[Float64A
         n = half / size
         turn = (np.eye(3) - n[:, :, None] * n[:, None, :]) / size[:, :, None] @ turn
     up = np.maximum(1.0 + n[:, 2], 1e-9)
+    # position u = n_xy sqrt(2 / (1 + n_z)), 2 sin(tilt / 2) long
     scale = np.sqrt(2.0 / up)
     slope = scale[:, None, None] * turn[:, :2]
     slope -= (scale / (2.0 * up))[:, None, None] * n[:, :2, None] * turn[:, None, 2]

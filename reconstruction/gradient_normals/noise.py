@@ -71,6 +71,7 @@ def estimate_noise(stacks: Mapping[str, PatternStack]) -> SensorNoise | None:
                 continue
             some = y[used][:, good]
             w = weights[used]
+            # w @ samples has mean 0 and variance sum w_k^2 (read + gain s_k): a line in light
             light.append((w**2) @ some)
             square.append((w @ some) ** 2)
             count.append(np.full(some.shape[1], np.sum(w**2)))

@@ -101,6 +101,7 @@ def interpolate_middles(e, s, se, sw, inverse, diagonals, P):  # type: ignore[no
                 north = zero
             if P[RIGHT_0, row + 1, column] + P[RIGHT_1, row + 1, column] == zero:
                 south = zero
+            # solve the middle node's equation for it, with its four neighbors interpolated already
             w00 = west * P[BELOW_0, row, column] + north * P[RIGHT_0, row, column]
             w10 = west * P[BELOW_1, row, column] + south * P[RIGHT_0, row + 1, column]
             w01 = east * P[BELOW_0, row, column + 1] + north * P[RIGHT_1, row, column]

@@ -126,7 +126,8 @@ def _finish(  # type: ignore[no-untyped-def]
         return False
     nx, ny, nz = b0 / length, b1 / length, b2 / length
     free = used - 3
-    # Huber (1981), section 7.6: covariance of an M-estimate of regression
+    # Huber (1981), section 7.6: covariance of an M-estimate of regression, K^2 E psi^2 / (E psi')^2
+    # times (X'X)^-1, with K = 1 + (p / n) var(psi') / (E psi')^2 and p = 3 parameters
     variance = math.inf
     if free > 0 and slope > 0.0:
         mean = slope / used
