@@ -1,6 +1,6 @@
-"""How kernels over pixels are compiled: ahead of the first call, for read-only arrays as well.
+"""Options of Numba kernels over pixels: eager compilation, read-only arrays, contraction.
 
-Contraction is the only liberty that they take with arithmetic: NaN and infinity keep their meaning.
+Contraction is the only relaxation of arithmetic: NaN and infinity keep their meaning.
 """
 
 from typing import Any, Final

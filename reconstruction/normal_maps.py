@@ -1,4 +1,4 @@
-"""Normals with what is known about them: what every estimator of normals returns."""
+"""Normal maps with errors and masks, the result of every estimator of normals."""
 
 from dataclasses import dataclass, field
 
@@ -8,12 +8,12 @@ from reconstruction.arrays import BoolArray, FloatArray, Int32Array
 
 
 class PhotometricStereoError(ValueError):
-    """Images, lights or masks that no normal can be computed from."""
+    """Images, lights or masks that normals cannot be computed from."""
 
 
 @dataclass(frozen=True, slots=True)
 class NormalMaps:
-    """Normals with what is known about them; every array has the points' shape.
+    """Normals with albedo, errors and masks; every array has the points' shape.
 
     Where `valid` is False, normals and albedo are 0 and the standard error is pi; nothing is NaN.
 
@@ -23,14 +23,14 @@ class NormalMaps:
         Unit vectors, outward, in the frame of the light directions.
     albedo : ndarray, shape (...)
         In the unit of intensity over that of `light_intensity`; 1 for a white Lambertian surface
-        where the lights' intensity says so. Above 1 is possible.
+        if light intensities are calibrated. Above 1 is possible.
     residual : ndarray, shape (...)
         Root mean square of intensity over light intensity, less the fit, over the samples used.
     valid : ndarray of bool, shape (...)
         At least three samples from directions that span space, and a signal above its noise.
     stderr_rad : ndarray, shape (...)
-        Root mean square angle between estimate and truth that noise leads to, rad, at most pi,
-        which is given where three samples leave no residual and no variance is known.
+        Root mean square angle between estimate and ground truth due to noise, rad, at most pi,
+        the value if three samples leave no residual and no variance is given.
     stderr_albedo : ndarray, shape (...)
         Standard error of `albedo`; infinite in the same case.
     used : ndarray of int, shape (...)

@@ -10,7 +10,7 @@ from model.fresnel import ETA_SKIN
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
-MIN_CONTRAST = 0.05  # of the crossed diffuse weight over the leak, below which nothing separates
+MIN_CONTRAST = 0.05  # least crossed diffuse weight less the leak at which separation is possible
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,9 +20,9 @@ class PolarizerAxes:
     Attributes
     ----------
     light : tuple of float
-        Of the films in front of the lights.
+        Of the polarizers in front of the lights.
     parallel, crossed : tuple of float
-        Of the camera's analyser in its two states; both lie in the film.
+        Of the camera's analyzer in its two states; both are in the plane of the polarizer.
     """
 
     light: tuple[float, float, float] = (0.0, 1.0, 0.0)
@@ -35,10 +35,14 @@ class PolarizerAxes:
             axis = np.asarray(getattr(self, name), dtype=np.float64)
             if axis.shape != (3,) or abs(float(axis @ axis) - 1.0) > 1e-5:
                 raise ValueError(
-                    f"PolarizerAxes.{name}: got {axis.tolist()}, expected a unit vector"
+                    f"PolarizerAxes.{name}: got {axis.tolist()}, expected a unit vector; "
+                    "divide by its length"
                 )
         if np.linalg.norm(np.cross(self.parallel, self.crossed)) < 0.5:
-            raise ValueError("PolarizerAxes: parallel and crossed axes are nearly the same")
+            raise ValueError(
+                f"PolarizerAxes: got parallel {self.parallel} and crossed {self.crossed}, expected "
+                "axes that differ; correct the rig's analyzer states"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,13 +52,13 @@ class Separation:
     Attributes
     ----------
     diffuse : ndarray, shape (..., C)
-        Total unpolarized diffuse radiance: what the camera would see of the diffuse reflection
-        without its analyser. NaN where not `valid`.
+        Total unpolarized diffuse radiance, as the camera would record it without its analyzer.
+        NaN where not `valid`.
     specular : ndarray, shape (..., C)
-        Specular radiance as it passes the parallel analyser. May be negative by noise; NaN where
+        Specular radiance transmitted by the parallel analyzer. May be negative by noise; NaN where
         not `valid`.
     stderr : ndarray, shape (..., C), or None
-        Standard error of `diffuse`; None when no variance was given.
+        Standard error of `diffuse`; None without a variance.
     stderr_specular : ndarray, shape (..., C), or None
         Standard error of `specular`.
     valid : ndarray of bool, shape (...)
@@ -86,7 +90,7 @@ def separate(
 ) -> Separation:
     """Separate diffuse and specular radiance of a parallel and a crossed image.
 
-    With ``s`` the specular radiance through the parallel analyser, ``d`` the total diffuse
+    With ``s`` the specular radiance through the parallel analyzer, ``d`` the total diffuse
     radiance, ``k`` the part of ``s`` that also passes crossed and weights ``w`` near 1::
 
         parallel =   s + w_p d / 2
@@ -97,10 +101,10 @@ def separate(
     parallel, crossed : ndarray of float, shape (..., C)
         Linear images of the same scene, exposure and light, black-subtracted, any unit.
     extinction : float or array_like, shape (C,) or broadcastable, optional
-        Crossed over parallel contrast of the films, > 1 (1000 means k = 1e-3). None: ideal films.
+        Contrast of the polarizers, parallel over crossed, > 1 (1000 means k = 1e-3). None: ideal.
     normals : ndarray of float, shape (..., 3), optional
-        Unit normals in the rig frame, with `view_dir`: corrects for diffuse light being partly
-        polarized as it leaves the surface (weights up to 14 % off 1 at 60 to 73 degrees).
+        Unit normals in the rig frame, with `view_dir`: corrects for the partial polarization of
+        diffuse light at the exit (weights up to 14 % off 1 at 60 to 73 degrees).
     light_dir : array_like, shape (3,), (..., 3) or (L, 1, ..., 1, 3), optional
         Unit vectors to the light or the L lights of equal strength, away from the surface.
         Corrects `diffuse` to light that enters unpolarized (with `normals`), and `k` for
@@ -112,11 +116,11 @@ def separate(
     valid : ndarray of bool, shape (...), optional
         Pixels to use.
     saturation : float, optional
-        Value from which a pixel of either image counts as saturated.
+        Value above which a pixel of either image counts as saturated.
     leak_stderr : float or array_like, shape (C,)
         Standard error of ``1 / extinction``; enters both standard errors.
     axes : PolarizerAxes, optional
-        Default: lights and parallel analyser vertical (+y), crossed analyser horizontal.
+        Default: lights and parallel analyzer vertical (+y), crossed analyzer horizontal.
     eta : float
         Refractive index of the surface.
 
@@ -128,14 +132,14 @@ def separate(
     Raises
     ------
     ValueError
-        If shapes or ranges do not fit, or the films do not separate at all.
+        If shapes or ranges do not fit, or the polarizers do not separate at all.
 
     Notes
     -----
     Without `normals` the classic ``diffuse = 2 crossed``, ``specular = parallel - crossed`` results
-    for ideal films. An analyser's film is taken to pass half of unpolarized light in both states;
-    its leak adds the relative amount ``k`` to that, which a white reference taken the same way
-    takes out. Diffuse light is taken to leave the interior unpolarized and to be refracted at a
+    for ideal polarizers. The analyzer is assumed to transmit half of unpolarized light in both
+    states; its leak adds the relative amount ``k``, which a white reference measured the same way
+    cancels. Diffuse light is assumed to be unpolarized in the interior and refracted at a
     smooth surface (Atkinson and Hancock 2006, doi 10.1109/TIP.2006.871114).
 
     Examples
@@ -152,7 +156,7 @@ def separate(
     facing = np.ones(p.shape[:-1], dtype=bool)
     w_p = w_c = np.ones(1, dtype=kind)
     if normals is not None and view_dir is None:
-        raise ValueError("normals: got them without view_dir, expected both or neither")
+        raise ValueError("normals: got them without view_dir, expected both or neither; add it")
     Checks().within("eta", eta, "(1, 4)")
     if view_dir is not None:
         v = _unit("view_dir", view_dir, kind)
@@ -170,8 +174,8 @@ def separate(
     contrast = w_c - leak * w_p
     if float(np.max(contrast)) < MIN_CONTRAST:
         raise ValueError(
-            f"extinction: got a leak of {float(np.min(leak)):.3g}, the two images do not differ"
-            " enough to be separated; check the polarizers"
+            f"extinction: got a leak of {float(np.min(leak)):.3g}, expected one at which the two"
+            " images differ enough to be separated; check the polarizers"
         )
     good = facing & np.isfinite(p).all(axis=-1) & np.isfinite(c).all(axis=-1)
     good &= np.broadcast_to((contrast >= MIN_CONTRAST).all(axis=-1), good.shape)
@@ -214,7 +218,9 @@ def _images(parallel: FloatArray, crossed: FloatArray) -> tuple[FloatArray, Floa
     Checks().shape("crossed", c, p.shape)
     kind = np.result_type(p.dtype, c.dtype)
     if not np.issubdtype(kind, np.floating):
-        raise ValueError(f"parallel, crossed: got {kind}, expected linear images of floating type")
+        raise ValueError(
+            f"parallel, crossed: got {kind}, expected linear images of floating type; convert them"
+        )
     return p.astype(kind, copy=False), c.astype(kind, copy=False)
 
 
@@ -225,7 +231,10 @@ def _leak(extinction: ArrayLike | None, shape: tuple[int, ...]) -> Float64Array:
     Checks().within("extinction (parallel over crossed; inf if ideal)", ratio, "(1, inf]")
     leak = np.atleast_1d(1.0 / ratio)
     if np.broadcast_shapes(leak.shape, shape) != shape:
-        raise ValueError(f"extinction: got shape {ratio.shape} for images of shape {shape}")
+        raise ValueError(
+            f"extinction: got shape {ratio.shape}, expected one that broadcasts to images of shape "
+            f"{shape}; give one value per channel"
+        )
     return leak
 
 
@@ -247,7 +256,7 @@ def _unit(name: str, vectors: ArrayLike, kind: np.dtype) -> FloatArray:
     length = np.linalg.norm(array, axis=-1)
     known = np.isfinite(length)
     if not known.any() or np.abs(length[known] - 1.0).max() > 0.01:
-        raise ValueError(f"{name}: expected unit vectors, got lengths other than 1")
+        raise ValueError(f"{name}: got lengths other than 1, expected unit vectors; divide by them")
     return array
 
 
@@ -260,32 +269,32 @@ def _normalized(a: FloatArray) -> FloatArray:
 
 
 def _passed_field(absorbing: FloatArray, direction: FloatArray) -> FloatArray:
-    """Direction of the field a film passes along a ray: across the ray and its absorbing axis."""
+    """Return the field that a polarizer transmits along a ray, across ray and absorbing axis."""
     return _normalized(np.cross(np.broadcast_to(absorbing, direction.shape), direction))
 
 
 def _analyser_absorbs(axes: PolarizerAxes, kind: np.dtype) -> tuple[FloatArray, FloatArray]:
-    """Absorbing axes of the parallel and the crossed analyser, in the plane of the film."""
+    """Return the absorbing axes of the parallel and the crossed analyzer, in its plane."""
     parallel, crossed = np.asarray(axes.parallel), np.asarray(axes.crossed)
     film = _normalized(np.cross(parallel, crossed))
     return np.cross(film, parallel).astype(kind), np.cross(film, crossed).astype(kind)
 
 
 def _light_absorbs(axes: PolarizerAxes, light: FloatArray) -> FloatArray:
-    """Absorbing axis of a light's film, which faces the middle of the subject."""
+    """Return the absorbing axis of a light's polarizer, which faces the middle of the subject."""
     middle = _normalized(np.nanmean(light.reshape(-1, 3), axis=0))
     return _normalized(np.cross(middle, np.asarray(axes.light, dtype=light.dtype)))
 
 
 def fresnel_amplitudes(cosine: FloatArray, eta: float) -> tuple[FloatArray, FloatArray]:
-    """Return the amplitudes r_s and r_p that a surface of index `eta` reflects, of cosines > 0."""
+    """Return the amplitude reflectances r_s and r_p of a surface of index `eta`, cosines > 0."""
     inside = np.sqrt(1.0 - (1.0 - cosine**2) / eta**2)
     r_s = (cosine - eta * inside) / (cosine + eta * inside)
     return r_s, (eta * cosine - inside) / (eta * cosine + inside)
 
 
 def _transmittances(cosine: FloatArray, eta: float) -> tuple[FloatArray, FloatArray]:
-    """Fresnel's power transmittance of a smooth surface across (s) and in (p) the plane."""
+    """Return Fresnel's power transmittances across (s) and in (p) the plane of incidence."""
     r_s, r_p = fresnel_amplitudes(cosine, eta)
     return 1.0 - r_s**2, 1.0 - r_p**2
 
@@ -293,13 +302,13 @@ def _transmittances(cosine: FloatArray, eta: float) -> tuple[FloatArray, FloatAr
 def _polarized_over_unpolarized(
     normal: FloatArray, direction: FloatArray, field: FloatArray, eta: float
 ) -> tuple[FloatArray, BoolArray]:
-    """Return T(direction, field) over its mean over fields, shape (...), and where it holds."""
+    """Return T(direction, field) over its mean over fields, shape (...), and where it is valid."""
     cosine = _dot(normal, direction)
     towards = cosine > 1e-3  # turned away, or so grazing that T vanishes
     t_s, t_p = _transmittances(np.clip(np.where(towards, cosine, 1.0), 0.0, 1.0), eta)
     across = np.cross(normal, np.broadcast_to(direction, normal.shape))
     length2 = _dot(across, across)
-    # along the normal s and p are the same, and any direction serves
+    # along the normal s and p are equal, and any direction serves
     share_s = np.where(length2 > 1e-12, _dot(field, across) ** 2 / np.maximum(length2, 1e-12), 0.5)
     return (t_s * share_s + t_p * (1.0 - share_s)) / (0.5 * (t_s + t_p)), towards
 
@@ -318,7 +327,7 @@ def _exit_weights(
 
 
 def _by_light(light: FloatArray) -> list[FloatArray]:
-    """Split (L, 1, ..., 3) into its lights; one direction or one field of directions stays one."""
+    """Split (L, 1, ..., 3) into its lights; keep one direction or one field of directions."""
     if light.ndim >= 3 and all(side == 1 for side in light.shape[1:-1]):
         return list(light)
     return [light]
@@ -327,7 +336,7 @@ def _by_light(light: FloatArray) -> list[FloatArray]:
 def _entry_weight(
     normal: FloatArray, light: FloatArray, axes: PolarizerAxes, eta: float
 ) -> tuple[FloatArray, BoolArray]:
-    """How much of the polarized light enters, over as much unpolarized light, shape (..., 1)."""
+    """Return the transmittance of the polarized over that of unpolarized light, (..., 1)."""
     polarized = np.zeros(normal.shape[:-1], dtype=normal.dtype)
     unpolarized = np.zeros_like(polarized)
     for one in _by_light(light):
@@ -346,10 +355,10 @@ def _entry_weight(
 def _tilted_leak(
     leak: FloatArray, light: FloatArray, view: FloatArray, axes: PolarizerAxes, eta: float
 ) -> FloatArray:
-    """Crossed over parallel of specular light, with the turn of its plane of polarization.
+    """Return the crossed over parallel specular light, with the rotation of its polarization.
 
-    Fresnel's amplitudes at the facet that mirrors light into the camera weigh the s and p parts of
-    the field differently, so that light out of the planes of symmetry comes back turned.
+    Fresnel's amplitudes at the facet that mirrors light into the camera weight the s and p parts of
+    the field differently, so that the polarization of light out of the planes of symmetry rotates.
     """
     kind = view.dtype
     absorbs_p, absorbs_c = _analyser_absorbs(axes, kind)
@@ -359,7 +368,7 @@ def _tilted_leak(
         half = _normalized(to_light + to_view)
         s = np.cross(half, to_light)
         length = np.linalg.norm(s, axis=-1, keepdims=True)
-        # light from behind the camera: no plane, no turn; any s across the ray serves
+        # light along the view: no plane of incidence, no rotation; any s across the ray serves
         s = np.where(length > 1e-6, s, np.cross(np.asarray([0.3, 0.8, 0.52], kind), to_light))
         s = _normalized(s)
         cosine = np.clip(_dot(half, to_light), 0.0, 1.0)

@@ -1,6 +1,6 @@
-"""Map a function over tiles with a bounded number in flight, in order.
+"""Map a function over tiles in order, with a bounded number in flight.
 
-The one seam for parallel and distributed work: any executor with ``submit`` fits, a
+The only interface for parallel and distributed work: any executor with ``submit`` fits, a
 ``concurrent.futures`` pool or ``distributed.Client(...).get_executor()`` alike.
 """
 
@@ -34,18 +34,18 @@ def map_tiles(
     executor
         Where to run; None runs in this thread.
     window
-        The most tiles that may be in flight at once.
+        Largest number of tiles in flight.
 
     Yields
     ------
     Result
-        One result a tile, in order. When a tile raises, the tiles that have not started
+        One result per tile, in order. If a tile raises, tiles not yet started
         are cancelled and the error is passed on.
 
     Raises
     ------
     ValueError
-        When ``window`` is below 1.
+        If ``window`` is below 1.
 
     Examples
     --------
@@ -77,9 +77,9 @@ def map_on_threads(
     *,
     window: int = 8,
 ) -> list[Result]:
-    """Return ``fn(tile)`` of all tiles: on an executor, or on one thread a core, at most 8.
+    """Return ``fn(tile)`` of all tiles: on an executor, or on one thread per core, at most 8.
 
-    Several tiles get threads where no executor is given; one runs in this thread. The other
+    Several tiles get threads if no executor is given; one runs in this thread. The other
     parameters are those of :func:`map_tiles`.
     """
     if executor is not None or len(tiles) < 2:

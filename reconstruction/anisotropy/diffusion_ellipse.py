@@ -1,4 +1,4 @@
-"""The ellipse that 1/sigma_tr draws over the directions of anisotropic tissue: equations and fit.
+"""Describe and fit the ellipse of 1/sigma_tr over the directions of anisotropic tissue.
 
 With parameters ``l, u, v``: h = hypot(u, v) is the log of the ratio of its axes, (u, v) / h is
 (cos, sin) of twice the direction of its long axis, and l the log of the geometric mean of the
@@ -18,9 +18,9 @@ N_MEAN_DIRECTIONS = 360
 """Directions over which sigma_tr is averaged; exact to rounding up to ratios of 25."""
 MAX_ELLIPSE_ITERATIONS = 100
 MAX_ELLIPSE_STEP = 1.0
-"""Of u and v in one iteration."""
+"""Largest step of u and v in one iteration."""
 ELLIPSE_STEP_TOL = 1e-11
-"""Of the parameters' steps."""
+"""Step of the parameters at which the fit has converged."""
 
 
 def relative_sigma_tr(
@@ -37,19 +37,19 @@ def relative_sigma_tr(
     -------
     values : ndarray, shape (B, N)
     derivatives : ndarray, shape (B, N, 2)
-        By u and v.
+        Derivatives by u and v.
     """
     c, s = np.cos(2 * angle_rad), np.sin(2 * angle_rad)
     u, v = uv[:, :1], uv[:, 1:]
     h = np.hypot(u, v)
     small = h < 1e-3
     safe = np.where(small, 1.0, h)
-    # sinh(h) / h, and its derivative over h, over h
+    # sinh(h) / h, and its derivative by h divided by h
     k = np.where(small, 1.0 + h * h / 6.0, np.sinh(safe) / safe)
     k1 = np.where(small, 1.0 / 3.0 + h * h / 30.0, (np.cosh(safe) - k) / safe**2)
     along = u * c + v * s
     cosine = along / np.where(h > 0, h, 1.0)
-    # cosh h - sinh h cosine, without cancelling along the long axis
+    # cosh h - sinh h cosine, without cancellation along the long axis
     values = np.sqrt(np.exp(-h) + np.sinh(h) * (1.0 - cosine))
     by_u = (k * u - k1 * u * along - k * c) / (2 * values)
     by_v = (k * v - k1 * v * along - k * s) / (2 * values)
@@ -57,7 +57,7 @@ def relative_sigma_tr(
 
 
 def uniform_axial_directions() -> Float64Array:
-    """Return directions that go evenly over all axes, rad, (`N_MEAN_DIRECTIONS`,)."""
+    """Return directions uniform over all axes, rad, (`N_MEAN_DIRECTIONS`,)."""
     return np.asarray(np.arange(N_MEAN_DIRECTIONS) * (np.pi / N_MEAN_DIRECTIONS))
 
 
@@ -72,16 +72,16 @@ def fit_ellipses(
     ----------
     angle_rad : ndarray, shape (N,)
     values, weight : ndarray, shape (N, B)
-        Of sigma_tr, near 1 in size; weights as of `start`.
+        Values of sigma_tr, near 1, and weights as in `start`.
     start : HarmonicFit
-        Tells where there is a fit, and where the first harmonic is in it.
+        Linear fit: which series can be fitted, and which with the first harmonic.
 
     Returns
     -------
     parameters : ndarray, shape (B, 5)
-        l, u, v, a, b; a and b are 0 where not fitted, all where nothing is.
+        l, u, v, a, b; a and b are 0 where not fitted, all are 0 without a fit.
     inverse : ndarray, shape (B, 5, 5)
-        Covariance for weights that are inverse variances; 0 in what is not fitted.
+        Covariance if the weights are inverse variances; 0 for parameters not fitted.
     residual : ndarray, shape (B,)
         Weighted sum of squared residuals.
     """
@@ -128,7 +128,7 @@ def fit_ellipses(
         active = active[np.abs(step).max(axis=1) > ELLIPSE_STEP_TOL]
         if not active.size:
             break
-    # a factor that is 1 where nothing is fitted keeps the decomposition regular
+    # ones on the diagonal of parameters not fitted keep the matrix regular
     rows = np.concatenate([np.sqrt(w)[..., None] * jacobian, eye * ~free[:, None, :]], axis=1)
     triangle = np.linalg.inv(np.linalg.qr(rows, mode="r"))
     inverse = np.einsum("bij,bkj->bik", triangle, triangle) * (free[:, :, None] & free[:, None, :])
@@ -138,7 +138,7 @@ def fit_ellipses(
 def _linearized(
     angle_rad: Float64Array, y: Float64Array, p: Float64Array, free: BoolArray
 ) -> tuple[Float64Array, Float64Array]:
-    """Return residuals (B, N) and the model's derivatives (B, N, 5), 0 by what is not free."""
+    """Return residuals (B, N) and the model's derivatives (B, N, 5), 0 for fixed parameters."""
     shape, by_uv = relative_sigma_tr(angle_rad, p[:, 1:3])
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     size = np.exp(0.5 * p[:, :1])

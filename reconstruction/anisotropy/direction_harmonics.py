@@ -1,9 +1,9 @@
-"""Weighted fits of the first two harmonics over directions, and their exact p-values.
+"""Fit the first two harmonics over directions with weights, and compute exact p-values.
 
 ``y = b0 + b1 cos theta + b2 sin theta + b3 cos 2 theta + b4 sin 2 theta``. Directions run along
 the first axis of arrays, independent series along the second.
 
-For normal errors whose ratios are known, the weighted sum of squares that two coefficients explain
+For normal errors of known ratios, the weighted sum of squares explained by two coefficients
 over that of the residuals is F's with 2 degrees of freedom above, whose tail has a closed form:
 ``P(F > f) = (1 + 2 f / d)^(-d/2)``; for known errors, ``P(chi2 > x) = exp(-x/2)``.
 """
@@ -19,17 +19,17 @@ from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 CONSTANT_COLUMNS, ODD_COLUMNS, AXIAL_COLUMNS = slice(0, 1), slice(1, 3), slice(3, 5)
 """Columns of `design_matrix`."""
 MIN_DIRECTIONS = 5
-"""Different directions without which nothing is said: three are fitted, two show the errors."""
+"""Fewest distinct directions: three coefficients are fitted, two give the errors."""
 MIN_FIRST_HARMONIC_DIRECTIONS = 8
-"""Different directions from which the first harmonic is fitted, too."""
+"""Fewest distinct directions for a fit of the first harmonic."""
 MAX_CONDITION_NUMBER = 50.0
-"""Of the design matrix for an axis; directions close together do not tell a harmonic."""
+"""Limit of the design matrix for an axis; close directions do not determine a harmonic."""
 MAX_FIRST_HARMONIC_CONDITION_NUMBER = 6.0
-"""Beyond, directions do not go around: the first harmonic would cost more than it tells."""
+"""Limit for the first harmonic: beyond it directions do not cover a turn, and it adds noise."""
 OUTLIER_FALSE_ALARM_RATE = 1e-3
-"""Chance that a fit loses a good direction as an outlier; no more is added to false alarms."""
+"""Probability that a fit excludes a good direction; the same adds to false alarms at most."""
 DIRECTIONS_PER_OUTLIER = 8
-"""One of so many directions may be left out as an outlier."""
+"""Directions per excluded outlier."""
 
 
 def design_matrix(angle_rad: Float64Array) -> Float64Array:
@@ -47,7 +47,7 @@ def design_matrix(angle_rad: Float64Array) -> Float64Array:
 
 
 def count_distinct_directions(angle_rad: Float64Array, used: BoolArray) -> Int64Array:
-    """Return how many different directions of a turn are used, (B,); to a millionth of a turn."""
+    """Return the number of distinct used directions, (B,), to a millionth of a turn."""
     turns = np.round(np.mod(angle_rad / math.tau, 1.0) * 1e6).astype(np.int64) % 1_000_000
     same = turns == np.unique(turns)[:, None]
     return np.asarray((same.astype(np.int64) @ used.astype(np.int64) > 0).sum(axis=0))
@@ -55,23 +55,23 @@ def count_distinct_directions(angle_rad: Float64Array, used: BoolArray) -> Int64
 
 @dataclass(frozen=True, slots=True)
 class HarmonicFit:
-    """Weighted least squares of the harmonics, B series at once.
+    """Weighted least-squares fit of the harmonics, B series at once.
 
     Attributes
     ----------
     coefficients : ndarray, shape (B, 5)
         b0...b4; 0 where not fitted.
     determined, has_first_harmonic : ndarray of bool, shape (B,)
-        Constant and second harmonic are fitted; the first one is, too.
+        Whether constant and second harmonic, and whether also the first one, are fitted.
     residual : ndarray, shape (B,)
         Weighted sum of squared residuals.
     axial_power, first_harmonic_power : ndarray, shape (B,)
-        Weighted sums of squares that the second and the first harmonic explain.
+        Weighted sums of squares explained by the second and the first harmonic.
     dof : ndarray of int, shape (B,)
-        Degrees of freedom of the residuals; 0 where not told.
+        Degrees of freedom of the residuals; 0 where not determined.
     studentized : ndarray, shape (N, B)
         Deleted residuals over their standard errors: Student's t with one degree of freedom less
-        than `dof`; 0 where that leaves fewer than 2.
+        than `dof`; 0 if fewer than 2 remain.
     """
 
     coefficients: Float64Array
@@ -87,13 +87,13 @@ class HarmonicFit:
 def fit_harmonics(
     angle_rad: Float64Array, values: Float64Array, weight: Float64Array
 ) -> HarmonicFit:
-    """Fit the harmonics that the directions tell.
+    """Fit the harmonics that the directions determine.
 
     Parameters
     ----------
     angle_rad : ndarray, shape (N,)
     values, weight : ndarray, shape (N, B)
-        A weight of 0 leaves a direction out. Weights in ratios of inverse variances.
+        Relative inverse variances; a weight of 0 omits a direction.
 
     Returns
     -------
@@ -103,22 +103,22 @@ def fit_harmonics(
     n, count = values.shape
     used = weight > 0
     directions = count_distinct_directions(angle_rad, used)
-    told, odd = np.zeros(count, bool), np.zeros(count, bool)
+    determined, odd = np.zeros(count, bool), np.zeros(count, bool)
     for chosen, least, most, flag in (
-        ([0, 3, 4], MIN_DIRECTIONS, MAX_CONDITION_NUMBER, told),
+        ([0, 3, 4], MIN_DIRECTIONS, MAX_CONDITION_NUMBER, determined),
         ([0, 1, 2, 3, 4], MIN_FIRST_HARMONIC_DIRECTIONS, MAX_FIRST_HARMONIC_CONDITION_NUMBER, odd),
     ):
-        # singular values of the design on used directions, whatever their weights
+        # singular values of the design on used directions, with equal weights
         gram = np.einsum("ni,nb,nj->bij", x[:, chosen], used.astype(float), x[:, chosen])
         eigenvalues = np.linalg.eigvalsh(gram)
         flag[:] = (directions >= least) & (eigenvalues[:, -1] <= most**2 * eigenvalues[:, 0])
-    odd &= told
+    odd &= determined
     coefficients = np.zeros((count, 5))
     leverage = np.zeros((n, count))
     axial, first, dof = np.zeros(count), np.zeros(count), np.zeros(count, np.int64)
     root = np.sqrt(weight)
     for columns, series in (
-        (np.array([0, 3, 4]), np.flatnonzero(told & ~odd)),
+        (np.array([0, 3, 4]), np.flatnonzero(determined & ~odd)),
         (np.arange(5), np.flatnonzero(odd)),
     ):
         if not series.size:
@@ -133,22 +133,24 @@ def fit_harmonics(
         axial[series] = (turned[:, -2:] ** 2).sum(axis=1)
         if columns.size == 5:
             spread = np.einsum("bij,bkj->bik", inverse[:, ODD_COLUMNS], inverse[:, ODD_COLUMNS])
+            # two coefficients b of covariance C explain b' C^-1 b of the sum of squares
             solved = np.linalg.solve(spread, b[:, ODD_COLUMNS, None])[..., 0]
             first[series] = (b[:, ODD_COLUMNS] * solved).sum(axis=1)
         leverage[:, series] = (q * q).sum(axis=2).T
         dof[series] = used[:, series].sum(axis=0) - columns.size
     error = (values - x @ coefficients.T) * root
-    error[:, ~told] = 0.0
+    error[:, ~determined] = 0.0
     residual = (error**2).sum(axis=0)
+    # omitting direction i lowers the sum of squares by e_i^2 / (1 - h_i), h_i its leverage
     left = np.maximum(1.0 - leverage, 1e-12)
     deleted = residual - error**2 / left
-    # what rounding leaves of a residual is none
+    # residuals within rounding count as 0
     deleted = np.maximum(deleted, 1e-12 * residual)
-    enough = told & (dof >= 3) & (residual > 0)
+    enough = determined & (dof >= 3) & (residual > 0)
     per_one = np.sqrt(np.where(enough, deleted / np.maximum(dof - 1, 1), 1.0) * left)
     per_one = np.maximum(per_one, np.finfo(np.float64).tiny)
     studentized = np.where(enough & used, error / per_one, 0.0)
-    return HarmonicFit(coefficients, told, odd, residual, axial, first, dof, studentized)
+    return HarmonicFit(coefficients, determined, odd, residual, axial, first, dof, studentized)
 
 
 def exclude_outliers(
@@ -156,7 +158,7 @@ def exclude_outliers(
 ) -> tuple[Float64Array, BoolArray]:
     """Return the weights with those of outliers set to 0, and which ones these are, (N, B).
 
-    One at a time the direction of largest deleted residual is left out, while that is less likely
+    One at a time the direction of largest deleted residual is excluded, if it is less probable
     than `OUTLIER_FALSE_ALARM_RATE` over the number of directions, and at most one of
     `DIRECTIONS_PER_OUTLIER`.
     """
@@ -183,7 +185,7 @@ def exclude_outliers(
 
 
 def log_p_value(power: Float64Array, residual: Float64Array, dof: Int64Array) -> Float64Array:
-    """Return log P that two coefficients explain so much, in errors that the residuals tell.
+    """Return the log p-value of two coefficients with errors estimated from the residuals.
 
     Examples
     --------

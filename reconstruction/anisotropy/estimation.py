@@ -1,12 +1,12 @@
-"""Whether light spreads farther along one direction of the skin: ratio, axis and p-value.
+"""Estimate anisotropy of light diffusion in skin: ratio, axis and p-value.
 
 A probe's head turned about its source reads sigma_tr along several directions. Where diffusion is
 described by a tensor, light decays as ``exp(-sqrt(sigma_a r' D^-1 r))``: sigma_tr^2 is a quadratic
 form of the direction, and 1/sigma_tr drawn over it is an ellipse (`diffusion_ellipse`).
 
-theta and theta + 180 degrees are one axis. A first harmonic, in theta itself, is no property of
-such tissue: it tells that the head was tilted or badly coupled, or that the skin changes from one
-side to the other. It is fitted beside and reported apart, where the directions go around.
+theta and theta + 180 degrees are one axis. A first harmonic, in theta itself, is not a property of
+such tissue: the head was tilted or badly coupled, or the skin changes from one side to the
+other. It is fitted in addition and reported separately, if the directions cover a turn.
 
 The p-value is that of the harmonic in 2 theta of a linear weighted fit of sigma_tr, exact for
 normal errors in known ratios (`direction_harmonics`), at any size.
@@ -40,21 +40,22 @@ from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 Errors: TypeAlias = Literal["relative", "absolute"]
 
 MAX_EXPONENT = 300
-"""Powers of two from 1 beyond which values are brought near it: their squares keep within range."""
+"""Powers of two from 1 beyond which values are rescaled, to keep their squares in range."""
 MIN_DIRECTION_ERROR, MAX_DIRECTION_ERROR = 1e-307, 1e150
-"""Relative standard errors of one direction: less would divide 0 by 0, more is no reading."""
+"""Range of relative standard errors of one direction: below it 0 is divided by 0, above it a
+value is not a reading."""
 MAX_ERROR_RATIO = 1e12
-"""Standard errors over the least: directions of greater ones are left out, since beside the best
-ones rounding hides what they tell."""
+"""Standard error over the least one above which a direction is omitted, as rounding exceeds its
+information."""
 
 
 class AnisotropyError(ValueError):
-    """Directions, values or errors that no anisotropy can be told from."""
+    """Directions, values or errors from which anisotropy cannot be estimated."""
 
 
 @dataclass(frozen=True, slots=True)
 class Anisotropy:
-    """How far sigma_tr depends on the direction.
+    """Dependence of sigma_tr on the direction.
 
     Arrays have the shape (...) of one direction's values, such as (3,) for channels. Where not
     `valid`, ratios and p-values are 1 and standard errors infinite.
@@ -62,31 +63,31 @@ class Anisotropy:
     Attributes
     ----------
     ratio, ratio_stderr : ndarray
-        Greatest over least 1/sigma_tr, 1 or more, and its standard error. Errors make it greater
-        than it is: isotropic tissue shows some 1 + ratio_stderr.
+        Greatest over least 1/sigma_tr, 1 or more, and its standard error. Errors bias it upwards:
+        isotropic tissue yields some 1 + ratio_stderr.
     axis_rad, axis_stderr_rad : ndarray
-        Direction of greatest 1/sigma_tr in [0, pi), counted as the angles are, and its standard
-        error; up to `plane_vectors.UNKNOWN_AXIS_RAD`, where the ratio cannot be told from 1.
+        Direction of greatest 1/sigma_tr in [0, pi), in the convention of the angles, and its
+        standard error; up to `plane_vectors.UNKNOWN_AXIS_RAD` for a ratio that may be 1.
     p_value, log10_p : ndarray
-        Chance that isotropic tissue shows such a harmonic in 2 theta, and its decimal logarithm.
+        Probability of such a harmonic in 2 theta in isotropic tissue, and its decimal logarithm.
     mean_per_mm, mean_stderr_per_mm : ndarray
         sigma_tr averaged over all directions, 1/mm.
     tilt, tilt_stderr, tilt_rad, tilt_p_value : ndarray
         The first harmonic over the mean, with the direction of greatest sigma_tr in [0, 2 pi), and
-        the chance of it without a cause. 0, infinity, 0 and 1 where it is not fitted.
+        its p-value. 0, infinity, 0 and 1 where it is not fitted.
     chi2 : ndarray
         Sum of squared residuals of the ellipse over the standard errors given; without any, `dof`.
     dof : ndarray of int
         Degrees of freedom of the residuals.
     used, outlier : ndarray of bool, shape (N, ...)
-        Directions that the fit rests on; those left out because they contradict the others.
+        Directions that the fit uses; those omitted as outliers.
     valid : ndarray of bool
     reason : ndarray of str
         Why not valid; empty otherwise.
     parameters, covariance : ndarray, shapes (..., 3), (..., 3, 3)
         l, u, v of `diffusion_ellipse`, sigma_tr in 1/mm, and their covariance.
     errors : str
-        As of :func:`estimate`.
+        See :func:`estimate`.
     """
 
     ratio: Float64Array
@@ -122,29 +123,28 @@ def estimate(
     outliers: bool = True,
     log_ratio_error: float = 0.0,
 ) -> Anisotropy:
-    """Tell ratio and axis of anisotropy from sigma_tr along several directions.
+    """Estimate ratio and axis of anisotropy from sigma_tr along several directions.
 
     Parameters
     ----------
     angle_rad : array_like, shape (N,)
         Direction from the source to the detectors, rad; any turn, repeats allowed.
     sigma_tr_per_mm : array_like, shape (N, ...)
-        sigma_tr along each direction, 1/mm. Values that are not finite and above 0 are left out.
+        sigma_tr along each direction, 1/mm. Values that are not finite and above 0 are omitted.
     stderr_per_mm : array_like, shape (N, ...), optional
         Standard errors, 1/mm. None, or zeros throughout a channel: equal ones, of unknown size.
-        One that is not finite leaves its direction out.
+        A direction with one that is not finite is omitted.
     valid : array_like of bool, shape (N, ...), optional
-        Directions that count; the others may be anything.
+        Directions to use; values of the others are ignored.
     errors : {"relative", "absolute"}
-        Of unknown size in ratios as given, scaled by the residuals (F test); or of the size given
-        (chi-square test). The first holds when contact differs from turn to turn, which no
-        error of a fit knows of.
+        "relative": standard errors in ratios as given, scaled by the residuals (F test);
+        "absolute": as given (chi-square test). Use the first if contact differs from turn to turn,
+        which errors of fits do not include.
     outliers : bool
-        Leave out directions that contradict the others, one of eight at most: t test of deleted
-        residuals. The chance to lose a good one is
-        `direction_harmonics.OUTLIER_FALSE_ALARM_RATE`.
+        Omit outlier directions, one of eight at most: t test of deleted residuals. The probability
+        of omitting a good one is `direction_harmonics.OUTLIER_FALSE_ALARM_RATE`.
     log_ratio_error : float
-        Error of the log of the ratio over itself that all directions have in common; it widens
+        Relative error of the log of the ratio that is common to all directions; it widens
         the ratio's standard error.
 
     Returns
@@ -155,7 +155,7 @@ def estimate(
     ------
     AnisotropyError
         For fewer than `MIN_DIRECTIONS` different directions, shapes that do not fit, a standard
-        error below 0, of 0 beside others, or none where "absolute" ones are asked.
+        error below 0, some but not all 0, or none with "absolute".
 
     Examples
     --------
@@ -168,21 +168,21 @@ def estimate(
     angle, values, stderr, good, shape = _checked(
         angle_rad, sigma_tr_per_mm, stderr_per_mm, valid, errors
     )
-    # sums and squares of values at the ends of the range would leave it
+    # rescale: sums and squares of extreme values would overflow
     y, weight, outlier, least, scale, exponent = _normalize_values(
         angle, values, stderr, good, outliers
     )
     linear = direction_harmonics.fit_harmonics(angle, y, weight)
     p, inverse, residual = diffusion_ellipse.fit_ellipses(angle, y, weight, linear)
-    # what rounding leaves is neither a residual nor a harmonic
+    # residuals and harmonics are at least those of rounding
     rounding = (16 * np.finfo(np.float64).eps) ** 2 * (weight * y * y).sum(axis=0)
     residual = np.maximum(residual, rounding)
     factor, log_p, log_odd = _error_scale_and_p_values(linear, residual, least, rounding, errors)
     covariance = inverse * (factor**2)[:, None, None]
     covariance[:, 1:3, 1:3] += log_ratio_error**2 * p[:, 1:3, None] * p[:, None, 1:3]
     with np.errstate(over="ignore"):
-        told_chi2 = residual / least / least
-    chi2 = linear.dof.astype(np.float64) if stderr_per_mm is None else told_chi2
+        given_chi2 = residual / least / least
+    chi2 = linear.dof.astype(np.float64) if stderr_per_mm is None else given_chi2
 
     h, h_stderr, h_across = estimate_length(p[:, 1:3], covariance[:, 1:3, 1:3])
     mean, by_parameter = diffusion_ellipse.mean_over_directions(p[:, :3])
@@ -192,9 +192,11 @@ def estimate(
     tilt, tilt_stderr, _ = estimate_length(p[:, 3:], covariance[:, 3:, 3:])
     ellipse = p[:, :3].copy()
     ellipse[:, 0] += 2.0 * (np.log(scale) + exponent * math.log(2.0))
-    told, odd = linear.determined, linear.has_first_harmonic
+    determined, odd = linear.determined, linear.has_first_harmonic
 
-    def shaped(found: NDArray[Any], otherwise: float, where: BoolArray = told) -> NDArray[Any]:
+    def shaped(
+        found: NDArray[Any], otherwise: float, where: BoolArray = determined
+    ) -> NDArray[Any]:
         kept = where.reshape(-1, *[1] * (found.ndim - 1))
         return np.where(kept, found, otherwise).reshape((*shape, *found.shape[1:]))
 
@@ -215,8 +217,8 @@ def estimate(
         dof=linear.dof.reshape(shape),
         used=(weight > 0).reshape((-1, *shape)),
         outlier=outlier.reshape((-1, *shape)),
-        valid=told.reshape(shape),
-        reason=_reasons(angle, weight > 0, told).reshape(shape),
+        valid=determined.reshape(shape),
+        reason=_reasons(angle, weight > 0, determined).reshape(shape),
         parameters=shaped(ellipse, 0.0),
         covariance=shaped(covariance[:, :3, :3], math.inf),
         errors=errors,
@@ -226,7 +228,7 @@ def estimate(
 def _normalize_values(
     angle: Float64Array, values: Float64Array, stderr: Float64Array, good: BoolArray, outliers: bool
 ) -> tuple[Float64Array, Float64Array, BoolArray, Float64Array, Float64Array, Int64Array]:
-    """Return values about 1 and their weights, outliers, least errors, scale, power of two."""
+    """Return values scaled to about 1, weights, outliers, least errors, scale, power of two."""
     exponent = _scaling_exponent(np.where(good, values, 0.0).max(axis=0, initial=0.0))
     with np.errstate(over="ignore"):
         values, stderr = np.ldexp(values, -exponent), np.ldexp(stderr, -exponent)
@@ -238,12 +240,12 @@ def _normalize_values(
     relative = np.where(good, relative, math.inf)
     least = relative.min(axis=0, initial=math.inf)
     least = np.where(np.isfinite(least), least, 1.0)
-    # weights of 1 at most: errors of any size keep within range
+    # weights of 1 at most keep errors of any size in range
     weight = np.where(good & (relative <= MAX_ERROR_RATIO * least), (least / relative) ** 2, 0.0)
     outlier = np.zeros(weight.shape, bool)
     if outliers:
         weight, outlier = direction_harmonics.exclude_outliers(angle, y, weight)
-        # others beside one far above them were next to nothing of the mean
+        # one value far above the others would make these vanish in the mean
         kept = np.where(weight > 0, y, 0.0)
         closer = _scaling_exponent(kept.max(axis=0, initial=0.0))
         y = np.ldexp(np.where(closer == 0, y, kept), -closer)
@@ -258,10 +260,10 @@ def _error_scale_and_p_values(
     rounding: Any,
     errors: Errors,
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return what standard errors are multiplied by, and log P of both harmonics by chance."""
+    """Return the factor of the standard errors, and log p-values of both harmonics."""
     dof = np.maximum(linear.dof, 1)
     if errors == "relative":
-        # as wide as needed to hold 68 % with few degrees of freedom, too
+        # Student's t keeps the coverage at 68 % with few degrees of freedom
         factor = np.sqrt(residual / dof) * stats.t.ppf(special.ndtr(1.0), dof)
         linear_residual = np.maximum(linear.residual, rounding)
         log_p = direction_harmonics.log_p_value(linear.axial_power, linear_residual, linear.dof)
@@ -285,7 +287,7 @@ def _checked(
     valid: ArrayLike | None,
     errors: Errors,
 ) -> tuple[Float64Array, Float64Array, Float64Array, BoolArray, tuple[int, ...]]:
-    """Return angles (N,), values, standard errors and what counts (N, B), and the shape of B."""
+    """Return angles (N,), values, standard errors and validity (N, B), and the shape of B."""
     check = Checks(AnisotropyError)
     angle = check.numbers("angle_rad", angle_rad, ("N",))
     given = np.asarray(sigma_tr_per_mm, np.float64)
@@ -308,14 +310,18 @@ def _checked(
     zero = good & (stderr == 0)
     whole = (zero == good).all(axis=0)
     if (zero.any(axis=0) & ~whole).any():
-        raise AnisotropyError("stderr_per_mm: got 0 beside others, expected all above 0 or all 0")
+        raise AnisotropyError(
+            "stderr_per_mm: got 0 for some values, expected all above 0 or all 0; correct them"
+        )
     if errors == "absolute" and zero.any():
-        raise AnisotropyError('stderr_per_mm: got none or 0, expected above 0 for "absolute"')
+        raise AnisotropyError(
+            'stderr_per_mm: got none or 0, expected above 0 for "absolute"; use errors="relative"'
+        )
     return angle, values, np.where(whole, 1.0, stderr), good, shape
 
 
 def _scaling_exponent(largest: Float64Array) -> Int64Array:
-    """Return the power of two of values (B,) far from 1; 0 for those that are not, and for 0."""
+    """Return the power of two of values (B,) far from 1; 0 for other values."""
     exponent = np.frexp(largest)[1].astype(np.int64)
     return np.where((largest > 0) & (np.abs(exponent) > MAX_EXPONENT), exponent, 0)
 
@@ -328,7 +334,7 @@ def _reasons(angle: Float64Array, used: BoolArray, determined: BoolArray) -> NDA
             if ok
             else f"{n} usable directions, expected {MIN_DIRECTIONS} or more"
             if n < MIN_DIRECTIONS
-            else "directions lie too close together to tell an axis"
+            else "directions are too close together to determine an axis"
             for ok, n in zip(determined, several, strict=True)
         ],
         dtype=np.str_,
@@ -337,16 +343,16 @@ def _reasons(angle: Float64Array, used: BoolArray, determined: BoolArray) -> NDA
 
 @dataclass(frozen=True, slots=True)
 class SingleDirectionBias:
-    """What a fit along one direction of anisotropic tissue is off from the mean over directions.
+    """Bias of sigma_tr along one direction of anisotropic tissue from the mean over directions.
 
     Attributes
     ----------
     bias, stderr : ndarray, shape (K, ...)
-        sigma_tr along each direction asked, over its mean, minus 1; and its standard error.
+        sigma_tr along each given direction over its mean, minus 1; and its standard error.
     lowest, highest : ndarray, shape (...)
         Least and greatest bias of any direction.
     rms : ndarray, shape (...)
-        Root mean square over all directions: what a head set down at random is off.
+        Root mean square bias over all directions, as of a head at a random angle.
     """
 
     bias: Float64Array
@@ -359,14 +365,14 @@ class SingleDirectionBias:
 def estimate_single_direction_bias(
     anisotropy: Anisotropy, angle_rad: ArrayLike
 ) -> SingleDirectionBias:
-    """Say how far sigma_tr along single directions is from its mean over all directions.
+    """Estimate the bias of sigma_tr along single directions from its mean over all directions.
 
     Parameters
     ----------
     anisotropy : Anisotropy
-        Where it is not `valid` biases are 0, with infinite standard errors.
+        Where it is not `valid`, biases are 0 with infinite standard errors.
     angle_rad : array_like, shape (K,)
-        Directions in which the head would be set down, rad.
+        Directions of the head, rad.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Length and direction of plane vectors that are known with errors."""
+"""Compute length and direction of plane vectors with errors."""
 
 import math
 
@@ -8,7 +8,7 @@ from scipy import special
 from reconstruction.arrays import Float64Array
 
 UNKNOWN_AXIS_RAD = math.pi / math.sqrt(12.0)
-"""Standard deviation of an axis that may point anywhere."""
+"""Standard deviation of a uniformly distributed axis."""
 
 
 def quadratic_form(vectors: Float64Array, matrices: Float64Array) -> Float64Array:
@@ -19,7 +19,7 @@ def quadratic_form(vectors: Float64Array, matrices: Float64Array) -> Float64Arra
 def estimate_length(
     pair: Float64Array, covariance: Float64Array
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return the length of vectors, and their standard errors along and across themselves.
+    """Return the length of vectors, and their standard errors along and across the vectors.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def estimate_length(
     Returns
     -------
     length, along, across : ndarray, shape (B,)
-        A vector of length 0 is taken to point along the first axis.
+        A vector of length 0 points along the first axis.
 
     Examples
     --------
@@ -50,7 +50,7 @@ def estimate_length(
 
 
 def wrap_angle(angle: Float64Array, period: float) -> Float64Array:
-    """Return angles within [0, period), in their unit; what rounds up to the period is 0.
+    """Wrap angles to [0, period), in their unit; values that round to the period become 0.
 
     Examples
     --------

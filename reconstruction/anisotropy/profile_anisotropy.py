@@ -1,16 +1,15 @@
-"""Ratio and axis of anisotropy from whole profiles, each compared with the mean one.
+"""Estimate ratio and axis of anisotropy from whole profiles, each compared with the mean one.
 
-Where scattering depends on the direction and absorption does not, the profile along direction i is
-the mean one times what a model of tissue says that other scattering does to it::
+If scattering depends on the direction and absorption does not, the profile along direction i is
+the mean one times the effect of the different scattering in a model of tissue::
 
     R_i(r_k) = exp(b_i) m_k T(r_k; sigma_a, sigma_s' exp(d_i)) / T(r_k; sigma_a, sigma_s')
 
-``d_i`` is the log of sigma_s' over the mean, ``b_i`` the log of how well the head couples and
-``m_k`` the mean reading of fibre k. T, `model.photon_table`, serves for differences alone: what is
-wrong with a fibre in all directions alike (its gain, its distance, stray light) or with the model
-is in m_k. Near the source more scattering is more light, far away it is less, so that neither is
-mistaken for coupling. Readings are compared as they are, not as logarithms: those lost in noise,
-even negative ones, count without bias.
+``d_i`` is the log of sigma_s' over the mean, ``b_i`` the log of the head's coupling and
+``m_k`` the mean reading of fiber k. T, `model.photon_table`, is used for differences alone: errors
+common to all directions, of a fiber (gain, distance, stray light) or of the model, are in m_k. More
+scattering is more light near the source and less far away, and so differs from coupling. Readings
+are compared without logarithms: those within noise, even negative ones, are used without bias.
 """
 
 from collections.abc import Callable
@@ -29,20 +28,20 @@ Table: TypeAlias = Callable[[Float64Array, Float64Array], tuple[Float64Array, Fl
 """sigma_a (B, 1, 1) and sigma_s' (B, N, 1) to T and dT / d sigma_s', (B, N, F)."""
 
 MIN_COMPARED_FIBERS = 6
-"""A direction has two numbers of its own; fewer fibres tell little beside them."""
+"""Fewest fibers compared: a direction has two parameters of its own."""
 MIN_FIBER_SIGNAL_SIGMAS = 3.0
-"""Readings of a fibre, averaged over directions, that stand out of their errors so many times
-count; a rule on each reading by itself would keep those that noise made large."""
+"""Standard errors by which a fiber's reading, averaged over directions, must exceed 0. A test of
+each single reading would select those that noise made large."""
 LOG_RATIO_MODEL_ERROR = 0.05
-"""Relative error of logs of ratios of sigma_tr, from a model whose scattering is the same in all
+"""Relative error of logs of ratios of sigma_tr, by a model whose scattering is equal in all
 directions: against fits of each direction, and Monte Carlo of directed scattering."""
 N_COMPARISON_ROUNDS = 10
 MAX_COMPARISON_STEP = 0.3
-"""Of b and d in a round."""
+"""Largest change of b and d per round."""
 MIN_ROUND_RATIO = 1e-3
-"""A mean reading stays above so much of what it was in the round before."""
+"""Least ratio of a mean reading to that of the round before."""
 MIN_READING_ERROR = 1e-4
-"""Relative error of readings, where none is stated and a variance is 0."""
+"""Relative error of readings if none is given and a variance is 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +57,7 @@ class ProfileComparison:
         b, about a mean of 0.
     valid : ndarray of bool, shape (N, B)
     used : ndarray of bool, shape (B, F)
-        Fibres that count.
+        Fibers that are used.
     """
 
     log_scattering: Float64Array
@@ -78,18 +77,18 @@ def compare_profiles(
     *,
     floor: float,
 ) -> ProfileComparison:
-    """Compare profiles of several directions.
+    """Fit relative scattering and coupling to profiles of several directions.
 
     Parameters
     ----------
     readings, variance, valid : ndarray, shape (N, B, F)
-        Readings, 1/mm^2, their variances, and which count; the others may be anything.
+        Readings, 1/mm^2, their variances, and which are used; values of the others are ignored.
     sigma_a_per_mm, sigma_s_prime_per_mm : ndarray, shape (B,)
-        Of the mean profile, 1/mm; a series where one is not finite and above 0 is not valid.
+        Of the mean profile, 1/mm; a series with one not finite and above 0 is not valid.
     table : callable
-        Model of tissue at the fibres' distances.
+        Model of tissue at the fibers' distances.
     floor : float
-        Relative error of each reading that variances do not know of, 0 or more.
+        Relative error of each reading not included in its variance, 0 or more.
 
     Returns
     -------
@@ -117,6 +116,7 @@ def compare_profiles(
     d, b = np.zeros((series, n)), np.zeros((series, n))
     inverse = np.zeros((series, n, 2, 2))
     members = np.maximum(comparable.sum(axis=1), 1)[:, None]
+    # alternate: Gauss-Newton for (b, d) of each direction with m fixed, then m in closed form
     for _ in range(N_COMPARISON_ROUNDS):
         scattering = s * np.exp(d)[..., None]
         light, slope = table(a, scattering)
@@ -167,46 +167,46 @@ def estimate_from_profiles(
     errors: Errors = "relative",
     outliers: bool = True,
 ) -> Anisotropy:
-    """Tell ratio and axis of anisotropy from the profiles themselves.
+    """Estimate ratio and axis of anisotropy from profiles.
 
-    Each profile is compared with the mean one (:func:`compare_profiles`) and asked how much more
-    tissue scatters along its direction, and how well the head coupled. What is wrong with a fibre
-    in all directions cancels, and so does coupling: errors are several times smaller than those of
+    Each profile is compared with the mean one (:func:`compare_profiles`), which gives the relative
+    scattering along its direction and the head's coupling. Errors of a fiber that are common to
+    all directions cancel, and so does coupling: errors are several times smaller than those of
     sigma_tr fitted direction by direction (bench stage "anisotropy").
 
     Parameters
     ----------
     angle_rad : array_like, shape (N,)
-        As of `anisotropy.estimate`.
+        See `anisotropy.estimate`.
     radius_mm : array_like, shape (F,)
-        Distances of the fibres from the source, mm, at least 0.
+        Distances of the fibers from the source, mm, at least 0.
     reflectance_per_mm2 : array_like, shape (N, ..., F)
         Profiles, 1/mm^2.
     variance : array_like, shape (N, ..., F), optional
         Of the profiles.
     sigma_a_per_mm, sigma_s_prime_per_mm : array_like, shape (...)
         Fitted to the mean profile, or means of fits, 1/mm. Where one is not finite and above 0
-        nothing is told.
+        nothing is fitted.
     eta, g
-        As of `model.photon_table.reflectance`.
+        See `model.photon_table.reflectance`.
     valid : array_like of bool, shape (N, ..., F), optional
-        Readings that count; those that are not finite never do.
+        Readings to use; those that are not finite are never used.
     floor : float
-        Relative error of each reading that its variance does not know of, at least 0: coupling
-        that differs from fibre to fibre.
+        Relative error of each reading not included in its variance, at least 0: coupling
+        that differs between fibers.
     errors, outliers
-        As of `anisotropy.estimate`.
+        See `anisotropy.estimate`.
 
     Returns
     -------
     Anisotropy
-        Directions with too few readings are not in `used`. The ratio's standard error holds
+        Directions with too few readings are not in `used`. The ratio's standard error includes
         `LOG_RATIO_MODEL_ERROR`.
 
     Raises
     ------
     AnisotropyError
-        As of `anisotropy.estimate`, and for distances or a floor out of range.
+        See `anisotropy.estimate`; also for distances or a floor out of range.
 
     Examples
     --------
@@ -226,7 +226,7 @@ def estimate_from_profiles(
     check.shape("reflectance_per_mm2", profiles, (angle.size, *profiles.shape[1:-1], r.size))
     check.within("floor", floor, "[0, inf)")
     if errors == "absolute" and variance is None:
-        raise AnisotropyError('variance: got none, expected one for "absolute" errors')
+        raise AnisotropyError('variance: got none, expected one; give it or use errors="relative"')
     of_each: Float64Array = np.zeros_like(profiles)
     if variance is not None:
         of_each = np.asarray(variance, np.float64)
@@ -250,16 +250,16 @@ def estimate_from_profiles(
     found = compare_profiles(
         profiles.reshape(rows), of_each.reshape(rows), good.reshape(rows), a, s, table, floor=floor
     )
-    told = found.valid
-    a, s = np.where(told, a, 1.0), np.where(told, s, 1.0) * np.exp(found.log_scattering)
+    fitted = found.valid
+    a, s = np.where(fitted, a, 1.0), np.where(fitted, s, 1.0) * np.exp(found.log_scattering)
     sigma_tr = np.sqrt(3.0 * a * (a + s))
-    stderr = sigma_tr * 0.5 * s / (a + s) * np.where(told, found.stderr, 1.0)
+    stderr = sigma_tr * 0.5 * s / (a + s) * np.where(fitted, found.stderr, 1.0)
     back = (angle.size, *shape)
     return estimate(
         angle,
         sigma_tr.reshape(back),
         stderr.reshape(back),
-        valid=told.reshape(back),
+        valid=fitted.reshape(back),
         errors=errors,
         outliers=outliers,
         log_ratio_error=LOG_RATIO_MODEL_ERROR,

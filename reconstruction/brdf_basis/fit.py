@@ -1,4 +1,4 @@
-"""Surface BRDFs as non-negative mixtures of tabulated materials, and fewer mixtures for all.
+"""Fit surface BRDFs as non-negative mixtures of tabulated materials, and reduce the mixtures.
 
 One convention, in fit and evaluation alike. With L the radiance, E the irradiance a surface facing
 the light would get, theta the light's angle to the normal and F_t = 1 - F_r::
@@ -6,9 +6,9 @@ the light would get, theta the light's angle to the normal and F_t = 1 - F_r::
     surface sample  R_s = L / E - cos(theta) F_t(light) F_t(view) R_d / pi      [1/sr]
     model           R_s = cos(theta) sum_j x_j M_j(light, view)
 
-The materials M_j hold their Fresnel reflection as measured ones do, so F_r is counted once: nothing
-multiplies it again (the paper's eqs. (2), (3), (7) leave room for twice). Highlights have the
-light's color, so samples are one number for all channels.
+The materials M_j include their Fresnel reflection as measured ones do, so F_r is counted once:
+nothing multiplies it again (the paper's eqs. (2), (3), (7) could be read as twice). Highlights have
+the light's color, so samples are one number for all channels.
 
 References
 ----------
@@ -31,26 +31,26 @@ from reconstruction.brdf_basis.nnls_kernels import fit_points
 from reconstruction.lumitexels import boundary_kernels
 
 MIN_SAMPLE_COSINE = 0.1
-"""Samples whose light or view is nearer to the horizon are not used."""
+"""Least cosine of light and view of a used sample."""
 N_REWEIGHTINGS = 3
-POINTS_PER_BLOCK = 64  # points that share their working memory
+POINTS_PER_BLOCK = 64  # points with a common working memory
 PLATEAU_FRACTION = 0.05
 
 
 class SampleError(ValueError):
-    """Samples whose shapes do not fit each other."""
+    """Samples of inconsistent shapes."""
 
 
 @dataclass(frozen=True, slots=True)
 class SurfaceSamples:
-    """What the surface of P points reflected in M pairs of light and view.
+    """Surface reflection of P points in M pairs of light and view.
 
     Attributes
     ----------
     value : ndarray of float32, shape (P, M)
         R_s of this module's convention, 1/sr; negative by noise.
     variance : ndarray of float32, shape (P, M)
-        Of `value`; 0: not known (then all samples of a point count the same).
+        Of `value`; 0: unknown (then all samples of a point have equal weights).
     light_dir, view_dir : ndarray of float32, shape (P, M, 3)
         Unit vectors away from the surface, rig frame.
     normals : ndarray of float32, shape (P, 3)
@@ -80,20 +80,20 @@ class SurfaceSamples:
 
 @dataclass(frozen=True, slots=True)
 class BasisWeights:
-    """Mixtures of a basis, one a point.
+    """Mixtures of a basis, one per point.
 
     Attributes
     ----------
     weights : ndarray of float64, shape (P, K)
-        Shares of the materials, at least 0. The materials are nearly dependent: compare mixtures by
-        their BRDFs, never by these numbers. 0 where not `valid`.
+        Weights of the materials, at least 0. The materials are nearly dependent: compare mixtures
+        by their BRDFs, never by these numbers. 0 where not `valid`.
     residual : ndarray of float64, shape (P,)
         Weighted RMS of samples - model, 1/sr; NaN where not `valid`.
     stderr : ndarray of float64, shape (P,)
         Relative standard error of the BRDF's overall scale; NaN where not `valid`, or where the
         mixture is empty.
     valid : ndarray of bool, shape (P,)
-        False where no sample could be used.
+        False without a usable sample.
     """
 
     weights: Float64Array
@@ -129,7 +129,7 @@ def surface_samples(
     eta
         Relative refractive index, as in the estimate of `r_d`.
     variance
-        Of `brdf_samples`, same shape. Channels are averaged by its inverse, evenly without it.
+        Of `brdf_samples`, same shape. Channels are averaged by its inverse, or evenly without it.
     valid
         Samples to use, (P, M); None: all that are finite.
 
@@ -188,7 +188,7 @@ def fit_weights(
     basis
         Materials; see :mod:`model.brdf.tables`.
     compress
-        "cbrt": misfits count as differences of cube roots, as far as they exceed the noise.
+        "cbrt": misfits are differences of cube roots, as far as they exceed the noise.
         "none": plain least squares, weighted by the variances where these are known.
 
     Returns
@@ -229,12 +229,12 @@ def evaluate(
     view_dir: ArrayLike,
     normal: ArrayLike,
 ) -> Float64Array:
-    """Return the mixtures' BRDF, 1/sr, without the cosine; nothing multiplies it by F_r again.
+    """Evaluate the mixtures' BRDF, 1/sr, without the cosine and without another factor F_r.
 
     Parameters
     ----------
     weights
-        Shares (..., K), broadcast with the directions.
+        Weights (..., K), broadcast with the directions.
     light_dir, view_dir, normal
         Unit vectors (..., 3) away from the surface, in one frame.
 
@@ -255,23 +255,24 @@ def reduce(
     Parameters
     ----------
     weights
-        Shares (P, K) or a fit; points that are not valid are left at 0.
+        Weights (P, K) or a fit; points that are not valid keep 0.
     rank
-        Number of common mixtures, at least 1. More than the data can hold is refused.
+        Number of common mixtures, at least 1 and at most the smaller of P and K.
     basis
-        Where given, materials count by how much they reflect and the error is that of the BRDFs;
-        else both are of the shares themselves, whatever a share of its material means.
+        If given, materials are scaled by their reflection, and the error is that of the BRDFs;
+        otherwise both are of the weights themselves.
     seed
-        Of the factorization.
+        Seed of the factorization.
 
     Returns
     -------
     weights : ndarray, shape (P, rank)
-        Shares of the common mixtures. A fit to the samples on ``basis.mixed(basis_mix)`` is better.
+        Weights of the common mixtures. A fit to the samples on ``basis.mixed(basis_mix)`` is
+        better.
     basis_mix : ndarray, shape (rank, K)
         The common mixtures, each of sum 1.
     relative_error : float
-        Root of the squared misfit over the square of what is factored.
+        Root of the squared misfit over the square of the factored matrix.
     """
     found = weights.weights if isinstance(weights, BasisWeights) else weights
     shares = Checks().numbers("weights", found, ("P", "K"), interval="[0, inf)")
@@ -301,22 +302,21 @@ def reduce(
 
 def _factor(model: NMF, data: Float64Array) -> tuple[Float64Array, Float64Array]:
     with warnings.catch_warnings():
-        # A factorization stopped early is a valid one, a little worse; its error says how good.
+        # A factorization stopped early is valid but slightly worse; its error includes that
         warnings.simplefilter("ignore", ConvergenceWarning)
         found = model.fit_transform(data)
     return found, np.asarray(model.components_)
 
 
 def find_plateau_rank(errors: ArrayLike, *, fraction: float = PLATEAU_FRACTION) -> int:
-    """Return the rank from which more do not help: within `fraction` of all that ranks gained.
+    """Return the first rank whose error is within `fraction` of the whole gain of the least error.
 
     Parameters
     ----------
     errors
         Errors of ranks 1, 2, ...
-    share
-        The rule: the first rank whose error exceeds the least one by no more than this share of the
-        fall from rank 1 to the least error.
+    fraction
+        Allowed excess over the least error, as a fraction of the fall from rank 1 to it.
 
     Examples
     --------
@@ -335,12 +335,12 @@ def render_lit_sphere(
     light_dir: ArrayLike = (0.5, 0.5, 0.70710678),
     size_px: int = 128,
 ) -> Float64Array:
-    """Return the lobe of one mixture on a sphere seen from +z, far away.
+    """Render one mixture on a sphere viewed from +z at a distance, without the diffuse part.
 
     Parameters
     ----------
     weights
-        Shares (K,).
+        Weights (K,).
     light_dir
         Unit vector to the light; +x right, +y up.
     size_px
@@ -349,7 +349,7 @@ def render_lit_sphere(
     Returns
     -------
     ndarray, shape (size_px, size_px)
-        BRDF times cosine of the light, 1/sr; row 0 is the top; 0 beside the sphere.
+        BRDF times cosine of the light, 1/sr; row 0 is the top; 0 outside the sphere.
     """
     at = (np.arange(size_px) + 0.5) / size_px * 2.0 - 1.0
     x, y = np.meshgrid(at, -at)

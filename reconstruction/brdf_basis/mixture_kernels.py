@@ -1,6 +1,6 @@
-"""Mixtures of a tabulated basis at many samples of many points, compiled.
+"""Evaluate mixtures of a tabulated basis at many samples of many points (Numba).
 
-`reconstruction.brdf_basis.evaluate` is the plain twin; tests hold both together.
+`reconstruction.brdf_basis.evaluate` is the plain counterpart; tests compare both.
 """
 
 import math
@@ -27,7 +27,7 @@ def evaluate_mixtures(
     table : ndarray of float32, shape (N_d, N_phi, N_h, L)
         Of a `brdf_tables.BrdfBasis`; L >= K.
     weights : ndarray, shape (P, K)
-        Shares of the basis.
+        Weights of the basis.
     light_dir, view_dir : ndarray, shape (P, M, 3)
         Unit vectors away from the surface.
     normals : ndarray, shape (P, 3)

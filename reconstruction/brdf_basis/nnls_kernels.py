@@ -1,9 +1,9 @@
-"""Non-negative least squares of many points at once, each with its own matrix from the tables.
+"""Solve non-negative least squares of many points, each with its own matrix from the tables.
 
-Per point: the rows of its matrix from the tables, then rounds of two steps. A small working set of
-columns is solved by Lawson and Hanson's active sets through its Gram matrix, and one pass over the
+Per point: the rows of its matrix from the tables, then rounds of two steps. Lawson and Hanson's
+active sets solve for a small working set of columns through its Gram matrix, and one pass over the
 whole matrix finds the columns outside that would lower the misfit most. The full Gram matrix is
-never formed. A point starts from its neighbour's columns, and a reweighting from its own.
+never formed. Each point starts from its neighbor's columns, each reweighting from its own.
 
 References
 ----------
@@ -28,16 +28,16 @@ from reconstruction.brdf_basis.row_kernels import (
 )
 
 MAX_ACTIVE_COLUMNS = 32
-"""Most columns in a working set; when it is full, the unused ones leave it."""
+"""Size of a working set; when it is full, unused columns leave it."""
 MAX_JOINING_COLUMNS = 4
-"""Most columns that join a working set at once."""
+"""Largest number of columns that join a working set at once."""
 MISFIT_TOL = 4e-5
-"""A column joins while it alone would lower the squared misfit by more than this squared."""
+"""Root of the relative decrease of the squared misfit from which a column joins."""
 MIN_INDEPENDENT_FRACTION = 1e-7
-"""A column whose part outside those in use is a smaller share of its square than this is refused:
-the Gram matrix, summed in float32, knows no more."""
+"""Fraction of a column's square outside those in use, below which it is refused: the Gram matrix,
+summed in float32, does not resolve less."""
 HUBER_SIGMAS = 3.0
-"""Residuals beyond so many standard deviations pull with constant force."""
+"""Standard deviations beyond which the weight of a residual falls as its inverse."""
 
 
 @njit(nogil=True)
@@ -104,14 +104,14 @@ def _minimize_active_set(gram, rhs, size, norm, x, active, low, trial, refused):
                     p = active[i]
                     x[p] = max(x[p] + reach * (trial[i] - x[p]), 0.0)
                 if first < 0:
-                    if entering >= 0:  # it stays: those refused before may fit now
+                    if entering >= 0:  # it stays; columns refused before may fit now
                         for p in range(size):
                             refused[p] = False
                     break
             gone = active[first]
             x[gone] = 0.0
             if gone == entering:
-                refused[gone] = True  # it came in and went at once: not again
+                refused[gone] = True  # it left at once: refused
             used -= 1
             for i in range(first, used):
                 active[i] = active[i + 1]
@@ -178,7 +178,7 @@ def _solve(  # type: ignore[no-untyped-def]
     _extend_normal_equations(0, size, column, target, count, gram, rhs)
     norm = math.sqrt(dot(target, target, count))
     for step in range(materials + 2):
-        # The first round's misfit is that of what the set explains at best
+        # The first round's tolerance is coarse, as its misfit is that of the starting set
         _minimize_active_set(
             gram, rhs, size, 1e-3 * norm if step == 0 else norm, x, active, low, trial, refused
         )
@@ -211,7 +211,7 @@ def _solve(  # type: ignore[no-untyped-def]
                     best, joining = pull[k], k
             if joining < 0:
                 break
-            for k in range(materials):  # a step along this column leaves about so much to others
+            for k in range(materials):  # a step along it lowers others' pull
                 pull[k] -= kinship[joining, k] * best
             pull[joining] = 0.0
             working[size] = joining
@@ -226,16 +226,16 @@ def _solve(  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _update_weights(value, variance, model, count, weight, scatter):  # type: ignore[no-untyped-def]
-    """Weigh samples by noise plus a misfit that is even in cube roots; return its new square.
+    """Weight samples by noise plus a misfit uniform in cube roots; return its updated square.
 
     With u the model, a misfit tau of cube roots is 3 u^(2/3) tau of u, so the weight is
-    1 / (var + 9 tau^2 u^(4/3)). tau^2 is what the residuals leave over the noise.
+    1 / (var + 9 tau^2 u^(4/3)). tau^2 is the excess of the squared residuals over the noise.
     """
     mean = 0.0
     for i in range(count):
         mean += model[i]
     mean /= count
-    if mean < 1e-30:  # a model without light has no cube roots to weigh by
+    if mean < 1e-30:  # the cube roots of a zero model are 0
         return scatter
     floor = 0.02 * mean
     above = 0.0
@@ -246,7 +246,7 @@ def _update_weights(value, variance, model, count, weight, scatter):  # type: ig
         total = float64(variance[i]) + scatter * spread
         share = spread / (total * total)
         r = float64(value[i]) - model[i]
-        # An outlier tells nothing of the others' misfit.
+        # An outlier does not inform the others' misfit: clip it
         above += share * (min(r * r, HUBER_SIGMAS * HUBER_SIGMAS * total) - variance[i])
         below += share * spread
     scatter = max(above / below, 1e-8 * mean ** (2.0 / 3.0))
@@ -293,7 +293,7 @@ def fit_points(  # type: ignore[no-untyped-def]
     """Fit every point; fill ``weights`` (P, K), return weighted RMS residuals and standard errors.
 
     ``reweightings`` 0: weights from the variances alone (1 where a point has none); otherwise so
-    many passes weigh by noise and by cube roots. ``block`` points share their working memory, and
+    many passes weight by noise and by cube roots. ``block`` points share their working memory, and
     start from each other's columns. The standard error is that of the lobe's scale, as a fraction
     of it.
     """
@@ -359,7 +359,7 @@ def fit_points(  # type: ignore[no-untyped-def]
             else:
                 fill_any(flat, cos_l, place, weight, count, rows, square)
             kept = 0
-            for p in range(size):  # the neighbour's columns in use
+            for p in range(size):  # the neighbor's columns in use
                 if x[p] > 0.0:
                     working[kept] = working[p]
                     kept += 1

@@ -1,4 +1,4 @@
-"""Rows of a point's matrix: what each basis BRDF of the table reflects of each sample's light."""
+"""Fill rows of a point's matrix: reflection of each basis BRDF for each sample (Numba)."""
 
 import math
 from collections.abc import Callable
@@ -28,7 +28,7 @@ def _angle(c):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp", "nnan"})
 def find_nodes(light, view, normal, picked, count, cos_l, node_position):  # type: ignore[no-untyped-def]
-    """Fill the cosine of the light and the place on the table's axes of the picked samples."""
+    """Fill the cosine of the light and the position on the table's axes of the picked samples."""
     n0, n1, n2 = float64(normal[0]), float64(normal[1]), float64(normal[2])
     on_d, on_phi, on_h = node_position[0], node_position[1], node_position[2]
     for j in range(count):
@@ -52,7 +52,7 @@ def find_nodes(light, view, normal, picked, count, cos_l, node_position):  # typ
 
 
 def _row_filler(fixed: int) -> Callable[..., Any]:
-    """Return the kernel that fills a matrix; one of fixed width runs in unrolled vectors."""
+    """Return the kernel that fills a matrix; one of fixed width is unrolled to vectors."""
 
     @njit(nogil=True, fastmath=FAST_MATH)
     def fill(flat, cos_l, place, weight, count, rows, square):  # type: ignore[no-untyped-def]
@@ -97,7 +97,7 @@ fill_any = _row_filler(0)
 
 @njit(nogil=True, fastmath=FAST_MATH)
 def multiply_transpose(rows, force, count, total):  # type: ignore[no-untyped-def]
-    """Fill the matrix' transpose times ``force``, in blocks of float32 added up in float64."""
+    """Fill the matrix' transpose times ``force``, in blocks of float32 summed in float64."""
     lanes = rows.shape[1]
     block = np.empty(lanes, dtype=np.float32)
     total[:] = 0.0

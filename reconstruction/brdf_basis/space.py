@@ -1,9 +1,8 @@
-"""How many common mixtures a set of surface BRDFs needs: error against their number.
+"""Compute the error of surface BRDFs against the number of common mixtures.
 
 Mixtures of tabulated materials (`reconstruction.brdf_basis.fit_weights`) are factored into fewer
-mixtures common to all points; the error says how far the BRDFs of the points lie from what the
-common mixtures can make with shares of at least 0. Points that the mixtures were not made of give
-the error out of sample.
+mixtures common to all points. The error is the distance of the points' BRDFs from the best
+combinations of these with weights of at least 0. Held-out points give the error out of sample.
 
 References
 ----------
@@ -28,15 +27,15 @@ Method = Literal["shares", "brdf"]
 CURVE_RANKS: Final = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16)
 MAX_SWEEPS: Final = 60
 SWEEP_TOL: Final = 1e-7
-"""Relative change of what is lowered below which a refinement ends."""
+"""Relative change of the objective at which a refinement ends."""
 MAX_STRENGTH_RATIO: Final = 8.0
-"""Times the median strength from which on a point's mixture counts as not held down by samples."""
+"""Strength over the median from which samples do not constrain a point's mixture."""
 PLATEAU_FRACTIONS: Final = (0.02, 0.05, 0.1)
-"""Shares of the plateau's rule at which it is told."""
+"""Fractions of the plateau's rule that are reported."""
 
 
 class SpaceError(ValueError):
-    """Points that make no space of BRDFs."""
+    """Points that do not form a space of BRDFs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,19 +45,19 @@ class SpaceCurve:
     Attributes
     ----------
     ranks : tuple of int
-        Numbers of mixtures, growing.
+        Numbers of mixtures, increasing.
     error : ndarray, shape (R,)
         Relative error on the points that the mixtures were made of.
     held_out : ndarray, shape (R,)
-        The same on points they were not made of; NaN where none was kept.
+        The same on held-out points; NaN without any.
     held_out_stderr : ndarray, shape (R,)
-        Its standard error over these points; groups, where there are any, count as one each.
+        Its standard error over these points; a group counts as one.
     mixes : tuple of ndarray, shape (rank, K)
         The mixtures of each rank, each of sum 1.
     points, held_out_points : int
-        How many there were of either.
+        Numbers of points of both kinds.
     omitted : tuple of (int, str)
-        Ranks that were asked for and not made, with the reason.
+        Requested ranks that were not made, with the reason.
     """
 
     ranks: tuple[int, ...]
@@ -73,18 +72,18 @@ class SpaceCurve:
     def plateau_rank(
         self, *, fraction: float = brdf_basis.PLATEAU_FRACTION, max_rank: int | None = None
     ) -> int:
-        """Return the number of mixtures from which on more do not help.
+        """Return the number of mixtures beyond which the error hardly falls.
 
         The first rank whose error exceeds the least one by no more than `fraction` of the fall from
         the first rank to the least error (`reconstruction.brdf_basis.find_plateau_rank`). The
-        answer depends on the share, and on how many ranks are looked at.
+        result depends on the fraction, and on the largest rank.
 
         Parameters
         ----------
-        share
+        fraction
             See above.
-        most
-            Look at ranks up to this one only; None: all.
+        max_rank
+            Largest rank to use; None: all.
         """
         among = [k for k, rank in enumerate(self.ranks) if max_rank is None or rank <= max_rank]
         if not among:
@@ -92,14 +91,14 @@ class SpaceCurve:
         return self.ranks[brdf_basis.find_plateau_rank(self.error[among], fraction=fraction) - 1]
 
     def normalized(self) -> Float64Array:
-        """Return the errors over that of the first rank, (R,): several curves on one scale."""
+        """Return the errors over that of the first rank, (R,), to compare several curves."""
         return self.error / self.error[0] if self.error[0] > 0.0 else np.zeros_like(self.error)
 
 
 def is_constrained(weights: ArrayLike, basis: BrdfBasis) -> BoolArray:
-    """Return which points' mixtures are held down by their samples, (P,).
+    """Return which points' mixtures are constrained by their samples, (P,).
 
-    A lobe so narrow that no pair of light and view met it can have any share: mixtures of more
+    A lobe so narrow that no pair of light and view met it can have any weight: mixtures of more
     than `MAX_STRENGTH_RATIO` times the median strength, and empty ones, are not used.
     """
     strength = _checked(weights, basis) @ basis.strength()
@@ -119,26 +118,26 @@ def compute_error_curve(
     method: Method = "brdf",
     seed: int = 0,
 ) -> SpaceCurve:
-    """Factor mixtures into ever more common ones.
+    """Factor mixtures into increasing numbers of common ones; return the errors.
 
     Parameters
     ----------
     weights
-        Shares (P, K) of the materials, at least 0, of the points that the mixtures are made of.
+        Weights (P, K) of the materials, at least 0, of the points that the mixtures are made of.
     basis
         The K materials.
     ranks
-        Numbers of common mixtures, growing; those that the points cannot hold are left out.
+        Numbers of common mixtures, increasing; those above the number of points are omitted.
     held_out
-        Shares (Q, K) of other points.
+        Weights (Q, K) of other points.
     groups
-        Whom each of these belongs to, (Q,): points of one person err alike.
+        Person of each of these, (Q,); errors of one person's points are correlated.
     method
-        "shares": factored as shares of the materials weighted by their strength, as the paper does
-        (scikit-learn's NMF). "brdf": the same as a start, then mixtures and shares in turn take
+        "shares": weights of the materials, scaled by their strength, are factored, as in the paper
+        (scikit-learn's NMF). "brdf": the same as a start, then mixtures and weights in turn take
         their best values for the BRDFs themselves, and no rank is worse than a smaller one.
     seed
-        Of the factorization.
+        Seed of the factorization.
 
     Returns
     -------
@@ -147,31 +146,36 @@ def compute_error_curve(
     Raises
     ------
     SpaceError
-        Nothing reflects, or no rank can be made.
+        If all weights are 0, or no rank can be made.
     ValueError
-        The shares do not fit the basis, or are negative.
+        If the weights do not fit the basis, or are negative.
 
     Notes
     -----
-    The error is the root of the squared gap between the BRDFs of all points and of what the
-    mixtures make of them with their best shares, over the square of the BRDFs; nodes of the tables
-    count by solid angle, as in `brdf_basis.reduce` (whose own error is that of the factorization's
-    shares, which are not the best for the BRDFs, and is larger). Materials are nearly dependent:
-    shares that look different may be one BRDF, and factoring shares spends mixtures on that.
+    The error is the root of the squared difference between the BRDFs of all points and their best
+    approximation by the mixtures, over the square of the BRDFs. Nodes of the tables count by solid
+    angle, as in `brdf_basis.reduce` (whose own error is that of the factorization's weights, which
+    are not the best for the BRDFs, and is larger). Materials are nearly dependent: different
+    weights may be one BRDF, and a factorization of weights spends mixtures on that.
     """
     shares = _checked(weights, basis)
     if list(ranks) != sorted(set(ranks)) or not len(ranks) or ranks[0] < 1:
-        raise SpaceError(f"ranks: got {list(ranks)}, expected growing numbers from 1")
+        raise SpaceError(f"ranks: got {list(ranks)}, expected increasing numbers from 1; sort them")
     Checks().choice("method", method, ("shares", "brdf"))
     gram = brdf_inner_products(basis)
     if not np.any(shares):
-        raise SpaceError(f"weights: all {len(shares)} points are 0, none shows how it reflects")
+        raise SpaceError(
+            f"weights: got {len(shares)} points of 0, expected some above; check the samples"
+        )
     most = min(shares.shape)
     made = [rank for rank in ranks if rank <= most]
     if not made:
-        raise SpaceError(f"ranks: got {list(ranks)}, but {len(shares)} points hold {most} at most")
+        raise SpaceError(
+            f"ranks: got {list(ranks)}, expected some up to {most} for {len(shares)} points; "
+            "add a smaller rank"
+        )
     left_out = tuple(
-        (rank, f"{len(shares)} points of {shares.shape[1]} materials hold {most} at most")
+        (rank, f"{len(shares)} points of {shares.shape[1]} materials allow {most} at most")
         for rank in ranks
         if rank > most
     )
@@ -209,18 +213,18 @@ def compute_error_curve(
 def refine_mixtures(
     weights: ArrayLike, mix: ArrayLike, basis: BrdfBasis, *, sweeps: int = MAX_SWEEPS
 ) -> Float64Array:
-    """Lower the BRDFs' error of common mixtures, shares and mixtures in turn.
+    """Refine common mixtures for the BRDFs' error, weights and mixtures in turn.
 
     Parameters
     ----------
     weights
-        Shares (P, K), at least 0.
+        Weights (P, K), at least 0.
     mix
         Mixtures to start from, (R, K), at least 0.
     basis
         The K materials.
     sweeps
-        How often all are renewed.
+        Largest number of passes over all weights and mixtures.
 
     Returns
     -------
@@ -229,8 +233,8 @@ def refine_mixtures(
 
     Notes
     -----
-    Coordinate descent in the metric of the materials' products: every share of all points, and
-    every entry of the mixtures, in turn takes its best value of at least 0 while all others stand,
+    Coordinate descent in the metric of the materials' products: every weight of all points, and
+    every entry of the mixtures, in turn takes its best value of at least 0 with all others fixed,
     so that the error never grows (hierarchical alternating least squares: Cichocki and Phan 2009,
     doi:10.1587/transfun.E92.A.708, there without a metric).
     """
@@ -255,17 +259,20 @@ def refine_mixtures(
 
 
 def _descend(values: Float64Array, target: Float64Array, square: Float64Array) -> None:
-    """Lower x A x' - 2 b x' of each row x, one column after the other, in place; x >= 0."""
+    """Lower x A x' - 2 b x' of each row x in place, column by column, with x >= 0.
+
+    The minimum along x_k is x_k + (b_k - (x A)_k) / A_kk, clipped to 0.
+    """
     for k in np.flatnonzero(np.diag(square) > 0.0):
         step = (target[:, k] - values @ square[:, k]) / square[k, k]
         values[:, k] = np.maximum(values[:, k] + step, 0.0)
 
 
 def repeat_distance(first: ArrayLike, second: ArrayLike, basis: BrdfBasis) -> float:
-    """Return how far two fits of the same points lie apart, as a part of their BRDFs.
+    """Return the relative distance of two fits of the same points.
 
-    The root of half the squared difference, over the mean square: what noise alone leaves, and
-    what no number of mixtures should explain.
+    The root of half the squared difference of the BRDFs over their mean square: the part of noise,
+    which no number of mixtures should explain.
     """
     a, b = _checked(first, basis), _checked(second, basis)
     Checks(SpaceError).shape("second", b, a.shape)
@@ -277,7 +284,7 @@ def repeat_distance(first: ArrayLike, second: ArrayLike, basis: BrdfBasis) -> fl
 
 
 def brdf_inner_products(basis: BrdfBasis) -> Float64Array:
-    """Return the products of the materials' BRDFs, (K, K), nodes counting by solid angle."""
+    """Return the inner products of the materials' BRDFs, (K, K), nodes weighted by solid angle."""
     strength = basis.strength()
     return basis.cosine_similarity() * np.outer(strength, strength)
 
@@ -299,7 +306,7 @@ def _error(shares: Float64Array, mix: Float64Array, gram: Float64Array) -> float
 def _add_worst_points(
     shares: Float64Array, mix: Float64Array, rank: int, gram: Float64Array
 ) -> Float64Array:
-    """Add the points that mixtures make worst, one after the other, until there are enough."""
+    """Add the points with the largest error to the mixtures, one by one, up to a rank."""
     while len(mix) < rank:
         gap = shares - mixture_coordinates(shares, mix, gram) @ mix
         worst = shares[int(np.argmax(_squares(gap, gram)))]
@@ -310,7 +317,7 @@ def _add_worst_points(
 def _jackknife_error(
     shares: Float64Array, groups: NDArray[np.generic], mix: Float64Array, gram: Float64Array
 ) -> tuple[float, float]:
-    """Return the error of points and its standard error by leaving out one group after another."""
+    """Return the error of points and its jackknife standard error over groups."""
     if not np.any(shares):
         return float("nan"), float("nan")
     gap = shares - mixture_coordinates(shares, mix, gram) @ mix

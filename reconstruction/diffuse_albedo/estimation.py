@@ -1,9 +1,9 @@
-"""Diffuse reflectance R_d from BRDF samples (eq. 6), and the reduced albedo from it (eq. 5).
+"""Estimate diffuse reflectance R_d from BRDF samples (eq. 6).
 
-The paper takes the least of pi f / (F_t F_t) over a point's samples. Of noisy samples the least is
-too low, and the more samples the lower. Here the diffuse part is fitted together with a few white
-lobes whose shares are at least 0: samples far from the mirror direction, where the lobes have died
-away, hold it; those below what noise allows are dropped.
+The paper takes the least of pi f / (F_t F_t) over a point's samples. The least of noisy samples is
+biased low, increasingly with their number. Here the diffuse part is fitted together with a few
+white lobes of weights of at least 0: samples far from the mirror direction, where the lobes vanish,
+determine it; those below what noise allows are omitted.
 
 References
 ----------
@@ -26,9 +26,9 @@ Method = Literal["envelope", "stable_minimum", "minimum"]
 
 NORMAL_STDERR_RAD = np.deg2rad(1.0)
 GRAZING_COSINE = 0.3
-"""The stable minimum penalizes samples nearer to the horizon than this (73 degrees)."""
+"""Cosine to the horizon below which the stable minimum penalizes samples (73 degrees)."""
 DISCARD_FRACTION = 0.01
-"""What the stable minimum drops where `discard` is None and nothing is known of the noise."""
+"""Fraction that the stable minimum discards if `discard` is None and noise is unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +41,12 @@ class DiffuseAlbedo:
         R_d of each channel, absolute. Not clamped: a black surface gives small values of either
         sign, an overexposed calibration values above 1. NaN where not `valid`.
     stderr : ndarray of float64, shape of `r_d`
-        Standard error of `r_d`; NaN where not `valid`, and where it cannot be known (a minimum; up
+        Standard error of `r_d`; NaN where not `valid`, and where it is unknown (a minimum; up
         to 3 samples of unknown variance).
     valid : ndarray of bool, shape (...)
         False where a channel has no usable sample.
     discarded : ndarray of int64, shape (...)
-        Channel values without a say in the end: outliers on either side.
+        Channel values with weight 0 in the end: outliers on either side.
     """
 
     r_d: Float64Array
@@ -75,7 +75,7 @@ def estimate(
     brdf_samples
         f_r = L / (E cos), 1/sr, (..., M, C), of a white-balanced camera: a white surface has 1/pi
         in all channels, and highlights the same value in all. Or (..., M), of one channel; the
-        normals' shape tells which.
+        normals' shape decides which.
     light_dirs, view_dirs
         Unit vectors (..., M, 3) or broadcast, away from the surface.
     normals
@@ -85,18 +85,19 @@ def estimate(
     variance
         Of `brdf_samples`, same shape, > 0. None: one unknown variance for all of a channel.
     discard
-        Smallest values to drop in each channel. None: those that noise does not explain.
+        Number of smallest values to discard in each channel. None: those that noise does not
+        explain.
     valid
         Samples to use, (..., M) or (..., M, C); None: all that are finite.
     method
         "envelope", or the paper's "stable_minimum" and plain "minimum", for comparison.
     normal_stderr_rad
-        Standard error of the normals, rad: it makes grazing light count less.
+        Standard error of the normals, rad; it lowers the weight of grazing light.
 
     Returns
     -------
     DiffuseAlbedo
-        Without the channels' axis where the samples have none.
+        Without the channels' axis if the samples have none.
 
     Raises
     ------
@@ -211,9 +212,10 @@ def _checked(
     usable &= np.asarray(np.isfinite(n).all(axis=-1))[:, None, None]
     var = np.ones_like(f)
     if variance is not None:
-        told = np.asarray(variance, np.float32)
-        told = told[..., None] if gray and told.ndim else told
-        var = whole("variance", told, samples, channels)
+        given_variance = np.asarray(variance, np.float32)
+        if gray and given_variance.ndim:
+            given_variance = given_variance[..., None]
+        var = whole("variance", given_variance, samples, channels)
         usable &= (var > 0.0) & np.isfinite(var)
     return _Samples(f, var, light, view, n, usable), lead, gray
 
@@ -228,18 +230,18 @@ def _ratios(samples: _Samples, eta: float) -> tuple[Float64Array, Float64Array, 
     cos_light, cos_view = (np.where(above, cosine, 1.0) for cosine in cosines)
     through = boundary_kernels.boundary_transmittance(cos_light, cos_view, eta)
     good = samples.usable & above[..., None]
-    with np.errstate(divide="ignore", invalid="ignore"):  # nothing is let through below eta = 1
+    with np.errstate(divide="ignore", invalid="ignore"):  # transmittance may be 0 below eta = 1
         ratio = np.pi * np.where(good, samples.f, 0.0) / through[..., None]
     return np.where(good, ratio, np.inf), cosines[0], cosines[1]
 
 
 def _ranks(ratio: Float64Array) -> NDArray[np.intp]:
-    """Return each value's place from the smallest, along the samples."""
+    """Return each value's rank from the smallest, along the samples."""
     return np.argsort(np.argsort(ratio, axis=1, kind="stable"), axis=1, kind="stable")
 
 
 def _lower_quartile(ratio: Float64Array, usable: BoolArray) -> Float64Array:
-    """Return the lower quartile of the ratios: a start that neither lobes nor outliers move far."""
+    """Return the lower quartile of the ratios, a start hardly affected by lobes or outliers."""
     count = usable.sum(axis=1)
     ordered = np.sort(ratio, axis=1)
     at = np.clip(count // 4, 0, np.maximum(count - 1, 0))
@@ -255,7 +257,7 @@ def _minimum(
     method: Method,
     discard: int | None,
 ) -> tuple[Float64Array, NDArray[np.intp]]:
-    """Return eq. (6) as it stands, or with grazing samples raised and the smallest dropped."""
+    """Return eq. (6) unchanged, or with grazing samples raised and the smallest omitted."""
     drop = np.zeros(len(ratio), dtype=np.intp)
     if method == "stable_minimum":
         grazing = np.clip(np.minimum(cos_l, cos_v) / GRAZING_COSINE, MIN_FACTOR_COSINE, 1.0)

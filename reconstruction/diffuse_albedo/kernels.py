@@ -1,4 +1,4 @@
-"""The diffuse albedo's inner loop: R_d and a few white lobes fitted together, point by point."""
+"""Fit R_d and a few white lobes together, point by point (Numba)."""
 
 import math
 
@@ -6,16 +6,16 @@ import numpy as np
 from numba import boolean, float32, float64, int64, njit, prange, types, void
 
 BECKMANN_ROUGHNESS = (0.13, 0.2, 0.3, 0.45)
-"""Beckmann roughness of the lobes that may lie over the diffuse part; no tails."""
+"""Beckmann roughness of the lobes above the diffuse part; no tails."""
 GGX_ROUGHNESS = (0.2, 0.35)
-"""GGX roughness of those with tails. Wider ones of either look like the diffuse part."""
+"""GGX roughness of those with tails. Wider ones of either resemble the diffuse part."""
 N_FIT_STEPS = 8
 LOBE_SHAPE_ERROR = 0.3
-"""How far a lobe may be off its shape, as a fraction: what it covers says less of R_d."""
+"""Relative error of a lobe's shape; lowers the weight of samples that a lobe covers."""
 LOBE_ENTRY_SIGMAS = 1.5
-"""Standard errors from which on a lobe is taken to be there."""
+"""Standard errors above which a lobe enters the fit."""
 TUKEY_SIGMAS = 4.0
-"""Standard deviations beyond which a residual has no say (Tukey's biweight)."""
+"""Standard deviations beyond which a residual has weight 0 (Tukey's biweight)."""
 CLIP_SIGMAS = 1.5
 CLIPPED_MEAN = 0.7784655
 """Mean of min(z^2, 1.5^2) over normal z: turns a clipped mean square into a variance."""
@@ -36,7 +36,7 @@ def _fresnel(c, eta):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _shapes(light, view, normal, eta, transmittance, slope, lobe):  # type: ignore[no-untyped-def]
-    """Fill the unit diffuse BRDF, what an error of the normal does to it, and the lobes.
+    """Fill the unit diffuse BRDF, its relative change with the normal, and the lobes.
 
     Returns False for a light or view too near to the horizon.
     """
@@ -176,14 +176,14 @@ def fit_envelope(  # type: ignore[no-untyped-def]
 ):
     """Fill R_d (P, C), its standard error, and samples used and dropped (P, 2) of every point.
 
-    ``start`` is a first R_d; ``tilt_rad`` the normals' standard error; ``has_variance`` says
-    whether the variances are, or only their ratios.
+    ``start`` is an initial R_d; ``tilt_rad`` the normals' standard error; ``has_variance`` whether
+    the variances are known, rather than only their ratios.
     """
     points, samples, channels = f.shape
     for point in prange(points):
         n = channels + _N_LOBES
         through = np.empty(samples)  # unit diffuse BRDF, F_t F_t / pi
-        slope = np.empty(samples)  # relative error of it a rad of the normal
+        slope = np.empty(samples)  # its relative error per rad of the normal
         lobe = np.empty((samples, _N_LOBES))
         good = np.zeros(samples, dtype=np.bool_)
         h = np.empty((n, n))
@@ -242,7 +242,7 @@ def fit_envelope(  # type: ignore[no-untyped-def]
                     spread = float64(variance[point, i, c]) * scale2[c] + extra
                     z2 = (f[point, i, c] - dull - shine) ** 2 / spread
                     clipped[c] += min(z2, CLIP_SIGMAS * CLIP_SIGMAS)
-                    # The first steps only start: they forgive more.
+                    # The first steps only refine the start: a wider cutoff
                     cut = TUKEY_SIGMAS if step > 3 else TUKEY_SIGMAS * (2.0 ** (4 - step))
                     share = max(1.0 - z2 / (cut * cut), 0.0)
                     if share == 0.0:
@@ -262,7 +262,7 @@ def fit_envelope(  # type: ignore[no-untyped-def]
             for i in range(n):
                 for j in range(i):
                     h[j, i] = h[i, j]
-            if seen.min() < 3:  # nothing to tell lobes from
+            if seen.min() < 3:  # too few samples to determine lobes
                 for k in range(_N_LOBES):
                     h[channels + k, channels + k] = 0.0
             size = _bounded(h, rhs, channels, free, low, b, x)

@@ -1,6 +1,6 @@
-"""Pictures with what is known of their samples: of several channels, and sorted by polarization.
+"""Keep pattern images with variances and masks: by channel, and sorted by polarization.
 
-Channels are added up where the reflection has no color, and taken one by one else.
+Channels are summed where the reflection has no color, otherwise taken separately.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Valid = BoolArray | Mapping[Key, BoolArray] | None
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatternSamples:
-    """Pictures with what is known of their samples, as of `from_patterns`."""
+    """Pattern images with variances, masks and saturation, as given to `from_patterns`."""
 
     patterns: Mapping[Key, ArrayLike]
     variance: Variance
@@ -40,14 +40,14 @@ class PatternSamples:
 
     @property
     def channels(self) -> int | None:
-        """Number of channels on the pictures' last axis; None where they are (H, W)."""
+        """Number of channels on the images' last axis; None where they are (H, W)."""
         shapes = {np.shape(image) for image in self.patterns.values()}
         if len(shapes) == 1 and len(shape := shapes.pop()) == 3:
             return int(shape[2])
-        return None  # what does not fit is told later, by name
+        return None  # the check of each image reports a mismatch by its key
 
     def channel(self, number: int) -> PatternSamples:
-        """Return one channel of pictures, variances and masks; what has no channels stays."""
+        """Return one channel of images, variances and masks; keep those without channels."""
 
         def sliced(given: Any) -> Any:
             if isinstance(given, Mapping):
@@ -60,7 +60,7 @@ class PatternSamples:
         return PatternSamples(*given, self.saturation)
 
     def sum_channels(self) -> PatternSamples:
-        """Add the channels of pictures up; NaN where one of them is not valid or saturated."""
+        """Sum the channels of images; NaN where one of them is not valid or saturated."""
         out: dict[Key, FloatArray] = {}
         for key, given in self.patterns.items():
             image = np.asarray(given)
@@ -93,7 +93,7 @@ class PatternSamples:
 
 
 def stack_channels(maps: Sequence[NormalMaps]) -> NormalMaps:
-    """Return the maps of channels as one, channels on the points' last axis."""
+    """Stack the maps of channels to one, channels on the points' last axis."""
     return NormalMaps(
         np.stack([m.normals for m in maps], axis=-2),
         *(
@@ -104,15 +104,15 @@ def stack_channels(maps: Sequence[NormalMaps]) -> NormalMaps:
 
 
 def sort_by_polarization(samples: PatternSamples) -> dict[str, PatternStack]:
-    """Check the pictures and sort them by polarization.
+    """Check the images and sort them by polarization.
 
     Returns
     -------
-    dict of str to Stack
-        By polarization, of those that pictures were given of.
+    dict of str to PatternStack
+        By polarization, of those with images.
     """
     check = Checks(GradientError)
-    check.require(samples.patterns, "patterns", "none", "pictures keyed (pattern, polarizer)")
+    check.require(samples.patterns, "patterns", "none", "images keyed (pattern, polarizer)")
     shape: tuple[int, ...] = ()
     stacks: dict[str, PatternStack] = {}
     for key, picture in samples.patterns.items():
@@ -174,7 +174,7 @@ def _with_variance(
         key, where = (name, polarizer), f"variance[{name!r}, {polarizer!r}]"
         own = variance
         if isinstance(variance, Mapping):
-            check.require(key in variance, "variance", f"none of {key}", "one of every picture")
+            check.require(key in variance, "variance", f"none of {key}", "one of every image")
             own = variance[key]
         values = np.asarray(own, np.float64)
         check.shape(where, values, (), shape)
@@ -182,7 +182,7 @@ def _with_variance(
             check.within(where, float(values), "(0, inf)")
         with np.errstate(invalid="ignore"):
             good = np.isfinite(values) & (values > 0)
-        if not good.all():  # of an unknown variance: as if the sample were not there
+        if not good.all():  # samples of unknown variance are not used
             before = stack.valid.get(name)
             stack.valid[name] = good if before is None else before & good
             values = np.where(good, values, 1.0)

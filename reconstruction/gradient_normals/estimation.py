@@ -1,12 +1,12 @@
-"""Normals from pictures under full light, gradients and their complements, two polarizations.
+"""Estimate normals from images under full light, gradients and their complements.
 
 Under light that grows along an axis, a reflection is brighter the further its lobe points that way:
-the pictures are the lobe's first moments, and their vector points along its axis (Ma et al. 2007,
+the images are the lobe's first moments, and their vector points along its axis (Ma et al. 2007,
 doi 10.2312/EGWR/EGSR07/183-194; complements: Wilson et al. 2010, doi 10.1145/1731047.1731055). For
-the specular reflection, which is what parallel polarizers show more than crossed ones, that is the
-mirror direction, and the normal half way between it and the view. For the diffuse one it is the
-normal. With `SphereLights` the vector is not taken at its word, but looked up in what these very
-lights show of this lobe (:mod:`reconstruction.gradient_normals.lobe_response`).
+the specular reflection, parallel less crossed, that is the mirror direction, and the normal is half
+way between it and the view. For the diffuse one it is the normal. With `SphereLights` the vector is
+corrected by a table of the moments that these lights give for each normal
+(:mod:`reconstruction.gradient_normals.lobe_response`).
 """
 
 import logging
@@ -52,28 +52,28 @@ from reconstruction.tiles import map_on_threads
 _log = logging.getLogger(__name__)
 
 MAX_MEDIAN_LEAKAGE = 0.02
-"""Median leakage from which polarizers do not cross well: 8 degrees off."""
+"""Median leakage above which polarizers are badly crossed: 8 degrees off."""
 
 
 MAX_RESIDUAL_RATIO = 3.0
-"""Mean square of residuals over their variance from which pictures are said not to fit together."""
+"""Mean square of residuals over their variance above which images count as inconsistent."""
 ROUGHNESS_LADDER = (0.03, 0.06, 0.12, 0.24, 0.48, 0.9)
-"""Ladder on which a roughness is searched."""
+"""Grid on which a roughness is searched."""
 
 
 @dataclass(frozen=True, slots=True)
 class Roughness:
-    """The roughness that a map's lobes have on the whole.
+    """Roughness common to the lobes of a map.
 
     Attributes
     ----------
     alpha : float
-        GGX roughness of the lobe within a (smoothed) pixel, whatever makes it: facets, relief that
-        the optics do not resolve, the smoothing.
+        GGX roughness of the lobe within a (smoothed) pixel, from facets, unresolved relief and
+        smoothing.
     stderr : float
         Standard error of `alpha`.
     pixels : int
-        How many it was computed from.
+        Number of pixels it was estimated from.
     """
 
     alpha: float
@@ -82,7 +82,7 @@ class Roughness:
 
 
 Smoothing: TypeAlias = float | tuple[float, float] | Literal["wiener"]
-"""How moments are filtered, see :func:`from_patterns`."""
+"""Filter of the moments, see :func:`from_patterns`."""
 
 
 def from_patterns(
@@ -100,71 +100,71 @@ def from_patterns(
     smoothing: Smoothing = 0.0,
     executor: Executor | None = None,
 ) -> NormalMaps:
-    """Compute normals from pictures under a sphere's patterns.
+    """Compute normals from images under a sphere's patterns.
 
     Parameters
     ----------
     patterns : mapping of (str, str) to array_like, shape (H, W) or (H, W, C)
-        Linear pictures by pattern ("full", "x", "y", "z", "-x", "-y", "-z", "dark") and polarizer
-        ("parallel", "crossed"), one unit, all at one level and exposure. With dark frames among
-        them, these are subtracted; without, the pictures are taken to be without dark level. Any
-        set that tells full light and three gradients will do, as full, x, y, z or x, -x, y, z; NaN
-        where there is no sample.
+        Linear images by pattern ("full", "x", "y", "z", "-x", "-y", "-z", "dark") and polarizer
+        ("parallel", "crossed"), one unit, all at one level and exposure. Dark frames are
+        subtracted; without them, the images must have no dark level. Any set suffices that
+        determines full light and three gradients, as full, x, y, z or x, -x, y, z; NaN
+        where there is not a sample.
     component : "specular" or "diffuse"
-        Which reflection. Specular needs both polarizers; its channels are added up, as it has no
-        color. Diffuse needs crossed pictures; channels have a normal each.
+        Which reflection. Specular needs both polarizers; its channels are summed, as it has no
+        color. Diffuse needs crossed images; each channel has its own normals.
     view : array_like, shape (3,) or (H, W, 3)
         Unit vectors to the camera, rig frame (y up).
     variance : float, SensorNoise, or mapping like `patterns` of arrays or numbers, optional
-        Of the samples. None: estimated from how redundant patterns contradict each other; where
+        Of the samples. None: estimated from the contradictions of redundant patterns; where
         none are redundant, noise stays unknown, and standard errors are pi.
     valid : ndarray of bool, shape (H, W), or mapping like `patterns`, optional
         Samples to use.
     saturation : float, optional
         Value from which a sample counts as saturated, before the dark frame is subtracted.
     lights : SphereLights, optional
-        The lights as they are. None: an even sphere of light all around, and narrow lobes.
+        The actual lights. None: an even sphere of light, and narrow lobes.
     alpha : float or Roughness, optional
         GGX roughness of the facets within a pixel, for specular normals with `lights`. None:
         estimated over the map (:func:`estimate_roughness`).
     eta : float
         Refractive index of the surface, with `lights`.
     points_mm : array_like, shape (H, W, 2) or (H, W, 3), optional
-        Where the pixels are on the patch, rig frame, with lights at a finite distance: directions
-        to the lights then follow. Give `view` by pixel, too.
+        Positions of the pixels on the patch, rig frame, for lights at a finite distance: directions
+        to the lights then vary. Give `view` per pixel, too.
     smoothing : float, (float, float) or "wiener"
-        Standard deviation of a Gaussian that the moments are smoothed by before anything that is
-        not linear is done to them, px; of two numbers the second is that of the crossed images,
-        where skin glows with less detail. The optics' own blur is a good choice; noise falls about
-        as 1 / (3.5 px). "wiener" filters the moments by what share of each spatial frequency is
-        signal (:mod:`reconstruction.gradient_normals.wiener`): as much as noise and optics ask
-        for. Standard errors then hold the detail that is lost, too.
+        Standard deviation of a Gaussian that smooths the moments before any nonlinear step, px; of
+        two numbers the second is that of the crossed images, where subsurface scattering removes
+        detail. The optics' own blur is a good choice; noise falls about as 1 / (3.5 px). "wiener"
+        filters the moments by the fraction of signal at each spatial frequency
+        (:mod:`reconstruction.gradient_normals.wiener`): as much as noise and optics require.
+        Standard errors then include the detail that is lost.
     executor : Executor, optional
-        Threads to map tiles of rows over; default one thread a core, at most 8.
+        Threads to map tiles of rows over; default one thread per core, at most 8.
 
     Returns
     -------
     NormalMaps
-        Shape (H, W), or (H, W, C) for diffuse normals of C channels; float64 where a picture is
-        float64, else float32. `albedo` is, with `lights`, what is reflected over what a dielectric
-        of `eta` (specular) or a white interior below it (diffuse) would, in units of a white
+        Shape (H, W), or (H, W, C) for diffuse normals of C channels; float64 where an image is
+        float64, else float32. With `lights`, `albedo` is the reflection over that of a dielectric
+        of `eta` (specular) or of a white interior below it (diffuse), in units of a white
         diffuser facing the view in full light; without `lights` the full light itself.
-        `stderr_rad` holds the noise, and what `lights` and `alpha` say about their own errors
-        (these are alike in neighbouring pixels).
+        `stderr_rad` includes the noise and the stated errors of `lights` and `alpha`, which are
+        correlated between neighboring pixels.
 
     Raises
     ------
-    MissingPatterns
-        Where patterns do not tell the moments, or one polarizer's pictures are not there.
+    MissingPatternsError
+        If patterns do not determine the moments, or one polarizer's images are missing.
     GradientError, SphereLightsError
         For arrays, settings and lights that do not fit.
 
     Notes
     -----
-    Cast shadows and light between furrows are not corrected. Diffuse light leaves a smooth surface
-    partly polarized; with `lights` the part that parallel less crossed keeps is taken out. An
-    analyser that is off by an angle d in both states costs cos 2d of the specular signal and turns
-    no normal; nothing in the pictures tells it, so leakage has to be calibrated.
+    Cast shadows and interreflection between grooves are not corrected. Diffuse light leaves a
+    smooth surface partly polarized; with `lights` the part in parallel less crossed is subtracted.
+    An analyzer that is off by an angle d in both states scales the specular signal by cos 2d and
+    turns no normal; the images do not reveal it, so leakage has to be calibrated.
 
     Examples
     --------
@@ -245,15 +245,15 @@ def estimate_roughness(
     smooth_px: float = 0.0,
     smooth_crossed_px: float | None = None,
 ) -> Roughness:
-    """Estimate the roughness that makes the map's specular moment vectors as long as they are.
+    """Estimate the roughness under which the map's specular moment vectors have their lengths.
 
-    Over the full light the vector is the shorter, the wider the lobe. Parameters are those of
-    :func:`from_patterns`; so are the errors.
+    Relative to the full light the vector is shorter for a wider lobe. Parameters and errors are
+    those of :func:`from_patterns`.
 
     Returns
     -------
     Roughness
-        At an end of the range searched, 0.03 to 0.9, where the lobes are beyond it, with a warning
+        At an end of the range searched, 0.03 to 0.9, if the lobes are beyond it, with a warning
         in the log.
 
     Raises
@@ -268,7 +268,10 @@ def estimate_roughness(
     reflection = _reflection_of(samples, "specular", lights, smooth)
     found = _roughness(reflection, lights, normalize_views(view, reflection.shape)[0], eta)
     if found.pixels == 0:
-        raise GradientError("patterns: no pixel has a specular signal above its noise")
+        raise GradientError(
+            "patterns: got no pixel with a specular signal above its noise, expected some; "
+            "check exposure and polarizers"
+        )
     return found
 
 
@@ -281,7 +284,7 @@ def _reflection_of(
     """Return the moments of one component's reflection, corrected for leaking polarizers."""
     leakage = 0.0
     if lights is not None:
-        # lights near Brewster's angle reflect next to nothing, most of it crossed: not a mean
+        # the median, as lights near Brewster's angle reflect little, most of it crossed
         leakage = float(np.median(lights.leakage[lights.intensities > 0]))
         if leakage > MAX_MEDIAN_LEAKAGE:
             _warn_of_leakage(round(leakage, 4))
@@ -292,10 +295,10 @@ def _reflection_of(
 
 @lru_cache(maxsize=64)
 def _warn_of_leakage(leakage: float) -> None:
-    """Say once for all pictures of one sphere how much passes crossed polarizers."""
+    """Warn once for all images of one sphere about light that passes crossed polarizers."""
     _log.warning(
-        "polarizers leak: crossed pictures hold %.1f %% of the specular reflection, as if the"
-        " analyser were %.0f degrees off; corrected, at the price of signal",
+        "polarizers leak: crossed images contain %.1f %% of the specular reflection, as if the"
+        " analyzer were %.0f degrees off; corrected, at the cost of signal",
         100.0 * leakage,
         np.degrees(np.arctan(np.sqrt(leakage))),
     )
@@ -306,7 +309,7 @@ def _roughness(
 ) -> Roughness:
     rows = list(reflection.tiles())
     height, width = reflection.shape
-    if len(rows) > 8:  # some strips tell as much as all
+    if len(rows) > 8:  # some strips suffice
         rows = [slice(r.start, min(r.start + 16, r.stop)) for r in rows[:: len(rows) // 8]]
     columns = max(1, height * width // 65_536)
     picked = []
@@ -319,12 +322,12 @@ def _roughness(
     moments = np.ascontiguousarray(first), np.ascontiguousarray(second)
 
     def excess(log_alpha: float) -> tuple[float, FloatArray]:
-        """Return how much longer the vectors are than this roughness makes them, each and all."""
+        """Return the vectors' mean excess length over this roughness's, and each one's part."""
         table = lobe_response.specular_response(
             lights, view=middle, alpha=float(np.exp(log_alpha)), eta=eta
         )
         found = MomentInversion.prepare(reflection, table, lights, eta).normals(moments)
-        # no vector is longer than its light; a lobe that falls between lights has no length at all
+        # a vector is at most as long as its light; a lobe between lights has no defined length
         length = found[:, kernels.CONCENTRATION]
         good = (found[:, kernels.STATUS] == kernels.GOOD) & (length >= 0.0) & (length <= 1.0)
         if not good.any():
@@ -345,7 +348,7 @@ def _roughness(
     if change.size == 0:
         best = int(np.nanargmin(np.abs(values)))
         _log.warning(
-            "roughness: lobes are %s than any of roughness %g to %g; %g is taken",
+            "roughness: lobes are %s than those of roughness %g to %g; %g is used",
             "narrower" if values[best] > 0.0 else "wider",
             ROUGHNESS_LADDER[0],
             ROUGHNESS_LADDER[-1],
@@ -388,9 +391,9 @@ def _maps(
             if one.shape[1]:
                 misfit += one[moment_kernels.MISFIT]
                 count += one[moment_kernels.USED]
-                told = np.isfinite(one[moment_kernels.CHI])
-                chi += float(one[moment_kernels.CHI][told].sum())
-                free += float(one[moment_kernels.FREE][told].sum())
+                known = np.isfinite(one[moment_kernels.CHI])
+                chi += float(one[moment_kernels.CHI][known].sum())
+                free += float(one[moment_kernels.FREE][known].sum())
         residual = np.sqrt(misfit / np.maximum(count, 1)).reshape(good.shape)
         for flat, values, none in (
             (flats[0], found[..., kernels.ALBEDO], 0.0),
@@ -406,8 +409,8 @@ def _maps(
     chi, free = (sum(part) for part in zip(*contradiction, strict=True))
     if reflection.has_given_noise and free and chi > MAX_RESIDUAL_RATIO * free:
         _log.warning(
-            "patterns contradict each other: residuals of redundant pictures are %.1f times their"
-            " noise; did subject or light change between them?",
+            "patterns contradict each other: residuals of redundant images are %.1f times their"
+            " noise; check that subject and light did not change between them",
             np.sqrt(chi / free),
         )
     return NormalMaps(normals, flats[0], flats[1], valid, flats[2], flats[3], used)

@@ -1,4 +1,4 @@
-"""Moments of the lights to normals, by a table of responses."""
+"""Invert moments of the lights to normals, by a table of responses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from reconstruction.gradient_normals.patterns import GradientError
 from reconstruction.gradient_normals.sphere_lights import SphereLights, view_frame
 
 MIN_MOMENT_SIGMAS = 3.0
-"""Length of the moment vector over its standard error, below which a pixel has no normal."""
+"""Length of the moment vector over its standard error, below which a pixel has no signal."""
 
 
 def normalize_views(
@@ -40,11 +40,14 @@ def frame_positions(
     middle: FloatArray,
     lights: SphereLights | None,
 ) -> FloatArray | None:
-    """Return the pixels' places (P, 2) along the frame's first two axes, mm."""
+    """Return the pixels' positions (P, 2) along the frame's first two axes, mm."""
     if points_mm is None:
         return None
     if lights is None or not np.isfinite(lights.distance_mm):
-        raise GradientError("points_mm: got them without lights of finite distance_mm")
+        raise GradientError(
+            "points_mm: got points, but lights without a finite distance_mm; "
+            "give the lights' distance or omit points_mm"
+        )
     points = np.asarray(points_mm, np.float64)
     points = Checks(GradientError).numbers("points_mm", points, (*shape, 2), (*shape, 3))
     flat = points.reshape(-1, points.shape[-1])
@@ -52,27 +55,27 @@ def frame_positions(
         flat = np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
     if np.linalg.norm(flat, axis=1).max() > 0.2 * lights.distance_mm:
         raise GradientError(
-            "points_mm: got points farther from the middle than a fifth of the lights' distance;"
-            " directions to the lights are followed to first order only"
+            "points_mm: got points farther from the middle than a fifth of the lights' distance,"
+            " expected nearer ones, as directions follow to first order only; crop the images"
         )
     return np.asarray(flat @ view_frame(middle)[:2].T)
 
 
 @dataclass(frozen=True, slots=True)
 class MomentInversion:
-    """What turns the moments of a reflection into normals.
+    """Constants of the inversion of a reflection's moments to normals.
 
     Attributes
     ----------
     reflection : Reflection
     table : Response
-        Of size 0: vectors point where they should.
+        Of size 0: vectors are used uncorrected.
     eta : float
         Refractive index.
-    analyser : ndarray, shape (2,)
+    analyzer : ndarray, shape (2,)
         Passing axis in the frame of the table; zeros without lights.
     starts : ndarray of float64, shape (G, G, 2)
-        Where the search for a place begins, by what is seen.
+        Starts of the search for a position, by the observed one.
     """
 
     reflection: ReflectionMoments
@@ -88,7 +91,7 @@ class MomentInversion:
         lights: SphereLights | None,
         eta: float,
     ) -> MomentInversion:
-        """Prepare the inversion by a table that was made for these lights."""
+        """Prepare the inversion with a table made for these lights."""
         analyser, starts = np.zeros(2), np.zeros((2, 2, 2))
         if lights is not None:
             analyser = np.asarray(table.frame[:2] @ np.asarray(lights.analyser))
@@ -104,16 +107,16 @@ class MomentInversion:
         view: FloatArray | None = None,
         position: FloatArray | None = None,
     ) -> Float64Array:
-        """Return normals and what is known of them (P, NORMAL_COLUMNS), see :mod:`kernels`.
+        """Return normals with albedo and errors (P, NORMAL_COLUMNS), see :mod:`kernels`.
 
         Parameters
         ----------
         moments : pair of ndarray, shape (MOMENT_ROWS, P)
             As of `Reflection.moments`.
         view : ndarray, shape (P, 3), optional
-            Each pixel's view, where it is not the table's.
+            Each pixel's view, if it differs from the table's.
         position : ndarray, shape (P, 2), optional
-            Each pixel's place in the field, mm.
+            Each pixel's position in the field, mm.
         """
         table, reflection = self.table, self.reflection
         out = np.empty((moments[0].shape[1], kernels.NORMAL_COLUMNS))

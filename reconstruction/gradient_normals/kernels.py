@@ -1,4 +1,4 @@
-"""Compiled inner loops of gradient normals: moments of one polarization, and their inversion.
+"""Invert moments of the lights to normals, per pixel (Numba).
 
 Every kernel is serial and releases the interpreter, for tiles of rows on threads.
 """
@@ -24,11 +24,11 @@ from reconstruction.gradient_normals.moment_kernels import (
 N_X, N_Y, N_Z, ALBEDO, STDERR, STDERR_ALBEDO, CONCENTRATION, CONCENTRATION_SEEN, STATUS = range(9)
 NORMAL_COLUMNS = 9
 GOOD, DIM, LOST, HORIZON = 0.0, 1.0, 2.0, 3.0
-"""Status: a normal; no signal above its noise; too few samples; no normal leads to what is seen."""
+"""Status: a normal; signal within its noise; too few samples; no normal has the observed vector."""
 
 _MAX_PASSES = 24
 _STEPS_BACK = 8
-_MAX_POSITION_ERROR = 2e-3  # distance between what is seen and what the place found shows
+_MAX_POSITION_ERROR = 2e-3  # distance between the observed position and that of the normal found
 _COARSE_TOL = 2e-3
 _MAX_MOMENT_CHANGE = (
     1e-2  # relative changes of the moment vector by the polarization of diffuse light
@@ -40,7 +40,7 @@ _MIN_FACING = 0.1  # cosine to the view, which tables end at
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def _cell(min_coordinate, step, size, u):  # type: ignore[no-untyped-def]
-    """Return the first of the four grid lines about a place, and the place between them."""
+    """Return the first of the four grid lines about a position, and the position between them."""
     q = (u - min_coordinate) / step
     i = min(max(math.floor(q), 1), size - 3)
     return i - 1, q - i
@@ -66,7 +66,7 @@ def _slopes(f):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def lookup(table, min_coordinate, step, u0, u1, x, y):  # type: ignore[no-untyped-def]
-    """Return the place seen of a normal at (u0, u1), from (x, y), and its derivatives.
+    """Return the observed position of a normal at (u0, u1), from (x, y), and its derivatives.
 
     In the order v0, v1, dv0/du0, dv0/du1, dv1/du0, dv1/du1.
     """
@@ -104,7 +104,7 @@ def lookup(table, min_coordinate, step, u0, u1, x, y):  # type: ignore[no-untype
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _interpolate_covariance(table, min_coordinate, step, u0, u1, covariance):  # type: ignore[no-untyped-def]
-    """Put scale, concentration and systematic covariance (3) at a place into ``covariance``."""
+    """Write scale, concentration and systematic covariance (3) at a position to ``covariance``."""
     i0, f = _cell(min_coordinate, step, table.shape[0], u0)
     i1, g = _cell(min_coordinate, step, table.shape[0], u1)
     wx, wy = _weights(f), _weights(g)
@@ -118,9 +118,9 @@ def _interpolate_covariance(table, min_coordinate, step, u0, u1, covariance):  #
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _solve_newton(table, min_coordinate, step, s0, s1, u0, u1, x, y, close):  # type: ignore[no-untyped-def]
-    """Find the place whose normal shows (s0, s1), by Newton's method from (u0, u1).
+    """Find the position whose normal is observed at (s0, s1), by Newton's method from (u0, u1).
 
-    Return the place, what it still lacks, and the derivatives there.
+    Return the position, the remaining residual, and the derivatives there.
     """
     v0, v1, j00, j01, j10, j11 = lookup(table, min_coordinate, step, u0, u1, x, y)
     e0, e1 = s0 - v0, s1 - v1
@@ -129,7 +129,7 @@ def _solve_newton(table, min_coordinate, step, s0, s1, u0, u1, x, y, close):  # 
         if off < close:
             break
         det = j00 * j11 - j01 * j10
-        # where the table folds: a step as if nothing were skewed
+        # where the table folds, the Jacobian is near singular: take the identity for it
         d0 = (j11 * e0 - j01 * e1) / det if det > 0.02 else e0
         d1 = (j00 * e1 - j10 * e0) / det if det > 0.02 else e1
         stride = math.sqrt(d0 * d0 + d1 * d1)
@@ -154,9 +154,9 @@ def _solve_newton(table, min_coordinate, step, s0, s1, u0, u1, x, y, close):  # 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_start_grid(table, min_coordinate, step, out):  # type: ignore[no-untyped-def]
-    """Put the places that show those of a grid into ``out`` (G, G, 2): where Newton may begin.
+    """Write the inverse of the table on a coarse grid to ``out`` (G, G, 2), as Newton's starts.
 
-    The grid covers -sqrt(2) to sqrt(2); where nothing shows a place, it is given itself.
+    The grid covers -sqrt(2) to sqrt(2); an observed position without a normal is its own start.
     """
     size = out.shape[0]
     reach = math.sqrt(2.0)
@@ -175,7 +175,7 @@ def fill_start_grid(table, min_coordinate, step, out):  # type: ignore[no-untype
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _start(grid, s0, s1):  # type: ignore[no-untyped-def]
-    """Return the place to begin at, by the bilinear grid of :func:`fill_start_grid`."""
+    """Return the start of the search, by the bilinear grid of :func:`fill_start_grid`."""
     size = grid.shape[0]
     scale = (size - 1) / (2.0 * math.sqrt(2.0))
     q0, q1 = (s0 + math.sqrt(2.0)) * scale, (s1 + math.sqrt(2.0)) * scale
@@ -192,9 +192,9 @@ def _start(grid, s0, s1):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _exit_ratio(nx, ny, nz, a0, a1, eta):  # type: ignore[no-untyped-def]
-    """Return how much more diffuse light passes the parallel analyser than the crossed one.
+    """Return the excess of diffuse light through the parallel over the crossed analyzer.
 
-    Unpolarized inside, refracted on its way out; the normal and the analyser's axis (a0, a1) are
+    Unpolarized inside, refracted on its way out; the normal and the analyzer's axis (a0, a1) are
     in the frame of the view.
     """
     flat = nx * nx + ny * ny
@@ -228,35 +228,34 @@ def invert(  # type: ignore[no-untyped-def]
     close,
     out,
 ):
-    """Turn moments into normals, per pixel.
+    """Invert moments to normals, per pixel.
 
     Parameters
     ----------
     parallel, crossed : ndarray, shape (MOMENT_ROWS, P)
-        What is given as `parallel` less what is given as `crossed` is inverted; a `crossed` of no
-        pixels is 0.
+        `parallel` less `crossed` is inverted; a `crossed` without pixels is 0.
     frame : ndarray, shape (3, 3)
         Rows right, up, view.
     mirror : bool
-        A reflection's vector, not a matte surface's.
+        Whether the vector is of a specular reflection, not a diffuse one.
     table, least, step
-        See :class:`reconstruction.gradient_normals.lobe_response.LobeResponseTable`; a table of
-        size 0: the vector points where it should.
+        See :class:`reconstruction.gradient_normals.lobe_response.LobeResponseTable`; with a table
+        of size 0 the vector is used uncorrected.
     grid : ndarray, shape (G, G, 2)
-        Of :func:`fill_start_grid`; not read without a table.
-    analyser : ndarray, shape (2,)
+        See :func:`fill_start_grid`; not read without a table.
+    analyzer : ndarray, shape (2,)
         Passing axis in the frame; zeros: diffuse light is taken to be unpolarized.
     eta : float
     view : ndarray, shape (P, 3), or (0, 3)
-        Each pixel's view, rig frame, where it is not the frame's.
+        Each pixel's view, rig frame, if it differs from the frame's.
     position : ndarray, shape (P, 2), or (0, 2)
-        Each pixel's place in the field, along the frame's first two axes, mm.
+        Each pixel's position in the field, along the frame's first two axes, mm.
     has_noise : bool
         Whether variances are known.
     needed : float
-        Length of the vector over its standard error below which there is no signal.
+        Length of the vector over its standard error below which it is noise.
     close : float
-        How near to what is seen the search ends.
+        Distance to the observed position at which the search ends.
     out : ndarray, shape (P, NORMAL_COLUMNS)
     """
     two = crossed.shape[1] > 0
@@ -306,7 +305,7 @@ def invert(  # type: ignore[no-untyped-def]
         status = GOOD
         x, y = (position[p, 0], position[p, 1]) if position.shape[0] else (0.0, 0.0)
         j00, j01, j10, j11 = 1.0, 0.0, 0.0, 1.0
-        rough = polarized  # normals as the grid has them, until the polarization settles
+        rough = polarized  # normals from the start grid, until the polarization converges
         for turn in range(last + 1):
             for i in range(3):
                 s = 0.0
@@ -327,7 +326,7 @@ def invert(  # type: ignore[no-untyped-def]
             if not (length > 0.0 and c0 > 0.0) or (has_noise and length < needed * wide):
                 status = DIM
                 break
-            # where the vector points, as a place, and how it moves with the vector
+            # position that the vector points to, and its derivative by the vector
             n0, n1, n2 = c[0] / length, c[1] / length, c[2] / length
             for i in range(3):
                 for j in range(3):
@@ -374,7 +373,7 @@ def invert(  # type: ignore[no-untyped-def]
             square = min(u0 * u0 + u1 * u1, 1.9)
             m = math.sqrt(1.0 - 0.25 * square)
             fresh = _exit_ratio(u0 * m, u1 * m, 1.0 - 0.5 * square, analyser[0], analyser[1], eta)
-            # what the change does to the vector's direction
+            # relative change of the vector by the polarization's change
             change = abs(fresh - ratio) * abs(crossed[C_0, p]) / c0
             ratio = fresh
             if rough:
@@ -386,7 +385,7 @@ def invert(  # type: ignore[no-untyped-def]
         if status != GOOD:
             out[p, STATUS] = status
             continue
-        # noise: covariance of the place seen, through the inverse of the table's derivative
+        # noise: covariance of the observed position, through the inverse of the table's derivative
         e00, e01, e11 = 0.0, 0.0, 0.0
         if has_noise:
             for i in range(3):
@@ -418,7 +417,7 @@ def invert(  # type: ignore[no-untyped-def]
         g1 = frame[0, 1] * n0 + frame[1, 1] * n1 + frame[2, 1] * n2
         g2 = frame[0, 2] * n0 + frame[1, 2] * n1 + frame[2, 2] * n2
         if mirror and view.shape[0]:
-            # the lobe's axis is what is known; half way between it and this pixel's own view
+            # the lobe's axis is measured; the normal is half way between it and the pixel's view
             r0 = 2.0 * n2 * g0 - frame[2, 0] + view[p, 0]
             r1 = 2.0 * n2 * g1 - frame[2, 1] + view[p, 1]
             r2 = 2.0 * n2 * g2 - frame[2, 2] + view[p, 2]
@@ -429,10 +428,10 @@ def invert(  # type: ignore[no-untyped-def]
             g0, g1, g2 = r0 / size, r1 / size, r2 / size
         longer = length
         if has_noise:
-            # noise across the vector makes it longer
+            # noise across the vector makes it longer: E|v| = |v| + trace across / (2 |v|)
             longer -= 0.5 * (cov[0, 0] + cov[1, 1] + cov[2, 2] - wide * wide) / length
         if mirror and tabled and n2 < _STEEP:
-            # near Brewster's angle another normal shows the same vector, but not as long
+            # near Brewster's angle a second normal has this direction, but another vector length
             doubt = 3.0 * math.sqrt(max(var0, 0.0) + wide * wide) / c0 if has_noise else 0.0
             if abs(longer / c0 - spread[1]) > _UNLIKE + doubt:
                 out[p, STATUS] = HORIZON

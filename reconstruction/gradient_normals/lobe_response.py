@@ -1,12 +1,12 @@
-"""What the lights of a gradient sphere see of a surface: moments of its lobe, by its normal.
+"""Table the moments that a gradient sphere's lights give of a surface's lobe, by its normal.
 
 Under a sphere of lights the first moments of a reflection point along its lobe, and the mirror
-direction follows. With a finite number of lights, a hole, unequal light and a lobe that Fresnel and
-shadowing skew the moments point elsewhere. Both are the same sum over the lights, and are tabled
-here, by the normal, so that the estimator can look up which normal leads to what was seen.
+direction follows. With a finite number of lights, a hole, unequal light and a lobe skewed by
+Fresnel and shadowing, the moments point elsewhere. Both are the same sum over the lights, tabled
+here by the normal, so that the estimator can find the normal of an observed vector.
 
-Normals and what is seen of them are written as places in an equal-area disc about the view (Lambert
-azimuthal): a place ``u`` is 2 sin(tilt / 2) long and points where the normal leans.
+Normals and observed vectors are written as positions in an equal-area disc about the view (Lambert
+azimuthal): a position ``u`` is 2 sin(tilt / 2) long and points to the azimuth of the normal.
 """
 
 from collections.abc import Callable
@@ -33,32 +33,30 @@ from reconstruction.gradient_normals.sphere_lights import (
 from reconstruction.polarization import fresnel_amplitudes
 
 TABLE_REACH = 1.3
-"""Length of the places that tables are made for: tilts up to 81 degrees."""
+"""Radius of the positions in tables: tilts up to 81 degrees."""
 MARGIN_LINES = 4
 """Grid lines around them."""
 FINEST, COARSEST = 0.0125, 0.04
-"""Distance of grid lines; a lobe's roughness has four of them in between."""
+"""Spacing of grid lines; a lobe's roughness has four of them in between."""
 FIELD_MM = 1.0
-"""Step of the differences by which the tables follow a point that moves across the field."""
+"""Step of the differences by which the tables depend on a point's position in the field."""
 
 F_X, F_Y, SCALE, CONCENTRATION, SYS_XX, SYS_XY, SYS_YY = range(7)
-"""Layers of a table: place seen (2); full light over a white diffuser's; length of the mean vector
-to the lights; covariance of the place seen from what is not known about the lights (3)."""
+"""Layers of a table: observed position (2); full light over a white diffuser's; length of the mean
+vector to the lights; covariance of the observed position from the lights' errors (3)."""
 TABLE_LAYERS = 7
 FIELD_LAYERS = 4
-"""Further layers where the field counts: change of the place seen with the point, 1/mm."""
+"""Further layers for lights at a finite distance: change of the observed position, 1/mm."""
 
 
 @dataclass(frozen=True, slots=True)
 class LobeResponseTable:
-    """A table of what is seen, by the normal's place; spline coefficients.
+    """Table of observed position and light by the normal's position; spline coefficients.
 
     Attributes
     ----------
     coefficients : ndarray of float64, shape (G, G, K)
-        Cubic B-splines on a grid of places, first axis along the frame's second direction.
-    min_coordinate, step : float
-        Place of the first grid line, distance of grid lines.
+        Cubic B-splines on a grid of positions, first axis along the frame's second direction.
     frame : ndarray, shape (3, 3)
         Rows: right, up and the view, in the rig frame.
     """
@@ -73,21 +71,21 @@ class LobeResponseTable:
 
 
 def facet_reflectance(lights: SphereLights, view: Float64Array, eta: float) -> Float64Array:
-    """Return what facets that mirror each light into the view send through the analyser, (L,).
+    """Return the reflection of facets that mirror each light, through the analyzer, (L,).
 
     Over the light's own irradiance, after its film; the same for every normal, as the facet is.
 
     Raises
     ------
     SphereLightsError
-        For a view that is no unit vector or within 0.06 degrees of the analyser's axis, or a
+        For a view that is not a unit vector or within 0.06 degrees of the analyzer's axis, or a
         refractive index outside 1...4.
     """
     view, eta = require_unit_vectors("view", np.asarray(view, np.float64)[None])[0], _index(eta)
     if abs(float(view @ np.asarray(lights.analyser))) > 1.0 - 5e-7:
         raise SphereLightsError(
-            f"view: got {view.tolist()}, the axis {list(lights.analyser)} of the analyser:"
-            " expected one across it"
+            f"view: got {view.tolist()}, along the analyzer's axis {list(lights.analyser)},"
+            " expected one across it; correct the rig's analyzer axis"
         )
     light = lights.directions
     facet = light + view
@@ -97,7 +95,7 @@ def facet_reflectance(lights: SphereLights, view: Float64Array, eta: float) -> F
     r_s, r_p = fresnel_amplitudes(cosine, eta)
     s = np.cross(facet, light)
     size = np.linalg.norm(s, axis=1, keepdims=True)
-    # a light along the view: s and p are alike, and any direction across serves
+    # a light along the view: s and p are equal, and any direction across serves
     s = np.where(size > 1e-9, s / np.maximum(size, 1e-9), view_frame(view)[0])
     p_in, p_out = np.cross(-light, s), np.cross(np.broadcast_to(view, s.shape), s)
     a_s, a_p = s @ np.asarray(lights.analyser), p_out @ np.asarray(lights.analyser)
@@ -105,7 +103,7 @@ def facet_reflectance(lights: SphereLights, view: Float64Array, eta: float) -> F
         e_s = np.sum(lights.polarizers * s, axis=1)
         e_p = np.sum(lights.polarizers * p_in, axis=1)
         return np.asarray((a_s * r_s * e_s + a_p * r_p * e_p) ** 2)
-    # the field that becomes the analyser's, of unit length: 1 / (a_s^2 / r_s^2 + a_p^2 / r_p^2)
+    # the field that becomes the analyzer's, of unit length: 1 / (a_s^2 / r_s^2 + a_p^2 / r_p^2)
     lost = (a_s * r_p) ** 2 + (a_p * r_s) ** 2
     return np.asarray((r_s * r_p) ** 2 / np.maximum(lost, 1e-300))
 
@@ -132,14 +130,14 @@ def specular_response(
     eta : float
         Refractive index of the surface.
     near : bool
-        Add the layers by which a point's place in the field counts.
+        Add the layers by which a point's position in the field counts.
     alpha_stderr : float
         Standard error of `alpha`; enters the systematic covariance.
 
     Raises
     ------
     SphereLightsError
-        For a roughness or index that no such surface has.
+        For a roughness or index outside its range.
     """
     Checks(SphereLightsError).within("alpha", alpha, "[0.02, 1]")
     Checks(SphereLightsError).within("alpha_stderr", alpha_stderr, "[0, inf)")
@@ -208,7 +206,7 @@ def _cached(
             layers[part, SYS_XX] += move[:, 0] ** 2
             layers[part, SYS_XY] += move[:, 0] * move[:, 1]
             layers[part, SYS_YY] += move[:, 1] ** 2
-    layers[:, :2] -= places  # what differs from the normal's own place is smooth
+    layers[:, :2] -= places  # the deviation from the normal's own position is smooth
     grid = layers.reshape(len(axis), len(axis), -1)
     coefficients = np.stack(
         [spline_filter(grid[..., k], order=3, mode="mirror") for k in range(grid.shape[2])], axis=-1
@@ -229,7 +227,7 @@ def _local(lights: SphereLights, point_mm: Float64Array) -> tuple[Float64Array, 
 
 
 def _white(lights: SphereLights, frame: Float64Array) -> float:
-    """Return what a white diffuser that faces the view shows under full light."""
+    """Return the light of a white diffuser that faces the view under full light."""
     facing = np.maximum(lights.directions @ frame[2], 0.0)
     return float(np.sum(lights.intensities * facing) / np.pi)
 
@@ -237,7 +235,7 @@ def _white(lights: SphereLights, frame: Float64Array) -> float:
 def _specular_sums(lights: SphereLights, frame: Float64Array, alpha: float, eta: float) -> Sums:
     view = frame[2]
     mirrored = facet_reflectance(lights, view, eta) * (1.0 - lights.leakage)
-    # the analyser halves the white diffuser's light, and none of the polarized reflection's
+    # the analyzer halves the white diffuser's light but not the polarized reflection's
     mirrored = mirrored * 2.0 / max(_white(lights, frame), 1e-300)
 
     def each(normals: Float64Array, point_mm: Float64Array) -> Float64Array:
@@ -275,13 +273,14 @@ def _diffuse_sums(lights: SphereLights, frame: Float64Array, eta: float) -> Sums
 def _layers(
     lights: SphereLights, frame: Float64Array, each: Float64Array, mirror: bool
 ) -> Float64Array:
-    """Return the layers (P, LAYERS) of what each light gives (P, L)."""
+    """Return the layers (P, LAYERS) from each light's contribution (P, L)."""
     axes = lights.programmed if len(lights.programmed) else lights.directions
     axes = axes @ frame.T
     full = each.sum(axis=1)
     vector = each @ axes
     place, slope = direction_from_moments(vector, mirror)
     some = np.maximum(lights.intensities, 1e-300)
+    # relative variance of each light's part; parallel less crossed is proportional to 1 - leakage
     doubt = (lights.intensity_stderr / some) ** 2
     if mirror:
         passing = np.maximum(np.abs(1.0 - lights.leakage), 1e-9)
@@ -291,6 +290,7 @@ def _layers(
     out[:, SCALE] = full
     out[:, CONCENTRATION] = np.linalg.norm(vector, axis=1) / np.maximum(full, 1e-300)
     if doubt.any():
+        # independent lights: sum over them of the outer square of derivative times deviation
         move = np.einsum("pij,lj->pil", slope, axes) * (each * np.sqrt(doubt))[:, None]
         out[:, SYS_XX] = np.sum(move[:, 0] ** 2, axis=1)
         out[:, SYS_XY] = np.sum(move[:, 0] * move[:, 1], axis=1)
@@ -299,7 +299,7 @@ def _layers(
 
 
 def direction_from_moments(vector: Float64Array, mirror: bool) -> tuple[Float64Array, Float64Array]:
-    """Return the place that a moment vector points at, and its derivative by the vector.
+    """Return the observed position of a moment vector, and its derivative by the vector.
 
     Parameters
     ----------
@@ -326,6 +326,7 @@ def direction_from_moments(vector: Float64Array, mirror: bool) -> tuple[Float64A
     size = np.where(size > 1e-150, size, short)
     size = np.maximum(size, 1e-300)[:, None]
     n = vector / size
+    # d(v / |v|) / dv = (I - n n') / |v|, chained with the same for n + view in a mirror
     turn = (np.eye(3) - n[:, :, None] * n[:, None, :]) / size[:, :, None]
     if mirror:
         half = n + np.array([0.0, 0.0, 1.0])
@@ -333,6 +334,7 @@ def direction_from_moments(vector: Float64Array, mirror: bool) -> tuple[Float64A
         n = half / size
         turn = (np.eye(3) - n[:, :, None] * n[:, None, :]) / size[:, :, None] @ turn
     up = np.maximum(1.0 + n[:, 2], 1e-9)
+    # position u = n_xy sqrt(2 / (1 + n_z)), 2 sin(tilt / 2) long
     scale = np.sqrt(2.0 / up)
     slope = scale[:, None, None] * turn[:, :2]
     slope -= (scale / (2.0 * up))[:, None, None] * n[:, :2, None] * turn[:, None, 2]

@@ -1,4 +1,4 @@
-"""Moments of the lights from the patterns of a pixel, compiled."""
+"""Fit moments of the lights to the patterns of a pixel (Numba)."""
 
 import numpy as np
 from numba import njit
@@ -23,12 +23,12 @@ def fit_moments(y, noise, gain, read, noise_source, dark, out):  # type: ignore[
     Parameters
     ----------
     y : ndarray, shape (8, P)
-        Samples; NaN where there is none.
+        Samples; NaN where missing.
     noise : ndarray, shape (8, P)
         Variances; read only where `noise_source` is 1.
     gain, read : float
         Variance as ``read + gain * signal``; read only where `noise_source` is 2. With
-        `noise_source` 0 all samples count alike, and variances are for a variance of 1.
+        `noise_source` 0 all samples have equal weights, and variances are for a variance of 1.
     noise_source : int
     dark : bool
         Whether the dark level is unknown; else it is 0.
@@ -37,9 +37,9 @@ def fit_moments(y, noise, gain, read, noise_source, dark, out):  # type: ignore[
     Notes
     -----
     With a dark level ``b``, the full light gives ``b + c_0``, a pattern and its complement
-    ``b + (c_0 +- c_w) / 2``. Their sum says ``2 b + c_0`` and nothing of ``c_w``; so two unknowns
-    are fitted to at most five numbers, and each ``c_w`` then to at most two samples. Together this
-    is the generalised least squares of all samples in closed form.
+    ``b + (c_0 +- c_w) / 2``. Their sum is ``2 b + c_0`` and does not depend on ``c_w``; so two
+    unknowns are fitted to at most five numbers, and each ``c_w`` then to at most two samples.
+    Together this is the generalized least squares of all samples in closed form.
     """
     nan = np.nan
     v = np.empty(8)
@@ -62,7 +62,7 @@ def fit_moments(y, noise, gain, read, noise_source, dark, out):  # type: ignore[
         rounds = 2 if noise_source == 2 else 1
         for turn in range(rounds):
             if noise_source == 2:
-                # signals of the fit before, not the samples: these would weigh their own noise
+                # signals of the previous fit: weights from the samples' own noise would be biased
                 base = max(out[C_0, p], 0.0) if turn else top
                 floor = 1e-6 * (read + gain * top) if top > 0.0 else max(read, 1e-12)
                 for k in range(8):
@@ -131,7 +131,7 @@ def fit_moments(y, noise, gain, read, noise_source, dark, out):  # type: ignore[
                 plus, minus = y[1 + axis, p], y[4 + axis, p]
                 vp, vm = v[1 + axis], v[4 + axis]
                 if plus == plus and minus == minus:
-                    share = vm / (vp + vm)  # weight of the pattern, the rest its complement's
+                    share = vm / (vp + vm)  # weight of the pattern, one less it the complement's
                     t = 2.0 * share - 1.0
                     s = 4.0 * vp * share
                     c = share * (2.0 * (plus - b) - c0) + (1.0 - share) * (c0 - 2.0 * (minus - b))

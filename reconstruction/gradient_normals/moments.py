@@ -1,4 +1,4 @@
-"""Moments of a reflection under a sphere's patterns, by tiles of rows, smoothed or not."""
+"""Compute moments of a reflection under a sphere's patterns, by tiles of rows, smoothed or not."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -30,37 +30,37 @@ _VARIANCE_PAIRS = (
     (moment_kernels.V_XZ, 1, 3),
     (moment_kernels.V_YZ, 2, 3),
 )
-"""Rows of variances, and which moments they are of."""
+"""Rows of variances, and the moments they belong to."""
 KERNEL_RADIUS_SIGMAS = 3.5
-"""Where a smoothing kernel ends, in its standard deviations."""
+"""Radius of a smoothing kernel, in its standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReflectionMoments:
-    """What is needed to compute the moments of a component, tile by tile.
+    """Images and settings from which the moments of a component are computed, tile by tile.
 
     Attributes
     ----------
     component : "specular" or "diffuse"
     parallel : Stack or None
-        None for diffuse moments of crossed pictures alone.
+        None for diffuse moments of crossed images alone.
     crossed : Stack
     noise : SensorNoise or None
-        None where the stacks hold variances, or nothing is known.
+        None if the stacks contain variances, or noise is unknown.
     noise_source : int
         0: noise is unknown; 1: the stacks' variances; 2: `noise`.
     has_given_noise : bool
-        Whether the noise was given, and residuals can be judged by it.
+        Whether the noise was given, so that residuals can be tested against it.
     leakage : float
-        Of the specular reflection what passes crossed, over parallel; for diffuse moments.
+        Crossed over parallel transmission of the specular reflection; for diffuse moments.
     smooth_px : tuple of float
         Standard deviations of the Gaussians, parallel and crossed, px.
     kind : dtype
         float32 or float64.
     filtered_moments : tuple of ndarray, shape (4, H, W), or None
-        Filtered moments, parallel and crossed, that replace the pictures' own.
+        Filtered moments, parallel and crossed, that replace the images' own.
     variance_ratios : tuple of ndarray, shape (2, 4), or None
-        Variance of what is to be inverted, over that of the pictures' own parallel and crossed
+        Variance of the moments to invert, over that of the images' own parallel and crossed
         moments, with `filtered_moments`.
     """
 
@@ -82,16 +82,16 @@ class ReflectionMoments:
         return self.crossed.shape
 
     def tiles(self) -> Iterator[slice]:
-        """Yield slices of rows that cover the pictures."""
+        """Yield slices of rows that cover the images."""
         height, width = self.shape
         step = max(1, TILE_PIXELS // width)
         for start in range(0, height, step):
             yield slice(start, min(start + step, height))
 
     def moments(self, rows: slice) -> tuple[FloatArray, FloatArray]:
-        """Return what is to be inverted (MOMENT_ROWS, P), and what is to be taken off it.
+        """Return the moments to invert (MOMENT_ROWS, P), and those to subtract from them.
 
-        The second one is (MOMENT_ROWS, 0) where nothing is.
+        The second are (MOMENT_ROWS, 0) if there are none.
         """
         crossed = self._of(self.crossed, rows, self.smooth_px[1])
         if self.parallel is None:
@@ -112,7 +112,7 @@ class ReflectionMoments:
         return cleaned, crossed[:, :0]
 
     def _replace(self, first: FloatArray, second: FloatArray, rows: slice) -> None:
-        """Put filtered moments in, and all of their variance into the first."""
+        """Insert filtered moments, with all of their variance in the first."""
         if self.filtered_moments is None or self.variance_ratios is None:
             return
         lost = ~np.isfinite(first[0]) | ~np.isfinite(second[0])
@@ -137,7 +137,7 @@ class ReflectionMoments:
         noise = stack.variances(slice(start, stop), self.kind)
         height, width = y.shape[1:]
         out = np.empty((moment_kernels.MOMENT_ROWS, height * width), self.kind)
-        # a view that repeats itself keeps doing so
+        # a broadcast view stays broadcast
         flat = noise.reshape(len(y), -1)
         if noise.strides[2] == 0:
             flat = np.broadcast_to(noise[:, :1, 0], flat.shape)
@@ -187,7 +187,7 @@ def prepare_moments(
     leakage: float,
     smooth_px: tuple[float, float],
 ) -> ReflectionMoments:
-    """Check that the pictures tell the component, and what is known of their noise.
+    """Check that the images determine the component, and how their noise is known.
 
     Parameters
     ----------
@@ -206,10 +206,10 @@ def prepare_moments(
     for polarizer in wanted:
         if polarizer not in stacks:
             text = (
-                f"patterns: got no {polarizer} pictures; {component} normals need"
-                f" {' and '.join(wanted)} ones, full, x, y, z at least"
+                f"patterns: got no {polarizer} images; {component} normals need"
+                f" {' and '.join(wanted)} ones, full, x, y, z at least; add them"
             )
-            why = ": parallel pictures hold both reflections, and crossed ones tell the diffuse"
+            why = ": parallel images contain both reflections, crossed ones only the diffuse"
             raise MissingPatternsError(text + why if component == "specular" else text)
         require_patterns(
             stacks[polarizer].images, polarizer=polarizer, purpose=f"{component} normals"
@@ -221,17 +221,17 @@ def prepare_moments(
     elif parallel is not None:
         used["parallel"] = parallel
     judged = noise is not None or used["crossed"].variance is not None
-    told = 1 if used["crossed"].variance is not None else 2
-    if told == 2:
+    noise_source = 1 if used["crossed"].variance is not None else 2
+    if noise_source == 2:
         noise = noise or estimate_noise(used)
-        told = 0 if noise is None else 2
+        noise_source = 0 if noise is None else 2
     kinds = {image.dtype for stack in used.values() for image in stack.images.values()}
     return ReflectionMoments(
         component,
         parallel,
         stacks["crossed"],
-        noise if told == 2 else None,
-        told,
+        noise if noise_source == 2 else None,
+        noise_source,
         judged,
         leakage,
         smooth_px,
@@ -240,19 +240,19 @@ def prepare_moments(
 
 
 def apply_wiener_filter(reflection: ReflectionMoments) -> ReflectionMoments:
-    """Return the reflection with its moments filtered by what share of each frequency is signal.
+    """Filter a reflection's moments by the fraction of signal at each frequency.
 
-    Diffuse moments are filtered first, and what is left of the parallel ones without them next:
-    skin glows with less detail than it mirrors.
+    Diffuse moments are filtered first, then the parallel ones less these: the specular reflection
+    has finer detail than the diffuse one.
 
     Raises
     ------
     GradientError
-        Where the noise is not known.
+        If the noise is unknown.
     """
     if not reflection.noise_source:
         raise GradientError(
-            "wiener: noise is unknown, as no patterns are redundant; give variance, or a smoothing"
+            "wiener: noise is unknown, as no patterns are redundant; give variance or smoothing"
             " in px"
         )
     height, width = reflection.shape
@@ -285,10 +285,10 @@ def apply_wiener_filter(reflection: ReflectionMoments) -> ReflectionMoments:
 
 
 def share_dark_frames(stacks: Mapping[str, PatternStack]) -> dict[str, PatternStack]:
-    """Give a dark frame that was taken in one polarization only to the other, too.
+    """Use a dark frame of one polarization for the other, too.
 
-    The analyser does not change it where no other light is about. Its noise then counts in both,
-    though it cancels in their difference: standard errors err to the large side.
+    The analyzer does not change it without other light. Its noise then counts in both,
+    though it cancels in their difference: standard errors are conservative.
     """
     out = dict(stacks)
     dark = [name for name, stack in stacks.items() if stack.has_dark]

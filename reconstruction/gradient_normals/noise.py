@@ -1,4 +1,4 @@
-"""The noise of a gradient sphere's pictures, as far as these tell it themselves."""
+"""Estimate the noise of a gradient sphere's images from their redundancy."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ from reconstruction.gradient_normals.patterns import (
     design_matrix,
 )
 
-_CHI_MEDIAN = 0.4549364  # of the square of a standard normal variable
+_CHI_MEDIAN = 0.4549364  # median of the square of a standard normal variable
 
 
 @dataclass(frozen=True, slots=True)
 class SensorNoise:
-    """Variance of a sample as ``read_variance + gain * signal``, in the pictures' unit.
+    """Variance of a sample as ``read_variance + gain * signal``, in the images' unit.
 
     Attributes
     ----------
@@ -33,15 +33,15 @@ class SensorNoise:
     read_variance: float
 
     def __post_init__(self) -> None:
-        """Refuse what is no variance."""
+        """Refuse variances below 0 or both 0."""
         check = Checks(GradientError)
         check.settings(self, gain="[0, inf)", read_variance="[0, inf)")
         some = self.gain or self.read_variance
-        check.require(some, "SensorNoise", "no noise at all", "gain or read_variance")
+        check.require(some, "SensorNoise", "0 for both", "gain or read_variance")
 
 
 def estimate_noise(stacks: Mapping[str, PatternStack]) -> SensorNoise | None:
-    """Estimate the sensor's noise from how patterns and complements contradict each other.
+    """Estimate the sensor's noise from the contradictions of patterns and complements.
 
     Parameters
     ----------
@@ -51,13 +51,13 @@ def estimate_noise(stacks: Mapping[str, PatternStack]) -> SensorNoise | None:
     Returns
     -------
     SensorNoise or None
-        None where no pictures are redundant.
+        None where no images are redundant.
 
     Notes
     -----
-    Pattern plus complement is the full light whatever the surface. Differences of such sums have
-    the samples' noise alone; their squares, as medians over pixels of like brightness, are fitted
-    by a line on the sum of signals, both its coefficients at least 0.
+    Pattern plus complement is the full light for any surface. Differences of such sums contain
+    the samples' noise alone; their squares, as medians over pixels of similar brightness, are
+    fitted by a line on the sum of signals, both its coefficients at least 0.
     """
     light, square, count = [], [], []
     for stack in stacks.values():
@@ -71,6 +71,7 @@ def estimate_noise(stacks: Mapping[str, PatternStack]) -> SensorNoise | None:
                 continue
             some = y[used][:, good]
             w = weights[used]
+            # w @ samples has mean 0 and variance sum w_k^2 (read + gain s_k): a line in light
             light.append((w**2) @ some)
             square.append((w @ some) ** 2)
             count.append(np.full(some.shape[1], np.sum(w**2)))
@@ -82,7 +83,7 @@ def estimate_noise(stacks: Mapping[str, PatternStack]) -> SensorNoise | None:
 
 
 def _contrasts(stack: PatternStack) -> list[Float64Array]:
-    """Return weights (8,) of orthogonal sums of the pictures that hold nothing but noise."""
+    """Return weights (8,) of orthogonal sums of the images that contain noise alone."""
     names: list[str] = [name for name in PATTERN_NAMES if name in stack.images]
     if stack.redundancy < 1:
         return []

@@ -1,7 +1,7 @@
-"""The pictures of a gradient sphere: which there are, and whether they suffice.
+"""Name the patterns of a gradient sphere, stack their images, and check that they suffice.
 
-Four numbers a polarization are asked for, the full light and its moments along x, y and z. Each
-picture is a weighted sum of them: the full light itself, or half of it plus or less half a moment.
+There are four unknowns per polarization, the full light and its moments along x, y and z. Each
+image is a weighted sum of them: the full light itself, or half of it plus or minus half a moment.
 """
 
 from collections.abc import Mapping
@@ -19,23 +19,23 @@ POLARIZER_NAMES: Final = ("parallel", "crossed")
 
 
 class GradientError(ValueError):
-    """Pictures that no normals can be computed from."""
+    """Images that normals cannot be computed from."""
 
 
 class MissingPatternsError(GradientError):
-    """Too few patterns to tell the light and its three moments."""
+    """Too few patterns to determine the light and its three moments."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatternStack:
-    """The pictures of one polarization, by pattern.
+    """The images of one polarization, by pattern.
 
     Attributes
     ----------
     images : dict of str to ndarray, shape (H, W)
     variance : dict of str to ndarray, broadcastable to (H, W), or None
     valid : dict of str to ndarray of bool, shape (H, W)
-        Only those that are not valid everywhere.
+        Only masks with invalid pixels.
     """
 
     images: dict[str, FloatArray]
@@ -50,12 +50,12 @@ class PatternStack:
 
     @property
     def has_dark(self) -> bool:
-        """Whether a dark frame is among the pictures, and not yet subtracted."""
+        """Whether there is a dark frame that is not yet subtracted."""
         return "dark" in self.images
 
     @property
     def redundancy(self) -> int:
-        """How many more pictures there are than what is asked for."""
+        """Number of images beyond the number of unknowns."""
         return redundancy(self.images)
 
     def samples(self, rows: slice, kind: Any) -> FloatArray:
@@ -73,7 +73,7 @@ class PatternStack:
         return out
 
     def variances(self, rows: slice, kind: Any) -> FloatArray:
-        """Return variances (8, h, W); 1 where no picture is, and a view where it can be."""
+        """Return variances (8, h, W); 1 without an image, broadcast views where possible."""
         height, width = len(range(*rows.indices(self.shape[0]))), self.shape[1]
         if self.variance is None:
             return np.broadcast_to(np.ones(1, kind), (len(PATTERN_NAMES), height, width))
@@ -86,7 +86,7 @@ class PatternStack:
 
 
 def design_matrix(names: list[str], *, dark: bool) -> Float64Array:
-    """Return the weights (R, 4 or 5) of full light, moments and dark level in each picture."""
+    """Return the weights (R, 4 or 5) of full light, moments and dark level in each image."""
     rows = []
     for name in names:
         row = [0.0, 0.0, 0.0, 0.0]
@@ -99,7 +99,7 @@ def design_matrix(names: list[str], *, dark: bool) -> Float64Array:
 
 
 def redundancy(names: Mapping[str, Any]) -> int:
-    """Return the number of pictures beyond those that tell everything; below 0 where too few.
+    """Return the number of images beyond the unknowns; below 0 if these are not determined.
 
     Examples
     --------
@@ -115,12 +115,12 @@ def redundancy(names: Mapping[str, Any]) -> int:
 
 
 def require_patterns(names: Mapping[str, Any], *, polarizer: str, purpose: str) -> None:
-    """Refuse patterns that do not tell the full light and its three moments.
+    """Refuse patterns that do not determine the full light and its three moments.
 
     Raises
     ------
     MissingPatterns
-        Saying which are missing, and which would do.
+        With those that are missing, and which would suffice.
     """
     if redundancy(names) >= 0:
         return
@@ -131,7 +131,7 @@ def require_patterns(names: Mapping[str, Any], *, polarizer: str, purpose: str) 
         needs.append("full, or a complement of one more pattern")
     missing = [name for name in PATTERN_NAMES if name not in names]
     raise MissingPatternsError(
-        f"patterns: {purpose} needs the {polarizer} pictures to tell full light and three"
+        f"patterns: {purpose} needs the {polarizer} images to determine full light and three"
         f" gradients; got {', '.join(lit) or 'none'}; missing {', '.join(missing)};"
-        f" {' and '.join(needs)} would do"
+        f" {' and '.join(needs)} would suffice; add them"
     )

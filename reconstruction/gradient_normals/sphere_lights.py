@@ -1,4 +1,4 @@
-"""Lights of a gradient sphere, and the disc that normals are looked up on."""
+"""Describe the lights of a gradient sphere, and map normals to positions on a disc."""
 
 from dataclasses import dataclass, field
 from functools import partial
@@ -11,7 +11,7 @@ from reconstruction.arrays import Float64Array
 
 
 class SphereLightsError(ValueError):
-    """Lights that no gradient sphere has."""
+    """Lights outside the ranges of a gradient sphere."""
 
 
 _none = partial(np.zeros, 0)
@@ -19,26 +19,26 @@ _none = partial(np.zeros, 0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SphereLights:
-    """The lights of a gradient sphere and their films, as they were measured.
+    """Lights of a gradient sphere with their polarizers, as measured.
 
     Attributes
     ----------
     directions : ndarray, shape (L, 3)
         Unit vectors from the middle of the patch to the lights, rig frame, at least four.
     intensities : ndarray, shape (L,)
-        What each light gives at the patch, relative, >= 0; any scale. Default: all 1.
+        Light of each source at the patch, relative, >= 0; any scale. Default: all 1.
     leakage : ndarray, shape (L,)
-        Of the specular reflection into the camera what passes crossed, over what passes parallel,
+        Crossed transmission of the specular reflection into the camera over the parallel one,
         >= 0; below 1 for most lights. Default: 0.
     polarizers : ndarray, shape (L, 3)
-        Unit vectors of the electric field that each light sends to the patch. Default (0, 3): such
-        that what a facet reflects into the view is polarized along the analyser.
-    analyser : tuple of float
-        Passing axis of the analyser in its parallel state.
+        Unit vectors of the electric field that each light sends to the patch. Default (0, 3):
+        polarizers under which a facet reflects light polarized along the analyzer.
+    analyzer : tuple of float
+        Passing axis of the analyzer in its parallel state.
     programmed : ndarray, shape (L, 3)
         The vectors whose coordinates the patterns were made of; default: `directions`.
     distance_mm : float
-        Of the lights from the middle of the patch; inf: a point's place does not count.
+        Distance of the lights from the patch's middle; inf: a point's position does not matter.
     intensity_stderr : ndarray, shape (L,)
         Standard error of `intensities`. Default: 0.
     leakage_stderr : ndarray, shape (L,)
@@ -74,8 +74,8 @@ class SphereLights:
             values = given.copy() if given.size else np.full(count, float(name == "intensities"))
             _keep(self, name, check.numbers(name, values, (count,), interval="[0, inf)"))
         check.require(self.intensities.any(), "intensities", "0 for every light", "some light")
-        # a few may exceed 1, by a film mounted across or where the surface hardly reflects the
-        # parallel state: what they give parallel less crossed is negative, and counts as such
+        # a few may exceed 1, by a polarizer mounted crosswise or where the surface hardly reflects
+        # the parallel state: their parallel less crossed light is negative and counts as such
         middle = float(np.median(self.leakage[self.intensities > 0]))
         got = f"{middle:g} in the middle of the lights"
         expected = "crossed over parallel below 1; are the two states exchanged?"
@@ -98,7 +98,7 @@ class SphereLights:
         return tuple(v.tobytes() if isinstance(v, np.ndarray) else v for v in values)
 
     def __eq__(self, other: object) -> bool:
-        """Compare by numbers, so that a table that one holds serves the other."""
+        """Compare by numbers, so that equal lights share a cached table."""
         return isinstance(other, SphereLights) and self._contents() == other._contents()
 
     def __hash__(self) -> int:
@@ -148,14 +148,14 @@ def view_frame(view: ArrayLike) -> Float64Array:
 
 
 def normal_from_disc(position: Float64Array) -> Float64Array:
-    """Return the unit normals (..., 3) at places (..., 2), in the frame of the view.
+    """Return the unit normals (..., 3) at positions (..., 2), in the frame of the view.
 
-    The horizon is at a length of sqrt(2); places beyond it have the normal of the horizon there.
+    The horizon is at a length of sqrt(2); positions beyond it have the normal of the horizon there.
 
     Raises
     ------
     SphereLightsError
-        For places that are not finite.
+        For positions that are not finite.
 
     Examples
     --------
@@ -170,7 +170,7 @@ def normal_from_disc(position: Float64Array) -> Float64Array:
 
 
 def disc_from_normal(normal: Float64Array) -> Float64Array:
-    """Return the places (..., 2) of unit normals (..., 3), in the frame of the view.
+    """Return the positions (..., 2) of unit normals (..., 3), in the frame of the view.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""Filter the moments by how much of each spatial frequency is signal, before they become normals.
+"""Filter moments by the fraction of signal at each spatial frequency.
 
 A lens passes no detail beyond its diffraction limit, and a relief has little at most frequencies;
-noise has as much at all. With the noise known, the spectrum of a moment's image says what share of
-each frequency is signal (Wiener 1949), and that share is kept.
+white noise has equal power at all. With the noise known, the spectrum of a moment's image gives the
+fraction of signal at each frequency, which is the Wiener filter (Wiener 1949).
 """
 
 import numpy as np
@@ -12,28 +12,28 @@ from scipy.ndimage import gaussian_filter, uniform_filter
 from reconstruction.arrays import BoolArray, FloatArray
 
 PAD_PX = 24
-"""Mirrored border, so that the ends of a picture do not meet."""
+"""Mirrored border, so that opposite sides of an image do not mix."""
 SPECTRUM_BANDS = 64
-"""A spectrum is averaged over about this part of its width, which it must be smooth over."""
+"""Number of bands over the spectrum's width, within which it is averaged."""
 
 
 def filter_image(image: FloatArray, variance: float, valid: BoolArray) -> tuple[FloatArray, float]:
-    """Return a picture as its signal most likely is, and what is left of its noise.
+    """Filter an image to its most probable signal; return it with its remaining error.
 
     Parameters
     ----------
     image : ndarray, shape (H, W)
         Signal and white noise; not read where not valid.
     variance : float
-        Of the noise, mean over the picture.
+        Mean variance of the noise over the image.
     valid : ndarray of bool, shape (H, W)
 
     Returns
     -------
     picture : ndarray, shape (H, W)
-        Mirrored or smoothed from its neighbours where not valid.
+        Mirrored or smoothed from its neighbors where not valid.
     share : float
-        Mean square error of `picture` over `variance`: noise that is kept and signal that is lost
+        Mean square error of `picture` over `variance`, of remaining noise and lost signal
         together, 0 to 1.
 
     Examples
@@ -73,10 +73,10 @@ def _pads(side: int) -> tuple[int, int]:
 
 
 def _averaged(power: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """Average the half spectrum of a real picture over bands of frequencies, periodically."""
+    """Average the half spectrum of a real image over bands of frequencies, periodically."""
     rows, columns = (max(3, side // SPECTRUM_BANDS) | 1 for side in shape)
     half = columns
-    # the missing half is the other one's mirror image, rows turned too
+    # the missing half is the other one's mirror image, with its rows reversed
     turned = np.roll(power[::-1], 1, axis=0)
     last = power.shape[1] - 1 if shape[1] % 2 == 0 else power.shape[1]
     left = turned[:, half:0:-1]
@@ -88,7 +88,7 @@ def _averaged(power: FloatArray, shape: tuple[int, ...]) -> FloatArray:
 
 
 def _full_mean(half: FloatArray, width: int) -> float:
-    """Return the mean over the whole spectrum of what the half of it holds."""
+    """Return the mean over the whole spectrum from its stored half."""
     weight = np.full(half.shape[1], 2.0)
     weight[0] = 1.0
     if width % 2 == 0:

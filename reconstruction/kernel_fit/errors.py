@@ -1,13 +1,13 @@
-"""Errors of fitted kernels: what another patch of the same skin and size would change.
+"""Estimate errors of fitted kernels: their scatter over other patches of the same skin and size.
 
-Blocks of the map tell how its histogram scatters, neighboring buckets and neighboring blocks
-together; histograms drawn with that scatter tell how far the best kernel moves.
+Counts in blocks of the map give the scatter of its histogram, with the correlation of neighboring
+buckets and blocks. Histograms are drawn with that scatter, and the best kernel is found for each.
 
 Where both histograms are of one piece of skin, as neutral and strained maps of a session are, they
-scatter together: a furrow more than usual is in both, and moves the kernel by little. Then both
-are drawn with the same factor on each piece of skin, pieces matched by the place on the skin, and
-each kernel with the scatter of its own histogram: a kernel that deepens furrows scatters more than
-one that does not. Else the target is drawn as of other skin.
+scatter together: a patch with more grooves than usual has them in both, and the kernel moves by
+little. Then both are drawn with the same factor on each piece of skin, matched by position on the
+skin, and each kernel with the scatter of its own histogram: a kernel that deepens grooves scatters
+more than one that does not. Otherwise the target is drawn as of other skin.
 """
 
 import math
@@ -25,20 +25,20 @@ from reconstruction.normal_histogram.blocks import MIN_BLOCKS
 N_DRAWS = 200
 """Histograms drawn for the standard errors."""
 MAX_CANDIDATE_KERNELS = 64
-"""Nearly-as-good kernels among which each draw finds its best."""
+"""Almost equally good kernels among which each draw finds its best."""
 CANDIDATE_SIGMAS = 3.0
-"""They are taken from within so many standard errors of the distance."""
+"""Excess distance up to which they are taken, in standard errors of the distance."""
 MAX_PAIRED_KERNELS = 140
-"""The same of histograms of one piece of skin."""
+"""Like `MAX_CANDIDATE_KERNELS`, for histograms of one piece of skin."""
 PAIRED_PX = 1_000_000
-"""Of maps with more normals the valley is shorter, and fewer are taken, down to
-`MAX_CANDIDATE_KERNELS`: on 1000 x 1000 pixels each takes 0.02 s."""
+"""Normals up to which that number is used. With more the valley is shorter, and fewer are taken,
+down to `MAX_CANDIDATE_KERNELS`: on 1000 x 1000 pixels each takes 0.02 s."""
 PAIRED_SIGMAS = 4.0
-"""The same of histograms of one piece of skin, whose valley is wider than their scatter."""
+"""Like `CANDIDATE_SIGMAS`, for histograms of one piece of skin; the valley is wider than these."""
 INTERVAL_COVERAGES = 0.6827, 0.95
-"""Shares of draws within the half widths of intervals that are told."""
+"""Coverages of the two intervals: fractions of draws within their half widths."""
 GAUSSIAN_95 = 1.959964
-"""Half width of a Gaussian's interval of the second share over that of the first."""
+"""Half width of a Gaussian's second interval over that of its first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +49,8 @@ class BlockCounts:
     ----------
     counts : ndarray of float64, shape (blocks, buckets)
     variance_inflation : float
-        By how much larger the variance of the mean squared slope is than that of independent
-        blocks, because neighbors are alike.
+        Factor by which the variance of the mean squared slope exceeds that of independent blocks,
+        as neighboring blocks are correlated.
     """
 
     counts: Float64Array
@@ -63,12 +63,12 @@ class BlockCounts:
 
     @property
     def occupied(self) -> int:
-        """Buckets that hold anything; at least 1."""
+        """Buckets with at least one normal; at least 1."""
         return max(1, int(np.count_nonzero(self.counts.sum(axis=0))))
 
     @property
     def effective_samples(self) -> float:
-        """Independent samples that would be as noisy."""
+        """Number of independent samples with the same noise."""
         return max(
             1.0,
             normal_blocks.effective_sample_count(self.counts, self.samples)
@@ -76,10 +76,10 @@ class BlockCounts:
         )
 
     def residuals(self) -> Float64Array:
-        """Return each block's part in the error of the shares, (blocks, buckets).
+        """Return each block's contribution to the error of the bucket fractions, (blocks, buckets).
 
-        With independent unit normal factors on the blocks, the sum scatters as the shares do over
-        other patches of the same skin, neighboring buckets together.
+        Weighted by independent unit normal factors, their sum scatters as the fractions do over
+        other patches of the same skin, with the correlation of buckets.
         """
         sizes = self.counts.sum(axis=1)
         counts = self.counts[sizes > 0]
@@ -87,25 +87,25 @@ class BlockCounts:
         return np.asarray(normal_blocks.block_residuals(counts) * scale)
 
     def distance_stderr(self, target: Float64Array, target_samples: float) -> float:
-        """Return the standard error of the distance to a target of so many effective samples."""
+        """Return the standard error of the distance to a target of given effective samples."""
         effective, residuals = self.effective_samples, self.residuals()
         signs = np.sign(self.counts.sum(axis=0) / self.samples - target)
-        # a sum of signs has a variance of at most 1 an independent sample; or what blocks show
+        # A sum of signs has at most variance 1 per independent sample; blocks may show more
         own = max(1.0 / effective, float(np.sum((residuals @ signs) ** 2)))
         return math.sqrt(own * (1.0 + effective / target_samples))
 
     def block_contributions(self, target_samples: float) -> Float64Array:
-        """Return the parts of blocks in the error of both histograms, as of `residuals`."""
+        """Return blocks' contributions to the error of both histograms, see `residuals`."""
         return self.residuals() * math.sqrt(1.0 + self.effective_samples / target_samples)
 
 
 def count_blocks(grid: KernelGrid, alpha: float, sigma_um: float) -> BlockCounts:
-    """Count the normals of a relief that a kernel has changed, in blocks of its map.
+    """Count the normals of a relief convolved with a kernel, in blocks of its map.
 
     Parameters
     ----------
     grid
-        Of the search.
+        The search's grid.
     alpha, sigma_um
         The kernel; sigma in um.
     """
@@ -125,12 +125,12 @@ def count_blocks(grid: KernelGrid, alpha: float, sigma_um: float) -> BlockCounts
 def near_best_kernels(
     grid: KernelGrid, search_result: KernelSearchResult, noise: float
 ) -> Int64Array:
-    """Return the kernels that are no further than `noise` from the best, (K, 2).
+    """Return the kernels whose distance exceeds the best's by at most `noise`, (K, 2).
 
     Parameters
     ----------
-    grid, found
-        Of the search.
+    grid, search_result
+        The search's grid and result.
     noise : float
         In units of the distance.
 
@@ -153,7 +153,7 @@ class HalfWidths:
     Attributes
     ----------
     alpha, sigma_um : tuple of float
-        Of 68.27 and 95 %; the second is at least a Gaussian's.
+        At coverages of 68.27 and 95 %; the second is at least a Gaussian's.
     """
 
     alpha: tuple[float, float]
@@ -162,12 +162,12 @@ class HalfWidths:
 
 @dataclass(frozen=True, slots=True)
 class HistogramResampling:
-    """Histograms drawn anew, and how far they move the best kernel of a search.
+    """Redraw histograms, and measure how far the best kernel of a search moves.
 
     Attributes
     ----------
     grid, search_result
-        Of the search.
+        The search's grid and result.
     noise : float
         Standard error of the distance.
     rng
@@ -180,14 +180,14 @@ class HistogramResampling:
     rng: np.random.Generator
 
     def best_kernel_widths(self, scatter: Float64Array) -> HalfWidths:
-        """Return ways of the best kernel that most drawn histograms of other skin stay within.
+        """Return half widths for a target of other skin: quantiles of the best kernel's moves.
 
-        Not their root mean square: a long valley leads few of them far away.
+        Quantiles rather than the root mean square, as a long valley leads few draws far away.
 
         Parameters
         ----------
         scatter : ndarray, shape (blocks, buckets)
-            Of `BlockCounts.scatter`.
+            See `BlockCounts.block_contributions`.
         """
         near = near_best_kernels(self.grid, self.search_result, CANDIDATE_SIGMAS * self.noise)
         some = near[
@@ -203,15 +203,15 @@ class HistogramResampling:
         return _widths(self.grid, some, best)
 
     def paired_widths(self, target_blocks: Float64Array, growth: float) -> HalfWidths | None:
-        """Return ways of the best that most drawn pairs of histograms of one skin stay within.
+        """Return half widths for a target of the same skin, both histograms drawn together.
 
         Parameters
         ----------
         target_blocks : ndarray, shape (blocks, buckets)
-            Counts behind the target in the skin of each block of the relief, of `count_blocks`.
+            Counts of the target in the skin of each block of the relief, see `count_blocks`.
         growth : float
-            Of `BlockCounts`. Of the relief's roughness, not of its difference from the target's:
-            how many furrows a patch has is what the next patch differs by.
+            `BlockCounts.variance_inflation` of the relief's roughness, not of its difference from
+            the target's: patches differ by their number of grooves.
 
         Returns
         -------
@@ -229,7 +229,7 @@ class HistogramResampling:
         factors = np.float32(math.sqrt(len(both) / (len(both) - 1) * growth)) * factors
         factors = factors.astype(np.float32)
         near = near_best_kernels(grid, self.search_result, PAIRED_SIGMAS * self.noise)
-        # dense about the best, sparse where hardly a draw comes
+        # dense near the best, sparse where few draws end
         most = max(
             MAX_CANDIDATE_KERNELS,
             min(MAX_PAIRED_KERNELS, MAX_PAIRED_KERNELS * PAIRED_PX // relief.places.size),
@@ -252,7 +252,7 @@ class HistogramResampling:
 
 
 def add_grid_error(widths: HalfWidths, grid: KernelGrid) -> HalfWidths:
-    """Return half widths with the grid's own: a step over sqrt(12), as of an even error."""
+    """Add the grid's own error, a step over sqrt(12) as of a uniform error, to half widths."""
     step = [float(np.diff(g).min()) if g.size > 1 else 0.0 for g in (grid.alphas, grid.sigmas_um)]
 
     def widened(width: tuple[float, float], even: float) -> tuple[float, float]:
@@ -263,7 +263,7 @@ def add_grid_error(widths: HalfWidths, grid: KernelGrid) -> HalfWidths:
 
 
 def _widths(grid: KernelGrid, some: Int64Array, best: NDArray[np.intp]) -> HalfWidths:
-    """Return quantiles of how far draws' best kernels are from the best, which is the first."""
+    """Return quantiles of the distances of the draws' best kernels from the first, the best."""
     sigmas_um, alphas = grid.sigmas_um, grid.alphas
     i, j = some[best].T
     ways = np.abs([alphas[j] - alphas[some[0, 1]], sigmas_um[i] - sigmas_um[some[0, 0]]])

@@ -1,9 +1,9 @@
-"""The convolution kernel that makes a neutral relief's normals distributed as a strained one's.
+"""Fit the kernel that maps the normal distribution of a neutral relief to that of a strained one.
 
 Eq. (7) of Nagano et al. 2015: over alpha in [-2, 1] by 0.01 and sigma in [1, 100] um by 0.5, the
 neutral map is convolved along one axis with ``(1 - alpha) delta + alpha G(sigma)``, stretched, its
-normals sorted into buckets, and the sum over buckets of the differences to a target minimised.
-`neutral_relief` says what is fixed of Gaussian, border, holes and slopes.
+normals sorted into buckets, and the sum over buckets of the differences to a target minimized.
+`neutral_relief` defines Gaussian, border, holes and slopes.
 
 References
 ----------
@@ -42,17 +42,17 @@ BUCKET_LIMIT = 1.0
 
 @dataclass(frozen=True, slots=True)
 class KernelSearch:
-    """How the grid is searched.
+    """Settings of the search over the grid.
 
     Attributes
     ----------
     method : {"hierarchical", "exhaustive"}
-        The first returns what the second does, but for a chance of 1e-6 (`kernel_fit.search`), in
-        a fraction of the time.
+        "hierarchical" returns the result of "exhaustive", except with a probability of 1e-6
+        (`kernel_fit.search`), in a fraction of the time.
     first_sample : int
-        Pixels that the hierarchical search begins with.
+        Pixels in the first sample of the hierarchical search.
     seed : int
-        Of its samples, and of the draws for the standard errors.
+        Seed of its samples, and of the draws for the standard errors.
     """
 
     method: Literal["hierarchical", "exhaustive"] = "hierarchical"
@@ -83,27 +83,27 @@ def fit_kernel(
         Displacement map of the neutral skin, um; row 0 is the top. Heights that are not finite
         count as not valid.
     target_histogram : ndarray, shape (bins, bins)
-        Of the strained skin's normals, axes (n_y, n_x), as of `normal_histogram.histogram`; sums
-        to 1, or to less where normals beyond the limit are counted in the whole.
+        Fractions of the strained skin's normals, axes (n_y, n_x), of `normal_histogram.histogram`;
+        they sum to 1, or to less where normals beyond the limit are counted in the whole.
     stretch : float
         The skin's ratio r of lengths along the axis, > 0.
     axis : {"x", "y", 1, 0}
-        Of the jaws: columns (x, 1) or rows (y, 0).
+        Axis of the jaws: columns (x, 1) or rows (y, 0).
     pixel_um : float or (float, float)
         Side of a neutral pixel, or its height and width, um.
     bins : int
-        As of `normal_histogram.histogram`.
+        See `normal_histogram.histogram`.
     search : KernelSearch
-        How the grid is searched.
+        Settings of the search.
     stretch_across : float
         Ratio of lengths across the axis; 1 as in the paper.
     valid : ndarray of bool, shape (H, W), optional
     target_samples : float, optional
-        Effective number of samples behind the target (`NormalStatistics.effective_samples`); as
-        many as behind the neutral relief by default. For `noise` and standard errors only.
+        Effective number of samples of the target (`NormalStatistics.effective_samples`); by default
+        that of the neutral relief. It affects `noise` and standard errors only.
     target_blocks : ndarray of int, shape (rows, columns, bins, bins), optional
-        Where the target is of the same piece of skin: its counts in the skin of each block of the
-        neutral map (`normal_blocks.grid_of`, `normal_blocks.block_counts`), for standard errors
+        For a target of the same piece of skin: its counts in the skin of each block of the neutral
+        map (`normal_blocks.grid_of`, `normal_blocks.block_counts`). It affects standard errors
         only.
     grid : (array_like, array_like)
         Strengths alpha, increasing, within [-2, 1], and standard deviations, um, increasing, > 0;
@@ -119,7 +119,7 @@ def fit_kernel(
     KernelFitError
         For shapes, ranges or sums that do not fit, or a relief without slopes.
     HistogramError
-        For numbers of buckets that make no histogram.
+        For bins that make no histogram.
     """
     check = Checks(KernelFitError)
     normal_histogram.check_buckets(bins, BUCKET_LIMIT)
@@ -184,5 +184,5 @@ def _blocks(
     check = Checks(KernelFitError)
     flat = check.numbers("target_blocks", parts, (*grid, bins, bins), interval="[0, inf)")
     flat = flat.reshape(grid[0] * grid[1], bins * bins)
-    # beyond the limit nothing is in the target, either
+    # the target's normals beyond the limit are not in its blocks: their counts are 0
     return np.append(flat, np.zeros((len(flat), 1)), axis=1)

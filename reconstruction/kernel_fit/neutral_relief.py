@@ -1,15 +1,15 @@
-"""A neutral relief as fits of kernels take it: its axis of strain along the rows, and convolved.
+"""Prepare a neutral relief for fits of kernels: axis of strain along the rows, and convolution.
 
-What is fixed, here and in `model.microstructure`:
+Conventions, here and in `model.microstructure`:
 
 - G is the continuous Gaussian at whole pixels within 4 sigmas, divided by its sum. Well below a
-  pixel it is the delta function: then alpha means nothing, and all such kernels are tied.
+  pixel it is the delta function: then alpha has no effect, and all such kernels are tied.
 - At the map's border the relief is mirrored about the edges of the outermost pixels.
-- Holes are filled linearly along the axis before the convolution; a pixel of a hole is no sample.
+- Holes are filled linearly along the axis before the convolution; their pixels are not samples.
 - Stretching divides slopes along the axis by r, and those across it by ``stretch_across``.
-- Normals come from central differences, one-sided where one neighbour is missing
-  (`relief_slopes.slopes`), in single precision: of 10,000 samples fewer than one comes into
-  another bucket than in double precision.
+- Normals come from central differences, one-sided where one neighbor is missing
+  (`relief_slopes.slopes`), in single precision: of 10,000 samples fewer than one moves to another
+  bucket than in double precision.
 """
 
 from dataclasses import dataclass, field
@@ -28,7 +28,7 @@ Axis = Literal["x", "y", 0, 1]
 
 
 class KernelFitError(ValueError):
-    """A relief, target or setting that no kernel can be fitted to."""
+    """Reliefs, targets or settings that no kernel can be fitted to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +38,9 @@ class NeutralRelief:
     Attributes
     ----------
     height_um : ndarray of float32, shape (H, W)
-        About its mean; holes filled along the rows.
+        Less its mean; holes filled along the rows.
     code : ndarray of uint8, shape (H, W)
-        Where slopes are taken, of `relief_slopes.stencil`.
+        Stencil of the slopes, of `relief_slopes.slope_stencil`.
     right_um, down_um : float
         Deformed distance to the next column and row along the histogram's axes, signed.
     pixel_um : float
@@ -55,7 +55,7 @@ class NeutralRelief:
     places: Int64Array = field(init=False)
     """(N,) pixels with slopes, y * W + x."""
     starts: Int64Array = field(init=False)
-    """(H,) samples in the rows before."""
+    """(H,) number of samples in the rows before."""
     along: Float32Array = field(init=False)
     """(N,) minus the neutral relief's slopes after stretching."""
     across: Float32Array = field(init=False)
@@ -72,18 +72,18 @@ class NeutralRelief:
             object.__setattr__(self, name, leans)
 
     def _negative_slopes(self, height: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """Return minus the slopes of heights at the samples, along and across: (N,), (N,)."""
+        """Return the negative slopes of heights at the samples, along and across: (N,), (N,)."""
         a, b = np.empty(self.places.size, np.float32), np.empty(self.places.size, np.float32)
         right, down = np.float32(self.right_um), np.float32(self.down_um)
         kernels.negative_slopes(height, self.code, self.starts, right, down, a, b)
         return a, b
 
     def weights(self, sigma_um: float) -> Float32Array:
-        """Return the discrete Gaussian's right half, from the middle on; they sum to 1 mirrored."""
+        """Return the discrete Gaussian's right half from the middle on; mirrored it sums to 1."""
         return gaussian_weights(sigma_um / self.pixel_um).astype(np.float32)
 
     def slope_change(self, sigma_um: float) -> tuple[Float32Array, Float32Array]:
-        """Return what a Gaussian of sigma changes the samples' slopes by: (N,), (N,)."""
+        """Return the change of the samples' slopes by a Gaussian of sigma: (N,), (N,)."""
         moved = np.empty_like(self.height_um)
         kernels.blur_difference(self.height_um, self.weights(sigma_um), moved)
         return self._negative_slopes(moved)
@@ -98,17 +98,17 @@ def prepare_relief(
     stretch_across: float = 1.0,
     valid: ArrayLike | None = None,
 ) -> NeutralRelief:
-    """Return a neutral relief, its axis of strain turned into rows, with its samples.
+    """Prepare a neutral relief: turn its axis of strain into rows and sample its slopes.
 
     Parameters
     ----------
     neutral_height_um, stretch, axis, pixel_um, stretch_across, valid
-        As of `kernel_fit.fit_kernel`.
+        See `kernel_fit.fit_kernel`.
 
     Raises
     ------
     KernelFitError
-        Without a single slope, for what is no map, mask or pixel, a stretch that is not finite
+        Without a single slope, for a map, mask or pixel that is none, a stretch that is not finite
         and positive, or another axis.
     """
     check = Checks(KernelFitError)
@@ -120,7 +120,7 @@ def prepare_relief(
         code = slope_stencil(neutral_height_um, valid)
         down, right = pixel_sides(pixel_um)
     except HistogramError as error:
-        raise KernelFitError(f"of the neutral relief, {error}") from error
+        raise KernelFitError(f"neutral relief: {error}") from error
     check.require(code.any(), "neutral_height_um", "no pixel with a slope", "at least one")
     height = np.asarray(neutral_height_um, np.float64)
     good = _usable(height, valid)
@@ -140,7 +140,7 @@ def _usable(height: Float64Array, valid: ArrayLike | None) -> BoolArray:
 
 
 def _fill_holes(height: Float64Array, good: BoolArray) -> Float64Array:
-    """Return heights about their mean, with holes filled linearly along the rows."""
+    """Return heights less their mean, with holes filled linearly along the rows."""
     filled = np.where(good, height - height[good].mean(), 0.0)
     columns = np.arange(height.shape[1])
     for y in np.flatnonzero(~good.all(axis=1) & good.any(axis=1)):
@@ -157,26 +157,26 @@ def convolve_relief(
     pixel_um: float | tuple[float, float],
     valid: ArrayLike | None = None,
 ) -> Float64Array:
-    """Return a map convolved along one axis with eq. (6)'s kernel, as the search does it.
+    """Convolve a map along one axis with eq. (6)'s kernel, with the conventions of the fit.
 
     Parameters
     ----------
     height_um : array_like, shape (H, W)
-        um; those that are not finite count as not valid.
+        um; values that are not finite count as not valid.
     alpha, sigma_um : float
         Strength, and standard deviation in um, above 0.
     axis, pixel_um, valid
-        As of `kernel_fit.fit_kernel`.
+        See `kernel_fit.fit_kernel`.
 
     Returns
     -------
     ndarray of float64, shape (H, W)
-        um; heights that are not valid come back as they were.
+        um; heights that are not valid are unchanged.
 
     Raises
     ------
     KernelFitError
-        As of :func:`prepare_relief`.
+        See :func:`prepare_relief`.
 
     Examples
     --------

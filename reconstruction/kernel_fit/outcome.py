@@ -1,4 +1,4 @@
-"""What a search for a kernel found: the kernel with its noise, its valley and a finer minimum."""
+"""Summarize the search for a kernel: the kernel with its noise, its valley and a finer minimum."""
 
 import math
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ from reconstruction.kernel_fit.search import KernelGrid, KernelSearchResult
 from reconstruction.normal_histogram.statistics import SAMPLES_PER_BUCKET
 
 FINER_ALPHA, FINER_SIGMA = 10, 5
-"""The refinement's steps are so much smaller than the grid's, within one step to either side."""
+"""Steps of the refinement per grid step, within one step to either side."""
 
 
 @dataclass(frozen=True, slots=True)
 class KernelFit:
-    """A kernel of eq. (6) for one axis and stretch, and how well it is told.
+    """A kernel of eq. (6) for one axis and stretch, with its errors.
 
     Attributes
     ----------
@@ -31,26 +31,26 @@ class KernelFit:
     near_best : ndarray of float64, shape (K, 3)
         alpha, sigma_um and distance of the kernels whose distance is within `noise` of the best,
         the best first, then by distance: the flat valley around the minimum. Distances of kernels
-        that a hierarchical search dropped are estimates from a sample.
+        that a hierarchical search excluded are estimates from a sample.
     valid : bool
         There is a minimum: distances over the grid differ by more than `noise`.
     noise : float
         Standard error of the distance, from the effective numbers of samples of both histograms.
     floor : float
-        Mean distance of two histograms of one surface with such numbers of samples.
+        Mean distance of two histograms of one surface with these numbers of samples.
     distance_before : float
-        Eq. (7)'s sum for the neutral relief, only stretched.
+        Eq. (7)'s sum for the neutral relief, stretched but not convolved.
     alpha_refined, sigma_refined_um, distance_refined : float
         The best on a grid finer by ten in alpha and five in sigma, a step to either side.
     alpha_stderr, sigma_stderr_um : float
-        How far the best moves in 68 % of cases when both histograms are drawn anew, with the
-        scatter that blocks of the map show, neighbors together: what another patch of the same
-        skin and size would change; at least a grid step over sqrt(12). Infinite where not `valid`.
-        With `target_blocks` both are drawn together, as of one piece of skin; else as if the
-        target were of other skin. alpha and sigma make up for one another, so that their errors
+        Move of the best kernel that 68 % of draws stay within. Histograms are drawn with the
+        scatter between blocks of the map, with their correlation: the deviation of another patch
+        of the same skin and size; at least a grid step over sqrt(12). Infinite where not `valid`.
+        With `target_blocks` both are drawn together, as of one piece of skin; otherwise as if the
+        target were of other skin. alpha and sigma compensate each other, so that their errors
         are not Gaussian.
     alpha_95, sigma_95_um : float
-        Half widths of 95 % intervals, of the same draws; at least 1.96 standard errors. More where
+        Half widths of 95 % intervals, of the same draws; at least 1.96 standard errors, more where
         a long valley leads some draws far away.
     alpha_interval, sigma_interval_um : tuple of float
         Least and largest of `near_best`.
@@ -61,11 +61,11 @@ class KernelFit:
     samples : int
         Slopes of the neutral relief.
     effective_samples : float
-        Independent samples that would be as noisy.
+        Number of independent samples with the same noise.
     search : str
         "exhaustive" or "hierarchical".
     miss_probability : float
-        Chance at most that the exhaustive search's result is another one.
+        Upper bound of the probability that the exhaustive search's result differs.
     passes : float
         Kernels evaluated, in units of all pixels; 59,899 for an exhaustive search.
     reason : str
@@ -108,19 +108,19 @@ def summarize_search(
     target_blocks: Float64Array | None,
     rng: np.random.Generator,
 ) -> KernelFit:
-    """Return what a search found, with its noise, its valley and a finer minimum.
+    """Summarize a search: the best kernel with its noise, its valley and a finer minimum.
 
     Parameters
     ----------
-    grid, found
-        Of the search.
+    grid, search_result
+        The search's grid and result.
     search : str
         Its name.
     target_samples : float or None
-        Effective number of samples behind the target; None: as many as behind the relief.
+        Effective number of samples of the target; None: that of the relief.
     target_blocks : ndarray, shape (blocks, bins ** 2 + 1), or None
-        Counts behind the target in the skin of each block of the relief, where it is of the same
-        piece of skin.
+        Counts of the target in the skin of each block of the relief, if it is of the same piece of
+        skin.
     rng
         Draws histograms for the standard errors.
     """
@@ -145,23 +145,23 @@ def summarize_search(
     )
     reason = ""
     if np.ptp(relief.along) == 0.0 and np.ptp(relief.across) == 0.0:
-        reason = "the neutral relief is flat: every kernel leaves it so"
+        reason = "the neutral relief is flat: no kernel changes it"
     elif occupied == 1 and np.count_nonzero(target) == 1 and distance in (0.0, 2.0):
-        reason = "one bucket holds everything"
+        reason = "all normals are in one bucket"
     elif float(search_result.distance.max()) - distance <= noise:
         reason = "the distance does not depend on the kernel beyond its noise"
     if reason:
         alpha, distance = 0.0, before
         refined = (alpha, sigma, distance)
-        told = kernel_errors.HalfWidths((math.inf, math.inf), (math.inf, math.inf))
+        widths = kernel_errors.HalfWidths((math.inf, math.inf), (math.inf, math.inf))
     else:
         refined = _refined(grid, (i, j), distance)
         draws = kernel_errors.HistogramResampling(grid, search_result, noise, rng)
         pair = target_blocks is not None and draws.paired_widths(
             target_blocks, blocks.variance_inflation
         )
-        told = pair or draws.best_kernel_widths(blocks.block_contributions(theirs))
-        told = kernel_errors.add_grid_error(told, grid)
+        widths = pair or draws.best_kernel_widths(blocks.block_contributions(theirs))
+        widths = kernel_errors.add_grid_error(widths, grid)
     return KernelFit(
         alpha=alpha,
         sigma_um=sigma,
@@ -174,10 +174,10 @@ def summarize_search(
         alpha_refined=refined[0],
         sigma_refined_um=refined[1],
         distance_refined=refined[2],
-        alpha_stderr=told.alpha[0],
-        sigma_stderr_um=told.sigma_um[0],
-        alpha_95=told.alpha[1],
-        sigma_95_um=told.sigma_um[1],
+        alpha_stderr=widths.alpha[0],
+        sigma_stderr_um=widths.sigma_um[0],
+        alpha_95=widths.alpha[1],
+        sigma_95_um=widths.sigma_um[1],
         alpha_interval=(float(near[:, 0].min()), float(near[:, 0].max())),
         sigma_interval_um=(float(near[:, 1].min()), float(near[:, 1].max())),
         at_edge=i in (0, sigmas_um.size - 1) or j in (0, alphas.size - 1),

@@ -1,17 +1,17 @@
-"""The search of eq. (7): the kernel on a grid whose relief has normals distributed as a target.
+"""Search a grid of kernels for the one of least distance in eq. (7), exhaustively or by samples.
 
 Slopes are linear in alpha, so one convolution and one pass serve all alphas of one sigma. The
 exhaustive search passes over all of the grid. The hierarchical one evaluates the grid on growing
-random samples of pixels, drops what is shown to be worse than a kernel already evaluated on all
-pixels, and evaluates what is left on all pixels.
+random samples of pixels, excludes kernels proven worse than one already evaluated on all pixels,
+and evaluates the remaining kernels on all pixels.
 
-Why a drop is right: for numbers ``s_b`` within [-1, 1] the distance ``sum |H_b - h_b|`` is at least
-``sum s_b (H_b - h_b)``, and ``sum s_b h_b`` is the mean over pixels of ``s`` at the pixel's bucket.
-With s chosen before they are drawn, a mean over m pixels drawn without replacement out of M is
-above the mean of all by more than ``sqrt(2 ln(1/p) (1 - (m - 1) / M) / m)`` with a chance of at
-most p (Serfling 1974). s is the sign of H - h, of the kernel itself on the pixels drawn before, or
-of a nearby kernel on all pixels. p is so small that over all tests of a search the chance of
-dropping the best kernel is at most `MAX_MISS_PROBABILITY`.
+Proof of an exclusion: for numbers ``s_b`` within [-1, 1] the distance ``sum |H_b - h_b|`` is at
+least ``sum s_b (H_b - h_b)``, and ``sum s_b h_b`` is the mean over pixels of ``s`` at the pixel's
+bucket. With s chosen before they are drawn, a mean over m pixels drawn without replacement out of M
+is above the mean of all by more than ``sqrt(2 ln(1/p) (1 - (m - 1) / M) / m)`` with a probability
+of at most p (Serfling 1974). s is the sign of H - h, of the kernel itself on the pixels drawn
+before, or of a nearby kernel on all pixels. p is so small that over all tests of a search the
+probability of excluding the best kernel is at most `MAX_MISS_PROBABILITY`.
 
 References
 ----------
@@ -31,27 +31,27 @@ from reconstruction.kernel_fit.neutral_relief import KernelFitError, NeutralReli
 from reconstruction.normal_histogram import kernels
 
 MAX_MISS_PROBABILITY = 1e-6
-"""Chance at most that a hierarchical search drops the exhaustive search's result."""
+"""Bound of the probability that a hierarchical search excludes the exhaustive search's result."""
 DISTANCE_ROUNDING = 2e-4
-"""Distance granted to rounding: on samples, sums of single precision are taken in another order."""
+"""Allowance for rounding: on samples, sums of single precision are taken in another order."""
 TIE_TOL = 1e-12
 """Distances that differ by less are tied."""
 FIRST_SAMPLE_PIXELS = 16_384
 SAMPLE_GROWTH = 5.6
-"""From one sample to the next. On 2000 x 2000 pixels these took the fewest evaluations of what was
-tried, with samples whose neighbourhoods stay below `MAX_WINDOW_BYTES`."""
+"""Factor from one sample to the next. On 2000 x 2000 pixels the two need the fewest evaluations of
+the values tested, with samples whose neighborhoods stay below `MAX_WINDOW_BYTES`."""
 MAX_SAMPLE_FRACTION = 0.35
-"""Share of all pixels from which all are taken."""
+"""Fraction of all pixels from which a sample is replaced by all pixels."""
 MAX_WINDOW_BYTES = 300_000_000
-"""Most memory for the neighbourhoods of sampled pixels; beyond, whole maps are convolved."""
+"""Memory limit of the neighborhoods of sampled pixels; beyond, whole maps are convolved."""
 N_ANCHORS = 6
 """Kernels evaluated on all pixels between two samples."""
 MAX_CACHED_COUNT_BYTES = 100_000_000
-"""Most memory for counts of kernels evaluated on all pixels, which standard errors need again."""
+"""Memory limit of the counts kept for standard errors, of kernels evaluated on all pixels."""
 
 
 Slopes = tuple[Float32Array, Float32Array]
-"""Along and across the axis of the kernel."""
+"""Slopes along and across the axis of the kernel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +61,9 @@ class TargetBuckets:
     Attributes
     ----------
     target : ndarray of float64, shape (bins ** 2 + 1,)
-        Shares, axes (across, along) made flat, then the share beyond the limit.
+        Fractions, axes (across, along) flattened, then the fraction beyond the limit.
     bins, limit
-        As of `normal_histogram.histogram`.
+        See `normal_histogram.histogram`.
     """
 
     target: Float64Array
@@ -79,12 +79,12 @@ class TargetBuckets:
 
 @dataclass(frozen=True, slots=True)
 class KernelGrid:
-    """Kernels that change a relief, and the target that its normals shall come to.
+    """Relief, kernels to convolve it with, and the target of its normals.
 
     Attributes
     ----------
-    relief : Relief
-    buckets : Buckets
+    relief : NeutralRelief
+    buckets : TargetBuckets
     alphas, sigmas_um : ndarray of float64, shapes (A,), (S,)
         Increasing.
     """
@@ -95,7 +95,7 @@ class KernelGrid:
     sigmas_um: Float64Array
 
     def count(self, sigma_um: float, alphas: Float64Array) -> Int32Array:
-        """Count all pixels of the relief that kernels of one sigma have changed, in parts."""
+        """Count all pixels of the relief convolved with kernels of one sigma, in parts."""
         relief = self.relief
         change = relief.slope_change(float(sigma_um))
         return self.buckets.count((relief.along, relief.across), change, alphas)
@@ -107,13 +107,13 @@ class KernelGrid:
 
 @dataclass(frozen=True, slots=True)
 class KernelSearchResult:
-    """What a search knows of its grid; arrays have the shape (sigmas, alphas).
+    """Distances of a search over its grid; arrays have the shape (sigmas, alphas).
 
     Attributes
     ----------
     distance : ndarray
-        Of eq. (7): exact over all pixels where `exact`, elsewhere from the largest sample that
-        the kernel was evaluated on, less the best kernel's excess on the same sample.
+        Eq. (7)'s sum: exact over all pixels where `exact`; elsewhere from the kernel's largest
+        sample, less the best kernel's excess on the same sample.
     exact : ndarray of bool
     best : tuple of int
         Indices (sigma, alpha) of the least exact distance. Ties go to the gentlest kernel: least
@@ -121,7 +121,7 @@ class KernelSearchResult:
     passes : float
         Kernels evaluated, in units of all pixels.
     counts : dict of (int, int) to ndarray of int32, shape (bins ** 2 + 1,)
-        Of some of the exact kernels, by their indices (sigma, alpha).
+        Counts of some of the exact kernels, by their indices (sigma, alpha).
     """
 
     distance: Float64Array
@@ -131,12 +131,12 @@ class KernelSearchResult:
     counts: dict[tuple[int, int], Int32Array] = field(default_factory=dict)
 
     def histograms(self, grid: KernelGrid, indices: Int64Array) -> Float64Array:
-        """Return histograms of kernels, (K, buckets), counting what the search has not kept.
+        """Return histograms of kernels, (K, buckets); count those that the search has not kept.
 
         Parameters
         ----------
         grid
-            Of the search.
+            The search's grid.
         indices : ndarray, shape (K, 2)
             Indices (sigma, alpha).
         """
@@ -159,7 +159,7 @@ def find_best(
     Raises
     ------
     KernelFitError
-        Where the grid is empty, or there is not one distance a kernel.
+        Where the grid is empty, or there is not one distance per kernel.
     """
     shape = sigmas_um.size, alphas.size
     good = distance.size and distance.shape == shape
@@ -183,17 +183,17 @@ def search_exhaustively(grid: KernelGrid) -> KernelSearchResult:
 def search_hierarchically(
     grid: KernelGrid, *, first_sample: int = FIRST_SAMPLE_PIXELS, rng: np.random.Generator
 ) -> KernelSearchResult:
-    """Find what :func:`search_exhaustively` does, but for a chance of `MAX_MISS_PROBABILITY`.
+    """Find the result of :func:`search_exhaustively`, except with `MAX_MISS_PROBABILITY`.
 
     Parameters
     ----------
     grid
-        What is convolved with which kernels, and what it shall come to.
+        Relief, kernels and target.
     first_sample : int
         Pixels that all kernels are evaluated on; grows by `SAMPLE_GROWTH` from one round to the
         next.
     rng
-        Draws the pixels. The result does not depend on it, but for the chance
+        Draws the pixels. The result does not depend on it, except with the probability
         `MAX_MISS_PROBABILITY`.
     """
     pixels = grid.relief.places.size
@@ -212,13 +212,13 @@ class _Race:
     def __init__(self, grid: KernelGrid) -> None:
         shape = (grid.sigmas_um.size, grid.alphas.size)
         self.grid, self.alphas, self.sigmas = grid, grid.alphas, grid.sigmas_um
-        self.low = np.zeros(shape)  # distances are at least this
-        self.guess = np.full(shape, np.inf)  # on the largest sample so far
-        self.level = np.zeros(shape, int)  # which sample that was
+        self.low = np.zeros(shape)  # proven lower bounds of the distances
+        self.guess = np.full(shape, np.inf)  # distances on the largest sample so far
+        self.level = np.zeros(shape, int)  # number of that sample
         self.exact = np.zeros(shape, bool)
         self.distance = np.full(shape, np.inf)  # exact ones
         self.counts: dict[tuple[int, int], Int32Array] = {}
-        # of target - histogram, of kernels evaluated on all pixels
+        # signs of target - histogram, of kernels evaluated on all pixels
         self.signs: list[Float64Array] = []
         self.passes = 0.0
 
@@ -236,7 +236,7 @@ class _Race:
             self._anchor()
         self._finish()
         best = find_best(self.distance, self.alphas, self.sigmas)
-        # a sample's distance is larger than that of all, alike for kernels that are alike
+        # a sample's distance exceeds that of all pixels, by a similar excess for similar kernels
         excess = np.zeros(len(sizes))
         for number in range(len(sizes)):
             both = self.exact & (self.level == number)
@@ -250,14 +250,15 @@ class _Race:
 
     @property
     def _open(self) -> BoolArray:
-        """Kernels that may still be the best, and are not evaluated on all pixels."""
+        """Kernels that may be the best and are not yet evaluated on all pixels."""
         return ~self.exact & (self.low <= self.distance.min())
 
     def _sample(self, chosen: Int64Array, before: int, log: float, number: int) -> None:
         relief, buckets = self.grid.relief, self.grid.buckets
         pixels, m = relief.places.size, chosen.size
         rest, fresh = pixels - before, m - before
-        # Serfling's bound, of the mean over what was not drawn before
+        # Serfling's bound on the mean over the pixels not drawn before, scaled to all pixels; the
+        # counts of the pixels drawn before are known exactly
         slack = (
             math.sqrt(2.0 * log * (1.0 - (fresh - 1) / rest) / fresh) * rest / pixels
             + DISTANCE_ROUNDING
@@ -281,7 +282,7 @@ class _Race:
             self.passes += j.size * m / pixels
 
     def _anchor(self) -> None:
-        """Evaluate the best guess with its neighbours, and the best at sigmas spread over all."""
+        """Evaluate the best guess with its neighbors, and the best at sigmas over the range."""
         self.signs = []
         best = int(np.argmin(np.where(self.exact, np.inf, self.guess)))
         i, j = divmod(best, self.alphas.size)
@@ -310,7 +311,7 @@ class _Race:
             self.signs.append(np.sign(target - shares))
 
     def _finish(self) -> None:
-        """Evaluate the open ones, most promising sigma first."""
+        """Evaluate the remaining kernels, most promising sigma first."""
         while self._open.any():
             hope = np.where(self._open, self.guess, np.inf).min(axis=1)
             i = int(np.argmin(hope))
@@ -318,7 +319,7 @@ class _Race:
 
 
 class _SampledChange:
-    """What Gaussians change the slopes of some pixels by."""
+    """Changes of the slopes of sampled pixels by Gaussians."""
 
     SIZE = 1024
 

@@ -1,9 +1,9 @@
-"""A table of kernels over the stretch ratio, fitted to kernels of single states of strain.
+"""Fit a table of kernels over the stretch ratio to kernels of single strain steps.
 
-alpha: connected lines through the neutral kernel (r = 1, alpha = 0), held within [-2, 1] as the
-kernel's definition is; how many lines, up to a given number, is decided by the Bayesian information
-criterion, where they meet by least squares. sigma: one line for compression and one for stretching,
-which do not meet (Nagano2015, section 5, "Kernel Table Construction", done there by hand).
+alpha: connected lines through the neutral kernel (r = 1, alpha = 0), clipped to [-2, 1] by the
+kernel's definition. The Bayesian information criterion selects the number of lines up to a given
+one, least squares their breaks. sigma: one line for compression and one for stretching, which do
+not meet (Nagano2015, section 5, "Kernel Table Construction", done there by hand).
 
 References
 ----------
@@ -29,11 +29,11 @@ from model.microstructure import ALPHA_LIMITS, KernelTable, kernel_parameters
 from reconstruction.arrays import BoolArray, Float64Array
 
 MIN_POINTS = 2
-"""Points that inform a line of alpha, at least; its ends and the neutral kernel count."""
+"""Fewest points that inform a line of alpha; its ends and the neutral kernel count."""
 BREAK_GRID = 24
-"""Places tried for a break, beside the points', before it is moved in finer steps."""
+"""Positions tried for a break, besides the points', before it is moved in finer steps."""
 NEUTRAL_STRETCH_TOL = 1e-6
-"""Stretch ratios nearer to 1 are neutral: they tell nothing of either branch."""
+"""Distance from 1 up to which a stretch ratio is neutral and informs neither branch."""
 MIN_SIGMA_UM = 1.0
 """The smallest sigma that Nagano2015 searches, section 5."""
 
@@ -44,13 +44,13 @@ class KernelTableFitError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class TableFit:
-    """A table with what is known about it.
+    """A fitted table with residuals and errors.
 
     Attributes
     ----------
     table : KernelTable
     segments : int
-        Lines of alpha, without the parts held at the limits.
+        Lines of alpha, without the parts clipped at the limits.
     criterion : dict of int to float
         Bayesian information criterion of each number of lines that was tried; the least is taken.
     alpha_rms : float
@@ -58,17 +58,17 @@ class TableFit:
     sigma_rms_um : tuple of float
         The same of sigma, um, in compression and in stretching; NaN without that branch.
     alpha_stderr : tuple of float
-        Standard errors of the slopes of alpha's lines at these breaks; infinite where the points
-        leave none over.
+        Standard errors of the slopes of alpha's lines at these breaks; infinite without degrees of
+        freedom.
     break_stderr : tuple of float
-        Half of the way that each break can move until the sum of squares has grown by one
+        Half the range of each break within which the sum of squares grows by at most one
         residual's (a break's likelihood has corners at the points).
     sigma_compression_stderr_um, sigma_stretch_stderr_um : (slope, intercept)
         Standard errors of sigma's lines, um.
     sigma_compression_covariance_um2, sigma_stretch_covariance_um2 : float
         Covariance of slope and intercept, um^2.
     alpha_covariance : ndarray, shape (segments, segments)
-        Of the slopes at these breaks.
+        Covariance of the slopes at these breaks.
     """
 
     table: KernelTable
@@ -102,15 +102,15 @@ def fit_table(
     stretch, alpha, sigma_um : array_like, shape (N,)
         Ratios r > 0, strengths in [-2, 1], standard deviations > 0 in um.
     weights : array_like, shape (N,) or (N, 2), optional
-        Inverse variances of the points, up to a common factor that the residuals tell: of both
-        parameters, or of alpha and of sigma. Equal by default; 0 leaves a point out.
+        Inverse variances of the points, up to a common factor found from the residuals: of both
+        parameters, or of alpha and of sigma. Equal by default; 0 omits a point.
     max_segments : int
-        Most lines of alpha, 1...4. Two are as many as eq. (8) has within its limits.
+        Largest number of lines of alpha, 1...4; eq. (8) has two within its limits.
     min_points : int
-        Points that each line of alpha must be informed by: on it or its ends, the neutral kernel
-        among them, and not held at a limit.
+        Fewest points that inform each line of alpha: on it or its ends, the neutral kernel among
+        them, and not clipped at a limit.
     source : str
-        Goes into the table.
+        Source recorded in the table.
 
     Returns
     -------
@@ -120,7 +120,7 @@ def fit_table(
     Raises
     ------
     KernelTableFitError
-        For fewer than two points on a side that has any, or values beyond their ranges.
+        For fewer than two points on a side with any, or values beyond their ranges.
     """
     check = Checks(KernelTableFitError)
     r, a, s = (np.asarray(v, np.float64).reshape(-1) for v in (stretch, alpha, sigma_um))
@@ -135,13 +135,13 @@ def fit_table(
         check.within(f"point {point}, stretch", stretched, "(0, inf)")
         check.within(f"point {point}, alpha", strength, str(list(ALPHA_LIMITS)))
         check.within(f"point {point}, sigma_um", width, "(0, inf)")
-    told = (np.abs(r - 1.0) > NEUTRAL_STRETCH_TOL) & (w > 0).all(axis=1)
-    r, a, s, w = r[told], a[told], s[told], w[told]
+    informing = (np.abs(r - 1.0) > NEUTRAL_STRETCH_TOL) & (w > 0).all(axis=1)
+    r, a, s, w = r[informing], a[informing], s[informing], w[informing]
     low, high = r < 1.0, r > 1.0
     for name, side in (("compression", low), ("stretching", high)):
         ratios = np.unique(r[side]).size
         check.require(ratios != 1, name, "one stretch ratio", "at least two")
-    check.require(r.size, "stretch", "no point beside the neutral one", "some")
+    check.require(r.size, "stretch", "neutral points only", "others with positive weights")
     order = np.argsort(r)
     r, a, s, w, low, high = r[order], a[order], s[order], w[order], low[order], high[order]
     points = _Points(r, a, w[:, 0])
@@ -153,7 +153,8 @@ def fit_table(
         if fit is None or n <= 2 * segments - 1:
             continue
         fits[segments] = fit
-        # mean of the squares, with a floor for points that lie on lines
+        # BIC = n log(mean square) + parameters log n: k slopes and k - 1 breaks; the floor is for
+        # points exactly on lines
         mean = max(fit.rss / points.w.sum(), 1e-12)
         criterion[segments] = n * math.log(mean) + (2 * segments - 1) * math.log(n)
     check.require(fits, "alpha", f"{n} points", "more than a line's one slope")
@@ -186,7 +187,7 @@ def fit_table(
 
 
 def _design(r: Float64Array, breaks: Float64Array) -> Float64Array:
-    """Return how much of the way from 1 to r lies on each line, signed: alpha = design @ slopes."""
+    """Return the signed length between 1 and r on each line, so that alpha = design @ slopes."""
     edges = np.concatenate([[-np.inf], breaks, [np.inf]])
     low, high = np.minimum(r, 1.0)[:, None], np.maximum(r, 1.0)[:, None]
     overlap = np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1])
@@ -199,7 +200,7 @@ def _lines(slopes: Float64Array, breaks: Float64Array) -> tuple[tuple[float, flo
     edges = np.concatenate([[-np.inf], breaks, [np.inf]])
     lines = []
     for k, m in enumerate(slopes):
-        # the line that holds the neutral kernel goes through it to the last digit
+        # the line through the neutral kernel goes through it without rounding
         r0, v0 = 1.0, 0.0
         if not edges[k] < 1.0 <= edges[k + 1]:
             r0, v0 = breaks[max(k - 1, 0)], values[max(k - 1, 0)]
@@ -216,9 +217,9 @@ class _Points:
     w: Float64Array
 
     def slopes(self, breaks: Float64Array) -> tuple[Float64Array, BoolArray, float]:
-        """Return slopes of least squares, which points inform them, and the sum of squares.
+        """Return slopes by least squares, the points that inform them, and the sum of squares.
 
-        A point on a limit where the lines go beyond it is met exactly, and says nothing more.
+        A point on a limit is met exactly where the lines go beyond it; it does not inform a slope.
         """
         a, X, root = self.a, _design(self.r, breaks), np.sqrt(self.w)
         used = np.ones(a.size, bool)
@@ -238,7 +239,7 @@ class _Points:
         return best
 
     def fit_lines(self, segments: int, min_points: int) -> _AlphaFit | None:
-        """Return lines and breaks of least squares; None without room."""
+        """Fit lines and breaks by least squares; None without enough points."""
 
         def tried(breaks: Float64Array) -> _AlphaFit:
             none = _AlphaFit(self, breaks, breaks, math.inf)
@@ -271,7 +272,7 @@ class _Points:
 
 @dataclass(frozen=True, slots=True)
 class _AlphaFit:
-    """Lines of least squares, with the sum of squares that they leave."""
+    """Lines fitted by least squares, with their residual sum of squares."""
 
     points: _Points
     slopes: Float64Array
@@ -284,13 +285,13 @@ class _AlphaFit:
         return self.points.r.size - self.slopes.size - self.breaks.size
 
     def move_break(self, k: int, position: float) -> Float64Array:
-        """Return the breaks with one of them elsewhere."""
+        """Return the breaks with one of them moved."""
         breaks = self.breaks.copy()
         breaks[k] = position
         return breaks
 
     def covariance(self) -> Float64Array:
-        """Return that of the slopes at these breaks; infinite where no point is left over."""
+        """Return the slopes' covariance at these breaks; infinite without degrees of freedom."""
         slopes, informing, _ = self.points.slopes(self.breaks)
         X = _design(self.points.r, self.breaks)[informing]
         if self.dof <= 0 or np.linalg.matrix_rank(X) < slopes.size:
@@ -299,7 +300,7 @@ class _AlphaFit:
         return np.asarray(np.linalg.inv(weighted.T @ X) * self.rss / self.dof)
 
     def break_stderr(self) -> tuple[float, ...]:
-        """Return half of the ways that breaks can move until the misfit grows by one residual's."""
+        """Return half the range of each break until the misfit grows by one residual's."""
         if self.dof <= 0:
             return (math.inf,) * self.breaks.size
         most = self.rss * (1.0 + 1.0 / self.dof)
@@ -345,7 +346,7 @@ def _fit_sigma(
 
 @dataclass(frozen=True, slots=True)
 class DirectionDependence:
-    """How kernels of single directions of stretch depart from one table of all.
+    """Deviations of kernels under single directions of stretch from one table of all directions.
 
     Attributes
     ----------
@@ -356,9 +357,9 @@ class DirectionDependence:
     alpha_stderr, sigma_stderr_um : tuple of float
         Standard errors of the offsets, from the scatter within directions.
     p_alpha, p_sigma : float
-        Chance of offsets that differ so much when the direction does not matter (one-way analysis
-        of variance; the table's own fit is not counted). The paper saw such a dependence on the
-        chin, and leaves it out of its model.
+        Probability of offsets that differ as much if the direction has no effect (one-way analysis
+        of variance; the table's own fit is not counted). The paper observed such a dependence on
+        the chin, and omits it from its model.
     """
 
     angle_rad: tuple[float, ...]
@@ -382,14 +383,14 @@ def estimate_direction_dependence(
     Parameters
     ----------
     table : KernelTable
-        Of all directions together; covers the stretch ratios.
+        Table of all directions together; covers the stretch ratios.
     stretch, alpha, sigma_um, angle_rad : array_like, shape (N,)
-        One entry a state: ratio, kernel, direction of the jaws; finite.
+        One entry per strain step: ratio, kernel, direction of the jaws; finite.
 
     Raises
     ------
     KernelTableFitError
-        For fewer than two directions, not more states than directions, or what is not finite.
+        For fewer than two directions, not more steps than directions, or values not finite.
     """
     check = Checks(KernelTableFitError)
     given = {"stretch": stretch, "alpha": alpha, "sigma_um": sigma_um, "angle_rad": angle_rad}
@@ -398,14 +399,15 @@ def estimate_direction_dependence(
     )
     directions, group = np.unique(angle, return_inverse=True)
     k = directions.size
-    got = f"{k} directions of {r.size} states"
-    check.require(2 <= k < r.size, "angle_rad", got, "2 or more, and more states")
+    got = f"{k} directions of {r.size} strain steps"
+    check.require(2 <= k < r.size, "angle_rad", got, "2 or more directions, and more steps")
     count = np.bincount(group, minlength=k)
     offsets, errors, chances = [], [], []
-    for value, told in zip((a, s), kernel_parameters(r, table, extrapolate="refuse"), strict=True):
+    tables = kernel_parameters(r, table, extrapolate="refuse")
+    for value, tabled in zip((a, s), tables, strict=True):
         # in a unit of their own, whose squares neither vanish nor overflow
-        unit = float(np.abs(value - told).max()) or 1.0
-        residual = (value - told) / unit
+        unit = float(np.abs(value - tabled).max()) or 1.0
+        residual = (value - tabled) / unit
         mean = np.bincount(group, residual, k) / count
         within = float(np.sum((residual - mean[group]) ** 2)) / (r.size - k)
         between = float(np.sum(count * (mean - residual.mean()) ** 2)) / (k - 1)

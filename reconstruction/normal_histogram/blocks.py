@@ -1,8 +1,8 @@
-"""Blocks that a map of normals is cut into, whose differences tell the noise of its statistics.
+"""Divide a map of normals into blocks, whose differences give the noise of its statistics.
 
-Furrows and plateaus of skin are as long as blocks of a small patch: one block says what the next
-will, and the scatter of blocks as if they were independent is too sure of the mean. So blocks are
-taken for a random field of unknown strength and reach plus what each has of its own, and the error
+Grooves and plateaus of skin are as long as blocks of a small patch: adjacent blocks correlate, and
+the scatter of blocks taken as independent underestimates the error of the mean. So blocks are
+modeled as a random field of unknown strength and reach plus independent errors, and the error
 is that of the mean of such a field (parameters integrated out; Handcock and Stein 1993,
 doi:10.1080/00401706.1993.10485354).
 """
@@ -20,18 +20,18 @@ from reconstruction.normal_histogram.counting import check_buckets
 from reconstruction.normal_histogram.relief_slopes import HistogramError, rotate_components, slopes
 
 BLOCKS_PER_SIDE = 8
-"""A map is cut into so many blocks a side."""
+"""Number of blocks per side of a map."""
 CORRELATION_LENGTHS = (0.5, 1.0, 1.5, 2.0)
-"""Lengths over which blocks are alike, in sides of a block; of eight blocks across a map. Fields
-longer than a quarter of the map are little scatter in it: their share cannot be told from it."""
+"""Candidate correlation lengths, in sides of a block; of eight blocks across a map. Fields longer
+than a quarter of the map hardly scatter in it, so that their fraction is not identifiable."""
 CORRELATED_FRACTIONS = (0.0, 0.3, 0.6, 0.8, 0.95)
-"""Of the blocks' variance, what neighbors have in common."""
+"""Candidate fractions of the blocks' variance that neighbors share."""
 MIN_BLOCKS = 5
-"""Fewer tell neither how they scatter nor how they are alike."""
+"""Fewest blocks from which scatter and correlation can be estimated."""
 
 
 def block_grid_shape(shape: tuple[int, ...], blocks: int = BLOCKS_PER_SIDE) -> tuple[int, int]:
-    """Return into how many rows and columns of blocks `assign_blocks` cuts a map of (H, W) pixels.
+    """Return the rows and columns of blocks into which `assign_blocks` divides (H, W) pixels.
 
     Examples
     --------
@@ -44,9 +44,9 @@ def block_grid_shape(shape: tuple[int, ...], blocks: int = BLOCKS_PER_SIDE) -> t
 def assign_blocks(
     pixel_indices: Int64Array, shape: tuple[int, ...], blocks: int = BLOCKS_PER_SIDE
 ) -> tuple[Int64Array, int]:
-    """Return the block of pixels ``y * W + x``, and how many blocks there are.
+    """Return the block of each pixel ``y * W + x``, and the number of blocks.
 
-    A map is cut into ``blocks`` along each axis, fewer where they would be below 4 pixels.
+    A map has ``blocks`` along each axis, fewer where they would be below 4 pixels.
     """
     down, across = block_grid_shape(shape, blocks)
     y, x = np.divmod(pixel_indices, shape[1])
@@ -64,26 +64,26 @@ def count_block_normals(
     valid: ArrayLike | None = None,
     angle_rad: float = 0.0,
 ) -> Int64Array:
-    """Count a relief's normals by blocks of any shape, as of another map of the same skin.
+    """Count a relief's normals by blocks of any shape, e.g. of another map of the same skin.
 
     Parameters
     ----------
     height, pixel, bins, limit, valid, angle_rad
         As of `normal_histogram.histogram`.
     block : ndarray of int, shape (H, W)
-        Of each pixel, 0 to `blocks` - 1; pixels with another number are left out.
+        Of each pixel, 0 to `blocks` - 1; pixels with another number are omitted.
     blocks : int
         At least 1.
 
     Returns
     -------
     ndarray of int64, shape (blocks, bins, bins)
-        Axes (n_y, n_x) of each; normals beyond the limit are left out.
+        Axes (n_y, n_x) of each; normals beyond the limit are omitted.
 
     Raises
     ------
     HistogramError
-        For a map of blocks of another shape, and as of `normal_histogram.histogram`.
+        For a map of blocks of another shape, and as in `normal_histogram.histogram`.
     """
     check_buckets(bins, limit)
     Checks(HistogramError).shape("block", block, np.shape(height))
@@ -97,7 +97,7 @@ def count_block_normals(
 
 
 def block_residuals(counts: Float64Array) -> Float64Array:
-    """Return what each block adds to the error of the shares that all have in common.
+    """Return each block's contribution to the error of the common bucket fractions.
 
     Parameters
     ----------
@@ -121,20 +121,20 @@ def block_residuals(counts: Float64Array) -> Float64Array:
 
 
 def effective_sample_count(counts: Float64Array, samples: int) -> float:
-    """Return how many independent samples would make blocks differ as much as they do.
+    """Return the number of independent samples with the same differences between blocks.
 
     Parameters
     ----------
     counts : ndarray, shape (blocks, buckets)
         Of each block.
     samples : int
-        Of all, which is also the most that is returned.
+        Number of all samples, the upper bound of the result.
 
     Returns
     -------
     float
-        ``sum p (1 - p) / sum var(p)`` with the variance of each bucket's share by a jackknife over
-        blocks; `samples` where there are fewer than two blocks with samples.
+        ``sum p (1 - p) / sum var(p)`` with the variance of each bucket's fraction by a jackknife
+        over blocks; `samples` with fewer than two blocks with samples.
     """
     sizes = counts.sum(axis=1)
     counts, sizes = counts[sizes > 0], sizes[sizes > 0]
@@ -153,7 +153,7 @@ def effective_sample_count(counts: Float64Array, samples: int) -> float:
 def mean_stderr(
     values: Float64Array, sizes: Float64Array, positions: Float64Array
 ) -> tuple[float, float]:
-    """Return the standard error of the mean of all samples, and what it is of that of independents.
+    """Return the standard error of the mean of all samples, and its inflation by correlation.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def mean_stderr(
         alike = np.exp(-((apart / reach) ** 2))
         for share in CORRELATED_FRACTIONS:
             if share == 0.0 and reach != CORRELATION_LENGTHS[0]:
-                continue  # without a field its reach does not matter
+                continue  # a field of strength 0 has no length
             correlation = share * alike + (1.0 - share) * own
             lower = np.linalg.cholesky(correlation + 1e-9 * np.eye(count))
             both = np.column_stack([np.ones(count), values])
@@ -201,7 +201,7 @@ def mean_stderr(
             information = float(one @ one)
             rest = seen - one * (one @ seen) / information
             scatter = float(rest @ rest)
-            # the case without a field stands for all reaches
+            # strength 0 occurs once but represents all lengths: equal prior weight
             log = np.log(len(CORRELATION_LENGTHS)) if share == 0.0 else 0.0
             log -= float(np.log(np.diag(lower)).sum()) + 0.5 * np.log(information)
             logs.append(log - 0.5 * (count - 1) * np.log(scatter))

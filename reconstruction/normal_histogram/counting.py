@@ -1,4 +1,4 @@
-"""Distributions of normals of a relief: 64 x 64 histograms, their distances and what chance adds.
+"""Count a relief's normals in 64 x 64 histograms, compare these, and compute their noise floor.
 
 A normal is ``n = (-dh/dx, -dh/dy, 1) / length`` with x to the right and y up; a histogram has the
 axes (n_y, n_x), both increasing, and sums to 1 (Nagano2015 section 4, figs. 8 and 9). Slopes are
@@ -34,7 +34,7 @@ def count_normals(
     slope_x, slope_y : array_like
         dh/dx and dh/dy, dimensionless, finite.
     bins : int
-        Buckets a side, 1...4096.
+        Buckets per side, 1...4096.
     limit : float
         The buckets span [-limit, limit] of n_x and n_y; 0 < limit <= 1. The last bucket holds its
         upper edge too.
@@ -49,7 +49,7 @@ def count_normals(
     Raises
     ------
     HistogramError
-        For slopes that are not as many, and buckets that are none.
+        For different numbers of slopes, and bins or limits out of range.
     """
     check_buckets(bins, limit)
     p = np.ascontiguousarray(slope_x, np.float64).reshape(-1)
@@ -61,7 +61,7 @@ def count_normals(
 
 
 def check_buckets(bins: int, limit: float) -> None:
-    """Refuse numbers of buckets and limits that make no histogram."""
+    """Refuse numbers of buckets and limits out of range."""
     Checks(HistogramError).within("bins", bins, "[1, 4096]")
     Checks(HistogramError).within("limit", limit, "(0, 1]")
 
@@ -76,7 +76,7 @@ def histogram(
     valid: ArrayLike | None = None,
     angle_rad: float = 0.0,
 ) -> Float64Array:
-    """Return the share of a relief's normals in each bucket of (n_y, n_x).
+    """Return the fraction of a relief's normals in each bucket of (n_y, n_x).
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def histogram(
         Side of a pixel, or its height and width (a relief stretched along x by r has a width of
         r times its height).
     bins : int
-        Buckets a side.
+        Buckets per side.
     limit : float
         Buckets span [-limit, limit]; normals beyond are in no bucket
         (`normal_statistics.measure` counts them).
@@ -106,9 +106,9 @@ def histogram(
     Raises
     ------
     HistogramError
-        Without a single slope or sample within the limit, and for buckets that are none.
+        Without a single slope or sample within the limit, and for bins or limits out of range.
     HistogramError
-        Of which it is one: for heights that are no map of real numbers, or a mask of another
+        Its base class: for heights that are not a map of real numbers, or a mask of another
         shape or type.
 
     Examples
@@ -160,20 +160,20 @@ def normalize_counts(counts: Int64Array) -> Float64Array:
 
 
 def distance(a: ArrayLike, b: ArrayLike) -> float:
-    """Return ``sum |a - b|`` over buckets, 0...2: the total variation as eq. (7) has it.
+    """Return ``sum |a - b|`` over buckets, 0...2: the total variation of eq. (7).
 
-    Half of it, 0...1, is what is elsewhere called the total variation distance
-    (`model.metrics` and others): the share of samples that would have to change their bucket.
+    Half of it, 0...1, is the total variation distance elsewhere
+    (`model.metrics` and others): the fraction of samples that would have to change their bucket.
 
     Parameters
     ----------
     a, b : array_like, same shape
-        Shares of samples.
+        Fractions of samples.
 
     Raises
     ------
     HistogramError
-        For histograms of different shapes, or shares that are not finite.
+        For histograms of different shapes, or fractions that are not finite.
 
     Examples
     --------
@@ -188,7 +188,7 @@ def distance(a: ArrayLike, b: ArrayLike) -> float:
 
 
 def halved_distance(a: ArrayLike, b: ArrayLike) -> float:
-    """Return half of :func:`distance`, 0...1: the share of samples in other buckets."""
+    """Return half of :func:`distance`, 0...1: the fraction of samples in other buckets."""
     return 0.5 * distance(a, b)
 
 
@@ -198,20 +198,20 @@ def noise_floor(histogram: ArrayLike, samples: float, other_samples: float | Non
     Parameters
     ----------
     histogram : array_like
-        Shares that sum to 1.
+        Fractions that sum to 1.
     samples, other_samples : float
-        Independent samples of each (the effective number); the second is as the first by default.
+        Independent samples of each (the effective number); the second equals the first by default.
 
     Returns
     -------
     float
         ``sum E|X - Y|`` of two Poisson counts in each bucket, exact for equal numbers of samples;
-        for others the number whose variance is the mean of both is taken. 0 for infinitely many.
+        otherwise for the number whose variance is the mean of both. 0 for infinitely many.
 
     Raises
     ------
     HistogramError
-        For shares that are not finite or below 0, and numbers that are not above 0.
+        For fractions that are not finite or below 0, and numbers that are not above 0.
 
     Examples
     --------

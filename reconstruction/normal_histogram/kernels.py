@@ -1,7 +1,7 @@
-"""Inner loops of histograms of normals and of the search for kernels.
+"""Count normals in histograms, also of many convolution kernels at once (Numba).
 
 Kernels are parallel and called from one thread. None uses fast-math and every sum is of integers,
-so that a result depends neither on the number of threads nor on where a sample stands in a block.
+so that a result depends neither on the number of threads nor on a sample's position in a block.
 """
 
 import math
@@ -16,23 +16,23 @@ from numba import njit, prange
 BLOCK_SAMPLES = 4096
 """Samples whose slopes stay in the cache while all alphas pass over them."""
 SUM_LANES = 64
-"""Buckets whose sums are taken side by side."""
+"""Buckets that are summed in parallel vector lanes."""
 MAX_THREADS = 8
-"""Each thread holds a histogram of every alpha (5 MB at 301 and 64 x 64)."""
+"""Limit, as each thread keeps a histogram of every alpha (5 MB at 301 and 64 x 64)."""
 
 
 MIN_PARALLEL_NORMALS = 100_000_000
-"""Normals computed in all, below which one thread is sooner done than several are brought in."""
+"""Total number of normals below which one thread is faster than several."""
 
 
 def thread_count() -> int:
-    """Return into how many parts the samples are cut."""
+    """Return the number of parts that the samples are divided into."""
     return min(int(numba.get_num_threads()), MAX_THREADS)
 
 
 @contextmanager
 def limit_threads(work: int) -> Iterator[None]:
-    """Keep to one thread while ``work`` normals are computed, if they are few."""
+    """Limit the kernels to one thread while ``work`` normals are computed, if these are few."""
     before = numba.get_num_threads()
     if work < MIN_PARALLEL_NORMALS:
         numba.set_num_threads(1)
@@ -44,7 +44,7 @@ def limit_threads(work: int) -> Iterator[None]:
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def slopes(height: Any, code: Any, right: Any, down: Any) -> Any:
-    """Return dh/dx and dh/dy: central or one-sided differences as `code` says, 0 without.
+    """Return dh/dx and dh/dy: central or one-sided differences by `code`, 0 without.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def count_slopes(p: Any, q: Any, bins: Any, limit: Any, parts: Any) -> Any:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count_in_groups(p: Any, q: Any, group: Any, groups: Any, bins: Any, limit: Any) -> Any:
-    """Return counts as of `count_slopes` of each group of samples: (groups, bins^2 + 1)."""
+    """Return the counts of `count_slopes` for each group of samples: (groups, bins^2 + 1)."""
     counts = np.zeros((groups, bins * bins + 1), np.int64)
     scale = bins / (2.0 * limit)
     for i in range(p.size):
@@ -105,7 +105,7 @@ def count_in_groups(p: Any, q: Any, group: Any, groups: Any, bins: Any, limit: A
 def negative_slopes(
     height: Any, code: Any, starts: Any, right: Any, down: Any, a: Any, b: Any
 ) -> None:
-    """Write minus the slopes of the samples, row by row, into `a` and `b`.
+    """Write the negative slopes of the samples, row by row, to `a` and `b`.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def negative_slopes(
 
 @njit(inline="always")
 def _mirrored(i, n):  # type: ignore[no-untyped-def]
-    """Return the index within n that i comes to, mirrored about the edges of the end pixels."""
+    """Return the index within n that i is mirrored to about the edges of the end pixels."""
     j = i % (2 * n)
     return j if j < n else 2 * n - 1 - j
 
@@ -163,7 +163,7 @@ def blur_difference(height: Any, weights: Any, out: Any) -> None:
 def fill_windows(
     height: Any, code: Any, positions: Any, right: Any, down: Any, along: Any, across: Any
 ) -> None:
-    """Write the second differences of minus the slopes around samples, k pixels to either side.
+    """Write the second differences of the negative slopes around samples, k pixels to either side.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ def count_kernels(
                     within = u >= zero and u <= top and v >= zero and v <= top
                     bucket[i] = place if within else cells
                 own = counts[part, j]
-                # neighbours on the skin share buckets: take far ones in turn
+                # neighbors on the skin share buckets: alternate distant ones to avoid stalls
                 quarter = size // 4
                 for i in range(quarter):
                     own[bucket[i]] += 1
@@ -300,7 +300,7 @@ def distances(counts: Any, target: Any) -> Any:
 def distance_bounds(
     first: Any, second: Any, target: Any, before: Any, fresh: Any, pixels: Any, signs: Any
 ) -> Any:
-    """Return distances on a sample, and estimates of what the distances are at least.
+    """Return distances on a sample, and estimates of lower bounds of all pixels' distances.
 
     Parameters
     ----------
@@ -320,7 +320,7 @@ def distance_bounds(
     out = np.empty((kinds, 2))
     grown = (pixels - before) / fresh
     for j in prange(kinds):
-        # sums of every LANES-th bucket, so that neighbours are added at once; then the sums' sums
+        # sums of every LANES-th bucket, so that neighbors are added at once; then the sums' sums
         total, own = np.zeros(SUM_LANES), np.zeros(SUM_LANES)
         lows = np.zeros((signs.shape[0], SUM_LANES))
         x, y, gap = np.empty(SUM_LANES), np.empty(SUM_LANES), np.empty(SUM_LANES)
@@ -337,7 +337,7 @@ def distance_bounds(
             for i in range(size):
                 h = wanted[i]
                 total[i] += abs(h - (x[i] + y[i]) / (before + fresh))
-                # as the old pixels have it exactly, and the fresh ones tell the rest
+                # exact over the pixels drawn before, extrapolated from the fresh ones
                 g = h - (x[i] + y[i] * grown) / pixels
                 gap[i] = g
                 so_far = h - x[i] / before

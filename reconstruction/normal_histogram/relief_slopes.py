@@ -1,8 +1,8 @@
-"""Slopes of a relief, and of normals, along x to the right and y up.
+"""Compute slopes of a relief, and of normals, along x to the right and y up.
 
-A normal is ``n = (-dh/dx, -dh/dy, 1) / length``. Slopes are central differences; where only one
-neighbour is there, at a border or beside a hole, they are one-sided, and a pixel without a
-neighbour along an axis has none.
+A normal is ``n = (-dh/dx, -dh/dy, 1) / length``. Slopes are central differences; with only one
+neighbor, at a border or a hole, they are one-sided, and a pixel without a
+neighbor along an axis has none.
 """
 
 import math
@@ -16,11 +16,11 @@ from reconstruction.normal_histogram import kernels
 
 
 class HistogramError(ValueError):
-    """A relief, normals, shares or settings that no histogram can be made of."""
+    """Reliefs, normals, fractions or settings that do not give a histogram."""
 
 
 def slope_stencil(height: ArrayLike, valid: ArrayLike | None = None) -> UInt8Array:
-    """Return which neighbours each pixel's slopes are taken from.
+    """Return the neighbors from which each pixel's slopes are computed.
 
     Parameters
     ----------
@@ -32,13 +32,13 @@ def slope_stencil(height: ArrayLike, valid: ArrayLike | None = None) -> UInt8Arr
     Returns
     -------
     ndarray of uint8, shape (H, W)
-        Bits 1, 2, 4, 8: the neighbour to the left, right, above (row - 1), below is usable; 0
-        where the pixel has no slope: it is not valid, or lacks both neighbours along an axis.
+        Bits 1, 2, 4, 8: the neighbor to the left, right, above (row - 1), below is usable; 0
+        where the pixel has no slope: it is not valid, or lacks both neighbors along an axis.
 
     Raises
     ------
     HistogramError
-        For heights that are no map of real numbers, and a mask of another shape or type.
+        For heights that are not a map of real numbers, and a mask of another shape or type.
 
     Examples
     --------
@@ -62,7 +62,9 @@ def _as_height_map(height: ArrayLike) -> FloatArray:
     try:
         given = np.asarray(height)
     except ValueError as error:  # rows of a list that differ in length
-        raise HistogramError(f"height: got no array ({error}), expected a map (H, W)") from error
+        raise HistogramError(
+            f"height: got no array ({error}), expected a map (H, W); give rows of equal length"
+        ) from error
     if given.ndim != 2 or given.dtype.kind not in "biuf":
         raise HistogramError(
             f"height: got {given.dtype} of shape {given.shape}, expected real numbers of shape "
@@ -72,7 +74,7 @@ def _as_height_map(height: ArrayLike) -> FloatArray:
 
 
 def _mask(valid: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray:
-    """Return a mask as an array; one that is not given holds everywhere."""
+    """Return a mask as an array, True everywhere by default."""
     if valid is None:
         return np.ones(shape, bool)
     mask = np.asarray(valid)
@@ -105,7 +107,7 @@ def slopes(
     y_up: bool = True,
     valid: ArrayLike | None = None,
 ) -> tuple[Float64Array, Float64Array, BoolArray]:
-    """Return the slopes of a relief, by differences over two pixels or, at edges, one.
+    """Compute the slopes of a relief, by differences over two pixels or, at edges, one.
 
     Parameters
     ----------
@@ -116,7 +118,7 @@ def slopes(
     y_up : bool
         True: y points to row 0. False: y grows with the row.
     valid : array_like of bool, shape (H, W), optional
-        Heights to use, as of :func:`slope_stencil`.
+        Heights to use, see :func:`slope_stencil`.
 
     Returns
     -------
@@ -128,7 +130,7 @@ def slopes(
     Raises
     ------
     HistogramError
-        As of :func:`slope_stencil` and :func:`pixel_sides`.
+        See :func:`slope_stencil` and :func:`pixel_sides`.
 
     Examples
     --------
@@ -185,19 +187,19 @@ def slopes_from_normals(
 def rotate_components(
     a: FloatArray, b: FloatArray, angle_rad: float
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the components of plane vectors, such as slopes, along turned axes.
+    """Return the components of plane vectors, such as slopes, along rotated axes.
 
     Parameters
     ----------
     a, b : ndarray, same shape
         Components along x and y, finite.
     angle_rad : float
-        The axes are turned counterclockwise (y up) by it.
+        Counterclockwise rotation of the axes (y up).
 
     Returns
     -------
     along, across : ndarray of float64
-        Components along the turned x and y axis.
+        Components along the rotated x and y axis.
 
     Raises
     ------

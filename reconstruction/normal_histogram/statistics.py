@@ -1,4 +1,4 @@
-"""Statistics of a map's normals: their histogram with its noise, and variances with errors.
+"""Measure a map's normals: their histogram with its noise, and variances with errors.
 
 References
 ----------
@@ -22,7 +22,7 @@ from reconstruction.normal_histogram.counting import check_buckets, normalize_co
 from reconstruction.normal_histogram.relief_slopes import rotate_components, slopes
 
 SAMPLES_PER_BUCKET = 16.0
-"""Mean number of samples in an occupied bucket below which a histogram is called aliased: its
+"""Mean number of samples per occupied bucket below which a histogram is aliased: its
 distance from another one of the same surface is then above 0.8 * sqrt(2 / 16) = 28 %."""
 
 
@@ -37,20 +37,19 @@ class NormalStatistics:
     samples, outside : int
         Normals counted, and those beyond the limit.
     effective_samples : float
-        Independent samples that would be as noisy: neighbouring normals are alike. From the
-        differences between blocks of the map, and how alike neighboring blocks are; at most
-        `samples`.
+        Number of independent samples with the same noise: neighboring normals are correlated. From
+        the differences between blocks of the map and their correlation; at most `samples`.
     occupied : int
-        Buckets that hold anything.
+        Buckets with at least one sample.
     samples_per_bucket : float
-        Samples a bucket, averaged over occupied buckets with equal weight.
+        Samples per bucket, averaged over occupied buckets with equal weight.
     aliased : bool
-        `samples_per_bucket` is below `SAMPLES_PER_BUCKET`: distances then show chance.
+        `samples_per_bucket` is below `SAMPLES_PER_BUCKET`: distances are then mostly noise.
     variance_x, variance_y : float
         Of n_x and n_y (n_s, n_t on turned axes) about their means, over all samples.
     stderr_x, stderr_y : float
-        Standard errors of the variances, of what another patch of the same skin and size would
-        show (`reconstruction.normal_histogram.blocks.mean_stderr`); infinite below five blocks.
+        Standard errors of the variances, with the scatter over other patches of the same skin and
+        size (`reconstruction.normal_histogram.blocks.mean_stderr`); infinite below five blocks.
     """
 
     histogram: Float64Array
@@ -76,15 +75,15 @@ def measure_normals(
     angle_rad: float = 0.0,
     blocks: int = BLOCKS_PER_SIDE,
 ) -> NormalStatistics:
-    """Return the histogram of a relief's normals, its noise and the normals' variances.
+    """Measure the histogram of a relief's normals, its noise and the normals' variances.
 
     Parameters
     ----------
     height, pixel, bins, limit, valid, angle_rad
         As of `normal_histogram.histogram`.
     blocks : int
-        The map is cut into ``blocks ** 2`` parts, whose scatter gives the standard errors; they
-        must be longer than the relief is correlated with itself.
+        The map has ``blocks ** 2`` blocks, whose scatter gives the standard errors; blocks
+        must be longer than the correlation length of the relief.
 
     Returns
     -------
@@ -93,9 +92,9 @@ def measure_normals(
     Raises
     ------
     HistogramError
-        Without a single sample within the limit, and for buckets that are none.
+        Without a single sample within the limit, and for bins or limits out of range.
     HistogramError
-        For what is no map of real numbers, no mask or no pixel.
+        For heights that are not a map of real numbers, and invalid masks or pixels.
 
     Examples
     --------

@@ -1,11 +1,11 @@
-"""Height from normals of surfaces that jump: bilaterally weighted integration.
+"""Integrate normals of surfaces with jumps to heights, by bilaterally weighted least squares.
 
-A pixel's slope is held to its neighbours on either side, on each side with a weight that falls
-where the height steps more on that side than on the other (Cao, Santo, Shi, Okura and Matsushita
-2022, Bilateral normal integration, ECCV, doi 10.1007/978-3-031-19769-7_32). Both weights of a pixel
-and direction sum to one, so that a border takes at most one of a pixel's two neighbours away.
+A pixel's slope constrains the steps to its neighbors on both sides, on each side with a weight that
+falls where the height steps more on that side than on the other (Cao, Santo, Shi, Okura and
+Matsushita 2022, Bilateral normal integration, ECCV, doi 10.1007/978-3-031-19769-7_32). Both weights
+of a pixel and direction sum to one, so that a jump removes at most one of its two neighbors.
 
-A jump all around a closed contour leaves no trace in normals: nothing can find its height.
+A jump all around a closed contour leaves no trace in normals, so its height cannot be recovered.
 """
 
 from dataclasses import dataclass
@@ -29,9 +29,11 @@ from reconstruction.normal_maps import NormalMaps
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _side_weights(x, ex, ey, facing, k, wx, wy):  # type: ignore[no-untyped-def]
-    """Write each pixel's weight of its right and of its lower neighbour; x has a border of one.
+    """Write each pixel's weight of its right and of its lower neighbor; x has a border of one.
 
     ``ex``, ``ey``: whether there is an edge to the right and below. Half where one side is missing.
+    The weight is a logistic function of the difference of both sides' squared steps (the paper's
+    eq. (12) with sharpness k); m n . w turns height steps into distances along the normal.
     """
     rows, columns = facing.shape
     for i in prange(1, rows + 1):
@@ -52,7 +54,7 @@ def _side_weights(x, ex, ey, facing, k, wx, wy):  # type: ignore[no-untyped-def]
 def _one_sided(gx, gy, ux, uy, wx, wy, ex, ey, x, ax, ay, dx, dy, energy):  # type: ignore[no-untyped-def]
     """Write the edges' weights and differences from both pixels' own slopes; energy of x by rows.
 
-    ``ux``, ``uy``: what a pixel's slope counts, (H, W). The least weight is 1e-7.
+    ``ux``, ``uy``: confidence of a pixel's slope, (H, W). The least weight is 1e-7.
     """
     rows, columns = gx.shape
     for i in prange(1, rows + 1):
@@ -89,11 +91,11 @@ class BilateralSettings:
         The paper's k, per square of a pixel's height, > 0. Its own 2 leaves many jumps joined
         and stops early; 20 with ``stop=0`` finds more of them, in all rounds.
     rounds : int
-        Most rounds of new weights, >= 1.
+        Largest number of rounds of new weights, >= 1.
     stop : float
-        Relative change of the energy at which no more rounds are made, >= 0.
+        Relative change of the energy at which the rounds end, >= 0.
     inner : int
-        Most conjugate gradient iterations a round, >= 1.
+        Largest number of conjugate gradient iterations per round, >= 1.
     """
 
     sharpness: float = 2.0
@@ -111,22 +113,22 @@ class BilateralSettings:
 
 @dataclass(frozen=True, slots=True)
 class DiscontinuousHeight:
-    """A height with jumps.
+    """Height of a surface with jumps, and the weights that it was found with.
 
     Attributes
     ----------
     height : ndarray, shape (H, W)
-        As of `normal_integration.HeightMap`.
+        See `normal_integration.HeightMap`.
     valid : ndarray of bool, shape (H, W)
     part : ndarray of int32, shape (H, W)
-        Connected parts of the mask; jumps do not count.
+        Connected parts of the mask; jumps do not divide parts.
     right, below : ndarray, shape (H, W), float32
-        Weight of the pixel's neighbour to the right and below, in [0, 1]; that of the opposite
-        neighbour is the rest. Far from 1/2 beside a jump.
+        Weight of the pixel's neighbor to the right and below, in [0, 1]; that of the opposite
+        neighbor is one less it. Far from 1/2 at a jump.
     energy : float
         The paper's objective at the last round's weights, px^2.
     rounds : int
-        That were made.
+        Number of rounds.
     converged : bool
         Whether the energy stopped changing.
     """
@@ -151,28 +153,28 @@ def integrate_with_discontinuities(
     camera: Perspective | None = None,
     settings: BilateralSettings | None = None,
 ) -> DiscontinuousHeight:
-    """Return a height that may jump where the slopes of both sides do not fit a joined surface.
+    """Integrate normals to a height that may jump where slopes of both sides contradict.
 
     Parameters
     ----------
     normals, pixel, valid, stderr_rad, y_up, camera
-        As of `normal_integration.integrate`.
-    settings : Bilateral, optional
+        See `normal_integration.integrate`.
+    settings : BilateralSettings, optional
 
     Returns
     -------
-    BrokenHeight
+    DiscontinuousHeight
 
     Raises
     ------
     IntegrationError
-        As `integrate` does.
+        See `integrate`.
 
     Notes
     -----
-    Begins with the joined surface and repeats: weights from the present heights, then a few
+    Starts with the joined surface and repeats: weights from the present heights, then a few
     conjugate gradient steps with a multigrid made for these weights. The objective has many
-    minima, and which one is reached depends on that beginning. On smooth relief the plain
+    minima; the start decides which one is reached. On smooth relief the plain
     `integrate` is better: differences here are of first order (a pixel's own slope), not fourth.
 
     Examples
@@ -180,7 +182,7 @@ def integrate_with_discontinuities(
     >>> import numpy as np
     >>> flat = np.broadcast_to([0.0, 0.0, 1.0], (8, 8, 3))
     >>> found = integrate_with_discontinuities(flat)
-    >>> float(np.ptp(found.height)), found.settled
+    >>> float(np.ptp(found.height)), found.converged
     (0.0, True)
     """
     Checks(IntegrationError).within("pixel", pixel, "(0, inf)")
@@ -223,7 +225,7 @@ def integrate_with_discontinuities(
 
 
 def _confidence(slopes: SlopeField) -> tuple[Float32Array, Float32Array]:
-    """Return what each slope counts: n_z^2 as in the paper, or the inverse of its variance."""
+    """Return the confidence of each slope: n_z^2 as in the paper, or its inverse variance."""
     if slopes.variance_x.shape == slopes.gx.shape and slopes.scale > 0.0:
         return 1.0 / slopes.variance_x, 1.0 / slopes.variance_y
     squared = slopes.facing * slopes.facing

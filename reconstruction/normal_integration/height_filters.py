@@ -1,4 +1,4 @@
-"""Relief without bulge, and slopes without needless noise."""
+"""Filter heights and slopes: remove form from a relief, and reduce noise of slopes."""
 
 from dataclasses import replace
 
@@ -19,10 +19,10 @@ _TRUNCATE_SIGMAS = 4.0  # standard deviations at which the Gaussian ends
 def high_pass(
     height: FloatArray, *, pixel: float, cutoff: float, valid: BoolArray | None = None
 ) -> FloatArray:
-    """Remove form and bulge: what is longer than `cutoff`.
+    """Remove form from a height: wavelengths longer than `cutoff`.
 
     Subtracts at each pixel the plane fitted to its surroundings with Gaussian weights, over valid
-    pixels of the same connected part only, as a part's constant says nothing about another's.
+    pixels of the same connected part only, as the constants of parts are unrelated.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def high_pass(
     pixel : float
         Size of a pixel.
     cutoff : float
-        Wavelength of which half the amplitude is left, same unit as `pixel`.
+        Wavelength whose amplitude is halved, same unit as `pixel`.
     valid : ndarray of bool, shape (H, W), optional
 
     Returns
@@ -46,8 +46,8 @@ def high_pass(
     Notes
     -----
     Farther than 0.75 cutoffs from borders and holes this is the Gaussian filter of ISO 16610-21:
-    no phase, and of a wave of length l it leaves 1 - 2^(-(cutoff / l)^2). Near borders the plane
-    keeps a slope from leaking in (ISO 16610-28 for the means of doing so): planes are removed
+    without phase; a wave of length l keeps the fraction 1 - 2^(-(cutoff / l)^2). Near borders the
+    plane keeps a slope from leaking in (ISO 16610-28 for such methods): planes are removed
     everywhere, parabolas up to a constant away from borders.
 
     Examples
@@ -89,7 +89,7 @@ def _without_planes(values: FloatArray, inside: BoolArray, sigma: float) -> Floa
     ]
     x = [np.fft.rfft(k).conj().astype(y[0].dtype) for k in moments[1]]
 
-    middle = values[inside].mean()  # so that digits are not lost on a constant
+    middle = values[inside].mean()  # keeps float32 digits for the relief
 
     def averages(data: FloatArray, orders: list[tuple[int, int]]) -> list[FloatArray]:
         waves = fft.rfft2(data, size, workers=2)
@@ -130,7 +130,11 @@ def _moments(size: int, reach: int, sigma: float) -> list[Float64Array]:
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _subtract_plane(h, inside, s, sx, sy, sxx, sxy, syy, t, tx, ty, out):  # type: ignore[no-untyped-def]
-    """Write h less the value here of the plane with these weighted moments."""
+    """Write h less the value at the pixel of the plane with these weighted moments.
+
+    Normal equations about the window's center of mass (a, b) / n: covariances xx, yy, xy of the
+    positions, x1, y1 of position and height.
+    """
     rows, columns = h.shape
     for i in prange(rows):
         for j in range(columns):
@@ -159,21 +163,21 @@ def _subtract_plane(h, inside, s, sx, sy, sxx, sxy, syy, t, tx, ty, out):  # typ
 def denoise_slopes(
     slopes: SlopeField, *, strength: float = 1.0, sigma_px: float = 1.0
 ) -> SlopeField:
-    """Smooth slopes where their differences are noise, and leave them where they are not.
+    """Smooth slopes where their differences are noise, and keep them elsewhere.
 
     Parameters
     ----------
     slopes : SlopeField
         With `scale`, which is the variance of the noise.
     strength : float
-        What the stated variance is multiplied by, >= 0; 0 returns the slopes as they are.
+        Factor of the stated variance, >= 0; 0 returns the slopes unchanged.
     sigma_px : float
         Standard deviation of the Gaussian window, px, in (0, 3].
 
     Returns
     -------
     SlopeField
-        Variances are those after smoothing; noise is then correlated between neighbours.
+        Variances are those after smoothing; noise is then correlated between neighbors.
 
     Raises
     ------
@@ -183,15 +187,17 @@ def denoise_slopes(
     Notes
     -----
     At each pixel a plane is fitted to both slopes in the window, weighted by Gaussian and
-    variance. What the data depart from it by more than noise is kept: the output is
+    variance. Deviations from it beyond the noise are kept: the output is
     f + a (g - f) with f the plane's value, a = max(0, 1 - s E / Q), Q the weighted sum of squared
-    residuals of both slopes and E what noise alone would give (a local Wiener filter, Lee 1980,
+    residuals of both slopes and E its expectation for noise alone (a local Wiener filter, Lee 1980,
     doi 10.1109/TPAMI.1980.4766994, about a plane instead of a mean). The transfer inside is
-    a + (1 - a) exp(-sigma^2 theta^2 / 2), theta in radians a pixel: positive, so that nothing
+    a + (1 - a) exp(-sigma^2 theta^2 / 2), theta in radians per pixel: positive, so that nothing
     rings; at a = 0 noise's variance falls to 1 / (4 pi sigma^2), 0.08 for one pixel.
     """
     if not slopes.scale > 0.0:
-        raise IntegrationError("stderr_rad: got none, expected the noise that is to be removed")
+        raise IntegrationError(
+            "stderr_rad: got none, expected the noise to remove; give it, or set denoise=0"
+        )
     Checks(IntegrationError).within("strength", strength, "[0, inf)")
     Checks(IntegrationError).within("sigma_px", sigma_px, "(0, 3]")
     if strength == 0.0:
@@ -220,7 +226,11 @@ def denoise_slopes(
 
 @njit(cache=True, inline="always", error_model="numpy")
 def _plane(values, variance, valid, i, j, g, scale):  # type: ignore[no-untyped-def]
-    """Return a window's plane here, its residuals' Q and E, and the variance of f and f, g."""
+    """Return a window's plane here, its residuals' Q and E, and the variance of f and f, g.
+
+    M = X' X / v is inverted by its cofactors (c..): its last row over det gives f, and the trace
+    of M^-1 times the noise's moments (k..) is what the fit takes off E.
+    """
     reach = g.size // 2
     rows, columns = values.shape
     m, mx, my, mxx, mxy, myy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -263,7 +273,7 @@ def _plane(values, variance, valid, i, j, g, scale):  # type: ignore[no-untyped-
     f = (cx * tx + cy * ty + c * t) / det
     Q = squares - (p * tx + q * ty + f * t)
     E = weights - (cxx * kxx + cyy * kyy + c * k + 2.0 * (cxy * kxy + cx * kx + cy * ky)) / det
-    # variance of f: row C of M^-1 against X' (w^2 / v) X
+    # variance of f: last row c of M^-1 on both sides of X' (w^2 / v) X
     spread = (
         cx * (cx * kxx + cy * kxy + c * kx)
         + cy * (cx * kxy + cy * kyy + c * ky)

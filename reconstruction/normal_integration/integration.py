@@ -1,8 +1,7 @@
-"""Height of a surface from its normals.
+"""Integrate normals to heights by weighted least squares.
 
-The slopes that the normals give are integrated by weighted least squares over any mask, for
-parallel rays or a pinhole camera. See `discontinuity_integration` for surfaces that jump,
-`height_filters` for what follows, `relief_errors` for standard errors.
+Works over any mask, for parallel rays or a pinhole camera. See `discontinuities` for surfaces with
+jumps, `height_filters` for filters of heights and slopes, `relief_errors` for standard errors.
 """
 
 from collections.abc import Callable
@@ -36,16 +35,16 @@ class ConvergenceError(IntegrationError, ArithmeticError):
 
 @dataclass(frozen=True, slots=True)
 class IntegrationSettings:
-    """Effort of an integration.
+    """Numerical settings of an integration.
 
     Attributes
     ----------
     tolerance : float
         Residual of the normal equations over their right side, in (0, 1).
     iterations : int
-        Most conjugate gradient iterations, >= 1.
+        Largest number of conjugate gradient iterations, >= 1.
     order : int
-        Of the quadrature between pixels: 4, or 2 for the mean of two neighbours.
+        Order of the quadrature between pixels: 4, or 2 for the mean of two neighbors.
     """
 
     tolerance: float = 1e-5
@@ -60,15 +59,15 @@ class IntegrationSettings:
 
 @dataclass(frozen=True, slots=True)
 class HeightMap:
-    """A height with what is known about it.
+    """Height with its mask, connected parts and convergence.
 
     Attributes
     ----------
     height : ndarray, shape (H, W)
         Towards the camera (+z), in the unit of `pixel`; mean 0 over each connected part, whose
-        constant normals cannot tell; 0 where `valid` is False.
+        constant normals do not determine; 0 where `valid` is False.
     valid : ndarray of bool, shape (H, W)
-        Pixels that were asked for and whose normal faces the camera.
+        Pixels of the mask whose normal faces the camera.
     part : ndarray of int32, shape (H, W)
         Number of the connected part (by rows and columns, not diagonally), from 1; 0 outside.
     convergence : Convergence
@@ -92,24 +91,24 @@ def integrate(
     denoise: float = 0.0,
     settings: IntegrationSettings | None = None,
 ) -> FloatArray:
-    """Return the height whose slopes fit those of the normals best.
+    """Integrate normals to the height whose slopes fit them best.
 
     Parameters
     ----------
     normals : ndarray, shape (..., H, W, 3), or NormalMaps of (H, W)
-        Outward, any length but 0, z towards the camera. Of `NormalMaps`, `valid` and
-        `stderr_rad` are taken where not given here (`valid` besides). Maps of a stack are
-        integrated each by itself.
+        Outward, any length but 0, z towards the camera. `valid` and `stderr_rad` of `NormalMaps`
+        are defaults of those here (`valid` applies in addition). Maps of a stack are integrated
+        separately.
     pixel : float
         Size of a pixel on the surface; its unit is that of the height. Under perspective, at the
         mean height, so that the camera's distance is `pixel * focal_px`.
     valid : ndarray of bool, shape (..., H, W), optional
         Pixels to integrate. Those whose normal is 0, not finite or more than 88.8 degrees from
-        the ray are left out besides.
+        the ray are omitted in addition.
     stderr_rad : float or ndarray, shape (..., H, W), optional
-        Standard error of the normals, rad (root mean square angle). Slopes then count by the
-        inverse of the variance it gives them, which rises towards the horizon. A thousandth and
-        a thousandfold of the median are the least and the most that count. None: all slopes alike.
+        Standard error of the normals, rad (root mean square angle). Slopes are then weighted by
+        their inverse variance, which rises towards the horizon. Errors are clipped to a thousandth
+        and a thousandfold of their median. None: equal weights.
     y_up : bool
         Whether n_y > 0 leans to the image's top (row 0); False: to its bottom.
     camera : Perspective, optional
@@ -119,7 +118,7 @@ def integrate(
     denoise : float
         Strength of `height_filters.denoise_slopes` before integration, 0: none, 1: by the
         stated noise; needs standard errors.
-    settings : Settings, optional
+    settings : IntegrationSettings, optional
 
     Returns
     -------
@@ -131,14 +130,14 @@ def integrate(
     ------
     IntegrationError
         For shapes or settings that do not fit, or without any usable normal.
-    NotConverged
+    ConvergenceError
         Where the iterations do not suffice.
 
     Notes
     -----
-    Minimises sum a_e (h_q - h_p - d_e)^2 over neighbours p, q with d_e the integral of slope
+    Minimizes sum a_e (h_q - h_p - d_e)^2 over neighbors p, q with d_e the integral of slope
     between them (Quéau, Durou and Aujol 2018, doi 10.1007/s10851-017-0773-x, for the problem
-    and its variants). Fields with curl are projected: their part without a height is dropped.
+    and its variants). Fields with curl are projected: their solenoidal part is discarded.
 
     Examples
     --------
@@ -174,7 +173,7 @@ def _converged(found: HeightMap) -> FloatArray:
     if not found.convergence.converged:
         raise ConvergenceError(
             f"iterations: residual {found.convergence.residual:.1e} after "
-            f"{found.convergence.iterations}; allow more, or a larger tolerance"
+            f"{found.convergence.iterations}; allow more iterations, or set a larger tolerance"
         )
     return found.height
 
@@ -182,7 +181,7 @@ def _converged(found: HeightMap) -> FloatArray:
 def _for_each(
     name: str, values: Any, shape: tuple[int, ...]
 ) -> Callable[[tuple[int, ...]], NDArray[Any] | None]:
-    """Return what belongs to each map of a stack: None, a number, or a part of an array."""
+    """Return the part of an argument for each map of a stack: None, a number, or an array."""
     if values is None:
         return lambda at: None
     given = np.asarray(values)
@@ -204,12 +203,12 @@ def integrate_map(
     denoise: float = 0.0,
     settings: IntegrationSettings | None = None,
 ) -> HeightMap:
-    """Return the height as `integrate` does, with mask, parts and how well it was solved.
+    """Integrate one map as `integrate` does; return height, mask, parts and convergence.
 
     Parameters
     ----------
     normals, pixel, valid, stderr_rad, y_up, camera, method, denoise, settings
-        As of `integrate`.
+        See `integrate`.
 
     Returns
     -------
@@ -218,7 +217,7 @@ def integrate_map(
     Raises
     ------
     IntegrationError
-        As of `integrate`; equations that were not solved are told by `convergence` instead.
+        See `integrate`; an unsolved system is reported by `convergence` instead.
     """
     Checks(IntegrationError).within("pixel", pixel, "(0, inf)")
     chosen = settings or IntegrationSettings()
@@ -262,7 +261,7 @@ def _by_multigrid(
 
 
 def _by_cosines(slopes: SlopeField, settings: IntegrationSettings) -> Float64Array:
-    """Solve the same equations on a full rectangle, whose eigenvectors are cosines."""
+    """Solve the same equations on a full rectangle, whose eigenvectors are cosines (DCT)."""
     _, _, dx, dy = slope_fields.edges(slopes, order=settings.order)
     b = dx[1:-1, :-2] - dx[1:-1, 1:-1] + dy[:-2, 1:-1] - dy[1:-1, 1:-1]
     rows, columns = b.shape
@@ -271,7 +270,7 @@ def _by_cosines(slopes: SlopeField, settings: IntegrationSettings) -> Float64Arr
     of_column = 4.0 * np.sin(0.5 * np.pi * np.arange(columns) / columns) ** 2
     of_row[0] = np.inf if rows * columns == 1 else of_row[0]
     eigenvalues = of_row[:, None] + of_column[None, :]
-    eigenvalues[0, 0] = np.inf  # the constant
+    eigenvalues[0, 0] = np.inf  # the constant is undetermined: 0
     waves /= eigenvalues
     return np.asarray(fft.idctn(waves, type=2, norm="ortho", workers=2, overwrite_x=True))
 

@@ -1,9 +1,9 @@
-"""Slopes as they were before the lens blurred them, as far as noise allows.
+"""Restore slopes that a lens has blurred, by a Wiener filter.
 
-A macro lens at a small aperture passes waves of some tens of micrometres with half their height,
-and nothing at all below its cutoff. What lies between the cutoff and the sampling limit of the
-pixels is noise alone, so that the pictures tell their own noise; what stands above it is divided by
-the lens's transfer, and the rest is left out (Wiener 1949; Gonzalez and Woods 2018, section 5.8).
+A macro lens at a small aperture passes waves of some tens of micrometers with half their height,
+and none shorter than its cutoff. Between the cutoff and the sampling limit of the pixels there is
+noise alone, which estimates the noise from the images. Waves above the noise are divided by the
+lens's transfer, the others omitted (Wiener 1949; Gonzalez and Woods 2018, section 5.8).
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 
 MAX_GAIN = 4.0
-"""Waves are raised by this factor at most: what the lens weakens more is as good as lost."""
+"""Largest gain: waves that the lens weakens more are lost."""
 SMOOTH_BINS = 2.0
 """Standard deviation by which the spectrum is smoothed, in bins of its own grid."""
 PAD_PX = 32
 MIN_COSINE = 0.1
-"""Normals farther from the view than this are no measurement of a slope."""
+"""Least cosine between normal and view of a usable slope."""
 NOISE_CUTOFF_RATIO = 1.03
-"""Of the cutoff: frequencies from here on hold noise alone."""
+"""Frequency over the cutoff from which there is noise alone."""
 
 
 class RestorationError(ValueError):
-    """Normals or a lens that slopes cannot be restored with."""
+    """Normals or lenses that slopes cannot be restored with."""
 
 
 @dataclass(frozen=True, slots=True)
 class Aperture:
-    """A lens without aberrations and the pixels behind it, both as they are on the subject.
+    """A lens without aberrations and the pixels behind it, both as sizes on the subject.
 
     Attributes
     ----------
@@ -49,19 +49,19 @@ class Aperture:
     pixel_um: float
 
     def __post_init__(self) -> None:
-        """Refuse what is no lens."""
+        """Refuse sizes that are not positive."""
         Checks(RestorationError).settings(self, cutoff_um="(0, inf)", pixel_um="(0, inf)")
 
     @staticmethod
     def of(
         *, f_number: float, magnification: float, wavelength_um: float, pixel_um: float
     ) -> Aperture:
-        """Return the aperture of a lens that images ``magnification`` times.
+        """Return the aperture of a lens from f-number, magnification and wavelength.
 
         Parameters
         ----------
         f_number
-            As engraved, for a subject far away; the working one is (1 + magnification) times it.
+            As engraved, for a distant subject; the working one is (1 + magnification) times it.
         magnification
             Size of the image over that of the subject, > 0.
         wavelength_um
@@ -99,7 +99,7 @@ class Aperture:
 
 @dataclass(frozen=True, slots=True)
 class RestoredNormals:
-    """Normals of the surface before the lens.
+    """Restored normals with their noise.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class RestoredNormals:
     kept_noise : float
         The same after it.
     filter : ndarray, shape (H + 64, W + 64)
-        What waves are multiplied by, on the grid of `scipy.fft.fftfreq`.
+        Factor of each wave, on the grid of `scipy.fft.fftfreq`.
     """
 
     normals: FloatArray
@@ -119,7 +119,7 @@ class RestoredNormals:
     filter: Float64Array
 
     def sample_noise(self, rng: np.random.Generator) -> tuple[Float64Array, Float64Array]:
-        """Draw the noise that is left in both slopes, each of shape (H, W)."""
+        """Draw the remaining noise of both slopes, each of shape (H, W)."""
         shape = self.normals.shape[:2]
         x, y = (
             filter_by_transfer(self.noise * rng.standard_normal(shape), self.filter)
@@ -131,7 +131,7 @@ class RestoredNormals:
 def restore_normals(
     normals: FloatArray, *, lens: Aperture, valid: BoolArray, smooth_px: float = 0.0
 ) -> RestoredNormals:
-    """Undo the blur of the lens where waves stand above the noise.
+    """Undo the blur of the lens for waves above the noise.
 
     Parameters
     ----------
@@ -139,13 +139,13 @@ def restore_normals(
         Unit vectors towards +z, blurred by the lens.
     lens : Aperture
     valid : ndarray of bool, shape (H, W)
-        Where they are known.
+        Pixels with known normals.
     smooth_px : float
-        Standard deviation of a Gaussian by which they have been smoothed besides, px.
+        Standard deviation of a Gaussian that also smoothed them, px.
 
     Returns
     -------
-    Restored
+    RestoredNormals
 
     Raises
     ------
@@ -154,7 +154,10 @@ def restore_normals(
     """
     known = valid & (normals[..., 2] > MIN_COSINE) & np.isfinite(normals).all(axis=-1)
     if not known.any():
-        raise RestorationError("valid: got no pixel with a normal towards the view")
+        raise RestorationError(
+            "valid: got no pixel with a normal towards the view, expected some; "
+            "check the mask and the sign of n_z"
+        )
     z = np.where(known, normals[..., 2], 1.0)
     slopes = [np.where(known, -normals[..., i] / z, 0.0).astype(np.float64) for i in (0, 1)]
     means = [float(s[known].mean()) for s in slopes]
@@ -172,12 +175,14 @@ def restore_normals(
     if np.count_nonzero(beyond) < 16:
         raise RestorationError(
             f"pixel_um: got {lens.pixel_um:g}, expected below half of the lens's cutoff period "
-            f"{lens.cutoff_um:g}: no frequency holds noise alone"
+            f"{lens.cutoff_um:g}, so that some frequencies are noise alone; use a larger f-number "
+            "or smaller pixels"
         )
-    # in powers of the smoothing: its weakest waves are rounding errors, and are not asked
-    told = beyond & (smoothing > 0.05)
-    told = told if np.count_nonzero(told) >= 16 else beyond
-    noise_power = float(np.mean(power[told]) / np.mean(smoothing[told] ** 2))
+    # divide by the smoothing's power; where that is weakest only rounding errors are left
+    noise_band = beyond & (smoothing > 0.05)
+    noise_band = noise_band if np.count_nonzero(noise_band) >= 16 else beyond
+    noise_power = float(np.mean(power[noise_band]) / np.mean(smoothing[noise_band] ** 2))
+    # Wiener filter S / (S + N) over the blur, with S + N the smoothed power spectrum
     even = ndimage.gaussian_filter(power, SMOOTH_BINS, mode="wrap")
     signal = np.maximum(even - noise_power * smoothing**2, 0.0)
     share = np.where(even > 0, signal / np.where(even > 0, even, 1.0), 0.0)
@@ -201,6 +206,6 @@ def _padded(values: Float64Array) -> Float64Array:
 
 
 def filter_by_transfer(values: Float64Array, transfer: Float64Array) -> Float64Array:
-    """Return values whose waves were multiplied by a transfer on a grid 64 pixels larger."""
+    """Multiply the waves of values by a transfer on a grid 64 pixels larger."""
     whole = fft.ifft2(fft.fft2(_padded(values), workers=-1) * transfer, workers=-1).real
     return whole[PAD_PX:-PAD_PX, PAD_PX:-PAD_PX]

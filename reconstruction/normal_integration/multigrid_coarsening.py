@@ -1,7 +1,7 @@
-"""Coarser grids of a multigrid on masked grids with weighted edges; see `integration_kernels`.
+"""Coarsen masked grids with weighted edges for a multigrid; see `multigrid_kernels`.
 
 Coarse nodes are the fine ones of even row and column. A fine node between them takes the mean of
-its coarse neighbours weighted by its own couplings, so that nothing is carried over an edge
+its coarse neighbors weighted by its own couplings, so that nothing passes over an edge
 without weight (Alcouffe, Brandt, Dendy and Painter 1981, doi 10.1137/0902035; Dendy 1982,
 doi 10.1016/0021-9991(82)90057-2); the coarse couplings are those of Galerkin.
 """
@@ -11,7 +11,7 @@ from numba import njit, prange
 
 _FAST_MATH = {"reassoc", "contract", "nsz", "arcp"}
 EAST, SOUTH, SOUTHEAST, SOUTHWEST, INVERSE = range(5)
-"""Planes of a coarse level: couplings to four of the eight neighbours, one over the diagonal."""
+"""Planes of a coarse level: couplings to four of the eight neighbors, one over the diagonal."""
 RIGHT_0, RIGHT_1, BELOW_0, BELOW_1, MID_00, MID_01, MID_10, MID_11 = range(8)
 """Planes of interpolation by coarse node: to the fine node right of it, below it, and between."""
 
@@ -40,8 +40,8 @@ def _share(a, b):  # type: ignore[no-untyped-def]
 def interpolate_edges(e, s, se, sw, inverse, diagonals, P):  # type: ignore[no-untyped-def]
     """Write the interpolation weights of fine nodes between two coarse ones.
 
-    A node that is coupled to neither, as in a passage one pixel wide, has the first of them for
-    itself where no fine node stands there: passages are passages on coarse levels too.
+    A node that is coupled to neither, as in a passage one pixel wide, takes the first of them
+    if that is not a fine node itself: passages remain open on coarse levels.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     rows, columns = P.shape[1:]
@@ -79,7 +79,7 @@ def interpolate_edges(e, s, se, sw, inverse, diagonals, P):  # type: ignore[no-u
 
 @njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def interpolate_middles(e, s, se, sw, inverse, diagonals, P):  # type: ignore[no-untyped-def]
-    """Write the weights of fine nodes between four coarse ones, through their neighbours'."""
+    """Write the weights of fine nodes between four coarse ones, through their neighbors'."""
     zero, one = np.float32(0.0), np.float32(1.0)
     rows, columns = P.shape[1:]
     for row in prange(1, rows - 1):
@@ -92,7 +92,7 @@ def interpolate_middles(e, s, se, sw, inverse, diagonals, P):  # type: ignore[no
                 continue
             west, east = max(e[i, j - 1], zero), max(e[i, j], zero)
             north, south = max(s[i - 1, j], zero), max(s[i, j], zero)
-            # neighbours that take nothing from a coarse node cannot pass anything on
+            # neighbors without weight from a coarse node cannot pass its value on
             if P[BELOW_0, row, column] + P[BELOW_1, row, column] == zero:
                 west = zero
             if P[BELOW_0, row, column + 1] + P[BELOW_1, row, column + 1] == zero:
@@ -101,6 +101,7 @@ def interpolate_middles(e, s, se, sw, inverse, diagonals, P):  # type: ignore[no
                 north = zero
             if P[RIGHT_0, row + 1, column] + P[RIGHT_1, row + 1, column] == zero:
                 south = zero
+            # solve the middle node's equation for it, with its four neighbors interpolated already
             w00 = west * P[BELOW_0, row, column] + north * P[RIGHT_0, row, column]
             w10 = west * P[BELOW_1, row, column] + south * P[RIGHT_0, row + 1, column]
             w01 = east * P[BELOW_0, row, column + 1] + north * P[RIGHT_1, row, column]
@@ -121,7 +122,7 @@ def interpolate_middles(e, s, se, sw, inverse, diagonals, P):  # type: ignore[no
 
 @njit(cache=True, inline="always")
 def _column(P, inverse, row, column, p):  # type: ignore[no-untyped-def]
-    """Write what a coarse node gives to the nine fine nodes around it."""
+    """Write the interpolation weights of a coarse node to the nine fine nodes around it."""
     p[1, 1] = 1.0 if inverse[2 * row - 1, 2 * column - 1] > 0.0 else 0.0
     p[1, 2] = P[RIGHT_0, row, column]
     p[1, 0] = P[RIGHT_1, row, column - 1]

@@ -1,12 +1,12 @@
 """Multigrid on masked grids with weighted edges: the inner loops of `weighted_poisson`.
 
 A level is a grid of unknowns with an empty border of one node all around, so that node (i, j) of
-the grid stands at [i + 1, j + 1]. The finest level couples each node to four neighbours by the
+the grid is at [i + 1, j + 1]. The finest level couples each node to four neighbors by the
 weights of its edges (nodes outside the mask have no edges), coarser ones to eight, see
 `multigrid_coarsening`.
 
-Smoothing is Gauss-Seidel in colours, whose result does not depend on threads; after the last
-colour of a sweep its residuals are zero, which restriction makes use of. Sums are kept by rows in
+Smoothing is Gauss-Seidel in colors, whose result does not depend on threads; after the last
+color of a sweep its residuals are zero, which restriction uses. Sums are kept by rows in
 float64 and added in order. Kernels with ``parallel=True`` are called from one thread.
 """
 
@@ -109,7 +109,7 @@ def prolong_even(P, coarse, inverse, x):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def smooth(ax, ay, inverse, b, x, odd):  # type: ignore[no-untyped-def]
-    """Solve each node of one colour of the finest level for itself: odd 1 or 0."""
+    """Solve the equation of each node of one color of the finest level: odd 1 or 0."""
     rows, columns = b.shape
     for i in prange(1, rows - 1):
         for j in range(1 + (i + 1 + odd) % 2, columns - 1, 2):
@@ -124,9 +124,9 @@ def smooth(ax, ay, inverse, b, x, odd):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, parallel=True, fastmath=_FAST_MATH)
 def smooth_coarse(A, b, x, first_row, first_column):  # type: ignore[no-untyped-def]
-    """Solve two colours of a coarse level for themselves: every second row, both its colours.
+    """Solve the equations of two colors of a coarse level: every second row, both its colors.
 
-    ``first_row``: 1 or 2; the colour of columns ``first_column``: 1 or 2 comes first.
+    ``first_row``: 1 or 2; the color of columns ``first_column``: 1 or 2 comes first.
     """
     rows, columns = b.shape
     e, s, se, sw, inverse = A[EAST], A[SOUTH], A[SOUTHEAST], A[SOUTHWEST], A[INVERSE]

@@ -1,10 +1,10 @@
-"""Errors of integrated heights: of slopes with white noise, and of what no estimator models.
+"""Estimate errors of integrated heights: of slopes with white noise, and of unmodeled effects.
 
-Light goes from one wall of a furrow to the other, facets hide one another, and the lens averages
-light where the estimator takes it to average slopes. On simulated patches of forehead, cheek and
-chin (seeds 0 to 5, at rest, with the sensor's noise) what is left of the errors without noise is
-about the same share of the relief itself on each. The shares are those with which 68 % of truths
-lie in 68 % regions; ``skinrig bench --stage intervals`` judges them on other seeds.
+Interreflection in grooves, occlusion between facets and averaging by the lens are not modeled by
+the estimator. On simulated patches of forehead, cheek and chin (seeds 0 to 5, at rest, with the
+sensor's noise) the errors beyond noise are about the same fraction of the relief on each. The
+fractions below give 68 % regions a coverage of 68 %; ``skinrig bench --stage intervals`` evaluates
+them on other seeds.
 """
 
 from typing import Final
@@ -21,14 +21,14 @@ RELATIVE_SLOPE_ERROR: Final = 0.055
 
 
 def height_stderr(height: FloatArray, stderr: Float32Array, valid: BoolArray) -> Float32Array:
-    """Return standard errors of a relief's heights by noise and model together.
+    """Return standard errors of a relief's heights, of noise and unmodeled effects together.
 
     Parameters
     ----------
     height
-        (H, W), finite where valid; without what is longer than the relief.
+        (H, W), finite where valid; without form longer than the relief.
     stderr
-        (H, W), by noise alone, in the height's unit.
+        (H, W), of noise alone, in the height's unit.
     valid
         (H, W).
 
@@ -51,14 +51,14 @@ def height_stderr(height: FloatArray, stderr: Float32Array, valid: BoolArray) ->
 
 
 def normal_stderr(normals: FloatArray, stderr: Float32Array, valid: BoolArray) -> Float32Array:
-    """Return standard errors of a relief's normals by noise and model together.
+    """Return standard errors of a relief's normals, of noise and unmodeled effects together.
 
     Parameters
     ----------
     normals
         (H, W, 3), unit vectors where valid, z towards the camera.
     stderr
-        (H, W), rad in each of two directions, by noise alone.
+        (H, W), rad in each of two directions, of noise alone.
     valid
         (H, W).
 
@@ -85,25 +85,27 @@ def expected_height_rms(
     Parameters
     ----------
     shape : tuple of int
-        (H, W) of the rectangle; all pixels valid, all weights alike.
+        (H, W) of the rectangle; all pixels valid, of equal weights.
     slope_stderr : float
-        Standard deviation of each of both slopes, dimensionless.
+        Standard deviation of each slope, dimensionless.
     pixel : float
     cutoff : float, optional
-        Of `high_pass`, same unit as `pixel`.
+        Cutoff of `high_pass`, same unit as `pixel`.
 
     Returns
     -------
     float
-        In the unit of `pixel`; borders are treated as if the picture were mirrored.
+        In the unit of `pixel`; borders are mirrored.
 
     Examples
     --------
-    Noise of 1.5 degrees' tilt on 2048 x 2048 pixels of 6 um, without what is longer than 1 mm:
+    Noise of 1.5 degrees of tilt on 2048 x 2048 pixels of 6 um, without wavelengths above 1 mm:
 
     >>> round(expected_height_rms((2048, 2048), 0.026, pixel=6.0, cutoff=1000.0), 2)
     0.12
     """
+    # least squares in the cosine basis: height = D' A slope / (D' D), where A averages slopes over
+    # an edge (edges' quadrature of order 4) and D' D is the Laplacian
     waves = [np.pi * np.arange(n) / n for n in shape]
     laplacian, power = np.zeros(shape), np.zeros(shape)
     squared = np.zeros(shape)

@@ -1,7 +1,7 @@
-"""Slopes of a surface from its normals, with their variances, and differences between pixels.
+"""Compute slopes from normals, their variances, and differences between pixels.
 
-A normal n seen along the ray with direction -w gives the slopes -n_x / (n . w) and -n_y / (n . w),
-in pixels of height a pixel; w = (0, 0, 1) for parallel rays. Under perspective the same slopes
+A normal n observed along the ray with direction -w gives the slopes -n_x / (n . w) and
+-n_y / (n . w), in pixels of height per pixel; w = (0, 0, 1) for parallel rays. With perspective the
 are those of -f log(depth), with f in pixels (Quéau, Durou and Aujol 2018,
 doi 10.1007/s10851-017-0773-x, section 2).
 """
@@ -18,11 +18,11 @@ from reconstruction.normal_integration.weighted_poisson import IntegrationError
 from reconstruction.normal_maps import NormalMaps
 
 MIN_RAY_COSINE = 0.02
-"""Least cosine between normal and ray of a pixel that is used: 88.9 degrees."""
+"""Least cosine between normal and ray of a usable pixel: 88.9 degrees."""
 MAX_STDERR_RATIO = 1e3
-"""Standard errors count as at most so many times, and at least one over that of, their median."""
+"""Standard errors are clipped to their median times this and over this."""
 _MAX_VARIANCE_RATIO = 10.0
-"""Variance over that of an edge's own pixels from which pixels beyond them are not asked."""
+"""Variance over that of an edge's own pixels above which pixels beyond it are not used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Perspective:
     center_px: tuple[float, float]
 
     def __post_init__(self) -> None:
-        """Refuse what is no camera."""
+        """Refuse a focal length or principal point out of range."""
         Checks(IntegrationError).settings(self, focal_px="(0, inf)")
         Checks(IntegrationError).numbers("Perspective.center_px", self.center_px, (2,))
 
@@ -55,12 +55,12 @@ class SlopeField:
     gx, gy : ndarray, shape (H, W), float64
         Change of height, in pixels, to the next column and to the next row (downwards).
     variance_x, variance_y : ndarray, shape (H, W) or (1, 1), float32
-        Of the slopes, relative to one another where `scale` is 0; (1, 1): all the same.
+        Of the slopes, relative where `scale` is 0; (1, 1): all equal.
     facing : ndarray, shape (H, W), float32
-        Cosine between normal and ray, as far as the ray is the view's axis: n . w.
+        n . w: cosine between normal and ray where the ray is the view's axis.
     valid : ndarray of bool, shape (H, W)
     scale : float
-        Variance of angles that variances are to be multiplied by, rad^2; 0 where none is known.
+        Factor of the variances: variance of angles, rad^2; 0 where unknown.
     """
 
     gx: Float64Array
@@ -74,9 +74,11 @@ class SlopeField:
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _slopes(n, relative, cx, cy, per_focal, up, gx, gy, vx, vy, facing, valid):  # type: ignore[no-untyped-def]
-    """Write slopes and variances of the pixels that are valid, and drop those that have none.
+    """Write slopes and variances of valid pixels; make those without a slope invalid.
 
-    ``relative``: variance of angles, (H, W) or (1, 1), read where vx is (H, W).
+    ``relative``: variance of angles, (H, W) or (1, 1), read where vx is (H, W). A turn of n by an
+    angle of variance s^2 in a random direction changes g = -n_x / m, m = n . w, by a vector with
+    variance s^2 |n|^2 |m e_x - n_x w|^2 / (2 m^4).
     """
     rows, columns = gx.shape
     weighted = vx.shape[0] == rows and vx.shape[1] == columns
@@ -116,12 +118,12 @@ def from_normals(
     y_up: bool = True,
     camera: Perspective | None = None,
 ) -> SlopeField:
-    """Return the slopes of normals, see `normal_integration.integrate` for the parameters.
+    """Compute slopes of normals; see `normal_integration.integrate` for the parameters.
 
     Raises
     ------
     IntegrationError
-        For shapes that do not fit, negative standard errors, or no usable pixel at all.
+        For shapes that do not fit, negative standard errors, or no usable pixel.
     """
     if isinstance(normals, NormalMaps):
         n = np.asarray(normals.normals)
@@ -159,7 +161,8 @@ def from_normals(
     )
     if not good.any():
         raise IntegrationError(
-            f"valid: got no pixel with a normal that faces the camera among {shape[0]} x {shape[1]}"
+            f"valid: got no pixel with a normal that faces the camera among {shape[0]} x "
+            f"{shape[1]}, expected some; check the mask and y_up"
         )
     return SlopeField(gx, gy, vx, vy, facing, good, scale)
 
@@ -175,7 +178,7 @@ def _relative_variance(
     some = sigma[good] if sigma.ndim else sigma.reshape(1)
     Checks(IntegrationError).within("stderr_rad at valid pixels", some, "[0, inf]")
     positive = some[(some > 0.0) & (some < np.inf)]
-    if positive.size == 0:  # nothing told apart
+    if positive.size == 0:  # equal weights
         return None, 0.0
     middle = float(np.median(positive))
     if sigma.ndim == 0:
@@ -187,7 +190,10 @@ def _relative_variance(
 
 @njit(cache=True, inline="always")
 def _difference(before, a, b, after, has_before, has_after):  # type: ignore[no-untyped-def]
-    """Return the integral of slope from a to b, by the polynomial through the pixels there are."""
+    """Return the integral of slope from a to b, by the polynomial through the valid pixels.
+
+    Cubic through four: (-1, 13, 13, -1) / 24; parabola through three: (-1, 8, 5) / 12.
+    """
     if has_before and has_after:
         return (13.0 * (a + b) - (before + after)) / 24.0
     if has_before:
@@ -236,20 +242,20 @@ def _edges(gx, gy, vx, vy, valid, smooth, ax, ay, dx, dy):  # type: ignore[no-un
 def edges(
     field: SlopeField, *, order: int = 4
 ) -> tuple[Float32Array, Float32Array, Float64Array, Float64Array]:
-    """Return weights and wanted differences of the edges between pixels.
+    """Return weights and target differences of the edges between pixels.
 
     Parameters
     ----------
     field : SlopeField
     order : int
-        4: by the cubic through four pixels in a row (three or two at borders); what is left of a
-        wave of theta radians a pixel is 1 - 11 theta^4 / 720. 2: the mean of two pixels, which
-        leaves 1 - theta^2 / 12.
+        4: by the cubic through four pixels in a row (three or two at borders); a wave of theta
+        radians per pixel keeps the fraction 1 - 11 theta^4 / 720. 2: by the mean of two pixels,
+        which keeps 1 - theta^2 / 12.
 
     Returns
     -------
     tuple of ndarray, shape (H + 2, W + 2)
-        (ax, ay) float32, (dx, dy) float64, as `weighted_poisson.solve` takes them.
+        (ax, ay) float32, (dx, dy) float64, for `weighted_poisson.solve_poisson`.
     """
     shape = (field.gx.shape[0] + 2, field.gx.shape[1] + 2)
     ax, ay = np.zeros(shape, np.float32), np.zeros(shape, np.float32)

@@ -1,6 +1,6 @@
-"""Heights whose differences along a grid's edges fit given ones best, by weighted least squares.
+"""Solve for heights whose differences along a grid's edges fit given ones by least squares.
 
-Minimises sum a_e (x_q - x_p - d_e)^2 over the edges e = (p, q) of a grid of pixels. Its normal
+Minimizes sum a_e (x_q - x_p - d_e)^2 over the edges e = (p, q) of a grid of pixels. Its normal
 equations are solved by conjugate gradients with a multigrid cycle as preconditioner, without a
 matrix. See `multigrid_kernels` for the multigrid.
 """
@@ -15,12 +15,12 @@ from reconstruction.normal_integration import multigrid_coarsening as coarsening
 from reconstruction.normal_integration import multigrid_kernels as kernels
 
 COARSEST_SIDE = 6
-"""Nodes a side at which a grid is not made coarser any more."""
+"""Nodes per side at which coarsening ends."""
 _COARSEST_SWEEPS = 12
 _MIN_PARALLEL_NODES = 1 << 16
-"""Nodes of a level below which one thread does it."""
+"""Nodes of a level below which it is solved by one thread."""
 _RESIDUAL_REDUCTION = 1e-4
-"""Of the residual by float32 steps, before it is computed anew."""
+"""Reduction of the residual by float32 steps before it is recomputed in float64."""
 
 
 class IntegrationError(ValueError):
@@ -29,10 +29,10 @@ class IntegrationError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Convergence:
-    """How a solution was reached."""
+    """Iterations and residual of a solution."""
 
     iterations: int
-    """Of the conjugate gradients."""
+    """Number of conjugate gradient iterations."""
     residual: float
     """Norm of the normal equations' residual over that of their right side, in float64."""
     converged: bool
@@ -49,13 +49,13 @@ class _Level:
 
 
 class MultigridHierarchy:
-    """The grids of a multigrid, made from the weights of the finest grid's edges.
+    """Grids of a multigrid, from the weights of the finest grid's edges.
 
     Parameters
     ----------
     ax, ay : ndarray, shape (H + 2, W + 2), float32
         Weight of the edge from node [i, j] to [i, j + 1] and to [i + 1, j], >= 0; pixel (0, 0)
-        stands at [1, 1]. Edges that would leave the picture have weight 0.
+        is at [1, 1]. Edges that would leave the image have weight 0.
     """
 
     def __init__(self, ax: Float32Array, ay: Float32Array) -> None:
@@ -81,7 +81,7 @@ class MultigridHierarchy:
             diagonals = True
 
     def cycle(self, b: Float32Array, x: Float32Array) -> None:
-        """Write x, about A^-1 b: one V cycle, symmetric in the sense that CG needs."""
+        """Write x, about A^-1 b, by one V cycle, symmetric as conjugate gradients require."""
         ax, ay, inverse = self.ax, self.ay, self.inverse
         kernels.smooth_from_zero(ax, ay, inverse, b, x)
         if self.levels:
@@ -103,7 +103,7 @@ class MultigridHierarchy:
         level = self.levels[depth]
         threads = get_num_threads()
         if threads > 1 and level.b.size < _MIN_PARALLEL_NODES:
-            set_num_threads(1)  # waiting for one another would take longer than the work
+            set_num_threads(1)  # synchronization would take longer than the work
             try:
                 self._coarse_cycle(depth)
             finally:
@@ -134,22 +134,22 @@ def solve_poisson(
     tolerance: float = 1e-5,
     iterations: int = 200,
 ) -> Convergence:
-    """Solve for x in place, from where it stands.
+    """Solve for x in place, starting from its values.
 
     Parameters
     ----------
-    hierarchy : Hierarchy
+    hierarchy : MultigridHierarchy
         Of the edges' weights; it gives the preconditioner and the equations.
     dx, dy : ndarray, shape (H + 2, W + 2), float64
-        Difference wanted along the edges of `MultigridHierarchy.ax` and `MultigridHierarchy.ay`,
+        Target differences along the edges of `MultigridHierarchy.ax` and `MultigridHierarchy.ay`,
         finite.
     x : ndarray, shape (H + 2, W + 2), float64
-        Where to begin, and the solution. Its constant in each connected part is arbitrary.
+        Start and solution. Its constant in each connected part is arbitrary.
     tolerance : float
-        Of the residual's norm over that of the right side, and of the error's energy as the
-        preconditioner sees it.
+        Of the residual's norm over that of the right side, and of the error's energy in the
+        preconditioner's norm.
     iterations : int
-        Most iterations in all.
+        Largest number of iterations in all.
 
     Returns
     -------
@@ -165,7 +165,7 @@ def solve_poisson(
         before, found = found, norm / given if given > 0.0 else 0.0
         if found <= tolerance or done >= iterations or not found < 0.5 * before:
             return Convergence(done, found, found <= tolerance)
-        # r is rounded: what it gains in constants must stay small beside it
+        # r is rounded to float32: constants in it from rounding must stay small against r
         goal = max(0.9 * tolerance * given, _RESIDUAL_REDUCTION * norm)
         left, rz = norm, 0.0
         while done < iterations:

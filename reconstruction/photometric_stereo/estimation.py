@@ -1,9 +1,9 @@
-"""Normals and albedo from images under many lights, robust against shadows and highlights.
+"""Estimate normals and albedo from images under many lights, robust to shadows and highlights.
 
 The model is Lambertian: a sample under light ``l`` is ``albedo * e_l * max(n . d_l, 0)``, with
-``e_l`` what a light of normal incidence gives (`light_intensity`, over the squared distance where
-positions are known). Samples that do not obey it, which are shadows, highlights and defects, are
-found by their residuals and lose their weight.
+``e_l`` its irradiance at normal incidence (`light_intensity`, over the squared distance if
+positions are given). Shadows, highlights and defects violate it; they are found by their residuals
+and lose their weight.
 """
 
 from concurrent.futures import Executor
@@ -22,36 +22,36 @@ from reconstruction.tiles import map_on_threads
 
 TILE_POINTS = 8192
 MIN_AGREEING_FRACTION = 0.5
-"""Of the samples that are not dark, how many must agree with a robust fit."""
+"""Least fraction of the samples that are not dark which must agree with a robust fit."""
 TIGHT_RESIDUAL = 0.02
-"""Standard deviation of a robust fit's residuals, over a bright sample, up to which it stands as
-it is: real matte surfaces depart from Lambert's law by more."""
+"""Standard deviation of a robust fit's residuals, over a bright sample, up to which it is accepted
+without further evidence: real matte surfaces deviate from Lambert's law by more."""
 CLEAR_OUTLIER_RESIDUAL = 0.2
 """Residual over a bright sample from which a sample is a clear outlier."""
 LOOSE_RESIDUAL = 0.15
-"""Standard deviation as of `TIGHT_RESIDUAL` that asks for one more clear outlier as evidence."""
+"""Same standard deviation above which acceptance needs one more clear outlier as evidence."""
 MIN_SINGULAR_RATIO = 3e-3
-"""Least over largest singular value of the light directions, below which they lie in a plane."""
+"""Ratio of the light directions' extreme singular values below which they count as coplanar."""
 
 
 @dataclass(frozen=True, slots=True)
 class Robustness:
-    """How samples that are not Lambertian are told from those that are.
+    """Settings by which samples that are not Lambertian are rejected.
 
     Attributes
     ----------
     l1_iterations
-        Most steps of the least absolute deviations that the fit begins with, >= 0.
+        Largest number of steps of least absolute deviations at the start, >= 0.
     iterations
-        Most steps of the biweight that ends it, >= 1.
+        Largest number of steps of the biweight at the end, >= 1.
     shadow
-        Part of a bright sample below which a sample does not take part in the beginning, [0, 1).
+        Fraction of a bright sample below which a sample is not used at the start, [0, 1).
     grazing
         Cosine to the fitted normal below which a light does not count as lighting the point,
         [0, 1).
     tuning
-        Residual, in standard deviations, from which a sample has no weight; 4.685 has 95 % of
-        the efficiency of least squares where all is normal.
+        Residual, in standard deviations, above which a sample has weight 0; 4.685 has 95 % of
+        the efficiency of least squares for normal errors.
     few
         A point with fewer samples than this, and no variance given, has the plain fit
         (``robust=False``) unless there is evidence for the robust one; 0: always the robust.
@@ -113,31 +113,31 @@ def estimate_normals(
         Linear, black-subtracted samples of one channel under each light, any unit; points of any
         shape, images (N, H, W) or surface points (N, P). Whole numbers are read as they are.
     light_directions_n3 : array_like, shape (N, 3) or (N, ..., 3)
-        Directions towards the lights, any length but zero; one a light, or one a light and point
-        (then a zero vector leaves the sample out). Not read where positions are given.
+        Directions towards the lights, any length but zero; one per light, or one per light and
+        point (then a zero vector omits the sample). Not read if positions are given.
     light_positions_mm : array_like, shape (N, 3), optional
-        Of near lights, with `points_mm`; directions and the fall of the light with the squared
-        distance then follow.
+        Positions of near lights, with `points_mm`; they give directions and the inverse square
+        law.
     points_mm : array_like, shape (..., 3), optional
         Points of the surface, same frame.
     light_intensity : array_like, shape (N,) or (N, ...), optional
-        What each light gives a white surface at normal incidence; with positions, times mm^2.
-        Default: all the same, 1 (with positions: 1 at the median distance).
+        Irradiance of a white surface by each light at normal incidence; with positions, times
+        mm^2. Default: all equal, 1 (with positions: 1 at the median distance).
     variance : array_like, optional
-        Of the samples: a number, (N,) or (N, ...). Where None, noise is taken to be the same
-        under all lights (relative to their intensity) and its size from the residuals; of few
-        lights these tell little, see `Robustness.few`. What is expected of a sample, not what its
-        own photons tell: low draws would weigh most, see Notes.
+        Of the samples: a number, (N,) or (N, ...). None: the same under all lights (relative to
+        their intensity), estimated from the residuals; few lights give a poor estimate, see
+        `Robustness.few`. Give the variance expected of a sample, not that of its own photon
+        count: low counts would weigh most, see Notes.
     valid : ndarray of bool, shape (N, ...) or (...), optional
         Samples, or points, to use: not saturated, not occluded.
     robust : bool
-        False: least squares of all valid samples, for matte surfaces under few lights. Where no
-        variance is given, a sample's weight is the square of its intensity, so that shadows count
-        for nothing and dark samples for little.
+        False: least squares of all valid samples, for matte surfaces under few lights. Without a
+        variance, a sample's weight is then the square of its intensity, so that shadows have
+        weight 0 and dark samples little.
     robustness : Robustness, optional
         Settings of the robust fit.
     executor : Executor, optional
-        Threads to map tiles of points over; default one thread a core, at most 8.
+        Threads to map tiles of points over; default one thread per core, at most 8.
 
     Returns
     -------
@@ -153,19 +153,19 @@ def estimate_normals(
     -----
     The robust fit begins with least absolute deviations by iteratively reweighted least squares
     over the samples that are not dark, and ends with Tukey's biweight over those that the fitted
-    normal sees lit, with the noise from the median residual. Standard errors are those of an
-    M-estimate (Huber 1981, doi 10.1002/0471725250, section 7.6); a known variance is taken as
-    known unless the residuals exceed it beyond chance.
+    normal faces, with the noise from the median residual. Standard errors are those of an
+    M-estimate (Huber 1981, doi 10.1002/0471725250, section 7.6); a given variance is trusted
+    unless the residuals exceed it beyond chance.
 
-    A variance by a sample's own photons pulls the albedo down and the errors with it: of 24 lights,
-    3 photons a sample at normal incidence and half a photon of read noise 68 % intervals of the
-    albedo hold 27 % (``robust=False``; 10 photons: 41, 100: 63). By the photons that a fit expects,
-    the first one of equal variances and two by the fit before, they hold 70 % (68, 69); at 1 photon
-    nothing does, 43 %, as only the bright draws leave a normal.
+    A variance from a sample's own photon count biases the albedo and its errors low: of 24 lights,
+    3 photons per sample at normal incidence and half a photon of read noise the coverage of 68 %
+    intervals of the albedo is 27 % (``robust=False``; 10 photons: 41, 100: 63). With the photons
+    expected from a fit, the first one of equal variances and two from the fit before, it is 70 %
+    (68, 69); at 1 photon it is 43 % in any case, as only the bright draws yield a normal.
 
-    With few samples a median residual is little evidence, and matte surfaces depart from
-    Lambert's law by a few percent, most where they are dark: what is rejected then may be good.
-    So where no variance is given and `Robustness.few` says so, the fit of ``robust=False`` stands
+    With few samples a median residual is weak evidence, and matte surfaces deviate from
+    Lambert's law by a few percent, most where they are dark: rejected samples may be good.
+    So below `Robustness.few` samples and without a variance, the fit of ``robust=False`` is kept
     unless the robust one leaves residuals of less than 2 % of a bright sample, or it makes at
     least one sample fewer a clear outlier; the more, the larger its own residuals are.
 
@@ -194,7 +194,7 @@ def estimate_normals(
     good = np.empty(count, bool)
     noise = _per_sample("variance", variance, lights, shape)
     mask = _usable(valid, lights, shape)
-    # float32 keeps millimetres to 1e-4 at the size of a room
+    # float32 keeps millimeters to 1e-4 at the size of a room
     shared, positions, points = (
         array.astype(kind, order="C") for array in (lit.shared, lit.positions, lit.points)
     )
@@ -245,7 +245,7 @@ def _of_kind(array: NDArray[Any], kind: Any) -> FloatArray:
 
 
 class _Geometry(NamedTuple):
-    """How light vectors are given, and the arrays that give them."""
+    """Form of the light vectors, and the arrays of that form."""
 
     way: int
     shared: FloatArray = np.zeros((1, 3))

@@ -1,6 +1,7 @@
-"""Normals halfway between the brightest light and the view, after Weyrich et al. 2005, section 6.
+"""Estimate normals as half vectors of the brightest light and the view.
 
-The published estimate, to stand beside photometric stereo. doi 10.1145/1141911.1141987
+The estimate of Weyrich et al. 2005, section 6, for comparison with photometric stereo.
+doi 10.1145/1141911.1141987
 """
 
 import math
@@ -18,19 +19,19 @@ from reconstruction.tiles import map_on_threads
 
 TILE_POINTS = 2048
 N_BRIGHTEST = 4
-"""Samples of one view whose directions are interpolated; the paper's number."""
+"""Number of samples of one view whose directions are interpolated, as in the paper."""
 OUTLIER_SIGMAS = 3.0
 MIN_ANGLE_SD_RAD = math.radians(1.0)
-"""Views closer than this to the others' middle are no outliers, however well those agree."""
+"""Distance from the others' middle up to which a view is never an outlier."""
 
 
 class HalfVectorError(ValueError):
-    """Samples that do not fit each other."""
+    """Samples of inconsistent shapes or types."""
 
 
 @dataclass(frozen=True, slots=True)
 class HalfVectorNormals:
-    """Normals from the brightest samples; where not `valid` normals are 0 and the error pi.
+    """Normals from the brightest samples; where not `valid`, (0, 0, 0) with an error of pi.
 
     Attributes
     ----------
@@ -39,8 +40,8 @@ class HalfVectorNormals:
     valid : ndarray of bool, shape (P,)
         At least two views agree.
     stderr_rad : ndarray, shape (P,)
-        Scatter of the views' estimates over the root of their number, rad. It does not know what
-        all views have in common, such as the spacing of the lights.
+        Scatter of the views' estimates over the root of their number, rad. Without errors common
+        to all views, such as those by the spacing of the lights.
     views : ndarray of int, shape (P,)
         Views that agree.
     """
@@ -73,7 +74,7 @@ def estimate(
     valid : ndarray of bool, shape (P, M), optional
         Samples to use.
     executor : Executor, optional
-        Threads to map tiles over; default one thread a core, at most 8.
+        Threads to map tiles over; default one thread per core, at most 8.
 
     Returns
     -------
@@ -87,8 +88,8 @@ def estimate(
     Notes
     -----
     The direction of greatest reflectance is the mean of the four directions weighted by their
-    values, which is how "interpolation between" them is read here. Of the views' half vectors those
-    farther from the most central one than three times the median distance are left out.
+    values, our reading of the paper's "interpolation between" them. Views whose half vectors are
+    farther from the most central one than three times the median distance are omitted.
 
     Examples
     --------
@@ -141,7 +142,7 @@ def estimate(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _half_vectors(values, light_dir, view_dir, view, valid, best, which, half):  # type: ignore[no-untyped-def]
-    """Put one point's half vectors into ``half`` (V, 3) and return their number."""
+    """Write one point's half vectors to ``half`` (V, 3) and return their number."""
     best[:] = -math.inf
     which[:] = -1
     for k in range(values.size):

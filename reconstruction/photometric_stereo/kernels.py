@@ -1,6 +1,6 @@
-"""Photometric stereo's inner loop: one robust linear fit a point, vectorised over its lights.
+"""Fit one robust linear model per point, vectorized over its lights (Numba).
 
-`reconstruction.photometric_stereo` is the door. A kernel is serial and releases the lock: tiles
+`reconstruction.photometric_stereo` is the entry point. A kernel is serial and releases the lock:
 of points are mapped over threads. All reals have the type of the data (float32 or float64).
 """
 
@@ -26,9 +26,9 @@ from reconstruction.photometric_stereo.solver_kernels import (
 BLOCK_POINTS = 32
 """Points gathered at once: rows of a stack are read in whole cache lines."""
 LIGHT_LANES = 32
-"""Lights are filled up to a multiple with samples of no strength: vector loops have no rest."""
+"""Lights are padded to a multiple with samples of weight 0, for vector loops without remainder."""
 SHARED, PER_POINT, NEAR = 0, 1, 2
-"""How light vectors are given: one a light, one a light and point, or positions."""
+"""Forms of light vectors: one per light, one per light and point, or positions."""
 
 # Rows of the table of results.
 NX, NY, NZ, ALBEDO, RESIDUAL, STDERR, STDERR_ALBEDO, USED, SCALE = range(9)
@@ -36,12 +36,12 @@ RESULT_ROWS = 9
 
 TUKEY_EFFICIENCY = 0.95  # of the biweight with c = 4.685 at the normal distribution
 MAX_STDERR_RAD = 0.5
-"""Standard error from which a signal drowns in its noise."""
+"""Relative standard error above which a signal is lost in its noise."""
 
 
 @njit(cache=True, nogil=True, fastmath=FAST_MATH, error_model="numpy")
 def _moments(x, y, z, v, s, e, m, b0, b1, b2, per_reach2, least, sums):  # type: ignore[no-untyped-def]
-    """Sum what the standard errors need over the samples with weight; return their number."""
+    """Sum the moments for standard errors over weighted samples; return their number."""
     zero, one, five = x.dtype.type(0.0), x.dtype.type(1.0), x.dtype.type(5.0)
     xx, xy, xz, yy, yz, zz = zero, zero, zero, zero, zero, zero
     dxx, dxy, dxz, dyy, dyz, dzz = zero, zero, zero, zero, zero, zero
@@ -57,7 +57,7 @@ def _moments(x, y, z, v, s, e, m, b0, b1, b2, per_reach2, least, sums):  # type:
         w = one if lit else zero
         bright += m[k]
         agrees += m[k] * w
-        # directions without strength: of unit length
+        # unit directions, without strength
         per = w / (sk * sk if lit else one)
         wx, wy, wz = w * xk, w * yk, w * zk
         xx += wx * xk
@@ -100,7 +100,7 @@ def _moments(x, y, z, v, s, e, m, b0, b1, b2, per_reach2, least, sums):  # type:
 def _finish(  # type: ignore[no-untyped-def]
     x, y, z, v, s, e, m, b0, b1, b2, scale, above, known, robust, settings, sums, out
 ):
-    """Write normal, albedo, residual and standard errors of one point; False where it has none."""
+    """Write normal, albedo, residual and standard errors of one point; False without a fit."""
     kind = x.dtype.type
     length = math.sqrt(float(b0) * b0 + float(b1) * b1 + float(b2) * b2)
     if not (length > 0.0 and length < math.inf):
@@ -126,7 +126,8 @@ def _finish(  # type: ignore[no-untyped-def]
         return False
     nx, ny, nz = b0 / length, b1 / length, b2 / length
     free = used - 3
-    # Huber (1981), section 7.6: covariance of an M-estimate of regression
+    # Huber (1981), section 7.6: covariance of an M-estimate of regression, K^2 E psi^2 / (E psi')^2
+    # times (X'X)^-1, with K = 1 + (p / n) var(psi') / (E psi')^2 and p = 3 parameters
     variance = math.inf
     if free > 0 and slope > 0.0:
         mean = slope / used
@@ -144,7 +145,7 @@ def _finish(  # type: ignore[no-untyped-def]
     full = xx * cxx + xy * cxy + xz * cxz
     if not full > 0.0:
         return False
-    # covariance C T C: with weights of their own the samples' noise is not one
+    # sandwich C T C, as the weights are not the samples' inverse variances
     hxx, hxy, hxz = (
         cxx * txx + cxy * txy + cxz * txz,
         cxx * txy + cxy * tyy + cxz * tyz,
@@ -231,7 +232,7 @@ def _fit_point(  # type: ignore[no-untyped-def]
     if not bright > zero:
         return False
     if not known and not robust:
-        # nothing says how good the samples are, nothing finds the bad: dark ones are the doubtful
+        # neither variances nor a robust fit: intensity is the only measure of a sample's quality
         for k in range(x.size):
             e[k] = min(max(q[k], zero) / bright, one)
             x[k], y[k], z[k] = x[k] * e[k], y[k] * e[k], z[k] * e[k]
@@ -244,7 +245,7 @@ def _fit_point(  # type: ignore[no-untyped-def]
             x, y, z, v, s, e, m, b0, b1, b2, one, zero, known, False, settings, sums, out
         )
     dark = settings.shadow * bright
-    # samples below zero are noise around a shadow, and as much of it lies above
+    # samples below zero are noise around a shadow, with an equal part above zero
     below, negative = 0, zero
     for k in range(x.size):
         if m[k] > zero and q[k] < zero:
@@ -273,7 +274,7 @@ def _fit_point(  # type: ignore[no-untyped-def]
     floor = settings.floor * bright * total / kind(lit)
     if known:
         floor = max(floor, one)
-    # what the fit itself sees near the dark may be a shadow as well
+    # samples near the dark that face away from the fitted normal may be shadows as well
     above = settings.dark_fit * dark
     scale = one
     for step in range(steps):
@@ -291,8 +292,8 @@ def _fit_point(  # type: ignore[no-untyped-def]
     loose = scale * kind(lit) / (bright * total)
     if known or not done or n >= settings.few or loose <= settings.tight:
         return done
-    # few samples, and the robust fit is not much better than real surfaces are Lambertian: what
-    # looks like an outlier may be chance, unless it is a clear one; more so the looser the fit
+    # few samples, and the residuals exceed the deviations of real surfaces from Lambert's law: an
+    # apparent outlier may be chance, unless it is a clear one; more so the larger the residuals
     p0, p1, p2 = fit_intensity_weighted(x, y, z, v, s, e, q, m)
     clear = settings.clear
     gained = _count_outliers(x, y, z, s, q, p0, p1, p2, bright, clear)
@@ -308,7 +309,7 @@ def _fit_point(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _gather(samples, start, size, known, v, s):  # type: ignore[no-untyped-def]
-    """Write samples and strengths of a block of points in units of noise; 0 what is not usable."""
+    """Write samples and strengths of a block of points in units of noise; 0 for unusable ones."""
     intensity, variance, usable, strength = samples
     kind = v.dtype.type
     zero, one = kind(0.0), kind(1.0)

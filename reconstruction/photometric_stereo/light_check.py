@@ -1,8 +1,8 @@
-"""Whether a list of lights belongs to its images: order, dead lights, strengths, by shading alone.
+"""Check by shading whether a list of lights belongs to its images: order, dead lights, strengths.
 
 A matte object under N lights spans a space of three images; a list in the wrong order does not
-explain it. Whatever turns all directions alike (a mirrored axis) explains the shading as well and
-is not seen here.
+explain it. A common rotation or reflection of all directions (a mirrored axis) explains the shading
+equally well and is not detected.
 """
 
 from dataclasses import dataclass
@@ -18,31 +18,31 @@ from reconstruction.photometric_stereo.estimation import estimate_normals
 
 SAMPLE_POINTS = 1500
 MIN_LIGHT_STRENGTH = 0.05
-"""Strength, relative to the median light, below which a light gave none."""
+"""Strength, relative to the median light, below which a light is dead."""
 ORDER_MISFIT_RATIO = 0.7
-"""A different order is named when it leaves less than this part of the listed order's misfit."""
+"""Ratio of misfits below which another order is reported instead of the listed one."""
 MAX_SHADING_MISFIT = 0.15
 """Misfit over mean brightness up to which shading counts as explained."""
 
 
 @dataclass(frozen=True, slots=True)
 class LightCheck:
-    """What shading says about a list of lights.
+    """Evidence of shading about a list of lights.
 
     Attributes
     ----------
     order : str
-        "as listed", or the name of the order that fits clearly better, or "unknown" where none
-        that was tried explains the shading.
+        "as listed", or the name of the order that fits clearly better, or "unknown" if none of
+        those tried explains the shading.
     permutation : ndarray of int, shape (N,)
         Row of the list for each image under that order.
     misfit : dict of str to float
-        Mean absolute residual over mean brightness, per order that was tried.
+        Mean absolute residual over mean brightness, per order tried.
     strength : ndarray, shape (N,)
         Of each light, relative to their median, under that order; 0 for a dead one.
     dead : ndarray of bool, shape (N,)
     points : int
-        How many were looked at.
+        Number of points used.
     """
 
     order: str
@@ -71,7 +71,7 @@ def check_lights(
     valid : ndarray of bool, shape (N, ...) or (...), optional
         Samples or points to use.
     rng : Generator
-        Chooses the points that are looked at.
+        Chooses the points.
 
     Returns
     -------
@@ -80,7 +80,7 @@ def check_lights(
     Raises
     ------
     PhotometricStereoError
-        Where fewer than four lights gave light, or no point is lit by enough of them.
+        If fewer than four lights gave light, or no point is lit by enough of them.
     """
     stack = np.asarray(intensity)
     lights = stack.shape[0]
@@ -98,7 +98,7 @@ def check_lights(
     if np.count_nonzero(~dead) < 4:
         raise PhotometricStereoError(
             f"intensity: got light from {np.count_nonzero(~dead)} of {lights} lights, expected at"
-            " least 4 to compare an order with the shading"
+            " least 4 to compare an order with the shading; check the lights and the exposure"
         )
     evidence = _ShadingSamples(samples, usable, dead)
     orders = _orders(lights)
@@ -130,7 +130,8 @@ def _chosen(
             mask = np.count_nonzero(each, axis=0) * 2 > lights
         else:
             raise PhotometricStereoError(
-                f"valid: got shape {given.shape}, expected {shape} or {(lights, *shape)}"
+                f"valid: got shape {given.shape}, expected {shape} or {(lights, *shape)}; "
+                "give a mask of points, or of lights and points"
             )
     places = np.flatnonzero(mask)
     if places.size > 20 * SAMPLE_POINTS:
@@ -139,7 +140,9 @@ def _chosen(
     level = np.where(np.isfinite(level), level, 0.0)
     seen = level > 0
     if not seen.any():
-        raise PhotometricStereoError("intensity: no point is lit by half of the lights")
+        raise PhotometricStereoError(
+            "intensity: got no point lit by half of the lights, expected some; check the exposure"
+        )
     places = places[seen & (level >= np.quantile(level[seen], 0.3))]
     if places.size > SAMPLE_POINTS:
         places = np.sort(rng.choice(places, SAMPLE_POINTS, replace=False))
@@ -151,7 +154,7 @@ def _chosen(
 
 
 def _orders(lights: int) -> dict[str, NDArray[np.intp]]:
-    """Return what lists are mistaken for, each the list's row for every image."""
+    """Return orders that lists are commonly mistaken for, each the list's row for every image."""
     index = np.arange(lights, dtype=np.intp)
     text = np.array(sorted(range(lights), key=str), np.intp)
     inverse = np.empty_like(text)
@@ -175,14 +178,14 @@ def _orders(lights: int) -> dict[str, NDArray[np.intp]]:
 
 @dataclass(frozen=True, slots=True)
 class _ShadingSamples:
-    """Samples (L, P) of some points, which of them count, and lights that give nothing."""
+    """Samples (L, P) of some points, which of them are usable, and dead lights."""
 
     samples: Float64Array
     usable: BoolArray
     dead: BoolArray
 
     def shading(self, directions: Float64Array) -> tuple[Float64Array, BoolArray]:
-        """Return what a matte surface shows under lights of these directions, and where."""
+        """Return the shading of a matte surface under lights of these directions, and where."""
         alive = ~self.dead
         found = estimate_normals(
             self.samples[alive], directions[alive], valid=self.usable[alive], robust=True
@@ -191,11 +194,11 @@ class _ShadingSamples:
         return np.maximum(matte, 0.0), found.valid
 
     def misfit(self, directions: Float64Array) -> float:
-        """Return the mean size of what no matte surface explains, over that of the samples."""
+        """Return the mean absolute residual of a matte surface, over the mean sample."""
         shading, valid = self.shading(directions)
         counted = self.usable & ~self.dead[:, None]
         size = float(np.mean(self.samples[counted]))
-        # a point without a fit is explained by nothing
+        # at a point without a fit the whole sample is residual
         residual = np.where(valid[None], np.abs(self.samples - shading), self.samples)
         return float(np.mean(residual[counted])) / size
 

@@ -1,13 +1,13 @@
-"""Which lights tell most of a surface's normals: Fisher information, and a greedy choice by it.
+"""Choose lights for normals by Fisher information, greedily.
 
-A Lambertian sample s = rho E cos(theta) of a light in direction l tells of the logarithm of its
-signal, with g the derivatives of log cos(theta) by the normal's two tilts and of log rho by itself,
+A Lambertian sample s = rho E cos(theta) of a light in direction l informs the logarithm of its
+signal. With g the derivatives of log cos(theta) by the normal's two tilts and of log rho by itself,
 
     I = w g g^T,    g = (l.t1 / l.n, l.t2 / l.n, 1),    w = s^2 / var(s)
 
 Its inverse, summed over the lights that reach a point, bounds the covariance of tilts and albedo.
-Lights are chosen one after the other, each the one that lowers the mean squared error of the points
-most, and those that later ones made superfluous are taken off again (an A-optimal exchange).
+Lights are chosen one by one, each the one that lowers the mean squared error of the points most;
+those that later ones made superfluous are then removed (an A-optimal exchange).
 
 References
 ----------
@@ -25,29 +25,30 @@ from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array
 
 UNKNOWN_ERROR_RAD = np.radians(10.0)
-"""Error that a point without an estimate counts as: about what a scan's normals are off."""
+"""Error assigned to a point without an estimate: about that of a scan's normals."""
 _PRIOR_INFORMATION = 1e-6
-"""Information held before the first light: tilts and log albedo known to a thousand."""
+"""Information before the first light: standard deviations of 1000 of tilts and log albedo."""
 
 
 class SelectionError(ValueError):
-    """Lights that nothing can be chosen of."""
+    """Lights or settings that do not allow a choice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FisherInformation:
-    """What each of L lights tells of each of P points.
+    """Fisher information of each of L lights about each of P points.
 
     Attributes
     ----------
     tilt : ndarray of float64, shape (P, L, 2)
         l.t / l.n for two tangents.
     weight : ndarray of float64, shape (P, L)
-        Inverse variance of the logarithm of the sample; 0 where the light tells nothing.
+        Inverse variance of the logarithm of the sample; 0 for a light without information.
     reaches : ndarray of bool, shape (P, L)
-        The light shows the point, be it too obliquely, or in a highlight, to tell of its normal.
+        The light illuminates the point, even if too obliquely, or in a highlight, to inform its
+        normal.
     importance : ndarray of float64, shape (P,)
-        How much a point counts, e.g. its area.
+        Weight of a point, e.g. its area.
     systematic_rad : ndarray of float64, shape (P,)
         Error of each tilt that no light removes.
     """
@@ -77,7 +78,7 @@ class FisherInformation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorPrediction:
-    """Errors that a set of lights leaves.
+    """Predicted errors with a set of lights.
 
     Attributes
     ----------
@@ -86,12 +87,12 @@ class ErrorPrediction:
     log_albedo : ndarray of float64, shape (P,)
         Standard error of log rho.
     valid : ndarray of bool, shape (P,)
-        At least `least` lights reach the point.
+        At least `min_lights` lights reach the point.
     valid_fraction : float
-        By importance.
+        Fraction of valid points by importance.
     median_rad : float
-        Median angle between estimate and truth over the valid points: where half of the angles,
-        Rayleigh distributed at each point, lie below. pi / 2 where no point is valid.
+        Median angle between estimate and ground truth over the valid points, whose angles are
+        Rayleigh distributed each. pi / 2 without a valid point.
     """
 
     tilt_rad: Float64Array
@@ -103,18 +104,18 @@ class ErrorPrediction:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightSelection:
-    """Lights in the order of their choice, and what each further one buys.
+    """Chosen lights in order, with the predicted errors after each.
 
     Attributes
     ----------
     lights : tuple of int
         Those kept, in the order of choice.
     path : tuple of (int, float, float)
-        After each light that was taken: how many, predicted median error in rad, share valid.
-    prediction : Prediction
+        After each light: how many, predicted median error in rad, fraction valid.
+    prediction : ErrorPrediction
         Of the lights kept.
     reached : bool
-        Whether what was wanted is predicted.
+        Whether the prediction meets the targets.
     """
 
     lights: tuple[int, ...]
@@ -132,7 +133,7 @@ def fisher_information(
     importance: ArrayLike | None = None,
     systematic_rad: ArrayLike = 0.0,
 ) -> FisherInformation:
-    """Return what lights tell of points.
+    """Compute the Fisher information of lights about points.
 
     Parameters
     ----------
@@ -143,11 +144,11 @@ def fisher_information(
     relative_variance : array_like, shape (P, L)
         Variance of each sample over its square, > 0; infinite where there is none.
     reaches : array_like of bool, shape (P, L), optional
-        Which lights show a point; those that tell of it by default.
+        Which lights illuminate a point; by default those with information.
     importance : array_like, shape (P,), optional
-        How much a point counts; 1 by default.
+        Weight of a point; 1 by default.
     systematic_rad : array_like, shape (P,) or ()
-        Error of each tilt that stays whatever the lights.
+        Error of each tilt that is independent of the lights.
 
     Examples
     --------
@@ -180,11 +181,11 @@ def fisher_information(
 def predict_errors(
     information: FisherInformation, lights: ArrayLike, *, min_lights: int
 ) -> ErrorPrediction:
-    """Return the errors that these lights leave.
+    """Predict the errors with a set of lights.
 
     Parameters
     ----------
-    information : Information
+    information : FisherInformation
     lights : array_like of int
         Numbers along L.
     min_lights : int
@@ -205,26 +206,26 @@ def select_lights(
     max_lights: int | None = None,
     fixed: tuple[int, ...] = (),
 ) -> LightSelection:
-    """Choose as few lights as reach an error.
+    """Choose as few lights as meet a median error and a fraction of valid points.
 
     Parameters
     ----------
-    information : Information
+    information : FisherInformation
     median_rad : float
-        Wanted median angle, rad.
+        Target of the median angle, rad.
     valid_fraction : float
-        Wanted share of the points that have an estimate, 0 to 1.
+        Target of the fraction of points with an estimate, 0 to 1.
     min_lights : int
         Fewest lights that must reach a point, at least 3.
     max_lights : int, optional
         Largest number to choose; all by default.
     fixed : tuple of int
-        Lights that are used anyway.
+        Lights that are used in any case.
 
     Returns
     -------
-    Selection
-        `reached` says whether what is wanted is predicted; if not, the selection holds the
+    LightSelection
+        `reached` is whether the prediction meets the targets; if not, the selection contains the
         `max_lights` best lights.
     """
     Checks(SelectionError).within("min_lights", min_lights, "[3, inf)")
@@ -261,17 +262,18 @@ def _start(found: FisherInformation, chosen: NDArray[np.intp]) -> Float64Array:
 
 
 def _gains(found: FisherInformation, chosen: list[int], min_lights: int) -> Float64Array:
-    """Return by how much each light would lower the mean squared error of the points, (L,).
+    """Return the decrease of the points' mean squared error by each light, (L,).
 
-    Points that too few lights reach count `UNKNOWN_ERROR_RAD` and more, the more the fewer reach
-    them, so
-    that a light towards them is worth something before the last one comes.
+    A point that too few lights reach has an error of `UNKNOWN_ERROR_RAD` or more, which falls with
+    each light that reaches it, so that a light has a gain before the point has an estimate.
     """
     at = np.asarray(chosen, np.intp)
     covariance = np.linalg.inv(_start(found, at))
     reached = np.count_nonzero(found.reaches[:, at], axis=1)
     g = np.concatenate([found.tilt, np.ones((*found.weight.shape, 1))], axis=-1)
-    moved = np.einsum("pij,plj->pli", covariance, g)  # Sherman and Morrison 1950
+    # Sherman and Morrison 1950: adding w g g' to A lowers A^-1 by w (A^-1 g)(A^-1 g)' over
+    # 1 + w g' A^-1 g
+    moved = np.einsum("pij,plj->pli", covariance, g)
     bend = np.einsum("pli,pli->pl", moved, g)
     drop = found.weight * np.sum(moved[..., :2] ** 2, -1) / (1.0 + found.weight * bend)
     trace = covariance[:, 0, 0] + covariance[:, 1, 1]

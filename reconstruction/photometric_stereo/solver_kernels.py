@@ -1,4 +1,4 @@
-"""Steps of one point's robust least squares, compiled."""
+"""Compute steps of one point's robust least squares (Numba)."""
 
 from typing import Any, NamedTuple
 
@@ -59,7 +59,7 @@ def _solve(a, g):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, fastmath=FAST_MATH, error_model="numpy")
 def step_l1(x, y, z, v, m, b0, b1, b2, soft):  # type: ignore[no-untyped-def]
-    """Return the Newton step of sum m |r| with |r| rounded off below ``soft``."""
+    """Return the Newton step of sum m |r| with |r| smoothed below ``soft``."""
     zero = x.dtype.type(0.0)
     xx, xy, xz, yy, yz, zz, gx, gy, gz = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for k in range(x.size):
@@ -104,7 +104,7 @@ def step_squares(x, y, z, v, m, b0, b1, b2):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, fastmath=FAST_MATH, error_model="numpy")
 def step_biweight(x, y, z, v, s, b0, b1, b2, per_reach2, min_shading):  # type: ignore[no-untyped-def]
-    """Return the step of Tukey's biweight over the samples that the fit itself sees lit."""
+    """Return the step of Tukey's biweight over the samples that the fitted normal faces."""
     zero, one = x.dtype.type(0.0), x.dtype.type(1.0)
     xx, xy, xz, yy, yz, zz, gx, gy, gz = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for k in range(x.size):
@@ -129,7 +129,7 @@ def step_biweight(x, y, z, v, s, b0, b1, b2, per_reach2, min_shading):  # type: 
 
 @njit(cache=True, nogil=True, fastmath=FINITE_MATH, error_model="numpy")
 def kth_largest(q, rank):  # type: ignore[no-untyped-def]
-    """Return about the rank-th largest of the values above 0, from above."""
+    """Return an upper approximation of the rank-th largest of the values above 0."""
     zero, one = q.dtype.type(0.0), q.dtype.type(1.0)
     top = total = zero
     for k in range(q.size):
@@ -151,9 +151,9 @@ def kth_largest(q, rank):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, fastmath=FAST_MATH, error_model="numpy")
 def fill_residuals(x, y, z, v, s, m, b0, b1, b2, min_shading, q):  # type: ignore[no-untyped-def]
-    """Put |r| of the samples that are not dark into q, -1 for others; return their number.
+    """Write |r| of lit samples to q, -1 for others; return their number.
 
-    Nor those that the fit does not see lit.
+    Lit are samples that are not dark and that the fitted normal faces.
     """
     zero, one = x.dtype.type(0.0), x.dtype.type(1.0)
     count = zero
@@ -177,7 +177,7 @@ def residual_scale(q, count):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fit_intensity_weighted(x, y, z, v, s, e, q, m):  # type: ignore[no-untyped-def]
-    """Return least squares with each sample weighed by the square of its intensity.
+    """Return least squares with each sample weighted by the square of its intensity.
 
     Leaves the weights' roots in e, intensities in q and the weights in m.
     """

@@ -1,10 +1,10 @@
-"""An affine map through displaced windows whose deviations from it are alike in neighbors.
+"""Fit an affine map to displaced windows with correlated deviations.
 
-Skin is stiffer here than there, so that its parts move less or more than the mean stretch says;
-what a window is off the affine map, the next one is off, too. Of such deviations a map of a small
-patch cannot be told from a larger stretch, and their scatter alone says too little of it: the fit
-has taken part of them. So they are taken for a random field of unknown strength and reach plus an
-error of each window's own, and the map's error is what such fields do to it (generalized least
+The stiffness of skin varies, so that parts move less or more than the mean stretch, and adjacent
+windows deviate alike. In a map of a small patch such deviations resemble a larger stretch, and
+their scatter alone underestimates its error, as the fit absorbs a part of them. So they are modeled
+as a random field of unknown strength and reach plus an independent error of each window, and the
+map's error follows from such fields (generalized least
 squares with the field's parameters integrated out; Handcock and Stein 1993,
 doi:10.1080/00401706.1993.10485354).
 """
@@ -15,11 +15,11 @@ from scipy.linalg import solve_triangular
 from reconstruction.arrays import Float64Array
 
 CORRELATION_LENGTHS = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
-"""Lengths over which deviations are alike, in windows. What is finer a window averages; what is
-longer moves a picture of a few windows as a whole and is no scatter in it. On simulated skin (seeds
-0 to 8) windows' displacements are alike over 0.8 to 1.2 windows of 150 um."""
+"""Candidate correlation lengths, in windows. A window averages over shorter ones; longer ones move
+all of a few windows together and do not scatter in them. On simulated skin (seeds 0 to 8) windows'
+displacements are correlated over 0.8 to 1.2 windows of 150 um."""
 SHARED_FRACTIONS = (0.0, 0.3, 0.6, 0.8, 0.9, 0.97)
-"""Of the deviations' variance, what neighbors have in common."""
+"""Candidate fractions of the deviations' variance that neighbors share."""
 
 
 def fit_affine(
@@ -30,23 +30,23 @@ def fit_affine(
     Parameters
     ----------
     points_px : ndarray, shape (N, 2)
-        Points of the first picture about its middle, px; at least 7, not on a line.
+        Points of the first image about its middle, px; at least 7, not on a line.
     displaced_px : ndarray, shape (N, 2)
-        Where they are in the second, px.
+        Positions in the second image, px.
     window_px : float
-        Side of the windows that were followed: the unit of `CORRELATION_LENGTHS`.
+        Side of the tracked windows: the unit of `CORRELATION_LENGTHS`.
 
     Returns
     -------
     map : ndarray of float64, shape (3, 2)
-        Linear part (transposed) over the shift: ``[x, y, 1] @ map`` is the place found.
+        Linear part (transposed) over the shift: ``[x, y, 1] @ map`` is the position in the second.
     covariance : ndarray of float64, shape (6, 6)
         Of the linear part row by row, then of the shift of the middle, px.
 
     Raises
     ------
     ValueError
-        For fewer points, points on a line, or what is no number.
+        For fewer points, points on a line, or coordinates that are not finite.
 
     Examples
     --------
@@ -57,10 +57,13 @@ def fit_affine(
     """
     count = len(points_px)
     if not (np.isfinite(points_px).all() and np.isfinite(displaced_px).all()):
-        raise ValueError("points_px, found: got what is no number, expected finite px")
+        raise ValueError("points_px, found: got values that are not finite, expected finite px")
     design = np.column_stack([points_px, np.ones(count)])
     if count < 7 or np.linalg.matrix_rank(design) < 3:
-        raise ValueError(f"points_px: got {count} points, expected at least 7, not all on one line")
+        raise ValueError(
+            f"points_px: got {count} points, expected at least 7, not all on one line; "
+            "track more windows"
+        )
     apart = np.linalg.norm(points_px[:, None] - points_px[None], axis=-1) / window_px
     free = count - 3
     kept: list[tuple[float, Float64Array, Float64Array, Float64Array]] = []
@@ -68,21 +71,21 @@ def fit_affine(
         alike = _correlation(apart / reach)
         for share in SHARED_FRACTIONS:
             if share == 0.0 and reach != CORRELATION_LENGTHS[0]:
-                continue  # without a field its reach does not matter
+                continue  # a field of strength 0 has no length
             kept.append(
                 _fit_with_correlation(
                     design, displaced_px, share * alike + (1.0 - share) * np.eye(count)
                 )
             )
     log = np.array([each[0] for each in kept])
-    # the case without a field stands for all reaches
+    # strength 0 occurs once but represents all lengths: equal prior weight
     log[0] += np.log(len(CORRELATION_LENGTHS))
     weight = np.exp(log - log.max())
     weight /= weight.sum()
     solution = np.einsum("k,kij->ij", weight, np.array([each[1] for each in kept]))
     total = np.zeros((6, 6))
     for share_of, (_, one, inverse, scatter) in zip(weight, kept, strict=True):
-        # mean of an inverse Wishart of two coordinates
+        # mean of the inverse Wishart posterior of two coordinates, plus the scatter of the means
         total += share_of * np.kron(scatter / max(free - 3, 1), inverse)
         way = (one - solution).T.ravel()
         total += share_of * np.outer(way, way)
@@ -92,7 +95,7 @@ def fit_affine(
 
 
 def _correlation(distance: Float64Array) -> Float64Array:
-    """Return a Gaussian correlation: a window's displacement is a mean over smooth ones."""
+    """Return a Gaussian correlation, as a window's displacement averages over smooth ones."""
     return np.exp(-(distance**2))
 
 

@@ -1,10 +1,10 @@
-"""Where every pixel of one picture is in another: dense optical flow on top of a first guess.
+"""Find the position of every pixel of one image in another by dense optical flow.
 
-The flow is followed on local contrast, forth and back. How far it is off has several parts: noise,
-by the pictures' remaining difference over their texture (Lucas and Kanade's normal equations); the
-gap between the ways forth and back; what the last round still moved; and how much the skin is
-stretched and bent within a window, which the flow's patches are not. Where the gap is large, the
-first guess stays, moved as neighbors are.
+The flow refines an initial guess on local contrast, forth and back. Its error has several parts:
+noise, by the images' remaining difference over their texture (Lucas and Kanade's normal equations);
+the gap between the ways forth and back; the last round's step; and strain and bending of the skin
+within a window, which the flow's patches lack. Where the gap is large, the
+guess is kept, moved like its neighbors.
 
 References
 ----------
@@ -23,40 +23,40 @@ from reconstruction.arrays import BoolArray, Float32Array, FloatArray, UInt8Arra
 from reconstruction.registration.tracking import is_inside_image
 
 N_WARP_ROUNDS = 2
-"""How often the second picture is warped and the rest followed."""
+"""Number of rounds in which the second image is warped and the remaining flow estimated."""
 MAX_GAP_PX = 1.0
-"""Farther from where it began after the way back, a pixel has followed something else."""
+"""Largest distance to the starting point after the way back of a correctly tracked pixel."""
 TEXTURE_WINDOW_PX = 5.0
-"""Gaussian window whose texture stands for that of the flow's patches, px."""
+"""Gaussian window in place of the flow's patches for texture, px."""
 GAP_WINDOW_PX = 8.0
 """Gaussian window over which gaps are averaged, and unknown flow is filled."""
 DERIVATIVE_WINDOW_PX = 3.0
-"""Gaussian window that derivatives of the displacement are taken at, px."""
+"""Gaussian window for derivatives of the displacement, px."""
 _CUBIC_SLOPE = -0.75
 """Slope of OpenCV's cubic kernel at a pixel's distance."""
 ERROR_FACTORS = (1.2, 0.3, 1.1, 12.0, 0.04)
-"""Squared error along an axis, by parts: the variance by noise, the squares of gap and last step
-(px^2), of the Laplacian (1/px^2 times px^4) and of the gradient of the displacement (times px^2).
-Least squares on simulated faces of another seed, moved by smooth fields of 3 to 12 px that bend
-over 15 to 60 px, in other states of blood."""
+"""Factors of the squared error along an axis: of the variance by noise, the squares of gap and last
+step (px^2), of the Laplacian (1/px^2 times px^4) and of the gradient of the displacement (times
+px^2). Least squares on simulated faces of another seed, moved by smooth fields of 3 to 12 px that
+bend over 15 to 60 px, with other blood volume fractions."""
 MIN_FLOW_ERROR_PX = 0.01
-"""Interpolation and rounding to 8 bits, px."""
+"""Error of interpolation and rounding to 8 bits, px."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DenseFlow:
-    """Where each pixel of the first picture is in the second.
+    """Positions of the first image's pixels in the second, with errors.
 
     Attributes
     ----------
     source_px : ndarray of float32, shape (H, W, 2)
-        Column and row in the second picture.
+        Column and row in the second image.
     stderr_px : ndarray of float32, shape (H, W)
         Estimated standard error along each axis.
     gap_px : ndarray of float32, shape (H, W)
-        How far a pixel ends from where it began, after the way back.
+        Distance of a pixel from its start after the way back.
     followed : ndarray of bool, shape (H, W)
-        The flow was believed; elsewhere the first guess stands, moved as neighbors are.
+        The flow was accepted; elsewhere the guess is kept, moved like its neighbors.
     """
 
     source_px: Float32Array
@@ -75,20 +75,20 @@ def refine_flow(
     valid_second: BoolArray,
     rounds: int = N_WARP_ROUNDS,
 ) -> DenseFlow:
-    """Refine a guess of where the pixels of one picture are in another.
+    """Refine a guess of the positions of one image's pixels in another.
 
     Parameters
     ----------
     first, second : ndarray of uint8, shapes (H, W) and (h, w)
-        Local contrast, as of `reconstruction.registration.normalize_local_contrast`.
+        Local contrast, see `reconstruction.registration.normalize_local_contrast`.
     source_px : ndarray, shape (H, W, 2)
-        The guess: column and row in the second picture.
+        The guess: column and row in the second image.
     stderr_px : ndarray, shape (H, W)
         Its standard error along each axis.
     valid, valid_second : ndarray of bool
-        Which pixels of each picture show the subject.
+        Pixels of the subject in each image.
     rounds : int
-        How often the rest is followed; 0 leaves the guess as it is.
+        Number of refinements; 0 returns the guess.
 
     Returns
     -------
@@ -114,7 +114,7 @@ def refine_flow(
         weight = known.astype(np.float32)
         share = np.maximum(_blurred(weight), 1e-6)
         wide = _blurred(np.where(known, gap, 0.0).astype(np.float32) ** 2) / share
-        # the rest moves as its neighbors do, less so with distance from them
+        # other pixels move like their neighbors, less so with distance from them
         filled = _blurred(there * weight[..., None]) / (share[..., None] + 1e-2)
         went = _blurred(weight * (there**2).sum(axis=-1)) / share
         bent, strained = _deformation(moved)
@@ -144,13 +144,9 @@ def sample_image(image: Any, at_px: Float32Array, *, interpolation: int = cv2.IN
 
 
 def interpolated_noise_variance(at_px: Float32Array) -> Float32Array:
-    """Return the variance that cubic interpolation leaves of noise of single pixels, (H, W).
+    """Return the factor of noise variance of single pixels by cubic interpolation, (H, W).
 
-    Parameters
-    ----------
-    at_px
-        (H, W, 2): column and row, px. On pixels themselves all of it is left, 1; in the middle
-        between four the sum of the squared weights, 0.51.
+    It is the sum of the squared weights of the four pixels along each axis.
     """
     left = np.ones(at_px.shape[:2], np.float32)
     for axis in (0, 1):

@@ -1,8 +1,8 @@
-"""The same points of two pictures, found without anybody's landmarks.
+"""Match points of two images without landmarks.
 
-Scale-invariant features are matched by their descriptors both ways. Skin repeats itself, so that
-many matches are wrong: those that agree with a rough common motion are kept, and of these the ones
-that move about as their neighbors do.
+Scale-invariant features are matched by their descriptors both ways. The texture of skin repeats, so
+that many matches are wrong: those that agree with a rough common motion are kept, and of these the
+ones that move like their neighbors.
 
 References
 ----------
@@ -21,40 +21,40 @@ from reconstruction.registration.tracking import RegistrationError
 
 MAX_FEATURES = 3000
 MAX_LOWE_RATIO = 0.85
-"""A match whose second best is not clearly worse is left out (Lowe's ratio)."""
+"""Ratio of best to second best distance above which a match is ambiguous (Lowe's ratio)."""
 MAX_AFFINE_DEVIATION = 0.06
-"""How far a match may be off the common affine motion, as a part of the picture's diagonal."""
+"""Largest deviation from the common affine motion, as a fraction of the image's diagonal."""
 N_NEIGHBORS = 8
 MAX_NEIGHBOR_DEVIATION = 0.25
-"""How much a match may differ from its neighbors' motion, as a part of their distance ..."""
+"""Largest deviation from the neighbors' motion, as a fraction of their distance."""
 MIN_NEIGHBOR_DEVIATION_PX = 1.5
-"""... and this much at any distance."""
+"""Deviation from the neighbors' motion that is allowed at any distance, px."""
 CELLS_PER_SIDE = 24
-"""At most one match is kept in each cell of so many by so many over the picture."""
+"""Cells per side of the image; at most one match is kept per cell."""
 MIN_MATCHES = 12
-"""Fewer that agree may agree by chance."""
+"""Fewest agreeing matches; fewer may agree by chance."""
 
 
 class FeatureError(RegistrationError):
-    """Two pictures in which too few of the same points were found."""
+    """Two images with too few common points."""
 
 
 def match_features(
     first: UInt8Array, second: UInt8Array, *, valid: BoolArray, valid_second: BoolArray
 ) -> tuple[Float64Array, Float64Array]:
-    """Find points that two pictures share.
+    """Match points that two images have in common.
 
     Parameters
     ----------
     first, second : ndarray of uint8, (H, W)
-        Local contrast, as of `reconstruction.registration.normalize_local_contrast`.
+        Local contrast, see `reconstruction.registration.normalize_local_contrast`.
     valid, valid_second : ndarray of bool
-        Where features may lie.
+        Pixels in which features may be.
 
     Returns
     -------
     points_px, moved_px : ndarray of float64, shape (K, 2)
-        Column and row in the first and in the second picture, K at least `MIN_MATCHES`.
+        Column and row in the first and in the second image, K at least `MIN_MATCHES`.
 
     Raises
     ------
@@ -70,21 +70,22 @@ def match_features(
     if min(len(place) for place in places) < MIN_MATCHES:
         raise FeatureError(
             f"features: found {len(places[0])} and {len(places[1])}, "
-            f"expected at least {MIN_MATCHES} in both pictures; give landmarks"
+            f"expected at least {MIN_MATCHES} in both images; give landmarks"
         )
     pairs = _mutual(words[0], words[1])
     one, two = places[0][pairs[:, 0]], places[1][pairs[:, 1]]
     one, two = _smooth(one, two, float(np.hypot(*first.shape)))
     if len(one) < MIN_MATCHES:
         raise FeatureError(
-            f"features: {len(one)} agree on a smooth motion, expected at least {MIN_MATCHES}; "
+            f"features: got {len(one)} that agree on a smooth motion, expected at least "
+            f"{MIN_MATCHES}; "
             "give landmarks"
         )
     return one, two
 
 
 def _mutual(words: Any, others: Any) -> NDArray[np.intp]:
-    """Return the pairs of descriptors that choose each other, and no second one nearly as much."""
+    """Return pairs of descriptors that are mutually nearest and clearly nearer than the second."""
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     there = matcher.knnMatch(words, others, k=2)
     back = [m[0].trainIdx for m in matcher.knnMatch(others, words, k=1)]
@@ -101,7 +102,7 @@ def _mutual(words: Any, others: Any) -> NDArray[np.intp]:
 def _smooth(
     one: Float64Array, two: Float64Array, diagonal: float
 ) -> tuple[Float64Array, Float64Array]:
-    """Keep matches that move with the whole, and about as their neighbors do."""
+    """Keep matches that follow the common motion and that of their neighbors."""
     if len(one) < MIN_MATCHES:
         return one[:0], two[:0]
     cv2.setRNGSeed(0)  # sampling is repeatable

@@ -1,8 +1,8 @@
-"""How the head moved during a capture, from tracking frames of all cameras.
+"""Estimate the motion of the head during a capture from tracking frames of all cameras.
 
-Points of the scan are followed from a reference frame to every other in each camera; one rigid
-motion a frame explains all cameras' tracks together. What it does not explain is an expression,
-and a frame with much of that is not usable.
+Points of the scan are tracked from a reference frame to every other in each camera; one rigid
+motion per frame is fitted to all cameras' tracks together. Large residuals are an expression,
+and a frame with many of them is not usable.
 """
 
 from collections.abc import Sequence
@@ -19,21 +19,21 @@ from reconstruction.registration import tracking as registration
 MIN_TRACK_COSINE = 0.4
 """Cosine between normal and view below which a point is not tracked."""
 MIN_TRACKS = 12
-"""Tracks below which a frame tells no motion."""
+"""Fewest tracks from which a frame's motion is estimated."""
 TRACK_TUKEY_SIGMAS = 4.685
 TRACK_OUTLIER_SIGMAS, TRACK_OUTLIER_PX = 4.0, 0.3
-"""Residual, in the capture's usual scale and in px, from which a track moves on its own."""
+"""Residual, in the capture's median scale and in px, above which a track is nonrigid."""
 MAX_EXCESS_NONRIGID_FRACTION = 0.05
-"""Share of such tracks, beyond the capture's usual one, from which a frame is not usable."""
+"""Excess of a frame's fraction of nonrigid tracks above the median that makes it unusable."""
 MAX_NONRIGID_FRACTION = 0.3
 MAX_NONRIGID_FRAME_FRACTION = 1 / 3
-"""Part of the frames from which on a track that moves on its own is not one of the skin."""
+"""Fraction of frames above which a track that is nonrigid is not on the skin."""
 FACE_PART_MM = 15.0
 MAX_PART_RESIDUAL_RATIO = 2.5
-"""Residual of the worst part of a face over the capture's usual one, and over what is usual beside
-the frame's own residuals: from either on it is an expression."""
+"""Residual of the worst part of a face over the capture's median one, and over the median relative
+to the frame's own residuals: an expression exceeds both."""
 BLOCK_PX = 32
-"""Side of the parts of an image whose tracks err alike."""
+"""Side of the parts of an image within which errors of tracks are correlated."""
 _DIFFERENCE_MM = 0.01
 _MIN_RESIDUAL_PX = 1e-6
 _RAYLEIGH_MEDIAN = (
@@ -42,15 +42,15 @@ _RAYLEIGH_MEDIAN = (
 
 
 class HeadMotionError(ValueError):
-    """Frames, cameras or points that no motion can be estimated from."""
+    """Frames, cameras or points from which motion cannot be estimated."""
 
 
 class TrackingCamera(Protocol):
-    """What is needed of a camera."""
+    """Camera interface for tracking."""
 
     @property
     def center_mm(self) -> Float64Array:
-        """Centre of projection, (3,)."""
+        """Center of projection, (3,)."""
 
     def project(self, points_mm: Float64Array) -> Float64Array:
         """Return column and row (N, 2) of points (N, 3)."""
@@ -58,22 +58,22 @@ class TrackingCamera(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class HeadMotion:
-    """Rigid motion of the head: a point x of the scan is at R x + t.
+    """Rigid motion of the head: a point x of the scan moves to R x + t.
 
     Attributes
     ----------
     times_s : ndarray, shape (T,)
-        Of the tracking frames, rising.
+        Times of the tracking frames, increasing.
     rotation_rad : ndarray, shape (T, 3)
         Rotation vectors about the rig's origin.
     translation_mm : ndarray, shape (T, 3)
     stderr : ndarray, shape (T, 6)
         Of rotation (rad) and translation (mm); 0 for the reference frame, infinite where a frame
-        tells no motion.
+        does not determine the motion.
     usable : ndarray of bool, shape (T,)
-        Enough tracks, and the face moved as a whole.
+        Enough tracks, and a rigid motion of the face.
     residual_px : ndarray, shape (T,)
-        Scale of what the rigid motion leaves of the tracks.
+        Scale of the tracks' residuals from the rigid motion.
     tracks : ndarray of int, shape (T,)
     """
 
@@ -86,18 +86,21 @@ class HeadMotion:
     tracks: NDArray[np.intp]
 
     def interpolate(self, times_s: ArrayLike) -> tuple[Float64Array, Float64Array]:
-        """Return the motion between frames: rotation vectors (K, 3) and translations (K, 3).
+        """Interpolate the motion: rotation vectors (K, 3) and translations (K, 3).
 
-        Straight between usable frames; before the first and after the last as there.
+        Linear between usable frames, constant before the first and after the last.
 
         Raises
         ------
         HeadMotionError
-            When no frame is usable.
+            If no frame is usable.
         """
         when = np.atleast_1d(np.asarray(times_s, np.float64))
         if not self.usable.any():
-            raise HeadMotionError("usable: got no frame that tells the motion, expected one")
+            raise HeadMotionError(
+                "usable: got no frame that determines the motion, expected one or more; "
+                "check the tracking frames"
+            )
         known = self.times_s[self.usable]
         turn, shift = (
             np.stack([np.interp(when, known, row) for row in values[self.usable].T], axis=-1)
@@ -106,7 +109,7 @@ class HeadMotion:
         return turn, shift
 
     def matrices(self, times_s: ArrayLike) -> Float64Array:
-        """Return the motion as (K, 4, 4) matrices that take points to where they were."""
+        """Return the motion as (K, 4, 4) matrices that move points from the scan to the frame."""
         turn, shift = self.interpolate(times_s)
         out = np.tile(np.eye(4), (len(turn), 1, 1))
         out[:, :3, :3] = rotation_matrix(turn)
@@ -114,7 +117,7 @@ class HeadMotion:
         return out
 
     def is_covered(self, times_s: ArrayLike) -> BoolArray:
-        """Return which times lie between two usable frames that follow each other, (K,)."""
+        """Return which times are between two consecutive usable frames, (K,)."""
         when = np.atleast_1d(np.asarray(times_s, np.float64))
         after = np.searchsorted(self.times_s, when, side="left")
         exact = (after < len(self.times_s)) & (
@@ -126,7 +129,7 @@ class HeadMotion:
         return inside & self.usable[low] & self.usable[high]
 
     def displacement_mm(self, points_mm: ArrayLike) -> Float64Array:
-        """Return how far points are from where the scan has them, root mean square, (T,)."""
+        """Return the root mean square displacement of points from the scan, (T,)."""
         points = np.asarray(points_mm, np.float64).reshape(-1, 3)
         moved = points @ np.swapaxes(rotation_matrix(self.rotation_rad), -1, -2)
         moved = moved + self.translation_mm[:, None] - points
@@ -134,7 +137,7 @@ class HeadMotion:
 
 
 def rotation_matrix(vector_rad: ArrayLike) -> Float64Array:
-    """Return the rotation of a rotation vector (..., 3) as matrices (..., 3, 3), Rodrigues.
+    """Convert rotation vectors (..., 3) to matrices (..., 3, 3) by Rodrigues' formula.
 
     Examples
     --------
@@ -173,16 +176,16 @@ def estimate(
     cameras : sequence of C cameras
         With ``project(points_mm)`` and ``center_mm``.
     points_mm, normals : array_like, shape (P, 3)
-        The scan's points and outward normals as the head is in the reference frame; some thousands
-        are enough.
+        The scan's points and outward normals with the head as in the reference frame; some
+        thousands suffice.
     times_s : array_like, shape (T,)
-        Of the frames, rising, s.
+        Of the frames, increasing, s.
     reference : int
-        Frame in which the head is where the scan has it.
+        Frame in which the head has the scan's pose.
     tracks_per_camera : int
-        The most points to follow in each camera.
+        Largest number of points to track in each camera.
     iterations : int
-        Gauss-Newton steps.
+        Largest number of Gauss-Newton steps.
 
     Returns
     -------
@@ -191,12 +194,12 @@ def estimate(
     Raises
     ------
     HeadMotionError
-        For shapes that do not fit, times that do not rise, or too few points with texture.
+        For shapes that do not fit, times that do not increase, or too few points with texture.
 
     Notes
     -----
-    Standard errors take parts of an image as independent; what all tracks have in common, such as
-    the noise of the reference frame, is not in them.
+    Standard errors take parts of an image as independent; errors common to all tracks, such as
+    the noise of the reference frame, are not included.
     """
     points, outward, times = _checked(frames, cameras, points_mm, normals, times_s, reference)
     chosen, evened = [], []
@@ -210,7 +213,7 @@ def estimate(
     total = sum(len(rows) for rows in chosen)
     if total < MIN_TRACKS:
         raise HeadMotionError(
-            f"points_mm: {total} points have texture in the reference frame, expected at least "
+            f"points_mm: got {total} points with texture in the reference frame, expected at least "
             f"{MIN_TRACKS}; light the tracking frames better or check the cameras' poses"
         )
     found = []
@@ -226,12 +229,12 @@ def estimate(
 
 @dataclass(frozen=True, slots=True)
 class _Pose:
-    """Rotation vector and translation of one frame, and what they leave of each track."""
+    """Rotation vector and translation of one frame, with the tracks' residuals."""
 
     motion: Float64Array
     stderr: Float64Array
     residual_px: Float64Array
-    """Length, infinite for a track that was lost."""
+    """Length of each track's residual, infinite for a lost track."""
 
 
 def _checked(
@@ -250,7 +253,10 @@ def _checked(
     check.shape("times_s", times, (len(frames),))
     check.within("steps of times_s", np.diff(times), "(0, inf)")
     if any(len(pictures) != len(cameras) for pictures in frames) or not len(cameras):
-        raise HeadMotionError(f"frames: expected one picture of each of {len(cameras)} cameras")
+        raise HeadMotionError(
+            f"frames: got another number of images per frame, expected {len(cameras)}, one per "
+            "camera, at least one; check the frames"
+        )
     check.within("reference", reference, f"[0, {len(frames)})")
     good = np.isfinite(points).all(axis=1) & np.isfinite(outward).all(axis=1)
     return points[good], outward[good], times
@@ -308,9 +314,9 @@ def _pose(
 
 
 def _worst_part(points: Float64Array, length: Float64Array) -> float:
-    """Return the largest median residual of the parts of a face, 0 where none has three tracks.
+    """Return the largest median residual of the parts of a face, 0 if none has three tracks.
 
-    Parts overlap by half, so that an expression lies in one of them as a whole.
+    Parts overlap by half, so that one of them contains a local expression as a whole.
     """
     worst = 0.0
     for shift in (0.0, 0.5):
@@ -323,7 +329,7 @@ def _worst_part(points: Float64Array, length: Float64Array) -> float:
 
 
 def _blocks(seen: Sequence[tuple[TrackingCamera, Float64Array, Float64Array]]) -> NDArray[np.intp]:
-    """Return a number for each track: that of its camera's part of the image."""
+    """Return for each track the number of its camera's part of the image."""
     names = [
         np.stack([np.full(len(at), k), *(at // BLOCK_PX).T.astype(np.intp)], axis=1)
         for k, (_, _, at) in enumerate(seen)
@@ -335,11 +341,11 @@ def _blocks(seen: Sequence[tuple[TrackingCamera, Float64Array, Float64Array]]) -
 def _stderr(
     r: Float64Array, J: Float64Array, u2: Float64Array, block: NDArray[np.intp]
 ) -> Float64Array:
-    """Return the standard errors (6,), infinite where the tracks do not tell the motion.
+    """Return the standard errors (6,), infinite where the tracks do not determine the motion.
 
-    Tracks of one part of an image err alike: their windows overlap, their texture is foreshortened
-    alike. The pull of each part as a whole is what counts (Liang and Zeger 1986,
-    doi 10.1093/biomet/73.1.13), and no less than independent tracks would have.
+    Errors of tracks in one part of an image are correlated: their windows overlap, with the same
+    foreshortening. So the gradient is summed over each part (cluster-robust; Liang and Zeger 1986,
+    doi 10.1093/biomet/73.1.13), and errors are at least those of independent tracks.
     """
     kept = u2 < 1
     w = np.where(kept, (1 - u2) ** 2, 0.0)
@@ -367,7 +373,7 @@ def _stderr(
 def _residuals(
     seen: Sequence[tuple[TrackingCamera, Float64Array, Float64Array]], motion: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Return what is left of the tracks (n, 2) and its derivative by the motion (n, 2, 6)."""
+    """Return residuals of the tracks (n, 2) and their derivatives by the motion (n, 2, 6)."""
     rows, slopes = [], []
     R = rotation_matrix(motion[:3])
     for camera, points, tracked in seen:
@@ -380,28 +386,28 @@ def _residuals(
             step[axis] = _DIFFERENCE_MM
             ahead, behind = camera.project(moved + step), camera.project(moved - step)
             by_place[:, :, axis] = (ahead - behind) / (2 * _DIFFERENCE_MM)
-        # a small further turn w moves R x by w x (R x): columns e_k x (R x)
+        # a small further rotation w moves R x by w x (R x): columns e_k x (R x)
         cross = np.cross(np.eye(3)[None], turned[:, None, :])
         slopes.append(
             np.concatenate([np.einsum("nij,nkj->nik", by_place, cross), by_place], axis=-1)
         )
     r, J = np.concatenate(rows), np.concatenate(slopes)
     known = np.isfinite(r).all(axis=1) & np.isfinite(J).all(axis=(1, 2))
-    # a point that a step took behind its camera pulls no more
+    # a point that a step moved behind its camera has no gradient
     return np.where(known[:, None], r, 1e6), np.where(known[:, None, None], J, 0.0)
 
 
 def _evaluate_frames(
     found: Sequence[_Pose], points: Float64Array, times: Float64Array, reference: int
 ) -> HeadMotion:
-    """Compare the frames with each other: what is usual is noise, what is not an expression."""
+    """Mark usable frames by comparison: typical residuals are noise, larger ones an expression."""
     left = np.array([f.residual_px for f in found])
     known = np.isfinite(left)
     scales = np.array([_middle(row) / _RAYLEIGH_MEDIAN for row in left])
-    told = np.array([np.isfinite(f.stderr).all() for f in found])
-    others = told & (np.arange(len(found)) != reference)
+    determined = np.array([np.isfinite(f.stderr).all() for f in found])
+    others = determined & (np.arange(len(found)) != reference)
     far = left > max(TRACK_OUTLIER_SIGMAS * _middle(scales[others]), TRACK_OUTLIER_PX)
-    # what leaves the head in many frames is no expression but an edge that hides points
+    # a track that is nonrigid in many frames is at an occluding edge, not in an expression
     steady = np.ones(len(points), bool)
     if np.count_nonzero(others) >= 4:
         steady = np.mean(far[others], axis=0) <= MAX_NONRIGID_FRAME_FRACTION
@@ -409,10 +415,10 @@ def _evaluate_frames(
     worst = np.array(
         [_worst_part(points[use], row[use]) for row, use in zip(left, known & steady, strict=True)]
     )
-    usable = told & (
+    usable = determined & (
         share <= min(_middle(share[others]) + MAX_EXCESS_NONRIGID_FRACTION, MAX_NONRIGID_FRACTION)
     )
-    # residuals grow as the head turns in its light, and the worst part's with them
+    # residuals grow as the head turns under the lights, also those of the worst part
     own = worst / np.maximum(scales, _MIN_RESIDUAL_PX)
     usual = np.minimum(_middle(worst[others]), _middle(own[others]) * scales)
     usable &= worst <= np.fmax(MAX_PART_RESIDUAL_RATIO * usual, TRACK_OUTLIER_PX)
@@ -430,6 +436,6 @@ def _evaluate_frames(
 
 
 def _middle(values: Float64Array) -> float:
-    """Return the median of the finite values, 0 where there are none."""
+    """Return the median of the finite values, 0 without any."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else 0.0

@@ -1,10 +1,10 @@
-"""How skin was stretched, sheared and moved between two pictures of it, with standard errors.
+"""Measure stretch, shear and motion of skin between two images of it, with standard errors.
 
 Nagano et al. 2015 (doi 10.1145/2766894) take the stretch ratio from the caliper. Tape creeps and
-slips, so here it is the skin's own: an affine map between two pictures of its pigment, first by
-maximizing the enhanced correlation coefficient (Evangelidis and Psarakis 2008,
-doi 10.1109/TPAMI.2008.113) over a pyramid, then by least squares on many small windows that were
-followed separately, whose scatter, as alike as it is in neighbors, gives the standard errors
+slips, so here the skin itself is measured: an affine map between two images of its pigment, first
+by maximizing the enhanced correlation coefficient (Evangelidis and Psarakis 2008,
+doi 10.1109/TPAMI.2008.113) over a pyramid, then by least squares on many small windows tracked
+separately, whose correlated scatter gives the standard errors
 (`reconstruction.registration.affine_fit`).
 """
 
@@ -31,11 +31,11 @@ MIN_TOP_SIDE_PX = 48
 STRAIN_WINDOW_PX = 25
 MAX_WINDOWS = 600
 MIN_WINDOWS = 12
-"""Fewer windows tell nothing of their own scatter: six numbers are fitted to them."""
+"""Fewest windows whose scatter can be estimated: six parameters are fitted to them."""
 WINDOW_OUTLIER_SIGMAS = 4.0
-"""Windows farther off the fit than this many robust standard deviations are left out."""
+"""Robust standard deviations above which a window is an outlier."""
 MAX_WINDOW_RESIDUAL_PX = 2.0
-"""Windows farther off the fit than this have followed something else."""
+"""Residual above which a window was tracked wrongly, px."""
 N_STRAIN_ROUNDS = 3
 
 _FLIP_Y = np.diag([1.0, -1.0])
@@ -43,9 +43,9 @@ _FLIP_Y = np.diag([1.0, -1.0])
 
 @dataclass(frozen=True, slots=True)
 class Strain:
-    """How skin in one picture became skin in another.
+    """Affine deformation of the skin from one image to another.
 
-    A point at x (mm or px from the image's middle, +x right, +y up) comes to ``gradient @ x +
+    A point at x (mm or px from the image's middle, +x right, +y up) moves to ``gradient @ x +
     shift``.
 
     Attributes
@@ -55,13 +55,13 @@ class Strain:
     shift_px : ndarray of float64, shape (2,)
         Of the image's middle, px, +y up.
     covariance : ndarray of float64, shape (6, 6)
-        Of F row by row, then of the shift.
+        Covariance of F row by row, then of the shift.
     residual_px : float
-        Root mean square distance of windows from the affine map, px: noise, and what is not affine.
+        Root mean square distance of windows from the affine map, px: noise and other deformation.
     windows : int
         Windows that the map was fitted to.
     valid : bool
-        False when too few windows could be followed; the numbers then mean nothing.
+        False if too few windows could be tracked; the values are then undefined.
     """
 
     gradient: Float64Array
@@ -77,7 +77,7 @@ class Strain:
         Examples
         --------
         >>> made = Strain(np.diag([1.1, 0.95]), np.zeros(2), np.zeros((6, 6)), 0.0, 20, True)
-        >>> made.along(0.0)
+        >>> made.stretch_along(0.0)
         (1.1, 0.0)
         """
         axis = np.array([math.cos(angle_rad), math.sin(angle_rad)])
@@ -87,7 +87,7 @@ class Strain:
         return length, _stderr(slope, self.covariance)
 
     def shear(self, angle_rad: float) -> tuple[float, float]:
-        """Return by how much less than a right angle is between two lines, rad, and its error.
+        """Return the decrease from a right angle between two lines, rad, and its standard error.
 
         The lines were at ``angle_rad`` and across it.
         """
@@ -118,7 +118,7 @@ class Strain:
         return _stderr(slope, self.covariance)
 
     def affine_px(self, shape: tuple[int, int]) -> Float64Array:
-        """Return the map of pixels (column, row), first picture to second, shape (2, 3)."""
+        """Return the map of pixels (column, row), first image to second, shape (2, 3)."""
         return _to_pixels(self.gradient, self.shift_px, shape)
 
 
@@ -128,7 +128,7 @@ STRAIN_GUESSES = tuple(
     for up in (1.0, 0.88, 1.14, 0.76, 1.28)
     if across != 1.0 or up != 1.0
 )
-"""Stretches along x and y that a search begins with when nothing is known."""
+"""Stretches along x and y at which a search without a guess starts."""
 
 
 def measure_strain(
@@ -139,19 +139,19 @@ def measure_strain(
     valid: BoolArray | None = None,
     valid_second: BoolArray | None = None,
 ) -> Strain:
-    """Measure the affine deformation that took the skin of one picture to that of another.
+    """Measure the affine deformation of the skin from one image to another.
 
     Parameters
     ----------
     first, second : ndarray, shape (H, W)
-        Linear pictures in which the same skin can be recognized: light from inside the skin
-        (crossed polarizers), whose texture is pigment and moves with it. Row 0 is the top.
+        Linear images in which the same skin can be recognized: subsurface scattered light (crossed
+        polarizers), whose texture is pigment and moves with the skin. Row 0 is the top.
     start : ndarray, shape (2, 2), optional
-        Deformation gradient to begin with, as from the state before or from the caliper's reading;
-        by default the identity, and where that leads nowhere a grid of stretches. It decides where
-        the search begins, not the result.
+        Initial deformation gradient, as from the strain step before or from the caliper's reading;
+        by default the identity, and if that fails a grid of stretches. It is the start of the
+        search and does not affect the result.
     valid, valid_second : ndarray of bool, shape (H, W), optional
-        What is skin in each picture.
+        Skin in each image.
 
     Returns
     -------
@@ -160,7 +160,7 @@ def measure_strain(
     Raises
     ------
     RegistrationError
-        When pictures differ in shape or are too small.
+        If images differ in shape or are too small.
     """
     Checks(RegistrationError).shape("first", first, ("H", "W"))
     Checks(RegistrationError).shape("second", second, np.shape(first))
@@ -184,7 +184,7 @@ def measure_strain(
 
 
 def _filled(image: FloatArray, valid: BoolArray | None) -> FloatArray:
-    """Put the median where there is no skin: a hard edge would be followed instead of it."""
+    """Fill pixels other than skin with the median: a hard edge would be tracked instead of skin."""
     if valid is None or valid.all():
         return image
     inside = np.asarray(image)[valid & np.isfinite(image)]
@@ -209,7 +209,7 @@ def _from_pixels(affine: Float64Array, shape: tuple[int, int]) -> tuple[Float64A
 def _warped_back(
     image: UInt8Array, affine: Float64Array, interpolation: int, border: int = 128
 ) -> Any:
-    """Return an image of the second picture's size where the first one's pixels have come to."""
+    """Warp an image back by an affine map, in its own size."""
     size, flags = (image.shape[1], image.shape[0]), interpolation | cv2.WARP_INVERSE_MAP
     return cv2.warpAffine(image, affine, size, flags=flags, borderValue=border)
 
@@ -217,7 +217,7 @@ def _warped_back(
 def _phase_shift(
     one: UInt8Array, two: UInt8Array, affine: Float64Array, mask: BoolArray
 ) -> Float64Array:
-    """Return how far the second picture, warped back, lies from the first, px."""
+    """Return the shift of the second image, warped back, from the first, px."""
     size = one.shape[1], one.shape[0]
     back = _warped_back(two, affine, cv2.INTER_LINEAR)
     window = cv2.createHanningWindow(size, cv2.CV_32F)
@@ -232,7 +232,7 @@ def _phase_shift(
 def _pyramid(
     one: UInt8Array, two: UInt8Array, affine: Float64Array, mask: BoolArray
 ) -> Float64Array:
-    """Improve an affine map from coarse to fine; a level that does not converge changes nothing."""
+    """Improve an affine map from coarse to fine; a level that does not converge is skipped."""
     levels = [(one.astype(np.float32), two.astype(np.float32), mask.astype(np.uint8))]
     while min(levels[-1][0].shape) >= 2 * MIN_TOP_SIDE_PX and len(levels) < 6:
         a, b, m = levels[-1]
@@ -244,7 +244,7 @@ def _pyramid(
             )
         )
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-6)
-    # the finest level is left to the windows, which also tell the error
+    # the finest level is left to the windows, which also give the error
     last = 1 if len(levels) > 2 else 0
     for level in range(len(levels) - 1, last - 1, -1):
         a, b, m = levels[level]
@@ -265,7 +265,7 @@ def _pyramid(
 def _by_windows(
     one: UInt8Array, two: UInt8Array, affine: Float64Array, mask: BoolArray, other: BoolArray
 ) -> Strain:
-    """Follow windows of the first picture into the second, warped back, and fit all of them."""
+    """Track windows of the first image into the second, warped back, and fit all of them."""
     shape = one.shape[0], one.shape[1]
     grid = np.stack(np.meshgrid(np.arange(0, shape[1], 3), np.arange(0, shape[0], 3)), axis=-1)
     candidates = grid.reshape(-1, 2).astype(np.float64)
@@ -293,7 +293,7 @@ def _by_windows(
                 gradient, shift, np.full((6, 6), np.inf), math.inf, int(good.sum()), False
             )
         small, covariance, residual, used = fit
-        # back(x) = two(affine x): a window found at small x there is at affine (small x) in two
+        # back(x) = two(affine x): a window at small x in `back` is at affine (small x) in `two`
         affine = np.column_stack(
             [affine[:, :2] @ small[:, :2], affine[:, :2] @ small[:, 2] + affine[:, 2]]
         )
@@ -305,7 +305,7 @@ def _by_windows(
 def _fit(
     start: Float64Array, found: Float64Array, shape: tuple[int, int], *, last: bool
 ) -> tuple[Float64Array, Float64Array, float, int] | None:
-    """Fit an affine map to what is no outlier: by least squares, or with its errors when `last`.
+    """Fit an affine map to all but outliers: by least squares, or with its errors when `last`.
 
     Returns
     -------
@@ -345,7 +345,7 @@ def _fit(
 
 
 def _carry(covariance: Float64Array, linear: Float64Array) -> Float64Array:
-    """Carry the covariance of a small map through the large one before it, into axes with y up."""
+    """Propagate the covariance of a small map through the preceding one, to axes with y up."""
     jacobian = np.zeros((6, 6))
     outer = _FLIP_Y @ linear
     for i in range(2):

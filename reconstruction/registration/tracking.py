@@ -1,4 +1,4 @@
-"""Where points of one image are in another of the same scene: optical flow, checked both ways."""
+"""Track points from one image to another by optical flow, checked both ways."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,22 +17,22 @@ class RegistrationError(ValueError):
 
 CONTRAST_SIGMA_PX = 8.0
 MAX_BACKTRACK_ERROR_PX = 0.3
-"""Farthest a point may end from where it began after the way back."""
+"""Largest distance of a point from its start after the way back, px."""
 MIN_IMAGE_PEAK = 1e-12
-"""Brightest value below which, or above one over which, a picture's unit is not kept: local spreads
-would fall below the floor that stands for no texture at all, or overflow."""
+"""Brightest value below which, or above whose inverse, an image is rescaled: local standard
+deviations would fall below the floor for textureless areas, or overflow."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """Where points went.
+    """Positions of tracked points in the second image.
 
     Attributes
     ----------
     points_px : ndarray of float64, shape (K, 2)
-        Column and row in the second image; where not `valid`, where they were in the first.
+        Column and row in the second image; where not `valid`, those in the first.
     valid : ndarray of bool, shape (K,)
-        Found, inside the image, and found again on the way back.
+        Found inside the image, and consistent on the way back.
     """
 
     points_px: Float64Array
@@ -40,12 +40,12 @@ class Tracks:
 
 
 def normalize_local_contrast(image: FloatArray) -> UInt8Array:
-    """Return the local contrast of an image as 8-bit values: mean and brightness of light are gone.
+    """Normalize an image to local contrast, 8 bit: local mean and standard deviation are removed.
 
     Parameters
     ----------
     image : ndarray, shape (H, W)
-        Linear values, any unit. What is not finite counts as 0.
+        Linear values, any unit. Values that are not finite count as 0.
     sigma_px : float
         Of the neighborhood, px, > 0.
 
@@ -57,7 +57,7 @@ def normalize_local_contrast(image: FloatArray) -> UInt8Array:
     Raises
     ------
     RegistrationError
-        When `image` is no (H, W) of at least 16 x 16.
+        If `image` is not (H, W) of at least 16 x 16.
     """
     Checks(RegistrationError).shape("image", image, ("H", "W"))
     Checks(RegistrationError).within("sides of image, px", np.shape(image), "[16, inf)")
@@ -65,7 +65,7 @@ def normalize_local_contrast(image: FloatArray) -> UInt8Array:
     values = np.maximum(np.where(known, image, 0.0), 0.0)
     top = float(values.max())
     if top > 0.0 and not MIN_IMAGE_PEAK < top < 1.0 / MIN_IMAGE_PEAK:
-        values = values / top  # squares in single precision hold no more
+        values = values / top  # squares would overflow or vanish in single precision
     values = np.sqrt(values).astype(np.float32)
     mean = cv2.GaussianBlur(values, (0, 0), CONTRAST_SIGMA_PX)
     rest = values - mean
@@ -75,7 +75,7 @@ def normalize_local_contrast(image: FloatArray) -> UInt8Array:
 
 
 def is_inside_image(at_px: FloatArray, shape: tuple[int, ...], margin_px: int = 0) -> BoolArray:
-    """Return which places (..., 2), column and row, lie in an image, so far from its border."""
+    """Return which positions (..., 2), column and row, are in an image, less a margin."""
     last = [shape[1] - 1 - margin_px, shape[0] - 1 - margin_px]
     return np.asarray(((at_px >= margin_px) & (at_px <= last)).all(axis=-1))
 
@@ -93,11 +93,11 @@ def select_textured_points(
     Parameters
     ----------
     local_contrast : ndarray of uint8, shape (H, W)
-        As from `normalize_local_contrast`.
+        See `normalize_local_contrast`.
     points_px : ndarray, shape (P, 2)
-        Candidates; those that are not finite or too near the border are left out.
+        Candidates; those that are not finite or too near the border are omitted.
     count : int
-        The most to choose; those with most texture.
+        Largest number to choose, by most texture.
     cell_px, margin_px : int
         Side of the cells, and width of the border, px.
 
@@ -131,12 +131,12 @@ def track_points(
     window_px: int = 17,
     levels: int = 3,
 ) -> Tracks:
-    """Follow points from one image to another by pyramidal Lucas-Kanade, forth and back.
+    """Track points from one image to another by pyramidal Lucas-Kanade, forth and back.
 
     Parameters
     ----------
     first, second : ndarray of uint8, shape (H, W)
-        As from `normalize_local_contrast`.
+        See `normalize_local_contrast`.
     points_px : ndarray, shape (K, 2)
         Column and row in `first`.
     window_px : int

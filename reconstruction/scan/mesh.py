@@ -1,4 +1,4 @@
-"""A scanned mesh made ready for measurements: cleaned, refined to many points, laid out flat."""
+"""Prepare a scanned mesh for measurements: repair, refine to many points, and unwrap."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from reconstruction.scan.repair import (
 )
 
 FACE_BOX_MM: Final = ((-100.0, -108.0, -105.0), (100.0, 150.0, 60.0))
-"""Where a face is in the rig frame; the neck below the chin and clothes are outside."""
+"""Box around a face in the rig frame; the neck below the chin and clothes are outside."""
 MAX_POINTS: Final = 4_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinedScan:
-    """A surface of many points that photographs are sampled at."""
+    """Surface of many points at which photographs are sampled."""
 
     points_mm: Float32Array
     """Shape (P, 3)."""
@@ -38,12 +38,12 @@ class RefinedScan:
     corner_uv: Float32Array
     """Texture coordinates of each triangle's corners, shape (F, 3, 2), (0, 0) bottom left."""
     coarse: TriangleMesh
-    """The cleaned scan that was refined, with texture coordinates: for rays."""
+    """The repaired scan before refinement, with texture coordinates; used for ray casting."""
     report: RepairReport
-    """What the cleaning found."""
+    """Counts of the repairs."""
 
     def transform(self, rotation: Float64Array, translation_mm: Float64Array) -> RefinedScan:
-        """Return the surface after a rigid motion ``rotation @ p + translation_mm``."""
+        """Apply a rigid motion ``rotation @ p + translation_mm`` to the surface."""
         turn = np.asarray(rotation, np.float64)
         vertices_mm = self.coarse.vertices_mm @ turn.T + translation_mm
         coarse = replace(self.coarse, vertices_mm=vertices_mm)
@@ -56,12 +56,12 @@ class RefinedScan:
 
 
 def load_ply(data: bytes) -> TriangleMesh:
-    """Read the mesh that a session holds, a PLY in mm.
+    """Read a session's scan, a PLY in mm.
 
     Raises
     ------
     ScanMeshError
-        Where the bytes are no mesh.
+        Where the bytes are not a mesh.
     """
     import trimesh
 
@@ -69,12 +69,15 @@ def load_ply(data: bytes) -> TriangleMesh:
         loaded: Any = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
         vertices = np.asarray(loaded.vertices, np.float64)
         faces = np.asarray(loaded.faces, np.int64)
-    except Exception as exc:  # the reader raises whatever its parser meets
-        raise ScanMeshError(f"scan: got no PLY mesh ({exc})") from exc
+    except Exception as exc:  # the parser raises various types
+        raise ScanMeshError(
+            f"scan: got {exc}, expected a PLY mesh; export the scan as PLY again"
+        ) from exc
     if not len(faces) or not np.isfinite(vertices).all():
         raise ScanMeshError(
             f"scan: got {len(faces)} triangles and "
-            f"{np.count_nonzero(~np.isfinite(vertices))} numbers that are not finite"
+            f"{np.count_nonzero(~np.isfinite(vertices))} coordinates that are not finite, expected "
+            "triangles with finite coordinates; export the scan again"
         )
     uv = getattr(loaded.visual, "uv", None)
     given = uv is not None and len(uv) == len(vertices)
@@ -82,14 +85,15 @@ def load_ply(data: bytes) -> TriangleMesh:
 
 
 def prepare_scan(scan: bytes | TriangleMesh, *, points: int = 500_000) -> RefinedScan:
-    """Crop, repair, lay out and refine a scan.
+    """Crop, repair, unwrap and refine a scan.
 
     Parameters
     ----------
     scan : bytes or TriangleMesh
-        A PLY in mm, or what `load_ply` returned.
+        A PLY in mm, or the result of `load_ply`.
     points : int
-        About so many points: Loop subdivision multiplies them by four, the nearest step is taken.
+        Approximate number of points: Loop subdivision multiplies it by four per step; the nearest
+        number of steps is taken.
 
     Returns
     -------
@@ -99,7 +103,7 @@ def prepare_scan(scan: bytes | TriangleMesh, *, points: int = 500_000) -> Refine
     Raises
     ------
     ScanMeshError
-        Where nothing of the scan can be used.
+        Where no part of the scan is usable.
     """
     mesh = load_ply(scan) if isinstance(scan, bytes) else scan
     mesh, report = repair_mesh(crop(mesh, box_mm=FACE_BOX_MM))
@@ -109,7 +113,7 @@ def prepare_scan(scan: bytes | TriangleMesh, *, points: int = 500_000) -> Refine
 
 
 def unwrap_mesh(mesh: TriangleMesh) -> TriangleMesh:
-    """Lay a surface out flat with little stretch, in charts that fill the unit square (xatlas)."""
+    """Unwrap a surface with little stretch, into charts that fill the unit square (xatlas)."""
     import xatlas
 
     _, index, uv = xatlas.parametrize(
@@ -117,7 +121,10 @@ def unwrap_mesh(mesh: TriangleMesh) -> TriangleMesh:
         np.ascontiguousarray(mesh.faces, np.uint32),
     )
     if len(index) != len(mesh.faces):
-        raise ScanMeshError(f"unwrap: got {len(index)} triangles back, expected {len(mesh.faces)}")
+        raise ScanMeshError(
+            f"unwrap: got {len(index)} triangles back, expected {len(mesh.faces)}; "
+            "decimate the scan and try again"
+        )
     return TriangleMesh(mesh.vertices_mm, mesh.faces, np.asarray(uv, np.float64)[index])
 
 
@@ -136,7 +143,7 @@ def refine_mesh(
 
     Checks(ScanMeshError).within("points", points, f"[3, {MAX_POINTS}]")
     if mesh.corner_uv is None:
-        raise ScanMeshError("mesh: got no texture coordinates, expected some; see unwrap")
+        raise ScanMeshError("mesh: got no texture coordinates, expected some; see unwrap_mesh")
     steps = max(round(float(np.log(points / len(mesh.vertices_mm)) / np.log(4.0))), 0)
     fine = _split_chords(mesh)
     for _ in range(steps):
@@ -145,7 +152,10 @@ def refine_mesh(
         fine = TriangleMesh(vertices, np.asarray(faces, np.int64), _halved(uv))
     uv = fine.corner_uv
     if uv is None or len(uv) != len(fine.faces):
-        raise ScanMeshError("refine: got another number of triangles than of texture triangles")
+        raise ScanMeshError(
+            "refine: got different numbers of triangles and texture triangles, expected equal "
+            "numbers; unwrap the mesh again"
+        )
     return RefinedScan(
         fine.vertices_mm.astype(np.float32),
         fine.normals(),
@@ -157,7 +167,7 @@ def refine_mesh(
 
 
 def _halved(uv: Float64Array | None) -> Float64Array | None:
-    """Return texture coordinates of the four triangles of each, in the order of trimesh."""
+    """Return texture coordinates of the four parts of each triangle, in the order of trimesh."""
     if uv is None:
         return None
     a, b, c = uv[:, 0], uv[:, 1], uv[:, 2]
@@ -169,8 +179,8 @@ def _halved(uv: Float64Array | None) -> Float64Array | None:
 def _split_chords(mesh: TriangleMesh) -> TriangleMesh:
     """Halve the inner edges that join two vertices of the rim.
 
-    trimesh takes every neighbour on the rim for a neighbour along it, which would throw the ends
-    of such an edge far off; after the split, and after each subdivision, there is none.
+    trimesh takes every neighbor on the rim for a neighbor along it, which would displace the ends
+    of such an edge; after the split, and after each subdivision, there is none.
     """
     vertices, faces, uv = mesh.vertices_mm, mesh.faces, mesh.corner_uv
     while True:
@@ -183,7 +193,7 @@ def _split_chords(mesh: TriangleMesh) -> TriangleMesh:
         rows = [k for k in np.flatnonzero(chord).tolist() if tuple(edges[k].tolist()) not in alone]
         if not rows:
             return TriangleMesh(vertices, faces, uv)
-        # one edge a triangle and pass, so that no triangle is halved along two at once
+        # one edge per triangle and pass, so that no triangle is halved along two at once
         by_edge: dict[tuple[int, int], list[int]] = {}
         for k in rows:
             by_edge.setdefault(tuple(edges[k].tolist()), []).append(k)

@@ -1,10 +1,10 @@
-"""A scan laid onto the dome: the rigid motion under which its normals are those in the photographs.
+"""Register a scan to the dome: find the rigid motion that makes its normals match photographs.
 
-Each view alone gives normals by photometric stereo, which need no exact geometry: a scan that is a
-few millimetres off moves the directions to the lights by a fraction of a degree. The motion is
-then the one that makes the scan's normals, turned and projected into all views, agree with these.
-Turning the scan turns its normals, so rotation follows from thousands of normals; shifts follow
-from where nose, eyes and mouth bend them. No texture, no landmark and no true mesh is needed.
+Each view alone gives normals by photometric stereo, which needs no exact geometry: a scan that is a
+few millimeters off moves the directions to the lights by a fraction of a degree. The motion is
+the one under which the scan's normals, rotated and projected into all views, agree with these.
+Rotating the scan rotates its normals, so rotation follows from thousands of normals; translation
+follows from the curvature at nose, eyes and mouth. Texture, landmarks or a true mesh are not used.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,13 +28,13 @@ from reconstruction.scan.rough_normals import (
 )
 
 MAX_IMAGE_WIDTH_PX: Final = 320
-"""Larger images are binned 2 x 2 until they are no wider."""
+"""Width down to which larger images are binned 2 x 2."""
 MAX_BLUR_STEPS: Final = 12
 """Gauss-Newton steps for each blur."""
 MIN_SCAN_COSINE: Final = 0.35
-"""Points seen at a flatter angle say nothing: 70 degrees."""
+"""Least cosine between normal and view of a used point: 70 degrees."""
 ERROR_CELL_MM: Final = 20.0
-"""Errors within such a cube are taken for one when standard errors are computed."""
+"""Side of the cubes within which errors are taken as fully correlated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,19 +46,19 @@ class RigidFit:
     translation_mm: Float64Array
     """Shape (3,)."""
     center_mm: Float64Array
-    """Centre of the scan in the rig frame; errors of turn and shift are told about it."""
+    """Center of the scan in the rig frame; errors of rotation and shift refer to it."""
     stderr: Float64Array
-    """Of the turn about x, y, z, rad, and of the shift of `center_mm` along x, y, z, mm: (6,).
+    """Of the rotation about x, y, z, rad, and of the shift of `center_mm` along x, y, z, mm: (6,).
     From the scatter of residuals between cells of the surface, and from how far the last blur
-    moved the fit: a blur of bent surfaces shifts them."""
+    moved the fit: a blur of curved surfaces shifts them."""
     residual_deg: float
     """Median angle between the scan's normals and the photographs'."""
     samples: int
-    """Pairs of point and view that took part."""
+    """Number of pairs of point and view used."""
     converged: bool
 
     def move(self, points_mm: ArrayLike) -> Float64Array:
-        """Return points of the scan in the rig frame."""
+        """Transform points of the scan to the rig frame."""
         return np.asarray(points_mm, np.float64) @ self.rotation.T + self.translation_mm
 
 
@@ -71,20 +71,20 @@ def register_scan(
     start: tuple[ArrayLike, ArrayLike] | None = None,
     blurs_px: Sequence[float] = (8.0, 3.0, 1.5, 0.5),
 ) -> RigidFit:
-    """Find the rigid motion of a scan that makes its normals those of the views.
+    """Find the rigid motion of a scan under which its normals match those of the views.
 
     Parameters
     ----------
     points_mm, normals : array_like, shape (P, 3)
-        Of the scan, in its own frame; some thousand are enough.
+        Of the scan, in its own frame; some thousand suffice.
     evidence : sequence of NormalEvidence
-        At least one view; several for shifts along each view's axis.
+        One view or more; several for shifts along each view's axis.
     visible : ndarray of bool, shape (V, P), optional
-        Points that each view sees; those that face it by default.
+        Points visible to each view; by default those that face it.
     start : (rotation, translation_mm), optional
-        First guess; no motion by default.
+        Initial guess; no motion by default.
     blurs_px : sequence of float
-        The normal maps are blurred by these deviations, one after the other: far first.
+        Standard deviations of the blur of the normal maps, px, from coarse to fine.
 
     Returns
     -------
@@ -92,8 +92,8 @@ def register_scan(
 
     Raises
     ------
-    RegistrationError
-        Where fewer than 200 pairs of point and view take part, or the motion is not determined.
+    ScanRegistrationError
+        With fewer than 200 pairs of point and view, or if the motion is not determined.
     """
     p = np.asarray(points_mm, np.float64)
     n = np.asarray(normals, np.float64)
@@ -114,14 +114,14 @@ def register_scan(
             system = _gauss_newton(p, n, turn, shift, center, maps, evidence, visible)
             if system.samples < 200:
                 raise ScanRegistrationError(
-                    f"samples: got {system.samples} points seen, expected at least 200; "
+                    f"samples: got {system.samples} visible points, expected at least 200; "
                     "check the calibration, and the scan's unit and frame"
                 )
             step = -np.asarray(np.linalg.solve(system.matrix, system.gradient), np.float64)
             small = _rotation(step[:3])
             turn = small @ turn
             shift = small @ (shift - center) + center + step[3:]
-            # bilinear maps have kinks at which steps of this size go to and fro
+            # bilinear maps have kinks between which steps of this size oscillate
             converged = bool(np.linalg.norm(step[:3]) < 1e-4 and np.linalg.norm(step[3:]) < 1e-2)
             if converged:
                 break
@@ -133,7 +133,7 @@ def register_scan(
         vector = 0.5 * np.array(
             [turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]
         )
-        # how large such an error is shows there, not which way it goes
+        # the last step measures the size of the blur's error, not its direction
         sizes = [np.linalg.norm(v) / np.sqrt(3) for v in (vector, center_last - center_before)]
         stderr = np.hypot(stderr, np.repeat(sizes, 3))
     angle = np.degrees(2.0 * np.arcsin(np.clip(0.5 * np.median(system.size), 0.0, 1.0)))
@@ -160,16 +160,16 @@ def align_scan(
     mesh : TriangleMesh
         The cleaned scan in its own frame, within about 10 mm and 5 degrees of the rig's.
     cameras : sequence of RayCamera
-    lights : Lights
-        Those of the images; 20 to 40 well spread ones are enough.
+    lights : LightSources
+        Those of the images; 20 to 40 well distributed ones suffice.
     stacks : callable
         Returns the images of a view by its index, shape (L, H, W), NaN where not valid.
     binning : int
         Camera pixels along each side of an image pixel.
     points : int
-        Vertices of the mesh that take part.
+        Number of vertices of the mesh used.
     rounds : int
-        Of photometric normals and fit; each uses the motion found before.
+        Rounds of photometric normals and fit; each uses the motion found before.
     rng : numpy.random.Generator
         Draws the points.
 
@@ -217,12 +217,12 @@ def align_scan(
             blurs_px=(8.0, 3.0, 1.5, 0.5) if number == 0 else (1.5, 0.5),
         )
     if fit is None:
-        raise ScanRegistrationError(f"rounds: got {rounds}, expected at least 1")
+        raise ScanRegistrationError(f"rounds: got {rounds}, expected at least 1; set it higher")
     return fit
 
 
 def _binned(stack: FloatArray) -> tuple[Float32Array, int]:
-    """Return images up to `MAX_IMAGE_WIDTH_PX` wide, and the side of their pixels; NaN spreads."""
+    """Return images up to `MAX_IMAGE_WIDTH_PX` wide, and the side of their pixels, with NaN."""
     image, side = np.asarray(stack, np.float32), 1
     while max(image.shape[1:]) > MAX_IMAGE_WIDTH_PX:
         height, width = (n - n % 2 for n in image.shape[1:])
@@ -232,7 +232,7 @@ def _binned(stack: FloatArray) -> tuple[Float32Array, int]:
 
 
 def _face_normals(faces: Int64Array, normals: FloatArray, fit: RigidFit | None) -> Float64Array:
-    """Return the mean of the vertex normals of each triangle, turned as the fit has it."""
+    """Return the mean vertex normal of each triangle, rotated by the fit."""
     mean = np.asarray(normals, np.float64)[faces].sum(axis=1)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
     return mean if fit is None else mean @ fit.rotation.T
@@ -252,7 +252,7 @@ class _System:
 
 
 def _blurred(view: NormalEvidence, blur_px: float) -> Float32Array:
-    """Return normals weighed and blurred, and the weight, shape (H, W, 4)."""
+    """Return weighted and blurred normals, and the weight, shape (H, W, 4)."""
     weight = ndimage.gaussian_filter(view.weight, blur_px)
     layers = [
         ndimage.gaussian_filter(view.normals[..., k] * view.weight, blur_px) for k in range(3)
@@ -260,7 +260,7 @@ def _blurred(view: NormalEvidence, blur_px: float) -> Float32Array:
     normals = np.stack(layers, axis=-1) / np.maximum(weight, 1e-6)[..., None]
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     known = (view.weight > 0) & (weight > 0.25 * float(weight.max()))
-    # a rim where the mean leans to one side is left out
+    # the rim is omitted, since a mean from one side is tilted
     inner = ndimage.binary_erosion(view.weight > 0, iterations=max(round(blur_px), 1))
     normals = np.where(length > 0.2, normals / np.maximum(length, 1e-6), 0.0)
     trust = np.where(known & inner, view.weight, 0.0)
@@ -296,6 +296,7 @@ def _gauss_newton(
             [(_pixels(view, points[row] + 0.05 * e) - at) / 0.05 for e in np.eye(3)], axis=-1
         )  # (K, 2, 3)
         by_point = slope @ by_mm
+        # residual m(x) - R n; a small rotation w moves x by w x (x - c) and R n by w x R n
         jacobian = np.concatenate(
             [-by_point @ _cross(points[row] - center) + _cross(model[row]), by_point], axis=-1
         )
@@ -307,6 +308,7 @@ def _gauss_newton(
     r, jacobian = np.concatenate(residuals), np.concatenate(jacobians)
     size = np.linalg.norm(r, axis=1)
     scale = 1.5 * float(np.median(size)) + 1e-6 if len(size) else 1.0
+    # Cauchy weights, scaled by the median residual
     weight = np.concatenate(trusts) / (1.0 + (size / scale) ** 2)
     each = np.einsum("k,kij,ki->kj", weight, jacobian, r)
     by_point = np.stack([np.bincount(row, each[:, j], minlength=len(p)) for j in range(6)], axis=-1)
@@ -316,7 +318,10 @@ def _gauss_newton(
 
 
 def _clustered(system: _System, p: Float64Array) -> Float64Array:
-    """Return standard errors from the scatter of the gradient between cells of the surface."""
+    """Return standard errors from the scatter of the gradient between cells of the surface.
+
+    The cluster-robust sandwich H^-1 (sum g_c g_c') H^-1, g_c the gradient's part of a cell.
+    """
     _, cell = np.unique(np.floor(p / ERROR_CELL_MM).astype(int), axis=0, return_inverse=True)
     cell = cell.reshape(-1)
     sums = np.stack([np.bincount(cell, system.by_point[:, j]) for j in range(6)], axis=-1)

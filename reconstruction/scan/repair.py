@@ -1,7 +1,7 @@
-"""Scanned triangles made into one clean surface: manifold, oriented, without islands and pinholes.
+"""Repair scanned triangles to one surface: manifold, oriented, without islands and pinholes.
 
-Geometry and texture are kept apart: vertices are welded, and each corner of a triangle carries its
-own texture coordinates, so that seams of the texture are no cracks of the surface.
+Geometry and texture are separate: vertices are welded, and each corner of a triangle carries its
+own texture coordinates, so that seams of the texture do not split the surface.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from scipy.sparse.csgraph import connected_components
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 
 WELD_DISTANCE_MM: Final = 1e-3
-"""Vertices closer than about this are one."""
+"""Grid on which vertices are welded."""
 MIN_TRIANGLE_HEIGHT_MM: Final = 1e-3
-"""Triangles of less height are degenerate."""
+"""Height below which triangles are degenerate."""
 
 
 class ScanMeshError(ValueError):
-    """A scan of which no surface can be made."""
+    """Scans that do not yield a surface."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,12 +33,12 @@ class TriangleMesh:
     vertices_mm: Float64Array
     """Shape (V, 3)."""
     faces: Int64Array
-    """Shape (F, 3), counter-clockwise seen from outside."""
+    """Shape (F, 3), counter-clockwise from outside."""
     corner_uv: Float64Array | None = None
     """Texture coordinates of each corner, shape (F, 3, 2), (0, 0) bottom left; None: none yet."""
 
     def face_vectors(self) -> Float64Array:
-        """Return normals as long as twice each triangle's area, shape (F, 3)."""
+        """Return normals whose length is twice each triangle's area, shape (F, 3)."""
         a, b, c = (self.vertices_mm[self.faces[:, k]] for k in range(3))
         return np.asarray(np.cross(b - a, c - a), np.float64)
 
@@ -56,7 +56,7 @@ class TriangleMesh:
         return np.where(length > 0, total / np.maximum(length, 1e-300), up).astype(np.float32)
 
     def select_faces(self, rows: BoolArray | NDArray[np.intp]) -> TriangleMesh:
-        """Return some of the triangles, without vertices that none of them uses."""
+        """Return some of the triangles with the vertices they use."""
         faces = self.faces[rows]
         used, faces = np.unique(faces, return_inverse=True)
         uv = None if self.corner_uv is None else self.corner_uv[rows]
@@ -65,20 +65,20 @@ class TriangleMesh:
 
 @dataclass(frozen=True, slots=True)
 class RepairReport:
-    """What was found and mended; counts."""
+    """Counts of defects found and repaired."""
 
     counts: dict[str, int] = field(default_factory=dict)
 
     def __str__(self) -> str:
         """Return the counts that are not zero, in words."""
         found = [f"{count} {what}" for what, count in self.counts.items() if count]
-        return ", ".join(found) or "nothing to mend"
+        return ", ".join(found) or "nothing to repair"
 
 
 def repair_mesh(
     mesh: TriangleMesh, *, max_hole_mm: float = 40.0
 ) -> tuple[TriangleMesh, RepairReport]:
-    """Make one manifold, oriented surface of a scan.
+    """Repair a scan to one manifold, oriented surface.
 
     Parameters
     ----------
@@ -90,14 +90,14 @@ def repair_mesh(
     Returns
     -------
     mesh : TriangleMesh
-        The largest connected surface, oriented as most of its triangles were, and turned inside
-        out where it was.
+        The largest connected surface, oriented like the majority of its triangles, normals
+        outward.
     report : RepairReport
 
     Raises
     ------
     ScanMeshError
-        Where nothing is left.
+        Where no triangle is left.
     """
     counts: dict[str, int] = {}
     before = len(mesh.vertices_mm)
@@ -125,7 +125,7 @@ def repair_mesh(
 
 
 def weld(mesh: TriangleMesh) -> TriangleMesh:
-    """Join vertices at the same place."""
+    """Join vertices at the same position."""
     grid = np.round(mesh.vertices_mm / WELD_DISTANCE_MM).astype(np.int64)
     _, first, place = np.unique(grid, axis=0, return_index=True, return_inverse=True)
     return TriangleMesh(mesh.vertices_mm[first], place.reshape(-1)[mesh.faces], mesh.corner_uv)
@@ -134,18 +134,18 @@ def weld(mesh: TriangleMesh) -> TriangleMesh:
 def crop(
     mesh: TriangleMesh, *, box_mm: tuple[tuple[float, float, float], tuple[float, float, float]]
 ) -> TriangleMesh:
-    """Leave out what is no face.
+    """Omit triangles outside a box around the face.
 
     Parameters
     ----------
     mesh : TriangleMesh
     box_mm : pair of corners
-        Least and greatest coordinates of what stays; a triangle stays whole.
+        Least and greatest coordinates to keep; triangles are not cut.
 
     Raises
     ------
     ScanMeshError
-        Where nothing is left.
+        Where no triangle is left.
     """
     centers = mesh.vertices_mm[mesh.faces].mean(axis=1)
     low, high = np.array(box_mm)
@@ -166,7 +166,7 @@ def largest_surface(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def boundary_edges(faces: Int64Array) -> Int64Array:
-    """Return the directed edges that one triangle has alone, shape (E, 2)."""
+    """Return the directed edges of exactly one triangle, shape (E, 2)."""
     edges = directed_edges(faces)
     return np.asarray(edges[_uses(edges)[1] == 1])
 
@@ -177,7 +177,7 @@ def directed_edges(faces: Int64Array) -> Int64Array:
 
 
 def _uses(edges: Int64Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the number of each row's edge, whatever its direction, and how many rows have it."""
+    """Return the number of each row's undirected edge, and how many rows share it."""
     _, place, counts = np.unique(
         np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
     )
@@ -186,7 +186,7 @@ def _uses(edges: Int64Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _pairs(faces: Int64Array) -> tuple[NDArray[np.intp], BoolArray]:
-    """Return rows of directed edges that two triangles share, and which run the same way."""
+    """Return rows of directed edges that two triangles share, and which have equal direction."""
     edges = directed_edges(faces)
     place, uses = _uses(edges)
     order = np.argsort(place, kind="stable")
@@ -196,7 +196,7 @@ def _pairs(faces: Int64Array) -> tuple[NDArray[np.intp], BoolArray]:
 
 
 def _sound(mesh: TriangleMesh) -> BoolArray:
-    """Return the triangles that have an area."""
+    """Return which triangles have an area."""
     faces = mesh.faces
     differ = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     corners = mesh.vertices_mm[faces]
@@ -206,7 +206,7 @@ def _sound(mesh: TriangleMesh) -> BoolArray:
 
 
 def _without_surplus(mesh: TriangleMesh) -> TriangleMesh:
-    """Take away triangles until no edge has more than two: fins first, else all at that edge."""
+    """Remove triangles until no edge has more than two: fins first, else all at that edge."""
     while True:
         _, uses = _uses(directed_edges(mesh.faces))
         rows = np.arange(len(uses)) // 3
@@ -221,7 +221,9 @@ def _without_surplus(mesh: TriangleMesh) -> TriangleMesh:
 
 def _some(mesh: TriangleMesh, keep: BoolArray) -> TriangleMesh:
     if not keep.any():
-        raise ScanMeshError("mesh: got no sound triangle, expected a surface")
+        raise ScanMeshError(
+            "mesh: got no sound triangle, expected a surface; check the scan in a mesh viewer"
+        )
     return mesh.select_faces(keep)
 
 
@@ -234,9 +236,9 @@ def _face_groups(faces: Int64Array) -> NDArray[np.intp]:
 
 
 def _oriented(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
-    """Turn triangles over so that neighbours agree, as the larger part of each surface does.
+    """Turn triangles over so that neighbors agree with the majority of each surface.
 
-    Each triangle stands twice in a graph, as it is and turned over; what is joined agrees.
+    In a graph each triangle has two nodes, as it is and turned over; joined nodes agree.
     """
     count = len(mesh.faces)
     pairs, same = _pairs(mesh.faces)
@@ -246,7 +248,7 @@ def _oriented(mesh: TriangleMesh) -> tuple[TriangleMesh, int]:
     graph = coo_matrix((np.ones(len(ends[0])), ends), (2 * count,) * 2)
     _, group = connected_components(graph, directed=False)
     as_is, turned = group[:count], group[count:]
-    # a surface with one side only has both in one group: its triangles stay as they are
+    # a one-sided surface has both in one group: its triangles stay as they are
     size = np.bincount(as_is, minlength=int(group.max()) + 1)
     flip = (size[turned] > size[as_is]) & (as_is != turned)
     tie = (size[turned] == size[as_is]) & (turned < as_is)

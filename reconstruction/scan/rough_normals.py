@@ -1,4 +1,4 @@
-"""Rough normals of a scan's surface in one view, by photometric stereo without exact geometry."""
+"""Estimate rough normals of a scan's surface in one view by photometric stereo."""
 
 from dataclasses import dataclass
 from typing import Final, Protocol
@@ -12,17 +12,17 @@ from reconstruction.lumitexels import CameraProjection, LightSources
 from reconstruction.lumitexels.ray_casting import RayCaster
 
 COS_HIGHLIGHT: Final = float(np.cos(np.radians(45.0)))
-"""Half vectors closer to the normal than 45 degrees may be those of a highlight."""
+"""Cosine between half vector and normal above which a sample may be in a highlight: 45 degrees."""
 MIN_SCAN_LIGHTS: Final = 9
-"""So many lights take part at a pixel even where some are nearer to the highlight."""
+"""Fewest lights used at a pixel, even if some are nearer to the highlight."""
 N_SHADOW_ROUNDS: Final = 4
-"""Of least squares that leave out shadows further."""
+"""Rounds of least squares, each omitting more shadows."""
 MIN_COS_LIGHT: Final = 0.3
 MIN_COS_VIEW: Final = 0.2
 
 
 class ScanRegistrationError(ValueError):
-    """Photographs that do not say where the scan is."""
+    """Photographs that do not determine the scan's pose."""
 
 
 class RayCamera(CameraProjection, Protocol):
@@ -34,7 +34,7 @@ class RayCamera(CameraProjection, Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalEvidence:
-    """Normals of one view, as the light on its pixels tells them."""
+    """Normals of one view, from the shading of its pixels."""
 
     camera: RayCamera
     normals: Float32Array
@@ -54,35 +54,35 @@ def estimate_rough_normals(
     surface_normals: FloatArray,
     binning: int = 1,
 ) -> NormalEvidence:
-    """Return the normals that one view's images under single lights tell.
+    """Estimate normals from one view's images under single lights.
 
     Parameters
     ----------
     stack : ndarray, shape (L, H, W)
         Signal under each light, one channel or the mean of several; NaN where not valid.
     camera : RayCamera
-    lights : Lights
+    lights : LightSources
         As many as there are images.
     caster : RayCaster
-        The scan about where it is: it tells how far each pixel's surface is from the lights.
+        The scan about where it is; gives the distance of each pixel's surface from the lights.
     surface_normals : ndarray, shape (F, 3)
-        Unit normals of the scan's triangles as it is now: they tell, within some degrees, where
-        highlights are.
+        Unit normals of the scan's triangles in its present pose; they locate highlights within
+        some degrees.
     binning : int
         Camera pixels along each side of an image pixel.
 
     Notes
     -----
-    ``signal / irradiance = albedo T(l) T(v) n . l`` by least squares, with the share T of light
-    that passes the skin's boundary (Fresnel, eta 1.4). Samples are left out whose half vector lies
-    within 45 degrees of the scan's normal, where the boundary itself shines, and flat ones, where
-    T falls steeply; shadows and samples off the fit (Cauchy weights) count less from round to
-    round.
+    ``signal / irradiance = albedo T(l) T(v) n . l`` by least squares, with T the fraction of light
+    transmitted by the skin's boundary (Fresnel, eta 1.4). Omitted are samples whose half vector is
+    within 45 degrees of the scan's normal, where the boundary reflects, and grazing ones, where T
+    falls steeply. Shadows and outliers (Cauchy weights) lose weight from round to round.
     """
     count, height, width = stack.shape
     if count != len(lights.position_mm):
         raise ScanRegistrationError(
-            f"stack: got {count} images, expected {len(lights.position_mm)}"
+            f"stack: got {count} images, expected {len(lights.position_mm)}, one per light; "
+            "select the lights of the images"
         )
     row, column = np.mgrid[0:height, 0:width]
     pixels = np.stack([column, row], axis=-1).reshape(-1, 2) * binning + 0.5 * (binning - 1)
@@ -102,7 +102,7 @@ def estimate_rough_normals(
         half = direction - ways[part]
         cos_half = np.einsum("lpk,pk->lp", half, rough) / np.linalg.norm(half, axis=-1)
         facing_light = cos_light > MIN_COS_LIGHT
-        # of few lights those farthest from the highlight stay
+        # with few lights, keep those farthest from the highlight
         ordered = np.sort(np.where(facing_light, cos_half, np.inf), axis=0)
         edge = np.maximum(ordered[min(MIN_SCAN_LIGHTS, count) - 1], COS_HIGHLIGHT)
         diffuse = facing_light & (cos_half <= edge) & (cos_view > MIN_COS_VIEW)
@@ -117,7 +117,7 @@ def estimate_rough_normals(
 
 
 def _boundary_transmittance(cosine: Float64Array) -> Float64Array:
-    """Return the share of light that passes the skin's boundary at a cosine, at least 0.05."""
+    """Return the fraction of light transmitted by the skin's boundary, at least 0.05."""
     at = np.linspace(0.0, 1.0, 513)
     share = 1.0 - reflectance(at, ETA_SKIN)
     return np.maximum(np.interp(cosine, at, share), 0.05)
@@ -126,7 +126,7 @@ def _boundary_transmittance(cosine: Float64Array) -> Float64Array:
 def _robust_normals(
     direction: Float64Array, values: FloatArray
 ) -> tuple[Float64Array, Float64Array]:
-    """Return unit normals, shape (P, 3), and the share of the lights that fit them."""
+    """Return unit normals, shape (P, 3), and the fraction of the lights that fit them."""
     good = np.isfinite(values)
     y = np.where(good, values, 0.0).astype(np.float64)
     top = np.max(y, axis=0)
@@ -151,7 +151,7 @@ def _robust_normals(
 
 
 def _median(values: FloatArray) -> Float64Array:
-    """Return the median of each column, NaN left out; 0 where nothing is left."""
+    """Return the median of each column without NaN; 0 for an empty column."""
     ordered = np.sort(values, axis=0)  # NaN come last
     count = np.count_nonzero(np.isfinite(values), axis=0)
     middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[None] // 2, axis=0)[0]

@@ -1,32 +1,31 @@
-"""Radial profiles of reflectance to absorption, reduced scattering and sigma_tr, with intervals.
+"""Invert radial reflectance profiles to absorption, reduced scattering and sigma_tr.
 
-Three models stand to choose. "photon_table" is recommended: a white Monte Carlo table with the
-boundary and, for a fibre, its cone and core. "diffusion" (Kienle and Patterson 1997) is faster and
-does without the table's limits. "dipole" is what Weyrich et al. fitted, and the baseline.
+There are three models. "photon_table" is recommended: a white Monte Carlo table with the boundary
+and, for a fiber, its cone and core. "diffusion" (Kienle and Patterson 1997) is faster and has no
+table limits. "dipole" is the model of Weyrich et al., the baseline.
 
-How a profile is compared, for all three:
+All three are compared with a profile in the same way:
 
 - Reflectance falls by four to six decades over a probe, and far from the source it is noise about
-  zero. So residuals are linear, each over its standard deviation: a far fibre then says no more
-  than that the reflectance is small, and negative readings are used as they are. A model that is
-  off by some percent must not be weighed by a reading good to a thousandth, so that a share of the
-  model's profile joins each deviation (`ProfileModel.error`). Without a variance logarithms are
-  compared, and each fibre's weight is then found from the residuals around it.
-- What one number per profile may be off, one nuisance parameter with a prior describes: the common
-  scale (``common_error``), and for the table the asymmetry g of the phase function, which the
-  fibres near the source depend on. They are fitted along, which weighs the near fibres down rather
-  than cutting them off.
+  zero. So residuals are linear, each over its standard deviation: a far fiber then bounds the
+  reflectance from above, and negative readings are used as they are. A model that is off by some
+  percent must not be weighted by a reading good to a thousandth, so each deviation includes a
+  fraction of the model's profile (`ProfileModel.error`). Without a variance logarithms are
+  compared, and each fiber's weight is found from the residuals around it.
+- Errors common to a profile are nuisance parameters with a prior: the common scale
+  (``common_error``), and for the table the asymmetry g of the phase function, which affects the
+  fibers near the source. They are fitted with the coefficients, which reduces the weight of the
+  near fibers without a cutoff.
 - Each profile begins at the best of some hundred pairs on a grid, by logarithms, and again in a
   second valley of the misfit where there is one.
-- A misfit (layers, a wrong scale) is reported, and taken up by a relative model error, equal at all
-  fibres, which is found from the residuals; the profile is fitted again with it. As such residuals
-  are alike at neighbouring fibres, standard errors grow by how much they repeat each other.
+- A misfit (layers, a wrong scale) is reported, and absorbed by a relative model error, equal at all
+  fibers and found from the residuals; the profile is fitted again with it. Such residuals
+  correlate between neighboring fibers, and standard errors grow by that correlation.
 
-The paper does not say which fibres it fits nor how it weighs them. Its baseline here takes all
-fibres whose reading means something, and a tenth of the reflectance as the dipole's own error: that
-is, equal relative weights wherever the noise is below it. Linear residuals of equal weight would
-leave the nearest fibre alone to decide; those of measured variance the nearest few, where the
-dipole is worst.
+The paper does not state which fibers it fits nor their weights. Its baseline here takes all usable
+fibers, and a tenth of the reflectance as the dipole's own error: that is, equal relative weights
+wherever the noise is below it. Linear residuals of equal weight would leave the nearest fiber alone
+to decide; those of measured variance the nearest few, where the dipole is worst.
 
 References
 ----------
@@ -59,11 +58,11 @@ from reconstruction.subsurface.profile_batch import Fits, OmissionReason, Profil
 from reconstruction.subsurface.profile_fit import fit_profiles
 
 PROFILES_PER_BATCH = 8192
-"""Profiles fitted at a time, for the size of temporaries."""
+"""Profiles fitted at a time; bounds the memory of temporaries."""
 
 
 class SubsurfaceError(ValueError):
-    """Profiles, radii or settings that no fit can be made of."""
+    """Profiles, radii or settings that cannot be fitted."""
 
 
 def invert(
@@ -83,27 +82,27 @@ def invert(
     Parameters
     ----------
     radius_mm : array_like, shape (F,) or broadcast to that of the profiles
-        Distance of each fibre from the source, mm, at least 0.
+        Distance of each fiber from the source, mm, at least 0.
     reflectance_per_mm2 : array_like, shape (..., F)
-        Profiles, 1/mm^2: all exitance R(r), or what a fibre takes (``collection``). Values that
-        are not finite are left out, negative ones are used; sizes up to 1e30.
+        Profiles, 1/mm^2: all exitance R(r), or what a fiber collects (``collection``). Values that
+        are not finite are omitted, negative ones are used; sizes up to 1e30.
     eta : float
         Refractive index of the medium over that outside, at least 1.
     variance : array_like, broadcast to the profiles, optional
-        Of the reflectance, 1/mm^4: noise and what differs from fibre to fibre in the calibration.
-        Fibres of infinite, negative or NaN variance are left out. None: the noise is taken from the
-        residuals.
+        Of the reflectance, 1/mm^4: noise and calibration errors that differ between fibers.
+        Fibers of infinite, negative or NaN variance are omitted. None: the noise is estimated from
+        the residuals.
     method : {"photon_table", "diffusion", "dipole"}
     common_error : float
-        Relative standard deviation of a scale common to all fibres (of a calibration).
+        Relative standard deviation of a scale common to all fibers (of a calibration).
     model_error : float, optional
-        Relative deviation of each fibre for the model's sake, the method's own by default. Given
-        a number, no systematic error of a closed form is added to sigma_tr either.
+        Relative deviation of each fiber due to the model, the method's own by default. A number
+        also removes the systematic error of a closed form from that of sigma_tr.
     valid : array_like of bool, broadcast to the profiles, optional
     collection : {"all", "fibre"}
         What was collected, "all" by default; the closed forms take both as exitance.
     core_mm, source_core_mm : float
-        Core diameters of detection and source fibre, mm, for the table; 0 by default.
+        Core diameters of detection and source fiber, mm, for the table; 0 by default.
     g, g_error : float
         Asymmetry of the phase function and its standard deviation, for the table; 0 fixes it. By
         default those of soft tissue.
@@ -150,17 +149,16 @@ def nearest_medium(
     valid: ArrayLike | None = None,
     **optics: Any,
 ) -> SubsurfaceFit:
-    """Find the homogeneous medium whose profile is nearest to that of tissue that is none.
+    """Find the homogeneous medium whose profile is nearest to that of layered tissue.
 
-    `reconstruction.subsurface.nearest` has the definition. The profile is compared up to a factor,
-    which is in `SubsurfaceFit.scale`, by the photon table; `SubsurfaceFit.model_error` says how far
-    it is off, and is no error of what is defined: intervals are of the readings.
+    `reconstruction.subsurface.nearest` defines it. The profile is compared up to a factor,
+    `SubsurfaceFit.scale`, by the photon table. `SubsurfaceFit.model_error` is the remaining
+    distance; it is not an error of the defined medium, and intervals cover the readings' errors.
 
     Parameters
     ----------
-    radius_mm, reflectance_per_mm2, eta, variance, valid, core_mm, source_core_mm
-        As of :func:`invert`; reflectance in units of 1/mm^2, as the definition leaves out fibres
-        that take too little.
+        See :func:`invert`; reflectance in units of 1/mm^2, as the definition omits fibers that
+        collect too little.
     collection : {"all", "fibre"}
         What was collected, "fibre" by default.
 
@@ -171,7 +169,7 @@ def nearest_medium(
     Raises
     ------
     SubsurfaceError
-        As of :func:`invert`.
+        See :func:`invert`.
 
     Examples
     --------
@@ -201,13 +199,13 @@ def fit_dipole(
 ) -> SubsurfaceFit:
     """Fit Jensen's dipole, as Weyrich et al. did: the baseline.
 
-    Fibres and weights as the module says: all that can be used, of equal relative weight as far as
-    their noise allows. On true profiles sigma_tr comes out some 5 to 25 % too small.
+    Uses all usable fibers, of equal relative weight as far as their noise allows, see the module.
+    On true profiles sigma_tr comes out some 5 to 25 % too small.
 
     Parameters
     ----------
     radius_mm, reflectance_per_mm2, eta, variance, settings
-        As of :func:`invert`.
+        See :func:`invert`.
 
     Examples
     --------
@@ -224,7 +222,7 @@ def fit_dipole(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Layout:
-    """Profiles one a row, (N, F), with what of them is used."""
+    """Profiles, one per row, (N, F), with the fibers used."""
 
     y: Float64Array
     variance: Float64Array | None
@@ -235,7 +233,7 @@ class _Layout:
     """Leading axes of the profiles as given."""
 
     def batch(self, prior: Float64Array) -> ProfileBatch:
-        """Return the profiles as fits take them."""
+        """Return the profiles with a prior as a batch for fits."""
         return ProfileBatch.lay_out(self.y, self.variance, self.omission, prior)
 
     def fit(
@@ -273,7 +271,7 @@ def _lay_out(
     variance: ArrayLike | None,
     valid: ArrayLike | None,
 ) -> _Layout:
-    """Check profiles and lay them out, see `invert`."""
+    """Check profiles and lay them out as rows, see `invert`."""
     check = Checks(SubsurfaceError)
     y = np.asarray(reflectance_per_mm2, np.float64)
     check.shape("reflectance_per_mm2", y, ("...", "fibres"))
@@ -308,7 +306,8 @@ def _broadcast(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArra
         return np.broadcast_to(array, shape)
     except ValueError as error:
         raise SubsurfaceError(
-            f"{name}: got shape {array.shape}, expected one that broadcasts to {shape}"
+            f"{name}: got shape {array.shape}, expected one that broadcasts to {shape}; "
+            "give one value per fiber, or one per profile and fiber"
         ) from error
 
 

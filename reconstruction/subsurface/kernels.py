@@ -1,8 +1,8 @@
-"""Inner loops of radial profiles: the models, and where on a grid of them fits begin.
+"""Evaluate radial profiles of the forward models, and find starts of fits on a grid (Numba).
 
 Parameters of a profile are log sigma_a, log sigma_s', log of a common factor, and the asymmetry g.
 Models are the dipole and Kienle and Patterson's diffusion, which differ in constants only, and a
-table of log reflectance per fibre.
+table of log reflectance per fiber.
 
 References
 ----------
@@ -26,7 +26,7 @@ _FOUR_PI = 4.0 * math.pi
 
 
 class ForwardModel(NamedTuple):
-    """A forward model at fixed radii, as the kernels take it."""
+    """Forward model at fixed radii, as arrays for the kernels."""
 
     kind: int
     """`TABLE_MODEL` or a closed form."""
@@ -42,7 +42,10 @@ class ForwardModel(NamedTuple):
 
 @njit(inline="always")
 def decay(x):  # type: ignore[no-untyped-def]
-    """Return exp(-x) for x >= 0 within 2e-13 up to x = 100: (exp(-x/1024))^1024, no table."""
+    """Return exp(-x) for x >= 0 within 2e-13 up to x = 100: (exp(-x/1024))^1024, no table.
+
+    The polynomial is the Taylor series of exp(t) to t^9 by Horner's rule, squared ten times.
+    """
     t = -min(x, 660.0) * (1.0 / 1024.0)
     p = 1.0 + t * (1.0 / 9.0)
     p = 1.0 + t * 0.125 * p
@@ -72,9 +75,10 @@ def _closed(theta, radius, constants, m, jac):  # type: ignore[no-untyped-def]
     z0 = 1.0 / t
     z1 = stretch / t
     factor = math.exp(theta[2]) / _FOUR_PI * (s / t) ** power
+    # k = sqrt(3 a t), t = a + s: derivatives of k and of log t by log a and by log s
     k_a, k_s = k * (a + t) / (2.0 * t), k * s / (2.0 * t)
-    t_a, t_s = a / t, s / t  # of log t
-    lean = power * a / t  # of log albedo: by log s, minus that by log a
+    t_a, t_s = a / t, s / t
+    lean = power * a / t  # n d(log albedo)/d(log s) = -n d(log albedo)/d(log a), albedo = s / t
     phi = 3.0 * t * c_phi
     for f in range(radius.size):
         r2 = radius[f] * radius[f]
@@ -88,7 +92,7 @@ def _closed(theta, radius, constants, m, jac):  # type: ignore[no-untyped-def]
         P = e0 * i0 - e1 * i1
         value = phi * P + c_j * (T0 + T1)
         by_k = -phi * (e0 - e1) - c_j * k * (z0 * e0 * i0 + z1 * e1 * i1)
-        # by log z, equal for both depths
+        # both depths are proportional to 1 / t: one derivative by log z serves for -d/d(log t)
         by_z = -phi * (z0 * T0 - z1 * T1) + c_j * (
             z0 * q0 * (u0 - z0 * z0 * (k * k + 3.0 * u0 * i0 * i0))
             + z1 * q1 * (u1 - z1 * z1 * (k * k + 3.0 * u1 * i1 * i1))
@@ -117,10 +121,10 @@ def _cubic(x, count, w, d):  # type: ignore[no-untyped-def]
 
 @njit(fastmath=_FAST_MATH, error_model="numpy")
 def _tabled(theta, radius, axes, grid, w, m, jac):  # type: ignore[no-untyped-def]
-    """Fill reflectance and derivatives by all parameters from a grid (sigma_s', root, g, fibre).
+    """Fill reflectance and derivatives by all parameters from a grid (sigma_s', root, g, fiber).
 
-    It holds log R + sigma_tr r. The second axis is log(1 + 10 sqrt(sigma_a/sigma_s')); axes = first
-    node and spacing of each.
+    The grid is of log R + sigma_tr r. The second axis is log(1 + 10 sqrt(sigma_a/sigma_s')); axes =
+    first node and spacing of each.
     """
     n_s, n_u, n_g, fibres = grid.shape
     root = 10.0 * math.exp(0.5 * (theta[0] - theta[1]))
@@ -181,12 +185,12 @@ def find_valleys(score: Any, valley: Any, position: Any, depth: Any) -> None:
     Parameters
     ----------
     score : (N, S, K) float32
-        Infinite where there is no model.
+        Infinite outside the model's domain.
     valley : (2, N) int64
         Index on the first axis, the deepest valley first.
     position, depth : (2, N) float64
         Index on the second axis of the least misfit there, and that misfit, from the parabola
-        through three nodes; an infinite depth where there is no second valley.
+        through three nodes; the depth is infinite without a second valley.
     """
     profiles, n_s, n_k = score.shape
     at, low = np.empty(n_s), np.empty(n_s + 2)
@@ -199,6 +203,7 @@ def find_valleys(score: Any, valley: Any, position: Any, depth: Any) -> None:
                 if row[j] < row[k]:
                     k = j
             at[i], low[i + 1] = k, row[k]
+            # vertex of the parabola through three nodes: -lean / (2 bend), lower by lean^2/(8 bend)
             if 0 < k < n_k - 1 and row[k - 1] < np.inf and row[k + 1] < np.inf:
                 lean = float(row[k + 1]) - row[k - 1]
                 bend = float(row[k + 1]) + row[k - 1] - 2.0 * row[k]

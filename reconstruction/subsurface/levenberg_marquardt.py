@@ -1,4 +1,4 @@
-"""Levenberg and Marquardt's fit of many radial profiles, a thread for a share of them.
+"""Fit many radial profiles by Levenberg and Marquardt's method, in parallel threads (Numba).
 
 The parallel kernel is called from one thread. Sums may be taken in any order within a profile, but
 a profile's result does not depend on the others nor on the number of threads.
@@ -20,18 +20,18 @@ from reconstruction.subsurface.kernels import decay, evaluate_one
 MAX_LOG_STEP = 1.5
 """Largest change of a logarithm in one step."""
 LOG_STEP_TOL = 1e-5
-"""A step of the logarithms after which the next would change nothing that matters."""
+"""Step of the logarithms at which the fit has converged."""
 _FAST_MATH = {"contract", "reassoc", "nsz"}
 _MIN_REFLECTANCE = 1e-290
 
 
 class FitProblem(NamedTuple):
-    """What is fitted and how."""
+    """Data, weights, prior and limits of a fit."""
 
     y: Float64Array
     """(N, F): reflectance, or its logarithm where `logarithmic`."""
     variance: Float64Array
-    """(N, F): of `y`; infinite where a fibre is left out."""
+    """(N, F): of `y`; infinite where a fiber is omitted."""
     logarithmic: bool
     """Compare logarithms; then the model's error is not added."""
     prior: Float64Array
@@ -42,13 +42,13 @@ class FitProblem(NamedTuple):
     bounds: Float64Array
     """(4, 2): least and greatest value of each parameter."""
     rounds: int
-    """Times the model's error is taken anew."""
+    """Times the weights are recomputed with the model's error."""
     max_steps: int
-    """Steps of a round at most."""
+    """Largest number of steps per round."""
 
 
 class FitBuffers(NamedTuple):
-    """Where the results go."""
+    """Arrays that a fit fills."""
 
     theta: Float64Array
     """(N, 4): start; becomes the result."""
@@ -111,7 +111,7 @@ def _misfit(y, m, weight, logarithmic):  # type: ignore[no-untyped-def]
 
 @njit(fastmath=_FAST_MATH, error_model="numpy")
 def _normal(y, m, jac, weight, logarithmic, active, count, h, g):  # type: ignore[no-untyped-def]
-    """Fill J'WJ and J'W residual of the active parameters; scales `jac` to logs where wanted."""
+    """Fill J'WJ and J'W residual of the active parameters; scale `jac` to logs if logarithmic."""
     if logarithmic:
         for r in range(count):
             row = jac[active[r]]
@@ -192,6 +192,7 @@ def _fit_share(begin, end, curves, problem, found):  # type: ignore[no-untyped-d
                         p = active[r]
                         h[p, p] += 1.0 / prior[p, 1] ** 2
                         g[p] -= (now[p] - prior[p, 0]) / prior[p, 1] ** 2
+                        # a parameter at its limit stays there while the gradient points outward
                         if not (
                             (now[p] <= bounds[p, 0] and g[p] < 0.0)
                             or (now[p] >= bounds[p, 1] and g[p] > 0.0)
@@ -271,15 +272,15 @@ def _fit_share(begin, end, curves, problem, found):  # type: ignore[no-untyped-d
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def fit(curves: Any, problem: Any, found: Any, parts: Any) -> None:
-    """Fit every profile, from `found.theta` on.
+    """Fit every profile, starting from `found.theta`.
 
     Parameters
     ----------
-    curves : Curves
-    problem : Problem
-    found : Found
+    curves : ForwardModel
+    problem : FitProblem
+    found : FitBuffers
     parts : int
-        Shares of the profiles.
+        Number of parts that the profiles are divided into.
     """
     profiles = problem.y.shape[0]
     for part in prange(parts):

@@ -1,26 +1,25 @@
-"""The homogeneous medium whose profile is nearest to that of layered tissue, and how sure it is.
+"""Fit the homogeneous medium whose profile is nearest to that of layered tissue, with its errors.
 
-Tissue of layers has no sigma_tr of its own. What stands for it is a definition: of all half spaces
-of asymmetry `NEAREST_MEDIUM_G` the one whose profile is nearest up to a factor, by the mean square
-of the logarithms of the ratios over all fibres that take `MIN_REFLECTANCE_PER_MM2` or more, each of
-one weight.
-What is left of the profile then is no error of that medium: residuals that are there without any
-noise move it as little as they move the mean of a sample. So they must not widen its interval, and
-no fibre may be left out for the sake of its residual, or weighed by its noise: any other weights
-tell of another medium, its sigma_tr off by as much as a tenth where the misfit is a tenth.
+Layered tissue has no sigma_tr of its own, so it is defined: of all half spaces of asymmetry
+`NEAREST_MEDIUM_G`, the one whose profile is nearest up to a factor. Distance is the mean square of
+the logarithms of the ratios, with equal weights, over all fibers that collect
+`MIN_REFLECTANCE_PER_MM2` or more.
 
-So two things are told apart. First what the profile is without noise, at all of the definition's
-fibres: readings, and that what layers do to a profile is smooth
-(`reconstruction.subsurface.smooth_misfit`). Then the medium nearest to that, all fibres alike. A
-profile that is off by e, of covariance V, moves the medium by::
+The remaining residuals are not an error of that medium: as they exist without any noise, they move
+it as little as they move the mean of a sample. So they must not widen its interval. No fiber may be
+omitted for its residual or weighted by its noise: other weights define another medium, whose
+sigma_tr differs by as much as a tenth where the misfit is a tenth.
 
-    A^-1 J' e,   A = J' J - sum r J2
+There are two steps. First, estimate the profile without noise at all of the definition's fibers,
+from the readings and the smoothness of what layers do to a profile
+(`reconstruction.subsurface.smooth_misfit`). Second, fit the medium nearest to that, all fibers
+alike. An error e of the profile, of covariance V, moves the medium by::
 
-with J and J2 the first and second derivatives of log R and r what is left.
+with J and J2 the first and second derivatives of log R and r the remaining residuals.
 
 References
 ----------
-White 1982, doi:10.2307/1912526: errors of what is nearest in a family that does not hold the truth.
+White 1982, doi:10.2307/1912526: errors of the nearest member of a family without the true one.
 """
 
 from dataclasses import replace
@@ -36,33 +35,33 @@ from reconstruction.subsurface.profile_fit import MIN_DEVIATION, START_DEVIATION
 from reconstruction.subsurface.smooth_misfit import smooth_misfit
 
 NEAREST_MEDIUM_G: Final = 0.8
-"""Asymmetry of the media, of the definition."""
+"""Asymmetry of the media, by definition."""
 MIN_REFLECTANCE_PER_MM2: Final = 1e-7
-"""Of the definition's fibres: what 23 exposures up to 30 s still tell to about a tenth."""
+"""Least reflectance of the definition's fibers: 23 exposures up to 30 s measure it to a tenth."""
 MAX_RELATIVE_NOISE: Final = 0.3
-"""Relative deviation of a reading up to which it counts as used, and fits begin with it."""
+"""Relative deviation of a reading up to which it counts as used and starts the fit."""
 MAX_LOG_NOISE: Final = 0.1
-"""Likewise up to which its logarithm is compared. Of fainter ones that would leave out the low
-readings; they are compared as they are, with the profile found so far."""
+"""Relative deviation up to which a reading's logarithm is compared. Logarithms of fainter ones
+would omit low readings; these are compared linearly, about the profile found so far."""
 MAX_FAINT_LOG_STEP: Final = 3.0
-"""Logarithms by which such a reading may move the profile in a round: noise of no light does not
-lift it by orders of magnitude."""
+"""Logarithms by which such a reading may move the profile in a round: noise without light must not
+raise it by orders of magnitude."""
 LOG_FACTOR_SIGMA: Final = 1.0
-"""Standard deviation of the log of the factor: a layer on top dims, and does not do so by a hundred
-or brighten, as media of next to no scattering would ask for."""
+"""Standard deviation of the log of the factor: a layer on top dims, but neither by a hundred nor
+does it brighten, as media of almost no scattering would require."""
 SHARED_TABLE_ERROR: Final = 0.004
-"""Relative error of the photon table that fibres at like reduced distances share, as
+"""Relative error of the photon table that fibers at like reduced distances share, as
 `model.photon_table.relative_error` has it at 10 to 40 / sigma_s'."""
 TABLE_ERROR_RANGE: Final = (5.0, 30.0)
-"""Reduced distances between which it comes in."""
+"""Reduced distances between which that error sets in."""
 DENSE_LOG_OFFSET: Final = 0.1
-"""Below the logarithm of the most scattering: a start there."""
+"""Offset of a start below the logarithm of the largest scattering."""
 N_ROUNDS: Final = 4
-"""Times the profile without noise and the fibres that count are taken anew."""
+"""Times the profile without noise and its fibers are recomputed."""
 VALLEY_ROUND: Final = 1
-"""Of them, those before all valleys of the misfit are looked at again, by the profile found."""
+"""Rounds before all valleys of the misfit are searched again with the profile found."""
 DIFFERENCE_STEP: Final = 1e-3
-"""Of parameters, for second derivatives."""
+"""Step of the parameters for second derivatives."""
 N_FREE: Final = 3
 """Parameters that are fitted: log sigma_a, log sigma_s', log of the factor."""
 
@@ -75,7 +74,7 @@ def fit_nearest(batch: ProfileBatch, model: ProfileModel) -> Fits:
     batch
         Laid out with variances and a factor that is free.
     model
-        A table at the fibers' radii.
+        Table at the fibers' radii.
 
     Returns
     -------
@@ -87,7 +86,7 @@ def fit_nearest(batch: ProfileBatch, model: ProfileModel) -> Fits:
     safe = np.where(observed, y, 1.0)
     noise = np.where(observed, np.sqrt(variance) / safe, np.inf)
     known = observed & (noise < MAX_RELATIVE_NOISE)
-    # the mean of a logarithm is below the logarithm of the mean
+    # E[log y] is about log E[y] - variance / (2 E[y]^2): add that bias back
     logs = np.where(known, np.log(safe) + 0.5 * np.where(known, noise, 0.0) ** 2, 0.0)
     counts = known & (y >= MIN_REFLECTANCE_PER_MM2)
     wide = np.where(counts, noise**2 + model.error[0] ** 2 + START_DEVIATION**2, np.inf)
@@ -127,12 +126,12 @@ def fit_nearest(batch: ProfileBatch, model: ProfileModel) -> Fits:
 def _readings(
     batch: ProfileBatch, model: ProfileModel, profile: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Return logarithms of readings about a profile's, and their variances, each (N, F).
+    """Return logarithms of readings near a profile's, and their variances, each (N, F).
 
     Parameters
     ----------
     profile
-        Logarithms of what they are without noise, as far as it is known, (N, F).
+        Logarithms of the noise-free profile found so far, (N, F).
     """
     m, y = np.exp(np.maximum(profile, MIN_LOG_REFLECTANCE)), batch.y
     known = batch.used & np.isfinite(batch.variance)
@@ -147,7 +146,7 @@ def _readings(
 def _starts(
     batch: ProfileBatch, model: ProfileModel, logs: Float64Array, counts: BoolArray
 ) -> tuple[Float64Array, ...]:
-    """Return where fits begin, each (N, 4): two valleys, and the most scattering there is."""
+    """Return starts of the fits, each (N, 4): two valleys, and the largest scattering."""
     best, second, _ = model.starts(
         logs, counts / START_DEVIATION**2, float(batch.prior[3, 0]), float(batch.prior[2, 1])
     )
@@ -167,12 +166,12 @@ def _nearest_of(
     starts: tuple[Float64Array, ...],
     error: Float64Array | None = None,
 ) -> tuple[Fits, Float64Array]:
-    """Fit from every start; return the nearest medium and what the others leave in doubt.
+    """Fit from every start; return the nearest medium and the covariance between candidates.
 
-    Media may be as near as each other and far apart. Which one is nearest, a table that is off by
-    `SHARED_TABLE_ERROR` at many fibers alike then decides by chance: its mean square misfit of
-    deviation d has the error 2 d `SHARED_TABLE_ERROR`, to which that of the profile adds
-    (``error``, (N, F, F)). The others' distances join the covariance, each with its odds.
+    Distant media may be almost equally near. A table that is off by `SHARED_TABLE_ERROR` at many
+    fibers alike then decides between them by chance: its mean square misfit of deviation d has the
+    error 2 d `SHARED_TABLE_ERROR`, to which that of the profile adds (``error``, (N, F, F)). The
+    others' distances join the covariance, each with its odds.
     """
     each = [fit_from(model, batch, start, y=logs, variance=wide) for start in starts]
     nearest = each[0]
@@ -205,7 +204,11 @@ def _covariance(
     error: Float64Array,
     deviation: Float64Array,
 ) -> Float64Array:
-    """Return the covariance of the parameters, (N, 4, 4), by that of profiles; see the module."""
+    """Return the covariance of the parameters, (N, 4, 4), by that of profiles.
+
+    The sandwich A^-1 M A^-T of White 1982: A = J'J - sum r J2 is `bread`; M = J'VJ and the part
+    that the table's shared error adds is `meat`.
+    """
     share = bright.astype(np.float64)
     first = _slopes(model, theta)
     bread = np.einsum("npf,nf,nqf->npq", first, share, first)

@@ -1,4 +1,4 @@
-"""What fits of radial profiles tell: estimates with errors and intervals, and what to doubt."""
+"""Convert fits of radial profiles into estimates with errors, intervals and validity flags."""
 
 import math
 from dataclasses import dataclass
@@ -14,27 +14,27 @@ from reconstruction.subsurface.profile_fit import MIN_OBSERVED_FIBERS, MISFIT_P_
 
 MIN_FIBERS = 4
 MAX_LOG_STDERR = 0.5
-"""Standard error of log sigma_tr above which the profile does not tell it."""
+"""Standard error of log sigma_tr above which sigma_tr counts as not identified."""
 MAX_PAIR_LOG_STDERR = 0.3
-"""Likewise of log sigma_a and log sigma_s', which is said apart."""
+"""Likewise of log sigma_a and log sigma_s', for a remark of their own."""
 MAX_LOG_RMS = 0.7
-"""Root mean square of log(reading / model) above which a profile is of no such medium."""
+"""Root mean square of log(reading / model) above which no homogeneous medium fits the profile."""
 MAX_MODEL_ERROR = 0.5
 """Relative model error found from the residuals, likewise."""
 MAX_CORRELATION = 0.9
-"""Of residuals of neighbouring fibres."""
+"""Largest correlation assumed between residuals of neighboring fibers."""
 MAX_SYMMETRIC_LOG_STDERR = 0.2
 """Standard error of log sigma_tr up to which its interval is symmetric in the logarithm."""
 ONE_SIGMA_LEVEL = 0.6827
-"""Of the interval."""
+"""Coverage of the interval of sigma_tr."""
 CHANCE_SIGMAS = 2.0
-"""Standard deviations of the correlation of independent neighbours up to which it says nothing."""
+"""Standard deviations of the correlation of independent neighbors that it must exceed."""
 MAX_RELATIVE_MISFIT = 2.0
-"""Times the misfit that a fibre counts there at most: one must not hide what all others say."""
+"""Largest residual of a fiber in that correlation, in misfits: one fiber must not dominate."""
 
 
 class FitOutcome(IntFlag):
-    """What became of a fit; the first eight bits make it invalid, the others are remarks."""
+    """Outcome of a fit; the first eight bits make it invalid, the others are remarks."""
 
     GOOD = 0
     TOO_FEW_FIBRES = 1
@@ -50,29 +50,29 @@ class FitOutcome(IntFlag):
 
 _INVALID_CODE = 255
 _REASON_BY_CODE = {
-    FitOutcome.TOO_FEW_FIBRES: f"fewer than {MIN_FIBERS} fibres to use",
-    FitOutcome.NO_SIGNAL: f"fewer than {MIN_OBSERVED_FIBERS} fibres stand out of their noise",
-    FitOutcome.NOT_CONVERGED: "the fit did not settle",
-    FitOutcome.AT_BOUND: "a coefficient runs against its limit",
-    FitOutcome.OUTSIDE_DOMAIN: "sigma_a / sigma_s' is beyond what the model is good for",
-    FitOutcome.NOT_IDENTIFIED: "the profile does not tell sigma_tr",
+    FitOutcome.TOO_FEW_FIBRES: f"fewer than {MIN_FIBERS} usable fibers",
+    FitOutcome.NO_SIGNAL: f"fewer than {MIN_OBSERVED_FIBERS} fibers read above their noise",
+    FitOutcome.NOT_CONVERGED: "the fit did not converge",
+    FitOutcome.AT_BOUND: "sigma_a or sigma_s' is at its limit",
+    FitOutcome.OUTSIDE_DOMAIN: "sigma_a / sigma_s' is outside the model's domain",
+    FitOutcome.NOT_IDENTIFIED: "the profile does not determine sigma_tr",
     FitOutcome.WRONG_PROFILE: "no medium of this kind has such a profile, or its scale is wrong",
-    FitOutcome.MISFIT: "residuals exceed their errors; a model error takes up the rest",
-    FitOutcome.COEFFICIENTS_NOT_IDENTIFIED: "sigma_a and sigma_s' are not told apart well",
+    FitOutcome.MISFIT: "residuals exceed their errors; a model error accounts for the excess",
+    FitOutcome.COEFFICIENTS_NOT_IDENTIFIED: "sigma_a and sigma_s' are not identified separately",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class SubsurfaceFit:
-    """Coefficients of the media that profiles come from, leading axes as the profiles'.
+    """Coefficients of homogeneous media fitted to profiles; leading axes are the profiles'.
 
     Attributes
     ----------
     sigma_a_per_mm, sigma_s_prime_per_mm, sigma_tr_per_mm : ndarray, shape (...)
         Absorption, reduced scattering, and sqrt(3 sigma_a (sigma_a + sigma_s')), 1/mm; NaN where
-        the fibres do not suffice (`Outcome.TOO_FEW_FIBRES`, `Outcome.NO_SIGNAL`).
+        the fibers do not suffice (`FitOutcome.TOO_FEW_FIBRES`, `FitOutcome.NO_SIGNAL`).
     covariance : ndarray, shape (..., 2, 2)
-        Of (sigma_a, sigma_s'), 1/mm^2, nuisances included; infinite where nothing is told.
+        Of (sigma_a, sigma_s'), 1/mm^2, nuisances included; infinite where not identified.
     valid : ndarray of bool, shape (...)
         sigma_tr can be used. False with a reason in `outcome`.
     sigma_tr_stderr : ndarray, shape (...)
@@ -80,36 +80,36 @@ class SubsurfaceFit:
     interval_per_mm : ndarray, shape (..., 2)
         68 % interval of sigma_tr, 1/mm.
     chi2, p_value : ndarray, shape (...)
-        Squared residuals over their stated variances, with the nuisances' priors; and the chance
-        of more.
-        Without a variance chi2 equals `dof` but for its smoothing and says little.
+        Squared residuals over their stated variances, with the nuisances' priors; and the
+        probability of a larger value. Without a variance the weights come from the residuals, so
+        that chi2 equals `dof` but for its smoothing and does not test the fit.
     dof : ndarray of int, shape (...)
-        Fibres used less two.
+        Fibers used less two.
     inflation : ndarray, shape (...)
-        By how much residuals exceed their stated errors, sqrt(chi2/dof), for a misfit; 1 without.
+        Factor by which residuals exceed their stated errors, sqrt(chi2/dof); 1 without a misfit.
     model_error : ndarray, shape (...)
-        Relative error of the model at all fibres that explains a misfit; the fit and its standard
+        Relative error of the model at all fibers that explains a misfit; the fit and its standard
         errors are made with it. 0 without.
     bent : ndarray of bool, shape (...)
-        The misfit is one of the profile: neighbouring fibres agree about it by more than chance.
-        Tissue that is none of the model's bends a profile smoothly, while fibres that are each off
-        by themselves, as by dirt, do not agree. False without a misfit.
+        The misfit is one of the profile: residuals of neighboring fibers correlate by more than
+        chance. Tissue outside the model bends a profile smoothly, while independent faults of
+        fibers, such as dirt, do not correlate. False without a misfit.
     used : ndarray of bool, shape (..., F)
     left_out : ndarray of uint8, shape (..., F)
         Values of `OmissionReason`.
     outcome : ndarray of uint16, shape (...)
         Bits of `FitOutcome`.
     predicted_per_mm2 : ndarray, shape (..., F)
-        The fitted profile with the common factor, 1/mm^2, at every fibre.
+        The fitted profile with the common factor, 1/mm^2, at every fiber.
     residual : ndarray, shape (..., F)
         (reflectance - predicted) over its standard deviation, model error included; without a
         variance of logarithms; 0 where not used.
     scale : ndarray, shape (...)
-        Common factor of the reading, 1 without ``common_error``.
+        Common factor of the readings, 1 without ``common_error``.
     asymmetry : ndarray, shape (...)
         g as fitted, or as given.
     evaluations : ndarray of int, shape (...)
-        Profiles computed for the fit.
+        Profiles computed by the fit.
     method : str
     """
 
@@ -148,7 +148,7 @@ class SubsurfaceFit:
 
     @property
     def correlation(self) -> Float64Array:
-        """Correlation of sigma_a and sigma_s', shape (...); NaN where nothing is told."""
+        """Correlation of sigma_a and sigma_s', shape (...); NaN where not identified."""
         spread = self.sigma_a_stderr * self.sigma_s_prime_stderr
         known = np.isfinite(spread) & (spread > 0.0)
         ratio = np.full(spread.shape, np.nan)
@@ -156,7 +156,7 @@ class SubsurfaceFit:
 
     @property
     def coefficients_identified(self) -> BoolArray:
-        """Whether sigma_a and sigma_s' are told one by one; `valid` speaks of sigma_tr alone."""
+        """Whether sigma_a and sigma_s' are identified separately; `valid` is of sigma_tr alone."""
         unclear = (
             FitOutcome.COEFFICIENTS_NOT_IDENTIFIED
             | FitOutcome.TOO_FEW_FIBRES
@@ -165,12 +165,12 @@ class SubsurfaceFit:
         return np.asarray((self.outcome & np.uint16(unclear)) == 0)
 
     def reason(self, index: int | tuple[int, ...] = ()) -> str:
-        """Return what is to be said of one fit, empty for a good one.
+        """Describe the outcome of one fit; empty for a good one.
 
         Parameters
         ----------
         index
-            Of the leading axes; () for a single profile.
+            Index on the leading axes; () for a single profile.
         """
         code = int(self.outcome[index])
         return "; ".join(text for bit, text in _REASON_BY_CODE.items() if code & bit)
@@ -184,14 +184,14 @@ def evaluate_fits(
     *,
     by_definition: bool = False,
 ) -> SubsurfaceFit:
-    """Return estimates with errors, and which of them can be used.
+    """Compute estimates with errors from fits, and which of them can be used.
 
     Parameters
     ----------
     shape
         Leading axes of the estimates.
     by_definition
-        Whether the model's error is no error of what is estimated.
+        Leave the model's error out of the errors, since the estimate is defined by the model.
     """
     a, s = np.exp(fits.theta[:, 0]), np.exp(fits.theta[:, 1])
     sigma_tr = np.sqrt(3.0 * a * (a + s))
@@ -210,7 +210,8 @@ def evaluate_fits(
     elif not by_definition:
         widening = np.where(fits.model_error > 0.0, _repeats(residual), 1.0)
     logs = fits.covariance[:, :2, :2] * widening[:, None, None]
-    slope = 0.5 * np.stack([1.0 + a / (a + s), s / (a + s)], axis=1)  # of log sigma_tr
+    # log sigma_tr = (log 3 + log a + log(a + s)) / 2: its derivatives by log a and log s
+    slope = 0.5 * np.stack([1.0 + a / (a + s), s / (a + s)], axis=1)
     known = np.asarray(np.isfinite(logs).all(axis=(1, 2)))
     safe = np.where(known[:, None, None], logs, 0.0)
     log_variance = np.einsum("ni,nij,nj->n", slope, safe, slope)
@@ -295,10 +296,10 @@ def _residuals(batch: ProfileBatch, fits: Fits) -> Float64Array:
 
 
 def _bent(batch: ProfileBatch, fits: Fits) -> BoolArray:
-    """Return whose neighboring fibers agree about the misfit by more than chance, (N,).
+    """Return where residuals of neighboring fibers correlate by more than chance, (N,).
 
-    By their correlation, of fibers as far as their noise is below the misfit: that of n
-    independent ones is off from 0 by 1 / sqrt(n).
+    Fibers count as far as their noise is below the misfit. The correlation of n independent
+    residuals has the standard deviation 1 / sqrt(n).
     """
     model_error = fits.model_error[:, None]
     there = fits.used & (model_error > 0.0)
@@ -316,10 +317,10 @@ def _bent(batch: ProfileBatch, fits: Fits) -> BoolArray:
 
 
 def _repeats(residual: Float64Array) -> Float64Array:
-    """Return how many neighbours tell the same, from the residuals' correlation, (N,).
+    """Return how many neighboring residuals carry one independent value, (N,).
 
-    A medium that the model does not describe leaves residuals that are smooth over the fibres;
-    (1 + c)/(1 - c) of them count as one, as in a series of the first order.
+    A medium outside the model leaves residuals that are smooth over the fibers. With correlation c
+    of neighbors, (1 + c)/(1 - c) of them count as one, as in a first-order autoregression.
     """
     squares = np.maximum((residual**2).sum(axis=1), 1e-290)
     c = (residual[:, 1:] * residual[:, :-1]).sum(axis=1) / squares
@@ -332,8 +333,8 @@ def _interval(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the ends of the 68 % interval of sigma_tr.
 
-    Symmetric in the logarithm while that is well told; then in sigma_tr^2, which a profile is
-    linear in where the absorption is next to none.
+    Symmetric in the logarithm while its error is small; otherwise in sigma_tr^2, in which a
+    profile is linear under vanishing absorption.
     """
     clear = log_stderr < MAX_SYMMETRIC_LOG_STDERR
     spread = np.where(clear, log_stderr, 0.0)
@@ -346,7 +347,7 @@ def _interval(
 
 
 def _deviation(sigma_tr: Float64Array, log_stderr: Float64Array) -> Float64Array:
-    """Return the standard error, half the interval where that is wide; infinite where unknown."""
+    """Return the standard error: half the interval where that is wide, infinite where unknown."""
     low, high = _interval(sigma_tr, log_stderr)
     half = np.full(sigma_tr.shape, math.inf)
     np.subtract(0.5 * high, 0.5 * low, out=half, where=np.isfinite(high) & np.isfinite(low))

@@ -1,4 +1,4 @@
-"""Where on a face's texture a probe's sites are."""
+"""Texture coordinates of a probe's sites on a face, fixed or read from a table."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,21 +14,20 @@ SITE_UV: Final[Mapping[str, tuple[float, float]]] = {
     "cheek right": (0.737, 0.528),
     "chin": (0.500, 0.205),
 }
-"""Texture coordinates of the places where a probe is set down, on the simulated heads: of the
-points nearest to the landmarks of `rigsim.subject.head`, means of 8 heads (they differ by 0.002);
-chin is below it, where the skin faces down. Left and right as seen in the picture; a cheek that is
-not named otherwise is the left one."""
+"""Texture coordinates of the sites of a probe on the simulated heads: of the points nearest to the
+landmarks of `rigsim.subject.head`, means of 8 heads (they differ by 0.002); chin is below it, where
+the skin faces down. Left and right as in the image; "cheek" is the left one."""
 
 
 def read_landmarks(
     path: str | Path, *, texture_px: tuple[int, int]
 ) -> dict[str, tuple[float, float]]:
-    """Read where sites lie on a texture from a table ``name,x,y``.
+    """Read texture coordinates of sites from a table ``name,x,y``.
 
     Parameters
     ----------
     path
-        CSV with a header; x to the right and y down from the centre of the texture's upper left
+        CSV with a header; x to the right and y down from the center of the texture's upper left
         pixel, px.
     texture_px : (int, int)
         Height and width of the texture they were read from.
@@ -41,7 +40,7 @@ def read_landmarks(
     Raises
     ------
     TranslucencyError
-        For another header, something that is no number, a name twice, or a place beyond the
+        For another header, a value that is not a number, a name twice, or a site beyond the
         texture.
     """
     height, width = texture_px
@@ -54,7 +53,8 @@ def read_landmarks(
         u, v = (x + 0.5) / width, 1.0 - (y + 0.5) / height
         if not (0 <= u <= 1 and 0 <= v <= 1):
             raise TranslucencyError(
-                f"{path}: {name!r} lies at ({x}, {y}), expected within {width} x {height} px"
+                f"{path}: {name!r}: got ({x}, {y}), expected within {width} x {height} px; "
+                "correct the row or give the size of the texture it was read from"
             )
         found[name] = (u, v)
     return found

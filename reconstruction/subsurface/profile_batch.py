@@ -1,4 +1,4 @@
-"""Radial profiles laid out for the fit, one a row, and what fits make of them."""
+"""Lay out radial profiles for fits, one per row, and keep the results of fits."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from reconstruction.subsurface import levenberg_marquardt
 from reconstruction.subsurface.models import ProfileModel
 
 SIGNAL_SIGMAS = 3.0
-"""Standard deviations by which a reading exceeds 0 where it counts as observed."""
+"""Standard deviations by which an observed reading exceeds 0."""
 INITIAL_DEVIATION = 0.05
-"""Relative deviation of a reading for the first of the fits without a variance."""
+"""Relative deviation of a reading in the first of the fits without a variance."""
 MAX_WEIGHT_ROUNDS, MAX_ROUND_STEPS = 4, 60
-"""Times the model's error is computed again, and steps of a round."""
+"""Times the model's error is recomputed, and steps per round."""
 MIN_REFLECTANCE = 1e-290
 """Smallest prediction that has a logarithm."""
 
 
 class OmissionReason(IntEnum):
-    """Why a fiber takes no part in a fit; the values of `SubsurfaceFit.left_out`."""
+    """Why a fiber is not used in a fit; the values of `SubsurfaceFit.left_out`."""
 
     USED = 0
     MASKED = 1
@@ -38,7 +38,7 @@ class OmissionReason(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProfileBatch:
-    """Profiles as the fits take them; no fit changes them."""
+    """Profiles laid out for fits; no fit changes them."""
 
     y: Float64Array
     """(N, F) reflectance, or its logarithm; 0 where not used."""
@@ -47,9 +47,9 @@ class ProfileBatch:
     omission: UInt8Array
     """(N, F), values of `OmissionReason`."""
     observed: BoolArray
-    """(N, F): readings that stand out of their noise."""
+    """(N, F): readings above their noise."""
     logarithmic: bool
-    """Whether `y` are logarithms, since no variance was given."""
+    """Whether `y` are logarithms, because no variance was given."""
     prior: Float64Array
     """(4, 2): mean and standard deviation of each parameter; 0: fixed, infinite: free."""
 
@@ -73,7 +73,7 @@ class ProfileBatch:
 
     @property
     def used(self) -> BoolArray:
-        """Fibers that take part, (N, F)."""
+        """Fibers that are used, (N, F)."""
         return np.asarray(self.omission == OmissionReason.USED)
 
     def select(self, rows: NDArray[np.intp]) -> ProfileBatch:
@@ -89,7 +89,7 @@ class ProfileBatch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fits:
-    """What fits make of the profiles of a batch."""
+    """Results of fits of a batch, one row per profile."""
 
     theta: Float64Array
     """(N, 4), see `reconstruction.subsurface.kernels`."""
@@ -104,23 +104,23 @@ class Fits:
     steps: Int64Array
     """(N,) evaluations, negative where the fit did not converge."""
     used: BoolArray
-    """(N, F): fibers that the fit rests on."""
+    """(N, F): fibers that the fit uses."""
     observed: BoolArray
-    """(N, F): those of them that stand out of their noise."""
+    """(N, F): those of them that read above their noise."""
     outlier: BoolArray
-    """(N, F): fibers left out for their residuals."""
+    """(N, F): fibers omitted for their residuals."""
     model_error: Float64Array
     """(N,) relative error of the model found from the residuals, 0 without a misfit."""
     in_domain: BoolArray
-    """(N,): whether the model is good for `theta`."""
+    """(N,): whether `theta` is in the model's domain."""
     at_bound: BoolArray
     """(N,): whether a coefficient is at its limit."""
     bias: Float64Array
-    """(N,) systematic error of log sigma_tr by the model."""
+    """(N,) systematic error of log sigma_tr due to the model."""
 
     @classmethod
     def join(cls, parts: Sequence[tuple[NDArray[np.intp], Fits]]) -> Fits:
-        """Return the fits of parts of a batch, each with its rows, as those of the batch."""
+        """Join the fits of parts of a batch, each with its rows, in the batch's order."""
         order = np.argsort(np.concatenate([rows for rows, _ in parts]))
         return cls(
             *(
@@ -146,7 +146,7 @@ class Fits:
         return Fits(**arrays)
 
     def with_likelier(self, rows: NDArray[np.intp], other: Fits) -> Fits:
-        """Return fits with those of some profiles replaced where the other is the likelier."""
+        """Return fits with those of some profiles replaced where the other is more likely."""
         won = other.misfit < self.select(rows).misfit
         return self.with_rows(rows[won], other.select(won))
 
@@ -165,7 +165,7 @@ def fit_from(
     y: Float64Array | None = None,
     variance: Float64Array | None = None,
 ) -> Fits:
-    """Fit the profiles of a batch from `start` (N, 4) on, see `levenberg_marquardt.fit`.
+    """Fit the profiles of a batch starting from `start` (N, 4), see `levenberg_marquardt.fit`.
 
     Parameters
     ----------

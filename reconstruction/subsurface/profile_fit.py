@@ -1,4 +1,4 @@
-"""Fits of radial profiles: what is used, how it is weighted, where it begins."""
+"""Fit radial profiles: select fibers, weight them, choose starts and model a misfit."""
 
 import math
 from dataclasses import replace
@@ -12,7 +12,7 @@ from reconstruction.subsurface.models import ProfileModel
 from reconstruction.subsurface.profile_batch import MIN_REFLECTANCE, Fits, ProfileBatch, fit_from
 
 MIN_OBSERVED_FIBERS = 3
-"""Fibers that must stand out of their noise."""
+"""Fewest fibers that must read above their noise."""
 NEIGHBOR_FIBERS = 7
 """Fibers to either side whose residuals give the noise of one, without a variance."""
 MIN_DEVIATION = 1e-3
@@ -20,7 +20,7 @@ MIN_DEVIATION = 1e-3
 START_DEVIATION = 0.1
 """Relative error added for the comparison with starts."""
 MISFIT_P_VALUE = 1e-3
-"""A chi2 that chance exceeds so rarely is a misfit."""
+"""Probability of a larger chi2 below which a profile is a misfit."""
 FIBER_OUTLIER_SIGMAS = 6.0
 MAX_FIBER_OUTLIER_FRACTION = 0.1
 """Standard deviations that make a fiber an outlier, and the fraction of fibers that may be such."""
@@ -29,11 +29,11 @@ MAD_TO_SIGMA = 1.4826
 MIN_LOG_DEVIATION = 0.1
 """Median relative residual from which a profile is compared by its logarithms."""
 MAX_VALLEY_RISE = 50.0
-"""A second valley of the misfit is tried when it begins no higher above the deepest."""
+"""Excess misfit up to which a second valley is tried."""
 
 
 def fit_profiles(batch: ProfileBatch, model: ProfileModel) -> Fits:
-    """Fit profiles from the best of the starts on."""
+    """Fit profiles starting from the best points of a grid."""
     y, variance, observed = batch.y, batch.variance, batch.observed
     if batch.logarithmic:
         logs, weight = y, observed / START_DEVIATION**2
@@ -70,11 +70,11 @@ def fit_profiles(batch: ProfileBatch, model: ProfileModel) -> Fits:
 
 
 def _with_model_error(model: ProfileModel, batch: ProfileBatch, start: Float64Array) -> Fits:
-    """Fit profiles again that the model does not describe, with its error from the residuals.
+    """Fit misfitting profiles again, with a model error from the residuals.
 
-    The same relative error at all fibers, so that the fit is the best in relative terms, as
-    are the starts; a few fibers far off all others are left out. chi2 becomes that of the
-    errors as they were.
+    The relative error is equal at all fibers, so that the fit is the best in relative terms, as
+    are the starts; a few fibers far off all others are omitted. chi2 becomes that of the stated
+    errors.
     """
     y, variance, used = batch.y, batch.variance, batch.used
     wide = variance + (START_DEVIATION * np.abs(y)) ** 2
@@ -105,7 +105,7 @@ def _with_model_error(model: ProfileModel, batch: ProfileBatch, start: Float64Ar
 
 
 def _median_residual(batch: ProfileBatch, fits: Fits) -> Float64Array:
-    """Return the median of the relative residuals of what stands out of its noise, (N,)."""
+    """Return the median relative residual of the observed fibers, (N,)."""
     off = np.abs(batch.y / np.maximum(fits.predicted, MIN_REFLECTANCE) - 1.0)
     known = np.asarray(fits.observed.any(axis=1))
     shown = np.where(fits.observed | ~known[:, None], off, math.nan)
@@ -119,12 +119,12 @@ def _by_logarithms(
     best: Float64Array,
     second: Float64Array,
 ) -> Fits:
-    """Fit profiles of no such medium by their logarithms, from the best of the starts on.
+    """Fit profiles outside the model by their logarithms, starting from the best grid points.
 
-    A linear residual over a share of the model is small where the model is far too bright, so
-    that a profile that is off by tens of percent everywhere, as of layered tissue, is drawn to
-    media that it does not look like. Logarithms do not care which of the two is larger. What
-    does not stand out of its noise is left out.
+    A linear residual over a fraction of the model is small where the model is far too bright. A
+    profile that is off by tens of percent everywhere, as of layered tissue, is then drawn to
+    media that it does not resemble. Logarithms are symmetric in the two. Fibers within their noise
+    are omitted.
     """
     y, variance, observed = batch.y, batch.variance, batch.observed
     own = np.full(y.shape, math.inf)
@@ -136,7 +136,7 @@ def _by_logarithms(
     fits = fits.with_likelier(rows, other)
     for _ in range(2):
         off = np.where(observed, logs - fits.log_predicted, 0.0)
-        # of scatter about a fit of two coefficients
+        # two degrees of freedom go to the two coefficients
         kept = np.maximum(observed.sum(axis=1), 3)
         deviation = np.sqrt(np.maximum((off**2).sum(axis=1) / (kept - 2), MIN_DEVIATION**2))
         wide = own + deviation[:, None] ** 2
@@ -153,7 +153,7 @@ def _by_logarithms(
 
 
 def _is_misfit(fits: Fits) -> BoolArray:
-    """Return which fits are so bad that another minimum may be better, (N,)."""
+    """Return which fits are so bad that another valley may be better, (N,)."""
     observed = fits.observed.sum(axis=1)
     dof = np.maximum(observed - 2, 1)
     return np.asarray(

@@ -1,10 +1,10 @@
-"""What noisy readings along a row of fibres tell of something smooth, at all fibres.
+"""Smooth noisy values over a row of fibers with a cubic spline, and propagate their errors.
 
-The second derivative by the root of the distance is white noise of one strength: near the source
-profiles bend within less than a millimetre, far away over several. That is the cubic smoothing
-spline, and its errors are those of the Bayesian to whom straight lines cost nothing. The strength
-is the likeliest by the readings, level and slope integrated out, and by what layers of skin are
-like: readings whose noise hides all bends do not say that there are none.
+The second derivative over the root of the distance is white noise of one strength: near the source
+profiles bend within less than a millimeter, far away over several. That is the cubic smoothing
+spline; its errors are those of a Bayesian with a flat prior on straight lines. The strength is the
+most probable one given the readings, with level and slope integrated out, and a prior from layered
+skin: noise that hides all bends is not evidence that there are none.
 
 References
 ----------
@@ -19,31 +19,31 @@ import numpy as np
 from reconstruction.arrays import Float64Array
 
 BEND_STRENGTHS: Final = np.geomspace(1e-3, 1e3, 31)
-"""Of the second derivative by the root of mm, variance over a root of mm: from next to straight
-lines to those that follow every fibre."""
+"""Strengths of the second derivative by the root of mm, variance over a root of mm: from almost
+straight lines to those that follow every fiber."""
 PRIOR_STRENGTH, PRIOR_LOG_SIGMA = 1.0, 1.5
-"""Of strengths: the median of simulated skin of two layers (presets I to VI, three sites, seeds 0
-to 19), and a standard deviation of the logarithm half as large again as theirs, 0.9."""
+"""Prior of the strength: the median of simulated skin of two layers (presets I to VI, three sites,
+seeds 0 to 19), and 1.5 times their standard deviation of the logarithm, 0.9."""
 MIN_INFORMATION: Final = 1e-6
-"""Information of a reading that is none, so that even without any the rest is finite."""
+"""Information of a missing reading; keeps the system finite without any."""
 
 
 def smooth_misfit(
     radius_mm: Float64Array, value: Float64Array, variance: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Return smooth curves through noisy values, and their covariances.
+    """Smooth noisy values over the distance; return curves and their covariances.
 
     Parameters
     ----------
     radius_mm
-        Distances of the fibres, mm, at least three, no two alike, any order, (F,).
+        Distances of the fibers, mm, at least three, no two alike, any order, (F,).
     value, variance
-        At each fibre, independent errors, (N, F); infinite variance where nothing was read.
+        At each fiber, independent errors, (N, F); infinite variance where nothing was read.
 
     Returns
     -------
     curve : ndarray, shape (N, F)
-        Also where nothing was read: straight on.
+        Also where nothing was read: continued as a straight line.
     covariance : ndarray, shape (N, F, F)
 
     Examples
@@ -61,28 +61,28 @@ def smooth_misfit(
     bend, mass = _bends(np.sqrt(radius_mm[order]))
     weight = np.full(variance.shape, MIN_INFORMATION)
     np.divide(1.0, variance, out=weight, where=variance < 1.0 / MIN_INFORMATION)
-    told = np.where(weight > MIN_INFORMATION, value, 0.0)
-    likely = log_posterior(bend, mass, told[:, order], weight[:, order])
+    known = np.where(weight > MIN_INFORMATION, value, 0.0)
+    likely = log_posterior(bend, mass, known[:, order], weight[:, order])
     strength = BEND_STRENGTHS[likely.argmax(axis=1)]
     penalty = np.empty((order.size, order.size))
     penalty[np.ix_(order, order)] = bend @ np.linalg.solve(mass, bend.T)
     covariance = np.linalg.inv(_whole(weight, penalty, strength))
-    return np.asarray((covariance @ (weight * told)[..., None])[..., 0]), np.asarray(covariance)
+    return np.asarray((covariance @ (weight * known)[..., None])[..., 0]), np.asarray(covariance)
 
 
 def log_posterior(
     bend: Float64Array, mass: Float64Array, value: Float64Array, weight: Float64Array
 ) -> Float64Array:
-    """Return twice the logarithm of how likely each of `BEND_STRENGTHS` is, up to a constant.
+    """Return twice the log posterior of each of `BEND_STRENGTHS`, up to a constant.
 
-    With Q and R of the penalty Q R^-1 Q' and W the weights, what is left after level and slope is
-    Q' y, of covariance s R + Q' W^-1 Q: five diagonals, so that all strengths take as many steps as
-    there are fibres.
+    With Q and R of the penalty Q R^-1 Q' and W the weights, level and slope leave Q' y, of
+    covariance s R + Q' W^-1 Q. It has five diagonals, so the steps are linear in the number of
+    fibers.
 
     Parameters
     ----------
     bend, mass
-        Q, (F, F - 2), and R, (F - 2, F - 2); of fibres in the order of their places.
+        Q, (F, F - 2), and R, (F - 2, F - 2); fibers in the order of their positions.
     value, weight
         Readings, and one over their variances, > 0, (N, F).
 
@@ -121,7 +121,7 @@ def _below(bend: Float64Array, mass: Float64Array, variance: Float64Array, by: i
 
 
 def _whole(weight: Float64Array, penalty: Float64Array, strength: Float64Array) -> Float64Array:
-    """Return the information of readings and smoothness, (N, F, F)."""
+    """Return the sum of the information of readings and smoothness, (N, F, F)."""
     whole = penalty / strength[:, None, None]
     fibres = np.arange(penalty.shape[0])
     whole[:, fibres, fibres] += weight

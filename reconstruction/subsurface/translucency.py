@@ -1,10 +1,10 @@
-"""A map of translucency, 1/sigma_tr, from a few places of a face, with its standard error.
+"""Interpolate translucency, 1/sigma_tr, over a face from a few sites, with its standard error.
 
-log(1/sigma_tr) over a face is taken as a person's level plus a smooth field, both normal: the
+log(1/sigma_tr) over a face is modeled as a person's level plus a smooth field, both normal: the
 prior of a person is a population's (`model.translucency_population`), and correlations over the
-face fall off as ``exp(-d^2 / 2 length^2)``. What a map says is the posterior of that (kriging): it
-runs through well measured places, goes back towards the person's level away from them, and its
-standard error grows to what people and places differ by. Nothing is extrapolated.
+face fall off as ``exp(-d^2 / 2 length^2)``. A map is the posterior of that model (kriging): it
+passes through well measured sites and returns to the person's level away from them, where its
+standard error grows to the deviation between people and sites. Nothing is extrapolated.
 
 Translucency is 1/sigma_tr in mm (Weyrich et al. 2005, section 8): of two places, the one of
 smaller sigma_tr is the more translucent.
@@ -32,37 +32,37 @@ from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.subsurface.models import blas_threads
 
 TEXTURE_MM: Final = (200.0, 330.0)
-"""What the width and the height of that texture measure on the skin near the middle of the face;
-towards the ears the width is up to 340."""
+"""Width and height of the head texture on the skin near the middle of the face, mm; towards the
+ears the width is up to 340."""
 CORRELATION_LENGTH_MM: Final = 60.0
 """Distance at which deviations from the person's level are correlated by 0.61: assumed, about from
-a cheek to the nose. The paper says "slowly varying" and no number."""
+a cheek to the nose. The paper states "slowly varying" without a number."""
 MAX_RELATIVE_ERROR: Final = 0.5
-"""A place whose standard error is more of its sigma_tr cannot be told from 0 and is left out."""
+"""Relative standard error of sigma_tr above which a site is omitted: it may be 0."""
 REPEAT_DISTANCE_MM: Final = 2.0
-"""Measurements so near to each other are repeats of one place."""
+"""Distance up to which measurements are repeats of one site."""
 CONFLICT_P_VALUE: Final = 0.01
-"""Repeats of one place that differ so much by chance only this often are said to contradict."""
+"""Repeats of one site whose scatter is less probable than this count as contradictory."""
 MIN_RELATIVE_VARIANCE: Final = 1e-10
-"""Of the prior variance: no place is known better."""
+"""Least posterior variance over the prior's."""
 
 
 class TranslucencyError(ValueError):
-    """Places, values or a prior that no map can be made from."""
+    """Sites, values or a prior that no map can be computed from."""
 
 
 @dataclass(frozen=True, slots=True)
 class TranslucencyPrior:
-    """What is known of log(1/sigma_tr) before a person is measured, by channel.
+    """Prior of log(1/sigma_tr) for an unmeasured person, by channel.
 
     Attributes
     ----------
     log_mean : ndarray of float64, shape (C,)
         Mean of log(1/sigma_tr), sigma_tr in 1/mm.
     person_deviation : ndarray of float64, shape (C,)
-        Standard deviation from person to person of the level of a face, above 0.
+        Standard deviation of the level of a face between people, above 0.
     place_deviation : ndarray of float64, shape (C,)
-        Standard deviation from place to place of a face, above 0.
+        Standard deviation between sites of a face, above 0.
     length_mm : float
         Distance of correlation over the face, above 0.
     source : str
@@ -91,9 +91,9 @@ class TranslucencyPrior:
 def population_prior() -> TranslucencyPrior:
     """Return the prior of a person from table 2 of Weyrich et al. 2005.
 
-    The level varies by the part of the variance that places have in common, the places by the
-    rest and by what their means differ. Variances are averaged over places. The table's deviations
-    hold the noise of measurement, so that the prior is rather too wide.
+    The level varies by the part of the variance that sites have in common, the sites by the rest
+    and by the variance of their means. Variances are averaged over sites. The table's deviations
+    include the noise of measurement, so that the prior is rather too wide.
 
     Examples
     --------
@@ -129,18 +129,18 @@ class TranslucencyMap:
     stderr : ndarray of float32, shape (H, W, C)
         Half of the width of its 68 % interval, mm; 0 where not valid.
     valid : ndarray of bool, shape (H, W, C)
-        False outside the mask, and in a channel without a usable place.
+        False outside the mask, and in a channel without a usable site.
     log_stderr : ndarray of float32, shape (H, W, C)
         Standard deviation of log(1/sigma_tr): the interval is values times exp(-+ log_stderr).
     used : ndarray of bool, shape (S, C)
-        Measurements that the map rests on.
+        Measurements that the map uses.
     p_value : ndarray of float64, shape (C,)
-        Chance that the population holds a face so unlike its mean; 1 without a usable place. When
-        tiny, standard errors away from the places are not to be relied on.
+        Probability under the population of a face at least as far from its mean; 1 without a usable
+        site. Where it is tiny, do not rely on standard errors away from the sites.
     omitted : tuple of (str, str)
-        Measurement and channel, and why it was left out.
+        Measurement and channel, and why it was omitted.
     conflicts : tuple of (str, str)
-        Place and channel whose repeats contradict each other, and how; their error was widened.
+        Site and channel whose repeats contradict each other, and how; their error was widened.
     """
 
     values: Float32Array
@@ -165,7 +165,7 @@ def interpolate(
     texture_mm: tuple[float, float] = TEXTURE_MM,
     mask: ArrayLike | None = None,
 ) -> TranslucencyMap:
-    """Interpolate 1/sigma_tr over a texture from some places.
+    """Interpolate 1/sigma_tr over a texture from some sites.
 
     Parameters
     ----------
@@ -177,9 +177,9 @@ def interpolate(
     shape : (int, int)
         Rows and columns of the map.
     valid : array_like of bool, shape (S, C) or (S,), optional
-        Measurements that count.
+        Measurements to use.
     names : sequence of str, optional
-        What messages call the measurements; by default their numbers.
+        Names of the measurements in messages; by default their numbers.
     prior : TranslucencyPrior, optional
         Of C channels; that of table 2's population by default, which has three.
     texture_mm : (float, float)
@@ -194,8 +194,8 @@ def interpolate(
     Raises
     ------
     TranslucencyError
-        Without a single usable measurement, saying why each was left out; for shapes that do not
-        fit, coordinates beyond the texture, or standard errors below 0.
+        If no measurement is usable, with the reason for each; for shapes that do not fit,
+        coordinates beyond the texture, or standard errors below 0.
 
     Examples
     --------
@@ -220,7 +220,10 @@ def interpolate(
     usable, left_out = _usable(sigma, stderr, good, labels)
     if not usable.any():
         why = "; ".join(f"{where}: {reason}" for where, reason in left_out)
-        raise TranslucencyError(f"no usable measurement: {why}")
+        raise TranslucencyError(
+            f"sigma_tr_per_mm: got no usable measurement ({why}), expected one at least; "
+            "check the sites or measure again"
+        )
 
     channels = prior.log_mean.size
     values, half, log_stderr = np.zeros((3, rows, columns, channels), np.float32)
@@ -289,7 +292,7 @@ def _checked(
 def _usable(
     sigma: Float64Array, stderr: Float64Array, good: BoolArray, labels: list[str]
 ) -> tuple[BoolArray, list[tuple[str, str]]]:
-    """Return which measurements count (S, C), and why the others do not."""
+    """Return which measurements count (S, C), and why the others are omitted."""
     usable = np.zeros(good.shape, bool)
     left_out = []
     for s, c in np.ndindex(good.shape):
@@ -300,7 +303,7 @@ def _usable(
         elif not (math.isfinite(value) and math.isfinite(error)):
             reason = "sigma_tr or its standard error is not finite"
         elif value <= 0 or error > MAX_RELATIVE_ERROR * value:
-            reason = f"sigma_tr {value:.3g} ± {error:.3g} per mm cannot be told from 0"
+            reason = f"sigma_tr {value:.3g} ± {error:.3g} per mm does not differ from 0"
         usable[s, c] = not reason
         if reason:
             left_out.append((f"{labels[s]}, channel {c}", reason))
@@ -309,7 +312,7 @@ def _usable(
 
 @dataclass(frozen=True, slots=True)
 class _Places:
-    """Different places of one channel: positions (P, 2), mm; logs and their variances (P,)."""
+    """Distinct sites of one channel: positions (P, 2), mm; logs and their variances (P,)."""
 
     at_mm: Float64Array
     log: Float64Array
@@ -320,8 +323,8 @@ class _Places:
 def _merged(
     at_mm: Float64Array, log: Float64Array, error: Float64Array, labels: list[str]
 ) -> _Places:
-    """Average repeats of a place by their errors, wider where these do not explain the scatter."""
-    # an error of 0 would leave no weight to others; that of rounding is as good
+    """Average repeats of a site by their errors, widened where the scatter exceeds these."""
+    # an error of 0 would take all weight from the others; rounding is the least error
     error = np.maximum(error, 1e-7)
     left = np.arange(len(log))
     at, mean, variance, conflicts = [], [], [], []
@@ -352,11 +355,11 @@ class _Posterior:
     shared: float
     """Prior variance of the person's level."""
     local: float
-    """Prior variance of a place about it."""
+    """Prior variance of a site about it."""
     inverse: Float64Array
-    """Of the covariance of what was measured, (P, P)."""
+    """Inverse covariance of the measurements, (P, P)."""
     pull: Float64Array
-    """That inverse times what was measured above the mean, (P,)."""
+    """That inverse times the measurements less the mean, (P,)."""
     p_value: float
 
     @classmethod
@@ -379,6 +382,8 @@ class _Posterior:
 
         The kernel is a product of one over u and one over v, so maps are products of few columns.
         """
+        # Rasmussen and Williams, eqs. (2.25) and (2.26): mean k'K^-1 y, variance k(x, x) - k'K^-1 k
+        # with k = shared + local * along * across, expanded in products of rows and columns
         across = np.exp(-0.5 * ((u_mm[:, None] - self.at_mm[:, 0]) / self.length_mm) ** 2)
         along = np.exp(-0.5 * ((v_mm[:, None] - self.at_mm[:, 1]) / self.length_mm) ** 2)
         first, second = np.triu_indices(len(self.pull))

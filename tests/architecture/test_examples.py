@@ -1,4 +1,4 @@
-"""Which examples a test draws does not hang on which other tests share its process."""
+"""The examples that a test draws are independent of the tests that share its process."""
 
 import importlib.util
 import sys

@@ -1,4 +1,4 @@
-"""What starting costs: which libraries a command loads before it is asked for work, and how long.
+"""Cost of starting: libraries that a command loads before its work, and the time it takes.
 
 Each question is asked of a fresh process, since this one has loaded everything already.
 """

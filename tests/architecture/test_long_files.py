@@ -1,4 +1,4 @@
-"""Where long tests alone are asked for, files without any are not read; none is lost by that."""
+"""A run of long tests alone does not read files without any, and loses none."""
 
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""What pictures tell of their own errors, over all pictures."""
+"""Errors that are estimated from images, over all images."""
 
 import numpy as np
 from hypothesis import given, settings

@@ -1,4 +1,4 @@
-"""What a display and a real-time page are sent, over all light, widths and directions."""
+"""Values sent to a display and a real-time page, over all light, widths and directions."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What the caliper box does with time and skin, beyond the rows of its manual."""
+"""Caliper controller: time and skin, beyond the rows of its manual."""
 
 import dataclasses
 import json

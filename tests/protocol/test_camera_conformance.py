@@ -1,4 +1,4 @@
-"""What every camera must do, over sim:// and over TCP."""
+"""Conformance of every camera, over sim:// and over TCP."""
 
 import dataclasses
 import socket

@@ -1,4 +1,4 @@
-"""What the dome box does with tables, light and time, beyond the rows of its manual."""
+"""Dome controller: tables, light and time, beyond the rows of its manual."""
 
 import itertools
 import json

@@ -1,4 +1,4 @@
-"""What the box of the gradient sphere does with patterns and time, beyond its manual's rows."""
+"""Gradient sphere controller: patterns and time, beyond its manual's rows."""
 
 import itertools
 import json

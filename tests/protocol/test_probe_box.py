@@ -1,4 +1,4 @@
-"""What the probe box does with light, suction and time, beyond the rows of its manual."""
+"""Probe controller: light, suction and time, beyond the rows of its manual."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""What commands say when they end, well or badly: next steps, pages and plans, where they go."""
+"""Endings of commands after success or failure: next steps, pages and plans, and their streams."""
 
 import errno
 import json

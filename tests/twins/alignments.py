@@ -1,4 +1,4 @@
-"""How far a map on the neutral picture may be off because its places are."""
+"""Error of a map on the neutral image due to errors of position, written plainly."""
 
 from __future__ import annotations
 

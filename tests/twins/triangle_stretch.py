@@ -1,4 +1,4 @@
-"""How the triangles of a surface are stretched, from the eigenvalues of their metrics."""
+"""Stretch of a surface's triangles, from the eigenvalues of their metrics."""
 
 import numpy as np
 from numpy.typing import ArrayLike

@@ -257,7 +257,7 @@ def test_images_that_do_not_fit_are_refused():
         separate(np.ones((2, 2, 3), np.uint16), np.ones((2, 2, 3), np.uint16))
     with pytest.raises(ValueError, match="unit vector"):
         PolarizerAxes(light=(0.0, 2.0, 0.0))
-    with pytest.raises(ValueError, match="same"):
+    with pytest.raises(ValueError, match="axes that differ"):
         PolarizerAxes(crossed=(0.0, 1.0, 0.0))
 
 

@@ -1,4 +1,4 @@
-"""What the shell offers at Tab, as the shell asks for it."""
+"""Completions that the shell offers at Tab, requested as the shell does."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""What a plain ``skinrig`` tells people to do next, from what lies in a folder."""
+"""Next steps suggested by a plain ``skinrig``, from the contents of a folder."""
 
 import json
 import shlex

@@ -1,4 +1,4 @@
-"""Which map of a truth a state's blood is compared with."""
+"""Choice of the ground-truth map that an expression's blood volume fraction is compared with."""
 
 import numpy as np
 import pytest

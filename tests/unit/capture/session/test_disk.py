@@ -1,4 +1,4 @@
-"""What is to last is brought to the disk: the calls come, for the file or folder that is meant.
+"""Durable writes: synchronization is called for the file or folder concerned.
 
 `tests/conftest.py` has the tests wait for no disk, and a model of the disk stands in
 `tests/faults/test_power_cut.py`; here the calls to the operating system themselves are seen.

@@ -90,12 +90,12 @@ def test_ranks_unsupported_by_points_are_reported_and_omitted(three, basis):
     assert found.ranks == (1, 3)
     assert [rank for rank, _ in found.omitted] == [5, 9]
     assert "4 points" in found.omitted[0][1]
-    with pytest.raises(SpaceError, match="hold 1 at most"):
+    with pytest.raises(SpaceError, match="up to 1 for"):
         brdf_space.compute_error_curve(three[:1], basis, ranks=(2,))
 
 
 def test_all_dark_points_are_refused_but_some_accepted(three, basis):
-    with pytest.raises(SpaceError, match="all 10 points are 0"):
+    with pytest.raises(SpaceError, match="got 10 points of 0"):
         brdf_space.compute_error_curve(np.zeros((10, 59)), basis)
     some = np.concatenate([three[:50], np.zeros((20, 59))])
     found = brdf_space.compute_error_curve(some, basis, ranks=(1, 3), held_out=np.zeros((5, 59)))

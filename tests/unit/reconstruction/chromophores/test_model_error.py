@@ -1,4 +1,4 @@
-"""What a picture tells of how far its colors are from the model's."""
+"""Estimates of the deviation of an image's colors from the model's."""
 
 import tracemalloc
 

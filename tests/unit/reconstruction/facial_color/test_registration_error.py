@@ -1,4 +1,4 @@
-"""What color errs by where a picture was laid over another one."""
+"""Color errors due to the registration of two images."""
 
 import numpy as np
 import pytest

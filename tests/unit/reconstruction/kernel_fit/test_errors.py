@@ -1,4 +1,4 @@
-"""What standard errors of kernels are made of: blocks, valleys, and counts that a search kept."""
+"""Parts of the standard errors of kernels: blocks, valleys, and counts kept by a search."""
 
 import numpy as np
 import pytest

@@ -348,7 +348,7 @@ def test_settings_that_do_not_fit_are_refused(rng):
         (height, {"valid": np.ones((8, 7), bool)}, "valid: got"),
         (height, {"pixel_um": 0.0}, "pixel: got"),
     ):
-        with pytest.raises(KernelFitError, match=f"neutral relief, {word}"):
+        with pytest.raises(KernelFitError, match=f"neutral relief: {word}"):
             fit_kernel(wrong, target, **{**good, **change})
 
 

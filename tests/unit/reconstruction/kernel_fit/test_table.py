@@ -96,7 +96,7 @@ def test_points_that_tell_no_table_are_refused():
         fit_table([0.8, 0.9, 1.1], [-1, -0.5, 0.3], [10, 12, 14])
     with pytest.raises(KernelTableFitError, match="point 1"):
         fit_table([0.8, 0.9], [-1, np.nan], [10, 12])
-    with pytest.raises(KernelTableFitError, match="beside the neutral"):
+    with pytest.raises(KernelTableFitError, match="neutral points only"):
         fit_table([1.0, 1.0], [0.0, 0.0], [10, 12])
 
 

@@ -1,4 +1,4 @@
-"""What is held out: parsed, found in a session, or refused by name."""
+"""Held-out parts: parsed, found in a session, or refused by name."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Which stages ran, were reused or skipped, and that asking again costs nothing."""
+"""Record of stages run, reused or skipped; a repeated run has no cost."""
 
 import json
 

@@ -26,7 +26,7 @@ def sphere(subdivisions=3):
 def cap():
     """The front of a sphere: an open surface with a rim."""
     whole = sphere()
-    return whole.kept(whole.vertices_mm[whole.faces].mean(axis=1)[:, 2] > 10.0)
+    return whole.select_faces(whole.vertices_mm[whole.faces].mean(axis=1)[:, 2] > 10.0)
 
 
 def plane(side=9, *, uv=False):
@@ -54,7 +54,7 @@ def area(mesh):
 def test_sound_surface_is_unchanged():
     before = cap()
     after, report = repair_mesh(before, max_hole_mm=0.0)
-    assert str(report) == "nothing to mend"
+    assert str(report) == "nothing to repair"
     assert len(after.faces) == len(before.faces)
     assert area(after) == pytest.approx(area(before))
 
@@ -109,7 +109,7 @@ def test_surfaces_touching_at_single_vertex_are_separated():
 def test_islands_go_and_small_holes_are_filled():
     mesh = cap()
     centers = mesh.vertices_mm[mesh.faces].mean(axis=1)
-    holed = mesh.kept(np.linalg.norm(centers - [0, 0, RADIUS], axis=1) > 12.0)
+    holed = mesh.select_faces(np.linalg.norm(centers - [0, 0, RADIUS], axis=1) > 12.0)
     scrap = np.array([[0, 0, 200.0], [5, 0, 200], [0, 5, 200]])
     scan = TriangleMesh(
         np.concatenate([holed.vertices_mm, scrap]),
@@ -144,7 +144,7 @@ def test_nothing_sound_is_an_error():
     with pytest.raises(ScanMeshError, match="crop"):
         crop(cap(), box_mm=((500, 500, 500), (600, 600, 600)))
     for bad in (b"", b"ply\n", b"hello"):
-        with pytest.raises(ScanMeshError, match="no PLY"):
+        with pytest.raises(ScanMeshError, match="expected a PLY"):
             load_ply(bad)
 
 

@@ -97,7 +97,7 @@ def test_nothing_but_zeros_has_no_signal():
     assert fit.outcome == FitOutcome.NO_SIGNAL
     assert not fit.valid
     assert np.isnan(fit.sigma_tr_per_mm)
-    assert "stand out" in fit.reason()
+    assert "above their noise" in fit.reason()
 
 
 FIBRES = {"collection": "fibre", "core_mm": 0.2, "source_core_mm": 0.2}
@@ -292,7 +292,7 @@ def test_strong_absorption_is_beyond_diffusion_alone(rng):
         closed_form = fit_table(profile, variance, method=method)
         assert closed_form.outcome & FitOutcome.OUTSIDE_DOMAIN
         assert not closed_form.valid
-        assert "beyond what the model is good for" in closed_form.reason()
+        assert "outside the model's domain" in closed_form.reason()
 
 
 @pytest.mark.parametrize("eta", [1.0, 1.6])

@@ -194,7 +194,7 @@ def test_uncounted_positions_are_omitted_with_reasons():
     assert found.used.sum() == 8
     reasons = dict(found.omitted)
     assert reasons["forehead, channel 0"] == "sigma_tr or its standard error is not finite"
-    assert reasons["cheek left, channel 1"] == "sigma_tr 1e-09 ± 1 per mm cannot be told from 0"
+    assert reasons["cheek left, channel 1"] == "sigma_tr 1e-09 ± 1 per mm does not differ from 0"
     assert "not finite" in reasons["cheek right, channel 2"]
     assert reasons["chin, channel 0"] == "not valid"
     assert found.valid.all()
@@ -213,7 +213,7 @@ def test_channel_without_position_is_masked_all_without_error():
     assert found.p_value[2] == 1
     with pytest.raises(TranslucencyError, match=r"no usable.*forehead, channel 0: not valid"):
         interpolate(places, SIGMA_TR, SIGMA_TR, (8, 8), valid=np.zeros(4, bool), names=NAMES)
-    with pytest.raises(TranslucencyError, match="cannot be told from 0"):
+    with pytest.raises(TranslucencyError, match="does not differ from 0"):
         interpolate(places, SIGMA_TR, SIGMA_TR * MAX_RELATIVE_ERROR * 1.01, (8, 8))
 
 

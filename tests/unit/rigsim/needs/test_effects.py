@@ -1,4 +1,4 @@
-"""Which effects scenes build: by what they would change over the noise of that sensor."""
+"""Selection of simulated effects by their size over the sensor's noise."""
 
 import dataclasses
 import math

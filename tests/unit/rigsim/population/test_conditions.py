@@ -1,4 +1,4 @@
-"""What conditions and coatings do to skin: energy, reciprocity, directions of change, extremes."""
+"""Conditions and coatings of skin: energy, reciprocity, directions of change, extremes."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""How a run spends its budget, on stages that take no time."""
+"""Budget of a run, on stages that take no time."""
 
 import csv
 import json

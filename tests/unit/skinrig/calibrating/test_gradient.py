@@ -1,4 +1,4 @@
-"""Which sessions of the gradient sphere make which calibration, and which are refused by name."""
+"""Sessions of the gradient sphere give their calibrations, or are refused by name."""
 
 import dataclasses
 from datetime import date

@@ -1,4 +1,4 @@
-"""What a perfect probe takes from a phantom, and what its certificate leaves open."""
+"""A perfect probe's reading of a phantom, and the uncertainty that its certificate leaves."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""What a subject agreed to goes with every fit, edit, page and report, and stops exports."""
+"""A subject's consent accompanies every fit, edit, page and report, and stops exports."""
 
 import dataclasses
 import json

@@ -110,7 +110,7 @@ def test_missing_channel_fit_is_omitted_all_missing_masked():
     without_red = {name: (None, *values[1:]) for name, values in MEASURED.items()}
     assert not probe_sites.map_translucency(probe(without_red), position).map.valid.any()
     nothing = dict.fromkeys(MEASURED, (None, None, None))
-    with pytest.raises(TranslucencyError, match="no usable measurement"):
+    with pytest.raises(TranslucencyError, match="got no usable measurement"):
         probe_sites.map_translucency(probe(nothing), position)
 
 

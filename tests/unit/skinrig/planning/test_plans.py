@@ -1,4 +1,4 @@
-"""What is wanted of a plan, and the dome's own choice."""
+"""Targets of a plan, and the dome's own choice."""
 
 import dataclasses
 import json

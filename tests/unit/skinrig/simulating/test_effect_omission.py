@@ -1,4 +1,4 @@
-"""What a simulation is asked not to build goes by the names in its list of effects."""
+"""Effects omitted from a simulation by the names in its list of effects."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""What a series of exposures has shown so far: enough, hopeless, or to be gone on with."""
+"""Assessment of a series of exposures so far: enough, hopeless, or to be continued."""
 
 import numpy as np
 import pytest

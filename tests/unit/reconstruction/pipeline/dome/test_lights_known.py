@@ -1,4 +1,4 @@
-"""What a calibration of the dome's lights does not hold is said, and never used as if it did."""
+"""Gaps in a calibration of the dome's lights are reported, and never used as values."""
 
 from datetime import UTC, date, datetime
 

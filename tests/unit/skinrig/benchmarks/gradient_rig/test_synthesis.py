@@ -1,4 +1,4 @@
-"""What the benchmark of grown maps compares with: blended tiles, and its measures of structure."""
+"""References of the benchmark of grown maps: blended tiles, and its measures of structure."""
 
 import numpy as np
 import pytest
