@@ -136,7 +136,7 @@ def test_positions_are_kept_where_a_scale_is_given(rti, tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("13\nimg0.png 0 0 1\n", "13, as its first line"),
+        ("13\nimg0.png 0 0 1\n", "13, as in its first line"),
         ("1\nimg0.png 0 0\n", "three numbers"),
         ("1\nimg0.png 0 0 nan\n", "three numbers"),
         ("1\nimg0.png 0 0 0\n", "three numbers"),

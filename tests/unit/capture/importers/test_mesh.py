@@ -110,8 +110,11 @@ BROKEN = {
         (CORNERS.replace("100", "0.2").replace("50", "0.1") + "f 1 2 3\n").encode(),
         "--unit m",
     ),
-    "giant.obj": ((CORNERS.replace("100", "1e9") + "f 1 2 3\n").encode(), "no size of a face"),
-    "point.obj": (b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "no size of a face"),
+    "giant.obj": (
+        (CORNERS.replace("100", "1e9") + "f 1 2 3\n").encode(),
+        "implausible in size for a face",
+    ),
+    "point.obj": (b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "implausible in size for a face"),
     "head.stl": (b"solid", "suffix '.stl'"),
 }
 
@@ -177,7 +180,7 @@ def test_open_session_accepts_mesh_stays_open_without_names(session, scan):
     about = opened.attachment_line("scan.ply").about
     assert (about["unit"], about["format"], about["origin"]) == ("mm", "obj", "imported")
     assert b"lovelace" not in (session / "journal.jsonl").read_bytes()
-    with pytest.raises(SessionError, match="holds a scan already"):
+    with pytest.raises(SessionError, match="contains a scan already"):
         import_mesh(scan, session=session)
 
 

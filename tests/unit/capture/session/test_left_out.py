@@ -57,7 +57,7 @@ def test_omitted_steps_are_not_pending_and_session_completes(session):
     assert (line.about["aperture_mm"], line.t_host_s) == (5.6, 7.0)
     found = verify(session.path)
     assert found.ok
-    assert found.warnings == (f"{session.path}: 2 steps left out: {WHY}",)
+    assert found.warnings == (f"{session.path}: 2 steps omitted: {WHY}",)
 
 
 def test_omitted_steps_survive_interruption(session):
