@@ -308,7 +308,7 @@ def test_plan_beyond_dose_is_refused_before_sending():
     ("change", "match"),
     [
         ({"leds": 149}, "the box drives 149 LEDs"),
-        ({"cameras": 3}, "the box releases 3"),
+        ({"cameras": 3}, "the controller releases 3"),
         ({"row_max_us": 50_000}, "got dwell_s 0.0833"),
         ({"settle_us": 30_000}, "do not fit"),
         ({"max_at_once": 5}, "6 lights at once"),
@@ -341,7 +341,7 @@ def test_camera_with_incomparable_clock_is_refused(make):
         return honest()
 
     camera.clock_s = slow_clock_s
-    with pytest.raises(CameraError, match="clocks of camera and box"):
+    with pytest.raises(CameraError, match="clocks of camera and controller"):
         bench.run()
     assert not bench.unit.lit
 
