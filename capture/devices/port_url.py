@@ -33,7 +33,7 @@ def load_url_handler(url: str) -> None:
 def opening_advice(url: str, kind: type[Exception], number: int | None) -> str:
     """Return advice for a port that does not open."""
     if kind is PortBusy:
-        return "close the other program that uses it"
+        return "another program uses it; close that program"
     if number == errno.EACCES:
         return "no right to it: on Debian join the group dialout and log in again"
     if "://" in url:

@@ -175,7 +175,7 @@ def _folder(directory: Path) -> Path:
         if folder.is_dir() and not _is_ball(folder) and _images_in(folder)
     ]
     if len(below) != 1:
-        got = ", ".join(folder.name for folder in below) or "no pictures"
+        got = ", ".join(folder.name for folder in below) or "no images"
         raise LightListError(
             "is not a folder of one object under many lights",
             where=str(directory),

@@ -300,7 +300,7 @@ def test_plan_beyond_dose_is_refused_before_sending():
         )
         for k in range(201)
     ]
-    with pytest.raises(AcquisitionError, match=r"light dose: L000 would send out 50\.2 Ws"):
+    with pytest.raises(AcquisitionError, match=r"light dose: L000 would emit 50\.2 Ws"):
         check_safety(Plan("dome", tuple(steps)), DOME)
 
 

@@ -174,7 +174,7 @@ def test_folder_address_selects_release_by_controller_or_hand(folder):
 def test_folder_without_test_image_error_names_remedy(tmp_path):
     with pytest.raises(cameras.CameraUrlError, match="test image"):
         HotFolder(tmp_path)
-    with pytest.raises(cameras.CameraUrlError, match="is no folder"):
+    with pytest.raises(cameras.CameraUrlError, match="not a folder"):
         HotFolder(tmp_path / "nothing")
 
 

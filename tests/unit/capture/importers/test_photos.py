@@ -354,7 +354,7 @@ def test_empty_and_missing_photograph_folders_are_reported(tmp_path):
     (tmp_path / "notes.txt").write_text("x")
     with pytest.raises(PhotoError, match="contains no photographs"):
         import_photos(tmp_path, out=tmp_path / "s")
-    with pytest.raises(PhotoError, match="no such folder"):
+    with pytest.raises(PhotoError, match="folder not found"):
         import_photos(tmp_path / "missing", out=tmp_path / "s")
 
 

@@ -96,7 +96,7 @@ def test_other_missing_steps_still_need_reason(session):
 def test_omitted_step_is_neither_captured_nor_omitted_again(session):
     session.leave_out(["S003"], reason=WHY, t_host_s=0.0)
     before = (session.path / "journal.jsonl").read_bytes()
-    with pytest.raises(SessionError, match="was left out"):
+    with pytest.raises(SessionError, match="was omitted"):
         commit(session, "S003")
     with pytest.raises(SessionError, match="not left out before"):
         session.leave_out(["S002", "S003"], reason=WHY, t_host_s=0.0)
