@@ -68,13 +68,13 @@ class View(Document):
     camera_model: str
     serial: str
     position_mm: Vector
-    """Centre of projection, mm, rig frame."""
+    """Center of projection, mm, rig frame."""
     target_mm: Vector
     """Point on the optical axis, mm, rig frame."""
     up: Vector
     """Direction that is up in the image, rig frame, any length."""
     focal_mm: float
-    """Distance from centre of projection to sensor, mm, > 0."""
+    """Distance from center of projection to sensor, mm, > 0."""
     pixel_um: float
     """Pixel pitch, um, > 0."""
     width_px: int
@@ -103,8 +103,9 @@ class View(Document):
     shutter_lag_s: float = 0.0
     """Time from the trigger's edge until the shutter is fully open, s, >= 0."""
     focus_mm: float | None = None
-    """Distance from the centre of projection to the plane in focus, mm, > 0; None: that of the
-    target."""
+    """Distance from the center of projection to the plane in focus, mm, > 0; None: that of the
+    target.
+    """
 
     def __post_init__(self) -> None:
         checks = FaultCollector(f"View {self.name!r}", RigError)
@@ -161,7 +162,7 @@ class View(Document):
 
     @property
     def focus_distance_mm(self) -> float:
-        """Distance from the centre of projection to the plane in focus, mm."""
+        """Distance from the center of projection to the plane in focus, mm."""
         return self.distance_mm if self.focus_mm is None else self.focus_mm
 
     @property

@@ -41,7 +41,7 @@ class Light(Document):
 
     name: str
     position_mm: Vector
-    """Centre of the emitting disc, mm, rig frame."""
+    """Center of the emitting disc, mm, rig frame."""
     illuminant: str = "D55"
     """Name of the spectrum, see ``model.spectra.illuminant``."""
     polarizer_axis_deg: float | None = None
@@ -208,7 +208,7 @@ class Fiber(Document):
     numerical_aperture: float
     """Numerical aperture: sine of the half angle of acceptance in air, 0 < NA < 1."""
     spot_px: tuple[float, float]
-    """Nominal centre of its end in the camera's image, pixels, x right, y down."""
+    """Nominal center of its end in the camera's image, pixels, x right, y down."""
 
     def __post_init__(self) -> None:
         checks = FaultCollector(f"Fibre {self.name!r}", RigError)
@@ -221,7 +221,7 @@ class Fiber(Document):
 
     @property
     def radius_mm(self) -> float:
-        """Distance from the source fibre's centre, mm."""
+        """Distance from the source fiber's center, mm."""
         return math.hypot(*self.position_mm)
 
 
@@ -236,7 +236,7 @@ class Probe(Document):
     fibres: tuple[Fiber, ...]
     """Detection fibers, by growing distance from the source."""
     source_core_mm: float
-    """Diameter of the source fibre's core, mm, > 0."""
+    """Diameter of the source fiber's core, mm, > 0."""
     source_numerical_aperture: float
     """Numerical aperture: sine of the half angle of the emitted light in air, 0 < NA < 1."""
     suction_mbar: float
@@ -283,7 +283,7 @@ class Probe(Document):
 
     @property
     def radius_mm(self) -> tuple[float, ...]:
-        """Distances of the fibres from the source, mm.
+        """Distances of the fibers from the source, mm.
 
         Examples
         --------

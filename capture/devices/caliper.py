@@ -133,7 +133,7 @@ class CaliperBox(Box):
         Raises
         ------
         CommandRefused
-            Unless the box is armed, homed, at rest, and at step 0.
+            Unless the controller is armed, homed, at rest, and at step 0.
         """
         self._port.ask("CAL:ATT")
 

@@ -390,7 +390,7 @@ class Port:
         return None
 
     def _received(self, seconds: float) -> Iterator[Reply | Event]:
-        """Yield frames from the box for `seconds`; events are also kept in `events`."""
+        """Yield frames from the controller for `seconds`; events are also kept in `events`."""
         start_s = self.clock.monotonic()
         silent_s = 0.0
         bytes_left = MAX_NOISE_BYTES

@@ -226,7 +226,7 @@ class ProbeBox(Box):
         Raises
         ------
         CommandRefused
-            While the shutter is open (-213), or without such a fibre (-222).
+            While the shutter is open (-213), or without such a fiber (-222).
         PortTimeout
             When the cover does not arrive.
         """

@@ -97,8 +97,8 @@ def merge_series(
 
     - bias and dark current are each pixel's own, and their shot noise and errors count; - a weight
     also uses the light on the pixel's neighbors. From the pixel's own noisy
-      value alone it would favor low readings, by a tenth of an electron each, which sums up over
-      a spot to more than the farthest fibres give;
+      value alone it would favor low readings, by a tenth of an electron each, which sums up over a
+      spot to more than the farthest fibers give;
     - pixels that are unsaturated in two exposures or more determine the source's brightness in each
       frame, if it was not steady: see `MergedSeries.scale`;
     - the neighbors of a pixel decide whether it is near saturation, not its own value, which

@@ -43,7 +43,7 @@ class PolarizerFit:
     Attributes
     ----------
     strength, strength_stderr : ndarray of float64, shape (L,)
-        Flux of each light at an ideal mirror without an analyser, per second at level 1.
+        Flux of each light at an ideal mirror without an analyzer, per second at level 1.
     axis_error_rad, axis_error_stderr_rad : ndarray of float64, shape (L,)
         Deviation of each light's axis; shrunk to 0 where the readings leave its sign open.
     zero_rad, zero_stderr_rad : float

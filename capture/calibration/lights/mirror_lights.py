@@ -46,7 +46,7 @@ class SphereWindow:
     rows, columns : slice
         Smallest box around it.
     inside : ndarray of bool
-        Pixels of the box well inside the outline.
+        Pixels of the window well inside the outline.
     """
 
     rows: slice

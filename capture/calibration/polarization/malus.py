@@ -240,7 +240,7 @@ def find_modulated_pixels(
     Parameters
     ----------
     angles_rad : array_like, shape (N,)
-        Analyser angles.
+        Analyzer angles.
     images : sequence of N ndarray, shape (H, W) or (H, W, C)
         Dark-subtracted images.
     valid : ndarray of bool, shape (H, W), optional
