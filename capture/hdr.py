@@ -279,6 +279,7 @@ def merge_reference(
         weighted, total = np.zeros(shape), np.zeros(shape)
         for frame, t in zip(frames, times, strict=True):
             # one frame's weight for its own DN / t is t^2 / variance
+            # Poisson noise of N electrons is N; in DN^2 it is the mean signal in DN over the gain.
             spread = np.maximum(radiance, 0.0) * t / gain + floor
             weight = np.where(frame < white, t / spread, 0.0)
             weighted += weight * (frame.astype(np.float64) - black)

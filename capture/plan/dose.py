@@ -116,6 +116,7 @@ def fiber_light(plan: Plan, rig: Rig) -> FiberLight:
     core_m2 = math.pi * (0.5e-3 * probe.source_core_mm) ** 2
     # etendue of the core: area times pi NA^2, a cone of half angle asin(NA), evenly filled
     etendue_m2_sr = core_m2 * math.pi * probe.source_numerical_aperture**2
+    # Radiance is power over etendue; the limit is a radiance times time.
     stare_s = BLUE_LIMIT_J_M2_SR * etendue_m2_sr / power_w if power_w > 0 else math.inf
     return FiberLight(
         led=source.name,

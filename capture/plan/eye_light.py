@@ -39,6 +39,7 @@ def radiant_intensity(light: Light) -> float:
     power_w = light.power_w or 0.0
     if light.half_intensity_deg is None:
         return power_w / (4.0 * math.pi)
+    # The integral of cos^n over the hemisphere is 2 pi / (n + 1).
     return power_w * (light.lobe_exponent + 1.0) / (2.0 * math.pi)
 
 

@@ -99,6 +99,8 @@ def count_flashes(signal: Float64Array, *, min_change: float) -> float:
     >>> count_flashes(np.tile(on, 10), min_change=0.1)
     5.0
     """
+    # Turning points with hysteresis: a reversal counts once the signal has come back by min_change
+    # from its last extreme. Two of them are one flash.
     turns: list[int] = []
     low = high = extreme = float(signal[0]) if signal.size else 0.0
     rising: bool | None = None
@@ -136,6 +138,7 @@ def band_rms(signal: Float64Array) -> float:
     power = np.abs(np.fft.rfft(signal)) ** 2
     frequency_hz = np.fft.rfftfreq(signal.size, EYE_SAMPLE_S)
     inside = (frequency_hz >= FLICKER_BAND_HZ[0]) & (frequency_hz <= FLICKER_BAND_HZ[1])
+    # Parseval: the components at +f and -f together have the mean square 2 |X_f|^2 / n^2.
     return float(np.sqrt(2.0 * power[inside].sum()) / signal.size / mean)
 
 

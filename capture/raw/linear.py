@@ -231,6 +231,8 @@ def _shift_to_cell_center(
 
     At the border, where the neighbor is missing, the plane's own value is used.
     """
+    # Sites of one color are two pixels apart and the cell's middle half a pixel away, a quarter of
+    # the pitch: linear weights 3/4 and 1/4, squared for variances.
     near, far = np.float32(0.75**power), np.float32(0.25**power)
     for axis, forward in enumerate(ahead):
         lines = plane.T if axis else plane

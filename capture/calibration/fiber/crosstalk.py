@@ -189,6 +189,8 @@ def measure_crosstalk(masks: Mapping[int, FiberReadings], phantom: FiberReadings
     group = np.searchsorted(DISTANCE_EDGES, distance, side="right") - 1  # -1 on the diagonal
     offset, offset_variance = np.zeros((count, colors)), np.zeros((count, colors))
     matrix, variance = np.zeros((count, count)), np.zeros((count, count))
+    # Model: value[j, i] = X[j, i] source[i] + offset[j]. It is linear in X for a given offset and
+    # in the offset for a given X, so that the two are solved in turn.
     information = np.einsum("jic,ic->ji", weight, source**2)
     for _ in range(MAX_CROSSTALK_ITERATIONS):
         # each pair on its own, for the present estimate of the stray light
@@ -306,6 +308,8 @@ def shrink_to_mean(
     has_data = information > 0
     w, x = information[has_data], value[has_data]
     mean = float((w * x).sum() / w.sum())
+    # DerSimonian and Laird: Q = sum w (x - mean)^2 has the expectation (n - 1) + between (sum w -
+    # sum w^2 / sum w), which is solved for the variance between the true values.
     spread = float((w * (x - mean) ** 2).sum()) - (len(x) - 1)
     scale = float(w.sum() - (w**2).sum() / w.sum())
     between = max(spread / scale, 0.0) if scale > 0 else mean**2

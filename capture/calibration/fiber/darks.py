@@ -247,6 +247,7 @@ def measure_darks(
     hot |= _find_outliers(own_bias, MIN_HOT_DN)
     if many:
         hot |= _find_outliers(own_rate, MIN_HOT_DN / longest)
+    # The observed variance over pixels is the true variance plus that of the errors.
     spread = np.zeros((2, 2))
     kept = ~hot
     for i, own in enumerate((own_bias, own_rate)):

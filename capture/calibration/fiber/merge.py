@@ -206,6 +206,8 @@ class _Series:
         shape, gain = self.stack[0].shape, noise.gain_e_per_dn
         current = max(darks.mean_rate_dn_per_s, 0.0) / gain
         shot = light / gain
+        # Weighted least squares of value = rate t: the rate is sum(t v / var) / sum(t^2 / var), its
+        # variance 1 / sum(t^2 / var).
         signal, time = np.zeros(shape), np.zeros(shape)
         weights, dark_time = np.zeros(shape), np.zeros(shape)
         frames = zip(self.stack, self.times, lit, self.base, self.usable, strict=True)
@@ -246,6 +248,8 @@ class _Series:
         miss = np.where(usable, value / expected - 1.0, 0.0)
         total = information.sum(axis=0)
         mean = (information * miss).sum(axis=0) / total
+        # The free rate of each pixel is eliminated (Schur complement of its 1 x 1 block), which
+        # leaves normal equations of the frames' scales only.
         normal = np.diag(information.sum(axis=1)) - (information / total) @ information.T
         right = (information * (miss - mean)).sum(axis=1)
         # prior width of largest evidence; 0 where the frames hardly constrain each other

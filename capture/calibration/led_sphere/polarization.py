@@ -322,6 +322,8 @@ class _PolarizerProblem:
                 self.strength, self.turn, self.shared = trial
             damping = max(damping / 10, 1e-9)
             wider = self._scatter(arrow.covariance()[0][:, 1, 1])
+            # Weight of a residual z under Student's t with nu degrees of freedom: (nu + 1) / (nu +
+            # z^2), the expectation step of its scale mixture of normals.
             self.pull = np.where(
                 self.lit, (AXIS_T_DOF + 1) / (AXIS_T_DOF + (self.turn / wider) ** 2), 1.0
             )

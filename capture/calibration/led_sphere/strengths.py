@@ -79,6 +79,8 @@ def add_geometry_errors(
 
     def seen(turn: Float64Array, reflection: FacetReflection) -> tuple[Float64Array, Float64Array]:
         field = reflection.reflected_fields(turn)[:, 0]
+        # Squared, an axis and its opposite are equal; the phase is twice the angle, the modulus the
+        # reflected intensity.
         doubled = (field[:, 0] + 1j * field[:, 1]) ** 2
         return doubled, np.log(np.abs(doubled))
 
@@ -140,6 +142,8 @@ def measure_intensities(
     # lights are aimed at the origin, whereas the ball mirrors them from slightly next to it
     off = np.arccos(np.clip(np.sum(mirrored.to_light * direction, axis=1), -1.0, 1.0))
     lobe = np.array([led.intensity(float(a)) for led, a in zip(rig.lights, off, strict=True)])
+    # A spot's flux is radiance x emitting area x magnification x lobe towards the ball; the
+    # irradiance at the origin is radiance x emitting area / distance^2.
     per_strength = 1.0 / (mirrored.magnification_px2 * lobe * distance2)
     value = polarizers.strength * per_strength
     # effect of the ball's own parameters, except a factor that is common to all lights

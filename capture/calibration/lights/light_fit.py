@@ -254,6 +254,8 @@ class _Fit:
         prior[last:relief] = 1 / NORMAL_PRIOR_RAD**2
         prior[relief:] = 1 / self.plate.slope_rad**2
         used = np.zeros(total, bool)
+        # Intensities and gains share a free factor per channel. It is fixed by a strong weight on
+        # the sum of the cameras' log gains, so that their geometric mean is 1.
         gauge = np.zeros((3, total))
         gauge[:, self._responses : last] = np.tile(np.eye(3, N_RESPONSE), len(self.views))
         numbers = middle.copy()

@@ -323,6 +323,7 @@ class _Scene:
         position = start.copy()
         outlines = [self.spheres[n] for n in numbers]
         centers = np.array([sphere.center_mm for sphere in outlines])
+        # The outlines act as a normal prior of each sphere's center.
         stiffness = [np.linalg.inv(s.covariance_mm2 + 1e-12 * np.eye(3)) for s in outlines]
         sphere_of = np.array([numbers.index(m[2]) for m in matched])
         columns = np.stack([3 * light_of, base + 3 * sphere_of], axis=1)[..., None] + np.arange(3)

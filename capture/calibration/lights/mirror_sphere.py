@@ -183,6 +183,8 @@ def contour(
     other = np.cross(axis, side)
     turn = np.arange(count) * 2 * np.pi / count
     ring = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * other
+    # The touching rays have the half angle asin(R / d): their circle has the radius R cos and is d
+    # cos^2 away along the axis.
     sine = radius_mm / distance
     # where rays touch: the circle in which the polar plane cuts the sphere
     touch = camera.center_mm + distance * (1 - sine**2) * axis
@@ -322,6 +324,7 @@ def _fit_single_outline(edges: Float64Array, camera: CameraPose, radius_mm: floa
     # rays of a cone end in a plane: rays @ a = 1 with a along the axis
     a = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0]
     cosine = min(1.0 / float(np.linalg.norm(a)), 1 - 1e-12)
+    # |a| is 1 / cos of the cone's half angle, and the sine of the half angle is radius over range.
     range_mm = radius_mm / np.sqrt(1 - cosine**2)
     return np.asarray(camera.center_mm + range_mm * a / np.linalg.norm(a))
 

@@ -64,6 +64,8 @@ def reflection_points(
     """
     r = radius_mm
     to_eye, to_light = eyes_mm - centers_mm, lights_mm - centers_mm
+    # In the plane of eye, center and light, with e towards the eye: the eye is at (D, 0), the light
+    # at (x, y), and the mirror point r (cos a, sin a) has a between 0 and the light's azimuth.
     D = np.linalg.norm(to_eye, axis=-1)
     e = to_eye / D[:, None]
     x = np.sum(to_light * e, axis=-1)

@@ -318,6 +318,8 @@ def _fit_curve(
     else:
         coefficients, covariance, jitter, chi2_per_dof = _with_jitter(design, y, variance)
     a, b, c = (float(v) for v in coefficients)
+    # y = a + b cos 2x + c sin 2x = a + m cos 2(x - zero), with m = |(b, c)| and zero = atan2(c, b)
+    # / 2; the gradients below propagate the covariance to zero and leak.
     m = float(np.hypot(b, c))
     along = np.array([0.0, b, c]) / max(m, np.finfo(float).tiny)
     m_error = float(np.sqrt(along @ covariance @ along))

@@ -37,6 +37,7 @@ def fresnel_amplitudes(cosine: ArrayLike, eta: float) -> tuple[Float64Array, Flo
     >>> rs.round(6).tolist(), np.abs(rp).round(6).tolist()
     ([-0.2, -0.384615], [0.2, 0.0])
     """
+    # Snell's law gives the cosine inside: cos_t^2 = 1 - (1 - cos_i^2) / eta^2.
     outside = np.asarray(cosine, np.float64)
     inside = np.sqrt(1.0 - (1.0 - outside**2) / eta**2)
     rs = (outside - eta * inside) / (outside + eta * inside)
@@ -155,6 +156,8 @@ class FacetReflection:
         """
         light, camera, normal = self.to_light, self.to_camera, self.normal
         angle = (self.axis_rad + np.asarray(axis_error_rad, np.float64))[:, None]
+        # Jones calculus: the field is split along s and p of the plane of incidence, scaled by
+        # Fresnel's amplitudes, and put together in the axes of the reflected ray.
         absorbs = -np.sin(angle) * self.light_right + np.cos(angle) * self.light_up
         passed = _unit(_cross(absorbs, light))
         s = _cross(normal, light)
@@ -209,6 +212,8 @@ class FacetReflection:
             # the transmitted field is perpendicular to the ray and to the absorbing axis
             passes = _unit(self._in_image(_cross(absorbs, self.to_camera)[:, None], axes))
             along = np.sum(field * passes, axis=-1) ** 2
+            # Malus's law with leakage: the transmitted component, and a fraction of the absorbed
+            # one.
             behind = along + analyser * (whole - along)
             rows.append(behind[:, 0] + light * behind[:, 1])
         return np.array(rows)

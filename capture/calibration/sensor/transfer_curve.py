@@ -187,6 +187,8 @@ def block_statistics(
     weight = good.astype(np.float64)
     n = block_sums(weight, block)
     n = np.maximum(n, 1.0)
+    # Shot noise gives var A = V0 + K s_A and var B = V0 + K s_A / r; hence var(A - r B) = (1 + r^2)
+    # V0 + (1 + r) K s_A, and the mean of (A + r B) / 2 estimates s_A.
     mean = block_sums(weight * (a + ratio * b) / 2.0, block) / n
     d = (a - ratio * b) * weight
     d_sum = block_sums(d, block)
@@ -210,6 +212,7 @@ def _weighted_line(
     The weights are those of the fitted line, not of the scattered values, which would bias it low.
     """
     design = np.stack([np.ones_like(x), x], axis=1)
+    # A sample variance with dof degrees of freedom has the variance 2 y^2 / dof.
     predicted = np.full_like(y, y.mean())
     for _ in range(6):
         weight = dof / (2.0 * predicted**2)

@@ -307,7 +307,7 @@ def test_plan_beyond_dose_is_refused_before_sending():
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"leds": 149}, "the box drives 149 LEDs"),
+        ({"leds": 149}, "the controller drives 149 LEDs"),
         ({"cameras": 3}, "the controller releases 3"),
         ({"row_max_us": 50_000}, "got dwell_s 0.0833"),
         ({"settle_us": 30_000}, "do not fit"),
