@@ -97,7 +97,8 @@ def measure_drift(old: Calibration, new: Calibration) -> tuple[CalibrationDrift,
     Parameters
     ----------
     old, new : Calibration
-        Of the same kind and rig. Only quantities with the same shape in both are compared.
+        Two calibrations of one kind and rig. Only quantities with the same shape in both are
+        compared.
 
     Returns
     -------

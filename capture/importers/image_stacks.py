@@ -231,7 +231,7 @@ def _list_assumptions(
     if found.intensity is None:
         texts.append("all lights are of one strength, over the exposure where files state it")
     if found.kind != "lp":
-        texts.append("the lights are in the order of the pictures' names, counted as people do")
+        texts.append("the lights are in the order of the images' names, numbers sorted by value")
     return texts
 
 

@@ -221,7 +221,7 @@ def _from_display(pixels: NDArray[Any], where: str, notes: list[str]) -> Photo:
     table = np.rint(WHITE_DN * _decode_srgb(np.arange(codes) / (codes - 1))).astype(np.uint16)
     if pixels.ndim == 3 and (pixels == pixels[..., :1]).all():
         pixels = pixels[..., 0]
-        notes = [*notes, "the image is gray, so that it holds no color to estimate from"]
+        notes = [*notes, "the image is gray and contains no color to estimate from"]
     depth = "8" if codes == 256 else "16"
     notes = [
         f"{depth}-bit display values were decoded by the sRGB curve; the camera's tone and "

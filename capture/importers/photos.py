@@ -49,7 +49,7 @@ class PhotoImport:
     ignored: tuple[str, ...]
     """Omitted files that are not photographs."""
     color_states: tuple[str, ...] = ()
-    """Those of `states` with color photographs; chromophores cannot be estimated from gray ones."""
+    """Subset of `states` with color photographs; chromophores need color."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -74,7 +74,7 @@ def dome_plan(
     Raises
     ------
     PlanError
-        For what exceeds the limits of the rig's LEDs, or an exposure that does not fit.
+        When the limits of the rig's LEDs are exceeded, or an exposure does not fit.
 
     Examples
     --------

@@ -102,7 +102,7 @@ def gradient_plan(
         First (<= 0) and last (>= 0) position; all of the caliper's by default. The limit of the
         skin is found during the capture.
     patterns : sequence of str
-        Of :data:`capture.plan.steps.LIGHT_PATTERNS`.
+        Names of :data:`capture.plan.steps.LIGHT_PATTERNS`.
     darks : int
         Frames without light at the beginning, >= 0, in addition to the "dark" of each scan.
     exposure_s, dwell_s : float
@@ -121,7 +121,7 @@ def gradient_plan(
     Raises
     ------
     PlanError
-        For what exceeds the limits of the rig's LEDs or caliper.
+        When the limits of the rig's LEDs or caliper are exceeded.
 
     Examples
     --------

@@ -88,7 +88,7 @@ def multiplexed_plan(
     cycles : int, optional
         Alternative to ``captures``: shots for this number of cycles.
     read_out_s
-        Shortest time from shot to shot, s; by default what the rig's cameras need.
+        Shortest time from shot to shot, s; by default that of the rig's slowest camera.
     lead_cycles : int
         Cycles of prompts before the first shot, so that the subject follows the rhythm, >= 0.
     darks : int

@@ -90,7 +90,7 @@ def probe_plan(
     Raises
     ------
     PlanError
-        For what exceeds the limits of the rig's probe.
+        When the limits of the rig's probe are exceeded.
 
     Examples
     --------

@@ -48,7 +48,7 @@ _SETTING_RULES: Mapping[str, tuple[tuple[type, ...], Any, str]] = {
     "pattern": ((str,), lambda v: v in LIGHT_PATTERNS, f"one of {', '.join(LIGHT_PATTERNS)}"),
     "dwell_s": ((int, float), lambda v: 0 < v < math.inf, "seconds > 0"),
     "suction_mbar": ((int, float), lambda v: 0 < v < math.inf, "mbar > 0"),
-    "fibre": ((int,), lambda v: v >= 0, "a fibre's number >= 0, or none for all"),
+    "fibre": ((int,), lambda v: v >= 0, "a fiber's number >= 0, or none for all"),
     "start_s": ((int, float), lambda v: 0 <= v < math.inf, "seconds >= 0"),
 }
 
@@ -245,7 +245,7 @@ class Plan(Document):
         Raises
         ------
         PlanError
-            With every fault's path, what was found and what was expected.
+            With every fault's path, the value found and the value expected.
         """
         if isinstance(data, str | bytes):
             data = read_json(data, where=where, error=PlanError)

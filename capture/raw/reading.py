@@ -22,7 +22,7 @@ def read(path: str | Path) -> RawFrame:
     Parameters
     ----------
     path : str or Path
-        A DNG of ours, or a raw file of any camera LibRaw knows.
+        A DNG of ours, or a raw file of any camera that LibRaw supports.
 
     Returns
     -------

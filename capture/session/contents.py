@@ -113,7 +113,7 @@ def _check_against_plan(walked: JournalWalk, manifest: Manifest, where: str) -> 
         elif isinstance(line, OmissionLine):
             strangers = [step for step in line.steps if step not in steps or step in left_out]
             got, good = ", ".join(strangers), not strangers
-            expected = "steps of the plan, each left out once"
+            expected = "steps of the plan, each omitted once"
             left_out.update(line.steps)
         else:
             got, good, expected = line.file, line.file not in seen, "each frame once"
@@ -123,7 +123,7 @@ def _check_against_plan(walked: JournalWalk, manifest: Manifest, where: str) -> 
             if step is None:
                 got, good, expected = line.step, False, "a step of the plan"
             elif line.step in left_out:
-                got, good, expected = line.step, False, "no frame of a step that was left out"
+                got, good, expected = line.step, False, "no frame of an omitted step"
             elif line.camera not in step.cameras:
                 got, good, expected = line.camera, False, f"one of {', '.join(step.cameras)}"
         if not good:

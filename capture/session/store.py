@@ -66,7 +66,7 @@ class Session(SessionView):
     >>> session = Session.create(
     ...     folder.name + "/s", plan=flash_plan(rig, darks=1), rig=rig, devices={},
     ...     subject=SubjectRecord("P042", ("research",)), source="simulated", seed=1)
-    >>> step, camera = session.todo()[0]
+    >>> step, camera = session.pending_frames()[0]
     >>> blob = raw.encode_dng(
     ...     np.full((10, 16), 512, np.uint16), pattern="RGGB", black=512, white=16383,
     ...     step_id=step.id, session_id=session.id)
@@ -335,7 +335,9 @@ class Session(SessionView):
         checks.check("reason", reason, bool(reason.strip()), "a text")
         for step_id in step_ids:
             self.plan.step(step_id)  # names unknown steps
-            checks.check("step_ids", step_id, step_id not in self._left_out, "not left out before")
+            checks.check(
+                "step_ids", step_id, step_id not in self._left_out, "steps not omitted before"
+            )
         checks.close()
         line = OmissionLine(
             steps=tuple(step_ids), reason=reason, about=dict(about or {}), t_host_s=float(t_host_s)

@@ -225,7 +225,7 @@ class SessionView:
         if name not in self._attached:
             known = ", ".join(self._attached) or "none"
             faults = [Fault("attachment", short_repr(name), f"one of: {known}")]
-            raise SessionError("holds no such attachment", where=str(self.path), faults=faults)
+            raise SessionError("contains no such attachment", where=str(self.path), faults=faults)
         return self._attached[name]
 
     def attachment(self, name: str) -> bytes:

@@ -206,7 +206,7 @@ class BracketSeries:
         for camera in self._run.step_cameras(step).values():
             camera.abort()
 
-    # what is not needed -----------------------------------------------------------------------
+    # omission of exposures --------------------------------------------------------------------
 
     def _report_missing_fibers(self, placement: HeadPlacement, signal: FiberSignal) -> None:
         """Log the fibers without a signal in a whole series."""

@@ -64,7 +64,7 @@ class FiberSignal:
     level : ndarray of float64, shape (F, C)
         Largest peak above black of an unsaturated exposure so far, of full scale.
     rate_per_s : ndarray of float64, shape (F, C)
-        That peak per second, of full scale; 0 without such an exposure.
+        The same peak per second, of full scale; 0 without such an exposure.
     """
 
     def __init__(self, probe: Probe, view: View) -> None:
@@ -170,11 +170,11 @@ def stop_reason(signal: FiberSignal, last: Step, remaining: Sequence[Step]) -> s
         return ""
     first, final = (int(remaining[k].index["bracket"]) for k in (0, -1))
     span = f"bracket {first}" if first == final else f"brackets {first}-{final}"
-    what = f"all {len(signal.probe.fibres)} fibres"
+    what = f"all {len(signal.probe.fibres)} fibers"
     what += " that can be measured" if verdict.hopeless or verdict.saturated else ""
     at_s = float(last.settings["exposure_s"])
     reason = (
-        f"{span} left out: {what} above {100 * MIN_PEAK_LEVEL:g} % of full scale at {at_s:.2g} s"
+        f"{span} omitted: {what} above {100 * MIN_PEAK_LEVEL:g} % of full scale at {at_s:.2g} s"
     )
     if verdict.hopeless:
         reason += f"; {describe_fibers(verdict.hopeless, signal.probe)} would stay in the noise"
@@ -295,6 +295,6 @@ def find_unneeded_masks(session: Session) -> tuple[list[Step], str]:
     kept = usable_exposures(masks, signal.rate_per_s)
     rest = [step for step in masks if step.id not in kept]
     return rest, (
-        f"{len(rest)} of {len(masks)} exposures of the covered head left out: per fibre one "
-        "that shows it unsaturated serves, and one that shows light astray from it"
+        f"{len(rest)} of {len(masks)} exposures of the covered head omitted: one unsaturated "
+        "exposure per fiber and one for its stray light are enough"
     )

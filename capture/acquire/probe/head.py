@@ -169,7 +169,7 @@ class Head:
             f"and no hair is under the rim; {recovery_advice(captured=captured)}"
         )
 
-    # what is waited for -----------------------------------------------------------------------
+    # waiting ---------------------------------------------------------------------------------
 
     def _settle(self) -> None:
         """Wait until the suction has stayed within its limits for the rig's settling time."""

@@ -51,7 +51,7 @@ def check_probe(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
         fibre = step.settings.get("fibre")
         if fibre is not None and not int(fibre) < len(probe.fibres):
             has = f"the rig has {len(probe.fibres)}, counted from 0"
-            raise step_limit_error(step, f"got fibre {fibre}, {has}")
+            raise step_limit_error(step, f"got fiber {fibre}, {has}")
     if probe.suction_mbar > most_mbar:
         raise AcquisitionError(
             f"suction_mbar: the rig file has {probe.suction_mbar:g}, the controller allows at "

@@ -133,7 +133,7 @@ class ExpectedReflectance:
         common = np.array(self.common, np.float64)
         common = np.zeros((0, *value.shape)) if common.shape[0] == 0 else common
         checks = FaultCollector("ExpectedReflectance", CertificateError)
-        checks.check("per_mm2", value.shape, value.ndim == 2, "(fibres, colors)")
+        checks.check("per_mm2", value.shape, value.ndim == 2, "(fibers, colors)")
         good = bool(np.isfinite(value).all() and (value > 0).all())
         checks.check("per_mm2", short_repr(value.tolist()), good, "finite numbers > 0")
         checks.check("stderr", stderr.shape, stderr.shape == value.shape, f"shape {value.shape}")

@@ -124,8 +124,8 @@ class FiberCalibration:
         freeze_arrays(self, (count,), "dead", kind=np.bool_)
         if len(self.spots.names) != count or self.crosstalk.offset.shape != (count, colors):
             raise ValueError(
-                f"FibreCalibration: got {len(self.spots.names)} spots and cross-talk of"
-                f" {self.crosstalk.offset.shape}, expected {count} fibres in {colors} colors"
+                f"FibreCalibration: got {len(self.spots.names)} spots and cross-talk of "
+                f"{self.crosstalk.offset.shape}, expected {count} fibers in {colors} colors"
             )
 
     @property
@@ -159,9 +159,10 @@ class FiberCalibration:
         """
         if readings.names != self.names or readings.signal.shape != self.gain.shape:
             raise FiberError(
-                f"readings: got {len(readings.names)} fibres from {readings.names[:1]} in"
-                f" {readings.signal.shape[-1]} colors, expected those of the calibration,"
-                f" {len(self.names)} from {self.names[:1]} in {self.gain.shape[1]}"
+                f"readings: got {len(readings.names)} fibers from {readings.names[:1]} in "
+                f"{readings.signal.shape[-1]} colors, expected those of the calibration, "
+                f"{len(self.names)} from {self.names[:1]} in {self.gain.shape[1]}; read this "
+                "probe's frames again"
             )
         if not 0 < level <= 1:
             raise FiberError(f"level: got {level}, expected 0 < level <= 1")

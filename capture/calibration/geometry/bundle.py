@@ -58,7 +58,7 @@ def adjust(
     start : mapping of str to CameraPose
         Nominal or earlier cameras, by view name; those without corners are named in an error.
     gauge : {"board", "cameras"}
-        What fixes the rig frame: pose 0 of the board in the jig (see `BoardPose.in_jig`), or the
+        Gauge of the rig frame: pose 0 of the board in the jig (see `BoardPose.in_jig`), or the
         nominal cameras' centers, onto which the result is moved as a rigid body.
     prior : LensPrior, optional
         Prior of the lens parameters.

@@ -54,9 +54,9 @@ class LensPrior:
     focal : float
         Relative.
     principal : float
-        Of the principal point, relative to the image's width.
+        Position of the principal point, relative to the image's width.
     k1, k2, tangential, k3 : float
-        Of the distortion.
+        Coefficients of the distortion.
     """
 
     focal: float = 0.02

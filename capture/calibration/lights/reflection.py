@@ -49,7 +49,7 @@ def reflection_points(
     eyes_mm, centers_mm, lights_mm : ndarray, shape (n, 3)
         Centers of projection, of the spheres, and points outside the spheres.
     radius_mm : float
-        Of the spheres.
+        Radius of the spheres.
 
     Returns
     -------

@@ -133,7 +133,7 @@ class FacetReflection:
         Parameters
         ----------
         to_light : ndarray of float64, shape (L, 3)
-            From the facets, any length; polarizers face the facets as before.
+            Directions from the facets, any length; polarizers face the facets as before.
         eta : float
         """
         light = _unit(to_light)

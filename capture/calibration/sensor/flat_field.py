@@ -39,8 +39,8 @@ class SmoothField:
     Attributes
     ----------
     coefficients : ndarray of float64, shape (T,)
-        Of products of Legendre polynomials in row and column, each scaled to [-1, 1] over the
-        image, total degree up to 4 for T = 15.
+        Coefficients of products of Legendre polynomials in row and column, each scaled to [-1, 1]
+        over the image, total degree up to 4 for T = 15.
     covariance : ndarray of float64, shape (T, T)
         Covariance of the coefficients.
     residual : float

@@ -28,9 +28,9 @@ def neutral_mosaic(frame: RawFrame, color: ArrayLike) -> Float32Array:
     Parameters
     ----------
     frame : RawFrame
-        Of a sensor with a 2 x 2 color filter array, showing things of one color.
+        Frame of a sensor with a 2 x 2 color filter array, showing objects of one color.
     color : array_like, shape (3,)
-        That color in camera RGB, any scale, > 0.
+        Color of the objects in camera RGB, any scale, > 0.
 
     Returns
     -------

@@ -87,7 +87,7 @@ class TransferCurveFit:
     offset_dn2, slope_dn : float
         Variance without light and its slope.
     covariance : ndarray of float64, shape (2, 2)
-        Of (offset, slope), scaled by the scatter when that exceeds the expectation.
+        Covariance of (offset, slope), scaled by the scatter when that exceeds the expectation.
     chi2_per_dof : float
         Scatter around the line over its expectation.
     saturation_dn : float

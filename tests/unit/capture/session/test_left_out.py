@@ -98,7 +98,7 @@ def test_omitted_step_is_neither_captured_nor_omitted_again(session):
     before = (session.path / "journal.jsonl").read_bytes()
     with pytest.raises(SessionError, match="was omitted"):
         commit(session, "S003")
-    with pytest.raises(SessionError, match="not left out before"):
+    with pytest.raises(SessionError, match="not omitted before"):
         session.leave_out(["S002", "S003"], reason=WHY, t_host_s=0.0)
     assert (session.path / "journal.jsonl").read_bytes() == before
 
