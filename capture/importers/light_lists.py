@@ -62,7 +62,7 @@ def natural_sort_key(name: str) -> tuple[tuple[int, int | str], ...]:
 
     Examples
     --------
-    >>> sorted(["b.10.write_png", "b.2.write_png", "a.write_png"], key=natural_sort_key)
+    >>> sorted(["b.10.png", "b.2.png", "a.png"], key=natural_sort_key)
     ['a.png', 'b.2.png', 'b.10.png']
     """
     parts = re.split(r"(\d+)", name.casefold())
@@ -125,7 +125,7 @@ def _is_mask(file: Path) -> bool:
 
     Examples
     --------
-    >>> _is_mask(Path("buddha.mask.write_png")), _is_mask(Path("damask.write_png"))
+    >>> _is_mask(Path("buddha.mask.png")), _is_mask(Path("damask.png"))
     (True, False)
     """
     return "mask" in re.split(r"[^a-z]+", file.stem.lower())

@@ -275,8 +275,8 @@ class BundleProblem:
         """Return the normal matrix and the gradient of half the cost, free parameters only."""
         H, g = np.zeros((self.total, self.total)), np.zeros(self.total)
         for (name, pose), sighting in self.images.items():
-            # Gauss-Newton: H = sum J' W J and g = sum J' W r. An image couples its camera only with
-            # its pose; poses are not coupled with each other.
+            # Gauss-Newton: H = sum J' W J and g = sum J' W r. Each image couples its camera only
+            # with its pose; poses are not coupled with each other.
             of_camera, of_place = _derivatives(
                 cameras[name], places[pose], self.board.points_mm[sighting.ids]
             )
