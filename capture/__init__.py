@@ -1,1 +1,1 @@
-"""Drive the rig, know its errors, keep the frames."""
+"""Capture: rigs, plans, device drivers, sessions, calibration and raw frames."""

@@ -1,4 +1,4 @@
-"""Strict reading of small TOML and JSON documents: every fault listed, with path and near miss.
+"""Parse small TOML and JSON documents strictly: list every fault, with path and near miss.
 
 A document is a frozen dataclass. Types, unknown keys and non-finite numbers are checked by
 pydantic, ranges by the dataclass's own ``__post_init__``, so that a file and a constructor obey
@@ -34,7 +34,7 @@ _SI_UNITS: tuple[dict[str, float], ...] = (
 
 
 class Document:
-    """Base of dataclasses that stand in files: no unknown keys, no conversions, finite numbers."""
+    """Base of dataclasses in files: no unknown keys, no conversions, finite numbers."""
 
     __slots__ = ()
     __pydantic_config__: ClassVar[ConfigDict] = STRICT_CONFIG
@@ -46,13 +46,13 @@ class Document:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing wrong in a document: where, what was found, what was expected."""
+    """One fault of a document: its path, the value found, the value expected."""
 
     path: str
     got: str
     expected: str
     hint: str = ""
-    """A near miss, empty where there is none."""
+    """A near miss, empty without one."""
 
     def __str__(self) -> str:
         """Return ``path: got X, expected Y; hint``."""
@@ -61,18 +61,18 @@ class Fault:
 
 
 class InputError(ValueError):
-    """An input of ours that cannot be used: what, where, got, expected, what to do.
+    """Raised for an input that cannot be used: what, where, got, expected, what to do.
 
     Parameters
     ----------
     what : str
-        What is wrong, in a few words.
+        Fault, in a few words.
     where : str
-        File (and byte, where known), empty for values built in memory.
+        File (and byte, when known), empty for values built in memory.
     faults : sequence of Fault
-        Everything that is wrong, in document order.
+        All faults, in document order.
     advice : str
-        What to do about it.
+        Advice to the user.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class InputError(ValueError):
         return cls(problem, where=str(where), faults=[Fault(path, got, expected)], advice=advice)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Keep the parts when the error travels between processes."""
+        """Keep the parts when the error is passed between processes."""
         return (_rebuild, (type(self), self.what, self.where, self.faults, self.advice))
 
 
@@ -131,27 +131,27 @@ class FaultCollector:
         self._faults: list[Fault] = []
 
     def check(self, field: str, got: object, good: bool, expected: str) -> None:
-        """Note a fault of ``field`` unless ``good``."""
+        """Add a fault of ``field`` unless ``good``."""
         if not good:
             self._faults.append(Fault(field, short_repr(got), expected))
 
     def note(self, fault: Fault) -> None:
-        """Note a fault found elsewhere."""
+        """Add a fault found elsewhere."""
         self._faults.append(fault)
 
     def check_finite(self, **values: float | Iterable[float]) -> None:
-        """Note a fault for each value (or row of values) that is not finite."""
+        """Add a fault for each value (or row of values) that is not finite."""
         for field, value in values.items():
             row = (value,) if isinstance(value, int | float) else tuple(value)
             self.check(field, value, all(math.isfinite(x) for x in row), "finite numbers")
 
     def check_positive(self, **values: float) -> None:
-        """Note a fault for each value that is not a finite number above zero."""
+        """Add a fault for each value that is not a finite number above zero."""
         for field, value in values.items():
             self.check(field, value, math.isfinite(value) and value > 0, "a finite number > 0")
 
     def close(self) -> None:
-        """Raise everything noted, or return."""
+        """Raise an error with all faults, or return."""
         if self._faults:
             raise self._error(f"{self._what} is not valid", faults=self._faults)
 
@@ -170,11 +170,11 @@ def parse_document(kind: type[_T], data: object, *, where: str, error: type[Inpu
     kind : type
         Dataclass, its nested dataclasses carrying ``__pydantic_config__ = STRICT``.
     data : object
-        What ``tomllib`` or ``json`` returned.
+        Result of ``tomllib`` or ``json``.
     where : str
         Name of the file for the message.
     error : type of InputError
-        What to raise, once, with all faults.
+        Class of the error, raised once, with all faults.
     """
     bad: list[Fault] = []
     try:
@@ -197,7 +197,7 @@ def read_toml(path: Path, *, error: type[InputError]) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as exc:
-        raise error("there is no such file", where=str(path)) from exc
+        raise error("file not found", where=str(path)) from exc
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as exc:
         raise error(f"is not TOML: {exc}", where=str(path)) from exc
     except OSError as exc:
@@ -215,7 +215,7 @@ def read_json(text: str | bytes, *, where: str, error: type[InputError]) -> Any:
         if len(table) != len(pairs):
             seen: set[str] = set()
             twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
-            raise ValueError(f"key {twice!r} stands twice in one table")
+            raise ValueError(f"key {twice!r} is twice in one table")
         return table
 
     try:
@@ -226,7 +226,7 @@ def read_json(text: str | bytes, *, where: str, error: type[InputError]) -> Any:
 
 
 def canonical_json(data: object) -> bytes:
-    r"""Return the one byte string that stands for ``data``: sorted keys, no spaces, ASCII.
+    r"""Return the canonical bytes of ``data``: sorted keys, no spaces, ASCII.
 
     Examples
     --------
@@ -237,12 +237,12 @@ def canonical_json(data: object) -> bytes:
 
 
 def to_json_table(row: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass as JSON values, those of dataclasses in it too.
+    """Return the fields of a dataclass as JSON values, including those of nested dataclasses.
 
     Parameters
     ----------
     row : dataclass
-        Tuples become lists, and dates ISO 8601; what mappings hold is left as it is.
+        Tuples become lists, and dates ISO 8601; values in mappings are unchanged.
 
     Examples
     --------
@@ -263,7 +263,7 @@ def _plain(value: Any) -> Any:
 
 
 def suggest_key(key: str, known: Iterable[str]) -> str:
-    """Return a suggestion for an unknown key, empty where nothing is near.
+    """Return a suggestion for an unknown key, empty when nothing is near.
 
     Examples
     --------
@@ -305,7 +305,7 @@ def _path(location: Iterable[object]) -> str:
 
 
 def _faults(line: Any, kind: type) -> Iterable[Fault]:
-    """Translate one pydantic error into faults of ours."""
+    """Translate one pydantic error into our faults."""
     location = tuple(line["loc"])
     cause = line.get("ctx", {}).get("error")
     if isinstance(cause, InputError) and cause.faults:
@@ -319,7 +319,7 @@ def _faults(line: Any, kind: type) -> Iterable[Fault]:
     elif line["type"] in ("missing", "missing_argument"):
         yield Fault(_path(location), "nothing", "a value: the key is required")
     else:
-        # the library's sentences begin so; after our "expected" only their rest reads on
+        # prefixes of the library's sentences, which do not fit after our "expected"
         reason = str(line["msg"]).removeprefix("Value error, ").removeprefix("Input should be ")
         yield Fault(
             _path(location), short_repr(line["input"]), reason[:1].lower() + reason[1:].rstrip(".")
@@ -327,7 +327,7 @@ def _faults(line: Any, kind: type) -> Iterable[Fault]:
 
 
 def _known_keys(kind: Any, location: Sequence[object]) -> set[str]:
-    """Return the field names of the dataclass that stands at ``location`` inside ``kind``."""
+    """Return the field names of the dataclass at ``location`` inside ``kind``."""
     here = kind
     for part in location:
         if isinstance(part, str) and hasattr(here, "__dataclass_fields__"):
@@ -340,7 +340,7 @@ def _known_keys(kind: Any, location: Sequence[object]) -> set[str]:
 
 
 def _replace_non_json(data: object, path: str, bad: list[Fault]) -> object:
-    """Return ``data`` with what JSON cannot hold (NaN, dates) noted in ``bad`` and nulled."""
+    """Replace values that JSON cannot represent (NaN, dates) by null and list them in ``bad``."""
     if isinstance(data, dict):
         return {
             str(k): _replace_non_json(v, f"{path}.{k}" if path else str(k), bad)

@@ -1,4 +1,4 @@
-"""Brackets of exposures merged to linear radiance with its variance."""
+"""Merge brackets of exposures to linear radiance with its variance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,11 +15,12 @@ from capture.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UI
 from capture.documents import FaultCollector, InputError
 
 N_WEIGHTING_STEPS: Final = 1
-"""Rounds of weighing; a second changes the estimate by less than 1 % of its standard error."""
+"""Iterations of the weights; a second changes the estimate by less than 1 % of its standard error.
+"""
 _TILE_PIXELS: Final = 512
 _CHUNK_PIXELS: Final = 128
 _MAX_SERIAL_PIXELS: Final = 1 << 17  # pixels
-"""Tiles that a thread takes at a time, so that one on a busy core holds up no other."""
+"""Tiles per task of a thread, so that a busy core does not delay the others."""
 _FAST_MATH: Final = {"nsz", "arcp", "contract", "reassoc"}
 
 _MAX_EXACT_INTEGER: Final = 2.0**53
@@ -32,24 +33,24 @@ _Merged = tuple[Float32Array, Float32Array, BoolArray]
 
 
 class BracketError(InputError):
-    """Frames that cannot be merged."""
+    """Raised for frames that cannot be merged."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResponseCurve:
-    """How an encoded picture's values follow from exposure, up to one factor a channel."""
+    """Response of an encoded image: exposure of each value, up to one factor per channel."""
 
     exposure: Float64Array
     """Relative exposure (radiance times seconds) of each value, shape (256, C), 1 at value 128."""
     stderr: Float64Array
-    """Of `exposure`, shape (256, C), from groups of pixels fitted apart."""
+    """Standard error of `exposure`, shape (256, C), from groups of pixels fitted separately."""
     valid: BoolArray
-    """Values that were seen often enough and rise, shape (256, C)."""
+    """Values with enough samples and a rising response, shape (256, C)."""
 
     def linearize(self, image: UInt8Array) -> tuple[Float32Array, Float32Array, BoolArray]:
-        """Return relative exposure, its variance and where it is valid, each of the image's shape.
+        """Return relative exposure, its variance and a mask of valid pixels, in image shape.
 
-        The variance is that of the response and of the rounding to whole values.
+        The variance includes that of the response and of the rounding to whole values.
         """
         picture = np.asarray(image)
         if picture.dtype != np.uint8 or picture.shape[-1:] != self.exposure.shape[1:]:
@@ -75,20 +76,20 @@ def recover_response(
     pixels: int = 150,
     smoothness: float = 10.0,
 ) -> ResponseCurve:
-    """Recover the response of a camera from a bracket of JPEG pictures (OpenCV's Debevec).
+    """Recover the response of a camera from a bracket of JPEG images (OpenCV's Debevec).
 
-    Raw frames need no such thing: they are linear, see `merge`.
+    Raw frames do not need this: they are linear, see `merge`.
 
     Parameters
     ----------
     images : sequence of N arrays of uint8, shape (H, W, 3)
-        One scene from one place, N >= 2.
+        One scene from one position, N >= 2.
     exposures_s : array_like, shape (N,)
         Exposure times, s, not all the same.
     rng : numpy.random.Generator
         Draws the pixels.
     pixels : int
-        Of each of 8 groups that are fitted apart, at least 50.
+        Pixels in each of 8 groups that are fitted separately, at least 50.
     smoothness : float
         Weight of smoothness against the data, > 0.
 
@@ -99,7 +100,7 @@ def recover_response(
     Raises
     ------
     BracketError
-        Where shapes, kinds or times do not fit.
+        When shapes, types or times do not match.
 
     References
     ----------
@@ -123,7 +124,7 @@ def recover_response(
     checks.check_positive(smoothness=smoothness)
     checks.close()
     values = np.stack([image.reshape(-1, 3) for image in stack])  # (N, H W, 3)
-    # pixels spread over the values of the middle exposure, each group with its own
+    # pixels distributed over the values of the middle exposure, each group with its own
     middle = values[len(stack) // 2].mean(axis=-1)
     order = np.argsort(middle + rng.uniform(0, 1e-3, len(middle)), kind="stable")
     strata = np.array_split(order, pixels)
@@ -167,13 +168,13 @@ def merge(
         Raw DN of one camera, nothing subtracted; the scene and the light do not change. Of any
         type, floating ones included, as long as every value is whole.
     exposures_s : array_like, shape (N,)
-        Exposure times, s; one time as often as there are frames of it.
+        Exposure times, s; a time is repeated for each of its frames.
     gain : float
         Electrons per DN.
     read_noise : float
         Electrons rms, of one frame.
     black, white : float
-        Levels in DN; values from `white` on are saturated and left out.
+        Levels in DN; values from `white` on are saturated and omitted.
 
     Returns
     -------
@@ -181,27 +182,27 @@ def merge(
         DN above black per second, of the frames' shape; negative values are kept; NaN
         where not valid.
     variance : ndarray of float32, shape (H, W[, C])
-        Of `radiance`; NaN where not valid.
+        Variance of `radiance`; NaN where not valid.
     valid : ndarray of bool, shape (H, W[, C])
         False where every frame is saturated.
 
     Raises
     ------
     BracketError
-        Where shapes, times or levels do not fit, or a value is not whole.
+        When shapes, times or levels do not match, or a value is not whole.
 
     Notes
     -----
-    Frames that were averaged have less noise than one frame, and may hide pixels that were
-    saturated in some of them; of those with a dark frame subtracted, neither the saturation nor
-    the noise is known any more. Both are refused, since their variance would be wrong: give the
-    single frames, each with its time (the merge averages them), and the dark level as `black`.
+    Averaged frames have less noise than one frame, and may hide pixels that were saturated in some
+    of them; frames with a subtracted dark frame have an unknown saturation and noise. Both are
+    rejected, since their variance would be wrong: give the single frames, each with its time (the
+    merge averages them), and the dark level as `black`.
 
-    The estimate of largest likelihood for shot and read noise: each frame weighs by
-    ``t^2 / (radiance t / gain + (read_noise / gain)^2 + 1/12)``, the radiance in it being the
-    estimate itself, not the noisy value of the frame, which would favor low readings
-    (Granados et al. 2010, doi 10.1109/CVPR.2010.5540208). Frames of uint16 are read once, tile by
-    tile, on all cores; others go through `merge_reference`.
+    Maximum likelihood estimate for shot and read noise: the weight of a frame is ``t^2 / (radiance
+    t / gain + (read_noise / gain)^2 + 1/12)``. The radiance in it is the estimate itself, not the
+    noisy value of the frame, which would favor low readings (Granados et al. 2010, doi
+    10.1109/CVPR.2010.5540208). Frames of uint16 are read once, tile by tile, on all cores; others
+    go through `merge_reference`.
 
     Examples
     --------
@@ -225,9 +226,10 @@ def merge(
     shape = rows[0].shape
     radiance, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)
     valid = np.empty(shape, np.bool_)
-    # times are scaled to 1 so that float32 holds any of them
+    # times are scaled to 1 so that float32 can represent any of them
     longest = float(times.max())
-    # waking a second thread takes longer than a small frame; the choice holds for this thread only
+    # starting a second thread takes longer than a small frame; the choice applies to this thread
+    # only
     threads = get_num_threads()
     set_num_threads(1 if radiance.size < _MAX_SERIAL_PIXELS else threads)
     try:
@@ -259,7 +261,7 @@ def merge_reference(
     black: float,
     white: float,
 ) -> _Merged:
-    """Return what `merge` does, written plainly in float64 for whole numbers of any kind."""
+    """Return the result of `merge`, in plain float64 for whole numbers of any type."""
     times = np.asarray(exposures_s, np.float64)
     floor = (read_noise / gain) ** 2 + 1.0 / 12.0  # DN^2, with the rounding to whole DN
     shape = frames[0].shape
@@ -267,7 +269,7 @@ def merge_reference(
     for k in _choose_first_frames(times):
         frame, t = frames[k], times[k]
         usable = frame < white
-        # first by read noise alone, where the longest exposure counts most
+        # first with read noise alone, when the longest exposure has the largest weight
         signal += np.where(usable, (frame.astype(np.float64) - black) * t, 0.0)
         time += np.where(usable, t * t, 0.0)
     valid = time > 0
@@ -277,6 +279,7 @@ def merge_reference(
         weighted, total = np.zeros(shape), np.zeros(shape)
         for frame, t in zip(frames, times, strict=True):
             # one frame's weight for its own DN / t is t^2 / variance
+            # Poisson noise of N electrons is N; in DN^2 it is the mean signal in DN over the gain.
             spread = np.maximum(radiance, 0.0) * t / gain + floor
             weight = np.where(frame < white, t / spread, 0.0)
             weighted += weight * (frame.astype(np.float64) - black)
@@ -291,9 +294,9 @@ def merge_reference(
 
 
 def _choose_first_frames(times: Float64Array) -> Int64Array:
-    """Return the frames for the first guess: all, or of dense brackets those a factor 3 apart.
+    """Return the frames for the first estimate: all, or of dense brackets those a factor 3 apart.
 
-    The weights need the radiance to some percent only. The shortest and the longest take part.
+    The weights need the radiance to a few percent only. The shortest and the longest are included.
     """
     order = [int(k) for k in np.argsort(times, kind="stable")]
     chosen = order[:1]
@@ -309,7 +312,7 @@ def _as_float(frame: NDArray[Any]) -> bool:
 
 
 def _as_integer(frame: NDArray[Any]) -> NDArray[np.integer]:
-    """Return whole numbers of a floating type as uint16 where that holds them, else as int64."""
+    """Return whole numbers of a floating type as uint16 when they fit, else as int64."""
     held = not frame.size or (float(frame.min()) >= 0 and float(frame.max()) <= 65535)
     return frame.astype(np.uint16 if held else np.int64)
 
@@ -369,7 +372,7 @@ def _as_pointer(typing_context: Any, address: Any) -> Any:
 def _merge_tiles(  # type: ignore[no-untyped-def]
     addresses, times, starters, per_gain, floor, black, white, per_time, radiance, variance, valid
 ):
-    """Merge tile by tile: the frames' tiles stay in cache over the rounds of weighing."""
+    """Merge tile by tile: the frames' tiles stay in cache over the iterations of the weights."""
     size = radiance.shape[0]
     for tile in prange((size + _TILE_PIXELS - 1) // _TILE_PIXELS):
         start = tile * _TILE_PIXELS
@@ -403,7 +406,7 @@ def _merge_tiles(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy", fastmath=_FAST_MATH)
 def _add(frame, t, black, white, s, w):  # type: ignore[no-untyped-def]
-    """Add the tile of one frame, weighed as read noise alone would have it."""
+    """Add the tile of one frame with the weight of read noise alone."""
     for i in range(len(s)):
         v = np.float32(frame[i])
         usable = np.float32(v < white) * t
@@ -413,7 +416,7 @@ def _add(frame, t, black, white, s, w):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy", fastmath=_FAST_MATH)
 def _add_weighted(frame, t, first, floor, black, white, s, w):  # type: ignore[no-untyped-def]
-    """Add the tile of one frame, weighed by its time over its variance."""
+    """Add the tile of one frame with its time over its variance as weight."""
     for i in range(len(s)):
         v = np.float32(frame[i])
         weight = np.float32(v < white) * t / (first[i] * t + floor)

@@ -1,7 +1,7 @@
-"""The nominal rig: lights, views and boxes, read from a TOML file and frozen.
+"""The nominal rig: lights, views and controllers, read from a TOML file and frozen.
 
-What it is made of are modules of their own: `capture.rig` (a camera with its geometry) and
-`capture.rig_parts` (all else); their names are found here, too.
+The parts of a rig are in modules of their own: `capture.rig` (a camera with its geometry) and
+`capture.rig_parts` (all others); their names are also available here.
 """
 
 from __future__ import annotations
@@ -62,19 +62,19 @@ MAX_BINNING = 3.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class View(Document):
-    """One camera of the rig: pinhole, sensor and analyser, all nominal."""
+    """One camera of the rig: pinhole, sensor and analyzer, all nominal."""
 
     name: str
     camera_model: str
     serial: str
     position_mm: Vector
-    """Centre of projection, mm, rig frame."""
+    """Center of projection, mm, rig frame."""
     target_mm: Vector
     """Point on the optical axis, mm, rig frame."""
     up: Vector
     """Direction that is up in the image, rig frame, any length."""
     focal_mm: float
-    """Distance from centre of projection to sensor, mm, > 0."""
+    """Distance from center of projection to sensor, mm, > 0."""
     pixel_um: float
     """Pixel pitch, um, > 0."""
     width_px: int
@@ -87,14 +87,15 @@ class View(Document):
     cfa: Pattern
     """Colors of the 2 x 2 cell read row by row, or MONO."""
     black_level: int
-    """DN of no light."""
+    """Black level, DN."""
     white_level: int
-    """DN of saturation, at most 2**bit_depth - 1."""
+    """Saturation level, DN, at most 2**bit_depth - 1."""
     spectral_sensitivity: str = "Nikon 5100 (NPL)"
     """Name of the curves, see ``model.spectra.camera_sensitivity``."""
     analyser_axis_deg: float | None = None
-    """Axis of the analyser at rotator reading 0 (the parallel state), degrees, 0 <= axis < 180;
-    None: no analyser."""
+    """Axis of the analyzer at rotator reading 0 (the parallel state), degrees, 0 <= axis < 180;
+    None: no analyzer.
+    """
     full_well_e: float
     """Electrons at ``white_level``, > 0."""
     read_noise_e: float
@@ -102,8 +103,9 @@ class View(Document):
     shutter_lag_s: float = 0.0
     """Time from the trigger's edge until the shutter is fully open, s, >= 0."""
     focus_mm: float | None = None
-    """Distance from the centre of projection to the plane in focus, mm, > 0; None: that of the
-    target."""
+    """Distance from the center of projection to the plane in focus, mm, > 0; None: that of the
+    target.
+    """
 
     def __post_init__(self) -> None:
         checks = FaultCollector(f"View {self.name!r}", RigError)
@@ -160,12 +162,12 @@ class View(Document):
 
     @property
     def focus_distance_mm(self) -> float:
-        """Distance from the centre of projection to the plane in focus, mm."""
+        """Distance from the center of projection to the plane in focus, mm."""
         return self.distance_mm if self.focus_mm is None else self.focus_mm
 
     @property
     def field_mm(self) -> tuple[float, float]:
-        """Width and height seen at the target's distance, mm.
+        """Width and height of the field at the target's distance, mm.
 
         Examples
         --------
@@ -191,9 +193,9 @@ class View(Document):
     def resized(self, width_px: int) -> View:
         """Return this view with ``width_px`` columns and the same field of view; rows stay even.
 
-        Pixels grow as if the sensor's own were binned: a pixel of k times the side holds k^2
-        times the electrons, and its read noise is k times as large; no further than 3 x 3, where
-        the levels of the converter would begin to hide the noise.
+        Pixels grow as if the sensor's own were binned: a pixel of k times the side holds k^2 times
+        the electrons, and its read noise is k times as large; at most 3 x 3, beyond which the
+        levels of the converter would begin to hide the noise.
         """
         step = 1 if self.cfa == "MONO" else 2
         if not 2 <= width_px <= MAX_SIDE_PX or width_px % step:
@@ -235,9 +237,9 @@ def _unit(a: Vector) -> Vector:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rig(Document):
-    """Lights, views and boxes with their limits; lengths in mm in the rig frame.
+    """Lights, views and controllers with their limits; lengths in mm in the rig frame.
 
-    The frame's origin is the subject's centre; +x right, +y up, +z towards the main camera.
+    The frame's origin is the subject's center; +x right, +y up, +z towards the main camera.
     """
 
     name: str
@@ -246,17 +248,17 @@ class Rig(Document):
     boxes: tuple[str, ...]
     """Names of the controllers that drive the lights."""
     recycle_s: float
-    """Least time between two pops of a flash at power 1, s, >= 0; 0 where no light is a flash."""
+    """Minimum time between two flashes at power 1, s, >= 0; 0 without a flash."""
     max_pops_per_min: float = 20.0
-    """Most pops in any minute, > 0."""
+    """Maximum number of flashes in any minute, > 0."""
     polarizer_move_s: float = 0.5
-    """Time to turn the analyser, s, >= 0."""
+    """Time to turn the analyzer, s, >= 0."""
     leds: LedLimits | None = None
     """Limits of the rig's LEDs; None: it has none."""
     caliper: Caliper | None = None
-    """What stretches the skin; None: nothing does."""
+    """Caliper that stretches the skin; None: the rig has none."""
     probe: Probe | None = None
-    """What touches the skin with fibres; None: nothing does."""
+    """Contact probe with fibers; None: the rig has none."""
 
     def __post_init__(self) -> None:
         checks = FaultCollector(f"Rig {self.name!r}", RigError)
@@ -314,7 +316,7 @@ class Rig(Document):
     def subset(
         self, *, lights: Sequence[str] | None = None, views: Sequence[str] | None = None
     ) -> Rig:
-        """Return this rig with some of its lights and views only, in the rig's own order.
+        """Return this rig with only some of its lights and views, in the rig's own order.
 
         Parameters
         ----------
@@ -324,7 +326,7 @@ class Rig(Document):
         Raises
         ------
         RigError
-            Where a name is not of this rig.
+            When a name is not of this rig.
         """
         kept_lights = [self.light(name) for name in lights] if lights is not None else self.lights
         kept_views = [self.view(name) for name in views] if views is not None else self.views
@@ -341,7 +343,7 @@ def rig_from_json(data: Mapping[str, Any], *, where: str = "rig") -> Rig:
     Raises
     ------
     RigError
-        With every fault's path, what was found and what was expected.
+        With every fault's path, the value found and the value expected.
     """
     return parse_document(Rig, data, where=where, error=RigError)
 
@@ -352,12 +354,12 @@ def load_rig(name_or_path: str | Path) -> Rig:
     Parameters
     ----------
     name_or_path : str or Path
-        ``"flash"``, or a path (anything that ends in ``.toml`` or holds a separator).
+        ``"flash"``, or a path (anything that ends in ``.toml`` or contains a separator).
 
     Raises
     ------
     RigError
-        Where the file is missing or has faults; all of them are listed.
+        When the file is missing or has faults; all of them are listed.
 
     Examples
     --------
@@ -376,13 +378,13 @@ def load_rig(name_or_path: str | Path) -> Rig:
                 suggest_key(text, known)
                 or f"one of {', '.join(known)}, or the path of a .toml file"
             )
-            raise RigError("there is no such rig", faults=[Fault("rig", repr(text), hint)])
+            raise RigError("rig not found", faults=[Fault("rig", repr(text), hint)])
         path = shipped / f"{text}.toml"
     return rig_from_json(read_toml(path, error=RigError), where=str(path))
 
 
 MAX_LISTED_NAMES = 40
-"""Names of lights or views that a message lists; of more it tells the first ones and the last."""
+"""Maximum number of lights or views in a message; of more it lists the first ones and the last."""
 
 
 def _find_by_name(rows: tuple[Any, ...], name: str, label: str) -> Any:

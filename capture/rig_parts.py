@@ -1,4 +1,4 @@
-"""What a rig is made of but its cameras: lights, LEDs' limits, a caliper, a contact probe."""
+"""Parts of a rig other than cameras: lights, limits of LEDs, a caliper, a contact probe."""
 
 import dataclasses
 import math
@@ -10,15 +10,17 @@ Vector = tuple[float, float, float]
 
 ID_RULE = "1 to 64 of A-Z a-z 0-9 _ - . , not starting with a dot"
 AXIS_RULE = "0 <= degrees < 180"
-"""What an axis of a film may be."""
+"""Range of a polarizer's axis."""
 
 
 class RigError(InputError):
-    """A rig, or a rig file, that cannot be used."""
+    """Raised for a rig, or a rig file, that cannot be used."""
 
 
 def is_id(text: str) -> bool:
-    """Return whether ``text`` may name a step, view, light or box (and so be part of a file name).
+    """Return whether ``text`` is a valid name of a step, view, light or controller.
+
+    Such a name can also be part of a file name.
 
     Examples
     --------
@@ -31,26 +33,27 @@ def is_id(text: str) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Light(Document):
-    """One light of the rig: a flash, which gives its energy in one pop, or an LED.
+    """One light of the rig: a flash, with an energy per flash, or an LED.
 
     Angles of axes are measured in the plane across the light's beam from the horizontal (+x of a
-    camera at +z) towards +y, in degrees. A light points at the rig's origin.
+    camera at +z) towards +y, in degrees. Each light points at the rig's origin.
     """
 
     name: str
     position_mm: Vector
-    """Centre of the emitting disc, mm, rig frame."""
+    """Center of the emitting disc, mm, rig frame."""
     illuminant: str = "D55"
     """Name of the spectrum, see ``model.spectra.illuminant``."""
     polarizer_axis_deg: float | None = None
     """Axis of the polarizer in front of the light, degrees, 0 <= axis < 180; None: no polarizer."""
     energy_ws: float | None = None
-    """Of a flash: energy of one pop at power 1, Ws (J), > 0; None: the light is no flash."""
+    """For a flash: energy of one flash at power 1, Ws (J), > 0; None: not a flash."""
     power_w: float | None = None
-    """Of an LED: optical power at level 1, W, > 0; None: the light is no LED."""
+    """For an LED: optical power at level 1, W, > 0; None: not an LED."""
     half_intensity_deg: float | None = None
-    """Angle off the light's axis where its intensity has halved, falling as a power of the cosine,
-    0 < degrees < 90; None: the same in all directions."""
+    """Angle off the light's axis at which its intensity has halved, falling as a power of the
+    cosine, 0 < degrees < 90; None: the same in all directions.
+    """
     radius_mm: float
     """Radius of the emitting disc, mm, > 0."""
 
@@ -73,7 +76,7 @@ class Light(Document):
 
     @property
     def lobe_exponent(self) -> float:
-        """Power of the cosine off its axis by which the light falls off; 0 where even."""
+        """Exponent of the cosine off its axis in the light's intensity; 0 when uniform."""
         if self.half_intensity_deg is None:
             return 0.0
         return math.log(0.5) / math.log(math.cos(math.radians(self.half_intensity_deg)))
@@ -95,7 +98,7 @@ class Light(Document):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LedLimits(Document):
-    """What LEDs may do near eyes and skin, and what their driver can; a box may allow less.
+    """Limits of LEDs near eyes and skin, and of their driver; a controller may allow less.
 
     The numbers are this project's nominal ones, not a certificate: an assembled dome is measured.
     """
@@ -103,27 +106,27 @@ class LedLimits(Document):
     max_on_s: float = 0.5
     """Longest time an LED stays on for one command or row, s, > 0."""
     max_duty: float = 0.25
-    """Most mean level of an LED over ``duty_window_s``, 0 < duty <= 1."""
+    """Largest mean level of an LED over ``duty_window_s``, 0 < duty <= 1."""
     duty_window_s: float = 1.0
-    """Time over which duty is taken, s, > 0."""
+    """Time over which the duty is averaged, s, > 0."""
     thermal_tau_s: float = 4.0
     """Time constant of an LED's temperature, s, > 0."""
     thermal_trip: float = 0.6
-    """Temperature at which its driver trips, 0 < trip < 1; 1 is where it would settle when on."""
+    """Trip temperature of its driver, 0 < trip < 1; 1 is the steady state when on."""
     dose_ws: float = 50.0
-    """Most light an LED may send out to one subject, Ws, > 0."""
+    """Largest energy that an LED may emit to one subject, Ws, > 0."""
     max_at_once: int = 24
-    """Most LEDs that may be on together, >= 2."""
+    """Maximum number of LEDs that are on together, >= 2."""
     max_flashes_per_s: float = 3.0
     """Flashes seen by open eyes in any second must stay below this, > 0."""
     max_flicker_rms: float = 0.25
-    """Most light of 3 to 65 Hz at open eyes, rms over mean, > 0."""
+    """Largest light of 3 to 65 Hz at open eyes, rms over mean, > 0."""
     overlap_s: float = 1e-4
-    """How long before one LED goes off the next one is on, s, >= 0."""
+    """Time that the next LED is on before one goes off, s, >= 0."""
     settle_s: float = 1e-3
     """Time from an LED's turn to the cameras' release, s, >= ``overlap_s``."""
     max_rows: int = 1024
-    """Longest table the box holds, >= 1."""
+    """Longest table of the controller, rows, >= 1."""
 
     def __post_init__(self) -> None:
         checks = FaultCollector("LED limits", RigError)
@@ -145,25 +148,25 @@ class LedLimits(Document):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Caliper(Document):
-    """A caliper whose jaws are taped to the skin, and stretch or compress what lies between.
+    """Caliper whose jaws are taped to the skin, and stretch or compress the skin between them.
 
-    How much force it may use is no property of the rig: who captures must say it.
+    Its force limit is not a property of the rig: the operator must give it for each capture.
     """
 
     aperture_mm: float
     """Distance of the jaws at step 0, mm, > 0."""
     step_mm: float
-    """How far a step moves them, mm, > 0."""
+    """Distance per step of the jaws, mm, > 0."""
     first_step: int
     """Narrowest position, <= 0."""
     last_step: int
     """Widest position, >= 0."""
     angles_deg: tuple[float, ...]
-    """Angles that it can be set to, from +x towards +y, 0 <= degrees < 180."""
+    """Angles to which it can be set, from +x towards +y, 0 <= degrees < 180."""
     speed_mm_per_s: float
-    """How fast the jaws move, mm/s, > 0."""
+    """Speed of the jaws, mm/s, > 0."""
     settle_s: float = 0.3
-    """How long the skin is left to creep after a move before it is scanned, s, >= 0."""
+    """Time for the skin to creep between a move and the scan, s, >= 0."""
 
     def __post_init__(self) -> None:
         checks = FaultCollector("Caliper", RigError)
@@ -195,17 +198,17 @@ class Caliper(Document):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fiber(Document):
-    """One detection fibre of a contact probe, from the head's face to its end before the camera."""
+    """One detection fiber of a contact probe, from the head's face to its end at the camera."""
 
     name: str
     position_mm: tuple[float, float]
-    """Centre on the head's face from the source fibre's centre, mm; x along the line of fibres."""
+    """Center on the head's face relative to the source fiber's, mm; x along the line of fibers."""
     core_mm: float
     """Diameter of the core, mm, > 0."""
     numerical_aperture: float
-    """Sine of the half angle in air that the fibre takes light from, 0 < NA < 1."""
+    """Numerical aperture: sine of the half angle of acceptance in air, 0 < NA < 1."""
     spot_px: tuple[float, float]
-    """Nominal centre of its end in the camera's image, pixels, x right, y down."""
+    """Nominal center of its end in the camera's image, pixels, x right, y down."""
 
     def __post_init__(self) -> None:
         checks = FaultCollector(f"Fibre {self.name!r}", RigError)
@@ -218,42 +221,42 @@ class Fiber(Document):
 
     @property
     def radius_mm(self) -> float:
-        """Distance from the source fibre's centre, mm."""
+        """Distance from the source fiber's center, mm."""
         return math.hypot(*self.position_mm)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Probe(Document):
-    """A contact probe: one source fibre and a line of detection fibres, held on by suction.
+    """Contact probe: one source fiber and a line of detection fibers, held on by suction.
 
-    The rig's one light is what comes out of the source fibre, at the origin of the rig's frame;
-    +x is along the line of fibres and +z out of the skin.
+    The rig's only light is the end of the source fiber, at the origin of the rig's frame; +x is
+    along the line of fibers and +z out of the skin.
     """
 
     fibres: tuple[Fiber, ...]
-    """By growing distance from the source."""
+    """Detection fibers, by growing distance from the source."""
     source_core_mm: float
-    """Diameter of the source fibre's core, mm, > 0."""
+    """Diameter of the source fiber's core, mm, > 0."""
     source_numerical_aperture: float
-    """Sine of the half angle in air of the light that it sends out, 0 < NA < 1."""
+    """Numerical aperture: sine of the half angle of the emitted light in air, 0 < NA < 1."""
     suction_mbar: float
-    """Suction at which the head is held on the skin, mbar below the air's pressure, > 0."""
+    """Suction that holds the head on the skin, mbar below ambient pressure, > 0."""
     suction_tolerance_mbar: float
-    """How far from it a measurement may go on, mbar, > 0."""
+    """Tolerance of the suction during a measurement, mbar, > 0."""
     max_suction_mbar: float
-    """The most that the pump may draw, mbar, > 0."""
+    """Largest suction of the pump, mbar, > 0."""
     max_suction_s: float
-    """Longest time that skin is sucked at without a rest, s, > 0."""
+    """Longest suction of skin without a rest, s, > 0."""
     rest_s: float
     """Rest between two such times, vented, s, >= 0."""
     settle_s: float
-    """Time from the suction's being reached to the first exposure, s, >= 0."""
+    """Time from reaching the suction to the first exposure, s, >= 0."""
     max_open_s: float = 30.0
-    """Longest time that the source's shutter stays open for one command, s, > 0."""
+    """Longest opening of the source's shutter per command, s, > 0."""
     camera_c: float
-    """Temperature at which the camera is kept, degrees Celsius."""
+    """Nominal temperature of the camera, degrees Celsius."""
     camera_tolerance_c: float
-    """How far from it a measurement may go on, kelvin, > 0."""
+    """Tolerance of the temperature during a measurement, kelvin, > 0."""
 
     def __post_init__(self) -> None:
         checks = FaultCollector("Probe", RigError)
@@ -280,7 +283,7 @@ class Probe(Document):
 
     @property
     def radius_mm(self) -> tuple[float, ...]:
-        """Distances of the fibres from the source, mm.
+        """Distances of the fibers from the source, mm.
 
         Examples
         --------

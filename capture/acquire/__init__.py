@@ -1,7 +1,7 @@
-"""Run a plan on a rig: set up, expose, tear down; whatever happens, the lights end dark.
+"""Run a plan on a rig: set up, expose, tear down; the lights end dark in every case.
 
-The driver decides nothing and this package nothing about bytes: what to shoot is the plan's, what
-is missing is the session's, whether a frame is the right one is the camera rule's.
+The plan decides what to capture, the session which frames are missing, and the camera rule whether
+a frame is accepted. Drivers decide nothing, and this package knows nothing of bytes.
 """
 
 from capture.acquire.outcome import AcquisitionError, AcquisitionResult, Interrupted, Operator

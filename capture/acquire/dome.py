@@ -1,8 +1,9 @@
-"""Run a plan on the dome: the box steps through many lights by itself, the frames come after.
+"""Run a plan on the dome: the controller steps through the lights, then frames are fetched.
 
-Steps that share exposure and place of the target are one sequence. The box judges its table before
-it lights anything; while it runs only the lease is renewed. Afterwards the frames are gathered, a
-few rows of all cameras at a time: a row that lacks one camera's frame is taken again as a whole.
+Steps that share exposure and target position are one sequence. The controller checks its table
+before it lights anything; while it runs only the lease is renewed. Afterwards the frames are
+fetched, a few rows of all cameras at a time: a row that lacks one camera's frame is taken again as
+a whole.
 """
 
 import logging
@@ -33,15 +34,15 @@ from capture.rig import LedLimits, Rig
 log = logging.getLogger(__name__)
 
 MAX_BUFFERED_PIXEL_BYTES = 384 * 2**20
-"""Most pixels that are held at once."""
+"""Largest number of pixels in memory at once."""
 ROW_POLL_S = 0.2
 MIN_DARK_GAP_S = 1.1
-"""Darkness between single rows, so that no second sees more than one flash of them."""
+"""Dark time between single rows, s, so that no second contains more than one flash of them."""
 DOME_LEASE_S = 2.0
 
 
 def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> AcquisitionResult:
-    """Capture what the session still lacks of a plan of the dome; see `run_plan`."""
+    """Capture the missing steps of a plan on the dome; see `run_plan`."""
     box: DomeBox = boxes["dome"]
     check_safety(run.plan, run.rig, eyes=run.eyes)
     _check_box(run.plan, run.rig, box.limits)
@@ -61,8 +62,8 @@ def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> AcquisitionResult:
 
 
 def begin_lit_run(run: CaptureRun, box: LedBox, lease_s: float) -> None:
-    """Set up a box of LEDs for a run: dark, its lease, its cameras, the subject and the eyes."""
-    box.dark()  # whatever was going on before
+    """Prepare a controller of LEDs for a run: dark, lease, cameras, subject and eyes."""
+    box.dark()  # stop any sequence of before
     box.set_lease(lease_s)
     box.set_cameras((1 << len(run.rig.views)) - 1)
     if not run.session.frames():
@@ -71,12 +72,12 @@ def begin_lit_run(run: CaptureRun, box: LedBox, lease_s: float) -> None:
 
 
 def check_safety(plan: Plan, rig: Rig, *, eyes: Eyes = "open") -> None:
-    """Raise where a plan goes beyond the rig's own limits of light, before anything is sent.
+    """Raise an error when a plan exceeds the rig's own limits of light, before anything is sent.
 
     Raises
     ------
     AcquisitionError
-        For flicker that open eyes must not see, or a light dose above the rig's limit.
+        For flicker that is not allowed for open eyes, or a light dose above the rig's limit.
     """
     limits = rig.leds or LedLimits()
     flicker, dose = flicker_report(plan, rig), dose_report(plan, rig)
@@ -84,33 +85,36 @@ def check_safety(plan: Plan, rig: Rig, *, eyes: Eyes = "open") -> None:
         raise AcquisitionError(
             f"flicker: the plan gives {flicker.flashes_per_s:.1f} flashes per s and rms "
             f"{flicker.rms:.2f} of 3 to 65 Hz, open eyes allow less than "
-            f"{limits.max_flashes_per_s:g} and {limits.max_flicker_rms:g}; nothing was lit: order "
-            "the lights otherwise, or have the eyes closed or shielded and say so"
+            f"{limits.max_flashes_per_s:g} and {limits.max_flicker_rms:g}; nothing was lit: "
+            "change the order of the lights, or close or shield the eyes and give --eyes"
         )
     if dose.led_ws > limits.dose_ws:
         raise AcquisitionError(
-            f"light dose: {dose.led} would send out {dose.led_ws:.1f} Ws, the rig allows "
-            f"{limits.dose_ws:g} Ws to one subject; nothing was lit: shorten the plan"
+            f"light dose: {dose.led} would emit {dose.led_ws:.1f} Ws, the rig allows "
+            f"{limits.dose_ws:g} Ws per subject; nothing was lit: shorten the plan"
         )
 
 
 def _check_box(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
-    """Raise when a step asks for more than the box allows, before anything is sent."""
+    """Raise an error when a step exceeds the controller's limits, before anything is sent."""
     if int(limits.get("leds", 0)) != len(rig.lights):
         raise AcquisitionError(
-            f"lights: the box drives {limits.get('leds')} LEDs, the rig has {len(rig.lights)}; "
-            "numbers would mean other lights: use the rig file of this box"
+            f"lights: the controller drives {limits.get('leds')} LEDs, the rig has "
+            f"{len(rig.lights)}; numbers would mean other lights: use the rig file of this "
+            "controller"
         )
     if int(limits.get("cameras", 0)) != len(rig.views):
         raise AcquisitionError(
-            f"cameras: the box releases {limits.get('cameras')}, the rig has {len(rig.views)}; "
-            "use the rig file of this box"
+            f"cameras: the controller releases {limits.get('cameras')}, the rig has "
+            f"{len(rig.views)}; use the rig file of this controller"
         )
     settle_s, overlap_s = float(limits["settle_us"]) / 1e6, float(limits["overlap_us"]) / 1e6
     for step, row in zip(plan.steps, led_rows(plan.steps, rig), strict=True):
         check_dwell(step, row.dwell_s, limits)
         if len(row.leds) > int(limits["max_at_once"]):
-            what = f"got {len(row.leds)} lights at once, the box allows {limits['max_at_once']}"
+            what = (
+                f"got {len(row.leds)} lights at once, the controller allows {limits['max_at_once']}"
+            )
             raise step_limit_error(step, what)
         exposure_s = float(step.settings["exposure_s"])
         views = [rig.view(name) for name in step.cameras]
@@ -121,15 +125,15 @@ def _check_box(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
 
 
 def check_dwell(step: Step, dwell_s: float, limits: Mapping[str, Any]) -> None:
-    """Raise where a step's row is shorter or longer than the box allows."""
+    """Raise an error when a step's row is shorter or longer than the controller allows."""
     low_s, high_s = float(limits["row_min_us"]) / 1e6, float(limits["row_max_us"]) / 1e6
     if not low_s <= dwell_s <= high_s:
-        what = f"got dwell_s {dwell_s:g}, the box allows {low_s:g} to {high_s:g}"
+        what = f"got dwell_s {dwell_s:g}, the controller allows {low_s:g} to {high_s:g}"
         raise step_limit_error(step, what)
 
 
 def row_overrun_error(step: Step, dwell_s: float) -> AcquisitionError:
-    """Return the error of a step whose row has no room for its exposure."""
+    """Return the error of a step whose exposure does not fit into its row."""
     exposure_s = float(step.settings["exposure_s"])
     what = f"exposure_s {exposure_s:g} and the read-out do not fit into dwell_s {dwell_s:g}"
     return step_limit_error(step, what)
@@ -142,7 +146,7 @@ def _split_sequences(steps: Sequence[Step], max_steps: int) -> Iterator[list[Ste
 
 
 class _Sequences:
-    """The sequences of one run."""
+    """Sequences of one run."""
 
     def __init__(self, run: CaptureRun, box: DomeBox) -> None:
         self._run, self._box = run, box
@@ -150,14 +154,14 @@ class _Sequences:
         self._count = 0
 
     def prepare(self, step: Step) -> None:
-        """Have the target put where a step needs it."""
+        """Prompt for the target at the position that a step needs."""
         for kind in ("pose", "sphere"):
             if kind in step.index and self._place != (place := f"{kind} {step.index[kind]}"):
                 self._place = place
                 self._run.operator.prompt(place)
 
     def take(self, piece: Sequence[Step]) -> None:
-        """Take the steps of one sequence, and again those that a camera has missed."""
+        """Take the steps of one sequence, and repeat those that a camera has missed."""
         left = list(piece)
         why = ""
         for attempt in range(1, MAX_ATTEMPTS + 1):
@@ -170,9 +174,9 @@ class _Sequences:
         raise self._run.retry_limit_error(f"{len(left)} steps from {left[0].id} on", why)
 
     def _attempt(self, steps: list[Step], attempt: int) -> tuple[list[Step], str]:
-        """Run steps as one sequence, or one by one where that would flicker too much.
+        """Run steps as one sequence, or one by one when that would flicker too much.
 
-        The box counts what was lit before, too: after a little darkness a single step passes.
+        The controller also counts light of before: after a short dark time a single step passes.
         """
         try:
             return self._sequence(steps, attempt)
@@ -190,7 +194,7 @@ class _Sequences:
         return left, why
 
     def _sequence(self, steps: list[Step], attempt: int) -> tuple[list[Step], str]:
-        """Run steps as one sequence; return those that lack a frame, and why."""
+        """Run steps as one sequence; return those that lack a frame, and the reason."""
         run, box = self._run, self._box
         rows = led_rows(steps, run.rig)
         for name, camera in run.step_cameras(steps[0]).items():
@@ -198,7 +202,7 @@ class _Sequences:
         mask = run.camera_mask(steps[0])
         box.load([TableRow(row.leds, row.level, row.dwell_s, mask) for row in rows])
         box.arm()
-        log.info("the box judges the table: %s", box.arm_sequence(len(rows)))
+        log.info("evaluation of the table by the controller: %s", box.arm_sequence(len(rows)))
         self._count += 1
         table = TableRun(
             run,
@@ -215,7 +219,7 @@ class _Sequences:
     def _gather(
         self, steps: list[Step], rows: Sequence[LedRow], table: TableRun, attempt: int
     ) -> list[Step]:
-        """Keep the rows of which every camera has a frame; return the steps of the others."""
+        """Keep the rows with a frame of every camera; return the steps of the others."""
         run, names = self._run, steps[0].cameras
         pixels = sum(2 * view.width_px * view.height_px for view in map(run.rig.view, names))
         at_once = max(1, MAX_BUFFERED_PIXEL_BYTES // pixels)

@@ -1,4 +1,4 @@
-"""Cameras set as a step wants them, and their frames as files of a session."""
+"""Set cameras for a step, and write their frames as files of a session."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,28 +12,28 @@ from capture.rig import View
 from capture.session import Session
 
 FRAME_MARGIN_S = 5.0
-"""How much longer than exposure and read-out a frame may take to come."""
+"""Largest delay of a frame beyond exposure and readout, s."""
 
 
 def requested_exposure(step: Step) -> Exposure:
-    """Return the exposure that a step asks for."""
+    """Return the exposure that a step requests."""
     return Exposure(float(step.settings["exposure_s"]), int(step.settings["iso"]))
 
 
 def configure_camera(name: str, camera: Camera, want: Exposure) -> None:
-    """Set the camera of view ``name``; raise where it is off by more than a third of a stop."""
+    """Set the camera of view ``name``; reject a deviation of more than a third of a stop."""
     got = camera.configure(want)
     if abs(got.deviation_ev(want)) > 1.0 / 3.0 + 1e-9:
         raise CameraError(
             f"view {name!r}: the camera sets {got.exposure_s:g} s at ISO {got.iso}, the plan "
-            f"wants {want.exposure_s:g} s at ISO {want.iso}; choose settings it has"
+            f"needs {want.exposure_s:g} s at ISO {want.iso}; choose settings that the camera has"
         )
 
 
 def arm_cameras(
     cameras: Mapping[str, Camera], want: Exposure, triggers: Mapping[str, Trigger]
 ) -> dict[str, float]:
-    """Set cameras and arm each for one frame; return each one's time of that, s, by view."""
+    """Set cameras and arm each for one frame; return the arming times, s, by view."""
     armed_s = {}
     for name, camera in cameras.items():
         configure_camera(name, camera, want)
@@ -48,7 +48,7 @@ def collect_frames(
     armed_s: Mapping[str, float],
     timeouts_s: Mapping[str, float],
 ) -> tuple[dict[str, Frame], int]:
-    """Return one believed frame a camera, by view, and how many stale ones were dropped."""
+    """Return one accepted frame per camera, by view, and the number of stale ones dropped."""
     frames, stale = {}, 0
     for name, camera in cameras.items():
         frames[name], dropped = next_frame(
@@ -59,7 +59,7 @@ def collect_frames(
 
 
 def frame_timeout_s(step: Step, view: View) -> float:
-    """Return how long a step's frame may take to come, s."""
+    """Return the timeout of a step's frame, s."""
     return float(step.settings["exposure_s"]) + view.readout_s + FRAME_MARGIN_S
 
 
@@ -71,10 +71,10 @@ def encode_step_frame(
     session: Session,
     light: Mapping[str, Value],
 ) -> bytes:
-    """Encode a frame as our DNG, with the step and the light in it."""
+    """Encode a frame as our DNG, with its step and its light."""
     info = camera.info
     if isinstance(frame.image, bytes):
-        # a maker's raw file is written anew: its own metadata can name people and places
+        # a foreign raw file is encoded again, because its own metadata can name people and places
         where = f"step {step.id}, view {view.name}"
         picture = raw.decode(memoryview(frame.image), where=where)
     else:

@@ -1,4 +1,4 @@
-"""A run of a plan, on any rig: what it uses, what it keeps, its account, its end in the dark."""
+"""State of a run on any rig: devices, frames kept, result, and the end in the dark."""
 
 import contextlib
 import logging
@@ -22,29 +22,29 @@ MAX_ATTEMPTS = 3
 
 
 class AcquisitionError(DeviceError, RuntimeError):
-    """A plan could not be carried out; what was captured is safe in the session."""
+    """Raised when a plan could not be carried out; captured frames are safe in the session."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """The operator stopped the capture; the session can be resumed."""
+    """Raised when the operator stopped the capture; the session can be resumed."""
 
 
 @dataclass(frozen=True, slots=True)
 class AcquisitionResult:
-    """What a run of a plan did.
+    """Result of a run of a plan.
 
     Attributes
     ----------
     steps
-        Steps captured in this run.
+        Number of steps captured in this run.
     frames
-        Frames committed.
+        Number of frames committed.
     stale
-        Stale frames that were dropped.
+        Number of stale frames dropped.
     retakes
-        Steps that had to be shot again.
+        Number of steps that were repeated.
     dead_lights
-        Lights that the box reports as drawing no current.
+        Lights that the controller reports as drawing no current.
     """
 
     steps: int
@@ -60,30 +60,30 @@ def _ignore(_: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """Who runs a plan: asked, kept informed, and able to stop it.
+    """Interface to the person who runs a plan: prompts, progress, and a stop.
 
     Attributes
     ----------
     progress
-        Called with one line a step, or a second of a sequence.
+        Called with one line per step, or per second of a sequence.
     prompt
-        Called before the first step that needs it with the state ("smile"), with the place of the
-        target on the dome ("pose 3"), with how skin is to be taped ("tape the skin at 45
-        degrees"), or with where the probe goes ("put the cap on the head", "place the head on the
-        cheek at 0 degrees"); returns when the subject or the target is ready. Called
-        too with what to press when only a hand can release a camera.
+        Called before the first step that needs it with the state ("smile"), with the position of
+        the target on the dome ("pose 3"), with the taping of the skin ("tape the skin at 45
+        degrees"), or with the placement of the probe ("put the cap on the head", "place the head on
+        the cheek at 0 degrees"); returns when the subject or the target is ready. Also called with
+        the shutter to press when only a person can release a camera.
     interrupted
-        Asked before each step, or each sequence; True stops in good order.
+        Called before each step, or each sequence; True stops in good order.
     clock
-        The host's time, s since 1970, for the journal.
+        Time of the host, s since 1970, for the journal.
     run_id
-        Begins the token of every flash or sequence of this run; drawn at random by default, so
-        that no two bear one token, also after a resume.
+        First part of the token of every flash or sequence of this run; random by default, so that
+        all tokens differ, also after a resume.
     signal
-        Called in a sequence with the state that the subject shall change to, at the time; gives a
+        Called in a sequence, at the time, with the state to which the subject shall change; gives a
         sound and returns at once.
     timer
-        What the times of a sequence are kept by; the world's own where it is simulated.
+        Timer of a sequence; the simulation's own when it is simulated.
     """
 
     progress: Callable[[str], None] = _ignore
@@ -95,21 +95,21 @@ class Operator:
     timer: Clock = SYSTEM_CLOCK
 
     def stop_if_asked(self) -> None:
-        """Raise `Interrupted` when the capture is to stop."""
+        """Raise `Interrupted` when the operator has asked for a stop."""
         if self.interrupted():
             raise Interrupted
 
 
 @dataclass(slots=True)
 class CaptureRun:
-    """One run of a plan: what it uses, and what it has done so far.
+    """One run of a plan: its devices, and its results so far.
 
     Attributes
     ----------
     plan, rig, cameras, session, operator, eyes, force_limit_n, all_brackets
         See `capture.acquire.run.run_plan`.
     steps, frames, stale, retakes : int
-        What was done so far, see `AcquisitionResult`.
+        Results so far, see `AcquisitionResult`.
     """
 
     plan: Plan
@@ -127,7 +127,7 @@ class CaptureRun:
     _attempts: dict[tuple[str, str], int] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Look up the last attempt of each frame that is committed."""
+        """Look up the last attempt of each committed frame."""
         records = self.session.frames()
         self._attempts = {(record.step_id, record.camera): record.attempt for record in records}
 
@@ -164,23 +164,23 @@ class CaptureRun:
         t_box_s: float | None,
         journal_entries: Mapping[str, Value],
     ) -> None:
-        """Commit the frames of a step, one a camera.
+        """Commit the frames of a step, one per camera.
 
         Parameters
         ----------
         step, frames
             The step and its frames by view.
         light
-            What made the frames; written into each file.
+            Light of the frames; written into each file.
         tries
-            How often the step was shot until all cameras had it.
+            Number of attempts until all cameras had a frame.
         t_box_s
-            When the cameras were released, on the box's clock; None where no box did.
+            Time of the cameras' release, on the controller's clock; None without a controller.
         noted
-            What else the journal says of the frames.
+            Further journal entries of the frames.
         """
         for name, frame in frames.items():
-            # a step of which only some cameras were kept is shot again with all of them
+            # a step of which only some cameras were kept is repeated with all of them
             attempt = self._attempts.get((step.id, name), 0) + 1
             shot = {"exposure_s": frame.exposure.exposure_s, "iso": frame.exposure.iso}
             self.session.commit(
@@ -198,52 +198,52 @@ class CaptureRun:
         self.steps += 1
 
     def note_retake(self, step: Step, attempt: int, reason: object) -> str:
-        """Note that a step must be taken again; return why."""
+        """Record that a step must be repeated; return the reason."""
         log.warning("step %s, attempt %d: %s", step.id, attempt, reason)
         self.retakes += 1
         return str(reason)
 
     def omit_steps(self, ids: Sequence[str], reason: str, about: Mapping[str, Value]) -> None:
-        """Note in the session that steps are not taken, and why."""
+        """Record in the session that steps are omitted, and why."""
         time_s = self.operator.clock()
         self.session.omit_steps(ids, reason=reason, about=about, t_host_s=time_s)
 
     def retry_limit_error(self, label: str, reason: str) -> AcquisitionError:
-        """Return the error of a step that failed too often, with what to do about it."""
+        """Return the error of a step that failed too often, with advice."""
         advice = recovery_advice(captured=bool(self.session.frames()))
         return AcquisitionError(f"{label}: failed {MAX_ATTEMPTS} times ({reason}); {advice}")
 
     def summarize(self, dead_leds: Iterable[int] = ()) -> AcquisitionResult:
-        """Return what was done, with the numbers of the LEDs that drew no current."""
+        """Return the result, with the numbers of the LEDs that drew no current."""
         dead = tuple(self.rig.lights[led].name for led in sorted(dead_leds))
         return AcquisitionResult(self.steps, self.frames, self.stale, self.retakes, dead)
 
     def tear_down(self, box: Box) -> None:
-        """Put the light out and let the cameras go; nothing here hides the error that led here."""
+        """Switch the light off and release the cameras; errors here are logged, not raised."""
         try:
             box.dark()
         except DeviceError as error:
-            # the box's own lease puts the light out when the host is not heard
-            log.error("the box did not go dark on command: %s; its lease ends the light", error)
+            # without the host, the controller's own lease switches the light off
+            log.error("the controller did not go dark: %s; its lease ends the light", error)
         for camera in self.cameras.values():
             with contextlib.suppress(DeviceError):
                 camera.abort()
 
 
 def recovery_advice(*, captured: bool) -> str:
-    """Return what to do after a capture failed, by whether the session has frames."""
+    """Return advice after a failed capture, by whether the session has frames."""
     if captured:
         return "the session keeps its frames: remove the cause, then add --resume to the command"
     return "no frame was recorded: remove the cause, then run the command again"
 
 
 def step_limit_error(step: Step, problem: str, *, action: str = "lit") -> AcquisitionError:
-    """Return the error of a step that asks for more than its box allows; nothing was ``action``."""
+    """Return the error of a step beyond its controller's limits; nothing was ``action``."""
     return AcquisitionError(f"step {step.id}: {problem}; nothing was {action}: change the plan")
 
 
 def require_trigger_line(name: str, camera: Camera, trigger_line: str) -> None:
-    """Raise if a camera cannot be released by ``trigger_line``, the name of a controller's line."""
+    """Raise an error if a camera cannot be released by ``trigger_line``, the name of a line."""
     if Trigger.EDGE not in camera.info.triggers:
         serial = camera.info.serial
         raise CameraError(

@@ -1,8 +1,8 @@
-"""Scans of the gradient sphere: a table of patterns in, the frame that each of them made out.
+"""Scan patterns with the gradient sphere: upload a table, return the frame of each pattern.
 
-The box judges its table before it lights anything, then steps by itself; meanwhile only leases are
-renewed, those of everybody who asked for it. Frames are matched to patterns by time. A pattern that
-lacks a camera's frame is taken again; what a scan gives is whole.
+The controller checks its table before it lights anything, then steps on its own; meanwhile the
+leases of all registered controllers are renewed. Frames are matched to patterns by time. A pattern
+that lacks a camera's frame is taken again: a scan returns all frames.
 """
 
 import logging
@@ -23,26 +23,26 @@ log = logging.getLogger(__name__)
 
 SCAN_POLL_S = 0.1
 SCAN_DARK_GAP_S = 1.1
-"""Darkness after which no window of duty, and no second of flashes, holds an earlier scan."""
+"""Dark time after which the limits of duty and flashes no longer include an earlier scan, s."""
 MAX_DARK_GAPS = 5
 
 
 @dataclass(frozen=True, slots=True)
 class StepFrames:
-    """The frames of one step, one a camera."""
+    """Frames of one step, one per camera."""
 
     step: Step
     frames: Mapping[str, Frame]
     t_box_s: float
-    """When its light released the cameras, on the sphere's clock."""
+    """Time of the cameras' release, on the sphere's clock."""
     tries: int
-    """How often the step was shot until all cameras had it."""
+    """Number of attempts until all cameras had a frame."""
     token: str
-    """Name of the scan."""
+    """Token of the scan."""
 
 
 def analyzer_reading_deg(step: Step) -> float:
-    """Return the reading of the analyser that a step asks for, degrees.
+    """Return the reading of the analyzer that a step requests, degrees.
 
     Examples
     --------
@@ -61,8 +61,7 @@ class PatternScanner:
     run, sphere
         The run and its sphere.
     keep_alive
-        Called a few times a second while a scan is going on, so that other boxes know that the
-        host is there.
+        Called several times per second during a scan, so that other controllers keep their lease.
     """
 
     def __init__(
@@ -92,7 +91,7 @@ class PatternScanner:
         raise self._run.retry_limit_error(f"scan of {steps[0].id}", why)
 
     def commit(self, taken: Sequence[StepFrames], actual: Mapping[str, Value]) -> None:
-        """Commit the frames of a scan, with what else is known of them."""
+        """Commit the frames of a scan, with further journal entries."""
         dead = self._run.light_names(sorted(self._sphere.failed_leds))
         for one in taken:
             step = one.step
@@ -120,11 +119,11 @@ class PatternScanner:
         return self._run.encode_frame(taken.step, name, taken.frames[name], light)
 
     def rotate_analyzer(self, step: Step) -> None:
-        """Begin to turn the analyser to where a step wants it."""
+        """Start turning the analyzer to the reading of a step."""
         self._sphere.set_analyzer(analyzer_reading_deg(step))
 
     def pause(self, seconds: float) -> None:
-        """Let time pass while all boxes know that the host is there."""
+        """Wait while the leases of all controllers are renewed."""
         left_s = seconds
         while left_s > 0.0:
             self._sphere.listen(min(left_s, SCAN_POLL_S))
@@ -134,7 +133,7 @@ class PatternScanner:
     # one sequence -----------------------------------------------------------------------------
 
     def _sequence(self, steps: Sequence[Step], attempt: int) -> tuple[list[StepFrames], str]:
-        """Run steps as one table; return those of which every camera has a frame."""
+        """Run steps as one table; return those with a frame of every camera."""
         run, sphere = self._run, self._sphere
         for name, camera in run.step_cameras(steps[0]).items():
             configure_camera(name, camera, requested_exposure(steps[0]))
@@ -153,7 +152,7 @@ class PatternScanner:
         sphere.arm()
         sphere.set_analyzer(rows[0].analyser_deg)
         sphere.wait_settled()
-        log.info("the box judges the scan: %s", self._arm_scan(len(rows)))
+        log.info("evaluation of the scan by the controller: %s", self._arm_scan(len(rows)))
         self._scans += 1
         token = f"{run.operator.run_id}.{self._scans}.{attempt}"
         table = TableRun(
@@ -174,7 +173,7 @@ class PatternScanner:
         return taken, table.end()
 
     def _arm_scan(self, rows: int) -> TableEvaluation:
-        """Arm the table, after darkness where the light of a moment ago makes it too much."""
+        """Arm the table, after a dark time when recent light would exceed the limits."""
         for _ in range(MAX_DARK_GAPS):
             try:
                 return self._sphere.arm_scan(rows)

@@ -1,4 +1,4 @@
-"""Run a plan on the rig that it is for."""
+"""Dispatch a plan to the rig that it is for."""
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
@@ -25,29 +25,28 @@ def run_plan(
     force_limit_n: float | None = None,
     all_brackets: bool = False,
 ) -> AcquisitionResult:
-    """Capture what the session still lacks of a plan.
+    """Capture the missing steps of a plan.
 
     Parameters
     ----------
     plan
-        What to capture; steps that the session holds already are not repeated.
+        Plan to capture; steps that the session contains already are not repeated.
     rig
         The rig that the plan is for.
     boxes, cameras
-        Open drivers by name: the box of the rig ("flash", "dome", "probe" or "gradient_sphere",
-        and "caliper" where skin is stretched), and a camera for each view.
+        Open drivers by name: the controller of the rig ("flash", "dome", "probe" or
+        "gradient_sphere", and "caliper" for stretched skin), and a camera for each view.
     session
         Open for writing.
     operator
-        Who runs the plan: what is said and asked, and by which clocks; nobody by default.
+        Prompts, progress, stop and clocks; nobody by default.
     eyes
-        What a person says of the subject's eyes: "open", "closed" or "shielded". Light that
-        flickers too much for open eyes is refused; so are patterns on skin with open eyes.
+        State of the subject's eyes, confirmed by a person: "open", "closed" or "shielded". Light
+        that flickers too much for open eyes is refused; so are patterns on skin with open eyes.
     force_limit_n
-        Greatest force of the caliper on the skin, N; there is no default, and nothing moves
-        without.
+        Greatest force of the caliper on the skin, N; it has no default, and nothing moves without.
     all_brackets
-        Whether the probe takes all exposures of a series, also those that can show no more.
+        Whether the probe takes all exposures of a series, also those that cannot add information.
 
     Returns
     -------
@@ -56,17 +55,17 @@ def run_plan(
     Raises
     ------
     AcquisitionError
-        When a step fails three times, or the plan goes beyond what the box allows; this is found
-        before anything flashes.
+        When a step fails three times, or the plan exceeds the controller's limits; the latter is
+        checked before anything flashes.
     DeviceError
-        When a box or camera is lost; what was captured is safe in the session.
+        When a controller or camera is lost; captured frames are safe in the session.
     Interrupted
-        When the operator said so.
+        When the operator stopped the capture.
     """
     plan.check(rig)
     kind = find_rig_kind(rig)
     if (box := RIG_KINDS[kind].box) not in boxes:
-        raise AcquisitionError(f"box {box!r}: no port was given; add --port {box}=URL")
+        raise AcquisitionError(f"controller {box!r}: no port was given; add --port {box}=URL")
     check_serials(cameras, [(view.name, view.serial) for view in rig.views])
     asked: dict[str, Any] = {
         "eyes": eyes,

@@ -1,7 +1,7 @@
-"""A box's table of light run once, and the frames that its rows made.
+"""Run a controller's table of light once, and match the frames to its rows.
 
-The box steps through its table by itself; meanwhile only leases are renewed, those of everybody who
-asked for it. Afterwards the frames are gathered and matched to rows by time.
+The controller steps through its table on its own; meanwhile the leases of all registered
+controllers are renewed. Afterwards the frames are fetched and matched to rows by time.
 """
 
 import logging
@@ -27,25 +27,25 @@ from capture.plan import Step
 
 N_CLOCK_READINGS = 8
 CLOCK_DRIFT_S_PER_S = 2e-4
-"""How far a camera's clock may run away, s per s."""
+"""Largest drift of a camera's clock, s per s."""
 MAX_ROW_TIME_DEVIATION = 0.25
-"""Most deviation of a frame from its row's time, of the shortest row."""
+"""Largest deviation of a frame from its row's time, of the shortest row."""
 
 
 @dataclass(frozen=True, slots=True)
 class _ClockOffset:
-    """A camera's clock against the box's."""
+    """Offset of a camera's clock from the controller's."""
 
     offset_s: float
-    """Camera time less box time, s."""
+    """Camera time minus controller time, s."""
     uncertainty_s: float
-    """Half the time that the comparison took, s."""
+    """Half the duration of the comparison, s."""
     box_s: float
-    """Box time of the comparison, s."""
+    """Controller time of the comparison, s."""
 
 
 def compare_clocks(camera: Camera, box_clock_s: Callable[[], float]) -> _ClockOffset:
-    """Return a camera's clock against the box's: the best of a few comparisons."""
+    """Return the offset of a camera's clock from the controller's: the best of some comparisons."""
     best = _ClockOffset(0.0, float("inf"), 0.0)
     for _ in range(N_CLOCK_READINGS):
         before = camera.clock_s()
@@ -60,38 +60,38 @@ def compare_clocks(camera: Camera, box_clock_s: Callable[[], float]) -> _ClockOf
 
 
 class FrameStream:
-    """Frames of one camera as they come from a sequence, each given to its row.
+    """Frames of one camera as they come from a sequence, each assigned to its row.
 
     Parameters
     ----------
     name
-        Of the view.
+        Name of the view.
     camera
-        Armed for the sequence, which is over.
+        Armed for the sequence, which has ended.
     row_times_s
-        Box time at which each row released the cameras, by row.
+        Controller time at which each row released the cameras, by row.
     dwell_s
         Length of the shortest row, s.
     clock
-        The camera's clock against the box's.
+        Offset of the camera's clock from the controller's.
     want
-        The exposure that was asked for.
+        Requested exposure.
     lag_s
-        From release to open shutter, s.
+        Time from release to open shutter, s.
     timeout_s
-        How long the next frame may take, s.
+        Timeout of the next frame, s.
 
     Raises
     ------
     CameraError
-        When the clocks could not be compared well enough to tell rows apart.
+        When the clocks cannot be compared precisely enough to distinguish rows.
 
     Attributes
     ----------
     stale : int
-        Frames dropped because no row of the sequence made them.
+        Number of dropped frames that belong to no row of the sequence.
     refused : list of str
-        Why frames were not accepted.
+        Reasons of rejected frames.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class FrameStream:
     ) -> None:
         if clock.uncertainty_s > MAX_ROW_TIME_DEVIATION * dwell_s:
             raise CameraError(
-                f"view {name!r}: the clocks of camera and box could be compared to "
+                f"view {name!r}: the clocks of camera and controller could be compared to "
                 f"{1e3 * clock.uncertainty_s:.1f} ms only, too coarse for rows of "
                 f"{1e3 * dwell_s:.1f} ms; take load off this machine, or use slower rows"
             )
@@ -126,7 +126,7 @@ class FrameStream:
         self.refused: list[str] = []
 
     def read_until(self, row: int) -> dict[int, Frame]:
-        """Return the frames of all rows up to `row` that were not asked for before."""
+        """Return the frames of all rows up to `row` that were not returned before."""
         found: dict[int, Frame] = {}
         while not self._ended:
             if self._next is None and not self._fetch():
@@ -139,7 +139,7 @@ class FrameStream:
         return found
 
     def _fetch(self) -> bool:
-        """Get one more frame; return whether it belongs to a row still to come."""
+        """Fetch one more frame; return whether it belongs to a row still to come."""
         try:
             frame = self._camera.frame(self._timeout_s)
         except FrameTimeout as error:
@@ -155,7 +155,7 @@ class FrameStream:
             return False
         self._last_row = row
         try:
-            # the row is known by its time; what is left to check is who took it, and how
+            # time determines the row; camera and settings are left to check
             check_frame(
                 frame,
                 self._camera.info,
@@ -181,27 +181,27 @@ log = logging.getLogger(__name__)
 
 
 class TableRun:
-    """The rows of an armed table, one a step, run once.
+    """The rows of an armed table, one per step, run once.
 
     Parameters
     ----------
     run, box, steps
-        The steps share exposure and cameras, which are set; the box's table is armed.
+        Steps that share exposure and cameras, which are set; the controller's table is armed.
     dwell_s
         Length of the shortest row, s.
     token
-        Name of the run of the table.
+        Token of the run of the table.
     poll_s
-        How often the box is asked where it stands, s.
+        Interval between two polls of the controller, s.
     what
         Words for a table and its rows.
     keep_alive
-        Called at every look at the box, so that other boxes know that the host is there.
+        Called at every poll of the controller, so that other controllers keep their lease.
 
     Attributes
     ----------
     times_s : dict of int to float
-        When each row released the cameras, on the box's clock.
+        Time at which each row released the cameras, on the controller's clock.
     """
 
     def __init__(
@@ -225,7 +225,7 @@ class TableRun:
         box.trigger(token)
         self.times_s = self._listen(poll_s, keep_alive)
         box.dark()
-        for row in range(len(steps)):  # ask for the times whose reports were lost on the line
+        for row in range(len(steps)):  # query the times whose reports were lost on the line
             if row not in self.times_s and (time_s := box.step_time(row)) is not None:
                 self.times_s[row] = time_s
         self._streams = {
@@ -243,7 +243,7 @@ class TableRun:
         }
 
     def _listen(self, poll_s: float, keep_alive: Callable[[], object]) -> dict[int, float]:
-        """Renew the leases until the table is over; return when its rows released the cameras."""
+        """Renew the leases until the table has ended; return when its rows released the cameras."""
         times: dict[int, float] = {}
         while True:
             times.update(self._box.listen(poll_s))
@@ -258,8 +258,8 @@ class TableRun:
             self._run.operator.progress(f"{count} {step.id} {step.kind}")
 
     def rows(self, first: int, last: int) -> Iterator[tuple[int, dict[str, Frame]]]:
-        """Yield the rows before ``last`` of which every camera has its frame, with the frames."""
-        # camera by camera, so that each works on what it has just seen
+        """Yield the rows before ``last`` with a frame of every camera, with the frames."""
+        # camera by camera, so that each can process frames while they are in its cache
         found = {name: stream.read_until(last - 1) for name, stream in self._streams.items()}
         for row in range(first, last):
             frames = {name: some.pop(row) for name, some in found.items() if row in some}
@@ -267,7 +267,7 @@ class TableRun:
                 yield row, frames
 
     def end(self) -> str:
-        """Let the cameras go; return why rows lack frames, where some do."""
+        """Release the cameras; return why rows lack frames, if any do."""
         for name, camera in self._cameras.items():
             camera.abort()
             self._run.stale += self._streams[name].stale

@@ -1,4 +1,4 @@
-"""What a calibration is in memory: numbers with their errors, for whom, until when."""
+"""Calibrations in memory: quantities with errors, devices, and validity."""
 
 import hashlib
 import re
@@ -17,7 +17,7 @@ from capture.documents import InputError
 def freeze_arrays(
     row: Any, shape: tuple[int, ...], *names: str, kind: Any = np.float64, owner: str = ""
 ) -> None:
-    """Replace fields by read-only copies of the type; refuse another shape or infinite numbers.
+    """Replace fields by read-only copies of the type; reject another shape or infinite numbers.
 
     A field that is None becomes zeros.
     """
@@ -40,23 +40,23 @@ Source: TypeAlias = Literal["measured", "simulated"]
 
 
 class CalibrationError(InputError):
-    """A calibration that cannot be used; the message says why and what to do."""
+    """Raised for a calibration that cannot be used; the message states the remedy."""
 
 
 class CalibrationMissing(CalibrationError, FileNotFoundError):
-    """The folder holds no calibration of this kind."""
+    """Raised when the folder has no calibration of this kind."""
 
 
 class CalibrationDamaged(CalibrationError):
-    """The file is not a calibration of this schema, or was altered after it was written."""
+    """Raised for a file of another schema, or one that was altered after it was written."""
 
 
 class CalibrationExpired(CalibrationError):
-    """The calibration is used after (or before) the dates it holds for."""
+    """Raised for a calibration that is used outside its dates of validity."""
 
 
 class CalibrationMismatch(CalibrationError):
-    """The calibration belongs to another rig, another device or another kind."""
+    """Raised for a calibration of another rig, another device or another kind."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +68,7 @@ class Quantity:
     value : ndarray of float64
         Any shape; a scalar has shape ``()``. Unit: see the quantity's name.
     stderr : ndarray of float64 or None
-        Standard error (68 %) of each element; None where the quantity is a choice or a count, not
-        a measurement.
+        Standard error (68 %) of each element; None for a choice or a count, which is not measured.
     interval : tuple of (float or None, float or None) or None
         95 % interval of a scalar whose distribution is not symmetric; an open end is None.
     """
@@ -79,7 +78,7 @@ class Quantity:
     interval: tuple[float | None, float | None] | None = None
 
     def __post_init__(self) -> None:
-        """Convert to float64 arrays and refuse what is not finite or not of one shape."""
+        """Convert to float64 arrays and reject infinite values or differing shapes."""
         value = np.array(self.value, dtype=np.float64)
         if not np.isfinite(value).all():
             raise ValueError(f"Quantity.value: got {value.tolist()}, expected finite numbers")
@@ -102,28 +101,28 @@ class Quantity:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What one calibration run found, for whom, and until when.
+    """Result of one calibration run, with its devices and validity.
 
     Attributes
     ----------
     kind : str
         One of `CALIBRATION_KINDS`.
     rig : str
-        Name of the rig it was made on.
+        Name of the calibrated rig.
     serials : tuple of str
-        Serials of the devices it holds for.
+        Serials of the calibrated devices.
     created, valid_until : datetime.date
         First and last day on which it may be used.
     source : {"measured", "simulated"}
-        Whether the frames came from instruments or from a simulation.
+        Whether the frames were measured or simulated.
     values : mapping of str to mapping of str to Quantity
         ``values[serial][name]``.
     maps : mapping of str to ndarray of float32, shape (H, W) or (H, W, C)
         Images, by name; may be empty.
     notes : mapping of str to str
-        Words that belong to the numbers: color names, the reference used, the method.
+        Texts that belong to the numbers: color names, the reference used, the method.
     inputs : mapping of str to str
-        Digest of every frame that went in, by step or file name.
+        Digest of every input frame, by step or file name.
     versions : mapping of str to str
         Versions of the programs that made it.
     """
@@ -171,23 +170,24 @@ class Calibration:
         Raises
         ------
         CalibrationMismatch
-            If this calibration does not hold it.
+            If this calibration does not contain it.
         """
         if serial not in self.values:
             raise CalibrationMismatch(
-                f"{self.kind} calibration of rig {self.rig!r}: no values of device {serial!r}, it"
-                f" holds {sorted(self.values)}; calibrate this device"
+                f"{self.kind} calibration of rig {self.rig!r}: no values of device {serial!r}, "
+                f"it contains {sorted(self.values)}; calibrate this device"
             )
         if name not in self.values[serial]:
             raise CalibrationMismatch(
-                f"{self.kind} calibration of rig {self.rig!r}: no {name!r} of device {serial!r}, it"
-                f" holds {sorted(self.values[serial])}; calibrate again with this version"
+                f"{self.kind} calibration of rig {self.rig!r}: no {name!r} of device "
+                f"{serial!r}, it contains {sorted(self.values[serial])}; calibrate again with "
+                "this version"
             )
         return self.values[serial][name]
 
 
 class Origin(TypedDict):
-    """For which rig a calibration holds, from when to when, and what it was made from."""
+    """Rig, dates and inputs of a calibration."""
 
     rig: str
     source: Source
@@ -200,7 +200,7 @@ class Origin(TypedDict):
 
 
 class Provenance(Origin):
-    """The same of one device."""
+    """Rig, dates and inputs of the calibration of one device."""
 
     serial: str
 
@@ -261,7 +261,7 @@ def device_rows(names: Sequence[str], **columns: Column) -> dict[str, dict[str, 
     Parameters
     ----------
     names : sequence of N str
-        Of the devices.
+        Names of the devices.
     **columns : ndarray, shape (N, ...), or a pair of them
         The values by device, alone or with their standard errors.
 
@@ -289,11 +289,11 @@ class DeviceColumns:
         return np.array([self._calibration.quantity(n, name).value for n in self.names])
 
     def flags(self, name: str) -> NDArray[np.bool_]:
-        """Return a quantity that says yes or no, shape (N, ...)."""
+        """Return a yes-or-no quantity as bool, shape (N, ...)."""
         return np.asarray(self.values(name) > 0)
 
     def errors(self, name: str) -> Float64Array:
-        """Return the standard errors of a quantity, shape (N, ...); 0 where none is stated."""
+        """Return the standard errors of a quantity, shape (N, ...); 0 for a quantity without."""
         return np.array([self._calibration.quantity(n, name).stderr_or_zero for n in self.names])
 
     def values_and_errors(self, name: str) -> tuple[Float64Array, Float64Array]:
@@ -342,6 +342,6 @@ def default_validity(created: date, days: int = DEFAULT_VALIDITY_DAYS) -> date:
 
 
 def require_plain_name(name: str) -> None:
-    """Raise ValueError unless a name can be part of a file's name."""
+    """Raise ValueError unless a name is valid in a file name."""
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,40}", name):
         raise ValueError(f"map name: got {name!r}, expected small letters, digits and _")

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from capture.arrays import Float64Array
 
 HUBER_SIGMAS = 2.5
-"""Robust standard deviations beyond which a residual counts less."""
+"""Robust standard deviations beyond which a residual is down-weighted."""
 SIGMA_PER_MAD = 1.4826
 """Standard deviation of normal residuals over the median of their absolute values."""
 

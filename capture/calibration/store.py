@@ -1,8 +1,8 @@
-"""The CALIBRATION/ format ``skinrig.calibration/1``: what is known of the instruments, until when.
+"""Read and write the CALIBRATION/ format ``skinrig.calibration/1``.
 
 One JSON file per kind (``sensor.json``, ``color.json``, ...), written atomically and sealed with a
-digest of its own content; images that belong to it (a white reference) are float32 EXR files
-beside it, named by their digest. Numbers are keyed by the serial of the camera they belong to.
+digest of its own content; images that belong to it (a white reference) are float32 EXR files in the
+same folder, named by their digest. Numbers are keyed by the serial of their camera.
 """
 
 import contextlib
@@ -98,14 +98,14 @@ def save(calibration: Calibration, directory: str | Path) -> Path:
     """Write a calibration as ``<directory>/<kind>.json`` (and its maps), replacing an older one.
 
     The JSON file appears whole or not at all: maps are written first under names made of their
-    digests, then the JSON is renamed into place, then maps nobody names any more are removed.
+    digests, then the JSON is renamed into place, then unused maps are removed.
 
     Parameters
     ----------
     calibration : Calibration
-        What to write.
+        Calibration to write.
     directory : str or Path
-        Made if missing.
+        Created if missing.
 
     Returns
     -------
@@ -163,7 +163,7 @@ def load(directory: str | Path, kind: str) -> Calibration:
     Raises
     ------
     CalibrationMissing
-        If there is no such file.
+        If the file does not exist.
     CalibrationDamaged
         If the file is not of this schema, or it or one of its maps was altered.
     """
@@ -180,7 +180,10 @@ def load(directory: str | Path, kind: str) -> Calibration:
         ) from exc
     document = _parse(path, raw)
     if document.kind != kind:
-        raise CalibrationMismatch(f"{path}: holds kind {document.kind!r}, expected {kind!r}")
+        raise CalibrationMismatch(
+            f"{path}: contains kind {document.kind!r}, expected {kind!r}; "
+            "rename the file or calibrate again"
+        )
     try:
         return Calibration(
             kind=document.kind,
@@ -229,7 +232,7 @@ def _quantity_from(document: _QuantityFile) -> Quantity:
 
 
 def _seal(document: Mapping[str, Any]) -> str:
-    """Digest of a document without its own seal, in canonical JSON."""
+    """Return the digest of a document without its own seal, in canonical JSON."""
     body = {key: value for key, value in document.items() if key != "sha256"}
     text = json.dumps(body, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
     return hashlib.sha256(text.encode()).hexdigest()
@@ -306,7 +309,7 @@ def _read_map(folder: Path, name: str, entry: _MapFile) -> Float32Array:
 
     require_plain_name(name)
     if Path(entry.file).name != entry.file:
-        raise CalibrationDamaged(f"map {name}: file {entry.file!r} leaves the folder")
+        raise CalibrationDamaged(f"map {name}: file {entry.file!r} is outside the folder")
     path = folder / entry.file
     if not path.is_file():
         raise CalibrationDamaged(f"{path}: missing, map {name!r} needs it; calibrate again")

@@ -1,4 +1,4 @@
-"""Whether a calibration may be used here and today, and how it moved since the last one."""
+"""Check whether a calibration is valid for a rig and a day, and measure its drift."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from capture.calibration.record import Calibration, CalibrationExpired, Calibrat
 
 @dataclass(frozen=True, slots=True)
 class CalibrationDrift:
-    """How one number moved between two calibrations.
+    """Change of one number between two calibrations.
 
     Attributes
     ----------
@@ -20,7 +20,7 @@ class CalibrationDrift:
     old, new, change : float
         In the quantity's unit; ``change = new - old``.
     sigmas : float or None
-        Change over its combined standard error; None where neither calibration states one.
+        Change over its combined standard error; None when neither calibration states one.
     """
 
     serial: str
@@ -44,12 +44,12 @@ def require_valid(
     on_date: date,
     kind: str | None = None,
 ) -> Calibration:
-    """Return the calibration if it may be used here and today; say clearly why not otherwise.
+    """Return the calibration if it is valid for rig, devices and day; raise an error otherwise.
 
     Parameters
     ----------
     calibration : Calibration
-        The candidate.
+        Calibration to check.
     rig : str
         Name of the rig of the session to be corrected.
     serials : iterable of str
@@ -57,18 +57,21 @@ def require_valid(
     on_date : datetime.date
         Day of the session.
     kind : str, optional
-        The kind wanted.
+        Required kind.
 
     Raises
     ------
     CalibrationMismatch
         If it belongs to another rig or another device, or is of another kind.
     CalibrationExpired
-        If `on_date` lies outside its validity.
+        If `on_date` is outside its validity.
     """
     what = f"{calibration.kind} calibration of {calibration.created}"
     if kind is not None and calibration.kind != kind:
-        raise CalibrationMismatch(f"{what}: is of kind {calibration.kind!r}, expected {kind!r}")
+        raise CalibrationMismatch(
+            f"{what}: is of kind {calibration.kind!r}, expected {kind!r}; "
+            "choose the folder of that kind"
+        )
     if calibration.rig != rig:
         raise CalibrationMismatch(
             f"{what}: made on rig {calibration.rig!r}, the session is of rig {rig!r}; calibrate"
@@ -94,7 +97,8 @@ def measure_drift(old: Calibration, new: Calibration) -> tuple[CalibrationDrift,
     Parameters
     ----------
     old, new : Calibration
-        Of the same kind and rig. Only quantities with the same shape in both are compared.
+        Two calibrations of one kind and rig. Only quantities with the same shape in both are
+        compared.
 
     Returns
     -------

@@ -1,1 +1,1 @@
-"""Drivers: the wire format, the port, one thin driver for each box, and cameras."""
+"""Instrument drivers: wire format, serial port, one driver per controller, and cameras."""

@@ -1,4 +1,4 @@
-"""What every box answers: who it is, its limits, arming, lease, status and errors."""
+"""Base driver of all controllers: identity, limits, arming, lease, status and errors."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ T = TypeVar("T")
 
 
 class StatusBit:
-    """One bit of a status, as a property of it.
+    """Expose one bit of a status word as a property.
 
     Parameters
     ----------
     place
-        Of the bit; 0 is worth 1.
+        Position of the bit; bit 0 has the value 1.
     """
 
     def __init__(self, place: int) -> None:
@@ -35,17 +35,17 @@ class StatusBit:
 
 @dataclass(frozen=True, slots=True)
 class BoxStatus:
-    """The bits of ``STAT?`` that all boxes share."""
+    """Bits of ``STAT?`` that all controllers share."""
 
     bits: int
-    """Their sum."""
+    """Sum of the set bits."""
 
     armed = StatusBit(0)
     """Whether light is allowed."""
     tripped = StatusBit(1)
-    """Whether the lease ran out since the box was last armed."""
+    """Whether the lease has expired since the controller was last armed."""
     errors_waiting = StatusBit(2)
-    """Whether `Box.errors` would find something."""
+    """Whether the error queue of the controller holds entries (`Box.errors`)."""
     lit = StatusBit(6)
     """Whether a lamp is on."""
     stopped = StatusBit(8)
@@ -53,23 +53,23 @@ class BoxStatus:
 
 
 class Box:
-    """Driver of the commands that all boxes share.
+    """Driver of the commands that all controllers share.
 
     Parameters
     ----------
     port
-        Open; owned by the driver from now on.
+        Open port; the driver closes it.
     serial
-        Serial number that the box must have; empty: any.
+        Expected serial number of the controller; empty: any.
 
     Raises
     ------
     WrongDevice
-        When the box is of another kind, or another one.
+        When the controller is of another kind or has another serial number.
     """
 
     kind: ClassVar[str]
-    """What the box must say it is."""
+    """Kind that the controller must report."""
 
     def __init__(self, port: Port, *, serial: str = "") -> None:
         self._port = port
@@ -88,17 +88,17 @@ class Box:
     # identity ---------------------------------------------------------------------------------
 
     def hello(self, *, serial: str = "") -> Hello:
-        """Introduce the host, learn the epoch and read the limits."""
+        """Introduce the host, then read the controller's boot epoch and limits."""
         hello = self._port.hello()
         if hello.kind != self.kind:
             raise WrongDevice(
-                f"{self._port.url}: got a {hello.kind!r} box with serial {hello.serial}, expected "
-                f"a {self.kind!r} box; exchange the addresses"
+                f"{self._port.url}: got a {hello.kind!r} controller with serial {hello.serial}, "
+                f"expected a {self.kind!r} controller; exchange the addresses"
             )
         if serial and hello.serial != serial:
             raise WrongDevice(
-                f"{self._port.url}: got the {self.kind} box {hello.serial}, expected {serial}; "
-                "exchange the addresses"
+                f"{self._port.url}: got the {self.kind} controller {hello.serial}, expected "
+                f"{serial}; exchange the addresses"
             )
         self._identity = hello
         self._limits = self._port.capabilities()
@@ -106,55 +106,55 @@ class Box:
 
     @property
     def port(self) -> Port:
-        """The port, for its statistics and events."""
+        """The port, with its statistics and events."""
         return self._port
 
     @property
     def identity(self) -> Hello:
-        """Who answered the last hello."""
+        """Identity of the controller, from the last hello."""
         return self._identity
 
     @property
     def limits(self) -> Mapping[str, Any]:
-        """What the box allows (``SYST:CAP?``), units in the names; read at hello."""
+        """Limits of the controller (``SYST:CAP?``), units in the keys; read at hello."""
         return self._limits
 
     def identify(self) -> str:
-        """Return maker, model, serial number and firmware."""
+        """Return manufacturer, model, serial number and firmware."""
         return self._port.ask("*IDN?")
 
     # arming -----------------------------------------------------------------------------------
 
     def arm(self) -> None:
-        """Allow light; the lease begins."""
+        """Allow light and start the lease."""
         self._port.ask("SYST:ARM")
 
     def dark(self) -> None:
-        """Put all light out and disarm, at once."""
+        """Switch all light off and disarm, at once."""
         self._port.ask("SAFE")
 
     def is_armed(self) -> bool:
-        """Tell whether light is allowed."""
+        """Return whether light is allowed."""
         return self._flag("SYST:ARM?")
 
     def set_lease(self, lease_s: float) -> None:
-        """Set after how much silence, in s, the box goes dark (0.3 to 5)."""
+        """Set the lease, the silence in s after which the controller goes dark (0.3 to 5)."""
         self._port.ask(f"SYST:WDOG {round(lease_s * 1e3)}")
 
     def lease_s(self) -> float:
-        """Return after how much silence, in s, the box goes dark."""
+        """Return the lease: the silence, in s, after which the controller goes dark."""
         return self._number("SYST:WDOG?") / 1e3
 
     def ping(self) -> float:
-        """Return the box's clock, in s since its power-up; renews the lease."""
+        """Return the controller's clock, in s since power-up, and renew the lease."""
         return self._number("SYST:PING?") / 1e6
 
     def reset(self) -> None:
-        """Go dark, disarm, and return to the settings of power-up."""
+        """Go dark, disarm, and restore the settings of power-up."""
         self._port.ask("*RST")
 
     def errors(self) -> list[tuple[int, str]]:
-        """Return and remove the queued errors, oldest first."""
+        """Return the queued errors, oldest first, and empty the queue."""
         found: list[tuple[int, str]] = []
         for _ in range(64):
             payload = self._port.ask("SYST:ERR?")
@@ -167,16 +167,16 @@ class Box:
         return found
 
     def clear_errors(self) -> None:
-        """Empty the error queue."""
+        """Empty the error queue of the controller."""
         self._port.ask("*CLS")
 
     def close(self) -> None:
-        """Go dark if the box still answers, and close the port."""
+        """Go dark if the controller still answers, then close the port."""
         try:
             if self._port.boot != wire.UNKNOWN_BOOT:
                 self.dark()
         except DeviceError as exc:
-            log.warning("%s; the lease of the box puts its light out", exc)
+            log.warning("%s; the lease of the controller switches its light off", exc)
         finally:
             self._port.close()
 
@@ -188,18 +188,18 @@ class Box:
         )
 
     def _read(self, text: str, decode: Callable[[str], T], expected: str, *, shown: str = "") -> T:
-        """Ask and decode the answer; a ValueError or KeyError of ``decode`` is a bad answer.
+        """Send a query and decode its answer; ValueError or KeyError mean `BadAnswer`.
 
         Parameters
         ----------
         text
-            The command.
+            Query to send.
         decode
-            Of the payload.
+            Function that decodes the payload.
         expected
-            What the payload should have been, in words.
+            Description of the expected payload, for the error message.
         shown
-            The command as an error shows it, where not as it is.
+            Form of the query in error messages, where it differs from ``text``.
         """
         payload = self._port.ask(text)
         try:
@@ -210,7 +210,7 @@ class Box:
     def _read_or_none(
         self, text: str, decode: Callable[[str], T], expected: str, *, shown: str = ""
     ) -> T | None:
-        """Ask and decode the answer; None where the box says that there is nothing."""
+        """Send a query and decode its answer; None when the controller reports no value."""
         return self._read(
             text, lambda got: None if got == "NONE" else decode(got), expected, shown=shown
         )
@@ -228,7 +228,7 @@ class Box:
         return self._read(text, parse_whole_number, expected, shown=shown)
 
     def _token_time(self, command: str, token: str, *, shown: str = "") -> float:
-        """Give a command with a token; return the box's time at which it was done, s."""
+        """Send a command with a token and return the controller's time of execution, s."""
 
         def time_s(payload: str) -> float:
             name, _, t_us = payload.partition(",")
@@ -241,7 +241,7 @@ class Box:
     def _wait_settled(
         self, timeout_s: float, poll_s: float, listen: Callable[[float], object], fault: str
     ) -> None:
-        """Wait until all acts are over, by the box's time whatever the box is."""
+        """Wait until all movements are over, in the controller's time, real or simulated."""
         waited_s = 0.0
         while not self._flag("*OPC?"):
             if waited_s >= timeout_s:
@@ -250,7 +250,7 @@ class Box:
             waited_s += poll_s
 
     def _keep_lease(self, seconds: float, every_s: float) -> None:
-        """Let time pass and renew the lease."""
+        """Wait for a time while renewing the lease."""
         left_s = seconds
         while left_s > 0.0:
             self._port.listen(min(left_s, every_s))
@@ -259,14 +259,14 @@ class Box:
 
 
 def parse_whole_number(text: str) -> int:
-    """Return a number that is written in digits only; raise ValueError otherwise."""
+    """Return a number written in digits only; raise ValueError otherwise."""
     if not text.isdecimal():
         raise ValueError(text)
     return int(text)
 
 
 def format_decimal(field: str, value: float, digits: int) -> str:
-    """Return a finite number in as few digits as it needs, at most ``digits`` after the point.
+    """Format a finite number in as few digits as needed, at most ``digits`` after the point.
 
     Examples
     --------

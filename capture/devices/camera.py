@@ -1,8 +1,8 @@
-"""What every camera answers, and the rule by which a frame is believed.
+"""Camera interface, and the rule by which a frame is accepted.
 
-A valid image can be the wrong one: left over from an earlier trigger, of the camera next to it,
-or taken with other settings. A frame is therefore accepted on what it says of itself, never
-because it arrived.
+A valid image can be the wrong one: left over from an earlier trigger, from the camera next to it,
+or taken with other settings. Each frame is therefore accepted by its own metadata, never because it
+arrived.
 """
 
 from __future__ import annotations
@@ -24,45 +24,45 @@ MAX_EXPOSURE_DEVIATION_EV = 1.0 / 3.0
 
 
 class CameraError(DeviceError, RuntimeError):
-    """A camera did not do what was asked."""
+    """Raised when a camera did not do what was requested."""
 
 
 class CameraUrlError(CameraError, ValueError):
-    """An address that no camera answers to."""
+    """Raised for an address at which no camera answers."""
 
 
 class CameraBusy(CameraError):
-    """Another program has the camera."""
+    """Raised when another program uses the camera."""
 
 
 class FrameTimeout(CameraError, TimeoutError):
-    """No frame came in time."""
+    """Raised when no frame came in time."""
 
 
 class FrameRefused(CameraError):
-    """A frame that is not the one that was asked for."""
+    """Raised for a frame that is not the requested one."""
 
 
 class StaleFrame(FrameRefused):
-    """A frame of an earlier trigger."""
+    """Raised for a frame of an earlier trigger."""
 
 
 class WrongCamera(FrameRefused):
-    """A frame of another camera."""
+    """Raised for a frame of another camera."""
 
 
 class WrongExposure(FrameRefused):
-    """A frame with other settings than those asked for."""
+    """Raised for a frame with other settings than those requested."""
 
 
 class Trigger(StrEnum):
-    """What starts an exposure."""
+    """Source of the trigger of an exposure."""
 
     SOFTWARE = "software"
     EDGE = "edge"
     LEVEL = "level"
     HAND = "hand"
-    """A person's finger on the shutter."""
+    """A person presses the shutter button."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,23 +72,23 @@ class Exposure:
     Attributes
     ----------
     exposure_s
-        Time, s, above 0.
+        Exposure time, s, above 0.
     iso
-        Sensitivity, above 0.
+        ISO sensitivity, above 0.
     """
 
     exposure_s: float
     iso: int
 
     def __post_init__(self) -> None:
-        """Refuse what no camera can do."""
+        """Reject times and sensitivities that are not positive."""
         if not (math.isfinite(self.exposure_s) and self.exposure_s > 0):
             raise ValueError(f"exposure_s: got {self.exposure_s}, expected a time above 0")
         if self.iso <= 0:
             raise ValueError(f"iso: got {self.iso}, expected a number above 0")
 
     def deviation_ev(self, other: Exposure) -> float:
-        """Return how much brighter ``self`` makes an image than ``other``, in stops.
+        """Return how much brighter ``self`` exposes than ``other``, in stops.
 
         Examples
         --------
@@ -100,20 +100,20 @@ class Exposure:
 
 @dataclass(frozen=True, slots=True)
 class CameraInfo:
-    """What a camera is.
+    """Identity and properties of a camera.
 
     Attributes
     ----------
     serial, model
         The serial number identifies the camera; no two in a rig share one.
     width_px, height_px
-        Of its frames.
+        Size of its frames.
     pattern
         Color filter array, "RGGB" and so on, or "MONO".
     black, white
-        Levels, DN; black for each position of the filter array.
+        Levels, DN; black for each position of the color filter array.
     triggers
-        Those it understands.
+        Triggers that it supports.
     """
 
     serial: str
@@ -128,22 +128,22 @@ class CameraInfo:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One frame as a camera hands it over, with what it says of itself.
+    """One frame as a camera delivers it, with its metadata.
 
     Attributes
     ----------
     serial
-        Of the camera that took it.
+        Serial number of the camera that took it.
     seq
-        Counts the frames since the camera was armed, from 0.
+        Number of the frame since the camera was armed, from 0.
     t_start_s, t_end_s
-        Of the exposure, on the camera's clock.
+        Begin and end of the exposure, on the camera's clock.
     exposure
-        What was really set.
+        Settings read back from the camera.
     image
         Sensor values, (H, W) uint16, or a whole raw file as bytes.
     light
-        What the camera knows of the light; may be empty.
+        Metadata of the light, as far as the camera has any; may be empty.
     """
 
     serial: str
@@ -156,36 +156,36 @@ class Frame:
 
 
 class Camera(Protocol):
-    """A camera, whatever is behind it."""
+    """Interface of a camera, whatever its connection."""
 
     @property
     def info(self) -> CameraInfo:
-        """What it is."""
+        """Identity and properties of the camera."""
 
     def clock_s(self) -> float:
         """Return the time on the clock that stamps its frames, s."""
 
     def configure(self, want: Exposure) -> Exposure:
-        """Set an exposure and return what was really set."""
+        """Set an exposure and return the settings in effect."""
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """Make ready for ``count`` frames; frames waiting from before are dropped."""
+        """Prepare for ``count`` frames and drop frames that wait from before."""
 
     def fire(self) -> None:
-        """Start one exposure; for the software trigger only."""
+        """Start one exposure (software trigger only)."""
 
     def frame(self, timeout_s: float) -> Frame:
         """Return the next frame, or raise :class:`FrameTimeout`."""
 
     def abort(self) -> None:
-        """Give up what was armed."""
+        """Cancel what was armed."""
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Release the camera."""
 
 
 def check_address(url: str) -> None:
-    """Raise unless the address names a kind of camera that is installed; opens nothing.
+    """Check that the address names an installed kind of camera; nothing is opened.
 
     Raises
     ------
@@ -232,34 +232,34 @@ def open_camera(url: str) -> Camera:
 def check_frame(
     frame: Frame, info: CameraInfo, *, seq: int, not_before_s: float, want: Exposure
 ) -> None:
-    """Raise when ``frame`` is not the one that was asked for.
+    """Raise an error when ``frame`` is not the requested one.
 
     Parameters
     ----------
     frame
-        As the camera handed it over.
+        The frame as the camera delivered it.
     info
-        Of the camera that was asked.
+        Properties of the camera that was triggered.
     seq
-        The number that the frame must carry.
+        Number that the frame must have.
     not_before_s
-        When the trigger was given, on the camera's clock.
+        Time of the trigger, on the camera's clock.
     want
-        The exposure that was asked for.
+        Exposure that was requested.
 
     Raises
     ------
     WrongCamera
-        When the serial number is another's.
+        When the serial number is another camera's.
     StaleFrame
-        When it was exposed before the trigger, or carries another number.
+        When it was exposed before the trigger, or has another number.
     WrongExposure
         When its settings differ by more than a third of a stop.
     """
     if frame.serial != info.serial:
         raise WrongCamera(
-            f"camera {info.serial}: got a frame of camera {frame.serial}; two cameras are "
-            "mixed up: address each by its serial number"
+            f"camera {info.serial}: got a frame of camera {frame.serial}; two cameras are mixed "
+            "up: address each by its serial number"
         )
     if frame.seq != seq:
         raise StaleFrame(f"camera {info.serial}: got frame number {frame.seq}, expected {seq}")
@@ -287,23 +287,23 @@ def check_frame(
 def next_frame(
     camera: Camera, *, seq: int, not_before_s: float, want: Exposure, timeout_s: float
 ) -> tuple[Frame, int]:
-    """Return the frame that was asked for, and how many stale ones were dropped on the way.
+    """Return the requested frame, and the number of stale frames dropped before it.
 
     Parameters
     ----------
     camera
-        Armed.
+        Camera, armed.
     seq, not_before_s, want
         As for :func:`check_frame`.
     timeout_s
-        For each frame that is waited for.
+        Time to wait for each frame, s.
 
     Raises
     ------
     FrameTimeout
-        When nothing came, or nothing but stale frames (at most 8 are looked at).
+        When nothing came, or nothing but stale frames (at most 8 are read).
     WrongCamera, WrongExposure
-        Which no waiting mends.
+        When waiting cannot help.
     """
     for stale in range(8):
         frame = camera.frame(timeout_s)
@@ -318,14 +318,14 @@ def next_frame(
 
 
 def check_serials(cameras: Mapping[str, Camera], expected: Sequence[tuple[str, str]]) -> None:
-    """Raise when a view's camera is not the one the rig file names.
+    """Raise an error when a view's camera is not the one that the rig file names.
 
     Parameters
     ----------
     cameras
-        By view.
+        Cameras by view.
     expected
-        View and serial number, as in the rig file.
+        Serial number by view, as in the rig file.
     """
     for view, serial in expected:
         if view not in cameras:
@@ -333,6 +333,6 @@ def check_serials(cameras: Mapping[str, Camera], expected: Sequence[tuple[str, s
         got = cameras[view].info.serial
         if got != serial:
             raise WrongCamera(
-                f"view {view!r}: got the camera {got}, expected {serial} as the rig file says; "
-                "exchange the addresses, or write the new serial number into the rig file"
+                f"view {view!r}: got the camera {got}, expected {serial} (rig file); exchange "
+                "the addresses, or write the new serial number into the rig file"
             )

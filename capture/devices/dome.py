@@ -1,8 +1,8 @@
-"""The dome's box: one method a command, units in and out, no policy.
+"""Driver of the dome: one method per command, physical units, no policy.
 
-A table of rows is uploaded and compared by its checksum, then armed, which makes the box judge it,
-and triggered; from then on the box steps by itself and reports each release of cameras. The lease
-runs meanwhile: `DomeBox.listen` renews it.
+A table of rows is uploaded and compared by its checksum. Arming makes the controller check the
+table against its limits; the trigger starts it. The controller then steps on its own and reports
+each camera release. The lease runs meanwhile: `DomeBox.listen` renews it.
 """
 
 from collections.abc import Sequence
@@ -14,19 +14,19 @@ from capture.devices.led_box import LEVEL_STEPS, LedBox, LedStatus, TableEvaluat
 
 @dataclass(frozen=True, slots=True)
 class TableRow:
-    """One row of the box's table."""
+    """One row of the controller's table."""
 
     leds: tuple[int, ...]
     """Numbers of the LEDs that are on together; empty: dark."""
     level: float
-    """Light relative to full, 0 to 1; the box sets thousandths."""
+    """Light relative to full, 0 to 1, in steps of 1/1000."""
     dwell_s: float
-    """How long, s; the box counts microseconds."""
+    """Duration, s, in steps of 1 microsecond."""
     mask: int
-    """Cameras that are released: bit 0 is the first."""
+    """Mask of the cameras to release: bit 0 is the first."""
 
     def text(self) -> str:
-        """Return the row in the one spelling that the table's checksum is taken of.
+        """Return the row in the canonical spelling that the table's checksum covers.
 
         Examples
         --------
@@ -39,7 +39,7 @@ class TableRow:
 
 
 class DomeBox(LedBox):
-    """Driver of the dome's box; see `capture.devices.box.Box`."""
+    """Driver of the dome's controller; see `capture.devices.box.Box`."""
 
     kind: ClassVar[str] = "dome"
 
@@ -50,22 +50,22 @@ class DomeBox(LedBox):
     # sequence ---------------------------------------------------------------------------------
 
     def load(self, rows: Sequence[TableRow]) -> None:
-        """Replace the box's table and compare its checksum.
+        """Replace the controller's table and compare its checksum.
 
         Raises
         ------
         BadAnswer
-            When the box holds another table than was sent.
+            When the controller has another table than the one sent.
         """
         self._send_table("SEQ", [row.text() for row in rows], joint=";")
 
     def arm_sequence(self, rows: int) -> TableEvaluation:
-        """Let the box judge its table of `rows` rows and make it ready for one run.
+        """Let the controller check its table of `rows` rows and prepare one run of it.
 
         Raises
         ------
         CommandRefused
-            Beyond duty (101), heat (102), dose (104), or flicker for open eyes (105).
+            Beyond the limits of duty (101), heat (102), dose (104), or flicker for open eyes (105).
         """
         return self._arm_table(rows)
 
@@ -78,7 +78,7 @@ class DomeBox(LedBox):
         self._port.ask(f"LED:ON {names},{span_ms},{round(level * LEVEL_STEPS)}")
 
     def put_out(self, leds: Sequence[int] = ()) -> None:
-        """Put LEDs out; all of them when none is named."""
+        """Switch LEDs off; all of them when none is given."""
         self._port.ask(f"LED:OFF {'+'.join(map(str, leds)) or 'ALL'}")
 
     def lit(self) -> tuple[int, ...]:

@@ -1,47 +1,47 @@
-"""Errors that devices raise."""
+"""Exceptions of instrument drivers."""
 
 
 class DeviceError(Exception):
-    """Root of what drivers raise about a device."""
+    """Base class of the exceptions that drivers raise about an instrument."""
 
 
 class PortUrlError(DeviceError, ValueError):
-    """The URL names no way to reach a device."""
+    """Raised for a URL that does not lead to an instrument."""
 
 
 class LinkLost(DeviceError, ConnectionError):
-    """The port cannot be opened, or is gone; whether the last act was done is not known."""
+    """Raised when the port cannot be opened or is lost; the last command may have been done."""
 
 
 class PortBusy(LinkLost):
-    """Another program holds the port."""
+    """Raised when another program uses the port."""
 
 
 class PortTimeout(DeviceError, TimeoutError):
-    """No answer in spite of retries; whether the act was done is not known."""
+    """Raised when no answer came despite retries; the command may have been executed."""
 
 
 class BoxRebooted(DeviceError, ConnectionResetError):
-    """The box started again: it is dark, disarmed and has forgotten its settings."""
+    """Raised after a reboot of the controller: it is dark, disarmed and has lost its settings."""
 
 
 class WrongDevice(DeviceError, ValueError):
-    """Behind the URL is another device, or one that speaks another version."""
+    """Raised when the URL leads to another device, or to another protocol version."""
 
 
 class BadAnswer(DeviceError, ValueError):
-    """A well-framed answer whose content is not what the manual says."""
+    """Raised for a well-framed answer whose content does not follow the protocol."""
 
 
 class CommandRefused(DeviceError, RuntimeError):
-    """The box refused and did nothing.
+    """Raised when the controller refused a command and did nothing.
 
     Attributes
     ----------
     code
-        Why, see `capture.devices.wire.Code`.
+        Reason, see `capture.devices.wire.Code`.
     text
-        The command.
+        Command that was refused.
     """
 
     def __init__(self, text: str, code: int, reason: str) -> None:

@@ -1,8 +1,8 @@
-"""The flash box: one method a command, units in and out, no policy.
+"""Driver of the flash controller: one method per command, physical units, no policy.
 
-Nothing lights unless the box is armed, and an armed box that hears nothing for its lease goes dark
-and disarms itself. After `BoxRebooted` call `hello` and set everything up again: the box has
-forgotten it.
+Nothing lights unless the controller is armed. An armed controller that receives nothing during its
+lease goes dark and disarms itself. After `BoxRebooted` call `hello` and set everything up again:
+the settings are lost.
 """
 
 from collections.abc import Mapping
@@ -18,62 +18,62 @@ _POLARIZER_WORDS: Mapping[str, Polarizer] = {"PAR": "parallel", "CROS": "crossed
 _REPORT_FIELDS = "token,us,power,PAR|CROS,degrees,count"
 _MIN_WAIT_S = 0.02
 _CHARGE_POLL_S = 0.2
-"""Longest silence while waiting; shorter than the shortest lease."""
+"""Longest silence while waiting, s; shorter than the shortest lease."""
 
 
 @dataclass(frozen=True, slots=True)
 class FlashReport:
-    """What the box says of a pop."""
+    """Report of a flash by the controller."""
 
     token: str
-    """Name that was given to it."""
+    """Token given with the command."""
     t_box_s: float
-    """Time on the box's clock, s since its power-up."""
+    """Time on the controller's clock, s since power-up."""
     power: float
-    """Energy relative to a full pop, 0 to 1."""
+    """Energy relative to a full flash, 0 to 1."""
     polarizer: Polarizer
-    """Stop that was last asked for."""
+    """Polarizer state that was last requested."""
     analyser_deg: float
     """Reading of the rotator, degrees; 0 parallel, 90 crossed."""
     count: int
-    """Pops since the box was made, this one included."""
+    """Number of flashes since manufacture, this one included."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChargeState:
-    """Whether a pop is possible."""
+    """Charge of the capacitor, and when a flash is possible."""
 
     charge: float
-    """Energy in the capacitor, 0 to 1 of a full pop."""
+    """Energy in the capacitor, 0 to 1 of a full flash."""
     ready: bool
-    """Whether an armed box would fire now."""
+    """Whether an armed controller would fire now."""
     ready_in_s: float
-    """When it would, s; 0 when ready."""
+    """Time until it would, s; 0 when ready."""
 
 
 class FlashStatus(BoxStatus):
-    """The bits of ``STAT?``."""
+    """Bits of ``STAT?``."""
 
     __slots__ = ()
 
     turning = StatusBit(4)
-    """Whether the analyser turns."""
+    """Whether the analyzer turns."""
 
 
 class FlashBox(Box):
-    """Driver of the flash box.
+    """Driver of the flash controller.
 
     Parameters
     ----------
     port
-        Open; owned by the driver from now on.
+        Open port; the driver closes it.
     serial
-        Serial number that the box must have; empty: any.
+        Expected serial number of the controller; empty: any.
 
     Raises
     ------
     WrongDevice
-        When the box is no flash box, or another one.
+        When the controller is not a flash controller, or has another serial number.
     """
 
     kind = FLASH_KIND
@@ -85,60 +85,60 @@ class FlashBox(Box):
     # analyser ---------------------------------------------------------------------------------
 
     def set_polarizer(self, polarizer: str) -> None:
-        """Begin to turn the analyser to "parallel" or "crossed"."""
+        """Start turning the analyzer to "parallel" or "crossed"."""
         words = {stop: word for word, stop in _POLARIZER_WORDS.items()}
         if polarizer not in words:
             raise ValueError(f"polarizer: got {polarizer!r}, expected 'parallel' or 'crossed'")
         self._port.ask(f"FLAS:POL {words[polarizer]}")
 
     def polarizer(self) -> Polarizer:
-        """Return the stop that was last asked for."""
+        """Return the polarizer state that was last requested."""
         return self._read("FLAS:POL?", _POLARIZER_WORDS.__getitem__, "PAR or CROS")
 
     def set_analyzer(self, angle_deg: float) -> None:
-        """Begin to turn the analyser to a reading, in degrees."""
+        """Start turning the analyzer to a reading, in degrees."""
         self._port.ask(f"FLAS:POL:ANG {format_decimal('angle_deg', angle_deg, 9)}")
 
     def analyser_deg(self) -> float:
-        """Return the reading that the analyser has or turns to, in degrees."""
+        """Return the present or target reading of the analyzer, in degrees."""
         return self._number("FLAS:POL:ANG?")
 
     def is_settled(self) -> bool:
-        """Tell whether the analyser stands still."""
+        """Return whether the analyzer is at rest."""
         return self._flag("*OPC?")
 
     # flash ------------------------------------------------------------------------------------
 
     def set_power(self, power: float) -> None:
-        """Set the power of the next pops, 0 to 1 of full."""
+        """Set the power of the next flashes, 0 to 1 of full."""
         self._port.ask(f"FLAS:POW {format_decimal('power', power, 9)}")
 
     def power(self) -> float:
-        """Return the power of the next pop, 0 to 1 of full."""
+        """Return the power of the next flash, 0 to 1 of full."""
         return self._number("FLAS:POW?")
 
     def set_sync_delay(self, seconds: float) -> None:
-        """Set how long after the camera line the flash pops, in s; 0 at power-up."""
+        """Set the delay from the camera line to the flash, in s; 0 at power-up."""
         self._port.ask(f"FLAS:SYNC {format_decimal('seconds', seconds * 1e6, 9)}")
 
     def sync_delay_s(self) -> float:
-        """Return how long after the camera line the flash pops, in s."""
+        """Return the delay from the camera line to the flash, in s."""
         return self._number("FLAS:SYNC?") / 1e6
 
     def charge_state(self) -> ChargeState:
-        """Tell whether a pop is possible, and when it will be."""
+        """Return whether a flash is possible, and when it will be."""
         return self._read("FLAS:CHAR?", _charge_state, "charge,ready,ms")
 
     def wait_charged(self, timeout_s: float) -> None:
-        """Wait until a pop is possible: charged, recovered, and the analyser at rest.
+        """Wait until a flash is possible: charged, recovered, and the analyzer at rest.
 
-        Time passes by listening to the line, so that it is the box's time whatever the box is, and
-        the lease is renewed.
+        Waiting means listening to the line, so that time is the controller's, real or simulated,
+        and the lease is renewed.
 
         Raises
         ------
         PortTimeout
-            When the box is not ready in `timeout_s`.
+            When the controller is not ready in `timeout_s`.
         """
         waited_s = 0.0
         while not (state := self.charge_state()).ready:
@@ -152,37 +152,37 @@ class FlashBox(Box):
             waited_s += pause_s
 
     def fire(self, token: str) -> FlashReport:
-        """Pulse the camera line and pop once, after the delay that was set.
+        """Pulse the camera line and flash once, after the set delay.
 
-        A retry on the line never pops twice. After `PortTimeout` or `LinkLost` it is not known
-        whether it popped: `last_pop` tells, unless the box has rebooted.
+        A repeated request never flashes twice. After `PortTimeout` or `LinkLost` it is not known
+        whether it flashed: `last_pop` reports it, unless the controller has rebooted.
         """
         return self._read(f"FLAS:FIRE {token}", _parse_report, _REPORT_FIELDS, shown="FLAS:FIRE")
 
     def last_pop(self) -> FlashReport | None:
-        """Return the report of the last pop since power-up, None when there was none."""
+        """Return the report of the last flash since power-up, None when there was none."""
         return self._read_or_none("FLAS:LAST?", _parse_report, _REPORT_FIELDS)
 
     def count(self) -> int:
-        """Return the number of pops since the box was made."""
+        """Return the number of flashes since manufacture."""
         return int(self._number("FLAS:COUN?"))
 
     def trigger_cameras(self, token: str) -> float:
-        """Pulse the camera line without light; return the box's time of the pulse, in s."""
+        """Pulse the camera line without light; return the controller's time of the pulse, in s."""
         return self._token_time("CAM:TRIG", token)
 
     # lamps ------------------------------------------------------------------------------------
 
     def lamp_on(self, seconds: float) -> None:
-        """Light the modelling lamps for `seconds` (at most 0.5) from now."""
+        """Light the modeling lamps for `seconds` (at most 0.5) from now."""
         self._port.ask(f"FLAS:LAMP ON,{format_decimal('seconds', seconds * 1e3, 9)}")
 
     def lamp_off(self) -> None:
-        """Put the modelling lamps out."""
+        """Switch the modeling lamps off."""
         self._port.ask("FLAS:LAMP OFF")
 
     def is_lamp_lit(self) -> bool:
-        """Tell whether the modelling lamps are on."""
+        """Return whether the modeling lamps are on."""
         return self._flag("FLAS:LAMP?")
 
 

@@ -1,10 +1,11 @@
-"""The gradient sphere's box: one method a command, units in and out, no policy.
+"""Driver of the gradient sphere: one method per command, physical units, no policy.
 
-A pattern is a light of all LEDs at once: full, or weighted by a coordinate of the way to each of
-them (`capture.plan.steps.LIGHT_PATTERNS`). A scan is a table of patterns: uploaded, compared by its
-checksum, armed, which makes the box judge it, and triggered; the box then steps by itself, turns
-the analyser where a row asks for another reading (in the dark), releases the cameras once each
-light is steady, and reports each release. The lease runs meanwhile: `listen` renews it.
+A pattern lights all LEDs at once: full, or weighted by a coordinate of the direction to each
+(`capture.plan.steps.LIGHT_PATTERNS`). A scan is a table of patterns: uploaded, compared by its
+checksum, armed, which makes the controller check it against its limits, and triggered. The
+controller then steps on its own, turns the analyzer in the dark where a row has another reading,
+releases the cameras once each light is steady, and reports each release. The lease runs meanwhile:
+`listen` renews it.
 """
 
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ from capture.plan.steps import LIGHT_PATTERNS
 
 Polarizer = Literal["parallel", "crossed"]
 ANALYZER_DEG: dict[str, float] = {"parallel": 0.0, "crossed": 90.0}
-"""Reading of the analyser in each state."""
+"""Reading of the analyzer per polarizer state, degrees."""
 _ANALYZER_POLL_S = 0.05
 
 
@@ -28,18 +29,19 @@ class PatternRow:
     pattern: str
     """full, x, y, z, -x, -y, -z or dark."""
     analyser_deg: float
-    """Reading of the analyser, degrees, 0 to 180; 0 is parallel, 90 crossed. Where it differs from
-    that of the row before, the box turns it first, in the dark; that time is not part of
-    ``dwell_s``."""
+    """Reading of the analyzer, degrees, 0 to 180; 0 is parallel, 90 crossed. Where it differs from
+    the row before, the controller turns it first, in the dark; that time is not part of
+    ``dwell_s``.
+    """
     level: float
-    """Light relative to full, 0 to 1; the box sets thousandths."""
+    """Light relative to full, 0 to 1, in steps of 1/1000."""
     dwell_s: float
-    """How long, s; the box counts microseconds."""
+    """Duration, s, in steps of 1 microsecond."""
     mask: int
-    """Cameras that are released: bit 0 is the first."""
+    """Mask of the cameras to release: bit 0 is the first."""
 
     def text(self) -> str:
-        """Return the row in the one spelling that the table's checksum is taken of.
+        """Return the row in the canonical spelling that the table's checksum covers.
 
         Examples
         --------
@@ -55,19 +57,19 @@ class PatternRow:
 
 
 class SphereStatus(LedStatus):
-    """The bits of ``STAT?``."""
+    """Bits of ``STAT?``."""
 
     __slots__ = ()
 
     turning = StatusBit(10)
-    """Whether the analyser turns."""
+    """Whether the analyzer turns."""
 
 
 class GradientSphereBox(LedBox):
-    """Driver of the gradient sphere's box; see `capture.devices.box.Box`.
+    """Driver of the gradient sphere's controller; see `capture.devices.box.Box`.
 
-    Its limits (``limits``) are named as the dome's, and ``move_s_per_deg`` (time in which the
-    analyser turns by one degree, s), ``analyser_min_deg`` and ``analyser_max_deg``.
+    Keys of ``limits`` are those of the dome, and ``move_s_per_deg`` (time in which the analyzer
+    turns by one degree, s), ``analyser_min_deg`` and ``analyser_max_deg``.
     """
 
     kind: ClassVar[str] = "gradient_sphere"
@@ -79,40 +81,40 @@ class GradientSphereBox(LedBox):
     # analyser ---------------------------------------------------------------------------------
 
     def set_polarizer(self, polarizer: str) -> None:
-        """Begin to turn the analyser to "parallel" or "crossed"; refused while a light is on."""
+        """Start turning the analyzer to "parallel" or "crossed"; refused while a light is on."""
         if polarizer not in ANALYZER_DEG:
             raise ValueError(f"polarizer: got {polarizer!r}, expected 'parallel' or 'crossed'")
         self._port.ask(f"POL {ANALYZER_DEG[polarizer]:.0f}")
 
     def set_analyzer(self, angle_deg: float) -> None:
-        """Begin to turn the analyser to a reading of 0 to 180 degrees."""
+        """Start turning the analyzer to a reading of 0 to 180 degrees."""
         self._port.ask(f"POL:ANG {format_decimal('angle_deg', angle_deg, 3)}")
 
     def analyser_deg(self) -> float:
-        """Return the reading that the analyser has or turns to, in degrees."""
+        """Return the present or target reading of the analyzer, in degrees."""
         return self._number("POL?")
 
     def is_settled(self) -> bool:
-        """Tell whether the analyser stands still and no scan is running."""
+        """Return whether the analyzer is at rest and no scan is running."""
         return self._flag("*OPC?")
 
     def wait_settled(self, timeout_s: float = 5.0) -> None:
-        """Wait until the analyser stands still; the lease is renewed.
+        """Wait until the analyzer is at rest; the lease is renewed.
 
         Raises
         ------
         PortTimeout
-            When it does not in `timeout_s`.
+            When it still turns after `timeout_s`.
         """
-        fault = f"the analyser still turns after {timeout_s:g} s; check it"
+        fault = f"the analyzer still turns after {timeout_s:g} s; check it"
         self._wait_settled(timeout_s, _ANALYZER_POLL_S, self.listen, fault)
 
     # single patterns --------------------------------------------------------------------------
 
     def light(self, pattern: str, seconds: float, *, level: float = 1.0) -> None:
-        """Light a pattern for `seconds` (at most 0.5) from now; "dark" puts the light out.
+        """Light a pattern for `seconds` (at most 0.5) from now; "dark" switches the light off.
 
-        Refused (-213) while the analyser turns.
+        Refused (-213) while the analyzer turns.
         """
         if pattern == "dark":
             self.put_out()
@@ -121,7 +123,7 @@ class GradientSphereBox(LedBox):
         self._port.ask(f"PATT {_pattern(pattern).upper()},{span_ms},{round(level * LEVEL_STEPS)}")
 
     def put_out(self) -> None:
-        """Put the light out."""
+        """Switch the light off."""
         self._port.ask("PATT DARK")
 
     def lit(self) -> str:
@@ -134,40 +136,40 @@ class GradientSphereBox(LedBox):
     # scans ------------------------------------------------------------------------------------
 
     def load(self, rows: Sequence[PatternRow]) -> None:
-        """Replace the box's table and compare its checksum.
+        """Replace the controller's table and compare its checksum.
 
         Raises
         ------
         BadAnswer
-            When the box holds another table than was sent.
+            When the controller has another table than the one sent.
         """
         self._send_table("SEQ", [row.text() for row in rows], joint=";")
 
     def arm_scan(self, rows: int) -> TableEvaluation:
-        """Let the box judge its table of `rows` rows and make it ready for one run.
+        """Let the controller check its table of `rows` rows and prepare one run of it.
 
         Raises
         ------
         CommandRefused
-            Beyond duty (101), heat (102), dose (104), or flicker for open eyes (105); -213 while
-            the analyser turns.
+            Beyond the limits of duty (101), heat (102), dose (104), or flicker for open eyes (105);
+            -213 while the analyzer turns.
         """
         return self._arm_table(rows)
 
     # gains ------------------------------------------------------------------------------------
 
     def set_gains(self, gains: Sequence[float]) -> None:
-        """Make every LED give only a share of what a pattern asks of it, so that all are alike.
+        """Scale each LED by a factor of 0 to 1, so that all give equal light.
 
         Parameters
         ----------
         gains
-            One per LED, 0 to 1; the box sets thousandths. A reset forgets them.
+            One per LED, 0 to 1, in steps of 1/1000. A reset clears them.
 
         Raises
         ------
         BadAnswer
-            When the box holds others than were sent.
+            When the controller has other gains than those sent.
         """
         for number, gain in enumerate(gains):
             if not 0.0 <= gain <= 1.0:
@@ -175,7 +177,7 @@ class GradientSphereBox(LedBox):
         self._send_table("GAIN", [str(round(gain * LEVEL_STEPS)) for gain in gains], joint="+")
 
     def clear_gains(self) -> None:
-        """Let every LED give what a pattern asks of it."""
+        """Reset the gains of all LEDs to 1."""
         self._port.ask("GAIN:CLE")
 
 

@@ -1,11 +1,11 @@
-"""Request and reply over a pyserial URL, and the tree of errors that devices raise.
+"""Request and reply over a pyserial URL, with retries, timeouts and events.
 
 A port is opened with `serial.serial_for_url`, so ``/dev/serial/by-id/...``, ``socket://host:port``
 and every URL of the entry-point group ``capture.urlhandlers`` are the same to a driver. Of pyserial
 only open, read, write, in_waiting, reset_input_buffer and close are used.
 
-One thread uses a port. One request is under way at a time; a retry sends the same bytes, so that
-the box can tell it from a new request and never acts twice.
+One thread uses a port. One request is pending at a time; a retry sends the same bytes, so that the
+controller recognizes it and never executes a command twice.
 """
 
 import contextlib
@@ -58,22 +58,22 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 READ_SLICE_S = 0.02
-"""How long one read waits, in s; longer waits are made of slices."""
+"""Duration of one read, in s; longer waits are made of several reads."""
 MAX_CAPABILITY_PARTS = 1024
 MAX_NOISE_BYTES = 65_536
-"""So many bytes without the answer among them end an attempt, whatever the clock says."""
+"""Number of bytes without the answer after which an attempt ends, whatever the clock."""
 
 try:
     from termios import error as _termios_error
 except ImportError:  # pragma: no cover - Windows has no termios
     _termios_error = OSError  # type: ignore[misc,assignment]
 
-# what pyserial lets through when the device is gone or the port was closed under a reader
+# what pyserial raises when the device is gone or the port was closed during a read
 _LINK_FAILURES = (OSError, _termios_error, TypeError, AttributeError)
 
 
 class Clock(Protocol):
-    """Where time comes from; real or simulated."""
+    """Source of time, real or simulated."""
 
     def monotonic(self) -> float:
         """Return the time in s since any fixed instant."""
@@ -95,36 +95,36 @@ SYSTEM_CLOCK: Clock = _SystemClock()
 
 @dataclass(slots=True)
 class LinkStatistics:
-    """What happened on one port since it was made."""
+    """Counters of one port since it was made."""
 
     requests: int = 0
-    """Commands and queries asked for."""
+    """Commands and queries requested."""
     frames: int = 0
     """Frames sent, retries included."""
     retries: int = 0
     """Frames sent again."""
     naks: int = 0
-    """Times the box reported a damaged frame."""
+    """Damaged frames reported by the controller."""
     stale: int = 0
-    """Answers to earlier requests, thrown away."""
+    """Answers to earlier requests, dropped."""
     bad_lines: int = 0
-    """Lines that were not frames, thrown away."""
+    """Lines that were not frames, dropped."""
     lost_events: int = 0
     """Gaps in the numbers of events."""
     reboots: int = 0
-    """Times the box was found to have started again."""
+    """Detected restarts of the controller."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """How a box introduces itself."""
+    """Identity of a controller, from its answer to hello."""
 
     version: int
     """Version of the wire protocol."""
     kind: str
-    """What it is, e.g. ``flash``."""
+    """Kind of controller, e.g. ``flash``."""
     serial: str
-    """Serial number: the device, whatever the port is called today."""
+    """Serial number: identifies the device, whatever the port's name."""
     firmware: str
     boot: int
     """Epoch drawn at power-up, 1 to 65535."""
@@ -135,31 +135,32 @@ class _WriteStalled(Exception):
 
 
 class Port:
-    """A box on a pyserial URL, asked one thing at a time.
+    """Connection to a controller on a pyserial URL, one request at a time.
 
     Parameters
     ----------
     url
-        ``/dev/...``, ``socket://host:port``, or what a handler of `URL_HANDLERS` knows.
+        ``/dev/...``, ``socket://host:port``, or a scheme of a handler of `URL_HANDLERS`.
     clock
-        Measures timeouts; a read that returns nothing also counts as its slice of time, so that a
+        Clock of the timeouts; a read that returns nothing also counts as its duration, so that a
         port on a simulated clock times out under any clock.
     timeout_s
-        Wait for an answer before the same bytes are sent again.
+        Wait for an answer before the same bytes are sent again, s.
     retries
-        How often they are sent again.
+        Number of repetitions.
     first_seq
-        First sequence number. By default random, so that a box never takes a new run's request for
-        a retry of the last run's; give it only for byte-identical replays on a fresh box.
+        First sequence number. By default random, so that a controller never takes a new run's
+        request for a retry of the last run's; give it only for byte-identical replays on a fresh
+        controller.
     baudrate
         Bits per second, for real serial lines.
 
     Raises
     ------
     PortUrlError
-        When no handler knows the URL.
+        When no handler supports the URL.
     LinkLost
-        When the port cannot be opened (`PortBusy` when another program holds it).
+        When the port cannot be opened (`PortBusy` when another program uses it).
     """
 
     def __init__(
@@ -199,12 +200,13 @@ class Port:
         self.close()
 
     def hello(self, *, timeout_s: float = 3.0) -> Hello:
-        """Learn the epoch and the identity of the box; needed first and after each reboot.
+        """Read the epoch and the identity of the controller; needed first and after each reboot.
 
         Parameters
         ----------
-        patience_s
-            How long to knock: opening a port may reset the box, which is then deaf for a while.
+        timeout_s
+            Time to repeat the request, s: opening a port may reset the controller, which then does
+            not answer for a while.
         """
         self._check_thread()
         self.boot = wire.UNKNOWN_BOOT
@@ -220,7 +222,7 @@ class Port:
         version, kind, serial_number, firmware = _hello_fields(self.url, reply.payload)
         if version != wire.PROTOCOL_VERSION:
             raise WrongDevice(
-                f"{self.url}: the box speaks protocol {version}, expected "
+                f"{self.url}: the controller speaks protocol {version}, expected "
                 f"{wire.PROTOCOL_VERSION}; update its firmware or this program"
             )
         self.boot = reply.boot
@@ -232,28 +234,30 @@ class Port:
         Raises
         ------
         CommandRefused
-            The box did nothing and says why.
+            The controller did nothing and gave a reason.
         PortTimeout, LinkLost, BoxRebooted
-            It is not known whether it was done.
+            The command may have been executed.
         """
         self._check_thread()
         if self.boot == wire.UNKNOWN_BOOT:
-            raise BoxRebooted(f"{self.url}: the epoch of the box is not known; say hello first")
+            raise BoxRebooted(
+                f"{self.url}: the epoch of the controller is not known; call hello() first"
+            )
         reply = self._exchange(text, attempts=1 + self._retries, knock=False)
         if reply.code != Code.OK:
             raise CommandRefused(text, reply.code, reply.payload)
         return reply.payload
 
     def capabilities(self) -> dict[str, Any]:
-        """Return what the box allows (``SYST:CAP?``), units in the names.
+        """Return the limits of the controller (``SYST:CAP?``), units in the keys.
 
-        It is fetched in short parts: of a long line too few survive a bad cable, and each retry
-        would cost all of it.
+        They are fetched in short parts: too few long lines survive a bad cable, and each retry
+        would repeat all of it.
 
         Raises
         ------
         BadAnswer
-            Where the parts make no sealed JSON object.
+            When the parts are not a sealed JSON object.
         """
         parts: list[str] = []
         last = "0"
@@ -278,24 +282,24 @@ class Port:
         )
 
     def listen(self, seconds: float) -> list[Event]:
-        """Let `seconds` pass on the line and return the events that came, oldest first."""
+        """Listen to the line for `seconds` and return the events that came, oldest first."""
         self._check_thread()
         for frame in self._received(seconds):
-            # an answer nobody waits for is stale
+            # an answer to no pending request is stale
             self.statistics.stale += isinstance(frame, Reply)
         events = list(self.events)
         self.events.clear()
         return events
 
     def reopen(self, url: str | None = None) -> Hello:
-        """Close, open again (elsewhere when `url` is given) and say hello."""
+        """Close the port, open it again (at `url` when given) and repeat hello."""
         self.close()
         self.url = self.url if url is None else url
         self._open()
         return self.hello()
 
     def close(self) -> None:
-        """Close the port; doing so twice is allowed."""
+        """Close the port; calling it twice is allowed."""
         port, self._serial = self._serial, None
         if port is not None:
             with contextlib.suppress(*_LINK_FAILURES):
@@ -303,7 +307,9 @@ class Port:
 
     def _check_thread(self) -> None:
         if threading.get_ident() != self._owner:
-            raise RuntimeError(f"{self.url}: used by two threads; a port belongs to its maker")
+            raise RuntimeError(
+                f"{self.url}: used by two threads; use a port only in the thread that made it"
+            )
 
     def _open(self) -> None:
         load_url_handler(self.url)
@@ -312,7 +318,8 @@ class Port:
                 self.url,
                 baudrate=self._baudrate,
                 timeout=READ_SLICE_S,
-                # pyserial's RFC 2217 client refuses one; its socket's own time limits then hold
+                # pyserial's RFC 2217 client rejects a write timeout; its socket's own timeouts then
+                # apply
                 write_timeout=None if self.url.startswith("rfc2217://") else self._timeout_s,
                 exclusive=True,
             )
@@ -340,8 +347,8 @@ class Port:
         except _LINK_FAILURES as exc:
             self.close()
             raise LinkLost(
-                f"{self.url}: the link was lost in {action} ({exc}); whether the last act was done "
-                "is not known; reopen the port"
+                f"{self.url}: the link was lost in {action} ({exc}); the last command may have "
+                "been executed; reopen the port"
             ) from exc
 
     def _exchange(self, text: str, *, attempts: int, knock: bool) -> Reply:
@@ -352,20 +359,21 @@ class Port:
         for attempt in range(attempts):
             statistics.frames += 1
             statistics.retries += attempt > 0
-            # a newline lost before would glue two frames together
+            # without this newline a lost one would join two frames
             line = b"\n" + frame if knock or attempt else frame
             try:
                 with self._translate_errors("write"):
                     self._serial.write(line)
             except _WriteStalled:
-                log.warning("%s: the box does not take bytes", self.url)
+                log.warning("%s: the controller does not accept bytes", self.url)
                 continue
             reply = self._await_reply(seq)
             if reply is not None:
                 return reply
         raise PortTimeout(
-            f"{self.url}: no answer to {text!r} after {attempts} attempts of {self._timeout_s:g} "
-            "s; whether it was done is not known; check cable and power, then say hello"
+            f"{self.url}: no answer to {text!r} after {attempts} attempts of "
+            f"{self._timeout_s:g} s; the command may have been executed; check cable and power, "
+            "then connect again"
         )
 
     def _await_reply(self, seq: int) -> Reply | None:
@@ -382,7 +390,7 @@ class Port:
         return None
 
     def _received(self, seconds: float) -> Iterator[Reply | Event]:
-        """Yield frames from the box for `seconds`; events are also kept in `events`."""
+        """Yield frames from the controller for `seconds`; events are also kept in `events`."""
         start_s = self.clock.monotonic()
         silent_s = 0.0
         bytes_left = MAX_NOISE_BYTES
@@ -411,8 +419,9 @@ class Port:
             self.boot = wire.UNKNOWN_BOOT
             self.statistics.reboots += 1
             raise BoxRebooted(
-                f"{self.url}: the box has started again (epoch {frame.boot:04x}) and forgotten its "
-                "settings; it is dark and disarmed; say hello, then set it up again"
+                f"{self.url}: the controller has started again (epoch {frame.boot:04x}) and "
+                "lost its settings; it is dark and disarmed; connect again, then set it up "
+                "again"
             )
         if isinstance(frame, Event):
             if self._next_event is not None and frame.number > self._next_event:

@@ -1,4 +1,4 @@
-"""Serial ports by URL: handlers, names, and what to do where one does not open."""
+"""Serial ports by URL: handlers, names, and advice for a port that does not open."""
 
 import errno
 import importlib
@@ -19,21 +19,21 @@ def serial_ports() -> list[str]:
 
 
 def load_url_handler(url: str) -> None:
-    """Make the entry point that serves the scheme of `url` known to pyserial."""
+    """Register the entry point that serves the scheme of `url` with pyserial."""
     scheme, separator, _ = url.partition("://")
     if not separator:
         return
     for entry_point in importlib.metadata.entry_points(group=URL_HANDLERS, name=scheme.lower()):
-        # pyserial swallows an ImportError of its handlers; here it shows
+        # pyserial hides an ImportError of its handlers; this import raises it
         importlib.import_module(f"{entry_point.value}.protocol_{entry_point.name}")
         if entry_point.value not in serial.protocol_handler_packages:
             serial.protocol_handler_packages.append(entry_point.value)
 
 
 def opening_advice(url: str, kind: type[Exception], number: int | None) -> str:
-    """Return what to do about a port that does not open."""
+    """Return advice for a port that does not open."""
     if kind is PortBusy:
-        return "another program holds it"
+        return "another program uses it; close that program"
     if number == errno.EACCES:
         return "no right to it: on Debian join the group dialout and log in again"
     if "://" in url:

@@ -1,11 +1,12 @@
-"""The contact probe's box: one method a command, units in and out, no policy.
+"""Driver of the contact probe: one method per command, physical units, no policy.
 
-A person puts the head on the skin. Light and suction need an armed box and end by themselves, at
-the latest after ``shutter_max_ms`` and ``suction_max_ms``; then the skin rests. An armed box that
-hears nothing for its lease shuts the shutter, puts the LED out, vents and disarms: renew the lease
-(`ProbeBox.listen`, or any question) while a camera looks. `ProbeBox.dark` and the closing of the
-driver do the same. Whatever vents, but `ProbeBox.vent` and the pump's own end, makes the box forget
-where the head sits: a person has to look, and `ProbeBox.place` has to say it anew.
+A person puts the head on the skin. Light and suction need an armed controller and end on their own,
+at the latest after ``shutter_max_ms`` and ``suction_max_ms``; then the skin rests. An armed
+controller that receives nothing during its lease closes the shutter, switches the LED off, vents
+and disarms: renew the lease (`ProbeBox.listen`, or any query) while a camera exposes.
+`ProbeBox.dark` and closing the driver do the same. Any venting except `ProbeBox.vent` and the
+pump's own end clears the placement: a person has to check the head, then `ProbeBox.place` has to be
+called again.
 """
 
 import math
@@ -19,38 +20,41 @@ SuctionEnd = Literal["timed", "asked", "low", "lost", "high", "gauge", "interloc
 _SHUTTER_ENDS_BY_WORD: dict[str, ShutterEnd] = {word.upper(): word for word in get_args(ShutterEnd)}
 _SUCTION_ENDS_BY_WORD: dict[str, SuctionEnd] = {word.upper(): word for word in get_args(SuctionEnd)}
 _VALVE_POLL_S = 0.1
-"""Silence between two renewals of the lease; shorter than the shortest lease."""
+"""Interval between two renewals of the lease, s; shorter than the shortest lease."""
 _VALVE_MARGIN_S = 2.0
-"""Longer than this over its own time no movement may take."""
+"""Largest time that a movement may take beyond its nominal duration, s."""
 
 
 @dataclass(frozen=True, slots=True)
 class ShutterOpening:
-    """One opening of the source's shutter, on the box's clock."""
+    """One opening of the source's shutter, on the controller's clock."""
 
     number: int
-    """Openings tried since the box was made, this one included."""
+    """Number of openings since manufacture, failed ones and this one included."""
     t_open_s: float
-    """When the blades had cleared the fibre and the camera's line was pulsed, s since power-up."""
+    """Time when the blades had cleared the fiber and the camera line was pulsed, s since power-up.
+    """
     ended: ShutterEnd
-    """open: not yet. timed: by its own end. asked: by `ProbeBox.close_shutter`, or the head was
-    taken off. pump: the suction ended. jam: the blades did not close, and the LED was put out.
-    interlock, dark: the box has let go of everything."""
+    """open: not ended yet. timed: by its own end. asked: by `ProbeBox.close_shutter`, or the head
+    was taken off. pump: the suction ended. jam: the blades did not close, and the LED was switched
+    off. interlock, dark: the controller has shut everything down.
+    """
     t_shut_s: float
-    """When its light ended, s since power-up; inf when not yet."""
+    """Time when its light ended, s since power-up; inf when not yet."""
 
 
 @dataclass(frozen=True, slots=True)
 class SuctionReport:
-    """How a time of suction ended."""
+    """Outcome of a period of suction."""
 
     number: int
-    """Times of suction since the box was made, this one included."""
+    """Number of suction periods since manufacture, this one included."""
     ended: SuctionEnd
     """timed: by its own end. asked: by `ProbeBox.vent`. low: not reached in time, so a leak or a
-    pump that does not turn. lost: it fell at once, the head has come off. high: the regulator does
-    not hold it. gauge: the gauge is dead. interlock, dark: the box has let go of everything. Only
-    the first two keep the place of the head."""
+    pump that does not turn. lost: it dropped at once, the head has come off. high: the regulator
+    does not hold it. gauge: the gauge has failed. interlock, dark: the controller has shut
+    everything down. Only the first two keep the placement of the head.
+    """
     suction_mbar: float
     """Last reading of the gauge before its end, mbar."""
     t_box_s: float
@@ -59,18 +63,18 @@ class SuctionReport:
 
 @dataclass(frozen=True, slots=True)
 class SuctionState:
-    """What the pump does now."""
+    """State of the pump."""
 
     on: bool
-    """Whether it sucks."""
+    """Whether the pump is on."""
     wanted_mbar: float
-    """What it was asked for, mbar; 0 when it is off."""
+    """Requested suction, mbar; 0 when the pump is off."""
     left_s: float
-    """Time to its own end, s, or of the skin's rest when it is off."""
+    """Time until the suction ends, s; when the pump is off, until the skin's rest ends."""
 
 
 class ProbeStatus(BoxStatus):
-    """The bits of ``STAT?``; what is lit is the source fibre."""
+    """Bits of ``STAT?``; the source of light is the source fiber."""
 
     __slots__ = ()
 
@@ -79,20 +83,21 @@ class ProbeStatus(BoxStatus):
     sucking = StatusBit(5)
     """Whether the pump is on."""
     placed = StatusBit(9)
-    """Whether a person has said where the head sits, and nothing has happened since."""
+    """Whether a person has confirmed the placement of the head, and it is still valid."""
     resting = StatusBit(10)
-    """Whether the skin has to rest yet."""
+    """Whether the skin still has to rest."""
     jammed = StatusBit(11)
     """Whether the shutter is stuck open."""
 
 
 class ProbeBox(Box):
-    """Driver of the contact probe's box; see `capture.devices.box.Box`.
+    """Driver of the contact probe's controller; see `capture.devices.box.Box`.
 
-    Its limits (``limits``): ``fibres``, ``level_steps``, ``shutter_min_ms``, ``shutter_max_ms``,
+    Keys of ``limits``: ``fibres``, ``level_steps``, ``shutter_min_ms``, ``shutter_max_ms``,
     ``shutter_lag_ms`` (command to open blades), ``cover_ms``, ``suction_min_mbar``,
-    ``suction_max_mbar``, ``suction_min_ms``, ``suction_max_ms``, ``reach_ms`` (by then the suction
-    must hold), ``rest_ms``, ``control_period_ms``, ``camera_c``, ``source_w``, ``dose_ws``.
+    ``suction_max_mbar``, ``suction_min_ms``, ``suction_max_ms``, ``reach_ms`` (time in which the
+    suction must be reached), ``rest_ms``, ``control_period_ms``, ``camera_c``, ``source_w``,
+    ``dose_ws``.
 
     One measurement::
 
@@ -114,7 +119,7 @@ class ProbeBox(Box):
     # head and suction -------------------------------------------------------------------------
 
     def place(self, site: str, angle_deg: float) -> None:
-        """Pass on where a person has put the head, and its turn about its own axis, 0 to 360.
+        """Report site and rotation (0 to 360 degrees about its axis) of the placed head.
 
         Raises
         ------
@@ -124,56 +129,56 @@ class ProbeBox(Box):
         self._port.ask(f"HEAD:SITE {site},{format_decimal('angle_deg', angle_deg, 6)}")
 
     def placement(self) -> tuple[str, float] | None:
-        """Return site and angle in degrees; None: nobody has said it since the head was let go."""
+        """Return site and angle in degrees of the placement; None when it is not valid."""
         return self._read_or_none("HEAD:SITE?", _placement, "a number")
 
     def take_away(self) -> None:
-        """Pass on that the head is taken off; it is vented and its place is forgotten."""
+        """Report that the head is taken off: the controller vents it and clears the placement."""
         self._port.ask("HEAD:FREE")
 
     def suck(self, mbar: float, seconds: float) -> int:
-        """Switch the pump on for `seconds` from now; return the number of this time of suction.
+        """Switch the pump on for `seconds` from now; return the number of this suction period.
 
-        It is accepted at once; `pressure_mbar` tells when the suction is there. A retry on the line
-        never begins it twice.
+        The command returns at once; poll `pressure_mbar` until the suction is reached. A repeated
+        request never starts it twice.
 
         Raises
         ------
         CommandRefused
-            Nothing was switched on: not armed (-203), 108 after the lease ran out, the head not
-            placed or the pump on (-213), the skin rests (103), beyond the limits (-222), the gauge
-            dead (-240), the emergency stop open (107).
+            Nothing was switched on: not armed (-203), lease expired (108), head not placed or pump
+            on (-213), the skin rests (103), beyond the limits (-222), gauge failed (-240),
+            emergency stop open (107).
         """
         span_ms = format_decimal("seconds", seconds * 1e3, 6)
         text = f"PUMP ON,{span_ms},{format_decimal('mbar', mbar, 6)}"
         return self._count(text, "the number of the suction", shown="PUMP ON")
 
     def vent(self) -> None:
-        """Switch the pump off and open the vent; the head stays placed, and the skin rests."""
+        """Switch the pump off and open the vent; the placement stays valid, and the skin rests."""
         self._port.ask("PUMP VENT")
 
     def suction(self) -> SuctionState:
-        """Return what the pump does."""
+        """Return the state of the pump."""
         return self._read("PUMP?", _suction_state, "ON,mbar,ms or REST,ms or VENT")
 
     def last_suction(self) -> SuctionReport | None:
-        """Return how the last suction ended, None when none has since power-up."""
+        """Return the outcome of the last suction, None when there was none since power-up."""
         return self._read_or_none("PUMP:LAST?", _suction_report, "number,END,mbar,us")
 
     def pressure_mbar(self) -> float:
-        """Return the suction under the head, mbar below the air's pressure; has noise."""
+        """Return the suction under the head, mbar below ambient pressure; has noise."""
         return self._number("PRES?")
 
     # light ------------------------------------------------------------------------------------
 
     def set_level(self, level: float) -> None:
-        """Drive the LED behind the closed shutter at 0 to 1 of full; the box sets thousandths.
+        """Drive the LED behind the closed shutter at 0 to 1 of full, in steps of 1/1000.
 
         Raises
         ------
         CommandRefused
-            Not armed (-203, 108), the shutter open (-213), the LED or the shutter dead (-240), the
-            emergency stop open (107). 0 is never refused.
+            Not armed (-203, 108), shutter open (-213), LED or shutter failed (-240), emergency stop
+            open (107). 0 is never refused.
         """
         steps = int(self.limits["level_steps"])
         if not 0.0 <= level <= 1.0:
@@ -181,22 +186,22 @@ class ProbeBox(Box):
         self._port.ask(f"LED {round(level * steps)}")
 
     def level(self) -> float:
-        """Return what the LED is driven at, 0 to 1 of full."""
+        """Return the drive level of the LED, 0 to 1 of full."""
         return self._number("LED?") / float(self.limits["level_steps"])
 
     def open_shutter(self, seconds: float) -> ShutterOpening:
-        """Open the shutter for `seconds`; the camera's line is pulsed when the blades are clear.
+        """Open the shutter for `seconds`; the camera line is pulsed when the blades are clear.
 
-        With the LED on it opens only while the head is held: an eye might be before the fibre.
-        Returns when it has opened. A retry on the line never opens it twice.
+        With the LED on it opens only while the head is held, because an eye might be in front of
+        the fiber. The call returns when the shutter is open. A repeated request never opens it
+        twice.
 
         Raises
         ------
         CommandRefused
-            Nothing opened: not armed (-203), 108 after the lease ran out, open already, the cover
-            moves, or the LED is on and the head not held (-213), beyond the limits (-222), the
-            blades stuck or made dark meanwhile (-240), the dose of light reached (104), the
-            emergency stop open (107).
+            Nothing opened: not armed (-203), lease expired (108), already open, cover moving, or
+            LED on and head not held (-213), beyond the limits (-222), blades stuck or made dark
+            meanwhile (-240), dose limit reached (104), emergency stop open (107).
         """
         span_ms = format_decimal("seconds", seconds * 1e3, 6)
         return self._read(
@@ -204,24 +209,24 @@ class ProbeBox(Box):
         )
 
     def close_shutter(self) -> None:
-        """Close the shutter before its own end; where it is stuck open, try to close it again."""
+        """Close the shutter early; when it is stuck open, try to close it again."""
         self._port.ask("SHUT CLOSE")
 
     def last_opening(self) -> ShutterOpening | None:
-        """Return the last opening and how it ended, None when there was none since power-up."""
+        """Return the last opening and its end, None when there was none since power-up."""
         return self._read_or_none("SHUT:LAST?", _opening, "number,END,us,us")
 
     def count_openings(self) -> int:
-        """Return how many openings were tried since the box was made."""
+        """Return the number of openings since manufacture, failed ones included."""
         return int(self._number("SHUT:COUN?"))
 
     def cover(self, fiber: int | None) -> None:
-        """Cover all detection fibres but number `fiber`, from 0; None: uncover all. Wait for it.
+        """Cover all detection fibers except number `fiber`, from 0, and wait; None: uncover all.
 
         Raises
         ------
         CommandRefused
-            While the shutter is open (-213), or without such a fibre (-222).
+            While the shutter is open (-213), or without such a fiber (-222).
         PortTimeout
             When the cover does not arrive.
         """
@@ -229,15 +234,15 @@ class ProbeBox(Box):
         self._wait(float(self.limits["cover_ms"]) / 1e3 + _VALVE_MARGIN_S)
 
     def uncovered_fiber(self) -> int | None:
-        """Return the number of the only fibre that is not covered; None: none is covered."""
+        """Return the number of the only uncovered fiber; None when none is covered."""
         return self._read("FIB?", lambda got: None if got == "ALL" else int(float(got)), "a number")
 
     def dose_ws(self) -> float:
-        """Return the light that went into this subject, Ws."""
+        """Return the light energy emitted into this subject, Ws."""
         return self._number("DOSE?")
 
     def new_subject(self, pseudonym: str) -> None:
-        """Begin to count the dose anew."""
+        """Restart the dose counter for a new subject."""
         self._port.ask(f"DOSE:NEW {pseudonym}")
 
     # camera -----------------------------------------------------------------------------------
@@ -247,20 +252,20 @@ class ProbeBox(Box):
         return self._number("CAM:TEMP?")
 
     def trigger_camera(self, token: str) -> float:
-        """Pulse the camera's line without light; return the box's time, s."""
+        """Pulse the camera line without light; return the controller's time, s."""
         return self._token_time("CAM:TRIG", token, shown=f"CAM:TRIG {token}")
 
     # time -------------------------------------------------------------------------------------
 
     def listen(self, seconds: float, *, every_s: float = _VALVE_POLL_S) -> None:
-        """Let `seconds` pass while the box does what it does: the lease is renewed.
+        """Wait for `seconds` while the controller holds its state: the lease is renewed.
 
         Parameters
         ----------
         seconds
-            How long, s.
+            Duration, s.
         every_s
-            Silence between two renewals, s; shorter than the lease.
+            Interval between two renewals, s; shorter than the lease.
         """
         self._keep_lease(seconds, every_s)
 

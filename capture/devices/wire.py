@@ -1,4 +1,4 @@
-"""The line format between host and box: framing, sequence numbers, checksum, codes; no I/O.
+"""Line format between host and controller: framing, sequence numbers, checksum, codes; no I/O.
 
 Three kinds of lines exist, each printable ASCII ended by a newline, at most 1024 bytes long::
 
@@ -7,9 +7,9 @@ Three kinds of lines exist, each printable ASCII ended by a newline, at most 102
     box -> host   !<number>:<boot> <NAME> <payload>*<CRC4>
 
 ``seq`` and ``number`` are decimal without leading zeros, 0 to 2**32 - 1; ``boot`` is the epoch that
-the box drew at power-up, four lower-case hexadecimal digits, with 0000 for "not known yet";
+the controller drew at power-up, four lower-case hexadecimal digits, with 0000 for "not known yet";
 ``CRC4`` is CRC-16/IBM-3740 of all bytes before its ``*``, four upper-case hexadecimal digits. One
-frame has exactly one encoding, so that a retry can be recognised by its bytes. Any other line is
+frame has exactly one encoding, so that a retry can be recognized by its bytes. Any other line is
 bare: people and foreign programs may send queries that way, never a command.
 """
 
@@ -23,7 +23,7 @@ MAX_LINE_BYTES = 1024
 """Longest line in bytes, its newline included."""
 MAX_SEQ = 2**32 - 1
 UNKNOWN_BOOT = 0
-"""Epoch of a host that has not said hello; no box ever draws it."""
+"""Epoch of a host before hello; no controller ever draws it."""
 
 _NUMBER_PATTERN = r"(0|[1-9][0-9]{0,9})"
 _FRAME_PATTERN = re.compile(rf"([@=!]){_NUMBER_PATTERN}:([0-9a-f]{{4}}) (.*)", re.DOTALL)
@@ -33,11 +33,11 @@ _CHECKSUM_PATTERN = re.compile(rb"\*[0-9A-F]{4}\Z")
 
 
 class BadFrame(ValueError):
-    """A line that is not exactly one frame; its number must not be guessed."""
+    """Raised for a line that is not exactly one frame; its number must not be guessed."""
 
 
 class Code(enum.IntEnum):
-    """What a box answers: 0 done, negative as SCPI defines them, positive ours."""
+    """Result codes of a controller: 0 done, negative as SCPI defines them, positive ours."""
 
     OK = 0
     SYNTAX = -102
@@ -83,7 +83,7 @@ class Request:
     seq: int
     """Sequence number, 0 to 2**32 - 1; a retry keeps it."""
     boot: int
-    """Epoch the host believes in, 0 to 65535; 0 before hello."""
+    """Epoch that the host assumes, 0 to 65535; 0 before hello."""
     text: str
     """Command and arguments, printable ASCII, not empty."""
 
@@ -102,11 +102,11 @@ class Reply:
     seq: int
     """Number of the request that is answered."""
     boot: int
-    """Epoch of the box, 1 to 65535."""
+    """Epoch of the controller, 1 to 65535."""
     code: int
     """0 done; any other value: refused, nothing was done (see `Code`)."""
     payload: str = ""
-    """Value asked for, or why it was refused; printable ASCII."""
+    """Requested value, or the reason of the refusal; printable ASCII."""
 
     def __post_init__(self) -> None:
         _check_counter("seq", self.seq)
@@ -118,12 +118,12 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something a box says unasked."""
+    """Message that a controller sends without a request."""
 
     number: int
-    """Counter of events since power-up, so that a lost one shows."""
+    """Counter of events since power-up, from which lost events are detected."""
     boot: int
-    """Epoch of the box, 1 to 65535."""
+    """Epoch of the controller, 1 to 65535."""
     name: str
     """Upper-case word, e.g. ``WDOG:TRIP``."""
     payload: str = ""
@@ -160,7 +160,7 @@ def seal(text: str) -> str:
 
 
 def unseal(sealed: str) -> str:
-    """Return the text that `seal` was given; raise `BadFrame` when it is damaged."""
+    """Return the text that `seal` has sealed; raise `BadFrame` when it is damaged."""
     data = sealed.encode("ascii", errors="replace")
     if _CHECKSUM_PATTERN.search(data) is None:
         raise BadFrame(f"checksum: got {sealed[-5:]!r} at the end, expected '*' and 4 hex digits")
@@ -202,7 +202,7 @@ def decode(line: bytes) -> Request | Reply | Event:
     Raises
     ------
     BadFrame
-        For anything that `encode` cannot have produced.
+        For any line that `encode` cannot have produced.
 
     Examples
     --------
@@ -234,19 +234,19 @@ def decode(line: bytes) -> Request | Reply | Event:
 
 
 def is_frame_like(line: bytes) -> bool:
-    """Tell whether a line is, or was before it was damaged, meant as a frame."""
+    """Return whether a line is a frame, or a damaged one."""
     return line[:1] in (b"@", b"=", b"!") or _CHECKSUM_PATTERN.search(line) is not None
 
 
 def next_seq(seq: int) -> int:
-    """Return the number after `seq`; it starts again at 0 after 2**32 - 1."""
+    """Return the number after `seq`, modulo 2**32."""
     return 0 if seq == MAX_SEQ else seq + 1
 
 
 class LineSplitter:
-    r"""Cut a byte stream into lines and drop what is too long, up to the next newline.
+    r"""Split a byte stream into lines and drop a line that is too long, up to the next newline.
 
-    One carriage return before the newline is taken off, because terminals send it.
+    One carriage return before the newline is removed, because terminals send it.
 
     Examples
     --------
@@ -263,7 +263,7 @@ class LineSplitter:
         self.overlong_lines = 0
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Return the lines that `data` completes, without their ends; empty lines are left out."""
+        """Return the lines that `data` completes, without their ends; empty lines are omitted."""
         lines = []
         *ended, rest = data.split(b"\n")
         for piece in ended:
@@ -276,7 +276,7 @@ class LineSplitter:
         return [line for line in lines if line]
 
     def clear(self) -> None:
-        """Forget a line that has begun."""
+        """Drop a line that has begun."""
         self._pending.clear()
         self._discarding = False
 

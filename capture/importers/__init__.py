@@ -1,4 +1,4 @@
-"""Foreign data into SESSION/: photographs stripped of what identifies people, scanned meshes."""
+"""Import foreign data into SESSION/: photographs without personal metadata, scanned meshes."""
 
 from capture.importers.image_stacks import ImageStackImport, import_light_list
 from capture.importers.images import Photo, PhotoError, read_photo

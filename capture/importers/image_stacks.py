@@ -1,4 +1,4 @@
-"""Pictures of one object under many lights into a closed SESSION/."""
+"""Import images of one object under many lights into a closed SESSION/."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -32,22 +32,22 @@ Encoding = Literal["auto", "sRGB", "linear"]
 LIGHT_LIST_RIG_NAME = "light-list"
 N_SAMPLE_POINTS = 3000
 LINEAR_MISFIT_RATIO = 0.8
-"""Linear values are believed when they leave less than this part of the misfit."""
+"""Values count as linear when their misfit is below this fraction of the sRGB misfit."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImageStackImport:
-    """What an import of pictures with a light list made."""
+    """Result of an import of images with a light list."""
 
     path: str
     """The SESSION/ folder."""
     frames: int
     lights: str
-    """Where the lights are from: file or folder, and kind."""
+    """Source of the lights: file or folder, and kind."""
     encoding: str
-    """How the values were read: "raw", "linear" or "sRGB"."""
+    """Interpretation of the values: "raw", "linear" or "sRGB"."""
     mask: str
-    """Name of the mask's file, empty where there is none."""
+    """Name of the mask's file, empty when there is none."""
     assumed: list[str]
 
 
@@ -62,26 +62,26 @@ def import_light_list(
     subject: SubjectRecord | None = None,
     now: Callable[[], datetime] | None = None,
 ) -> ImageStackImport:
-    """Turn pictures of one object under many lights into a closed session; all, or none.
+    """Import images of one object under many lights into a closed session; all, or none.
 
     Parameters
     ----------
     directory : str or Path
-        Folder of the pictures, in any format that `read_photo` takes; see `light_lists.find`.
+        Folder of the images, in any format that `read_photo` reads; see `light_lists.find`.
     out : str or Path
         The new SESSION/ folder.
     lights : str or Path, optional
-        Light list or folder of a chrome ball, where it is not found by itself.
+        Light list or folder of a chrome ball; default: found in the folder.
     mask : str or Path, optional
-        Picture that is bright where the object is; default the folder's own ``*mask*``.
+        Image that is bright where the object is; default the folder's own ``*mask*``.
     encoding : {"auto", "sRGB", "linear"}
-        Of 8-bit and PNG values. "auto" reads them as linear where three images explain the others
-        clearly better so, as light that adds up must.
+        Encoding of 8-bit and PNG values. "auto" reads them as linear when three images then predict
+        the others clearly better, because light adds up linearly.
     mm_per_px : float, optional
-        Size of a pixel at the object: then the list's rows are positions in mm around the
-        picture's middle, and the lights count as near.
+        Size of a pixel at the object: then the list's rows are positions in mm around the image's
+        center, and the lights are near.
     subject : Subject, optional
-        What is shown; default an unnamed one.
+        Subject of the images; default an unnamed one.
     now : callable, optional
         Clock, returns a time with its zone.
 
@@ -92,9 +92,9 @@ def import_light_list(
     Raises
     ------
     LightListError, PhotoError
-        Naming what does not fit; then nothing is written.
+        When the input is invalid; the message names the fault, and nothing is written.
     SessionError
-        Where `out` is not free.
+        When `out` is not free.
     """
     clock = now or (lambda: datetime.now(UTC))
     if encoding not in ("auto", "sRGB", "linear"):
@@ -102,9 +102,9 @@ def import_light_list(
     found = light_lists.find_light_list(Path(directory), lights=Path(lights) if lights else None)
     if len(found.images) < 3:
         raise LightListError(
-            "has too few pictures",
+            "has too few images",
             where=str(directory),
-            faults=[Fault("pictures", str(len(found.images)), "at least 3, one a light")],
+            faults=[Fault("pictures", str(len(found.images)), "at least 3, one per light")],
         )
     near = mm_per_px is not None
     if mm_per_px is not None and not 0 < mm_per_px < 1e3:
@@ -145,13 +145,13 @@ def import_light_list(
 
 
 def _pixel_shape(frame: raw.RawFrame) -> tuple[int, int]:
-    """Return rows and columns of an imported picture: a 2 x 2 cell is one pixel, unless MONO."""
+    """Return rows and columns of an imported image: a 2 x 2 cell is one pixel, unless MONO."""
     height, width = frame.cfa.shape
     return (height, width) if frame.pattern == "MONO" else (height // 2, width // 2)
 
 
 def _encode_srgb(linear: FloatArray) -> FloatArray:
-    """Return display values of linear light in [0, 1], IEC 61966-2-1.
+    """Encode linear light in [0, 1] as display values, IEC 61966-2-1.
 
     Examples
     --------
@@ -162,7 +162,7 @@ def _encode_srgb(linear: FloatArray) -> FloatArray:
 
 
 def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, dict[str, None]]:
-    """Read every picture once; return samples (N, P) over white, the first photo, and its notes."""
+    """Read every image once; return samples (N, P) over white, the first photo, and its notes."""
     rows, notes, faults = [], {}, []
     first: Photo | None = None
     chosen: NDArray[np.intp] | None = None
@@ -187,16 +187,16 @@ def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, d
         rows.append(gray.astype(np.float64) / frame.white)
     if faults or first is None:
         raise PhotoError(
-            "pictures differ",
+            "images differ",
             where=str(found.images[0].parent),
             faults=faults,
-            advice="All pictures must be of one camera and one setting.",
+            advice="All images must be of one camera and one setting.",
         )
     return np.array(rows), first, notes
 
 
 def _is_linear_despite_encoding(samples: Float64Array, found: LightList) -> bool:
-    """Return whether the files' values obey the shading better than the light they should code."""
+    """Return whether the stored values fit the shading model better than their decoded light."""
     decoded = np.clip(samples, 0.0, 1.0)
     codes = np.asarray(_encode_srgb(decoded))
     return _misfit(codes, found.directions) < LINEAR_MISFIT_RATIO * _misfit(
@@ -205,7 +205,7 @@ def _is_linear_despite_encoding(samples: Float64Array, found: LightList) -> bool
 
 
 def _misfit(samples: FloatArray, directions: Float64Array) -> float:
-    """Return the mean residual of a matte shading, bright samples first, over the mean."""
+    """Return the mean residual of a matte shading over the mean, from the brightest samples."""
     lit = samples[:, samples.mean(axis=0) > 0.02]
     if lit.shape[1] < 10 or len(lit) < 4:
         return 1.0
@@ -231,7 +231,7 @@ def _list_assumptions(
     if found.intensity is None:
         texts.append("all lights are of one strength, over the exposure where files state it")
     if found.kind != "lp":
-        texts.append("the lights are in the order of the pictures' names, counted as people do")
+        texts.append("the lights are in the order of the images' names, numbers sorted by value")
     return texts
 
 

@@ -1,4 +1,4 @@
-"""One photograph, of whatever format, as a raw frame of linear values without its metadata."""
+"""Read a photograph of any format as a raw frame of linear values without its metadata."""
 
 import struct
 import zlib
@@ -19,10 +19,11 @@ MAX_IMAGE_BYTES = 2**30
 MAX_IMAGE_PIXELS = 2**26  # four raw cells each: the largest frame a session takes
 MAX_IMAGE_SIDE_PX = 32_767
 WHITE_DN = 65_535
-FLOAT_BLACK_DN = 1_024  # room for the negative values of floating-point pictures
-FLOAT_HEADROOM = 1.02  # nothing in a floating-point picture saturates, so its top stays below white
+FLOAT_BLACK_DN = 1_024  # room for the negative values of floating-point images
+FLOAT_HEADROOM = 1.02  # floating-point images do not saturate, so their maximum stays below white
 
-# What nothing in a picture tells: electrons at full scale and read noise of a small camera sensor
+# Assumed noise of a small camera sensor, which image files do not record: electrons at full scale
+# and read noise.
 ASSUMED_FULL_WELL_E = 20_000.0
 ASSUMED_READ_NOISE_E = 10.0
 
@@ -30,12 +31,12 @@ _JPEG_MAGIC, _PNG_MAGIC, _EXR_MAGIC = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"\
 _TIFF_MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _TIFF_SUFFIXES = (".tif", ".tiff")
 _FORMAT_NAMES = {".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG", ".exr": "OpenEXR"}
-"""What a file of that name, which is none and no raw file either, was meant to be."""
+"""Kinds of files by suffix, for the message about a file that cannot be decoded."""
 _IMAGE_ADVICE = "Give the photograph as the camera or the raw converter wrote it."
 
 
 class PhotoError(InputError):
-    """A photograph, or a folder of them, that cannot be imported."""
+    """Raised for a photograph, or a folder of them, that cannot be imported."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +44,14 @@ class Photo:
     """A decoded photograph."""
 
     frame: raw.RawFrame
-    """Linear values; a picture's pixel is one 2 x 2 cell, which "superpixel" gives back exactly.
-    Holds no time, place, serial number or owner."""
+    """Linear values; an image's pixel is one 2 x 2 cell, which "superpixel" restores exactly.
+    Contains no time, location, serial number or owner.
+    """
     encoding: Encoding
-    """What the file held: raw sensor values, linear light, or display values that were decoded."""
+    """Encoding of the file: raw sensor values, linear light, or display values that were decoded.
+    """
     notes: tuple[str, ...] = ()
-    """What was assumed or lost, one sentence each."""
+    """Assumptions and losses, one sentence each."""
 
 
 def read_photo(path: str | Path) -> Photo:
@@ -68,7 +71,7 @@ def read_photo(path: str | Path) -> Photo:
     Raises
     ------
     PhotoError
-        Where the file is missing, empty, cut short, too large, or no photograph.
+        When the file is missing, empty, truncated, too large, or not a photograph.
     """
     file = Path(path)
     where = str(file)
@@ -85,7 +88,7 @@ def read_photo(path: str | Path) -> Photo:
 
 
 def _decode_srgb(values: FloatArray) -> FloatArray:
-    """Return linear light of display values in [0, 1], IEC 61966-2-1.
+    """Decode display values in [0, 1] to linear light, IEC 61966-2-1.
 
     Examples
     --------
@@ -96,7 +99,7 @@ def _decode_srgb(values: FloatArray) -> FloatArray:
 
 
 def _rgb_to_mosaic(rgb: UInt16Array) -> UInt16Array:
-    """Return an RGGB frame, (2H, 2W), each of whose 2 x 2 cells is one pixel of an RGB picture.
+    """Return an RGGB frame, (2H, 2W), each of whose 2 x 2 cells is one pixel of an RGB image.
 
     Examples
     --------
@@ -119,7 +122,7 @@ def _error(what: str, where: str, path: str, got: str, expected: str) -> PhotoEr
 def _head(file: Path, where: str) -> bytes:
     try:
         if not file.is_file():
-            raise _error("is no file", where, "file", "nothing or a folder", "a photograph")
+            raise _error("is not a file", where, "file", "nothing or a folder", "a photograph")
         size = file.stat().st_size
         if size == 0:
             raise _error("is empty", where, "size", "0 bytes", "a photograph")
@@ -140,7 +143,7 @@ def _check_size(width: int, height: int, where: str) -> None:
         or (width * height > MAX_IMAGE_PIXELS)
     ):
         raise _error(
-            "is absurd in size",
+            "is implausible in size",
             where,
             "size",
             f"{width} x {height} pixels",
@@ -166,9 +169,9 @@ def _raw(file: Path, where: str) -> Photo:
         if (kind := _FORMAT_NAMES.get(file.suffix.lower())) is not None:
             begins = repr(file.read_bytes()[:4])
             expected = f"those of a {kind}"
-            raise _error(f"is no {kind}", where, "first bytes", begins, expected) from exc
+            raise _error(f"is not a {kind}", where, "first bytes", begins, expected) from exc
         raise PhotoError(exc.what, where=where, faults=exc.faults, advice=_IMAGE_ADVICE) from exc
-    except NotImplementedError as exc:  # LibRaw's word for a filter array it cannot describe
+    except NotImplementedError as exc:  # LibRaw's code for a filter array that it cannot describe
         raise _error("has an unknown filter array", where, "cell", str(exc), "2 x 2") from exc
     notes = []
     if frame.noise_profile is None:
@@ -177,7 +180,7 @@ def _raw(file: Path, where: str) -> Photo:
         notes.append(NOISE_NOTE)
     if frame.neutral is None and frame.pattern != "MONO":
         notes.append("the file names no white balance, so its channels count as balanced")
-    # what identifies people, places and owners stays behind
+    # metadata that identify people, places and owners are dropped
     frame = replace(
         frame, camera_serial="", captured_at=None, step_id="", session_id="", light={}, path=""
     )
@@ -213,16 +216,16 @@ def _display(file: Path, where: str, what: str, notes: list[str]) -> Photo:
 def _from_display(pixels: NDArray[Any], where: str, notes: list[str]) -> Photo:
     """Decode 8- or 16-bit display values, (H, W) or (H, W, 3)."""
     if pixels.dtype not in (np.uint8, np.uint16):
-        raise _error("is of no known depth", where, "samples", str(pixels.dtype), "8 or 16 bit")
+        raise _error("has an unknown depth", where, "samples", str(pixels.dtype), "8 or 16 bit")
     codes = 256 if pixels.dtype == np.uint8 else 65_536
     table = np.rint(WHITE_DN * _decode_srgb(np.arange(codes) / (codes - 1))).astype(np.uint16)
     if pixels.ndim == 3 and (pixels == pixels[..., :1]).all():
         pixels = pixels[..., 0]
-        notes = [*notes, "the picture is gray, so that it holds no color to estimate from"]
+        notes = [*notes, "the image is gray and contains no color to estimate from"]
     depth = "8" if codes == 256 else "16"
     notes = [
-        f"{depth}-bit display values were decoded by the sRGB curve; what the camera did to tone"
-        " and color before is not undone",
+        f"{depth}-bit display values were decoded by the sRGB curve; the camera's tone and "
+        "color processing before is not undone",
         *notes,
         NOISE_NOTE,
     ]
@@ -230,7 +233,7 @@ def _from_display(pixels: NDArray[Any], where: str, notes: list[str]) -> Photo:
 
 
 def _check_png(data: bytes, where: str) -> tuple[str, list[str]]:
-    """Walk the chunks of a PNG: sizes, checksums, end."""
+    """Check the chunks of a PNG: sizes, checksums, end."""
     at = 8
     kinds: set[bytes] = set()
     notes: list[str] = []
@@ -264,7 +267,7 @@ _JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def _check_jpeg(data: bytes, where: str) -> tuple[str, list[str]]:
-    """Walk the segments of a JPEG up to its scan, and look for the end of that."""
+    """Check the segments of a JPEG up to its scan, and the end of the scan."""
     at, notes, sized = 2, [], False
     cut = _error("is cut short", where, "JPEG", f"{len(data)} bytes", "a whole file")
     while True:
@@ -299,7 +302,7 @@ def _check_jpeg(data: bytes, where: str) -> tuple[str, list[str]]:
 
 
 def _linear(pixels: NDArray[Any], where: str, notes: list[str]) -> Photo:
-    """Store linear whole numbers as they are, floating-point values on a scale of their own."""
+    """Store linear integers unchanged, and floating-point values on a scale of their own."""
     if pixels.dtype == np.uint16:
         return Photo(_frame(pixels, 0), "linear", (*notes, NOISE_NOTE))
     values = pixels.astype(np.float64)
@@ -313,20 +316,20 @@ def _linear(pixels: NDArray[Any], where: str, notes: list[str]) -> Photo:
     if (dn < 0).any():
         notes.append(f"{int((dn < 0).sum())} values far below zero were raised to the lowest level")
     if not known.all():
-        notes.append(f"{int((~known).sum())} values that are no numbers count as saturated")
+        notes.append(f"{int((~known).sum())} values that are not numbers count as saturated")
     stored = np.where(known, np.clip(dn, 0, WHITE_DN - 1), WHITE_DN).astype(np.uint16)
     return Photo(_frame(stored, FLOAT_BLACK_DN), "linear", (*notes, NOISE_NOTE))
 
 
 def _channels(pixels: NDArray[Any], where: str, notes: list[str]) -> NDArray[Any]:
-    """Return (H, W) or (H, W, 3) of whatever a file holds."""
+    """Return any decoded array as (H, W) or (H, W, 3)."""
     squeezed = pixels[..., 0] if pixels.ndim == 3 and pixels.shape[2] == 1 else pixels
     if squeezed.ndim == 3 and squeezed.shape[2] == 4:
         notes.append("transparency was dropped")
         squeezed = squeezed[..., :3]
     if squeezed.ndim != 2 and not (squeezed.ndim == 3 and squeezed.shape[2] == 3):
         raise _error(
-            "is no picture", where, "shape", str(pixels.shape), "(H, W), (H, W, 3) or (H, W, 4)"
+            "is not an image", where, "shape", str(pixels.shape), "(H, W), (H, W, 3) or (H, W, 4)"
         )
     return squeezed
 
@@ -363,7 +366,7 @@ def _tiff(file: Path, where: str) -> Photo:
         ZeroDivisionError,
     ) as exc:
         got = str(exc).splitlines()[0][:120] if str(exc) else type(exc).__name__
-        raise _error("is no readable TIFF", where, "TIFF", got, "an uncompressed TIFF") from exc
+        raise _error("is not a readable TIFF", where, "TIFF", got, "an uncompressed TIFF") from exc
     if pages > 1:
         notes.append(f"only the first of {pages} pages was taken")
     if planar:
@@ -375,7 +378,7 @@ def _tiff(file: Path, where: str) -> Photo:
         return _from_display(pixels, where, notes)
     if pixels.dtype == np.uint16 or np.issubdtype(pixels.dtype, np.floating):
         return _linear(pixels, where, [*notes, "the TIFF's values count as linear light"])
-    raise _error("is of no known depth", where, "samples", str(pixels.dtype), "8, 16 bit or float")
+    raise _error("has an unknown depth", where, "samples", str(pixels.dtype), "8, 16 bit or float")
 
 
 def _exr(file: Path, where: str) -> Photo:
@@ -396,10 +399,10 @@ def _exr(file: Path, where: str) -> Photo:
         raise _error("is damaged", where, "OpenEXR", got, "a whole OpenEXR file") from exc
     names = next((n for n in (("R", "G", "B"), ("Y",)) if set(n) <= set(channels)), None)
     if names is None:
-        raise _error("holds no picture", where, "channels", ", ".join(sorted(channels)), "R, G, B")
+        raise _error("contains no image", where, "channels", ", ".join(sorted(channels)), "R, G, B")
     if left := sorted(set(channels) - set(names)):
-        notes.append(f"channels {', '.join(left)} were left out")
+        notes.append(f"channels {', '.join(left)} were omitted")
     planes = [channels[name].astype(np.float32) for name in names]
     if any(plane.shape != (height, width) for plane in planes):
-        raise _error("holds no picture", where, "channels", "different sizes", "one size")
+        raise _error("contains no image", where, "channels", "different sizes", "one size")
     return _linear(planes[0] if len(planes) == 1 else np.stack(planes, axis=-1), where, notes)

@@ -1,4 +1,4 @@
-"""The session of imported pictures: appears whole or not at all; its camera is a stand-in."""
+"""Create the session of imported images, complete or not at all, with a placeholder camera."""
 
 import hashlib
 import shutil
@@ -17,18 +17,18 @@ from capture.rig import Light, Rig, Vector, View
 from capture.session import Session, SessionDiskError, SubjectRecord
 
 SENSOR_MM = 36.0
-"""Width of the full-frame sensor that stands in for an unknown one."""
+"""Width of the full-frame sensor that is assumed for an unknown one."""
 DISTANCE_MM = 1000.0
-"""Distance of a camera, or of a light, that nobody measured."""
+"""Assumed distance of a camera or a light whose distance was not measured."""
 
 
 def make_placeholder_view(frame: RawFrame, **known: Any) -> View:
-    """Return a view that fits a picture of which only the frame is known.
+    """Return a view for an image of which only the frame is known.
 
     Parameters
     ----------
     frame
-        The picture.
+        Frame of the image.
     **known
         Other fields of the view.
     """
@@ -57,18 +57,18 @@ def make_placeholder_view(frame: RawFrame, **known: Any) -> View:
 
 
 def make_placeholder_light(name: str, position_mm: Vector, illuminant: str, **known: Any) -> Light:
-    """Return a light of which nothing but its place and color is known."""
+    """Return a light of which only position and color are known."""
     about = {"illuminant": illuminant, "energy_ws": 1.0, "radius_mm": 1.0, **known}
     return Light(name=name, position_mm=position_mm, **about)
 
 
 def make_placeholder_rig(name: str, lights: Sequence[Light], *views: View) -> Rig:
-    """Return a rig without boxes."""
+    """Return a rig without controllers."""
     return Rig(name=name, lights=tuple(lights), views=views, boxes=(), recycle_s=0.0)
 
 
 def hash_file(file: Path) -> str:
-    """Return the digest of a file's bytes, with its algorithm's name before it."""
+    """Return the digest of a file's bytes, prefixed with its algorithm's name."""
     return f"sha256:{hashlib.sha256(file.read_bytes()).hexdigest()}"
 
 
@@ -81,14 +81,14 @@ def create_imported_session(
     extra: Mapping[str, Any],
     clock: Callable[[], datetime],
 ) -> Iterator[Session]:
-    """Make a session at ``target`` that is closed at the end, or none.
+    """Create a session at ``target`` that is closed at the end; on failure nothing is kept.
 
     Raises
     ------
     PhotoError
         Unless ``target`` is a new or empty folder.
     SessionDiskError
-        Where the disk refuses; nothing is kept.
+        When the disk refuses; nothing is kept.
     """
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise PhotoError(

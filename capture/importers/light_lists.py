@@ -1,4 +1,4 @@
-"""Light lists of the field: .lp, lights.txt, light_directions.txt, chrome balls.
+"""Read light lists in use in the field: .lp, lights.txt, light_directions.txt, chrome balls.
 
 Directions are towards the lights: x right, y up, z towards the camera, as .lp files have them.
 """
@@ -25,25 +25,25 @@ IMAGE_SUFFIXES = frozenset(
 BALL_FOLDER_NAMES = ("chrome", "ball", "sphere", "mirror")
 MAX_LIGHTS = 10_000
 UNIT_LENGTH_RANGE = (0.98, 1.02)
-"""Lengths up to which the rows of a list count as directions rounded in the file."""
+"""Range of lengths in which the rows of a list count as rounded unit vectors."""
 
 
 class LightListError(InputError):
-    """A light list, or a folder of pictures with one, that cannot be imported."""
+    """Raised for a light list, or a folder of images with one, that cannot be imported."""
 
 
 @dataclass(frozen=True, slots=True)
 class LightList:
-    """Lights in the order of the pictures."""
+    """Lights in the order of the images."""
 
     images: tuple[Path, ...]
     vectors: Float64Array
     """(N, 3), as in the file: unit vectors, or positions."""
     kind: Kind
     file: str
-    """Name of the file or folder they are from."""
+    """Name of the file or folder of the list."""
     intensity: Float64Array | None = None
-    """(N, 3), relative strength per channel, where the folder has it."""
+    """(N, 3), relative strength per channel, where the folder gives it."""
 
     @property
     def directions(self) -> Float64Array:
@@ -58,11 +58,11 @@ class LightList:
 
 
 def natural_sort_key(name: str) -> tuple[tuple[int, int | str], ...]:
-    """Return a key that sorts names as people count: 2 before 10.
+    """Return a sort key that orders numbers in names by value: 2 before 10.
 
     Examples
     --------
-    >>> sorted(["b.10.write_png", "b.2.write_png", "a.write_png"], key=natural_sort_key)
+    >>> sorted(["b.10.png", "b.2.png", "a.png"], key=natural_sort_key)
     ['a.png', 'b.2.png', 'b.10.png']
     """
     parts = re.split(r"(\d+)", name.casefold())
@@ -70,15 +70,15 @@ def natural_sort_key(name: str) -> tuple[tuple[int, int | str], ...]:
 
 
 def find_light_list(directory: Path, *, lights: Path | None = None) -> LightList:
-    """Find the pictures of a folder and the lights they were taken under.
+    """Find the images of a folder and the lights under which they were taken.
 
     Parameters
     ----------
     directory : Path
-        The folder of the pictures, or one above it that holds a single such folder.
+        The folder of the images, or one above it that contains a single such folder.
     lights : Path, optional
-        A .lp file, a text file of directions, or a folder of a chrome ball; default: what is found
-        in the folder or beside it, in that order.
+        A .lp file, a text file of directions, or a folder of a chrome ball; default: the one found
+        in the folder or next to it, in that order.
 
     Returns
     -------
@@ -87,17 +87,17 @@ def find_light_list(directory: Path, *, lights: Path | None = None) -> LightList
     Raises
     ------
     LightListError
-        Where there are no pictures or no lights, or their numbers or names do not fit.
+        When images or lights are missing, or their numbers or names do not match.
     """
     if not directory.is_dir():
         raise LightListError(
-            "there is no such folder", where=str(directory), advice="Name a folder of pictures."
+            "folder not found", where=str(directory), advice="Name a folder of images."
         )
     directory, source = _folder(directory), lights or None
     if source is None:
         source = _source(directory)
     if not source.exists():
-        raise LightListError("there is no such light list", where=str(source))
+        raise LightListError("light list not found", where=str(source))
     if source.is_dir():
         pictures = _images_in(directory)
         return LightList(pictures, _from_ball(source, len(pictures)), "chrome ball", source.name)
@@ -107,9 +107,9 @@ def find_light_list(directory: Path, *, lights: Path | None = None) -> LightList
 
 
 def _images_in(directory: Path) -> tuple[Path, ...]:
-    """Return the pictures of a folder in natural order, without its masks.
+    """Return the images of a folder in natural order, without its masks.
 
-    A ``filenames.txt`` names them in its own order.
+    A ``filenames.txt`` lists them in its own order.
     """
     listed = directory / "filenames.txt"
     if listed.is_file():
@@ -121,18 +121,18 @@ def _images_in(directory: Path) -> tuple[Path, ...]:
 
 
 def _is_mask(file: Path) -> bool:
-    """Return whether a picture's name says that it is a mask.
+    """Return whether an image is a mask by its name.
 
     Examples
     --------
-    >>> _is_mask(Path("buddha.mask.write_png")), _is_mask(Path("damask.write_png"))
+    >>> _is_mask(Path("buddha.mask.png")), _is_mask(Path("damask.png"))
     (True, False)
     """
     return "mask" in re.split(r"[^a-z]+", file.stem.lower())
 
 
 def find_mask(directory: Path) -> Path | None:
-    """Return the mask of a folder of pictures, None where it has none or several."""
+    """Return the mask of a folder of images, None when it has none or several."""
     found = [f for f in directory.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES and _is_mask(f)]
     return found[0] if len(found) == 1 else None
 
@@ -143,12 +143,12 @@ def read_mask(path: Path, shape: tuple[int, int]) -> BoolArray:
     Raises
     ------
     LightListError
-        Where it is of another size than the pictures, or black.
+        When its size differs from the images', or it is black.
     """
     values = to_gray(read_photo(path).frame)
     if values.shape != shape:
         got, wanted = f"{values.shape[1]} x {values.shape[0]}", f"{shape[1]} x {shape[0]}"
-        raise LightListError.at("does not fit the pictures", "mask", got, wanted, where=path)
+        raise LightListError.at("does not fit the images", "mask", got, wanted, where=path)
     top = float(values.max())
     if top <= 0:
         raise LightListError("is black", where=str(path), faults=[Fault("mask", "no pixel", "one")])
@@ -156,7 +156,7 @@ def read_mask(path: Path, shape: tuple[int, int]) -> BoolArray:
 
 
 def to_gray(frame: RawFrame) -> Float32Array:
-    """Return the mean of an imported picture's channels, (H, W), DN; each 2 x 2 cell is a pixel."""
+    """Return the mean of an imported image's channels, (H, W), DN; each 2 x 2 cell is a pixel."""
     cells = frame.cfa.astype(np.float32)
     if frame.pattern == "MONO":
         return cells
@@ -166,7 +166,7 @@ def to_gray(frame: RawFrame) -> Float32Array:
 
 
 def _folder(directory: Path) -> Path:
-    """Return the folder of the pictures: this one, or the only one below that is no ball's."""
+    """Return the folder of the images: this one, or its only subfolder without a chrome ball."""
     if _images_in(directory):
         return directory
     below = [
@@ -175,12 +175,12 @@ def _folder(directory: Path) -> Path:
         if folder.is_dir() and not _is_ball(folder) and _images_in(folder)
     ]
     if len(below) != 1:
-        got = ", ".join(folder.name for folder in below) or "no pictures"
+        got = ", ".join(folder.name for folder in below) or "no images"
         raise LightListError(
-            "is no folder of one object under many lights",
+            "is not a folder of one object under many lights",
             where=str(directory),
-            faults=[Fault("folders with pictures", got, "one")],
-            advice="Name the folder that holds the object's pictures.",
+            faults=[Fault("folders with images", got, "one")],
+            advice="Name the folder that contains the object's images.",
         )
     return below[0]
 
@@ -197,7 +197,7 @@ def _source(directory: Path) -> Path:
                 "has several light lists",
                 where=str(folder),
                 faults=[Fault("*.lp", ", ".join(f.name for f in lists), "one")],
-                advice="Say which with --lights.",
+                advice="Name one with --lights.",
             )
         for candidate in (*lists, folder / "light_directions.txt", folder / "lights.txt"):
             if candidate.is_file():
@@ -210,7 +210,7 @@ def _source(directory: Path) -> Path:
         "has no light list",
         where=str(directory),
         faults=[Fault("lights", "none", "*.lp, lights.txt, light_directions.txt or chrome/")],
-        advice="Put one beside the pictures, or name it with --lights.",
+        advice="Put one next to the images, or name it with --lights.",
     )
 
 
@@ -220,7 +220,7 @@ def _text(path: Path) -> str:
     except OSError as exc:
         raise LightListError(f"cannot be read: {exc.strerror}", where=str(path)) from exc
     if len(data) > 2**24 or b"\0" in data:
-        raise LightListError("is no light list", where=str(path))
+        raise LightListError("is not a light list", where=str(path))
     return data.decode("utf-8-sig", "replace")
 
 
@@ -232,7 +232,7 @@ def _vector(words: Sequence[str], where: str) -> list[float]:
     if len(vector) != 3 or not all(map(math.isfinite, vector)) or not any(vector):
         got = " ".join(words)[:60] or "nothing"
         raise LightListError(
-            "is no light list", where=where, faults=[Fault("light", got, "three numbers x y z")]
+            "is not a light list", where=where, faults=[Fault("light", got, "three numbers x y z")]
         )
     return vector
 
@@ -243,9 +243,9 @@ def _from_lp(path: Path, directory: Path) -> LightList:
     count = int(lines[0]) if lines and re.fullmatch(r"\d+", lines[0]) else None
     rows = lines[1:] if count is not None else lines
     if not rows or (count is not None and count != len(rows)) or len(rows) > MAX_LIGHTS:
-        expected = "one line a picture" if count is None else f"{count}, as its first line says"
+        expected = "one line per image" if count is None else f"{count}, as in its first line"
         raise LightListError.at(
-            "is no complete light list", "lines", str(len(rows)), expected, where=path
+            "is not a complete light list", "lines", str(len(rows)), expected, where=path
         )
     pictures, vectors = [], []
     for number, row in enumerate(rows, start=1 if count is None else 2):
@@ -254,12 +254,12 @@ def _from_lp(path: Path, directory: Path) -> LightList:
         vectors.append(_vector(words[-3:], where))
         pictures.append(_find_image_file(" ".join(words[:-3]), directory, path))
     if len(set(pictures)) < len(pictures):
-        raise LightListError("names a picture twice", where=str(path))
+        raise LightListError("contains an image twice", where=str(path))
     return LightList(tuple(pictures), np.array(vectors), "lp", path.name)
 
 
 def _find_image_file(name: str, directory: Path, source: Path) -> Path:
-    """Return the file an entry means: by name, without its folder, or with another suffix."""
+    """Return the file of an entry: by name, without its folder, or with another suffix."""
     base = re.split(r"[\\/]", name)[-1]
     files = {file.name.casefold(): file for file in directory.iterdir() if file.is_file()}
     if base.casefold() in files:
@@ -273,32 +273,32 @@ def _find_image_file(name: str, directory: Path, source: Path) -> Path:
     if len(alike) == 1:
         return alike[0]
     raise LightListError(
-        "names a picture that is not there",
+        "names a missing image",
         where=str(source),
         faults=[Fault("picture", repr(name), f"a file in {directory}")],
     )
 
 
 def _from_text(path: Path, directory: Path) -> LightList:
-    """Read rows x y z, after a count or not, for the pictures in their natural order."""
+    """Read rows x y z, with or without a count, for the images in their natural order."""
     rows = [line.split() for line in _text(path).splitlines() if line.split()]
     count = None
     if rows and len(rows[0]) == 1 and rows[0][0].isdigit():
         count, rows = int(rows[0][0]), rows[1:]
     if len(rows) > MAX_LIGHTS or (count is not None and count != len(rows)):
         raise LightListError(
-            "is no complete light list",
+            "is not a complete light list",
             where=str(path),
-            faults=[Fault("lines", str(len(rows)), f"{count}, as its first line says")],
+            faults=[Fault("lines", str(len(rows)), f"{count}, as in its first line")],
         )
     vectors = np.array([_vector(row, f"{path}, light {k + 1}") for k, row in enumerate(rows)])
     pictures = _images_in(directory)
     if len(pictures) != len(rows):
         raise LightListError(
-            "does not fit the pictures",
+            "does not fit the images",
             where=str(path),
-            faults=[Fault("lights", str(len(rows)), f"{len(pictures)}, one a picture")],
-            advice="Move pictures that are none of the series away, or name the mask *mask*.",
+            faults=[Fault("lights", str(len(rows)), f"{len(pictures)}, one per image")],
+            advice="Move images that do not belong to the series away, or name the mask *mask*.",
         )
     strengths = directory / "light_intensities.txt"
     intensity = None
@@ -321,9 +321,9 @@ def _from_ball(folder: Path, count: int) -> Float64Array:
 
     pictures, mask = _images_in(folder), find_mask(folder)
     if len(pictures) != count or mask is None:
-        got = f"{len(pictures)} pictures, {'a' if mask else 'no'} mask"
+        got = f"{len(pictures)} images, {'a' if mask else 'no'} mask"
         raise LightListError.at(
-            "does not fit the pictures", "ball", got, f"{count} pictures and one mask", where=folder
+            "does not fit the images", "ball", got, f"{count} images and one mask", where=folder
         )
     grays = [to_gray(read_photo(picture).frame) for picture in pictures]
     try:

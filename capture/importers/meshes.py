@@ -1,4 +1,4 @@
-"""Scanned meshes of any maker into SESSION/: OBJ and PLY, checked, in millimetres."""
+"""Import scanned meshes into SESSION/: OBJ and PLY, checked, in millimeters."""
 
 import hashlib
 import io
@@ -16,7 +16,7 @@ from capture.session import Session, SessionError, reopen_copy
 
 MM_PER_UNIT: Final[Mapping[str, float]] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 EXTENT_RANGE_MM: Final = (20.0, 3000.0)
-"""Longest side of a scan of a face, a head or a person."""
+"""Range of the longest side of a scan of a face, a head or a person."""
 MAX_FILE_BYTES: Final = 2**31
 SCAN_FILE: Final = "scan.ply"
 """Name of the attachment that holds a session's scanned mesh."""
@@ -25,21 +25,21 @@ _PLY_COUNT: Final = re.compile(rb"element[ \t]+(vertex|face)[ \t]+(\d+)")
 
 
 class MeshImportError(InputError):
-    """A mesh file that cannot be used."""
+    """Raised for a mesh file that cannot be used."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScannedMesh:
-    """Triangles as they stand in a file, in millimetres; nothing is cleaned or joined."""
+    """Triangles of a file, in millimeters; nothing is cleaned or joined."""
 
     vertices_mm: Float32Array
     """Positions, shape (V, 3), mm, the scanner's frame."""
     faces: Int32Array
-    """Vertex indices, shape (F, 3); polygons of more corners are cut into triangles."""
+    """Vertex indices, shape (F, 3); polygons with more corners are split into triangles."""
     uv: Float32Array | None
-    """Texture coordinates, shape (V, 2), (0, 0) bottom left; None where the file has none."""
+    """Texture coordinates, shape (V, 2), (0, 0) bottom left; None when the file has none."""
     about: Mapping[str, str | int | float | bool]
-    """Where it is from: hash and kind of the file, unit, counts."""
+    """Provenance: hash and kind of the file, unit, counts."""
 
     def to_ply(self) -> bytes:
         """Return the mesh as a binary PLY with float32 positions (and ``s``, ``t``)."""
@@ -62,10 +62,10 @@ class ScannedMesh:
 
 @dataclass(frozen=True, slots=True)
 class MeshImport:
-    """What an import did."""
+    """Result of an import."""
 
     path: str
-    """The session that holds the mesh now."""
+    """The session that contains the mesh now."""
     vertices: int
     faces: int
     has_uv: bool
@@ -83,7 +83,7 @@ def read_mesh(path: str | Path, *, unit: str = "mm") -> ScannedMesh:
     path : str or Path
         A file that ends in .obj or .ply.
     unit : {"mm", "cm", "m", "inch"}
-        What one unit of the file is.
+        Unit of the file's coordinates.
 
     Returns
     -------
@@ -92,8 +92,8 @@ def read_mesh(path: str | Path, *, unit: str = "mm") -> ScannedMesh:
     Raises
     ------
     MeshImportError
-        Where the file is missing, empty, cut short or no mesh, where a position is not finite, or
-        where the mesh is no size of a face in this unit.
+        When the file is missing, empty, truncated or not a mesh, when a position is not finite, or
+        when the extent in this unit is implausible for a face.
     """
     place = Path(path)
     if unit not in MM_PER_UNIT:
@@ -135,34 +135,36 @@ def read_mesh(path: str | Path, *, unit: str = "mm") -> ScannedMesh:
 def import_mesh(
     path: str | Path, *, session: str | Path, out: str | Path | None = None, unit: str = "mm"
 ) -> MeshImport:
-    """Attach a scanned mesh to a session that holds none yet, as ``scan.ply`` in mm.
+    """Attach a scanned mesh to a session that contains none yet, as ``scan.ply`` in mm.
 
     Parameters
     ----------
     path : str or Path
         See `read_mesh`.
     session : str or Path
-        An open session, which stays open; or, with `out`, a closed one, which stays as it is.
+        An open session, which stays open; or, with `out`, a closed one, which is not modified.
     out : str or Path, optional
-        New folder for a copy of a closed session that holds the mesh, and is closed again.
+        New folder for a copy of a closed session, which contains the mesh and is closed again.
     unit : {"mm", "cm", "m", "inch"}
-        What one unit of the file is.
+        Unit of the file's coordinates.
 
     Raises
     ------
     MeshImportError
-        Where the mesh cannot be used.
+        When the mesh cannot be used.
     SessionError
-        Where the session holds a scan already, or is closed and no `out` is given.
+        When the session contains a scan already, or is closed and no `out` is given.
     """
     mesh = read_mesh(path, unit=unit)
     found = Session.open(session)
     if SCAN_FILE in found.attachments():
-        advice = "What is attached stays: make a new session for another scan."
+        advice = "Attachments are never replaced: make a new session for another scan."
         faults = [Fault("attachment", f"{SCAN_FILE}, attached before", "none of that name")]
-        raise SessionError("holds a scan already", where=str(session), faults=faults, advice=advice)
+        raise SessionError(
+            "contains a scan already", where=str(session), faults=faults, advice=advice
+        )
     if found.closed and out is None:
-        advice = "Name a folder for a copy that holds the mesh: --out COPY."
+        advice = "Name a folder for a copy with the mesh: --out COPY."
         raise SessionError("the session is closed", where=str(session), advice=advice)
     if out is not None:
         opened, reason = reopen_copy(session, out)
@@ -186,10 +188,10 @@ def _decode(data: bytes, kind: str, source: Path) -> _Arrays:
     import trimesh
 
     try:
-        # a stream and not a path: no file named inside (materials, textures) is opened
+        # a stream and not a path: files named inside (materials, textures) are not opened
         loaded: Any = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False)
         parts = [part for part in loaded.dump() if hasattr(part, "faces")]
-    except Exception as exc:  # the readers raise whatever their parsers meet
+    except Exception as exc:  # the readers raise whatever their parsers raise
         reason = str(exc).splitlines()[0] if str(exc) else type(exc).__name__
         raise _error(source, "content", reason, f"a whole {kind.upper()} file") from exc
     if not parts or not sum(len(part.faces) for part in parts):
@@ -213,8 +215,8 @@ def _check(vertices: Float64Array, faces: Int64Array, ply: bytes, where: Path) -
     counts = {name: int(count) for name, count in _PLY_COUNT.findall(ply.split(b"end_header")[0])}
     for name, got in ((b"vertex", len(vertices)), (b"face", len(faces))):
         if got < counts.get(name, 0):
-            text = f"{counts[name]}, as its header says"
-            raise _error(where, f"{name.decode()} elements", f"{got}: the file is cut short", text)
+            text = f"{counts[name]}, as in its header"
+            raise _error(where, f"{name.decode()} elements", f"{got}: the file is truncated", text)
     if faces.min() < 0 or faces.max() >= len(vertices):
         text = f"0 to {len(vertices) - 1}"
         raise _error(where, "faces", f"vertices {faces.min()} to {faces.max()}", text)
@@ -231,7 +233,7 @@ def _check_extent(extent_mm: Float64Array, scale: float, where: Path) -> None:
     fitting = [u for u, s in MM_PER_UNIT.items() if low <= longest / scale * s <= high]
     hint = f"it would be in {' or '.join(fitting)}: --unit {fitting[0]}" if fitting else ""
     fault = Fault("size", f"{longest:.4g} mm", f"{low:g} to {high:g} mm", hint)
-    raise MeshImportError("is no size of a face", where=str(where), faults=[fault])
+    raise MeshImportError("is implausible in size for a face", where=str(where), faults=[fault])
 
 
 def _error(source: Path, field: str, got: str, expected: str) -> MeshImportError:

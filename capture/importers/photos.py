@@ -1,4 +1,4 @@
-"""A folder of photographs into a closed SESSION/, with everything that had to be assumed."""
+"""Import a folder of photographs into a closed SESSION/, with every assumption recorded."""
 
 import logging
 import re
@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 
 IMPORTED_RIG_NAME = "imported"
 UNKNOWN_SERIAL = "unknown"
-RAW_CURVES = "Nikon 5100 (NPL)"  # what stands in for a camera nobody measured
+RAW_CURVES = "Nikon 5100 (NPL)"  # assumed for a camera without a measured sensitivity
 IMAGE_CURVES = "linear sRGB"
 SIDECAR_SUFFIXES = frozenset(
     ".txt .md .csv .json .xmp .thm .pp3 .dop .xml .html .pdf .zip .mov .mp4 .lp".split()
@@ -37,24 +37,24 @@ _POLARIZER_WORDS = {"parallel": "parallel", "crossed": "crossed", "cross": "cros
 
 @dataclass(frozen=True, slots=True)
 class PhotoImport:
-    """What an import made."""
+    """Result of an import."""
 
     path: str
     """The SESSION/ folder."""
     frames: int
     assumed: list[str]
-    """What had to be assumed, one sentence each; also in the session's manifest."""
+    """Assumptions, one sentence each; also in the session's manifest."""
     states: tuple[str, ...]
     """Names of the subject's states, one per photograph or pair of photographs."""
     ignored: tuple[str, ...]
-    """Files that are no photographs, left out."""
+    """Omitted files that are not photographs."""
     color_states: tuple[str, ...] = ()
-    """Those of `states` whose photographs hold color; gray ones tell nothing of chromophores."""
+    """Subset of `states` with color photographs; chromophores need color."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    """One photograph found fit, before it is written."""
+    """One valid photograph, before it is written."""
 
     file: Path
     sha256: str
@@ -66,7 +66,7 @@ class _Entry:
 
     @property
     def camera(self) -> tuple[object, ...]:
-        """What tells one camera (and its setting) from another."""
+        """Key that distinguishes one camera (and its setting) from another."""
         view = self.view
         shape = (view.height_px, view.width_px)
         return view.camera_model, view.cfa, shape, view.black_level, view.white_level
@@ -84,11 +84,11 @@ def import_photos(
     subject: SubjectRecord | None = None,
     now: Callable[[], datetime] | None = None,
 ) -> PhotoImport:
-    """Turn photographs into a closed session; all of them, or none.
+    """Import photographs into a closed session; all of them, or none.
 
     Every photograph becomes a state of the subject, named after its file; a single one is called
-    "neutral". Two files that differ only by the words "parallel" and "crossed" in their names are
-    the two polarizer states of one photograph. Time, place, owner and serial numbers stay behind.
+    "neutral". Two files whose names differ only by the words "parallel" and "crossed" are the two
+    polarizer states of one photograph. Time, location, owner and serial numbers are dropped.
 
     Parameters
     ----------
@@ -98,18 +98,18 @@ def import_photos(
         The new SESSION/ folder.
     rig : Rig, optional
         The rig whose first camera took the photographs, so that its calibrations apply; they must
-        be raw files of that camera's size. Default: a rig made up from what the files say.
+        be raw files of that camera's size. Default: a rig assembled from the files' metadata.
     camera_serial : str
         Serial number to record, for calibrations; without `rig` only.
     sensitivity : str, optional
         Name of the camera's spectral sensitivity, see ``model.spectra``; without `rig` only.
-        Default "linear sRGB" for pictures, that of a common camera for raw files.
+        Default "linear sRGB" for developed images, that of a common camera for raw files.
     illuminant : str, optional
-        Name of the light; default "D65" for pictures, "D55" for raw files.
+        Name of the light; default "D65" for developed images, "D55" for raw files.
     kind : {"subject", "chart", "flat", "dark"}
-        What the photographs show.
+        Content of the photographs.
     subject : Subject, optional
-        Who they show; default an unnamed one who agreed to nothing beyond the capture.
+        Person in the photographs; default an unnamed one who agreed to nothing beyond the capture.
     now : callable, optional
         Clock, returns a time with its zone.
 
@@ -122,7 +122,7 @@ def import_photos(
     PhotoError
         Listing every file that cannot be used; then nothing is written.
     SessionError
-        Where `out` is not free.
+        When `out` is not free.
     """
     clock = now or (lambda: datetime.now(UTC))
     files, ignored = _files(Path(directory))
@@ -145,12 +145,12 @@ def import_photos(
 
 
 def _files(directory: Path) -> tuple[list[Path], list[str]]:
-    """Return the candidates in a folder, sorted by name, and what is left out."""
+    """Return the photographs in a folder, sorted by name, and the omitted entries."""
     if directory.is_file():
         return [directory], []
     if not directory.is_dir():
         raise PhotoError(
-            "there is no such folder", where=str(directory), advice="Name a folder or one file."
+            "folder not found", where=str(directory), advice="Name a folder or one file."
         )
     files, ignored = [], []
     for file in sorted(directory.iterdir()):
@@ -160,7 +160,7 @@ def _files(directory: Path) -> tuple[list[Path], list[str]]:
             files.append(file)
     if not files:
         raise PhotoError(
-            "holds no photographs",
+            "contains no photographs",
             where=str(directory),
             faults=[Fault("files", f"{len(ignored)} other entries", "at least one photograph")],
         )
@@ -239,7 +239,7 @@ def _rig(
 
 
 def _parse_stem(stem: str) -> tuple[str, str | None]:
-    """Split a file's stem into a state and the polarizer's state its words name.
+    """Split a file's stem into a state and the polarizer state in its words.
 
     Examples
     --------
@@ -286,7 +286,7 @@ def _steps(
 def _assumptions(
     entries: Sequence[_Entry], *, made_up: bool, light: str, camera: View
 ) -> list[str]:
-    """Return every assumption once, with how many photographs it concerns."""
+    """Return every assumption once, with the number of photographs concerned."""
     counts = Counter(note for entry in entries for note in entry.notes)
     total = len(entries)
     texts = [note if n == total else f"{note} ({n} of {total})" for note, n in counts.items()]

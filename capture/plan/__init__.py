@@ -1,4 +1,4 @@
-"""What shall be captured: steps and plans, and each rig's generators of them."""
+"""Capture plans: steps, plans, and the plan generators of each rig."""
 
 from capture.plan.flash import (
     FLAT_POWERS,

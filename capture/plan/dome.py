@@ -1,4 +1,4 @@
-"""Plans of the light dome: one light at a time at several exposures, and its targets."""
+"""Generate plans of the light dome: one light at a time at several exposures, and its targets."""
 
 import math
 from collections.abc import Sequence
@@ -15,22 +15,22 @@ from capture.rig import LedLimits, Rig
 DomeTarget = Literal["charuco", "mirror", "white", "dark"]
 
 DOME_EXPOSURES_S = (0.06, 0.015)
-"""Two stops apart; the longer one and its read-out fit into a twelfth of a second."""
+"""Two stops apart; the longer one and its readout fit into a twelfth of a second."""
 FRAMES_PER_S = 12.0
 TRACKING_INTERVAL_LIGHTS = 25
 """Lights between two tracking frames."""
 N_TRACKING_LIGHTS = 6
 MIN_TRACKING_LIGHT = 0.25
-"""Least light of a tracking frame at the eyes, of the brightest single light."""
+"""Smallest light of a tracking frame at the eyes, of the brightest single light."""
 MIN_PLATE_COSINE = 0.15
-"""Lights that meet a plate flatter than this tell nothing of it."""
+"""Cosine of incidence below which a light on the plate is not used."""
 N_OUTLINE_LIGHTS = 24
 N_MIRROR_LIGHTS = 8
-"""Lights that are on together to show a sphere's outline, and in a sphere."""
+"""Numbers of lights that are on together for a sphere's outline, and in a sphere."""
 MIRROR_LEVEL = 0.002
-"""Of these: a sphere shows the radiance of an LED, thousands of times that of a lit white."""
+"""Level of these lights: a sphere mirrors an LED's radiance, thousands of times a lit white."""
 LEVEL_STEPS = 1000
-"""The box sets an LED's level in so many steps."""
+"""Number of steps of an LED's level."""
 
 
 def dome_plan(
@@ -44,7 +44,7 @@ def dome_plan(
     iso: int = 100,
     order: Sequence[int] | None = None,
 ) -> Plan:
-    """Plan a capture of a subject: every light by itself, at every exposure.
+    """Plan a capture of a subject: one light at a time, at every exposure.
 
     Parameters
     ----------
@@ -53,14 +53,14 @@ def dome_plan(
     exposures_s : sequence of float
         Exposure of each pass over all lights, s.
     frames_per_s : float
-        Lights a second, > 0.
+        Lights per second, > 0.
     tracking_interval : int
         Lights between two frames lit by several lights at once, from which motion is estimated; 0
         for none. A pass with tracking also begins and ends with one.
     darks : int
         Frames without light at each exposure, >= 0.
     level : float
-        Of each light, 0 < level <= 1.
+        Level of each light, 0 < level <= 1.
     iso : int
     order : sequence of int, optional
         Numbers of all lights; by default the order with the least flicker.
@@ -68,13 +68,13 @@ def dome_plan(
     Returns
     -------
     Plan
-        Per exposure: darks, then all lights in one order, so that a light's frames of different
-        passes are equally far apart in time.
+        Per exposure: dark frames, then all lights in one order, so that a light's frames of
+        different passes are equally far apart in time.
 
     Raises
     ------
     PlanError
-        For what the rig's LEDs may not do, or an exposure that does not fit.
+        When the limits of the rig's LEDs are exceeded, or an exposure does not fit.
 
     Examples
     --------
@@ -125,19 +125,18 @@ def dome_calibration_plan(
         A dome.
     target : {"charuco", "mirror", "white", "dark"}
         "charuco": a board in ``poses`` poses, each lit by several lights at the first exposure;
-        "mirror": a mirror sphere at ``spheres`` places, each once before the lit dome, for its
-        outline, and then lit by groups of lights, faintly, at the last exposure: what it shows are
-        the lights themselves; "white": a white plate in ``plates`` poses (no pose faces all
+        "mirror": a mirror sphere at ``spheres`` positions, each once in front of the lit dome, for
+        its outline, and then lit by groups of lights, faintly, at the last exposure, because it
+        mirrors the lights themselves; "white": a white plate in ``plates`` poses (no pose faces all
         lights), each once lit by several lights, for its markers, and then by every light at the
-        first exposure; "dark": ``8 * darks`` frames with the caps on, at every
-        exposure.
+        first exposure; "dark": ``8 * darks`` frames with the caps on, at every exposure.
     exposures_s : sequence of float
         As for `dome_plan`.
     poses, spheres, plates : int
-        Poses of the board, places of the sphere and poses of the plate, >= 1; a person moves them
-        in between.
+        Poses of the board, positions of the sphere and poses of the plate, >= 1; a person moves
+        them in between.
     plate_normals : sequence of (3,), optional
-        About where the plate's front looks in each pose: lights behind it are left out.
+        Approximate normal of the plate's front in each pose: lights behind it are omitted.
     darks : int
         Frames with no light at the exposure in use, >= 0; none for the mirror.
     level, iso
@@ -189,9 +188,9 @@ def _cosine(a: Sequence[float], b: Sequence[float]) -> float:
 
 
 def choose_tracking_lights(rig: Rig) -> list[int]:
-    """Return lights spread over the half of the dome in front of the subject, at most 6.
+    """Return at most 6 lights distributed over the half of the dome in front of the subject.
 
-    Each next one is the farthest from those before it, beginning with the most frontal.
+    Farthest-point selection that begins with the most frontal light.
     """
     place = np.array([light.position_mm for light in rig.lights], np.float64)
     place /= np.linalg.norm(place, axis=1)[:, None]
@@ -204,13 +203,13 @@ def choose_tracking_lights(rig: Rig) -> list[int]:
 
 
 class _Series(StepSeries):
-    """Steps being numbered, for all views of one dome."""
+    """Numbered steps, for all views of one dome."""
 
     def __init__(self, rig: Rig, *, frames_per_s: float, iso: int) -> None:
         require_argument(rig.leds is not None, "rig", rig.name, "one with LEDs and their limits")
         require_argument(frames_per_s > 0, "frames_per_s", frames_per_s, "> 0")
         self._limits = rig.leds or LedLimits()
-        # the box counts microseconds
+        # the controller counts microseconds
         self.dwell_s = round(1e6 / frames_per_s) / 1e6
         most_s = self._limits.max_on_s
         slowest = f"at least {1.0 / most_s:g} 1/s"
@@ -225,7 +224,7 @@ class _Series(StepSeries):
         level = float(settings.get("level", 0.0))
         require_argument(0 <= level <= 1, "level", level, "0 to 1")
         limits = self._limits
-        # an LED held longer than the duty allows would be refused by the box
+        # the controller would refuse an LED that is on longer than the duty allows
         on_s = limits.max_duty * limits.duty_window_s
         require_argument(
             level * self.dwell_s <= on_s, "level x dwell", level * self.dwell_s, f"<= {on_s}"
@@ -246,9 +245,9 @@ class _Series(StepSeries):
     def tracking(
         self, number: int, after: int, exposure_s: float, before: int, level: float
     ) -> None:
-        """Add a tracking frame as bright to the eyes as the light before it, where that suffices.
+        """Add a tracking frame as bright to the eyes as the light before it, if possible.
 
-        So it is no flash among its neighbours.
+        A frame of equal brightness is not a flash among its neighbors.
         """
         brightest = level * float(self._eye.max())
         wanted = max(level * float(self._eye[before]), MIN_TRACKING_LIGHT * brightest)
@@ -259,7 +258,7 @@ class _Series(StepSeries):
     def expose_tracking_lights(
         self, identity: str, kind: Kind, index: Index, exposure_s: float, level: float
     ) -> None:
-        """Add a step lit by the tracking lights together; ``level`` is cut to what one may give."""
+        """Add a step lit by the tracking lights together; ``level`` is limited as for one light."""
         limits = self._limits
         most = min(1.0, limits.max_duty * limits.duty_window_s / self.dwell_s)
         if kind != "tracking":  # together as bright as one light alone
@@ -301,7 +300,7 @@ class _Series(StepSeries):
 
 
 def to_box_rows(rows: Sequence[LedRow]) -> list[tuple[tuple[int, ...], int, int]]:
-    """Return rows as the box counts them: LEDs, level in thousandths, time in us.
+    """Return rows in the controller's units: LEDs, level in thousandths, time in us.
 
     Examples
     --------

@@ -1,8 +1,8 @@
-"""How much light a plan of LEDs gives to the subject, before it is given.
+"""Predict the light dose of a plan of LEDs for the subject.
 
-The blue-light limit of a source that somebody stares at is a weighted radiance times time of
-1e6 J m^-2 sr^-1 within 1e4 s (IEC 62471:2006, section 4.3.3). Here all of an LED's radiance counts
-as blue, which no spectrum exceeds, so the figure is an upper bound. A laboratory must measure.
+The blue-light limit of a source that a person looks at is a weighted radiance times time of 1e6 J
+m^-2 sr^-1 within 1e4 s (IEC 62471:2006, section 4.3.3). Here all of an LED's radiance counts as
+blue, which no spectrum exceeds, so the figure is an upper bound. A laboratory must measure.
 """
 
 import math
@@ -21,28 +21,28 @@ BLUE_LIMIT_J_M2_SR = 1e6
 
 @dataclass(frozen=True, slots=True)
 class DoseReport:
-    """Light that a plan gives."""
+    """Light dose of a plan."""
 
     led: str
-    """Name of the light that gives most."""
+    """Name of the light with the largest dose."""
     led_ws: float
-    """What it sends out, Ws."""
+    """Energy that it emits, Ws."""
     limit_ws: float
-    """What it may send out to one subject, Ws; inf where the rig names no limit."""
+    """Energy that it may emit to one subject, Ws; inf without a limit in the rig."""
     blue_share: float
-    """Its radiance times its time over the blue-light limit, all of it counted as blue."""
+    """Its radiance times its time over the blue-light limit, with all of it counted as blue."""
     eye_j_m2: float
     """Radiant exposure at the eyes from all lights, J/m^2."""
 
 
 def dose_report(plan: Plan, rig: Rig) -> DoseReport:
-    """Return the light that a plan of the dome, or of the gradient sphere, gives.
+    """Return the light dose of a plan of the dome or of the gradient sphere.
 
     Parameters
     ----------
     plan : Plan
     rig : Rig
-        With the lights that the plan names.
+        Rig with the lights that the plan names.
 
     Examples
     --------
@@ -70,29 +70,31 @@ def dose_report(plan: Plan, rig: Rig) -> DoseReport:
 
 
 SKIN_APERTURE_MM = 3.5
-"""Over which irradiance of skin is averaged (ICNIRP 2013, doi:10.1097/HP.0b013e3182983fd4)."""
+"""Diameter over which the irradiance of skin is averaged (ICNIRP 2013,
+doi:10.1097/HP.0b013e3182983fd4).
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class FiberLight:
-    """Light out of the source fibre."""
+    """Light dose from the source fiber."""
 
     led: str
     """Name of the light."""
     led_ws: float
-    """All that a plan sends out, Ws."""
+    """Energy that a plan emits, Ws."""
     placement_ws: float
-    """The most of it at one placement of the head, Ws."""
+    """Largest energy at one placement of the head, Ws."""
     limit_ws: float
-    """What may be sent out to one subject, Ws; inf where the rig names no limit."""
+    """Energy that may be emitted to one subject, Ws; inf without a limit in the rig."""
     skin_w_m2: float
     """Irradiance of the skin, averaged over `SKIN_APERTURE_MM`, W/m^2."""
     stare_s: float
-    """After which an eye at the fibre would be at the blue-light limit, s."""
+    """Time after which an eye at the fiber would be at the blue-light limit, s."""
 
 
 def fiber_light(plan: Plan, rig: Rig) -> FiberLight:
-    """Return the light that a plan of the fibre probe gives.
+    """Return the light dose of a plan of the fiber probe.
 
     Examples
     --------
@@ -112,8 +114,9 @@ def fiber_light(plan: Plan, rig: Rig) -> FiberLight:
         given_ws = sum(_given_ws(step, source) for step in steps)
         by_placement[placement] = by_placement.get(placement, 0.0) + given_ws
     core_m2 = math.pi * (0.5e-3 * probe.source_core_mm) ** 2
-    # a cone of half angle asin(NA), evenly filled: etendue of the core
+    # etendue of the core: area times pi NA^2, a cone of half angle asin(NA), evenly filled
     etendue_m2_sr = core_m2 * math.pi * probe.source_numerical_aperture**2
+    # Radiance is power over etendue; the limit is a radiance times time.
     stare_s = BLUE_LIMIT_J_M2_SR * etendue_m2_sr / power_w if power_w > 0 else math.inf
     return FiberLight(
         led=source.name,
@@ -126,7 +129,7 @@ def fiber_light(plan: Plan, rig: Rig) -> FiberLight:
 
 
 def source_energy_ws(plan: Plan, rig: Rig) -> float:
-    """Return the light that the source fibre sends out in a plan, Ws."""
+    """Return the energy that the source fiber emits in a plan, Ws."""
     _, source = _source(rig)
     return sum(_given_ws(step, source) for step in plan.steps if step.kind != "dark")
 

@@ -1,11 +1,11 @@
-"""How much of each LED's light reaches the subject's eyes, by a cosine model.
+"""Irradiance of each LED at the subject's eyes, by a cosine model.
 
-An eye is a small plane at its place in the nominal head, facing +z. It receives an LED's intensity
-in its direction times the cosine to +z over the distance squared; what comes from behind does not
-reach it. Lids, pupil and gaze are left out: eyes are taken as open and looking straight ahead.
+An eye is a small plane at its position in the nominal head, facing +z. It receives an LED's
+intensity in its direction times the cosine to +z over the distance squared; light from behind does
+not reach it. Lids, pupil and gaze are omitted: eyes are taken as open and looking straight ahead.
 
-In the gradient sphere a patch of skin is at the origin and the eyes are somewhere beside it, within
-a sixth of the way to the lights: they are taken at the patch.
+In the gradient sphere a patch of skin is at the origin and the eyes are near it, within a sixth of
+the distance to the lights: they are taken at the patch.
 """
 
 import math
@@ -20,14 +20,14 @@ EYES_MM: tuple[Vector, Vector] = ((-31.0, 25.0, 80.0), (31.0, 25.0, 80.0))
 """Corneas of a nominal adult head in the rig frame, mm."""
 
 PATCH_MM: tuple[Vector, ...] = ((0.0, 0.0, 0.0),)
-"""Where the eyes are taken to be when a patch of skin is at the origin."""
+"""Assumed position of the eyes when a patch of skin is at the origin."""
 
 
 def radiant_intensity(light: Light) -> float:
     """Return an LED's intensity on its axis at level 1, W/sr.
 
-    Its power is spread over a hemisphere as a power of the cosine off the axis, or over the whole
-    sphere where it shines the same in all directions.
+    Its power is distributed over a hemisphere as a power of the cosine off the axis, or over the
+    whole sphere when it emits equally in all directions.
 
     Examples
     --------
@@ -39,6 +39,7 @@ def radiant_intensity(light: Light) -> float:
     power_w = light.power_w or 0.0
     if light.half_intensity_deg is None:
         return power_w / (4.0 * math.pi)
+    # The integral of cos^n over the hemisphere is 2 pi / (n + 1).
     return power_w * (light.lobe_exponent + 1.0) / (2.0 * math.pi)
 
 
@@ -51,15 +52,15 @@ def eye_irradiance(
     ----------
     rig : Rig
     eyes_mm : sequence of 3-vectors, optional
-        Where the eyes are, mm, rig frame; by default those of a nominal head, or, before a caliper,
-        the patch itself.
+        Positions of the eyes, mm, rig frame; by default those of a nominal head, or, in front of a
+        caliper, the patch itself.
     facing : 3-vector
-        Where they look, unit length.
+        Viewing direction, unit length.
 
     Returns
     -------
     ndarray
-        (L,), in the order of ``rig.lights``; 0 for what is behind the eyes.
+        (L,), in the order of ``rig.lights``; 0 for lights behind the eyes.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Plans of the flash rig: a subject in several states, and the calibration targets."""
+"""Generate plans of the flash rig: a subject in several states, and the calibration targets."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -45,20 +45,20 @@ def flash_plan(
         Image pairs per state, >= 1.
     interleave : bool
         Whether all other states come between two repeats of one, as in Jimenez et al. 2010: the
-        repeats then tell how well a state is repeated, not only how well it is held.
+        repeats then measure how reproducible a state is, not only how well it is held.
     darks : int
         Frames with no light at the beginning, >= 0.
     power : float
         Flash power, 0 < power <= 1.
     exposure_s : float
-        Exposure time, s; it covers the pop.
+        Exposure time, s; it includes the flash.
     iso : int
 
     Returns
     -------
     Plan
-        Darks, then per state and repeat a parallel and a crossed image; the order of the two
-        alternates, so that the analyser turns once per pair. The repeats of a state follow each
+        Dark frames, then per state and repeat a parallel and a crossed image; the order of the two
+        alternates, so that the analyzer turns once per pair. The repeats of a state follow each
         other, or with ``interleave`` each repeat goes through all states.
 
     Examples
@@ -109,7 +109,7 @@ def flash_calibration_plan(
     target : {"dark", "flat", "chart", "malus"}
         "dark": ``8 * repeats`` frames with the cap on; "flat": 10 flash powers on an even white
         field, ``repeats`` frames each (photon transfer pairs); "chart": ``repeats`` parallel and
-        crossed images of a color chart; "malus": 13 analyser angles from 0 to 180 degrees,
+        crossed images of a color chart; "malus": 13 analyzer angles from 0 to 180 degrees,
         ``repeats`` frames each.
     repeats : int
         Frames per condition, >= 1 (>= 2 for "flat": pairs).
@@ -151,7 +151,7 @@ def flash_calibration_plan(
 
 
 class _Series(StepSeries):
-    """Steps being numbered, for all views of one rig at one exposure."""
+    """Numbered steps, for all views of one rig at one exposure."""
 
     def __init__(self, rig: Rig, *, exposure_s: float, iso: int) -> None:
         super().__init__(rig, exposure_s=exposure_s, iso=iso)

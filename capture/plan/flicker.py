@@ -1,11 +1,11 @@
-"""How much the light of LEDs flickers for the subject's open eyes.
+"""Predict the flicker of a plan of LEDs for the subject's open eyes.
 
 Flashes at 3 Hz or more can provoke seizures in people who are sensitive to light (Harding, Wilkins,
 Erba, Barkley, Fisher 2005, doi:10.1111/j.1528-1167.2005.31305.x); the band reported is 3 to about
 65 Hz. The light at the eyes (`capture.plan.eye_light`) is averaged over 1/65 s, the shortest time
-in which flicker is seen, and two figures are taken of it: opposing pairs of changes of a tenth of
-the maximum, counted in the worst second, and the rms of its 3 to 65 Hz part over its mean.
-These are planning figures, not a medical certificate.
+in which flicker is visible. Two figures are computed from it: opposing pairs of changes of a tenth
+of the maximum, counted in the worst second, and the rms of its 3 to 65 Hz part over its mean. These
+are planning figures, not a medical certificate.
 """
 
 from collections.abc import Sequence
@@ -22,12 +22,14 @@ from capture.rig import LedLimits, Rig
 FLICKER_BAND_HZ = (3.0, 65.0)
 FLICKER_FUSION_HZ = 65.0
 MIN_FLASH_CHANGE = 0.1
-"""Least change of a flash, of the brightest light of the plan."""
+"""Smallest change of a flash, of the brightest light of the plan."""
 EYE_SAMPLE_S = 1e-3
 DARK_PADDING_S = 1.0
-"""Darkness before and after each piece of a plan."""
+"""Dark time before and after each piece of a plan, s."""
 MIN_RMS_DURATION_S = 2.0
-"""Shorter pieces are judged by their flashes alone: of one flash, any rms over mean is large."""
+"""Duration below which a piece is evaluated by its flashes only, s: the rms over mean of one flash
+is always large.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,14 +39,14 @@ class FlickerReport:
     flashes_per_s: float
     """Flashes in the worst second."""
     rms: float
-    """Root mean square of the light of 3 to 65 Hz over its mean; 0 where all pieces are short."""
+    """Root mean square of the light of 3 to 65 Hz over its mean; 0 when all pieces are short."""
     seconds: float
-    """Time of all pieces, s."""
+    """Duration of all pieces, s."""
     mean_w_m2: float
     """Mean irradiance at the eyes, W/m^2."""
 
     def within(self, limits: LedLimits) -> bool:
-        """Tell whether open eyes may see this."""
+        """Return whether the flicker is allowed for open eyes."""
         return self.flashes_per_s < limits.max_flashes_per_s and self.rms <= limits.max_flicker_rms
 
 
@@ -83,13 +85,13 @@ def eye_signal(
 
 
 def average_over_flicker_fusion(signal: Float64Array) -> Float64Array:
-    """Return a signal averaged over 1/65 s, as the eye sees it."""
+    """Average a signal over 1/65 s, the flicker fusion time of the eye."""
     width = round(1.0 / FLICKER_FUSION_HZ / EYE_SAMPLE_S)
     return np.convolve(signal, np.full(width, 1.0 / width), mode="same")
 
 
 def count_flashes(signal: Float64Array, *, min_change: float) -> float:
-    """Return the most flashes in any second: half its turns that differ by ``min_change``.
+    """Return the most flashes in any second: half the turning points that differ by ``min_change``.
 
     Examples
     --------
@@ -97,6 +99,8 @@ def count_flashes(signal: Float64Array, *, min_change: float) -> float:
     >>> count_flashes(np.tile(on, 10), min_change=0.1)
     5.0
     """
+    # Turning points with hysteresis: a reversal counts once the signal has come back by min_change
+    # from its last extreme. Two of them are one flash.
     turns: list[int] = []
     low = high = extreme = float(signal[0]) if signal.size else 0.0
     rising: bool | None = None
@@ -134,13 +138,14 @@ def band_rms(signal: Float64Array) -> float:
     power = np.abs(np.fft.rfft(signal)) ** 2
     frequency_hz = np.fft.rfftfreq(signal.size, EYE_SAMPLE_S)
     inside = (frequency_hz >= FLICKER_BAND_HZ[0]) & (frequency_hz <= FLICKER_BAND_HZ[1])
+    # Parseval: the components at +f and -f together have the mean square 2 |X_f|^2 / n^2.
     return float(np.sqrt(2.0 * power[inside].sum()) / signal.size / mean)
 
 
 def flicker_of_rows(
     rows: Sequence[LedRow], weights: Float64Array, *, overlap_s: float = 0.0
 ) -> FlickerReport:
-    """Return the figures of rows that follow one another without a pause.
+    """Return the flicker of rows that follow one another without a pause.
 
     Parameters
     ----------
@@ -161,14 +166,14 @@ def flicker_of_rows(
 def flicker_report(plan: Plan, rig: Rig) -> FlickerReport:
     """Return the flicker of a plan for open eyes: the worst figures of its pieces.
 
-    Where the analyser turns between two patterns of the gradient sphere it is dark.
+    While the analyzer turns between two patterns of the gradient sphere it is dark.
 
     Parameters
     ----------
     plan : Plan
-        Of the dome or the gradient sphere.
+        Plan of the dome or the gradient sphere.
     rig : Rig
-        With the lights that the plan names.
+        Rig with the lights that the plan names.
 
     Examples
     --------
@@ -196,7 +201,7 @@ def flicker_report(plan: Plan, rig: Rig) -> FlickerReport:
 
 
 def _insert_analyzer_rotations(steps: Sequence[Step], rig: Rig) -> list[LedRow]:
-    """Return the rows of steps, and darkness where the analyser turns between two of them."""
+    """Return the rows of steps, with darkness while the analyzer turns between two of them."""
     rows: list[LedRow] = []
     before: object = None
     for step, row in zip(steps, led_rows(steps, rig), strict=True):

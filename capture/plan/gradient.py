@@ -1,9 +1,9 @@
-"""Plans of the gradient sphere: skin under patterns, state of strain by state, and its targets.
+"""Generate plans of the gradient sphere: strain steps of skin under patterns, and its targets.
 
-A state of the skin is a position of the caliper. It is scanned once: some patterns with the
-analyser parallel, the same crossed. Patterns follow one another from bright to dark, and those that
-complete each other stand side by side, so that the light flickers little and skin that moves has
-moved little between x and -x.
+A strain step of the skin is a position of the caliper. It is scanned once: some patterns with the
+analyzer parallel, the same crossed. Patterns follow one another from bright to dark, and
+complementary ones are adjacent, so that the light flickers little and the skin has moved little
+between x and -x.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,29 +29,31 @@ from capture.rig import Caliper, LedLimits, Rig
 GradientTarget = Literal["ball", "dark", "flat"]
 
 PATTERN_DWELL_S = 0.031
-"""Light of a pattern: 16 of them take half a second, and all LEDs stay within a duty of a quarter,
-because x and -x together are one full."""
+"""Duration of a pattern, s: 16 of them take half a second, and all LEDs stay within a duty of a
+quarter, because x and -x together are one full.
+"""
 PATTERN_EXPOSURE_S = 0.018
-"""Fits into it with the read-out."""
+"""Exposure that fits into the dwell time with the readout, s."""
 SCAN_ORDER = ("full", "z", "x", "-x", "y", "-y", "-z", "dark")
-"""From bright to dark for an eye beside the patch."""
+"""Order from bright to dark for an eye next to the patch."""
 BALL_SERIES: dict[int, tuple[float, ...]] = {
     0: (0.007, 0.03, 0.12, 0.5),
     80: (0.08, 0.5),
     90: (0.08, 0.5),
     100: (0.08, 0.5),
 }
-"""Levels of the LEDs that a ball of black glass shows, by the analyser's reading, degrees. It
-mirrors 4 % of what is far brighter than lit skin, but near Brewster's angle a thousandth of that;
-and readings on both sides of 90 tell which way an LED's polarizer is turned."""
+"""Levels of the LEDs for a ball of black glass, by the analyzer's reading, degrees. It mirrors 4 %
+of lights that are far brighter than lit skin, but near Brewster's angle a thousandth of that;
+readings on both sides of 90 determine the sign of an LED's polarizer rotation.
+"""
 BALL_DARK_S = 0.4
-"""Darkness between two readings: eyes nearby then see fewer than three flashes a second."""
+"""Dark time between two readings, s: eyes nearby then see fewer than three flashes per second."""
 FLAT_LEVELS = (0.03, 0.06, 0.11, 0.17, 0.23, 0.34, 0.45, 0.57, 0.7, 0.85)
 """Levels of the photon transfer series: dense in the shadows, and near full scale at the end."""
 
 
 def state_name(angle_deg: float, step: int) -> str:
-    """Return the name of a state of the skin: the caliper's angle and position.
+    """Return the name of a strain step: the caliper's angle and position.
 
     Examples
     --------
@@ -63,7 +65,7 @@ def state_name(angle_deg: float, step: int) -> str:
 
 
 def strain_state(step: Step) -> str | None:
-    """Return the state that a step shows; None where the caliper holds no skin.
+    """Return the strain step of a capture step; None without skin in the caliper.
 
     Examples
     --------
@@ -93,33 +95,33 @@ def gradient_plan(
     Parameters
     ----------
     rig : Rig
-        With a caliper.
+        Rig with a caliper.
     angles : sequence of float, optional
         Angles of the caliper, degrees, of those it has; all of them by default.
     steps : pair of int, optional
-        First (<= 0) and last (>= 0) position; all of the caliper's by default. How far skin really
-        follows is found out when it is captured.
+        First (<= 0) and last (>= 0) position; all of the caliper's by default. The limit of the
+        skin is found during the capture.
     patterns : sequence of str
-        Of :data:`capture.plan.steps.LIGHT_PATTERNS`.
+        Names of :data:`capture.plan.steps.LIGHT_PATTERNS`.
     darks : int
-        Frames without light at the beginning, >= 0, beside the "dark" of each scan.
+        Frames without light at the beginning, >= 0, in addition to the "dark" of each scan.
     exposure_s, dwell_s : float
-        Exposure, and light, of each pattern, s.
+        Exposure, and duration of the light, of each pattern, s.
     level : float
-        Of the LEDs, 0 < level <= 1.
+        Level of the LEDs, 0 < level <= 1.
     iso : int
 
     Returns
     -------
     Plan
-        Darks, then per angle the neutral state, compression step by step, and stretching step by
-        step from neutral; per state every pattern parallel, then crossed. Ids are like
+        Dark frames, then per angle the neutral state, compression step by step, and stretching step
+        by step from neutral; per step every pattern parallel, then crossed. Ids are like
         "a000-m2-par-x".
 
     Raises
     ------
     PlanError
-        For what the rig's LEDs or caliper may not do.
+        When the limits of the rig's LEDs or caliper are exceeded.
 
     Examples
     --------
@@ -173,12 +175,12 @@ def gradient_calibration_plan(
     dwell_s: float = PATTERN_DWELL_S,
     iso: int = 100,
 ) -> Plan:
-    """Plan the frames of one calibration of the gradient sphere; no caliper takes part.
+    """Plan the frames of one calibration of the gradient sphere, without the caliper.
 
     Parameters
     ----------
     rig : Rig
-        With LEDs.
+        Rig with LEDs.
     target : {"ball", "dark", "flat"}
         "ball": a ball of black glass under "full" at the readings and levels of `BALL_SERIES`, and
         under "dark";
@@ -189,9 +191,9 @@ def gradient_calibration_plan(
     darks : int
         Frames without light before the flats, >= 0.
     level : float
-        Of the LEDs that the ball shows, over that of the series, 0 < level <= 1.
+        Level of the LEDs for the ball, over that of the series, 0 < level <= 1.
     exposure_s, dwell_s, iso
-        As for `gradient_plan`.
+        As in `gradient_plan`.
 
     Examples
     --------
@@ -241,7 +243,7 @@ def group_by_state(plan: Plan) -> Iterator[tuple[str, list[Step]]]:
 
 
 def scan_duty(steps: Sequence[Step], rig: Rig) -> float:
-    """Return the most mean level of an LED over the rig's window, of steps without a pause.
+    """Return the largest mean level of an LED over the rig's window, of steps without a pause.
 
     Examples
     --------
@@ -263,7 +265,7 @@ def scan_duty(steps: Sequence[Step], rig: Rig) -> float:
         clock += row.dwell_s
         ends[number] = clock
     starts = ends - [row.dwell_s for row in rows]
-    # the mean is greatest in a window that ends with a row, or begins with one
+    # the moving mean is largest in a window that ends with a row, or begins with one
     edges = np.concatenate([ends, starts + limits.duty_window_s])
     most = 0.0
     for end in edges:
@@ -291,7 +293,7 @@ def _ordered(patterns: Sequence[str]) -> list[str]:
 
 
 class _Series(StepSeries):
-    """Steps being collected, for all views of one rig at one exposure."""
+    """Collected steps, for all views of one rig at one exposure."""
 
     def __init__(self, rig: Rig, *, exposure_s: float, dwell_s: float, iso: int) -> None:
         require_argument(rig.leds is not None, "rig", rig.name, "one with LEDs and their limits")
@@ -303,7 +305,7 @@ class _Series(StepSeries):
         lag_s = max(view.shutter_lag_s for view in rig.views)
         room_s = dwell_s - limits.settle_s - limits.overlap_s - lag_s
         fits = 0 < exposure_s <= room_s and exposure_s + readout_s + lag_s <= dwell_s
-        expected = f"to fit with read-out {readout_s:g} s into {dwell_s:g} s a pattern"
+        expected = f"to fit with read-out {readout_s:g} s into {dwell_s:g} s per pattern"
         require_argument(fits, "exposure_s", exposure_s, expected)
         super().__init__(rig, exposure_s=float(exposure_s), dwell_s=float(dwell_s), iso=iso)
         self._limits = limits
@@ -314,7 +316,7 @@ class _Series(StepSeries):
             self.add(f"D{repeat:03d}", "dark", {"repeat": repeat}, **dark)
 
     def plan(self) -> Plan:
-        """Return the plan; a piece of it that asks too much of an LED is refused."""
+        """Return the plan; raise an error for a piece that exceeds an LED's duty."""
         limits = self._limits
         judged: dict[tuple[object, ...], float] = {}
         for piece in split_passes(self._steps):

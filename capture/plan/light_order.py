@@ -1,7 +1,8 @@
-"""In which order the dome's lights are shown, so that open eyes see little flicker.
+"""Order the dome's lights so that open eyes see little flicker.
 
-All orders begin and end where the eyes see least, because a piece of a plan begins and ends dark.
-Which order is best is not decided here by rule but measured, see `best_order`.
+All orders begin and end with the light that is dimmest at the eyes, because a piece of a plan
+begins and ends dark. The best order is found by a computation of the flicker of each, see
+`best_order`.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,7 +17,7 @@ from capture.plan.rows import LedRow
 from capture.rig import Rig
 
 N_ORDER_BANDS = 6
-"""Bands of eye light within which the path is kept short."""
+"""Number of bands of eye light within which the path is kept short."""
 
 
 def order_by_name(rig: Rig) -> list[int]:
@@ -33,9 +34,9 @@ def order_along_spiral(rig: Rig) -> list[int]:
 
 
 def order_by_short_path(rig: Rig) -> list[int]:
-    """Return a short path through all lights: always on to the nearest, then mended by 2-opt.
+    """Return a short path through all lights: nearest neighbor first, improved by 2-opt.
 
-    It begins at the light that the eyes see least.
+    It begins at the light that is dimmest at the eyes.
     """
     return _short_path(
         _directions(rig), list(range(len(rig.lights))), int(np.argmin(eye_irradiance(rig)))
@@ -43,13 +44,13 @@ def order_by_short_path(rig: Rig) -> list[int]:
 
 
 def _order_by_rise_and_fall(rig: Rig) -> list[int]:
-    """Return the lights sorted by what the eyes see: every other one rising, the rest falling."""
+    """Return the lights sorted by eye irradiance: every other one rising, the rest falling."""
     rising = np.argsort(eye_irradiance(rig), kind="stable")
     return [int(k) for k in (*rising[::2], *rising[1::2][::-1])]
 
 
 def _order_by_bands(rig: Rig) -> list[int]:
-    """Return the lights in bands of what the eyes see, rising and falling, each a short path."""
+    """Return the lights in bands of eye irradiance, rising and falling, each a short path."""
     place, light = _directions(rig), eye_irradiance(rig)
     rising = np.argsort(light, kind="stable")
     legs = [rising[::2], rising[1::2][::-1]]
@@ -82,7 +83,7 @@ def compare_orders(rig: Rig, *, dwell_s: float) -> dict[str, FlickerReport]:
     ----------
     rig : Rig
     dwell_s : float
-        Time of each light, s.
+        Duration of each light, s.
     """
     weights = eye_irradiance(rig)
     overlap_s = rig.leds.overlap_s if rig.leds is not None else 0.0
@@ -99,7 +100,7 @@ def best_order(rig: Rig, *, dwell_s: float) -> list[int]:
     Parameters
     ----------
     rig, dwell_s
-        As for `compare_orders`.
+        As in `compare_orders`.
 
     Examples
     --------
@@ -139,7 +140,7 @@ def _improve_2opt(position: Float64Array, path: list[int]) -> list[int]:
             a, b = position[way[i]], position[way[i + 1]]
             ends = position[way[i + 2 :]]
             after = np.vstack([position[way[i + 3 :]], np.zeros((1, 3))])
-            # the last light has nothing behind it: reversing up to it saves that step
+            # the path is open: reversing up to the last light removes one edge and adds one
             old = np.linalg.norm(a - b) + np.linalg.norm(ends - after, axis=1)
             new = np.linalg.norm(ends - a, axis=1) + np.linalg.norm(b - after, axis=1)
             old[-1], new[-1] = np.linalg.norm(a - b), np.linalg.norm(ends[-1] - a)

@@ -1,13 +1,13 @@
-"""Plans of sequences in time: a face that changes by a sound, shots with a period of their own.
+"""Generate timed plans: a face that changes on a prompt, and shots with their own period.
 
-A camera that needs seconds for an image cannot follow a face. Where the face does the same again
-and again, it can: prompted to change every ``prompt_period_s``, it repeats every two prompts, and
-shots whose period is no whole share of that cycle meet it at another phase each time (Jimenez et
-al. 2010, section 3.1, doi 10.1145/1866158.1866167). What an event does to the blood once, exercise
-or a drink, is followed by shots at times after the event.
+A camera that needs seconds per image cannot follow a face. It can sample a face that repeats:
+prompted to change every ``prompt_period_s``, the face repeats every two prompts, and shots whose
+period is not a simple fraction of that cycle sample another phase each time (Jimenez et al. 2010,
+section 3.1, doi 10.1145/1866158.1866167). A single change of the blood by an event, exercise or a
+drink, is sampled by shots at times after the event.
 
-Periods are taken as the decimals they are written with, and counted as fractions: which phases a
-sequence meets is a question of common measures, which rounded numbers do not have.
+Periods are taken as the decimals in which they are written, and counted as fractions: the sampled
+phases depend on common measures, which rounded numbers do not have.
 """
 
 import math
@@ -21,21 +21,21 @@ from capture.plan.steps import Plan, PlanError, Step, Value, require_argument
 from capture.rig import Rig
 
 RELEASE_DELAY_S = 0.04
-"""Time from an image at hand to the release of the next one, s: arming camera and box."""
+"""Time from a received image to the release of the next one, s: arming camera and controller."""
 SEQUENCE_EXPOSURE_S = 0.008
 SEQUENCE_ISO = 100
 REPEATED_PHASE_FRACTION = Fraction(1, 10)
-"""Part of the phases that are met again by default, to see whether they repeat."""
+"""Fraction of the phases that are sampled again by default, to test the repeatability."""
 
 
 class ReadOutError(PlanError):
-    """Shots follow each other faster than the camera can be read out.
+    """Raised when shots follow each other faster than the camera can be read out.
 
     Attributes
     ----------
     equivalent_s : float
-        The shortest period, s, that the camera can keep and that meets the same phases; nan where
-        there is none.
+        The shortest period, s, that the camera can follow and that samples the same phases; nan
+        without such a period.
     """
 
     equivalent_s: float = math.nan
@@ -44,7 +44,7 @@ class ReadOutError(PlanError):
 def min_shot_interval_s(rig: Rig, exposure_s: float) -> Fraction:
     """Return the shortest time from shot to shot of a rig's slowest camera, s.
 
-    Shutter lag, exposure, read-out and the release of the next image.
+    Shutter lag, exposure, readout and the release of the next image.
 
     Examples
     --------
@@ -72,13 +72,13 @@ def multiplexed_plan(
     darks: int = 4,
     power: float = 1.0,
 ) -> Plan:
-    """Plan crossed flash images of a subject who changes between two states by a sound.
+    """Plan crossed flash images of a subject who changes between two states on a prompt.
 
     Parameters
     ----------
     rig : Rig
     state, rest : str
-        The expression that even prompts ask for, and what odd prompts ask for.
+        Expressions of even and of odd prompts.
     prompt_period_s
         Time from prompt to prompt, s; the cycle is twice as long and begins with ``state``.
     shot_period_s
@@ -86,11 +86,11 @@ def multiplexed_plan(
     captures : int, optional
         Number of shots. By default every phase once and a tenth of them twice.
     cycles : int, optional
-        Instead: shots for so many cycles.
+        Alternative to ``captures``: shots for this number of cycles.
     read_out_s
-        Shortest time from shot to shot, s; by default what the rig's cameras need.
+        Shortest time from shot to shot, s; by default that of the rig's slowest camera.
     lead_cycles : int
-        Cycles of prompts before the first shot, so that the subject is in the rhythm, >= 0.
+        Cycles of prompts before the first shot, so that the subject follows the rhythm, >= 0.
     darks : int
         Frames with no light at the beginning, >= 0.
     power
@@ -99,15 +99,15 @@ def multiplexed_plan(
     Returns
     -------
     Plan
-        Darks, then the shots. Each has ``start_s`` among its settings: s after the prompt that
-        ends the lead; and in its index ``state`` (what was asked for last), ``phase_s`` (s since
-        the last prompt of ``state``), ``number``, and ``repeat`` (how often the phase was met
-        before). The analyser stays crossed: it cannot turn between shots.
+        Dark frames, then the shots. Each has ``start_s`` among its settings: s after the prompt
+        that ends the lead; and in its index ``state`` (last prompt), ``phase_s`` (s since the last
+        prompt of ``state``), ``number``, and ``repeat`` (number of earlier samples of the phase).
+        The analyzer stays crossed: it cannot turn between shots.
 
     Raises
     ------
     ReadOutError
-        When the camera is too slow; the message offers a period that meets the same phases.
+        When the camera is too slow; the message offers a period that samples the same phases.
     PlanError
         When the flash is too slow, or an argument is not as expected.
 
@@ -185,8 +185,8 @@ def course_plan(
     ----------
     rig : Rig
     state : str
-        What the event is; the operator is asked for it, and time 0 is when he says it is over:
-        the exercise, or the drink.
+        Name of the event; the operator is prompted for it, and time 0 is when he reports its end:
+        of the exercise, or of the drink.
     duration_s
         Time of the last shot, s, at most.
     shot_period_s
@@ -194,14 +194,14 @@ def course_plan(
     before : int
         Shots of ``rest`` before the event, >= 1.
     rest : str
-        The state before.
+        State before the event.
     read_out_s, darks, power
         See :func:`multiplexed_plan`.
 
     Returns
     -------
     Plan
-        Darks, shots of ``rest``, and shots with ``start_s``, s after the event.
+        Dark frames, shots of ``rest``, and shots with ``start_s``, s after the event.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-"""The phases of a cycle that a train of shots meets.
+"""Phases of a cycle that a series of shots samples.
 
-Periods are taken as the decimals they are written with, and counted as fractions: which phases a
-sequence meets is a question of common measures, which rounded numbers do not have.
+Periods are taken as the decimals in which they are written, and counted as fractions: the sampled
+phases depend on common measures, which rounded numbers do not have.
 """
 
 import math
@@ -13,11 +13,11 @@ from capture.documents import Fault, short_repr
 from capture.plan.steps import Plan, PlanError, Step, require_argument
 
 Seconds = int | float | str | Decimal | Fraction
-"""A time; numbers count as the decimals that they are printed as."""
+"""A time; numbers count as the decimals in which they are printed."""
 
 
 MIN_PHASES = 8
-"""With fewer, four in each half of the cycle, nothing can be said of what lies between."""
+"""Minimum number of phases, four in each half of the cycle; fewer alias."""
 
 
 _MAX_PERIOD_DENOMINATOR = 10**6
@@ -26,25 +26,25 @@ _MAX_PERIOD_DENOMINATOR = 10**6
 
 @dataclass(frozen=True, slots=True)
 class PhaseGrid:
-    """Which phases of a cycle a train of shots can meet."""
+    """Phases of a cycle that a series of shots can sample."""
 
     cycle_s: Fraction
-    """Time after which the subject does the same again, s."""
+    """Duration of the cycle, s."""
     shot_period_s: Fraction
     """Time from shot to shot, s."""
     distinct: int
-    """Number of phases; from there on they repeat."""
+    """Number of distinct phases; after that they repeat."""
     interval_s: Fraction
-    """Time between neighbouring phases, all of them met, s: the effective sampling interval."""
+    """Time between neighboring phases, all of them sampled, s: the effective sampling interval."""
 
     @property
     def is_aliased(self) -> bool:
-        """Whether so few phases are met that what lies between the states cannot be seen."""
+        """Whether too few phases are sampled to resolve the course between the states."""
         return self.distinct < MIN_PHASES
 
 
 def to_fraction(value: Seconds) -> Fraction:
-    """Return a time as the fraction that its decimal notation means.
+    """Return a time as the fraction of its decimal notation.
 
     Examples
     --------
@@ -54,7 +54,7 @@ def to_fraction(value: Seconds) -> Fraction:
     Raises
     ------
     PlanError
-        For what is no finite number.
+        For a value that is not a finite number.
     """
     try:
         number = Fraction(value if isinstance(value, Fraction) else str(value))
@@ -65,7 +65,7 @@ def to_fraction(value: Seconds) -> Fraction:
 
 
 def phase_grid(prompt_period_s: Seconds, shot_period_s: Seconds) -> PhaseGrid:
-    """Return the phases that shots meet of a subject who changes with every prompt.
+    """Return the phases that shots sample of a subject who changes with every prompt.
 
     Parameters
     ----------
@@ -92,10 +92,11 @@ def phase_grid(prompt_period_s: Seconds, shot_period_s: Seconds) -> PhaseGrid:
 def equivalent_period_s(
     prompt_period_s: Seconds, shot_period_s: Seconds, read_out_s: Seconds
 ) -> Fraction:
-    """Return the shortest period a camera can keep that meets the same phases as another one, s.
+    """Return the shortest feasible period that samples the same phases as another one, s.
 
-    Half cycles are added until the camera can follow: a whole number of them lets the phases meet
-    in another order at most; an odd one may change their number, and is passed over where it does.
+    Half cycles are added until the camera can follow. A whole number of cycles changes only the
+    order of the phases; an odd number of half cycles may change their number, and is skipped when
+    it does.
 
     Parameters
     ----------
@@ -121,31 +122,31 @@ def equivalent_period_s(
 
 @dataclass(frozen=True, slots=True)
 class PhaseCoverage:
-    """Which phases of its cycle a sequence covers."""
+    """Phases of its cycle that a sequence covers."""
 
     cycle_s: float
-    """Time after which the subject does the same again, s."""
+    """Duration of the cycle, s."""
     covered_s: tuple[float, ...]
-    """Distinct phases that are met, s, in order."""
+    """Distinct sampled phases, s, in order."""
     repeats: tuple[int, ...]
-    """How often each is met, >= 1."""
+    """Number of samples of each, >= 1."""
     captures: int
     """Number of shots."""
     possible: int
-    """How many phases such a train of shots would meet if it went on."""
+    """Number of phases that an endless series of these shots would sample."""
     interval_s: float
-    """Time between neighbours of those, s."""
+    """Time between neighbors of those, s."""
     largest_gap_s: float
     """Longest stretch of the cycle without a shot, s."""
 
     @property
     def distinct(self) -> int:
-        """Number of phases that are met."""
+        """Number of sampled phases."""
         return len(self.covered_s)
 
     @property
     def is_aliased(self) -> bool:
-        """Whether shot and prompt periods meet too few phases, however long the sequence is."""
+        """Whether shot and prompt periods sample too few phases, however long the sequence is."""
         return self.possible < MIN_PHASES
 
     def __str__(self) -> str:
@@ -164,7 +165,7 @@ class PhaseCoverage:
 
 
 def phase_coverage(plan: Plan) -> PhaseCoverage:
-    """Return which phases of its cycle the shots of a multiplexed plan meet.
+    """Return the phases of its cycle that the shots of a multiplexed plan sample.
 
     Raises
     ------
@@ -201,7 +202,7 @@ largest gap 0.25 s
 
 
 def timed_steps(plan: Plan) -> tuple[Step, ...]:
-    """Return the steps of a plan that are to be taken at a time."""
+    """Return the steps of a plan that have a time."""
     return tuple(step for step in plan.steps if "start_s" in step.settings)
 
 

@@ -1,9 +1,9 @@
-"""Plans of the fibre probe: series of exposures on skin, and its calibration on a phantom.
+"""Generate plans of the fiber probe: exposures on skin, and its calibration on a phantom.
 
-Between the nearest and the farthest fibre light falls by more than five decades, of which one
-exposure shows three: so each measurement is a series of exposures, from short to long, of one
-placement of the head. A pump holds the head on the skin for as long as skin bears it without a
-rest; what does not fit into that time follows after the rest, with the head where it was.
+Between the nearest and the farthest fiber light decreases by more than five decades, of which one
+exposure covers three. Each measurement is therefore a series of exposures, from short to long, of
+one placement of the head. A pump holds the head for as long as skin tolerates without a rest; the
+remaining exposures follow after the rest, at the same placement.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,23 +17,25 @@ from capture.rig import Probe, Rig, is_id
 ProbeTarget = Literal["phantom", "dark"]
 
 PROBE_SITES = ("forehead", "cheek", "chin")
-"""Where Weyrich et al. (2006) placed their head; "chin" is below it."""
+"""Sites of Weyrich et al. (2006); "chin" is below them."""
 PHANTOM_SITE = "phantom"
 """Site of the block of known optics."""
 CAP_SITE = "cap"
-"""Where the head is while frames without light are taken."""
+"""Site of the head during frames without light."""
 N_BRACKETS = 23
 MAX_EXPOSURE_S = 30.0
 BRACKET_STEP_EV = 2.0 / 3.0
-"""Weyrich et al. (2006), section 8 (doi 10.1145/1141911.1141987): 23 pictures, 2/3 stop apart, in
-about 88 s. From 30 s down they take 81 s, and 0.3 s each to be read out."""
+"""Weyrich et al. (2006), section 8 (doi 10.1145/1141911.1141987): 23 images, 2/3 stop apart, in
+about 88 s. From 30 s down they take 81 s, plus 0.3 s of readout each.
+"""
 DARK_POSITIONS = (0.0, 0.75, 1.0)
-"""Where in the series, from its shortest to its longest exposure, frames without light stand."""
+"""Positions of dark exposures in the series, from its shortest to its longest exposure."""
 MASK_INTERVAL = 3
-"""Every third exposure of the series is planned for a covered head: two stops apart."""
+"""Interval of brackets planned for a covered head: every third, two stops apart."""
 MAX_MASK_EXPOSURE_S = 8.0
-"""A covered head is exposed no longer: cross-talk from a fibre that is dim after this is lost in
-the noise, and does not matter."""
+"""Longest exposure of a covered head, s: cross-talk of a fiber that is dim after this is below the
+noise, and can be neglected.
+"""
 
 
 def probe_plan(
@@ -54,42 +56,41 @@ def probe_plan(
     Parameters
     ----------
     rig : Rig
-        With a probe.
+        Rig with a probe.
     sites : sequence of str
-        Where the head is placed, in this order.
+        Sites of the head, in this order.
     repeats : int
-        How often at each site and angle, >= 1; the head is placed anew each time.
+        Repeats at each site and angle, >= 1; the head is placed again each time.
     angles : int
-        How many directions of the line of fibres about the source, >= 1: multiples of 360/angles
-        degrees. 16 are 22.5 degrees apart and go all round, as in figure 10 of Weyrich et al.
-        (2006), rather than half: tissue whose fibres lie one way looks the same from opposite
-        directions, tissue that changes from one side to the other does not, and only a full turn
-        tells the two apart.
+        Number of directions of the line of fibers about the source, >= 1: multiples of 360/angles
+        degrees. 16 are 22.5 degrees apart over the full circle, as in figure 10 of Weyrich et al.
+        (2006), rather than half: tissue with aligned fibers is equal in opposite directions, tissue
+        that changes from one side to the other is not, and only a full circle separates the two.
     brackets : int
         Exposures of a series, >= 2; number 0 is the shortest.
     max_exposure_s : float
-        The last exposure, s, > 0.
+        Last exposure, s, > 0.
     step_ev : float
-        From one exposure to the next, stops, > 0.
+        Ratio of successive exposures, stops, > 0.
     darks : int
         Frames without light for each of few exposure times, >= 0, before the head is placed; a cap
-        keeps the room's light out. Few times are enough: what a pixel shows in the dark is its
-        offset and a current times the exposure. The shortest gives the one, the longest the other,
-        and one between shows where this is not so.
+        blocks ambient light. Few times are enough: the dark signal of a pixel is an offset plus a
+        current times the exposure. The shortest time gives the offset, the longest the current, and
+        one between detects deviations.
     level : float
-        Of the LED behind the source fibre, 0 < level <= 1.
+        Level of the LED behind the source fiber, 0 < level <= 1.
     iso : int
 
     Returns
     -------
     Plan
-        Darks, then per site, repeat and angle the series from short to long. Ids are like
+        Dark frames, then per site, repeat and angle the series from short to long. Ids are like
         "forehead-r0-a000-b07".
 
     Raises
     ------
     PlanError
-        For what the rig's probe may not do.
+        When the limits of the rig's probe are exceeded.
 
     Examples
     --------
@@ -136,21 +137,21 @@ def probe_calibration_plan(
     level: float = 1.0,
     iso: int = 100,
 ) -> Plan:
-    """Plan the frames of one calibration of the fibre probe.
+    """Plan the frames of one calibration of the fiber probe.
 
     Parameters
     ----------
     rig : Rig
-        With a probe.
+        Rig with a probe.
     target : {"phantom", "dark"}
-        "phantom": darks; the series of exposures on a block of known optics; then per fibre some
-        exposures with all other fibres covered, `MASK_INTERVAL` brackets apart. Of those only two
-        that serve are taken unless all are asked for, see `capture.acquire.probe.fiber_signal`;
-        "dark": the darks only.
+        "phantom": dark frames; the series of exposures on a block of known optics; then per fiber
+        some exposures with all other fibers covered, `MASK_INTERVAL` brackets apart. Of those only
+        two useful ones are taken unless all are requested, see
+        `capture.acquire.probe.fiber_signal`; "dark": the dark frames only.
     repeats : int
-        Placements on the phantom, >= 1; fibres are covered at the first.
+        Placements on the phantom, >= 1; fibers are covered at the first.
     brackets, longest_s, step_ev, level, iso
-        As for `probe_plan`.
+        As in `probe_plan`.
     darks : int
         Frames without light for each of a few exposure times; >= 1 of the dark.
 
@@ -201,7 +202,7 @@ def exposure_series_s(
 def group_by_series(plan: Plan) -> Iterator[tuple[HeadPlacement, tuple[Step, ...]]]:
     """Return the series of a plan on skin or phantom in its order, each with its steps.
 
-    The steps of a series show one placement of the head; each covered fibre has a series.
+    The steps of a series show one placement of the head; each covered fiber has a series.
 
     Examples
     --------
@@ -218,7 +219,7 @@ def group_by_series(plan: Plan) -> Iterator[tuple[HeadPlacement, tuple[Step, ...
 
 
 class _Series(StepSeries):
-    """Steps being collected, for the one camera of a probe."""
+    """Collected steps, for the one camera of a probe."""
 
     def __init__(
         self, rig: Rig, *, brackets: int, longest_s: float, step_ev: float, level: float, iso: int

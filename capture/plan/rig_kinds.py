@@ -1,4 +1,4 @@
-"""The kinds of rigs: by which controller one is recognized, and which step shows the subject.
+"""Kinds of rigs: the controller that identifies each, and the step that shows the subject.
 
 The folders and modules of a rig bear its kind's name: `capture.acquire.flash` has ``acquire``,
 `reconstruction.pipeline.flash.recipe` has ``RECIPE``.
@@ -10,7 +10,7 @@ from capture.rig import Rig
 
 
 class RigKind(NamedTuple):
-    """What tells rigs and their sessions from others."""
+    """Distinguishing features of a kind of rigs and of its sessions."""
 
     box: str
     """The controller that every rig of the kind has."""
@@ -27,7 +27,7 @@ RIG_KINDS: Final = {
 
 
 def find_rig_kind(rig: Rig) -> str:
-    """Return the name of a rig's kind: that of its controller, "flash" where it has none of them.
+    """Return the name of a rig's kind: that of its controller, "flash" when it has none of them.
 
     Examples
     --------

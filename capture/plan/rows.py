@@ -1,4 +1,4 @@
-"""Rows of light: what the steps of a plan ask of a rig's LEDs, one after the other."""
+"""Rows of light: the LEDs that the steps of a plan switch on, one after the other."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -22,12 +22,12 @@ class LedRow:
     level: float
     """Light relative to full, 0 to 1."""
     dwell_s: float
-    """How long, s."""
+    """Duration, s."""
     fractions: tuple[float, ...] = ()
-    """Of the level, what each of the LEDs gives, 0 to 1; empty: all of them all of it."""
+    """Weight of each LED relative to the level, 0 to 1; empty: all 1."""
 
     def light_levels(self, lights: int) -> Float64Array:
-        """Return the level of each of so many lights, shape (lights,), 0 to 1.
+        """Return the levels of a number of lights, shape (lights,), 0 to 1.
 
         Examples
         --------
@@ -40,12 +40,12 @@ class LedRow:
 
 
 def pattern_weights(positions_mm: Sequence[Vector], pattern: str) -> Float64Array:
-    """Return what a pattern of the gradient sphere asks of lights at these places, 0 to 1.
+    """Return the weights of lights in a pattern of the gradient sphere, 0 to 1.
 
     Parameters
     ----------
     positions_mm : sequence of 3-vectors
-        Rig frame.
+        Positions of the lights, rig frame.
     pattern : str
         "full": 1; "x": (1 + x)/2 with x of the unit vector to the light, "-x": (1 - x)/2; so y and
         z; "dark": 0.
@@ -83,7 +83,7 @@ def step_lights(step: Step) -> tuple[str, ...]:
 
 
 def led_rows(steps: Iterable[Step], rig: Rig) -> tuple[LedRow, ...]:
-    """Return what steps of the dome, or the sphere, ask of the LEDs of ``rig``, one row a step.
+    """Return the LED rows of steps of the dome or the sphere, one row per step.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def led_rows(steps: Iterable[Step], rig: Rig) -> tuple[LedRow, ...]:
             continue
         names = step_lights(step)
         for name in names:
-            rig.light(name)  # names what is unknown
+            rig.light(name)  # names unknown lights
         level = float(step.settings.get("level", 0.0)) if names else 0.0
         rows.append(LedRow(tuple(numbers[name] for name in names), level, dwell_s))
     return tuple(rows)
@@ -114,10 +114,10 @@ def _pattern_weights(positions_mm: tuple[Vector, ...], pattern: str) -> tuple[fl
 
 
 def split_passes(steps: Sequence[Step]) -> list[list[Step]]:
-    """Cut steps where cameras must be set anew or something must be put before them.
+    """Split steps where cameras must be set again or something must be put in front of them.
 
-    Steps of one piece share exposure, sensitivity, cameras, pose and the state of the skin, and so
-    can follow one another without a pause.
+    Steps of one piece share exposure, sensitivity, cameras, pose and the state of the skin, so that
+    they can follow one another without a pause.
     """
     pieces: list[list[Step]] = []
     before: object = None

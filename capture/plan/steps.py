@@ -1,4 +1,4 @@
-"""What shall be captured: frozen steps and plans."""
+"""Frozen steps and plans of a capture."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LIGHT_PATTERNS: tuple[str, ...] = get_args(Pattern)
 STEP_KINDS: tuple[str, ...] = get_args(Kind)
 POLARIZER_STATES: tuple[str, ...] = get_args(Polarizer)
 
-# settings every rig understands: name -> (types, test, what is expected)
+# settings every rig understands: name -> (types, test, expected value)
 _SETTING_RULES: Mapping[str, tuple[tuple[type, ...], Any, str]] = {
     "polarizer": ((str,), lambda v: v in POLARIZER_STATES, '"parallel" or "crossed"'),
     "analyser_deg": ((int, float), lambda v: 0 <= v < 360, "0 <= degrees < 360"),
@@ -48,39 +48,39 @@ _SETTING_RULES: Mapping[str, tuple[tuple[type, ...], Any, str]] = {
     "pattern": ((str,), lambda v: v in LIGHT_PATTERNS, f"one of {', '.join(LIGHT_PATTERNS)}"),
     "dwell_s": ((int, float), lambda v: 0 < v < math.inf, "seconds > 0"),
     "suction_mbar": ((int, float), lambda v: 0 < v < math.inf, "mbar > 0"),
-    "fibre": ((int,), lambda v: v >= 0, "a fibre's number >= 0, or none for all"),
+    "fibre": ((int,), lambda v: v >= 0, "a fiber's number >= 0, or none for all"),
     "start_s": ((int, float), lambda v: 0 <= v < math.inf, "seconds >= 0"),
 }
 
 
 class PlanError(InputError):
-    """A plan, or a plan file, that cannot be carried out."""
+    """Raised for a plan, or a plan file, that cannot be carried out."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step(Document):
-    """One thing to capture.
+    """One step of a capture.
 
     Parameters
     ----------
     id : str
-        Unlike every other step's, usable in a file name.
+        Unique in the plan, usable in a file name.
     kind : str
         Of the flash rig "flat", "chart", "malus" or "subject"; of the dome "olat" (one light at a
         time), "tracking" (several at once), "charuco", "mirror" or "white"; of the gradient sphere
-        "gradient" (skin) or "ball" (a ball of black glass); of the fibre probe "fibres" (skin),
-        "phantom" (a block of known optics) or "mask" (that, with all fibres covered but one); of
+        "gradient" (skin) or "ball" (a ball of black glass); of the fiber probe "fibres" (skin),
+        "phantom" (a block of known optics) or "mask" (the same with all fibers covered but one); of
         all "dark".
     index : mapping of str to str, int or float
-        Where the step stands in its series, e.g. ``{"state": "neutral", "repeat": 0}``.
+        Indices of the step in its series, e.g. ``{"state": "neutral", "repeat": 0}``.
     settings : mapping of str to str, int, float or bool
         ``polarizer`` ("parallel" or "crossed"), ``power`` (0 to 1 of a light's full energy),
         ``exposure_s`` (s), ``iso``; ``analyser_deg`` (rotator reading, degrees; 0 is parallel, 90
         crossed) takes precedence over ``polarizer``. On the dome ``light`` (its name), or ``leds``
         (names joined by +), at ``level`` (0 to 1) for ``dwell_s``; in the gradient sphere
-        ``pattern`` instead of lights; of the fibre probe ``suction_mbar`` and ``fibre`` (number of
-        the only fibre that is not covered). Of a sequence ``start_s``, when, s after its beginning.
-        A rig may bring further names.
+        ``pattern`` instead of lights; of the fiber probe ``suction_mbar`` and ``fibre`` (number of
+        the only uncovered fiber). In a sequence ``start_s``, s after its beginning. Rigs may
+        define further names.
     cameras : tuple of str
         Views that take a frame.
 
@@ -119,7 +119,7 @@ class Step(Document):
         object.__setattr__(self, "settings", MappingProxyType(dict(self.settings)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Travel between processes as plain dictionaries."""
+        """Return the dictionaries from which the object is rebuilt in another process."""
         parts = (self.id, self.kind, dict(self.index), dict(self.settings), self.cameras)
         return (Step, parts)
 
@@ -139,16 +139,16 @@ def _check_settings(settings: Mapping[str, Value]) -> list[Fault]:
 
 @dataclass(frozen=True, slots=True)
 class Plan(Document):
-    """Steps in the order of capture, for one rig, with the limits they were planned within.
+    """Steps in the order of capture, for one rig, with the limits that were planned for.
 
     Parameters
     ----------
     rig : str
         Name of the rig.
     steps : tuple of Step
-        At least one; ids differ, also when upper and lower case are not told apart.
+        At least one; ids are unique, also when upper and lower case are equivalent.
     limits : mapping of str to float
-        What the planner kept to, e.g. ``{"max_pops_per_min": 20.0, "recycle_s": 1.5}``.
+        Limits observed by the planner, e.g. ``{"max_pops_per_min": 20.0, "recycle_s": 1.5}``.
     """
 
     rig: str
@@ -170,7 +170,7 @@ class Plan(Document):
         object.__setattr__(self, "limits", MappingProxyType(dict(self.limits)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Travel between processes as plain dictionaries."""
+        """Return the dictionaries from which the object is rebuilt in another process."""
         return (Plan, (self.rig, self.steps, dict(self.limits)))
 
     def step(self, step_id: str) -> Step:
@@ -184,7 +184,7 @@ class Plan(Document):
         raise PlanError(f"the plan has no step {step_id!r}", faults=[fault])
 
     def check(self, rig: Rig) -> None:
-        """Raise where the plan is for another rig or asks for views the rig does not have."""
+        """Raise an error when the plan is for another rig, or names views that it lacks."""
         checks = FaultCollector(f"Plan for rig {self.rig!r}", PlanError)
         checks.check("rig", self.rig, self.rig == rig.name, f"the rig's name {rig.name!r}")
         views = [view.name for view in rig.views]
@@ -196,15 +196,14 @@ class Plan(Document):
         checks.close()
 
     def estimate_duration_s(self, rig: Rig) -> float:
-        """Return the least time the plan takes on ``rig``, s.
+        """Return the minimum duration of the plan on ``rig``, s.
 
-        Per step the slowest camera's exposure and read-out, or the recycling of the flash or the
-        time that the light stays on where that is longer, and the turning of the analyser where
-        its state changes. Where a caliper's position changes its way, and the time in which the
-        skin creeps; where a head is held by suction, pumping and rests, and all exposures of a
-        series, though some may turn out to be not needed. Of a sequence its lead and its last
-        time. Not the time of the person who tapes the
-        caliper or places the head.
+        Per step the slowest camera's exposure and readout, or the recycling of the flash or the
+        duration of the light when that is longer, and the turning of the analyzer when its state
+        changes. When a caliper's position changes its travel, and the time of the skin's creep;
+        when a head is held by suction, pumping and rests, and all exposures of a series, though
+        some may turn out to be unnecessary. For a sequence its lead and its last time. The time of
+        a person who tapes the caliper or places the head is not included.
         """
         total, last_s = self.limits.get("lead_s", 0.0), 0.0
         each_s: list[float] = []
@@ -216,7 +215,7 @@ class Plan(Document):
             pause_s = max(rig.recycle_s * power, 60.0 / rig.max_pops_per_min) if power > 0 else 0.0
             pause_s = max(pause_s, float(step.settings.get("dwell_s", 0.0)))
             each_s.append(max(float(step.settings.get("exposure_s", 0.0)) + readout_s, pause_s))
-            if "start_s" in step.settings:  # a sequence lasts as long as its times say
+            if "start_s" in step.settings:  # the times of a sequence determine its duration
                 last_s = max(last_s, float(step.settings["start_s"]) + each_s[-1])
                 continue
             total += each_s[-1]
@@ -227,12 +226,12 @@ class Plan(Document):
             if rig.caliper is not None and "caliper" in step.index:
                 now = (step.index.get("angle"), int(step.index["caliper"]))
                 if now != held:
-                    # a turned caliper is taped on anew, at step 0
+                    # a turned caliper is taped on again, at step 0
                     way = abs(now[1] - (held[1] if now[0] == held[0] else 0))
                     move_s = way * rig.caliper.step_mm / rig.caliper.speed_mm_per_s
                     move_s += rig.caliper.settle_s
                 held = now
-            total += max(turn_s, move_s)  # the analyser turns while the jaws move
+            total += max(turn_s, move_s)  # the analyzer turns while the jaws move
         return (
             total
             + last_s
@@ -246,7 +245,7 @@ class Plan(Document):
         Raises
         ------
         PlanError
-            With every fault's path, what was found and what was expected.
+            With every fault's path, the value found and the value expected.
         """
         if isinstance(data, str | bytes):
             data = read_json(data, where=where, error=PlanError)
@@ -254,14 +253,14 @@ class Plan(Document):
 
 
 class StepSeries:
-    """Steps being collected, for all views of one rig.
+    """Collected steps, for all views of one rig.
 
     Parameters
     ----------
     rig
         The rig.
     **every
-        Settings of every step that does not say otherwise.
+        Default settings of every step.
     """
 
     def __init__(self, rig: Rig, **every: Value) -> None:
@@ -280,11 +279,11 @@ class StepSeries:
 
 
 def int_if_whole(angle_deg: float) -> int | float:
-    """Return an angle as a whole number where it is one."""
+    """Return an angle as a whole number when it is one."""
     return int(angle_deg) if float(angle_deg).is_integer() else float(angle_deg)
 
 
 def require_argument(condition: bool, name: str, got: object, expected: str) -> None:
-    """Raise `PlanError` where an argument of a generator of plans is not as expected."""
+    """Raise `PlanError` when an argument of a plan generator is not as expected."""
     if not condition:
         raise PlanError("cannot plan", faults=[Fault(name, short_repr(got), expected)])

@@ -1,4 +1,4 @@
-"""How long a head is held by suction: which steps share a placement, and where skin has a rest."""
+"""Divide the steps of a placement into periods of suction and rests of the skin."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,13 +7,13 @@ from typing import Protocol
 from capture.rig import Probe
 
 WIRE_SLACK_S = 0.1
-"""What words on the wire and a camera may take beside exposure and read-out, s."""
+"""Time for commands and camera in addition to exposure and readout, s."""
 PUMP_TIME_S = 2.0
-"""About how long a pump takes to reach its suction, s."""
+"""Typical time until a pump reaches its suction, s."""
 
 
 class ProbeStep(Protocol):
-    """What this module needs of a plan's step."""
+    """Attributes of a plan's step that this module needs."""
 
     @property
     def kind(self) -> str:
@@ -30,7 +30,7 @@ class ProbeStep(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class HeadPlacement:
-    """Where a person has put the head; another repeat is another placement."""
+    """Placement of the head by a person; another repeat is another placement."""
 
     site: str
     angle_deg: float
@@ -42,7 +42,7 @@ class HeadPlacement:
 
 
 def step_placement(step: ProbeStep) -> HeadPlacement | None:
-    """Return where a step wants the head; None where it does not matter.
+    """Return the placement of the head for a step; None when it does not matter.
 
     Examples
     --------
@@ -60,7 +60,7 @@ def step_placement(step: ProbeStep) -> HeadPlacement | None:
 
 
 def exposure_time_per_suction_s(probe: Probe) -> float:
-    """Return how long exposures and their read-out may take in one suction, s.
+    """Return the time for exposures and their readout in one suction, s.
 
     Examples
     --------
@@ -72,7 +72,7 @@ def exposure_time_per_suction_s(probe: Probe) -> float:
 
 
 def split_into_suctions(seconds: Sequence[float], probe: Probe) -> list[range]:
-    """Return which exposures of a placement share a suction, each with its read-out, s.
+    """Return the exposures of a placement that share a suction, each with its readout, s.
 
     Examples
     --------
@@ -92,7 +92,7 @@ def split_into_suctions(seconds: Sequence[float], probe: Probe) -> list[range]:
 
 
 def suction_overhead_s(steps: Sequence[ProbeStep], seconds: Sequence[float], probe: Probe) -> float:
-    """Return the time that suction and rests add to a plan's steps, each of so many seconds."""
+    """Return the time that suction and rests add to a plan's steps with given durations, s."""
     total, held, group = 0.0, None, list[float]()
 
     def end_of_group() -> float:

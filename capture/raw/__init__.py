@@ -1,4 +1,4 @@
-"""Raw frames: our own DNG written and read, foreign raw files read, linear values with variance."""
+"""Raw frames: write and read our own DNG, read foreign files, convert to linear values."""
 
 from capture.raw.dng import encode_dng, encode_frame, write_dng
 from capture.raw.frame import RawError, RawFrame, noise_profile

@@ -1,4 +1,4 @@
-"""Our own DNG: uncompressed 16 bit, deterministic, describing itself down to step and light.
+"""Write and read our own DNG: uncompressed 16 bit, deterministic, with step and light.
 
 References
 ----------
@@ -44,7 +44,7 @@ _CFA_PHOTOMETRIC, _LINEAR_PHOTOMETRIC = 32803, 34892
 _ALIGNMENT_BYTES = 64
 _CROP_PX = 8
 _HEAD_BYTES = 65_536
-# XYZ (D65) -> linear sRGB, IEC 61966-2-1: stands in the file where the camera's own is unknown
+# XYZ (D65) -> linear sRGB, IEC 61966-2-1: written to the file when the camera's own is unknown
 _SRGB_FROM_XYZ = (3.2406, -1.5372, -0.4986, -0.9689, 1.8758, 0.0415, 0.0557, -0.2040, 1.0570)
 
 _XMP_TEMPLATE = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
@@ -64,7 +64,7 @@ def encode_dng(
     white: int,
     **description: Any,
 ) -> bytes:
-    """Return the bytes of a DNG that holds ``cfa`` unchanged; equal arguments give equal bytes.
+    """Encode ``cfa`` unchanged as a DNG; equal arguments give equal bytes.
 
     Parameters
     ----------
@@ -73,11 +73,11 @@ def encode_dng(
     pattern : str
         "RGGB", "BGGR", "GRBG", "GBRG" or "MONO".
     black : float or sequence of 4 floats
-        DN of no light, for all positions of the 2 x 2 cell or row by row.
+        Black level, DN, for all positions of the 2 x 2 cell or row by row.
     white : int
-        DN of saturation.
+        Saturation level, DN.
     exposure_s, iso, f_number, focal_mm
-        Exposure time (s), sensitivity, f-number, focal length (mm); left out where None.
+        Exposure time (s), sensitivity, f-number, focal length (mm); omitted when None.
     camera_model, camera_serial : str
         ASCII, as the camera names itself.
     color_matrix : array, shape (3, 3), optional
@@ -89,9 +89,9 @@ def encode_dng(
         variance = scale * x + offset in fractions of full scale, see `noise_profile`.
     captured_at : datetime with zone, optional
     step_id, session_id : str
-        Where the frame belongs.
+        Step and session of the frame.
     light : mapping, optional
-        The light that made the frame (polarizer, power, token, analyser): JSON values.
+        Light of the frame (polarizer, power, token, analyzer): JSON values.
 
     Raises
     ------
@@ -122,10 +122,10 @@ def encode_dng(
 
 
 def encode_frame(frame: RawFrame) -> bytes:
-    """Return the bytes of a DNG that holds a frame unchanged; see `encode_dng`."""
+    """Encode a frame unchanged as a DNG; see `encode_dng`."""
     pixels = np.ascontiguousarray(frame.cfa, dtype="<u2").tobytes()
     exif = _exif_entries(frame)
-    # lay out once with zero offsets to learn the sizes, then with the true ones
+    # lay out once with zero offsets to compute the sizes, then with the true ones
     main = encode_directory(_main_entries(frame, pixels, 0, 0), 8)
     exif_at = 8 + len(main)
     pixels_at = (
@@ -137,7 +137,7 @@ def encode_frame(frame: RawFrame) -> bytes:
 
 
 def write_dng(path: str | Path, cfa: UInt16Array, **description: Any) -> None:
-    """Write a DNG that appears whole or not at all; keyword arguments as for `encode_dng`."""
+    """Write a DNG atomically; keyword arguments as for `encode_dng`."""
     blob = encode_dng(cfa, **description)
     target = Path(path)
     part = target.with_name(target.name + ".part")
@@ -149,22 +149,22 @@ def write_dng(path: str | Path, cfa: UInt16Array, **description: Any) -> None:
 
 
 def is_skinrig_dng(buffer: memoryview) -> bool:
-    """Return whether the file was written by `encode_dng`, even where a part of its head is hurt.
+    """Return whether the file was written by `encode_dng`, even when part of its head is damaged.
 
-    Two marks are looked for, so that a damaged file of ours is refused by our strict reader and
-    never guessed at by a lenient one (LibRaw knows some formats by nothing but the file's size).
+    Two marks are searched for, so that a damaged file of ours is rejected by our strict reader and
+    never interpreted by a lenient one (LibRaw identifies some formats only by the file's size).
     """
     head = bytes(buffer[:_HEAD_BYTES])
     return XMP_NAMESPACE.encode() in head or f"{SOFTWARE_NAME}\0".encode() in head
 
 
 def decode_dng(buffer: memoryview, *, where: str = "") -> RawFrame:
-    """Return the frame of a DNG of ours; its pixels are a read-only view of ``buffer``.
+    """Decode a DNG of ours; the frame's pixels are a read-only view of ``buffer``.
 
     Raises
     ------
     RawError
-        Where the file is cut short, damaged in one bit of its pixels, or not of ours.
+        When the file is truncated, damaged in one bit of its pixels, or not of ours.
     """
     tags = Directory(buffer, where=where)
     if 50706 not in tags or XMP_NAMESPACE.encode() not in tags.data(700):
@@ -282,7 +282,7 @@ def _exif_entries(frame: RawFrame) -> list[Entry]:
     if frame.f_number is not None:
         entries.append(encode_entry(33437, RATIONAL, [frame.f_number]))
     if frame.iso is not None:
-        # ISO above 16 bit stands in the long tag alone, EXIF 2.3 section 4.6.5
+        # ISO above 16 bit is in the long tag only, EXIF 2.3 section 4.6.5
         entries.append(encode_entry(34855, SHORT, [min(int(frame.iso), 65_535)]))
         entries.append(encode_entry(34864, SHORT, [3]))
         entries.append(encode_entry(34867, LONG, [int(frame.iso)]))
@@ -313,7 +313,7 @@ def _xmp(frame: RawFrame, pixels: bytes) -> bytes:
 
 
 def _read_xmp(packet: bytes, where: str) -> dict[str, str]:
-    """Return our attributes; a packet that declares entities is refused (expansion attacks)."""
+    """Return our attributes; reject a packet that declares entities (expansion attacks)."""
     if len(packet) > 65_536 or re.search(rb"<!(DOCTYPE|ENTITY)", packet):
         raise _error("is damaged", where, "XMP", f"{len(packet)} bytes", "plain, below 64 KiB")
     try:

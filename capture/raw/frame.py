@@ -1,4 +1,4 @@
-"""One raw frame in memory: sensor values and what is needed to understand them."""
+"""One raw frame in memory: sensor values, levels, settings and provenance."""
 
 import math
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ ILLUMINANT_CODES: Mapping[str, int] = {"A": 17, "D55": 20, "D65": 21, "D75": 22,
 
 
 class RawError(InputError):
-    """A raw file, or the content of one, that cannot be used."""
+    """Raised for a raw file, or the content of one, that cannot be used."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -32,32 +32,32 @@ class RawFrame:
     pattern: str
     """Colors of the 2 x 2 cell row by row ("RGGB", "BGGR", "GRBG", "GBRG"), or "MONO"."""
     black: tuple[float, ...]
-    """DN of no light for each position of the cell, row by row; a single value for MONO."""
+    """Black level, DN, for each position of the cell, row by row; a single value for MONO."""
     white: int
-    """DN of saturation."""
+    """Saturation level, DN."""
     exposure_s: float | None = None
-    """Exposure time, s; None where the file does not say."""
+    """Exposure time, s; None when the file does not contain it."""
     iso: int | None = None
-    """Sensitivity; None where the file does not say."""
+    """Sensitivity; None when the file does not contain it."""
     camera_model: str = ""
     camera_serial: str = ""
     color_matrix: Float64Array | None = None
-    """(3, 3) from CIE XYZ of ``color_illuminant`` to camera RGB; None where unknown."""
+    """(3, 3) from CIE XYZ of ``color_illuminant`` to camera RGB; None when unknown."""
     color_illuminant: str = "D65"
     """Illuminant of ``color_matrix``: "A", "D50", "D55", "D65" or "D75"."""
     neutral: tuple[float, float, float] | None = None
-    """Camera RGB of a neutral surface, largest 1; None where unknown."""
+    """Camera RGB of a neutral surface, largest 1; None when unknown."""
     noise_profile: tuple[float, float] | None = None
     """(scale, offset): variance = scale * x + offset, x in fractions of full scale (DNG 1.3)."""
     f_number: float | None = None
     focal_mm: float | None = None
     captured_at: datetime | None = None
-    """Time of capture with its zone; None where the file does not say."""
+    """Time of capture with its zone; None when the file does not contain it."""
     step_id: str = ""
     """Step of the plan the frame belongs to, empty for foreign files."""
     session_id: str = ""
     light: Mapping[str, Any] = field(default_factory=dict)
-    """The light that made the frame: polarizer, power, token, analyser."""
+    """Light of the frame: polarizer, power, token, analyzer."""
     path: str = ""
     """File the frame was read from, empty for a frame made in memory."""
 

@@ -1,4 +1,4 @@
-"""From DN to linear camera RGB with the variance that shot and read noise leave in it."""
+"""Convert DN to linear camera RGB with its variance from shot and read noise."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -13,7 +13,7 @@ Demosaic = Literal["superpixel", "centered", "bilinear"]
 LINEAR_UNIT = "fraction of full scale"
 
 _COLOR_LETTERS = "RGB"
-# bilinear interpolation of red and blue is separable; green takes its four neighbours
+# bilinear interpolation of red and blue is separable; green is the mean of its four neighbors
 _TRIANGLE_FILTER = (0.5, 1.0, 0.5)
 
 
@@ -42,14 +42,14 @@ def linear_rgb(
     Parameters
     ----------
     frame : RawFrame
-        Of a sensor with a 2 x 2 color filter array.
+        Frame of a sensor with a 2 x 2 color filter array.
     demosaic : {"superpixel", "centered", "bilinear"}
         "superpixel": one output pixel per 2 x 2 cell, (H/2, W/2), the two greens averaged, no
-        correlation between pixels, but the colors of a pixel stand up to a sensor pixel apart: a
-        gradient of brightness shows as a tint. "centered": the same size, every color
+        correlation between pixels, but the colors of a pixel are up to one sensor pixel apart: a
+        gradient of brightness appears as a tint. "centered": the same size, every color
         interpolated linearly to the middle of the cell, so that a gradient has no tint; the noise
-        of neighbouring pixels is slightly correlated. "bilinear": (H, W), missing colors from
-        their neighbours, at the border from those that exist; the noise of neighbouring pixels is
+        of neighboring pixels is slightly correlated. "bilinear": (H, W), missing colors from their
+        neighbors, at the border from those that exist; the noise of neighboring pixels is
         correlated.
     gain : float, optional
         Calibrated conversion gain, electrons per DN; with ``read_noise`` instead of the file's
@@ -66,7 +66,7 @@ def linear_rgb(
     Raises
     ------
     RawError
-        For a MONO frame, and where neither the frame nor the caller says how noisy the sensor is.
+        For a MONO frame, and when neither the frame nor the caller gives a noise profile.
 
     Examples
     --------
@@ -97,7 +97,7 @@ def linear_mono(
     Parameters
     ----------
     frame : RawFrame
-        Of a sensor without color filters.
+        Frame of a sensor without color filters.
     gain, read_noise : float, optional
         As in `linear_rgb`.
 
@@ -111,7 +111,7 @@ def linear_mono(
     Raises
     ------
     RawError
-        For a frame with color filters, and where nothing says how noisy the sensor is.
+        For a frame with color filters, and when the noise profile is missing.
 
     Examples
     --------
@@ -144,7 +144,7 @@ def interpolate(
     values, variance : ndarray of float32, shape (H, W)
         Linear values behind a 2 x 2 color filter array, and their variance; H and W are even.
     good : ndarray of bool, shape (H, W)
-        False for values that must not be used; no pixel that they contribute to is valid.
+        False for values that must not be used; pixels to which they contribute are invalid.
     pattern : str
         "RGGB", "BGGR", "GRBG" or "GBRG".
     demosaic : {"superpixel", "centered", "bilinear"}
@@ -180,10 +180,10 @@ def _pixels(
         else:
             fault = Fault("noise_profile", "none", "one in the file, or gain and read_noise")
             advice = "Calibrate the sensor and pass gain (electrons per DN) and read_noise."
-            what = "nothing says how noisy this frame is"
+            what = "the noise profile of this frame is missing"
             raise RawError(what, where=frame.path, faults=[fault], advice=advice)
         x[rows, columns] = part
-        # below black the expected signal is none, not a negative shot noise
+        # below black the expected signal is zero, and shot noise is not negative
         variance[rows, columns] = np.float32(scale) * np.maximum(part, 0) + np.float32(offset)
     return x, variance
 
@@ -229,8 +229,10 @@ def _shift_to_cell_center(
 ) -> Float32Array:
     """Shift a plane by a quarter of its pitch along both axes, with weights to ``power``.
 
-    At the border, where the neighbor is missing, the plane's own value stands alone.
+    At the border, where the neighbor is missing, the plane's own value is used.
     """
+    # Sites of one color are two pixels apart and the cell's middle half a pixel away, a quarter of
+    # the pitch: linear weights 3/4 and 1/4, squared for variances.
     near, far = np.float32(0.75**power), np.float32(0.25**power)
     for axis, forward in enumerate(ahead):
         lines = plane.T if axis else plane
@@ -255,7 +257,7 @@ def _bilinear(
         for cell in (c for c in range(4) if pattern[c] == letter):
             mask[cell // 2 :: 2, cell % 2 :: 2] = 1
         spread = _interpolate_green if letter == "G" else _interpolate_sparse
-        # weights that leave the image are shared among the others: a flat field stays flat
+        # weights outside the image are redistributed to the others: a flat field stays flat
         total = spread(mask, power=1)
         rgb[..., band] = spread(x * mask, power=1) / total
         noise[..., band] = spread(variance * mask, power=2) / total**2
@@ -276,7 +278,7 @@ def _interpolate_sparse(plane: Float32Array, *, power: int) -> Float32Array:
 
 
 def _interpolate_green(plane: Float32Array, *, power: int) -> Float32Array:
-    """Convolve the green plane: itself where it is green, else a quarter of each neighbour."""
+    """Convolve the green plane: itself at green sites, else a quarter of each neighbor."""
     weight = np.float32(0.25**power)
     spread = plane.copy()
     spread[1:] += weight * plane[:-1]

@@ -1,4 +1,4 @@
-"""Raw files of any make: ours by our own reader, all others through LibRaw."""
+"""Read raw files of any camera: ours by our own reader, all others through LibRaw."""
 
 import mmap
 from pathlib import Path
@@ -17,23 +17,23 @@ _FLOAT_SAMPLES = 3
 
 
 def read(path: str | Path) -> RawFrame:
-    """Return the raw frame of a file.
+    """Read the raw frame of a file.
 
     Parameters
     ----------
     path : str or Path
-        A DNG of ours, or a raw file of any camera LibRaw knows.
+        A DNG of ours, or a raw file of any camera that LibRaw supports.
 
     Returns
     -------
     RawFrame
-        The visible sensor values unchanged, uint16, shape (H, W). Of a foreign file with an odd
-        visible area the last row or column is left out, so that 2 x 2 cells are whole.
+        The visible sensor values unchanged, uint16, shape (H, W). For a foreign file with an odd
+        visible area the last row or column is omitted, so that 2 x 2 cells are whole.
 
     Raises
     ------
     RawError
-        Where the file is missing, empty, cut short, damaged, absurd in size or not a raw file;
+        When the file is missing, empty, truncated, damaged, implausible in size or not a raw file;
         also for sensors without a 2 x 2 cell and for floating-point DNGs.
     """
     where = str(path)
@@ -59,7 +59,7 @@ def decode(buffer: memoryview, *, where: str = "") -> RawFrame:
 
 
 def _tags(buffer: memoryview, where: str) -> Directory | None:
-    """Return the first directory; None where the file is no TIFF, an error for a broken DNG."""
+    """Return the first directory; None when the file is not a TIFF, an error for a broken DNG."""
     if bytes(buffer[:4]) not in (b"II*\0", b"MM\0*"):
         return None
     try:
@@ -91,7 +91,7 @@ def _decode_with_libraw(buffer: memoryview, tags: Directory | None, where: str) 
 
 
 class _Reader:
-    """The one method of a file that LibRaw needs."""
+    """File object with the only method that LibRaw needs."""
 
     def __init__(self, buffer: memoryview) -> None:
         self._buffer = buffer
@@ -139,12 +139,12 @@ def _translate(raw: Any, tags: Directory | None, where: str) -> RawFrame:
         )
     except RawError as exc:
         raise RawError(
-            "cannot be understood", where=where, faults=exc.faults, advice=_RAW_ADVICE
+            "cannot be decoded", where=where, faults=exc.faults, advice=_RAW_ADVICE
         ) from exc
 
 
 def _read_description(raw: Any, tags: Directory | None) -> dict[str, Any]:
-    """Return what the file says beside its pixels; whatever it does not say stays out."""
+    """Return the metadata of a file; missing fields are omitted."""
     found: dict[str, Any] = {}
     other = getattr(raw, "other", None)
     if other is not None:
@@ -159,7 +159,7 @@ def _read_description(raw: Any, tags: Directory | None) -> dict[str, Any]:
     if all(x > 0 for x in balance):
         inverse = [1.0 / x for x in balance]
         found["neutral"] = tuple(x / max(inverse) for x in inverse)
-    # rawpy's matrix is all zeros for any DNG (LibRaw issue 751), so it is taken from the tags
+    # rawpy's matrix is all zeros for any DNG (LibRaw issue 751), so it is read from the tags
     matrix = np.asarray(raw.rgb_xyz_matrix[:3], np.float64)
     if matrix.any():
         found["color_matrix"] = matrix

@@ -1,4 +1,4 @@
-"""The little of TIFF that a DNG needs: directories of tags, written and read within bounds.
+"""Subset of TIFF for DNG: directories of tags, written and read within bounds.
 
 References
 ----------
@@ -35,7 +35,7 @@ class Entry:
 
 
 def encode_entry(tag: int, kind: int, values: Sequence[float] | str | bytes) -> Entry:
-    """Return a little-endian entry; rationals take the nearest fraction of 32-bit integers."""
+    """Return a little-endian entry; rationals are the nearest fraction of 32-bit integers."""
     if isinstance(values, str):
         values = values.encode("ascii") + b"\0"
     if isinstance(values, bytes):
@@ -51,7 +51,7 @@ def encode_entry(tag: int, kind: int, values: Sequence[float] | str | bytes) -> 
 
 
 def encode_directory(entries: Iterable[Entry], offset: int) -> bytes:
-    """Return a directory, as it stands at ``offset`` of the file, followed by its longer values."""
+    """Encode a directory for ``offset`` of the file, followed by its longer values."""
     ordered = sorted(entries, key=lambda e: e.tag)
     table = struct.pack("<H", len(ordered))
     place = offset + 2 + 12 * len(ordered) + 4
@@ -66,14 +66,14 @@ def encode_directory(entries: Iterable[Entry], offset: int) -> bytes:
 
 
 class Directory:
-    """The tags of one directory of a file, read on demand and never outside the file.
+    """Tags of one directory of a file, read on demand and never outside the file.
 
     Parameters
     ----------
     buffer : memoryview
         The whole file.
     offset : int or None
-        Where the directory stands; None for the first.
+        Offset of the directory; None for the first.
     where : str
         File name for messages.
     """
@@ -100,7 +100,7 @@ class Directory:
         return tag in self._tags
 
     def data(self, tag: int) -> bytes:
-        """Return the bytes of ``tag``; empty where it is missing."""
+        """Return the bytes of ``tag``; empty when it is missing."""
         if tag not in self._tags:
             return b""
         kind, count, at = self._tags[tag]
@@ -116,7 +116,7 @@ class Directory:
         return bytes(self._buffer[at : at + size])
 
     def numbers(self, tag: int) -> tuple[float, ...]:
-        """Return the values of ``tag``, rationals divided; empty where it is missing."""
+        """Return the values of ``tag``, rationals divided; empty when it is missing."""
         data = self.data(tag)
         if not data:
             return ()
@@ -131,7 +131,7 @@ class Directory:
         return tuple(n / d if d else float("nan") for n, d in pairs)
 
     def number(self, tag: int) -> float | None:
-        """Return the first value of ``tag``, or None where it is missing."""
+        """Return the first value of ``tag``, or None when it is missing."""
         return next(iter(self.numbers(tag)), None)
 
     def integer(self, tag: int, default: int | None = None) -> int:
@@ -144,12 +144,12 @@ class Directory:
         return int(values[0])
 
     def text(self, tag: int) -> str:
-        """Return the printable ASCII of ``tag``, empty where it is missing."""
+        """Return the printable ASCII of ``tag``, empty when it is missing."""
         text = self.data(tag).split(b"\0")[0].decode("ascii", "replace").strip()
         return "".join(c if c.isascii() and c.isprintable() else "?" for c in text)
 
     def children(self, tag: int) -> list[Directory]:
-        """Return the directories that ``tag`` points to; none where it is missing."""
+        """Return the directories that ``tag`` points to; empty when it is missing."""
         places = self.numbers(tag)[:16]
         return [Directory(self._buffer, offset=int(p), where=self._where) for p in places]
 
@@ -169,7 +169,7 @@ class Directory:
         return RawError(what, where=self._where, faults=[Fault(path, got, expected)], advice=advice)
 
 
-@lru_cache(maxsize=4096)  # a session's frames say the same numbers
+@lru_cache(maxsize=4096)  # a session's frames repeat the same numbers
 def _fraction(value: float, top: int) -> tuple[int, int]:
     """Return the nearest numerator and denominator that both stay within ``top``."""
     exact = Fraction(value)

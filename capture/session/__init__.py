@@ -1,4 +1,4 @@
-"""The SESSION/ format: frames that appear whole, a hash-chained journal, resume and verify."""
+"""SESSION/ format: atomically written frames, a hash-chained journal, resume and verify."""
 
 from capture.session.disk import Disk
 from capture.session.errors import (

@@ -1,4 +1,4 @@
-"""Reading a session folder: the manifest, the journal, and what they say about each other."""
+"""Read a session folder: manifest, journal, and their consistency."""
 
 import os
 import stat
@@ -26,7 +26,7 @@ MAX_JOURNAL_BYTES = 2**30
 
 @dataclass(frozen=True, slots=True)
 class SessionContents:
-    """What the two text files of a session say."""
+    """Content of the two text files of a session."""
 
     manifest: Manifest
     walk: JournalWalk
@@ -43,7 +43,7 @@ class SessionContents:
 
     @property
     def omission_lines(self) -> tuple[OmissionLine, ...]:
-        """What was left out and why, in the order in which it was."""
+        """Omitted steps and their reasons, in the order in which they were omitted."""
         return tuple(line for _, line in self.walk.lines if isinstance(line, OmissionLine))
 
     @property
@@ -53,20 +53,20 @@ class SessionContents:
 
     @property
     def close_line(self) -> CloseLine | None:
-        """The end of the session, None while it is open."""
+        """Closing line of the session, None while it is open."""
         last = self.walk.lines[-1][1] if self.walk.lines else None
         return last if isinstance(last, CloseLine) else None
 
 
 def read_contents(path: Path) -> SessionContents:
-    """Return manifest and journal of the session at ``path``; damage of the journal is noted.
+    """Return manifest and journal of the session at ``path``; damage of the journal is recorded.
 
     Raises
     ------
     SessionError
-        Where there is no session, or one of an unknown schema.
+        When the folder is not a session, or its schema is unknown.
     SessionDamage
-        Where session.json is not what was written, or the journal is missing.
+        When session.json differs from what was written, or the journal is missing.
     """
 
     def no_session() -> SessionError:
@@ -99,7 +99,7 @@ def read_contents(path: Path) -> SessionContents:
 
 
 def _check_against_plan(walked: JournalWalk, manifest: Manifest, where: str) -> JournalWalk:
-    """Note the first line that the plan does not allow: an unknown step, a frame twice."""
+    """Record the first line that the plan does not allow: an unknown step, a frame twice."""
     seen: set[str] = set()
     left_out: set[str] = set()
     steps = {step.id: step for step in manifest.plan.steps}
@@ -113,7 +113,7 @@ def _check_against_plan(walked: JournalWalk, manifest: Manifest, where: str) -> 
         elif isinstance(line, OmissionLine):
             strangers = [step for step in line.steps if step not in steps or step in left_out]
             got, good = ", ".join(strangers), not strangers
-            expected = "steps of the plan, each left out once"
+            expected = "steps of the plan, each omitted once"
             left_out.update(line.steps)
         else:
             got, good, expected = line.file, line.file not in seen, "each frame once"
@@ -123,7 +123,7 @@ def _check_against_plan(walked: JournalWalk, manifest: Manifest, where: str) -> 
             if step is None:
                 got, good, expected = line.step, False, "a step of the plan"
             elif line.step in left_out:
-                got, good, expected = line.step, False, "no frame of a step that was left out"
+                got, good, expected = line.step, False, "no frame of an omitted step"
             elif line.camera not in step.cameras:
                 got, good, expected = line.camera, False, f"one of {', '.join(step.cameras)}"
         if not good:
@@ -145,7 +145,7 @@ def list_files(path: Path) -> list[str]:
 
 
 def _require_folder(folder: Path) -> None:
-    """Raise where ``folder`` is missing or is a link to somewhere else."""
+    """Raise an error when ``folder`` is missing or is a symbolic link."""
     try:
         plain = stat.S_ISDIR(os.lstat(folder).st_mode)
     except FileNotFoundError:

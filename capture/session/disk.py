@@ -1,6 +1,6 @@
-"""The file operations that a session's safety rests on, each one method that a test can replace.
+"""File operations on which a session's safety rests, each one method that a test can replace.
 
-Reading needs no such care and is one function.
+Reading needs no such care: it is one function.
 """
 
 import fcntl
@@ -17,14 +17,14 @@ _E = TypeVar("_E", bound=SessionError)
 
 
 class Disk:
-    """The real disk. Every method is one operation in the order of a power-cut model."""
+    """Operations of the real disk; each method is one operation of a power-cut model."""
 
     def make_dir(self, path: Path) -> None:
         """Make a directory whose parent exists."""
         os.mkdir(path)
 
     def create(self, path: Path) -> int:
-        """Make a new file for writing and return its descriptor; an existing one is an error."""
+        """Create a new file for writing and return its descriptor; an existing one is an error."""
         return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
 
     def open_append(self, path: Path) -> int:
@@ -38,11 +38,11 @@ class Disk:
             rest = rest[os.write(descriptor, rest) :]
 
     def fsync(self, descriptor: int) -> None:
-        """Bring a file's data and size to the medium."""
+        """Flush a file's data and size to the medium."""
         os.fsync(descriptor)
 
     def fdatasync(self, descriptor: int) -> None:
-        """Bring a file's data, and the size needed to read it, to the medium."""
+        """Flush a file's data, and the size needed to read it, to the medium."""
         os.fdatasync(descriptor)
 
     def truncate(self, descriptor: int, size: int) -> None:
@@ -50,15 +50,15 @@ class Disk:
         os.ftruncate(descriptor, size)
 
     def rename(self, old: Path, new: Path) -> None:
-        """Give a file its new name in one step."""
+        """Rename a file atomically."""
         os.rename(old, new)
 
     def remove(self, path: Path) -> None:
-        """Take a file's name away."""
+        """Remove a file's name."""
         os.unlink(path)
 
     def fsync_dir(self, path: Path) -> None:
-        """Bring the names in a directory to the medium."""
+        """Flush the names in a directory to the medium."""
         descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             os.fsync(descriptor)
@@ -66,11 +66,11 @@ class Disk:
             os.close(descriptor)
 
     def close(self, descriptor: int) -> None:
-        """Close a descriptor; a lock held through it ends."""
+        """Close a descriptor; a lock held through it is released."""
         os.close(descriptor)
 
     def lock(self, descriptor: int) -> bool:
-        """Take the writer's lock; False where another process holds it."""
+        """Acquire the writer's lock; False when another process has it."""
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -86,7 +86,7 @@ def read_file(
     Raises
     ------
     SessionDamage
-        Where the file is missing (unless ``missing`` says otherwise), too large, or no plain file.
+        When the file is missing (unless ``missing`` allows it), too large, or not a regular file.
     """
     try:
         flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC

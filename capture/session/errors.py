@@ -1,27 +1,27 @@
-"""What can be wrong with a session."""
+"""Exceptions of sessions."""
 
 from capture.documents import InputError
 
 
 class SessionError(InputError):
-    """A session that cannot be used in the way asked."""
+    """Raised when a session cannot be used in the requested way."""
 
 
 class NotASession(SessionError):
-    """A folder that holds no session."""
+    """Raised for a folder that is not a session."""
 
 
 class SessionDamage(SessionError):
-    """A session whose files are not what was written."""
+    """Raised for a session whose files differ from what was written."""
 
 
 class SessionLocked(SessionError):
-    """A session that another process is writing."""
+    """Raised for a session that another process is writing."""
 
 
 class ConsentError(SessionError):
-    """A use of the data that its subject has not agreed to."""
+    """Raised for a use of the data that its subject has not agreed to."""
 
 
 class SessionDiskError(SessionError, OSError):
-    """The disk refused an operation; what was acknowledged before is safe."""
+    """Raised when the disk refused an operation; what was acknowledged before is safe."""

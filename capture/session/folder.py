@@ -1,4 +1,4 @@
-"""The folder of a session made and put in order, one disk operation after the other."""
+"""Create and repair the folder of a session, one disk operation after the other."""
 
 import logging
 import os
@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 
 class DiskErrors:
-    """Turn the operating system's errors into one of ours, naming session and cause."""
+    """Convert the operating system's errors to session errors that name session and cause."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -43,7 +43,7 @@ class DiskErrors:
 
 
 def write_new(disk: Disk, path: Path, data: bytes) -> None:
-    """Write a new file and bring its data to the medium; its name is the caller's to sync."""
+    """Write a new file and flush its data; the caller flushes its name."""
     descriptor = disk.create(path)
     try:
         disk.write(descriptor, data)
@@ -53,12 +53,12 @@ def write_new(disk: Disk, path: Path, data: bytes) -> None:
 
 
 def make_folder(disk: Disk, path: Path, manifest: bytes) -> None:
-    """Make the folder of a session with an empty journal and its manifest.
+    """Create the folder of a session with an empty journal and its manifest.
 
     Raises
     ------
     SessionError
-        Unless the folder is new, empty, or the debris of an interrupted creation.
+        Unless the folder is new, empty, or left over from an interrupted creation.
     """
     require_free(path)
     with DiskErrors(path):
@@ -71,7 +71,7 @@ def make_folder(disk: Disk, path: Path, manifest: bytes) -> None:
 
 
 def write_manifest(disk: Disk, path: Path, manifest: bytes) -> None:
-    """Write the manifest under its name, last: from that moment on the session exists."""
+    """Write the manifest under its name, last: from then on the session exists."""
     part = path / f"{MANIFEST_FILE}.part"
     if part.exists():
         disk.remove(part)
@@ -83,7 +83,7 @@ def write_manifest(disk: Disk, path: Path, manifest: bytes) -> None:
 
 
 def require_free(path: Path) -> None:
-    """Raise unless the folder is new, empty, or the debris of an interrupted creation."""
+    """Raise an error unless the folder is new, empty, or left over from an interrupted creation."""
     advice = "Choose a new folder, or resume the session that is there."
     if path.is_symlink() or (path.exists() and not path.is_dir()):
         kind = "a link" if path.is_symlink() else "a file"
@@ -109,7 +109,7 @@ def require_free(path: Path) -> None:
 
 
 def move_orphans(disk: Disk, path: Path, contents: SessionContents) -> None:
-    """Move files without a line to ``orphans/``; a committed file that is gone is an error."""
+    """Move files without a line to ``orphans/``; a missing committed file is an error."""
     lines = {line.file: line for line in contents.file_lines}
     present = list_files(path)
     for line in lines.values():

@@ -1,8 +1,9 @@
 """journal.jsonl: one sealed line per frame, attachment or omission, chained to all before it.
 
-A line is ``{"h":HASH,"r":RECORD}`` in canonical JSON, with HASH the SHA-256 of the hash before and
-of RECORD; the first is chained to the seal of session.json. So a line of another session, a line
-left out, and any changed byte are found, and a line cut by a crash can only be the last.
+A line is ``{"h":HASH,"r":RECORD}`` in canonical JSON, with HASH the SHA-256 of the previous hash
+and of RECORD; the first is chained to the seal of session.json. Any line of another session, a
+missing line, and any changed byte are therefore detected, and a line truncated by a crash can only
+be the last.
 """
 
 import hashlib
@@ -32,21 +33,21 @@ _XXH128_PATTERN = re.compile(r"[0-9a-f]{32}")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameLine(Document):
-    """One committed frame, as the journal holds it."""
+    """Journal line of one committed frame."""
 
     step: str
     camera: str
     attempt: int
     file: str
-    """Path inside the session; must be the one that step, camera and attempt give."""
+    """Path inside the session; must follow from step, camera and attempt."""
     bytes: int
     xxh128: str
     settings: Mapping[str, Value]
-    """What was asked for."""
+    """Requested settings."""
     actual: Mapping[str, Value]
-    """What box and camera report to have done."""
+    """Settings that controller and camera report."""
     t_box_s: float | None
-    """Time of the exposure on the clock of the box; None where there is no box."""
+    """Time of the exposure on the controller's clock; None for a rig without controller."""
     t_host_s: float
 
     def __post_init__(self) -> None:
@@ -64,15 +65,15 @@ class FrameLine(Document):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AttachmentLine(Document):
-    """One file that belongs to the capture and is no frame, as the journal holds it."""
+    """Journal line of one attached file: part of the capture, but not a frame."""
 
     name: str
     file: str
-    """Path inside the session; must be the one that the name gives."""
+    """Path inside the session; must follow from the name."""
     bytes: int
     xxh128: str
     about: Mapping[str, Value]
-    """Where it is from, for people: texts and numbers."""
+    """Provenance of the file: texts and numbers."""
 
     def __post_init__(self) -> None:
         checks = FaultCollector("Attachment line", SessionDamage)
@@ -87,17 +88,17 @@ class AttachmentLine(Document):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OmissionLine(Document):
-    """Steps of the plan that will not be captured, as the journal holds them."""
+    """Journal line of plan steps that will not be captured."""
 
     steps: tuple[str, ...]
     reason: str
-    """Why, for people."""
+    """Reason, for people."""
     about: Mapping[str, Value]
-    """What was found, for programs: texts and numbers."""
+    """Findings, for programs: texts and numbers."""
     t_host_s: float
 
     def __post_init__(self) -> None:
-        checks = FaultCollector("Line of steps left out", SessionDamage)
+        checks = FaultCollector("Line of omitted steps", SessionDamage)
         differ = len(set(self.steps)) == len(self.steps) > 0
         checks.check("steps", self.steps, differ, "at least one, none twice")
         for step in self.steps:
@@ -108,13 +109,13 @@ class OmissionLine(Document):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CloseLine(Document):
-    """The end of a session: nothing may follow."""
+    """Journal line that ends a session: nothing may follow."""
 
     frames: int
     missing: tuple[str, ...]
-    """Steps of the plan that were neither captured nor left out with a reason of their own."""
+    """Number of plan steps that were neither captured nor omitted with a reason of their own."""
     reason: str
-    """Why they were not, empty where none is missing."""
+    """Reason why steps are missing; empty when none is."""
 
 
 Line = FrameLine | AttachmentLine | OmissionLine | CloseLine
@@ -128,18 +129,18 @@ _LINE_KINDS: Mapping[str, type[Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class JournalWalk:
-    """What a journal holds."""
+    """Result of following a journal's chain."""
 
     lines: tuple[tuple[int, Line], ...]
-    """First byte and content of every good line."""
+    """First byte and content of every valid line."""
     head: str
     """Last hash of the chain."""
     end: int
-    """Byte after the last good line."""
+    """Byte after the last valid line."""
     torn: int
-    """Bytes after ``end`` that a crash cut off in the middle of writing; 0 for none."""
+    """Bytes after ``end`` of a line that a crash truncated; 0 for none."""
     damage: SessionDamage | None
-    """The first line that is not what was written; None where all are."""
+    """The first line that differs from what was written; None when all are valid."""
 
     @property
     def closed(self) -> bool:
@@ -160,7 +161,7 @@ def frame_path(step: str, camera: str, attempt: int) -> str:
 
 
 def is_attachment_name(name: str) -> bool:
-    """Return whether ``name`` can be an attachment's, a plain file name.
+    """Return whether ``name`` is valid for an attachment: a plain file name.
 
     Examples
     --------
@@ -182,7 +183,7 @@ def attachment_path(name: str) -> str:
 
 
 def seal_line(previous: str, line: Line) -> tuple[bytes, str]:
-    """Return the bytes of the line that follows ``previous``, and its hash."""
+    """Return the bytes of the line after ``previous``, and its hash."""
     kind = next(name for name, known in _LINE_KINDS.items() if isinstance(line, known))
     record = canonical_json({"type": kind, **to_json_table(line)})
     digest = hashlib.sha256(previous.encode("ascii") + record).hexdigest()
@@ -190,7 +191,7 @@ def seal_line(previous: str, line: Line) -> tuple[bytes, str]:
 
 
 def walk_journal(data: bytes, *, seal: str, where: str) -> JournalWalk:
-    """Follow the chain from ``seal`` to the last line, a torn tail, or the first damage."""
+    """Follow the chain from ``seal`` to the last line, a truncated line, or the first damage."""
     lines: list[tuple[int, Line]] = []
     head, start = seal, 0
     while start < len(data):
@@ -215,7 +216,7 @@ def walk_journal(data: bytes, *, seal: str, where: str) -> JournalWalk:
 
 
 def _unseal(text: bytes, head: str, where: str) -> tuple[Line | None, str]:
-    """Return content and hash of one line; None where only its newline is missing."""
+    """Return content and hash of one line; None when only its newline is missing."""
     if len(text) > MAX_LINE_BYTES:
         raise _damage_error(where, None, "line", f"{len(text)} bytes", f"at most {MAX_LINE_BYTES}")
     content = read_json(text, where=where, error=SessionDamage)
@@ -242,11 +243,11 @@ def _unseal(text: bytes, head: str, where: str) -> tuple[Line | None, str]:
 
 
 def _is_torn(text: bytes, unended: bool, *, last: bool, head: str) -> bool:
-    """Return whether a bad line looks like the cut-off end of an interrupted write.
+    """Return whether a bad line looks like the truncated end of an interrupted write.
 
-    A write that never reached the disk leaves a prefix of the line, zeros, or a prefix and zeros.
-    A flipped bit leaves at most one zero byte, and a line whose newline was hit is one byte longer
-    than a whole record: these are damage to something acknowledged.
+    An interrupted write leaves a prefix of the line, zeros, or a prefix and zeros. A flipped bit
+    leaves at most one zero byte, and a line whose newline was hit is one byte longer than a whole
+    record: these are damage to an acknowledged line.
     """
     if not last:
         return False

@@ -1,4 +1,4 @@
-"""session.json: who, what, with which rig and plan; written once, sealed in every byte."""
+"""session.json: subject, rig, plan and provenance; written once, every byte sealed."""
 
 import hashlib
 import json
@@ -35,17 +35,17 @@ _PSEUDONYM_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 @dataclass(frozen=True, slots=True)
 class SubjectRecord(Document):
-    """Who was captured, never by name, and what the person agreed to.
+    """Captured subject, by pseudonym, and the uses that the person has consented to.
 
     Parameters
     ----------
     pseudonym : str
-        1 to 64 letters, digits, ``_ . -``; no space, so that a full name is refused.
+        1 to 64 letters, digits, ``_ . -``; no space, so that a full name is rejected.
     consent_scope : tuple of str
-        What the data may be used for, e.g. ``("research", "publication")``; ``("any",)`` for
-        every use, as of a subject that is no person; empty for nothing beyond the capture itself.
+        Permitted uses of the data, e.g. ``("research", "publication")``; ``("any",)`` for every
+        use, as of an object; empty for nothing beyond the capture itself.
     consent_expires : date or None
-        Last day of the consent; None where it has no end.
+        Last day of the consent; None when it has no end.
 
     Examples
     --------
@@ -68,13 +68,13 @@ class SubjectRecord(Document):
 
 @dataclass(frozen=True, slots=True)
 class CalibrationRef(Document):
-    """A calibration that was in force, by the hash of its file."""
+    """Calibration in force during the capture, identified by the hash of its file."""
 
     kind: str
     sha256: str
     """``sha256:`` and 64 hexadecimal digits."""
     path: str = ""
-    """Where it stood, for people; the hash decides."""
+    """Path at the time of the capture, for people; the hash identifies the file."""
 
     def __post_init__(self) -> None:
         checks = FaultCollector("CalibrationRef", SessionError)
@@ -86,7 +86,7 @@ class CalibrationRef(Document):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Manifest(Document):
-    """The content of session.json."""
+    """Content of session.json."""
 
     id: str
     created_at: datetime
@@ -95,7 +95,7 @@ class Manifest(Document):
     plan: Plan
     rig: Rig
     devices: Mapping[str, Any] = field(default_factory=dict)
-    """What each box and camera said it is (identification, serial number, limits)."""
+    """Identification, serial number and limits that each controller and camera reported."""
     calibrations: tuple[CalibrationRef, ...] = ()
     seed: int | None = None
     """Seed of a simulated session; None for a measured one."""
@@ -127,7 +127,7 @@ def seal(content: Mapping[str, Any]) -> tuple[bytes, str]:
     Raises
     ------
     SessionError
-        Where ``content`` holds what JSON cannot.
+        When ``content`` contains a value that JSON cannot represent.
     """
     try:
         digest = hashlib.sha256(_format_document(content)).hexdigest()
@@ -143,9 +143,9 @@ def decode(data: bytes, *, where: str) -> tuple[Manifest, str]:
     Raises
     ------
     SessionError
-        Where the schema is not ours.
+        When the schema is not ours.
     SessionDamage
-        Where any byte differs from what was written, or the content has faults.
+        When any byte differs from what was written, or the content is invalid.
     """
     content = read_json(data, where=where, error=SessionDamage)
     if not isinstance(content, dict):
@@ -168,7 +168,7 @@ def decode(data: bytes, *, where: str) -> tuple[Manifest, str]:
 
 
 def package_versions() -> dict[str, str]:
-    """Return the versions of what wrote a session."""
+    """Return the versions of the software that wrote a session."""
     try:
         ours = version("skinrig")
     except PackageNotFoundError:

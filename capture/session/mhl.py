@@ -1,4 +1,4 @@
-"""ASC MHL: the manifest by which film archives keep a chain of custody, for folders handed on.
+"""ASC MHL: write the manifest by which film archives verify folders after a transfer.
 
 A folder gets ``ascmhl/`` with its first generation: every file's size, date and XXH128, and a chain
 file with the manifest's own C4 ID. Tools that know the format verify the folder and add theirs.
@@ -25,7 +25,7 @@ MHL_FOLDER, CHAIN_FILE = "ascmhl", "ascmhl_chain.xml"
 _LIST_NAMESPACE, _DIRECTORY_NAMESPACE = "urn:ASC:MHL:v2.0", "urn:ASC:MHL:DIRECTORY:v2.0"
 _BASE58_ALPHABET = "123456789ABCDEFGHJKLMNPQRSTUVWXYZabcdefghijkmnopqrstuvwxyz"
 _WITHHELD_HOST = "withheld"
-"""Stands for the host's name, which the schema demands and which is nobody's business."""
+"""Replaces the host's name, which the schema requires and which stays private."""
 
 
 def c4_id(data: bytes) -> str:
@@ -52,14 +52,14 @@ def write_first_generation(folder: str | Path, *, now: datetime, version: str) -
     folder : str or Path
         All files in it are listed; symbolic links are refused.
     now : datetime
-        With its zone.
+        Time of writing, with its zone.
     version : str
-        Of the program that hands the folder on.
+        Version of the program that transfers the folder.
 
     Raises
     ------
     SessionError
-        Where the folder has a history already, is empty, or holds a link.
+        When the folder has a history already, is empty, or contains a link.
     """
     place = Path(folder)
     moment = now.astimezone(UTC)

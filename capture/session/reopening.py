@@ -1,4 +1,4 @@
-"""A closed session is never modified; what must be added goes into a copy that is open again."""
+"""Copy a closed session, which is never modified, into one that is open for additions."""
 
 from pathlib import Path
 
@@ -26,9 +26,9 @@ def reopen_copy(
 ) -> tuple[Session, str]:
     """Copy a closed session without its closing line, and open the copy for writing.
 
-    Every byte is checked while it is copied. The copy has the same id, manifest and chain of
-    hashes up to the closing line, so that its frames are the same frames; its `content_hash`
-    differs as soon as something is added.
+    Every byte is checked while it is copied. The copy has the same id, manifest and chain of hashes
+    up to the closing line, so that its frames are identical; its `content_hash` differs as soon as
+    something is added.
 
     Parameters
     ----------
@@ -44,15 +44,15 @@ def reopen_copy(
     Session
         The copy, open for writing.
     str
-        Why frames are missing, as the closing line said; empty where none is. Close the copy
-        with it.
+        Reason of missing frames, from the closing line; empty when none is missing. Pass it on when
+        closing the copy.
 
     Raises
     ------
     SessionError
-        Where the session is not closed, or `copy` is not free.
+        When the session is not closed, or `copy` is not free.
     SessionDamage
-        Where one bit of the session is not what was written.
+        When any bit of the session differs from what was written.
     """
     disk = disk or Disk()
     place, target = Path(path), Path(copy)
@@ -80,7 +80,7 @@ def reopen_copy(
             write_new(disk, target / line.file, check_file(place / line.file, line))
         for name in folders:
             disk.fsync_dir(target / name)
-        if (target / JOURNAL_FILE).exists():  # debris of an interrupted creation, empty
+        if (target / JOURNAL_FILE).exists():  # left over from an interrupted creation, empty
             disk.remove(target / JOURNAL_FILE)
         write_new(disk, target / JOURNAL_FILE, journal)
         write_manifest(disk, target, manifest)

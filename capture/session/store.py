@@ -1,4 +1,4 @@
-"""A session being written or read: create, commit, resume, close, query."""
+"""Write and read a session: create, commit, resume, close, query."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _log = logging.getLogger(__name__)
 
 
 class Session(SessionView):
-    """Frames on disk with the journal that vouches for them.
+    """Frames on disk with the journal that verifies them.
 
     Make one with `create`, go on with `resume`, read with `open`. A committed frame survives a
     killed process and a power cut; a closed session is never modified.
@@ -66,7 +66,7 @@ class Session(SessionView):
     >>> session = Session.create(
     ...     folder.name + "/s", plan=flash_plan(rig, darks=1), rig=rig, devices={},
     ...     subject=SubjectRecord("P042", ("research",)), source="simulated", seed=1)
-    >>> step, camera = session.todo()[0]
+    >>> step, camera = session.pending_frames()[0]
     >>> blob = raw.encode_dng(
     ...     np.full((10, 16), 512, np.uint16), pattern="RGGB", black=512, white=16383,
     ...     step_id=step.id, session_id=session.id)
@@ -108,9 +108,9 @@ class Session(SessionView):
         path : str or Path
             The folder; its parent exists.
         plan, rig : Plan, Rig
-            Checked against each other.
+            Must fit each other.
         devices : mapping
-            What each box and camera said it is: JSON values.
+            Identification of each controller and camera: JSON values.
         subject : Subject
         source : {"measured", "simulated"}
         calibrations : sequence of CalibrationRef, or of tables of kind, sha256, path
@@ -128,7 +128,7 @@ class Session(SessionView):
         Raises
         ------
         SessionError
-            Where the folder holds something, or a value cannot be written.
+            When the folder is not empty, or a value cannot be written.
         """
         disk = disk or Disk()
         place = Path(path)
@@ -150,14 +150,14 @@ class Session(SessionView):
 
     @classmethod
     def open(cls, path: str | Path) -> Session:
-        """Open a session for reading, closed or not; a torn last line is left alone.
+        """Open a session for reading, closed or not; a truncated last line is not modified.
 
         Raises
         ------
         SessionError
-            Where there is no session or its schema is unknown.
+            When the folder is not a session, or its schema is unknown.
         SessionDamage
-            Where manifest or journal are not what was written.
+            When manifest or journal differ from what was written.
         """
         place = Path(path)
         return cls(place, read_undamaged_contents(place), disk=Disk(), descriptor=None)
@@ -166,17 +166,17 @@ class Session(SessionView):
     def resume(cls, path: str | Path, *, disk: Disk | None = None) -> Session:
         """Open a session for writing after any kind of interruption.
 
-        Takes the writer's lock, cuts a torn last line of the journal, and sets files without a
-        line aside in ``orphans/``. What was acknowledged is there; the rest is in `todo`.
+        Acquires the writer's lock, removes a truncated last line of the journal, and moves files
+        without a line to ``orphans/``. Acknowledged frames are kept.
 
         Raises
         ------
         SessionLocked
-            Where another process is writing.
+            When another process is writing.
         SessionError
-            Where the session is closed.
+            When the session is closed.
         SessionDamage
-            Where manifest or journal are not what was written, or a committed frame is missing.
+            When manifest or journal differ from what was written, or a committed frame is missing.
         """
         disk = disk or Disk()
         place = Path(path)
@@ -186,7 +186,7 @@ class Session(SessionView):
         try:
             if not disk.lock(descriptor):
                 what = "another process is writing this session"
-                raise SessionLocked(what, where=str(place), advice="Wait for it, or stop it.")
+                raise SessionLocked(what, where=str(place), advice="Wait for its end, or stop it.")
             contents = read_undamaged_contents(place)  # again, under the lock
             if contents.walk.closed:
                 advice = "Start a new session; a closed one is never modified."
@@ -214,7 +214,7 @@ class Session(SessionView):
         t_host_s: float,
         attempt: int = 1,
     ) -> None:
-        """Put one frame on the medium; when this returns, it survives a power cut.
+        """Write one frame to the medium; when this returns, it survives a power cut.
 
         Parameters
         ----------
@@ -223,9 +223,9 @@ class Session(SessionView):
         blob : bytes
             A DNG of ours that names the same step and this session.
         settings, actual : mapping
-            What was asked for, and what box and camera report.
+            Requested settings, and those that controller and camera report.
         t_box_s : float or None
-            Time of the exposure on the box's clock, s.
+            Time of the exposure on the controller's clock, s.
         t_host_s : float
             Time of arrival on the host's clock, s.
         attempt : int
@@ -234,10 +234,9 @@ class Session(SessionView):
         Raises
         ------
         SessionError
-            Where the frame does not belong here; nothing is written.
+            When the frame does not fit the plan; nothing is written.
         SessionDiskError
-            Where the disk refuses; nothing committed before is touched, and the session can be
-            resumed.
+            When the disk refuses; committed frames are unchanged, and the session can be resumed.
         """
         descriptor = self._writable()
         self._check_commit(step_id, camera, blob, attempt)
@@ -257,30 +256,29 @@ class Session(SessionView):
         self._lines.setdefault((step_id, camera), []).append(line)
 
     def attach(self, name: str, data: bytes, *, about: Mapping[str, Value] | None = None) -> None:
-        """Put a file that is no frame on the medium; when this returns, it survives a power cut.
+        """Attach a file other than a frame; when this returns, it survives a power cut.
 
         Parameters
         ----------
         name : str
             1 to 64 of A-Z a-z 0-9 _ - . , not starting with a dot, e.g. ``"scan.ply"``; not the
-            name of an attachment that is there, for what is attached is never replaced.
+            name of an existing attachment, because attachments are never replaced.
         data : bytes
             Its content, at least one byte.
         about : mapping, optional
-            Where it is from: texts, finite numbers, true or false.
+            Provenance: texts, finite numbers, true or false.
 
         Raises
         ------
         SessionError
-            Where the session is closed, or name or content do not fit; nothing is written.
+            When the session is closed, or name or content are invalid; nothing is written.
         SessionDiskError
-            Where the disk refuses; nothing committed before is touched, and the session can be
-            resumed.
+            When the disk refuses; committed frames are unchanged, and the session can be resumed.
         """
         descriptor = self._writable()
         if name in self._attached:
             faults = [Fault("name", short_repr(name), "a name that is free")]
-            advice = "What is attached stays; choose another name."
+            advice = "Attachments are never replaced; choose another name."
             what = "an attachment of this name is there already"
             raise SessionError(what, where=str(self.path), faults=faults, advice=advice)
         checks = FaultCollector("Attachment", SessionError)
@@ -306,39 +304,40 @@ class Session(SessionView):
         about: Mapping[str, Value] | None = None,
         t_host_s: float,
     ) -> None:
-        """Note, safe from a power cut, that steps will not be captured, and why.
+        """Record, safe from a power cut, that steps will not be captured, and why.
 
-        The session is complete without them. Frames that they have already stay on the disk and do
-        not count: what cannot be had whole is not had.
+        The session is complete without them. Frames of these steps stay on the disk but do not
+        count: a step is used completely or not at all.
 
         Parameters
         ----------
         step_ids : sequence of str
-            Steps of the plan that were not left out before.
+            Steps of the plan that were not omitted before.
         reason : str
-            For people.
+            Reason, for people.
         about : mapping, optional
-            What was found: texts, finite numbers, true or false.
+            Findings: texts, finite numbers, true or false.
         t_host_s : float
             The host's time, s.
 
         Raises
         ------
         SessionError
-            Where the session is closed, a step is unknown or was left out before, or no reason is
-            given; nothing is written.
+            When the session is closed, a step is unknown or was omitted before, or the reason is
+            empty; nothing is written.
         SessionDiskError
-            Where the disk refuses; nothing committed before is touched, and the session can be
-            resumed.
+            When the disk refuses; committed frames are unchanged, and the session can be resumed.
         """
         descriptor = self._writable()
-        checks = FaultCollector("Steps left out", SessionError)
+        checks = FaultCollector("Omitted steps", SessionError)
         differ = len(set(step_ids)) == len(step_ids) > 0
         checks.check("step_ids", tuple(step_ids), differ, "at least one, none twice")
         checks.check("reason", reason, bool(reason.strip()), "a text")
         for step_id in step_ids:
-            self.plan.step(step_id)  # names what is unknown
-            checks.check("step_ids", step_id, step_id not in self._left_out, "not left out before")
+            self.plan.step(step_id)  # names unknown steps
+            checks.check(
+                "step_ids", step_id, step_id not in self._left_out, "steps not omitted before"
+            )
         checks.close()
         line = OmissionLine(
             steps=tuple(step_ids), reason=reason, about=dict(about or {}), t_host_s=float(t_host_s)
@@ -349,7 +348,7 @@ class Session(SessionView):
         self._left_out.update(dict.fromkeys(line.steps, line))
 
     def _write(self, descriptor: int, line: FrameLine | AttachmentLine, blob: bytes) -> None:
-        """Bring a file and then its line of the journal to the medium."""
+        """Write a file and then its line of the journal to the medium."""
         text, head = self._seal(line)
         target = self.path / line.file
         part = target.with_name(target.name + ".part")
@@ -365,34 +364,37 @@ class Session(SessionView):
 
     @contextmanager
     def _acknowledging(self, head: str) -> Iterator[None]:
-        """Advance to a head after its line is written; release the session where that fails."""
+        """Advance to a head after its line is written; release the session on failure."""
         try:
             with DiskErrors(self.path):
                 yield
         except SessionDiskError:
-            # how much reached the medium is unknown: only resume() can tell
+            # how much reached the medium is unknown: only resume() can find out
             self.release()
             raise
         self._head = head
 
     def close(self, *, missing_reason: str = "") -> None:
-        """End the session for good: nothing can be added afterwards.
+        """Close the session for good: nothing can be added afterwards.
 
         Parameters
         ----------
         missing_reason : str
-            Why steps of the plan are missing; required where some are that were not left out.
+            Why steps of the plan are missing; required when steps are missing that were not
+            omitted.
 
         Raises
         ------
         SessionError
-            Where steps are missing and no reason is given.
+            When steps are missing and no reason is given.
         """
         descriptor = self._writable()
         missing = tuple(dict.fromkeys(step.id for step, _ in self.pending_frames()))
         if missing and not missing_reason:
             faults = [Fault("steps", f"{len(missing)} missing, first {missing[0]!r}", "none")]
-            advice = "Capture them, release() the session to go on later, or say why they stay out."
+            advice = (
+                "Capture them, release() the session to continue later, or give missing_reason."
+            )
             what = "the session is not complete"
             raise SessionError(what, where=str(self.path), faults=faults, advice=advice)
         frames = sum(len(lines) for lines in self._lines.values())
@@ -406,7 +408,7 @@ class Session(SessionView):
             self.release()
 
     def release(self) -> None:
-        """Let go of the writer's lock; the session stays open and can be resumed."""
+        """Release the writer's lock; the session stays open and can be resumed."""
         if self._descriptor is not None:
             self._disk.close(self._descriptor)
             self._descriptor = None
@@ -416,13 +418,15 @@ class Session(SessionView):
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Release the lock; closing is a deliberate act."""
+        """Release the lock; the session is not closed."""
         self.release()
 
     def _writable(self) -> int:
         if self._descriptor is None:
             why = "closed" if self.closed else "not open for writing"
-            advice = "A closed session is never modified; Session.resume opens one that is not."
+            advice = (
+                "A closed session is never modified; open an unfinished one with Session.resume."
+            )
             raise SessionError(f"the session is {why}", where=str(self.path), advice=advice)
         return self._descriptor
 
@@ -432,13 +436,15 @@ class Session(SessionView):
             faults = [Fault("camera", short_repr(camera), f"one of {', '.join(step.cameras)}")]
             raise SessionError(f"step {step_id!r} has no such camera", faults=faults)
         if step_id in self._left_out:
-            faults = [Fault("step", short_repr(step_id), "one that was not left out")]
-            raise SessionError("the step was left out", where=str(self.path), faults=faults)
+            faults = [Fault("step", short_repr(step_id), "one that was not omitted")]
+            raise SessionError("the step was omitted", where=str(self.path), faults=faults)
         done = self._lines.get((step_id, camera), [])
         expected = done[-1].attempt + 1 if done else 1
         if attempt < 1 or (done and attempt != expected):
             faults = [Fault("attempt", str(attempt), f"{expected}")]
-            advice = "A committed frame stays; take it again with the next attempt number."
+            advice = (
+                "A committed frame is never replaced; take it again with the next attempt number."
+            )
             what = f"frame of step {step_id!r}, camera {camera!r} is already committed"
             raise SessionError(what, where=str(self.path), faults=faults, advice=advice)
         check_blob(blob, step_id, self.id)
@@ -454,7 +460,7 @@ class Session(SessionView):
             raise SessionError("the journal line cannot be written", faults=faults) from exc
         if len(text) > MAX_LINE_BYTES:
             faults = [Fault("line", f"{len(text)} bytes", f"at most {MAX_LINE_BYTES}")]
-            raise SessionError("what is said of it is too long", faults=faults)
+            raise SessionError("its metadata are too long", faults=faults)
         return text, head
 
     def _append(self, descriptor: int, text: bytes) -> None:

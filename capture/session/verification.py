@@ -1,4 +1,4 @@
-"""Recompute everything a session says about itself, and name what is not so."""
+"""Verify a session: recompute every hash and seal, and list the differences."""
 
 import os
 from dataclasses import dataclass
@@ -25,18 +25,18 @@ _KNOWN_NAMES |= {"index.sqlite", "ascmhl"}
 
 @dataclass(frozen=True, slots=True)
 class VerifyReport:
-    """What verification found."""
+    """Result of a verification."""
 
     ok: bool
-    """Whether every committed byte is what was written."""
+    """Whether every committed byte is as it was written."""
     problems: tuple[str, ...]
-    """Damage: each names the file (and the byte, where one is known)."""
+    """Damage: one entry per file (with the byte, where it is known)."""
     warnings: tuple[str, ...]
-    """What a person should know though nothing is damaged."""
+    """Findings that matter to a person although nothing is damaged."""
     frames: int
-    """Committed frames whose files are good."""
+    """Number of committed frames whose files are intact."""
     bytes: int
-    """Bytes of those frames and of the attachments that are good."""
+    """Bytes of those frames and of the intact attachments."""
 
 
 def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
@@ -47,7 +47,7 @@ def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
     path : str or Path
         The session's folder.
     today : date, optional
-        Day on which consent is judged; today by default.
+        Day on which consent is evaluated; today by default.
 
     Returns
     -------
@@ -56,15 +56,14 @@ def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
     Raises
     ------
     NotASession
-        Where there is none; nothing can be said of what is not there.
+        When the folder is not a session.
 
     Notes
     -----
-    A flipped bit anywhere in a committed file is found: session.json carries a seal over all its
-    bytes, the journal a SHA-256 chain from that seal, and the journal a XXH3-128 of every frame and
-    attachment.
-    This guards against accidents; against a forger only a copy of the last hash kept elsewhere
-    helps (``Session.content_hash``).
+    A flipped bit anywhere in a committed file is detected: session.json carries a seal over all its
+    bytes, the journal a SHA-256 chain from that seal, and the journal an XXH3-128 of every frame
+    and attachment. This protects against accidents; against a forger only a copy of the last hash
+    kept elsewhere helps (``Session.content_hash``).
     """
     place = Path(path)
     problems: list[str] = []
@@ -119,13 +118,13 @@ def _state(place: Path, contents: SessionContents) -> list[str]:
         notes.append(f"{place}: closed with {missing} frames missing: {end.reason}")
     for reason in dict.fromkeys(left_out.values()):
         count = sum(other == reason for other in left_out.values())
-        notes.append(f"{place}: {count} steps left out: {reason}")
+        notes.append(f"{place}: {count} steps omitted: {reason}")
     if (place / ORPHANS_FOLDER).is_dir() and (orphans := os.listdir(place / ORPHANS_FOLDER)):
         notes.append(
             f"{place / ORPHANS_FOLDER}: {len(orphans)} files set aside after interruptions"
         )
     for name in sorted(set(os.listdir(place)) - _KNOWN_NAMES):
-        notes.append(f"{place / name}: not a part of the session, nothing vouches for it")
+        notes.append(f"{place / name}: not a part of the session, not verified")
     return notes
 
 
@@ -136,5 +135,5 @@ def _consent(contents: SessionContents, today: date) -> list[str]:
         return [f"{who}: no consent beyond the capture is recorded"]
     expires = subject.consent_expires
     if expires is not None and today > expires:
-        return [f"{who}: consent expired on {expires}; the data may not be used any more"]
+        return [f"{who}: consent expired on {expires}; do not use the data any more"]
     return []

@@ -1,4 +1,4 @@
-"""What a session can be asked, whether it is being written or only read."""
+"""Query a session, whether it is being written or only read."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from capture.session.journal import AttachmentLine, FrameLine, OmissionLine
 from capture.session.manifest import ANY_USE
 
 MAX_FRAME_BYTES = 2**30
-"""Of one frame, and of one attachment."""
+"""Journal line of a frame or of an attachment."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +39,7 @@ class FrameRecord:
 
     @property
     def index(self) -> Mapping[str, str | int | float]:
-        """Where the step stands in its series."""
+        """Indices of the step in its series."""
         return self.step.index
 
     @property
@@ -54,22 +54,22 @@ class FrameRecord:
 
     @property
     def attempt(self) -> int:
-        """1 for the first time the frame was taken."""
+        """Number of the attempt, from 1."""
         return self.line.attempt
 
     @property
     def settings(self) -> Mapping[str, Value]:
-        """What was asked for."""
+        """Requested settings."""
         return self.line.settings
 
     @property
     def actual(self) -> Mapping[str, Value]:
-        """What box and camera report to have done."""
+        """Settings that controller and camera report."""
         return self.line.actual
 
 
 def check_file(path: Path, line: FrameLine | AttachmentLine) -> bytes:
-    """Return the bytes of a committed file, after size and hash have been checked."""
+    """Return the bytes of a committed file after a check of size and hash."""
     what = "frame" if isinstance(line, FrameLine) else "attachment"
     blob = read_file(path, limit=MAX_FRAME_BYTES, label=what)
     found = xxhash.xxh3_128_hexdigest(blob)
@@ -82,10 +82,10 @@ def check_file(path: Path, line: FrameLine | AttachmentLine) -> bytes:
 
 
 def check_blob(blob: bytes, step_id: str, session_id: str) -> None:
-    """Refuse a frame that is too large or that names another step or session."""
+    """Reject a frame that is too large or that names another step or session."""
     if len(blob) > MAX_FRAME_BYTES:
         faults = [Fault("blob", f"{len(blob)} bytes", f"at most {MAX_FRAME_BYTES}")]
-        raise SessionError("the frame is absurdly large", faults=faults)
+        raise SessionError("the frame is too large", faults=faults)
     frame = raw.decode(memoryview(blob), where=f"frame of step {step_id}")
     for field, got, wanted in (
         ("step_id", frame.step_id, step_id),
@@ -93,7 +93,7 @@ def check_blob(blob: bytes, step_id: str, session_id: str) -> None:
     ):
         if got != wanted:
             advice = "Encode the DNG with the step and session it is committed to."
-            what = "the frame says it belongs elsewhere"
+            what = "the frame names another step or session"
             raise SessionError(what, faults=[Fault(field, short_repr(got), wanted)], advice=advice)
 
 
@@ -103,19 +103,19 @@ class SessionView:
     Attributes
     ----------
     path : Path
-        Its folder.
+        Folder of the session.
     manifest : Manifest
-        All that was known when the session began.
+        Manifest, written when the session began.
     id : str
         Name of the session, written into each of its frames.
     plan : Plan
-        What was to be captured.
+        Planned steps.
     rig : Rig
-        The nominal rig, resized as it was used.
+        The nominal rig, at the image size in use.
     source : {"measured", "simulated"}
-        Whether light or a simulation made the frames.
+        Whether the frames are measured or simulated.
     subject : Subject
-        Who was captured.
+        Captured subject.
     seed : int or None
         Seed of the simulation, None for a measured session.
     """
@@ -140,7 +140,7 @@ class SessionView:
     def pending_frames(self) -> list[tuple[Step, str]]:
         """Return the steps and cameras without a committed frame, in the order of the plan.
 
-        Steps that were left out are not to be done.
+        Omitted steps are not returned.
         """
         return [
             (step, camera)
@@ -151,7 +151,7 @@ class SessionView:
         ]
 
     def omitted_steps(self) -> Mapping[str, str]:
-        """Return the steps that will not be captured, each with the reason, in the plan's order."""
+        """Return the omitted steps, each with its reason, in the order of the plan."""
         return {
             step.id: self._left_out[step.id].reason
             for step in self.plan.steps
@@ -159,22 +159,22 @@ class SessionView:
         }
 
     def omission_line(self, step_id: str) -> OmissionLine:
-        """Return what the journal says of a step that was left out.
+        """Return the journal line of an omitted step.
 
         Raises
         ------
         SessionError
-            Where it was not.
+            When the step was not omitted.
         """
         if step_id not in self._left_out:
-            faults = [Fault("step", short_repr(step_id), "a step that was left out")]
-            raise SessionError("was not left out", where=str(self.path), faults=faults)
+            faults = [Fault("step", short_repr(step_id), "an omitted step")]
+            raise SessionError("was not omitted", where=str(self.path), faults=faults)
         return self._left_out[step_id]
 
     def frames(self, kind: str | None = None, **index: str | int | float) -> list[FrameRecord]:
         """Return the last attempt of each committed frame, in the order of the plan.
 
-        Frames of a step that was left out afterwards are not among them.
+        Frames of a step that was omitted afterwards are not returned.
 
         Parameters
         ----------
@@ -195,12 +195,12 @@ class SessionView:
         ]
 
     def read(self, record: FrameRecord) -> raw.RawFrame:
-        """Return a committed frame, after its hash has been checked.
+        """Return a committed frame after a check of its hash.
 
         Raises
         ------
         SessionDamage
-            Where the file is missing or one bit of it differs from what was committed.
+            When the file is missing or differs in any bit from what was committed.
         """
         where = self.path / record.file
         blob = check_file(where, record.line)
@@ -215,28 +215,28 @@ class SessionView:
         return tuple(self._attached)
 
     def attachment_line(self, name: str) -> AttachmentLine:
-        """Return what the journal says of an attachment: size, hash, and where it is from.
+        """Return the journal line of an attachment: size, hash, and provenance.
 
         Raises
         ------
         SessionError
-            Where there is none of that name.
+            When there is none of that name.
         """
         if name not in self._attached:
             known = ", ".join(self._attached) or "none"
             faults = [Fault("attachment", short_repr(name), f"one of: {known}")]
-            raise SessionError("holds no such attachment", where=str(self.path), faults=faults)
+            raise SessionError("contains no such attachment", where=str(self.path), faults=faults)
         return self._attached[name]
 
     def attachment(self, name: str) -> bytes:
-        """Return the bytes of an attachment, after its hash has been checked.
+        """Return the bytes of an attachment after a check of its hash.
 
         Raises
         ------
         SessionError
-            Where there is none of that name.
+            When there is none of that name.
         SessionDamage
-            Where the file is missing or one bit of it differs from what was attached.
+            When the file is missing or differs in any bit from what was attached.
         """
         line = self.attachment_line(name)
         return check_file(self.path / line.file, line)
@@ -248,7 +248,7 @@ class SessionView:
         return in_time and bool({scope, ANY_USE} & set(self.subject.consent_scope))
 
     def require_consent(self, scope: str, *, today: date | None = None) -> None:
-        """Raise `ConsentError` where `is_export_allowed` is False."""
+        """Raise `ConsentError` when `is_export_allowed` is False."""
         if not self.is_export_allowed(scope, today=today):
             allowed = ", ".join(self.subject.consent_scope) or "nothing"
             until = self.subject.consent_expires
@@ -260,10 +260,10 @@ class SessionView:
 
     @property
     def closed(self) -> bool:
-        """Whether the session has ended for good."""
+        """Whether the session is closed."""
         return self._close_line is not None
 
     @property
     def content_hash(self) -> str:
-        """``sha256:`` hash that vouches for manifest, journal and, through it, every frame."""
+        """``sha256:`` hash that covers manifest, journal and, through it, every frame."""
         return self._head if self._head.startswith("sha256:") else f"sha256:{self._head}"

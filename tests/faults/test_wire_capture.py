@@ -150,7 +150,7 @@ def test_plan_beyond_controller_limits_moves_and_lights_nothing(world, session, 
     simulated = world()
     more = {"polarizer": "parallel", "exposure_s": 0.008, "iso": 100, **settings}
     plan = Plan("flash", (Step("S1", "subject", {}, more, ("cam",)),))
-    with pytest.raises(AcquisitionError, match="the box allows"):
+    with pytest.raises(AcquisitionError, match="the controller allows"):
         capture(simulated, session, plan)
     assert simulated.pops == []
     assert not any("FLAS:PO" in line or "ARM" in line for line in simulated.transcript)

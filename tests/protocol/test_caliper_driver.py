@@ -263,7 +263,7 @@ def test_end_report_of_different_move_is_refused(alone):
 def test_a_sphere_is_not_taken_for_a_caliper():
     world = World(RIG, seed=5)
     name = world.register(next(NAMES))
-    with pytest.raises(WrongDevice, match="expected a 'caliper' box"):
+    with pytest.raises(WrongDevice, match="expected a 'caliper' controller"):
         CaliperBox(Port(f"sim://gradient_sphere?world={name}", clock=world.clock))
     world.unregister()
 

@@ -178,7 +178,7 @@ def test_a_dead_led_is_named():
 def test_flash_controller_is_not_accepted_as_dome():
     world = World(seed=5)
     name = world.register(next(NAMES))
-    with pytest.raises(WrongDevice, match="expected a 'dome' box"):
+    with pytest.raises(WrongDevice, match="expected a 'dome' controller"):
         DomeBox(Port(f"sim://flash?world={name}", clock=world.clock))
     world.unregister()
 

@@ -253,7 +253,7 @@ def test_controller_of_other_kind_is_refused(rig, monkeypatch):
     monkeypatch.setattr("rigsim.boxes.flash.FlashUnit.kind", "dome")
     world = World(rig, faults=Faults())
     name = world.register("protocol-dome")
-    with pytest.raises(WrongDevice, match="'dome' box"):
+    with pytest.raises(WrongDevice, match="'dome' controller"):
         FlashBox(Port(f"sim://flash?world={name}"))
     assert not world.link("flash").attached
     world.unregister()

@@ -244,5 +244,5 @@ def test_analyzer_that_never_arrives_is_abandoned(monkeypatch):
 
 
 def test_a_dome_is_not_taken_for_a_sphere():
-    with pytest.raises(WrongDevice, match="expected a 'gradient_sphere' box"):
+    with pytest.raises(WrongDevice, match="expected a 'gradient_sphere' controller"):
         GradientSphereBox(Port("sim://dome?seed=9"))

@@ -184,7 +184,7 @@ def test_another_epoch_is_a_reboot_until_hello(open_port, answer):
     port = open_port((ask(8, "STAT?"), answer), hello, (ask(10, "STAT?", boot=0x1111), b""))
     with pytest.raises(BoxRebooted):
         port.ask("STAT?")
-    with pytest.raises(BoxRebooted, match="say hello"):
+    with pytest.raises(BoxRebooted, match="call hello"):
         port.ask("STAT?")
     assert port.hello().boot == 0x1111
     port.line.script[-1] = (ask(10, "STAT?", boot=0x1111), say(10, "0", boot=0x1111))

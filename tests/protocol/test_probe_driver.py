@@ -344,7 +344,7 @@ def test_invalid_answer_is_reported(alone, header, payload, call, match):
 
 
 def test_a_flash_is_not_taken_for_a_probe():
-    with pytest.raises(WrongDevice, match="expected a 'probe' box"):
+    with pytest.raises(WrongDevice, match="expected a 'probe' controller"):
         ProbeBox(Port("sim://flash?seed=77"))
 
 

@@ -220,7 +220,7 @@ def test_radius_error_of_percent_is_refused_misplaces_lights(mirrors):
         edges[name] = mirror_sphere.find_outline(image, camera, 50.5)
     edges = {name: e for name, e in edges.items() if e is not None}
     with pytest.raises(
-        mirror_sphere.MirrorSphereError, match=r"radius_mm: got 50.5, but .* say 50\.0"
+        mirror_sphere.MirrorSphereError, match=r"radius_mm: got 50.5, but .* give 50\.0"
     ):
         mirror_sphere.locate_sphere(edges, cameras, 50.5)
 

@@ -209,7 +209,7 @@ def test_dark_and_wrong_size_frames_are_refused(ball):
         )
         for k, part in enumerate(shots[:4])
     ]
-    with pytest.raises(BallError, match="no spot stands out"):
+    with pytest.raises(BallError, match="no spot above the dark level"):
         survey_sphere(dark, RIG)
     with pytest.raises(BallError, match="of this rig"):
         survey_sphere(shots, load_rig("gradient"))

@@ -1,4 +1,4 @@
-"""Run a plan on the flash rig: one pop a step, its frame believed or the step shot again."""
+"""Run a plan on the flash rig: one flash per step; a step without a valid frame is repeated."""
 
 import logging
 import math
@@ -22,23 +22,22 @@ from capture.rig import Rig
 log = logging.getLogger(__name__)
 
 MAX_SLEEP_S = 1.0
-"""Longest sleep, after which the operator is asked whether to stop."""
+"""Longest sleep between two checks for a stop by the operator, s."""
 PROMPT_LEAD_S = 0.05
-"""Prompts are given by the clock up to here before a frame is due; then it is waited for."""
+"""Time before a frame is due until which prompts are given, s; then the frame is awaited."""
 COMMAND_LEAD_S = 0.1
-"""No prompt is due so soon after the commands that set the light begin."""
+"""Minimum time between a prompt and the commands that set the light, s."""
 TIME_ROUNDING_S = 1e-6
 """Rounding of times that are sums of periods."""
 
 
 def run_sequence(run: CaptureRun, box: FlashBox, steps: Sequence[Step]) -> None:
-    """Capture the timed steps that a session still lacks; see `acquire`.
+    """Capture the missing timed steps of a session; see `acquire`.
 
-    Each frame's ``actual`` gets ``time_s`` (s, when the flash popped, in the sequence's time),
-    ``late_s`` (s after its planned time), ``time_error_s`` (s, how well the clocks of host and box
-    could be compared), ``block`` (0, and one more each time that the sequence is resumed); and of
-    a prompted one ``phase_s`` (s since the last prompt of the expression was given), ``prompt``
-    (what was asked for last).
+    Each frame's ``actual`` gets ``time_s`` (s, sequence time of the flash), ``late_s`` (s after its
+    planned time), ``time_error_s`` (s, uncertainty of the comparison of host and controller
+    clocks), ``block`` (0, and one more each time that the sequence is resumed); and for a prompted
+    step ``phase_s`` (s since the last prompt of the expression), ``prompt`` (last prompt).
     """
     limits = run.plan.limits
     period_s = float(limits.get("prompt_period_s", 0.0))
@@ -72,10 +71,10 @@ def run_sequence(run: CaptureRun, box: FlashBox, steps: Sequence[Step]) -> None:
 
 
 class _ShotSchedule:
-    """The time of a sequence, and what happens in it beside the shots."""
+    """Schedule of a sequence: its clock, its shots, and the events between them."""
 
     block = 0
-    """How often the sequence was begun before."""
+    """Number of times that the sequence was started before."""
 
     def __init__(self, run: CaptureRun) -> None:
         self._run = run
@@ -94,33 +93,33 @@ class _ShotSchedule:
         return self.operator.timer.monotonic() - self._zero
 
     def to_sequence_time_s(self, timer_s: float) -> float:
-        """Return the sequence's time at a reading of the timer, s."""
+        """Convert a reading of the timer to the sequence's time, s."""
         return timer_s - self._zero
 
     def due_s(self, step: Step, free_s: float) -> float:
-        """Return when a step is to be taken, s; not before ``free_s`` where that can be helped."""
+        """Return the time at which a step is due, s; not before ``free_s`` if possible."""
         return float(step.settings["start_s"])
 
     def reschedule(self, step: Step, attempt: int, why: str) -> list[tuple[Step, int]]:
-        """Return the step and its next attempt where it can be taken later, else nothing."""
+        """Return the step and its next attempt when it can be taken later, else nothing."""
         raise NotImplementedError
 
     def wait(self, until_s: float) -> None:
-        """Let time pass; stop in good order where that is asked for."""
+        """Wait, and stop in good order when the operator asks for it."""
         while (rest_s := until_s - self.now_s()) > TIME_ROUNDING_S:
             self.operator.timer.sleep(min(rest_s, MAX_SLEEP_S))
             self.operator.stop_if_asked()
 
     def wait_for_gap(self, span_s: float) -> None:
-        """Let time pass until nothing is due for a while, s."""
+        """Wait until nothing is due for a while, s."""
 
     def journal_entries(self, time_s: float) -> dict[str, Value]:
-        """Return what is to be noted of a shot at a time, s."""
+        """Return the journal entries of a shot at a time, s."""
         return {"time_s": time_s, "block": self.block}
 
 
 class _PromptedSchedule(_ShotSchedule):
-    """A subject who changes with every prompt."""
+    """Schedule of a subject who changes expression with every prompt."""
 
     def __init__(self, run: CaptureRun, steps: Sequence[Step], period_s: float) -> None:
         super().__init__(run)
@@ -181,13 +180,13 @@ class _PromptedSchedule(_ShotSchedule):
 
 
 class _EventSchedule(_ShotSchedule):
-    """What follows an event, which happens once."""
+    """Schedule of shots after an event that happens once."""
 
     def __init__(self, run: CaptureRun, steps: Sequence[Step]) -> None:
         super().__init__(run)
         self._state = str(steps[0].index.get("state", "event"))
         self._elapsed_s = 0.0
-        # the host's clock alone knows how long a run was interrupted
+        # only the host's clock covers the time of an interruption
         for record in run.session.frames("subject"):
             if "time_s" in record.line.actual:
                 zero = record.line.t_host_s - float(record.line.actual["time_s"])
@@ -217,7 +216,7 @@ class _EventSchedule(_ShotSchedule):
 
 
 class _ScheduledShot(ShotTiming):
-    """One shot's time: waited for, kept, and compared with the box's."""
+    """Timing of one shot: wait for it, and compare its time with the controller's."""
 
     def __init__(
         self,
@@ -236,14 +235,14 @@ class _ScheduledShot(ShotTiming):
         self._busy_s += max(view.shutter_lag_s + view.readout_s for view in views)
 
     def prepare(self) -> None:
-        """Do nothing: the light was set while the shot before was read out."""
+        """Do nothing: the light was set during the readout of the previous shot."""
 
     def wait(self) -> None:
         """Wait until the shot is due."""
         self._rhythm.wait(self._due_s)
 
     def use_readout_time(self, report: FlashReport | None) -> None:
-        """Find out when the flash popped; make the light ready for the next shot; go on in time."""
+        """Compute the time of the flash and prepare the light of the next shot, on schedule."""
         timer = self._rhythm.operator.timer
         before = timer.monotonic()
         box_s = self.box.ping()
@@ -256,7 +255,7 @@ class _ScheduledShot(ShotTiming):
             "time_error_s": 0.5 * (after - before),
         }
         if self._then is not None:
-            # waiting for the charge would keep a prompt waiting, and so would the commands
+            # waiting for the charge, or sending commands, would delay a prompt
             self._rhythm.wait(time_s + self._charged_s)
             self._rhythm.wait_for_gap(COMMAND_LEAD_S)
             set_light(self._then, self.box)
@@ -264,7 +263,7 @@ class _ScheduledShot(ShotTiming):
 
 
 def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> AcquisitionResult:
-    """Capture what the session still lacks of a plan of the flash rig; see `run_plan`."""
+    """Capture the missing steps of a plan on the flash rig; see `run_plan`."""
     box: FlashBox = boxes["flash"]
     operator = run.operator
     _check_limits(run.plan, box.limits)
@@ -272,7 +271,7 @@ def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> AcquisitionResult:
     missing = run.pending_steps()
     state: str | None = None
     try:
-        box.dark()  # whatever was going on before
+        box.dark()  # stop any activity of before
         if "sync_max_us" in box.limits:
             box.set_sync_delay(lag_s)
         untimed = [step for step in missing if "start_s" not in step.settings]
@@ -293,7 +292,7 @@ def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> AcquisitionResult:
 
 
 def _take_step(run: CaptureRun, box: FlashBox, step: Step, prefix: str) -> None:
-    """Take one step; it is shot again where it failed."""
+    """Take one step, and repeat it when it fails."""
     why = ""
     for attempt in range(1, MAX_ATTEMPTS + 1):
         why = shoot(run, ShotTiming(step, box), prefix, attempt)
@@ -303,7 +302,7 @@ def _take_step(run: CaptureRun, box: FlashBox, step: Step, prefix: str) -> None:
 
 
 def _check_limits(plan: Plan, limits: Mapping[str, Any]) -> None:
-    """Raise when a step asks for more than the box allows, before anything is sent."""
+    """Raise an error when a step exceeds the controller's limits, before anything is sent."""
     low, high = float(limits.get("power_min", 0.0)), float(limits.get("power_max", 1.0))
     first = float(limits.get("analyser_min_deg", 0.0))
     last = float(limits.get("analyser_max_deg", 360.0))
@@ -312,21 +311,22 @@ def _check_limits(plan: Plan, limits: Mapping[str, Any]) -> None:
         if step.kind == "dark" or power == 0.0:
             continue
         if not low <= power <= high:
-            what = f"got power {power:g}, the box allows {low:g} to {high:g}"
+            what = f"got power {power:g}, the controller allows {low:g} to {high:g}"
             raise step_limit_error(step, what, action="fired")
         angle_deg = float(step.settings.get("analyser_deg", first))
         if not first <= angle_deg <= last:
-            what = f"got analyser_deg {angle_deg:g}, the box allows {first:g} to {last:g}"
+            what = f"got analyser_deg {angle_deg:g}, the controller allows {first:g} to {last:g}"
             raise step_limit_error(step, what, action="fired")
 
 
 def _sync_delay_s(rig: Rig, limits: Mapping[str, Any]) -> float:
-    """Return how long after the camera line the box must pop: when the last shutter is open."""
+    """Return the delay from camera line to flash until the last shutter is open, s."""
     lag_s = max((view.shutter_lag_s for view in rig.views), default=0.0)
     most_s = float(limits.get("sync_max_us", 0.0)) / 1e6
     if lag_s > most_s:
         raise AcquisitionError(
-            f"shutter_lag_s: got {lag_s:g} s in the rig file, the box waits {most_s:g} s at most "
-            "from camera line to pop; nothing was fired: every lit frame would be dark"
+            f"shutter_lag_s: got {lag_s:g} s in the rig file, the controller waits {most_s:g} s "
+            "at most from camera line to flash; nothing was fired: every lit frame would be "
+            "dark; use a faster camera"
         )
     return lag_s

@@ -1,4 +1,4 @@
-"""One shot of the flash rig: its light set, its exposure made, its frames collected and kept."""
+"""Take one shot of the flash rig: set the light, expose, collect and keep the frames."""
 
 import contextlib
 from collections.abc import Mapping
@@ -13,13 +13,13 @@ from capture.plan import Step, Value
 
 CHARGE_TIMEOUT_S = 60.0
 SHUTTER_PRESS_TIMEOUT_S = 60.0
-"""How long a person has for pressing a shutter."""
+"""Time in which a person has to press a shutter, s."""
 MAX_TOKEN_CHARS = 48
-"""Characters of the longest token that a box takes."""
+"""Maximum length of a token that a controller accepts."""
 
 
 class ShotTiming:
-    """One shot's time: before it, at it, and while the cameras read out; here at once."""
+    """Timing of one shot: before it, at it, and during readout; this one is immediate."""
 
     def __init__(self, step: Step, box: FlashBox) -> None:
         self.step, self.box = step, box
@@ -30,35 +30,35 @@ class ShotTiming:
         set_light(self.step, self.box)
 
     def wait(self) -> None:
-        """Wait until the shot is due; all is ready but the flash not armed."""
+        """Wait until the shot is due; everything is ready, but the flash is not armed."""
 
     def use_readout_time(self, report: FlashReport | None) -> None:
-        """Use the time while the cameras read out; the report is what the box says of the flash."""
+        """Use the time of the readout; ``report`` is the controller's report of the flash."""
 
 
 def shoot(run: CaptureRun, timing: ShotTiming, prefix: str, attempt: int) -> str:
-    """Take a step with all its cameras and keep it, or none: one bad frame spoils the step.
+    """Take a step with all its cameras and keep it, or none: one bad frame invalidates the step.
 
     Parameters
     ----------
     run
         The run.
     moment
-        The step, its box and its time.
+        The step, its controller and its time.
     prefix
-        Begins the name of the flash: the run, and the number in the run.
+        First part of the token of the flash: the run, and the number in the run.
     attempt
-        How often the step is tried, this time included.
+        Number of this attempt at the step, from 1.
 
     Returns
     -------
     str
-        Why the step can be tried again; nothing where it is kept.
+        Reason to repeat the step; empty when it is kept.
     """
     step = timing.step
     try:
         timing.prepare()
-        # run, number in the run, try; then as much of the step as a box takes
+        # run, number in the run, attempt; then as much of the step's id as the controller accepts
         token = f"{prefix}.{attempt}.{step.id}"[:MAX_TOKEN_CHARS]
         report, frames = _expose(run, timing, token)
     except (FrameRefused, FrameTimeout, CommandRefused) as error:
@@ -82,7 +82,7 @@ def shoot(run: CaptureRun, timing: ShotTiming, prefix: str, attempt: int) -> str
 def _expose(
     run: CaptureRun, timing: ShotTiming, token: str
 ) -> tuple[FlashReport | None, dict[str, Frame]]:
-    """Set the cameras, make the exposure, and collect one frame a camera; the light is set."""
+    """Set the cameras, expose, and collect one frame per camera; the light is set."""
     step, box = timing.step, timing.box
     want, chosen = requested_exposure(step), run.step_cameras(step)
     lit = flash_power(step) > 0
@@ -94,7 +94,7 @@ def _expose(
             camera.fire()
     report = None
     if lit:
-        # armed for this pop only: a read-out may outlast any lease
+        # armed for this flash only: a readout may last longer than any lease
         box.arm()
         report = box.fire(token)
         box.dark()
@@ -116,22 +116,22 @@ def _expose(
 
 
 def _choose_trigger(name: str, camera: Camera, lit: bool) -> Trigger:
-    """Return what releases a camera for a step: the box where there is light to meet."""
+    """Return the trigger of a camera for a step: the controller, when light is synchronized."""
     if not lit:
         for trigger in (Trigger.SOFTWARE, Trigger.EDGE, Trigger.HAND):
             if trigger in camera.info.triggers:
                 return trigger
-    # exposing on request would miss the flash: every lit frame would be dark
+    # an exposure on request would miss the flash: every lit frame would be dark
     why = (
-        "flash box's trigger line; release it from the box and let a tethering program write "
-        "its files into a hot folder"
+        "flash controller's trigger line; release it from the controller and let a tethering "
+        "program write its files into a hot folder"
     )
     require_trigger_line(name, camera, why)
     return Trigger.EDGE
 
 
 def _describe_light(report: FlashReport | None) -> dict[str, Value]:
-    """Which light made a frame: what the box acknowledged, not what was asked for."""
+    """Return the light of a frame: as acknowledged by the controller, not as requested."""
     if report is None:
         return {"light": "none", "power": 0.0}
     return {
@@ -149,7 +149,7 @@ def flash_power(step: Step) -> float:
 
 
 def set_light(step: Step, box: FlashBox) -> None:
-    """Turn the analyser, set the power, and wait until the flash could pop."""
+    """Turn the analyzer, set the power, and wait until a flash is possible."""
     power = flash_power(step)
     if power > 0:
         if "analyser_deg" in step.settings:
@@ -161,11 +161,11 @@ def set_light(step: Step, box: FlashBox) -> None:
 
 
 def _abort_cameras(run: CaptureRun, step: Step, error: Exception) -> None:
-    """Make the cameras of a step that failed ready for the next one."""
+    """Prepare the cameras of a failed step for the next one."""
     for name, camera in run.step_cameras(step).items():
         if isinstance(error, CommandRefused):
-            # a misfire has pulsed the camera line: a dark frame is being read out, and
-            # until it has come the camera would miss the next pulse
+            # A misfire has pulsed the camera line: a dark frame is being read out, and until it has
+            # come the camera would miss the next pulse.
             with contextlib.suppress(CameraError):
                 camera.frame(frame_timeout_s(step, run.rig.view(name)))
         camera.abort()

@@ -1,4 +1,4 @@
-"""Run a plan on the gradient sphere: skin in a caliper, state of strain by state, or a target."""
+"""Run a plan on the gradient sphere: strain steps of skin in a caliper, or a target."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -22,23 +22,23 @@ from capture.rig import Rig
 
 
 def check_eyes(run: CaptureRun, *, skin: bool) -> None:
-    """Raise where light would be too much; patterns on skin may come close to an eye."""
+    """Raise an error for too much light; patterns on skin may come close to an eye."""
     check_safety(run.plan, run.rig, eyes=run.eyes)
     if skin and run.eyes == "open":
         raise AcquisitionError(
-            "eyes: patterns change many times a second, and the patch may lie beside an eye; "
-            "nothing was lit: have the eyes closed or shielded and say so with --eyes"
+            "eyes: patterns change many times per second, and the patch may be next to an eye; "
+            "nothing was lit: close or shield the eyes and give --eyes"
         )
 
 
 def check_sphere(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
-    """Raise where the sphere's box is another one, or is asked for more than it allows."""
+    """Raise an error when the sphere's controller is another one, or its limits are exceeded."""
     counts = {"leds": ("lights", len(rig.lights)), "cameras": ("cameras", len(rig.views))}
     for name, (what, count) in counts.items():
         if int(limits.get(name, 0)) != count:
             raise AcquisitionError(
-                f"{what}: the sphere's box has {limits.get(name)}, the rig {count}; nothing was "
-                "lit: use the rig file of this box"
+                f"{what}: the sphere's controller has {limits.get(name)}, the rig {count}; "
+                "nothing was lit: use the rig file of this controller"
             )
     settle_s = float(limits["settle_us"]) / 1e6
     low_deg, high_deg = float(limits["analyser_min_deg"]), float(limits["analyser_max_deg"])
@@ -51,26 +51,29 @@ def check_sphere(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
             raise row_overrun_error(step, dwell_s)
         angle_deg = analyzer_reading_deg(step)
         if not low_deg <= angle_deg <= high_deg:
-            what = f"got analyser_deg {angle_deg:g}, the box turns from {low_deg:g} to {high_deg:g}"
+            what = (
+                f"got analyser_deg {angle_deg:g}, the controller turns from {low_deg:g} to "
+                f"{high_deg:g}"
+            )
             raise step_limit_error(step, what)
     longest = max(len(piece) for piece in split_passes(plan.steps))
     if longest > int(limits["max_rows"]):
         raise AcquisitionError(
-            f"plan: a scan has {longest} patterns, the box holds {limits['max_rows']}; nothing "
-            "was lit: change the plan"
+            f"plan: a scan has {longest} patterns, the controller holds {limits['max_rows']}; "
+            "nothing was lit: change the plan"
         )
 
 
 def check_caliper(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
-    """Raise where the caliper is another one than the rig file's, or is sent beyond its travel."""
+    """Raise an error when the caliper is not the rig file's, or the plan exceeds its travel."""
     drawn = rig.caliper
     if drawn is None:
         raise AcquisitionError("caliper: the rig file has none; use that of this rig")
     for name, expected in (("aperture_mm", drawn.aperture_mm), ("step_mm", drawn.step_mm)):
         if abs(float(limits.get(name, 0.0)) - expected) > 1e-6:
             raise AcquisitionError(
-                f"caliper: its box says {name} {limits.get(name)}, the rig file {expected:g}; "
-                "nothing has moved: use the rig file of this box"
+                f"caliper: its controller reports {name} {limits.get(name)}, the rig file has "
+                f"{expected:g}; nothing has moved: use the rig file of this controller"
             )
     known = [float(angle) for angle in limits["angles_deg"]]
     low, high = int(limits["step_min"]), int(limits["step_max"])
@@ -82,12 +85,12 @@ def check_caliper(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
             raise AcquisitionError(
                 f"step {step.id}: got position {position} at {angle:g} degrees, the caliper has "
                 f"{low} to {high} at {', '.join(f'{a:g}' for a in known)}; nothing has moved: "
-                "change the plan, or use the rig file of this box"
+                "change the plan, or use the rig file of this controller"
             )
 
 
 def check_force(limit_n: float | None, limits: Mapping[str, Any]) -> None:
-    """Raise where no force limit is given, or one beyond the sensor's range."""
+    """Raise an error when the force limit is missing, or outside the sensor's range."""
     low, high = float(limits["force_limit_min_n"]), float(limits["force_limit_max_n"])
     if limit_n is None:
         raise AcquisitionError(
@@ -105,9 +108,9 @@ SPHERE_LEASE_S = 2.0
 
 
 def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> AcquisitionResult:
-    """Capture what the session still lacks of a plan of the gradient sphere; see `run_plan`.
+    """Capture the missing steps of a plan on the gradient sphere; see `run_plan`.
 
-    Everything that can be refused is, before anything is lit or moves.
+    All checks are made before anything is lit or moves.
     """
     skin = any(strain_state(step) is not None for step in run.plan.steps)
     sphere: GradientSphereBox = boxes["gradient_sphere"]
@@ -119,7 +122,9 @@ def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> AcquisitionResult:
         require_trigger_line(name, camera, why)
     if skin:
         if caliper is None:
-            raise AcquisitionError("box 'caliper': no port was given; add --port caliper=URL")
+            raise AcquisitionError(
+                "controller 'caliper': no port was given; add --port caliper=URL"
+            )
         check_caliper(run.plan, run.rig, caliper.limits)
         check_force(run.force_limit_n, caliper.limits)
     scanner = PatternScanner(run, sphere, caliper.ping if caliper is not None else lambda: None)

@@ -1,10 +1,10 @@
-"""States of skin in a caliper, scanned as far as the skin lets itself be moved.
+"""Scan strain steps of skin in a caliper, as far as the skin can be moved.
 
-Per angle a person tapes the jaws to the skin once; neutral is scanned, then the jaws go step by
-step to where the skin buckles, back, and to where it comes off. What cannot be reached is left out
-of the session with the reason. All frames of a state are of one scan of one taping: when the skin
-is let go in between, for whatever reason, it is taped again, the newly taped neutral is pictured
-once, the jaws walk the same way, and the state is scanned anew.
+Per angle a person tapes the jaws to the skin once; neutral is scanned, then the jaws compress step
+by step until the skin buckles, go back, and stretch until it comes off. Steps that cannot be
+reached are omitted from the session with the reason. All frames of a step are of one scan of one
+taping. When the skin is released in between, it is taped again, an image of the new neutral is
+taken, the jaws repeat their way, and the whole step is scanned again.
 """
 
 import logging
@@ -27,32 +27,32 @@ from capture.session import Session
 EndKind = Literal["buckled", "detached", "force"]
 
 BUCKLING_FORCE_RATIO = 0.7
-"""Skin whose push grows by less than this part of its growth a step before has buckled."""
+"""Fraction of its previous growth below which a growth of the push means buckling."""
 PLATEAU_FORCE_RATIO = 0.05
-"""Below this part the step before had reached the plateau already."""
+"""Fraction of growth below which the previous step had already reached the plateau."""
 
 _END_DESCRIPTIONS: dict[EndKind, str] = {
-    "buckled": "the skin buckled: its push grew no more",
+    "buckled": "the skin buckled: its push no longer grew",
     "detached": "the skin came off the tape",
-    "force": "the force limit was met",
+    "force": "the force limit was reached",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class BranchEnd:
-    """Where a way ended."""
+    """End of a way from neutral."""
 
     kind: EndKind
     position: int
-    """First position that is not to be had."""
+    """First position that cannot be reached."""
     reading_mm: float
-    """Distance of the jaws when this was found, mm."""
+    """Distance of the jaws at the end, mm."""
     force_n: float
-    """Force then, N."""
+    """Force at the end, N."""
 
 
 class StrainLimitReached(Exception):
-    """Skin cannot be moved further this way.
+    """Raised when the skin cannot be moved further in this direction.
 
     Attributes
     ----------
@@ -67,12 +67,12 @@ class StrainLimitReached(Exception):
 
 
 class ForceMonitor:
-    """Follows the force step by step one way from neutral.
+    """Monitor of the force, step by step in one direction from neutral.
 
     Parameters
     ----------
     caliper
-        For the readings.
+        Caliper, for the readings.
     direction
         -1 compresses, +1 stretches.
     at_rest_n
@@ -80,10 +80,11 @@ class ForceMonitor:
 
     Notes
     -----
-    Compressed skin pushes the jaws apart, about in proportion, until it buckles out of its plane;
-    from then on its push stays. A position whose push has grown by less than `BUCKLING_FORCE_RATIO`
-    of the mean growth a step is behind the onset. Where it has not grown at all the position before
-    was behind it, too, by less than what would have shown then: it is given up as well.
+    Compressed skin pushes the jaws apart, approximately in proportion, until it buckles out of its
+    plane; from then on its push stays constant. A position whose push has grown by less than
+    `BUCKLING_FORCE_RATIO` of the mean growth per step is beyond the onset. When the push has not
+    grown at all, the position before was beyond the onset, too, by less than could be detected
+    there: it is omitted as well.
     """
 
     def __init__(self, caliper: Caliper, direction: int, *, at_rest_n: float) -> None:
@@ -92,12 +93,12 @@ class ForceMonitor:
         self._pushes = [-at_rest_n]
 
     def check(self, position: int, report: MoveReport, force_n: float) -> None:
-        """Note a position that was reached.
+        """Check the force at a position that was reached.
 
         Raises
         ------
         EndOfSkin
-            Where this is one too far.
+            When this position is beyond the limit of the skin.
         """
         if report.ended == "detached":
             raise StrainLimitReached(
@@ -126,17 +127,17 @@ class ForceMonitor:
 log = logging.getLogger(__name__)
 
 CALIPER_LEASE_S = 5.0
-"""A camera's frames may keep the host busy for a while; after this silence the skin is let go."""
+"""Silence after which the skin is released, s: cameras' frames may keep the host busy."""
 N_FORCE_READINGS = 8
 
 
 class _SkinReleased(Exception):
-    """The skin was let go though nothing ended; it can be taped again."""
+    """Raised when the skin was released before its limit; it can be taped again."""
 
 
 @dataclass(frozen=True, slots=True)
 class _StrainState:
-    """A state of the skin that is to be scanned."""
+    """A strain step that is to be scanned."""
 
     angle_deg: float
     position: int
@@ -148,7 +149,7 @@ class _StrainState:
 
 
 class SkinStates:
-    """The states of one run: what is held, how far it went, what is left."""
+    """Strain steps of one run: attachment, limits found, and steps still missing."""
 
     def __init__(
         self, run: CaptureRun, caliper: CaliperBox, scanner: PatternScanner, force_limit_n: float
@@ -163,12 +164,12 @@ class SkinStates:
         self._reading_mm = self._force_n = 0.0
 
     def scan(self) -> None:
-        """Scan what is missing, angle by angle, in the plan's order."""
+        """Scan the missing steps, angle by angle, in the plan's order."""
         for angle_deg in dict.fromkeys(state.angle_deg for state in self._states):
             self._complete_angle(angle_deg)
 
     def _find_missing_states(self, angle_deg: float) -> list[_StrainState]:
-        """Return the states of an angle that are not there, or not from one taping."""
+        """Return the steps of an angle that are missing, or not from one taping."""
         left_out = self._session.omitted_steps()
         frames: dict[str, set[object]] = {}
         for record in self._session.frames("gradient"):
@@ -185,7 +186,7 @@ class SkinStates:
         return found
 
     def _complete_angle(self, angle_deg: float) -> None:
-        """Scan an angle's states; tape the skin again where it was let go."""
+        """Scan the steps of an angle; have the skin taped again when it was released."""
         before, tries = len(self._find_missing_states(angle_deg)), 0
         why = ""
         while missing := self._find_missing_states(angle_deg):
@@ -203,7 +204,7 @@ class SkinStates:
                 release_skin(self._caliper)
 
     def _attach(self, angle_deg: float) -> None:
-        """Bring empty jaws to step 0 at an angle and have a person tape them to the skin."""
+        """Move empty jaws to step 0 at an angle and have a person tape them to the skin."""
         caliper = self._caliper
         self._operator.stop_if_asked()
         caliper.dark()
@@ -227,7 +228,7 @@ class SkinStates:
         log.info("attachment %d, at %g degrees", self._attachment, angle_deg)
 
     def _scan_angle(self, angle_deg: float) -> None:
-        """Scan neutral, then compression, then stretching, of what is missing."""
+        """Scan what is missing: neutral, then compression, then stretching."""
         self._position = 0
         self._settle(self._drawn.reading_mm(0))
         for state in self._states:
@@ -241,7 +242,7 @@ class SkinStates:
             self._scan_branch(angle_deg, direction)
 
     def _scan_branch(self, angle_deg: float, direction: int) -> None:
-        """Walk from neutral as far as states are missing, or as the skin lets itself be moved."""
+        """Move from neutral through the missing steps, up to the limit of the skin."""
         wanted = {
             state.position: state
             for state in self._find_missing_states(angle_deg)
@@ -269,9 +270,7 @@ class SkinStates:
     def _move(self, position: int) -> MoveReport:
         """Move and let the skin creep; raise `_SkinReleased` after any other release."""
         try:
-            self._scanner.rotate_analyzer(
-                self._states[0].steps[0]
-            )  # while the jaws are on their way
+            self._scanner.rotate_analyzer(self._states[0].steps[0])  # during the move
             report = self._caliper.move_to(position)
         except CommandRefused as error:
             if error.code not in (Code.WATCHDOG_TRIPPED, Code.NOT_ARMED):
@@ -290,7 +289,7 @@ class SkinStates:
         self._reading_mm, self._force_n = reading_mm, sum(readings) / len(readings)
 
     def _scan_state(self, state: _StrainState, ended: str) -> None:
-        """Scan a state and commit it when it was held to the end."""
+        """Scan a step and commit it when the skin was held to the end."""
         self._operator.progress(
             f"{state.name}: {self._reading_mm:.2f} mm, {self._force_n:+.3f} N, {ended}"
         )
@@ -301,13 +300,13 @@ class SkinStates:
         self._scanner.commit(taken, self._actual(ended))
 
     def _check_held(self, position: int) -> None:
-        """Raise where the skin was lost while it was scanned."""
+        """Raise an error when the skin was released during the scan."""
         if self._caliper.is_attached():
             return
         status = self._caliper.status()
         if position == 0 or status.tripped or status.stopped or not status.armed:
             raise _SkinReleased(
-                f"position {position}: the caliper let the skin go while it was scanned"
+                f"position {position}: the caliper released the skin during the scan"
             )
         raise StrainLimitReached(BranchEnd("detached", position, self._reading_mm, self._force_n))
 
@@ -320,7 +319,7 @@ class SkinStates:
         }
 
     def _photograph_neutral(self, neutral: _StrainState) -> None:
-        """Attach one picture of newly taped neutral skin, by which tapings can be compared."""
+        """Attach one image of newly taped neutral skin, with which tapings can be compared."""
         step = next((s for s in neutral.steps if s.settings["pattern"] == "full"), neutral.steps[0])
         (one,) = self._scanner.scan([step])
         self._check_held(0)
@@ -340,7 +339,7 @@ class SkinStates:
             )
 
     def _omit_states(self, angle_deg: float, direction: int, end: StrainLimitReached) -> None:
-        """Note in the session that this way goes no further."""
+        """Record in the session that the skin cannot be moved further."""
         left_out = self._session.omitted_steps()
         first = direction * end.end.position
         ids = [
@@ -374,7 +373,7 @@ def _group_states(plan: Plan) -> Iterator[_StrainState]:
 
 
 def _count_attachments(session: Session) -> int:
-    """Return how often the skin was taped before, as far as anything came of it."""
+    """Return the number of earlier tapings that left frames in the session."""
     lines = [session.attachment_line(name).about for name in session.attachments()]
     lines += [record.actual for record in session.frames("gradient")]
     lines += [session.omission_line(step).about for step in session.omitted_steps()]
@@ -382,8 +381,8 @@ def _count_attachments(session: Session) -> int:
 
 
 def release_skin(caliper: CaliperBox) -> None:
-    """Release the skin and disarm; nothing here hides the error that led here."""
+    """Release the skin and disarm; errors of the release are logged, not raised."""
     try:
         caliper.dark()
     except DeviceError as error:
-        log.error("the caliper could not be told to let go: %s; its lease does", error)
+        log.error("the caliper did not confirm the release: %s; its lease releases the skin", error)

@@ -1,9 +1,9 @@
-"""Series of exposures of one placement of the probe's head: held, watched, ended when it is enough.
+"""Take a series of exposures of one placement of the probe's head, up to the last useful one.
 
-All frames of a series are of one placement; they are committed when the last is there. When the
-head is lost in between, it is placed anew and the series begins again. Exposures run from short to
-long, and those that can show no more are left out, with the reason. No short one ever is: whether
-one saturates nowhere is known only when it is there, and it costs a read-out.
+All frames of a series are of one placement; they are committed when the last one has come. When the
+head is lost in between, a person places it again and the series starts over. Exposures run from
+short to long. Long ones that cannot add information are omitted, with the reason; short ones never
+are, because only the frame itself shows whether it saturates, and it costs one readout.
 """
 
 import logging
@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class _TakenExposure:
-    """An exposure that is to be kept."""
+    """An exposure that will be kept."""
 
     exposed: SourceExposure
     actual: dict[str, Value]
@@ -49,7 +49,7 @@ class _TakenExposure:
 
 
 class BracketSeries:
-    """The series of one run."""
+    """Series of exposures of one run."""
 
     def __init__(self, run: CaptureRun, box: ProbeBox) -> None:
         self._run, self._session, self._operator = run, run.session, run.operator
@@ -62,7 +62,7 @@ class BracketSeries:
     # darks ------------------------------------------------------------------------------------
 
     def darks(self) -> None:
-        """Take the frames without light that are missing, with the head capped."""
+        """Take the missing frames without light, with the head capped."""
         missing = [step for step in self._run.pending_steps() if step.kind == "dark"]
         if missing:
             self._head.cap()
@@ -87,7 +87,7 @@ class BracketSeries:
                 continue
             if not self._box.status().placed:
                 why = self._note_retake(
-                    step, attempt, ShutterFault("the box has let go of the cap")
+                    step, attempt, ShutterFault("the controller has released the cap")
                 )
                 continue
             after_c = self._head.temperature_c()
@@ -98,7 +98,7 @@ class BracketSeries:
     # series -----------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Take the series that are missing, in the plan's order, with the head placed as needed."""
+        """Take the missing series, in the plan's order, with the head placed as needed."""
         for placement, steps in group_by_series(self._session.plan):
             if steps[0].kind == "mask" and not self._run.all_brackets:
                 self._omit_steps(*find_unneeded_masks(self._session))
@@ -106,7 +106,7 @@ class BracketSeries:
                 self._complete_series(placement, steps)
 
     def _is_missing(self, steps: Sequence[Step]) -> bool:
-        """Tell whether a series lacks frames, or has some of several placements."""
+        """Return whether a series lacks frames, or has frames of several placements."""
         left_out = self._session.omitted_steps()
         ids = {step.id for step in steps if step.id not in left_out}
         found = [record for record in self._session.frames() if record.step_id in ids]
@@ -134,7 +134,7 @@ class BracketSeries:
     def _take_series(
         self, placement: HeadPlacement, wanted: Sequence[Step]
     ) -> tuple[list[_TakenExposure], str]:
-        """Take a series of one placement; return it, and why the rest of it is not needed."""
+        """Take a series of one placement; return it, and the reason to omit the rest."""
         signal = FiberSignal(self._probe, self._run.rig.view(wanted[0].cameras[0]))
         taken: list[_TakenExposure] = []
         self._head.require_placement(placement)
@@ -161,7 +161,7 @@ class BracketSeries:
         return taken, ""
 
     def _take_exposure(self, placement: HeadPlacement, step: Step) -> _TakenExposure:
-        """Take one exposure with the head held before and after, or take it again."""
+        """Take one exposure with the head held before and after, or repeat it."""
         why = ""
         needs_s = float(step.settings["exposure_s"]) + readout_s(self._run, step)
         level = float(step.settings["level"])
@@ -206,10 +206,10 @@ class BracketSeries:
         for camera in self._run.step_cameras(step).values():
             camera.abort()
 
-    # what is not needed -----------------------------------------------------------------------
+    # omission of exposures --------------------------------------------------------------------
 
     def _report_missing_fibers(self, placement: HeadPlacement, signal: FiberSignal) -> None:
-        """Say of a whole series which fibres it does not show."""
+        """Log the fibers without a signal in a whole series."""
         verdict = signal.verdict([])
         for pairs, what in (
             (verdict.hopeless, "stays in the noise"),
@@ -244,12 +244,12 @@ class BracketSeries:
 
 
 def _pixels(frame: Frame, step: Step) -> np.ndarray:
-    """Return the sensor values of a frame, also of one that is a maker's raw file."""
+    """Return the sensor values of a frame, also of a foreign raw file."""
     if isinstance(frame.image, bytes):
         return np.asarray(raw.decode(memoryview(frame.image), where=f"step {step.id}").cfa)
     return frame.image
 
 
 def _count_placements(session: Session) -> int:
-    """Return how often the head was placed in earlier runs, as far as anything came of it."""
+    """Return the number of placements in earlier runs that left frames in the session."""
     return max((int(r.actual.get("placement", 0)) for r in session.frames()), default=0)

@@ -1,8 +1,7 @@
-"""What a series of exposures has shown of the fibres so far, and whether longer ones can tell more.
+"""Estimate the fibers' signal during a series, and decide whether longer exposures are needed.
 
-This looks at a frame as it comes, at the nominal places of the spots, and only decides when to
-stop; the measurement itself is made later, of the raw frames, by a calibration that knows where the
-spots are.
+Frames are evaluated as they come, at the nominal positions of the spots, only to decide when to
+stop. The measurement itself uses the raw frames later, with the calibrated positions of the spots.
 """
 
 import math
@@ -18,51 +17,54 @@ from capture.rig import Probe, View
 from capture.session import Session
 
 MIN_PEAK_LEVEL = 0.5
-"""Share of full scale that a spot has to reach, unsaturated: at two thirds of a stop the next
-exposure would reach 0.8 and saturate after that."""
+"""Fraction of full scale that an unsaturated spot has to reach: with steps of two thirds of a stop
+the next exposure would reach 0.8 and the one after that saturate.
+"""
 MIN_SERIES_SNR = 100.0
-"""Signal to noise that all unsaturated exposures of a spot together have to reach: a per cent."""
+"""Signal-to-noise ratio that all unsaturated exposures of a spot have to reach together: one
+percent.
+"""
 MIN_MEASURABLE_SNR = 3.0
-"""What would stay below this even with all exposures that are left cannot be measured."""
+"""Signal-to-noise ratio below which a spot counts as not measurable, even with all exposures."""
 PEAK_RANK_PX = 8
-"""The eighth brightest pixel of a color counts as a spot's peak: fewer may be hot."""
+"""Rank of the pixel of a color that counts as a spot's peak: fewer may be hot."""
 SPOT_HALF_SIDE_PITCH = 0.4
-"""Half the side of the square in which a spot is sought, of the distance between spots."""
+"""Half the side of the search square of a spot, in distances between spots."""
 BACKGROUND_DISTANCE_PITCH = 0.55
-"""Farther than this from every spot, of that distance, is what no fibre lights."""
+"""Distance from every spot, in distances between spots, beyond which a pixel is background."""
 _COLOR_INDEX = {"R": 0, "G": 1, "B": 2}
 COLOR_NAMES = ("red", "green", "blue")
 
 
 @dataclass(frozen=True, slots=True)
 class SeriesVerdict:
-    """Whether a series may end."""
+    """Decision on the end of a series."""
 
     enough: bool
-    """Whether every fibre has been measured that can be, in every color."""
+    """Whether every measurable fiber has been measured, in every color."""
     hopeless: tuple[tuple[int, int], ...]
-    """Fibre and color of what no exposure of the series shows."""
+    """Fiber and color of spots without a signal in any exposure."""
     saturated: tuple[tuple[int, int], ...]
-    """The same of what saturates in every one."""
+    """Fiber and color of spots that are saturated in every exposure."""
 
 
 class FiberSignal:
-    """Light of each fibre in each color, exposure by exposure of one series.
+    """Light of each fiber in each color, exposure by exposure of one series.
 
     Parameters
     ----------
     probe : Probe
-        For the nominal spots.
+        Gives the nominal spots.
     view : View
-        The camera; its levels and its noise.
+        The camera, with its levels and its noise.
 
     Attributes
     ----------
     probe : Probe
     level : ndarray of float64, shape (F, C)
-        Greatest peak above black of an unsaturated exposure so far, of full scale.
+        Largest peak above black of an unsaturated exposure so far, of full scale.
     rate_per_s : ndarray of float64, shape (F, C)
-        That peak per second, of full scale; 0 where there is none.
+        The same peak per second, of full scale; 0 without such an exposure.
     """
 
     def __init__(self, probe: Probe, view: View) -> None:
@@ -95,7 +97,7 @@ class FiberSignal:
         self._looked = 0
 
     def add_exposure(self, image: UInt16Array, exposure_s: float) -> None:
-        """Take an exposure into account: sensor values, shape (H, W), and its time, s."""
+        """Add an exposure: sensor values, shape (H, W), and its time, s."""
         view = self._view
         pixels = np.asarray(image).ravel()
         full = float(view.white_level - view.black_level)
@@ -123,16 +125,16 @@ class FiberSignal:
 
     @property
     def signal_to_noise(self) -> Float64Array:
-        """Signal to noise of all unsaturated exposures of each fibre and color, shape (F, C)."""
+        """Signal-to-noise ratio of all unsaturated exposures per fiber and color, shape (F, C)."""
         return self._sum / np.sqrt(np.maximum(self._variance, 1e-12))
 
     def verdict(self, remaining_s: Sequence[float]) -> SeriesVerdict:
-        """Tell whether the exposures that are left, s, can show more.
+        """Decide whether the remaining exposures, s, can add information.
 
         Notes
         -----
-        The light of a fibre that has not been seen is taken as bright as three standard errors
-        above its estimate; only what even that would leave in the noise is given up.
+        A fiber without a signal so far is assumed to have its estimate plus three standard errors;
+        it is given up only when even that would stay in the noise.
         """
         snr = self.signal_to_noise
         measured = (self.level >= MIN_PEAK_LEVEL) & (snr >= MIN_SERIES_SNR)
@@ -153,12 +155,12 @@ class FiberSignal:
 
 
 def stop_reason(signal: FiberSignal, last: Step, remaining: Sequence[Step]) -> str:
-    """Return why the exposures that are left after the last show no more; empty where they may.
+    """Return why the remaining exposures are not needed; empty when they are.
 
     Parameters
     ----------
     signal : FiberSignal
-        Of the exposures up to the last.
+        Signal of the exposures up to the last.
     last : Step
     remaining : sequence of Step
         At least one, by growing exposure.
@@ -168,11 +170,11 @@ def stop_reason(signal: FiberSignal, last: Step, remaining: Sequence[Step]) -> s
         return ""
     first, final = (int(remaining[k].index["bracket"]) for k in (0, -1))
     span = f"bracket {first}" if first == final else f"brackets {first}-{final}"
-    what = f"all {len(signal.probe.fibres)} fibres"
+    what = f"all {len(signal.probe.fibres)} fibers"
     what += " that can be measured" if verdict.hopeless or verdict.saturated else ""
     at_s = float(last.settings["exposure_s"])
     reason = (
-        f"{span} left out: {what} above {100 * MIN_PEAK_LEVEL:g} % of full scale at {at_s:.2g} s"
+        f"{span} omitted: {what} above {100 * MIN_PEAK_LEVEL:g} % of full scale at {at_s:.2g} s"
     )
     if verdict.hopeless:
         reason += f"; {describe_fibers(verdict.hopeless, signal.probe)} would stay in the noise"
@@ -184,7 +186,7 @@ def stop_reason(signal: FiberSignal, last: Step, remaining: Sequence[Step]) -> s
 
 
 def describe_fibers(pairs: Sequence[tuple[int, int]], probe: Probe) -> str:
-    """Return fibres and colors as words.
+    """Return fibers and colors as words.
 
     Examples
     --------
@@ -231,21 +233,22 @@ def _pairs(mask: BoolArray) -> tuple[tuple[int, int], ...]:
 
 
 MAX_UNSATURATED_LEVEL = 0.7
-"""Share of full scale up to which a spot is safely unsaturated."""
+"""Fraction of full scale up to which a spot is safely unsaturated."""
 MAX_OVEREXPOSURE = 64.0
-"""How many times longer its neighbors are looked at: a thousandth of it then stands at some per
-cent of full scale, and what is saturated does not yet spill over."""
+"""Ratio of the exposures for a spot and for its neighbors: a thousandth of its light is then some
+percent of full scale, and the saturated spot does not bleed yet.
+"""
 
 
 def usable_exposures(steps: Sequence[Step], rate_per_s: Float64Array) -> set[str]:
-    """Return the ids of those exposures of covered heads that serve.
+    """Return the ids of the useful exposures with covered heads.
 
     Parameters
     ----------
     steps : sequence of Step
-        Of kind "mask".
+        Steps of kind "mask".
     rate_per_s : ndarray of float64, shape (F, C)
-        Peak of each fibre in each color on the same phantom, full scales per second.
+        Peak of each fiber in each color on the same phantom, full scales per second.
 
     Examples
     --------
@@ -264,17 +267,17 @@ def usable_exposures(steps: Sequence[Step], rate_per_s: Float64Array) -> set[str
         seconds = np.array([float(step.settings["exposure_s"]) for step in ordered])
         brightest = float(rate_per_s[fibre].max())
         own = max(int(np.count_nonzero(seconds * brightest <= MAX_UNSATURATED_LEVEL)) - 1, 0)
-        # exposures are whole milliseconds on some boxes: a hair of room
+        # exposures are whole milliseconds on some controllers: leave some room
         others = int(np.count_nonzero(seconds <= 1.01 * MAX_OVEREXPOSURE * seconds[own])) - 1
         kept |= {ordered[own].id, ordered[others].id}
     return kept
 
 
 def find_unneeded_masks(session: Session) -> tuple[list[Step], str]:
-    """Return which exposures of covered heads a session can do without, and why.
+    """Return the unneeded exposures of covered heads, and the reason.
 
-    They are chosen once: where one was taken or left out before, or where the phantom has not been
-    seen at its first placement, none.
+    The choice is made once: when one of them was taken or omitted before, or when the phantom was
+    not observed at its first placement, none is unneeded.
     """
     masks = [step for step in session.plan.steps if step.kind == "mask"]
     left_out = session.omitted_steps()
@@ -292,6 +295,6 @@ def find_unneeded_masks(session: Session) -> tuple[list[Step], str]:
     kept = usable_exposures(masks, signal.rate_per_s)
     rest = [step for step in masks if step.id not in kept]
     return rest, (
-        f"{len(rest)} of {len(masks)} exposures of the covered head left out: per fibre one that "
-        "shows it unsaturated serves, and one that shows light astray from it"
+        f"{len(rest)} of {len(masks)} exposures of the covered head omitted: one unsaturated "
+        "exposure per fiber and one for its stray light are enough"
     )

@@ -1,8 +1,8 @@
-"""The probe's head on the skin: placed by a person, held by suction, watched.
+"""Place the probe's head by a person, hold it by suction, and monitor it.
 
-A placement lasts as long as the head is held or rests in good order. Where the suction ends by
-itself, or is not reached, nobody knows whether the head is still where it was: a person places it
-anew, and all exposures of the series are taken again.
+A placement is valid while the head is held or rests in good order. When the suction ends
+unexpectedly, or is not reached, the position of the head is uncertain: a person places it again,
+and all exposures of the series are repeated.
 """
 
 import logging
@@ -19,40 +19,40 @@ log = logging.getLogger(__name__)
 
 SUCTION_POLL_S = 0.1
 SUCTION_MARGIN_S = 1.0
-"""Beyond the box's own time for reaching a suction."""
+"""Margin beyond the controller's own time for reaching a suction, s."""
 DETACHED_SUCTION_RATIO = 0.5
-"""A head under less than this of its suction has come off."""
+"""Fraction of its suction below which a head has come off."""
 CAMERA_TEMPERATURE_TIMEOUT_S = 180.0
-"""How long a camera that is too warm, or too cold, is waited for, s."""
+"""Longest wait for a camera to reach its temperature, s."""
 CAMERA_TEMPERATURE_POLL_S = 1.0
 
 
 class HeadLost(Exception):
-    """Nobody knows whether the head is where it was placed; it can be placed anew."""
+    """Raised when the position of the head is uncertain; it can be placed again."""
 
 
 class HoldOutOfTolerance(Exception):
-    """Suction or temperature went beyond its limits during an exposure; it can be taken again."""
+    """Raised when suction or temperature left their limits; the exposure can be repeated."""
 
 
 class Head:
-    """Where the head is, and whether it is held there.
+    """Placement of the head, and its hold by suction.
 
     Parameters
     ----------
     probe
-        For suction, tolerances and times.
+        Suction, tolerances and times.
     box
-        Its driver.
+        Driver of its controller.
     operator
-        Who places it.
+        Person who places it.
     placements
-        How often it was placed in earlier runs.
+        Number of placements in earlier runs.
 
     Attributes
     ----------
     placements : int
-        How often it was placed, these included.
+        Number of placements, these included.
     """
 
     def __init__(self, probe: Probe, box: ProbeBox, operator: Operator, *, placements: int) -> None:
@@ -62,7 +62,7 @@ class Head:
         self.placements = placements
 
     def require_placement(self, placement: HeadPlacement) -> None:
-        """Have the head at a placement; a person is asked where it is not there."""
+        """Ensure a placement of the head; a person is prompted when it is elsewhere."""
         if self._place == placement:
             return
         self.detach()
@@ -79,37 +79,37 @@ class Head:
         log.info("placement %d: %s", self.placements, placement)
 
     def cap(self) -> None:
-        """Have a person cap the head, so that no light of the room enters the fibres."""
+        """Have a person cap the head, so that no ambient light enters the fibers."""
         self.detach()
         self._operator.stop_if_asked()
         self._operator.prompt("put the cap on the head")
         self.keep_capped()
 
     def keep_capped(self) -> None:
-        """Tell a box that has let go of everything meanwhile that the cap is where it was."""
+        """Report the cap again to a controller that has cleared its placement meanwhile."""
         if not self._box.status().placed:
             self._box.arm()
             self._box.place(CAP_SITE, 0.0)
 
     def detach(self) -> None:
-        """Vent, disarm and forget the placement: a person's hands are at the head now."""
+        """Vent, disarm and clear the placement: a person's hands are at the head now."""
         self._box.dark()
         self._place = None
 
     def note_loss(self, reason: str) -> None:
-        """Have the head placed anew before anything else, and say why."""
+        """Require a new placement before anything else, and record the reason."""
         self.detach()
         self._again = f" again: {reason}"
 
     def hold(self, level: float, next_s: float) -> None:
-        """Have the head held, settled, for at least so long, and the LED lit.
+        """Hold the head, settled, for at least a time, with the LED on.
 
         Raises
         ------
         HeadLost
-            Where the suction is not reached, or was lost.
+            When the suction is not reached, or was lost.
         AcquisitionError
-            Where the gauge is dead.
+            When the gauge has failed.
         """
         state = self._box.suction()
         if state.on and state.left_s >= next_s + WIRE_SLACK_S:
@@ -128,7 +128,7 @@ class Head:
         self._settle()
 
     def release(self) -> None:
-        """Vent; the head stays where it is, and the skin has its rest."""
+        """Vent; the head stays in its place, and the skin rests."""
         self._box.vent()
 
     def readings(self) -> tuple[float, float]:
@@ -137,9 +137,9 @@ class Head:
         Raises
         ------
         NotHeld
-            Where one is not; the head is vented then.
+            When one is outside; the head is vented then.
         HeadLost
-            Where the box has let go of the head, or it has come off.
+            When the controller has released the head, or it has come off.
         """
         probe = self._probe
         suction_mbar, camera_c = self._box.pressure_mbar(), self._box.camera_c()
@@ -156,24 +156,23 @@ class Head:
         return suction_mbar, camera_c
 
     def temperature_c(self) -> float:
-        """Return the camera's temperature, degrees Celsius, after it has come within its limits."""
+        """Return the camera's temperature, degrees Celsius, after it has reached its limits."""
         return self._wait_for_temperature()
 
     def placement_error(
         self, placement: HeadPlacement, reason: str, *, captured: bool
     ) -> AcquisitionError:
-        """Return the error of a placement at which the measurement cannot be made."""
+        """Return the error of a placement at which the measurement is not possible."""
         return AcquisitionError(
-            f"measurement of {placement}: refused, {reason}, {MAX_ATTEMPTS} times; no frame of it"
-            f" is "
-            "kept. Check that the membrane is whole and the tube is on, and that no fold and no "
-            f"hair lies under the rim; {recovery_advice(captured=captured)}"
+            f"measurement of {placement}: refused, {reason}, {MAX_ATTEMPTS} times; no frame of "
+            "it is kept. Check that the membrane is whole and the tube is on, and that no fold "
+            f"and no hair is under the rim; {recovery_advice(captured=captured)}"
         )
 
-    # what is waited for -----------------------------------------------------------------------
+    # waiting ---------------------------------------------------------------------------------
 
     def _settle(self) -> None:
-        """Wait until the suction has stayed within its limits for as long as the rig says."""
+        """Wait until the suction has stayed within its limits for the rig's settling time."""
         probe = self._probe
         reach_s = float(self._box.limits["reach_ms"]) / 1e3 + SUCTION_MARGIN_S
         waited_s, within_s = 0.0, 0.0
@@ -195,7 +194,7 @@ class Head:
             within_s += pause_s if good else 0.0
 
     def _wait_for_temperature(self) -> float:
-        """Wait until the camera is as cold as it is to be; return its temperature."""
+        """Wait until the camera has reached its temperature; return the temperature."""
         waited_s = 0.0
         while not self._is_temperature_within(camera_c := self._box.camera_c()):
             if waited_s == 0.0:
@@ -217,29 +216,29 @@ class Head:
             raise HeadLost(self._describe_suction_end())
 
     def _translate_refusal(self, error: CommandRefused) -> Exception:
-        """Return what a refusal of the pump or the LED means."""
+        """Return the meaning of a refusal by the pump or the LED."""
         if error.code in (Code.WATCHDOG_TRIPPED, Code.NOT_ARMED, Code.IGNORED):
-            return HeadLost("the box had let go of the head")
+            return HeadLost("the controller had released the head")
         return error
 
     def _describe_suction_end(self) -> str:
         """Return in words how the last suction ended."""
         report = self._box.last_suction()
         if report is None:
-            return "the box had let go of the head"
+            return "the controller had released the head"
         if report.ended == "gauge":
             raise AcquisitionError(
-                "the pressure gauge of the probe's box is dead; the head was vented: have it "
-                "mended, then run the same command with --resume"
+                "the pressure gauge of the probe's controller has failed; the head was vented: "
+                "have it repaired, then run the same command with --resume"
             )
         found = self._format_suction(report.suction_mbar)
         return {
             "low": f"the suction reached only {found}",
             "lost": f"the suction fell to {found}",
             "high": f"the suction rose to {found}",
-            "timed": "the suction came to its end too early",
+            "timed": "the suction ended too early",
             "asked": "the head was vented",
-        }.get(report.ended, "the box had let go of the head")
+        }.get(report.ended, "the controller had released the head")
 
     def _format_suction(self, suction_mbar: float) -> str:
         probe = self._probe

@@ -1,4 +1,4 @@
-"""Run a plan on the fibre probe: darks, then series of exposures, placement by placement."""
+"""Run a plan on the fiber probe: dark frames, then series of exposures per placement."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,20 +19,20 @@ from capture.rig import Rig
 
 
 def check_probe(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
-    """Raise where the box is another one than the rig file's, or is asked for more than it allows.
+    """Raise an error when the controller is not the rig file's, or its limits are exceeded.
 
     Raises
     ------
     AcquisitionError
-        With what was found, what was expected, and what to change.
+        With the value found, the value expected, and the change to make.
     """
     probe = rig.probe
     if probe is None:
         raise AcquisitionError("probe: the rig file has none; use that of this rig")
     if int(limits.get("fibres", 0)) != len(probe.fibres):
         raise AcquisitionError(
-            f"fibres: the box has {limits.get('fibres')}, the rig {len(probe.fibres)}; nothing "
-            "was lit: use the rig file of this box"
+            f"fibers: the controller has {limits.get('fibres')}, the rig {len(probe.fibres)}; "
+            "nothing was lit: use the rig file of this controller"
         )
     low_s = float(limits["shutter_min_ms"]) / 1e3
     high_s = float(limits["shutter_max_ms"]) / 1e3
@@ -51,28 +51,28 @@ def check_probe(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
         fibre = step.settings.get("fibre")
         if fibre is not None and not int(fibre) < len(probe.fibres):
             has = f"the rig has {len(probe.fibres)}, counted from 0"
-            raise step_limit_error(step, f"got fibre {fibre}, {has}")
+            raise step_limit_error(step, f"got fiber {fibre}, {has}")
     if probe.suction_mbar > most_mbar:
         raise AcquisitionError(
-            f"suction_mbar: the rig file says {probe.suction_mbar:g}, the box draws at most "
-            f"{most_mbar:g}; nothing was sucked at: change the rig file"
+            f"suction_mbar: the rig file has {probe.suction_mbar:g}, the controller allows at "
+            f"most {most_mbar:g}; no suction was applied: change the rig file"
         )
     if probe.max_suction_s > float(limits["suction_max_ms"]) / 1e3 + 1e-6:
         raise AcquisitionError(
-            f"max_suction_s: the rig file says {probe.max_suction_s:g}, the box sucks for at most "
-            f"{float(limits['suction_max_ms']) / 1e3:g} s; nothing was sucked at: change the rig "
-            "file"
+            f"max_suction_s: the rig file has {probe.max_suction_s:g}, the controller applies "
+            f"suction for at most {float(limits['suction_max_ms']) / 1e3:g} s; no suction was "
+            "applied: change the rig file"
         )
     given_ws, most_ws = source_energy_ws(plan, rig), float(limits["dose_ws"])
     if given_ws > most_ws:
         raise AcquisitionError(
-            f"light dose: the plan gives {given_ws:.3g} Ws, the box allows {most_ws:g} Ws a "
-            "subject; nothing was lit: plan fewer sites, repeats or angles"
+            f"light dose: the plan gives {given_ws:.3g} Ws, the controller allows {most_ws:g} "
+            "Ws per subject; nothing was lit: plan fewer sites, repeats or angles"
         )
 
 
 def check_cameras(run: CaptureRun) -> None:
-    """Raise where a camera cannot be released by the probe, or opens after the light has begun."""
+    """Raise an error when the probe cannot release a camera, or its shutter opens too late."""
     for view in run.rig.views:
         why = "probe's trigger line; an exposure of its own would miss the shutter's light"
         require_trigger_line(view.name, run.cameras[view.name], why)
@@ -84,28 +84,28 @@ def check_cameras(run: CaptureRun) -> None:
 
 
 PROBE_LEASE_S = 5.0
-"""A frame may keep the host busy for a while; after this silence the box lets go."""
+"""Silence after which the controller shuts down, s: a frame may keep the host busy."""
 
 
 def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> AcquisitionResult:
-    """Capture what the session still lacks of a plan of the fibre probe; see `run_plan`.
+    """Capture the missing steps of a plan on the fiber probe; see `run_plan`.
 
-    Everything that can be refused is, before anything is lit or sucked at. The dark frames come
-    first, under a cap; then a person is asked to place the head, once per series on
-    skin. Whatever happens, the shutter ends up shut, the LED out and the head vented.
+    All checks are made before anything is lit or suction is applied. The dark frames come first,
+    under a cap; then a person is prompted to place the head, once per series on skin. In every case
+    the shutter ends closed, the LED off and the head vented.
 
     Raises
     ------
     AcquisitionError
-        Where the suction cannot be held at a placement, three times; where the camera does not come
-        to its temperature; or where a frame fails three times.
+        When the suction cannot be held at a placement, three times; when the camera does not reach
+        its temperature; or when a frame fails three times.
     """
     box: ProbeBox = boxes["probe"]
     check_probe(run.plan, run.rig, box.limits)
     check_cameras(run)
     series = BracketSeries(run, box)
     try:
-        box.dark()  # whatever was going on before
+        box.dark()  # stop any activity of before
         box.set_lease(PROBE_LEASE_S)
         if not run.session.frames():
             box.new_subject(run.session.id[:32])

@@ -1,8 +1,8 @@
-"""One exposure of the probe: light through the source fibre, and the frame that it made.
+"""Make one exposure of the probe: light through the source fiber, and the resulting frame.
 
-The shutter pulses the camera's line when its blades are clear and ends the light by itself. A frame
-is believed when it began with that pulse and has the exposure that was asked for, and when the
-shutter says that its light lasted as long.
+The shutter pulses the camera line when its blades are clear, and closes at the end of its time. A
+frame is accepted when it began with that pulse and has the requested exposure, and when the
+reported opening of the shutter lasted as long.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,31 +18,31 @@ from capture.devices.wire import Code
 from capture.plan import Step
 
 LEASE_RENEWAL_S = 1.0
-"""Silence between two renewals of the lease while nothing but time is waited for."""
+"""Interval between two renewals of the lease while waiting, s."""
 FRAME_TIMEOUT_S = 3.0
-"""How long a frame may take after its read-out, s: the box waits a little longer for its host."""
+"""Delay of a frame after its readout, s: the controller waits slightly longer for its host."""
 SHUTTER_REPORT_TIMEOUT_S = 0.2
-"""How long the end of an opening may take to be told, s."""
+"""Delay of the report of a shutter's end, s."""
 MAX_SHUTTER_DEVIATION = 0.02
-"""How far the light's time may be off what was asked for, relative; a fibre's light is as much."""
+"""Relative tolerance of the light's duration; a fiber's light has the same tolerance."""
 SHUTTER_MARGIN_S = 5e-5
-"""And beyond that, s: of the shortest exposure this is within a stop's twentieth."""
+"""Additional tolerance, s: a twentieth of a stop of the shortest exposure."""
 
 
 class ShutterFault(FrameRefused):
-    """The shutter did not let light through for as long as it was asked to."""
+    """Raised when the shutter was not open for the requested time."""
 
 
 @dataclass(frozen=True, slots=True)
 class SourceExposure:
-    """One exposure that is believed, one frame a camera."""
+    """One accepted exposure, with one frame per camera."""
 
     step: Step
     frames: Mapping[str, Frame]
     t_box_s: float
-    """When the cameras were released, on the box's clock."""
+    """Time of the cameras' release, on the controller's clock."""
     open_s: float
-    """How long the light lasted, s; 0 in the dark."""
+    """Duration of the light, s; 0 in the dark."""
 
 
 def expose_dark(run: CaptureRun, box: ProbeBox, step: Step, *, token: str) -> SourceExposure:
@@ -51,16 +51,16 @@ def expose_dark(run: CaptureRun, box: ProbeBox, step: Step, *, token: str) -> So
 
 
 def expose(run: CaptureRun, box: ProbeBox, step: Step) -> SourceExposure:
-    """Open the shutter once, and collect one frame a camera.
+    """Open the shutter once, and collect one frame per camera.
 
     Raises
     ------
     FrameRefused, FrameTimeout
-        Where a frame is not believed or does not come; it can be tried again.
+        When a frame is not accepted or does not come; it can be repeated.
     HeadLost
-        Where the box has let go of the head meanwhile.
+        When the controller has released the head meanwhile.
     CommandRefused
-        Where the box forbids it for another reason.
+        When the controller refuses it for another reason.
     """
     seconds = float(step.settings["exposure_s"])
 
@@ -72,7 +72,7 @@ def expose(run: CaptureRun, box: ProbeBox, step: Step) -> SourceExposure:
                 recover_shutter(box, step)
                 raise ShutterFault(str(error)) from error
             if error.code in (Code.WATCHDOG_TRIPPED, Code.NOT_ARMED, Code.IGNORED):
-                raise HeadLost("the box did not hold the head") from error
+                raise HeadLost("the controller did not hold the head") from error
             raise
         try:
             return opening.t_open_s, _light_s(step, box, opening)
@@ -86,7 +86,7 @@ def expose(run: CaptureRun, box: ProbeBox, step: Step) -> SourceExposure:
 
 
 def _light_s(step: Step, box: ProbeBox, opening: ShutterOpening) -> float:
-    """Wait until the shutter has closed and return how long its light lasted, s."""
+    """Wait until the shutter has closed and return the duration of its light, s."""
     seconds = float(step.settings["exposure_s"])
     box.listen(seconds, every_s=LEASE_RENEWAL_S)
     last = box.last_opening()
@@ -108,17 +108,17 @@ def _light_s(step: Step, box: ProbeBox, opening: ShutterOpening) -> float:
 
 
 def recover_shutter(box: ProbeBox, step: Step) -> None:
-    """Try to close a shutter that is stuck, and to light the LED again that was put out for it."""
+    """Try to close a stuck shutter, and to light again the LED that was switched off for it."""
     try:
         box.close_shutter()
         box.set_level(float(step.settings["level"]))
     except CommandRefused as error:
         if error.code != Code.HARDWARE:
-            raise HeadLost("the box had let go of the head") from error
+            raise HeadLost("the controller had released the head") from error
 
 
 def readout_s(run: CaptureRun, step: Step) -> float:
-    """Return the longest read-out of a step's cameras, s."""
+    """Return the longest readout of a step's cameras, s."""
     return max(run.rig.view(name).readout_s for name in step.cameras)
 
 
@@ -128,7 +128,7 @@ def _expose(
     want, chosen = requested_exposure(step), run.step_cameras(step)
     armed_s = arm_cameras(chosen, want, dict.fromkeys(chosen, Trigger.EDGE))
     t_box_s, open_s = release()
-    # the lease is renewed up to the moment at which the frame should be there
+    # the lease is renewed until the frame is due
     dark_s = 0.0 if open_s else want.exposure_s
     box.listen(dark_s + readout_s(run, step), every_s=LEASE_RENEWAL_S)
     frames, stale = collect_frames(chosen, want, armed_s, dict.fromkeys(chosen, FRAME_TIMEOUT_S))

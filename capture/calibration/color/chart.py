@@ -15,13 +15,13 @@ logger = logging.getLogger(__name__)
 
 
 CHART_ROWS, CHART_COLUMNS = 4, 6
-PATCH_SIDE_PITCH = 0.87  # side of a patch over the distance of neighbours, ColorChecker Classic
-MAX_DETECTION_PX = 2000  # longer sides are shrunk for detection only
-MAX_AFFINE_MISFIT = 0.35  # of the spread of the patches' colors that an affine map may leave
+PATCH_SIDE_PITCH = 0.87  # side of a patch over the distance of neighbors, ColorChecker Classic
+MAX_DETECTION_PX = 2000  # longer sides are reduced for detection only
+MAX_AFFINE_MISFIT = 0.35  # largest residual of an affine map, over the span of the colors
 
 
 class ChartError(CalibrationError):
-    """No usable color chart in the image; the message says what was looked for and what to do."""
+    """Raised for an image without a usable color chart; the message states what to do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ def find_chart(image: NDArray, *, corners: ArrayLike | None = None) -> Float64Ar
         RGB in any linear or display scale, white-balanced or not.
     corners : array_like, shape (4, 2), optional
         x, y of the centers of the patches dark skin, bluish green, black and white (the chart's
-        corner patches, clockwise), when detection is to be skipped.
+        corner patches, clockwise), to skip detection.
 
     Returns
     -------
@@ -63,7 +63,7 @@ def find_chart(image: NDArray, *, corners: ArrayLike | None = None) -> Float64Ar
     Raises
     ------
     ChartError
-        If no chart is found, or what is found has not the chart's colors.
+        If no chart is found, or its colors are not the chart's.
     """
     pixels = np.asarray(image)
     if pixels.ndim != 3 or pixels.shape[2] != 3:
@@ -92,8 +92,8 @@ def measure_patches(
     valid : ndarray of bool, shape (H, W) or (H, W, 3), optional
         False where a pixel is saturated or must not be used.
     fraction : float
-        Side of the averaged square over the distance of neighbouring patches, at most 0.6 so that
-        a chart at 45 degrees stays inside its patches.
+        Side of the averaged square over the distance of neighboring patches, at most 0.6 so that a
+        chart at 45 degrees stays inside its patches.
 
     Returns
     -------
@@ -122,16 +122,16 @@ def measure_patches(
 
 
 def _to_unit(pixels: NDArray) -> Float64Array:
-    """Scale to about [0, 1] by the bright end of the image; finite and not negative."""
+    """Scale by the bright end of the image to about [0, 1], finite and not negative."""
     image = np.nan_to_num(np.asarray(pixels, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0)
     top = float(np.quantile(image, 0.995))
     if not top > 0:
-        raise ChartError("image: it is black, no chart can be seen; expose longer")
+        raise ChartError("image: it is black, no chart can be found; expose longer")
     return np.maximum(image / top, 0.0)
 
 
 def _renderings(unit: Float64Array) -> list[tuple[str, Float64Array]]:
-    """Ways to show the image to the detector, the likeliest first."""
+    """Yield renderings of the image for the detector, the most promising first."""
     balanced = unit / np.maximum(unit.mean(axis=(0, 1)), 1e-9) * float(unit.mean())
     return [
         ("as it is", unit),
@@ -166,20 +166,20 @@ def _detect(unit: Float64Array) -> Float64Array:
             centers: Float64Array = (corners.reshape(24, 4, 2).mean(axis=1) + 0.5) / scale - 0.5
             return centers
     raise ChartError(
-        "image: no ColorChecker Classic found; it must be whole in the picture, evenly lit, in"
-        " focus and larger than about 60 pixels; or give the centers of its corner patches"
+        "image: no ColorChecker Classic found; show the whole chart, evenly lit, in focus and "
+        "larger than about 60 pixels; or give the centers of its corner patches"
     )
 
 
 def _grid() -> Float64Array:
-    """Model coordinates (column, row) of the 24 patches."""
+    """Return model coordinates (column, row) of the 24 patches."""
     return np.array(
         [(c, r) for r in range(CHART_ROWS) for c in range(CHART_COLUMNS)], dtype=np.float64
     )
 
 
 def _homography(model: Float64Array, points: Float64Array, weight: Float64Array) -> Float64Array:
-    """Plane projective map by weighted direct linear transform, shape (3, 3)."""
+    """Return the plane projective map by weighted direct linear transform, shape (3, 3)."""
     mean, spread = points.mean(axis=0), max(float(points.std()), 1e-9)
     q = (points - mean) / spread
     rows = []
@@ -206,14 +206,14 @@ def _grid_from_corners(corners: Float64Array) -> Float64Array:
 
 
 def _pitch(centers: Float64Array) -> float:
-    """Smallest distance of neighbouring patches, pixels."""
+    """Return the smallest distance of neighboring patches, pixels."""
     grid = centers.reshape(CHART_ROWS, CHART_COLUMNS, 2)
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
     return float(min(steps))
 
 
 def _window(x: float, y: float, half: float, shape: tuple[int, ...]) -> tuple[slice, slice] | None:
-    """Pixels whose centers lie within `half` of (x, y); None when that leaves the image."""
+    """Return the pixels whose centers are within `half` of (x, y); None outside the image."""
     x0, x1 = int(np.ceil(x - half)), int(np.floor(x + half))
     y0, y1 = int(np.ceil(y - half)), int(np.floor(y + half))
     if x0 < 0 or y0 < 0 or x1 >= shape[1] or y1 >= shape[0] or x1 < x0 or y1 < y0:
@@ -222,10 +222,10 @@ def _window(x: float, y: float, half: float, shape: tuple[int, ...]) -> tuple[sl
 
 
 def _refine(unit: Float64Array, centers: Float64Array) -> Float64Array:
-    """Move centers to the middle of the even areas found around them, tied by one homography.
+    """Move centers to the middle of the even areas found around them, constrained by a homography.
 
-    A patch counts only where its color stands out of the frame around it; dark patches on the
-    black frame do not, and follow from the others.
+    A patch counts only where its color differs from the frame around it; dark patches on the black
+    frame do not, and follow from the others.
     """
     pitch = _pitch(centers)
     if pitch < 8:
@@ -257,7 +257,7 @@ def _refine(unit: Float64Array, centers: Float64Array) -> Float64Array:
             weight[i] = 1.0
     if weight.sum() < 10:
         return centers
-    for _ in range(5):  # reweighted, so that one misled patch does not bend the grid
+    for _ in range(5):  # reweighted, so that one outlier does not distort the grid
         fitted = _project(_homography(_grid(), found, np.sqrt(weight)), _grid())
         miss = np.linalg.norm(fitted - found, axis=1)
         scale = max(float(np.median(miss[weight > 0])), 0.02 * pitch)
@@ -266,17 +266,17 @@ def _refine(unit: Float64Array, centers: Float64Array) -> Float64Array:
 
 
 def _check_order(unit: Float64Array, centers: Float64Array) -> Float64Array:
-    """Return the centers in the chart's order; refuse a mirrored chart or foreign colors."""
+    """Return the centers in the chart's order; reject a mirrored chart or foreign colors."""
     height, width = unit.shape[:2]
     inside = (centers >= 0).all() and (centers <= [width - 1, height - 1]).all()
     if not inside:
-        raise ChartError("image: the chart is cut by the edge of the picture; show it whole")
+        raise ChartError("image: the chart is cut by the edge of the image; show it whole")
     half = max(0.2 * _pitch(centers), 0.6)
     colors = np.empty((24, 3))
     for i, (x, y) in enumerate(centers):
         window = _window(x, y, half, unit.shape)
         if window is None:
-            raise ChartError("image: the chart is cut by the edge of the picture; show it whole")
+            raise ChartError("image: the chart is cut by the edge of the image; show it whole")
         colors[i] = np.median(unit[window].reshape(-1, 3), axis=0)
     target = np.cbrt(np.maximum(xyz_to_linear_srgb(chart_reference("D50"), illuminant="D50"), 0.0))
     design = np.column_stack([np.cbrt(colors), np.ones(24)])
@@ -295,8 +295,9 @@ def _check_order(unit: Float64Array, centers: Float64Array) -> Float64Array:
     best = min(misfit, key=misfit.__getitem__)
     if misfit[best] > MAX_AFFINE_MISFIT:
         raise ChartError(
-            "image: what looks like a chart has not the colors of a ColorChecker Classic (an affine"
-            f" map leaves {100 * misfit[best]:.0f} % of their spread); use that chart, unobstructed"
+            "image: what looks like a chart has not the colors of a ColorChecker Classic (an "
+            f"affine map leaves {100 * misfit[best]:.0f} % of their spread); use that chart, "
+            "unobstructed"
         )
     centers = centers[layouts[best].ravel()]
     (ax, ay), (bx, by) = (

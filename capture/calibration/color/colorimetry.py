@@ -1,4 +1,4 @@
-"""XYZ, Lab and white points: what a color calibration needs of CIE 15, on arrays."""
+"""XYZ, Lab, white points and color differences of CIE 15, on arrays."""
 
 import csv
 from importlib.resources import files
@@ -24,7 +24,7 @@ _BRADFORD_CONES = np.array(
 # Primaries of IEC 61966-2-1 (sRGB) as chromaticities x, y
 _SRGB_XY = ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))
 
-_LAB_CUBE_ROOT_START = (6.0 / 29.0) ** 3  # CIE 15:2004, where the cube root begins
+_LAB_CUBE_ROOT_START = (6.0 / 29.0) ** 3  # CIE 15:2004, threshold of the cube root
 
 
 def white_point(illuminant: str) -> Float64Array:
@@ -84,7 +84,7 @@ def delta_e_2000(lab_a: ArrayLike, lab_b: ArrayLike) -> Float64Array:
 
 
 def _adapt(xyz: ArrayLike, source_white: ArrayLike, target_white: ArrayLike) -> Float64Array:
-    """Return XYZ seen under another white, by the Bradford transform, shape (..., 3)."""
+    """Return XYZ adapted to another white by the Bradford transform, shape (..., 3)."""
     source = _BRADFORD_CONES @ np.asarray(source_white, dtype=np.float64)
     target = _BRADFORD_CONES @ np.asarray(target_white, dtype=np.float64)
     matrix = np.linalg.solve(_BRADFORD_CONES, (target / source)[:, None] * _BRADFORD_CONES)

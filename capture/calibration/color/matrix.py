@@ -1,4 +1,4 @@
-"""Color calibration: from the patches of a chart to a camera matrix with its Delta E."""
+"""Fit a camera matrix to the patches of a chart, with its Delta E."""
 
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, Unpack
@@ -24,12 +24,12 @@ from capture.calibration.record import (
 
 Method: TypeAlias = Literal["linear", "root_polynomial"]
 
-NEUTRAL_PATCHES = slice(18, 23)  # white to neutral 3.5; the black patch is too glossy to balance by
+NEUTRAL_PATCHES = slice(18, 23)  # white to neutral 3.5; the black patch is too specular
 
 
 @dataclass(frozen=True, slots=True)
 class ColorMatrix:
-    """A map from camera RGB to XYZ, fitted to a chart.
+    """Map from camera RGB to XYZ, fitted to a chart.
 
     Attributes
     ----------
@@ -38,15 +38,15 @@ class ColorMatrix:
         are r, g, b, sqrt(rg), sqrt(gb), sqrt(rb).
     delta_e : ndarray of float64, shape (N,)
         CIEDE2000 of every patch when the matrix is fitted to the others (leave one out); NaN for
-        patches that were not used.
+        unused patches.
     stderr : ndarray of float64, shape of ``matrix``
-        Standard errors by the jackknife over patches: they hold the misfit of the model, which is
-        larger than the noise.
+        Standard errors by the jackknife over patches: they include the misfit of the model, which
+        is larger than the noise.
     method : {"linear", "root_polynomial"}
     illuminant : str
-        The light XYZ is for.
+        Illuminant of XYZ.
     fitted_delta_e : ndarray of float64, shape (N,)
-        CIEDE2000 of the patches in the fit itself; smaller, and no measure of quality.
+        CIEDE2000 of the patches in the fit itself; smaller, and not a measure of quality.
     """
 
     matrix: Float64Array
@@ -91,7 +91,7 @@ def fit_matrix(
     """Fit the map from camera RGB to XYZ that comes closest to a chart's colors.
 
     The least squares are done in Lab, linearized around the reference, so that dark and light
-    patches count as the eye weighs them.
+    patches have perceptual weights.
 
     Parameters
     ----------
@@ -104,9 +104,10 @@ def fit_matrix(
         A 3 x 3 matrix, or the root polynomial of degree 2, which does not change with exposure
         either (Finlayson, Mackiewicz and Hurlbert 2015).
     illuminant : str
-        The light of the reference: "D50", "D55", "D65", "A" or "E".
+        Illuminant of the reference: "D50", "D55", "D65", "A" or "E".
     white : array_like, shape (3,), optional
-        Camera RGB of the perfect diffuser; given, it is mapped to the illuminant's white exactly.
+        Camera RGB of the perfect diffuser; when given, it is mapped to the illuminant's white
+        exactly.
     valid : array_like of bool, shape (N,), optional
         Patches to use.
 
@@ -171,7 +172,7 @@ def fit_matrix(
 def neutral_white(
     camera_rgb: ArrayLike, *, reference: ArrayLike | None = None, valid: ArrayLike | None = None
 ) -> Quantity:
-    """Return the camera RGB a perfect diffuser would have, from the chart's neutral patches.
+    """Estimate the camera RGB of a perfect diffuser from the chart's neutral patches.
 
     Parameters
     ----------
@@ -247,7 +248,7 @@ def _solve(
     white_xyz: Float64Array,
     white_terms: Float64Array | None,
 ) -> Float64Array:
-    """Least squares in linearized Lab for vec(M), with M white_terms = white_xyz if wanted."""
+    """Solve least squares in linearized Lab for vec(M); optionally M white_terms = white_xyz."""
     jacobian = lab_jacobian(xyz, white_xyz)
     unknowns = terms.shape[1]
     # Lab residual of one patch: J (M t - x), linear in the rows of M

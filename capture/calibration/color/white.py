@@ -1,4 +1,4 @@
-"""White reference: what light falls where, as this camera sees it, from a white tile."""
+"""White reference: illumination and camera response per pixel, from a white tile."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ N_WHITE_BLOCKS = 24  # samples along the shorter side for the smooth fit
 
 @dataclass(frozen=True, slots=True)
 class WhiteReference:
-    """Signal of a perfect white diffuser at every pixel, at unit light.
+    """Signal of a perfect white diffuser at every pixel, for unit light.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class WhiteReference:
         Standard error; NaN where not `valid`.
     valid : ndarray of bool, shape (H, W)
     residual : ndarray of float64, shape (3,)
-        Relative scatter of the tile around the smooth fit; 0 where nothing was smoothed.
+        Relative scatter of the tile around the smooth fit; 0 without smoothing.
     """
 
     signal: Float32Array
@@ -43,7 +43,7 @@ class WhiteReference:
     def balance(
         self, rgb: NDArray, *, light: float = 1.0, variance: NDArray | None = None
     ) -> tuple[Float32Array, Float32Array, BoolArray]:
-        """Return reflectance per channel, its variance, and where it holds.
+        """Return reflectance per channel, its variance, and the mask of valid pixels.
 
         A white surface comes out as (1, 1, 1) in every channel and at every pixel.
 
@@ -59,7 +59,7 @@ class WhiteReference:
         Returns
         -------
         reflectance, variance : ndarray of float32, shape (H, W, 3)
-            NaN where not valid. The variance holds that of the reference.
+            NaN where not valid. The variance includes that of the reference.
         valid : ndarray of bool, shape (H, W)
         """
         if rgb.shape != self.signal.shape:
@@ -69,7 +69,7 @@ class WhiteReference:
             )
         if not light > 0:
             raise ValueError(f"light: got {light}, expected > 0")
-        # in float64: thin signals squared leave the range of float32 weights
+        # in float64: small signals squared leave the range of float32 weights
         signal = self.signal.astype(np.float64) * light
         reflectance = rgb / signal
         own = 0.0 if variance is None else variance / signal**2
@@ -81,7 +81,7 @@ class WhiteReference:
         )
 
     def to_calibration(self, **about: Unpack[Provenance]) -> Calibration:
-        """Return this as a `Calibration` of kind "white" for one camera; not valid is 0 there."""
+        """Return this as a `Calibration` of kind "white" for one camera; invalid pixels are 0."""
         white = np.nanmean(self.signal[self.valid].astype(np.float64), axis=0)
         return make_single_device_calibration(
             "white",
@@ -122,8 +122,8 @@ def white_reference(
     Parameters
     ----------
     images : sequence of ndarray of float, shape (H, W, 3)
-        Linear camera RGB, fraction of full scale. For diffuse images take the tile the same way
-        (crossed, or the diffuse of `reconstruction.polarization.separate`).
+        Linear camera RGB, fraction of full scale. For diffuse images photograph the tile in the
+        same way (crossed, or the diffuse of `reconstruction.polarization.separate`).
     variances : sequence of ndarray of float, shape (H, W, 3)
         Variance of each image.
     valid : sequence of ndarray of bool, shape (H, W)
@@ -131,10 +131,10 @@ def white_reference(
     lights : array_like, shape (N,), optional
         Relative amount of light of each image (flash power); default 1.
     reflectance : float
-        Of the tile, in (0, 1].
+        Reflectance of the tile, in (0, 1].
     degree : int or None
-        Total degree of the polynomial the shading is smoothed by; None keeps every pixel with its
-        own noise.
+        Total degree of the polynomial that smooths the shading; None keeps every pixel with its own
+        noise.
 
     Returns
     -------

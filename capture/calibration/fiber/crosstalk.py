@@ -1,4 +1,4 @@
-"""Cross-talk of fibres: what each spot reads of every other fibre's light, and stray light."""
+"""Cross-talk of fibers: fraction of every other fiber's light in each spot, and stray light."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,40 +12,40 @@ from capture.calibration.fiber.readings import FiberReadings
 from capture.calibration.record import CalibrationError, freeze_arrays
 
 DISTANCE_EDGES: Final = (1, 2, 3, 4, 6, 9, 14, 21)
-"""First distance, in fibres, of each group that is taken to be alike."""
+"""First distance, in fibers, of each group of pairs with similar cross-talk."""
 GROUP_MEAN_DISTANCE: Final = 4
-"""Places apart, out of `DISTANCE_EDGES`, from which pairs are known by their group's mean alone."""
+"""Distance, one of `DISTANCE_EDGES`, from which pairs take the mean of their group."""
 MIN_PAIR_SCATTER: Final = 0.3
-"""Of pairs as far apart about their mean, relative: a few of them may agree by chance."""
+"""Smallest relative scatter of a group's pairs: a few of them may agree by chance."""
 MAX_SPOT_OVERLAP: Final = 0.05
-"""Above this a pair's spots overlap: they tell nothing of others as far apart."""
+"""Cross-talk above which a pair's spots overlap, so that other pairs cannot follow from it."""
 COVER_TRANSMITTANCE_SCATTER: Final = 0.3
-"""By how much covers may differ in what they let through, relative."""
+"""Relative scatter of the covers' transmittance."""
 MAX_CROSSTALK_ITERATIONS: Final = 30
 
 
 class CrossTalkError(CalibrationError):
-    """Spots whose light cannot be told apart."""
+    """Raised for spots whose light cannot be separated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CrossTalk:
-    """How light of the fibres mixes in the spots' readings: ``s = X u + o``.
+    """Mixing of the fibers' light in the spots' readings: ``s = X u + o``.
 
     Attributes
     ----------
     matrix, stderr : ndarray of float64, shape (F, F)
-        X: ``matrix[j, i]`` is what spot j reads of fibre i's light, over what spot i reads of it;
-        1 on the diagonal, with error 0.
+        X: ``matrix[j, i]`` is the reading of spot j from fiber i's light over that of spot i; 1 on
+        the diagonal, with error 0.
     offset, offset_stderr : ndarray of float64, shape (F, C)
-        o: stray light in each spot that is no fibre's, full scales per second; the error of each
-        by itself.
+        o: stray light in each spot from outside the fibers, full scales per second; the error is
+        the independent part.
     offset_common : ndarray of float64, shape (F, C)
-        By how much one standard error that the spots of a color share changes the offsets.
+        Change of the offsets for one standard error of the part that the spots of a color share.
     measured : bool
-        False: no frames told it; the matrix is 1, and its errors are unknown.
+        False: not measured; the matrix is the identity, with unknown errors.
     cover_leak, cover_leak_stderr : float
-        What a covered fibre still let through when this was measured, of its own light.
+        Transmittance of a covered fiber during the measurement, relative to its own light.
     """
 
     matrix: Float64Array
@@ -67,24 +67,25 @@ class CrossTalk:
         away = np.abs(self.matrix).sum(axis=0) - 1.0
         if count and not float(away.max()) < 0.9:
             raise CrossTalkError(
-                f"cross-talk: got {float(away.max()):.2f} of a fibre's light in the others' spots,"
-                " expected less than 0.9: they cannot be told apart; check focus and cover"
+                f"cross-talk: got {float(away.max()):.2f} of a fiber's light in the others' "
+                "spots, expected less than 0.9: their light cannot be separated; check focus "
+                "and cover"
             )
 
     def unmix(
         self, signal: Float64Array, variance: Float64Array
     ) -> tuple[Float64Array, Float64Array]:
-        """Return the light of each fibre by itself, and its variance.
+        """Return the light of each fiber without cross-talk, and its variance.
 
         Parameters
         ----------
         signal, variance : ndarray of float64, shape (F, C)
-            Of readings; the readings' errors are independent.
+            Readings and variances; the readings' errors are independent.
 
         Returns
         -------
         light, variance : ndarray of float64, shape (F, C)
-            The variance holds the readings' errors and those of the offset, not the matrix's: see
+            The variance includes the errors of readings and offset, not the matrix's: see
             `matrix_variance`.
         """
         back = np.linalg.inv(self.matrix)
@@ -94,17 +95,17 @@ class CrossTalk:
     def matrix_variance(
         self, light: Float64Array, reference: Float64Array, ratio: Float64Array
     ) -> Float64Array:
-        """Return the variance that the matrix's errors add to light judged by a reference.
+        """Return the variance that the matrix's errors add to light relative to a reference.
 
         Parameters
         ----------
         light : ndarray of float64, shape (F, C)
-            Of the fibres, unmixed.
+            Light of the fibers, unmixed.
         reference : ndarray of float64, shape (F, C)
             Light of a target unmixed by the same matrix, by which `light` is divided; its errors
-            are the same ones, so that what both have alike cancels.
+            are the same ones, so that the common part cancels.
         ratio : ndarray of float64, shape (F, C)
-            ``light / reference``, or 0 where only `light` is asked for.
+            ``light / reference``, or 0 for the variance of `light` alone.
 
         Returns
         -------
@@ -118,16 +119,15 @@ class CrossTalk:
     def shared_changes(
         self, light: Float64Array, reference: Float64Array, ratio: Float64Array
     ) -> Float64Array:
-        """Change of `light` for one standard error of each far group of pairs, shape (G, F, C).
+        """Return the change of `light` for one standard error of each far group, shape (G, F, C).
 
-        Pairs of fibres that are `GROUP_MEAN_DISTANCE` places apart or more are fainter than
-        their noise: what is known of them is the mean of their group, whose error is the same in
-        all of them.
+        Cross-talk of pairs that are `GROUP_MEAN_DISTANCE` fibers apart or more is below its noise:
+        only the mean of their group is known, and its error is common to all of them.
 
         Parameters
         ----------
         light, reference, ratio : ndarray of float64, shape (F, C)
-            As of `matrix_variance`.
+            As in `matrix_variance`.
         """
         place = np.arange(len(light))
         group = np.searchsorted(DISTANCE_EDGES, np.abs(place[:, None] - place), side="right") - 1
@@ -139,21 +139,21 @@ class CrossTalk:
 
 
 def no_crosstalk(count: int, colors: int) -> CrossTalk:
-    """Return a matrix of no cross-talk, for where none was measured."""
+    """Return an identity matrix, for a probe whose cross-talk was not measured."""
     nothing = np.zeros((count, colors))
     return CrossTalk(np.eye(count), np.zeros((count, count)), nothing, nothing, nothing, False)
 
 
 def measure_crosstalk(masks: Mapping[int, FiberReadings], phantom: FiberReadings) -> CrossTalk:
-    """Measure cross-talk and stray light with one fibre uncovered at a time.
+    """Measure cross-talk and stray light with one fiber uncovered at a time.
 
     Parameters
     ----------
     masks : mapping of int to FiberReadings
-        By the number of the uncovered fibre, on one bright target with one light; not all fibres
-        need to be there.
+        Readings by the number of the uncovered fiber, on one bright target with one light; not all
+        fibers are required.
     phantom : FiberReadings
-        The same with no fibre covered: tells what leaks through the covers from stray light.
+        Readings with no fiber covered, which separate the covers' leak from stray light.
 
     Returns
     -------
@@ -161,24 +161,24 @@ def measure_crosstalk(masks: Mapping[int, FiberReadings], phantom: FiberReadings
 
     Notes
     -----
-    Spot j reads ``X_ji`` times what the uncovered fibre i gives, and light that is the same
-    whichever fibre is uncovered: stray light ``o_j``, and what leaks through the fibre's own cover,
-    a share of its light that all covers have in common but for 30 %.
+    The reading of spot j is ``X_ji`` times the light of the uncovered fiber i, plus light that does
+    not depend on i: stray light ``o_j``, and the leak of fiber j's own cover, a fraction of its
+    light that is common to all covers within 30 %.
 
-    Most of the 756 pairs of 28 fibres are fainter than their noise; each is drawn to the mean of
-    the pairs as far apart, as far as their own scatter (the random-effects estimate of DerSimonian
-    and Laird 1986, doi 10.1016/0197-2456(86)90046-2) tells. The three colors share one matrix.
+    Most of the 756 pairs of 28 fibers are below their noise. Each is shrunk to the mean of the
+    pairs at its distance, with weights from their scatter (random-effects estimate, DerSimonian and
+    Laird 1986, doi 10.1016/0197-2456(86)90046-2). The three colors share one matrix.
     """
     first = next(iter(masks.values()))
     count, colors = first.signal.shape
     used = [i for i in sorted(masks) if masks[i].valid[i].any()]
-    # source: light of the uncovered fibre in its own spot; column i, color c
+    # source: light of the uncovered fiber in its own spot; column i, color c
     source = np.zeros((count, colors))
     value = np.zeros((count, count, colors))  # reading of j with i uncovered
     weight = np.zeros((count, count, colors))
     for i in used:
         readings = masks[i]
-        # a fibre that gives no light tells of stray light only
+        # a fiber without light only contributes to the estimate of stray light
         source[i] = np.where(readings.detected[i], readings.signal[i], 0.0)
         good = readings.valid & readings.valid[i]
         value[:, i] = readings.signal
@@ -189,12 +189,14 @@ def measure_crosstalk(masks: Mapping[int, FiberReadings], phantom: FiberReadings
     group = np.searchsorted(DISTANCE_EDGES, distance, side="right") - 1  # -1 on the diagonal
     offset, offset_variance = np.zeros((count, colors)), np.zeros((count, colors))
     matrix, variance = np.zeros((count, count)), np.zeros((count, count))
+    # Model: value[j, i] = X[j, i] source[i] + offset[j]. It is linear in X for a given offset and
+    # in the offset for a given X, so that the two are solved in turn.
     information = np.einsum("jic,ic->ji", weight, source**2)
     for _ in range(MAX_CROSSTALK_ITERATIONS):
-        # each pair by itself, given the stray light
+        # each pair on its own, for the present estimate of the stray light
         seen = np.einsum("jic,ic->ji", weight * (value - offset[:, None]), source)
         matrix, variance = _shrink_to_group_mean(seen, information, group)
-        # stray light, given the pairs; what is uncertain of a pair counts as noise
+        # stray light, for the present pairs; a pair's uncertainty counts as noise
         doubt = weight / (1.0 + weight * source[None] ** 2 * variance[..., None])
         total = doubt.sum(axis=1)
         rest = value - matrix[..., None] * source[None]
@@ -217,10 +219,10 @@ def measure_crosstalk(masks: Mapping[int, FiberReadings], phantom: FiberReadings
 def _separate_stray_light(
     steady: Float64Array, variance: Float64Array, phantom: FiberReadings
 ) -> tuple[float, float, Float64Array, Float64Array, Float64Array]:
-    """Part light that is the same in all masks into a cover's leak and stray light.
+    """Split the light common to all masks into the covers' leak and stray light.
 
-    Returns the leak, its standard error, and stray light drawn to the mean of each color's spots,
-    with its errors by itself and in common, shape (F, C).
+    Returns the leak, its standard error, and stray light shrunk to the mean of each color's spots,
+    with its independent and common errors, shape (F, C).
     """
     count, colors = steady.shape
     good = phantom.valid & (variance > 0)
@@ -228,7 +230,8 @@ def _separate_stray_light(
     leak, leak_variance = 0.0, 0.0
     level = np.zeros(colors)
     for _ in range(MAX_CROSSTALK_ITERATIONS):
-        # one leak and a stray light in each color; covers differ, so bright fibres do not rule
+        # one leak and a stray light in each color; covers differ, so that bright fibers must not
+        # dominate
         spread = np.where(
             good, variance + (COVER_TRANSMITTANCE_SCATTER * leak * source) ** 2, np.inf
         )
@@ -260,7 +263,7 @@ def _separate_stray_light(
 def _shrink_to_group_mean(
     observed: Float64Array, information: Float64Array, group: NDArray[np.intp]
 ) -> tuple[Float64Array, Float64Array]:
-    """Return each pair drawn to its group's mean, and its variance."""
+    """Return each pair shrunk to its group's mean, and its variance."""
     matrix, variance = np.zeros_like(observed), np.zeros_like(observed)
     own = np.divide(observed, information, out=np.zeros_like(observed), where=information > 0)
     last = 0.0
@@ -276,7 +279,7 @@ def _shrink_to_group_mean(
             variance[here] = alone**2 + common**2
             last = float(np.median(np.abs(matrix[here])))
         else:
-            # nothing is told of such a distance: no more than of the one before
+            # no data for this distance: its cross-talk is at most that of the distance before
             variance[here] = last**2
     return matrix, variance
 
@@ -284,17 +287,17 @@ def _shrink_to_group_mean(
 def shrink_to_mean(
     value: Float64Array, information: Float64Array, min_scatter: float
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return values drawn to their mean as far as their own scatter tells, and standard errors.
+    """Shrink values to their mean by their own scatter; return them with their standard errors.
 
-    The first errors are of each by itself, the second what all share by the error of the mean.
+    The first errors are independent, the second is the common error of the mean.
 
     Parameters
     ----------
     value : ndarray of float64, shape (n,)
     information : ndarray of float64, shape (n,)
-        Inverse variances; 0 where nothing was measured, 1 or more of them above 0.
+        Inverse variances; 0 for missing values, at least one above 0.
     min_scatter : float
-        Standard deviation of the true values over their mean, at least: a few may agree by chance.
+        Smallest standard deviation of the true values over their mean: a few may agree by chance.
 
     Examples
     --------
@@ -302,9 +305,11 @@ def shrink_to_mean(
     >>> value.round(2).tolist()
     [1.0, 3.0, 2.0]
     """
-    told = information > 0
-    w, x = information[told], value[told]
+    has_data = information > 0
+    w, x = information[has_data], value[has_data]
     mean = float((w * x).sum() / w.sum())
+    # DerSimonian and Laird: Q = sum w (x - mean)^2 has the expectation (n - 1) + between (sum w -
+    # sum w^2 / sum w), which is solved for the variance between the true values.
     spread = float((w * (x - mean) ** 2).sum()) - (len(x) - 1)
     scale = float(w.sum() - (w**2).sum() / w.sum())
     between = max(spread / scale, 0.0) if scale > 0 else mean**2
@@ -312,7 +317,7 @@ def shrink_to_mean(
     both = 1.0 / (1.0 / w + between)
     mean, error = float((both * x).sum() / both.sum()), 1.0 / float(both.sum())
     share = between * information / (1.0 + between * information)
-    known = np.where(told, value, mean)
+    known = np.where(has_data, value, mean)
     return (
         share * known + (1.0 - share) * mean,
         np.sqrt((1.0 - share) * between),

@@ -1,4 +1,4 @@
-"""Frames with the shutter closed: what each pixel reads without light, at any exposure time."""
+"""Fit bias and dark current of each pixel to frames with a closed shutter."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ from capture.rig import CFA_PATTERNS, View
 
 HOT_FIT_SIGMAS: Final = 6.0
 MIN_HOT_DN: Final = 1.0
-"""What no hot pixel stays below at the longest exposure."""
+"""Dark signal that every hot pixel exceeds at the longest exposure."""
 DARK_CURRENT_DOUBLING_K: Final = 7.0
 DARK_CURRENT_DOUBLING_STDERR_K: Final = 1.0
-"""By how much a sensor warms until its dark current doubles; Widenhorn et al. 2002, doi
-10.1117/12.463446, find silicon near 0 C to double each 6 to 8 K."""
+"""Warming that doubles the dark current, K; Widenhorn et al. 2002, doi 10.1117/12.463446, find 6 to
+8 K for silicon near 0 C.
+"""
 MAX_TEMPERATURE_GAP_K: Final = 10.0
-"""Beyond this a dark current is not carried from one temperature to another."""
+"""Largest temperature difference over which a dark current is extrapolated, K."""
 TEMPERATURE_TOL_K: Final = 0.5
 
 
 class DarkError(CalibrationError):
-    """Dark frames that are missing, or do not fit the exposures they are taken off."""
+    """Raised for missing dark frames, or ones that do not fit the exposures to be corrected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,7 @@ class CameraNoise:
     gain_e_per_dn: float
     """Electrons per DN, > 0."""
     read_noise_e: float
-    """Of one frame, electrons rms, >= 0."""
+    """Read noise of one frame, electrons rms, >= 0."""
     black_dn: float
     """DN without light, >= 0."""
     white_dn: float
@@ -55,7 +56,7 @@ class CameraNoise:
     pattern: str
     """Colors of the 2 x 2 cell read row by row, or MONO."""
     origin: str
-    """"nominal" (of the rig's file) or "calibrated"."""
+    """Source of the values: "nominal" (rig file) or "calibrated"."""
 
     def __post_init__(self) -> None:
         checks = FaultCollector("CameraNoise", DarkError)
@@ -69,13 +70,13 @@ class CameraNoise:
 
     @classmethod
     def from_view(cls, view: View) -> CameraNoise:
-        """Return what the rig's file says of a camera."""
+        """Return the nominal values of a camera from the rig file."""
         levels = float(view.black_level), float(view.white_level)
         return cls(view.gain_e_per_dn, view.read_noise_e, *levels, view.cfa, "nominal")
 
     @classmethod
     def from_sensor(cls, sensor: SensorCalibration) -> CameraNoise:
-        """Return what a calibration of the sensor measured, averaged over its colors."""
+        """Return the values of a sensor calibration, averaged over its colors."""
         means = sensor.mean_gain_e_per_dn(), sensor.mean_read_noise_e()
         gain, read_noise = (float(mean.value) for mean in means)
         levels = float(sensor.black_dn.value.mean()), float(sensor.white_dn)
@@ -94,23 +95,22 @@ class CameraNoise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DarkModel:
-    """What each pixel reads without light: ``bias + rate t``.
+    """Dark signal of each pixel: ``bias + rate t``.
 
     Attributes
     ----------
     bias_dn, rate_dn_per_s : ndarray of float64, shape (H, W)
     covariance : ndarray of float64, shape (2, 2)
-        Of a pixel's bias and rate: DN^2, DN^2/s, DN^2/s^2. The errors of two pixels are
-        independent.
+        Covariance of a pixel's bias and rate: DN^2, DN^2/s, DN^2/s^2. Pixels are independent.
     hot : ndarray of bool, shape (H, W)
-        Pixels whose dark current stands out of the others'.
+        Pixels whose dark current is an outlier.
     mean_rate_dn_per_s, mean_rate_stderr : float
-        Of all pixels that are not hot.
+        Mean over all pixels that are not hot.
     times_s : tuple of float
         Exposure times of the dark frames, ascending, each once.
     frames : int
     temperature_c : float or None
-        Of the camera; None: not known.
+        Temperature of the camera; None: not known.
     """
 
     bias_dn: Float64Array
@@ -124,12 +124,12 @@ class DarkModel:
     temperature_c: float | None = None
 
     def require(self, exposures_s: ArrayLike) -> None:
-        """Raise unless the model tells the dark signal of these exposures.
+        """Raise an error unless the model covers the dark signal of these exposures.
 
         Raises
         ------
         DarkError
-            Where the darks have one exposure time only, and it is another.
+            When the dark frames have a single exposure time, different from these.
         """
         times = np.asarray(exposures_s, np.float64)
         if len(self.times_s) == 1 and (np.abs(times / self.times_s[0] - 1) > 0.01).any():
@@ -142,13 +142,12 @@ class DarkModel:
     def at(self, temperature_c: float | None) -> DarkModel:
         """Return the model of a camera at another temperature.
 
-        The dark current doubles each 7 K (+- 1 K); what that leaves uncertain is added to the
-        covariance.
+        The dark current doubles every 7 K (+- 1 K); the covariance includes this uncertainty.
 
         Raises
         ------
         DarkError
-            Where the temperatures are more than 10 K apart.
+            When the temperatures are more than 10 K apart.
         """
         if temperature_c is None or self.temperature_c is None:
             return self
@@ -194,7 +193,7 @@ def measure_darks(
         s, > 0.
     noise : CameraNoise
     temperature_c : float, optional
-        Of the camera, mean over the frames, degrees Celsius.
+        Temperature of the camera, mean over the frames, degrees Celsius.
 
     Returns
     -------
@@ -203,14 +202,14 @@ def measure_darks(
     Raises
     ------
     DarkError
-        Where there are no frames, or they do not fit each other.
+        When frames are missing, or do not fit each other.
 
     Notes
     -----
-    Each pixel's bias and rate are drawn to the mean of all pixels as far as their own spread,
-    found from the same frames, tells (best linear unbiased prediction; Robinson 1991, doi
-    10.1214/ss/1177011926). With few darks that costs less noise than each pixel by itself, and
-    less bias than one number for all.
+    Bias and rate of each pixel are shrunk to the mean of all pixels by their scatter, estimated
+    from the same frames (best linear unbiased prediction; Robinson 1991, doi
+    10.1214/ss/1177011926). With few dark frames this has less noise than each pixel's own fit, and
+    less bias than one value for all pixels.
     """
     times = np.asarray(exposures_s, np.float64)
     stack = [np.asarray(frame) for frame in frames]
@@ -225,7 +224,7 @@ def measure_darks(
     distinct = tuple(float(t) for t in np.unique(times))
     longest = distinct[-1]
     if len(distinct) == 1:
-        times = np.zeros_like(times)  # all is bias then
+        times = np.zeros_like(times)  # then all of it is bias
     level = np.array([_clipped_mean(frame) for frame in stack]) - noise.black_dn
     bright = [frame >= noise.white_dn for frame in stack]
     bias, rate, slope_error = _fit_dark_line(times, level, noise.floor_dn2 / stack[0].size)
@@ -241,13 +240,14 @@ def measure_darks(
         [[one.sum(), (one * times).sum()], [(one * times).sum(), (one * times**2).sum()]]
     )
     if not many:
-        normal[1, 1] = 1.0  # no time, so no rate: keeps its prior, which is none
+        normal[1, 1] = 1.0  # without exposure time the rate keeps its prior, zero
     error = np.linalg.inv(normal)
     own_bias, own_rate = error[0, 0] * z0 + error[0, 1] * z1, error[1, 0] * z0 + error[1, 1] * z1
     hot = np.logical_or.reduce(bright)
     hot |= _find_outliers(own_bias, MIN_HOT_DN)
     if many:
         hot |= _find_outliers(own_rate, MIN_HOT_DN / longest)
+    # The observed variance over pixels is the true variance plus that of the errors.
     spread = np.zeros((2, 2))
     kept = ~hot
     for i, own in enumerate((own_bias, own_rate)):
@@ -281,7 +281,7 @@ def _clipped_mean(frame: NDArray[np.integer]) -> float:
 def _fit_dark_line(
     times: Float64Array, level: Float64Array, variance: float
 ) -> tuple[float, float, float]:
-    """Return bias, rate, and the rate's standard error with the scatter between frames."""
+    """Return bias, rate, and the rate's standard error including the scatter between frames."""
     centered = times - times.mean()
     square = float(centered @ centered)
     if square <= 0:

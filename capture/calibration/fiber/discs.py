@@ -1,4 +1,4 @@
-"""Blurred discs in a raw mosaic: places that look like one, and the fit of one."""
+"""Find candidate spots in a raw mosaic and fit blurred discs to them."""
 
 from typing import Any, Final
 
@@ -13,29 +13,30 @@ from capture.calibration.fiber.merge import MergedSeries, color_masks
 GrayImage = tuple[Float64Array, Float64Array]
 """Sum of a cell's colors at every pixel, full scales per second, and its variance, (H, W)."""
 DiscFit = tuple[Float64Array, Float64Array, float]
-"""x, y, radius, edge in pixels, their standard errors, and the radius of a disc as large as what is
-brighter than half."""
+"""x, y, radius, edge in pixels, their standard errors, and the radius of a disc with the area above
+half maximum.
+"""
 
 SEARCH_BLUR_PITCH: Final = 0.12
-"""Blur of the search for spots, in distances between neighbors."""
+"""Blur of the search for spots, in distances of neighbors."""
 SPOT_NOISE_SIGMAS: Final = 8.0
-"""What a spot stands out of the noise by."""
+"""Smallest height of a spot above the noise, in standard deviations."""
 MIN_SPOT_CONTRAST: Final = 0.3
-"""What a spot stands out of the light around it by, at least."""
+"""Smallest height of a spot above the light around it, relative."""
 BORDER_PITCH: Final = 0.2
-"""Nearer to the image's border than this no spot is sought, in distances between neighbors."""
+"""Border of the image without a search for spots, in distances of neighbors."""
 MAX_CENTER_STDERR_PITCH: Final = 0.04
-"""Standard error of a place that is no place any more."""
+"""Largest standard error of a valid position, pixels."""
 SPOT_SCATTER: Final = 0.03
-"""How far pixels of a spot scatter about a smooth disc, relative."""
+"""Scatter of a spot's pixels about a smooth disc, relative."""
 SPOT_GRADIENT_PRIOR: Final = 0.1
-"""Slopes and bend of the light over a spot, relative, as large as they may well be."""
+"""Prior standard deviation of slopes and curvature of the light over a spot, relative."""
 
 
 def gray_image(merged: MergedSeries, pattern: str) -> GrayImage:
     """Return the sum of a cell's colors at every pixel, and its variance; gaps are filled."""
     values = np.where(merged.valid, merged.rate, merged.smooth)
-    # saturated in every frame: brighter than what was measured anywhere near
+    # saturated in every frame: brighter than any measured pixel nearby
     if merged.saturated.any():
         top = float(values.max(initial=0.0))
         values = np.where(merged.saturated, max(top, 1e-12), values)
@@ -45,7 +46,7 @@ def gray_image(merged: MergedSeries, pattern: str) -> GrayImage:
     padded = np.pad(values, 1, mode="edge")
     noisy = np.pad(merged.variance, 1, mode="edge")
     height, width = values.shape
-    # (1 2 1) x (1 2 1) holds each color of a 2 x 2 cell with the same weight, about the pixel
+    # (1 2 1) x (1 2 1) weights each color of a 2 x 2 cell equally, centered on the pixel
     for i, a in enumerate((0.25, 0.5, 0.25)):
         for j, b in enumerate((0.25, 0.5, 0.25)):
             total += a * b * padded[i : i + height, j : j + width]
@@ -54,11 +55,11 @@ def gray_image(merged: MergedSeries, pattern: str) -> GrayImage:
 
 
 def find_candidates(image: GrayImage, pitch: float) -> Float64Array:
-    """Return the tops that stand out of noise and surroundings, brightest first, shape (n, 2)."""
+    """Return maxima above noise and surroundings, brightest first, shape (n, 2)."""
     gray, variance = image
     blur = SEARCH_BLUR_PITCH * pitch
     smooth = gaussian_filter(gray, blur, mode="nearest")
-    # the blurred noise of a cell's sum, whose neighbors share pixels: at most 4 pixels' worth
+    # noise of the blurred sum over cells, whose neighbors share pixels: at most that of 4 pixels
     noise = np.sqrt(gaussian_filter(variance, blur, mode="nearest") * 4.0) / (2.0 * blur)
     side = 2 * int(0.3 * pitch) + 1
     top = smooth == maximum_filter(smooth, side, mode="nearest")
@@ -66,14 +67,14 @@ def find_candidates(image: GrayImage, pitch: float) -> Float64Array:
     above = np.pad(smooth, ((lift, 0), (0, 0)), mode="edge")[: smooth.shape[0]]
     below = np.pad(smooth, ((0, lift), (0, 0)), mode="edge")[lift:]
     around = np.minimum(above, below)
-    stands = (smooth - around > SPOT_NOISE_SIGMAS * noise) & (
+    is_prominent = (smooth - around > SPOT_NOISE_SIGMAS * noise) & (
         smooth - around > MIN_SPOT_CONTRAST * np.abs(around)
     )
-    # beside the border the blur doubles what noise there is
+    # at the border the blur doubles the noise
     border = round(BORDER_PITCH * pitch)
     inner = np.zeros_like(top)
     inner[border : top.shape[0] - border, border : top.shape[1] - border] = True
-    rows, columns = np.nonzero(top & stands & inner & (smooth > 0))
+    rows, columns = np.nonzero(top & is_prominent & inner & (smooth > 0))
     order = np.argsort(-smooth[rows, columns], kind="stable")[:200]
     return np.stack([columns, rows], axis=1)[order].astype(np.float64)
 
@@ -81,7 +82,7 @@ def find_candidates(image: GrayImage, pitch: float) -> Float64Array:
 def fit_disc(
     merged: MergedSeries, image: GrayImage, pattern: str, position: Float64Array, pitch: float
 ) -> DiscFit | None:
-    """Fit a disc with a blurred edge to the raw mosaic about a place; None where none fits."""
+    """Fit a disc with a blurred edge to the raw mosaic around a position; None without a fit."""
     height, width = merged.rate.shape
     half = int(0.5 * pitch)
     x0, y0 = (round(float(v)) for v in position)
@@ -114,7 +115,7 @@ def fit_disc(
     data = data / scale
 
     parts = [np.flatnonzero(color == c) for c in range(len(colors))]
-    # slopes and bend of a color may be as large as UNEVEN of its level, with a normal prior
+    # slopes and curvature of a color have a normal prior with UNEVEN of its level as deviation
     stiff = [
         np.array([0.0, 1.0, 1.0, 1.0, 0.0]) / (SPOT_GRADIENT_PRIOR * max(v / scale, 1e-3))
         for v in levels
@@ -123,7 +124,7 @@ def fit_disc(
     def split(p: Float64Array) -> tuple[list[Float64Array], list[Float64Array], Float64Array]:
         """Return residuals of each color's best linear model, and their amplitudes.
 
-        A fibre's modes are not filled alike: light over the disc has slopes and a bend.
+        A fiber's modes are not filled evenly: light over the disc has slopes and curvature.
         """
         u, v = (px - p[0]) / p[2], (py - p[1]) / p[2]
         d = np.hypot(u, v)
@@ -164,7 +165,7 @@ def fit_disc(
 
 
 def _standard_errors(done: Any, freedom: int) -> Float64Array | None:
-    """Return the standard errors of a least-squares fit; None where it does not determine them."""
+    """Return the standard errors of a least-squares fit; None when it is not determined."""
     chi2 = 2.0 * done.cost / max(freedom, 1)
     try:
         covariance = np.linalg.inv(done.jac.T @ done.jac) * max(chi2, 1.0)
@@ -175,7 +176,7 @@ def _standard_errors(done: Any, freedom: int) -> Float64Array | None:
 
 
 def drop_duplicate_fits(fits: list[DiscFit], min_distance: float) -> list[DiscFit]:
-    """Return the fits without those that ended on an earlier one."""
+    """Return the fits without duplicates of an earlier one."""
     kept: list[DiscFit] = []
     for fit in fits:
         if all(np.hypot(*(fit[0][:2] - other[0][:2])) > min_distance for other in kept):

@@ -1,4 +1,4 @@
-"""A fibre probe as calibrated: from light in the spots to reflectance in the fibres."""
+"""Calibrate the gains of a fiber probe on a phantom of known optics."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,9 +14,9 @@ from capture.calibration.fiber.readings import FiberReadings
 from capture.calibration.fiber.spots import FiberSpots
 
 DEAD_FIBER_GAIN: Final = 0.05
-"""Of the usual gain: a fibre that surely gives less is dead."""
+"""Fraction of the usual gain below which a fiber is dead."""
 MIN_GAIN_SIGMAS: Final = 3.0
-"""Of a gain over its standard error."""
+"""Smallest gain over its standard error."""
 
 
 def calibrate_fibers(
@@ -33,18 +33,18 @@ def calibrate_fibers(
     Parameters
     ----------
     phantom : FiberReadings
-        All fibres uncovered.
+        Readings with all fibers uncovered.
     masks : mapping of int to FiberReadings
-        One fibre uncovered, by its number, on the same phantom; empty: cross-talk and stray light
-        are taken to be none.
+        Readings with one fiber uncovered, by its number, on the same phantom; empty: cross-talk and
+        stray light are taken as zero.
     spots : FiberSpots
-        The apertures of all readings.
+        Apertures of all readings.
     radius_mm : array_like, shape (F,)
-        Distance of each fibre from the source.
+        Distance of each fiber from the source.
     expected : ExpectedReflectance
-        What the fibres should take from the phantom.
+        Expected reflectance of the phantom in each fiber.
     level : float
-        Of the source in all readings, 0 < level <= 1.
+        Drive level of the source in all readings, 0 < level <= 1.
 
     Returns
     -------
@@ -53,7 +53,7 @@ def calibrate_fibers(
     Raises
     ------
     FiberError
-        Where the shapes do not fit, or no fibre gives light.
+        When the shapes do not match, or no fiber has light.
     """
     count, colors = phantom.signal.shape
     if expected.per_mm2.shape != (count, colors) or len(spots.names) != count:
@@ -64,22 +64,22 @@ def calibrate_fibers(
     if not 0 < level <= 1:
         raise FiberError(f"level: got {level}, expected 0 < level <= 1")
     mixed = measure_crosstalk(masks, phantom) if masks else no_crosstalk(count, colors)
-    signal, variance, told = fill_invalid(phantom)
+    signal, variance, possible = fill_invalid(phantom)
     light, spread = mixed.unmix(signal, variance)
     doubt = mixed.matrix_variance(light, light, np.zeros_like(light))
     error = np.sqrt(spread + doubt + mixed.offset_common**2)
     gain = light / expected.per_mm2
-    bright = np.asarray(phantom.valid & told & (light > MIN_GAIN_SIGMAS * error), np.bool_)
+    bright = np.asarray(phantom.valid & possible & (light > MIN_GAIN_SIGMAS * error), np.bool_)
     usual = np.array([np.median(g[b]) if b.any() else 0.0 for g, b in zip(gain.T, bright.T)])  # noqa: B905
     if phantom.saturated.all():
         raise FiberError(
-            "phantom: all fibres are saturated in every exposure; take shorter ones, or a lower"
-            " level of the source"
+            "phantom: all fibers are saturated in every exposure; take shorter ones, or a lower "
+            "level of the source"
         )
     if not (usual > 0).any():
         raise FiberError(
-            "phantom: no fibre gives light; check the source, its shutter, the head's contact with"
-            " the phantom, and the exposures"
+            "phantom: no fiber has light; check the source, its shutter, the head's contact "
+            "with the phantom, and the exposures"
         )
     most = (light + MIN_GAIN_SIGMAS * error) / expected.per_mm2
     dim = np.asarray(phantom.valid & (most < DEAD_FIBER_GAIN * usual), np.bool_)

@@ -1,4 +1,4 @@
-"""Brackets of exposures merged to the rate of light on each pixel, the dark signal taken off."""
+"""Merge brackets of exposures to the rate of light on each pixel, dark signal subtracted."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ from capture.documents import FaultCollector
 from capture.hdr import BracketError
 
 NOISE_WINDOW_PX: Final = 3
-"""Side of the square of one color's pixels that the noise of each is told from."""
+"""Side of the square of one color's pixels from which their noise is estimated."""
 SATURATION_MARGIN_SIGMAS: Final = 4.0
 MIN_RIPPLE_SIGMAS: Final = 20.0
-"""Of a pixel's light over its error, to tell how bright the source was in each frame."""
+"""Smallest light of a pixel, in standard errors, for the estimate of the source's variation."""
 MAX_RIPPLE: Final = 0.1
-"""Standard deviation of the source's light from frame to frame, relative, at most."""
+"""Largest relative standard deviation of the source's light from frame to frame."""
 MIN_RIPPLE_LOG_EVIDENCE: Final = 3.0
-"""By how much the logarithm of the evidence for a ripple has to be more than for none."""
+"""Smallest gain in log evidence that accepts a variation of the source."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,18 +35,18 @@ class MergedSeries:
         Full scales per second above the dark signal, raw mosaic; may be negative; 0 where not
         valid.
     variance : ndarray of float64, shape (H, W)
-        Of `rate`; 0 where not valid.
+        Variance of `rate`; 0 where not valid.
     smooth : ndarray of float64, shape (H, W)
         `rate` averaged over the nearest valid pixels of the same color.
     valid : ndarray of bool, shape (H, W)
         False where a pixel is hot or saturated in every frame.
     saturated : ndarray of bool, shape (H, W)
-        In every frame; not hot.
+        Saturated in every frame, but not hot.
     exposures_s : tuple of float
-        Ascending.
+        Exposure times, ascending.
     scale, scale_stderr : tuple of float
-        Light of each frame per second over the mean of all, from what the frames tell of each
-        other, and its standard error: a source that is not steady, a shutter that is not exact.
+        Light of each frame per second over the mean of all, estimated from the frames themselves,
+        and its standard error: it corrects an unsteady source and an inexact shutter.
     """
 
     rate: Float64Array
@@ -67,7 +67,7 @@ def merge_series(
     noise: CameraNoise,
     light_s: ArrayLike | None = None,
 ) -> MergedSeries:
-    """Merge raw frames of one scene at several exposure times, and take off the dark signal.
+    """Merge raw frames of one scene at several exposure times and subtract the dark signal.
 
     Parameters
     ----------
@@ -76,10 +76,10 @@ def merge_series(
     exposures_s : array_like, shape (N,)
         s, > 0, any order.
     darks : DarkModel
-        At the frames' temperature.
+        Dark model at the frames' temperature.
     noise : CameraNoise
     light_s : array_like, shape (N,), optional
-        How long the light lasted in each frame, s, > 0; None: as long as the exposure.
+        Duration of the light in each frame, s, > 0; None: as long as the exposure.
 
     Returns
     -------
@@ -88,21 +88,21 @@ def merge_series(
     Raises
     ------
     BracketError, DarkError
-        Where shapes or times do not fit.
+        When shapes or times do not match.
 
     Notes
     -----
-    As `capture.hdr.merge`, by weights ``t / variance``, but for light that is fainter than the
-    dark signal and than the noise of a pixel:
+    As `capture.hdr.merge`, with weights ``t / variance``, but for light below the dark signal and
+    below the noise of a pixel:
 
-    - bias and dark current are each pixel's own, and their shot noise and errors count;
-    - a weight follows from the light on the pixel's neighbors too. From the pixel's own noisy
-      value alone it would favor low readings, by a tenth of an electron each, which sums up over
-      a spot to more than the farthest fibres give;
-    - frames that two exposures or more show unsaturated tell how bright the source was in each,
-      if it was not steady: see `MergedSeries.scale`;
-    - whether a pixel is near saturation is told from its neighbors, not from its own value, which
-      would leave out its high readings.
+    - bias and dark current are each pixel's own, and their shot noise and errors count; - a weight
+    also uses the light on the pixel's neighbors. From the pixel's own noisy
+      value alone it would favor low readings, by a tenth of an electron each, which sums up over a
+      spot to more than the farthest fibers give;
+    - pixels that are unsaturated in two exposures or more determine the source's brightness in each
+      frame, if it was not steady: see `MergedSeries.scale`;
+    - the neighbors of a pixel decide whether it is near saturation, not its own value, which
+      would omit its high readings.
     """
     stack = [np.asarray(frame) for frame in frames]
     times = np.asarray(exposures_s, np.float64)
@@ -112,11 +112,11 @@ def merge_series(
     darks.require(times)
     order = np.argsort(times, kind="stable")
     stack, times, lit = [stack[k] for k in order], times[order], lit[order]
-    # what each frame shows without light is the same in all that follows
+    # the dark signal of each frame does not change in the iterations below
     base = [noise.black_dn + darks.bias_dn + darks.rate_dn_per_s * t for t in times]
     series = _Series(stack, times, base, _usable(stack, noise), darks, noise)
     hot = darks.hot
-    # first by read noise alone, then with the noise of the light that was found
+    # first with read noise alone, then with the shot noise of the light found
     guess, seen, _ = series.estimate_rate(lit, np.zeros(stack[0].shape))
     smooth = _smooth(guess, seen & ~hot, noise.pattern)
     light = np.maximum(smooth, 0.0)
@@ -136,7 +136,7 @@ def merge_series(
 
 
 def color_masks(shape: tuple[int, ...], pattern: str) -> list[BoolArray]:
-    """Return where each color's pixels lie in a raw frame, in the order R, G, B (or one, MONO).
+    """Return the mask of each color's pixels in a raw frame, in the order R, G, B (or MONO).
 
     Examples
     --------
@@ -174,7 +174,7 @@ def _check(
 
 
 def _usable(stack: list[NDArray[np.integer]], noise: CameraNoise) -> list[BoolArray]:
-    """Return in which pixels each frame is not saturated, nor would be by chance."""
+    """Return the pixels of each frame that are below saturation by a safe margin."""
     spread = np.sqrt(noise.span_dn / noise.gain_e_per_dn + noise.floor_dn2)
     highest = noise.white_dn - SATURATION_MARGIN_SIGMAS * spread
     result = []
@@ -189,7 +189,7 @@ def _usable(stack: list[NDArray[np.integer]], noise: CameraNoise) -> list[BoolAr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Series:
-    """Raw frames in order of their times, with what they show without light."""
+    """Raw frames in order of their times, with their dark signal."""
 
     stack: list[NDArray[np.integer]]
     times: Float64Array
@@ -201,11 +201,13 @@ class _Series:
     def estimate_rate(
         self, lit: Float64Array, light: Float64Array
     ) -> tuple[Float64Array, BoolArray, Float64Array]:
-        """Return rate, where any frame counts, and variance, DN/s, weighed for a rate of light."""
+        """Return rate, mask of valid pixels, and variance, DN/s, weighted for a rate of light."""
         darks, noise = self.darks, self.noise
         shape, gain = self.stack[0].shape, noise.gain_e_per_dn
         current = max(darks.mean_rate_dn_per_s, 0.0) / gain
         shot = light / gain
+        # Weighted least squares of value = rate t: the rate is sum(t v / var) / sum(t^2 / var), its
+        # variance 1 / sum(t^2 / var).
         signal, time = np.zeros(shape), np.zeros(shape)
         weights, dark_time = np.zeros(shape), np.zeros(shape)
         frames = zip(self.stack, self.times, lit, self.base, self.usable, strict=True)
@@ -217,7 +219,7 @@ class _Series:
             dark_time += weight * t
         seen = time > 0
         below = np.where(seen, time, 1.0)
-        # what errors of a pixel's bias and dark current become
+        # propagated errors of a pixel's bias and dark current
         by_bias, by_rate = weights / below, dark_time / below
         (bias2, both), (_, rate2) = darks.covariance
         variance = 1.0 / below + bias2 * by_bias**2 + 2.0 * both * by_bias * by_rate
@@ -228,8 +230,8 @@ class _Series:
     ) -> tuple[Float64Array, Float64Array]:
         """Return the light of each frame over the mean, and its standard error.
 
-        Least squares of ``value = rate scale time`` over pixels (K, P) whose rates are free, with a
-        normal prior of the scales about 1, as wide as their evidence is greatest for.
+        Least squares of ``value = rate scale time`` over pixels (K, P) with free rates, and a
+        normal prior of the scales about 1 whose width maximizes the evidence.
         """
         darks, noise = self.darks, self.noise
         rate, light = rate.ravel()[clear], light.ravel()[clear]
@@ -246,9 +248,11 @@ class _Series:
         miss = np.where(usable, value / expected - 1.0, 0.0)
         total = information.sum(axis=0)
         mean = (information * miss).sum(axis=0) / total
+        # The free rate of each pixel is eliminated (Schur complement of its 1 x 1 block), which
+        # leaves normal equations of the frames' scales only.
         normal = np.diag(information.sum(axis=1)) - (information / total) @ information.T
         right = (information * (miss - mean)).sum(axis=1)
-        # the prior's width of most evidence; where the frames tell little of each other, none
+        # prior width of largest evidence; 0 where the frames hardly constrain each other
         values, vectors = np.linalg.eigh(0.5 * (normal + normal.T))
         values, along = np.maximum(values, 0.0), vectors.T @ right
         best, width2 = MIN_RIPPLE_LOG_EVIDENCE, 0.0
@@ -263,7 +267,7 @@ class _Series:
 
 
 def _smooth(values: Float64Array, valid: BoolArray, pattern: str) -> Float64Array:
-    """Return the mean over the neighbors of the same place in the cell; 0 where there is none."""
+    """Return the mean over the neighbors at the same position in the cell; 0 without any."""
     result = np.zeros_like(values)
     step = 1 if pattern == "MONO" else 2
     for row in range(step):

@@ -1,4 +1,4 @@
-"""A block of known optics: its certificate, and what the fibres should take from it."""
+"""Phantom of known optics: certificate, and expected reflectance in each fiber."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +14,7 @@ SCHEMA: Final = "skinrig.phantom/1"
 
 
 class CertificateError(CalibrationError):
-    """A phantom's certificate that cannot be used."""
+    """Raised for a phantom's certificate that cannot be used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,9 +22,9 @@ class CertificateUncertainty(Document):
     """Relative standard uncertainties (68 %), each common to all wavelengths."""
 
     sigma_a: float
-    """Of the absorption coefficients, 0 <= u < 0.5."""
+    """Standard uncertainty of the absorption coefficients, 0 <= u < 0.5."""
     sigma_s_prime: float
-    """Of the reduced scattering coefficients, 0 <= u < 0.5."""
+    """Standard uncertainty of the reduced scattering coefficients, 0 <= u < 0.5."""
 
     def __post_init__(self) -> None:
         checks = FaultCollector("Uncertainty of a phantom", CertificateError)
@@ -36,7 +36,7 @@ class CertificateUncertainty(Document):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhantomCertificate(Document):
-    """Optics of a homogeneous block, large and thick beside the probe, as its maker states them.
+    """Certified optics of a homogeneous block, large and thick compared with the probe.
 
     Examples
     --------
@@ -60,7 +60,7 @@ class PhantomCertificate(Document):
     """Reduced scattering coefficient at each wavelength, 1/mm, > 0."""
     uncertainty: CertificateUncertainty
     name: str = ""
-    """What is written on the block."""
+    """Label on the block."""
 
     def __post_init__(self) -> None:
         checks = FaultCollector("Phantom", CertificateError)
@@ -83,13 +83,13 @@ class PhantomCertificate(Document):
     def at(self, wavelength_nm: Any) -> tuple[Float64Array, Float64Array]:
         """Return sigma_a and sigma_s' at wavelengths, 1/mm.
 
-        Between those of the certificate both follow a power of the wavelength; a certificate of
-        one wavelength holds for all.
+        Both are interpolated as powers of the wavelength; a certificate of one wavelength is valid
+        for all.
 
         Raises
         ------
         CertificateError
-            Where a wavelength lies outside of several.
+            When a wavelength is outside the range of several.
         """
         wanted = np.asarray(wavelength_nm, np.float64)
         known = np.array(self.wavelength_nm)
@@ -98,7 +98,7 @@ class PhantomCertificate(Document):
                 "phantom's certificate does not reach far enough",
                 "wavelength_nm",
                 f"{known[0]:g} to {known[-1]:g} nm",
-                f"{wanted.min():g} to {wanted.max():g} nm, the light that the camera sees",
+                f"{wanted.min():g} to {wanted.max():g} nm, the camera's range",
             )
         x = np.log(np.clip(wanted, known[0], known[-1]))
         sigma_a, sigma_s = (
@@ -110,17 +110,17 @@ class PhantomCertificate(Document):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExpectedReflectance:
-    """What the fibres of a perfect probe take from the phantom.
+    """Expected reflectance of the phantom in each fiber of a perfect probe.
 
     Attributes
     ----------
     per_mm2 : ndarray of float64, shape (F, C)
-        Reflectance in the fibre, 1/mm^2, > 0, averaged over each color's band.
+        Reflectance in the fiber, 1/mm^2, > 0, averaged over each color's band.
     stderr : ndarray of float64, shape (F, C)
-        1/mm^2; of each fibre by itself.
+        1/mm^2; independent between fibers.
     common : ndarray of float64, shape (T, F, C)
-        Relative changes, one pattern for each of T causes at one standard uncertainty of it: what
-        the certificate leaves uncertain moves all fibres together.
+        Relative changes, one pattern for each of T causes at one standard uncertainty:
+        uncertainties of the certificate move all fibers together.
     """
 
     per_mm2: Float64Array
@@ -133,7 +133,7 @@ class ExpectedReflectance:
         common = np.array(self.common, np.float64)
         common = np.zeros((0, *value.shape)) if common.shape[0] == 0 else common
         checks = FaultCollector("ExpectedReflectance", CertificateError)
-        checks.check("per_mm2", value.shape, value.ndim == 2, "(fibres, colors)")
+        checks.check("per_mm2", value.shape, value.ndim == 2, "(fibers, colors)")
         good = bool(np.isfinite(value).all() and (value > 0).all())
         checks.check("per_mm2", short_repr(value.tolist()), good, "finite numbers > 0")
         checks.check("stderr", stderr.shape, stderr.shape == value.shape, f"shape {value.shape}")
@@ -161,7 +161,7 @@ def read_certificate(path: str | Path) -> PhantomCertificate:
     Raises
     ------
     CertificateError
-        With every fault's path, what was found and what was expected.
+        With every fault's path, the value found and the value expected.
     """
     where = str(path)
     try:

@@ -1,4 +1,4 @@
-"""A fibre probe as calibrated: gains, cross-talk and stray light, and the reflectance they give."""
+"""Calibration of a fiber probe: gains, cross-talk, stray light, and reflectance from readings."""
 
 from __future__ import annotations
 
@@ -31,30 +31,30 @@ from capture.rig import Rig
 
 
 class FiberError(CalibrationError):
-    """Readings that a fibre probe cannot be calibrated from, or that are not this probe's."""
+    """Raised for readings that cannot calibrate a fiber probe, or are of another probe."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FiberReflectance:
-    """Reflectance in each fibre, with what its errors have in common kept apart.
+    """Reflectance in each fiber, with the common part of its errors kept separate.
 
     Attributes
     ----------
     names : tuple of str
-        Of the F fibres.
+        Names of the F fibers.
     radius_mm : ndarray of float64, shape (F,)
         Distance from the source.
     reflectance_per_mm2 : ndarray of float64, shape (F, C)
-        May be negative where there is no light; 0 where not valid.
+        May be negative for a fiber without light; 0 where not valid.
     variance : ndarray of float64, shape (F, C)
-        1/mm^4, of each fibre by itself: readings, stray light, cross-talk, gain.
+        1/mm^4, independent between fibers: readings, stray light, cross-talk, gain.
     common_per_mm2 : ndarray of float64, shape (T, F, C)
-        One pattern for each of T causes at one standard uncertainty of it: what the phantom's
-        certificate leaves uncertain, and last the error of stray light that the fibres share.
+        One pattern for each of T causes at one standard uncertainty: the phantom's certificate, and
+        last the common error of stray light.
     valid : ndarray of bool, shape (F, C)
     saturated : ndarray of bool, shape (F, C)
     reasons : mapping of str to str
-        By fibre: why it is not valid in some color.
+        Reason by fiber why it is not valid in some color.
     """
 
     names: tuple[str, ...]
@@ -68,12 +68,12 @@ class FiberReflectance:
 
     @property
     def stderr(self) -> Float64Array:
-        """Standard error of each fibre, with the common part, 1/mm^2, shape (F, C)."""
+        """Standard error of each fiber, common part included, 1/mm^2, shape (F, C)."""
         return np.sqrt(self.variance + (self.common_per_mm2**2).sum(axis=0))
 
     @property
     def covariance(self) -> Float64Array:
-        """Covariance of the fibres in each color, 1/mm^4, shape (C, F, F)."""
+        """Covariance of the fibers in each color, 1/mm^4, shape (C, F, F)."""
         count = len(self.names)
         own = self.variance.T[:, :, None] * np.eye(count)
         return np.asarray(own + np.einsum("tfc,tgc->cfg", self.common_per_mm2, self.common_per_mm2))
@@ -81,27 +81,27 @@ class FiberReflectance:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FiberCalibration:
-    """Gains, cross-talk and stray light of a fibre probe.
+    """Gains, cross-talk and stray light of a fiber probe.
 
     Attributes
     ----------
     spots : FiberSpots
-        Where the fibres end in the image, and their names.
+        Positions of the fibers' ends in the image, and their names.
     radius_mm : ndarray of float64, shape (F,)
-        Distance of each fibre from the source.
+        Distance of each fiber from the source.
     gain, gain_stderr : ndarray of float64, shape (F, C)
-        Full scales per second for a reflectance of 1/mm^2, the source at level 1; the error is of
-        each fibre by itself, without cross-talk's.
+        Full scales per second for a reflectance of 1/mm^2, the source at level 1; the error is
+        independent between fibers, without that of cross-talk.
     common : ndarray of float64, shape (T, F, C)
-        Relative errors of all gains together, see `ExpectedReflectance.common`.
+        Relative errors common to all gains, see `ExpectedReflectance.common`.
     light : ndarray of float64, shape (F, C)
-        Of the phantom, unmixed, full scales per second at level 1.
+        Light of the phantom, unmixed, full scales per second at level 1.
     crosstalk : CrossTalk
-        Its offset at level 1.
+        Cross-talk, with the offset at level 1.
     valid : ndarray of bool, shape (F, C)
-        Where the gain is known.
+        Fibers and colors with a known gain.
     dead : ndarray of bool, shape (F,)
-        Fibres that give no light.
+        Fibers without light.
     """
 
     spots: FiberSpots
@@ -124,24 +124,24 @@ class FiberCalibration:
         freeze_arrays(self, (count,), "dead", kind=np.bool_)
         if len(self.spots.names) != count or self.crosstalk.offset.shape != (count, colors):
             raise ValueError(
-                f"FibreCalibration: got {len(self.spots.names)} spots and cross-talk of"
-                f" {self.crosstalk.offset.shape}, expected {count} fibres in {colors} colors"
+                f"FibreCalibration: got {len(self.spots.names)} spots and cross-talk of "
+                f"{self.crosstalk.offset.shape}, expected {count} fibers in {colors} colors"
             )
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the fibres."""
+        """Names of the fibers."""
         return self.spots.names
 
     def reflectance(self, readings: FiberReadings, *, level: float = 1.0) -> FiberReflectance:
-        """Return the reflectance in each fibre.
+        """Return the reflectance in each fiber.
 
         Parameters
         ----------
         readings : FiberReadings
-            Of this probe, by the same apertures.
+            Readings of this probe, by the same apertures.
         level : float
-            Of the source, 0 < level <= 1.
+            Drive level of the source, 0 < level <= 1.
 
         Returns
         -------
@@ -150,24 +150,25 @@ class FiberCalibration:
         Raises
         ------
         FiberError
-            Where the readings are of other fibres or colors.
+            When the readings are of other fibers or colors.
 
         Notes
         -----
-        ``R = X^-1 (s - o) / gain``. A fibre that is saturated still leaks into its neighbors: its
-        light is guessed from theirs, with an error as large as the guess.
+        ``R = X^-1 (s - o) / gain``. A saturated fiber still leaks into its neighbors: its light is
+        interpolated from theirs, with an error as large as the estimate.
         """
         if readings.names != self.names or readings.signal.shape != self.gain.shape:
             raise FiberError(
-                f"readings: got {len(readings.names)} fibres from {readings.names[:1]} in"
-                f" {readings.signal.shape[-1]} colors, expected those of the calibration,"
-                f" {len(self.names)} from {self.names[:1]} in {self.gain.shape[1]}"
+                f"readings: got {len(readings.names)} fibers from {readings.names[:1]} in "
+                f"{readings.signal.shape[-1]} colors, expected those of the calibration, "
+                f"{len(self.names)} from {self.names[:1]} in {self.gain.shape[1]}; read this "
+                "probe's frames again"
             )
         if not 0 < level <= 1:
             raise FiberError(f"level: got {level}, expected 0 < level <= 1")
-        signal, variance, told = fill_invalid(readings)
+        signal, variance, possible = fill_invalid(readings)
         light, spread = self.crosstalk.unmix(signal / level, variance / level**2)
-        valid = np.asarray(readings.valid & self.valid & told, np.bool_)
+        valid = np.asarray(readings.valid & self.valid & possible, np.bool_)
         gain = np.where(self.valid, self.gain, 1.0)
         ratio = np.where(self.valid, light / np.where(self.valid, self.light, 1.0), 0.0)
         spread = spread + self.crosstalk.matrix_variance(light, self.light, ratio)
@@ -175,7 +176,7 @@ class FiberCalibration:
         own = spread / gain**2 + (value * self.gain_stderr / gain) ** 2
         # the phantom's light has the same error of stray light, which cancels in part
         stray = -self.crosstalk.offset_common / gain * (1.0 - ratio)
-        # weighed as if each fibre's own, and once more as what moves all far fibres together
+        # counted as independent per fiber, and again as the part that moves all far fibers together
         mixed = self.crosstalk.shared_changes(light, self.light, ratio) / gain
         common = np.concatenate([value * self.common, stray[None], mixed])
         return FiberReflectance(
@@ -193,12 +194,12 @@ class FiberCalibration:
         reasons = {}
         for i, name in enumerate(self.names):
             if self.dead[i]:
-                reasons[name] = "dead: gives no light of the phantom"
+                reasons[name] = "dead: no light from the phantom"
             elif not self.spots.found[i]:
                 reasons[name] = "has no spot of its own in the image"
             elif not self.valid[i].all():
                 reasons[name] = (
-                    "its gain is not known: too little light of the phantom, or saturated"
+                    "its gain is not known: too little light from the phantom, or saturated"
                 )
             elif readings.saturated[i].any():
                 reasons[name] = "saturated even in the shortest exposure"
@@ -207,12 +208,12 @@ class FiberCalibration:
         return reasons
 
     def to_calibration(self, *, serial: str, **about: Unpack[Origin]) -> Calibration:
-        """Return this as a `Calibration` of kind "fibre", by fibre, and of the camera.
+        """Return this as a `Calibration` of kind "fibre", keyed by fiber and camera.
 
         Parameters
         ----------
         serial
-            Of the camera.
+            Serial number of the camera.
         rig, source, created
             As in `Calibration`.
         **about
@@ -257,12 +258,12 @@ class FiberCalibration:
         Raises
         ------
         CalibrationMismatch
-            If the calibration is of another rig or camera, or lacks one of the rig's fibres.
+            If the calibration is of another rig or camera, or lacks one of the rig's fibers.
         """
         if calibration.kind != "fibre" or calibration.rig != rig.name or rig.probe is None:
             raise CalibrationMismatch(
-                f"calibration: got kind {calibration.kind!r} of rig {calibration.rig!r}, expected"
-                f" 'fibre' of {rig.name!r}, a rig with a probe"
+                f"calibration: got kind {calibration.kind!r} of rig {calibration.rig!r}, "
+                f"expected 'fibre' of {rig.name!r}, a rig with a probe"
             )
         table = DeviceColumns(calibration, [fibre.name for fibre in rig.probe.fibres])
 
@@ -301,9 +302,9 @@ class FiberCalibration:
         folder : str or Path
         rig : Rig
         view : str
-            Name of the camera behind the fibres.
+            Name of the camera behind the fibers.
         on : date, optional
-            Day of use; None does not ask how old the calibration is.
+            Day of use; None skips the check of the validity.
 
         Raises
         ------
@@ -320,24 +321,24 @@ class FiberCalibration:
 
 
 def fill_invalid(readings: FiberReadings) -> tuple[Float64Array, Float64Array, BoolArray]:
-    """Return signal and variance, those of fibres that are not valid guessed from the next ones.
+    """Fill signal and variance of invalid fibers from their neighbors.
 
-    And in which colors that can be done, shape (C,): where all are saturated nothing is known of
-    the light that leaks.
+    Also returns the colors in which that is possible, shape (C,): where all fibers are saturated
+    the leaking light is unknown.
     """
     signal, variance = readings.signal.copy(), readings.variance.copy()
     possible = np.ones(signal.shape[1], np.bool_)
     place = np.arange(len(signal))
     for c in range(signal.shape[1]):
-        told = readings.detected[:, c]
+        detected = readings.detected[:, c]
         gap = ~readings.valid[:, c]
         if not gap.any():
             continue
-        if not told.any():
+        if not detected.any():
             possible[c] = not readings.saturated[:, c].any()
             continue
-        # at the ends of the row by the slope of the two next ones
-        known, value = place[told], np.log(signal[told, c])
+        # at the ends of the row, extrapolate by the slope of the next two
+        known, value = place[detected], np.log(signal[detected, c])
         guess = np.interp(place, known, value)
         if len(known) > 1:
             slope = (value[1] - value[0]) / (known[1] - known[0])

@@ -1,4 +1,4 @@
-"""What each detection fibre gives: a series of brackets summed over the fibres' spots."""
+"""Light from each detection fiber: a series of brackets summed over the fibers' spots."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,42 +13,42 @@ from capture.calibration.fiber.merge import MergedSeries, color_masks, merge_ser
 from capture.calibration.fiber.spots import FiberSpots
 
 APERTURE_GUARD_PX: Final = 6.0
-"""Between the row's apertures and the pixels that tell the light around them."""
+"""Gap between the row's apertures and the pixels of the local background."""
 BACKGROUND_HALF_WIDTH_PITCH: Final = 2.0
-"""How far to the sides of a spot that light is looked at, in distances between neighbors."""
+"""Extent of the background to both sides of a spot, in distances of neighbors."""
 MIN_BACKGROUND_PIXELS: Final = 200
-"""Pixels of a color that tell the light around a spot."""
+"""Smallest number of background pixels of a color."""
 FILLED_PIXEL_STDERR: Final = 0.1
-"""Of a pixel that is filled from its neighbors, relative."""
+"""Relative error of a pixel that is filled from its neighbors."""
 MAX_FILLED_FRACTION: Final = 0.2
-"""Share of an aperture's pixels of one color that may be filled."""
+"""Largest fraction of an aperture's pixels of one color that may be filled."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FiberReadings:
-    """Light out of each fibre in each color.
+    """Light from each fiber in each color.
 
     Attributes
     ----------
     names : tuple of str
-        Of the F fibres.
+        Names of the F fibers.
     signal : ndarray of float64, shape (F, C)
-        Full scales per second, summed over the pixels of a color in the fibre's aperture, above
-        the dark signal and the light around the spot; may be negative; 0 where not valid. C = 3
-        (R, G, B), or 1 (MONO).
+        Full scales per second, summed over the pixels of a color in the fiber's aperture, above the
+        dark signal and the local background; may be negative; 0 where not valid. C = 3 (R, G, B),
+        or 1 (MONO).
     variance : ndarray of float64, shape (F, C)
-        Of `signal`: shot, read and dark noise, rounding, errors of the dark frames and of the light
-        around; 0 where not valid.
+        Variance of `signal`: shot, read and dark noise, rounding, errors of dark frames and
+        background; 0 where not valid.
     valid : ndarray of bool, shape (F, C)
         False where saturated, or where too many pixels are hot.
     saturated : ndarray of bool, shape (F, C)
         A pixel of the spot is at the white level even in the shortest frame.
     around : ndarray of float64, shape (F, C)
-        Light around the spot that was taken off, full scales per second and pixel.
+        Subtracted background around the spot, full scales per second and pixel.
     exposures_s : tuple of float
-        Of the frames, ascending.
+        Exposure times of the frames, ascending.
     noise_origin : str
-        Where gain and read noise are from: "nominal" or "calibrated".
+        Source of gain and read noise: "nominal" or "calibrated".
     """
 
     names: tuple[str, ...]
@@ -83,7 +83,7 @@ class FiberReadings:
 
     @property
     def detected(self) -> BoolArray:
-        """Where a valid signal is more than three standard errors above none, shape (F, C)."""
+        """Whether a valid signal exceeds three standard errors, shape (F, C)."""
         return np.asarray(self.valid & (self.signal > 3.0 * self.stderr))
 
 
@@ -97,23 +97,23 @@ def read_fibers(
     temperature_c: float | None = None,
     light_s: ArrayLike | None = None,
 ) -> FiberReadings:
-    """Read the fibres from a series of exposures.
+    """Read the fibers from a series of exposures.
 
     Parameters
     ----------
     frames : sequence of N arrays of integers, shape (H, W)
-        Raw DN of one series, nothing subtracted; one frame or more.
+        Raw DN of one series, nothing subtracted; at least one frame.
     exposures_s : array_like, shape (N,)
         s, > 0, any order.
     spots : FiberSpots
-        Where the fibres end in these frames.
+        Positions of the fibers' ends in these frames.
     darks : DarkModel
         See `fibre_darks.measure_darks`.
     noise : CameraNoise
     temperature_c : float, optional
-        Of the camera during the series; the dark current is carried over to it.
+        Temperature of the camera during the series, to which the dark current is extrapolated.
     light_s : array_like, shape (N,), optional
-        How long the light lasted in each frame, s, > 0; None: as long as the exposure.
+        Duration of the light in each frame, s, > 0; None: as long as the exposure.
 
     Returns
     -------
@@ -122,7 +122,7 @@ def read_fibers(
     Raises
     ------
     BracketError, DarkError
-        Where shapes, times or temperatures do not fit.
+        When shapes, times or temperatures do not match.
     """
     merged = merge_series(
         frames, exposures_s, darks=darks.at(temperature_c), noise=noise, light_s=light_s
@@ -138,7 +138,7 @@ def sum_spots(merged: MergedSeries, spots: FiberSpots, *, noise: CameraNoise) ->
     merged : MergedSeries
     spots : FiberSpots
     noise : CameraNoise
-        For its color filter pattern.
+        Gives the color filter pattern.
 
     Returns
     -------
@@ -146,9 +146,9 @@ def sum_spots(merged: MergedSeries, spots: FiberSpots, *, noise: CameraNoise) ->
 
     Notes
     -----
-    Light around a spot is the mean over pixels above and below the row, up to two neighbors away:
-    stray light, the lens's veil, and what the dark frames have wrong in common, as a camera that
-    has warmed up. Pixels that are hot are filled from their neighbors, with 10 % of standard error.
+    The background of a spot is the mean over pixels above and below the row, up to two neighbors
+    away: stray light, veiling glare, and the common error of the dark frames, as after a warm-up of
+    the camera. Hot pixels are filled from their neighbors, with a standard error of 10 %.
     """
     shape = merged.rate.shape
     colors = color_masks(shape, noise.pattern)
@@ -160,7 +160,7 @@ def sum_spots(merged: MergedSeries, spots: FiberSpots, *, noise: CameraNoise) ->
     hot = ~merged.valid & ~merged.saturated
     for i in range(count):
         inside = spots.mask(i, shape)
-        beside = _background_pixels(spots, i, shape) & merged.valid
+        background = _background_pixels(spots, i, shape) & merged.valid
         for c, color in enumerate(colors):
             pixels = inside & color
             number = int(pixels.sum())
@@ -175,11 +175,11 @@ def sum_spots(merged: MergedSeries, spots: FiberSpots, *, noise: CameraNoise) ->
                 continue
             measured = pixels & ~filled
             signal[i, c] = merged.rate[measured].sum() + merged.smooth[filled].sum()
-            # a neighbor's noise in place of a pixel's own, and how unlike neighbors are
+            # noise of the neighbor that replaces a pixel, and the difference of neighbors
             spread = merged.variance[measured]
             variance[i, c] = spread.sum() + gaps * spread.mean()
             variance[i, c] += FILLED_PIXEL_STDERR**2 * float((merged.smooth[filled] ** 2).sum())
-            level = beside & color
+            level = background & color
             if (seen := int(level.sum())) >= MIN_BACKGROUND_PIXELS:
                 around[i, c] = merged.rate[level].mean()
                 signal[i, c] -= number * around[i, c]

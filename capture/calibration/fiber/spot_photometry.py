@@ -1,4 +1,4 @@
-"""Light of small bright spots: exposures put together, middles, and sums over apertures."""
+"""Photometry of small bright spots: merged exposures, centroids, and sums over apertures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,19 +9,19 @@ from numpy.typing import ArrayLike, NDArray
 from capture.arrays import BoolArray, Float32Array, Float64Array
 from capture.raw import RawFrame
 
-# pixels of the background further off than this belong to something else
+# background pixels that deviate more than this belong to something else
 BACKGROUND_CLIP_SIGMAS = 3.0
 MIN_RING_PIXELS = 8
-# how far the background, bright spots' wings, may differ from a plane
+# largest deviation of the background, the wings of bright spots, from a plane
 BACKGROUND_PLANE_MISFIT = 0.02
 MAX_CENTERING_STEPS = 12
 CENTERING_TOL_PX = 0.01
-RING_RADII = (1.3, 1.8)  # inner and outer radius of the background, of the disc's
+RING_RADII = (1.3, 1.8)  # inner and outer radius of the background ring, relative to the disc's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpotImage:
-    """One exposure, linear.
+    """One linear exposure of spots.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class SpotImage:
     amount_s : float
         Exposure time x level of the lights, s, > 0.
     reading_deg : float
-        Reading of the analyser, degrees.
+        Reading of the analyzer, degrees.
     """
 
     signal: Float32Array
@@ -64,7 +64,7 @@ class RateImage:
     Attributes
     ----------
     rate, variance : ndarray of float32, shape (H, W)
-        Signal per second at level 1; where every exposure is saturated the least it can be.
+        Signal per second at level 1; a lower bound where every exposure is saturated.
     valid : ndarray of bool, shape (H, W)
         False where every exposure is saturated.
     """
@@ -83,9 +83,9 @@ class Flux:
     value, variance : ndarray of float64, shape (L,)
         Signal x px^2 above the local background; 0 and 0 where not `whole`.
     saturated : ndarray of bool, shape (L,)
-        A pixel of the aperture is saturated: `value` is only the least it can be.
+        A pixel of the aperture is saturated: `value` is a lower bound.
     whole : ndarray of bool, shape (L,)
-        Aperture and background lie in the image.
+        Aperture and background are inside the image.
     """
 
     value: Float64Array
@@ -103,7 +103,7 @@ def make_spot_image(
     dark_variance: float = 0.0,
     flat: NDArray | float = 1.0,
 ) -> SpotImage:
-    """Return an exposure of a monochrome camera.
+    """Return a linear exposure of a monochrome camera, dark-subtracted and flat-fielded.
 
     Parameters
     ----------
@@ -112,21 +112,21 @@ def make_spot_image(
     amount_s, reading_deg
         As in `SpotImage`.
     dark : ndarray of float32, shape (H, W), or float
-        What a frame without light shows above black, fraction of full scale.
+        Signal of a frame without light above black, fraction of full scale.
     dark_variance : float
-        Of that, per pixel.
+        Variance of `dark` per pixel.
     flat : ndarray, shape (H, W), or float
-        Response of the pixels, 1 in the middle: signals are divided by it.
+        Relative response of the pixels, 1 in the middle: signals are divided by it.
 
     Raises
     ------
     ValueError
-        If the frame is not monochrome or does not say how noisy it is.
+        If the frame is not monochrome or has no noise profile.
     """
     if frame.pattern != "MONO" or frame.noise_profile is None:
         raise ValueError(
-            f"frame: got pattern {frame.pattern!r} and noise profile {frame.noise_profile},"
-            " expected a monochrome frame that says how noisy it is"
+            f"frame: got pattern {frame.pattern!r} and noise profile {frame.noise_profile}, "
+            "expected a monochrome frame with a noise profile"
         )
     span = np.float32(1.0 / (frame.white - frame.black[0]))
     x = (frame.cfa.astype(np.float32) - np.float32(frame.black[0])) * span
@@ -143,12 +143,12 @@ def make_spot_image(
 
 
 def merge_spot_images(shots: Sequence[SpotImage]) -> RateImage:
-    """Put exposures of one scene together, each pixel from those in which it is not saturated.
+    """Merge exposures of one scene, each pixel from those in which it is not saturated.
 
     Parameters
     ----------
     shots : sequence of Shot
-        Of one reading of the analyser.
+        Exposures at one reading of the analyzer.
 
     Examples
     --------
@@ -169,7 +169,7 @@ def merge_spot_images(shots: Sequence[SpotImage]) -> RateImage:
         amount += np.float32(part.amount_s) * part.valid
     valid = amount > 0
     if not valid.all():
-        # where all are saturated the shortest says most
+        # where all are saturated the shortest exposure gives the highest lower bound
         short = min(shots, key=lambda part: part.amount_s)
         signal[~valid], variance[~valid] = short.signal[~valid], short.variance[~valid]
         amount[~valid] = short.amount_s
@@ -179,20 +179,20 @@ def merge_spot_images(shots: Sequence[SpotImage]) -> RateImage:
 def measure_centroids(
     image: RateImage, pixels: Float64Array, *, aperture_px: Float64Array
 ) -> tuple[Float64Array, Float64Array, BoolArray]:
-    """Return the middles of spots, their intensity-weighted mean places.
+    """Return the intensity-weighted centroids of spots.
 
     Parameters
     ----------
     image : RateImage
     pixels : ndarray of float64, shape (L, 2)
-        About where they are; NaN: nowhere.
+        Approximate positions; NaN: none.
     aperture_px : ndarray of float64, shape (L,)
-        Radius of the disc that holds each spot, px.
+        Radius of the disc that contains each spot, px.
 
     Returns
     -------
     middle : ndarray of float64, shape (L, 2)
-        NaN where a spot is not whole within the image or holds no light.
+        NaN where a spot is cut by the image's border or has no light.
     stderr : ndarray of float64, shape (L,)
         Standard error of a coordinate by the noise, px; NaN likewise.
     saturated : ndarray of bool, shape (L,)
@@ -235,9 +235,9 @@ def measure_flux(part: SpotImage, pixels: Float64Array, *, aperture_px: Float64A
     ----------
     part : Shot
     pixels : ndarray of float64, shape (L, 2)
-        Their middles, px; NaN: none.
+        Centers of the spots, px; NaN: none.
     aperture_px : ndarray of float64, shape (L,)
-        Radius of the discs; the rings reach from 1.3 to 1.8 of it.
+        Radius of the discs; the rings extend from 1.3 to 1.8 of it.
     """
     count = len(pixels)
     value, variance = np.zeros(count), np.zeros(count)
@@ -259,20 +259,20 @@ def measure_flux(part: SpotImage, pixels: Float64Array, *, aperture_px: Float64A
 
 
 def encircled_energy(aperture_px: ArrayLike, airy_px: float) -> Float64Array:
-    """Return the share of a spot's light that `measure_flux` finds behind a perfect lens.
+    """Return the fraction of a spot's light that `measure_flux` collects for a perfect lens.
 
     Parameters
     ----------
     aperture_px : array_like
-        Radius of the disc, px, wide against the spot and against `airy_px`.
+        Radius of the disc, px, large compared with the spot and with `airy_px`.
     airy_px : float
         Wavelength times the working f-number, px.
 
     Notes
     -----
-    Far out, the light beyond r falls as 0.2026 airy_px / r, the mean of the rings' (Born and Wolf,
-    Principles of Optics, section 8.5.2): some falls beyond the disc, some into the ring that the
-    background is taken from.
+    Far out, the light beyond r decreases as 0.2026 airy_px / r, the mean over the Airy rings (Born
+    and Wolf, Principles of Optics, section 8.5.2). Part of it is beyond the disc, part in the ring
+    from which the background is taken.
 
     Examples
     --------
@@ -288,7 +288,7 @@ def encircled_energy(aperture_px: ArrayLike, airy_px: float) -> Float64Array:
 def _window(
     at: Float64Array, shape: tuple[int, ...], aperture_px: float, every: Float64Array
 ) -> tuple[slice, slice, Float64Array, BoolArray, Float64Array, Float64Array] | None:
-    """Return slices, weights of the disc, the ring, and offsets; None where it is not whole."""
+    """Return slices, weights of the disc, the ring, and offsets; None for a cut spot."""
     if not np.isfinite(at).all():
         return None
     near, outer = RING_RADII[0] * aperture_px, RING_RADII[1] * aperture_px
@@ -312,7 +312,7 @@ def _window(
 def _background(
     values: Float64Array, noise: Float64Array, around: BoolArray, dx: Float64Array, dy: Float64Array
 ) -> tuple[Float64Array, float]:
-    """Return a plane through a ring without what sticks out of it, and its middle's variance."""
+    """Fit a plane through a ring without outliers; return it and the variance at its center."""
     basis = np.stack([np.ones(int(around.sum())), dx[around], dy[around]], axis=1)
     ring, sigma = values[around], np.sqrt(noise[around])
     near = np.abs(ring - np.median(ring)) <= BACKGROUND_CLIP_SIGMAS * sigma

@@ -1,4 +1,4 @@
-"""The ends of the detection fibres in the camera's image: found, measured, put in order."""
+"""Find and measure the ends of the detection fibers in the camera's image, in order."""
 
 from __future__ import annotations
 
@@ -20,43 +20,43 @@ from capture.calibration.fiber.merge import MergedSeries
 from capture.calibration.record import CalibrationError, freeze_arrays
 
 MAX_SPOT_OFFSET_PITCH: Final = 0.35
-"""How far a spot may lie from its place in the row."""
+"""Largest distance of a spot from its position in the row."""
 MAX_ROW_SHIFT_PITCH: Final = 0.5
-"""Beyond half a distance between neighbors nobody can tell whose a spot is."""
+"""Beyond half the distance of neighbors a spot cannot be assigned to a fiber."""
 MIN_SPOT_FRACTION: Final = 0.5
-"""Of the fibres must show, or the image is not one of this probe."""
+"""Smallest fraction of the fibers with a spot in an image of this probe."""
 APERTURE_EDGE_WIDTHS: Final = 2.5
-"""Widths of the blurred edge that an aperture reaches beyond the radius."""
+"""Extent of an aperture beyond the radius, in widths of the blurred edge."""
 
 
 class FiberSpotError(CalibrationError):
-    """Spots in the image that are not those of the probe's fibres."""
+    """Raised when the spots in the image are not those of the probe's fibers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FiberSpots:
-    """Where each fibre ends in the image.
+    """Position of each fiber's end in the image.
 
     Attributes
     ----------
     names : tuple of str
-        Of the F fibres, in the probe's order.
+        Names of the F fibers, in the probe's order.
     center_px, center_stderr_px : ndarray of float64, shape (F, 2)
-        x right, y down, pixel (0, 0)'s centre at (0, 0). Of a fibre that was not found: where
-        the others say that it ends.
+        x right, y down, pixel (0, 0)'s center at (0, 0). For a fiber without a spot: extrapolated
+        from the others.
     radius_px, radius_stderr_px : ndarray of float64, shape (F,)
-        Where the brightness has fallen to half; the mean of the others where not found.
+        Radius at half brightness; the mean of the others for a fiber without a spot.
     edge_px : ndarray of float64, shape (F,)
         Standard deviation of the edge's blur.
     found : ndarray of bool, shape (F,)
     aperture_px : float
-        Radius of the disc that a spot's light is summed over, one for all.
+        Radius of the disc over which a spot's light is summed, common to all.
     shift_px : tuple of (float, float)
-        Mean of the places less the nominal ones.
+        Mean of the positions minus the nominal ones.
     rotation_rad : float
-        Of the row, from x to y.
+        Rotation of the row, from x to y.
     findings : tuple of str
-        What is wrong: fibres that are dark, spots that overlap.
+        Faults: fibers that are dark, spots that overlap.
     """
 
     names: tuple[str, ...]
@@ -82,31 +82,31 @@ class FiberSpots:
 
     @property
     def overlapping(self) -> BoolArray:
-        """Where a fibre's aperture meets that of another, shape (F,)."""
+        """Whether a fiber's aperture overlaps another one, shape (F,)."""
         apart = np.linalg.norm(self.center_px[:, None] - self.center_px[None], axis=-1)
         np.fill_diagonal(apart, np.inf)
         return np.asarray(apart.min(axis=1) < 2.0 * self.aperture_px)
 
     def mask(self, fiber: int, shape: tuple[int, ...]) -> BoolArray:
-        """Return the pixels whose centres lie in a fibre's aperture, shape (H, W)."""
+        """Return the pixels whose centers are in a fiber's aperture, shape (H, W)."""
         return _within(shape, self.center_px[fiber], self.aperture_px)
 
     def track(self, merged: MergedSeries, pattern: str) -> tuple[FiberSpots, Float64Array]:
-        """Return the spots where they lie in another series, and how far they went.
+        """Return the spots in another series, and their shift.
 
         Parameters
         ----------
         merged : MergedSeries
-            A later series; half the row or more shall give light.
+            A later series; half of the row or more must have light.
         pattern : str
             Color filter pattern.
 
         Returns
         -------
         spots : FiberSpots
-            Shifted as one, by the mean of the spots that stand out, weighed by their errors.
+            Shifted as one, by the mean of the spots above the noise, weighted by their errors.
         shift_px : ndarray of float64, shape (2,)
-            0 where too few stand out to tell.
+            0 when too few spots are above the noise.
         """
         image = gray_image(merged, pattern)
         pitch = _pitch(self.center_px)
@@ -131,31 +131,31 @@ def find_fiber_spots(
     pattern: str,
     masks: Mapping[int, MergedSeries] | None = None,
 ) -> FiberSpots:
-    """Find the fibres' ends in the image of a bright target.
+    """Find the fibers' ends in the image of a bright target.
 
     Parameters
     ----------
     merged : MergedSeries
-        Of the phantom, all fibres uncovered.
+        Series of the phantom, all fibers uncovered.
     nominal_px : array_like, shape (F, 2)
-        Nominal places, in the probe's order; the row as a whole may lie up to half the distance
-        between neighbors away, and turned a little.
+        Nominal positions, in the probe's order; the row as a whole may be shifted by up to half the
+        distance of neighbors, and slightly rotated.
     names : sequence of F str
     pattern : str
         Color filter pattern.
     masks : mapping of int to MergedSeries, optional
-        Series with one fibre uncovered, by its number: they tell fibres whose spots touch, and
+        Series with one fiber uncovered, by its number: they separate fibers whose spots touch, and
         check the order.
 
     Returns
     -------
     FiberSpots
-        Fibres without a spot are reported, not an error.
+        Fibers without a spot are reported, not an error.
 
     Raises
     ------
     SpotError
-        Where there are more spots than fibres, spots at places of no fibre, or fewer than half.
+        When there are more spots than fibers, spots away from any fiber, or fewer than half.
     """
     nominal = np.asarray(nominal_px, np.float64)
     count = len(nominal)
@@ -169,8 +169,8 @@ def find_fiber_spots(
     fits = drop_duplicate_fits(fits, 0.25 * pitch)
     if not fits:
         raise FiberSpotError(
-            f"fibre spots: found none in the image, expected {count} in a row {pitch:.0f} px apart;"
-            " check that the light was on, the head on the phantom, and the exposures"
+            f"fiber spots: found none in the image, expected {count} in a row {pitch:.0f} px "
+            "apart; check that the light was on, the head on the phantom, and the exposures"
         )
     typical = float(np.median([fit[2] for fit in fits]))
     whole = [fit for fit in fits if 0.5 * typical < fit[2] < 2.5 * typical]
@@ -181,17 +181,17 @@ def find_fiber_spots(
     if stray:
         where = "; ".join(f"x {places[k][0]:.0f}, y {places[k][1]:.0f} px" for k in stray[:6])
         raise FiberSpotError(
-            f"fibre spots: found {len(whole)} spots, of which {len(stray)} lie where none of the"
-            f" {count} fibres ends ({where}); check which way round the image is, that nothing else"
-            " shines into the camera, and the places in the rig's file"
+            f"fiber spots: found {len(whole)} spots, of which {len(stray)} are where none of "
+            f"the {count} fibers ends ({where}); check the orientation of the image, that no "
+            "other light enters the camera, and the positions in the rig's file"
         )
     found = spot >= 0
     if found.sum() < max(MIN_SPOT_FRACTION * count, 2):
         where = ", ".join(f"{x:.0f}" for x in sorted(places[:, 0]))
         raise FiberSpotError(
-            f"fibre spots: found {int(found.sum())} (at x {where} px), expected {count}, at least"
-            f" {int(np.ceil(MIN_SPOT_FRACTION * count))}; check the phantom's contact,"
-            " the light and the exposures"
+            f"fiber spots: found {int(found.sum())} (at x {where} px), expected {count}, at "
+            f"least {int(np.ceil(MIN_SPOT_FRACTION * count))}; check the phantom's contact, the "
+            "light and the exposures"
         )
     best: list[DiscFit | None] = [whole[k] if k >= 0 else None for k in spot]
     findings = [
@@ -211,7 +211,7 @@ def _consult_masks(
     pitch: float,
     findings: list[str],
 ) -> None:
-    """Measure in their own frames the fibres that touch or are missing, and check the order."""
+    """Measure touching or missing fibers in their own frames, and check the order."""
     known = np.array([model[i] if fit is None else fit[0][:2] for i, fit in enumerate(best)])
     size = float(np.median([fit[2] for fit in best if fit is not None]))
     apart = np.linalg.norm(known[:, None] - known[None], axis=-1)
@@ -223,7 +223,7 @@ def _consult_masks(
         image = gray_image(series, pattern)
         alone = find_candidates(image, pitch)
         if len(alone) == 0:
-            continue  # too faint to tell
+            continue  # too faint to measure
         brightest = alone[0]
         nearest = int(np.argmin(np.linalg.norm(model - brightest, axis=1)))
         if (
@@ -231,16 +231,16 @@ def _consult_masks(
             and np.linalg.norm(model[nearest] - brightest) < MAX_SPOT_OFFSET_PITCH * pitch
         ):
             if best[i] is None:
-                continue  # dark: what shows is a neighbor's leak
+                continue  # dark: the spot is a neighbor's leak
             raise FiberSpotError(
-                f"fibre spots: with only {names[i]} uncovered the brightest spot is that of"
-                f" {names[nearest]} (x {brightest[0]:.0f}, y {brightest[1]:.0f} px); check the"
-                " cover, and the order of the fibres in the rig's file"
+                f"fiber spots: with only {names[i]} uncovered the brightest spot is that of "
+                f"{names[nearest]} (x {brightest[0]:.0f}, y {brightest[1]:.0f} px); check the "
+                "cover, and the order of the fibers in the rig's file"
             )
         fit = fit_disc(series, image, pattern, brightest, pitch) if doubtful else None
         if fit is not None and np.linalg.norm(fit[0][:2] - model[i]) < 0.5 * pitch:
             best[i] = fit
-            findings.append(f"{names[i]}: its place is from the frames with it alone uncovered")
+            findings.append(f"{names[i]}: its position is from the frames with it alone uncovered")
 
 
 def _table(
@@ -269,8 +269,8 @@ def _table(
         if names[i] in touching:
             continue
         findings.append(
-            f"{names[i]}: no spot at x {model[i, 0]:.0f}, y {model[i, 1]:.0f} px: the fibre is"
-            " dark, or its light too faint"
+            f"{names[i]}: no spot at x {model[i, 0]:.0f}, y {model[i, 1]:.0f} px: the fiber is "
+            "dark, or its light too faint"
         )
     shift = (value[found, :2] - nominal[found]).mean(axis=0)
     turn = np.polyfit(value[found, 0], value[found, 1] - nominal[found, 1], 1)[0]
@@ -294,14 +294,14 @@ def _table(
 def _assign(
     positions: Float64Array, nominal: Float64Array, pitch: float
 ) -> tuple[Int64Array, Float64Array]:
-    """Return the spot of each fibre (-1: none), and where each fibre should end."""
+    """Return the spot of each fiber (-1: none), and each fiber's expected position."""
     offset = (positions[:, None] - nominal[None]).reshape(-1, 2)
     offset = offset[(np.abs(offset) <= MAX_ROW_SHIFT_PITCH * pitch).all(axis=1)]
     spot = np.full(len(nominal), -1)
     if len(offset) == 0:
         return spot, nominal.copy()
     near = np.linalg.norm(offset[:, None] - offset[None], axis=-1) < 0.15 * pitch
-    # the shift that most agree to; the smaller of two
+    # the shift with the most matches; of two, the smaller
     votes = near.sum(axis=1) - 1e-3 * np.linalg.norm(offset, axis=1) / pitch
     model = nominal + offset[near[int(np.argmax(votes))]].mean(axis=0)
     for _ in range(4):
@@ -321,7 +321,7 @@ def _assign(
 def _between(
     positions: Float64Array, spot: Int64Array, model: Float64Array, pitch: float
 ) -> dict[int, tuple[int, int]]:
-    """Return the spots that lie between two neighbors of which neither has one of its own."""
+    """Return the spots between two neighbors of which neither has a spot of its own."""
     found = {}
     for k in set(range(len(positions))) - set(spot.tolist()):
         for i in np.flatnonzero((spot[:-1] < 0) & (spot[1:] < 0)).tolist():
@@ -333,7 +333,7 @@ def _between(
 def _fit_similarity(
     nominal: Float64Array, observed: Int64Array, found: Float64Array
 ) -> Float64Array:
-    """Return the nominal places turned, scaled and shifted onto those found (least squares)."""
+    """Return the nominal positions rotated, scaled and shifted onto those found (least squares)."""
     one, two = nominal[observed] @ np.array([1, 1j]), found @ np.array([1, 1j])
     centered = one - one.mean()
     factor = (centered.conj() @ (two - two.mean())) / (centered.conj() @ centered)
@@ -342,7 +342,7 @@ def _fit_similarity(
 
 
 def _pitch(positions: Float64Array) -> float:
-    """Return the usual distance of neighbors, px."""
+    """Return the median distance of neighbors, px."""
     if len(positions) < 2:
         return 40.0
     return float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1)))

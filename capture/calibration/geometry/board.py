@@ -1,4 +1,4 @@
-"""Chessboards and ChArUco boards: found in images, and one camera's lens from them."""
+"""Find chessboards and ChArUco boards in images, and calibrate one camera's lens from them."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ logger = logging.getLogger(__name__)
 Pattern: TypeAlias = tuple[str, int, int] | tuple[str, int, int, str]
 
 MARKER_SIDE_RATIO = 0.75  # side of a marker over that of a square, as most boards are printed
-MIN_BOARD_CORNERS = 6  # of a board in an image: fewer fix its place badly
+MIN_BOARD_CORNERS = 6  # corners of a board in an image: fewer determine its pose badly
 MIN_BOARD_IMAGES = 3
-REFINE_HALF_WINDOW_PITCH = 0.35  # half window of corner refinement over the distance of neighbours
+REFINE_HALF_WINDOW_PITCH = 0.35  # half window of corner refinement over the distance of neighbors
 N_SIDE_SAMPLES = 17  # across each side of a marker
 SIDE_SEARCH_BITS = 0.45  # of a marker's bit, on both sides of its border
 CORNER_STOP_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
 
 
 class BoardError(CalibrationError):
-    """Images or a board from which no camera can be calibrated; the message names them."""
+    """Raised for images or a board that cannot calibrate a camera; the message names them."""
 
 
 @dataclass(frozen=True)
 class Board:
-    """A flat board of squares; x right, y down as seen from its front, z into it.
+    """Flat board of squares; x right, y down as seen from its front, z into it.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class CornerObservation:
     ids : ndarray of int64, shape (n,)
         Indices into the target's points.
     pixels : ndarray of float64, shape (n, 2)
-        Column and row, px; pixel (0, 0)'s centre is (0, 0).
+        Column and row, px; pixel (0, 0)'s center is (0, 0).
     """
 
     ids: Int64Array
@@ -141,7 +141,7 @@ class CornerObservation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Intrinsics:
-    """One camera's pinhole and lens.
+    """Pinhole and lens of one camera.
 
     Attributes
     ----------
@@ -152,13 +152,13 @@ class Intrinsics:
     image_size : tuple of int
         Columns and rows.
     rms_px : float
-        Root mean square distance of the corners to where the fit puts them.
+        Root mean square distance of the corners to the fitted ones.
     stderr : ndarray of float64, shape (9,)
         Standard errors of fx, fy, cx, cy (px), k1, k2, p1, p2, k3.
     per_image_px : ndarray of float64, shape (used images,)
-        The same of each image that showed the board.
+        RMS distance of each image that shows the board.
     used, missing : tuple of str
-        Names of the images in which the board was and was not found.
+        Names of the images with and without the board.
     """
 
     matrix: Float64Array
@@ -202,12 +202,12 @@ def find_board(image: NDArray, board: Board) -> CornerObservation | None:
     image : ndarray
         See `_gray8`.
     board : Board
-        What to look for.
+        Board to find.
 
     Returns
     -------
     Sighting or None
-        At least 6 corners (all of a chessboard's), or None where there is no such board.
+        At least 6 corners (all of a chessboard's), or None when the board is not found.
     """
     gray = _gray8(image)
     if board.kind == "chessboard":
@@ -244,7 +244,7 @@ def find_markers(image: NDArray, dictionary: str, ids: Iterable[int]) -> CornerO
     image : ndarray
         See `_gray8`.
     dictionary : str
-        As of `Board`.
+        As in `Board`.
     ids : iterable of int
         Numbers of the markers; the k-th of them has the points 4 k to 4 k + 3, clockwise from
         its top left.
@@ -252,7 +252,7 @@ def find_markers(image: NDArray, dictionary: str, ids: Iterable[int]) -> CornerO
     Returns
     -------
     Sighting or None
-        None where fewer than two of the markers are found.
+        None when fewer than two of the markers are found.
     """
     wanted = {number: k for k, number in enumerate(ids)}
     detector = cv2.aruco.ArucoDetector(
@@ -276,7 +276,7 @@ def find_markers(image: NDArray, dictionary: str, ids: Iterable[int]) -> CornerO
 def _square_corners(gray: Float64Array, corners: Float64Array) -> Float64Array | None:
     """Return a dark square's corners as the crossings of lines fitted to its four sides.
 
-    None where a side shows no clear edge.
+    None when a side has no clear edge.
     """
     along = np.linspace(0.12, 0.88, N_SIDE_SAMPLES)[:, None]
     places = corners.copy()
@@ -307,7 +307,7 @@ def _square_corners(gray: Float64Array, corners: Float64Array) -> Float64Array |
 
 
 def _line(points: Float64Array) -> Float64Array:
-    """Return a, b, c of the line a x + b y = c through points; the two farthest are dropped."""
+    """Return a, b, c of the line a x + b y = c through points; the two farthest are omitted."""
     for _ in range(2):
         middle = points.mean(axis=0)
         normal = np.linalg.svd(points - middle)[2][1]
@@ -354,7 +354,7 @@ def calibrate_intrinsics(
     References
     ----------
     Z. Zhang, "A flexible new technique for camera calibration", doi:10.1109/34.888718; solved by
-    OpenCV, whose standard errors these are.
+    OpenCV, which also gives the standard errors.
     """
     board = Board.of(pattern, square_mm=square_mm)
     used: list[str] = []

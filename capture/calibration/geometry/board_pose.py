@@ -1,4 +1,4 @@
-"""Poses of a flat target: where it stood, and how far its corners are from there."""
+"""Poses of a flat target, and residuals of its corners."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class FlatTarget(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardPose:
-    """Where a board stood: ``x_rig = rotation x_board + translation_mm``."""
+    """Pose of a board: ``x_rig = rotation x_board + translation_mm``."""
 
     rotation: Float64Array
     translation_mm: Float64Array
@@ -33,7 +33,7 @@ class BoardPose:
 
     @classmethod
     def to_jig_pose(cls, board: Board) -> BoardPose:
-        """Return the jig's place: the board's middle in the rig's origin, its front towards +z."""
+        """Return the jig's pose: the board's center in the rig's origin, its front towards +z."""
         width, height = board.size_mm
         rotation = np.diag([1.0, -1.0, -1.0])
         return cls(rotation, -rotation @ np.array([width / 2, height / 2, 0.0]))
@@ -42,17 +42,17 @@ class BoardPose:
 def corner_residuals_px(
     camera: CameraPose, pose: BoardPose, board: FlatTarget, sighting: CornerObservation
 ) -> Float64Array:
-    """Return how far corners are from where a camera and a place put them, px, shape (n,)."""
+    """Return the distance of corners from their projections, px, shape (n,)."""
     found = camera.project(pose.to_rig(board.points_mm[sighting.ids]))
     return np.asarray(np.linalg.norm(found - sighting.pixels, axis=-1))
 
 
 def relative_motion(a: BoardPose, b: BoardPose) -> tuple[Float64Array, Float64Array]:
-    """Return the rigid motion that takes place a to place b."""
+    """Return the rigid motion from pose a to pose b."""
     rotation = b.rotation @ a.rotation.T
     return rotation, b.translation_mm - rotation @ a.translation_mm
 
 
 def move_pose(pose: BoardPose, rotation: Float64Array, shift: Float64Array) -> BoardPose:
-    """Return a pose after a rotation, (3, 3), and a shift, mm, of its frame."""
+    """Return a pose after a rotation, (3, 3), and a translation, mm, of its frame."""
     return BoardPose(rotation @ pose.rotation, rotation @ pose.translation_mm + shift)

@@ -1,9 +1,9 @@
-"""Bundle adjustment: cameras and board places that explain all corners at once.
+"""Bundle adjustment of cameras and board poses to all corners at once.
 
-Each camera has fifteen numbers (fx, fy, cx, cy, k1, k2, p1, p2, k3, a turn about its own axes, a
-shift), each place of the board six. The normal equations are summed from blocks, image by image,
-with analytic derivatives; what the workshop guarantees of a lens enters as a weak prior, so that a
-camera that saw few boards keeps a sensible lens.
+Each camera has fifteen parameters (fx, fy, cx, cy, k1, k2, p1, p2, k3, a rotation about its own
+axes, a translation), each pose of the board six. The normal equations are summed from blocks, image
+by image, with analytic derivatives. Manufacturing tolerances of the lens enter as a weak prior, so
+that a camera with few boards keeps a plausible lens.
 """
 
 from dataclasses import dataclass, replace
@@ -37,7 +37,7 @@ from capture.calibration.geometry.intrinsics import CameraPose
 __all__ = ["BundleError", "BundleResult", "adjust", "estimate_board_pose"]
 
 
-MIN_SHARED_POSES = 2  # places that a camera must share with others
+MIN_SHARED_POSES = 2  # poses that a camera must share with others
 
 
 def adjust(
@@ -48,7 +48,7 @@ def adjust(
     gauge: Gauge = "board",
     prior: LensPrior | None = None,
 ) -> BundleResult:
-    """Adjust all cameras and board places to all corners.
+    """Adjust all cameras and board poses to all corners.
 
     Parameters
     ----------
@@ -56,12 +56,12 @@ def adjust(
         Corners of the board in each image that shows it.
     board : Board
     start : mapping of str to CameraPose
-        Nominal or earlier cameras, by view name; those without sightings are named in an error.
+        Nominal or earlier cameras, by view name; those without corners are named in an error.
     gauge : {"board", "cameras"}
-        What fixes the rig frame: pose 0 of the board in the jig (see `BoardPose.in_jig`), or the
-        nominal cameras' centres, which the result is moved onto as a rigid body.
+        Gauge of the rig frame: pose 0 of the board in the jig (see `BoardPose.in_jig`), or the
+        nominal cameras' centers, onto which the result is moved as a rigid body.
     prior : LensPrior, optional
-        What is known of the lenses.
+        Prior of the lens parameters.
 
     Returns
     -------
@@ -70,7 +70,7 @@ def adjust(
     Raises
     ------
     BundleError
-        If a camera shares too few places with the others, or pose 0 is not seen.
+        If a camera shares too few poses with the others, or pose 0 is not visible.
 
     References
     ----------
@@ -103,9 +103,9 @@ def adjust(
 def estimate_board_pose(
     sightings: Sightings, board: FlatTarget, cameras: Cameras, pose: int
 ) -> BoardPose:
-    """Return where the board stood, from all its images, with the cameras as given.
+    """Estimate the pose of a board from all its images, for given cameras.
 
-    Each image alone gives a guess; the one that suits all images best is refined on all of them.
+    Each image alone gives a start; the one that fits all images best is refined on all of them.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def estimate_board_pose(
             if best is None or misfit.sum() < best[0]:
                 best = float(misfit.sum()), place
     if best is None:
-        raise BundleError(f"pose {pose}: no image of it fits a flat board; leave it out")
+        raise BundleError(f"pose {pose}: no image of it fits a flat board; omit it")
     images = {(name, pose): sighting for name, sighting in seen.items()}
     used = {name: cameras[name] for name in seen}
     problem = BundleProblem(images, board, used, LensPrior(), "cameras", cameras_fixed=True)
@@ -142,7 +142,7 @@ def estimate_board_pose(
 
 
 def _check_shared(sightings: Sightings, cameras: Cameras, gauge: Gauge) -> None:
-    """Refuse cameras that nothing ties to the others."""
+    """Reject cameras that share no poses with the others."""
     poses = {name: {p for n, p in sightings if n == name} for name in cameras}
     unknown = sorted({name for name, _ in sightings} - set(cameras))
     if unknown:
@@ -152,14 +152,14 @@ def _check_shared(sightings: Sightings, cameras: Cameras, gauge: Gauge) -> None:
         shared = sum(count[p] > 1 for p in seen) if len(cameras) > 1 else len(seen)
         if shared < MIN_SHARED_POSES:
             raise BundleError(
-                f"camera {name}: shares {shared} board poses with other cameras (it saw"
-                f" {len(seen)}), expected at least {MIN_SHARED_POSES}; show the board where it and"
-                " another camera see it, tilted between them"
+                f"camera {name}: shares {shared} board poses with other cameras (it observed "
+                f"{len(seen)}), expected at least {MIN_SHARED_POSES}; show the board where it "
+                "and another camera see it, tilted between them"
             )
     if gauge == "board" and not count.get(0, 0):
         raise BundleError(
-            "pose 0: no camera saw the board in the jig, expected at least one; show it, or fix the"
-            " frame by the nominal cameras"
+            "pose 0: no camera observed the board in the jig, expected at least one; show it, "
+            "or fix the frame by the nominal cameras"
         )
     groups = [{name} for name in poses]
     for pose in count:
@@ -179,7 +179,7 @@ def _moved_camera(camera: CameraPose, rotation: Float64Array, shift: Float64Arra
 
 
 def _procrustes(points: Float64Array, wanted: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Return the rigid motion that takes points onto wanted ones, least squares."""
+    """Return the rigid motion of points onto target points, by least squares."""
     a, b = points.mean(axis=0), wanted.mean(axis=0)
     rotation, _ = Rotation.align_vectors(wanted - b, points - a)
     R = rotation.as_matrix()
@@ -191,16 +191,16 @@ RMS_PER_MEDIAN = 1.2011  # of distances whose coordinates are normal: (1 / ln 2)
 
 @dataclass(frozen=True, slots=True)
 class MovedCamera:
-    """A camera that no longer stands where the previous calibration puts it.
+    """Camera that has moved since the previous calibration.
 
     Attributes
     ----------
     name, serial : str
         View and camera.
     rms_px : float
-        Residual of the previous calibration, by the median.
+        RMS residual of the previous calibration, from the median.
     shift_mm, rotation_rad : float
-        How far its centre of projection went, and how it turned.
+        Displacement of its center of projection, and its rotation.
     """
 
     name: str
@@ -227,8 +227,8 @@ def find_moved_cameras(
 ) -> tuple[MovedCamera, ...]:
     """Find cameras that moved since the previous calibration, by their residuals.
 
-    For each camera the boards are placed by all others, as they were calibrated before. A camera
-    that disagrees with others that agree is blamed, the worst first; then the rest is asked again
+    For each camera the board poses are estimated from all others, as calibrated before. Among
+    cameras that disagree with an agreeing rest, the worst is marked as moved. The test is repeated
     without it, until all agree.
 
     Parameters
@@ -239,25 +239,25 @@ def find_moved_cameras(
     previous : mapping of str to CameraPose
         The cameras as calibrated before.
     ratio : float
-        How many times the residual of the remaining cameras a moved camera's is, > 1.
+        Smallest ratio of a moved camera's residual to that of the others, > 1.
     min_residual_px : float
-        Smaller residuals than this do not matter, px.
+        Smaller residuals are ignored, px.
 
     Returns
     -------
     tuple of Moved
-        Worst first; empty where all agree. At most half of the cameras can be found.
+        Worst first; empty when all agree. At most half of the cameras can be found.
 
     Raises
     ------
     BundleError
-        If fewer than three cameras saw the boards: then nobody can say which one moved.
+        If fewer than three cameras observed the boards: then the moved one cannot be identified.
     """
     names = sorted({name for name, _ in sightings})
     if len(names) < 3:
         raise BundleError(
-            f"cameras: got sightings of {', '.join(names) or 'none'}, expected of at least 3 to say"
-            " which one moved"
+            f"cameras: got sightings of {', '.join(names) or 'none'}, expected of at least 3 to "
+            "find the one that moved"
         )
     moved: list[MovedCamera] = []
     left = list(names)
@@ -282,7 +282,7 @@ def find_moved_cameras(
 def _agreement(
     sightings: Sightings, board: Board, cameras: Cameras, names: list[str], *, without: str
 ) -> tuple[float, float, dict[int, BoardPose]]:
-    """Return the residual of all cameras but one, that one's own, and the boards' places."""
+    """Return the residual of all cameras but one, that one's own, and the board poses."""
     rest = {k: s for k, s in sightings.items() if k[0] in names and k[0] != without}
     count = {pose: sum(p == pose for _, p in rest) for _, pose in rest}
     places = {
@@ -296,7 +296,7 @@ def _agreement(
     together, alone = np.concatenate(others), np.concatenate(own)
     if not together.size:
         return np.inf, np.nan, places
-    # by the median: a camera that moved moves all its corners, a bad corner is one of many
+    # by the median: a moved camera shifts all its corners, whereas a bad corner is one of many
     return (
         RMS_PER_MEDIAN * float(np.median(together)),
         RMS_PER_MEDIAN * float(np.median(alone)) if alone.size else np.nan,
@@ -307,7 +307,7 @@ def _agreement(
 def _resection(
     images: Sightings, board: Board, camera: CameraPose, poses: BoardPoses
 ) -> CameraPose:
-    """Return a camera's new place from boards whose places are known; the lens is kept."""
+    """Return a camera's new pose from boards of known pose; the lens is kept."""
     points = np.concatenate(
         [poses[p].to_rig(board.points_mm[s.ids]) for (_, p), s in images.items()]
     )

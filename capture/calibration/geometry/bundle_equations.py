@@ -1,8 +1,8 @@
-"""The normal equations of a bundle adjustment: residuals, derivatives, steps and covariance.
+"""Normal equations of a bundle adjustment: residuals, derivatives, steps and covariance.
 
-Each camera has fifteen numbers (fx, fy, cx, cy, k1, k2, p1, p2, k3, a turn about its own axes, a
-shift), each pose of the board six. The normal equations are summed from blocks, image by image,
-with analytic derivatives.
+Each camera has fifteen parameters (fx, fy, cx, cy, k1, k2, p1, p2, k3, a rotation about its own
+axes, a translation), each pose of the board six. The normal equations are summed from blocks, image
+by image, with analytic derivatives.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ Sightings: TypeAlias = Mapping[tuple[str, int], CornerObservation]
 Cameras: TypeAlias = Mapping[str, CameraPose]
 BoardPoses: TypeAlias = Mapping[int, BoardPose]
 Residuals: TypeAlias = Mapping[tuple[str, int], Float64Array]
-N_CAMERA, N_LENS, N_POSE = 15, 9, 6  # numbers of a camera, of these its lens, of a place
+N_CAMERA, N_LENS, N_POSE = 15, 9, 6  # parameters of a camera, of its lens, of a pose
 
 
 MAX_BUNDLE_STEPS = 100
@@ -42,21 +42,21 @@ MIN_SIGMA_PX = 1e-9
 
 
 class BundleError(CalibrationError):
-    """Sightings that do not tie the cameras together; the message names what is missing."""
+    """Raised for corners that do not connect the cameras; the message names what is missing."""
 
 
 @dataclass(frozen=True, slots=True)
 class LensPrior:
-    """Standard deviations of a lens about its nominal values; 0 holds a number fixed.
+    """Standard deviations of a lens about its nominal values; 0 holds a parameter fixed.
 
     Attributes
     ----------
     focal : float
         Relative.
     principal : float
-        Of the principal point, relative to the image's width.
+        Position of the principal point, relative to the image's width.
     k1, k2, tangential, k3 : float
-        Of the distortion.
+        Coefficients of the distortion.
     """
 
     focal: float = 0.02
@@ -76,24 +76,24 @@ class LensPrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleResult:
-    """What an adjustment found.
+    """Result of a bundle adjustment.
 
     Attributes
     ----------
     cameras : dict of str to CameraPose
-        By view name, with standard errors.
+        Cameras by view name, with standard errors.
     poses : dict of int to BoardPose
-        By pose number.
+        Board poses by number.
     rms_px : dict of str to float
-        Root mean square distance of a camera's corners to where the fit puts them.
+        Root mean square distance of a camera's corners to the fitted ones.
     sigma_px : float
-        Noise of a corner's coordinate that the residuals show.
+        Noise of a corner's coordinate, estimated from the residuals.
     corners : dict of str to int
-        How many corners each camera gave.
+        Number of corners of each camera.
     outliers : dict of tuple to int
-        Corners of each image (view, pose) farther than five sigmas; images without are left out.
+        Corners of each image (view, pose) farther than five sigmas; images without are omitted.
     center_covariance_mm2 : dict of str to ndarray of float64, shape (3, 3)
-        Of each camera's centre of projection, rig frame.
+        Covariance of each camera's center of projection, rig frame.
     """
 
     cameras: dict[str, CameraPose]
@@ -106,7 +106,7 @@ class BundleResult:
 
 
 class BundleProblem:
-    """Sightings as arrays, and the normal equations of their residuals."""
+    """Corners as arrays, and the normal equations of their residuals."""
 
     def __init__(
         self,
@@ -127,7 +127,7 @@ class BundleProblem:
         self.start = start
         self.gauge = gauge
         self.sigmas = {name: prior.sigmas(start[name]) for name in self.names}
-        self.first = len(self.names) * N_CAMERA  # where the places' numbers begin
+        self.first = len(self.names) * N_CAMERA  # index of the first pose parameter
         self.total = self.first + len(self.poses) * N_POSE
         free = np.zeros(self.total, bool)
         if not cameras_fixed:
@@ -144,7 +144,7 @@ class BundleProblem:
     def solve(
         self, cameras: Cameras, poses: BoardPoses
     ) -> tuple[dict[str, CameraPose], dict[int, BoardPose]]:
-        """Run Levenberg's method with Huber's weights; the scale is taken anew at each step."""
+        """Run Levenberg's method with Huber's weights; estimate the scale again at each step."""
         cameras, poses = dict(cameras), dict(poses)
         damping = 1e-3
         for _ in range(MAX_BUNDLE_STEPS):
@@ -170,8 +170,8 @@ class BundleProblem:
                 break
         else:
             raise BundleError(
-                f"bundle adjustment: still moving after {MAX_BUNDLE_STEPS} steps; show more"
-                " poses of the board, tilted more"
+                f"bundle adjustment: not converged after {MAX_BUNDLE_STEPS} steps; show more "
+                "poses of the board, tilted more"
             )
         return cameras, poses
 
@@ -218,10 +218,11 @@ class BundleProblem:
         return BundleResult(found, poses, rms, noise, corners, outliers, centers)
 
     def _inverse(self, H: Float64Array, cameras: Cameras) -> Float64Array:
-        """Return the covariance; with free frame, that of the frame fixed by the centres."""
+        """Return the covariance; with a free frame, for a frame fixed by the camera centers."""
         if self.gauge == "board" or self.cameras_fixed:
             return np.asarray(np.linalg.inv(H))
-        B = np.zeros((N_POSE, self.total))  # sum of shifts, sum of moments of the centres
+        # gauge constraints: the sum of shifts and the sum of moments of the centers vanish
+        B = np.zeros((N_POSE, self.total))
         middle = np.mean([cameras[name].center_mm for name in self.names], axis=0)
         for i, name in enumerate(self.names):
             to_center = np.hstack(_center_derivative(cameras[name]))
@@ -263,7 +264,7 @@ class BundleProblem:
         return total
 
     def _lens_pull(self, name: str, camera: CameraPose) -> Float64Array:
-        """Return how far a lens is from its prior, in standard deviations; 0 where fixed."""
+        """Return the distance of a lens from its prior, in standard deviations; 0 where fixed."""
         sigmas = self.sigmas[name]
         gap = _lens(camera) - _lens(self.start[name])
         return np.divide(gap, sigmas, out=np.zeros(N_LENS), where=sigmas > 0)
@@ -271,9 +272,11 @@ class BundleProblem:
     def _equations(
         self, cameras: Cameras, places: BoardPoses, residuals: Residuals, sigma: float
     ) -> tuple[Float64Array, Float64Array]:
-        """Return the normal matrix and the gradient of half the cost, free numbers only."""
+        """Return the normal matrix and the gradient of half the cost, free parameters only."""
         H, g = np.zeros((self.total, self.total)), np.zeros(self.total)
         for (name, pose), sighting in self.images.items():
+            # Gauss-Newton: H = sum J' W J and g = sum J' W r. Each image couples its camera only
+            # with its pose; poses are not coupled with each other.
             of_camera, of_place = _derivatives(
                 cameras[name], places[pose], self.board.points_mm[sighting.ids]
             )
@@ -327,7 +330,7 @@ class BundleProblem:
 def _derivatives(
     camera: CameraPose, pose: BoardPose, points_mm: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Return d pixel / d camera, shape (n, 2, 15), and d pixel / d place, shape (n, 2, 6)."""
+    """Return d pixel / d camera, shape (n, 2, 15), and d pixel / d pose, shape (n, 2, 6)."""
     on_board = points_mm @ pose.rotation.T
     turned = (on_board + pose.translation_mm) @ camera.rotation.T
     local = turned + camera.translation_mm
@@ -367,7 +370,7 @@ def _derivatives(
 
 
 def _center_derivative(camera: CameraPose) -> tuple[Float64Array, Float64Array]:
-    """Return how a camera's centre follows its turn and its shift."""
+    """Return the derivative of a camera's center by its rotation and its translation."""
     back = -camera.rotation.T
     # C = -R' t and R becomes exp([w]) R: dC = -R' [t] w - R' dt
     return back @ _cross_matrix(camera.translation_mm), back
@@ -381,7 +384,7 @@ def _cross_matrix(v: Float64Array) -> Float64Array:
 
 
 def _rotate(rotation: Float64Array, turn: Float64Array) -> Float64Array:
-    """Return a rotation after a small turn, orthonormal again."""
+    """Return a rotation after a small rotation, orthonormal again."""
     product = Rotation.from_rotvec(turn).as_matrix() @ rotation
     u, _, v = np.linalg.svd(product)
     return np.asarray(u @ v)

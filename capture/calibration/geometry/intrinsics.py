@@ -1,4 +1,4 @@
-"""Where a camera stands and how it projects, in the rig frame."""
+"""Pose and projection of a camera in the rig frame."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from capture.calibration.record import (
 )
 from capture.rig import Rig, View
 
-_OMITTED: Any = None  # __post_init__ puts an array in its place
+_OMITTED: Any = None  # __post_init__ replaces it by an array
 
 MAX_UNDISTORT_STEPS = 50
 MAX_UNDISTORT_STEP = 10.0  # a step beyond it diverges
@@ -31,7 +31,7 @@ UNDISTORT_TOL = 1e-12  # of normalized coordinates; a pixel is about 1e-4
 class CameraPose:
     """A camera in the rig frame: pinhole, lens distortion, rotation and translation.
 
-    Camera axes are x right, y down, z forward; pixel (0, 0)'s centre is (0, 0).
+    Camera axes are x right, y down, z forward; pixel (0, 0)'s center is (0, 0).
 
     Attributes
     ----------
@@ -42,15 +42,15 @@ class CameraPose:
     distortion : ndarray of float64, shape (5,)
         k1, k2, p1, p2, k3 of Brown's model (Brown 1966), on normalized coordinates.
     rotation : ndarray of float64, shape (3, 3)
-        Turns rig coordinates into camera axes; its rows are the camera's axes.
+        Rotates rig coordinates into camera axes; its rows are the camera's axes.
     translation_mm : ndarray of float64, shape (3,)
         A point X is at ``rotation @ X + translation_mm`` in camera axes.
     image_size : tuple of int
         Columns and rows.
     matrix_stderr, distortion_stderr : ndarray of float64, shapes (3, 3) and (5,)
-        Standard errors; 0 where a number was held fixed.
+        Standard errors; 0 where a parameter was held fixed.
     rotation_stderr_rad, translation_stderr_mm : ndarray of float64, shape (3,)
-        Standard errors of small turns about the camera's own axes, and of `translation_mm`.
+        Standard errors of small rotations about the camera's own axes, and of `translation_mm`.
     """
 
     serial: str
@@ -65,7 +65,7 @@ class CameraPose:
     translation_stderr_mm: Float64Array = _OMITTED
 
     def __post_init__(self) -> None:
-        """Convert to float64 and refuse what is no camera."""
+        """Convert to float64 and reject invalid cameras."""
         freeze_arrays(self, (3, 3), "matrix", "matrix_stderr", "rotation")
         freeze_arrays(self, (5,), "distortion", "distortion_stderr")
         freeze_arrays(self, (3,), "translation_mm", "translation_stderr_mm", "rotation_stderr_rad")
@@ -82,7 +82,7 @@ class CameraPose:
 
     @classmethod
     def nominal(cls, view: View) -> CameraPose:
-        """Return the camera as the rig's file describes it: no distortion, errors 0.
+        """Return the nominal camera from the rig file: no distortion, errors 0.
 
         Parameters
         ----------
@@ -105,11 +105,11 @@ class CameraPose:
 
     @property
     def center_mm(self) -> Float64Array:
-        """Centre of projection, mm, rig frame, shape (3,)."""
+        """Center of projection, mm, rig frame, shape (3,)."""
         return -self.rotation.T @ self.translation_mm
 
     def project(self, points_mm: ArrayLike) -> Float64Array:
-        """Return where points appear.
+        """Project points into the image.
 
         Parameters
         ----------
@@ -130,7 +130,7 @@ class CameraPose:
         return xy @ self.matrix[:2, :2].T + self.matrix[:2, 2]
 
     def rays(self, pixels: ArrayLike) -> Float64Array:
-        """Return the directions in which pixels look; the inverse of `project`.
+        """Return the viewing directions of pixels; the inverse of `project`.
 
         Parameters
         ----------
@@ -145,7 +145,7 @@ class CameraPose:
         Raises
         ------
         ValueError
-            Where the lens's distortion has no inverse there.
+            When the lens distortion has no inverse there.
         """
         px = np.asarray(pixels, dtype=np.float64)
         seen = (px - self.matrix[:2, 2]) @ np.linalg.inv(self.matrix[:2, :2]).T
@@ -168,7 +168,7 @@ class CameraPose:
 
 
 def distort(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
-    """Return where Brown's lens moves normalized image coordinates.
+    """Apply Brown's lens distortion to normalized image coordinates.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
-"""A small ball of black glass in a sphere of lights: its place, and what its spots say of them.
+"""Locate a ball of black glass in a sphere of lights, and measure the lights from its spots.
 
-The ball is black on black, so that its outline shows nothing: its place follows from the pattern of
-the spots in which it mirrors the lights, whose places are known to a few millimetres. All lights
-together tell the ball's place much better than one light's place is known, and from then on each
-spot tells its own light's direction.
+The ball is black on black, so that its outline is invisible. Its position follows from the pattern
+of the spots in which it mirrors the lights, whose positions are known to a few millimeters. All
+lights together determine the ball's position much better than one light's position is known. Each
+spot then gives the direction of its own light.
 """
 
 from dataclasses import dataclass
@@ -24,21 +24,21 @@ from capture.calibration.lights.reflection import (
 from capture.calibration.record import CalibrationError, freeze_arrays
 from capture.calibration.robust import HUBER_SIGMAS, mad_sigma
 
-SPOT_DETECTION_SIGMAS = 7.0  # of the smoothed image: none of 4 million pixels of noise gets there
+SPOT_DETECTION_SIGMAS = 7.0  # of the smoothed image: none of 4 million pixels of noise reaches it
 SPOT_BLUR_MM = 0.012
 MIN_SPOT_SEPARATION_MM = 0.06  # two spots closer than this are one
 MAX_SPOTS = 600
-MAX_BALL_OFFSET_MM = 4.0  # how far the ball may lie from the rig's origin
+MAX_BALL_OFFSET_MM = 4.0  # largest distance of the ball from the rig's origin
 VOTE_CELL_MM = 0.06
-SPOT_GATE_MM = 0.3  # of a spot from its predicted place, at first; spots lie 0.4 mm apart or more
+SPOT_GATE_MM = 0.3  # first gate about a spot's predicted position; spots are 0.4 mm apart or more
 MIN_SPOTS = 12
-MIN_LIGHT_FRACTION = 0.5  # of the lights: with fewer, the nominal places do not hold the ball's
+MIN_LIGHT_FRACTION = 0.5  # of the lights: fewer do not determine the position of the ball
 N_BALL_STEPS = 12
 MEDIAN_CHI2_2 = 1.3863  # median of chi-square with two degrees of freedom, 2 ln 2
 
 
 class BallError(CalibrationError):
-    """Photographs of the ball that tell nothing; the message says why and what to change."""
+    """Raised for unusable photographs of the ball; the message states the reason and the change."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,15 +46,16 @@ class GlassBall:
     """The target: a polished ball of black glass."""
 
     center_mm: tuple[float, float, float] = (0.0, 0.0, -3.0)
-    """About where its middle stands, mm, rig frame: half a radius behind the origin, where the
-    camera is focused, spots near the axis are sharp."""
+    """Approximate center, mm, rig frame: half a radius behind the origin, where the camera is
+    focused, so that spots near the axis are sharp.
+    """
     radius_mm: float = 6.0
     radius_stderr_mm: float = 0.02
     eta: float = 1.52
     """Refractive index, > 1."""
     eta_stderr: float = 0.002
     depth_stderr_mm: float = 1.0
-    """How well it stands there along the camera's axis, mm."""
+    """Standard deviation of its position along the camera's axis, mm."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -67,7 +68,7 @@ class GlassBall:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BallPosition:
-    """Where the ball is.
+    """Position and radius of the ball.
 
     Attributes
     ----------
@@ -75,7 +76,7 @@ class BallPosition:
         Rig frame.
     radius_mm : float
     covariance_mm2 : ndarray of float64, shape (4, 4)
-        Of centre and radius.
+        Covariance of center and radius.
     """
 
     center_mm: Float64Array
@@ -83,7 +84,7 @@ class BallPosition:
     covariance_mm2: Float64Array
 
     def __post_init__(self) -> None:
-        """Convert to float64 and refuse what is no ball."""
+        """Convert to float64 and reject invalid balls."""
         freeze_arrays(self, (3,), "center_mm")
         freeze_arrays(self, (4, 4), "covariance_mm2")
         if not 0 < self.radius_mm < np.inf:
@@ -92,7 +93,7 @@ class BallPosition:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BallFit:
-    """The ball's place, and which spot is which light's.
+    """Position of the ball, and the assignment of spots to lights.
 
     Attributes
     ----------
@@ -100,11 +101,11 @@ class BallFit:
     spot : ndarray of int64, shape (L,)
         Index of each light's spot; -1: none.
     in_field : ndarray of bool, shape (L,)
-        Where a spot is expected whole within the image.
+        Whether the whole spot is expected inside the image.
     stray : ndarray of int64
-        Spots that are no light's.
+        Spots that are not assigned to a light.
     light_scatter_mm : float
-        Standard deviation of the lights about their nominal places, along an axis.
+        Standard deviation of the lights about their nominal positions, along an axis.
     """
 
     ball: BallPosition
@@ -121,9 +122,9 @@ class LightDirections:
     Attributes
     ----------
     direction : ndarray of float64, shape (L, 3)
-        Unit vectors; NaN where there is no spot.
+        Unit vectors; NaN for lights without a spot.
     covariance : ndarray of float64, shape (L, 3, 3)
-        Of each, with what all have in common: the error of the ball's place.
+        Covariance of each, common error of the ball's position included.
     """
 
     direction: Float64Array
@@ -150,7 +151,7 @@ def find_spots(image: NDArray, *, pixel_mm: float, noise: float | None = None) -
     Returns
     -------
     ndarray of float64, shape (n, 2)
-        Column and row of their brightest places, brightest first, n <= 600.
+        Column and row of their maxima, brightest first, n <= 600.
 
     Examples
     --------
@@ -182,7 +183,7 @@ def locate_ball(
     noise_px: float = 0.5,
     lit: BoolArray | None = None,
 ) -> BallFit:
-    """Find the ball by its spots and tell which light made each.
+    """Locate the ball by its spots and assign the spots to lights.
 
     Parameters
     ----------
@@ -190,15 +191,15 @@ def locate_ball(
         Column and row of each spot, px.
     camera : CameraPose
     lights_mm : ndarray of float64, shape (L, 3)
-        Nominal places of the lights; what they have wrong in common becomes the ball's.
+        Nominal positions of the lights; their common error becomes the ball's.
     target : GlassBall
-        About where the ball stands, and how well that and its radius are known.
+        Nominal ball, with the uncertainties of position and radius.
     margin_mm : float
-        A spot's own size: closer to the image's border it is not whole.
+        Size of a spot: closer to the image's border it is cut.
     noise_px : float
-        Standard error of a spot's coordinate; half a pixel for brightest pixels.
+        Standard error of a spot's coordinate; half a pixel for maxima.
     lit : ndarray of bool, shape (L,), optional
-        Lights that can be expected to show; None: all.
+        Lights whose spots are expected; None: all.
 
     Returns
     -------
@@ -207,7 +208,7 @@ def locate_ball(
     Raises
     ------
     BallError
-        If there are no spots, if they do not match the lights, or if the field shows too little of
+        If spots are missing, if they do not match the lights, or if the field shows too little of
         the ball.
     """
     lights = np.asarray(lights_mm, np.float64)
@@ -219,16 +220,16 @@ def locate_ball(
     _require_field(nominal[shows], camera, pixel_mm, radius_mm)
     if len(found) == 0:
         raise BallError(
-            "ball: no spot stands out of the dark; check that the lights were on, that the ball"
-            " lies in the middle of the field, and the exposure"
+            "ball: no spot above the dark level; check that the lights were on, that the ball "
+            "is in the middle of the field, and the exposure"
         )
     shift, votes = _vote(found, nominal[shows], pixel_mm)
     if votes < MIN_SPOTS:
         raise BallError(
-            f"ball: {len(found)} spots, at most {votes} of which fit the lights' pattern at one"
-            f" place of the ball, expected {MIN_SPOTS} or more; check the target, its radius"
-            f" ({radius_mm:g} mm), the exposure, and that the ball lies within"
-            f" {MAX_BALL_OFFSET_MM:g} mm of the middle"
+            f"ball: {len(found)} spots, at most {votes} of which fit the lights' pattern for "
+            f"one position of the ball, expected {MIN_SPOTS} or more; check the target, its "
+            f"radius ({radius_mm:g} mm), the exposure, and that the ball is within "
+            f"{MAX_BALL_OFFSET_MM:g} mm of the middle"
         )
     right, down = camera.rotation[0], camera.rotation[1]
     start = about + pixel_mm * (shift[0] * right + shift[1] * down)
@@ -250,7 +251,7 @@ def light_directions(
     camera : CameraPose
     ball : Ball
     pixels : ndarray of float64, shape (L, 2)
-        Middle of each light's spot, px; NaN: none.
+        Center of each light's spot, px; NaN: none.
     pixel_stderr : ndarray of float64, shape (L,)
         Standard error of each coordinate, px.
     distance_mm : ndarray of float64, shape (L,)
@@ -289,7 +290,7 @@ def _require_field(
 
 
 def _vote(found: Float64Array, nominal: Float64Array, pixel_mm: float) -> tuple[Float64Array, int]:
-    """Return the shift of the pattern, px, that most spots agree to, and how many do."""
+    """Return the shift of the pattern, px, with the most matching spots, and their number."""
     expected = nominal[np.isfinite(nominal).all(axis=1)]
     offset = (found[:, None] - expected[None]).reshape(-1, 2)
     reach = MAX_BALL_OFFSET_MM / pixel_mm
@@ -320,7 +321,7 @@ def _refine(
     margin_px: float,
     noise_px: float,
 ) -> BallFit:
-    """Fit centre and radius by Gauss and Newton, each light free about its nominal place."""
+    """Fit center and radius by Gauss-Newton, each light free about its nominal position."""
     pixel_mm = float(np.linalg.norm(camera.center_mm)) / float(camera.matrix[0, 0])
     place = np.append(start_mm, target.radius_mm)
     expected = np.append(target.center_mm, target.radius_mm)
@@ -357,7 +358,7 @@ def _refine(
         covariance = np.linalg.inv(normal)
         change = covariance @ right
         place = place + change
-        # lights' own scatter, by the median so that a light put far away does not widen it
+        # the lights' own scatter, by the median so that a misplaced light does not widen it
         wide = float(np.median(distance2)) / MEDIAN_CHI2_2
         scatter_mm = float(np.clip(scatter_mm * np.sqrt(wide), 0.02, 20.0))
         if step >= 2:
@@ -367,9 +368,9 @@ def _refine(
     in_field = _inside(seen.pixels, camera, margin_px)
     if in_field[shows].sum() < MIN_LIGHT_FRACTION * shows.sum():
         raise BallError(
-            f"ball: {place[0]:+.2f} mm, {place[1]:+.2f} mm from the middle, only"
-            f" {int(in_field[shows].sum())} of {int(shows.sum())} spots lie in the field, expected"
-            f" {MIN_LIGHT_FRACTION:.0%} or more; centre it"
+            f"ball: {place[0]:+.2f} mm, {place[1]:+.2f} mm from the middle, only "
+            f"{int(in_field[shows].sum())} of {int(shows.sum())} spots are in the field, "
+            f"expected {MIN_LIGHT_FRACTION:.0%} or more; center it"
         )
     stray = np.setdiff1d(np.arange(len(found)), spot)
     return BallFit(
@@ -380,7 +381,7 @@ def _refine(
 def _match(
     tree: cKDTree, found: Float64Array, expected: Float64Array, gate_px: float
 ) -> Int64Array:
-    """Return each light's spot where both are each other's nearest within the gate, else -1."""
+    """Return each light's spot when both are mutual nearest neighbors within the gate, else -1."""
     spot = np.full(len(expected), -1)
     known = np.flatnonzero(np.isfinite(expected).all(axis=1))
     distance, nearest = tree.query(expected[known], distance_upper_bound=float(gate_px))

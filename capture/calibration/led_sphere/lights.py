@@ -1,4 +1,4 @@
-"""The lights of a polarized sphere as calibrated: directions, intensities, films, and leakage."""
+"""Calibrated lights of a polarized sphere: directions, intensities, polarizers, and leakage."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ from capture.rig import Rig
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SphereLightTable:
-    """Where the lights stand and how bright they are.
+    """Directions and intensities of the lights.
 
     Attributes
     ----------
     names : tuple of str
-        In the rig's order.
+        Names in the rig's order.
     directions : ndarray of float64, shape (L, 3)
         Unit vectors from the rig's origin.
     directions_stderr : ndarray of float64, shape (L, 3)
-        Standard errors; they have the ball's place in common.
+        Standard errors; the error of the ball's position is common to them.
     intensities, intensities_stderr : ndarray of float64, shape (L,)
-        Light that reaches the origin, over the mean of the valid lights.
+        Irradiance at the origin, over the mean of the valid lights.
     seen : ndarray of bool, shape (L,)
-        Where the direction was measured; elsewhere it is nominal.
+        Lights with a measured direction; the others are nominal.
     valid : ndarray of bool, shape (L,)
-        Where the intensity was measured. Elsewhere it is nominal, 1.
+        Lights with a measured intensity; the others are nominal, 1.
     dead : ndarray of bool, shape (L,)
-        Lights that gave none; they are valid, with an intensity near 0.
+        Lights that did not shine; they are valid, with an intensity near 0.
     """
 
     names: tuple[str, ...]
@@ -73,7 +73,7 @@ class SphereLightTable:
 
     @classmethod
     def nominal(cls, rig: Rig) -> SphereLightTable:
-        """Return the lights as the rig's file describes them, errors 0, all as bright.
+        """Return the nominal lights from the rig file, errors 0, all with equal intensity.
 
         Examples
         --------
@@ -102,7 +102,7 @@ class SphereLightTable:
         rig, source, created
             As in `Calibration`.
         ball : mapping of str to Quantity, optional
-            Of the target, kept under the serial "ball".
+            Ball of the target, stored under the serial "ball".
         **about
             ``valid_until``, ``notes``, ``inputs``, ``versions`` of `Calibration`.
         """
@@ -141,26 +141,26 @@ class SphereLightTable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpherePolarizers:
-    """What the films leak, as seen on glass, and as skin will.
+    """Leakage of the polarizers, measured on glass and predicted for skin.
 
     Attributes
     ----------
     names : tuple of str
     leakage, leakage_stderr : ndarray of float64, shape (L,)
-        Of the mirror reflection of each light by a surface of index `eta`: crossed over parallel.
+        Specular reflection of each light by a surface of index `eta`: crossed over parallel.
     glass_leakage, glass_leakage_stderr : ndarray of float64, shape (L,)
-        Of the ball, as measured.
+        Leakage on the ball, as measured.
     axis_error_rad, axis_error_stderr_rad : ndarray of float64, shape (L,)
-        By how much each light's polarizer is off its nominal axis.
+        Deviation of each light's polarizer from its nominal axis.
     valid : ndarray of bool, shape (L,)
-        Where the glass's leakage was measured; elsewhere `axis_error_rad` is what it may be, and
-        `leakage` what follows from the films alone.
+        Lights with measured leakage on glass; for the others `axis_error_rad` is the prior's width,
+        and `leakage` follows from the polarizers alone.
     misalignment_rad, misalignment_stderr_rad : float
-        What the analyser's reading lacks to its true angle.
+        True angle of the analyzer minus its reading.
     light_leak, light_leak_stderr, analyser_leak, analyser_leak_stderr : float
-        Inverse extinction ratios of the films.
+        Inverse extinction ratios of the polarizers.
     eta : float
-        Refractive index of the surface that `leakage` is for.
+        Refractive index of the surface of `leakage`.
     """
 
     names: tuple[str, ...]
@@ -190,14 +190,14 @@ class SpherePolarizers:
             raise ValueError("SphereFilms: got a leakage < 0 or eta <= 1, expected >= 0 and > 1")
 
     def to_calibration(self, *, serial: str, **about: Unpack[Origin]) -> Calibration:
-        """Return this as a `Calibration` of kind "polarization", by light, and of the camera.
+        """Return this as a `Calibration` of kind "polarization", keyed by light and camera.
 
         Parameters
         ----------
         serial
-            Of the camera behind the analyser.
+            Serial number of the camera behind the analyzer.
         rig, source, created, **about
-            As for `SphereLightTable.to_calibration`.
+            As in `SphereLightTable.to_calibration`.
         """
         values = device_rows(
             self.names,
@@ -220,7 +220,7 @@ class SpherePolarizers:
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, rig: Rig, serial: str) -> SpherePolarizers:
-        """Return the calibrated films of a rig and one of its cameras, in the rig's order.
+        """Return the calibrated polarizers of a rig and one of its cameras, in the rig's order.
 
         Raises
         ------
@@ -251,7 +251,7 @@ _LEAKAGE_FIELDS = ("leakage", "glass_leakage", "axis_error_rad")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SphereCalibration:
-    """What a CALIBRATION/ folder says of a polarized sphere.
+    """Calibration of a polarized sphere, from a CALIBRATION/ folder.
 
     Attributes
     ----------
@@ -274,9 +274,9 @@ class SphereCalibration:
         rig : Rig
             Its lights are returned, in its order.
         view : str
-            Name of the camera behind the analyser.
+            Name of the camera behind the analyzer.
         on : date, optional
-            Day of use; None does not ask how old the calibration is.
+            Day of use; None skips the check of the validity.
 
         Raises
         ------
@@ -304,7 +304,7 @@ class SphereCalibration:
 
 
 def _columns(calibration: Calibration, rig: Rig, kind: str) -> DeviceColumns:
-    """Return the quantities of a rig's lights; refuse another kind or rig."""
+    """Return the quantities of a rig's lights; reject another kind or rig."""
     if calibration.kind != kind or calibration.rig != rig.name:
         raise CalibrationMismatch(
             f"calibration: got kind {calibration.kind!r} of rig {calibration.rig!r}, expected"

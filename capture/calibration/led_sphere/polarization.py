@@ -1,10 +1,10 @@
-"""The films of a polarized sphere of lights, from what a glass ball reflects of each.
+"""Fit the polarizers of a sphere of lights to the reflections of each light in a glass ball.
 
-Glass reflects along and across the plane of incidence by Fresnel's amplitudes, which turns the
-polarization of each light by a known angle. What passes the analyser at two or more readings then
-tells three causes of leakage apart: the analyser's zero, the same for all; the films' extinction;
-and each light's own axis. From the causes follows what another surface, skin, leaks from each
-direction, which is not what the glass leaks.
+Glass reflects along and across the plane of incidence by Fresnel's amplitudes, which rotates the
+polarization of each light by a known angle. The light behind the analyzer at two or more readings
+then separates three causes of leakage: the analyzer's zero, common to all lights; the extinction of
+the polarizers; and each light's own axis. From these causes follows the leakage of another surface,
+skin, in each direction, which differs from that of the glass.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from capture.arrays import BoolArray, Float64Array
 from capture.calibration.polarization import PolarizationError
 from capture.calibration.polarization.polarized_reflection import FacetReflection
 
-MAX_ANALYZER_ZERO_DEG = 30  # of the analyser, searched
-TYPICAL_LEAK = 3e-4  # of film, its extinction 1e3 to 1e4
+MAX_ANALYZER_ZERO_DEG = 30  # of the analyzer, searched
+TYPICAL_LEAK = 3e-4  # of a polarizer, extinction 1e3 to 1e4
 LOG_LEAK_SCATTER = 1.5  # of its logarithm
 TYPICAL_AXIS_ERROR_RAD = np.radians(1.0)
 AXIS_ERROR_RANGE_RAD = (np.radians(0.02), np.radians(5.0))
-AXIS_T_DOF = 4.0  # of Student's t that the lights' own axes scatter by: some may be far off
+AXIS_T_DOF = 4.0  # degrees of freedom of Student's t for the lights' own axes: some may be far off
 MAX_POLARIZER_STEPS = 60
 POLARIZER_STEP_TOL = 1e-6
 POLARIZER_DERIVATIVE_STEP = 1e-5
-# widths of the axes' scatter within which a light may have a second answer
+# widths of the axes' scatter within which a light may have a second solution
 MODE_SCATTER_WIDTHS = 6.0
 MAX_MODE_AXIS_ERROR_RAD = np.radians(30.0)
 N_MODE_GRID = 41
@@ -38,24 +38,24 @@ MIN_POLARIZED_LIGHTS = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PolarizerFit:
-    """The films, as the spots of all lights and readings say.
+    """Polarizers fitted to the spots of all lights and readings.
 
     Attributes
     ----------
     strength, strength_stderr : ndarray of float64, shape (L,)
-        Flux of each light at an ideal mirror without an analyser, per second at level 1.
+        Flux of each light at an ideal mirror without an analyzer, per second at level 1.
     axis_error_rad, axis_error_stderr_rad : ndarray of float64, shape (L,)
-        How far each light's axis is off; where the readings leave its sign open it is drawn to 0.
+        Deviation of each light's axis; shrunk to 0 where the readings leave its sign open.
     zero_rad, zero_stderr_rad : float
-        What the analyser's reading lacks to its true angle.
+        True angle of the analyzer minus its reading.
     light_leak, analyser_leak : float
         Inverse extinction ratios.
     covariance : ndarray of float64, shape (L, 4, 4)
-        Of turn, zero and the logarithms of both leaks, for each light.
+        Covariance of rotation, zero and the logarithms of both leaks, for each light.
     axis_scatter_rad : float
-        Of the lights' axes about their nominal angles.
+        Scatter of the lights' axes about their nominal angles.
     chi2_per_dof : float
-        Above 1 the errors have been widened.
+        Above 1 the errors have been scaled up.
     """
 
     strength: Float64Array
@@ -72,7 +72,7 @@ class PolarizerFit:
 
     @property
     def leak_stderr(self) -> tuple[float, float]:
-        """Standard errors of the lights' and of the analyser's leak."""
+        """Standard errors of the lights' and of the analyzer's leak."""
         a, b = np.sqrt(self.covariance[0, 2, 2]), np.sqrt(self.covariance[0, 3, 3])
         return float(self.light_leak * a), float(self.analyser_leak * b)
 
@@ -84,23 +84,23 @@ def fit_polarizers(
     good: BoolArray,
     reflection: FacetReflection,
 ) -> PolarizerFit:
-    """Fit the films and the strengths of the lights to the spots' fluxes.
+    """Fit the polarizers and the intensities of the lights to the spots' fluxes.
 
     Parameters
     ----------
     readings_rad : array_like, shape (E,)
-        Reading of the analyser in each exposure; at least two that differ modulo pi.
+        Reading of the analyzer in each exposure; at least two that differ modulo pi.
     rates, variance : ndarray of float64, shape (E, L)
         Flux of each spot, per second at level 1, and its variance.
     good : ndarray of bool, shape (E, L)
-        False where it must not be used (saturated, not whole).
+        False where it must not be used (saturated, cut).
     reflection : Reflection
-        By the ball's glass.
+        Reflection by the ball's glass.
 
     Returns
     -------
     FilmFit
-        Lights without two good readings have strength, turn 0 with the errors of the prior.
+        Lights without two good readings have strength, rotation 0 with the errors of the prior.
 
     Raises
     ------
@@ -109,23 +109,22 @@ def fit_polarizers(
 
     Notes
     -----
-    Least squares with what is known beforehand: lights' axes scatter about their nominal angles by
-    Student's t (4 degrees of freedom) of a width that is fitted, and film leaks 1e-5 to 1e-2. With
-    readings 0 and 90 only, the sign of a light's own turn follows from the turn that glass itself
-    gives to its polarization, and is open where that is smaller; readings on both sides of 90
-    settle it.
+    Least squares with priors: the lights' axes scatter about their nominal angles by Student's t (4
+    degrees of freedom) of a fitted width, and the polarizers leak 1e-5 to 1e-2. With readings 0 and
+    90 only, the sign of a light's own rotation follows from the rotation by the glass itself, and
+    is open where that is smaller; readings on both sides of 90 determine it.
     """
     readings = np.asarray(readings_rad, np.float64)
     if len(np.unique(np.round(np.exp(2j * readings), 6))) < 2:
         raise PolarizationError(
-            f"analyser: got readings {np.degrees(readings).round(2).tolist()} degrees, expected two"
-            " that differ, parallel and crossed"
+            f"analyzer: got readings {np.degrees(readings).round(2).tolist()} degrees, expected "
+            "two that differ, parallel and crossed"
         )
     seen = np.array([len(np.unique(np.round(np.exp(2j * readings[ok]), 6))) >= 2 for ok in good.T])
     if seen.sum() < MIN_POLARIZED_LIGHTS:
         raise PolarizationError(
-            f"films: {int(seen.sum())} lights have two readings that are not saturated, expected"
-            f" {MIN_POLARIZED_LIGHTS} or more; add a shorter exposure"
+            f"polarizers: {int(seen.sum())} lights have two readings that are not saturated, "
+            f"expected {MIN_POLARIZED_LIGHTS} or more; add a shorter exposure"
         )
     weight = np.where(good & seen, 1.0 / np.where(variance > 0, variance, 1.0), 0.0)
     values = np.where(weight > 0, rates, 0.0)
@@ -137,20 +136,20 @@ def fit_polarizers(
 
 
 def leakage(fit: PolarizerFit, reflection: FacetReflection) -> tuple[Float64Array, Float64Array]:
-    """Return how much of a mirror reflection passes crossed, over parallel, with standard errors.
+    """Return crossed over parallel for specular reflection by a surface, with standard errors.
 
     Parameters
     ----------
     fit : FilmFit
     reflection : Reflection
-        Of the surface in question, skin for example, by facets that mirror each light into the
-        camera.
+        Reflection by the surface in question, for example skin, whose facets mirror each light into
+        the camera.
 
     Returns
     -------
     leakage, stderr : ndarray of float64, shape (L,)
-        Readings 90 over 0. Its mean over the errors of the films, not its value at the best films:
-        it is a square, and errors of angles of either sign add to it.
+        Ratio of readings 90 and 0. The mean over the errors of the polarizers, not the value for
+        the best fit: leakage is quadratic in the angles, so that errors of either sign add to it.
     """
     count = len(fit.axis_error_rad)
     shared = (fit.zero_rad, np.log(fit.light_leak), np.log(fit.analyser_leak))
@@ -172,8 +171,8 @@ def leakage(fit: PolarizerFit, reflection: FacetReflection) -> tuple[Float64Arra
 def _starts(
     readings: Float64Array, values: Float64Array, weight: Float64Array, reflection: FacetReflection
 ) -> list[float]:
-    """Return the two best zeros of the analyser if the lights stood as drawn, rad."""
-    # lights' own axes are off: their spots differ from this by some thousandths of their light
+    """Return the two best zeros of the analyzer for lights at their nominal axes, rad."""
+    # the axes deviate from nominal: the spots differ from the model by some thousandths
     slack = (3e-3 * np.abs(values).max(axis=0)) ** 2
     soft = np.where(weight > 0, weight / (1.0 + weight * slack), 0.0)
     zeros = np.radians(np.arange(-MAX_ANALYZER_ZERO_DEG, MAX_ANALYZER_ZERO_DEG + 1.0, 1.0))
@@ -190,7 +189,7 @@ def _starts(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ArrowSystem:
-    """Normal equations of two numbers of each light, and of three that all lights share."""
+    """Normal equations of two parameters of each light, and of three common ones."""
 
     block: Float64Array  # of each light's own, (L, 2, 2)
     border: Float64Array  # (L, 2, 3)
@@ -199,7 +198,7 @@ class _ArrowSystem:
     other: Float64Array  # (3,)
 
     def solve(self, damping: float) -> tuple[Float64Array, Float64Array]:
-        """Return the numbers, with a damped diagonal."""
+        """Return the parameters, with a damped diagonal."""
         damped = self.block + damping * self.block * np.eye(2)
         inverse = np.linalg.inv(damped)
         through = inverse @ self.border
@@ -211,7 +210,7 @@ class _ArrowSystem:
         return local - through @ shared, shared
 
     def covariance(self) -> tuple[Float64Array, Float64Array, Float64Array]:
-        """Return covariances of each light's two numbers, with the shared ones, and of those."""
+        """Return covariances of each light's two parameters, with the common ones, and of those."""
         inverse = np.linalg.inv(self.block)
         through = inverse @ self.border
         shared = np.linalg.inv(self.corner - np.einsum("kia,kib->ab", self.border, through))
@@ -220,9 +219,10 @@ class _ArrowSystem:
 
 
 class _PolarizerProblem:
-    """One descent: strengths and turns of the lights, and three numbers that all share.
+    """One descent: intensities and rotations of the lights, and three common parameters.
 
-    The normal equations are an arrow: a 2 x 2 block for each light, and a border of three.
+    The normal matrix has arrow form: a 2 x 2 block for each light, and a border of three. The
+    blocks are eliminated one by one (Schur complement), so that a step costs O(L).
     """
 
     def __init__(
@@ -262,7 +262,7 @@ class _PolarizerProblem:
 
     @property
     def cost(self) -> float:
-        """Minus twice the logarithm of the posterior, up to a constant."""
+        """Return minus twice the logarithm of the posterior, up to a constant."""
         data = self._objective(self.strength, self.turn, self.shared)
         data -= float(np.sum(self.pull * self.turn**2)) / self.scatter**2
         tails = np.log1p(self.turn[self.lit] ** 2 / (AXIS_T_DOF * self.scatter**2))
@@ -301,7 +301,7 @@ class _PolarizerProblem:
         return _ArrowSystem(block, border, corner, one, other)
 
     def solve(self) -> _PolarizerProblem:
-        """Descend, with Marquardt's damping; between steps fit the scatter of the axes."""
+        """Descend with Marquardt's damping; between steps fit the scatter of the axes."""
         damping = 1e-3
         now = self._objective(self.strength, self.turn, self.shared)
         for _ in range(MAX_POLARIZER_STEPS):
@@ -322,6 +322,8 @@ class _PolarizerProblem:
                 self.strength, self.turn, self.shared = trial
             damping = max(damping / 10, 1e-9)
             wider = self._scatter(arrow.covariance()[0][:, 1, 1])
+            # Weight of a residual z under Student's t with nu degrees of freedom: (nu + 1) / (nu +
+            # z^2), the expectation step of its scale mixture of normals.
             self.pull = np.where(
                 self.lit, (AXIS_T_DOF + 1) / (AXIS_T_DOF + (self.turn / wider) ** 2), 1.0
             )
@@ -333,7 +335,7 @@ class _PolarizerProblem:
         return self
 
     def solve_all_modes(self) -> _PolarizerProblem:
-        """Descend, and again from where single lights have a better answer on another side."""
+        """Descend, then again from better solutions of single lights on the other side."""
         self.solve()
         for _ in range(6):
             modes, cost = self._modes()
@@ -346,7 +348,7 @@ class _PolarizerProblem:
         return self
 
     def _light_cost(self, turn: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Return each light's own part of the cost at its best strength, and that strength."""
+        """Return each light's own part of the cost at its best intensity, and that intensity."""
         u = self._transmitted(turn, self.shared)
         power = np.sum(self.weight * u**2, axis=0)
         strength = np.sum(self.weight * u * self.values, axis=0) / np.where(power > 0, power, 1.0)
@@ -355,7 +357,7 @@ class _PolarizerProblem:
         return miss + tail, strength
 
     def _modes(self) -> tuple[Float64Array, Float64Array]:
-        """Return the two best answers for each light's turn and their costs, shapes (2, L)."""
+        """Return the two best rotations of each light and their costs, shapes (2, L)."""
         even = np.linspace(-1.0, 1.0, N_MODE_GRID)
         # closely where most axes are, coarsely where one far off may be
         grid = np.unique(
@@ -379,7 +381,7 @@ class _PolarizerProblem:
         modes, costs = (np.array(part) for part in zip(*found, strict=True))
         first = np.argsort(costs, axis=0)
         modes, costs = (np.take_along_axis(part, first, axis=0) for part in (modes, costs))
-        # one valley only, or both descents into the same
+        # one minimum only, or both descents into the same one
         single = (valley.sum(axis=0) < 2) | (np.abs(modes[0] - modes[1]) < MODE_TOL_RAD)
         costs[1, single] = np.inf
         return modes, costs
@@ -390,9 +392,9 @@ class _PolarizerProblem:
         return float(np.clip(np.sqrt(square), *AXIS_ERROR_RANGE_RAD))
 
     def result(self, observed: BoolArray) -> PolarizerFit:
-        """Return the fit, with errors widened where the residuals are larger than the noise."""
-        # how much the scattered axes tell: slope and spread of their pull (a sandwich), since
-        # weights that follow the residuals would count their own scatter as knowledge
+        """Return the fit, with errors scaled up where the residuals exceed the noise."""
+        # information of the scattered axes: slope and variance of their pull (a sandwich estimate),
+        # since weights that follow the residuals would count their own scatter as information
         z = self.turn[self.lit] / self.scatter
         slope = ((AXIS_T_DOF + 1) * (AXIS_T_DOF - z**2) / (AXIS_T_DOF + z**2) ** 2).sum()
         spread = ((self.pull[self.lit] * z) ** 2).sum()
@@ -401,11 +403,12 @@ class _PolarizerProblem:
         local, both, shared = self._normal().covariance()
         u = self._transmitted(self.turn, self.shared)
         chi2 = float(np.sum(self.weight * (self.values - self.strength * u) ** 2))
-        told = 1.0 - self.pull * local[:, 1, 1] / self.scatter**2  # share that the data tell
-        free = float(np.sum(self.weight > 0) - self.lit.sum() - told[self.lit].sum() - 3)
+        # information from the data, not from the prior of the axes: 1 - posterior / prior variance
+        from_data = 1.0 - self.pull * local[:, 1, 1] / self.scatter**2
+        free = float(np.sum(self.weight > 0) - self.lit.sum() - from_data[self.lit].sum() - 3)
         per_dof = chi2 / max(free, 1.0)
         wide = max(per_dof, 1.0)
-        # the same crossed light may come from a turn to the other side: how likely is that?
+        # a rotation to the other side gives the same crossed light: compute its probability
         modes, costs = self._modes()
         other = np.exp(-0.5 * np.clip(costs[1] - costs[0], 0.0, 700.0))
         other = np.where(self.lit, other / (1.0 + other), 0.0)

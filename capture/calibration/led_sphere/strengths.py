@@ -1,4 +1,4 @@
-"""Intensities and films of the lights, from what their spots in the ball give in each exposure."""
+"""Intensities and polarizers of the lights, from the fluxes of their spots in the ball."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,25 +16,25 @@ from capture.calibration.lights.reflection import MirroredLights, mirror_lights
 from capture.calibration.polarization.polarized_reflection import FacetReflection
 from capture.rig import Rig
 
-EXPOSURE_REPEATABILITY = 1e-3  # how well an exposure's light repeats
+EXPOSURE_REPEATABILITY = 1e-3  # relative repeatability of an exposure's light
 
 
-PIXEL_RESPONSE_STDERR = 1e-3  # how well pixels' responses are known over a spot
+PIXEL_RESPONSE_STDERR = 1e-3  # relative error of the pixels' responses, averaged over a spot
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpotRates:
-    """Light per second of each light's spot in each exposure, with what may be used of it.
+    """Flux of each light's spot in each exposure, with masks of usable values.
 
     Attributes
     ----------
     readings_deg : ndarray of float64, shape (E,)
-        Of the analyser.
+        Readings of the analyzer.
     rate, variance : ndarray of float64, shape (E, L)
     good : ndarray of bool, shape (E, L)
-        Whole and not saturated.
+        Inside the image and not saturated.
     saturated : ndarray of bool, shape (L,)
-        In every exposure.
+        Saturated in every exposure.
     """
 
     readings_deg: Float64Array
@@ -45,7 +45,7 @@ class SpotRates:
 
     @property
     def is_measured(self) -> BoolArray:
-        """Which lights have usable rates at two or more readings, shape (L,)."""
+        """Whether a light has usable rates at two or more readings, shape (L,)."""
         return np.array([len(set(self.readings_deg[ok] % 180.0)) >= 2 for ok in self.good.T])
 
 
@@ -55,7 +55,7 @@ def measure_rates(
     aperture_px: Float64Array,
     aperture_fraction: Float64Array,
 ) -> SpotRates:
-    """Return rates of spots at positions (L, 2); apertures hold `aperture_fraction` of each."""
+    """Return rates of spots at positions (L, 2); apertures collect `aperture_fraction` of each."""
     rows = []
     for shot in shots:
         flux = measure_flux(shot, position_px, aperture_px=aperture_px)
@@ -71,14 +71,16 @@ def measure_rates(
 def add_geometry_errors(
     polarizers: PolarizerFit, glass: FacetReflection, eta_stderr: float, angle_rad: Float64Array
 ) -> PolarizerFit:
-    """Return the films with what errors of directions and of the glass's index add to theirs.
+    """Return the polarizers with errors that include those of directions and of the glass's index.
 
-    What is measured is how the reflected light is polarized and how much it is. Near Brewster's
-    angle glass turns the polarization of light fast with the angle, and reflects little.
+    Both the polarization and the amount of the reflected light depend on the angle of incidence:
+    near Brewster's angle glass rotates the polarization fast with the angle, and reflects little.
     """
 
     def seen(turn: Float64Array, reflection: FacetReflection) -> tuple[Float64Array, Float64Array]:
         field = reflection.reflected_fields(turn)[:, 0]
+        # Squared, an axis and its opposite are equal; the phase is twice the angle, the modulus the
+        # reflected intensity.
         doubled = (field[:, 0] + 1j * field[:, 1]) ** 2
         return doubled, np.log(np.abs(doubled))
 
@@ -112,7 +114,7 @@ def add_geometry_errors(
         turned = -angle / slope
         turn2 += turned**2
         share = share + by_turn[1] * turned
-        # what the index changes for all is no difference between lights
+        # a change of the index that is common to all lights is not a difference between them
         share2 += (share - np.median(share) if index else share) ** 2
     covariance = polarizers.covariance.copy()
     covariance[:, 0, 0] += turn2
@@ -134,15 +136,17 @@ def measure_intensities(
     mirrored: MirroredLights,
     direction: Float64Array,
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the light that each light sends to the origin, any common unit, with errors."""
+    """Return the irradiance of each light at the origin, in any common unit, with errors."""
     place = direction * np.linalg.norm([light.position_mm for light in rig.lights], axis=1)[:, None]
     distance2 = np.sum(place**2, axis=1)
-    # lights point at the origin, the ball mirrors them a little beside it
+    # lights are aimed at the origin, whereas the ball mirrors them from slightly next to it
     off = np.arccos(np.clip(np.sum(mirrored.to_light * direction, axis=1), -1.0, 1.0))
     lobe = np.array([led.intensity(float(a)) for led, a in zip(rig.lights, off, strict=True)])
+    # A spot's flux is radiance x emitting area x magnification x lobe towards the ball; the
+    # irradiance at the origin is radiance x emitting area / distance^2.
     per_strength = 1.0 / (mirrored.magnification_px2 * lobe * distance2)
     value = polarizers.strength * per_strength
-    # what the ball's own numbers change, beyond a factor that all lights have in common
+    # effect of the ball's own parameters, except a factor that is common to all lights
     shares = []
     root = np.linalg.cholesky(ball.covariance_mm2 + 1e-18 * np.eye(4))
     for column in root.T:
@@ -163,7 +167,7 @@ def polarizer_table(
     rates: SpotRates,
     eta: float,
 ) -> SpherePolarizers:
-    """Return the films of the lights, with their leakage and the ratio of crossed to parallel."""
+    """Return the polarizers, with their leakage and the ratio of crossed to parallel."""
     usable = rates.good & rates.is_measured
     weight = np.where(usable, 1.0 / np.where(rates.variance > 0, rates.variance, 1.0), 0.0)
     states = []
@@ -178,7 +182,7 @@ def polarizer_table(
     ratio = np.where(seen, crossed / safe, 0.0)
     ratio_stderr = np.where(seen, np.sqrt(c_var + ratio**2 * p_var) / safe, 0.0)
     light_error, analyser_error = polarizers.leak_stderr
-    # axes are measured from the horizontal, which turns fast with the direction near the poles
+    # axes are measured from the horizontal, which rotates fast with the direction near the poles
     upward = lights.directions[:, 1]
     horizon = np.linalg.norm(lights.directions_stderr, axis=1) / np.sqrt(2)
     horizon = horizon * np.abs(upward) / np.sqrt(np.maximum(1.0 - upward**2, 1e-6))

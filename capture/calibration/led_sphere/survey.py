@@ -1,4 +1,4 @@
-"""From photographs of a ball of black glass to the lights and the films of a polarized sphere."""
+"""Calibrate the lights and polarizers of a sphere from photographs of a ball of black glass."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -40,13 +40,13 @@ MAX_ANALYZER_OFFSET_DEG = 2.0
 MAX_POLARIZER_TURN_DEG = 3.0
 MAX_LIGHT_OFFSET_SIGMAS = 5.0
 MAX_LIGHT_OFFSET_DEG = 0.5
-SPOT_MARGIN_MM = 0.06  # around a spot as geometry draws it, for what the lens and the pixels blur
+SPOT_MARGIN_MM = 0.06  # margin around a spot's geometric image, for the blur by lens and pixels
 WAVELENGTH_MM = 5.5e-4
-# of a spot's middle, whatever its light: the pixels' own responses, the polish
+# error of a spot's centroid, independent of its light: the pixels' own responses, the polish
 MIN_CENTER_STDERR_PX = 0.03
-TYPICAL_CENTER_STDERR_PX = 0.1  # about how well middles are known, those of dim spots among them
-MAX_DEAD_INTENSITY = 0.05  # of the mean: a light dimmer than this is dead
-MAX_INTENSITY_STDERR = 0.3  # relative error above which an intensity is not called measured
+TYPICAL_CENTER_STDERR_PX = 0.1  # typical error of centroids, including those of dim spots
+MAX_DEAD_INTENSITY = 0.05  # of the mean: a dimmer light is dead
+MAX_INTENSITY_STDERR = 0.3  # relative error above which an intensity does not count as measured
 # of a usual spot's peak: fainter ones are reflections of spots, or their rings
 STRAY_PEAK_RATIO = 0.2
 MIN_STRAY_DISTANCE_MM = 0.4
@@ -55,22 +55,22 @@ SKIN_ETA = 1.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SphereSurvey:
-    """What photographs of the ball said.
+    """Result of a survey from photographs of the ball.
 
     Attributes
     ----------
     lights : SphereLightTable
     polarizers : SphereFilms
     ball : Ball
-        As found.
+        Ball, as located.
     light_scatter_mm : float
-        Of the lights about their nominal places, along an axis.
+        Scatter of the lights about their nominal positions, along an axis.
     turn_scatter_rad : float
-        Of the lights' polarizers about their nominal axes.
+        Scatter of the lights' polarizers about their nominal axes.
     readings_deg : tuple of float
-        Of the analyser.
+        Readings of the analyzer.
     findings : tuple of str
-        What is wrong with the rig.
+        Faults of the rig.
     """
 
     lights: SphereLightTable
@@ -90,15 +90,15 @@ def describe_findings(
     polarizers: PolarizerFit,
     strays: int,
 ) -> tuple[str, ...]:
-    """Return what is wrong with the rig, one sentence each.
+    """Return the faults of the rig, one sentence each.
 
     Parameters
     ----------
     survey : SphereSurvey
     position_mm : ndarray of float64, shape (L, 3)
-        Nominal places of the lights, mm.
+        Nominal positions of the lights, mm.
     in_field, saturated : ndarray of bool, shape (L,)
-        Lights mirrored within the image, and saturated in every exposure.
+        Lights mirrored inside the image, and saturated in every exposure.
     polarizers : FilmFit
     strays : int
         Number of bright spots that are not reflections of lights.
@@ -160,21 +160,21 @@ def survey_sphere(
     target: GlassBall | None = None,
     eta: float = SKIN_ETA,
 ) -> SphereSurvey:
-    """Find directions, intensities and films of a sphere's lights.
+    """Find directions, intensities and polarizers of a sphere's lights.
 
     Parameters
     ----------
     shots : sequence of Shot
-        Of the ball with all lights on, at two or more readings of the analyser, 0 and 90 among
-        them; several exposures of each keep bright and dim spots within the sensor's range.
+        Exposures of the ball with all lights on, at two or more readings of the analyzer, 0 and 90
+        among them; several exposures of each keep bright and dim spots within the sensor's range.
     rig : Rig
-        Nominal, with polarizers before lights and camera.
+        Nominal, with polarizers in front of lights and camera.
     view : str
         The camera.
     target : GlassBall, optional
         The ball; None: 12 mm, index 1.52.
     eta : float
-        Refractive index of the surface whose leakage is wanted; skin's by default.
+        Refractive index of the surface of the leakage; skin's by default.
 
     Returns
     -------
@@ -185,7 +185,7 @@ def survey_sphere(
     BallError
         If the photographs show no spots, too few, or not those of this rig.
     PolarizationError
-        If the readings do not tell the films.
+        If the readings do not determine the polarizers.
     """
     scene = _Scene(rig, view, target or GlassBall())
     camera, place = scene.camera, scene.place
@@ -193,8 +193,8 @@ def survey_sphere(
     for shot in shots:
         if shot.signal.shape != size:
             raise BallError(
-                f"frames: got {shot.signal.shape} pixels, expected {size} of view {view!r}; is it"
-                " a session of this rig?"
+                f"frames: got {shot.signal.shape} pixels, expected {size} of view {view!r}; is "
+                "it a session of this rig?"
             )
     aperture_px = np.maximum(scene.spot_radius_mm() / scene.pixel_mm, 2.5)
     seen = scene.find_lights(shots, aperture_px)
@@ -220,13 +220,13 @@ def survey_sphere(
     result = SphereSurvey(lights, table, fit.ball, *scatters, readings, ())
     in_field = fit.in_field & (rates.good.any(axis=0) | rates.saturated)
     stray = _bright_strays(seen, scene.pixel_mm)
-    told = describe_findings(result, place, in_field, rates.saturated, films, stray)
-    return replace(result, findings=told)
+    findings = describe_findings(result, place, in_field, rates.saturated, films, stray)
+    return replace(result, findings=findings)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ObservedLights:
-    """The ball, its spots, and the lights' directions by them."""
+    """The ball, its spots, and the lights' directions from them."""
 
     fit: BallFit
     spots: Float64Array
@@ -238,7 +238,7 @@ class _ObservedLights:
 
 
 class _Scene:
-    """A ball before the camera of a rig with a sphere of lights."""
+    """A ball in front of the camera of a rig with a sphere of lights."""
 
     def __init__(self, rig: Rig, view: str, target: GlassBall) -> None:
         self.rig, self.view, self.target = rig, rig.view(view), target
@@ -254,11 +254,11 @@ class _Scene:
         return view.focal_mm / (view.f_number * (1.0 + view.focal_mm / view.distance_mm))
 
     def spot_radius_mm(self) -> Float64Array:
-        """Return the radius of a disc that holds each spot, mm at the plane in focus, shape (L,).
+        """Return the radius of a disc around each spot, mm at the plane in focus, shape (L,).
 
-        A ball shows a distant light where its rays seem to cross, R cos / 2 behind its surface in
-        the plane of incidence and R / (2 cos) across it: far from the axis both lie out of focus,
-        one far.
+        The ball's virtual image of a distant light is R cos / 2 behind its surface in the plane of
+        incidence and R / (2 cos) across it: far from the axis both are out of focus, one of them
+        strongly.
         """
         ball, view = self.target, self.view
         shown = mirror_lights(self.camera, np.array(ball.center_mm), ball.radius_mm, self.place)
@@ -274,7 +274,7 @@ class _Scene:
         return np.asarray(0.5 * wide + SPOT_MARGIN_MM)
 
     def find_lights(self, shots: Sequence[SpotImage], aperture_px: Float64Array) -> _ObservedLights:
-        """Return the lights' directions by their spots; nominal ones where none is measured."""
+        """Return the lights' directions from their spots; nominal ones without a spot."""
         total = _sum_polarization_states(shots)
         spots = find_spots(total.rate, pixel_mm=self.pixel_mm)
         margin_mm = RING_RADII[1] * SPOT_MARGIN_MM
@@ -283,8 +283,8 @@ class _Scene:
         middle, noise_px, clipped = measure_centroids(total, start, aperture_px=aperture_px)
         measured = np.asarray(np.isfinite(middle).all(axis=1), bool)
         if not measured.any():
-            raise BallError("ball: no spot lies whole within the image; centre the ball")
-        # the ball by the spots' middles instead of their brightest pixels
+            raise BallError("ball: no whole spot inside the image; center the ball")
+        # the ball again, by the spots' centroids instead of their maxima
         sharp = locate_ball(
             middle[measured],
             self.camera,
@@ -307,10 +307,10 @@ class _Scene:
     def reflection(
         self, eta: float, to_light: Float64Array, to_camera: Float64Array, facing: Float64Array
     ) -> FacetReflection:
-        """Return the lights as facets of an index mirror them into the camera."""
+        """Return the lights with their mirror facets of a refractive index."""
         axis, name = self.view.analyser_axis_deg, self.view.name
         if axis is None:
-            text = f"view {name!r}: has no analyser; this rig's films cannot be calibrated"
+            text = f"view {name!r}: has no analyzer; this rig's polarizers cannot be calibrated"
             raise BallError(text)
         toward = {"to_light": to_light, "to_camera": to_camera, "facing": facing}
         return FacetReflection.of(self.rig.lights, self.camera, axis, eta, **toward)
@@ -319,7 +319,7 @@ class _Scene:
 def _light_table(
     rig: Rig, seen: _ObservedLights, fluxed: BoolArray, strength: tuple[Float64Array, Float64Array]
 ) -> SphereLightTable:
-    """Return the lights with intensities over their mean, and which are dead."""
+    """Return the lights with intensities over their mean, and the dead ones."""
     intensity, stderr = strength
     lit = fluxed & seen.measured & (intensity > MAX_DEAD_INTENSITY)
     if not lit.any():
@@ -336,7 +336,7 @@ def _light_table(
 
 
 def _bright_strays(seen: _ObservedLights, pixel_mm: float) -> int:
-    """Return how many bright spots belong to no light and lie away from lights' spots."""
+    """Return the number of bright spots that belong to no light and are away from its spots."""
     if not len(seen.fit.stray):
         return 0
     spots, fit = seen.spots, seen.fit
@@ -351,7 +351,7 @@ def _bright_strays(seen: _ObservedLights, pixel_mm: float) -> int:
 
 
 def _sum_polarization_states(shots: Sequence[SpotImage]) -> RateImage:
-    """Return what comes parallel and crossed together, the light of each spot."""
+    """Return the sum of parallel and crossed flux, the light of each spot."""
     by_reading: dict[float, list[SpotImage]] = {}
     for shot in shots:
         by_reading.setdefault(shot.reading_deg, []).append(shot)

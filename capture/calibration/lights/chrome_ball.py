@@ -9,13 +9,13 @@ from scipy.ndimage import label
 from capture.arrays import BoolArray, Float64Array
 from capture.calibration.record import CalibrationError
 
-HIGHLIGHT_LEVEL = 0.9  # of the brightest pixel: what belongs to a highlight
-MIN_HIGHLIGHT_CONTRAST = 4.0  # brightest pixel over the median: below, nothing stands out
+HIGHLIGHT_LEVEL = 0.9  # of the brightest pixel: threshold of a highlight
+MIN_HIGHLIGHT_CONTRAST = 4.0  # brightest pixel over the median: below it nothing is a highlight
 MIN_BALL_PIXELS = 100
 
 
 class ChromeBallError(CalibrationError):
-    """Photographs of a ball that show no light; the message names them."""
+    """Raised for photographs of a ball without a highlight; the message names them."""
 
 
 def directions_from_chrome_ball(images: Sequence[NDArray], mask: NDArray) -> Float64Array:
@@ -24,9 +24,9 @@ def directions_from_chrome_ball(images: Sequence[NDArray], mask: NDArray) -> Flo
     Parameters
     ----------
     images : sequence of ndarray, shape (H, W) or (H, W, 3)
-        One photograph a light, any monotonic scale, the ball at one place.
+        One photograph per light, any monotonic scale, the ball at one position.
     mask : ndarray, shape (H, W) or (H, W, 3)
-        Where the ball is: bool, or brighter than half its largest value.
+        Mask of the ball: bool, or brighter than half its largest value.
 
     Returns
     -------
@@ -36,13 +36,13 @@ def directions_from_chrome_ball(images: Sequence[NDArray], mask: NDArray) -> Flo
     Raises
     ------
     ChromeBallError
-        If shapes differ, the mask holds no ball, or an image shows no highlight; it is named.
+        If shapes differ, the mask is empty, or an image shows no highlight; the message names it.
 
     Notes
     -----
-    The camera looks along -z from far away (orthographic): a highlight at the place of normal n
-    shows a light in the direction 2 (n . z) n - z. Perspective would turn it by up to the angle
-    at which the ball is seen.
+    The camera looks along -z from far away (orthographic): a highlight at the point of normal n is
+    a light in the direction 2 (n . z) n - z. Perspective would rotate it by up to the angle at
+    which the ball is seen.
 
     Examples
     --------
@@ -75,8 +75,8 @@ def directions_from_chrome_ball(images: Sequence[NDArray], mask: NDArray) -> Flo
         spot = _highlight_center(gray, inside)
         if spot is None:
             raise ChromeBallError(
-                f"image {number}: shows no highlight on the ball, expected one that stands out;"
-                " leave it out, or light the ball"
+                f"image {number}: shows no highlight on the ball, expected a bright one; omit "
+                "the image, or light the ball"
             )
         across = (spot - middle) / radius
         x, y = float(across[0]), -float(across[1])
@@ -88,13 +88,13 @@ def directions_from_chrome_ball(images: Sequence[NDArray], mask: NDArray) -> Flo
 
 
 def _highlight_center(gray: NDArray, inside: BoolArray) -> Float64Array | None:
-    """Return column and row of the middle of the brightest spot, or None where none stands out.
+    """Return column and row of the brightest spot's centroid, or None without a bright spot.
 
     Parameters
     ----------
     gray : ndarray of float, shape (H, W)
     inside : ndarray of bool, shape (H, W)
-        Where to look.
+        Mask of the ball.
     """
     values = np.where(inside & np.isfinite(gray), gray, 0.0)
     brightest = float(values.max(initial=0.0))

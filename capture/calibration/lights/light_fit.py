@@ -1,11 +1,11 @@
-"""Intensities and lobes of the lights, gains and vignetting of the cameras, from a white plate.
+"""Fit intensities and lobes of the lights, gains and vignetting of the cameras to a white plate.
 
-The logarithm of what a part of the plate shows is a sum: of the light's intensity, its lobe there,
-the cosine of incidence, the distance, the camera's gain and its vignetting. All frames together are
-fitted by a few Gauss-Newton steps, which also turn the plate at each pose by the little that its
-markers leave open, and give each of its parts the little slope that a flat plate may have. Before
-that, each light is asked whether the shading it makes is its own: the plate's parts, its poses and
-the frames without light tell where a light stands.
+The logarithm of the signal of a part of the plate is a sum: of the light's intensity, its lobe
+there, the cosine of incidence, the distance, the camera's gain and its vignetting. All frames
+together are fitted by a few Gauss-Newton steps. They also fit a small rotation of the plate at each
+pose, within the error of its markers, and a small slope of each part, within the flatness of the
+plate. Before that, the shading of each light is compared with that of all lights: parts, poses and
+dark frames determine the position of a light.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,50 +20,48 @@ from capture.calibration.lights.light_list import CameraResponse, LightTable
 from capture.calibration.lights.white_plate import PlateSamples, WhitePlate
 from capture.calibration.record import CalibrationError
 
-# numbers of a light (intensities, exponent, tilt), of a camera, of a pose or a part
+# parameters of a light (intensities, exponent, tilt), of a camera, of a pose or a part
 N_LIGHT, N_RESPONSE, N_TILT = 6, 5, 2
-MIN_INCIDENCE_COSINE = 0.25  # of incidence: flatter light shows the plate's waves
+MIN_INCIDENCE_COSINE = 0.25  # of incidence: at grazing incidence the plate's waviness dominates
 N_LIGHT_FIT_STEPS = 6
-TILT_PRIOR_RAD = 0.05  # how far an LED may point past the rig's origin
+TILT_PRIOR_RAD = 0.05  # largest angle between an LED's axis and the rig's origin
 EXPONENT_PRIOR_STD = 1.0
-NORMAL_PRIOR_RAD = 2e-3  # of the plate's normal as its markers show it
+NORMAL_PRIOR_RAD = 2e-3  # error of the plate's normal from its markers
 GAIN_PRIOR_STD = 0.2  # relative, of a camera's response
 VIGNETTING_PRIOR_STD = 0.4
-FRAME_RELATIVE_STDERR = (
-    3e-3  # relative, of all parts of a frame: the LED's pulses, the plate's place
-)
+FRAME_RELATIVE_STDERR = 3e-3  # relative, common to a frame: the LED's pulses, the plate's position
 # relative, of a part's mean: responses of pixels, form of the vignetting, cleanness
 PLATE_PART_RELATIVE_STDERR = 3e-3
-DEAD_LIGHT_BRIGHTNESS = 0.02  # of the usual brightness: a light below is dead
+DEAD_LIGHT_BRIGHTNESS = 0.02  # of the usual brightness: a dimmer light is dead
 DEAD_SIGMAS = 5.0
-MAX_SHADING_MISFIT = 3e-3  # part of a light's energy over all frames that its own shading may leave
-MIN_SHADING_MISFIT_RATIO = 5.0  # how much better another light's shading must fit
+MAX_SHADING_MISFIT = 3e-3  # fraction of a light's energy unexplained by its own shading
+MIN_SHADING_MISFIT_RATIO = 5.0  # smallest improvement of the fit by another light's shading
 
 
 class LightFitError(CalibrationError):
-    """Frames of a white plate from which lights cannot be calibrated."""
+    """Raised for frames of a white plate that cannot calibrate the lights."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightFit:
-    """What a white plate says of lights and cameras.
+    """Lights and cameras fitted to frames of a white plate.
 
     Attributes
     ----------
     table : LightTable
-        With intensities, lobes, axes and camera responses; dead lights and those that answer for
-        others are not valid there.
+        Table with intensities, lobes, axes and camera responses; dead and swapped lights are not
+        valid in it.
     dead : tuple of str
-        Lights that were on and gave no light.
+        Lights that were switched on but dark.
     swapped : dict of str to str
-        Lights whose shading is that of another: by the name that was on, the name of the light
-        that seems to have shone.
+        Lights with the shading of another: by the name that was switched on, the name of the light
+        that appears to have shone.
     unobserved : tuple of str
-        Lights of which no frame is usable (the plate never faced them).
+        Lights without a usable frame (the plate never faced them).
     residual : float
         Root mean square relative residual of the parts.
     frames : int
-        How many frames were used.
+        Number of frames used.
     """
 
     table: LightTable
@@ -77,20 +75,20 @@ class LightFit:
 def find_swapped_lights(
     samples: Sequence[PlateSamples], table: LightTable
 ) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Say which lights' frames show another light's shading, and which show none.
+    """Find lights whose frames show another light's shading, and dark ones.
 
     Parameters
     ----------
     samples : sequence of PlateSamples
-        Frames lit by one light each, at several poses of the plate; frames that the light cannot
-        reach belong to them.
+        Frames lit by one light each, at several poses of the plate, including frames that the light
+        cannot reach.
     table : LightTable
-        Where the lights should be.
+        Expected positions of the lights.
 
     Returns
     -------
     answers : dict of str to str
-        By the light that was on, the light whose place explains the frames.
+        By the light that was on, the light whose position explains the frames.
     dead : tuple of str
         Lights whose frames are dark although they should not be.
     """
@@ -132,7 +130,7 @@ def find_swapped_lights(
         and table.names[other] != name
         and own_left > max(MAX_SHADING_MISFIT, MIN_SHADING_MISFIT_RATIO * other_left)
     }
-    # a light that shines elsewhere leaves its own place dark, too: it is not dead
+    # a light that shines elsewhere leaves its own position dark, too: it is not dead
     dark_but_elsewhere = {n for n in dead if best[n][2] < 0.05 and level[n][1] > DEAD_SIGMAS}
     answers.update({n: table.names[best[n][1]] for n in dark_but_elsewhere})
     return answers, tuple(n for n in dead if n not in dark_but_elsewhere)
@@ -161,8 +159,8 @@ def fit_lights(
     Returns
     -------
     LightFit
-        The cameras' gains have a geometric mean of 1 in each channel; the plate's common error of
-        reflectance is not in the standard errors.
+        The cameras' gains have a geometric mean of 1 in each channel; the standard errors do not
+        include the common error of the plate's reflectance.
 
     Raises
     ------
@@ -176,8 +174,9 @@ def fit_lights(
             fit.add(row)
     if not fit.frames:
         raise LightFitError(
-            f"samples: none of {len(samples)} frames shows the plate lit from its front, neither"
-            " dark nor saturated; check exposure, order of the lights and the plate's places"
+            f"samples: none of {len(samples)} frames shows the plate lit from its front, "
+            "neither dark nor saturated; check exposure, order of the lights and the plate's "
+            "positions"
         )
     with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
         return fit.solve(dead, answers)
@@ -185,25 +184,25 @@ def fit_lights(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Frame:
-    """A frame's parts with all that does not change while fitting."""
+    """A frame's parts with all quantities that are constant during the fit."""
 
     light: int
     view: str
     pose: int
     part: Int64Array  # (n,)
-    turns: Float64Array  # how the log follows small slopes of the plate along its axes, (n, 2)
+    turns: Float64Array  # derivative of the log by small slopes of the plate along its axes, (n, 2)
     known: Float64Array  # log of white, cosine, distance, (n,)
     direction: Float64Array  # unit vectors from the light to the parts, (n, 3)
-    r2: Float64Array  # squared distance from the image's middle, 1 in the corner
+    r2: Float64Array  # squared distance from the image's center, 1 in the corner
     log_signal: Float64Array  # (n, 3)
     relative: Float64Array  # relative variance, (n, 3)
 
 
 class _Fit:
-    """Frames of a plate, and the numbers that explain them.
+    """Frames of a plate, and the parameters of the model.
 
-    The numbers are in this order: those of each light, of each camera's response, the turn of the
-    plate at each pose, and the slope of each of its parts.
+    Order of the parameters: each light, each camera's response, the rotation of the plate at each
+    pose, and the slope of each of its parts.
     """
 
     def __init__(
@@ -213,7 +212,7 @@ class _Fit:
         self.views = sorted(cameras)
         self.frames: list[_Frame] = []
         self._poses: dict[bytes, int] = {}
-        self._responses = N_LIGHT * len(table.names)  # where the cameras' numbers begin
+        self._responses = N_LIGHT * len(table.names)  # index of the first camera parameter
         self._turns = self._responses + N_RESPONSE * len(cameras)
         up = np.where(np.abs(table.axis[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
         side = np.cross(table.axis, up)
@@ -255,6 +254,8 @@ class _Fit:
         prior[last:relief] = 1 / NORMAL_PRIOR_RAD**2
         prior[relief:] = 1 / self.plate.slope_rad**2
         used = np.zeros(total, bool)
+        # Intensities and gains share a free factor per channel. It is fixed by a strong weight on
+        # the sum of the cameras' log gains, so that their geometric mean is 1.
         gauge = np.zeros((3, total))
         gauge[:, self._responses : last] = np.tile(np.eye(3, N_RESPONSE), len(self.views))
         numbers = middle.copy()
@@ -274,7 +275,8 @@ class _Fit:
                 r, J = self._rows(f, numbers, columns)
                 w = 1 / f.relative.ravel()
                 JW = J * w[:, None]
-                # parts of a frame share an error: Woodbury's formula
+                # parts of a frame share an error, covariance D + s^2 1 1': inverted by Woodbury's
+                # formula
                 ones = JW.sum(axis=0)
                 share = FRAME_RELATIVE_STDERR**2 / (1 + FRAME_RELATIVE_STDERR**2 * w.sum())
                 H[np.ix_(columns, columns)] += JW.T @ J - share * np.outer(ones, ones)
@@ -297,7 +299,7 @@ class _Fit:
         return LightFit(table, dead, swapped, unseen, rms, len(self.frames))
 
     def _columns(self, f: _Frame) -> Int64Array:
-        """Return where the numbers of a frame's light, camera and pose are."""
+        """Return the columns of a frame's light, camera and pose."""
         camera = self._responses + N_RESPONSE * self.views.index(f.view)
         starts = (N_LIGHT * f.light, camera, self._turns + N_TILT * f.pose)
         sizes = (N_LIGHT, N_RESPONSE, N_TILT)
@@ -306,7 +308,7 @@ class _Fit:
     def _rows(
         self, f: _Frame, numbers: Float64Array, columns: Int64Array
     ) -> tuple[Float64Array, Float64Array]:
-        """Return residuals, model minus seen, shape (3 n,), and how they follow the columns."""
+        """Return residuals, model minus measured, shape (3 n,), and derivatives by the columns."""
         n = len(f.known)
         mine = numbers[columns]
         light, camera = mine[:N_LIGHT], mine[N_LIGHT : N_LIGHT + N_RESPONSE]
@@ -340,7 +342,7 @@ class _Fit:
         return axis, *((way - (way @ axis) * axis) / length for way in (side, across))
 
     def _table(self, numbers: Float64Array, errors: Float64Array) -> tuple[LightTable, BoolArray]:
-        """Return what the numbers say of lights and cameras, and which lights were seen."""
+        """Return lights and cameras of the fitted parameters, and the observed lights."""
         table, lights = self.table, len(self.table.names)
         rows = numbers[: self._responses].reshape(lights, N_LIGHT)
         row_errors = errors[: self._responses].reshape(lights, N_LIGHT)
@@ -367,7 +369,7 @@ class _Fit:
 
 
 def _shapes(table: LightTable, points: Float64Array, normals: Float64Array) -> Float64Array:
-    """Return what each light of intensity 1 gives to points with normals, shape (L, n)."""
+    """Return the signal of each light of intensity 1 at points with normals, shape (L, n)."""
     to_light = table.position_mm[:, None] - points
     distance = np.linalg.norm(to_light, axis=-1)
     cosine = np.clip(np.sum(to_light * normals, axis=-1) / distance, 0.0, None)

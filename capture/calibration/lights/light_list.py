@@ -1,4 +1,4 @@
-"""What the rig's lights give where: positions, intensities, lobes, and the cameras' response."""
+"""Calibrated lights of a rig: positions, intensities, lobes, and the cameras' responses."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from capture.calibration.record import (
 )
 from capture.rig import Rig
 
-_OMITTED: Any = None  # __post_init__ puts an array in its place
+_OMITTED: Any = None  # __post_init__ replaces it by an array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraResponse:
-    """How strongly a camera answers, relative to the mean of the rig's cameras.
+    """Response of a camera, relative to the mean of the rig's cameras.
 
     Attributes
     ----------
     gain : ndarray of float64, shape (3,)
         Per channel, 1 for the mean camera.
     vignetting : ndarray of float64, shape (2,)
-        Response at distance r from the image's middle, r = 1 in the corner, is
-        ``gain (1 + v0 r^2 + v1 r^4)``.
+        Response at distance r from the image's center, r = 1 in the corner, is ``gain (1 + v0 r^2 +
+        v1 r^4)``.
     gain_stderr, vignetting_stderr : ndarray of float64, shapes (3,) and (2,)
         Standard errors.
     """
@@ -45,7 +45,7 @@ class CameraResponse:
     vignetting_stderr: Float64Array = field(default_factory=lambda: np.zeros(2))
 
     def __post_init__(self) -> None:
-        """Convert to float64 and refuse what is no response."""
+        """Convert to float64 and reject invalid responses."""
         freeze_arrays(self, (3,), "gain", "gain_stderr")
         freeze_arrays(self, (2,), "vignetting", "vignetting_stderr")
         if (self.gain <= 0).any() or 1 + self.vignetting.sum() <= 0:
@@ -81,10 +81,10 @@ class CameraResponse:
 class LightTable:
     """The lights of a rig as the reconstruction needs them.
 
-    A perfect Lambertian white at distance d from light l, its normal turned by theta from the
-    direction to the light, at phi off the light's axis, gives
-    ``signal = intensity[l] cos(phi)**exponent[l] cos(theta) / d**2`` in camera RGB (fraction of
-    full scale per second of light at level 1) to a camera of response 1.
+    A perfect Lambertian white at distance d from light l, its normal rotated by theta from the
+    direction to the light, at phi off the light's axis, gives ``signal = intensity[l]
+    cos(phi)**exponent[l] cos(theta) / d**2`` in camera RGB (fraction of full scale per second of
+    light at level 1) to a camera of response 1.
 
     Attributes
     ----------
@@ -93,17 +93,17 @@ class LightTable:
     intensity : ndarray of float64, shape (L, 3)
         Camera RGB, fraction of full scale per second x mm^2, >= 0.
     exponent : ndarray of float64, shape (L,)
-        Of the lobe, >= 0; 0: the same in all directions.
+        Exponent of the lobe, >= 0; 0: the same in all directions.
     names : tuple of str
-        Names of the lights, one each.
+        Names of the lights, unique.
     axis : ndarray of float64, shape (L, 3)
-        Unit vectors in which the lights point; by default at the rig's origin.
+        Unit vectors of the lights' axes; by default towards the rig's origin.
     valid : ndarray of bool, shape (L,)
-        False for lights that must not be used (dead, or their place unknown).
+        False for lights that must not be used (dead, or of unknown position).
     position_stderr_mm, intensity_stderr, exponent_stderr : ndarray of float64
         Standard errors, shapes as the values; 0: nominal.
     cameras : mapping of str to CameraResponse
-        By serial; a camera that is not named has response 1.
+        Responses by serial; a camera without an entry has response 1.
     """
 
     position_mm: Float64Array
@@ -146,15 +146,15 @@ class LightTable:
 
     @classmethod
     def nominal(cls, rig: Rig, *, white_per_s: float = 1.0) -> LightTable:
-        """Return the lights as the rig's file describes them.
+        """Return the nominal lights from the rig file.
 
         Parameters
         ----------
         rig : Rig
             With LEDs; a flash counts by its energy.
         white_per_s : float
-            Signal per second of a perfect white at the rig's origin that faces a light of 1 W:
-            the file does not say it, so that nominal intensities are relative. > 0.
+            Signal per second of a perfect white at the rig's origin that faces a 1 W light. The
+            rig file does not contain it, so that nominal intensities are relative. > 0.
 
         Examples
         --------
@@ -195,7 +195,7 @@ class LightTable:
         Raises
         ------
         ValueError
-            If a point lies in a light.
+            If a point is at a light.
         """
         points = np.atleast_2d(np.asarray(points_mm, dtype=np.float64))
         to_light = self.position_mm[:, None] - points[None]

@@ -1,7 +1,7 @@
-"""Places of lights from their highlights on mirror spheres, seen by several cameras.
+"""Locate lights by their highlights on mirror spheres, seen by several cameras.
 
-Every highlight says: a light lies on this reflected ray. All highlights together place the lights,
-and correct the spheres' centres within the errors that their outlines left.
+Each light is on the reflected ray of its highlight. All highlights together locate the lights, and
+correct the spheres' centers within the errors of their outlines.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from capture.calibration.lights.mirror_sphere import MirrorSphereError, SpherePo
 from capture.calibration.lights.reflection import reflect, reflection_pixels, reflection_points
 from capture.calibration.robust import huber_weights, mad_sigma
 
-MIN_RIM_DISTANCE_PX = 1.5  # highlights closer to the outline are left alone
+MIN_RIM_DISTANCE_PX = 1.5  # highlights closer to the outline are ignored
 HIGHLIGHT_NOISE_SIGMAS = 8.0  # above the median in the sphere
 # of the brightest pixel in the sphere: fainter spots are reflections of spots
 MIN_HIGHLIGHT_PEAK = 0.02
-# how far a light may be from a reflected ray to be the one that made it
+# largest distance of a light from a reflected ray that it can have caused
 LIGHT_GATE_MM = 60.0
 MIN_HIGHLIGHT_CAMERAS = 2
 MIN_HIGHLIGHTS = 3
-# of a highlight's middle, whatever its size: noise, the surface's polish
+# error of a highlight's centroid, whatever its size: noise, the surface's polish
 MIN_HIGHLIGHT_STDERR_PX = 0.03
 MAX_MIRROR_STEPS = 25
-MIRROR_STEP_TOL = 1e-3  # square of the last step over its standard errors, all numbers together
+MIRROR_STEP_TOL = 1e-3  # square of the last step over its standard errors, all parameters together
 DERIVATIVE_STEP_MM = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SphereWindow:
-    """The part of an image that shows a sphere; made once for a camera and a sphere.
+    """Part of an image that shows a sphere; made once for a camera and a sphere.
 
     Attributes
     ----------
     rows, columns : slice
         Smallest box around it.
     inside : ndarray of bool
-        Pixels of the box well inside the outline.
+        Pixels of the window well inside the outline.
     """
 
     rows: slice
@@ -79,14 +79,14 @@ class SphereWindow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Highlights:
-    """Bright spots that one camera saw in one sphere while some lights were on.
+    """Bright spots of one camera in one sphere while some lights were on.
 
     Attributes
     ----------
     view : str
         Name of the camera.
     sphere : int
-        Number of the sphere's place.
+        Number of the sphere's position.
     lit : tuple of str
         Names of the lights that were on.
     pixels : ndarray of float64, shape (n, 2)
@@ -101,26 +101,26 @@ class Highlights:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightPositions:
-    """Where the lights are.
+    """Positions of the lights.
 
     Attributes
     ----------
     names : tuple of str
     position_mm : ndarray of float64, shape (L, 3)
-        Rig frame; the nominal place where not `valid`.
+        Rig frame; the nominal position where not `valid`.
     covariance_mm2 : ndarray of float64, shape (L, 3, 3)
         0 where not `valid`.
     cameras, highlights : ndarray of int64, shape (L,)
-        How many cameras and highlights placed each light.
+        Number of cameras and highlights that locate each light.
     valid : ndarray of bool, shape (L,)
         At least 2 cameras and 3 highlights.
     unobserved : tuple of str
-        Lights that were on and should have been seen, but never were: dead or not connected.
+        Lights that were on and should have been visible, but never were: dead or not connected.
     swapped : dict of str to str
-        Lights at whose place another one shone: by the name that was switched on, the name of the
-        light whose nominal place was seen. Their positions are those seen.
+        Lights at whose position another one shone: by the name that was switched on, the name of
+        the light whose nominal position was observed. Their positions are the observed ones.
     sigma_px : float
-        Noise of a highlight's coordinate that the residuals show.
+        Noise of a highlight's coordinate, estimated from the residuals.
     """
 
     names: tuple[str, ...]
@@ -145,13 +145,13 @@ def find_highlights(image: NDArray, window: SphereWindow) -> Float64Array:
     Parameters
     ----------
     image : ndarray of float, shape (H, W)
-        Gray, linear, full resolution; saturated pixels hold what they read.
+        Gray, linear, full resolution; saturated pixels keep their values.
     window : SphereWindow
 
     Returns
     -------
     ndarray of float64, shape (n, 2)
-        Intensity-weighted middle of each spot, px, brightest first.
+        Intensity-weighted centroid of each spot, px, brightest first.
     """
     part = np.asarray(image[window.rows, window.columns], np.float64)
     values = part[window.inside]
@@ -166,7 +166,8 @@ def find_highlights(image: NDArray, window: SphereWindow) -> Float64Array:
     spots, count = label(above > limit, structure=np.ones((3, 3)))
     pixels, flux = [], []
     for k in range(1, count + 1):
-        # its faint border belongs to a spot, too: without it the middle leans to bright pixels
+        # its faint border belongs to a spot, too: without it the centroid is biased to bright
+        # pixels
         spot = binary_dilation(spots == k) & ((spots == k) | (spots == 0))
         rows, columns = np.nonzero(spot)
         weight = np.clip(above[rows, columns], 0.0, None)
@@ -186,22 +187,22 @@ def locate_lights(
     light_radius_mm: float = 10.0,
     nominal_stderr_mm: float | None = None,
 ) -> LightPositions:
-    """Place lights by their highlights.
+    """Locate lights by their highlights.
 
     Parameters
     ----------
     highlights : sequence of Highlights
-        Of all cameras, spheres and groups of lights.
+        Highlights of all cameras, spheres and groups of lights.
     cameras : mapping of str to CameraPose
         Calibrated, by view name.
     spheres : mapping of int to SpherePosition
     nominal : mapping of str to array_like, shape (3,)
-        Where each light should be, mm; it tells highlights apart and starts the fit.
+        Expected position of each light, mm; it identifies highlights and starts the fit.
     light_radius_mm : float
-        Radius of the lights' discs, mm, >= 0; it tells how wide their images are.
+        Radius of the lights' discs, mm, >= 0; it determines the size of their images.
     nominal_stderr_mm : float, optional
-        Standard deviation of the lights about their nominal places, mm: what few highlights leave
-        open follows the drawing. None takes nothing from the drawing.
+        Standard deviation of the lights about their nominal positions, mm: a prior for lights with
+        few highlights. None uses no prior.
 
     Returns
     -------
@@ -217,9 +218,9 @@ def locate_lights(
     matched, answers, unseen = scene.match(highlights)
     if not matched:
         raise MirrorSphereError(
-            f"highlights: none of {sum(len(s.pixels) for s in highlights)} spots lies where one"
-            f" of the"
-            f" {len(names)} lights would show; check the spheres, the cameras and the exposure"
+            f"highlights: none of {sum(len(s.pixels) for s in highlights)} spots is where one "
+            f"of the {len(names)} lights would appear; check the spheres, the cameras and the "
+            "exposure"
         )
     for name, other in answers.items():
         start[names.index(name)] = nominal[other]
@@ -230,8 +231,8 @@ def locate_lights(
     used = [m for m in matched if valid[m[0]]]
     if not used:
         raise MirrorSphereError(
-            f"highlights: no light was seen by {MIN_HIGHLIGHT_CAMERAS} cameras in {MIN_HIGHLIGHTS}"
-            " images; show the sphere at more places, to more cameras"
+            f"highlights: no light was observed by {MIN_HIGHLIGHT_CAMERAS} cameras in "
+            f"{MIN_HIGHLIGHTS} images; show the sphere at more positions, to more cameras"
         )
     with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
         position, covariance, sigma = scene.adjust(used, start, light_radius_mm, nominal_stderr_mm)
@@ -243,7 +244,7 @@ _Matched = tuple[int, str, int, Float64Array]  # light, view, sphere, pixel
 
 
 class _Scene:
-    """Cameras, spheres and lights, whose spots are matched and whose places are adjusted."""
+    """Cameras, spheres and lights: match the spots and adjust the positions."""
 
     def __init__(
         self,
@@ -257,7 +258,7 @@ class _Scene:
     def match(
         self, highlights: Sequence[Highlights]
     ) -> tuple[list[_Matched], dict[str, str], tuple[str, ...]]:
-        """Say which light made which spot; lights that answer for others; lights never seen."""
+        """Return the light of each spot, swapped lights, and lights never observed."""
         names, matched = self.names, list[_Matched]()
         expected: Counter[int] = Counter()
         found: Counter[int] = Counter()
@@ -268,7 +269,7 @@ class _Scene:
             lit = [names.index(name) for name in shot.lit]
             places = self.nominal_mm[lit]
             where = reflection_pixels(camera, sphere.center_mm, sphere.radius_mm, places)
-            # lights well in view: their highlight is not squeezed at the rim
+            # lights well in view: their highlight is not compressed at the rim
             visible = _is_clear_of_rim(camera, sphere, where) if len(lit) else np.zeros(0, bool)
             expected.update(k for k, ok in zip(lit, visible, strict=True) if ok)
             if not len(shot.pixels):
@@ -310,9 +311,10 @@ class _Scene:
         light_radius_mm: float,
         nominal_stderr_mm: float | None,
     ) -> tuple[Float64Array, Float64Array, float]:
-        """Return all lights' places and covariances and the rms of a coordinate.
+        """Return all lights' positions and covariances and the rms of a coordinate.
 
-        Newton's method on the lights and the spheres' centres, which also the outlines hold.
+        Newton's method on the lights and on the spheres' centers, which the outlines constrain,
+        too.
         """
         numbers = sorted(self.spheres)
         lights, light_of = np.unique([m[0] for m in matched], return_inverse=True)
@@ -321,6 +323,7 @@ class _Scene:
         position = start.copy()
         outlines = [self.spheres[n] for n in numbers]
         centers = np.array([sphere.center_mm for sphere in outlines])
+        # The outlines act as a normal prior of each sphere's center.
         stiffness = [np.linalg.inv(s.covariance_mm2 + 1e-12 * np.eye(3)) for s in outlines]
         sphere_of = np.array([numbers.index(m[2]) for m in matched])
         columns = np.stack([3 * light_of, base + 3 * sphere_of], axis=1)[..., None] + np.arange(3)
@@ -328,7 +331,7 @@ class _Scene:
         H, r, robust, count = np.eye(total), np.zeros((1, 2)), np.ones(1), 1.0
         for _ in range(MAX_MIRROR_STEPS):
             r, J = self._rows(matched, centers[sphere_of], position[lights][light_of])
-            # a spot narrower than a pixel hides where in the pixel it is
+            # within a spot narrower than a pixel, the position in the pixel is unknown
             width = 2 * light_radius_mm * np.linalg.norm(J[:, :, :3], axis=2)
             usual = np.sqrt(MIN_HIGHLIGHT_STDERR_PX**2 + np.clip(1 - width, 0, None) ** 3 / 12)
             z = r / usual
@@ -390,7 +393,7 @@ class _Scene:
 
 
 def _is_clear_of_rim(camera: CameraPose, sphere: SpherePosition, pixels: Float64Array) -> BoolArray:
-    """Return which pixels lie in the inner nine tenths of a sphere and in the image."""
+    """Return the pixels in the inner nine tenths of a sphere and in the image."""
     inside = np.zeros(len(pixels), bool)
     good = np.isfinite(pixels).all(axis=1)
     good &= (pixels > 1).all(axis=1) & (pixels < np.array(camera.image_size) - 2).all(axis=1)
@@ -406,7 +409,7 @@ def _is_clear_of_rim(camera: CameraPose, sphere: SpherePosition, pixels: Float64
 def _ray_distance_mm(
     camera: CameraPose, sphere: SpherePosition, pixels: Float64Array, lights_mm: Float64Array
 ) -> Float64Array:
-    """Return how far each light is from each reflected ray, mm, shape (spots, lights)."""
+    """Return the distance of each light from each reflected ray, mm, shape (spots, lights)."""
     point, direction, hit = reflect(camera, pixels, sphere.center_mm, sphere.radius_mm)
     to_light = lights_mm[None] - point[:, None]
     along = np.einsum("slk,sk->sl", to_light, direction)

@@ -1,8 +1,8 @@
-"""A mirror sphere in calibrated cameras: where it is, and what it shows where.
+"""Locate a mirror sphere in calibrated cameras by its outlines.
 
-The rays that touch a sphere form a cone around the ray to its centre; a camera sees the cone as an
-ellipse whose middle is not the centre's image. Centres are therefore fitted to rays, never to a
-circle in the image.
+The rays that touch a sphere form a cone around the ray to its center. Its image is an ellipse whose
+middle is not the center's image. Centers are therefore fitted to rays, never to a circle in the
+image.
 """
 
 from collections.abc import Mapping
@@ -18,8 +18,8 @@ from capture.calibration.geometry import CameraPose
 from capture.calibration.record import CalibrationError
 from capture.calibration.robust import HUBER_SIGMAS, mad_sigma
 
-N_OUTLINE_ANGLES = 180  # places on the outline where an edge is sought
-EDGE_SEARCH_RADII = 0.12  # how far from the outline, of its radius, in the first search
+N_OUTLINE_ANGLES = 180  # points on the outline where an edge is searched
+EDGE_SEARCH_RADII = 0.12  # distance from the outline, relative to its radius, in the first search
 MIN_EDGE_SEARCH_PX = 3.0
 EDGE_STEP_PX = 0.25
 FINE_STEP_PX = 0.125
@@ -31,16 +31,16 @@ MIN_OUTLINE_EDGES = 30
 MAX_GLARE_RATIO = 1.15
 VOTE_CELL_PX = 2.0  # cells of the search for the sphere
 MAX_RADIUS_SIGMAS = 5.0
-MAX_RADIUS_MISFIT = 0.002  # relative difference of the radius below which nothing is said
+MAX_RADIUS_MISFIT = 0.002  # relative difference of the radius that is accepted
 
 
 class MirrorSphereError(CalibrationError):
-    """Images in which a mirror sphere cannot be located; the message names them."""
+    """Raised for images in which a mirror sphere cannot be located; the message names them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpherePosition:
-    """Where a sphere is.
+    """Position of a sphere.
 
     Attributes
     ----------
@@ -49,13 +49,13 @@ class SpherePosition:
     radius_mm : float
         As given.
     covariance_mm2 : ndarray of float64, shape (3, 3)
-        Of the centre.
+        Covariance of the center.
     rms_px : float
         Root mean square distance of edges to the fitted outline.
     fitted_radius_mm, fitted_radius_stderr_mm : float
-        What the outlines say of the radius when it is left free; infinite error with one camera.
+        Radius fitted to the outlines; infinite error with one camera.
     cameras : tuple of str
-        Those whose outline was used.
+        Cameras whose outline was used.
     """
 
     center_mm: Float64Array
@@ -73,17 +73,17 @@ def find_outline(image: NDArray, camera: CameraPose, radius_mm: float) -> Float6
     Parameters
     ----------
     image : ndarray of float, shape (H, W)
-        Gray, linear, noise even enough; the sphere is darker than what is behind it.
+        Gray, linear, noise nearly uniform; the sphere is darker than its background.
     camera : CameraPose
     radius_mm : float
-        Of the sphere.
+        Radius of the sphere.
 
     Returns
     -------
     ndarray of float64, shape (n, 2), or None
-        Columns and rows of edges, px; None where no outline stands out.
+        Columns and rows of edges, px; None when no outline is found.
     """
-    gray = np.sqrt(np.clip(np.asarray(image, np.float64), 0.0, None))  # even noise
+    gray = np.sqrt(np.clip(np.asarray(image, np.float64), 0.0, None))  # uniform noise
     distance = float(np.linalg.norm(camera.center_mm))
     focal = float(camera.matrix[0, 0])
     start = _vote(gray, [focal * radius_mm / (distance * f) for f in (0.9, 0.95, 1.0, 1.05, 1.1)])
@@ -123,7 +123,7 @@ def locate_sphere(
         Edges by view name, see `find_outline`.
     cameras : mapping of str to CameraPose
     radius_mm : float
-        Of the sphere, > 0.
+        Radius of the sphere, > 0.
     check_radius : bool
         Whether outlines that contradict the radius are an error.
 
@@ -134,7 +134,7 @@ def locate_sphere(
     Raises
     ------
     SphereError
-        If there is no outline, or the outlines of several cameras contradict the radius.
+        If the outline is missing, or the outlines of several cameras contradict the radius.
     """
     if not outlines or not radius_mm > 0:
         raise MirrorSphereError(
@@ -155,9 +155,9 @@ def locate_sphere(
             MAX_RADIUS_SIGMAS * free_stderr, MAX_RADIUS_MISFIT * radius_mm
         ):
             raise MirrorSphereError(
-                f"radius_mm: got {radius_mm:g}, but the outlines in {len(outlines)} cameras say"
-                f" {free_radius:.3f} ± {free_stderr:.3f} mm; measure the sphere, or calibrate the"
-                " cameras"
+                f"radius_mm: got {radius_mm:g}, but the outlines in {len(outlines)} cameras "
+                f"give {free_radius:.3f} ± {free_stderr:.3f} mm; measure the sphere, or "
+                "calibrate the cameras"
             )
     residual = np.concatenate(
         [_outline_px(cameras[n], edges, center, radius_mm) for n, edges in outlines.items()]
@@ -183,6 +183,8 @@ def contour(
     other = np.cross(axis, side)
     turn = np.arange(count) * 2 * np.pi / count
     ring = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * other
+    # The touching rays have the half angle asin(R / d): their circle has the radius R cos and is d
+    # cos^2 away along the axis.
     sine = radius_mm / distance
     # where rays touch: the circle in which the polar plane cuts the sphere
     touch = camera.center_mm + distance * (1 - sine**2) * axis
@@ -190,7 +192,7 @@ def contour(
 
 
 def _vote(gray: Float64Array, radii_px: list[float]) -> tuple[Float64Array, float] | None:
-    """Return middle and radius of the dark disc that most edges point away from."""
+    """Return center and radius of the dark disc that most edges point away from."""
     smooth = gaussian_filter(gray, 1.5)
     gy, gx = np.gradient(smooth)
     size = np.hypot(gx, gy)
@@ -236,7 +238,7 @@ def _edges(
     shift = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1.0), 0.0)
     found = outline + (steps[at] + np.clip(shift, -1, 1) * EDGE_STEP_PX)[:, None] * outward
     inside = _in_image(found, gray.shape, 1.0)
-    # edges much weaker than most are none, and lights near the rim or behind it make false ones
+    # edges much weaker than most are dropped: lights near the rim or behind it cause false ones
     strong = peak > 0.3 * np.median(peak[fine]) if fine.any() else fine
     background = np.median(lines[:, steps > 0])
     dark = lines.max(axis=1) < MAX_GLARE_RATIO * background
@@ -248,10 +250,11 @@ def _fine_edges(
 ) -> Float64Array:
     """Return edges to a few hundredths of a pixel, near an outline known to about one.
 
-    Just inside the rim a sphere shows what is just behind it, then, as the root of the distance,
-    what is farther round: the steep slope moves the place of the steepest slope. Each line across
-    the edge is therefore fitted by a straight background outside and by a constant, a root and a
-    slope inside, blurred by a pixel; the edge is where such a line fits best.
+    Just inside the rim a sphere mirrors the background next to it, then, as the square root of the
+    distance, the background farther round: the slope of the mirrored background shifts the steepest
+    point. Each line across the edge is therefore fitted by a straight background outside and by a
+    constant, a root and a slope inside, blurred by a pixel; the edge is the position of the best
+    fit.
     """
     outline, outward = _outline(camera, center, radius_mm)
     half = min(
@@ -294,7 +297,7 @@ def _edge_basis_cached(steps: tuple[float, ...], at: float) -> Float64Array:
 
 
 def _edge_basis(steps: Float64Array, at: float) -> Float64Array:
-    """Return an orthonormal basis of lines with an edge at a place, shape (steps, 5)."""
+    """Return an orthonormal basis of lines with an edge at a position, shape (steps, 5)."""
     return _edge_basis_cached(tuple(np.round(steps, 6).tolist()), round(float(at), 6))
 
 
@@ -316,11 +319,12 @@ def _in_image(pixels: Float64Array, shape: tuple[int, ...], margin: float) -> Bo
 
 
 def _fit_single_outline(edges: Float64Array, camera: CameraPose, radius_mm: float) -> Float64Array:
-    """Return a centre from one outline: by the axis and angle of its cone."""
+    """Return a center from one outline, by the axis and angle of its cone."""
     rays = camera.rays(edges)
     # rays of a cone end in a plane: rays @ a = 1 with a along the axis
     a = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0]
     cosine = min(1.0 / float(np.linalg.norm(a)), 1 - 1e-12)
+    # |a| is 1 / cos of the cone's half angle, and the sine of the half angle is radius over range.
     range_mm = radius_mm / np.sqrt(1 - cosine**2)
     return np.asarray(camera.center_mm + range_mm * a / np.linalg.norm(a))
 
@@ -328,7 +332,7 @@ def _fit_single_outline(edges: Float64Array, camera: CameraPose, radius_mm: floa
 def _outline_px(
     camera: CameraPose, edges: Float64Array, sphere: Float64Array, radius_mm: float
 ) -> Float64Array:
-    """Return how far edges are outside the outline, px near the image's middle."""
+    """Return the distance of edges outside the outline, px near the image's center."""
     radius = sphere[3] if len(sphere) == 4 else radius_mm
     to_center = sphere[:3] - camera.center_mm
     distance = np.linalg.norm(to_center)
@@ -346,7 +350,7 @@ def _fit(
     *,
     free_radius: bool = False,
 ) -> tuple[Float64Array, float, Float64Array]:
-    """Return centre (and radius), the edges' noise and the normal matrix of a robust fit."""
+    """Return center (and radius), the edges' noise and the normal matrix of a robust fit."""
     sphere = np.append(start[:3], radius_mm) if free_radius else np.array(start[:3])
 
     def residuals(at: Float64Array) -> Float64Array:

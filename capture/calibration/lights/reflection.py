@@ -1,4 +1,4 @@
-"""Reflection in a sphere: where rays go from it, and where it shows a light."""
+"""Reflection in a sphere: reflected rays of pixels, and mirror points of lights."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ REFLECTION_TOL_RAD = 1e-12
 def reflect(
     camera: CameraPose, pixels: Float64Array, center_mm: Float64Array, radius_mm: float
 ) -> tuple[Float64Array, Float64Array, BoolArray]:
-    """Return where rays of pixels meet a sphere and where they go from there.
+    """Return where rays of pixels meet a sphere, and their reflected directions.
 
     Parameters
     ----------
@@ -42,20 +42,20 @@ def reflect(
 def reflection_points(
     eyes_mm: Float64Array, centers_mm: Float64Array, radius_mm: float, lights_mm: Float64Array
 ) -> tuple[Float64Array, BoolArray]:
-    """Return where spheres show lights to eyes.
+    """Return the mirror points of lights on spheres.
 
     Parameters
     ----------
     eyes_mm, centers_mm, lights_mm : ndarray, shape (n, 3)
-        Centres of projection, of the spheres, and points outside the spheres.
+        Centers of projection, of the spheres, and points outside the spheres.
     radius_mm : float
-        Of the spheres.
+        Radius of the spheres.
 
     Returns
     -------
     point_mm : ndarray of float64, shape (n, 3)
     seen : ndarray of bool, shape (n,)
-        False where the point is turned away from the eye or the light.
+        False where the point faces away from the eye or the light.
 
     Notes
     -----
@@ -64,6 +64,8 @@ def reflection_points(
     """
     r = radius_mm
     to_eye, to_light = eyes_mm - centers_mm, lights_mm - centers_mm
+    # In the plane of eye, center and light, with e towards the eye: the eye is at (D, 0), the light
+    # at (x, y), and the mirror point r (cos a, sin a) has a between 0 and the light's azimuth.
     D = np.linalg.norm(to_eye, axis=-1)
     e = to_eye / D[:, None]
     x = np.sum(to_light * e, axis=-1)
@@ -96,7 +98,7 @@ def reflection_points(
 def reflection_pixels(
     camera: CameraPose, center_mm: Float64Array, radius_mm: float, lights_mm: Float64Array
 ) -> Float64Array:
-    """Return where a sphere shows lights to a camera, shape (n, 2); NaN where it does not.
+    """Return the pixels of lights mirrored in a sphere, shape (n, 2); NaN where invisible.
 
     Parameters
     ----------
@@ -117,7 +119,7 @@ DERIVATIVE_STEP_MM = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MirroredLights:
-    """How a ball shows lights to a camera.
+    """Mirror images of lights in a ball.
 
     Attributes
     ----------
@@ -126,7 +128,7 @@ class MirroredLights:
     to_light, to_camera, normal : ndarray of float64, shape (L, 3)
         Unit vectors at the mirroring point of the ball.
     px_per_mm : ndarray of float64, shape (L, 2, 2)
-        How the spot moves with the light, along two directions across the line to it.
+        Derivative of the spot by the light's position, along two directions across the line to it.
     across : ndarray of float64, shape (L, 2, 3)
         These directions, unit vectors.
     """
@@ -147,7 +149,7 @@ class MirroredLights:
 def mirror_lights(
     camera: CameraPose, center_mm: Float64Array, radius_mm: float, lights_mm: Float64Array
 ) -> MirroredLights:
-    """Return where and how a ball mirrors lights into a camera.
+    """Return positions and derivatives of the lights' mirror images in a ball.
 
     Parameters
     ----------
@@ -155,7 +157,7 @@ def mirror_lights(
     center_mm, radius_mm
         The ball.
     lights_mm : ndarray of float64, shape (L, 3)
-        Places of the lights, outside the ball.
+        Positions of the lights, outside the ball.
     """
     lights = np.asarray(lights_mm, np.float64)
     eyes = np.broadcast_to(camera.center_mm, lights.shape)

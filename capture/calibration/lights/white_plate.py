@@ -1,4 +1,4 @@
-"""A white plate with markers at its edge: where it stands, and how bright its parts are."""
+"""White plate with markers at its edge: its pose, and the brightness of its parts."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from capture.calibration.geometry.board_pose import BoardPose
 
 PLATE_CELLS = (6, 4)  # columns and rows of parts into which the bare white is divided
 MIN_CELL_PIXELS = 12  # of a part in an image
-MIN_CELL_FILL = 0.5  # share of a part's pixels that must be usable
-MARKER_MARGIN_MM = 3.0  # of the bare white that is left alone, beside the markers
+MIN_CELL_FILL = 0.5  # fraction of a part's pixels that must be usable
+MARKER_MARGIN_MM = 3.0  # width of the bare white at the markers that is not used
 
 
 @dataclass(frozen=True)
 class WhitePlate:
-    """A flat white diffuser with eight markers around its bare middle.
+    """Flat white diffuser with eight markers around its bare middle.
 
     x right, y down as seen from its front, z into it; the origin is its top left corner. The
     markers are in the corners and in the middles of the sides, row by row from the top left.
@@ -38,10 +38,10 @@ class WhitePlate:
     first_marker : int
         Number of the first of the eight markers.
     reflectance, reflectance_stderr : float
-        Of the bare white: sintered PTFE between 400 and 700 nm is 0.99 (Weidner and Hsia 1981,
-        doi:10.1364/JOSA.71.000856); the error is common to all intensities.
+        Reflectance of the bare white: sintered PTFE between 400 and 700 nm is 0.99 (Weidner and
+        Hsia 1981, doi:10.1364/JOSA.71.000856); the error is common to all intensities.
     slope_rad : float
-        Root mean square slope of its surface in each direction: its finite flatness.
+        Root mean square slope of its surface in each direction: its deviation from flatness.
     """
 
     size_mm: tuple[float, float] = (252.0, 198.0)
@@ -80,24 +80,24 @@ class WhitePlate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlateSamples:
-    """How bright parts of a plate were in one frame.
+    """Brightness of the parts of a plate in one frame.
 
     Attributes
     ----------
     view : str
         Name of the camera.
     light : str
-        Name of the one light that was on.
+        Name of the only light that was on.
     on_s : float
-        Seconds that it was on, times its level, > 0.
+        Duration of the light times its level, s, > 0.
     rotation : ndarray of float64, shape (3, 3)
-        Of the plate, its axes as columns, rig frame; the third points into it.
+        Axes of the plate as columns, rig frame; the third points into it.
     part : ndarray of int64, shape (n,)
         Number of each part on the plate.
     points_mm : ndarray of float64, shape (n, 3)
-        Middles of the parts, rig frame.
+        Centers of the parts, rig frame.
     pixels : ndarray of float64, shape (n, 2)
-        Where they appear, px.
+        Image positions of the parts, px.
     signal, variance : ndarray of float64, shape (n, 3)
         Mean camera RGB, fraction of full scale, and its variance.
     """
@@ -114,26 +114,26 @@ class PlateSamples:
 
     @property
     def normal(self) -> Float64Array:
-        """Of the plate, towards its front, rig frame, shape (3,)."""
+        """Normal of the plate, towards its front, rig frame, shape (3,)."""
         return -self.rotation[:, 2]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlateWindow:
-    """Which pixels of a camera show which part of a plate; made once for a camera and a pose.
+    """Assignment of a camera's pixels to parts of a plate; made once for a camera and a pose.
 
     Attributes
     ----------
     rows, columns : slice
-        Of the half-size image with one RGB pixel for each 2 x 2 cell.
+        Window of the half-size image with one RGB pixel per 2 x 2 cell.
     part : ndarray of int64
-        Number of the part at each pixel of the box, -1 outside all.
+        Number of the part at each pixel of the window, -1 outside all.
     points_mm, pixels : ndarray of float64, shapes (n, 3) and (n, 2)
-        Middle of each part's pixels, rig frame and full-size image.
+        Center of each part's pixels, rig frame and full-size image.
     count : ndarray of int64, shape (n,)
         Pixels of each part.
     rotation : ndarray of float64, shape (3, 3)
-        As of `PlateSamples`.
+        As in `PlateSamples`.
     """
 
     rows: slice
@@ -146,14 +146,14 @@ class PlateWindow:
 
     @classmethod
     def of(cls, camera: CameraPose, pose: BoardPose, plate: WhitePlate) -> PlateWindow | None:
-        """Return the window of a plate in a camera; None where it is not seen from its front."""
+        """Return the window of a plate in a camera; None when the camera is not in front of it."""
         normal = -pose.rotation[:, 2]
         low, high = plate.bare_mm
         corners = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
         px = camera.project(pose.to_rig(corners))
         if normal @ (camera.center_mm - pose.translation_mm) <= 0 or not np.isfinite(px).all():
             return None
-        # pixel k of the half-size image has its middle at 2 k + 1/2
+        # pixel k of the half-size image has its center at 2 k + 1/2
         half = (np.array(camera.image_size) // 2).astype(int)
         first = np.clip(np.floor((px.min(axis=0) - 0.5) / 2), 0, half).astype(int)
         last = np.clip(np.ceil((px.max(axis=0) - 0.5) / 2) + 1, 0, half).astype(int)
@@ -167,7 +167,7 @@ class PlateWindow:
         share = (hit - low) / (high - low)
         cell = np.floor(share * PLATE_CELLS).astype(np.int64)
         inside = (share >= 0).all(axis=-1) & (share < 1).all(axis=-1)
-        # a pixel is made of its neighbours, too: none of them may show a marker
+        # a pixel is interpolated from its neighbors: none of them may show a marker
         inside = binary_erosion(inside, iterations=2)
         part = np.where(inside, cell[..., 1] * PLATE_CELLS[0] + cell[..., 0], -1)
         number = part[inside]
@@ -197,10 +197,10 @@ class PlateWindow:
         Parameters
         ----------
         rgb, variance : ndarray of float, shape (H/2, W/2, 3)
-            Linear camera RGB with a pixel for each 2 x 2 cell, dark subtracted.
+            Linear camera RGB with a pixel per 2 x 2 cell, dark subtracted.
         valid : ndarray of bool, shape (H/2, W/2)
         view, light, on_s
-            As of `PlateSamples`.
+            As in `PlateSamples`.
         """
         box = (self.rows, self.columns)
         part = np.where(valid[box], self.part, -1)

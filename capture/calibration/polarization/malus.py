@@ -1,4 +1,4 @@
-"""Polarization calibration: analyser zero and extinction of a pair of polarizers (Malus's law)."""
+"""Analyzer zero and extinction of a pair of polarizers, by a fit of Malus's law."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,11 +20,11 @@ from capture.calibration.record import (
 
 CONFIDENCE_LEVEL = 0.95
 MIN_MODULATION_SIGMAS = 5.0
-MAX_JITTER = 0.3  # relative; a light less steady than this is out of order
+MAX_JITTER = 0.3  # relative; a light with larger variations is out of order
 
 
 class PolarizationError(CalibrationError):
-    """A Malus series that cannot be fitted; the message says why and what to take."""
+    """Raised for a Malus series that cannot be fitted; the message states what to take."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,14 +34,14 @@ class MalusFit:
     Attributes
     ----------
     zero_rad, zero_stderr_rad : ndarray of float64, shape (C,)
-        Analyser angle of most transmission, in [-pi/2, pi/2), and its standard error.
+        Analyzer angle of largest transmission, in [-pi/2, pi/2), and its standard error.
     leak, leak_stderr : ndarray of float64, shape (C,)
-        Least over most transmission, ``(a - m) / (a + m)``; may come out below zero by noise.
+        Smallest over largest transmission, ``(a - m) / (a + m)``; may come out below zero by noise.
     extinction_lower, extinction_upper : ndarray of float64, shape (C,)
-        95 % interval of the extinction ratio ``1 / leak``; the upper end is inf where the leak
-        cannot be told from none.
+        95 % interval of the extinction ratio ``1 / leak``; the upper end is inf where the leak does
+        not differ significantly from zero.
     light_jitter : ndarray of float64, shape (C,)
-        Relative scatter of the light from frame to frame that the residuals ask for.
+        Relative scatter of the light from frame to frame, estimated from the residuals.
     chi2_per_dof : ndarray of float64, shape (C,)
         Scatter over its expectation without light jitter.
     """
@@ -58,19 +58,19 @@ class MalusFit:
 
 @dataclass(frozen=True, slots=True)
 class PolarizationCalibration:
-    """Analyser zero and leak of one camera with its lights.
+    """Analyzer zero and leak of one camera with its lights.
 
     Attributes
     ----------
     colors : tuple of str
         ("R", "G", "B") or ("MONO",).
     zero_rad : Quantity, shape ()
-        Rotator reading at which the analyser is parallel to the lights' polarizers.
+        Rotator reading at which the analyzer is parallel to the lights' polarizers.
     leak : Quantity, shape (C,)
-        Crossed over parallel transmission of polarized light, per color; a depolarizing target
-        adds to it, so that it is an upper bound of what the films let through.
+        Crossed over parallel transmission of polarized light, per color; an upper bound of the
+        polarizers' leak, because a depolarizing target adds to it.
     extinction_interval : tuple of (float, float or None), per color
-        95 % interval of ``1 / leak``; None where there is no upper end.
+        95 % interval of ``1 / leak``; None for an open upper end.
     light_jitter : float
         Relative scatter of the light between frames.
     """
@@ -84,9 +84,9 @@ class PolarizationCalibration:
     def crossed_leak(
         self, *, parallel_rad: float = 0.0, crossed_rad: float = np.pi / 2
     ) -> Float64Array:
-        """Return how much of polarized light passes crossed, over parallel, per color, shape (C,).
+        """Return the crossed fraction of polarized light, over parallel, per color, shape (C,).
 
-        Includes the analyser not standing exactly at its zero.
+        Includes the deviation of the analyzer from its zero.
 
         Parameters
         ----------
@@ -118,7 +118,7 @@ class PolarizationCalibration:
             values,
             {
                 "colors": " ".join(self.colors),
-                "extinction": "middle of its 95 % interval; the lower end where there is no upper",
+                "extinction": "middle of its 95 % interval; the lower end of an open interval",
             },
             **about,
         )
@@ -144,13 +144,13 @@ class PolarizationCalibration:
     def from_fit(cls, fit: MalusFit, colors: Sequence[str]) -> "PolarizationCalibration":
         """Return the calibration of one camera from the fit of its color channels.
 
-        The channels share the scatter of the light, so that the error of their common zero is
-        the smallest of theirs, not smaller.
+        The channels share the scatter of the light, so that the error of their common zero is the
+        smallest of theirs, not smaller.
         """
         if len(colors) != fit.leak.size:
             raise ValueError(f"colors: got {len(colors)}, expected {fit.leak.size}")
         weight = fit.zero_stderr_rad**-2
-        # angles are axes: average twice the angle
+        # angles are axes, equal modulo pi: average exp(2 i angle)
         zero = 0.5 * np.angle((weight * np.exp(2j * fit.zero_rad)).sum())
         return cls(
             colors=tuple(colors),
@@ -167,20 +167,20 @@ class PolarizationCalibration:
 def fit_malus(
     angles_rad: ArrayLike, intensity: ArrayLike, *, variance: ArrayLike | None = None
 ) -> MalusFit:
-    """Fit Malus's law to intensities over analyser angles.
+    """Fit Malus's law to intensities over analyzer angles.
 
     Linear least squares in (1, cos 2 angle, sin 2 angle). With a measurement variance given,
-    what scatters beyond it is taken as relative scatter of the light from frame to frame, so that
-    the dark angles, which tell the extinction, keep the weight they deserve.
+    scatter beyond it is modeled as relative scatter of the light from frame to frame, so that the
+    dark angles, which determine the extinction, keep their weight.
 
     Parameters
     ----------
     angles_rad : array_like, shape (N,)
-        Analyser angles; at least four that differ modulo pi.
+        Analyzer angles; at least four that differ modulo pi.
     intensity : array_like, shape (N,) or (N, C)
         Dark-subtracted intensity of a polarized (specular) target, any unit.
     variance : array_like, shape of ``intensity``, optional
-        Variance of each; without it all angles are taken as equally uncertain.
+        Variance of each; without it all angles have equal uncertainty.
 
     Returns
     -------
@@ -213,9 +213,7 @@ def fit_malus(
         if not (np.isfinite(variances).all() and (variances > 0).all()):
             raise PolarizationError("variance: expected finite numbers > 0")
     if not (np.isfinite(angles).all() and np.isfinite(curves).all()):
-        raise PolarizationError(
-            "angles_rad, intensity: expected finite numbers; leave out the rest"
-        )
+        raise PolarizationError("angles_rad, intensity: expected finite numbers; omit the rest")
     doubled = np.exp(2j * angles)
     if len(np.unique(np.round(doubled, 6))) < 4:
         raise PolarizationError(
@@ -237,18 +235,18 @@ def find_modulated_pixels(
     valid: BoolArray | None = None,
     fraction: float = 0.5,
 ) -> BoolArray:
-    """Return the pixels whose intensity follows the analyser most: the polarized target.
+    """Find the pixels whose intensity follows the analyzer most: the polarized target.
 
     Parameters
     ----------
     angles_rad : array_like, shape (N,)
-        Analyser angles.
+        Analyzer angles.
     images : sequence of N ndarray, shape (H, W) or (H, W, C)
         Dark-subtracted images.
     valid : ndarray of bool, shape (H, W), optional
         Pixels that may be used (saturated in no frame).
     fraction : float
-        Least modulation over that of the strongest pixels.
+        Smallest modulation over that of the strongest pixels.
 
     Returns
     -------
@@ -320,14 +318,16 @@ def _fit_curve(
     else:
         coefficients, covariance, jitter, chi2_per_dof = _with_jitter(design, y, variance)
     a, b, c = (float(v) for v in coefficients)
+    # y = a + b cos 2x + c sin 2x = a + m cos 2(x - zero), with m = |(b, c)| and zero = atan2(c, b)
+    # / 2; the gradients below propagate the covariance to zero and leak.
     m = float(np.hypot(b, c))
     along = np.array([0.0, b, c]) / max(m, np.finfo(float).tiny)
     m_error = float(np.sqrt(along @ covariance @ along))
     if a <= 0 or m <= MIN_MODULATION_SIGMAS * m_error:
         raise PolarizationError(
-            f"Malus series: the intensity does not follow the analyser (modulation {m:.3g} +-"
-            f" {m_error:.2g} of a mean {a:.3g}); use a specular target (a metal or glass"
-            " surface, not paper or skin) and check that the lights are polarized"
+            f"Malus series: the intensity does not follow the analyzer (modulation {m:.3g} +- "
+            f"{m_error:.2g} of a mean {a:.3g}); use a specular target (a metal or glass "
+            "surface, not paper or skin) and check that the lights are polarized"
         )
     across = np.array([0.0, -c, b]) / (2.0 * m**2)
     leak_slope = 2.0 * (m * np.array([1.0, 0.0, 0.0]) - a * along) / (a + m) ** 2

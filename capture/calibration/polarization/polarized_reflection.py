@@ -1,4 +1,4 @@
-"""Lights behind films, mirrored by smooth facets into a camera behind an analyser."""
+"""Reflection of polarized lights by smooth facets into a camera behind an analyzer."""
 
 from dataclasses import dataclass, replace
 from typing import Self
@@ -18,7 +18,7 @@ def fresnel_amplitudes(cosine: ArrayLike, eta: float) -> tuple[Float64Array, Flo
     Parameters
     ----------
     cosine : array_like
-        Of the angle of incidence, outside, 0 to 1.
+        Cosine of the angle of incidence, outside, 0 to 1.
     eta : float
         Refractive index of the inside over that of the outside, > 1.
 
@@ -37,6 +37,7 @@ def fresnel_amplitudes(cosine: ArrayLike, eta: float) -> tuple[Float64Array, Flo
     >>> rs.round(6).tolist(), np.abs(rp).round(6).tolist()
     ([-0.2, -0.384615], [0.2, 0.0])
     """
+    # Snell's law gives the cosine inside: cos_t^2 = 1 - (1 - cos_i^2) / eta^2.
     outside = np.asarray(cosine, np.float64)
     inside = np.sqrt(1.0 - (1.0 - outside**2) / eta**2)
     rs = (outside - eta * inside) / (outside + eta * inside)
@@ -46,20 +47,20 @@ def fresnel_amplitudes(cosine: ArrayLike, eta: float) -> tuple[Float64Array, Flo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FacetReflection:
-    """Lights behind films, mirrored by facets into a camera behind an analyser.
+    """Polarized lights, mirrored by facets into a camera behind an analyzer.
 
     Attributes
     ----------
     to_light, to_camera, normal : ndarray of float64, shape (L, 3)
         Unit vectors at each facet.
     light_right, light_up : ndarray of float64, shape (L, 3)
-        Axes of each light's film that its angle is measured from and towards.
+        Axes of each light's polarizer: its angle is measured from the first towards the second.
     axis_rad : ndarray of float64, shape (L,)
-        Nominal angle of what each light's film passes.
+        Nominal transmission axis of each light's polarizer.
     image_right, image_up : ndarray of float64, shape (3,)
-        Axes of the analyser.
+        Axes of the analyzer.
     analyser_rad : float
-        Nominal angle of what it passes at its reading 0.
+        Nominal transmission axis of the analyzer at reading 0.
     eta : float
         Refractive index of the facets.
     """
@@ -95,13 +96,14 @@ class FacetReflection:
             With polarizers.
         camera : CameraPose
         analyzer_deg : float
-            Nominal axis of the analyser at reading 0, degrees from the image's x axis to its top.
+            Nominal axis of the analyzer at reading 0, degrees from the image's x axis to its top.
         eta : float
             Refractive index, > 1.
         to_light, to_camera : ndarray of float64, shape (L, 3)
             Unit vectors from the facets.
         facing : ndarray of float64, shape (L, 3), optional
-            Directions from the rig's origin to the lights, whose films face it; None: nominal.
+            Directions from the rig's origin to the lights, which the polarizers face; None:
+            nominal.
 
         Raises
         ------
@@ -110,7 +112,9 @@ class FacetReflection:
         """
         bare = [light.name for light in lights if light.polarizer_axis_deg is None]
         if bare:
-            raise PolarizationError(f"lights: {', '.join(bare)} have no polarizer")
+            raise PolarizationError(
+                f"lights: {', '.join(bare)} have no polarizer; use a rig with polarizers"
+            )
         place = [light.position_mm for light in lights] if facing is None else facing
         beam = np.array(place, np.float64)
         beam /= np.linalg.norm(beam, axis=1, keepdims=True)
@@ -129,7 +133,7 @@ class FacetReflection:
         Parameters
         ----------
         to_light : ndarray of float64, shape (L, 3)
-            From the facets, any length; films face the facets as before.
+            Directions from the facets, any length; polarizers face the facets as before.
         eta : float
         """
         light = _unit(to_light)
@@ -142,20 +146,22 @@ class FacetReflection:
         Parameters
         ----------
         axis_error_rad : array_like, shape (L,) or ()
-            By how much each light's axis is off its nominal angle.
+            Deviation of each light's axis from its nominal angle.
 
         Returns
         -------
         ndarray of float64
-            First what a film passes, then what it should absorb, of unit amplitude at the film;
+            First the transmitted, then the absorbed component of unit amplitude at the polarizer;
             components along the image's right and up, made perpendicular to the ray.
         """
         light, camera, normal = self.to_light, self.to_camera, self.normal
         angle = (self.axis_rad + np.asarray(axis_error_rad, np.float64))[:, None]
+        # Jones calculus: the field is split along s and p of the plane of incidence, scaled by
+        # Fresnel's amplitudes, and put together in the axes of the reflected ray.
         absorbs = -np.sin(angle) * self.light_right + np.cos(angle) * self.light_up
         passed = _unit(_cross(absorbs, light))
         s = _cross(normal, light)
-        # a facet that faces the light leaves the plane of incidence free
+        # at normal incidence the plane of incidence is undefined, and any choice is valid
         straight = np.linalg.norm(s, axis=-1, keepdims=True) < 1e-9
         s = _unit(np.where(straight, _cross(self.image_up, light), s))
         p_in, p_out = _cross(s, light), _cross(camera, s)
@@ -174,23 +180,24 @@ class FacetReflection:
         light_leak: ArrayLike = 0.0,
         analyzer_leak: ArrayLike = 0.0,
     ) -> Float64Array:
-        """Return what reaches the sensor of each light, shape (E, L).
+        """Return the fraction of each light that reaches the sensor, shape (E, L).
 
         Parameters
         ----------
         readings_rad : array_like, shape (E,)
-            Readings of the analyser.
+            Readings of the analyzer.
         axis_error_rad : array_like, shape (L,) or ()
-            As for `reflected_fields`.
+            As in `reflected_fields`.
         zero_rad : array_like, shape (L,) or ()
-            What the analyser's reading lacks to its true angle.
+            True angle of the analyzer minus its reading.
         light_leak, analyzer_leak : array_like, shape (L,) or ()
-            Transmittance of the films along the absorbing axis over that along the passing one.
+            Transmittance along the absorbing axis over that along the transmission axis.
 
         Returns
         -------
         ndarray of float64
-            Over what comes polarized through the light's film: reflectance times the analyser.
+            Relative to the light transmitted by the light's polarizer: reflectance times the
+            analyzer.
         """
         field = self.reflected_fields(axis_error_rad)
         axes = self._image_axes()
@@ -202,9 +209,11 @@ class FacetReflection:
             angle = self.analyser_rad + reading + np.asarray(zero_rad, np.float64)
             angle = np.broadcast_to(angle, self.axis_rad.shape)[:, None]
             absorbs = -np.sin(angle) * self.image_right + np.cos(angle) * self.image_up
-            # what passes lies across the ray and the absorbing axis
+            # the transmitted field is perpendicular to the ray and to the absorbing axis
             passes = _unit(self._in_image(_cross(absorbs, self.to_camera)[:, None], axes))
             along = np.sum(field * passes, axis=-1) ** 2
+            # Malus's law with leakage: the transmitted component, and a fraction of the absorbed
+            # one.
             behind = along + analyser * (whole - along)
             rows.append(behind[:, 0] + light * behind[:, 1])
         return np.array(rows)

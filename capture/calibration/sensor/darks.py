@@ -1,4 +1,4 @@
-"""Frames without light: black level, temporal noise, fixed pattern, dark current, hot pixels."""
+"""Reduce frames without light: black level, noise, fixed pattern, dark current, hot pixels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ HOT_PIXEL_SIGMAS = 6.0
 
 @dataclass(frozen=True, slots=True)
 class DarkStatistics:
-    """What the darks say of one color.
+    """Statistics of the dark frames of one color.
 
     Attributes
     ----------
@@ -26,9 +26,9 @@ class DarkStatistics:
     variance_dn2, dof : float
         Temporal variance of a pixel, DN^2, and its degrees of freedom.
     dsnu_dn : (float, float)
-        Spread of the pixels' own levels and its standard error, DN.
+        Standard deviation of the pixels' own levels and its standard error, DN.
     slope_dn_per_s : (float, float) or None
-        Growth with exposure time and its standard error; None where all times are the same.
+        Growth with exposure time and its standard error; None when all times are equal.
     good : tuple of ndarray of bool
         Pixels that are not hot, per CFA position.
     positions : tuple of (row, column)
@@ -68,7 +68,7 @@ def reduce_darks(
     positions: tuple[tuple[int, int], ...],
     pattern: str,
 ) -> DarkStatistics:
-    """Reduce the darks of one color.
+    """Reduce the dark frames of one color.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def reduce_darks(
         Their exposure times, seconds.
     positions : tuple of (row, column)
         The color's places in the 2 x 2 cell.
-    pattern : str
+    Positions of the color in the 2 x 2 cell.
         CFA pattern or "MONO".
 
     Returns
@@ -128,7 +128,7 @@ def reduce_darks(
 
 
 def _common_std(a: Float64Array, b: Float64Array, ok: BoolArray) -> tuple[float, float]:
-    """Spread common to two independent averages: root of their covariance, with its error."""
+    """Return the root of the covariance of two averages, with its error."""
     x, y = a[ok] - a[ok].mean(), b[ok] - b[ok].mean()
     covariance = float(x @ y) / (x.size - 1)
     error = float(np.sqrt((x.var() * y.var() + covariance**2) / x.size))

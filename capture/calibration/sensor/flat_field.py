@@ -10,7 +10,7 @@ from capture.arrays import Float64Array
 
 @cache
 def _terms(degree: int) -> tuple[tuple[int, int], ...]:
-    """Exponent pairs (row, column) of all Legendre products up to a total degree."""
+    """Return exponent pairs (row, column) of all Legendre products up to a total degree."""
     return tuple((i, j) for i in range(degree + 1) for j in range(degree + 1 - i))
 
 
@@ -24,7 +24,7 @@ def _count(terms: int) -> int:
 def _basis(
     rows: Float64Array, columns: Float64Array, shape: tuple[int, int], degree: int
 ) -> tuple[Float64Array, Float64Array]:
-    """Legendre polynomials of the coordinates scaled to [-1, 1], each (n, degree + 1)."""
+    """Return Legendre polynomials of coordinates scaled to [-1, 1], each (n, degree + 1)."""
     v = 2.0 * rows / max(shape[0] - 1, 1) - 1.0
     u = 2.0 * columns / max(shape[1] - 1, 1) - 1.0
     legendre = np.polynomial.legendre.legvander
@@ -34,19 +34,19 @@ def _basis(
 
 @dataclass(frozen=True, slots=True)
 class SmoothField:
-    """A smooth field, 1 at the image's center.
+    """Smooth field, 1 at the image's center.
 
     Attributes
     ----------
     coefficients : ndarray of float64, shape (T,)
-        Of products of Legendre polynomials in row and column, each scaled to [-1, 1] over the
-        image, total degree up to 4 for T = 15.
+        Coefficients of products of Legendre polynomials in row and column, each scaled to [-1, 1]
+        over the image, total degree up to 4 for T = 15.
     covariance : ndarray of float64, shape (T, T)
-        Of the coefficients.
+        Covariance of the coefficients.
     residual : float
-        Root mean square of what the polynomial does not explain, relative.
+        Root mean square residual of the polynomial, relative.
     level : float
-        What the samples are at the image's center, in their unit.
+        Value of the samples at the image's center, in their unit.
     """
 
     coefficients: Float64Array
@@ -92,7 +92,7 @@ def fit_smooth_field(
     Parameters
     ----------
     values, rows, columns : ndarray of float64, shape (N,)
-        Samples, in any unit, and where they are, in pixels of the image.
+        Samples, in any unit, and their positions, in pixels of the image.
     shape : (int, int)
         Height and width of the image.
     degree : int
@@ -149,16 +149,16 @@ def fit_smooth_field(
 
 
 def pixel_response(first: Float64Array, second: Float64Array, *, block: int) -> tuple[float, float]:
-    """Return the relative pixel-to-pixel spread of sensitivity and its standard error.
+    """Return the relative pixel-to-pixel standard deviation of sensitivity and its standard error.
 
-    The covariance of two independent averages of flats, after a quadratic surface is taken off
-    each block: temporal noise is independent in the two and drops out, shading is smooth and is
-    taken off.
+    The covariance of two independent averages of flats, after a quadratic surface is subtracted
+    from each block: temporal noise is independent in the two and cancels, and the surface removes
+    the smooth shading.
 
     Parameters
     ----------
     first, second : ndarray of float64, shape (h, w)
-        Signals above black of one CFA position; NaN marks pixels not to use.
+        Signals above black of one CFA position; NaN marks unused pixels.
     block : int
         Block side, > 2.
 

@@ -1,4 +1,4 @@
-"""A color mosaic read as one gray image, where everything seen has the color of the light."""
+"""Read a color mosaic as one gray image, for scenes with the color of the light."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +12,7 @@ _COLOR_LETTERS = "RGB"
 def channel_levels(frame: RawFrame) -> Float64Array:
     """Return the median of each channel above black, fraction of full scale, shape (3,).
 
-    Of a frame that shows gray things only these are the color of the light.
+    For a frame of gray objects this is the color of the light.
     """
     levels: dict[str, list[float]] = {}
     for cell, color in enumerate(_pattern(frame)):
@@ -28,9 +28,9 @@ def neutral_mosaic(frame: RawFrame, color: ArrayLike) -> Float32Array:
     Parameters
     ----------
     frame : RawFrame
-        Of a sensor with a 2 x 2 color filter array, showing things of one color.
+        Frame of a sensor with a 2 x 2 color filter array, showing objects of one color.
     color : array_like, shape (3,)
-        That color in camera RGB, any scale, > 0.
+        Color of the objects in camera RGB, any scale, > 0.
 
     Returns
     -------

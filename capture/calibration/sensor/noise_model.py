@@ -1,7 +1,8 @@
 """Sensor calibration: black, gain, read noise, saturation, linearity, pixel response, flat field.
 
-Everything is estimated from darks and from pairs of flats at several amounts of light, per CFA
-color, with standard errors; see `capture.calibration.sensor.transfer_curve` for the curve itself.
+Everything is estimated from dark frames and from pairs of flats at several amounts of light, per
+CFA color, with standard errors; see `capture.calibration.sensor.transfer_curve` for the curve
+itself.
 """
 
 from collections.abc import Sequence
@@ -30,13 +31,13 @@ from capture.calibration.sensor.transfer_curve import (
     fit_transfer_curve,
 )
 
-QUANTIZATION_DN2 = 1.0 / 12.0  # variance of rounding to whole DN
+QUANTIZATION_DN2 = 1.0 / 12.0  # variance of rounding: uniform within +- 1/2 DN
 N_FLAT_BLOCKS = 16  # samples of the flat field along the shorter side
 
 
 @dataclass(frozen=True, slots=True)
 class SensorCalibration:
-    """What is known of one sensor; arrays are per color, in the order of ``colors``.
+    """Calibration of one sensor; arrays are per color, in the order of ``colors``.
 
     Attributes
     ----------
@@ -45,9 +46,9 @@ class SensorCalibration:
     colors : tuple of str
         ("R", "G", "B") or ("MONO",).
     white_dn : int
-        White level the frames were made with, DN.
+        White level of the frames, DN.
     black_dn : Quantity, shape (C,)
-        Mean of the darks, DN.
+        Mean of the dark frames, DN.
     gain_e_per_dn : Quantity, shape (C,)
         Electrons per DN.
     read_noise_e : Quantity, shape (C,)
@@ -60,23 +61,23 @@ class SensorCalibration:
     saturated_by : tuple of str
         "full well", "white level" or "not reached", per color.
     nonlinearity : Quantity, shape (C,)
-        Relative change of the response between no light and the most light used. What the light
-        source does between its power settings cannot be told apart from it.
+        Relative change of the response from no light to the most light used. It cannot be separated
+        from a nonlinearity of the light source.
     linearity_deviation : Quantity, shape (C,)
         Largest relative deviation of one level from a straight line through zero.
     prnu : Quantity, shape (C,)
-        Relative pixel-to-pixel spread of sensitivity (standard deviation).
+        Relative pixel-to-pixel standard deviation of sensitivity.
     dsnu_dn : Quantity, shape (C,)
-        Pixel-to-pixel spread of the dark level, DN.
+        Pixel-to-pixel standard deviation of the dark level, DN.
     dark_e_per_s : Quantity or None
-        Dark current, shape (C,); None where all darks have one exposure time.
+        Dark current, shape (C,); None when all dark frames have one exposure time.
     flat : tuple of SmoothField
-        Shading of the flat target as seen by this camera (vignetting times uneven light), per
+        Shading of the flat target in this camera's image (vignetting times uneven light), per
         color, 1 at the center.
     chi2_per_dof : tuple of float
         Scatter around the photon transfer line over its expectation; near 1 when the model holds.
     hot_pixels : int
-        Pixels left out.
+        Number of omitted pixels.
     """
 
     pattern: str
@@ -185,7 +186,7 @@ def calibrate_sensor(
     block: int = 16,
     flat_degree: int = 4,
 ) -> SensorCalibration:
-    """Calibrate a sensor from pairs of flats at several amounts of light and darks.
+    """Calibrate a sensor from pairs of flats at several amounts of light and dark frames.
 
     Parameters
     ----------
@@ -198,9 +199,9 @@ def calibrate_sensor(
     pattern : str
         CFA pattern or "MONO".
     dark_exposures_s : sequence of float, optional
-        Exposure time of each dark, seconds; with two different times the dark current is found.
+        Exposure time of each dark frame, seconds; two different times give the dark current.
     block : int
-        Side of the blocks the variance is taken over, in pixels of one CFA position.
+        Side of the blocks over which the variance is taken, in pixels of one CFA position.
     flat_degree : int
         Degree of the polynomial that describes the flat field.
 
@@ -211,7 +212,7 @@ def calibrate_sensor(
     Raises
     ------
     PhotonTransferError
-        If the frames do not allow it.
+        If the frames are not sufficient.
 
     Notes
     -----
@@ -300,7 +301,7 @@ def _fixed_pattern(
     degree: int,
     shape: tuple[int, int],
 ) -> tuple[tuple[float, float], SmoothField]:
-    """Pixel response and flat field from the sums of all first and all second frames."""
+    """Return pixel response and flat field from the sums of all first and all second frames."""
     step = 1 if dark.pattern == "MONO" else 2
     spreads, values, rows, columns = [], [], [], []
     for position, black, good in zip(dark.positions, *dark.levels, strict=True):
@@ -324,7 +325,7 @@ def _fixed_pattern(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ColorStatistics:
-    """What the frames say of the pixels of one color."""
+    """Statistics of the pixels of one color."""
 
     fit: TransferCurveFit
     dark: DarkStatistics
@@ -357,7 +358,7 @@ class _ColorStatistics:
 
 
 def _read_noise(fit: TransferCurveFit) -> tuple[float, float]:
-    """Read noise in electrons: sqrt(V0 - 1/12) / K, with the error of both."""
+    """Return read noise in electrons: sqrt(V0 - 1/12) / K, with the error of both."""
     variance = fit.offset_dn2 - QUANTIZATION_DN2
     error = float(np.sqrt(fit.covariance[0, 0]))
     if variance <= 0:
@@ -387,14 +388,15 @@ def fit_linearity(
     """Fit the response of one color to the amount of light.
 
     ``signal / light = a (1 + q light / light_max)``; the scatter is taken from the two frames of
-    the pairs and from the residuals, so that a light source that does not repeat well is honest.
+    the pairs and from the residuals, so that the error includes a light source with poor
+    repeatability.
 
     Parameters
     ----------
     pairs : sequence of FlatPair
         Unsaturated flats.
     dark : Darks
-        Of the same color.
+        Dark statistics of the same color.
 
     Returns
     -------
@@ -415,7 +417,7 @@ def fit_linearity(
     response = signals.mean(axis=1) / light
     half_difference = (signals[:, 0] - signals[:, 1]) / (2.0 * signals.mean(axis=1))
     design = np.stack([np.ones_like(light), light / light.max()], axis=1)
-    # an error of the black level weighs on the dark levels most
+    # an error of the black level is relatively largest for the dark levels
     weight = 1.0 / (
         1.0 + (dark.black_stderr / (signals.mean(axis=1) * max(half_difference.std(), 1e-6))) ** 2
     )

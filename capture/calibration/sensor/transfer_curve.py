@@ -1,8 +1,8 @@
-"""The photon transfer curve: temporal variance against mean signal, in blocks of one CFA color.
+"""Photon transfer curve: temporal variance against mean signal, in blocks of one CFA color.
 
-The difference of two frames of the same scene holds no fixed pattern, so its variance grows
-linearly with the mean signal even where the flat field is not flat:
-``variance = V0 + K signal`` [DN^2, DN], with ``1/K`` the gain in electrons per DN.
+The difference of two frames of the same scene contains no fixed pattern, so its variance grows
+linearly with the mean signal even where the flat field is not flat: ``variance = V0 + K signal``
+[DN^2, DN], with ``1/K`` the gain in electrons per DN.
 """
 
 from collections.abc import Sequence
@@ -17,13 +17,13 @@ from capture.calibration.record import CalibrationError
 LOW_SIGNAL_LEVEL = 0.4  # of the white level: below it nothing saturates in a usable sensor
 # variance over its prediction below which a block counts as saturated
 SATURATED_VARIANCE_RATIO = 0.5
-# distance to saturation, in standard deviations, that a usable block keeps
+# smallest distance of a usable block to saturation, in standard deviations
 SATURATION_CLIP_SIGMAS = 6.0
-PIXEL_RESPONSE_STD = 0.02  # pixel-to-pixel spread of sensitivity allowed for in that distance
+PIXEL_RESPONSE_STD = 0.02  # pixel-to-pixel variation of sensitivity allowed for in that distance
 
 
 class PhotonTransferError(CalibrationError):
-    """The frames do not allow a photon transfer fit; the message says why and what to take."""
+    """Raised for frames without a photon transfer fit; the message states what to take."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class FlatPair:
     first, second : ndarray of uint16, shape (H, W)
         Raw CFA frames in DN.
     light : float
-        Relative amount of light (flash power times exposure where it matters), > 0.
+        Relative amount of light (flash power times exposure time, when it varies), > 0.
     """
 
     first: UInt16Array
@@ -80,22 +80,22 @@ class BlockStatistics:
 
 @dataclass(frozen=True, slots=True)
 class TransferCurveFit:
-    """A straight photon transfer curve ``variance = offset + slope * signal``.
+    """Straight photon transfer curve ``variance = offset + slope * signal``.
 
     Attributes
     ----------
     offset_dn2, slope_dn : float
         Variance without light and its slope.
     covariance : ndarray of float64, shape (2, 2)
-        Of (offset, slope), scaled by the scatter where that exceeds what was expected.
+        Covariance of (offset, slope), scaled by the scatter when that exceeds the expectation.
     chi2_per_dof : float
         Scatter around the line over its expectation.
     saturation_dn : float
         Signal above black at which pixels saturate.
     saturated_by : {"full well", "white level", "not reached"}
-        What ended the range; "not reached": ``saturation_dn`` is the white level above black.
+        Cause of the limit; "not reached": ``saturation_dn`` is the white level above black.
     points : int
-        Blocks used.
+        Number of blocks used.
     """
 
     offset_dn2: float
@@ -156,9 +156,9 @@ def block_statistics(
 ) -> BlockStatistics:
     """Reduce a pair of planes to signal and temporal variance in blocks.
 
-    The second frame is scaled to the light of the first (flashes repeat to a percent or so), which
-    changes the abscissa: with ``r`` the ratio, ``var(A - r B) / (1 + r^2) = V0 + K s_A (1 + r) /
-    (1 + r^2)``.
+    The second frame is scaled to the light of the first (flashes repeat to about a percent), which
+    changes the abscissa: with ``r`` the ratio, ``var(A - r B) / (1 + r^2) = V0 + K s_A (1 + r) / (1
+    + r^2)``.
 
     Parameters
     ----------
@@ -187,6 +187,8 @@ def block_statistics(
     weight = good.astype(np.float64)
     n = block_sums(weight, block)
     n = np.maximum(n, 1.0)
+    # Shot noise gives var A = V0 + K s_A and var B = V0 + K s_A / r; hence var(A - r B) = (1 + r^2)
+    # V0 + (1 + r) K s_A, and the mean of (A + r B) / 2 estimates s_A.
     mean = block_sums(weight * (a + ratio * b) / 2.0, block) / n
     d = (a - ratio * b) * weight
     d_sum = block_sums(d, block)
@@ -205,11 +207,12 @@ def block_statistics(
 def _weighted_line(
     x: Float64Array, y: Float64Array, dof: Float64Array
 ) -> tuple[Float64Array, Float64Array, float]:
-    """Fit y = c0 + c1 x where y has relative error sqrt(2/dof); return fit, covariance, chi2/dof.
+    """Fit y = c0 + c1 x with relative errors sqrt(2/dof) of y; return fit, covariance, chi2/dof.
 
-    The weights come from the fitted line, not from the scattered values, which would pull it down.
+    The weights are those of the fitted line, not of the scattered values, which would bias it low.
     """
     design = np.stack([np.ones_like(x), x], axis=1)
+    # A sample variance with dof degrees of freedom has the variance 2 y^2 / dof.
     predicted = np.full_like(y, y.mean())
     for _ in range(6):
         weight = dof / (2.0 * predicted**2)
@@ -227,17 +230,17 @@ def _weighted_line(
 def fit_transfer_curve(
     levels: Sequence[BlockStatistics], *, dark_variance_dn2: float, dark_dof: float, range_dn: float
 ) -> TransferCurveFit:
-    """Fit the photon transfer line through blocks below saturation and the darks.
+    """Fit the photon transfer line to blocks below saturation and the dark frames.
 
-    Saturation is found where the variance collapses (the full well of the pixels) or where
-    pixels reach the white level, whichever comes first.
+    Saturation is the signal at which the variance collapses (full well of the pixels) or at which
+    pixels reach the white level, whichever is lower.
 
     Parameters
     ----------
     levels : sequence of Blocks
-        Of one color, any number of pairs and CFA positions.
+        Blocks of one color, any number of pairs and CFA positions.
     dark_variance_dn2, dark_dof : float
-        Temporal variance of the darks and its degrees of freedom.
+        Temporal variance of the dark frames and its degrees of freedom.
     range_dn : float
         White level minus black level.
 
@@ -248,7 +251,7 @@ def fit_transfer_curve(
     Raises
     ------
     PhotonTransferError
-        If too few blocks lie below saturation or the variance does not grow with the signal.
+        If too few blocks are below saturation or the variance does not grow with the signal.
     """
     x = np.concatenate([b.signal for b in levels])
     y = np.concatenate([b.variance for b in levels])
@@ -264,8 +267,8 @@ def fit_transfer_curve(
             )
         if not dark_variance_dn2 > 0 and not y[chosen].any():
             raise PhotonTransferError(
-                "photon transfer: the frames of the pairs are identical, so there is no noise to"
-                " measure; give two separate raw frames per level"
+                "photon transfer: the frames of the pairs are identical and contain no noise; "
+                "give two separate raw frames per level"
             )
         return _weighted_line(
             np.append(x[chosen], 0.0),

@@ -1,8 +1,8 @@
-r"""How a camera is spoken to over TCP: a sealed JSON line, then the pixels; no I/O.
+r"""Camera protocol over TCP: a sealed JSON line, then the pixels; no I/O.
 
 One message is a header line, ``<JSON object>*<CRC4>\n`` (ASCII, checksum as in
-`capture.devices.wire`), followed by as many bytes as its ``blob_bytes`` says, whose CRC-32 is
-``blob_crc32``; without these two keys nothing follows. The client sends one request and waits::
+`capture.devices.wire`), followed by ``blob_bytes`` bytes with the CRC-32 ``blob_crc32``; without
+these two keys nothing follows. The client sends one request and waits::
 
     {"id": 1, "do": "open", "version": 1, "view": "cam"}     -> {"id": 1, "ok": true, "info": {..}}
     {"id": 2, "do": "clock"}                                 -> {"id": 2, "ok": true, "clock_s": ..}
@@ -37,7 +37,7 @@ MAX_BLOB_BYTES = 2**30
 
 
 class BadMessage(ValueError):
-    """Bytes that are no message; the rest of the stream cannot be trusted."""
+    """Raised for bytes that are not a message; the rest of the stream cannot be trusted."""
 
 
 def encode_message(fields: Mapping[str, Any], blob: bytes | None = None) -> bytes:
@@ -56,7 +56,7 @@ def encode_message(fields: Mapping[str, Any], blob: bytes | None = None) -> byte
 
 
 def decode_header(line: bytes) -> dict[str, Any]:
-    """Return the fields of a header line without its newline; raise `BadMessage`."""
+    """Return the fields of a header line without its newline; raise `BadMessage` otherwise."""
     try:
         fields = json.loads(wire.unseal(line.decode("ascii")))
     except (ValueError, RecursionError) as exc:
@@ -67,7 +67,7 @@ def decode_header(line: bytes) -> dict[str, Any]:
 
 
 def blob_size(fields: Mapping[str, Any]) -> int:
-    """Return how many bytes follow a header, 0 to `MAX_BLOB_BYTES`; raise `BadMessage`."""
+    """Return the number of bytes after a header, 0 to `MAX_BLOB_BYTES`; raise `BadMessage`."""
     size = fields.get("blob_bytes", 0)
     if not isinstance(size, int) or isinstance(size, bool) or not 0 <= size <= MAX_BLOB_BYTES:
         raise BadMessage(f"blob_bytes: got {size!r}, expected 0 to {MAX_BLOB_BYTES}")
@@ -75,18 +75,18 @@ def blob_size(fields: Mapping[str, Any]) -> int:
 
 
 def check_blob(fields: Mapping[str, Any], blob: bytes) -> None:
-    """Raise `BadMessage` when the bytes after a header are not those it announced."""
+    """Raise `BadMessage` when the bytes after a header do not match its checksum."""
     if "blob_bytes" in fields and zlib.crc32(blob) != fields.get("blob_crc32"):
         raise BadMessage(f"blob_crc32: got {zlib.crc32(blob)}, expected {fields['blob_crc32']}")
 
 
 def info_to_json(info: CameraInfo) -> dict[str, Any]:
-    """Return what a camera is as JSON values."""
+    """Return the properties of a camera as JSON values."""
     return to_json_table(info)
 
 
 def info_from_json(table: Mapping[str, Any]) -> CameraInfo:
-    """Return what a camera is; raise `BadMessage` when something is missing."""
+    """Return the properties of a camera; raise `BadMessage` when a field is missing."""
     try:
         return CameraInfo(
             serial=str(table["serial"]),
@@ -103,7 +103,7 @@ def info_from_json(table: Mapping[str, Any]) -> CameraInfo:
 
 
 def frame_to_message(frame: Frame) -> tuple[dict[str, Any], bytes]:
-    """Return the fields and the blob of a frame."""
+    """Return the header fields and the blob of a frame."""
     table: dict[str, Any] = {
         "serial": frame.serial,
         "seq": frame.seq,
@@ -120,7 +120,7 @@ def frame_to_message(frame: Frame) -> tuple[dict[str, Any], bytes]:
 
 
 def frame_from_message(table: Mapping[str, Any], blob: bytes) -> Frame:
-    """Return the frame that `frame_to_message` was given; raise `BadMessage`."""
+    """Return the frame that `frame_to_message` has encoded; raise `BadMessage` otherwise."""
     image: UInt16Array | bytes = blob
     try:
         if "shape" in table:

@@ -1,9 +1,9 @@
 """Industrial cameras through GenICam, by serial number; needs the extra ``genicam``.
 
-The maker's GenTL producer talks to the camera; features are set by their standard names, pictures
-come as sensor values. The way through is tested with the simulated producer of the ``genicam``
-package, which streams, and with a stand-in for the features that it lacks (exposure, triggers,
-a clock); no camera has been at hand.
+The manufacturer's GenTL producer talks to the camera; features are set by their standard names, and
+images come as sensor values. The module is tested with the simulated producer of the ``genicam``
+package, which streams, and with a substitute for the features that it lacks (exposure, triggers, a
+clock). It has not been tested with a camera.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from capture.devices.cameras.genicam_producer import (
 from capture.devices.cameras.genicam_readout import Address, parse_address, prepare_readout
 
 MAX_BUFFER_BYTES = 2**32
-"""Most memory for the frames of a sequence, which are fetched when it is over."""
+"""Largest memory for the frames of a sequence, which are fetched after its end."""
 MIN_BUFFERS = 3
 STAMP_TOLERANCE_S = 1e-3
-"""How far a frame's stamp may be ahead of the camera's clock: ticks of either are rounded."""
+"""Largest lead of a frame's time stamp over the camera's clock, s: both count rounded ticks."""
 
 _IMAGE_PAYLOADS = (1, 4)
-"""An image, and one with chunk data after it (GenTL 1.6, PAYLOADTYPE_INFO_IDS)."""
+"""Payload types: an image, and an image with chunk data (GenTL 1.6, PAYLOADTYPE_INFO_IDS)."""
 
 
 def open_camera(rest: str) -> GenicamCamera:
@@ -52,7 +52,7 @@ def open_camera(rest: str) -> GenicamCamera:
     CameraUrlError
         When the address, the producer or the camera cannot be found.
     CameraError
-        When the camera lacks what is needed (`CameraBusy`: another program has it;
+        When the camera lacks a required feature (`CameraBusy`: another program uses it;
         `MissingHarvesters`: the extra is not installed).
     """
     address = parse_address(rest)
@@ -76,15 +76,15 @@ class GenicamCamera:
     connection
         The opened camera; closed with this object.
     address
-        What it is asked to be.
+        Requested settings.
     clock
-        The host's, s, for timeouts; for tests.
+        Clock of the host, s, for timeouts; for tests.
 
     Raises
     ------
     CameraError
-        When a feature is missing without which no frame can be believed: exposure time, trigger,
-        a clock that can be read, a raw pixel format, a known black level.
+        When a feature is missing without which no frame can be accepted: exposure time, trigger, a
+        readable clock, a raw pixel format, a known black level.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class GenicamCamera:
 
     @property
     def info(self) -> CameraInfo:
-        """What the camera is."""
+        """Identity and properties of the camera."""
         return self._info
 
     def clock_s(self) -> float:
@@ -122,10 +122,10 @@ class GenicamCamera:
         return float(self._features.read(self._readout.latched)) * self._readout.tick_s
 
     def configure(self, want: Exposure) -> Exposure:
-        """Set exposure time and gain to the nearest the camera has.
+        """Set exposure time and gain to the nearest values that the camera has.
 
-        A gain of 0 dB is the base sensitivity, and each 20 dB tenfold. A gain that does not tell
-        that it counts dB is left at its least, which is then called the base sensitivity.
+        A gain of 0 dB is the base sensitivity, and each 20 dB are a factor of ten. A gain whose
+        unit is not stated as dB is set to its minimum, which then counts as the base sensitivity.
         """
         features = self._features
         got_us = features.set_nearest(self._readout.exposure_feature, 1e6 * want.exposure_s)
@@ -145,7 +145,7 @@ class GenicamCamera:
         return self._got
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """Make ready for that many frames; those of before are dropped with their buffers."""
+        """Prepare for ``count`` frames; frames of before are dropped with their buffers."""
         if trigger not in self._info.triggers:
             raise CameraError(f"{self._url}: cannot be triggered by {trigger}")
         if count < 1:
@@ -153,7 +153,7 @@ class GenicamCamera:
         self.abort()
         features = self._features
         if features.has("TriggerSelector"):
-            # another trigger left on would have to come first
+            # another trigger that is still on would have to be disabled first
             for other in features.choices("TriggerSelector"):
                 features.set("TriggerSelector", other)
                 features.set_if_present("TriggerMode", "Off")
@@ -188,7 +188,7 @@ class GenicamCamera:
             When the camera is not armed for the software trigger.
         """
         if self._trigger is not Trigger.SOFTWARE or self._left == 0:
-            raise CameraError(f"{self._url}: is not armed for software")
+            raise CameraError(f"{self._url}: not armed for the software trigger; arm it first")
         self._left -= 1
         self._features.execute("TriggerSoftware")
 
@@ -200,12 +200,12 @@ class GenicamCamera:
         FrameTimeout
             When none came in time.
         FrameRefused
-            When what came is no frame of the format that was set.
+            When the frame has another format than the one that was set.
         LinkLost
-            When the camera does not answer any more.
+            When the camera no longer answers.
         """
         if self._trigger is None:
-            raise FrameTimeout(f"{self._url}: is not armed, so that no frame can come")
+            raise FrameTimeout(f"{self._url}: not armed; arm it before waiting for a frame")
         until_s = self._host_clock() + timeout_s
         incomplete = 0
         while (left_s := until_s - self._host_clock()) > 0:
@@ -217,36 +217,38 @@ class GenicamCamera:
                 finally:
                     with contextlib.suppress(*self._library.errors):
                         buffer.parent.queue_buffer(buffer)
-            # the library hands out nothing, early, for a frame of which bytes were lost
+            # for a frame with lost bytes the library returns nothing, before the timeout
             incomplete += until_s - self._host_clock() > 2e-3
-        self.clock_s()  # a camera that is gone says so here
+        self.clock_s()  # raises when the camera is disconnected
         cause = (
-            f"{incomplete} came with bytes missing: look at the cable, or use a packed format"
+            f"{incomplete} came with bytes missing: check the cable, or use a packed format"
             if incomplete
-            else f"is the box's trigger line plugged into the camera's {self._readout.line}?"
+            else f"is the controller's trigger line plugged into the camera's {self._readout.line}?"
             if self._trigger is Trigger.EDGE
             else "was it fired?"
         )
         raise FrameTimeout(f"{self._url}: no frame came in {timeout_s:g} s; {cause}")
 
     def abort(self) -> None:
-        """Give up what was armed."""
+        """Cancel what was armed."""
         self._trigger, self._left = None, 0
         with self._library.translate_errors(f"{self._url}: stopping"):
             self._acquirer.stop()
 
     def close(self) -> None:
-        """Let go of the camera; doing so twice is allowed."""
+        """Release the camera; calling it twice is allowed."""
         self._trigger = None
         self._connection.close()
 
     def _check_serial(self, serial: str) -> None:
-        """Raise when the camera calls itself otherwise than the producer does."""
+        """Raise an error when camera and producer report different serial numbers."""
         if not self._features.has("DeviceSerialNumber"):
             return
         own = str(self._features.read("DeviceSerialNumber"))
         if serial not in (own, self._connection.identifier):
-            raise WrongCamera(f"{self._url}: the camera that opened calls itself {own}")
+            raise WrongCamera(
+                f"{self._url}: the camera that opened reports the serial number {own}"
+            )
 
     def _take(self, buffer: Any) -> Frame:
         """Return the frame in a buffer of the library."""
@@ -291,7 +293,7 @@ class GenicamCamera:
         )
 
     def _count(self, frame_id: int) -> None:
-        """Go on to the next number; by more than one where the camera counts frames between."""
+        """Increment the frame number; by more than one when the camera reports skipped frames."""
         step = 1
         if frame_id >= 0:
             if self._frame_id is not None and frame_id > self._frame_id:
@@ -306,16 +308,16 @@ class GenicamCamera:
         return self._readout.tick_s * int(buffer.timestamp)
 
     def _check_stamp(self, start_s: float) -> None:
-        # a producer may stamp with the computer's time; the first frame tells
+        # a producer may stamp with the computer's time; the first frame reveals it
         if self._seq < 0 and start_s > (now_s := self.clock_s()) + STAMP_TOLERANCE_S:
             raise CameraError(
                 f"{self._url}: a frame is stamped {start_s - now_s:.3f} s ahead of the camera's "
-                "clock: the producer stamps by another clock, so that frames cannot be told from "
-                "older ones; use the maker's newest producer, or another maker's"
+                "clock: the producer stamps by another clock, so that older frames cannot be "
+                "recognized; use the manufacturer's newest producer, or another one"
             )
 
     def _optional(self, buffer: Any, name: str, otherwise: Any) -> Any:
-        """Return what a buffer tells, and `otherwise` where the producer does not know it."""
+        """Return an attribute of a buffer, or `otherwise` when the producer does not support it."""
         try:
             value = getattr(buffer, name)
         except self._library.errors as error:

@@ -1,7 +1,8 @@
-"""GenTL producers, the makers' libraries behind GenICam cameras, and the cameras they find.
+"""Load GenTL producers, the manufacturers' libraries, and connect to the cameras they find.
 
-A producer is a file ``*.cti`` that comes with a camera maker's software. One process can open a
-producer once only, so cameras of one producer share it; it is closed with the last of them.
+A producer is a file ``*.cti`` that comes with the camera manufacturer's software. One process can
+open a producer only once, so the cameras of one producer share it; it is closed with the last of
+them.
 """
 
 import contextlib
@@ -18,9 +19,9 @@ from capture.devices.camera import CameraBusy, CameraError, CameraUrlError
 from capture.devices.port import LinkLost
 
 PRODUCER_PATH_VARIABLE = "GENICAM_GENTL64_PATH"
-"""Variable that lists the folders of producers (GenTL 1.6, section 3.3)."""
+"""Environment variable that lists the folders of producers (GenTL 1.6, section 3.3)."""
 
-# what a camera answers to a wrong request; anything else means that it does not answer
+# a camera's answers to an invalid request; any other error means that it does not answer
 _REFUSALS = (
     "Access OutOfRange InvalidArgument LogicalError Property InvalidParameter InvalidValue"
     " NotImplemented NotAvailable"
@@ -28,27 +29,27 @@ _REFUSALS = (
 _REFUSAL_ERRORS = tuple(f"{name}Exception" for name in _REFUSALS.split())
 _BUSY_ERRORS = ("AccessDeniedException", "ResourceInUseException", "BusyException")
 
-# the library logs what it then raises, with a traceback; the error says it once
+# the library logs what it then raises, with a traceback; one message is enough
 _library_log = logging.getLogger("capture.genicam_library")
 _library_log.setLevel(logging.CRITICAL + 1)
 
 
 class MissingHarvesters(CameraError, ImportError):
-    """The optional library is not installed."""
+    """Raised when the optional library is not installed."""
 
 
 @dataclass(frozen=True, slots=True)
 class GenicamLibrary:
-    """What is used of the packages ``harvesters`` and ``genicam``."""
+    """The parts in use of the packages ``harvesters`` and ``genicam``."""
 
     core: Any
     """``harvesters.core``."""
     errors: tuple[type[Exception], ...]
-    """What GenApi (features) and GenTL (transport) raise."""
+    """Exceptions of GenApi (features) and GenTL (transport)."""
 
     @contextlib.contextmanager
     def translate_errors(self, action: str) -> Iterator[None]:
-        """Raise the library's errors as those of a camera, with what was being done."""
+        """Raise the library's errors as camera errors that name the action."""
         try:
             yield
         except self.errors as error:
@@ -59,8 +60,7 @@ class GenicamLibrary:
             if kind in _REFUSAL_ERRORS:
                 raise CameraError(text) from error
             raise LinkLost(
-                f"{text}; the camera does not answer: look at its cable and power, then open it "
-                "again"
+                f"{text}; the camera does not answer: check its cable and power, then open it again"
             ) from error
 
 
@@ -82,15 +82,15 @@ def load_library(url: str) -> GenicamLibrary:
 
 
 def producer_files(url: str, given: str) -> tuple[Path, ...]:
-    """Return the producers to look into.
+    """Return the producer files to search for cameras.
 
     Parameters
     ----------
     url
-        Of the camera, for messages.
+        Address of the camera, for messages.
     given
-        A file ``*.cti`` or a folder of such; empty: the folders of the environment variable
-        ``GENICAM_GENTL64_PATH``, which the makers' installers set.
+        A file ``*.cti`` or a folder of such files; empty: the folders of the environment variable
+        ``GENICAM_GENTL64_PATH``, which the manufacturers' installers set.
 
     Raises
     ------
@@ -128,16 +128,16 @@ _opened_producers: dict[Path, _OpenedProducer] = {}
 
 
 class Connection:
-    """A camera that this process has for itself.
+    """Exclusive connection of this process to a camera.
 
     Parameters
     ----------
     acquirer
-        Of the library.
+        Image acquirer of the library.
     file
-        The producer behind it.
+        File of the producer.
     model, identifier
-        As the producer tells them; may be empty.
+        As reported by the producer; may be empty.
 
     Attributes
     ----------
@@ -155,7 +155,7 @@ class Connection:
         self._file: Path | None = file
 
     def close(self) -> None:
-        """Let go of the camera, even of one that is gone; doing so twice is allowed."""
+        """Release the camera, also a disconnected one; calling it twice is allowed."""
         file, self._file = self._file, None
         if file is None:
             return
@@ -170,26 +170,26 @@ class Connection:
 def connect_camera(
     library: GenicamLibrary, url: str, serial: str, files: Sequence[Path]
 ) -> Connection:
-    """Open the camera of a serial number.
+    """Open the camera with a serial number.
 
     Parameters
     ----------
     library
         From :func:`load_library`.
     url
-        Of the camera, for messages.
+        Address of the camera, for messages.
     serial
-        Its serial number, or the producer's identifier of it, as the message for one that is not
-        there lists them.
+        Its serial number, or its identifier at the producer, as listed in the message for a camera
+        that is not found.
     files
-        Producers, the first that has the camera is taken.
+        Producers; the first one that finds the camera is used.
 
     Raises
     ------
     CameraUrlError
-        When no such camera is found; the message names those that are.
+        When no such camera is found; the message lists those that are.
     CameraBusy
-        When another program has it.
+        When another program uses it.
     LinkLost
         When it does not answer.
     """
@@ -248,9 +248,9 @@ def _close_unused(library: GenicamLibrary, file: Path) -> None:
 
 
 def _create(library: GenicamLibrary, harvester: Any, device: Any) -> Any:
-    """Open a device; the library takes Ctrl-C for itself then, which is given back."""
+    """Open a device and restore the handler of Ctrl-C, which the library replaces."""
     core = library.core
-    # chunks are not used, and one that cannot be read would cost its frame
+    # chunks are not used, and an unreadable one would lose its frame
     config = core.ParameterSet({core.ParameterKey.ENABLE_AUTO_CHUNK_DATA_UPDATE: False})
     if threading.current_thread() is not threading.main_thread():
         return harvester.create(device, config=config)
@@ -276,7 +276,7 @@ _WRITABLE_ACCESS_MODES = (2, 4)
 
 
 class Features:
-    """The features of one camera.
+    """Feature access of one camera.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ class Features:
     library
         From :func:`~capture.devices.cameras.genicam_producer.load_library`.
     where
-        The camera, for messages.
+        Name of the camera, for messages.
     """
 
     def __init__(self, nodes: Any, library: GenicamLibrary, where: str) -> None:
@@ -294,11 +294,11 @@ class Features:
         self._where = where
 
     def has(self, *names: str) -> bool:
-        """Return whether the camera has all of these features now."""
+        """Return whether all of these features are available now."""
         return all(self._access(name) not in _ABSENT_ACCESS_MODES for name in names)
 
     def is_writable(self, name: str) -> bool:
-        """Return whether the feature can be set now."""
+        """Return whether the feature can be written now."""
         return self._access(name) in _WRITABLE_ACCESS_MODES
 
     def read(self, name: str, *alternatives: str) -> Any:
@@ -314,17 +314,17 @@ class Features:
                 with self._library.translate_errors(f"{self._where}: {candidate}"):
                     return getattr(self._nodes, candidate).value
         raise CameraError(
-            f"{self._where}: has no feature {' or '.join((name, *alternatives))} that can be read"
-            f" now"
+            f"{self._where}: has no feature {' or '.join((name, *alternatives))} that can be "
+            "read now"
         )
 
     def unit(self, name: str) -> str:
-        """Return the unit of a feature; empty where it tells none."""
+        """Return the unit of a feature; empty when it states none."""
         with self._library.translate_errors(f"{self._where}: {name}"):
             return str(getattr(self._nodes, name).unit or "")
 
     def choices(self, name: str) -> list[str]:
-        """Return the values that an enumeration can be set to now; none where it is missing."""
+        """Return the values that an enumeration can take now; empty when the feature is missing."""
         if not self.has(name):
             return []
         with self._library.translate_errors(f"{self._where}: {name}"):
@@ -332,14 +332,14 @@ class Features:
             return [e.symbolic for e in entries if e.get_access_mode() not in _ABSENT_ACCESS_MODES]
 
     def enum_number(self, name: str) -> int:
-        """Return the number behind an enumeration's present value."""
+        """Return the integer value of an enumeration's present entry."""
         with self._library.translate_errors(f"{self._where}: {name}"):
             return int(getattr(self._nodes, name).get_int_value())
 
     def set(self, name: str, value: Any) -> None:
-        """Make a feature have a value.
+        """Set a feature to a value and read it back.
 
-        One that has it already is not written, so that it may be fixed.
+        A feature that has the value already is not written, so that it may be read-only.
 
         Raises
         ------
@@ -368,12 +368,12 @@ class Features:
             )
 
     def set_if_present(self, name: str, value: Any) -> None:
-        """As :meth:`set`, for a feature that a camera need not have."""
+        """Set an optional feature, as :meth:`set`; do nothing when it is missing."""
         if self.has(name):
             self.set(name, value)
 
     def set_nearest(self, name: str, value: float) -> float:
-        """Set a number within what the camera allows; return what it then is."""
+        """Set a number to the nearest allowed value and return the value read back."""
         with self._library.translate_errors(f"{self._where}: {name} to {value:g}"):
             node = getattr(self._nodes, name)
             low, high = float(node.min), float(node.max)
@@ -387,7 +387,7 @@ class Features:
             return float(node.value)
 
     def execute(self, name: str) -> None:
-        """Do a command."""
+        """Execute a command feature."""
         if not self.has(name):
             raise CameraError(f"{self._where}: has no command {name}")
         with self._library.translate_errors(f"{self._where}: {name}"):

@@ -1,8 +1,8 @@
-"""How an industrial camera is read out: raw values and their levels, trigger, clock.
+"""Configure an industrial camera for raw values with known levels, trigger and clock.
 
-A camera is set so that its values depend on light, exposure time and gain alone. Without a raw
-format, known levels, a trigger and a clock that can be read, no frame of it could be believed, so
-it is refused.
+The values of a configured camera depend on light, exposure time and gain alone. Cameras without a
+raw format, known levels, a trigger or a readable clock are rejected, because none of their frames
+could be accepted.
 """
 
 import math
@@ -15,27 +15,27 @@ from capture.devices.cameras.genicam_producer import Features
 from capture.devices.cameras.pixel_format import PixelFormat
 
 BASE_ISO = 100
-"""Sensitivity that a gain of 0 dB is called where the address does not say."""
+"""ISO value of a gain of 0 dB when the address gives none."""
 
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """What ``genicam:SERIAL?NAME=VALUE&...`` says.
+    """Parsed form of ``genicam:SERIAL?NAME=VALUE&...``.
 
     Attributes
     ----------
     serial
         Serial number of the camera.
     producer
-        File or folder of the GenTL producer; empty: as GENICAM_GENTL64_PATH says.
+        File or folder of the GenTL producer; empty: from GENICAM_GENTL64_PATH.
     pixel_format
-        As the camera names it; empty: the deepest raw one.
+        Camera's name of the format; empty: the raw format with the most bits.
     line
-        Input of the trigger; empty: that which the camera is set to, else its first.
+        Trigger input; empty: the present setting of the camera, or its first input.
     iso
-        What a gain of 0 dB is called, above 0.
+        ISO value of a gain of 0 dB, above 0.
     black
-        Level of no light, DN; None: as the camera's BlackLevel says.
+        Level without light, DN; None: from the camera's BlackLevel.
     """
 
     serial: str
@@ -47,12 +47,12 @@ class Address:
 
     @property
     def url(self) -> str:
-        """The address without what follows the serial number."""
+        """The address without its query."""
         return f"genicam:{self.serial}"
 
 
 def parse_address(rest: str) -> Address:
-    """Return what an address says.
+    """Parse the part of an address after ``genicam:``.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def parse_address(rest: str) -> Address:
     """
     serial, _, query = rest.partition("?")
     expected = (
-        f"genicam:{rest}: expected genicam:SERIAL, then at will ?producer=FILE.cti, "
+        f"genicam:{rest}: expected genicam:SERIAL, then optionally ?producer=FILE.cti, "
         "format=NAME, line=NAME, iso=NUMBER, black=DN, joined by &"
     )
     try:
@@ -96,7 +96,7 @@ def parse_address(rest: str) -> Address:
 
 _DN_UNITS = ("dn", "lsb", "adu", "count", "counts", "digital number")
 
-# what would make values or times depend on something else, where a camera has it
+# features that would make values or times depend on anything else, where a camera has them
 _RAW_SETTINGS = (
     ("TriggerSelector", "FrameStart"),
     ("AcquisitionMode", "Continuous"),
@@ -113,20 +113,20 @@ _RAW_SETTINGS = (
 
 @dataclass(frozen=True, slots=True)
 class Readout:
-    """What a camera was set to once, and the names of its features.
+    """Settings of a camera that do not change, and the names of its features.
 
     Attributes
     ----------
     info
-        What the camera is.
+        Identity and properties of the camera.
     pixel_format, format_number
-        Of its frames; the number by which a buffer names it.
+        Format of its frames; its number in a buffer.
     exposure_feature
-        Exposure time, microseconds.
+        Name of the exposure time, microseconds.
     latch, latched, tick_s
-        The command that holds the clock, the feature that then tells it, and its unit, s.
+        Command that latches the clock, feature with the latched value, and its unit, s.
     line
-        Input that triggers; empty where there is none.
+        Trigger input; empty when there is none.
     """
 
     info: CameraInfo
@@ -140,21 +140,21 @@ class Readout:
 
 
 def prepare_readout(features: Features, address: Address, model: str) -> Readout:
-    """Set a camera to raw values and return how it is read out.
+    """Set a camera to raw values and return its readout settings.
 
     Parameters
     ----------
     features
-        Of the camera, which is not streaming.
+        Features of the camera, which is not streaming.
     address
-        What it is asked to be.
+        Requested settings.
     model
-        Its name, for one that does not tell its own.
+        Name to use for a camera that reports none.
 
     Raises
     ------
     CameraError
-        When it lacks what a frame needs to be believed, or cannot be set to raw values.
+        When it lacks a feature that acceptance of frames needs, or cannot be set to raw values.
     """
     where = address.url
     for name, value in _RAW_SETTINGS:
@@ -165,7 +165,7 @@ def prepare_readout(features: Features, address: Address, model: str) -> Readout
     )
     if not exposure_feature:
         raise CameraError(
-            f"{where}: has no feature ExposureTime; a camera is needed whose exposure can be set"
+            f"{where}: has no feature ExposureTime; use a camera whose exposure time can be set"
         )
     latch, latched, tick_s = _clock_features(features, where)
     chosen = _choose_format(features, where, address.pixel_format)
@@ -176,7 +176,7 @@ def prepare_readout(features: Features, address: Address, model: str) -> Readout
 
 
 def _level_colors(features: Features, where: str) -> None:
-    """Take white balance out of the values, where a camera multiplies it in."""
+    """Set white balance to 1 on a camera that multiplies it into the values."""
     for color in features.choices("BalanceRatioSelector"):
         features.set("BalanceRatioSelector", color)
         if features.has("BalanceRatio"):
@@ -192,12 +192,12 @@ def _clock_features(features: Features, where: str) -> tuple[str, str, float]:
     if features.has("TimestampLatch", "TimestampLatchValue"):
         return "TimestampLatch", "TimestampLatchValue", 1e-9
     if features.has("GevTimestampControlLatch", "GevTimestampValue"):
-        # names of GigE Vision 1, which counts ticks of the camera's own
+        # names of GigE Vision 1, which counts the camera's own ticks
         ticks_hz = float(features.read("GevTimestampTickFrequency"))
         return "GevTimestampControlLatch", "GevTimestampValue", 1.0 / ticks_hz
     raise CameraError(
-        f"{where}: has no clock that can be read (TimestampLatch), so that its frames cannot be "
-        "told from older ones"
+        f"{where}: has no readable clock (TimestampLatch), so that older frames cannot be "
+        "recognized; use another camera"
     )
 
 
@@ -210,9 +210,8 @@ def _choose_format(features: Features, where: str, requested: str) -> PixelForma
     )
     if chosen is None or chosen.name not in offered:
         raise CameraError(
-            f"{where}: pixel format: got {requested or 'no raw one'}, expected a raw one of those"
-            f" that "
-            f"the camera has: {', '.join(offered) or 'none'}"
+            f"{where}: pixel format: got {requested or 'no raw one'}, expected a raw one of "
+            f"those that the camera has: {', '.join(offered) or 'none'}"
         )
     features.set("PixelFormat", chosen.name)
     return chosen
@@ -240,11 +239,12 @@ def _describe(
     triggers += [Trigger.EDGE] if line else []
     if not triggers:
         raise CameraError(
-            f"{where}: has no trigger (TriggerSource: {', '.join(sources) or 'missing'})"
+            f"{where}: has no trigger (TriggerSource: {', '.join(sources) or 'missing'}); use "
+            "another camera"
         )
     white = 2**chosen.bits - 1
     if features.has("PixelDynamicRangeMax"):
-        # 12 bits of a converter in 16-bit numbers end below 65535
+        # a converter of 12 bits in 16-bit numbers saturates below 65535
         white = min(int(features.read("PixelDynamicRangeMax")) or white, white)
     width, height = int(features.read("Width")), int(features.read("Height"))
     _check_size(where, chosen, width, height)
@@ -276,10 +276,10 @@ def _check_size(where: str, chosen: PixelFormat, width: int, height: int) -> Non
 
 
 def _black(features: Features, address: Address, chosen: PixelFormat, white: int) -> float:
-    """Return the level of no light, DN.
+    """Return the level without light, DN.
 
-    BlackLevel is told in whatever unit the maker likes, per cent among them: it is taken only where
-    it says that it counts DN.
+    The unit of BlackLevel is up to the manufacturer, percent among others: its value is used only
+    when the unit is DN.
     """
     black = address.black
     if black is None and features.has("BlackLevel"):
@@ -287,9 +287,9 @@ def _black(features: Features, address: Address, chosen: PixelFormat, white: int
             black = float(features.read("BlackLevel"))
     if black is None:
         raise CameraError(
-            f"{address.url}: does not tell its black level in DN; put the lens cap on, read the "
-            f"median of a {chosen.name} frame in the maker's viewer, and add black=DN to the "
-            "address"
+            f"{address.url}: does not report its black level in DN; put the lens cap on, read "
+            f"the median of a {chosen.name} frame in the manufacturer's viewer, and add "
+            "black=DN to the address"
         )
     if not 0 <= black < white:
         raise CameraError(

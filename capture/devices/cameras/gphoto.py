@@ -1,8 +1,8 @@
-"""Cameras that libgphoto2 knows, by serial number; needs the extra ``gphoto``.
+"""Cameras supported by libgphoto2, by serial number; needs the extra ``gphoto``.
 
-The flash box's line releases the camera and its file is fetched when it says that there is one; for
-frames without light the computer releases it. The way through this module is tested against a
-stand-in for the library; no camera has been at hand.
+The flash controller's line releases the camera, and its file is downloaded when the camera reports
+one; for frames without light the computer releases it. The module is tested against a substitute
+for the library. It has not been tested with a camera.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from capture.devices.camera import (
 from capture.devices.cameras.hot_folder import parse_camera_info
 
 EVENT_DRAIN_MS = 50
-"""How long old events are waited for when the camera is armed, ms."""
+"""Time for which old events are awaited when the camera is armed, ms."""
 EVENT_TIMEOUT_MS = 500
 """Longest wait for one event, ms."""
 
 
 class MissingGphoto2(CameraError, ImportError):
-    """The optional library is not installed."""
+    """Raised when the optional library is not installed."""
 
 
 def open_camera(serial: str) -> GphotoCamera:
@@ -55,10 +55,10 @@ class GphotoCamera:
     library
         The module ``gphoto2``.
     serial
-        As the camera itself reports it. Port names are not used: they move from camera to
-        camera when a cable is plugged in again.
+        Serial number that the camera itself reports. Port names are not used: they change when a
+        cable is plugged in again.
     clock
-        The host's, s; for tests.
+        Clock of the host, s; for tests.
     """
 
     def __init__(
@@ -99,18 +99,18 @@ class GphotoCamera:
 
     @property
     def info(self) -> CameraInfo:
-        """What the camera is; takes one test picture the first time it is asked."""
+        """Identity and properties of the camera; the first call takes a test image."""
         if self._info is None:
             picture = raw.decode(memoryview(self._capture()), where=f"gphoto2:{self._serial}")
             self._info = parse_camera_info(picture, self._serial, Trigger.SOFTWARE, Trigger.EDGE)
         return self._info
 
     def clock_s(self) -> float:
-        """Return the host's clock, which stamps the frames."""
+        """Return the clock of the host, which stamps the frames."""
         return self._clock()
 
     def configure(self, want: Exposure) -> Exposure:
-        """Set shutter and ISO to the nearest the camera has."""
+        """Set shutter time and ISO to the nearest values that the camera has."""
         self._want = want
         with self._translated():
             return self._configure(want)
@@ -131,7 +131,7 @@ class GphotoCamera:
         return Exposure(got["shutterspeed"], int(got["iso"]))
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """Make ready for the computer's release or the box's; files of before are let go."""
+        """Prepare for a release by the computer or the controller; files of before are ignored."""
         if trigger not in (Trigger.SOFTWARE, Trigger.EDGE):
             raise CameraError(f"gphoto2:{self._serial}: cannot be triggered by {trigger}")
         if count < 1:
@@ -143,22 +143,24 @@ class GphotoCamera:
         self._seq = 0
 
     def fire(self) -> None:
-        """Note the trigger; the exposure is made when the frame is asked for."""
+        """Record the trigger; the exposure is made when the frame is requested."""
         self._fired_s = self.clock_s()
 
     def frame(self, timeout_s: float) -> Frame:
-        """Expose now, or wait for what the box has released, and download the raw file.
+        """Expose now, or wait for the controller's release, and download the raw file.
 
-        A file whose bytes are those of the last one is that one again: it bears its old time, by
-        which it is known as stale. Another file that was released before the camera was armed, and
-        told of later only, cannot be told from the right one.
+        A file with the bytes of the last one is a repetition: it has the old time and is therefore
+        rejected as stale. Another file that was released before the camera was armed but reported
+        only later cannot be distinguished from the right one.
         """
         start = self.clock_s()
         if self._trigger is Trigger.EDGE:
             blob = self._await_file(start + timeout_s)
             start = self.clock_s() - self._want.exposure_s
         elif self._fired_s == float("-inf"):
-            raise FrameTimeout(f"gphoto2:{self._serial}: was not fired")
+            raise FrameTimeout(
+                f"gphoto2:{self._serial}: not fired; fire it before waiting for a frame"
+            )
         else:
             blob = self._capture()
         self._fired_s = float("-inf")
@@ -175,7 +177,7 @@ class GphotoCamera:
         return frame
 
     def abort(self) -> None:
-        """Forget the trigger."""
+        """Clear the trigger."""
         self._fired_s = float("-inf")
 
     def close(self) -> None:
@@ -192,8 +194,8 @@ class GphotoCamera:
                 left_ms = round(1e3 * (until_s - self.clock_s()))
                 if left_ms <= 0:
                     raise FrameTimeout(
-                        f"gphoto2:{self._serial}: no new file came; is the box's trigger line "
-                        "plugged into the camera?"
+                        f"gphoto2:{self._serial}: no new file came; is the controller's trigger "
+                        "line plugged into the camera?"
                     )
                 event = self._event(min(left_ms, EVENT_TIMEOUT_MS))
                 if event is not None and event[0] == self._library.GP_EVENT_FILE_ADDED:
@@ -217,7 +219,7 @@ class GphotoCamera:
 
 
 def _seconds(text: str) -> float | None:
-    """Return "1/125" or "0.5" or "100" as a number, None for "bulb" and "auto"."""
+    """Return "1/125", "0.5" or "100" as a number, None for "bulb" and "auto"."""
     top, _, bottom = text.strip().removesuffix("s").partition("/")
     try:
         return float(top) / float(bottom or 1)

@@ -1,8 +1,8 @@
-"""A folder as a camera: any tethering program that writes raw files there will do.
+"""Use a folder as a camera: any tethering program that writes raw files there fits.
 
-The flash box's trigger line releases the camera, with light and without, or a person's finger where
-the address says ``release=hand``. A frame is a raw file that appeared after the camera was armed
-and has stopped growing.
+The flash controller's trigger line releases the camera, with light and without; with
+``release=hand`` in the address a person does. Frames are raw files that appeared after the camera
+was armed and have stopped growing.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from capture.devices.camera import (
 
 FOLDER_POLL_S = 0.1
 FILE_SETTLE_S = 0.5
-"""A file whose size has not changed for so long is taken to be whole."""
+"""Time without a change of size after which a file counts as complete, s."""
 RAW_SUFFIXES = frozenset(
     ".dng .nef .cr2 .cr3 .arw .raf .orf .rw2 .pef .srw .kdc .dcr .iiq .3fr .rwl".split()
 )
@@ -44,7 +44,7 @@ def open_camera(rest: str) -> HotFolder:
 
 
 def parse_camera_info(frame: raw.RawFrame, serial: str, *triggers: Trigger) -> CameraInfo:
-    """Return what a raw file says of the camera that took it."""
+    """Read the properties of the camera from a raw file."""
     height, width = frame.cfa.shape
     levels = (frame.pattern, frame.black, frame.white)
     return CameraInfo(serial, frame.camera_model, width, height, *levels, triggers)
@@ -58,17 +58,17 @@ class HotFolder:
     path
         An existing folder.
     serial
-        Serial number that frames must carry; empty: that of the first file in the folder, which
-        must then hold one.
+        Serial number that frames must have; empty: that of the first file in the folder, which must
+        then contain one.
     by_hand
-        Whether nothing but a person can release the camera.
+        Whether only a person can release the camera.
     clock, sleep
         For tests; the clock must be the one that stamps files (seconds since 1970).
 
     Raises
     ------
     CameraUrlError
-        When the folder is missing, or no file tells the serial number.
+        When the folder is missing, or no file contains the serial number.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class HotFolder:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         if not path.is_dir():
-            raise CameraUrlError(f"hotfolder:{path}: is no folder; make it, then try again")
+            raise CameraUrlError(f"hotfolder:{path}: not a folder; make it, then try again")
         self._path = path
         self._clock = clock
         self._sleep = sleep
@@ -91,8 +91,8 @@ class HotFolder:
         sample = next(iter(sorted(self._seen)), None)
         if sample is None:
             raise CameraUrlError(
-                f"hotfolder:{path}: is empty; take one test picture into it, so that the camera "
-                "is known"
+                f"hotfolder:{path}: empty; take one test image into it, from which the camera "
+                "is identified"
             )
         frame = raw.read(sample)
         known = serial or frame.camera_serial or frame.camera_model
@@ -100,7 +100,7 @@ class HotFolder:
 
     @property
     def info(self) -> CameraInfo:
-        """What the test picture says of the camera."""
+        """Properties of the camera, from the test image."""
         return self._info
 
     def clock_s(self) -> float:
@@ -108,12 +108,12 @@ class HotFolder:
         return self._clock()
 
     def configure(self, want: Exposure) -> Exposure:
-        """Note what is wanted; the tethering program sets it."""
+        """Record the requested exposure; the tethering program sets it."""
         self._want = want
         return want
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """Ignore all that is in the folder now."""
+        """Ignore all files that are in the folder now."""
         if count < 1:
             raise CameraError(f"count: got {count}, expected 1 or more")
         if trigger not in self._info.triggers:
@@ -122,14 +122,17 @@ class HotFolder:
         self._seq = 0
 
     def fire(self) -> None:
-        """Refuse: a folder takes no picture.
+        """Raise an error: a folder cannot release a camera.
 
         Raises
         ------
         CameraError
             Always.
         """
-        raise CameraError(f"hotfolder:{self._path}: is released by the box or by hand, not by fire")
+        raise CameraError(
+            f"hotfolder:{self._path}: cannot be fired; release the camera by the "
+            "controller or by hand"
+        )
 
     def frame(self, timeout_s: float) -> Frame:
         """Wait for a new raw file that has stopped growing, and read it."""
@@ -161,7 +164,7 @@ class HotFolder:
         self._seen |= set(self._files())
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Do nothing: a folder needs no release."""
 
     def _files(self) -> list[Path]:
         return [p for p in self._path.iterdir() if p.suffix.lower() in RAW_SUFFIXES and p.is_file()]

@@ -1,7 +1,7 @@
-"""Raw pixel formats of industrial cameras, and their bytes as numbers.
+"""Raw pixel formats of industrial cameras, and the conversion of their bytes to numbers.
 
-Names and layouts are those of the Pixel Format Naming Convention (EMVA, PFNC 2.4): a number alone
-is one pixel in one or two bytes, ``p`` is packed without gaps from the lowest bit on,
+Names and layouts are those of the Pixel Format Naming Convention (EMVA, PFNC 2.4): a bare number of
+bits is one pixel in one or two bytes, ``p`` is packed without gaps from the lowest bit on,
 ``Packed`` is GigE Vision's older packing of two pixels in three bytes.
 """
 
@@ -26,7 +26,7 @@ _CFA_PATTERNS = {
 
 @dataclass(frozen=True, slots=True)
 class PixelFormat:
-    """A raw format of one number per pixel.
+    """Raw format with one number per pixel.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class PixelFormat:
     pattern
         Color filter array, "RGGB" and so on, or "MONO".
     bits
-        Of a pixel's number; its largest is 2**bits - 1.
+        Bits per pixel; the largest value is 2**bits - 1.
     packing
         "p", "Packed", or empty: one pixel in whole bytes.
     """
@@ -51,12 +51,12 @@ class PixelFormat:
         Raises
         ------
         ValueError
-            When a line of that width does not end with a whole group of packed pixels: where the
-            next one begins is then not settled by the convention.
+            When a line of that width does not end with a whole group of packed pixels: the
+            convention does not define where the next line begins.
         """
         if not self.packing:
             return width_px * (1 if self.bits == 8 else 2)
-        # the older packing spends four bits on the low two of a 10-bit pixel
+        # the older packing stores the low two bits of a 10-bit pixel in four bits
         bits = 12 if self.packing == "Packed" else self.bits
         group = 8 // math.gcd(bits, 8)
         if width_px % group:
@@ -80,13 +80,13 @@ class PixelFormat:
         Parameters
         ----------
         data
-            As the camera sent them; what follows the last line is ignored.
+            Bytes as the camera sent them; what follows the last line is ignored.
         width_px, height_px
-            Of the frame.
+            Size of the frame.
         padding_bytes
-            After each line.
+            Bytes after each line.
         big_endian
-            Whether numbers of two bytes have their high byte first.
+            Whether two-byte numbers have their high byte first.
 
         Returns
         -------
@@ -145,7 +145,7 @@ class PixelFormat:
 
 
 def parse_pixel_format(name: str) -> PixelFormat | None:
-    """Return the raw format of that name, None for one that is no raw format of 8 to 16 bits.
+    """Return the raw format with a name, None for a name of any other format than raw 8 to 16 bits.
 
     Examples
     --------
@@ -164,10 +164,10 @@ def parse_pixel_format(name: str) -> PixelFormat | None:
 
 
 def choose_deepest_format(names: list[str]) -> PixelFormat | None:
-    """Return the raw format with the most bits, of a filter array where the camera offers any.
+    """Return the raw format with the most bits, of a color filter array where the camera has one.
 
-    A color camera offers "Mono8" too, as a conversion of its own. Of formats as deep, the one that
-    is not packed.
+    A color camera offers "Mono8" too, as its own conversion. Among formats with equal bits, the
+    unpacked one is returned.
 
     Examples
     --------

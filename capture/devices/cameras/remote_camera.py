@@ -1,4 +1,4 @@
-"""A camera behind a TCP port: ``tcp://HOST:PORT/VIEW``, as ``skinrig serve`` prints it.
+"""Camera behind a TCP port: ``tcp://HOST:PORT/VIEW``, as ``skinrig serve`` prints it.
 
 Another program can serve its cameras in the same way: see `capture.devices.cameras.camera_wire`.
 """
@@ -24,9 +24,9 @@ from capture.devices.cameras.camera_wire import BadMessage
 from capture.devices.port import LinkLost
 
 ANSWER_TIMEOUT_S = 5.0
-"""How long an answer may take beyond what was asked for, s."""
+"""Largest delay of an answer beyond the requested time, s."""
 DEVELOP_TIMEOUT_S = 300.0
-"""How long a frame may take from its arrival until its pixels are sent, s."""
+"""Largest time from the arrival of a frame until its pixels are sent, s."""
 _ERROR_CLASSES = {"FrameTimeout": FrameTimeout, "CameraBusy": CameraBusy}
 
 
@@ -45,16 +45,16 @@ class RemoteCamera:
     Parameters
     ----------
     host, port
-        Where it is served.
+        Address of the server.
     view
-        Which of the cameras there.
+        View of the camera there.
 
     Raises
     ------
     LinkLost
         When nothing answers there.
     CameraError
-        When no such camera is served there (`CameraBusy`: another program has it).
+        When no such camera is served there (`CameraBusy`: another program uses it).
     """
 
     def __init__(self, host: str, port: int, view: str) -> None:
@@ -78,7 +78,7 @@ class RemoteCamera:
 
     @property
     def info(self) -> CameraInfo:
-        """What it is."""
+        """Identity and properties of the camera."""
         return self._info
 
     def clock_s(self) -> float:
@@ -87,13 +87,13 @@ class RemoteCamera:
             return float(self._ask("clock")["clock_s"])
 
     def configure(self, want: Exposure) -> Exposure:
-        """Set an exposure and return what was really set."""
+        """Set an exposure and return the settings in effect."""
         answer = self._ask("configure", exposure_s=want.exposure_s, iso=want.iso)
         with self._translate_errors():
             return Exposure(float(answer["exposure_s"]), int(answer["iso"]))
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        """Make ready for `count` frames; frames waiting from before are dropped."""
+        """Prepare for `count` frames and drop frames that wait from before."""
         self._ask("arm", count=count, trigger=str(trigger))
 
     def fire(self) -> None:
@@ -101,7 +101,7 @@ class RemoteCamera:
         self._ask("fire")
 
     def frame(self, timeout_s: float) -> Frame:
-        """Return the next frame, or raise `FrameTimeout`; a damaged one is `FrameRefused`."""
+        """Return the next frame, or raise `FrameTimeout`; a damaged one raises `FrameRefused`."""
         answer = self._ask("frame", timeout_s=timeout_s, reply_delay_s=timeout_s)
         try:
             camera_wire.check_blob(answer, answer["blob"])
@@ -110,11 +110,11 @@ class RemoteCamera:
             raise FrameRefused(f"{self._url}: a frame was damaged on its way: {exc!r}") from exc
 
     def abort(self) -> None:
-        """Give up what was armed."""
+        """Cancel what was armed."""
         self._ask("abort")
 
     def close(self) -> None:
-        """Let go of the camera; doing so twice is allowed."""
+        """Release the camera; calling it twice is allowed."""
         self._drop()
 
     def _drop(self) -> None:
@@ -129,7 +129,9 @@ class RemoteCamera:
             yield
         except (BadMessage, KeyError, TypeError, ValueError) as exc:
             self._drop()
-            raise CameraError(f"{self._url}: an answer made no sense: {exc!r}") from exc
+            raise CameraError(
+                f"{self._url}: got an answer that cannot be decoded: {exc!r}"
+            ) from exc
 
     def _ask(self, request: str, *, reply_delay_s: float = 0.0, **fields: Any) -> dict[str, Any]:
         """Send one request and return the fields of its answer, its bytes under ``blob``."""

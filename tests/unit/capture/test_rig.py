@@ -139,7 +139,7 @@ def test_file_that_is_not_rig_gives_single_error(tmp_path, content, reason):
 def test_unknown_name_errors_list_valid_names(flash):
     with pytest.raises(RigError, match="did you mean flash"):
         load_rig("flahs")
-    with pytest.raises(RigError, match="no such file"):
+    with pytest.raises(RigError, match="file not found"):
         load_rig("nowhere/rig.toml")
     with pytest.raises(RigError, match="did you mean cam"):
         flash.view("camm")

@@ -300,15 +300,15 @@ def test_plan_beyond_dose_is_refused_before_sending():
         )
         for k in range(201)
     ]
-    with pytest.raises(AcquisitionError, match=r"light dose: L000 would send out 50\.2 Ws"):
+    with pytest.raises(AcquisitionError, match=r"light dose: L000 would emit 50\.2 Ws"):
         check_safety(Plan("dome", tuple(steps)), DOME)
 
 
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"leds": 149}, "the box drives 149 LEDs"),
-        ({"cameras": 3}, "the box releases 3"),
+        ({"leds": 149}, "the controller drives 149 LEDs"),
+        ({"cameras": 3}, "the controller releases 3"),
         ({"row_max_us": 50_000}, "got dwell_s 0.0833"),
         ({"settle_us": 30_000}, "do not fit"),
         ({"max_at_once": 5}, "6 lights at once"),
@@ -341,7 +341,7 @@ def test_camera_with_incomparable_clock_is_refused(make):
         return honest()
 
     camera.clock_s = slow_clock_s
-    with pytest.raises(CameraError, match="clocks of camera and box"):
+    with pytest.raises(CameraError, match="clocks of camera and controller"):
         bench.run()
     assert not bench.unit.lit
 

@@ -149,7 +149,7 @@ def test_single_altered_pixel_is_detected(calibration, tmp_path):
         (lambda d: d.update(valid_until="2020-01-01"), "valid_until"),
         (lambda d: d["values"]["N5100-1"]["levels"].update(shape=[3]), "shape"),
         (lambda d: d["values"]["N5100-1"]["levels"].update(value=["8"]), "number"),
-        (lambda d: d["maps"]["shading"].update(file="../shading.exr"), "leaves the folder"),
+        (lambda d: d["maps"]["shading"].update(file="../shading.exr"), "is outside the folder"),
         (lambda d: d["maps"]["shading"].update(file="sensor-none.exr"), "missing"),
         (lambda d: d.update(source="guessed"), "measured"),
     ],

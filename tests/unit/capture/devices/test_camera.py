@@ -164,7 +164,7 @@ def test_folder_address_selects_release_by_controller_or_hand(folder):
         camera.arm(1, known)
         with pytest.raises(cameras.CameraError, match="cannot be released"):
             camera.arm(1, Trigger.SOFTWARE)
-        with pytest.raises(cameras.CameraError, match="by the box or by hand"):
+        with pytest.raises(cameras.CameraError, match="by the controller or by hand"):
             camera.fire()
     for query in ("?release=foot", "?seriel=A1", "?serial=", "?x"):
         with pytest.raises(cameras.CameraUrlError, match="release=hand"):
@@ -172,9 +172,9 @@ def test_folder_address_selects_release_by_controller_or_hand(folder):
 
 
 def test_folder_without_test_image_error_names_remedy(tmp_path):
-    with pytest.raises(cameras.CameraUrlError, match="test picture"):
+    with pytest.raises(cameras.CameraUrlError, match="test image"):
         HotFolder(tmp_path)
-    with pytest.raises(cameras.CameraUrlError, match="is no folder"):
+    with pytest.raises(cameras.CameraUrlError, match="not a folder"):
         HotFolder(tmp_path / "nothing")
 
 

@@ -136,14 +136,14 @@ def test_positions_are_kept_where_a_scale_is_given(rti, tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("13\nimg0.png 0 0 1\n", "13, as its first line"),
+        ("13\nimg0.png 0 0 1\n", "13, as in its first line"),
         ("1\nimg0.png 0 0\n", "three numbers"),
         ("1\nimg0.png 0 0 nan\n", "three numbers"),
         ("1\nimg0.png 0 0 0\n", "three numbers"),
         ("2\nimg0.png 0 0 1\nimg0.png 0 1 1\n", "twice"),
         ("1\nnowhere.png 0 0 1\n", "nowhere.png"),
         ("", "lines"),
-        ("\0\0", "no light list"),
+        ("\0\0", "not a light list"),
     ],
 )
 def test_a_broken_list_is_refused_by_name(rti, tmp_path, text, expected):
@@ -156,11 +156,11 @@ def test_a_broken_list_is_refused_by_name(rti, tmp_path, text, expected):
 
 def test_invalid_light_list_input_is_refused_by_name(rti, tmp_path):
     folder, _, _, _ = rti
-    with pytest.raises(LightListError, match="no such folder"):
+    with pytest.raises(LightListError, match="folder not found"):
         import_light_list(folder / "x", out=tmp_path / "s")
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(LightListError, match="no pictures"):
+    with pytest.raises(LightListError, match="no images"):
         import_light_list(empty, out=tmp_path / "s")
     cv2.imwrite(str(folder / "ball_mask.png"), np.full((9, 9), 255, np.uint8))
     with pytest.raises(LightListError, match="9 x 9"):

@@ -97,10 +97,10 @@ BROKEN = {
     "blank.ply": (b" \n\n", "an empty one"),
     "noise.ply": (bytes(range(256)) * 8, "a whole PLY file"),
     "noise.obj": (bytes(range(256)) * 8, "at least one triangle|a whole OBJ file"),
-    "cut.ply": (BINARY[:-100], "a whole PLY file|cut short"),
-    "header.ply": (BINARY[:60], "a whole PLY file|cut short|triangle"),
-    "cut-ascii.ply": (ASCII[:-200], "a whole PLY file|cut short"),
-    "middle-ascii.ply": (ASCII[:2000], "a whole PLY file|cut short"),
+    "cut.ply": (BINARY[:-100], "a whole PLY file|truncated"),
+    "header.ply": (BINARY[:60], "a whole PLY file|truncated|triangle"),
+    "cut-ascii.ply": (ASCII[:-200], "a whole PLY file|truncated"),
+    "middle-ascii.ply": (ASCII[:2000], "a whole PLY file|truncated"),
     "cut.obj": (HEAD.export(file_type="obj").encode()[:900], "whole OBJ|triangle"),
     "points.ply": (POINTS, "points only"),
     "points.obj": (CORNERS.encode(), "at least one triangle"),
@@ -110,8 +110,11 @@ BROKEN = {
         (CORNERS.replace("100", "0.2").replace("50", "0.1") + "f 1 2 3\n").encode(),
         "--unit m",
     ),
-    "giant.obj": ((CORNERS.replace("100", "1e9") + "f 1 2 3\n").encode(), "no size of a face"),
-    "point.obj": (b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "no size of a face"),
+    "giant.obj": (
+        (CORNERS.replace("100", "1e9") + "f 1 2 3\n").encode(),
+        "implausible in size for a face",
+    ),
+    "point.obj": (b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "implausible in size for a face"),
     "head.stl": (b"solid", "suffix '.stl'"),
 }
 
@@ -177,7 +180,7 @@ def test_open_session_accepts_mesh_stays_open_without_names(session, scan):
     about = opened.attachment_line("scan.ply").about
     assert (about["unit"], about["format"], about["origin"]) == ("mm", "obj", "imported")
     assert b"lovelace" not in (session / "journal.jsonl").read_bytes()
-    with pytest.raises(SessionError, match="holds a scan already"):
+    with pytest.raises(SessionError, match="contains a scan already"):
         import_mesh(scan, session=session)
 
 

@@ -118,7 +118,7 @@ def test_not_a_number_in_an_exr_is_masked(tmp_path):
     expected = np.ones((8, 8), bool)
     expected[2, 3] = False
     np.testing.assert_array_equal(linear(photo.frame).valid, expected)
-    assert any("2 values that are no numbers" in note for note in photo.notes)
+    assert any("2 values that are not numbers" in note for note in photo.notes)
 
 
 def test_a_raw_file_keeps_its_sensor_values(tmp_path):
@@ -352,9 +352,9 @@ def test_every_bad_file_is_named_at_once(picture, tmp_path):
 
 def test_empty_and_missing_photograph_folders_are_reported(tmp_path):
     (tmp_path / "notes.txt").write_text("x")
-    with pytest.raises(PhotoError, match="holds no photographs"):
+    with pytest.raises(PhotoError, match="contains no photographs"):
         import_photos(tmp_path, out=tmp_path / "s")
-    with pytest.raises(PhotoError, match="no such folder"):
+    with pytest.raises(PhotoError, match="folder not found"):
         import_photos(tmp_path / "missing", out=tmp_path / "s")
 
 

@@ -151,7 +151,7 @@ def test_all_faults_of_a_plan_file_are_listed(flash):
     ("text", "reason"),
     [
         ('{"rig": NaN}', "NaN"),
-        ('{"rig": "a", "rig": "b"}', "stands twice"),
+        ('{"rig": "a", "rig": "b"}', "is twice"),
         ("[" * 100_000, "is not JSON"),
         (b"\xff", "is not JSON"),
         ("", "is not JSON"),

@@ -485,7 +485,7 @@ def test_saturated_pixel_invalidates_exactly_its_contributions():
 
 def test_unknown_noise_is_an_error_not_a_guess(cfa):
     frame = RawFrame(cfa=cfa, pattern="RGGB", black=(0.0,) * 4, white=65535)
-    with pytest.raises(RawError, match="how noisy"):
+    with pytest.raises(RawError, match="noise profile"):
         raw.linear_rgb(frame)
     with pytest.raises(RawError, match="both or neither"):
         raw.linear_rgb(frame, gain=1.0)

@@ -57,7 +57,7 @@ def test_omitted_steps_are_not_pending_and_session_completes(session):
     assert (line.about["aperture_mm"], line.t_host_s) == (5.6, 7.0)
     found = verify(session.path)
     assert found.ok
-    assert found.warnings == (f"{session.path}: 2 steps left out: {WHY}",)
+    assert found.warnings == (f"{session.path}: 2 steps omitted: {WHY}",)
 
 
 def test_omitted_steps_survive_interruption(session):
@@ -96,9 +96,9 @@ def test_other_missing_steps_still_need_reason(session):
 def test_omitted_step_is_neither_captured_nor_omitted_again(session):
     session.leave_out(["S003"], reason=WHY, t_host_s=0.0)
     before = (session.path / "journal.jsonl").read_bytes()
-    with pytest.raises(SessionError, match="was left out"):
+    with pytest.raises(SessionError, match="was omitted"):
         commit(session, "S003")
-    with pytest.raises(SessionError, match="not left out before"):
+    with pytest.raises(SessionError, match="not omitted before"):
         session.leave_out(["S002", "S003"], reason=WHY, t_host_s=0.0)
     assert (session.path / "journal.jsonl").read_bytes() == before
 

@@ -486,10 +486,10 @@ def test_camera_without_trigger_line_is_refused_before_light(make):
 @pytest.mark.parametrize(
     ("key", "value", "match"),
     [
-        ("fibres", 12, "the box has 12, the rig 6"),
+        ("fibres", 12, "the controller has 12, the rig 6"),
         ("shutter_max_ms", 100.0, "the shutter opens for"),
-        ("suction_max_mbar", 40.0, "the box draws at most 40"),
-        ("suction_max_ms", 1000.0, "the box sucks for at most 1 s"),
+        ("suction_max_mbar", 40.0, "the controller allows at most 40"),
+        ("suction_max_ms", 1000.0, "the controller applies suction for at most 1 s"),
         ("dose_ws", 1e-4, "light dose"),
     ],
 )

@@ -239,7 +239,7 @@ def test_certificate_scale_uncertainty_is_common_to_all_fibers(rng):
 
 def test_readings_of_no_light_cannot_calibrate(rng):
     probe = Probe(rng, dead=range(28), stray=0.0)
-    with pytest.raises(FiberError, match="no fibre gives light"):
+    with pytest.raises(FiberError, match="no fiber has light"):
         probe.calibrate()
     bright = Probe(rng)
     with pytest.raises(FiberError, match="saturated in every exposure; take shorter"):

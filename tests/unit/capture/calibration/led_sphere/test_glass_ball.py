@@ -131,12 +131,12 @@ def test_crop_showing_half_ball_is_refused_by_name(rng):
     pixels = seen([3.2, 2.0, -3.0], PLACE, camera=half)
     inside = ((pixels > 0) & (pixels < 1299)).all(axis=1)
     assert 30 < inside.sum() < 66
-    with pytest.raises(BallError, match="spots lie in the field"):
+    with pytest.raises(BallError, match="spots are in the field"):
         locate_ball(pixels[inside], half, PLACE, TARGET)
 
 
 def test_missing_and_foreign_spots_are_refused_by_name(rng):
-    with pytest.raises(BallError, match="no spot stands out"):
+    with pytest.raises(BallError, match="no spot above the dark level"):
         locate_ball(np.zeros((0, 2)), CAMERA, PLACE, TARGET)
     with pytest.raises(BallError, match="lights' pattern"):
         locate_ball(rng.uniform(0, 2047, (100, 2)), CAMERA, PLACE, TARGET)

@@ -117,7 +117,7 @@ def test_sphere_is_located_within_errors_wrong_radius_detected(rng):
     # chi-square of 24 degrees of freedom, false alarm 1e-3 on each side
     assert 8.5 < squares < 51.2
     with pytest.raises(
-        MirrorSphereError, match=r"got 50.5, but the outlines in 5 cameras say 50\.0"
+        MirrorSphereError, match=r"got 50.5, but the outlines in 5 cameras give 50\.0"
     ):
         mirror_sphere.locate_sphere(outlines, CAMERAS, 1.01 * RADIUS_MM)
 
@@ -182,7 +182,7 @@ def test_lights_visible_to_single_camera_keep_nominal_flagged(rng):
     np.testing.assert_array_equal(found.position_mm[0], lights[name])
     assert found.valid[1:].sum() > 10
     one = [shot for shot in seen if shot.view == "C07"]
-    with pytest.raises(MirrorSphereError, match="no light was seen by 2 cameras"):
+    with pytest.raises(MirrorSphereError, match="no light was observed by 2 cameras"):
         mirror_lights.locate_lights(one, CAMERAS, spheres, lights)
 
 
