@@ -6,7 +6,7 @@ Targets and subjects are captured by the simulated rig at the demo's size and no
 band, unmasked pixels are compared with the ground truth blurred by lateral transport. Printed are:
 median relative error and bias, the coverage of the 68 % intervals, the coverage of intervals of
 noise alone (no model error), the intervals' median relative half-width, the median Cramer-Rao bound
-at the ground truth, and the masked fraction. A second row per band is restricted to pixels whose
+at the ground truth, and the masked fraction. The next row of the band is restricted to pixels whose
 bound is below 10 %; there the limit of the median error is 15 %. Elsewhere it is 1.3 times the
 bound.
 """

@@ -91,7 +91,7 @@ def trace(work: Path, scale: float, threads: int, seed: int) -> list[dict[str, F
         path = work / f"base{number}.npz"
         if not path.exists():
             started = time.process_time()
-            told = ABSORPTION[(base <= ABSORPTION) & (max(base, 0.003) * SPAN >= ABSORPTION)]
+            served = ABSORPTION[(base <= ABSORPTION) & (max(base, 0.003) * SPAN >= ABSORPTION)]
             radii, widths, values = [], [], []
             for group, (radius, width, photons) in enumerate(groups(base)):
                 stack = LayerStack(
@@ -115,7 +115,7 @@ def trace(work: Path, scale: float, threads: int, seed: int) -> list[dict[str, F
                     batches=BATCHES,
                     threads=threads,
                 )
-                more = np.maximum(told - max(base, LEAST), 0.0)
+                more = np.maximum(served - max(base, LEAST), 0.0)
                 values.append(
                     np.stack([paths.profile(m).batch_reflectance_per_mm2 for m in more], axis=-1)
                 )
@@ -123,7 +123,7 @@ def trace(work: Path, scale: float, threads: int, seed: int) -> list[dict[str, F
                 widths.append(np.full(len(radius), width))
             np.savez(
                 path,
-                told=told,
+                served=served,
                 radius=np.concatenate(radii),
                 width=np.concatenate(widths),
                 value=np.concatenate(values, axis=1),
@@ -219,7 +219,7 @@ def combine(runs: list[dict[str, FloatArray]]) -> tuple[FloatArray, FloatArray]:
     top = np.zeros((len(DISTANCE), len(ABSORPTION)))
     weight = np.zeros_like(top)
     for base, run in zip(BASES, runs, strict=True):
-        for column, a in enumerate(run["told"]):
+        for column, a in enumerate(run["served"]):
             shape, spread, chi2 = smoothed(
                 run["radius"], run["width"], run["value"][:, :, column], float(a)
             )
