@@ -15,7 +15,7 @@ from rigsim.arrays import Float32Array, Float64Array
 def polygon_edge_distance(
     x: Float64Array, y: Float64Array, *, jitter: float, seed: int
 ) -> tuple[Float32Array, Float32Array]:
-    """Return how far points are from the edges of a polygon net.
+    """Return the distance of points from the edges of a polygon net.
 
     Parameters
     ----------

@@ -69,7 +69,7 @@ def vessel_network(
     Returns
     -------
     ndarray of float32
-        Shape (...), 1 on a line's middle, falling to 0 beside it.
+        Shape (...), 1 on a line's center, falling to 0 on both sides.
     """
     flat = _flat(points_mm)
     # Lines are the zero crossings of smooth noise; its slope is about 1.6 units per cell.
@@ -106,8 +106,8 @@ def random_spots(
     softness
         Exponent of the edge: 2 is soft, 8 is crisp.
     smallest_mm
-        Spots are not drawn smaller than this, shape (...) or a number; what they gain in area they
-        lose in strength.
+        Spots are not drawn smaller than this, shape (...) or a number; their strength is reduced by
+        the gain in area.
 
     Returns
     -------
