@@ -14,14 +14,14 @@ length L, and absorption is applied afterwards as exp(-sigma_a L). Variance redu
   the cloud are thinned by roulette. The importance is diffusion's exp(-3 r^2/(4 L)) to the power
   0.6, so that large radii and strong absorption get as many photons as weak absorption.
 - At the surface the expected transmittance is scored instead of a random choice.
-- "fibre": each shallow collision scores what it sends directly into the fibre's cone (next-event
+- "fibre": each shallow collision scores what it sends directly into the fiber's cone (next-event
   estimation), in one direction drawn inside the cone.
 - Paths longer than 3000 transport lengths are continued by the diffusion's L^(-5/2) law, whose
   constant is taken from the last factor of two of the histogram.
 
-- Near the source few photons go into a fibre's cone where the phase function is narrow. For g = 0.9
+- Near the source few photons go into a fiber's cone where the phase function is narrow. For g = 0.9
   and 0.95 paths up to 4 transport lengths are traced separately by 8 and 16 times the photons.
-- Splines over the rings, as smooth as predicts half of the batches from the others best. Fibres are
+- Splines over the rings, as smooth as predicts half of the batches from the others best. Fibers are
   fitted as the quotient over light of all directions, which changes slowly far from the source.
 
 Tracing takes 20 minutes of one busy core, the table another half minute. It is the same for any
@@ -70,7 +70,7 @@ PHOTONS = {
     0.0: 80_000,
     0.3: 80_000,
 }
-# Near the source few photons go into a fibre's cone where the phase function is narrow: paths up to
+# Near the source few photons go into a fiber's cone where the phase function is narrow: paths up to
 # 4 transport lengths are traced again, by so many photons, instead.
 SHORT_PHOTONS = {0.9: 1_000_000, 0.95: 800_000}
 SHORT_BIN = 167

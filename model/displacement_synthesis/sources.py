@@ -48,7 +48,7 @@ def level_patch(
         Heights to use.
     cutoff_um : float
         Waves of this length keep half their height (ISO 16610-21); the paper removes detail
-        beyond a millimetre (Nagano2015 section 4).
+        beyond a millimeter (Nagano2015 section 4).
 
     Returns
     -------

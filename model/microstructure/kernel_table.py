@@ -82,7 +82,7 @@ class KernelTable:
     Attributes
     ----------
     alpha_breaks : tuple of float
-        Stretch ratios between neighbouring lines of alpha, increasing; empty for one line.
+        Stretch ratios between neighboring lines of alpha, increasing; empty for one line.
     alpha_lines : tuple of (slope, intercept)
         One more than breaks; they meet at the breaks, and alpha(1) = 0. The value is clamped to
         `ALPHA_LIMITS`, as in the kernel's definition.

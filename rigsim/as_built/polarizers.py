@@ -81,7 +81,7 @@ def draw_polarizers(rig: Rig) -> Polarizers:
 
     Returns
     -------
-    Films
+    Polarizers
         Extinction ratios of 1500 to 6000 and a zero within about a degree.
     """
     serials = "|".join(view.serial for view in rig.views)

@@ -12,10 +12,10 @@ from capture.rig import Rig, View
 from rigsim.arrays import Float32Array, Float64Array
 
 SPOT_RADIUS_PX: Final = 12.0
-"""Nominal radius of a fibre's end in the camera's image."""
+"""Nominal radius of a fiber's end in the camera's image."""
 
 FIBER_END_UNEVENNESS: Final = 0.05
-"""Standard deviation of the tilt and of the curvature of the light over a fibre's end, relative:
+"""Standard deviation of the tilt and of the curvature of the light over a fiber's end, relative:
 its modes are not filled alike."""
 
 
@@ -28,7 +28,7 @@ class ProbeTolerances:
     """Manufacturing tolerances; 0 gives the nominal probe. Values are this project's choice."""
 
     gain: float = 0.05
-    """Relative standard deviation of the fibres' transmissions; errors are at most twice as
+    """Relative standard deviation of the fibers' transmissions; errors are at most twice as
     large."""
     position_px: float = 0.6
     """Standard deviation of a spot's position, pixels, per axis."""
@@ -65,7 +65,7 @@ class ActualProbe:
     gain: Float64Array
     """Transmission relative to nominal, > 0, shape (F,)."""
     crosstalk: Float64Array
-    """Share of fibre j's light that comes out of fibre i, shape (F, F) at [i, j]; columns sum
+    """Share of fiber j's light that comes out of fiber i, shape (F, F) at [i, j]; columns sum
     to 1."""
     unevenness: Float64Array
     """Light over a spot: 1 + a u + b v + c (2 (u^2 + v^2) - 1) of u, v in radii, shape (F, 3)."""
@@ -120,11 +120,11 @@ def build_probe(rig: Rig, *, seed: int, tolerances: ProbeTolerances | None = Non
 
     Returns
     -------
-    ProbeBuild
+    ActualProbe
 
     Raises
     ------
-    BuildError
+    ProbeBuildError
         The rig has no probe.
 
     Examples
@@ -168,7 +168,7 @@ def build_probe(rig: Rig, *, seed: int, tolerances: ProbeTolerances | None = Non
 
 
 def fiber_unit_images(build: ActualProbe, view: View) -> Float32Array:
-    """Return the image of each fibre's light, wings and veil included.
+    """Return the image of each fiber's light, wings and veil included.
 
     All images have the same flux, up to losses of the wings outside the sensor: that of a uniform
     spot of nominal radius and height 1, pi (radius^2 + edge^2).
@@ -183,7 +183,7 @@ def fiber_unit_images(build: ActualProbe, view: View) -> Float32Array:
     Returns
     -------
     ndarray of float32
-        Shape (F, H, W), >= 0, for light that comes out of one fibre each.
+        Shape (F, H, W), >= 0, for light that comes out of one fiber each.
     """
     y = np.arange(view.height_px, dtype=np.float64)[:, None]
     x = np.arange(view.width_px, dtype=np.float64)[None, :]

@@ -130,7 +130,7 @@ def build_sphere(
 
     Returns
     -------
-    BuiltSphere
+    ActualSphere
     """
     drawn = nominal_sphere(rig)
     for name in (*dead, *weak):

@@ -1,7 +1,7 @@
 """Anisotropic tissue with aligned fibers, as in abdominal skin: direction-dependent profiles.
 
 Scattering from a direction w into w' has the density ``sigma_s a(w) a(w') p(w . w')`` with ``a(w) =
-1 + strength ((w . t)^2 - 1/3)``, t the axis in the surface along which the fibres run and p the
+1 + strength ((w . t)^2 - 1/3)``, t the axis in the surface along which the fibers run and p the
 Henyey-Greenstein function. It is the same both ways, so light is reciprocal. As p keeps a
 second-order harmonic with the factor g^2, the coefficient is ``sigma_s a(w) (1 + strength g^2 ((w .
 t)^2 - 1/3))`` in closed form. With a negative strength light is scattered less along the fibers
@@ -44,7 +44,7 @@ class AnisotropicTissue:
     strength: float = -1.0
     """Weight of the second-order harmonic, -1.5 < strength < 3; 0 for isotropic tissue."""
     axis_rad: float = 0.0
-    """Direction of the fibres in the surface, rad from +x towards +y."""
+    """Direction of the fibers in the surface, rad from +x towards +y."""
 
     def __post_init__(self) -> None:
         for name, holds, expected in (
@@ -76,8 +76,8 @@ def trace_anisotropic_profile(
     ----------
     tissue
         The tissue.
-    fibres
-        The fibres of one line.
+    fibers
+        The fibers of one line.
     azimuth_rad
         Directions of the line, rad from +x towards +y, shape (A,).
     photons, rng, batches, threads
@@ -90,7 +90,7 @@ def trace_anisotropic_profile(
 
     Returns
     -------
-    FibreProfile
+    FiberProfile
         `reflectance_per_mm2` of shape (F, A).
 
     Raises
@@ -184,7 +184,7 @@ def _overlap(fibres: profiles.FiberGeometry) -> tuple[Float64Array, float]:
 
 
 def _harmonics(radius_mm: float, fibres: profiles.FiberGeometry, max_harmonic: int) -> Float64Array:
-    """Return the even harmonics of a fibre's density over the direction to the exit, by radius."""
+    """Return the even harmonics of a fiber's density over the direction to the exit, by radius."""
     detector, source = 0.5 * fibres.core_mm, 0.5 * fibres.source_core_mm
     both = detector + source
     low = max(0.0, radius_mm - both)

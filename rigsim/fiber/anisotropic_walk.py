@@ -30,13 +30,13 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
     medium
         sigma_a, sigma_s (1/mm), g, eta, strength; the preferred axis is x. float64, shape (5,).
     sines
-        Numerical apertures of the source and of the fibres.
+        Numerical apertures of the source and of the fibers.
     spots
         Positions, x and y of the fibers in mm, by increasing distance, float64, shape (F, 2);
         density of (point in one core - point in the other) in 1/mm^2 by distance from the mean, the
         last node 0, shape (nodes,); and its nodes per mm.
     bins
-        First fibre and number of fibres that reach each bin of exit radius, and bins per mm.
+        First fiber and number of fibers that reach each bin of exit radius, and bins per mm.
     rings
         For each of some distances: first exit radius (mm), nodes per mm and, by node, the density's
         even harmonics over the direction; then light is scored by harmonics, and `bins` are those
@@ -46,7 +46,7 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
     per_mm
         Cells of `window` per mm, and growth of the kept weight per mm of depth.
     found
-        What is added to: light by fibre, shape (F, 1), or by distance and harmonic, shape (R, H);
+        What is added to: light by fiber, shape (F, 1), or by distance and harmonic, shape (R, H);
         and the weight that visited each distance, see there.
     """
     source_sine, fibre_sine = sines

@@ -1,7 +1,7 @@
 """Fit the homogeneous medium whose profile is nearest to a given one.
 
 Definition: of all half spaces of g = 0.8 and eta = 1.4 under air, the one whose reflectance in the
-fibre, by the stored Monte Carlo of `rigsim.fiber.white_fiber`, is up to a factor nearest to the
+fiber, by the stored Monte Carlo of `rigsim.fiber.white_fiber`, is up to a factor nearest to the
 given one: the logarithms of the ratios have the smallest variance over the fibers, with equal
 weights; fibers below `MIN_REFLECTANCE_PER_MM2` are omitted, as the probe's camera cannot detect
 them above noise. The factor accounts for pigment in a thin layer on top, which absorbs light on its
@@ -40,7 +40,7 @@ SEARCH_STARTS_PER_MM: Final = (
     (0.004, 60.0),
 )
 """Starting values of the search, sigma_a and sigma_s' in 1/mm; the best result is used. Layers dim
-near fibres less than far ones, which looks like more scattering than tissue has."""
+near fibers less than far ones, which looks like more scattering than tissue has."""
 MAX_SCATTERING_PER_MM: Final = 200.0
 """Of the search, 1/mm."""
 OFF_TABLE_RESIDUAL: Final = 1e3
@@ -60,9 +60,9 @@ class HomogeneousFit:
     sigma_s_prime_per_mm: float
     """Reduced scattering coefficient, 1/mm."""
     factor: float
-    """R_f over that of the medium, geometric mean over the fibres used."""
+    """R_f over that of the medium, geometric mean over the fibers used."""
     residual: float
-    """Standard deviation of log(R_f / R_f of the medium) over the fibres used; its root mean
+    """Standard deviation of log(R_f / R_f of the medium) over the fibers used; its root mean
     square where the factor is 1 by definition."""
     fibres: int
     """Number of fibers used."""
@@ -82,9 +82,9 @@ def fit_homogeneous_medium(
     Parameters
     ----------
     reflectance_per_mm2
-        R_f of the fibres, 1/mm^2, shape (F,).
-    fibres
-        The fibres.
+        R_f of the fibers, 1/mm^2, shape (F,).
+    fibers
+        The fibers.
     dimmed
         Whether a layer on top may absorb light: the factor is fitted, else 1.
 
@@ -96,7 +96,7 @@ def fit_homogeneous_medium(
     Raises
     ------
     FitError
-        Fewer than `MIN_BRIGHT_FIBERS` fibres are bright enough, or the best medium lies at the
+        Fewer than `MIN_BRIGHT_FIBERS` fibers are bright enough, or the best medium lies at the
         table's end.
 
     Examples

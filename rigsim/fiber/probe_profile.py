@@ -39,7 +39,7 @@ SUCTION_STEP_MBAR: Final = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BandProfile:
-    """Reflectance in the fibres in the camera's bands."""
+    """Reflectance in the fibers in the camera's bands."""
 
     reflectance_per_mm2: Float64Array
     """R_f in 1/mm^2, shape (F, 3), >= 0."""
@@ -93,7 +93,7 @@ class ProfileCache:
 
         Returns
         -------
-        Profile
+        BandProfile
             The same for equal arguments and seeds.
 
         Raises
@@ -207,7 +207,7 @@ def probe_fibers(probe: Probe) -> FiberGeometry:
     Raises
     ------
     TissueError
-        The detection fibres are not all alike.
+        The detection fibers are not all alike.
     """
     first: Fiber = probe.fibres[0]
     for fibre in probe.fibres:
@@ -238,7 +238,7 @@ def smooth_profile(
     Parameters
     ----------
     radii_mm
-        Distances of the fibres, mm, increasing, shape (F,).
+        Distances of the fibers, mm, increasing, shape (F,).
     batches
         Reflectance of independent batches of photons, >= 0, shape (B, F, bands).
 
@@ -246,7 +246,7 @@ def smooth_profile(
     -------
     reflectance, stderr : ndarray
         Shape (F, bands): exp of a cubic spline fitted to log reflectance; its errors by leaving
-        out one batch at a time. Fibres with more than `MAX_RELATIVE_ERROR` of relative error, and
+        out one batch at a time. Fibers with more than `MAX_RELATIVE_ERROR` of relative error, and
         all where fewer than `MIN_SPLINE_FIBERS` have less, stay as they were.
 
     Examples

@@ -141,7 +141,7 @@ class FibrousTissue:
     strength: float = -1.0
     """See `rigsim.fiber.anisotropic_tissue.AnisotropicTissue`; below 0 light goes farther along."""
     axis_deg: float = 0.0
-    """Direction of the fibres: the head's angle at which its line lies along them, degrees."""
+    """Direction of the fibers: the head's angle at which its line lies along them, degrees."""
 
     def __post_init__(self) -> None:
         try:

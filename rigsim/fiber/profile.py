@@ -1,7 +1,7 @@
 """Trace light from a source fiber to fibers on tissue: Monte Carlo scored in their cones.
 
 The quantity is the reflectance in the fiber R_f in 1/mm^2: the power in a detection fiber, divided
-by the source's power, the area of the fibre's core and the square of its aperture. Where the light
+by the source's power, the area of the fiber's core and the square of its aperture. Where the light
 that leaves is Lambertian, it is the exitance per source power, averaged over the core.
 
 Three methods reduce the variance. Light is scored at every collision instead of at random exits. A
@@ -52,15 +52,15 @@ class FiberGeometry:
     """A source fiber and detection fibers on the surface."""
 
     radii_mm: tuple[float, ...]
-    """Distances of the detection fibres' axes from the source's, mm, >= 0, at least one."""
+    """Distances of the detection fibers' axes from the source's, mm, >= 0, at least one."""
     core_mm: float = 0.2
-    """Diameter of the detection fibres' cores, mm, > 0."""
+    """Diameter of the detection fibers' cores, mm, > 0."""
     source_core_mm: float = 0.2
-    """Diameter of the source fibre's core, mm, >= 0."""
+    """Diameter of the source fiber's core, mm, >= 0."""
     numerical_aperture: float = 0.22
-    """Numerical aperture of the detection fibres, in (0, 1]; 1 in air accepts all angles."""
+    """Numerical aperture of the detection fibers, in (0, 1]; 1 in air accepts all angles."""
     source_numerical_aperture: float = 0.22
-    """Numerical aperture of the source fibre, in [0, 1]; 0 for parallel light."""
+    """Numerical aperture of the source fiber, in [0, 1]; 0 for parallel light."""
 
     def __post_init__(self) -> None:
         if not self.radii_mm:
@@ -110,14 +110,14 @@ class SpectralStack:
 
 @dataclass(frozen=True, slots=True)
 class FiberProfile:
-    """Reflectance in the fibre by distance, with one-sigma standard errors."""
+    """Reflectance in the fiber by distance, with one-sigma standard errors."""
 
     radii_mm: Float64Array
     """Distances of the fibers, mm, shape (F,)."""
     reflectance_per_mm2: Float64Array
     """R_f in 1/mm^2, shape (F,), or (F, bands) of a `SpectralStack`."""
     stderr: Float64Array
-    """Standard error of `reflectance_per_mm2`, same shape. Neighbours' errors are correlated."""
+    """Standard error of `reflectance_per_mm2`, same shape. Neighbors' errors are correlated."""
     batch_reflectance_per_mm2: Float64Array
     """`reflectance_per_mm2` of each independent batch, shape (batches, F[, bands])."""
     photons: int
@@ -157,7 +157,7 @@ class FiberPaths:
 
         Returns
         -------
-        FibreProfile
+        FiberProfile
 
         Raises
         ------
@@ -184,7 +184,7 @@ def trace_fiber_profile(
     batches: int = tissue_mc.MIN_BATCHES,
     threads: int = 1,
 ) -> FiberProfile:
-    """Trace light from a source fibre to detection fibres on the same surface.
+    """Trace light from a source fiber to detection fibers on the same surface.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def trace_fiber_profile(
         Layers and the media around them, at one wavelength or at several in bands. The source
         shines uniformly over its core and over the projected solid angle of its cone.
     radii_mm
-        Distances of the detection fibres from the source, mm, >= 0, shape (F,).
+        Distances of the detection fibers from the source, mm, >= 0, shape (F,).
     photons
         Photons to trace, rounded up to a multiple of `batches` (times wavelengths).
     rng
@@ -200,7 +200,7 @@ def trace_fiber_profile(
     core_mm, source_core_mm
         Diameters of the cores, mm.
     numerical_aperture, source_numerical_aperture
-        Apertures of the fibres, n sin(half angle).
+        Apertures of the fibers, n sin(half angle).
     batches
         Independent batches, at least 20.
     threads
@@ -208,7 +208,7 @@ def trace_fiber_profile(
 
     Returns
     -------
-    FibreProfile
+    FiberProfile
         R_f with standard errors. Light that left the source and was never scattered, only reflected
         by inner interfaces, is included; specular reflection of the surface is not.
 
@@ -255,8 +255,8 @@ def trace_fiber_paths(
     ----------
     stack, photons, rng, batches, threads
         As in `trace_fiber_profile`. Take the smallest absorption of interest.
-    fibres
-        The fibres.
+    fibers
+        The fibers.
     absorber
         Share of the counted absorber in each layer, >= 0 and somewhere > 0, shape (layers,) or
         (wavelengths, layers): 1 everywhere (the default) for absorption that is added to all
@@ -264,7 +264,7 @@ def trace_fiber_paths(
 
     Returns
     -------
-    FibrePaths
+    FiberPaths
 
     Raises
     ------

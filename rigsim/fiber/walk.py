@@ -74,11 +74,11 @@ def walk_to_fibers(  # type: ignore[no-untyped-def]
         Row 0 the medium above, rows 1 to n the layers, row n + 1 the medium below; see
         `TABLE_COLUMNS`. float64, shape (n + 2, 8).
     sines
-        Numerical apertures of the source and of the fibres.
+        Numerical apertures of the source and of the fibers.
     rings
-        Kernels, one row a fibre, in the order of their distance: smallest exit radius it takes
+        Kernels, one row a fiber, in the order of their distance: smallest exit radius it takes
         (mm), nodes per mm, bins of `starts` per mm, then its density (1/mm^2) at the nodes.
-        float64, shape (F, 3 + nodes + 1), the last value 0; first fibre and number of fibres that
+        float64, shape (F, 3 + nodes + 1), the last value 0; first fiber and number of fibers that
         reach each bin of exit radius, int64, shape (bins,).
     window
         Weight at which photons are kept, by their distance from the entry; lighter ones play,
@@ -96,7 +96,7 @@ def walk_to_fibers(  # type: ignore[no-untyped-def]
     seed
         State of the generator, not all zero, uint64, shape (4,).
     found
-        What is added to. Light in each fibre per area, aperture^2 and photon in 1/mm^2, float64,
+        What is added to. Light in each fiber per area, aperture^2 and photon in 1/mm^2, float64,
         shape (F,), when the histogram is empty; the histogram, the same by the path in the counted
         absorber, each score shared by the two nodes around it so that its mean path is kept.
         float64, shape (F, nodes) or (0, 0); the weight of scored collisions by distance from the

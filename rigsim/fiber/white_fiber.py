@@ -4,7 +4,7 @@ Lengths are in units of 1 / sigma_s', so that one table over the distance and si
 serves every medium of g = 0.8 and eta = 1.4 under air: R_f = sigma_s'^2 F(r sigma_s', sigma_a /
 sigma_s'). The table is package data made by ``tools/make_white_fibre.py`` from the photons of
 `rigsim.fiber.profile`, for a source that is a point of numerical aperture 0.22 and for points of
-detection of the same aperture; the fibres' cores are averaged over here.
+detection of the same aperture; the fibers' cores are averaged over here.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class FiberTable:
     def covers(
         self, sigma_a_per_mm: float, sigma_s_prime_per_mm: float, fibers: FiberGeometry
     ) -> bool:
-        """Return whether a medium under some fibres is inside the table."""
+        """Return whether a medium under some fibers is inside the table."""
         if not sigma_s_prime_per_mm > 0.0:
             return False
         both = 0.5 * (fibers.core_mm + fibers.source_core_mm)
@@ -130,18 +130,18 @@ class FiberTable:
         ----------
         sigma_a_per_mm, sigma_s_prime_per_mm
             Coefficients, 1/mm.
-        fibres
-            The fibres; both apertures 0.22.
+        fibers
+            The fibers; both apertures 0.22.
 
         Returns
         -------
         reflectance_per_mm2, stderr : ndarray
-            R_f in 1/mm^2 and its standard error, shape (F,). Errors of neighbours, and of similar
+            R_f in 1/mm^2 and its standard error, shape (F,). Errors of neighbors, and of similar
             media, are correlated.
 
         Raises
         ------
-        WhiteFibreError
+        FiberTableError
             Outside the table.
 
         Examples
@@ -225,8 +225,8 @@ def core_distances(fibers: FiberGeometry) -> tuple[Float64Array, Float64Array]:
 
     Parameters
     ----------
-    fibres
-        The fibres.
+    fibers
+        The fibers.
 
     Returns
     -------

@@ -201,7 +201,7 @@ def load_mesh(path: str | Path) -> Mesh:
     path
         An .npz with arrays ``vertices_mm`` (V, 3), ``faces`` (F, 3) and ``uv`` (V, 2), and, where
         it has blend shapes, ``shape_names`` (S,) and ``shape_deltas_mm`` (S, V, 3); or an .obj with
-        texture coordinates whose unit is the millimetre.
+        texture coordinates whose unit is the millimeter.
 
     Returns
     -------

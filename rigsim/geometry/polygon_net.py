@@ -20,9 +20,9 @@ def polygon_edge_distance(
     Parameters
     ----------
     x, y
-        Positions in units of the mean distance between polygon centres, same shape.
+        Positions in units of the mean distance between polygon centers, same shape.
     jitter
-        How irregular the polygons are: 0 is a square lattice, 1 moves centres over whole cells.
+        How irregular the polygons are: 0 is a square lattice, 1 moves centers over whole cells.
     seed
         Any integer.
 

@@ -199,6 +199,6 @@ def _spots(points, density, floor, cell, r_low, r_high, softness, salt):  # type
                     d2 = (dx * dx + dy * dy + dz * dz) / (drawn * drawn)
                     spot = (radius / drawn) ** 2 / (1.0 + d2 ** (0.5 * softness))
                     best = max(best, spot)
-        # The tail of a spot ends where its cell's neighbours end.
+        # The tail of a spot ends where its cell's neighbors end.
         out[n] = best if best > 0.01 else 0.0
     return out

@@ -111,7 +111,7 @@ def scan_face(
 
     Returns
     -------
-    Scan
+    ScanResult
 
     Raises
     ------
@@ -164,7 +164,7 @@ def wrap_template(
 
     Returns
     -------
-    Scan
+    ScanResult
         With texture coordinates in its PLY.
     """
     scanner = scanner or ScannerSettings()
@@ -258,7 +258,7 @@ def _range_image(
 
 
 def _smooth_around(ranges: Float64Array, good: BoolArray) -> BoolArray:
-    """Return the pixels whose good neighbours are at about the same range."""
+    """Return the pixels whose good neighbors are at about the same range."""
     far = ndimage.maximum_filter(np.where(good, ranges, -np.inf), 3)
     near = ndimage.minimum_filter(np.where(good, ranges, np.inf), 3)
     with np.errstate(invalid="ignore"):

@@ -45,7 +45,7 @@ Pairs = deque[tuple[Float32Array, Float32Array, float]]
 
 SQUEEZED_DEPTH_UM: Final = 10.0
 """Depth of tissue that resists the compression of a groove beyond the linear half-space, um. As in
-a compressible neo-Hookean solid, -log J keeps neighbouring points from changing sides; this
+a compressible neo-Hookean solid, -log J keeps neighboring points from changing sides; this
 project's choice, small against the wavelengths of the relief."""
 
 

@@ -195,7 +195,7 @@ def trace_photons(
 
     Returns
     -------
-    Transport
+    TransportResult
         Reflectance, transmittance, absorption and radial profile with standard errors.
 
     Raises
