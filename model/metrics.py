@@ -32,6 +32,7 @@ def angular_error_rad(a: ArrayLike, b: ArrayLike) -> Float64Array:
     """
     a = np.asarray(a, np.float64)
     b = np.asarray(b, np.float64)
+    # arctan2 of sine and cosine; arccos alone loses half of the digits of small angles
     cross = np.linalg.norm(np.cross(a, b), axis=-1)
     dot = np.sum(a * b, axis=-1)
     angle = np.arctan2(cross, dot)

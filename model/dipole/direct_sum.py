@@ -123,6 +123,8 @@ def encircled_fraction(radius_mm: ArrayLike, media: DipoleMedia) -> Float64Array
     """
     r = np.asarray(radius_mm, np.float64)
     total = np.zeros(np.broadcast_shapes(r.shape, media.scale.shape))
+    # With d^2 = r^2 + z^2, r dr = d dd: the integral of z (1 + sigma d) exp(-sigma d) / d^3 over
+    # the disc, r from 0, is exp(-sigma z) - z exp(-sigma d) / d.
     for z in (media.depth_mm, media.height_mm):
         d = np.maximum(np.hypot(r, z), 1e-300)
         sigma = media.sigma_tr_per_mm
@@ -155,6 +157,7 @@ def kernel_parts(
     inside = (r < a) & (a > MIN_RADIUS_PER_DEPTH * media.depth_mm)
     a = np.where(a > 0.0, a, 1.0)
     edge, missing = profile(a, media), _missing_fraction(a, media)
+    # bump of integral 1: 3 / (pi a^2) (1 - r^2 / a^2)^2 on the disc of radius a, smooth at its edge
     shape = np.where(inside, 3.0 / (np.pi * a**2) * (1.0 - (r / a) ** 2) ** 2, 0.0)
     own = _missing_fraction(SELF_RADIUS_FRACTION * a, media)
     far = np.where(inside, edge, profile(r, media))

@@ -234,6 +234,8 @@ def _survival(q: Float64Array, eta: float) -> Float64Array:
 
 def _lost(q: Float64Array, eta: float) -> tuple[Float64Array, Float64Array]:
     """Return 1 - R_d and its derivative by q; a sum of terms that are all at least 0."""
+    # R_d = (1 - q^2 / 3) S with S = (exp(-q) + exp(-b q)) / 2, so 1 - R_d = (1 - S) + q^2 / 3 S;
+    # expm1 keeps the digits of 1 - S near q = 0.
     b = 1.0 + 4.0 / 3.0 * fresnel.boundary_factor(eta)
     decayed = -0.5 * (np.expm1(-q) + np.expm1(-b * q))
     survived = 1.0 - decayed
@@ -248,12 +250,14 @@ def _solve(r_d: Float64Array, eta: float) -> Float64Array:
         raise ReflectanceOutlierError(f"r_d: got {float(r_d):g}, expected a value in [0, 1]")
     wanted = np.where(outlier, 0.5, 1.0 - r_d)  # exact subtraction for r_d >= 0.5 (Sterbenz)
     low, high = np.zeros(r_d.shape), np.full(r_d.shape, np.sqrt(3.0))
+    # start: 1 - R_d is about q (1 + b) / 2 = q (1 + 2 A / 3) near q = 0
     q = np.minimum(wanted / (1.0 + 2.0 / 3.0 * fresnel.boundary_factor(eta)), high)
     for _ in range(_MAX_STEPS):
         lost, slope = _lost(q, eta)
         below = lost < wanted
         low, high = np.where(below, q, low), np.where(below, high, q)
         step = q - (lost - wanted) / slope
+        # bisect where Newton's step leaves the bracket
         step = np.where((step >= low) & (step <= high), step, 0.5 * (low + high))
         done = np.abs(step - q) <= 4e-16 * q
         q = step

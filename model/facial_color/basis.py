@@ -132,6 +132,7 @@ def _state(
     s = ratio.value
     # eq. (5); where masks differ, mu_n of the shared pixels is not mu_n of all
     bias = seen.mean if alike else seen.mean + s * (own.mean - rest.mean)
+    # standard deviation of H_i - s H_n in the disc: var_i - 2 s cov + s^2 var_n
     misfit = np.sqrt(
         np.maximum(seen.deviation**2 - 2.0 * s * covariance + (s * rest.deviation) ** 2, 0.0)
     )

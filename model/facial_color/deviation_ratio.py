@@ -49,12 +49,12 @@ def estimate_ratio(
         Any shape, any common unit, >= 0.
     variance
         Variance of the numerator given the ratio, same shape, unit squared, >= 0.
-    held
+    valid
         Same shape: mask of known values. Elsewhere the result is the prior.
 
     Returns
     -------
-    Ratio
+    RatioEstimate
 
     Examples
     --------
@@ -68,6 +68,8 @@ def estimate_ratio(
     valid = valid & np.logical_and.reduce(known_of) & (np.nan_to_num(variance) >= 0.0)
     a, b, v = (np.where(valid, x, 0.0) for x in (numerator, denominator, variance))
     prior = global_ratio(a, b)
+    # a = s b + noise of variance v, s ~ N(rho, rho^2): the conjugate posterior has the mean
+    # rho + rho^2 b (a - rho b) / (rho^2 b^2 + v) and the variance rho^2 v / (rho^2 b^2 + v).
     gain, error = prior**2 * b, prior**2 * b**2 + v
     there = error > 0.0
     value = prior + np.where(there, gain * (a - prior * b) / np.where(there, error, 1.0), 0.0)

@@ -197,6 +197,7 @@ def _voxel_size_for(images: list[RangeImage], triangles: int) -> float:
     counts = np.array([len(fuse_range_images(images, side)[1]) for side in COARSE_VOXELS_MM])
     if not counts.all():
         raise MeshError("scan: got no triangle, expected a face that looks towards +z")
+    # Two coarse counts n h^2 = a A - b R h give both constants; then solve the quadratic for h.
     h = np.array(COARSE_VOXELS_MM)
     area, rim = np.linalg.solve(np.stack([np.ones(2), -h], axis=1), counts * h**2)
     rim = max(float(rim), 0.0)

@@ -81,6 +81,7 @@ def surface_rise_factor(stretch_s: float, stretch_t: float, poisson: float) -> f
     lame = 2.0 * poisson / (1.0 - 2.0 * poisson)
     if lame == 0.0 or area == 1.0:
         return 1.0
+    # free surface of a compressible neo-Hookean solid: z^2 - 1 + (lambda / mu) log J = 0, J = s t z
     low, high = min(1.0, 1.0 / area), max(1.0, 1.0 / area)
     return float(brentq(lambda z: z * z - 1.0 + lame * np.log(area * z), low, high, xtol=1e-13))
 

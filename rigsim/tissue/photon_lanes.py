@@ -210,7 +210,8 @@ def _run(
         cos_i = dr.abs(uz)
         sin2_t = ratio * ratio * (1.0 - cos_i * cos_i)
         cos_t = dr.sqrt(dr.maximum(1.0 - sin2_t, 0.0))
-        # Both polarizations over their common denominator, which avoids divisions.
+        # R = ((s-/s+)^2 + (p-/p+)^2) / 2: compare 2 chance (s+ p+)^2 with
+        # (s- p+)^2 + (p- s+)^2, which avoids divisions.
         s_minus, s_plus = eta * cos_i - eta_beyond * cos_t, eta * cos_i + eta_beyond * cos_t
         p_minus, p_plus = eta_beyond * cos_i - eta * cos_t, eta_beyond * cos_i + eta * cos_t
         mixed, other = s_minus * p_plus, p_minus * s_plus
