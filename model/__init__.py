@@ -1,1 +1,1 @@
-"""What is estimated: parameter classes, forward equations, the APPEARANCE/ format."""
+"""Appearance model: parameter classes, forward equations, the APPEARANCE/ format."""

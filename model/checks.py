@@ -1,4 +1,4 @@
-"""Checks of what functions are given, with one sentence for each kind of refusal."""
+"""Check arguments of functions, with one message per kind of error."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ FINITE = "(-inf, inf)"
 
 @dataclass(frozen=True, slots=True)
 class Checks:
-    """Refuses, with one kind of error, what a function was given.
+    """Check arguments and raise one class of error.
 
-    Every message says where, what it got and what it expected.
+    Every message has the form "where: got X, expected Y".
 
     Examples
     --------
@@ -31,21 +31,21 @@ class Checks:
     error: type[ValueError] = ValueError
 
     def require(self, condition: Any, name: str, got: Any, expected: str) -> None:
-        """Refuse what does not hold."""
+        """Raise the error unless a condition is true."""
         if not condition:
             raise self.error(f"{name}: got {got}, expected {expected}")
 
     def within(self, name: str, given: Any, interval: str = FINITE) -> None:
-        """Refuse numbers outside an interval such as ``"(0, 1]"``; "inf)" at its end means finite.
+        """Raise for numbers outside an interval such as ``"(0, 1]"``; "inf)" means finite.
 
         Parameters
         ----------
         name
-            What messages call it.
+            Name of the argument in messages.
         given
-            A number or an array; NaN lies in no interval.
+            A number or an array; NaN is outside every interval.
         interval
-            Two numbers between brackets: a square one holds its end, a round one does not.
+            Two numbers between brackets: square ones include their end, round ones exclude it.
         """
         low, high = (float(end) for end in interval[1:-1].split(","))
         values = np.asarray(given)
@@ -61,22 +61,22 @@ class Checks:
         raise self.error(f"{name}: got {got}, expected {what}")
 
     def choice(self, name: str, given: Any, allowed: Iterable[Any]) -> None:
-        """Refuse what is none of some names or numbers."""
+        """Raise unless a value is one of some names or numbers."""
         if given not in (names := tuple(allowed)):
             raise self.error(f"{name}: got {given!r}, expected one of {', '.join(map(str, names))}")
 
     def shape(self, name: str, array: Any, *expected: Axes) -> None:
-        """Refuse an array of none of some shapes.
+        """Raise unless an array has one of some shapes.
 
         Parameters
         ----------
         name
-            What messages call it.
+            Name of the argument in messages.
         array
             None passes.
         expected
-            Lengths of axes; a name such as "N" stands for any length of 1 or more, None for any
-            length, and "..." in the first place for any leading axes.
+            Lengths of axes; a name such as "N" means any length of 1 or more, None any length, and
+            "..." in the first position any leading axes.
         """
         if array is None or not expected:
             return
@@ -88,7 +88,7 @@ class Checks:
     def numbers(
         self, name: str, given: Any, *expected: Axes, interval: str = FINITE
     ) -> NDArray[np.float64]:
-        """Return an array in float64; refuse other shapes and numbers outside an interval."""
+        """Return an array in float64; raise for other shapes and numbers outside an interval."""
         array = np.asarray(given, np.float64)
         self.shape(name, array, *expected)
         self.within(name, array, interval)
@@ -97,14 +97,14 @@ class Checks:
     def broadcast_together(
         self, interval: str = "[-inf, inf]", /, **given: Any
     ) -> list[NDArray[np.float64]]:
-        """Return arrays in float64 at their common shape; refuse shapes that do not broadcast.
+        """Return arrays in float64 at their common shape; raise for shapes that do not broadcast.
 
         Parameters
         ----------
         interval
-            What all numbers lie in, as `within` takes it.
+            Interval of all numbers, in the notation of `within`.
         given
-            The arrays by the names that messages call them.
+            The arrays, by their names in messages.
         """
         arrays = {name: np.asarray(values, np.float64) for name, values in given.items()}
         if interval != "[-inf, inf]":
@@ -119,7 +119,7 @@ class Checks:
             ) from None
 
     def broadcast(self, name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-        """Return an array broadcast to a shape, or refuse it."""
+        """Return an array broadcast to a shape; raise where it does not broadcast."""
         try:
             return np.broadcast_to(array, shape)
         except ValueError:
@@ -128,14 +128,14 @@ class Checks:
             ) from None
 
     def mask(self, name: str, mask: Any, *expected: Axes) -> None:
-        """Refuse what is no bool array of one of some shapes, as `shape` takes them."""
+        """Raise unless a mask is a bool array of one of some shapes, as in `shape`."""
         kind = np.asarray(mask).dtype
         if kind != np.bool_:
             raise self.error(f"{name}: got {kind} {np.shape(mask)}, expected bool")
         self.shape(name, mask, *expected)
 
     def settings(self, settings: object, **intervals: str) -> None:
-        """Refuse fields of a record that lie outside their intervals, as `within` takes them."""
+        """Raise for fields of a record outside their intervals, in the notation of `within`."""
         for name, interval in intervals.items():
             self.within(f"{type(settings).__name__}.{name}", getattr(settings, name), interval)
 

@@ -26,7 +26,7 @@ _CHUNK_POINTS = 32_768
 
 
 class ColorTableError(ValueError):
-    """A color table cannot be built or asked for what it does not hold."""
+    """Error for a color table that cannot be built, or a lookup outside its range."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +55,7 @@ class ColorTable:
     x and y the fractions of the way across the cell."""
 
     def __post_init__(self) -> None:
-        """Refuse a table that is not one, and work out its cells."""
+        """Check the table's shape and compute the spline's cells."""
         rgb = np.asarray(self.rgb, dtype=np.float64)
         size = rgb.shape[0] if rgb.ndim else 0
         if rgb.shape != (size, size, 3) or size < _MIN_SIZE:
@@ -72,11 +72,11 @@ class ColorTable:
 
     @property
     def size(self) -> int:
-        """Nodes along each axis."""
+        """Return the number of nodes along each axis."""
         return int(self.rgb.shape[0])
 
     def lookup(self, c_m: ArrayLike, c_hd: ArrayLike) -> Float64Array:
-        """Return the color of skin.
+        """Return the color of skin with these chromophores.
 
         Parameters
         ----------
@@ -96,7 +96,7 @@ class ColorTable:
         return self._evaluate(c_m, c_hd)[0]
 
     def jacobian(self, c_m: ArrayLike, c_hd: ArrayLike) -> Float64Array:
-        """Return the derivatives of the color.
+        """Return the derivatives of the color by both volume fractions.
 
         Parameters
         ----------
@@ -129,7 +129,7 @@ class ColorTable:
     def _evaluate(
         self, c_m: ArrayLike, c_hd: ArrayLike
     ) -> tuple[Float64Array, Float64Array, Float64Array]:
-        """Return the color and its derivatives by the two node indices."""
+        """Return the color and its derivatives by the two fractional node indices."""
         i, j = Checks(ColorTableError).broadcast_together(
             c_m=_node_index("c_m", c_m, self.c_m_max, self.size),
             c_hd=_node_index("c_hd", c_hd, self.c_hd_max, self.size),
@@ -174,8 +174,8 @@ def build(
         `model.tissue_optics.layers.ANISOTROPY_SKIN`, and where melanin exceeds a few percent it
         matters.
     beta_m, oxygenation, eta
-        As in `model.tissue_optics.two_layer_reflectance`. With other values than the defaults, or
-        a g that is not stored, the spectra are computed first: 1 s (g = 0) to 5 s instead of 0.1.
+        As in `model.tissue_optics.two_layer_reflectance`. For other values than the defaults, or a
+        g that is not stored, the spectra are computed first: 1 s (g = 0) to 5 s instead of 0.1.
 
     Returns
     -------
@@ -284,7 +284,7 @@ def _log_spectra(anisotropy: float, beta_m: float, oxygenation: float, eta: floa
 
 
 def _spline_cells(rgb: Float64Array) -> Float64Array:
-    """Return the tensor cubic spline through the nodes as one polynomial a cell."""
+    """Return the tensor cubic spline through the nodes as one polynomial per cell."""
     nodes = np.arange(rgb.shape[0])
     along_i = CubicSpline(nodes, rgb, axis=0).c[::-1]  # (p, cell i, node j, channel)
     both = CubicSpline(nodes, along_i, axis=2).c[::-1]  # (q, cell j, p, cell i, channel)

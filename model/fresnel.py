@@ -9,7 +9,7 @@ from model.arrays import Float64Array
 from model.checks import Checks
 
 ETA_SKIN = 1.4
-"""Refractive index of skin relative to air, the value used where a paper does not give its own.
+"""Refractive index of skin relative to air, used where a paper does not give its own.
 
 Jimenez 2010 gives none (Donner 2008 has 1.4); Weyrich 2005 writes "about 1.3".
 """
@@ -47,10 +47,10 @@ def reflectance(cos_incident: ArrayLike, eta: float) -> Float64Array:
     """
     Checks().within("eta", eta, "(0, inf)")
     mu_i = np.asarray(cos_incident, dtype=np.float64)
-    with np.errstate(over="ignore"):  # beyond any number it is beyond the critical angle, too
+    with np.errstate(over="ignore"):  # an overflow to infinity is beyond the critical angle, too
         sin2_t = (1.0 - mu_i**2) / eta / eta  # the square of a huge index overflows
     mu_t = np.sqrt(np.maximum(0.0, 1.0 - sin2_t))
-    # At grazing incidence on a matched surface both terms are 0/0; nothing is reflected there.
+    # At grazing incidence on an index-matched surface both terms are 0/0; the limit is 0.
     sum_s = mu_i + eta * mu_t
     sum_p = eta * mu_i + mu_t
     safe_s = np.where(sum_s > 0.0, sum_s, 1.0)
@@ -91,7 +91,7 @@ def diffuse_internal(eta: float) -> float:
 
     Notes
     -----
-    1 - F_dr = (1 - F_external)/eta^2, because both describe the same rays.
+    1 - F_dr = (1 - F_external)/eta^2, by reciprocity: both integrals are over the same rays.
 
     Examples
     --------

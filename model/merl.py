@@ -1,4 +1,4 @@
-"""MERL .binary tables of isotropic BRDFs, and the half/difference angles they are laid out in.
+"""Read and write MERL .binary tables of isotropic BRDFs, and convert half/difference angles.
 
 References
 ----------
@@ -22,21 +22,21 @@ from model.checks import Checks
 TABLE_SHAPE = (90, 90, 180)
 """Bins over theta_h, theta_d and phi_d."""
 BRDF_SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
-"""BRDF in 1/sr of a stored 1, red, green, blue."""
+"""BRDF in 1/sr per stored unit, red, green, blue."""
 UNMEASURED_VALUE = -1.0
-"""Stored where there is no value; readers take anything negative."""
+"""Stored where the BRDF was not measured; readers accept any negative value."""
 FILE_BYTES = 12 + 3 * 8 * 90 * 90 * 180
 
 _HALF_PI = 0.5 * np.pi
 
 
 class MerlFileError(ValueError):
-    """A file that is no MERL table, or only part of one."""
+    """Error for a file that is not a MERL table, or only part of one."""
 
 
 @dataclass(frozen=True, slots=True)
 class MerlTable:
-    """An isotropic BRDF, one value a bin and channel.
+    """An isotropic BRDF, one value per bin and channel.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class MerlTable:
     def from_values(cls, values: ArrayLike) -> MerlTable:
         """Make a table of BRDF values in 1/sr, (90, 90, 180, 3) or broadcast.
 
-        What is negative, in any channel, was not measured: -1 is stored for all three.
+        A negative value in any channel means not measured: -1 is stored for all three.
         """
         brdf = np.broadcast_to(np.asarray(values, dtype=np.float64), (*TABLE_SHAPE, 3))
         none = np.any(brdf < 0.0, axis=-1)
@@ -93,7 +93,7 @@ class MerlTable:
 
     @property
     def measured(self) -> BoolArray:
-        """Bins measured in all channels, (90, 90, 180)."""
+        """Return the bins measured in all channels, (90, 90, 180)."""
         return np.asarray(np.all(self.stored >= 0.0, axis=0))
 
 
@@ -143,8 +143,8 @@ def to_angles(
     Returns
     -------
     theta_h, theta_d, phi_d : ndarray, shape (...)
-        rad; phi_d in (-pi, pi], 0 where it has no meaning (half vector at the normal, or light and
-        view the same). The difference vector is the light, as in the tables' definition.
+        rad; phi_d in (-pi, pi], 0 where it is undefined (half vector at the normal, or light equal
+        to view). The difference vector is the light, as in the tables' definition.
     """
     light, view, n = np.broadcast_arrays(
         *(np.asarray(v, dtype=np.float64) for v in (light_dir, view_dir, normal))
@@ -200,7 +200,7 @@ def to_directions(
 
 
 def read(path: str | os.PathLike[str]) -> MerlTable:
-    """Read a .binary file.
+    """Read a MERL .binary file.
 
     Raises
     ------
@@ -211,7 +211,7 @@ def read(path: str | os.PathLike[str]) -> MerlTable:
 
 
 def read_mean(path: str | os.PathLike[str]) -> Float64Array:
-    """Read the mean of a file's channels, plane by plane, with half the memory of `read`.
+    """Read the mean of a file's channels, one at a time, with half the memory of `read`.
 
     Returns
     -------
@@ -248,19 +248,17 @@ def _planes(file: Path) -> Iterator[Float64Array]:
         for _ in range(3):
             plane = np.fromfile(stream, dtype="<f8", count=int(np.prod(TABLE_SHAPE)))
             if not np.all(np.isfinite(plane)):
-                raise MerlFileError(
-                    f"{file}: got values that are not finite, expected negative for none"
-                )
+                raise MerlFileError(f"{file}: got values that are not finite, expected finite ones")
             yield plane.astype(np.float64, copy=False).reshape(TABLE_SHAPE)
 
 
 def write(path: str | os.PathLike[str], table: MerlTable) -> None:
-    """Write a .binary file, 34,992,012 bytes.
+    """Write a MERL .binary file, 34,992,012 bytes.
 
     Raises
     ------
     ValueError
-        When the table holds values that are not finite.
+        When the table contains values that are not finite.
     """
     Checks().within("MerlTable.stored", table.stored)
     with Path(path).open("wb") as stream:

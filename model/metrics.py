@@ -1,4 +1,4 @@
-"""How far an estimate is from a truth, and whether its standard errors are honest."""
+"""Error metrics of estimates against ground truth, and coverage of their intervals."""
 
 from dataclasses import dataclass
 
@@ -32,6 +32,7 @@ def angular_error_rad(a: ArrayLike, b: ArrayLike) -> Float64Array:
     """
     a = np.asarray(a, np.float64)
     b = np.asarray(b, np.float64)
+    # arctan2 of sine and cosine; arccos alone loses half of the digits of small angles
     cross = np.linalg.norm(np.cross(a, b), axis=-1)
     dot = np.sum(a * b, axis=-1)
     angle = np.arctan2(cross, dot)
@@ -61,16 +62,16 @@ def individual_typology_angle_deg(lightness: ArrayLike, b_star: ArrayLike) -> Fl
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """How often intervals held the truth.
+    """Fraction of intervals that contain the ground truth.
 
     Attributes
     ----------
     fraction
-        In [0, 1]; NaN when nothing was counted.
+        In [0, 1]; NaN without trials.
     interval
-        Exact (Clopper-Pearson) 95 % interval of the share, for independent trials.
+        Exact (Clopper-Pearson) 95 % interval of the fraction, for independent trials.
     count
-        Trials.
+        Number of trials.
     """
 
     fraction: float
@@ -86,7 +87,7 @@ def coverage(
     level: float = 0.6827,
     valid: ArrayLike | None = None,
 ) -> Coverage:
-    """Count how often ``truth`` lies in the Gaussian interval of ``estimate``.
+    """Return how often the Gaussian interval of ``estimate`` contains ``truth``.
 
     Parameters
     ----------
@@ -95,11 +96,11 @@ def coverage(
     level
         Nominal coverage, between 0 and 1.
     valid
-        Which trials count; None: all that are finite.
+        Trials that count; None: all that are finite.
 
     Examples
     --------
-    >>> coverage([0.0, 0.0], [1.0, 1.0], [0.5, 3.0]).share
+    >>> coverage([0.0, 0.0], [1.0, 1.0], [0.5, 3.0]).fraction
     0.5
     """
     Checks().within("level", level, "(0, 1)")
@@ -125,14 +126,14 @@ def median_with_interval(
     Parameters
     ----------
     values
-        Any shape; NaN are dropped. More than 20,000 are thinned by a random choice.
+        Any shape; NaN are omitted. More than 20,000 are thinned by a random choice.
     rng
         Draws the bootstrap samples.
 
     Returns
     -------
     median, (low, high)
-        NaN when there are no values.
+        NaN without values.
     """
     kept = np.asarray(values, np.float64).ravel()
     kept = kept[np.isfinite(kept)]

@@ -1,4 +1,4 @@
-"""What is known about a piece of skin: named maps with unit, standard error and valid mask."""
+"""Maps of a skin area, by name, each with unit, standard error and valid mask."""
 
 import re
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ MAP_UNITS: Mapping[str, str] = MappingProxyType(
         "residual": "1",
     }
 )
-"""Units of the maps that have one meaning everywhere; other names state their own."""
+"""Units of the maps with a fixed meaning; maps of other names have their own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +41,11 @@ class SkinMap:
     unit
         "1" for numbers without dimension.
     stderr
-        Standard error, same shape as ``values``; None only for a truth or a picture.
+        Standard error, same shape as ``values``; None only for ground truth or an image.
     valid
-        (H, W) bool; None: every pixel is valid. Values outside it mean nothing.
+        (H, W) bool; None: every pixel is valid. Values outside it are undefined.
     description
-        One line for people: frame, color space, what was assumed.
+        One line of text: frame, color space, assumptions.
     """
 
     values: Float32Array
@@ -55,7 +55,7 @@ class SkinMap:
     description: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse shapes that do not fit and valid pixels that are not finite."""
+        """Raise for shapes that do not fit and valid pixels that are not finite."""
         values = np.asarray(self.values, np.float32)
         Checks().shape("values", values, (None, None), (None, None, 3))
         object.__setattr__(self, "values", values)
@@ -80,7 +80,7 @@ class SkinMap:
 
 @dataclass(frozen=True, slots=True)
 class SkinAppearance:
-    """Maps of one size class with where they come from.
+    """Maps of one size class with their provenance.
 
     Attributes
     ----------
@@ -89,13 +89,13 @@ class SkinAppearance:
     source
         "measured" or "simulated".
     parameters, inputs, versions
-        JSON values: settings, hashes of what was read, versions of what computed it.
+        JSON values: settings, hashes of the input files, versions of the software.
     left_out
-        What was not computed, and why.
+        Results that were not computed, and why.
     files
-        What is no map, by file name, e.g. the mesh that the maps belong to as ``mesh.ply``.
+        Other files by name, e.g. the mesh of the maps as ``mesh.ply``.
     seed
-        Of the simulation; None when nothing was drawn.
+        Seed of the simulation; None without random numbers.
 
     Examples
     --------
@@ -114,7 +114,7 @@ class SkinAppearance:
     seed: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuse an unknown source and a unit that contradicts the map's name."""
+        """Raise for an unknown source and for a unit that contradicts the map's name."""
         Checks().choice("source", self.source, ("measured", "simulated"))
         for name in self.files:
             if _FILE_PATTERN.fullmatch(name) is None or name.endswith((".exr", "appearance.json")):

@@ -1,9 +1,9 @@
-"""The reflectance of skin: lobes of the surface, diffuse albedo and translucency as one model.
+"""Skin reflectance model: basis BRDFs of the surface, diffuse albedo and translucency.
 
-Light that a surface point reflects is the sum of what its surface turns back, a mixture of
-tabulated lobes, and of what entered the skin, was scattered and left again. Fresnel's reflection
-F_r is inside the tables and is counted nowhere else. Light that enters is multiplied by the
-transmittance F_t of its direction once, light that leaves by that of the view once.
+Reflected light is the sum of the surface reflection, a mixture of tabulated basis BRDFs, and of
+subsurface scattering. The tables include the Fresnel reflectance F_r, which is applied nowhere
+else. Entering light is multiplied once by the transmittance F_t of its direction, exiting light
+once by that of the view.
 
 References
 ----------
@@ -27,23 +27,23 @@ from model.skin import SkinAppearance, SkinMap
 
 BASIS_FILE = "brdf_basis.npz"
 WEIGHT_PREFIX = "basis_weight_"
-"""Maps of lobe shares are called by this and their number, from 0 on."""
+"""Prefix of the maps of lobe weights; their number from 0 on follows."""
 TRANSLUCENCY_MAP = "translucency"
 NORMAL_MAPS = ("normals_refined", "normals")
 """Maps of normals, the better one first."""
-_CHUNK_DIRECTIONS = 1 << 16  # directions that are looked up at a time
+_CHUNK_DIRECTIONS = 1 << 16  # directions per block of look-ups
 
 
 class SkinReflectanceError(ValueError):
-    """Maps that make no reflectance model."""
+    """Error for maps that do not make a reflectance model."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SkinReflectance:
     """Reflectance of skin over a texture.
 
-    Values of texels that are not `valid` are filled from those around, or 0: a picture may use
-    them, a statistic should not.
+    Values of texels that are not `valid` are filled from their surroundings, or 0: for rendering,
+    not for statistics.
 
     Attributes
     ----------
@@ -51,9 +51,9 @@ class SkinReflectance:
         Factor of the diffuse part, f = R_d F_t(light) F_t(view) / pi, camera RGB over a perfect
         white. Not clamped: see `dipole`.
     weights : ndarray of float32, shape (H, W, K)
-        Shares of the lobes, at least 0.
+        Weights of the lobes, at least 0.
     lobes : BrdfBasis
-        K lobes, 1/sr, F_r inside.
+        K lobes, 1/sr, including F_r.
     translucency_mm : ndarray of float32, shape (H, W, 3)
         1/sigma_tr, mm, above 0.
     normals : ndarray of float32, shape (H, W, 3)
@@ -61,13 +61,13 @@ class SkinReflectance:
     position_mm : ndarray of float32, shape (H, W, 3)
         Rig frame.
     valid : ndarray of bool, shape (H, W)
-        Texels where all of this is known.
+        Texels where all maps are known.
     eta : float
         Refractive index of the skin over that of air, at least 1.
     assumed : tuple of str
-        What was not measured, and what was taken for it.
+        Assumptions in place of missing measurements.
     r_d_stderr, translucency_stderr_mm : ndarray of float32, shape (H, W, 3), or None
-        Standard errors; None: not known.
+        Standard errors; None: unknown.
     """
 
     r_d: Float32Array
@@ -83,7 +83,7 @@ class SkinReflectance:
     translucency_stderr_mm: Float32Array | None = None
 
     def __post_init__(self) -> None:
-        """Refuse shapes that do not fit, and valid texels with values that no skin has."""
+        """Raise for shapes that do not fit, and for impossible values at valid texels."""
         shape = np.shape(self.valid)
         Checks(SkinReflectanceError).mask("valid", self.valid, ("H", "W"))
         known = ("r_d", "weights", "translucency_mm", "normals", "position_mm")
@@ -106,7 +106,7 @@ class SkinReflectance:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of the texture."""
+        """Return rows and columns of the texture."""
         height, width = self.valid.shape
         return int(height), int(width)
 
@@ -118,7 +118,7 @@ class SkinReflectance:
 def assemble(
     dome: SkinAppearance, *, translucency: ArrayLike | SkinMap | None = None
 ) -> SkinReflectance:
-    """Put the model together from the maps of a dome session.
+    """Assemble the model from the maps of a dome session.
 
     Parameters
     ----------
@@ -127,8 +127,8 @@ def assemble(
         the file `brdf_basis.npz`.
     translucency
         1/sigma_tr, mm: a map over the same texture coordinates, of any size, or values that
-        broadcast to (H, W, 3). None: the map `translucency` of the appearance; without one the
-        mean of table 2 over its people and places, and `assumed` says so.
+        broadcast to (H, W, 3). None: the map `translucency` of the appearance; without one the mean
+        of table 2 over people and sites, which `assumed` then lists.
 
     Returns
     -------
@@ -137,7 +137,7 @@ def assemble(
     Raises
     ------
     SkinReflectanceError
-        Naming the map or file that is missing or does not fit.
+        For a map or file that is missing or does not fit; names it.
     """
     needed = ("position", "r_d", f"{WEIGHT_PREFIX}0")
     for name in needed:
@@ -161,15 +161,16 @@ def assemble(
             )
         valid &= one.mask
     position, r_d, normals, *shares = maps
-    # shares are at least 0 at the points; drawn into texels beyond the rim they can undershoot
+    # weights are at least 0 at the points; extrapolated to texels beyond the rim they can
+    # undershoot
     weights = np.maximum(np.stack([one.values for one in shares], axis=-1), 0.0)
     length = np.linalg.norm(normals.values, axis=-1, keepdims=True)
     valid &= (length[..., 0] > 0.5) & np.isfinite(r_d.values).all(-1)
     assumed: tuple[str, ...] = ()
     if translucency is None and TRANSLUCENCY_MAP in dome.maps:
         translucency = dome.maps[TRANSLUCENCY_MAP]
-        told = dome.parameters.get("assumed", [])
-        assumed = tuple(str(one) for one in told) if isinstance(told, list | tuple) else ()
+        listed = dome.parameters.get("assumed", [])
+        assumed = tuple(str(one) for one in listed) if isinstance(listed, list | tuple) else ()
     if translucency is None:
         translucency, what = population_mean_mm()
         assumed = (what,)
@@ -190,18 +191,18 @@ def assemble(
 
 
 def population_mean_mm() -> tuple[Float64Array, str]:
-    """Return 1 over the mean sigma_tr of table 2 over its places, mm, (3,), and words for it."""
+    """Return 1 over the mean sigma_tr of table 2 over its sites, mm, (3,), and its description."""
     people = translucency_population.weyrich_2005()
     mean = people.mean_per_mm.mean(axis=0)
-    told = ", ".join(f"{value:.3f}" for value in mean)
+    mean_text = ", ".join(f"{value:.3f}" for value in mean)
     return 1.0 / mean, (
-        f"translucency is the population's: sigma_tr {told} per mm, the mean over people and over "
+        f"translucency is the population's: sigma_tr {mean_text} per mm, the mean over people and "
         f"{', '.join(people.sites)} (Weyrich et al. 2005, table 2)"
     )
 
 
 def load_basis(appearance: SkinAppearance) -> BrdfBasis:
-    """Return the lobes that the maps `basis_weight_0` and on are shares of.
+    """Return the lobes whose weights are the maps `basis_weight_0` and on.
 
     Raises
     ------
@@ -249,7 +250,7 @@ def lobe_brdf(
 
 
 def transmittance(cosine: ArrayLike, eta: float = fresnel.ETA_SKIN) -> Float64Array:
-    """Return F_t, the share of light that passes the surface at a cosine; 0 below the horizon.
+    """Return the transmittance F_t of the surface at a cosine; 0 below the horizon.
 
     Examples
     --------
@@ -279,7 +280,7 @@ def _map(appearance: SkinAppearance, name: str) -> SkinMap:
 
 
 def _normals(appearance: SkinAppearance) -> SkinMap:
-    """Return the better normals, and the others where those could not be had."""
+    """Return the better normals, and the others where those are missing."""
     there = [appearance.maps[name] for name in NORMAL_MAPS if name in appearance.maps]
     if len(there) == 1 or there[0].values.shape != there[1].values.shape:
         return there[0]
@@ -296,7 +297,7 @@ def _normals(appearance: SkinAppearance) -> SkinMap:
 def _resample_translucency(
     given: ArrayLike | SkinMap, shape: tuple[int, ...]
 ) -> tuple[Float32Array, Float32Array | None, BoolArray]:
-    """Return a translucency on a texture of a shape, its standard error, and where it is known."""
+    """Return a translucency resampled to a shape, its standard error, and the valid mask."""
     if isinstance(given, SkinMap):
         Checks(SkinReflectanceError).shape("translucency", given.values, ("H", "W", 3))
         known = _resample_image(given.mask.astype(np.float32)[..., None], shape)[..., 0] > 0.999
@@ -309,7 +310,7 @@ def _resample_translucency(
 
 
 def _resample_image(image: Float32Array, shape: tuple[int, ...]) -> Float32Array:
-    """Return (h, w, C) at the texels of another size, linear, held beyond its outermost texels."""
+    """Return (h, w, C) at the texels of another size: linear, clamped to the outermost texels."""
     for axis, size in enumerate(shape):
         old = image.shape[axis]
         if old == size:

@@ -14,7 +14,7 @@ from model.arrays import Float64Array
 from model.checks import Checks
 
 MAX_WAVELENGTH_NM = 1e6
-"""Longest wavelength that is one of light, nm."""
+"""Upper limit of wavelengths, nm."""
 
 WAVELENGTH_NM: Float64Array = np.arange(400.0, 701.0, 10.0)
 """Default sampling of the visible spectrum in nm: 400 to 700 in steps of 10, 31 samples."""
@@ -35,7 +35,7 @@ BASELINE_ORIGIN_NM, BASELINE_SCALE_NM = 154.0, 66.2
 MIE_FACTOR_PER_MM, MIE_EXPONENT = 14.74, -0.22
 RAYLEIGH_FACTOR_PER_MM, RAYLEIGH_EXPONENT = 2.2e11, -4.0
 
-FLASH_TEMPERATURE_K = 6_000.0  # plasma continuum of the tube
+FLASH_TEMPERATURE_K = 6_000.0  # temperature of the tube's plasma continuum
 FLASH_CUTOFF_NM, FLASH_CUTOFF_WIDTH_NM = 395.0, 8.0  # ultraviolet-absorbing envelope
 
 _CAMERA_FILES = {
@@ -54,7 +54,7 @@ XYZ_TO_LINEAR_SRGB: Float64Array = np.array(
 
 
 class SpectrumNameError(KeyError, ValueError):
-    """No spectrum of that name is stored."""
+    """Error for a name without a stored spectrum."""
 
     def __str__(self) -> str:
         return str(self.args[0])
@@ -161,7 +161,7 @@ def camera_sensitivity(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> F
     ----------
     name
         "Nikon 5100 (NPL)", "Sigma SDMerill (NPL)", or "linear sRGB": the color matching functions
-        of the sRGB primaries, negative in places, for pictures that are colorimetric already;
+        of the sRGB primaries, negative in places, for images that are already colorimetric;
         under D65 its white-balanced RGB is linear sRGB.
     wavelength_nm
         Wavelengths in nm, shape (n,). Outside the measured range the sensitivity is zero.
@@ -188,12 +188,12 @@ def camera_sensitivity(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> F
 
 
 def camera_names() -> tuple[str, ...]:
-    """Return the names that `camera_sensitivity` knows."""
+    """Return the camera names of `camera_sensitivity`."""
     return (*_CAMERA_FILES, LINEAR_SRGB)
 
 
 def illuminant_names() -> tuple[str, ...]:
-    """Return the names that `illuminant` knows."""
+    """Return the light names of `illuminant`."""
     return (*_DAYLIGHT_NOMINAL_K, "A", "E", "LED-B3", "xenon flash")
 
 
@@ -206,7 +206,7 @@ def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Ar
         "D50", "D55", "D65" (CIE daylight), "A", "E" (equal energy), "LED-B3" (white LED) or
         "xenon flash".
     wavelength_nm
-        Wavelengths in nm, shape (n,), 380 to 780 for daylight; the LED gives nothing outside that.
+        Wavelengths in nm, shape (n,), 380 to 780 for daylight; the LED is 0 outside that range.
 
     Returns
     -------
@@ -216,13 +216,13 @@ def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Ar
     Raises
     ------
     SpectrumNameError
-        When no light of that name is known.
+        When no light of that name is stored.
 
     Notes
     -----
     "xenon flash" is a smooth description of a photographic flash tube, not a measurement: a black
-    body of 6000 K seen through an envelope that absorbs the ultraviolet (logistic edge at 395 nm).
-    Its correlated color temperature is about 5950 K. The weak visible xenon lines are left out.
+    body of 6000 K behind an envelope that absorbs the ultraviolet (logistic edge at 395 nm).
+    Its correlated color temperature is about 5950 K. The weak visible xenon lines are omitted.
 
     References
     ----------
@@ -343,7 +343,7 @@ def _table(file_name: str) -> tuple[Float64Array, Float64Array]:
 
 
 def _sampled(file_name: str, wavelength_nm: ArrayLike, *, outside: float | None) -> Float64Array:
-    """Interpolate a table linearly; `outside` is the value beyond it, None forbids going there."""
+    """Interpolate a table linearly; `outside` is the value beyond it, None raises an error."""
     nodes, values = _table(file_name)
     wavelength = _wavelengths(wavelength_nm)
     if outside is None:
@@ -410,4 +410,4 @@ def _black_body(wavelength: Float64Array, c2_nm_k: float, temperature_k: float) 
 
 
 def _unknown(kind: str, name: str, known: tuple[str, ...]) -> str:
-    return f"{kind} {name!r} is not stored; known: {', '.join(known)}"
+    return f"{kind} {name!r} is not stored; use one of {', '.join(known)}"

@@ -1,7 +1,7 @@
-"""The APPEARANCE/ format: one EXR file a map, other files as they are, one sealed JSON document.
+"""Read and write APPEARANCE/ folders: one EXR file per map, other files, one sealed JSON document.
 
-``appearance.json`` names each file with its SHA-256, and seals itself; a folder appears whole
-or not at all. TRUTH/ folders have the same format.
+``appearance.json`` lists each file with its SHA-256 and contains a hash of its own content. A
+folder is written completely or not at all. TRUTH/ folders have the same format.
 """
 
 import hashlib
@@ -28,7 +28,7 @@ _NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 
 class StoreError(ValueError):
-    """An APPEARANCE/ folder that cannot be read or written as it is."""
+    """Error for an APPEARANCE/ folder that cannot be read or written."""
 
 
 class _Strict(BaseModel):
@@ -116,7 +116,7 @@ def write(path: str | Path, appearance: SkinAppearance) -> Path:
 
 
 def require_free(path: str | Path) -> None:
-    """Refuse a folder that `write` would refuse, before anything is computed for it.
+    """Raise for a folder that `write` would refuse, before any computation.
 
     Parameters
     ----------
@@ -126,19 +126,19 @@ def require_free(path: str | Path) -> None:
     Raises
     ------
     StoreError
-        When ``path`` exists and is something else, or nothing can be written beside it.
+        When ``path`` exists and is something else, or its parent folder cannot be written to.
     """
     target = Path(path)
     if target.exists() and not (target / DOCUMENT_FILE).is_file() and any(_entries(target)):
         raise StoreError(
-            f"{target}: exists and is no APPEARANCE/ folder; nothing was written: name another"
+            f"{target}: exists and is not an APPEARANCE/ folder; nothing was written: name another"
         )
-    beside = next(folder for folder in target.absolute().parents if folder.exists())
-    if not beside.is_dir():
-        raise StoreError(f"{target}: {beside} is a file, expected a folder; name another")
-    if not os.access(beside, os.W_OK | os.X_OK):
+    parent = next(folder for folder in target.absolute().parents if folder.exists())
+    if not parent.is_dir():
+        raise StoreError(f"{target}: {parent} is a file, expected a folder; name another")
+    if not os.access(parent, os.W_OK | os.X_OK):
         raise StoreError(
-            f"{target}: {beside} cannot be written to; name another, or give the right"
+            f"{target}: {parent} cannot be written to; name another, or give the right"
         )
 
 
@@ -155,8 +155,8 @@ def read(path: str | Path, *, map_names: tuple[str, ...] | None = None) -> SkinA
     Raises
     ------
     StoreError
-        Naming the file, when the folder is missing, damaged, of another schema version, or
-        holds no map of a wanted name.
+        When the folder is missing, damaged, of another schema version, or lacks a wanted map; names
+        the file.
     """
     folder = Path(path)
     document = read_document(folder)
@@ -187,7 +187,7 @@ def read_document(folder: Path) -> _Document:
         raw = path.read_bytes()
     except OSError as error:
         raise StoreError(
-            f"{folder}: is no APPEARANCE/ folder ({error.strerror}: {DOCUMENT_FILE}); "
+            f"{folder}: is not an APPEARANCE/ folder ({error.strerror}: {DOCUMENT_FILE}); "
             "`skinrig reconstruct` makes one"
         ) from error
     try:
@@ -225,7 +225,7 @@ def _write_synced(path: Path, data: bytes) -> None:
 
 
 def _replace(fresh: Path, target: Path) -> None:
-    """Move ``fresh`` to ``target``; an older folder stays until the new one is in place."""
+    """Move ``fresh`` to ``target``; an older folder is kept until the new one is in place."""
     old = None
     if target.exists():
         old = target.with_name(f".{target.name}.{uuid.uuid4().hex}.old")
@@ -287,7 +287,7 @@ def _write_file(path: Path, data: bytes) -> str:
 
 
 def _inside(folder: Path, name: str) -> Path:
-    """Return the path of a file that a document names, which may be plain and inside only."""
+    """Return the path of a file that a document names; it must be a plain name in the folder."""
     if Path(name).name != name or name.startswith("."):
         raise StoreError(f"{folder}: got file name {name!r}, expected a plain name")
     path = folder / name
@@ -318,7 +318,7 @@ def write_exr(path: str | Path, image: Float32Array) -> None:
     with OpenEXR.File(header, {channel: pixels}) as file:
         try:
             file.write(str(path))
-        except RuntimeError as error:  # what the library makes of a full disk
+        except RuntimeError as error:  # the library's error for a full disk
             raise StoreError(f"{path}: cannot be written ({error}); is the disk full?") from error
 
 
@@ -332,11 +332,11 @@ def read_exr(path: str | Path) -> Float32Array:
     Raises
     ------
     StoreError
-        When the file is no such EXR.
+        When the file is not an EXR of these channels.
     """
     import OpenEXR
 
-    # the library says less of these, and prints a line of its own
+    # checked here: the library's message is less specific, and it prints a line of its own
     try:
         with Path(path).open("rb") as stream:
             magic = stream.read(len(EXR_MAGIC))

@@ -1,7 +1,7 @@
-"""Textures of different resolutions over the same square: bilinear reading, and averaging down.
+"""Resample textures over the unit square: bilinear interpolation and area averaging.
 
-Texel i of n covers [i/n, (i + 1)/n] of the square, its centre at (i + 1/2)/n; beyond the outer
-centres the edge texel holds, as a graphics sampler that clamps does.
+Texel i of n covers [i/n, (i + 1)/n] of the square, its center at (i + 1/2)/n; beyond the outer
+centers the edge texel is repeated, as by a graphics sampler with clamping.
 """
 
 from typing import Any
@@ -14,7 +14,7 @@ from model.checks import Checks
 
 
 def bilinear_taps(texels: int, pixels: int) -> tuple[Int64Array, Float64Array]:
-    """Return each pixel's first texel and the part that the next one has, bilinearly.
+    """Return each pixel's first texel and the weight of the next one, for linear interpolation.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def bilinear_taps(texels: int, pixels: int) -> tuple[Int64Array, Float64Array]:
 
 
 def reading_matrix(texels: int, pixels: int) -> Any:
-    """Return the sparse matrix that reads `texels` bilinearly at `pixels`; rows sum to 1."""
+    """Return the sparse matrix that interpolates `texels` linearly at `pixels`; rows sum to 1."""
     first, part = bilinear_taps(texels, pixels)
     rows = np.arange(pixels)
     after = np.minimum(first + 1, texels - 1)
@@ -59,7 +59,7 @@ def averaging_matrix(pixels: int, texels: int) -> Any:
 
 
 def resample(texture: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Return a texture at another resolution: averaged where finer, read bilinearly where coarser.
+    """Return a texture at another resolution: averaged where finer, interpolated where coarser.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def resample(texture: FloatArray, shape: tuple[int, int]) -> FloatArray:
     Raises
     ------
     ValueError
-        For a texture of other numbers, or none, and for a shape without pixels.
+        For a texture that is empty or not of floats, and for a shape without pixels.
 
     Examples
     --------
@@ -88,7 +88,7 @@ def resample(texture: FloatArray, shape: tuple[int, int]) -> FloatArray:
     Checks().require(real, "texture", given.dtype, "floating point numbers")
     Checks().shape("texture", given, ("...", "h", "w"))
     Checks().numbers("shape", shape, (2,), interval="[1, inf)")
-    # sparse matrices know no halves: those are summed in single precision
+    # sparse matrices do not support float16: sum in float32
     out = given.astype(np.promote_types(given.dtype, np.float32), copy=False)
     for axis, pixels in ((-2, shape[0]), (-1, shape[1])):
         texels = out.shape[axis]

@@ -1,16 +1,16 @@
-"""How sigma_tr varies from person to person and over a face: table 2 of Weyrich et al. 2005.
+"""Population of sigma_tr over people and facial sites: table 2 of Weyrich et al. 2005.
 
-The table gives a mean and a "Var." of sigma_tr for three places and three channels. Read as
+The table gives a mean and a "Var." of sigma_tr for three facial sites and three channels. Read as
 variances these numbers contradict the extremes that the same paper prints, so they are taken as
-standard deviations here (decision 10); ``reading="variance"`` takes them by the letter.
+standard deviations here (decision 10); ``reading="variance"`` takes them literally.
 
-Everything is labelled by sigma_tr, in 1/mm. Translucency is 1/sigma_tr, so the subject of least
-sigma_tr is the *most* translucent one. The captions of the paper's figures 17 and 18 call the
-subject of least sigma_tr that of "minimum translucency": the words are swapped there, or the
-numbers in the text are; the text's definition of translucency is followed here.
+All values are sigma_tr, in 1/mm. Translucency is 1/sigma_tr, so the subject of smallest sigma_tr is
+the *most* translucent one. The captions of the paper's figures 17 and 18 call the subject of
+smallest sigma_tr that of "minimum translucency": either the captions or the numbers in the text are
+swapped; the text's definition of translucency is used here.
 
 The paper gives no distribution and no correlations. sigma_tr is positive, so its logarithm is
-taken as normal, with the two moments matched exactly. Correlations of the logarithms,
+assumed normal, with both moments matched exactly. Correlations of the logarithms,
 `SITE_CORRELATION` and `CHANNEL_CORRELATION`, are assumed.
 
 References
@@ -35,25 +35,25 @@ from model.checks import Checks
 Reading: TypeAlias = Literal["deviation", "variance"]
 
 SITE_NAMES = ("cheek", "forehead", "neck")
-"""Places of table 2, in its order; its neck is measured below the chin."""
+"""Sites of table 2, in its order; its neck is measured below the chin."""
 CHANNEL_NAMES = ("red", "green", "blue")
 SITE_OF_LABEL: Mapping[str, str] = {"chin": "neck", "below the chin": "neck"}
-"""Labels of sessions that name a place of the table by another word."""
+"""Session labels of the table's sites under other names."""
 SITE_CORRELATION = 0.25
-"""Of log sigma_tr between two places of a face, one channel. The paper gives none: assumed, such
-that the extremes of 87 faces (means over their places) come near those of figure 17."""
+"""Correlation of log sigma_tr between two sites of a face, one channel. Not in the paper: assumed,
+such that the extremes of 87 faces (means over their sites) are close to those of figure 17."""
 CHANNEL_CORRELATION = ((1.0, 0.8, 0.5), (0.8, 1.0, 0.7), (0.5, 0.7, 1.0))
-"""Of log sigma_tr between channels at a place: assumed. From the subject of least to that of
-greatest sigma_tr (figure 17) all three rise, blue by little."""
+"""Correlation of log sigma_tr between channels at a site: assumed. From the subject of smallest to
+that of greatest sigma_tr (figure 17) all three rise, blue by little."""
 
 
 class TranslucencyPopulationError(ValueError):
-    """Moments, correlations or measurements that make no population."""
+    """Error for moments, correlations or measurements that do not make a population."""
 
 
 @dataclass(frozen=True, slots=True)
 class TranslucencyPopulation:
-    """A positive, lognormal population of sigma_tr over places and channels.
+    """A lognormal population of sigma_tr over sites and channels.
 
     Attributes
     ----------
@@ -62,11 +62,11 @@ class TranslucencyPopulation:
     sites, channels : tuple of str
         Names along both axes.
     site_correlation : float
-        Correlation of log sigma_tr between any two places, 0 to 1, below 1.
+        Correlation of log sigma_tr between any two sites, 0 to 1, below 1.
     channel_correlation : tuple of tuples of float
         Correlation matrix of log sigma_tr over channels, positive definite.
     source : str
-        Where the moments come from, and how they were read.
+        Source of the moments and their reading.
     """
 
     mean_per_mm: Float64Array
@@ -78,7 +78,7 @@ class TranslucencyPopulation:
     source: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse moments that are not positive, and correlations that no population has."""
+        """Raise for moments that are not positive, and for impossible correlations."""
         shape = (len(self.sites), len(self.channels))
         for name in ("mean_per_mm", "deviation_per_mm"):
             values = np.array(getattr(self, name), np.float64)
@@ -102,12 +102,12 @@ class TranslucencyPopulation:
 
     @property
     def log_deviation(self) -> Float64Array:
-        """Standard deviation of log sigma_tr, (S, C)."""
+        """Return the standard deviation of log sigma_tr, (S, C)."""
         return np.sqrt(np.log1p((self.deviation_per_mm / self.mean_per_mm) ** 2))
 
     @property
     def log_mean(self) -> Float64Array:
-        """Mean of log sigma_tr, sigma_tr in 1/mm, (S, C)."""
+        """Return the mean of log sigma_tr, sigma_tr in 1/mm, (S, C)."""
         return np.asarray(np.log(self.mean_per_mm) - 0.5 * self.log_deviation**2)
 
     def log_covariance(self) -> Float64Array:
@@ -120,12 +120,12 @@ class TranslucencyPopulation:
         return np.asarray(correlation * np.outer(scale, scale))
 
     def sample(self, n: int, *, rng: np.random.Generator) -> Float64Array:
-        """Draw people.
+        """Draw sigma_tr of people.
 
         Parameters
         ----------
         n : int
-            How many, at least 1.
+            Number of people, at least 1.
         rng
             Draws them.
 
@@ -153,7 +153,7 @@ def weyrich_2005(*, reading: Reading = "deviation") -> TranslucencyPopulation:
     Parameters
     ----------
     reading : {"deviation", "variance"}
-        What the column "Var." holds: standard deviations (decision 10), or, as printed, variances.
+        Meaning of the column "Var.": standard deviations (decision 10), or, as printed, variances.
 
     Examples
     --------
@@ -178,13 +178,13 @@ def weyrich_2005(*, reading: Reading = "deviation") -> TranslucencyPopulation:
 
 @dataclass(frozen=True, slots=True)
 class SiteMeasurement:
-    """sigma_tr of one person at one place, as a fit gives it.
+    """Fitted sigma_tr of one person at one site.
 
     Attributes
     ----------
     subject, site : str
     sigma_tr_per_mm : tuple of float
-        One a channel, 1/mm.
+        One per channel, 1/mm.
     stderr_per_mm : tuple of float
         Their standard errors, 1/mm.
     valid : tuple of bool
@@ -198,14 +198,14 @@ class SiteMeasurement:
     valid: tuple[bool, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse lengths that differ."""
+        """Raise for lengths that differ."""
         for name in ("sigma_tr_per_mm", "stderr_per_mm"):
             object.__setattr__(self, name, tuple(float(v) for v in getattr(self, name)))
         object.__setattr__(self, "valid", tuple(bool(v) for v in self.valid))
         count = len(self.sigma_tr_per_mm)
         if not count:
             raise TranslucencyPopulationError(
-                "sigma_tr_per_mm: got nothing, expected one value a channel"
+                "sigma_tr_per_mm: got none, expected one value per channel"
             )
         if len(self.stderr_per_mm) != count or (self.valid and len(self.valid) != count):
             raise TranslucencyPopulationError(
@@ -216,20 +216,20 @@ class SiteMeasurement:
 
 @dataclass(frozen=True, slots=True)
 class PopulationTable:
-    """Mean and standard deviation of sigma_tr over people, by place and channel: table 2's layout.
+    """Mean and standard deviation of sigma_tr over people, by site and channel, as in table 2.
 
-    All arrays have shape (S, C), in 1/mm unless said otherwise.
+    All arrays have shape (S, C), in 1/mm unless stated otherwise.
 
     Attributes
     ----------
     sites, channels : tuple of str
     count : ndarray of int
         People in each cell. Means are 0 where it is 0, deviations and errors 0 where it is below
-        2: they mean nothing there.
+        2: they are undefined there.
     mean_per_mm, deviation_per_mm : ndarray
         Over people; the deviation with n - 1.
     mean_stderr_per_mm, deviation_stderr_per_mm : ndarray
-        Standard errors from the scatter over people; the deviation's needs no normal distribution.
+        Standard errors from the variance over people; the deviation's does not assume normality.
     noise_per_mm : ndarray
         Root mean square standard error of the measurements behind each person's value; 0 where
         nothing was measured, as in a simulated population.
@@ -246,12 +246,12 @@ class PopulationTable:
 
     @property
     def deviation_without_noise_per_mm(self) -> Float64Array:
-        """Deviation over people that the errors of measurement do not explain; 0 where all is."""
+        """Return the deviation over people in excess of measurement errors; 0 without excess."""
         deviation, noise = self.deviation_per_mm, self.noise_per_mm
         return np.sqrt(np.maximum(deviation - noise, 0.0)) * np.sqrt(deviation + noise)
 
     def rows(self) -> list[tuple[str, tuple[tuple[float, float], ...]]]:
-        """Return table 2's rows: a channel, and for each place mean and deviation, 1/mm."""
+        """Return table 2's rows: a channel, and for each site mean and deviation, 1/mm."""
         return [
             (
                 channel,
@@ -264,7 +264,7 @@ class PopulationTable:
         ]
 
     def text(self) -> str:
-        """Return the table for a terminal: a row a channel, mean and deviation with their errors.
+        """Return the table for a terminal, one row per channel: mean and deviation with errors.
 
         Examples
         --------
@@ -309,13 +309,13 @@ def table(
     Parameters
     ----------
     sigma_tr_per_mm : array_like, shape (n, S, C)
-        sigma_tr of n people at S places in C channels, 1/mm.
+        sigma_tr of n people at S sites in C channels, 1/mm.
     sites, channels : sequence of str
         Names along the last two axes.
     stderr_per_mm : array_like, shape (n, S, C), optional
         Standard errors of measured values, 1/mm; none for a simulated population.
     valid : array_like of bool, shape (n, S, C), optional
-        Values that count; the others may be anything.
+        Values that count; the others are ignored.
 
     Returns
     -------
@@ -323,7 +323,7 @@ def table(
 
     Raises
     ------
-    PopulationError
+    TranslucencyPopulationError
         For shapes that do not fit, or a counted value that is not finite and above 0.
     """
     values = np.asarray(sigma_tr_per_mm, np.float64)
@@ -339,7 +339,7 @@ def table(
     check.within("stderr_per_mm, counted", noise[good], "[0, inf)")
     n = good.sum(axis=0)
     some = np.maximum(n, 1)
-    # squares and fourth powers in a unit that keeps them from vanishing and from overflowing
+    # scaled so that squares and fourth powers neither underflow nor overflow
     values, noise = np.where(good, values, 0.0), np.where(good, noise, 0.0)
     unit, noise_unit = (int(np.frexp(of.max(initial=0.0))[1]) for of in (values, noise))
     values, noise = np.ldexp(values, -unit), np.ldexp(noise, -noise_unit)
@@ -373,22 +373,21 @@ def summarize(
 ) -> PopulationTable:
     """Tabulate measured people in table 2's layout.
 
-    Repeats of a person at a place are averaged first, by their errors, so that everybody counts
-    once; labels are translated by `SITE_OF_LABEL`.
+    Repeats of a person at a site are averaged first, weighted by their errors, so that every person
+    counts once; labels are translated by `SITE_OF_LABEL`.
 
     Parameters
     ----------
     measurements : iterable of SiteMeasurement
         In any order.
     sites : sequence of str, optional
-        Places to list; by default those of the table that were measured, in its order, then
-        others by name.
+        Sites to list; by default the measured ones of the table, in its order, then others by name.
     channels : sequence of str
 
     Raises
     ------
-    PopulationError
-        Without a measurement at these places, for another number of channels, or a counted
+    TranslucencyPopulationError
+        Without a measurement at these sites, for another number of channels, or a counted
         standard error that is not finite and above 0.
 
     Examples
@@ -411,7 +410,7 @@ def summarize(
         sites = [s for s in SITE_NAMES if s in found] + sorted(found - set(SITE_NAMES))
     if not found & set(sites):
         raise TranslucencyPopulationError(
-            f"measurements: got none at {', '.join(sites) or 'any place'}"
+            f"measurements: got none at {', '.join(sites) or 'any site'}, expected at least one"
         )
     shape = (len(by_person), len(sites), len(channels))
     values, errors, good = np.zeros(shape), np.zeros(shape), np.zeros(shape, bool)
@@ -423,17 +422,17 @@ def summarize(
 
 
 def _averaged(repeats: list[SiteMeasurement]) -> tuple[Float64Array, Float64Array, BoolArray]:
-    """Return the mean of repeats by their errors, its standard error, and where there is one."""
+    """Return the error-weighted mean of repeats, its standard error, and the mask of channels."""
     values = np.array([one.sigma_tr_per_mm for one in repeats])
     errors = np.array([one.stderr_per_mm for one in repeats])
-    told = np.array([one.valid or (True,) * values.shape[1] for one in repeats])
-    told &= np.isfinite(values) & (values > 0)
+    counted = np.array([one.valid or (True,) * values.shape[1] for one in repeats])
+    counted &= np.isfinite(values) & (values > 0)
     whose = f"stderr_per_mm of {repeats[0].subject!r}"
-    Checks(TranslucencyPopulationError).within(whose, errors[told], "(0, inf)")
-    some = np.asarray(told.any(axis=0), np.bool_)
-    # relative to the least error: squares of errors in a small unit vanish
-    least = np.where(some, np.where(told, errors, np.inf).min(axis=0), 1.0)
-    weights = np.where(told, (least / np.where(told, errors, 1.0)) ** 2, 0.0)
+    Checks(TranslucencyPopulationError).within(whose, errors[counted], "(0, inf)")
+    some = np.asarray(counted.any(axis=0), np.bool_)
+    # relative to the smallest error: squares of tiny errors underflow
+    least = np.where(some, np.where(counted, errors, np.inf).min(axis=0), 1.0)
+    weights = np.where(counted, (least / np.where(counted, errors, 1.0)) ** 2, 0.0)
     total = np.where(some, weights.sum(axis=0), 1.0)
-    mean = (np.where(told, values, 0.0) * (weights / total)).sum(axis=0)
+    mean = (np.where(counted, values, 0.0) * (weights / total)).sum(axis=0)
     return mean, least / np.sqrt(total), some

@@ -1,4 +1,4 @@
-"""Unit vectors."""
+"""Normalize vectors and project weights to the simplex."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from model.arrays import Float64Array, FloatArray
 
 
 def project_to_simplex(rows: Float64Array) -> Float64Array:
-    """Return the nearest shares of at least 0 that sum to 1, row by row (n, d)."""
+    """Return the nearest weights of at least 0 that sum to 1, row by row (n, d)."""
     falling = -np.sort(-rows, axis=1)
     excess = (np.cumsum(falling, axis=1) - 1.0) / np.arange(1, rows.shape[1] + 1)
     kept = np.count_nonzero(falling > excess, axis=1)
@@ -26,7 +26,7 @@ def unit_vectors(
     vectors
         (..., 3), of any length.
     min_length
-        Shorter vectors are divided by this: they stay shorter than 1.
+        Shorter vectors are divided by this and stay shorter than 1.
 
     Examples
     --------

@@ -1,9 +1,9 @@
-"""Compile the kernels that the demo calls, into numba's cache beside the modules, in processes.
+"""Compile the kernels that the demo calls into numba's per-module cache, in parallel.
 
-``tools/compiled_kernels.csv`` names them with their types; without this they are compiled when
-they are first called. Kernels whose types stand in their source are compiled as their module is
-imported; those that a cached function makes for a type of numbers stand under its name. A line that
-does not fit the code any more is left out and costs nothing.
+``tools/compiled_kernels.csv`` lists them with their argument types; a kernel that was not compiled
+here is compiled on its first call. Kernels with an explicit signature are compiled when their
+module is imported. Kernels that a cached function builds for an element type are listed under that
+function's name. Lines that no longer match the code are skipped.
 
 Usage: python tools/compile_kernels.py [--processes N]
        python tools/compile_kernels.py --record   (runs the demo, 3 minutes, and lists its kernels)
@@ -35,9 +35,9 @@ _NAMES = {name: getattr(types, name) for name in dir(types)} | {"bool": types.bo
 
 
 def compile_module(rows: list[tuple[str, str, str]]) -> int:
-    """Compile kernels of one module, or load them from the cache, and count those that cannot be.
+    """Compile the kernels of one module or load them from the cache; return how many failed.
 
-    One process does a whole module: two that write the cache of one function would lose entries.
+    One process handles a whole module: two processes that write one function's cache lose entries.
     """
     return sum(not _compile(*row) for row in rows)
 
@@ -53,15 +53,15 @@ def _compile(module: str, name: str, signature: str) -> bool:
             kernel(np.dtype(str(given)).type)
         elif not isinstance(kernel, Dispatcher):
             return False
-        elif given not in kernel.signatures:  # else the import has compiled it
+        elif given not in kernel.signatures:  # else compiled on import
             kernel.compile(given)
-    except (NumbaError, TypeError, RuntimeError):  # the last of kernels with types of their own
+    except (NumbaError, TypeError, RuntimeError):  # kernels with own signatures
         return False
     return True
 
 
 def _is_maker(found: Any) -> bool:
-    """Tell whether a name of a module is a cached function, which makes kernels."""
+    """Return whether a module attribute is a cached function that builds kernels."""
     return hasattr(found, "cache_info")
 
 
@@ -89,14 +89,14 @@ def listed() -> list[list[tuple[str, str, str]]]:
 
 
 def compile_all(processes: int) -> int:
-    """Compile what is listed and return how many lines do not fit the code."""
+    """Compile all listed kernels and return how many lines do not match the code."""
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         return sum(pool.map(compile_module, listed()))
 
 
 def record() -> None:
-    """Run the demo in this process, and list the module-level kernels it compiled anew."""
-    config.CACHE_DIR = tempfile.mkdtemp()  # what is compiled already would not be listed
+    """Run the demo in this process and list the module-level kernels that it compiled."""
+    config.CACHE_DIR = tempfile.mkdtemp()  # an empty cache: list all
     from numba.core import event
 
     class Recorder(event.Listener):  # type: ignore[misc]
@@ -116,13 +116,13 @@ def record() -> None:
 
     recorder = Recorder()
     with event.install_listener("numba:compile", recorder), tempfile.TemporaryDirectory() as out:
-        from skinrig.console import Console  # here: some kernels are compiled as they are imported
+        from skinrig.console import Console  # imported here: some kernels are compiled on import
         from skinrig.demo import run_demo
         from skinrig.demo_rigs import RIGS
 
         run_demo(Path(out) / "demo", list(RIGS), console=Console(False), jobs=1)
     rows = []
-    for function, seconds, given in recorder.found:  # all modules are whole by now
+    for function, seconds, given in recorder.found:  # all modules are fully imported by now
         name, kinds = _named(function, given)
         rows.append(
             {
@@ -136,7 +136,7 @@ def record() -> None:
 
 
 def write(rows: list[dict[str, Any]]) -> None:
-    """Write the list, in an order that does not depend on the run's."""
+    """Write the list in an order that does not depend on the order of compilation."""
     rows.sort(key=lambda row: (row["module"], row["function"], row["types"]))
     with LIST.open("w", encoding="utf-8", newline="") as stream:
         table = csv.DictWriter(
@@ -147,7 +147,7 @@ def write(rows: list[dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    """Read the command line."""
+    """Compile the listed kernels, or record the list, as the command line asks."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 4))
     parser.add_argument("--record", action="store_true")

@@ -1,20 +1,21 @@
-"""Fit how far the model is from a simulated capture without noise, and how much light skin gets.
+"""Fit the chromophore model's error on noise-free simulated captures, and the prior of shading.
 
     python tools/fit_model_error.py
 
-Subjects of seeds 0 to 19 over all skin types stand before the flash rig, at two resolutions. For
-each pixel the color that the table predicts for the true chromophores is compared with the crossed
-image over a white tile's, both seen through the color filter array but without noise. What the two
-differ by, in the logarithm and without the brightness that is common to the channels, is the
-model's error. Its terms (see ``reconstruction.chromophores.model_error``) are those under which the
-errors are likeliest, as of Student's t with few degrees of freedom: outlines, nostrils and eyelids
-must not widen everybody's intervals. Fine structure is taken from the picture with its noise, as
-later. The whole is scaled so that with the sensor's noise 68 % of pixels lie inside the 68 %
-ellipse of both.
+Subjects of seeds 0 to 19 over all skin types are rendered for the flash rig at two resolutions. Per
+pixel, the color that the table predicts for the ground-truth chromophores is compared with the
+ratio of the crossed image to that of a white reference, both sampled by the color filter array
+without noise. The model's error is their difference in log color, without the brightness that is
+common to the channels. Its terms (see ``reconstruction.chromophores.model_error``) are
+maximum-likelihood estimates under Student's t with few degrees of freedom, so that outliers at
+outlines, nostrils and eyelids do not widen every interval. Fine structure is estimated from the
+noisy image, as in a reconstruction. A common factor then scales the covariances so that, with the
+sensor's noise added, 68 % of pixels are inside the joint 68 % ellipse.
 
-For where there is no picture there is also one covariance of all pixels of the larger resolution,
-without the outermost 5 %, scaled likewise. The brightness itself is the pixels' log shading. All go
-to ``reconstruction/data/chromophore_model_error.json``. Coverage is judged on seeds from 400 on.
+Where no image is available, one covariance of all pixels of the larger resolution is used: without
+the outermost 5 %, scaled likewise. The brightness is the pixels' log shading. All results are
+written to ``reconstruction/data/chromophore_model_error.json``. Coverage is evaluated on seeds from
+400 on.
 """
 
 from __future__ import annotations
@@ -42,12 +43,12 @@ PRESETS = ("palest", "I", "II", "III", "IV", "V", "VI", "darkest")
 STATES = ("neutral", "smile", "anger", "fear", "exercise")
 WIDTHS_PX = (384, 768)
 PIXELS = 2500
-"""Of each subject and resolution that the terms are fitted to."""
+"""Pixels of each subject and resolution that the terms are fitted to."""
 FREEDOM = 4.0
 """Degrees of freedom of Student's t."""
 BEGIN = (-6.9, 0.0, -6.9, -1.5, 1.3, -1.5, -4.0)
-"""Where the search begins: logarithms of transport's and fine structure's Cholesky factors, on the
-diagonal, and of the share that bounces; relative beside the diagonal."""
+"""Start of the search: logarithms of transport's and fine structure's Cholesky factors, on the
+diagonal, and of the interreflected fraction; off-diagonal elements are relative."""
 PLANE = np.array([[1.0, -1.0, 0.0], [1.0, 1.0, -2.0]]) / np.sqrt([[2.0], [6.0]])
 """Colors without brightness."""
 OUTERMOST = 0.05
@@ -58,7 +59,7 @@ TARGET = Path(__file__).resolve().parents[1] / "reconstruction/data/chromophore_
 
 
 def seen_by(scene: FlashScene, pattern: str) -> tuple[np.ndarray, np.ndarray]:
-    """Crossed image through the color filter array, read as a measurement is, without noise.
+    """Return the noise-free crossed image as sampled by the color filter array and demosaicked.
 
     The second array is the relative variance that the sensor's noise would have had.
     """
@@ -68,7 +69,7 @@ def seen_by(scene: FlashScene, pattern: str) -> tuple[np.ndarray, np.ndarray]:
     for cell, letter in enumerate(pattern):
         part = (slice(cell // 2, None, 2), slice(cell % 2, None, 2))
         mosaic[part] = radiance[..., "RGB".index(letter)][part]
-    # 16 bits round to a few 1e-5 of skin, far below what is looked for
+    # 16-bit rounding is a few 1e-5 of skin's signal, far below the model error
     cfa = np.round(mosaic / top * 65_000).astype(np.uint16)
     unit = 65_535 / 65_000 * top
     scale, offset = scene.sensor().noise_profile()
@@ -81,19 +82,19 @@ def seen_by(scene: FlashScene, pattern: str) -> tuple[np.ndarray, np.ndarray]:
     )
     seen = raw.linear_rgb(frame, demosaic="centered")
     rgb = seen.rgb.astype(np.float64)
-    with np.errstate(divide="ignore"):  # where no light falls
+    with np.errstate(divide="ignore"):  # pixels without light
         return rgb * unit, seen.variance / rgb**2
 
 
 def _scale(model: np.ndarray, errors: np.ndarray, variances: np.ndarray) -> float:
-    """Return the factor of the covariances with which 68 % of noisy errors are in 68 % ellipses.
+    """Return the factor of the covariances at which 68 % ellipses contain 68 % of noisy errors.
 
     `model` is (3, 3), or (n, 2, 2) in the plane without brightness.
     """
     seen = errors @ PLANE.T
     noise = np.einsum("ic,nc,jc->nij", PLANE, variances, PLANE)
     planar = PLANE @ model @ PLANE.T if model.ndim == 2 else model
-    reach = -2.0 * np.log(1.0 - WITHIN)  # of chi-square with two degrees of freedom
+    reach = -2.0 * np.log(1.0 - WITHIN)  # quantile of chi-square with two degrees of freedom
 
     def share_missing(scale: float) -> float:
         inverse = np.linalg.inv(noise + scale * planar)
@@ -104,7 +105,7 @@ def _scale(model: np.ndarray, errors: np.ndarray, variances: np.ndarray) -> floa
 
 @dataclass(frozen=True)
 class Sample:
-    """Some pixels of one picture."""
+    """Some pixels of one image."""
 
     error: np.ndarray
     """(n, 3) without noise."""
@@ -113,9 +114,9 @@ class Sample:
     variance: np.ndarray
     """(n, 3) of the noise, relative."""
     structure: np.ndarray
-    """(n,) fine structure of the noisy picture."""
+    """(n,) fine structure of the noisy image."""
     color: np.ndarray
-    """(n, 3) of the noisy picture."""
+    """(n, 3) of the noisy image."""
 
 
 def _sample(rgb, log_error, variance, good, rng) -> Sample:
@@ -138,11 +139,12 @@ def _sample(rgb, log_error, variance, good, rng) -> Sample:
 
 
 def _terms(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the planar covariances of transport and fine structure, and the share that bounces."""
+    """Return planar covariances of transport and fine structure, and the interreflected
+    fraction."""
 
-    def covariance(log_first: float, beside: float, log_second: float) -> np.ndarray:
+    def covariance(log_first: float, off_diagonal: float, log_second: float) -> np.ndarray:
         first = np.exp(log_first)
-        factor = np.array([[first, 0.0], [beside * first, np.exp(log_second)]])
+        factor = np.array([[first, 0.0], [off_diagonal * first, np.exp(log_second)]])
         return factor @ factor.T
 
     return covariance(*numbers[:3]), covariance(*numbers[3:6]), float(np.exp(numbers[6]))
@@ -158,7 +160,7 @@ def _planar(numbers: np.ndarray, sample: Sample) -> np.ndarray:
 
 
 def _fit_terms(samples: list[Sample]) -> tuple[np.ndarray, float]:
-    """Return the numbers of the likeliest terms, and the factor of all for 68 %."""
+    """Return the maximum-likelihood terms, and the common factor for 68 % coverage."""
 
     def unlikely(numbers: np.ndarray) -> float:
         total = 0.0
@@ -197,7 +199,7 @@ def main() -> None:
     by_preset: dict[str, list[float]] = {}
     for seed in SEEDS:
         preset, state = PRESETS[seed % len(PRESETS)], STATES[seed % len(STATES)]
-        # the blood alone: what faces do in expressions is no error of the color model
+        # vary blood alone: the motion of a face in expressions is not an error of the color model
         person = make_subject(preset, seed=seed)
         scenes = [FlashScene(rig, person, state=state, movement=False, seed=seed) for rig in rigs]
         for scene, (white, white_variance) in zip(scenes, whites, strict=True):

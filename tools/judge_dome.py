@@ -1,10 +1,10 @@
-"""Judge the light dome on simulated faces: capture, calibrate, reconstruct, compare with the truth.
+"""Evaluate the dome rig on simulated faces: capture, calibrate, reconstruct, compare.
 
     python tools/judge_dome.py OUT PRESET SEED [WIDTH_PX VIEWS LIGHTS]
 
-By default all 150 lights and 16 cameras at half resolution (650 pixels across; about 10 GB and
-half an hour on two cores). What lies in OUT already is not made again. The table is printed for the
-scanned geometry and, to tell the scanner's share of the error, for the true mesh.
+By default all 150 lights and 16 cameras are used at half resolution (650 pixels across; about 10 GB
+and half an hour on two cores). Existing folders in OUT are reused. The error table is printed for
+the scanned geometry and for the ground-truth mesh, which separates the scanner's part of the error.
 """
 
 from __future__ import annotations

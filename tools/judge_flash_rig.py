@@ -1,13 +1,14 @@
-"""Judge the flash rig on subjects that set nothing: seeds 100 to 119, all skin types and states.
+"""Evaluate the flash rig on held-out subjects: seeds 100 to 119, all skin types and expressions.
 
     python tools/judge_flash_rig.py [FIRST LAST]
 
-Targets and subjects are captured through the simulated rig at the demo's size and noise. For each
-melanin band, over the pixels that are not masked and against the truth with lateral transport:
-median relative error and bias, the share of truths in the 68 % intervals, the same for intervals
-of noise alone (no model error), half the intervals' median relative width, the median Cramer-Rao
-bound at the truth, and the share masked; then the same for the pixels whose bound is below 10 %,
-where the median error must be 15 % at most. Elsewhere it must be within 1.3 times the bound.
+Targets and subjects are captured by the simulated rig at the demo's size and noise. Per melanin
+band, unmasked pixels are compared with the ground truth blurred by lateral transport. Printed are:
+median relative error and bias, the coverage of the 68 % intervals, the coverage of intervals of
+noise alone (no model error), the intervals' median relative half-width, the median Cramer-Rao bound
+at the ground truth, and the masked fraction. The next row of the band is restricted to pixels whose
+bound is below 10 %; there the limit of the median error is 15 %. Elsewhere it is 1.3 times the
+bound.
 """
 
 from __future__ import annotations

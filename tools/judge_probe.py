@@ -1,11 +1,11 @@
-"""Judge the fibre probe on homogeneous media: capture, calibrate, reconstruct, compare sigma_tr.
+"""Evaluate the fiber probe on homogeneous media: capture, calibrate, reconstruct, compare sigma_tr.
 
     python tools/judge_probe.py OUT FIRST_SEED MEDIA [REPEATS]
 
 Draws media with sigma_tr from 0.3 to 3.0 per mm and sigma_s' from 0.7 to 3.0 per mm, evenly in the
 logarithm, and g from 0.7 to 0.9; simulates each as a session of REPEATS placements with all its
 noise, and prints the error of sigma_tr by the three methods with the coverage of the 68 %
-intervals. Each repeat is a placement of its own. What lies in OUT already is not made again.
+intervals. Each repeat is an independent placement. Existing folders in OUT are reused.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def main(arguments: list[str]) -> None:
         truth = store.read(truth_folder(session))
         own = evaluation.compare_fits(store.read(out / f"appearance-{seed}"), truth)
         rows += own
-        told = [
+        fits = [
             f"{row.method} {row.channel} {100 * row.relative:+.2f} "
             f"({'in' if row.covered else 'out'}{'' if row.valid else ', not valid'})"
             for row in own
@@ -63,7 +63,7 @@ def main(arguments: list[str]) -> None:
         ]
         print(
             f"seed {seed}: sigma_a {sigma_a:.4f} sigma_s' {sigma_s_prime:.3f} g {g:.2f}; "
-            f"{'; '.join(told)}",
+            f"{'; '.join(fits)}",
             flush=True,
         )
     print("method          fits  median %  worst %  bias %  68 % interval covers %")

@@ -1,11 +1,11 @@
-"""Judge the skin reflectance model: photographs that no fit has seen, against its renderings.
+"""Evaluate the skin reflectance model: compare its renderings with held-out photographs.
 
     python tools/judge_reflectance.py OUT WIDTH_PX SEED [SUBJECT ...]
 
-Five simulated faces, lightest to darkest, whose light spreads in the skin and goes from skin to
-skin: captured with the dome's targets, calibrated, reconstructed without every twelfth of 48
-lights and one of 6 cameras, fitted, and rendered for 24 of the photographs held out. What lies in
-OUT already is not made again. 320 pixels across take some two minutes of processor time a face.
+Five faces, lightest to darkest, are simulated with lateral scattering and interreflection. Each is
+captured with the dome's targets, calibrated, reconstructed without every twelfth of 48 lights and
+one of 6 cameras, fitted, and rendered for 24 of the held-out photographs. Existing folders in OUT
+are reused. At 320 pixels across, a face takes some two minutes of processor time.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ DOME: dict[str, Any] = {"lights": 48, "views": 6}
 
 
 def main(arguments: list[str]) -> int:
-    """Return 0 where all subjects keep to the limit."""
+    """Return 0 if all subjects are within the limit."""
     out, width, seed = Path(arguments[0]), int(arguments[1]), int(arguments[2])
     subjects = arguments[3:] or SUBJECTS
     out.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Make ``docs/images/dome-maps.png``: maps of the demo's simulated face, beside their truth.
+"""Make ``docs/images/dome-maps.png``: maps of a simulated face and ground truth.
 
 skinrig demo --rigs dome --out demo
 python tools/make_dome_maps.py demo
@@ -41,7 +41,7 @@ def panels(
 
 
 def main(demo: Path) -> None:
-    """Draw estimate and truth of the demo in this folder."""
+    """Draw the demo's estimated and ground-truth maps of this folder."""
     found = store.read(demo / "appearance-dome-III")
     place = found.maps["position"]
     points = place.values[place.valid].astype(np.float64)

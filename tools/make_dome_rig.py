@@ -1,9 +1,9 @@
 """Print capture/rigs/dome.toml: 150 LEDs on a geodesic sphere and 16 cameras around the face.
 
-The vertices of an icosahedron whose edges are cut in four lie on a sphere in 162 places; the
-twelve lowest, where the subject's shoulders are, hold no LED. Weyrich et al. 2005, section 5, give
-150 LEDs on a geodesic dome and 16 cameras but no coordinates; these are this project's choice, with
-every camera at least four degrees away from the nearest LED.
+An icosahedron whose edges are cut in four has 162 vertices on a sphere; the twelve lowest, at the
+subject's shoulders, carry no LED. Weyrich et al. 2005, section 5, give 150 LEDs on a geodesic dome
+and 16 cameras but no coordinates; these are this project's choice, with every camera at least four
+degrees away from the nearest LED.
 
     python tools/make_dome_rig.py > capture/rigs/dome.toml
 """
@@ -23,7 +23,7 @@ ROWS_DEG = {
 
 
 def led_positions() -> np.ndarray:
-    sphere = trimesh.creation.icosphere(subdivisions=2)  # each halving doubles: 4 parts an edge
+    sphere = trimesh.creation.icosphere(subdivisions=2)  # two halvings: 4 parts per edge
     places = sphere.vertices / np.linalg.norm(sphere.vertices, axis=1)[:, None]
     places = places[np.argsort(-places[:, 1], kind="stable")][:150]
     azimuth = np.degrees(np.arctan2(places[:, 0], places[:, 2])).round(3)

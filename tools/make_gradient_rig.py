@@ -1,15 +1,14 @@
 """Print capture/rigs/gradient.toml: a sphere of polarized LEDs, a macro camera and a caliper.
 
-The vertices of an icosahedron whose edges are cut in four lie on a sphere in 162 places, here with
-the middle of one of the icosahedron's faces towards the camera, so that its lens looks between the
-LEDs; places behind the subject's head hold none. Nagano et al. 2015, section 4
-(doi 10.1145/2766894), give a sphere of polarized LEDs without coordinates; these are this
-project's choice.
+An icosahedron whose edges are cut in four has 162 vertices on a sphere. The center of one of its
+faces is turned towards the camera, so that the lens looks between the LEDs; vertices behind the
+subject's head carry none. Nagano et al. 2015, section 4 (doi 10.1145/2766894), give a sphere of
+polarized LEDs without coordinates; these are this project's choice.
 
-Each LED's polarizer is turned so that what a facet reflects from it straight into the camera is
-polarized along the analyser at its reading 0, and so extinguished at 90 (the choice of Ma et al.
-2007, doi 10.2312/EGWR/EGSR07/183-194, for one point of view): along the plane of incidence and
-across it Fresnel's amplitudes differ, and the light's own axis makes up for that.
+Each LED's polarizer is rotated so that a facet's mirror reflection into the camera is polarized
+along the analyzer's axis at reading 0, and extinguished at 90 (the choice of Ma et al. 2007, doi
+10.2312/EGWR/EGSR07/183-194, for one point of view). Fresnel's amplitudes along and across the plane
+of incidence differ; the axis of the LED's polarizer compensates for this.
 
     python tools/make_gradient_rig.py > capture/rigs/gradient.toml
 """
@@ -20,7 +19,7 @@ import numpy as np
 import trimesh
 
 LIGHTS_MM = 600.0
-BEHIND = -0.6  # cosine to +z below which the subject's head and shoulders are
+BEHIND = -0.6  # cosine to +z; the subject's head and shoulders are below it
 ETA = 1.4
 ANALYSER_DEG = 90.0
 
@@ -34,7 +33,7 @@ def led_directions() -> np.ndarray:
     side = corners.vertices[corners.faces[0][0]]
     top = side - (side @ front) * front
     top /= np.linalg.norm(top)
-    # a third of the net's own angle: no LED then stands straight above or below the subject
+    # a third of the net's own angle: keeps every LED off the vertical through the subject
     turn = np.radians(7.0)
     right = np.cross(top, front)
     axes = np.stack(
@@ -51,7 +50,7 @@ def led_directions() -> np.ndarray:
 
 
 def polarizer_axis_deg(to_light: np.ndarray) -> float:
-    """Return the axis that a facet turns into the analyser's, degrees in the LED's plane."""
+    """Return the polarizer axis, degrees, whose mirror reflection is along the analyzer's axis."""
     to_camera = np.array([0.0, 0.0, 1.0])
     angle = np.radians(ANALYSER_DEG)
     wanted = np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -65,7 +64,7 @@ def polarizer_axis_deg(to_light: np.ndarray) -> float:
     s /= np.linalg.norm(s)
     p_in, p_out = np.cross(-to_light, s), np.cross(to_camera, s)
     field = (wanted @ s) / across * s + (wanted @ p_out) / along * p_in
-    # capture.rig.Light: from the horizontal towards up, as the camera sees a light beside it
+    # capture.rig.Light: from the horizontal towards up, for a light next to the camera
     right = np.cross([0.0, 1.0, 0.0], to_light)
     right /= np.linalg.norm(right)
     up = np.cross(to_light, right)

@@ -1,27 +1,27 @@
 """Make model/data/photon_table.npz: reflectance around a beam on semi-infinite turbid media.
 
 Run from the repository root, ``python tools/make_photon_table.py WORK`` with a folder for
-intermediate results; each asymmetry g and collection is one checkpoint there, and the table is made
-of those that exist. See `main` for options.
+intermediate results; each asymmetry g and collection is one checkpoint there, and existing
+checkpoints make up the table. See `main` for options.
 
-White Monte Carlo with sigma_s' = 1 and no absorption: photons are histogrammed over the radius and
-the length of their path, and absorption is put in afterwards. What makes few photons enough:
+White Monte Carlo with sigma_s' = 1 and no absorption: photons are histogrammed over radius and path
+length L, and absorption is applied afterwards as exp(-sigma_a L). Variance reduction:
 
-- One walk serves all indices of refraction. It is driven by the largest, which reflects most;
-  beside the photon go its relative weights for the others, multiplied by the ratio of the Fresnel
+- One walk serves all refractive indices. The largest one drives it, as it reflects most;
+  the photon carries relative weights for the others, multiplied by the ratio of the Fresnel
   reflectances at every hit of the surface.
-- Photons that are far out for the length of their path are split and those near the middle of the
-  cloud, and long ones, are thinned, after the diffusion's exp(-3 r^2/(4 L)) to the power 0.6. So
-  large radii and strong absorption get as many photons as weak absorption gets.
-- At the surface the expected transmitted part is scored, not a random choice.
-- "fibre": each shallow collision scores what it sends directly into the fibre's cone (next-event
+- Photons that are far out for their path length are split; long ones and those near the middle of
+  the cloud are thinned by roulette. The importance is diffusion's exp(-3 r^2/(4 L)) to the power
+  0.6, so that large radii and strong absorption get as many photons as weak absorption.
+- At the surface the expected transmittance is scored instead of a random choice.
+- "fibre": each shallow collision scores what it sends directly into the fiber's cone (next-event
   estimation), in one direction drawn inside the cone.
 - Paths longer than 3000 transport lengths are continued by the diffusion's L^(-5/2) law, whose
   constant is taken from the last factor of two of the histogram.
 
-- Near the source few photons go into a fibre's cone where the phase function is narrow. For
-  g = 0.9 and 0.95 paths up to 4 transport lengths are traced apart by 8 and 16 times the photons.
-- Splines over the rings, as smooth as predicts half of the batches from the others best. Fibres are
+- Near the source few photons go into a fiber's cone where the phase function is narrow. For g = 0.9
+  and 0.95 paths up to 4 transport lengths are traced separately by 8 and 16 times the photons.
+- Splines over the rings, as smooth as predicts half of the batches from the others best. Fibers are
   fitted as the quotient over light of all directions, which changes slowly far from the source.
 
 Tracing takes 20 minutes of one busy core, the table another half minute. It is the same for any
@@ -58,9 +58,9 @@ NUMERICAL_APERTURE = 0.22
 LOG_RADIUS_START, LOG_RADIUS_STEP, RADIUS_BINS = log(0.005), 0.1, 94  # 0.005 to 60
 LOG_PATH_START, LOG_PATH_STEP, PATH_BINS = log(0.005), 0.04, 333  # 0.005 to 3050
 PATH_END = 3000.0
-LATE_BIN = 316  # paths of 1541 and longer tell the constant of the law that continues them
+LATE_BIN = 316  # paths of 1541 and longer give the constant of the L^(-5/2) law
 COLLECTIONS = ("all", "fibre")
-# Photons a batch: about equal times but for g = 0 and 0.5, which need fewer.
+# Photons per batch: about equal times except for g = 0 and 0.5, which need fewer.
 PHOTONS = {
     0.8: 250_000,
     0.9: 125_000,
@@ -70,17 +70,17 @@ PHOTONS = {
     0.0: 80_000,
     0.3: 80_000,
 }
-# Near the source few photons go into a fibre's cone where the phase function is narrow: paths up to
+# Near the source few photons go into a fiber's cone where the phase function is narrow: paths up to
 # 4 transport lengths are traced again, by so many photons, instead.
 SHORT_PHOTONS = {0.9: 1_000_000, 0.95: 800_000}
 SHORT_BIN = 167
 BATCHES = 32
 ROOT_ABSORPTIONS = 0.1 * np.expm1(np.linspace(0.0, log(41.0), 25))  # 0 to 4: sigma_a <= 16
 SPLIT_POWER, SPLIT_LIMIT = 0.6, 15.0
-NARROW = 1.0 / 1.4**2  # the part of the sine squared that the cone of eta = 1.4 fills
+NARROW = 1.0 / 1.4**2  # fraction of the sine squared that the cone of eta = 1.4 fills
 NARROW_SHARE = 0.75  # directions drawn in the cone of eta = 1.4, the others in that of eta = 1
 STACK = 4096
-RELIABLE = 0.15  # relative error of a ring up to which it is used
+RELIABLE = 0.15  # largest relative error of a ring that is used
 FOLDS = 8  # of the jackknife
 MODEL_ERROR = 5e-4  # of the splines themselves, relative
 _UNIT = 2.0**-53
@@ -100,7 +100,7 @@ def _draw(state):
 
 @njit(inline="always")
 def _reflected(mu, eta):
-    """Fresnel reflectance from inside at the cosine mu."""
+    """Return the Fresnel reflectance from inside at the cosine mu."""
     sin2 = eta * eta * (1.0 - mu * mu)
     if eta == 1.0:
         return 0.0
@@ -292,7 +292,7 @@ def absorb(hist, absorptions):
 
 
 def simulate(folder, g, collection, photons, batches):
-    """Trace what is missing of `batches` batches of `photons`, keeping each in `folder`."""
+    """Trace the missing ones of `batches` batches of `photons`, keeping each in `folder`."""
     name = folder / f"g{g:g}-{collection}-{photons}.npz"
     rings, late = [], []
     seconds = 0.0
@@ -355,13 +355,13 @@ def basis(x):
 
 
 def reference(x, kappa):
-    """Return ln of the diffusion's law that the table is relative to."""
+    """Return ln of the diffusion profile to which the table is relative."""
     d = np.sqrt(np.exp(2.0 * x) + 1.0)
     return np.log1p(kappa * d) - 3.0 * np.log(d) - kappa * d
 
 
 def reliable(error):
-    """Return a smoothed copy of the rings' relative errors, and which rings are to be used."""
+    """Return a smoothed copy of the rings' relative errors, and a mask of reliable rings."""
     smooth = error.copy()
     for shift in (1, 2):
         smooth[shift:-shift] = np.exp(
@@ -399,7 +399,7 @@ def fit(mean, error, kappa, roughness, near=None):
     penalty = bend.T @ bend + far.T @ far
     drawn = 0.0 if near is None else penalty @ near
     design, inner_design = basis(centre), basis(inner).reshape(*inner.shape, -1)
-    correction = np.zeros(centre.size)  # ln of a ring's mean over the value at its centre
+    correction = np.zeros(centre.size)  # ln of a ring's mean over the value at its center
     log_reference = reference(centre, kappa)
     for _ in range(3):
         target = np.log(safe) - log_reference - correction
@@ -448,7 +448,7 @@ def choose_roughness(stored, kappas, near=None):
                     roughness,
                     None if near is None else near[e, :, k],
                 )
-                # the ring means of smooth profiles and their values at the centre differ alike
+                # ring mean over center value is nearly the same for all smooth profiles
                 other, used_too = fit(mean[e, :, k], error[e, :, k], kappas[k], 1.0)
                 both = used & used_too
                 relative = (error / np.maximum(mean, 1e-300))[e, both, k]
@@ -462,7 +462,7 @@ def choose_roughness(stored, kappas, near=None):
 def tabulate(pair, g):
     """Return for both collections spline coefficients (etas, radii, roots) and ln of errors.
 
-    The errors stand on every other knot.
+    The errors are given at every other knot.
     """
     kappas = np.array([0.0, *(asymptotic_decay(u * u, g) for u in ROOT_ABSORPTIONS[1:])])
     folds = [slice(None)]
@@ -529,7 +529,7 @@ def make_table(folder):
 
 
 def main():
-    """Trace photons and make the table of all there are.
+    """Trace photons and make the table from all existing batches.
 
     ``--trace-only`` leaves the table alone, ``--table-only`` traces nothing.
     """

@@ -3,7 +3,7 @@
     python tools/make_portrait_maps.py
 
 The photograph is NASA's portrait of the astronaut Eileen Collins, in the public domain, as
-scikit-image ships it. Nothing is known of camera and light; what is assumed is printed.
+scikit-image ships it. Camera and light are unknown; the assumptions are printed.
 """
 
 from __future__ import annotations

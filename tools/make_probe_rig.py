@@ -1,11 +1,11 @@
-"""Print capture/rigs/probe.toml: a source fibre, 28 detection fibres, suction and a cooled camera.
+"""Print capture/rigs/probe.toml: a source fiber, 28 detection fibers, suction, a cooled camera.
 
-Weyrich et al. 2006, section 8 (doi 10.1145/1141911.1141987), give a linear array of a source fibre
-and 28 detection fibres, 23 exposures 2/3 stop apart in about 88 s, suction and air cooling; the
-measures are this project's choice. Fibres of 0.2 mm core stand a quarter of a millimetre apart,
-from 0.3 to 7.05 mm: close enough for the steep part of blue profiles, far enough for red tails.
-Their ends keep that order before the camera, so that light that strays from a spot falls first on
-spots nearly as bright.
+Weyrich et al. 2006, section 8 (doi 10.1145/1141911.1141987), give a linear array of a source fiber
+and 28 detection fibers, 23 exposures 2/3 stop apart in about 88 s, suction and air cooling; the
+dimensions are this project's choice. Fibers of 0.2 mm core are a quarter of a millimeter apart,
+from 0.3 to 7.05 mm: close enough for the steep part of blue profiles, far enough for red tails. The
+camera images their ends in the same order, so that stray light of a spot falls first on spots that
+are nearly as bright.
 
     python tools/make_probe_rig.py > capture/rigs/probe.toml
 """

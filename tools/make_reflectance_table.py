@@ -2,9 +2,9 @@
 
 Run from the repository root; takes about half a minute. The grid is uniform in the cube roots of
 melanin and dermal blood (Jimenez 2010, eq. 7) over Table 1's ranges, at 400 to 700 nm in steps of
-10; stored is the logarithm of the accurate tier's reflectance, for scattering as the paper has it
-(g = 0) and as skin has it (g = 0.8). Cubic interpolation between the nodes is within 5e-5 of the
-tier itself; tests/unit/model/test_color_table.py checks that on random points.
+10; stored is the logarithm of the accurate tier's reflectance, for the paper's scattering (g = 0)
+and for skin's (g = 0.8). Cubic interpolation between the nodes is within 5e-5 of the tier itself;
+tests/unit/model/test_color_table.py checks that on random points.
 """
 
 from pathlib import Path

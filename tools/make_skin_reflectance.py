@@ -2,16 +2,17 @@
 
     python tools/make_skin_reflectance.py [--photons-scale 1] [--threads 2] [--seed 20100]
 
-For every wavelength a few stacks of increasing melanin are traced, and every returned photon's path
-lengths in epidermis and dermis are kept. A photon of weight w in a stack with (c_ref, 0) has weight
-w exp(-(c_m - c_ref) a - c_hd b) in one with (c_m, c_hd), where a and b hold its path lengths, for
-all absorptions are linear in the two fractions and scattering does not depend on them. So a run
-serves all c_m >= c_ref with common random numbers, and the table is smooth and monotone in both
-fractions. Runs of more melanin, where photons are short-lived and cheap, take over smoothly between
-c_ref and 2.5 c_ref. The same photons, sorted by their distance from the beam, give the lateral
-profiles. Standard errors come from independent batches.
+Per wavelength a few stacks of increasing melanin are traced, and every returned photon's path
+lengths in epidermis and dermis are stored. A photon of weight w in a stack with (c_ref, 0) has
+weight w exp(-(c_m - c_ref) a - c_hd b) in one with (c_m, c_hd), where a and b are its path lengths
+times the absorption per unit of fraction: all absorptions are linear in the two fractions, and
+scattering does not depend on them. So one run serves all c_m >= c_ref with common random numbers,
+and the table is smooth and monotone in both fractions. Runs of more melanin, where photons are
+short-lived and cheap, take over smoothly between c_ref and 2.5 c_ref. The same photons, sorted by
+their distance from the beam, give the lateral profiles. Standard errors are those of independent
+batches.
 
-Finished wavelengths are kept in the work folder, so that an interrupted run goes on where it was.
+Finished wavelengths are kept in the work folder; an interrupted run resumes from them.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def shares(c_m: FloatArray) -> FloatArray:
-    """Share of each run in the estimate at each c_m, shape (runs, nodes), columns sum to 1."""
+    """Return each run's weight in the estimate at each c_m, (runs, nodes); columns sum to 1."""
     result = np.zeros((len(RUNS), c_m.size))
     result[0] = 1.0
     for index, (c_ref, _) in enumerate(RUNS[1:], start=1):
@@ -65,7 +66,7 @@ def shares(c_m: FloatArray) -> FloatArray:
 def survivals(
     paths: EscapePaths, wavelength_nm: float, c_ref: float, c_m: FloatArray, c_hd: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Weights at each melanin, shape (n, c_m), and their factors by blood, shape (n, c_hd)."""
+    """Return photon weights at each melanin (n, c_m) and their factors by blood (n, c_hd)."""
     baseline = skin_layers.baseline_per_mm(wavelength_nm)
     melanin = skin_layers.melanin_per_mm(wavelength_nm) - baseline
     blood = skin_layers.blood_per_mm(wavelength_nm) - baseline
@@ -79,7 +80,7 @@ def survivals(
 def ring_sums(
     paths: EscapePaths, wavelength_nm: float, c_ref: float, c_m: FloatArray, c_hd: FloatArray
 ) -> FloatArray:
-    """Reflectance within each ring, shape (c_m, c_hd, rings)."""
+    """Return the reflectance within each ring, shape (c_m, c_hd, rings)."""
     by_melanin, by_blood = survivals(paths, wavelength_nm, c_ref, c_m, c_hd)
     order = np.argsort(paths.radius_mm)
     ends = np.searchsorted(paths.radius_mm[order], RING_EDGES_MM)
@@ -90,7 +91,7 @@ def ring_sums(
 def simulate(
     wavelength_nm: float, *, seed: int, scale: float, threads: int
 ) -> dict[str, FloatArray]:
-    """Trace one wavelength; reflectance and ring reflectance with their standard errors."""
+    """Trace one wavelength; return reflectance and ring reflectance with their standard errors."""
     c_m, c_hd = c_m_axis(NODES), c_hd_axis(NODES)
     lateral_c_m, lateral_c_hd = c_m_axis(LATERAL_NODES), c_hd_axis(LATERAL_NODES)
     fine, coarse = shares(c_m), shares(lateral_c_m)
@@ -122,7 +123,7 @@ def simulate(
 def _add(
     sums: dict[str, FloatArray], name: str, batches: FloatArray, share: FloatArray, used: FloatArray
 ) -> None:
-    """Add one run's share of mean and variance of the mean; batches on the first axis."""
+    """Add one run's weighted mean and variance of the mean; batches are on the first axis."""
     shape = (share.size, *batches.shape[2:])
     mean = sums.setdefault(name, np.zeros(shape))
     variance = sums.setdefault(f"{name}_variance", np.zeros(shape))
@@ -132,7 +133,7 @@ def _add(
 
 
 def parameters(seed: int, scale: float) -> dict[str, object]:
-    """Everything that the numbers depend on."""
+    """Return all parameters that determine the table's values."""
     wavelengths = [float(nm) for nm in WAVELENGTH_NM]
     return {
         "recipe": RECIPE,
@@ -159,7 +160,7 @@ def parameters(seed: int, scale: float) -> dict[str, object]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Trace what is missing, then write the table."""
+    """Trace the missing wavelengths, then write the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument(
         "--out", type=Path, default=ROOT / "rigsim" / "data" / "skin_reflectance_mc.npz"
@@ -180,7 +181,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         part = folder / f"{nm:.0f}nm.npz"
         if not part.exists():
             start = time.perf_counter()
-            # BLAS threads that wait for small products would take the cores from the photons.
+            # BLAS threads that spin between small products would take cores from the tracing
+            # threads.
             with threadpool_limits(1):
                 sums = simulate(nm, seed=args.seed, scale=args.photons_scale, threads=args.threads)
             unfinished = part.with_suffix(".partial")

@@ -5,8 +5,8 @@ see `main` for options).
 
 - People: the 87 of `rigsim.population.population.draw_population`. A random half of them gets a
 tan (1.5 times the
-  melanin); everybody gets one of normal (twice as often), cold, hot, sweat, lotion, makeup and
-  powder instead of what they wore.
+  melanin); everybody gets one condition out of normal (twice as often), cold, hot, sweat, lotion,
+  makeup and powder instead of their own.
 - Surface: materials fitted to 2 % noisy light from 40 points of each face in 240 pairs of light
   and view, R_d estimated from the same samples; mean mixtures; 8 common ones as in figure 15 of
   Weyrich et al.; traits are the conditions, sex and age.
@@ -15,10 +15,11 @@ tan (1.5 times the
   freckles, beard, conditions) is learned from ten people seen without and with each; sex, group
   and age from the 87. From the 87 alone, tan comes to a cosine of about 0.92 with the truth, as
   people differ more than a tan.
-- "regression": what a trait adds beside all others and, of the ten, beside who they are.
-- Truth: other people are simulated without and with each trait, free of noise. The cosines between
-  their mean change and the traits' vectors are printed and stored. For the albedo it is that of
-  the vectors of the whole face.
+- "regression": a trait's effect with all other traits as covariates and, of the ten, their
+  identities.
+- Ground truth: other people are each simulated without and with each trait, without noise. The
+  cosines between their mean change and the traits' vectors are printed and stored; for the albedo,
+  those of the vectors of the whole face.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ REGIONS = ("face", "beard", "no-beard")
 OPPOSITES = {"female": "male", "asian": "caucasian"}
 RANK, POINTS = 8, 40
 COMPARED = 8
-"""People who are simulated twice for the truth."""
+"""People who are simulated twice, for the ground truth."""
 DIRECTIONS = 8
 """Of the albedo's space that are stored."""
 LIMIT_BYTES = 1_500_000
@@ -83,7 +84,7 @@ def mixtures(people: Sequence[Member], seed: int) -> np.ndarray:
 
 
 def kept(work: Path | None, name: str, make: Callable[[], np.ndarray]) -> np.ndarray:
-    """Return what an earlier run left in the work folder, or make it."""
+    """Return an array of an earlier run from the work folder, or compute it."""
     path = None if work is None else work / f"{name}.npy"
     if path is not None and path.is_file():
         return np.load(path)
@@ -111,7 +112,7 @@ def surface_space(people: Sequence[Member], means: np.ndarray, seed: int) -> Tra
 
 
 def packaged(space: TraitSpace) -> TraitSpace:
-    """Leave out all but the first directions, which vectors do not need, and add opposites."""
+    """Omit directions that the vectors do not need, and add each trait's opposite."""
     notes = {}
     if len(space.basis) > DIRECTIONS:
         notes["basis"] = f"the first {DIRECTIONS} of {len(space.basis)}; vectors are of all"
@@ -146,7 +147,7 @@ def surface_truth(space: TraitSpace, people: Sequence[Member], seed: int) -> dic
 
 
 def visits(people: Sequence[Member]) -> tuple[list[Member], list[str], list[str]]:
-    """Return people without and with each trait, what each visit shows and whose it is."""
+    """Return people without and with each trait, and the trait and the person of each visit."""
     seen, shows, whose = [], [], []
     for person in people:
         bare = dataclasses.replace(person, applied=(), marks=frozenset(), **WITHOUT)
@@ -165,7 +166,7 @@ def visits(people: Sequence[Member]) -> tuple[list[Member], list[str], list[str]
 def drawn(
     faces: CommonFaces, people: Sequence[Member], noise: float, stream: tuple[int, int]
 ) -> np.ndarray:
-    """Draw albedo maps, (n, N, N, 4), the mask last."""
+    """Draw albedo maps, (n, N, N, 4), the mask as last channel."""
     found = []
     for k, person in enumerate(people):
         one = faces.albedo(person, noise=noise, rng=np.random.default_rng([*stream, k]))
@@ -202,13 +203,13 @@ def albedo_space(
     labels = trait_truth.label_members(people, BORN)
     worn = {n: np.array([n in p.labels for p in people]) for n in PUT_ON}
     space = fitted(many, {**labels, **worn}, ages, texture, seed)
-    told = {name: np.array([one == name for one in shows]) for name in PUT_ON}
+    worn = {name: np.array([one == name for one in shows]) for name in PUT_ON}
     persons = {name: np.array([w == name for w in whose]) for name in dict.fromkeys(whose)}
     persons.pop(whose[0])
-    within = fitted(again, {**told, **persons}, {}, texture, seed)
+    within = fitted(again, {**worn, **persons}, {}, texture, seed)
     traits = {name: space.traits[name] for name in (*BORN, "age")}
     traits |= {name: within.traits[name] for name in PUT_ON}
-    # a vector's coordinates are those of the population's directions, to which it is projected
+    # vectors are projected to the population's directions
     traits = {
         name: dataclasses.replace(trait, coordinates=space.basis @ trait.vector)
         for name, trait in traits.items()
@@ -241,14 +242,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("model/data") / PACKAGED_FILE)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--size", type=int, default=256, help="texels a side of the faces")
-    parser.add_argument("--common", type=int, default=192, help="pixels a side of the common map")
-    parser.add_argument("--people", type=int, default=87, help="only so many, drawn at random")
-    parser.add_argument("--work", type=Path, help="folder that keeps samples for another run")
+    parser.add_argument("--size", type=int, default=256, help="texels per side of the faces")
+    parser.add_argument("--common", type=int, default=192, help="pixels per side of the common map")
+    parser.add_argument("--people", type=int, default=87, help="people, drawn at random")
+    parser.add_argument("--work", type=Path, help="folder that keeps samples for later runs")
     given = parser.parse_args()
     start = time.process_time()
 
-    def tell(text: str) -> None:
+    def report(text: str) -> None:
         print(f"{time.process_time() - start:6.0f} s  {text}", flush=True)
 
     people = population(given.seed)
@@ -256,14 +257,14 @@ def main() -> None:
     people = tuple(people[i] for i in sorted(order))
     means = kept(given.work, "surface", lambda: mixtures(people, given.seed))
     surface = surface_space(people, means, given.seed)
-    tell("surface learned")
+    report("surface learned")
     found = kept(
         given.work,
         "surface_truth",
         lambda: np.array(list(surface_truth(surface, people, given.seed).values())),
     )
     truth = {"surface": dict(zip(CONDITION_NAMES[1:], found.tolist(), strict=True))}
-    tell(f"cosines to the truth: {truth['surface']}")
+    report(f"cosines to the truth: {truth['surface']}")
     faces = CommonFaces.of(people, size=given.size, common=given.common)
     noise = trait_truth.ALBEDO_NOISE
     once = kept(given.work, "albedo", lambda: drawn(faces, people, noise, (given.seed, 7)))
@@ -272,7 +273,7 @@ def main() -> None:
     others = [people[i] for i in mixed[REPEATED : REPEATED + COMPARED_IN_COLOR]]
     seen, shows, whose = visits(some)
     again = kept(given.work, "again", lambda: drawn(faces, seen, noise, (given.seed, 9)))
-    tell("albedo maps drawn")
+    report("albedo maps drawn")
     texture = TextureSpace.fit(
         [albedo_vectors.encode_albedo(one[..., :3], "quantiles") for one in (*once, *again)],
         valid=[one[..., 3] > 0 for one in (*once, *again)],
@@ -283,9 +284,9 @@ def main() -> None:
         spaces[regions.space_name(region)] = albedo_space(
             both[0], people, both[1], shows, whose, texture, given.seed
         )
-        tell(f"albedo of {region} learned")
+        report(f"albedo of {region} learned")
     truth["albedo"] = albedo_truth(spaces["albedo"], faces, texture, others)
-    tell(f"cosines to the truth: {truth['albedo']}")
+    report(f"cosines to the truth: {truth['albedo']}")
     library = TraitLibrary(
         {name: packaged(space) for name, space in {**spaces, "surface": surface}.items()},
         "simulated",
@@ -307,7 +308,7 @@ def main() -> None:
     back = from_bytes(content)
     for name, space in back.spaces.items():
         worst = max(space.storage_error.values())
-        tell(f"{name}: {len(space.basis)} directions, storage error at most {100 * worst:.2f} %")
+        report(f"{name}: {len(space.basis)} directions, storage error at most {100 * worst:.2f} %")
         for trait in space.traits.values():
             sure = trait.confidence
             print(
@@ -317,7 +318,7 @@ def main() -> None:
     if len(content) > LIMIT_BYTES:
         raise SystemExit(f"{len(content)} bytes, expected at most {LIMIT_BYTES}")
     given.out.write_bytes(content)
-    tell(f"{given.out}: {len(content)} bytes")
+    report(f"{given.out}: {len(content)} bytes")
 
 
 if __name__ == "__main__":

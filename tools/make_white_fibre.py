@@ -1,12 +1,12 @@
-"""Make ``rigsim/data/white_fibre_mc.npz``: what fibres take from homogeneous half spaces.
+"""Make ``rigsim/data/white_fibre_mc.npz``: light collected by fibers on half spaces.
 
     python tools/make_white_fibre.py WORK [--photons-scale 1] [--threads 1] [--seed 20600]
 
-A few media of increasing absorption are traced with sigma_s' = 1 per mm; the paths of their photons
-give every larger absorption. Estimates of all media that can tell of an absorption are combined by
-their variances. Along the distance, the logarithm of each estimate is fitted by a cubic spline of
-few knots, so that light at neighbouring distances helps; leaving out one batch of photons at a time
-gives the standard errors. Runs are kept in WORK, so that an interrupted one goes on.
+A few media of increasing absorption are traced with sigma_s' = 1 per mm; their photons' path
+lengths give every larger absorption. The estimates of all media that are informative at an
+absorption are combined by inverse variance. Along the distance, the logarithm of each estimate is
+fitted by a cubic spline of few knots, which pools neighboring distances; a jackknife over batches
+of photons gives the standard errors. Runs are kept in WORK; an interrupted one resumes.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ PHOTONS = {
     1.0: (4_000_000, 8_000_000, 8_000_000),
     3.0: (4_000_000, 8_000_000, 8_000_000),
 }
-"""Of the runs near, in the middle and far, by absorption: the darker, the cheaper."""
+"""Photons of the near, middle and far runs, by absorption: the darker, the cheaper."""
 BASES = tuple(PHOTONS)
 ABSORPTION = np.concatenate(
     [
@@ -66,9 +66,9 @@ ABSORPTION = np.concatenate(
     ]
 )
 DISTANCE = np.geomspace(NEAREST, FARTHEST, 81)
-NOISIEST = 0.2  # relative error of a fibre that is still fitted
-LAST_LOG = 26.0  # photons are not asked for where less than exp(-this) of the light is left
-SPAN = 12.0  # a base tells of absorptions up to this multiple of its own
+NOISIEST = 0.2  # largest relative error of a fiber that is fitted
+LAST_LOG = 26.0  # no photons are traced where less than exp(-this) of the light is left
+SPAN = 12.0  # a base serves absorptions up to this multiple of its own
 
 
 def groups(base: float) -> list[tuple[FloatArray, float, int]]:
@@ -85,13 +85,13 @@ def groups(base: float) -> list[tuple[FloatArray, float, int]]:
 
 
 def trace(work: Path, scale: float, threads: int, seed: int) -> list[dict[str, FloatArray]]:
-    """Return, of each base, distances, widths, and F by batch, distance and absorption."""
+    """Return per base distances, widths, and F by batch, distance and absorption."""
     out = []
     for number, base in enumerate(BASES):
         path = work / f"base{number}.npz"
         if not path.exists():
             started = time.process_time()
-            told = ABSORPTION[(base <= ABSORPTION) & (max(base, 0.003) * SPAN >= ABSORPTION)]
+            served = ABSORPTION[(base <= ABSORPTION) & (max(base, 0.003) * SPAN >= ABSORPTION)]
             radii, widths, values = [], [], []
             for group, (radius, width, photons) in enumerate(groups(base)):
                 stack = LayerStack(
@@ -115,7 +115,7 @@ def trace(work: Path, scale: float, threads: int, seed: int) -> list[dict[str, F
                     batches=BATCHES,
                     threads=threads,
                 )
-                more = np.maximum(told - max(base, LEAST), 0.0)
+                more = np.maximum(served - max(base, LEAST), 0.0)
                 values.append(
                     np.stack([paths.profile(m).batch_reflectance_per_mm2 for m in more], axis=-1)
                 )
@@ -123,7 +123,7 @@ def trace(work: Path, scale: float, threads: int, seed: int) -> list[dict[str, F
                 widths.append(np.full(len(radius), width))
             np.savez(
                 path,
-                told=told,
+                served=served,
                 radius=np.concatenate(radii),
                 width=np.concatenate(widths),
                 value=np.concatenate(values, axis=1),
@@ -191,7 +191,7 @@ def smoothed(
     use = np.arange(len(radius)) <= last
     use &= good
     curve = Curve(radius[use], width[use], absorption)
-    # errors that follow the light, as single ones are themselves uncertain by a sixth
+    # smooth errors: a single one is itself uncertain by a sixth
     smooth = (
         np.exp(
             np.convolve(
@@ -219,7 +219,7 @@ def combine(runs: list[dict[str, FloatArray]]) -> tuple[FloatArray, FloatArray]:
     top = np.zeros((len(DISTANCE), len(ABSORPTION)))
     weight = np.zeros_like(top)
     for base, run in zip(BASES, runs, strict=True):
-        for column, a in enumerate(run["told"]):
+        for column, a in enumerate(run["served"]):
             shape, spread, chi2 = smoothed(
                 run["radius"], run["width"], run["value"][:, :, column], float(a)
             )
@@ -239,7 +239,7 @@ def combine(runs: list[dict[str, FloatArray]]) -> tuple[FloatArray, FloatArray]:
     error = np.where(known, 1.0 / np.sqrt(np.where(known, weight, 1.0)), 1.0)
     for column in range(len(ABSORPTION)):
         last = int(np.flatnonzero(known[:, column])[-1])
-        # beyond what photons reached: on with the last slope over the distance
+        # extrapolate beyond the farthest photons with the last slope over distance
         slope = (shape[last, column] - shape[last - 4, column]) / (
             DISTANCE[last] - DISTANCE[last - 4]
         )
@@ -250,7 +250,7 @@ def combine(runs: list[dict[str, FloatArray]]) -> tuple[FloatArray, FloatArray]:
 
 
 def main() -> None:
-    """Trace, fit, write."""
+    """Trace photons, fit the curves and write the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("work", type=Path)
     parser.add_argument("--photons-scale", type=float, default=1.0)

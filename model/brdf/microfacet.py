@@ -23,10 +23,10 @@ from model.checks import Checks
 Distribution = Literal["ggx", "beckmann", "blinn"]
 
 MIN_COSINE = 1e-3
-"""Cosines to the horizon below this count as this: the BRDF is finite everywhere."""
+"""Smallest cosine of light or view; smaller ones are clamped to keep the BRDF finite."""
 
 ROUGHNESS_RANGE = (1e-6, 1e6)
-"""Smoother facets are a mirror, which has no density; squares of both overflow far beyond."""
+"""Below it a surface is a mirror, which has no density; squares of values far outside overflow."""
 
 
 def facet_density(cos_h: ArrayLike, roughness: float, kind: Distribution = "ggx") -> Float64Array:
@@ -40,8 +40,8 @@ def facet_density(cos_h: ArrayLike, roughness: float, kind: Distribution = "ggx"
         GGX's alpha or Beckmann's m, within :data:`ROUGHNESS_RANGE`; the cosine power is matched to
         it as 2/m^2 - 2.
     kind
-        Which distribution. The cosine power is for m up to 0.5: Smith's shadowing is not its own,
-        and wider lobes give back up to 13 % more than they get near grazing.
+        Distribution of facets. The cosine power is for m up to 0.5: Smith's shadowing is not its
+        own, and wider lobes reflect up to 13 % too much near grazing.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def visibility(
 ) -> Float64Array:
     """Return G / (4 cos cos), height-correlated Smith shadowing and masking.
 
-    Cosines below :data:`MIN_COSINE`, behind the surface too, count as that.
+    Cosines below :data:`MIN_COSINE`, negative ones too, are clamped to it.
     """
     mu_l, mu_v = (
         np.clip(np.asarray(mu, dtype=np.float64), MIN_COSINE, 1.0) for mu in (cos_light, cos_view)
@@ -90,7 +90,7 @@ def brdf(
     eta: float,
     kind: Distribution = "ggx",
 ) -> Float64Array:
-    """Return the BRDF of a rough dielectric surface, 1/sr, without what enters and comes back.
+    """Return the specular BRDF of a rough dielectric surface, 1/sr, without subsurface scattering.
 
     Parameters
     ----------

@@ -1,8 +1,7 @@
 """The 59 dielectric materials of the built-in basis, as functions.
 
-Chosen to span what oily, dry, made-up and powdered skin may show: sharp to wide surface
-reflection of three kinds of facets at three refractive indices, sheen, light thrown back to its
-source, and what is left of the diffuse part.
+They span oily, dry, made-up and powdered skin: sharp to wide specular reflection of three facet
+distributions at three refractive indices, sheen, retroreflection, and a residual diffuse lobe.
 """
 
 from collections.abc import Callable, Iterator
@@ -63,7 +62,7 @@ def _facets(roughness: float, eta: float, kind: microfacet.Distribution) -> Brdf
 
 
 def _sheen(width: float) -> Brdf:
-    """Fine hairs that stand up: facets at right angles, sin^(1/width) of the half angle.
+    """Return the sheen of fine upright hairs: facet density sin^(1/width) of the half angle.
 
     Estevez and Kulla 2017 (sheen), with the shadowing of Neubelt and Pettineo 2013.
     """
@@ -78,7 +77,7 @@ def _sheen(width: float) -> Brdf:
 
 
 def _retro(width: float) -> Brdf:
-    """Light thrown back around its source: a Gaussian of the difference angle."""
+    """Return retroreflection: a Gaussian of the difference angle."""
 
     def brdf(light: Float64Array, view: Float64Array) -> Float64Array:
         _, _, _, cos_d = _cosines(light, view)
@@ -92,7 +91,7 @@ def _diffuse(light: Float64Array, view: Float64Array) -> Float64Array:
 
 
 def _rough_diffuse(light: Float64Array, view: Float64Array) -> Float64Array:
-    """Oren and Nayar 1994 with slopes of 0.5 rad."""
+    """Return the rough diffuse lobe of Oren and Nayar 1994 with slopes of 0.5 rad."""
     mu_l, mu_v, _, _ = _cosines(light, view)
     mu_l, mu_v = np.maximum(mu_l, 0.0), np.maximum(mu_v, 0.0)
     s2 = 0.5**2

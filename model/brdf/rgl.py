@@ -1,13 +1,13 @@
-"""Isotropic BRDFs as RGL's measured materials (.bsdf), which Mitsuba's ``measured`` evaluates.
+"""Read, write and evaluate isotropic BRDFs of RGL's .bsdf format (Mitsuba's ``measured``).
 
-For each of some view elevations a file holds, over the unit square, f_r times the cosine of the
-light, times 4 sigma(view) / ndf(half). The square is that of the half vector, (sqrt(2 theta / pi),
-(phi + pi) / 2 pi) with phi from the view's azimuth, flattened by the inverse of the sampling of a
-tabulated density ("vndf"). Everything is interpolated linearly.
+Per view elevation a file contains, over the unit square, f_r times the cosine of the light, times 4
+sigma(view) / ndf(half). The square is that of the half vector, (sqrt(2 theta / pi), (phi + pi) / 2
+pi) with phi from the view's azimuth, flattened by the inverse of the sampling of a tabulated
+density ("vndf"). Everything is interpolated linearly.
 
-What is written here has a constant density, ndf = 1 and sigma = 1/4: the square is that of the half
-vector and the values are f_r times the cosine, in readers that heed the file's ``jacobian`` and in
-those that do not. ``luminance`` is the density that light directions are drawn from.
+Files written here have a constant density, ndf = 1 and sigma = 1/4. The square is then that of the
+half vector and the values are f_r times the cosine, whether or not a reader uses the file's
+``jacobian``. ``luminance`` is the density that light directions are drawn from.
 
 References
 ----------
@@ -33,13 +33,13 @@ from model.vectors import unit_vectors
 N_ELEVATIONS = 45
 TABLE_SIDE = 90
 MAX_ELEVATION_RAD = np.deg2rad(89.0)
-"""View elevation of the last table; lower views take it."""
-_MIN_JACOBIAN = 1e-6  # as the readers have it, at the pole of the half vector
-_MIN_DENSITY_RATIO = 1e-3  # of the mean density: no direction is without
+"""View elevation of the last table; also used for views closer to the horizon."""
+_MIN_JACOBIAN = 1e-6  # smallest sine at the pole of the half vector, as in other readers
+_MIN_DENSITY_RATIO = 1e-3  # fraction of the mean density that every direction gets
 
 
 class RglFileError(ValueError):
-    """A tensor file that is no isotropic measured material."""
+    """Error for a tensor file that is not an isotropic measured material."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +74,7 @@ class RglTable:
     description: str
 
     def __post_init__(self) -> None:
-        """Check the shapes, and the densities."""
+        """Check shapes and densities."""
         count = len(self.theta_i)
         channels = len(self.wavelengths_nm) or 3
         check = Checks(RglFileError)
@@ -82,16 +82,16 @@ class RglTable:
         check.shape("luminance", self.luminance, (count, *self.values.shape[-1:] * 2))
         check.shape("vndf", self.vndf, (count, *self.vndf.shape[-2:]))
         if not (np.all(np.diff(self.theta_i) > 0) and np.all(np.isfinite(self.theta_i))):
-            raise RglFileError("theta_i: got elevations that do not grow")
+            raise RglFileError("theta_i: got unsorted elevations, expected increasing ones")
         for name in ("ndf", "sigma", "vndf", "luminance"):
             grid = getattr(self, name)
             check.require(min(grid.shape[-2:]) >= 2, name, grid.shape, "at least 2 x 2 nodes")
             check.within(name, grid, "[0, inf)")
         if not np.all(self.vndf.sum((1, 2)) > 0.0):
-            raise RglFileError("vndf: got an elevation without any density")
+            raise RglFileError("vndf: got an elevation without a value above 0")
 
     def evaluate(self, light_dir: ArrayLike, view_dir: ArrayLike) -> Float64Array:
-        """Return the BRDF.
+        """Return the BRDF for pairs of light and view direction.
 
         Parameters
         ----------
@@ -102,7 +102,7 @@ class RglTable:
         -------
         ndarray, shape (..., C)
             1/sr, without the cosine; 0 where light or view are below the horizon. Interpolated
-            together with the cosine, so with a growing relative error towards the horizon.
+            together with the cosine, so the relative error grows towards the horizon.
         """
         light, view = np.broadcast_arrays(
             *(np.asarray(v, dtype=np.float64) for v in (light_dir, view_dir))
@@ -118,7 +118,8 @@ class RglTable:
         found = slices.bilinear(self.values, _invert_sampling(self.vndf, slices, square))
         own = np.stack([np.sqrt(_elevation(at) * (2.0 / np.pi)), np.zeros(len(at))], -1)
         first = _Interpolation(*(np.zeros(len(at), np.intp),) * 2, np.zeros(len(at)))
-        # +x of the view's azimuth; an isotropic material's area depends on the elevation alone
+        # +x is the view's azimuth; the projected area of an isotropic material depends on elevation
+        # alone
         scale = first.bilinear(self.ndf[None, None], square) / (
             4.0 * first.bilinear(self.sigma[None, None], own)
         )
@@ -128,7 +129,7 @@ class RglTable:
 
 
 def tabulate_brdf(brdf: Brdf, *, description: str) -> RglTable:
-    """Tabulate a BRDF.
+    """Tabulate a BRDF given as a function.
 
     Parameters
     ----------
@@ -184,9 +185,9 @@ def read(path: str | os.PathLike[str]) -> RglTable:
     Raises
     ------
     model.brdf.tensor_file.TensorFileError
-        When it is no tensor file, or truncated.
+        When it is not a tensor file, or truncated.
     RglFileError
-        When a field is missing or of another shape, or the material is anisotropic.
+        When a field is missing or has another shape, or the material is anisotropic.
     """
     fields = tensor_file.read(path)
     spectral = "wavelengths" in fields
@@ -195,7 +196,7 @@ def read(path: str | os.PathLike[str]) -> RglTable:
     missing = [name for name in needed if name not in fields]
     if missing:
         raise RglFileError(
-            f"{path}: has no field {missing[0]}; it has {', '.join(fields) or 'none'}"
+            f"{path}: field {missing[0]} is missing, got {', '.join(fields) or 'none'}"
         )
     azimuths = fields["phi_i"].size
     if azimuths > 2:
@@ -227,7 +228,7 @@ def read(path: str | os.PathLike[str]) -> RglTable:
 
 
 def write(path: str | os.PathLike[str], table: RglTable) -> None:
-    """Write a .bsdf."""
+    """Write a table as a .bsdf file."""
     spectral = len(table.wavelengths_nm) > 0
     fields: dict[str, NDArray[Any]] = {
         "description": np.frombuffer(table.description.encode() or b" ", np.uint8),
@@ -246,14 +247,14 @@ def write(path: str | os.PathLike[str], table: RglTable) -> None:
 
 
 def _elevation(unit: Float64Array) -> Float64Array:
-    """Return the angle to +z, rad, without loss of digits near it."""
+    """Return the angle to +z, rad, without cancellation near 0."""
     apart = np.linalg.norm(unit - [0.0, 0.0, 1.0], axis=-1)
     return np.asarray(2.0 * np.arcsin(np.minimum(0.5 * apart, 1.0)))
 
 
 @dataclass(frozen=True, slots=True)
 class _Interpolation:
-    """Between which two tables each sample lies, and where."""
+    """Neighboring tables of each sample, and the interpolation weight."""
 
     low: NDArray[np.intp]
     high: NDArray[np.intp]
@@ -269,12 +270,12 @@ class _Interpolation:
         return cls(low, low + 1, share)
 
     def take(self, grids: Float64Array, *index: NDArray[np.intp]) -> Float64Array:
-        """Return elements of (T, ...), mixed from two tables."""
+        """Return elements of (T, ...), interpolated between two tables."""
         low, high = grids[(self.low, *index)], grids[(self.high, *index)]
         return np.asarray((1.0 - self.fraction) * low + self.fraction * high)
 
     def bilinear(self, grids: Float32Array, square: Float64Array) -> Float64Array:
-        """Return (n, C) of (T, C, Y, X) at places (n, 2), x first."""
+        """Return (n, C) of (T, C, Y, X) at positions (n, 2), x first."""
         (x, y), (fx, fy) = _cells(square, grids.shape[-1], grids.shape[-2])
         out = np.zeros((len(square), grids.shape[1]))
         for table, part in ((self.low, 1.0 - self.fraction), (self.high, self.fraction)):
@@ -297,13 +298,14 @@ def _cells(
 def _invert_sampling(
     vndf: Float32Array, slices: _Interpolation, square: Float64Array
 ) -> Float64Array:
-    """Return where sampling of a piecewise bilinear density would have come from, (n, 2).
+    """Return the uniform numbers (n, 2) that a piecewise bilinear density maps to these positions.
 
-    Rows first by the marginal density, then columns within the row: shares of the mass below.
+    The inverse of sampling is the cumulative distribution: of the marginal density over rows, then
+    of the conditional density over columns within the row.
     """
     density = vndf.astype(np.float64)
     _, height, width = density.shape
-    along = np.zeros_like(density)  # mass left of a node in its row
+    along = np.zeros_like(density)  # mass to the left of a node in its row
     along[..., 1:] = np.cumsum(0.5 * (density[..., 1:] + density[..., :-1]), axis=-1)
     rows = along[..., -1]
     below = np.zeros_like(rows)  # mass of the rows below

@@ -1,8 +1,8 @@
-"""Bases of tabulated isotropic BRDFs: the grid, lookups, and where the tables come from.
+"""Bases of tabulated isotropic BRDFs: grid, lookups and sources of the tables.
 
-A table holds BRDFs in 1/sr over MERL's half/difference angles, coarser than MERL's files and
-interpolated, each convolved with the solid angle of a light. Fresnel reflection is inside a table
-(as it is in measured ones): whoever evaluates it multiplies by nothing but the cosine of the light.
+A table contains BRDFs in 1/sr over MERL's half/difference angles, coarser than MERL's files and
+interpolated, each convolved with the solid angle of a light. Tables include Fresnel reflection, as
+measured ones do: radiance is table value times cosine of the light, without a further factor.
 
 References
 ----------
@@ -33,12 +33,12 @@ VECTOR_LANES = 16  # materials are padded to full vectors of float32
 MIN_STORED_VALUE = 1e-20
 """Values below this are stored as 0: a sum of denormal numbers is nine times as slow."""
 LED_RADIUS_RAD = 10.0 / 700.0
-"""Angular radius of the dome's lights (10 mm at 700 mm) seen from its centre."""
+"""Angular radius of the dome's lights (10 mm at 700 mm) from its center."""
 _HALF_PI = 0.5 * np.pi
 
 
 class BasisError(ValueError):
-    """A folder or a set of tables that makes no basis."""
+    """Error for a folder or a set of tables from which no basis can be made."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +73,7 @@ class BrdfBasis:
 
     @property
     def size(self) -> int:
-        """Number of materials."""
+        """Return the number of materials."""
         return len(self.names)
 
     def evaluate(
@@ -137,21 +137,21 @@ def tabulate(materials: dict[str, Brdf], *, light_radius_rad: float = 0.0) -> Br
     Parameters
     ----------
     materials
-        Name to function; see :data:`Brdf`. Where a function gives NaN, the nearest known node
-        stands in; values below 0 count as 0.
+        Name to function; see :data:`Brdf`. NaN is replaced by the nearest known node; values below
+        0 count as 0.
     light_radius_rad
         Angular radius of the light to convolve with, rad, in [0, 0.5].
     """
     columns = [_average_over_light(brdf, light_radius_rad) for brdf in materials.values()]
     if not columns:
-        raise BasisError("materials: got none, expected at least one")
+        raise BasisError("materials: got none, expected at least one; name a material")
     return _pad_table(np.stack(columns, axis=-1), list(materials), light_radius_rad)
 
 
 def basis_from_columns(
     columns: Float64Array | Float32Array, names: Sequence[str], *, light_radius_rad: float
 ) -> BrdfBasis:
-    """Return the basis whose table, without its padding, was kept.
+    """Return a basis from its stored table without padding.
 
     Parameters
     ----------
@@ -172,24 +172,23 @@ def load(folder: str | os.PathLike[str], *, light_radius_rad: float = LED_RADIUS
     Parameters
     ----------
     folder
-        Its .binary files, however that is spelt, are taken in the order of their names; other
-        files are left alone. One file is in memory at a time.
+        Its .binary files (upper or lower case) are read in the order of their names; other files
+        are ignored. One file is in memory at a time.
     light_radius_rad
         Angular radius of the light to convolve with, rad, in [0, 0.5].
 
     Raises
     ------
     BasisError
-        When the folder is missing or holds no .binary file, or one of them reflects nothing
-        anywhere.
+        When the folder is missing or has no .binary file, or one of them has no value above 0.
     model.merl.MerlFileError
-        When one of them is no MERL table.
+        When one of them is not a MERL table.
     """
     place = Path(folder)
     found = place.iterdir() if place.is_dir() else []
     paths = sorted((p for p in found if p.suffix.lower() == ".binary"), key=lambda p: p.name)
     if not paths:
-        raise BasisError(f"{folder}: got no .binary files, expected MERL tables")
+        raise BasisError(f"{folder}: got no .binary files, expected MERL tables; name their folder")
     columns = [_read_material(path, light_radius_rad) for path in paths]
     return _pad_table(np.stack(columns, -1), [path.stem for path in paths], light_radius_rad)
 
@@ -232,7 +231,7 @@ def _gram(basis: BrdfBasis) -> Float64Array:
 
 
 def _average_over_light(brdf: Brdf, radius_rad: float) -> Float64Array:
-    """Return a BRDF at the nodes, averaged with the cosine over a disc of light directions."""
+    """Return a BRDF at the nodes, cosine-weighted and averaged over a disc of light directions."""
     Checks(BasisError).within("light_radius_rad", radius_rad, "[0, 0.5]")
     d, phi, h = np.meshgrid(*grid_nodes(), indexing="ij")
     light, view = merl.to_directions(h, d, phi)
@@ -258,10 +257,12 @@ def _average_over_light(brdf: Brdf, radius_rad: float) -> Float64Array:
 
 
 def _fill_unknown(values: Float64Array) -> Float64Array:
-    """Put the nearest known node where a value is unknown, and 0 where it is below 0."""
+    """Replace unknown values by the nearest known node, and values below 0 by 0."""
     unknown = ~np.isfinite(values)
     if np.all(unknown):
-        raise BasisError("table: got no known value")
+        raise BasisError(
+            "table: got no known value, expected finite ones; check the material's function"
+        )
     if np.any(unknown):
         nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
         values = values[tuple(nearest)]
@@ -278,12 +279,12 @@ def _pad_table(columns: Float64Array, names: Sequence[str], light_radius_rad: fl
 def _locate_cell(
     mu_l: Float64Array, mu_v: Float64Array, between: Float64Array
 ) -> tuple[tuple[NDArray[np.intp], ...], tuple[Float64Array, Float64Array]]:
-    """Return the cell along theta_d, phi_d, theta_h and the place in it, from cosines alone."""
+    """Return the cell along theta_d, phi_d, theta_h and the position in it, from cosines alone."""
     cos_d = np.sqrt(np.clip(0.5 * (1.0 + between), 0.0, 1.0))
     sin_d = np.sqrt(np.clip(0.5 * (1.0 - between), 0.0, 1.0))
     cos_h = np.clip((mu_l + mu_v) / np.maximum(2.0 * cos_d, 1e-9), 0.0, 1.0)
     sin_h = np.sqrt(1.0 - cos_h**2)
-    # mu_v - mu_l = 2 sin_d sin_h cos(phi_d); the sign falls with the folding
+    # mu_v - mu_l = 2 sin_d sin_h cos(phi_d); folding by reciprocity drops the sign
     cos_phi = np.minimum(np.abs(mu_v - mu_l) / np.maximum(2.0 * sin_d * sin_h, 1e-9), 1.0)
     place = (
         np.arctan2(sin_d, cos_d) / _HALF_PI * (NODES_D - 1),

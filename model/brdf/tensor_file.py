@@ -1,7 +1,7 @@
-"""Tensor files: named arrays in one file, as RGL's measured materials (.bsdf) are kept.
+"""Read and write tensor files: named arrays in one file, the container of RGL's .bsdf materials.
 
 Little-endian: ``tensor_file`` and a zero, version 1.0, the number of fields; for each name, number
-of dimensions, type, place in the file and shape; then the arrays.
+of dimensions, type, offset in the file and shape; then the arrays.
 
 References
 ----------
@@ -28,7 +28,7 @@ TYPE_NAMES = ("u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4"
 
 
 class TensorFileError(ValueError):
-    """A file that is no tensor file, or only part of one."""
+    """Error for a file that is not a tensor file, or only part of one."""
 
 
 def read(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
@@ -42,13 +42,14 @@ def read(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
     Raises
     ------
     TensorFileError
-        When the file is none, of another version, or ends before what it names.
+        When the file is not a tensor file, of another version, or ends before an array that it
+        lists.
     """
     file = Path(path)
     size = file.stat().st_size
     with file.open("rb") as stream:
         if stream.read(len(TENSOR_MAGIC)) != TENSOR_MAGIC:
-            raise TensorFileError(f"{file}: is no tensor file: it does not begin with tensor_file")
+            raise TensorFileError(f"{file}: is not a tensor file; give an RGL .bsdf")
         version = _unpack(stream, "<BB", file)
         if version != FILE_VERSION:
             raise TensorFileError(f"{file}: got version {version}, expected {FILE_VERSION}")
@@ -75,7 +76,7 @@ def write(path: str | os.PathLike[str], fields: Mapping[str, NDArray[Any]]) -> N
     Raises
     ------
     TensorFileError
-        When an array's type is none of the format's.
+        When the format does not have an array's type.
     """
     arrays = {}
     for name, array in fields.items():

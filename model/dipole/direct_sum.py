@@ -1,11 +1,11 @@
-"""Light that spreads in skin from point to point, summed directly: kernel, closed forms, NumPy.
+"""Sum the dipole's lateral scattering directly over sources: kernel and closed forms in NumPy.
 
 The dipole's profile around a narrow beam integrates over a plane to R_d. Divided by R_d it is a
-kernel P of integral 1, which says where the light that comes out went in. Sources stand for areas:
-nearer than a source's reach P is replaced by P at the reach and a smooth bump that holds what is
-missing to the share of light within the reach, which is known in closed form. So the kernel keeps
-its integral of 1 however much finer P is than the sources, and where P is much wider than their
-reach, bump and P agree.
+kernel P of integral 1: the density of the entry point of exiting light. Each source represents an
+area. Nearer than a source's reach, P is replaced by its value at the reach plus a smooth bump. The
+bump contains the remainder of the fraction of light within the reach, which is known in closed
+form. So the kernel's integral stays 1 however much finer P is than the sources; where P is much
+wider than their reach, bump and P agree.
 
 :mod:`model.dipole.gather` sums the same over a tree, hundreds of times as fast.
 
@@ -28,15 +28,15 @@ from model.arrays import Float64Array
 from model.dipole import profile as dipole
 
 SOURCE_RADIUS_PER_SIDE = 2.0714
-"""Reach of a source in sides of a square of its area, so that thirteen sources tell the light at a
+"""Reach of a source in sides of a square of its area: thirteen sources contribute to the light at a
 point. Of a square lattice the bumps add up to 1 within 0.5 % anywhere: their Fourier transform, of
 Bessel's J3, is 0 at the lattice's frequency (third zero over 2 pi)."""
 SELF_RADIUS_FRACTION = 0.25
-"""Part of its reach, half a source's side, within which a source counts as the exit point's own."""
+"""Fraction of its reach, half a source's side, within which a source is the exit point's own."""
 MIN_RADIUS_PER_DEPTH = 1e-4
-"""Below this part of the source's depth a reach changes nothing, and rounding would."""
+"""Below this fraction of the source's depth a reach has no effect but rounding errors."""
 MIN_RELATIVE_LIGHT = 1e-10
-"""Share of even light below which a point is beyond all sources' light."""
+"""Fraction of even light below which a point counts as out of reach of all sources."""
 _CHUNK_BYTES = 1 << 25
 _MAX_DEPTH_RATIO = float(np.sqrt(3.0))
 
@@ -50,9 +50,9 @@ class DipoleMedia:
     sigma_tr_per_mm : ndarray
         1/mm.
     depth_mm, height_mm : ndarray
-        Of the real source below and of the virtual one above the surface, at least 0.
+        Distances of the real source below and of the virtual one above the surface, at least 0.
     scale : ndarray
-        1 over twice the part of the light that survives, R_d / alpha'.
+        1 over twice the surviving fraction of light, R_d / alpha'.
     """
 
     sigma_tr_per_mm: Float64Array
@@ -64,8 +64,8 @@ class DipoleMedia:
     def of(r_d: ArrayLike, translucency_mm: ArrayLike, *, eta: float) -> DipoleMedia:
         """Return the dipoles of R_d and 1/sigma_tr, mm, which broadcast together.
 
-        R_d above 1, which no medium has, counts as 1: light that does not spread. R_d below 0
-        counts as 0 here. Neither changes how much light comes back.
+        R_d above 1, which no medium has, counts as 1 (no lateral scattering), and R_d below 0 as 0.
+        Neither changes the amount of returned light.
 
         Examples
         --------
@@ -107,13 +107,13 @@ def profile(radius_mm: ArrayLike, media: DipoleMedia) -> Float64Array:
     for z in (media.depth_mm, media.height_mm):
         d = np.maximum(np.hypot(r, z), 1e-300)
         x = media.sigma_tr_per_mm * d
-        # one by one: the square of a distance of 0 would be lost
+        # multiplied one by one: squares of tiny distances would underflow
         total = total + z / d * (1.0 + x) * np.exp(-x) / d / d
     return np.asarray(media.scale * total / (2.0 * np.pi))
 
 
 def encircled_fraction(radius_mm: ArrayLike, media: DipoleMedia) -> Float64Array:
-    """Return the share of light that comes out within a radius of where it went in.
+    """Return the fraction of light that exits within a radius of its entry point.
 
     Examples
     --------
@@ -123,6 +123,8 @@ def encircled_fraction(radius_mm: ArrayLike, media: DipoleMedia) -> Float64Array
     """
     r = np.asarray(radius_mm, np.float64)
     total = np.zeros(np.broadcast_shapes(r.shape, media.scale.shape))
+    # With d^2 = r^2 + z^2, r dr = d dd: the integral of z (1 + sigma d) exp(-sigma d) / d^3 over
+    # the disc, r from 0, is exp(-sigma z) - z exp(-sigma d) / d.
     for z in (media.depth_mm, media.height_mm):
         d = np.maximum(np.hypot(r, z), 1e-300)
         sigma = media.sigma_tr_per_mm
@@ -131,7 +133,7 @@ def encircled_fraction(radius_mm: ArrayLike, media: DipoleMedia) -> Float64Array
 
 
 def kernel(radius_mm: ArrayLike, reach_mm: ArrayLike, media: DipoleMedia) -> Float64Array:
-    """Return the profile as sources of a finite reach carry it, 1/mm^2, integral 1.
+    """Return the profile of sources with a finite reach, 1/mm^2, of integral 1.
 
     Parameters
     ----------
@@ -145,16 +147,17 @@ def kernel(radius_mm: ArrayLike, reach_mm: ArrayLike, media: DipoleMedia) -> Flo
 def kernel_parts(
     radius_mm: ArrayLike, reach_mm: ArrayLike, media: DipoleMedia
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the kernel in two parts: `own` is light that comes out nearer than sources can tell.
+    """Return the kernel in two parts; `own` is light that exits closer than sources resolve.
 
-    It is the part of the bump that a reach of a quarter would have.
+    `own` is the bump with the excess light of a quarter of the reach (`SELF_RADIUS_FRACTION`).
     """
     r, a = np.asarray(radius_mm, np.float64), np.asarray(reach_mm, np.float64)
-    # a reach whose square is no number is that of a point
+    # a reach whose square underflows is a point's
     a = np.where(a > 1e-150, a, 0.0)
     inside = (r < a) & (a > MIN_RADIUS_PER_DEPTH * media.depth_mm)
     a = np.where(a > 0.0, a, 1.0)
     edge, missing = profile(a, media), _missing_fraction(a, media)
+    # bump of integral 1: 3 / (pi a^2) (1 - r^2 / a^2)^2 on the disc of radius a, smooth at its edge
     shape = np.where(inside, 3.0 / (np.pi * a**2) * (1.0 - (r / a) ** 2) ** 2, 0.0)
     own = _missing_fraction(SELF_RADIUS_FRACTION * a, media)
     far = np.where(inside, edge, profile(r, media))
@@ -162,7 +165,7 @@ def kernel_parts(
 
 
 def _missing_fraction(reach_mm: Float64Array, media: DipoleMedia) -> Float64Array:
-    """Return the share of light within a reach above that of an even disc as at its edge."""
+    """Return the fraction of light within a reach in excess of a disc of the edge's value."""
     return encircled_fraction(reach_mm, media) - np.pi * reach_mm**2 * profile(reach_mm, media)
 
 

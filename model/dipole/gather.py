@@ -1,15 +1,15 @@
-"""Light that entered skin at many points, gathered where it leaves: the dipole over a tree.
+"""Gather laterally scattered light at exit points: the dipole summed over a tree of sources.
 
-Each source of light stands for an area of the surface; distant ones are taken together, as far as
-a bound on the error allows. A node of the tree counts with its light, the first moments of the
-light and its area, so that what is left out are second derivatives of the dipole times second
-moments of the node: that product, from the node's nearest point on, is the bound.
+Each source represents an area of the surface; distant sources are merged as far as a bound on the
+error allows. A node of the tree contributes its light, the light's first moments and its area. The
+first omitted term of the Taylor series is the dipole's second derivatives times the node's second
+moments; that product, bounded from the node's nearest point on, is the error bound.
 
-Albedo measured from pictures holds the scattering already. So the light that the dipole brings
-together is divided by what even light would bring (post-scatter normalization): under even light
-exactly R_d times what entered leaves again, on curved, folded and bounded surfaces as on a plane.
-The sum without this division is there too: it falls off towards holes and edges, where light would
-be lost, and grows in folds, where the dipole of a plane counts both sides.
+Albedo measured from images already includes the scattering. So the gathered light is divided by the
+sum under even light (post-scatter normalization): under even light the exitance is exactly R_d
+times the entered light, on curved, folded and bounded surfaces as on a plane. The sum without this
+division is available too: it falls off towards holes and edges, where light is lost, and grows in
+folds, where the planar dipole counts both sides.
 
 References
 ----------
@@ -34,27 +34,27 @@ from model.dipole import source_tree_kernels
 from model.dipole.direct_sum import SOURCE_RADIUS_PER_SIDE, DipoleMedia
 
 GATHER_TOL = 0.1
-"""Largest error that exit points may have over the brightest light that entered, if all nodes erred
-to the same side by as much as they can. Measured errors are a hundred times smaller."""
+"""Limit of the error at exit points over the brightest light that entered, if all nodes erred
+in the same direction by their bounds. Measured errors are a hundred times smaller."""
 N_TOL_SHARING_NODES = 30.0
-"""Nodes that share the tolerance: so many come near their bounds."""
+"""Nodes that share the tolerance: about this many come near their bounds."""
 _CHUNK_POINTS = 1 << 14
 
 
 class GatherError(ValueError):
-    """Sources or exit points that light cannot be gathered from or at."""
+    """Error for sources or exit points that light cannot be gathered from or at."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceTree:
-    """Points of a surface in a tree, for any light that enters there.
+    """Points of a surface in a tree that serves any illumination of them.
 
     Attributes
     ----------
     center_mm : ndarray, shape (3,)
         Origin of the tree's own coordinates.
     order : ndarray of int
-        Sources in the tree's order; those without area are left out.
+        Sources in the tree's order; those without area are omitted.
     position, reach, area : ndarray of float32
         (S, 3), (S,), (S,): mm, mm, mm^2, in the tree's order.
     node_summary, low, high, skip : ndarray
@@ -76,25 +76,25 @@ class SourceTree:
 
     @staticmethod
     def of(source_mm: ArrayLike, source_area_mm2: ArrayLike) -> SourceTree:
-        """Build the tree.
+        """Build the tree over source points.
 
         Parameters
         ----------
         source_mm
             Points of the surface, (S, 3), mm.
         source_area_mm2
-            Area that each stands for, (S,), mm^2, at least 0.
+            Area that each represents, (S,), mm^2, at least 0.
 
         Raises
         ------
         GatherError
-            For other shapes, a place that is not finite or an area that is negative.
+            For other shapes, a position that is not finite or an area that is negative.
         """
         place = np.asarray(source_mm, np.float64)
         area = np.asarray(source_area_mm2, np.float64)
         _expect("source_mm", place, (len(place), 3))
         _expect("source_area_mm2", area, (len(place),), "[0, inf)")
-        # an area that float32 does not hold sends nothing
+        # an area that underflows in float32 contributes no light
         size, some = len(place), np.flatnonzero(area.astype(np.float32) > 0.0)
         place, area = place[some], area[some]
         center = place.mean(axis=0) if len(some) else np.zeros(3)
@@ -115,15 +115,15 @@ class SourceTree:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GatherResult:
-    """What leaves at exit points.
+    """Exitance at exit points, with its error bound and cost.
 
     Attributes
     ----------
     exitance : ndarray of float64, shape (Q, 3)
-        In the unit of what entered.
+        In the unit of the entered light.
     bound : ndarray of float32, shape (Q,)
-        No more than this, over the brightest light that entered and R_d, the tree adds to the
-        error of light and of mass.
+        Upper bound of the error that the tree adds to light and mass, over R_d and the brightest
+        light that entered.
     work : ndarray of int32, shape (Q,)
         Nodes and sources that were summed.
     """
@@ -134,7 +134,7 @@ class GatherResult:
 
 
 class GatherSettings(TypedDict, total=False):
-    """What `exitance` leaves to `gather`."""
+    """Options that `exitance` passes to `gather`."""
 
     eta: float
     normalize: bool
@@ -152,31 +152,31 @@ def exitance(
     translucency_mm: ArrayLike,
     **gathering: Unpack[GatherSettings],
 ) -> Float64Array:
-    """Return the radiant exitance below the surface at points, from light that entered at others.
+    """Return the radiant exitance below the surface at points for light that entered at others.
 
     Parameters
     ----------
     source_mm
         Points of the surface, (S, 3), mm, e.g. texels.
     source_area_mm2
-        Area that each stands for, (S,), mm^2; 0: none, the source is left out.
+        Area that each represents, (S,), mm^2; a source of area 0 is omitted.
     entered
-        Irradiance times F_t of its direction, (S, 3), W/mm^2: what passed the surface. Its largest
-        is 0 or at least 1e-30: the tree holds single precision.
+        Irradiance times F_t of its direction, (S, 3), W/mm^2: the light below the surface. Its
+        maximum is 0 or at least 1e-30, as the tree uses single precision.
     at_mm
         Exit points, (Q, 3), mm, on the same surface.
     r_d, translucency_mm
         R_d and 1/sigma_tr, mm, at the exit points, broadcast to (Q, 3). R_d above 1, which no
-        medium has, scales light that does not spread; nothing is clamped.
+        medium has, scales light without lateral scattering; it is not clamped.
     eta
         Refractive index of the skin over that of air.
     normalize
-        Divide by what even light would bring: see above.
+        Divide by the sum under even light: see above.
     tolerance
         Worst error over the brightest light that entered, see `GATHER_TOL`, above 0.
     entered_at
-        What enters at the exit points themselves, (Q, 3): taken for the light that comes out
-        nearer than the sources can tell. None: what enters at the sources near by.
+        Light that enters at the exit points themselves, (Q, 3): used for light that exits closer
+        than the sources resolve. None: that of the nearby sources.
     workers
         Threads.
 
@@ -217,7 +217,7 @@ def gather(
     entered_at: ArrayLike | None = None,
     workers: int = 1,
 ) -> GatherResult:
-    """Return what leaves, as `exitance`, for a tree that is used for several lights or views."""
+    """Return the exitance for a tree that is reused for several lights or views."""
     light = np.asarray(entered, np.float64)
     at = np.asarray(exit_mm, np.float64)
     _expect("entered", light, (tree.size, 3))
@@ -245,7 +245,7 @@ def gather(
         part = slice(start, start + _CHUNK_POINTS)
         media = DipoleMedia.of(albedo[part], length[part], eta=eta)
         here = np.ascontiguousarray(own[part]).view()
-        here.flags.writeable = False  # what may be written would have the kernel compiled anew
+        here.flags.writeable = False  # as in the compiled signature; else numba compiles again
         dipole_gather_kernels.gather(
             (at[part] - tree.center_mm).astype(np.float32),
             media.sigma_tr_per_mm,

@@ -1,4 +1,4 @@
-"""Walks from exit points through a tree of sources, and sums what the dipole carries over.
+"""Walk from exit points through a tree of sources and sum the dipole's light, compiled.
 
 Sources nearer than their reach are summed one by one in float64. Everything else, far sources and
 nodes that need not be opened, goes to a buffer that is evaluated in one stream in float32.
@@ -22,7 +22,7 @@ _TWO_PI = 2.0 * math.pi
 
 @njit(inline="always")
 def _decay(x):
-    """Return exp(-x) for x >= 0, within 5e-6 of itself up to 20 and 2e-3 up to 64, held there."""
+    """Return exp(-x), x >= 0: relative error 5e-6 up to 20, 2e-3 up to 64; constant beyond."""
     y = min(x, float32(64.0)) * float32(-0.015625)
     p = float32(0.008333333)
     p = p * y + float32(0.041666668)
@@ -40,7 +40,7 @@ def _decay(x):
 
 @njit(fastmath=_FAST_MATH, error_model="numpy")
 def _far(count, away2, area, light, pull, medium, total):
-    """Add light and mass of a buffer in one channel, first moments of the light included."""
+    """Add light and mass of a buffer in one channel, including the light's first moments."""
     sigma, depth, height, scale = medium
     s = float32(sigma)
     z_r, z_v = float32(depth), float32(height)
@@ -52,7 +52,7 @@ def _far(count, away2, area, light, pull, medium, total):
         over_v = float32(1.0) / math.sqrt(away2[i] + z_v2)
         d_r, d_v = (away2[i] + z_r2) * over_r, (away2[i] + z_v2) * over_v
         x_r, x_v = s * d_r, s * d_v
-        # z exp(-x) / d^3 of both sources
+        # z exp(-x) / d^3 of the real and the virtual source
         k_r = z_r * _decay(x_r) * over_r * over_r * over_r
         k_v = z_v * _decay(x_v) * over_v * over_v * over_v
         value = (float32(1.0) + x_r) * k_r + (float32(1.0) + x_v) * k_v
@@ -66,7 +66,7 @@ def _far(count, away2, area, light, pull, medium, total):
 
 @njit(error_model="numpy")
 def _disc(r2, medium):
-    """Return the profile at a radius, and the share of light within it."""
+    """Return the profile at a radius, and the fraction of light within it."""
     sigma, depth, height, scale = medium
     value = within = 0.0
     for z in (depth, height):
@@ -80,9 +80,9 @@ def _disc(r2, medium):
 
 @njit(error_model="numpy")
 def _near(count, away2, reach, area, light, medium, own, total):
-    """Add light and mass of sources within their reach, float64; see `dipole_sum.kernel`.
+    """Add light and mass of sources within their reach, float64; see `direct_sum.kernel`.
 
-    ``own`` is the light at the exit point itself; NaN: not known, each source's own counts.
+    ``own`` is the light at the exit point itself; NaN: unknown, each source's own light is used.
     """
     for i in range(count):
         a = reach[i]
@@ -185,9 +185,9 @@ def gather(
     sigma, depth, height, scale
         Dipoles of the exit points, (Q, 3) float64.
     own
-        Light that entered at the exit points, (Q, 3); NaN: not known.
+        Light that entered at the exit points, (Q, 3); NaN: unknown.
     tolerance
-        Most that a node may err by, over the brightest light that entered.
+        Largest error of a node over the brightest light that entered.
     place, reach, area, entered
         Sources in the tree's order, float32.
     seen, moments, low, high, skip
@@ -209,7 +209,7 @@ def gather(
     nodes = len(skip)
     for q in range(len(exit_point)):
         p0, p1, p2 = exit_point[q, 0], exit_point[q, 1], exit_point[q, 2]
-        # one kernel that is above all channels' own: widest decay, largest dipole
+        # one kernel above those of all channels (slowest decay, largest dipole) bounds all three
         s = float32(min(sigma[q, 0], sigma[q, 1], sigma[q, 2]))
         z = min(depth[q, 0], depth[q, 1], depth[q, 2])
         least2 = float32(z * z)

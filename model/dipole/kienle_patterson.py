@@ -1,8 +1,9 @@
-"""Diffuse reflectance around a narrow beam by the diffusion equation of Kienle and Patterson.
+"""Diffuse reflectance around a narrow beam by Kienle and Patterson's diffusion model.
 
-As the dipole, a source one transport length deep and its image; but the boundary is extrapolated
-by the effective reflection of fluence and flux together, and the reflectance is what the surface
-transmits of the radiance's first two moments, fluence and flux, integrated over all directions.
+As in the dipole, a source one transport length deep and its image. But the extrapolated boundary is
+that of the effective reflection of fluence and flux together, and the reflectance is the light that
+the surface transmits from the radiance's first two moments, fluence and flux, integrated over all
+directions.
 
 References
 ----------
@@ -20,7 +21,7 @@ from model.arrays import Float64Array
 from model.checks import Checks
 
 MAX_COEFFICIENT = 1e100
-"""Most of a coefficient, 1/mm, or a distance, mm: its cube is still a number."""
+"""Upper limit of a coefficient, 1/mm, or a distance, mm: its cube is still finite."""
 
 
 class ProfileDerivatives(NamedTuple):
@@ -76,7 +77,7 @@ def reflectance(
 def derivatives(
     radius_mm: ArrayLike, sigma_a_per_mm: ArrayLike, sigma_s_prime_per_mm: ArrayLike, eta: float
 ) -> ProfileDerivatives:
-    """Return the profile and its derivatives by both coefficients; arguments of `reflectance`.
+    """Return the profile and its derivatives by both coefficients; arguments as for `reflectance`.
 
     Without scattering the derivatives are 0, too.
 
@@ -126,7 +127,7 @@ def derivatives(
 
 
 def exit_coefficients(eta: float) -> tuple[float, float]:
-    """Return what the surface transmits of fluence and of flux, eq. (8) of the paper, exactly.
+    """Return the transmitted parts of fluence and flux, the exact integrals of the paper's eq. (8).
 
     Examples
     --------

@@ -15,8 +15,8 @@ from model.dipole import profile as dipole
 class DipoleMaps:
     """Coefficients of the medium under each texel and channel, all of shape (H, W, 3).
 
-    R_d of 1 leaves alpha' = 1 and sigma_t' infinite: light does not spread at all, and no medium
-    has such an albedo with a finite 1/sigma_tr. Such values are masked, but are no outliers.
+    R_d of 1 gives alpha' = 1 and an infinite sigma_t': no medium has such an albedo with a finite
+    1/sigma_tr. Such values are masked, but do not count as outliers.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class DipoleMaps:
 
     @property
     def albedo_prime(self) -> Float64Array:
-        """alpha'; rounds to 1 where `deficit` is small."""
+        """Return alpha'; it rounds to 1 where `deficit` is small."""
         return 1.0 - self.deficit
 
     @staticmethod

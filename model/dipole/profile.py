@@ -17,12 +17,12 @@ from model.arrays import BoolArray, Float64Array
 from model.checks import Checks
 
 MAX_COEFFICIENT = 1e100
-"""Most of a coefficient, 1/mm, or a distance, mm, of a profile: its cube is still a number."""
+"""Upper limit of a coefficient, 1/mm, or a distance, mm, of a profile: its cube is still finite."""
 _MAX_STEPS = 80  # bisection alone needs 60 for all digits; Newton steps are usually 5
 
 
 class ReflectanceOutlierError(ValueError):
-    """A total reflectance that no reduced albedo has."""
+    """Error for a total reflectance that no reduced albedo has."""
 
 
 def reflectance(
@@ -42,7 +42,7 @@ def reflectance(
     Returns
     -------
     ndarray
-        Reflectance per area, 1/mm^2; 0 where there is no scattering. Its integral over the plane
+        Reflectance per area, 1/mm^2; 0 without scattering. Its integral over the plane
         is :func:`total_reflectance` of the reduced albedo.
 
     Raises
@@ -158,7 +158,7 @@ def invert_total_reflectance(r_d: ArrayLike, eta: float) -> Float64Array:
     target = np.asarray(r_d, dtype=np.float64)
     q = _solve(target, eta)
     alpha = 1.0 - q**2 / 3.0
-    # Dividing R_d by what survives keeps the digits of a small alpha'.
+    # alpha' = R_d / (R_d / alpha') keeps the digits of a small alpha', which 1 - deficit loses.
     dark = np.asarray(target < 0.5)
     return np.asarray(np.where(dark, np.minimum(target / _survival(q, eta), 1.0), alpha))
 
@@ -207,7 +207,7 @@ def coefficients(
     """
     delta = Checks().numbers("deficit", deficit, interval="[0, 1]")
     if np.any(delta == 0.0):
-        raise ValueError("deficit: got 0, expected more: without absorption sigma_t' is undefined")
+        raise ValueError("deficit: got 0, expected above 0 (sigma_t' is undefined); mask R_d = 1")
     sigma_tr = Checks().numbers("sigma_tr_per_mm", sigma_tr_per_mm, interval="[0, inf)")
     sigma_t = sigma_tr / np.sqrt(3.0 * delta)
     return np.asarray(delta * sigma_t), np.asarray((1.0 - delta) * sigma_t)
@@ -234,6 +234,8 @@ def _survival(q: Float64Array, eta: float) -> Float64Array:
 
 def _lost(q: Float64Array, eta: float) -> tuple[Float64Array, Float64Array]:
     """Return 1 - R_d and its derivative by q; a sum of terms that are all at least 0."""
+    # R_d = (1 - q^2 / 3) S with S = (exp(-q) + exp(-b q)) / 2, so 1 - R_d = (1 - S) + q^2 / 3 S;
+    # expm1 keeps the digits of 1 - S near q = 0.
     b = 1.0 + 4.0 / 3.0 * fresnel.boundary_factor(eta)
     decayed = -0.5 * (np.expm1(-q) + np.expm1(-b * q))
     survived = 1.0 - decayed
@@ -246,14 +248,16 @@ def _solve(r_d: Float64Array, eta: float) -> Float64Array:
     outlier = is_outlier(r_d)
     if r_d.ndim == 0 and outlier:
         raise ReflectanceOutlierError(f"r_d: got {float(r_d):g}, expected a value in [0, 1]")
-    wanted = np.where(outlier, 0.5, 1.0 - r_d)  # exact for r_d >= 0.5
+    wanted = np.where(outlier, 0.5, 1.0 - r_d)  # exact subtraction for r_d >= 0.5 (Sterbenz)
     low, high = np.zeros(r_d.shape), np.full(r_d.shape, np.sqrt(3.0))
+    # start: 1 - R_d is about q (1 + b) / 2 = q (1 + 2 A / 3) near q = 0
     q = np.minimum(wanted / (1.0 + 2.0 / 3.0 * fresnel.boundary_factor(eta)), high)
     for _ in range(_MAX_STEPS):
         lost, slope = _lost(q, eta)
         below = lost < wanted
         low, high = np.where(below, q, low), np.where(below, high, q)
         step = q - (lost - wanted) / slope
+        # bisect where Newton's step leaves the bracket
         step = np.where((step >= low) & (step <= high), step, 0.5 * (low + high))
         done = np.abs(step - q) <= 4e-16 * q
         q = step

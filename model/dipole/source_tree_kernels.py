@@ -1,4 +1,4 @@
-"""Builds a tree over weighted points: halves along the longest side, sums and spreads of nodes."""
+"""Build a tree over weighted points, split along the longest side, with moments of the nodes."""
 
 # mypy: allow-untyped-defs
 
@@ -8,18 +8,18 @@ import numpy as np
 from numba import njit
 
 LEAF_SIZE = 8
-"""Most sources of a node that is not halved."""
+"""Largest number of sources in a leaf."""
 
-# columns of what a walk reads of each node
+# columns of a node's summary
 CENTER, RADIUS, REACH, AREA, SPREAD = 0, 3, 4, 5, 6
-"""Centroid (3), distance of its farthest source, the farthest that a source reaches from it, area,
+"""Centroid (3), distance of its farthest source, largest distance plus reach of a source, area,
 and area's second moment about it."""
 NODE_COLUMNS = 8
 
 
 @njit(cache=True, nogil=True)
 def split_sources(position, leaf):
-    """Return the sources' order and the nodes' first and last sources, nodes before their halves.
+    """Return the sources' order and the nodes' first and last sources, parents before children.
 
     ``position`` is (S, 3). A node ``i`` with ``skip[i] == i + 1`` is a leaf; any other's halves are
     node ``i + 1`` and what follows it.
@@ -62,7 +62,7 @@ def split_sources(position, leaf):
 
 @njit(cache=True, nogil=True)
 def _select(position, order, axis, lo, hi, middle):
-    """Reorder so that what lies below ``middle`` is no greater than what lies above (Hoare)."""
+    """Reorder so that keys before ``middle`` do not exceed those after it (Hoare's select)."""
     while lo < hi:
         pivot = position[order[(lo + hi) // 2], axis]
         i, j = lo, hi
@@ -85,7 +85,7 @@ def _select(position, order, axis, lo, hi, middle):
 
 @njit(cache=True, nogil=True)
 def summarize_nodes(position, area, reach, low, high):
-    """Return what a walk reads of each node, (N, 8), from sources in the tree's order."""
+    """Return the summary of each node, (N, 8), from sources in the tree's order."""
     nodes = len(low)
     found = np.zeros((nodes, NODE_COLUMNS), np.float32)
     for node in range(nodes):
@@ -96,7 +96,7 @@ def summarize_nodes(position, area, reach, low, high):
             x += a * position[i, 0]
             y += a * position[i, 1]
             z += a * position[i, 2]
-        # rounded first: distances are from the centroid that is kept
+        # rounded first: distances refer to the stored float32 centroid
         found[node, 0], found[node, 1], found[node, 2] = x / total, y / total, z / total
         x, y, z = np.float64(found[node, 0]), np.float64(found[node, 1]), np.float64(found[node, 2])
         farthest = moment = widest = 0.0

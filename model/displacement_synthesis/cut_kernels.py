@@ -1,4 +1,4 @@
-"""Cheapest cuts between overlapping windows, compiled."""
+"""Find the cheapest cuts between overlapping windows by dynamic programming, compiled."""
 
 # mypy: allow-untyped-defs
 
@@ -10,7 +10,7 @@ _INFINITE_COST = np.float32(3.0e38)
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _misfit_row(a, a0, a_step, b, b0, b_step, per_step, out):
-    """Write what a cut costs at each place of a row: squared slope that closing a step leaves.
+    """Write the cost of a cut at each pixel of a row: the squared slope left by closing its step.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ def _misfit_row(a, a0, a_step, b, b0, b_step, per_step, out):
     per_step : float32
         Squared slope per squared step of height, px^-2.
     out : (O,) float32, written
-        The last place has no neighbour and cannot be cut.
+        The last pixel has no neighbor and cannot be cut.
     """
     count = out.size
     a1, b1 = a0 + a_step, b0 + b_step
@@ -83,9 +83,9 @@ def _cheapest_path(misfit, first, last, path):
     ----------
     misfit : (length, overlap) float32
     first : int
-        Place in row 0, or -1: any.
+        Column in row 0, or -1: any.
     last : int
-        Place in the row after the last one, which a path must be able to step to, or -1: any.
+        Column in the row after the last one that the path must reach in one step, or -1: any.
     path : (length,) int16, written
     """
     length, overlap = misfit.shape
@@ -150,7 +150,7 @@ def cut_columns(row, grid, site, per_step):
 
 @njit(cache=True, nogil=True)
 def locate_in_cells(at, lines, wrap, overlap, cuts):
-    """Return which of a row of cells shows a pixel of the map, and where in its window.
+    """Return the cell of a row that shows a pixel of the map, and the pixel in its window.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def locate_in_cells(at, lines, wrap, overlap, cuts):
     wrap : bool
     overlap : int
     cuts : (n,) int16
-        Where each cell begins within what it shares with the one before.
+        Where each cell begins within its overlap with the one before.
     """
     count = lines.size - 1
     cell = min(int(at * count / lines[count]), count - 1)
@@ -199,14 +199,14 @@ def locate_in_row(row, y, x, grid, site):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _band_misfit(line, first, last, grid, site, per_step, band, misfit):
-    """Write what a cut costs between the rows of cells at a line, by the map's columns.
+    """Write the cost of a cut between the rows of cells at a line, by the map's columns.
 
     Parameters
     ----------
     first, last : int
         Columns of the map; the last one is not cut itself.
     band : (2, n, overlap) float32, written
-        Heights of the row above and of the row ``line``, turned.
+        Heights of the row above and of the row ``line``, transposed.
     misfit : (n, overlap) float32, written at the first ``last - first - 1``
     """
     heights, overlap = site.sources.heights, grid.overlap
@@ -230,8 +230,8 @@ def _band_misfit(line, first, last, grid, site, per_step, band, misfit):
 def cut_rows(line, grid, site, per_step):
     """Cut between the row of cells ``line`` and the one above it, cell by cell.
 
-    Where two cells of a row meet, the cut passes through the cheapest place of that column, so
-    that it can be found for each cell alone.
+    Where two cells of a row meet, the cut passes through the cheapest pixel of that column, so that
+    the cuts of cells are independent of each other.
 
     Parameters
     ----------
@@ -250,7 +250,7 @@ def cut_rows(line, grid, site, per_step):
     misfit = np.empty((longest + 1, overlap), np.float32)
     gates = np.empty(nx + 1, np.int64)
     for c in range(nx + 1):
-        # the cheapest place over a few columns
+        # the cheapest pixel over a few columns
         reach = 3
         begin = lines_x[c] - reach
         _band_misfit(line, begin, begin + 2 * reach + 2, grid, site, per_step, band, misfit)

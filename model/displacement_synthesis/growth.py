@@ -1,16 +1,17 @@
-"""Grow measured patches of skin to displacement maps of any size, by their own pixels.
+"""Grow measured patches of skin to displacement maps of any size by image quilting.
 
-A map is a grid of cells. Each gets a window of a patch, the one out of some drawn at random that
-can be cut most cheaply against its neighbours (image quilting: Efros and Freeman 2001,
-doi:10.1145/383259.383296), so furrows go on across cells and slopes keep their distribution. Cells
-are chosen in four groups by the parity of row and column, cuts are made cell by cell, and steps of
-height that are left at cuts are spread over a neighbourhood by a screened Poisson equation, which
-keeps the slopes of both sides. All of that is local, and chance is a hash of place and seed: the
-same seed gives the same bytes, whatever the number of threads, the tiles or their order.
+A map is a grid of cells. Each gets a window of a patch: out of some random candidates, the one with
+the cheapest cuts to its neighbors (image quilting: Efros and Freeman 2001,
+doi:10.1145/383259.383296). So grooves continue across cells and slopes keep their distribution.
+Cells are chosen in four groups by the parity of row and column, cuts are made cell by cell, and the
+remaining steps of height at cuts are distributed over a neighborhood by a screened Poisson
+equation, which keeps the slopes of both sides. All steps are local, and random numbers are hashes
+of position and seed: the same seed gives the same bytes for any number of threads and any tiles in
+any order.
 
-Sites are blended with weights divided by the root of their sum of squares: the sum of
-uncorrelated reliefs so keeps a variance between theirs (Heitz and Neyret 2018,
-doi:10.1145/3233304, section 2).
+Sites are blended with weights divided by the root of their sum of squares: so the sum of
+uncorrelated reliefs keeps a variance between theirs (Heitz and Neyret 2018, doi:10.1145/3233304,
+section 2).
 
 Nagano et al. 2015 (doi:10.1145/2766894) cover faces by the synthesis of Graham et al. 2013
 (doi:10.1111/cgf.12053), which is constrained by a coarser scan; this one is not.
@@ -36,7 +37,7 @@ Patches: TypeAlias = Sequence[ArrayLike] | Mapping[str, Sequence[ArrayLike]]
 
 MAX_SIDE_PX = 65_536
 MAX_FILLED_FRACTION = 0.1
-"""Share of a window's pixels that may be without a measured height."""
+"""Largest fraction of a window's pixels without a measured height."""
 SCALE_STEP = 1.04
 """Scales of one map are whole powers of this, so that features are at most 2 % off their size."""
 
@@ -52,7 +53,7 @@ def grow(
     threads: int = 1,
     **knobs: Any,
 ) -> Float32Array:
-    """Grow patches to a displacement map without seams.
+    """Grow patches to a seamless displacement map.
 
     Parameters
     ----------
@@ -63,13 +64,13 @@ def grow(
     rng
         Draws the seed: one number.
     regions : array_like, optional
-        For patches by site: which one is where, (h, w) integers into the sites' order, -1: any;
+        For patches by site: site at each position, (h, w) indices into the sites' order, -1: any;
         or weights (R, h, w) >= 0. Row 0 is row 0 of the map; any resolution.
     out : ndarray of float32, optional
         Where the map is written tile by tile, such as ``numpy.lib.format.open_memmap``'s;
         a map of 16,384 x 16,384 has 1 GB.
     progress : callable, optional
-        Called with (tiles done, tiles in all).
+        Called with (finished tiles, all tiles).
     threads : int
         Threads to use, 1 to 64; they do not change the result.
     **knobs
@@ -88,8 +89,8 @@ def grow(
 
     Notes
     -----
-    A map knows nothing of an atlas' islands: where two of them meet on the skin, what they show
-    does not (`model.displacement_synthesis.volume_noise` has no such edges).
+    A map ignores the islands of an atlas: where two of them meet on the skin, the map has a
+    discontinuity (`model.displacement_synthesis.volume_noise` is not).
 
     Examples
     --------
@@ -132,7 +133,7 @@ def build_layout(
     transition_px: float = 256.0,
     threads: int = 1,
 ) -> Layout:
-    """Choose what each place of a map shows, without drawing it.
+    """Choose the windows and cuts of a map without drawing it.
 
     Parameters
     ----------
@@ -145,16 +146,16 @@ def build_layout(
     patch_pixel_um : float
         Side of the patches' pixels, um.
     wrap : {"none", "u", "both"}
-        Where the map goes on at its other side: nowhere, left and right, or also above and below.
+        Periodic directions of the map: none, left to right, or also top to bottom.
     cells_px : (int, int), optional
-        Distance of cells, and how much neighbours share, even, at most the distance, px of the
-        map. By default a quarter and a twelfth of the smallest patch, at most 192 and 64.
+        Distance of cells, and overlap of neighbors (even, at most the distance), px of the map. By
+        default a quarter and a twelfth of the smallest patch, at most 192 and 64.
     candidates : int
-        Windows tried a cell, >= 1. More make better cuts, and a map of what is cut best.
+        Windows tried per cell, >= 1. More give better cuts but fewer distinct windows.
     range_px : float, optional
-        Distance over which steps at cuts are spread; three eighths of the overlap by default.
+        Distance over which steps at cuts are closed; three eighths of the overlap by default.
     transition_px : float
-        Width of the transition between sites, px; coarser regions blend over their own pixels.
+        Width of the transition between sites, px; coarser regions blend over one of their pixels.
 
     Returns
     -------
@@ -174,7 +175,7 @@ def build_layout(
         check.within(name, value, "(0, inf)")
     by_site = dict(patches) if isinstance(patches, Mapping) else {"patches": patches}
     if not by_site:
-        raise SynthesisError("patches: got no site")
+        raise SynthesisError("patches: got no site, expected one at least")
     scales = check.numbers("pixel_um", pixel_um, (), ("h", "w"), interval="(0, inf)")
     sides = [min(np.shape(p), default=0) for each in by_site.values() for p in each]
     smallest = int(min(sides, default=0) * patch_pixel_um / scales.max())
@@ -218,7 +219,7 @@ def _grid(
     for size, around in zip(shape, wraps, strict=True):
         count = max(1, size // cell)
         if around:
-            count -= count % 2  # neighbours differ in parity, across the edge too
+            count -= count % 2  # neighbors differ in parity, also across a periodic edge
             if count < 2:
                 raise SynthesisError(
                     f"size_px: got {size}, expected at least two cells of {cell} px where it wraps"
@@ -246,7 +247,7 @@ def _levels(
 
 
 def _find_needed_cells(weights: Float64Array, grid: CellGrid) -> BoolArray:
-    """Return which cells show a site at all, with a margin of a cell."""
+    """Return the cells in which a site is visible, with a margin of a cell."""
     shape = (int(grid.lines_y[-1]), int(grid.lines_x[-1]))
     found = np.empty((grid.lines_y.size - 1, grid.lines_x.size - 1), bool)
     for row in range(found.shape[0]):
@@ -279,8 +280,8 @@ def _choose(
         site.cells[~needed, 0] = -2
     allowed = _max_filled_pixels(sources, grid.window)
 
-    def choose(row: int, first: int, beside: bool, above: bool) -> None:
-        kernels.choose_windows(row, first, beside, above, grid, levels, site, allowed, knobs)
+    def choose(row: int, first: int, sides: bool, above: bool) -> None:
+        kernels.choose_windows(row, first, sides, above, grid, levels, site, allowed, knobs)
 
     def cut_columns(row: int) -> None:
         cut_kernels.cut_columns(row, grid, site, per_step)
@@ -289,14 +290,14 @@ def _choose(
         cut_kernels.cut_rows(line, grid, site, per_step)
 
     with ThreadPoolExecutor(threads) as pool:
-        for parity, first, beside, above in (
+        for parity, first, sides, above in (
             (0, 0, False, False),
             (0, 1, True, False),
             (1, 0, False, True),
             (1, 1, True, True),
         ):
             rows = range(parity, ny, 2)
-            list(pool.map(choose, rows, *([v] * len(rows) for v in (first, beside, above))))
+            list(pool.map(choose, rows, *([v] * len(rows) for v in (first, sides, above))))
         if (site.cells[..., 0] == -1).any():
             raise SynthesisError(
                 f"patches: got no window with at most {allowed} filled pixels in "
@@ -308,7 +309,7 @@ def _choose(
 
 
 def _max_filled_pixels(sources: PatchSources, window: int) -> int:
-    """Return how many filled pixels windows may have: what a twentieth of all windows keep to.
+    """Return the limit of filled pixels per window: their 5 % quantile over all windows.
 
     Raises
     ------
@@ -329,7 +330,7 @@ def _max_filled_pixels(sources: PatchSources, window: int) -> int:
     if most > MAX_FILLED_FRACTION * window**2:
         raise SynthesisError(
             f"patches: got holes of {100 * most / window**2:.0f} % of a window of {window} px even "
-            f"in its best places, expected at most {100 * MAX_FILLED_FRACTION:.0f} %: give "
+            f"in its best positions, expected at most {100 * MAX_FILLED_FRACTION:.0f} %: give "
             "patches with larger whole parts, or smaller cells_px"
         )
     return most

@@ -1,12 +1,12 @@
-"""Inner loops of displacement synthesis: choosing windows, cutting between them, laying them down.
+"""Inner loops of displacement synthesis: choose windows, cut between them, write them to tiles.
 
-Kernels are serial and release the lock, so that threads may run them side by side; each writes
-only what its caller gave it. Chance is a hash of place and seed, never a state, so that results do
-not depend on the order of calls.
+Kernels are serial and release the GIL, so that threads can run them in parallel; each writes only
+to its caller's arrays. Random numbers are hashes of position and seed, never a state, so that
+results do not depend on the order of calls.
 
-Windows are told by the index of their first pixel in one flat array of all sources. There is a
-second array with every source transposed, so that a cut that runs along a row is found like one
-that runs along a column.
+A window is identified by the index of its first pixel in one flat array of all sources. There is
+another array with every source transposed, so that cuts along rows use the code for cuts along
+columns.
 """
 
 # mypy: allow-untyped-defs
@@ -17,7 +17,7 @@ from numba import njit
 from model.displacement_synthesis.cut_kernels import cut_cost, locate_in_cells, locate_in_row
 
 MAX_DRAWS = 24
-"""Places drawn before a window with too many filled pixels is given up for another candidate."""
+"""Positions drawn per candidate before it is dropped for too many filled pixels."""
 
 
 @njit(cache=True, nogil=True)
@@ -48,8 +48,8 @@ def _count_filled(filled, source, y, x, window):
 def _draw_window(key, sources, filled, window, max_filled):
     """Return (source, row, column) of a window with few filled pixels; source -1: none found.
 
-    Places are drawn as if windows might stand out of the source by half their size, and are then
-    moved inside: pixels near its border are so used almost as often as those of the middle.
+    Positions are drawn as if windows could exceed the source by half their size, and are then
+    clamped to it: so pixels near its border are used almost as often as those in the middle.
     """
     for attempt in range(MAX_DRAWS):
         at = mix_bits(key + np.uint64(attempt))
@@ -75,7 +75,7 @@ def _draw_window(key, sources, filled, window, max_filled):
 
 @njit(cache=True, nogil=True)
 def _neighbor(row, column, axis, side, grid, cells):
-    """Return the cell beside (axis 1) or above and below (axis 0) one, or -1: none is chosen."""
+    """Return the neighbor cell along a row (axis 1) or column (axis 0), or -1: none is chosen."""
     cell = column if axis else row
     other, count = cell - 1 + 2 * side, cells.shape[axis]
     if grid.wrap[axis]:
@@ -87,21 +87,21 @@ def _neighbor(row, column, axis, side, grid, cells):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def choose_windows(row, first_column, beside, above, grid, levels, site, max_filled, knobs):
-    """Choose windows for every other cell of a row, by the cheapest cuts to neighbours there.
+def choose_windows(row, first_column, sides, above, grid, levels, site, max_filled, knobs):
+    """Choose windows for every other cell of a row by the cheapest cuts to existing neighbors.
 
     Parameters
     ----------
     row, first_column : int
         Cells (row, first_column), (row, first_column + 2), ...
-    beside, above : bool
-        Whether windows beside, and above and below, are chosen already.
+    sides, above : bool
+        Whether windows to the left and right, and above and below, are chosen already.
     grid : CellGrid
     levels : (ny, nx) int64
         Scale of each cell.
     site : SiteLayout
-        ``cells`` are written; their source before: -1 not chosen yet, -2 no cell is needed here;
-        after the call, -1: no window was to be had.
+        ``cells`` are written. Their source before the call: -1 not chosen yet, -2 no cell needed;
+        after the call, -1: no window found.
     max_filled : int
         Filled pixels of a window.
     knobs : (int, float32, uint64)
@@ -123,7 +123,7 @@ def choose_windows(row, first_column, beside, above, grid, levels, site, max_fil
                 continue
             cost = 0.0
             for axis in (1, 0):
-                if not (beside if axis else above):
+                if not (sides if axis else above):
                     continue
                 heights = sources.heights if axis else sources.transposed
                 lines = grid.lines_x if axis else grid.lines_y
@@ -150,7 +150,7 @@ def choose_windows(row, first_column, beside, above, grid, levels, site, max_fil
                 count = _count_filled(sources.filled, own[k], y, x, grid.window)
                 cells[row, column, 0], cells[row, column, 1] = first + k, y
                 cells[row, column, 2], cells[row, column, 3] = x, count
-                if not (beside or above):
+                if not (sides or above):
                     break
 
 
@@ -161,8 +161,8 @@ def write_windows(top, left, grid, site, out, labels, pixels):
     Parameters
     ----------
     top, left : int
-        First row and column of the tile on the map; it may stand out where the map wraps, and
-        is left at label -1 where it stands out of a map that does not.
+        First row and column of the tile on the map; it may exceed a map that wraps; pixels outside
+        a map that does not keep label -1.
     grid : CellGrid
     site : SiteLayout
     out : (h, w) float32, written
@@ -197,9 +197,9 @@ def write_windows(top, left, grid, site, out, labels, pixels):
 
 @njit(cache=True, nogil=True)
 def cut_divergence(out, labels, pixels, site, divergence):
-    """Write the divergence of what differences across cuts have too much.
+    """Write the divergence of the excess of height differences across cuts.
 
-    Across a cut the difference ought to be the mean of those that both windows have there.
+    The target difference across a cut is the mean of those of both windows there.
     """
     cells, sources, heights = site.cells, site.sources.table, site.sources.heights
     nx = cells.shape[1]

@@ -1,4 +1,4 @@
-"""Which window of which patch each place of a map shows, and drawing any part of it."""
+"""Layout of a displacement map: the window shown in each cell, and drawing of any part."""
 
 import math
 from collections.abc import Iterator
@@ -15,63 +15,63 @@ from model.displacement_synthesis.regions import interpolate_weights
 from model.displacement_synthesis.sources import PatchSources, SynthesisError
 
 TILE_PX = 1024
-"""Side of the tiles that steps are closed in; part of the result's definition."""
+"""Side of the tiles in which steps are closed; the result depends on it."""
 MARGIN_TO_RANGE_RATIO = 8.0
-"""A tile's margin in ranges of the screened Poisson equation: e^-8 of a step is left there."""
+"""A tile's margin in ranges of the screened Poisson equation: a step has decayed to e^-8."""
 
 
 class CellGrid(NamedTuple):
-    """Where cells are on a map."""
+    """Grid of the cells of a map."""
 
     lines_y: Int64Array
     """(ny + 1,) rows at which cells begin, the last one the map's height."""
     lines_x: Int64Array
     """(nx + 1,) columns at which cells begin, the last one the map's width."""
     overlap: int
-    """Pixels that neighbouring windows share, half of them on each side of a line."""
+    """Overlap of neighboring windows, px, half of it on each side of a line."""
     window: int
     """Side of the windows, px."""
     wrap: tuple[bool, bool]
-    """Whether the map goes on at its other side, vertically and horizontally."""
+    """Whether the map is periodic, vertically and horizontally."""
 
 
 class SiteLayout(NamedTuple):
-    """What the patches of one site were laid out to."""
+    """Layout of the patches of one site."""
 
     sources: PatchSources
     cells: Int64Array
     """(ny, nx, 4): source, row and column of the window, filled pixels in it; source -2: none."""
     across: NDArray[np.int16]
-    """(ny, nx, window): where each cell begins within what it shares with the one to the left."""
+    """(ny, nx, window): where each cell begins within its overlap with the one to the left."""
     down: NDArray[np.int16]
-    """(ny, width): where each row of cells begins within what it shares with the one above."""
+    """(ny, width): where each row of cells begins within its overlap with the one above."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Which window of which patch each place of a map shows; any part of it can be drawn alone."""
+    """Layout of a map: the window shown in each cell; any part can be drawn alone."""
 
     grid: CellGrid
     sites: tuple[SiteLayout, ...]
     weights: Float64Array | None
     """(R, h, w) weights of sites on a coarse grid; None: one site everywhere."""
     range_px: float
-    """Distance over which steps at cuts are spread, px."""
+    """Distance over which steps at cuts are closed, px."""
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of the map."""
+        """Return rows and columns of the map."""
         return int(self.grid.lines_y[-1]), int(self.grid.lines_x[-1])
 
     @property
     def filled_fraction(self) -> float:
-        """Share of the windows' pixels without a measured height, which were filled, 0 to 1."""
+        """Return the fraction of the windows' pixels that were filled, not measured, 0 to 1."""
         chosen = [site.cells[site.cells[..., 0] >= 0] for site in self.sites]
         count = sum(len(each) for each in chosen) * self.grid.window**2
         return float(sum(int(each[:, 3].sum()) for each in chosen)) / count
 
     def draw(self, rows: tuple[int, int], columns: tuple[int, int]) -> Float32Array:
-        """Draw a part of the map.
+        """Draw a part of the map; the result does not depend on the other parts.
 
         Parameters
         ----------
@@ -81,7 +81,7 @@ class Layout:
         Returns
         -------
         ndarray of float32
-            Heights, um, the same whatever part of the map they are drawn in.
+            Heights, um; a pixel is the same in every part.
 
         Raises
         ------
@@ -100,7 +100,7 @@ class Layout:
         return out
 
     def cut_mask(self, rows: tuple[int, int], columns: tuple[int, int]) -> BoolArray:
-        """Return which pixels touch another window than their own, in any site that shows there.
+        """Return the pixels that touch another window than their own, in any visible site.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Where on a map each site's skin is: coarse weights, and their smooth values at pixels."""
+"""Weights of the skin sites over a map: coarse grids, and smooth interpolation at pixels."""
 
 import math
 
@@ -30,8 +30,8 @@ def coarse_weights(
     Returns
     -------
     ndarray of float64, shape (count, rows, columns)
-        Sums to 1 over sites. What belongs to no site is as what is nearest to it, so that skin
-        goes on beyond an island's edge.
+        Sums to 1 over sites. Cells without a site take the nearest one's, so that skin continues
+        beyond an island's edge.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def coarse_weights(
         )
     total = weights.sum(axis=0)
     if not total.any():
-        raise SynthesisError("regions: got no site anywhere")
+        raise SynthesisError("regions: got no site, expected one at least")
     nearest = distance_transform_edt(total == 0, return_distances=False, return_indices=True)
     weights = (weights / np.where(total == 0, 1.0, total))[(slice(None), *nearest)]
     for axis, size in enumerate(shape, 1):
@@ -73,18 +73,18 @@ def interpolate_weights(
     *,
     wrap: tuple[bool, bool],
 ) -> Float64Array:
-    """Return one site's weight over a part of a map, by cubic B-splines: two smooth derivatives.
+    """Return one site's weight over a part of a map, by cubic B-splines (two derivatives).
 
     Parameters
     ----------
     weights : ndarray, shape (h, w)
-        Of :func:`coarse_weights`, of one site.
+        One site's weights of :func:`coarse_weights`.
     shape : (int, int)
         Rows and columns of the map.
     rows, columns : (int, int)
         First and last + 1 of the part.
     wrap : (bool, bool)
-        Whether the map goes on at its other side, vertically and horizontally.
+        Whether the map is periodic, vertically and horizontally.
     """
     down = _splines(weights.shape[0], shape[0], rows, wrap[0])
     right = _splines(weights.shape[1], shape[1], columns, wrap[1])

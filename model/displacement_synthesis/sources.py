@@ -1,4 +1,4 @@
-"""Measured patches made ready for synthesis: level, without holes, at the scales that are asked.
+"""Prepare measured patches for synthesis: level them, fill holes and resample to scales.
 
 References
 ----------
@@ -22,11 +22,11 @@ MAX_SOURCE_PX = 150_000_000
 
 
 MAX_HEIGHT_UM = 1e30
-"""Heights beyond have no sums in single precision."""
+"""Larger heights overflow sums in single precision."""
 
 
 class SynthesisError(ValueError):
-    """Patches, sizes, regions or knobs that nothing can be grown from."""
+    """Error for patches, sizes, regions or knobs that nothing can be grown from."""
 
 
 def level_patch(
@@ -36,7 +36,7 @@ def level_patch(
     valid: ArrayLike | None = None,
     cutoff_um: float = 1000.0,
 ) -> Float32Array:
-    """Take a patch's bulge and tilt away: what is longer than a cut-off.
+    """Remove a patch's bulge and tilt: all waves longer than a cut-off.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def level_patch(
         Heights to use.
     cutoff_um : float
         Waves of this length keep half their height (ISO 16610-21); the paper removes detail
-        beyond a millimetre (Nagano2015 section 4).
+        beyond a millimeter (Nagano2015 section 4).
 
     Returns
     -------
@@ -63,8 +63,8 @@ def level_patch(
 
     Notes
     -----
-    The mean is a Gaussian's over the heights that are there, normalised by its weight there, so a
-    border or a hole does not count as height 0.
+    The low-pass is a Gaussian mean over the valid heights, normalized by the Gaussian's weight on
+    them, so that a border or a hole does not count as height 0.
 
     Examples
     --------
@@ -95,7 +95,7 @@ def _checked(
         Checks(SynthesisError).mask("valid", mask, values.shape)
         known &= mask
     if not known.any():
-        raise SynthesisError(f"{name}: got no valid height")
+        raise SynthesisError(f"{name}: got no valid height, expected one at least")
     Checks(SynthesisError).within(
         f"heights of {name}", values[known], f"[-{MAX_HEIGHT_UM}, {MAX_HEIGHT_UM}]"
     )
@@ -103,7 +103,7 @@ def _checked(
 
 
 def fill_holes(height: FloatArray, valid: BoolArray) -> Float32Array:
-    """Return heights with each hole bridged by means of what surrounds it, the nearest first."""
+    """Return heights with each hole filled by means of its surroundings, from its rim inward."""
     values = np.where(valid, height, 0.0).astype(np.float64)
     weight = valid.astype(np.float64)
     sigma = 1.0
@@ -130,8 +130,8 @@ class PatchSources(NamedTuple):
     transposed: Float32Array
     """(N,) the same with each source transposed."""
     filled: Int32Array
-    """(M,) summed-area tables, (height + 1, width + 1) each, of pixels without a height of their
-    own."""
+    """(M,) summed-area tables, (height + 1, width + 1) each, of pixels without a measured height of
+    their own."""
 
 
 def gather_sources(
@@ -144,7 +144,7 @@ def gather_sources(
     patches : sequence of array_like, each (H, W)
         Heights, um; NaN: hole.
     zooms : sequence of float
-        Pixels of the result per pixel of a patch, one a scale.
+        Pixels of the result per pixel of a patch, one per scale.
     window : int
         Patches that are smaller at some scale are not used there.
     name : str
@@ -156,7 +156,7 @@ def gather_sources(
         When a scale has no patch that is large enough, or all are too large together.
     """
     if not len(patches):
-        raise SynthesisError(f"{name}: got no patch")
+        raise SynthesisError(f"{name}: got no patch, expected one at least")
     checked = [_checked(patch, None, f"{name}[{n}]") for n, patch in enumerate(patches)]
     whole = [(fill_holes(height, known), known) for height, known in checked]
     if sum(h.size * z * z for h, _ in whole for z in zooms) > MAX_SOURCE_PX:
@@ -178,7 +178,7 @@ def gather_sources(
         if len(rows) == firsts[-1]:
             largest = max(min(_scaled_shape(h.shape, zoom)) for h, _ in whole)
             raise SynthesisError(
-                f"{name}: got at most {largest} px a side at the result's scale, "
+                f"{name}: got at most {largest} px per side at the result's scale, "
                 f"expected at least {window}: give larger patches or smaller cells_px"
             )
         firsts.append(len(rows))
@@ -206,7 +206,7 @@ def _scaled_shape(shape: tuple[int, ...], zoom: float) -> tuple[int, int]:
 def _resample(
     height: Float32Array, valid: BoolArray, zoom: float
 ) -> tuple[Float32Array, BoolArray]:
-    """Return heights with ``zoom`` times the pixels a side, and which of them were filled."""
+    """Return heights with ``zoom`` times the pixels per side, and a mask of the filled ones."""
     if abs(zoom - 1.0) < 1e-9:
         return height, ~valid
     places = [(np.arange(n) + 0.5) / zoom - 0.5 for n in _scaled_shape(height.shape, zoom)]

@@ -1,13 +1,13 @@
 """Band-limited noise in space, for skin without a measured patch and without an atlas.
 
-A sum of plane waves of random direction, wave number and phase. It is a function of the place
-alone, so a surface that is evaluated point by point has neither seams nor a preferred direction
-(the volume noise of Nagano et al. 2015, fig. 5 top, doi:10.1145/2766894, whose kind they leave
-open).
+A sum of plane waves of random direction, wave number and phase. It is a function of the position in
+space alone, so a surface that is evaluated point by point has neither seams nor a preferred
+direction (the volume noise of Nagano et al. 2015, fig. 5 top, doi:10.1145/2766894, who do not
+specify its kind).
 
-The spectrum is stated: power is spread over wave numbers k (waves per mm) between two ends with a
-density proportional to ``k^slope``. The noise at distance r then has the covariance
-``variance * integral of p(k) sin(2 pi k r) / (2 pi k r) dk`` with that density p.
+The spectrum is given: power is distributed over wave numbers k (waves per mm) between two ends with
+a density proportional to ``k^slope``. The noise at distance r then has the covariance ``variance *
+integral of p(k) sin(2 pi k r) / (2 pi k r) dk`` with that density p.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from model.arrays import Float64Array
 from model.checks import Checks
 
 CHUNK_POINTS = 512
-"""Points whose sums stay in the cache while all waves pass over them."""
+"""Points per block: their sums stay in the cache during the loop over waves."""
 _RADIAL_NODES = 2001
 
 
 class VolumeNoiseError(ValueError):
-    """A spectrum or places that make no noise."""
+    """Error for a spectrum or positions from which no noise can be made."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -89,7 +89,7 @@ def _sum_of_waves(points: Any, waves: Any, phases: Any, amplitude: Any, out: Any
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VolumeNoise:
-    """Noise of a stated spectrum and variance; see :meth:`draw`."""
+    """Noise of a given spectrum and variance; see :meth:`draw`."""
 
     waves_per_mm: Float64Array
     """(M, 3) wave vectors."""
@@ -100,7 +100,7 @@ class VolumeNoise:
     band_per_mm: tuple[float, float]
     """Least and largest wave number, waves per mm."""
     slope: float
-    """Power's density over wave numbers is proportional to k to this power."""
+    """Exponent of k in the power's density over wave numbers."""
 
     @classmethod
     def draw(
@@ -112,19 +112,20 @@ class VolumeNoise:
         waves: int = 256,
         rng: np.random.Generator,
     ) -> VolumeNoise:
-        """Draw a noise.
+        """Draw a random noise field.
 
         Parameters
         ----------
         rms_um : float
             Root mean square, um, >= 0.
         band_per_mm : (float, float)
-            Least and largest wave number, waves per mm, 0 < least < largest. A map shows what is
-            below one wave in two of its pixels; keep the largest one below that.
+            Least and largest wave number, waves per mm, 0 < least < largest. Keep the largest one
+            below the Nyquist frequency of the map, one wave per two pixels.
         slope : float
-            -1 has as much power in each octave.
+            Exponent of the density; -1 gives equal power per octave.
         waves : int
-            Plane waves; with more, values are nearer to a normal distribution, and time grows.
+            Number of plane waves; more bring values nearer to a normal distribution and take
+            longer.
         rng
             Draws directions, wave numbers and phases.
 
@@ -146,8 +147,8 @@ class VolumeNoise:
         check("rms_um", rms_um, "[0, inf)")
         check("slope", slope, "[-20, 20]")
         check("waves", waves, "[8, 65536]")
-        # One wave in each of M equal parts of the power, each direction by itself: every part of
-        # the spectrum is there in each draw, and each wave is uniform over directions.
+        # Stratified: one wave in each of M parts of equal power, with independent directions. So
+        # every part of the spectrum occurs in each draw, and each wave is uniform over directions.
         share = (np.arange(waves) + rng.random(waves)) / waves
         if slope == -1.0:
             k = low * (high / low) ** share
@@ -168,12 +169,12 @@ class VolumeNoise:
         )
 
     def at(self, points_mm: ArrayLike) -> Float64Array:
-        """Return the noise at places.
+        """Return the noise at positions.
 
         Parameters
         ----------
         points_mm : array_like, shape (..., 3)
-            Places in space, mm, such as those of an atlas' pixels on the undeformed skin.
+            Positions in space, mm, such as those of an atlas' pixels on the undeformed skin.
 
         Returns
         -------
@@ -183,7 +184,7 @@ class VolumeNoise:
         Raises
         ------
         VolumeNoiseError
-            For places that are not finite or have no 3 coordinates.
+            For positions that are not finite or do not have 3 coordinates.
         """
         points = np.ascontiguousarray(points_mm, np.float64)
         Checks(VolumeNoiseError).shape("points_mm", points, ("...", 3))
@@ -195,12 +196,12 @@ class VolumeNoise:
         return out
 
     def covariance(self, distance_mm: ArrayLike) -> Float64Array:
-        """Return the covariance of the noise at two places, over all draws.
+        """Return the covariance of the noise at two positions, over all draws.
 
         Parameters
         ----------
         distance_mm : array_like
-            Distance of the places, mm.
+            Distance of the positions, mm.
 
         Returns
         -------
@@ -217,6 +218,6 @@ class VolumeNoise:
 
     @property
     def slope_variance(self) -> float:
-        """Expected square of the slope along any direction of a plane, dimensionless."""
+        """Return the expected squared slope along any direction of a plane, dimensionless."""
         k2 = float((self.waves_per_mm**2).sum(axis=1).mean())
         return (2.0 * math.pi * self.rms_um * 1e-3) ** 2 * k2 / 3.0

@@ -1,4 +1,4 @@
-"""Scale and bias maps of a hemoglobin rig: from measured maps, and for another face."""
+"""Fit scale and bias maps of a hemoglobin rig, and transfer them to another face."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from model.facial_color.state_maps import (
 
 TRANSFER_METHODS = ("ratio", "difference", "absolute")
 _MAX_TEXTURE_LINES = 256
-"""Rows and columns that the size of a map's texture is taken from."""
+"""Rows and columns from which the correlation area of a map's texture is estimated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,7 +38,7 @@ class _Neutral:
     cells: coarse_maps.CoarseGrid
     own: DiscStatistics
     mean: Float64Array
-    """Of discs, a value a cell."""
+    """Disc means, one value per cell."""
     mean_valid: BoolArray
 
     @classmethod
@@ -52,7 +52,7 @@ class _Neutral:
     ) -> _Neutral:
         image, valid = images[NEUTRAL], masks[NEUTRAL]
         if not valid.any():
-            raise FacialColorError(f"{NEUTRAL}: no pixel is valid, expected some")
+            raise FacialColorError(f"{NEUTRAL}: got no valid pixel, expected some")
         own = disc_statistics.measure(image, radius_px, valid=valid)
         mean, mean_valid = cells.coarsen(own.mean, valid)
         return cls(image, valid, errors[NEUTRAL], radius_px, cells, own, mean, mean_valid)
@@ -80,9 +80,9 @@ def fit_rig_maps(
     global_states: Iterable[str] | None,
     stored_size: int | None,
 ) -> RigMaps:
-    """Do the work of `HemoglobinRig.from_maps`."""
+    """Fit the maps of a rig to measured maps; see `HemoglobinRig.from_maps`."""
     if not states:
-        raise FacialColorError("states: got none, expected at least one beside the neutral")
+        raise FacialColorError("states: got none, expected at least one other than the neutral")
     for name in states:
         check_name(name)
     base = _image(NEUTRAL, neutral)
@@ -118,7 +118,7 @@ def _state(
     with np.errstate(invalid="ignore", divide="ignore"):
         alikeness = np.where(product > 0.0, np.clip(covariance / product, -1.0, 1.0), 0.0)
         draws = np.maximum(seen.count / texture_px, 1.0)
-    # The sampling error of a ratio of deviations of correlated pairs, at fixed denominator
+    # Sampling variance of a ratio of standard deviations of correlated pairs, denominator fixed
     sampled = seen.deviation**2 * (1.0 - alikeness**2) / draws
     measured = [
         _deviation_variance(
@@ -132,6 +132,7 @@ def _state(
     s = ratio.value
     # eq. (5); where masks differ, mu_n of the shared pixels is not mu_n of all
     bias = seen.mean if alike else seen.mean + s * (own.mean - rest.mean)
+    # standard deviation of H_i - s H_n in the disc: var_i - 2 s cov + s^2 var_n
     misfit = np.sqrt(
         np.maximum(seen.deviation**2 - 2.0 * s * covariance + (s * rest.deviation) ** 2, 0.0)
     )
@@ -172,8 +173,8 @@ def _deviation_variance(
 ) -> Float64Array:
     """Return the variance of a measured deviation from the errors of the pixels it is of.
 
-    An error e of the pixels adds up to e^2 to the square of a deviation, and 2 sigma e/sqrt(n)
-    more by chance. Nothing is known worse than to its own size, nor better than float32 rounds.
+    A pixel error e adds up to e^2 to a squared deviation, and a random 2 sigma e/sqrt(n). The
+    result is limited to the deviation's own size from above and to float32 rounding from below.
     """
     sigma = np.where(stats.valid, stats.deviation, 0.0)
     e2 = np.where(error.valid, error.mean**2 + error.deviation**2, 0.0)
@@ -186,10 +187,10 @@ def _deviation_variance(
 
 
 def texture_area_px(base: Float64Array, valid: BoolArray) -> float:
-    """Return the area over which a texture repeats itself, px: the sum of its squared correlation.
+    """Return the correlation area of a texture, px: the sum of its squared autocorrelation.
 
-    A disc of n pixels knows a deviation as well as n/area independent ones. The correlation is
-    taken along rows and columns and multiplied.
+    A disc of n pixels determines a deviation as well as n/area independent pixels. The area is the
+    product of the correlation lengths along rows and columns.
 
     Parameters
     ----------
@@ -230,7 +231,7 @@ def transfer_rig_maps(
     stderr: ArrayLike | None,
     transfer: str,
 ) -> RigMaps:
-    """Do the work of `HemoglobinRig.applied_to`."""
+    """Transfer the maps of a rig to another face; see `HemoglobinRig.transfer_to`."""
     Checks(FacialColorError).choice("transfer", transfer, TRANSFER_METHODS)
     base = _image(NEUTRAL, neutral)
     images = {NEUTRAL: base}
@@ -273,7 +274,7 @@ def transfer_rig_maps(
 def _resample(
     values: Float64Array, valid: BoolArray, shape: tuple[int, int]
 ) -> tuple[Float64Array, BoolArray]:
-    """Return a stored map at another size, and where it holds something."""
+    """Return a stored map at another size, and its mask of valid cells."""
     if values.shape == shape:
         return values, valid
     few = (min(values.shape[0], shape[0]), min(values.shape[1], shape[1]))

@@ -1,4 +1,4 @@
-"""Smooth maps kept small: averaged down over the pixels that count, and made large again."""
+"""Store smooth maps on coarse grids: average over valid pixels, and interpolate back."""
 
 from dataclasses import dataclass
 
@@ -9,16 +9,16 @@ from model.arrays import BoolArray, Float64Array
 
 
 class CoarseMapError(ValueError):
-    """A size that no map can be kept at."""
+    """Error for a size at which no map can be stored."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoarseGrid:
-    """How the pixels of a map share the cells of a small one.
+    """Relation between the pixels of a map and the cells of a coarse one.
 
-    Cell and pixel grids cover the same rectangle. A cell is the mean of the valid pixels in it,
-    by area; a pixel is interpolated bilinearly between the centres of the cells that hold valid
-    pixels. Both are linear, and a constant stays what it is.
+    Cell and pixel grids cover the same rectangle. A cell is the mean of the valid pixels in it, by
+    area; a pixel is interpolated bilinearly between the centers of the cells that contain valid
+    pixels. Both are linear and preserve a constant.
     """
 
     shape: tuple[int, int]
@@ -27,24 +27,24 @@ class CoarseGrid:
     """Of the small map, (h, w) cells, at most that of the map."""
 
     def __post_init__(self) -> None:
-        """Refuse cells smaller than pixels."""
+        """Raise for cells smaller than pixels."""
         for full, few in zip(self.shape, self.stored, strict=True):
             if not 1 <= few <= full:
                 raise CoarseMapError(f"stored: got {self.stored}, expected 1 to {self.shape}")
 
     def coarsen(self, values: Float64Array, valid: BoolArray) -> tuple[Float64Array, BoolArray]:
-        """Return the means of the cells (h, w), 0 where none is, and where there is one.
+        """Return the means of the cells (h, w), 0 where there is none, and the mask of means.
 
         Parameters
         ----------
         values
-            (H, W); what is not valid may be anything.
+            (H, W); ignored where not valid.
         valid
             (H, W).
         """
         down, across = (_areas(*pair) for pair in zip(self.shape, self.stored, strict=True))
         weight = down @ valid.astype(np.float64) @ across.T
-        # about one value, so that a constant comes back to the last digit
+        # relative to one value, so that a constant is preserved to the last digit
         about = float(values[valid].mean()) if valid.any() else 0.0
         total = down @ np.where(valid, values - about, 0.0) @ across.T
         held = weight > 1e-9
@@ -58,7 +58,7 @@ class CoarseGrid:
         cells
             Each (h, w).
         valid
-            (h, w): cells that hold something.
+            (h, w): cells with a value.
         """
         down, across = (
             _interpolation_weights(*pair) for pair in zip(self.shape, self.stored, strict=True)
@@ -73,7 +73,7 @@ class CoarseGrid:
 
 
 def coarse_grid(shape: tuple[int, int], size: int | None) -> CoarseGrid:
-    """Return the cells of a map kept at ``size`` a side, or at its own where that is less.
+    """Return the grid of a map stored at ``size`` cells per side, or its own size if that is less.
 
     Examples
     --------
@@ -87,7 +87,7 @@ def coarse_grid(shape: tuple[int, int], size: int | None) -> CoarseGrid:
 
 
 def _areas(pixels: int, cells: int) -> csr_array:
-    """Return how much of each pixel lies in each cell, (cells, pixels)."""
+    """Return the fraction of each pixel inside each cell, (cells, pixels)."""
     edges = np.arange(cells + 1) * (pixels / cells)
     starts = np.floor(edges[:-1] + 1e-9).astype(np.intp)
     ends = np.minimum(np.ceil(edges[1:] - 1e-9).astype(np.intp), pixels)
@@ -98,7 +98,7 @@ def _areas(pixels: int, cells: int) -> csr_array:
 
 
 def _interpolation_weights(pixels: int, cells: int) -> csr_array:
-    """Return the weights of linear interpolation between cell centres, (pixels, cells)."""
+    """Return the weights of linear interpolation between cell centers, (pixels, cells)."""
     at = np.clip((np.arange(pixels) + 0.5) * (cells / pixels) - 0.5, 0.0, cells - 1.0)
     low = np.minimum(at.astype(np.intp), max(cells - 2, 0))
     high = np.minimum(low + 1, cells - 1)

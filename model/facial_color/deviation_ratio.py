@@ -1,19 +1,19 @@
-"""The ratio of two deviations, where one may be lost: an estimate under a stated prior.
+"""Estimate the ratio of two standard deviations under a prior that bounds it near 0/0.
 
-Where the neutral map is nearly constant its deviation sigma_n tells little, and sigma_i/sigma_n
-of Jimenez 2010, eq. (5), has no bound. Here the ratio s of a place is drawn beforehand from
-Normal(rho, rho^2) with rho the ratio over the whole map, and what is seen is
-sigma_i = s sigma_n + error with the variance delta^2. The posterior mean
+Where the neutral map is nearly constant its deviation sigma_n carries little information, and
+sigma_i/sigma_n of Jimenez 2010, eq. (5), is unbounded. Here the prior of the local ratio s is
+Normal(rho, rho^2), with rho the ratio over the whole map, and the observation is sigma_i = s
+sigma_n + error with the variance delta^2. The posterior mean
 
     s = rho + rho^2 sigma_n (sigma_i - rho sigma_n) / (rho^2 sigma_n^2 + delta^2)
 
-goes to rho as sigma_n goes to 0. For given sigma_i and delta it is nowhere farther from rho than
-|sigma_i - rho sigma_n|/delta times rho/2, and delta is at least the sampling error of the disc.
+tends to rho as sigma_n tends to 0. For given sigma_i and delta its distance from rho is at most
+|sigma_i - rho sigma_n|/delta times rho/2, and delta is at least the disc's sampling error.
 
-The prior is as wide as the ratio itself: vessels may shut or double. It weighs as much as about
-one independent piece of texture (a unit-information prior, Kass and Wasserman 1995,
-doi:10.1080/01621459.1995.10476592): in a disc that holds n of them it moves the ratio by a share
-of 1/n, and eq. (5) holds as it stands.
+The prior is as wide as the ratio itself: vessels may shut or double. It weighs as much as about one
+independent piece of texture (a unit-information prior, Kass and Wasserman 1995,
+doi:10.1080/01621459.1995.10476592): in a disc with n of them it moves the ratio by a fraction 1/n,
+so that eq. (5) is nearly unchanged.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ import numpy as np
 from model.arrays import BoolArray, Float64Array
 
 ROUNDING_ERROR = float(np.finfo(np.float32).eps)
-"""Relative error below which no map is trusted: that of the float32 it is stored in."""
+"""Smallest relative error of a map: the rounding of its float32 storage."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +35,7 @@ class RatioEstimate:
     stderr: Float64Array
     """Posterior standard deviation, at most ``prior``."""
     prior: float
-    """rho: what was expected before a place was looked at, and its standard deviation."""
+    """rho: mean and standard deviation of the prior."""
 
 
 def estimate_ratio(
@@ -48,13 +48,13 @@ def estimate_ratio(
     numerator, denominator
         Any shape, any common unit, >= 0.
     variance
-        Of the numerator given the ratio, same shape, unit squared, >= 0.
-    held
-        Same shape: where they are known. Elsewhere the ratio is the prior's.
+        Variance of the numerator given the ratio, same shape, unit squared, >= 0.
+    valid
+        Same shape: mask of known values. Elsewhere the result is the prior.
 
     Returns
     -------
-    Ratio
+    RatioEstimate
 
     Examples
     --------
@@ -63,11 +63,13 @@ def estimate_ratio(
     >>> found.value.round(2).tolist()
     [1.5, 1.5, 1.5, 1.5]
     """
-    # one that is no number, or has no variance, would be in the prior of all
+    # values that are not finite or have no variance would corrupt the common prior
     known_of = [np.isfinite(x) for x in (numerator, denominator, variance)]
     valid = valid & np.logical_and.reduce(known_of) & (np.nan_to_num(variance) >= 0.0)
     a, b, v = (np.where(valid, x, 0.0) for x in (numerator, denominator, variance))
     prior = global_ratio(a, b)
+    # a = s b + noise of variance v, s ~ N(rho, rho^2): the conjugate posterior has the mean
+    # rho + rho^2 b (a - rho b) / (rho^2 b^2 + v) and the variance rho^2 v / (rho^2 b^2 + v).
     gain, error = prior**2 * b, prior**2 * b**2 + v
     there = error > 0.0
     value = prior + np.where(there, gain * (a - prior * b) / np.where(there, error, 1.0), 0.0)
@@ -78,7 +80,7 @@ def estimate_ratio(
 def global_ratio(numerator: Float64Array, denominator: Float64Array) -> float:
     """Return the least-squares ratio over a map.
 
-    1 where the denominator is 0 everywhere: nothing says that anything should change.
+    1 where the denominator is 0 everywhere: without information nothing changes.
     """
     known = float(np.sum(denominator**2))
     return float(np.sum(numerator * denominator)) / known if known > 0.0 else 1.0

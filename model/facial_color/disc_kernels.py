@@ -1,4 +1,4 @@
-"""Loops of the statistics in a disc: a square, two caps by row sums, two lobes by column sums."""
+"""Inner loops of disc statistics: a square, two caps by row sums, two lobes by column sums."""
 
 # mypy: allow-untyped-defs
 
@@ -38,7 +38,7 @@ def _powers(out, row, about, moment):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
 def _add_down(running, new, out):
-    """Go one row down with sums down columns."""
+    """Advance column sums by one row."""
     for i in range(new.size):
         running[i] += new[i]
         out[i] = running[i]
@@ -62,7 +62,7 @@ def _sum_rows(v, n, r0, r1, r2, r3):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
 def _finish(s1, s2, whole, about, rounding, mean, deviation):
-    """Write mean and deviation of a row of whole discs; return how many need another look."""
+    """Write mean and deviation of a row of whole discs; return how many need a second pass."""
     trusted, blur1, blur2, unit = rounding
     doubtful = 0
     per = 1.0 / whole
@@ -93,7 +93,7 @@ def _moments_of(row, about):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never", fastmath={"reassoc"})
 def _valid_moments_of(row, valid, about):
-    """Do the work of `_moments_of` where an entry is valid."""
+    """Return `_moments_of` over the valid entries."""
     n, s1, s2 = 0, 0.0, 0.0
     for i in range(row.size):
         d = np.float64(row[i]) - about
@@ -107,7 +107,7 @@ def _valid_moments_of(row, valid, about):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sum_disc(image, half, y, x):
-    """Return mean and variance of one disc by summing its pixels about one of them."""
+    """Return mean and variance of one disc by summing its pixels relative to one of them."""
     h, valid, masked = image
     rows, columns = h.shape
     reach = half.size - 1
@@ -134,7 +134,7 @@ def _sum_disc(image, half, y, x):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _is_constant_step(image, half, y, x, level):
-    """Return whether what a disc gains by a step to column `x` is all of one value."""
+    """Return whether all pixels that a disc gains by a step to column `x` have one value."""
     h = image[0]
     rows, columns = h.shape
     reach = half.size - 1
@@ -147,7 +147,7 @@ def _is_constant_step(image, half, y, x, level):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _tile(image, disc, trusted, box, room, found):
-    """Do the work of `disc_moments` for one tile.
+    """Compute `disc_moments` for one tile.
 
     Parameters
     ----------
@@ -160,8 +160,8 @@ def _tile(image, disc, trusted, box, room, found):
         Rows y0 to y1 and columns x0 to x1.
     room
         p, q: (K, L), (K + 1, L) in the type of `h`, for sums along rows and down columns; entry j
-        stands for column x0 - width + j. nothing: (L,), 0. Then for the sums of a tile, four rows,
-        sums down columns, and over squares.
+        is column x0 - width + j. nothing: (L,), 0. Then for the sums of a tile, four rows, sums
+        down columns, and over squares.
     found
         `mean`, `deviation` and `count`, written.
     """
@@ -239,7 +239,7 @@ def _tile(image, disc, trusted, box, room, found):
         for y in range(y0 - k0, y1 - k0):
             square_row(square, p, nothing, inner, width, high_rows, y, y == y0 - k0)
             disc_row(sums[moment, y + k0 - y0, :n], square, p, q, half, high, inner, high_rows, y)
-    # what rounding of the stored sums may have done to a disc's sum of squares and sum
+    # bound of the rounding of the stored sums in a disc's sum of squares and sum
     unit = np.finfo(h.dtype).eps
     chain = 0.5 * unit * np.sqrt(4.0 * (reach + width))
     blur2 = chain * largest
@@ -284,24 +284,24 @@ def disc_moments(
 ):
     """Write mean, deviation and number of valid pixels in a disc about each pixel.
 
-    A tile takes the mean of all that its discs can see as the value to sum about, and sums in
-    the type of `h`; a disc whose variance may be lost in the rounding of its tile's sums is
-    summed again by itself in float64.
+    A tile sums differences from the mean of all pixels in its discs, in the type of `h`, which
+    avoids cancellation in the sum of squares. A disc whose variance may be lost in the rounding of
+    its tile's sums is summed again on its own in float64.
 
     Parameters
     ----------
     h : (H, W) float32 or float64
-        What is not finite does not count.
+        Values that are not finite are omitted.
     valid : (H, W) uint8, or any when not `masked`
     half, high : (R + 1,), (C + 1,) int64
-        Half-width of the disc at each distance of a row from its centre, half-height at each
+        Half-width of the disc at each distance of a row from its center, half-height at each
         distance of a column, px; half[0] = C and high[0] = R.
     inner : int
         Half-side of a square in the disc; no column farther out is taller than it.
     tall, wide : int
         Pixels of a tile.
     parts : int
-        Runs of tiles that one thread does at a time.
+        Runs of tiles, one per thread at a time.
     trusted : float
         Relative error of a variance that rounding may cause.
     mean, deviation : (H, W) float64, written
@@ -316,7 +316,7 @@ def disc_moments(
     for a in range(reach + 1):
         whole += (2 * half[a] + 1) * (1 if a == 0 else 2)
     image, disc, found = (h, valid, masked), (half, high, inner, whole), (mean, deviation, count)
-    # each part keeps its buffers: fresh ones for every tile would be mapped and cleared anew
+    # buffers are reused within a part: allocating and clearing them per tile is slow
     most_rows = min(rows, tall + 2 * reach)
     length = min(wide, columns) + 2 * width + 1
     for part in prange(parts):

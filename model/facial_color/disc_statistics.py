@@ -1,8 +1,8 @@
-"""Mean and deviation of a map in a disc about every pixel (Jimenez 2010, eq. 1).
+"""Mean and standard deviation of a map in a disc about every pixel (Jimenez 2010, eq. 1).
 
-Only valid pixels within the map count, so that the border and holes bias nothing, and the
-variance is the mean of squared deviations about a value of the neighbourhood: it keeps its digits
-on a map that is nearly constant or drifts.
+Only valid pixels within the map count, so that border and holes cause no bias. The variance is the
+mean of squared differences from a value of the neighborhood: it keeps its digits on a map that is
+nearly constant or drifts.
 """
 
 import math
@@ -28,37 +28,37 @@ _MIN_SUM_RADIUS_PX: Final = 6.0
 
 
 class DiscStatisticsError(ValueError):
-    """A map or a disc that has no statistics."""
+    """Error for a map or a disc that has no statistics."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscStatistics:
-    """What lies in a disc about each pixel, arrays of shape (..., H, W)."""
+    """Statistics of a disc about each pixel, arrays of shape (..., H, W)."""
 
     mean: Float64Array
-    """Mean of the valid pixels; NaN where the disc holds none."""
+    """Mean of the valid pixels; NaN where the disc contains none."""
     deviation: Float64Array
-    """Standard deviation of the valid pixels, with 1/n; NaN where the disc holds none."""
+    """Standard deviation of the valid pixels, with 1/n; NaN where the disc contains none."""
     count: Int32Array
     """Valid pixels in the disc."""
 
     @property
     def valid(self) -> BoolArray:
-        """Where the disc holds a valid pixel."""
+        """Return the pixels whose disc contains a valid pixel."""
         return np.asarray(self.count > 0)
 
 
 def half_widths(radius_px: float, rows: int, columns: int) -> Int64Array:
-    """Return the half-width of the disc at each distance of a row from its centre, px.
+    """Return the half-width of the disc at each distance of a row from its center, px.
 
-    A pixel belongs to the disc when its centre does: ``||u|| <= r``.
+    A pixel belongs to the disc when its center does: ``||u|| <= r``.
 
     Parameters
     ----------
     radius_px
         Radius r, px, finite, >= 0; need not be whole.
     rows, columns
-        Most that is asked for to each side, >= 0.
+        Largest extent to each side, >= 0.
 
     Examples
     --------
@@ -66,7 +66,7 @@ def half_widths(radius_px: float, rows: int, columns: int) -> Int64Array:
     [2, 2, 1]
     """
     Checks(DiscStatisticsError).within("radius_px", radius_px, "[0, inf)")
-    # a disc that holds the whole map grows no more; the square of a huge radius overflows
+    # a disc that contains the whole map needs no larger radius, whose square could overflow
     square = math.floor(min(float(radius_px), math.hypot(rows, columns) + 1.0) ** 2)
     return np.array(
         [
@@ -78,7 +78,7 @@ def half_widths(radius_px: float, rows: int, columns: int) -> Int64Array:
 
 
 def _read_only_view(values: NDArray[Any]) -> NDArray[Any]:
-    """Return a view that cannot be written: a kernel is compiled anew for arrays that can."""
+    """Return a read-only view: numba compiles a second kernel for writable arrays."""
     view = values.view()
     view.flags.writeable = False
     return view
@@ -90,10 +90,10 @@ def measure(h: ArrayLike, radius_px: float, *, valid: BoolArray | None = None) -
     Parameters
     ----------
     h
-        Shape (..., H, W), any unit: each map by itself. float32 is summed in float32 about a
-        value of its neighbourhood, which leaves the deviation a relative error below 1e-4;
-        anything else, or in a disc of less than 6 px, in float64, with 1e-7. What is not finite
-        counts as missing.
+        Shape (..., H, W), any unit: each map separately. float32 is summed in float32 about a value
+        of its neighborhood, with a relative error of the deviation below 1e-4; anything else, or in
+        a disc of less than 6 px, in float64, with 1e-7. Values that are not finite count as
+        missing.
     radius_px
         Radius of the disc, px; 0 is the pixel alone, and a disc may be larger than the map.
     valid
@@ -103,12 +103,13 @@ def measure(h: ArrayLike, radius_px: float, *, valid: BoolArray | None = None) -
     Returns
     -------
     DiscStatistics
-        float64. A pixel that is not valid itself still gets what its disc holds.
+        float64. Invalid pixels get the statistics of their disc, too.
 
     Raises
     ------
     DiscStatisticsError
-        When the map is not (..., H, W), the mask does not fit, or the radius is no radius.
+        When the map is not (..., H, W), the mask does not fit, or the radius is negative or not
+        finite.
 
     Examples
     --------

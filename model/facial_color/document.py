@@ -1,4 +1,4 @@
-"""A hemoglobin rig as maps of an APPEARANCE/ folder with one JSON document, and back."""
+"""Convert a hemoglobin rig to maps of an APPEARANCE/ folder with one JSON document, and back."""
 
 import json
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ _STATE_MAPS: Final = {
     "bias": (_BLOOD_UNIT, "mean in a disc"),
     "misfit": (_BLOOD_UNIT, "deviation in a disc of the measured state from scale and bias"),
 }
-"""Units and descriptions of the maps that each state has."""
+"""Units and descriptions of each state's maps."""
 _STATE_KEYS: Final = ("prior", "storage_rms", "storage_largest")
 
 
@@ -57,12 +57,12 @@ def to_maps(rig: HemoglobinRig) -> tuple[dict[str, SkinMap], bytes]:
 
 
 def from_maps_and_document(maps: Mapping[str, SkinMap], document: bytes) -> HemoglobinRig:
-    """Return the rig of `to_maps`; maps of other names are not looked at.
+    """Return the rig of `to_maps`; maps of other names are ignored.
 
     Raises
     ------
     FacialColorError
-        Naming what is missing, unknown, of another schema or of another shape.
+        For a map or key that is missing, unknown, of another schema or of another shape; names it.
     """
     try:
         loaded = json.loads(document)

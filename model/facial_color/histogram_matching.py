@@ -1,8 +1,8 @@
-"""Local histogram matching without the Gaussian assumption (Jimenez 2010, section 4).
+"""Match local histograms without the Gaussian assumption (Jimenez 2010, section 4).
 
-Each value of the neutral map goes to the value at its percentile in the target's disc, about the
-nodes of a grid of windows whose mappings are blended bilinearly. `model.facial_color` does it with
-two numbers a disc instead.
+Each value of the neutral map is mapped to the target's value at the same percentile, in discs about
+the nodes of a grid; the mappings are blended bilinearly. `model.facial_color` uses two numbers per
+disc instead.
 """
 
 import math
@@ -42,7 +42,7 @@ def match(
     Parameters
     ----------
     neutral, target
-        (H, W) each, in one unit, aligned; what is not finite is not valid.
+        (H, W) each, in one unit, aligned; values that are not finite are not valid.
     radius_px
         Radius of the disc, px, at least 1.5.
     valid, valid_target
@@ -58,11 +58,11 @@ def match(
     Raises
     ------
     model.facial_color.disc_statistics.DiscStatisticsError
-        For maps, masks, a radius or a spacing that fit nothing.
+        For maps, masks, a radius or a spacing of a wrong shape or range.
 
     Notes
     -----
-    Equal values have their middle rank. An increasing affine target is reproduced exactly.
+    Equal values get their mean rank. An increasing affine target is reproduced exactly.
 
     Examples
     --------
@@ -78,7 +78,10 @@ def match(
     # the last nodes may lie outside the map
     half = half_widths(radius_px, a.shape[0] + spacing, a.shape[1] + spacing)
     total, weight = np.zeros(a.shape), np.zeros(a.shape)
-    for parity in (0, 1):  # windows of every other row of nodes share no pixel
+    for parity in (
+        0,
+        1,
+    ):  # windows of every other row of nodes do not overlap, so threads write disjoint pixels
         _match_windows(a, b, va, vb, half, spacing, parity, total, weight)
     found = va & (weight > 0.0)
     return HistogramMatch(np.where(found, total / np.where(found, weight, 1.0), np.nan), found)
@@ -87,7 +90,7 @@ def match(
 def _checked(
     neutral: ArrayLike, target: ArrayLike, valid: BoolArray | None, valid_target: BoolArray | None
 ) -> tuple[Float64Array, Float64Array, BoolArray, BoolArray]:
-    # copies: compiled loops are declared for arrays that may be written
+    # copies: the compiled signatures require writable arrays
     a, b = (np.array(x, np.float64, order="C") for x in (neutral, target))
     check = Checks(DiscStatisticsError)
     check.shape("neutral", a, ("H", "W"))
@@ -126,7 +129,7 @@ def _gather(h: Any, valid: Any, half: Any, y: Any, x: Any) -> Any:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _quantile(ordered: Any, fraction: Any) -> Any:
-    """Return the value below which a share of the ordered values lies."""
+    """Return the quantile of ordered values at a fraction."""
     n = ordered.size
     at = min(max(fraction * n - 0.5, 0.0), n - 1.0)
     low = min(int(at), n - 1)

@@ -1,4 +1,4 @@
-"""How far a predicted state is from its truth, beside what simpler animation would give."""
+"""Errors of a predicted state against its ground truth, and those of simpler animation."""
 
 from dataclasses import dataclass
 
@@ -14,21 +14,21 @@ class PredictionErrors:
     """Root mean square errors of one state's hemoglobin, volume fraction."""
 
     predicted: float
-    """Of the prediction."""
+    """Error of the prediction."""
     neutral_kept: float
-    """Of the neutral map shown in the state (Jimenez2010, fig. 12, bottom row)."""
+    """Of the neutral map, unchanged (Jimenez2010, fig. 12, bottom row)."""
     one_gain: float
-    """Of the neutral map times the best single factor (observation 5 says that it fails)."""
+    """Of the neutral map times the best single factor (which fails, observation 5)."""
     gain: float
-    """That factor, by least squares."""
+    """The factor, by least squares."""
     pixels: int
-    """That were compared."""
+    """Number of compared pixels."""
 
 
 def compare_prediction(
     predicted: ArrayLike, truth: ArrayLike, neutral: ArrayLike, *, valid: BoolArray | None = None
 ) -> PredictionErrors:
-    """Compare a predicted state with its truth, and with two ways to do without a rig.
+    """Compare a predicted state with its ground truth and with two predictions without a rig.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def compare_prediction(
 
     Returns
     -------
-    BloodErrors
+    PredictionErrors
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""The hemoglobin rig: blood of a face in any mixture of states (Jimenez 2010, eqs. 1 to 6).
+"""Hemoglobin rig: blood of a face in any blend of expressions (Jimenez 2010, eqs. 1 to 6).
 
-A state is a scale and a bias of the neutral map, smooth enough to be stored small; a blend is an
-affine combination of them. Expressions and global states (exercise, alcohol) are states alike.
+A state is a scale and a bias of the neutral map, smooth enough for a coarse grid; a blend is an
+affine combination of states. Both expressions and global states (exercise, alcohol) are states.
 
 References
 ----------
@@ -29,11 +29,11 @@ from model.facial_color.state_maps import NEUTRAL, FacialColorError, RigMaps
 from model.tissue_optics.layers import C_HD_MAX
 
 STORED_SIZE: Final = 256
-"""Cells a side of the stored scale and bias maps (Jimenez2010, section 6)."""
+"""Cells per side of the stored scale and bias maps (Jimenez2010, section 6)."""
 HEMOGLOBIN_LIMITS: Final = (0.0, C_HD_MAX)
-"""Volume fractions of blood that exist, Jimenez2010, Table 1."""
+"""Range of blood volume fractions, Jimenez2010, Table 1."""
 GLOBAL_GAINS: Final[Mapping[str, float]] = MappingProxyType({"anger": 1.27, "fear": 0.81})
-"""Factors of all blood at full emotion, beside the expression (Jimenez2010, section 7)."""
+"""Factors of all blood at full emotion, in addition to the expression (Jimenez2010, section 7)."""
 
 _SUM_ERROR = 1e-6
 
@@ -46,7 +46,7 @@ def local_statistics(
     Parameters
     ----------
     h
-        Shape (..., H, W); what is not finite counts as missing.
+        Shape (..., H, W); values that are not finite count as missing.
     radius_px
         Radius of the disc, px, >= 0, need not be whole.
     valid
@@ -56,15 +56,14 @@ def local_statistics(
     Returns
     -------
     mu, sigma : ndarray
-        Shape of the map, over the valid pixels of each disc within the map; NaN where it holds
+        Shape of the map, over the valid pixels of each disc within the map; NaN where it contains
         none. float32 for float32 and float16 maps, float64 otherwise.
-        `model.facial_color.disc_statistics.measure` tells how many pixels they are of, and gives
-        float64.
+        `model.facial_color.disc_statistics.measure` returns the pixel counts too, and float64.
 
     Raises
     ------
     model.facial_color.disc_statistics.DiscStatisticsError
-        For a map, mask or radius that is none.
+        For a map, mask or radius of a wrong shape or range.
 
     Examples
     --------
@@ -80,22 +79,22 @@ def local_statistics(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HemoglobinBlend:
-    """A face's blood in a mixture of states, arrays (H, W)."""
+    """Blood of a face in a blend of states, arrays (H, W)."""
 
     hemoglobin: FloatArray
     """Volume fraction within the limits; NaN outside ``valid``."""
     valid: BoolArray
-    """Where the neutral map and all states of the mixture are known."""
+    """Where the neutral map and all states of the blend are known."""
     clipped_fraction: float
-    """Part of the valid pixels that lay outside the limits."""
+    """Fraction of the valid pixels that were outside the limits and clamped."""
     stderr: FloatArray
-    """Standard error: of neutral map, scales, biases, and of what eq. (6) leaves out. Stated
-    errors of the maps are taken as shared by a disc, which is the worst case for a bias."""
+    """Standard error of neutral map, scales and biases, and the model error of eq. (6). Given
+    errors of the maps count as common to a disc, which is the worst case for a bias."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HemoglobinRig(RigMaps):
-    """Blood of one face in any affine mixture of the states it was measured in."""
+    """Blood of one face in any affine blend of its measured states."""
 
     @classmethod
     def from_maps(
@@ -109,27 +108,27 @@ class HemoglobinRig(RigMaps):
         global_states: Iterable[str] | None = None,
         stored_size: int | None = STORED_SIZE,
     ) -> HemoglobinRig:
-        """Make a rig from measured maps.
+        """Fit a rig to measured maps.
 
         Parameters
         ----------
         neutral
             Volume fraction of blood in the neutral state, (H, W).
         states
-            The other states by name, (H, W) each, aligned to the neutral map (a few pixels,
-            little against the radius, do not matter). A name is lower case, e.g. one of
+            The other states by name, (H, W) each, aligned to the neutral map within a few pixels
+            (little against the radius). A name is lower case, e.g. one of
             `rigsim.subject.perfusion.STATE_NAMES`.
         radius_px
             Radius of the disc of eq. (1), px.
         valid
-            (H, W) bool for all maps, or by name, "neutral" among them; what is not finite is
-            not valid in any case.
+            (H, W) bool for all maps, or by name, including "neutral"; values that are not finite
+            are never valid.
         stderr
-            Standard errors by name, (H, W); a map without is trusted to float32's rounding.
+            Standard errors by name, (H, W); float32's rounding for a map without one.
         global_states
-            States of the whole body; None: those of `GLOBAL_STATES` that there are.
+            States of the whole body; None: the given ones of `GLOBAL_STATES`.
         stored_size
-            Cells a side of the stored maps, or less when the map has less; None: as the map.
+            Cells per side of the stored maps, at most those of the map; None: as the map.
 
         Returns
         -------
@@ -138,7 +137,7 @@ class HemoglobinRig(RigMaps):
         Raises
         ------
         FacialColorError, model.facial_color.disc_statistics.DiscStatisticsError
-            For maps, masks, names or a radius that fit nothing.
+            For maps, masks, names or a radius of a wrong shape or range.
 
         Notes
         -----
@@ -163,30 +162,30 @@ class HemoglobinRig(RigMaps):
 
     @property
     def base(self) -> Float64Array:
-        """H_0 of eq. (4), (H, W): neutral map less its stored mean; NaN outside ``valid``.
+        """Return H_0 of eq. (4), (H, W): neutral map less its stored mean; NaN outside ``valid``.
 
-        Since the stored mean is taken off, not the exact one, the neutral state comes back
-        exactly: what storing small loses of mu_n stays in H_0.
+        H_0 is relative to the stored mean, not the exact one, so the neutral state is reproduced
+        exactly: the storage error of mu_n stays in H_0.
         """
         (mean,) = self.cells.refine(self.neutral_mean, valid=self.neutral_mean_valid)
         return np.where(self.valid, self.neutral - mean, np.nan)
 
     @property
     def scale(self) -> Mapping[str, Float64Array]:
-        """Stored scale maps by name, (h, w); 1 for the neutral state."""
+        """Return stored scale maps by name, (h, w); 1 for the neutral state."""
         return {NEUTRAL: np.ones_like(self.neutral_mean)} | {
             name: state.scale for name, state in self.states.items()
         }
 
     @property
     def bias(self) -> Mapping[str, Float64Array]:
-        """Stored bias maps by name, (h, w), volume fraction."""
+        """Return stored bias maps by name, (h, w), volume fraction."""
         return {NEUTRAL: self.neutral_mean} | {
             name: state.bias for name, state in self.states.items()
         }
 
     def storage_error(self) -> Mapping[str, tuple[float, float]]:
-        """Return what storing small changes in each state: rms and largest, volume fraction."""
+        """Return each state's error of coarse storage: rms and largest, volume fraction."""
         return {n: (s.storage_rms, s.storage_largest) for n, s in self.states.items()}
 
     def check_weights(
@@ -211,7 +210,9 @@ class HemoglobinRig(RigMaps):
         total = math.fsum(weights.values())
         if normalize:
             if abs(total) < _SUM_ERROR:
-                raise FacialColorError(f"weights: their sum is {total:g}: it cannot be made 1")
+                raise FacialColorError(
+                    f"weights: their sum is {total:g}: normalize cannot divide by it"
+                )
             return {name: weight / total for name, weight in weights.items()}
         if abs(total - 1.0) > _SUM_ERROR:
             rest = float(weights.get(NEUTRAL, 0.0)) + 1.0 - total
@@ -235,22 +236,22 @@ class HemoglobinRig(RigMaps):
         gain: float = 1.0,
         limits: tuple[float, float] = HEMOGLOBIN_LIMITS,
     ) -> HemoglobinBlend:
-        """Blend states, eq. (6).
+        """Blend states by eq. (6), with mask and errors.
 
         Parameters
         ----------
         weights
-            By name, "neutral" among them, summing to one; they may be negative or above one.
+            By name, including "neutral", summing to one; they may be negative or above one.
             Several states at full strength are ``{"smile": 1, "exercise": 1, "neutral": -1}``.
         normalize
-            Whether to divide the weights by their sum instead of refusing them.
+            Divide the weights by their sum instead of raising an error.
         gains
             Factors of all blood that go with states, e.g. `GLOBAL_GAINS`; each acts in
             proportion to its state's weight: the whole factor is 1 + sum of w_i (gain_i - 1).
         gain
-            One more factor of all blood.
+            Additional factor of all blood.
         limits
-            Least and largest concentration.
+            Smallest and largest volume fraction.
 
         Returns
         -------
@@ -270,7 +271,7 @@ class HemoglobinRig(RigMaps):
         if not (math.isfinite(factor) and factor >= 0.0):
             raise FacialColorError(f"gains: the factor of all blood is {factor:g}, expected >= 0")
         if not limits[0] < limits[1]:
-            raise FacialColorError(f"limits: got {limits}, expected the least first")
+            raise FacialColorError(f"limits: got {limits}, expected the smaller one first")
         few = self.neutral_mean_valid.copy()
         scale, bias = np.zeros_like(self.neutral_mean), np.zeros_like(self.neutral_mean)
         scale_variance, bias_variance, misfit = (np.zeros_like(scale) for _ in range(3))
@@ -289,9 +290,9 @@ class HemoglobinRig(RigMaps):
         up = self.cells.refine(
             scale, bias, self.neutral_mean, scale_variance, bias_variance, misfit, valid=few
         )
-        base = self.neutral - up[2]  # eq. (4), with the mean as it is stored
+        base = self.neutral - up[2]  # eq. (4), with the stored mean
         blood = factor * (up[1] + base * up[0])  # eq. (6)
-        # the misfit was seen with the noise of the maps in it
+        # the measured misfit includes the maps' noise
         pixel = np.maximum(up[5], (up[0] * self.neutral_stderr) ** 2)
         pixel += (ROUNDING_ERROR * self.neutral) ** 2
         error = factor * np.sqrt(pixel + up[4] + base * base * up[3])
@@ -324,20 +325,20 @@ class HemoglobinRig(RigMaps):
         stderr
             Standard error of the new map.
         transfer
-            What is kept of a bias. "ratio": mu_i/mu_n, since a vessel that dilates changes mean
-            and contrast by a factor, and so does the scale; "difference": mu_i - mu_n;
-            "absolute": mu_i as it is (the paper's stored maps), which gives the other face the
-            mean blood of this one as soon as a state is blended in.
+            Preserved quantity of a bias. "ratio": mu_i/mu_n, since a vessel that dilates changes
+            mean and contrast by a factor, and so does the scale; "difference": mu_i - mu_n;
+            "absolute": mu_i unchanged (the paper's stored maps), which gives the other face this
+            one's mean blood in each state.
 
         Returns
         -------
         HemoglobinRig
-            The radius goes with the size of the map.
+            The radius scales with the size of the map.
 
         Raises
         ------
         FacialColorError
-            For a map or mask that fits nothing.
+            For a map or mask of a wrong shape.
         """
         return self._from_rig_maps(
             basis.transfer_rig_maps(self, neutral, valid=valid, stderr=stderr, transfer=transfer)

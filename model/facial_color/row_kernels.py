@@ -1,4 +1,4 @@
-"""Sums of one row of discs by running sums, compiled."""
+"""Sum one row of discs by running sums, compiled."""
 
 # mypy: allow-untyped-defs
 
@@ -8,7 +8,7 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
 def _add_run(t, a, left, right):
-    """Add what lies between entries `left` and `right` of one row of prefix sums."""
+    """Add the sum between entries `left` and `right` of one row of prefix sums."""
     al, ar = a[left:], a[right:]
     for i in range(t.size):
         t[i] += ar[i] - al[i]
@@ -34,7 +34,7 @@ def _add_columns(t, upper, lower, one, other):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
 def _add_column_pairs(t, upper, lower, upper2, lower2, one, other):
-    """Do the work of `_add_columns`, and of the next columns outward between other rows."""
+    """Do `_add_columns`, also for the next columns outward between other rows."""
     ul, ur, ll, lr = upper[one:], upper[other:], lower[one:], lower[other:]
     vl, vr = upper2[one - 1 :], upper2[other + 1 :]
     ml, mr = lower2[one - 1 :], lower2[other + 1 :]
@@ -44,7 +44,7 @@ def _add_column_pairs(t, upper, lower, upper2, lower2, one, other):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="never")
 def _move_square(square, new, old, left, right):
-    """Add a run of the row that a square reaches, take off that of the row that it leaves."""
+    """Add a run of the row that a square enters, subtract that of the row that it leaves."""
     nl, nr, ol, orr = new[left:], new[right:], old[left:], old[right:]
     for i in range(square.size):
         square[i] += np.float64(nr[i] - nl[i]) - np.float64(orr[i] - ol[i])
@@ -60,10 +60,10 @@ def disc_row(t, square, p, q, half, high, inner, rows, y):
     square : (n,) float64
         Sum over the square of half-side `inner`.
     p, q : (K, L), (K + 1, L)
-        Sums along rows and down columns, before each entry, of the rows that the tile sees.
+        Sums along rows and down columns, before each entry, of the rows within reach of the tile.
     half, high : (R + 1,), (C + 1,) int64
     inner, rows : int
-        Rows before 0 and from `rows` on hold nothing.
+        Rows before 0 and from `rows` on are empty.
     y : int
         The row.
     """

@@ -16,19 +16,19 @@ NEUTRAL: Final = "neutral"
 
 
 GLOBAL_STATES: Final = ("exercise", "alcohol")
-"""States of the whole body: nothing of the face moves."""
+"""States of the whole body; the face does not move."""
 
 
 _NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,57}")
 
 
 class FacialColorError(ValueError):
-    """Maps that make no rig, or weights that make no blend."""
+    """Error for maps that cannot make a rig, or weights that cannot make a blend."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateMaps:
-    """One state as the rig stores it: arrays (h, w), 0 outside ``valid``."""
+    """Stored maps of one state: arrays (h, w), 0 outside ``valid``."""
 
     scale: Float64Array
     """sigma_i/sigma_n under the prior, eq. (5)."""
@@ -40,26 +40,26 @@ class StateMaps:
     """Standard error of the bias, volume fraction."""
     misfit: Float64Array
     """Deviation of the measured state from scale and bias of the neutral map, within a disc,
-    volume fraction: what the state's own pattern, misalignment and noise leave."""
+    volume fraction: the state's own pattern, misalignment and noise."""
     valid: BoolArray
-    """Cells that hold something."""
+    """Cells with a value."""
     prior: float
-    """Scale that was expected before a place was looked at: sigma_i/sigma_n of the whole map; of
-    a transferred rig, that of its source."""
+    """Prior of the scale: sigma_i/sigma_n of the whole map; of a transferred rig, that of its
+    source."""
     storage_rms: float
-    """Root mean square of what storing small changes in the state, volume fraction."""
+    """Root mean square error of coarse storage in the state, volume fraction."""
     storage_largest: float
-    """Largest such change."""
+    """Largest error of coarse storage."""
 
     def __post_init__(self) -> None:
-        """Refuse shapes that differ and numbers that are none."""
+        """Raise for shapes that differ and numbers that are not finite."""
         shape = self.valid.shape
         for name in ("scale", "bias", "scale_stderr", "bias_stderr", "misfit"):
             Checks(FacialColorError).numbers(name, getattr(self, name), shape)
 
 
 def check_name(name: str) -> None:
-    """Refuse a state's name that can be no map's."""
+    """Raise for a name that cannot be part of a map's name."""
     if name == NEUTRAL:
         raise FacialColorError(f"states: {NEUTRAL!r} is the neutral map's own name")
     if not _NAME_PATTERN.fullmatch(name):
@@ -77,16 +77,16 @@ class RigMaps:
     neutral_stderr: FloatArray
     """Standard error of the neutral map, (H, W); 0 where none was stated."""
     neutral_mean: Float64Array
-    """mu_n as stored, (h, w), volume fraction; bias of the neutral state."""
+    """Stored mu_n, (h, w), volume fraction; bias of the neutral state."""
     states: Mapping[str, StateMaps]
-    """By name, all but the neutral."""
+    """Maps by name, all but the neutral."""
     radius_px: float
     """Radius of the disc, px of the neutral map."""
     global_states: tuple[str, ...] = ()
-    """Which of the states are of the whole body."""
+    """Names of the states of the whole body."""
 
     def __post_init__(self) -> None:
-        """Refuse what does not fit together."""
+        """Raise for maps that do not fit together."""
         shape = self.neutral.shape
         check = Checks(FacialColorError)
         check.shape("neutral", self.neutral, ("H", "W"))
@@ -101,11 +101,11 @@ class RigMaps:
 
     @property
     def cells(self) -> CoarseGrid:
-        """How the stored maps lie on the neutral map."""
+        """Return the relation of the stored maps to the neutral map."""
         rows, columns = self.neutral.shape
         return CoarseGrid((rows, columns), (self.neutral_mean.shape[0], self.neutral_mean.shape[1]))
 
     @property
     def neutral_mean_valid(self) -> BoolArray:
-        """Cells of ``neutral_mean`` that hold something, (h, w)."""
+        """Return the cells of ``neutral_mean`` with a value, (h, w)."""
         return self.cells.coarsen(np.zeros(self.neutral.shape), self.valid)[1]

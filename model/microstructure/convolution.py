@@ -1,9 +1,9 @@
-"""Convolution of a displacement map with kernels that vary over it, in two passes along lines.
+"""Convolve a displacement map with spatially varying kernels, in two passes along lines.
 
 Eqs. (3)-(6) of Nagano et al. 2015: ``D_s = D * k_s`` along each pixel's axis s, then
 ``D' = D_s * k_t`` along its axis t, with ``k = (1 - alpha) delta + alpha G(sigma)``.
 
-What is fixed here:
+Conventions:
 
 - G is the continuous Gaussian at whole steps of one pixel along the line within 4 sigmas, divided
   by its sum, as in `model.microstructure.gaussian_weights`; far below a pixel it is the delta.
@@ -11,7 +11,7 @@ What is fixed here:
   0.5 px, half at 0.4 px: maps whose pixels are that coarse are changed less than they should be.
 - The delta is the pixel itself, so alpha = 0 changes no bit. Only G samples between pixels, by
   Keys' cubic: bilinear samples blur what is finer than some pixels by themselves, also across the
-  line ("linear" gives them). On lines along rows and columns both are exact.
+  line (available as "linear"). On lines along rows and columns both are exact.
 - Beyond the map's border it is mirrored about the edges of the outermost pixels.
 - Near holes and the borders of islands, samples come in pairs at the same distance to both sides,
   and a pair of which one cannot be taken counts as the pixel itself. That is an odd continuation
@@ -41,7 +41,7 @@ Sampling = Literal["cubic", "linear"]
 Border = Literal["mirror", "open"]
 
 MAX_SIGMA_PX = 1000.0
-"""A Gaussian wider than this is a mistake in units."""
+"""Upper limit of sigma, px; a wider Gaussian is a mistake in units."""
 
 _INTERPOLATION_CODES = {"linear": kernels.LINEAR, "cubic": kernels.CUBIC}
 _BORDER_CODES = {"mirror": kernels.MIRROR, "open": kernels.OPEN}
@@ -49,12 +49,12 @@ _ERROR_TEXTS = {
     kernels.NOT_FINITE: "got NaN or infinity",
     kernels.ALPHA: "got a strength beyond [-2, 1]",
     kernels.SIGMA: f"got a standard deviation beyond 0...{MAX_SIGMA_PX:g} px",
-    kernels.AXIS: "got an axis that is not of unit length where the kernel does something",
+    kernels.AXIS: "got an axis that is not of unit length where the kernel is not the identity",
 }
 
 
 class ConvolutionError(ValueError):
-    """Maps, kernels or settings that cannot be convolved."""
+    """Error for maps, kernels or settings that cannot be convolved."""
 
 
 class LineKernels(NamedTuple):
@@ -63,7 +63,7 @@ class LineKernels(NamedTuple):
     Attributes
     ----------
     axis : ndarray of float32, shape (h, w, 2) or (1, 1, 2)
-        Unit vectors in pixels, x right, y down; the sign means nothing.
+        Unit vectors in pixels, x right, y down; the sign is irrelevant.
     alpha : ndarray of float32, shape (h, w) or (1, 1)
         Strength in [-2, 1].
     sigma_px : ndarray of float32, shape (h, w) or (1, 1)
@@ -78,7 +78,7 @@ class LineKernels(NamedTuple):
     def of(
         cls, axis: ArrayLike, alpha: ArrayLike, sigma_px: ArrayLike, shape: tuple[int, int]
     ) -> LineKernels:
-        """Take scalars or fields of a window of the given shape."""
+        """Make kernels from scalars or fields of a window of the given shape."""
         return cls(
             _field("axis", axis, (*shape, 2)),
             _field("alpha", alpha, shape),
@@ -87,7 +87,7 @@ class LineKernels(NamedTuple):
 
     @property
     def is_identity(self) -> bool:
-        """Whether no pixel changes."""
+        """Return whether no pixel changes."""
         return not (self.alpha.any() and self.sigma_px.any())
 
     def part(self, window: MapWindow) -> LineKernels:
@@ -111,12 +111,13 @@ def _field(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Float32Array
 
 
 def kernel_reach(lines: LineKernels, shape: tuple[int, int], sampling: Sampling = "cubic") -> int:
-    """Return how many pixels away the farthest samples of a window are; 0 if nothing changes.
+    """Return the distance of a window's farthest samples, px; 0 if nothing changes.
 
     Raises
     ------
     ConvolutionError
-        For parameters that are not finite or beyond their ranges, or axes that are no unit vectors.
+        For parameters that are not finite or beyond their ranges, or axes that are not unit
+        vectors.
     """
     code, largest = kernels.check_rows(lines, shape[0], np.float32(MAX_SIGMA_PX))
     if code.any():
@@ -184,17 +185,17 @@ def convolve(
         Displacement, any unit; maps of a stack are convolved alike. float32 and float16 are
         computed in float32, everything else in float64. Row 0 is the top.
     axis_s, axis_t : array_like, shape (H, W, 2) or (2,)
-        Unit vectors (x right, y down) in pixels; the sign means nothing. Only looked at where
-        the kernel does something.
+        Unit vectors (x right, y down) in pixels; the sign is irrelevant. Ignored where the kernel
+        is the identity.
     alpha_s, sigma_s, alpha_t, sigma_t : array_like, shape (H, W) or ()
         Strengths in [-2, 1] and standard deviations along the axes, px, >= 0. They and the axes
         are taken in float32.
     valid : array_like of bool, shape (H, W) or that of `height`, optional
         Heights to sample; heights that are not finite never are. Others keep their value.
     sampling : {"cubic", "linear"}
-        How samples between pixels are taken: Keys' cubic, or bilinear, which is quicker and blurs.
+        Interpolation between pixels: Keys' cubic, or bilinear, which is quicker and blurs.
     border : {"mirror", "open"}
-        What is beyond the map: its mirror image, or nothing (as in a hole).
+        Continuation beyond the map: its mirror image, or none (as in a hole).
 
     Returns
     -------
@@ -204,7 +205,7 @@ def convolve(
     Raises
     ------
     ConvolutionError
-        For wrong shapes, parameters beyond their ranges, or axes that are no unit vectors.
+        For wrong shapes, parameters beyond their ranges, or axes that are not unit vectors.
 
     Examples
     --------
@@ -234,7 +235,7 @@ def convolve(
         return _pass(along_s, whole, clear, second, whole, shape, sampling, border)
 
     if source.ndim == 2:
-        return convolved(())  # no copy of a large map
+        return convolved(())  # without a copy of a large map
     out = np.empty_like(source)
     for at in np.ndindex(source.shape[:-2]):
         out[at] = convolved(at)
@@ -278,7 +279,7 @@ def convolve_tiled(
     finished: Collection[int] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Convolve a map tile by tile, to the bit as `convolve` does the whole.
+    """Convolve a map tile by tile; bit-identical to `convolve`.
 
     Parameters
     ----------
@@ -286,7 +287,7 @@ def convolve_tiled(
         Arrays or memory maps; different ones. The target takes float32.
     fields_at : callable
         Kernels of both passes for a window: ``(LineKernels, LineKernels)``, arrays of the window's
-        shape or (1, 1). It must give a pixel the same in every window.
+        shape or (1, 1). A pixel's kernels must be the same in every window.
     tile : int
         Side of a tile, px. A tile needs some 20 arrays of float32 of its size and margin.
     valid_at : callable, optional
@@ -294,10 +295,10 @@ def convolve_tiled(
     sampling, border
         As of `convolve`.
     finished : collection of int
-        Numbers of tiles (in the order of `list_tiles`) that the target holds already.
+        Numbers of tiles (in the order of `list_tiles`) that are already in the target.
     progress : callable, optional
-        Called as ``progress(number, count)`` after the tile of that number was written; what it
-        raises ends the work, and the tiles told so far are in the target.
+        Called as ``progress(number, count)`` after that tile was written. An exception it raises
+        ends the work; all tiles reported so far are in the target.
 
     Raises
     ------

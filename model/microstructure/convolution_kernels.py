@@ -1,7 +1,7 @@
-"""Inner loops of convolution along lines that turn from pixel to pixel.
+"""Inner loops of convolution along lines whose direction varies per pixel.
 
-Kernels are parallel over rows and called from one thread. None uses fast-math, and what a pixel
-becomes depends neither on the number of threads nor on the window it is computed in.
+Kernels are parallel over rows and called from one thread. None uses fast-math, and a pixel's result
+depends neither on the number of threads nor on the window.
 """
 
 # mypy: allow-untyped-defs
@@ -12,22 +12,22 @@ import numpy as np
 from numba import njit, prange
 
 TRUNCATE_SIGMAS = 4.0
-"""The discrete Gaussian ends at the whole number of pixels next to so many sigmas."""
+"""The discrete Gaussian is truncated at the pixel nearest to this many sigmas."""
 MIN_WEIGHT = 1e-8
-"""Of a neighbouring pixel; below it the Gaussian is the delta in single precision."""
+"""Smallest weight of a neighbor; below it the Gaussian is the delta in single precision."""
 MAX_DISTANCE_PX = 255
-"""Distances to what is not valid are told up to so many pixels."""
+"""Distances to invalid pixels are clamped to this many pixels."""
 LINEAR, CUBIC = 1, 2
-"""How many pixels to a side the sample between pixels takes from."""
+"""Pixels to each side that the interpolation uses."""
 MIRROR, OPEN = 0, 1
 """Beyond the border the map is mirrored about the edges of its outermost pixels, or nothing."""
 FINE, NOT_FINITE, ALPHA, SIGMA, AXIS = range(5)
-"""What may be wrong with a row's parameters."""
+"""Error codes of a row's parameters."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def distance_to_invalid(valid):
-    """Return how many king's moves each pixel is from the nearest one that is not valid.
+    """Return each pixel's chessboard distance to the nearest one that is not valid.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def distance_to_invalid(valid):
     Returns
     -------
     (H, W) uint8
-        0 where not valid, at most `MAX_DISTANCE_PX`. The map's border counts for nothing.
+        0 where not valid, at most `MAX_DISTANCE_PX`. The map's border does not count.
     """
     rows, columns = valid.shape
     out = np.empty((rows, columns), np.uint8)
@@ -72,7 +72,7 @@ def distance_to_invalid(valid):
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def check_rows(lines, rows, max_sigma):
-    """Return what is wrong with each row's parameters, and the largest sigma that is used there.
+    """Return an error code of each row's parameters, and the largest sigma used there.
 
     Parameters
     ----------
@@ -133,16 +133,16 @@ def _cubic(f):
 
 @njit(inline="always")
 def _mirrored(i, n):
-    """Return the index within n that i comes to, mirrored about the edges of the end pixels."""
+    """Return index i mirrored into 0...n - 1 about the edges of the end pixels."""
     j = i % (2 * n)
     return j if j < n else 2 * n - 1 - j
 
 
 @njit
 def _slow_sample(source, clear, frame, y, x, fy, fx, reach):
-    """Return a sample between the pixels y, y + 1 and x, x + 1 and whether all it needs is valid.
+    """Return a sample between the pixels y, y + 1 and x, x + 1, and whether its taps are valid.
 
-    `reach` pixels to each side are weighed; a weight of 0 needs nothing.
+    `reach` pixels to each side are weighted; taps of weight 0 need not be valid.
     """
     top, left, rows, columns, border = frame
     nothing = source.dtype.type(0.0)
@@ -187,15 +187,15 @@ def _tap(f, k, reach):
 def convolve_lines(source, clear, source_window, size, lines, window, reach, border, out):
     """Write ``h + alpha (G * h - h)`` with the Gaussian along each pixel's own line (eqs. 3 and 6).
 
-    Two samples at the same distance to both sides are one pair; a pair of which one cannot be
-    taken counts as the pixel itself.
+    Two samples at the same distance to both sides are one pair; a pair with an invalid sample
+    counts as the pixel itself.
 
     Parameters
     ----------
     source : (h, w) float32 or float64
         A window of the map.
     clear : (h, w) uint8 or (0, 0)
-        Of `distance_to_invalid` there; empty: all is valid.
+        Result of `distance_to_invalid`; empty: all is valid.
     source_window, window : Window
         Where source and output are in the map.
     size : (int, int)
@@ -232,7 +232,7 @@ def convolve_lines(source, clear, source_window, size, lines, window, reach, bor
                 continue
             ax = axis[row * xh, column * xw, 0]
             ay = axis[row * xh, column * xw, 1]
-            # w(i) = e^(i^2), by w(i + 1) = w(i) e^(2 i + 1)
+            # squares without powers: e^((i + 1)^2) = e^(i^2) e^(2 i + 1)
             e = math.exp(-0.5 / (kind(s) * kind(s)))
             if e < MIN_WEIGHT:
                 continue
@@ -299,7 +299,7 @@ def convolve_lines(source, clear, source_window, size, lines, window, reach, bor
                 for i in range(1, radius + 1):
                     good = False
                     pair = zero
-                    for finer in range(reach, 0, -1):  # cubic, then linear where a hole is near
+                    for finer in range(reach, 0, -1):  # cubic, or linear where a hole is near
                         pair = zero
                         good = True
                         for side in (1, -1):

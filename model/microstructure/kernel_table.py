@@ -1,12 +1,12 @@
-"""Microstructure of skin under strain: kernels of displacement maps, and which one a stretch asks.
+"""Kernels of displacement maps under strain: parameters by stretch ratio (Nagano et al. 2015).
 
 The strain of a mesh is `model.microstructure.mesh_strain`, its fields on a texture
 `model.microstructure.strain_fields`, the convolution `model.microstructure.convolution`; `strain`
-and `convolve` are found here too.
+and `convolve` are re-exported here.
 
-A neutral displacement map is convolved along the axis of strain with
-``k = (1 - alpha) delta + alpha G(sigma)`` (eq. 6): alpha > 0 blurs, alpha < 0 sharpens. A
-:class:`KernelTable` says which alpha and sigma belong to a stretch ratio.
+A neutral displacement map is convolved along the axis of strain with ``k = (1 - alpha) delta +
+alpha G(sigma)`` (eq. 6): alpha > 0 blurs, alpha < 0 sharpens. A :class:`KernelTable` maps a stretch
+ratio to alpha and sigma.
 
 References
 ----------
@@ -39,15 +39,15 @@ TABLE_SCHEMA = "skinrig.kernel-table/1"
 
 
 MAX_WIDTH_PX = 1e6
-"""Widest Gaussian, px: wider than any map, and its weights still fit into memory."""
+"""Upper limit of sigma, px: wider than any map, and the weights still fit into memory."""
 
 
 class KernelTableError(ValueError):
-    """A table of kernels that contradicts itself, or a stretch that it does not reach."""
+    """Error for an inconsistent table of kernels, or a stretch outside its range."""
 
 
 def gaussian_weights(sigma_px: float) -> Float64Array:
-    """Return the right half of the normalised discrete Gaussian, its centre first.
+    """Return the right half of the normalized discrete Gaussian, its center first.
 
     The continuous Gaussian at whole pixels up to ``TRUNCATE_SIGMAS`` sigmas, divided by its sum.
     Far below one pixel it is the delta function to machine precision, and blurs nothing.
@@ -82,10 +82,10 @@ class KernelTable:
     Attributes
     ----------
     alpha_breaks : tuple of float
-        Stretch ratios between neighbouring lines of alpha, increasing; empty for one line.
+        Stretch ratios between neighboring lines of alpha, increasing; empty for one line.
     alpha_lines : tuple of (slope, intercept)
-        One more than breaks; they meet at the breaks, and alpha(1) = 0. The value is held within
-        `ALPHA_LIMITS`, as the kernel's definition is.
+        One more than breaks; they meet at the breaks, and alpha(1) = 0. The value is clamped to
+        `ALPHA_LIMITS`, as in the kernel's definition.
     sigma_compression_um, sigma_stretch_um : (slope, intercept) or None
         Lines of sigma over r, um, for r < 1 and for r >= 1; None: that side was not measured.
     stretch_range : tuple of float
@@ -102,7 +102,7 @@ class KernelTable:
     source: str
 
     def __post_init__(self) -> None:
-        """Refuse lines that do not meet, miss (1, 0), or give a sigma of 0 in the range."""
+        """Raise for lines that do not meet, miss (1, 0), or have a sigma of 0 in the range."""
         for name in ("alpha_breaks", "stretch_range"):
             object.__setattr__(self, name, tuple(float(v) for v in getattr(self, name)))
         object.__setattr__(
@@ -144,7 +144,7 @@ class KernelTable:
                 raise KernelTableError(f"{name}: got sigma <= 0 um within {first:g}...{last:g}")
 
     def unlimited_alpha(self, r: Float64Array) -> Float64Array:
-        """Return the lines of alpha at stretch ratios r, not held within `ALPHA_LIMITS`."""
+        """Return the lines of alpha at stretch ratios r, not clamped to `ALPHA_LIMITS`."""
         line = (
             np.searchsorted(self.alpha_breaks, r) if self.alpha_breaks else np.zeros(r.shape, int)
         )
@@ -162,11 +162,11 @@ class KernelTable:
         below = self.sigma_compression_um or self.sigma_stretch_um
         above = self.sigma_stretch_um or self.sigma_compression_um
         if below is None or above is None:
-            raise KernelTableError("table: got no line for sigma")
+            raise KernelTableError("table: got no line for sigma, expected at least one side")
         return below, above
 
     def inside(self, stretch: ArrayLike) -> BoolArray:
-        """Return whether each stretch ratio lies in the fitted range."""
+        """Return whether each stretch ratio is in the fitted range."""
         r = np.asarray(stretch, np.float64)
         return (r >= self.stretch_range[0]) & (r <= self.stretch_range[1])
 
@@ -177,12 +177,12 @@ class KernelTable:
 
     @classmethod
     def from_json(cls, text: str) -> KernelTable:
-        """Read what :meth:`to_json` wrote.
+        """Read a table from the JSON text of :meth:`to_json`.
 
         Raises
         ------
         KernelTableError
-            For text that is no table, unknown or missing keys, or a table that contradicts itself.
+            For text that is not a table, unknown or missing keys, or an inconsistent table.
         """
         try:
             given: Any = json.loads(text)
@@ -223,7 +223,7 @@ class KernelPoints:
     Attributes
     ----------
     stretch, alpha, sigma_um : tuple of float
-        One entry a point: ratio along the jaws, strength, standard deviation in um.
+        One entry per point: ratio along the jaws, strength, standard deviation in um.
     """
 
     stretch: tuple[float, ...]
@@ -254,19 +254,19 @@ def kernel_parameters(
     *,
     extrapolate: Literal["hold", "formula", "refuse"] = "hold",
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the kernel that a stretch ratio asks for.
+    """Return the kernel parameters at stretch ratios.
 
     Parameters
     ----------
     stretch : array_like
         Ratios r > 0 of lengths along the axis: above 1 stretched, below 1 compressed.
     table : KernelTable
-        Of the skin in question; the paper's forehead by default (eqs. 8 and 9).
+        Table of the skin; the paper's forehead by default (eqs. 8 and 9).
     extrapolate : {"hold", "formula", "refuse"}
-        What is done beyond the fitted range; ``table.inside(stretch)`` tells which ones are.
-        "hold" gives the values of the nearest end. "formula" goes on along the lines: eq. (9) then
-        has sigma = 0 at and below r = 0.665, which switches sharpening off where skin is most
-        compressed. "refuse" is an error.
+        Treatment outside the fitted range (see ``table.inside(stretch)``). "hold" takes the values
+        of the nearest end. "formula" extends the lines: eq. (9) then has sigma = 0 at and below r =
+        0.665, which switches sharpening off where skin is most compressed. "refuse" raises an
+        error.
 
     Returns
     -------
@@ -297,7 +297,7 @@ def kernel_parameters(
         )
     if extrapolate == "hold":
         r = np.clip(r, low, high)
-    # a table's alpha(1) may be off by a rounding; nothing at all happens to neutral skin
+    # a table's alpha(1) may have a rounding error; neutral skin must not change at all
     alpha = np.where(r == 1.0, 0.0, np.clip(table.unlimited_alpha(r), *ALPHA_LIMITS))
     below, above = table.sigma_lines_um()
     sigma = np.where(r < 1.0, below[0] * r + below[1], above[0] * r + above[1])

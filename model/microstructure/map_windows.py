@@ -1,4 +1,4 @@
-"""Rectangles of a map, which is computed tile by tile."""
+"""Rectangles of a map that is computed tile by tile."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ class MapWindow(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Height and width."""
+        """Return height and width."""
         return self.bottom - self.top, self.right - self.left
 
     @property
     def rows(self) -> slice:
-        """Rows, as an index."""
+        """Return the rows as an index."""
         return slice(self.top, self.bottom)
 
     @property
     def columns(self) -> slice:
-        """Columns, as an index."""
+        """Return the columns as an index."""
         return slice(self.left, self.right)
 
     def expand(self, margin: int, shape: tuple[int, int]) -> MapWindow:
-        """Return the window with a margin, as far as the map goes."""
+        """Return the window with a margin, clipped to the map."""
         return MapWindow(
             max(self.top - margin, 0),
             min(self.bottom + margin, shape[0]),
@@ -38,7 +38,7 @@ class MapWindow(NamedTuple):
         )
 
     def within(self, other: MapWindow) -> MapWindow:
-        """Return the window counted from another's first pixel."""
+        """Return the window relative to another's first pixel."""
         return MapWindow(
             self.top - other.top,
             self.bottom - other.top,

@@ -1,11 +1,11 @@
-"""Strain of a deforming mesh: principal stretch ratios and their axes in the texture.
+"""Compute the strain of a deforming mesh: principal stretch ratios and axes in the texture.
 
-Eqs. (10)-(13) of Nagano et al. 2015. Q takes a triangle's plane to the texture, R is the rotation
-closest to it, T the plane deformation on R's axes; its singular values are the stretch ratios
-r_s >= r_t, and S = Q R^T V has the principal axes in texture coordinates, with the length that a
-millimetre of neutral skin along them has there.
+Eqs. (10)-(13) of Nagano et al. 2015. Q maps a triangle's plane to the texture, R is the rotation
+closest to it, T the plane deformation on R's axes; its singular values are the stretch ratios r_s
+>= r_t, and S = Q R^T V has the principal axes in texture coordinates, with the length that a
+millimeter of neutral skin along them has there.
 
-What is fixed here:
+Conventions:
 
 - T is taken as the right stretch tensor sqrt(F^T F): the paper's up to the rotation of the deformed
   triangle's frame, on which neither ratios nor axes depend, and which could only make averages
@@ -18,7 +18,8 @@ What is fixed here:
   has Q of its own island. Lips that touch and then part do not.
 - Where triangles around a vertex have their texture on opposite sides, the side with more area
   counts for Q.
-- Triangles without area in space are left out; those without area in the texture say nothing of Q.
+- Triangles without area in space are left out; those without area in the texture do not contribute
+  to Q.
 
 References
 ----------
@@ -36,7 +37,7 @@ from model.microstructure import strain_kernels as kernels
 
 
 class StrainError(ValueError):
-    """Meshes that cannot be compared."""
+    """Error for meshes that cannot be compared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +49,7 @@ class MeshStrain:
     r_s, r_t : ndarray of float64, shape (V,)
         Stretch ratios, r_s >= r_t >= 0; 1 where not `valid`.
     axis_s, axis_t : ndarray of float64, shape (V, 2)
-        Unit vectors (u, v) of the principal axes in the texture; the sign means nothing; 0 where
+        Unit vectors (u, v) of the principal axes in the texture; the sign is irrelevant; 0 where
         not `valid`. They are perpendicular on the skin, and in a texture that keeps angles.
     uv_per_mm_s, uv_per_mm_t : ndarray of float64, shape (V,)
         Texture units that one unit of length (mm) of neutral skin has along them.
@@ -64,11 +65,12 @@ class MeshStrain:
     point_index : ndarray of int64, shape (V,)
         Vertices of the same number are one point of the skin.
     degenerate_share : float
-        Of the triangles: without area in space.
+        Fraction of the triangles without area in space.
     uv_degenerate_share : float
-        Of the triangles: with an area in space, but none in the texture.
+        Fraction of the triangles with an area in space, but none in the texture.
     uv_turned_share : float
-        Of the triangles: on the texture's other side than most around one of their vertices.
+        Fraction of the triangles on the texture's other side than most around one of their
+        vertices.
     """
 
     r_s: Float64Array
@@ -98,7 +100,7 @@ def index_points(*positions: Float64Array) -> Int64Array:
     Parameters
     ----------
     *positions : ndarray, shape (V, N)
-        Compared to the bit, but for the sign of zero.
+        Compared bit by bit, except for the sign of zero.
 
     Examples
     --------

@@ -1,9 +1,9 @@
-"""Length of the skin's surface along a profile, stretched and compressed (Nagano2015, fig. 4).
+"""Surface length of a skin profile under stretch and compression (Nagano2015, fig. 4).
 
-Skin keeps a reserve of surface in its relief. A profile that is stretched or compressed without a
-change of its heights becomes longer or shorter along its surface, which would strain the skin;
-smoothing it under stretch and sharpening it under compression keeps the length. This module
-measures lengths, and finds how strong a kernel must be to keep one.
+The surface topography of skin is a reserve of length. A profile that is stretched or compressed
+with unchanged heights becomes longer or shorter along its surface, which would strain the skin;
+smoothing it under stretch and sharpening it under compression preserves the length. This module
+measures lengths and finds the strength of a length-preserving kernel.
 
 The kernel is that of eq. (6), ``(1 - alpha) delta + alpha G(sigma)``, convolved before the profile
 is stretched, with sigma on the neutral profile as everywhere in `model.microstructure`. Beyond the
@@ -28,11 +28,11 @@ from model.checks import Checks
 from model.microstructure.kernel_table import ALPHA_LIMITS, gaussian_weights
 
 MAX_ALPHA = 1e3
-"""Strengths beyond this are not sought: the profile has nothing at sigma's scale to sharpen."""
+"""Limit of the search for a strength: beyond it the profile has no detail at sigma's scale."""
 
 
 class SurfaceProfileError(ValueError):
-    """A profile, a stretch or a kernel that no length can be told of."""
+    """Error for a profile, a stretch or a kernel for which no length is defined."""
 
 
 def surface_length(height_um: ArrayLike, *, spacing_um: float) -> Float64Array:
@@ -52,7 +52,7 @@ def surface_length(height_um: ArrayLike, *, spacing_um: float) -> Float64Array:
 
     Raises
     ------
-    ProfileError
+    SurfaceProfileError
 
     Examples
     --------
@@ -88,7 +88,7 @@ def convolve_profile(
 
     Raises
     ------
-    ProfileError
+    SurfaceProfileError
         For heights, a strength or lengths that are not finite, or lengths that are not above 0.
     """
     height = _heights(height_um, spacing_um)
@@ -97,7 +97,7 @@ def convolve_profile(
 
 
 def _unit_change(height: Float64Array, sigma_um: float, spacing_um: float) -> Float64Array:
-    """Return the blurred profile less itself: what one of alpha adds."""
+    """Return the blurred profile less the profile: its change per unit of alpha."""
     Checks(SurfaceProfileError).within("sigma_um", sigma_um, "(0, inf)")
     half = gaussian_weights(sigma_um / spacing_um)
     weights = np.concatenate([half[:0:-1], half])
@@ -113,7 +113,7 @@ class LengthChange:
     neutral_um: float
     """Length of the neutral surface, um."""
     unchanged_um: float
-    """Length when the profile is stretched and its heights stay as they are, um."""
+    """Length when the profile is stretched with unchanged heights, um."""
     convolved_um: float
     """Length when it is convolved with the kernel and stretched, um."""
     alpha: float
@@ -123,19 +123,19 @@ class LengthChange:
 
     @property
     def unchanged_ratio(self) -> float:
-        """Length with unchanged heights over the neutral one."""
+        """Return the length with unchanged heights over the neutral one."""
         return self.unchanged_um / self.neutral_um
 
     @property
     def convolved_ratio(self) -> float:
-        """Length with the kernel over the neutral one; 1 where it keeps the length."""
+        """Return the length with the kernel over the neutral one; 1 where it is preserved."""
         return self.convolved_um / self.neutral_um
 
 
 def length_change(
     height_um: ArrayLike, *, spacing_um: float, stretch: float, alpha: float, sigma_um: float
 ) -> LengthChange:
-    """Return what a stretch and a kernel do to the length of a profile's surface.
+    """Return the surface lengths of a profile before and after a stretch, with and without kernel.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def length_change(
 
     Raises
     ------
-    ProfileError
+    SurfaceProfileError
 
     Examples
     --------
@@ -187,7 +187,7 @@ class LengthPreservingKernel:
     """The kernel that keeps a profile's length; see :func:`find_length_preserving_kernel`."""
 
     change: LengthChange
-    """What that kernel, or the nearest one, does."""
+    """Lengths with that kernel, or the nearest one."""
     is_preserved: bool
     """Whether the length is the neutral one."""
     within_limits: bool
@@ -212,14 +212,13 @@ def find_length_preserving_kernel(
 
     Returns
     -------
-    KeptLength
-        Not ``kept`` when stretch uses up what relief the kernel can smooth away, or when a
-        compressed profile has nothing that it could sharpen: then with the strength that comes
-        nearest.
+    LengthPreservingKernel
+        Not ``is_preserved`` when smoothing cannot make up for the stretch, or when a compressed
+        profile has no detail to sharpen: then with the nearest strength.
 
     Raises
     ------
-    ProfileError
+    SurfaceProfileError
 
     Notes
     -----
@@ -231,7 +230,7 @@ def find_length_preserving_kernel(
     --------
     >>> wave = 60.0 * np.sin(np.arange(600) / 10.0)
     >>> found = find_length_preserving_kernel(wave, spacing_um=5.0, stretch=1.05, sigma_um=30.0)
-    >>> found.kept, round(found.change.alpha, 2), round(found.change.convolved_ratio, 6)
+    >>> found.is_preserved, round(found.change.alpha, 2), round(found.change.convolved_ratio, 6)
     (True, 0.44, 1.0)
     """
     height = _profile(height_um, spacing_um, stretch)
@@ -247,7 +246,8 @@ def find_length_preserving_kernel(
         c = a + alpha * b
         return float((c * b / np.hypot(c, run)).sum())
 
-    # Blurring lowers slopes, so the length falls at alpha = 0 unless there is nothing to blur.
+    # Blurring lowers slopes, so the length decreases with alpha at 0 unless the profile is
+    # straight.
     alpha = 0.0
     if abs(excess(0.0)) > 1e-12 * neutral and slope(0.0) < 0:
         if excess(0.0) < 0:
@@ -266,7 +266,7 @@ def find_length_preserving_kernel(
 
 
 def _find_sign_change(function: Callable[[float], float], last: float) -> float:
-    """Return where a function changes its sign between 0 and ``last``; ``last`` if nowhere."""
+    """Return the argument of a sign change between 0 and ``last``; ``last`` if there is none."""
     if function(0.0) * function(last) > 0:
         return last
     return float(brentq(function, 0.0, last, xtol=1e-14, rtol=1e-13))

@@ -1,7 +1,7 @@
-"""Strain of a mesh as fields of its texture, and the kernels they ask for at each pixel.
+"""Rasterize the strain of a mesh into its texture, and look up the kernels of each pixel.
 
 T is interpolated between vertices and decomposed at each pixel (Nagano2015, eq. 11), and so is the
-texture's scale. Pixel (0, 0)'s centre is (0, 0) and row 0 is the top: u = (x + 1/2) / W,
+texture's scale. Pixel (0, 0)'s center is (0, 0) and row 0 is the top: u = (x + 1/2) / W,
 v = 1 - (y + 1/2) / H.
 """
 
@@ -21,7 +21,7 @@ from model.microstructure.map_windows import MapWindow
 from model.microstructure.mesh_strain import MeshStrain, StrainError
 
 PAD_PX = 4
-"""Pixels around islands that carry on their values, for samples between pixels."""
+"""Width of the padding around islands, px, for interpolation between pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,13 +31,13 @@ class TextureStrain:
     Attributes
     ----------
     stretch : ndarray of float32, shape (h, w, 2)
-        r_s and r_t; 1 where nothing is known.
+        r_s and r_t; 1 where unknown.
     axes : ndarray of float32, shape (h, w, 2, 2)
-        Unit vectors (x right, y down) of s and t, px; 0 where nothing is known.
+        Unit vectors (x right, y down) of s and t, px; 0 where unknown.
     px_per_mm : ndarray of float32, shape (h, w, 2)
-        Pixels that a millimetre of neutral skin has along s and t.
+        Pixels per millimeter of neutral skin along s and t.
     covered, padded : ndarray of bool, shape (h, w)
-        Centres that lie in a triangle, and those nearby that carry on its values.
+        Pixels with their center in a triangle, and padding pixels that repeat nearby values.
     """
 
     stretch: Float32Array
@@ -66,9 +66,9 @@ def rasterize(
     size : (int, int)
         Height and width of the whole texture, px.
     window : Window, optional
-        The whole texture by default. A pixel is the same, to the bit, in every window.
+        The whole texture by default. Pixels are bit-identical in every window.
     pad_px : int
-        Pixels by which islands are carried on.
+        Pixels by which islands are extended.
 
     Raises
     ------
@@ -110,23 +110,22 @@ def rasterize(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KernelRegions:
-    """Which kind of skin is where on a texture.
+    """Kinds of skin over a texture.
 
     Attributes
     ----------
     tables : tuple of KernelTable
         One for each kind.
     weights : ndarray, shape (N, h, w)
-        How much of each kind there is, >= 0, on the whole texture at any resolution, row 0 on top;
-        between pixels they are bilinear. They are divided by their sum; where it is 0, the first
-        kind is.
+        Weight of each kind, >= 0, over the whole texture at any resolution, row 0 on top; bilinear
+        between pixels. Weights are divided by their sum; where it is 0, the first kind counts.
     """
 
     tables: tuple[KernelTable, ...]
     weights: FloatArray
 
     def __post_init__(self) -> None:
-        """Refuse weights that do not fit the tables."""
+        """Raise for weights that do not fit the tables."""
         object.__setattr__(self, "tables", tuple(self.tables))
         count = len(self.tables)
         Checks(StrainError).within("tables", count, "[1, inf)")
@@ -134,7 +133,7 @@ class KernelRegions:
         Checks(StrainError).within("weights", self.weights, "[0, inf)")
 
     def weights_at(self, u: FloatArray, v: FloatArray) -> Float32Array:
-        """Return shares at rows of v and columns of u, shape (N, len(v), len(u))."""
+        """Return weights at rows of v and columns of u, shape (N, len(v), len(u))."""
         _, height, width = self.weights.shape
         y0, y1, fy = _between((1.0 - np.asarray(v)) * height - 0.5, height)
         x0, x1, fx = _between(np.asarray(u) * width - 0.5, width)
@@ -146,7 +145,7 @@ class KernelRegions:
         return np.asarray(found / np.where(total > 0.0, total, 1.0), np.float32)
 
     def table_at(self, uv: FloatArray) -> NDArray[np.intp]:
-        """Return the number of the table with the largest share at points, shape (V, 2)."""
+        """Return the number of the table with the largest weight at points, shape (V, 2)."""
         _, height, width = self.weights.shape
         y = np.clip(np.rint((1.0 - uv[:, 1]) * height - 0.5), 0, height - 1).astype(np.intp)
         x = np.clip(np.rint(uv[:, 0] * width - 0.5), 0, width - 1).astype(np.intp)
@@ -154,7 +153,7 @@ class KernelRegions:
 
 
 def _between(at: FloatArray, count: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Float32Array]:
-    """Return the pixels before and after places, and how far between them they are."""
+    """Return the pixels before and after positions, and the fractions between them."""
     held = np.clip(at, 0.0, count - 1.0)
     first = np.minimum(np.floor(held).astype(np.intp), max(count - 2, 0))
     return first, np.minimum(first + 1, count - 1), np.asarray(held - first, np.float32)
@@ -168,7 +167,7 @@ def regional_kernels(
     window: MapWindow | None = None,
     extrapolate: Literal["hold", "formula"] = "hold",
 ) -> tuple[LineKernels, LineKernels]:
-    """Return the kernels of both passes, alpha and sigma blended by how much of each kind is there.
+    """Return the kernels of both passes, alpha and sigma blended by the weight of each kind.
 
     Parameters
     ----------
@@ -205,20 +204,20 @@ def line_kernels(
     *,
     extrapolate: Literal["hold", "formula"] = "hold",
 ) -> tuple[LineKernels, LineKernels]:
-    """Return the kernels of both passes that a strain asks for at each pixel.
+    """Return the kernels of both passes for the strain at each pixel.
 
     Parameters
     ----------
     strain : TextureStrain
     table : KernelTable
-        Of the skin in question.
+        Table of the skin.
     extrapolate : {"hold", "formula"}
         As of `model.microstructure.kernel_parameters`.
 
     Returns
     -------
     LineKernels, LineKernels
-        Along s and along t; alpha is 0 where nothing is known.
+        Along s and along t; alpha is 0 where unknown.
     """
     Checks().choice("extrapolate", extrapolate, ("hold", "formula"))
     shape = strain.covered.shape

@@ -1,4 +1,4 @@
-"""Inner loops of the strain of a mesh: at its vertices, and filled into a texture.
+"""Inner loops of the strain of a mesh: per triangle and at its vertices.
 
 Symmetric 2 x 2 tensors are three numbers (11, 12, 22).
 """
@@ -11,11 +11,11 @@ import numpy as np
 from numba import njit
 
 MIN_HEIGHT_RATIO = 1e-6
-"""A triangle lower than this part of its longest edge is degenerate; so is one in the texture."""
+"""A triangle is degenerate if its height is below this fraction of its longest edge."""
 ISOTROPY_TOL = 1e-6
 """Relative difference of the two stretch ratios below which no axis is preferred."""
 FINE, DEGENERATE, NO_TEXTURE, TURNED = range(4)
-"""What triangles are: usable, without area, without area in the texture, against their own."""
+"""Kinds of triangles: usable, without area, without area in the texture, mirrored."""
 
 
 @njit(inline="always")
@@ -37,13 +37,13 @@ def _edge(points, i, j):
 def principal_values(p, q, r):
     """Return mean and half the difference of the eigenvalues of (p, q, r), and the larger's axis.
 
-    The axis is the first one where there is no difference.
+    The axis is the first one where both are equal.
     """
     mean, d = 0.5 * (p + r), 0.5 * (p - r)
     h = math.hypot(d, q)
     if h == 0.0:
         return mean, h, 1.0, 0.0
-    # half of the angle atan2(q, d), by the root that does not cancel
+    # half of the angle atan2(q, d), by the root without cancellation
     if d >= 0.0:
         c = math.sqrt(0.5 * (1.0 + d / h))
         return mean, h, c, 0.5 * q / (h * c)
@@ -53,7 +53,7 @@ def principal_values(p, q, r):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def triangle_strain(rest, moved, faces, uv):
-    """Return what each triangle does, in its own plane.
+    """Return the strain of each triangle in its own plane.
 
     Parameters
     ----------
@@ -69,8 +69,8 @@ def triangle_strain(rest, moved, faces, uv):
     area : (F,) float64
         Twice the rest area.
     change : (F, 3) float64
-        Right stretch tensor less 1, ``sqrt(F^T F) - 1``, on these axes: 0 to the bit where no
-        edge changes.
+        Right stretch tensor less 1, ``sqrt(F^T F) - 1``, on these axes: exactly 0 where no edge
+        changes.
     to_uv : (F, 2, 2) float64
         From these axes to the texture (Q of eq. 13's text, on the plane).
     """
@@ -139,7 +139,7 @@ def triangle_strain(rest, moved, faces, uv):
 
 @njit(inline="always")
 def _rotate_axes(basis, normal):
-    """Return a triangle's axes turned by the shortest way into the plane across `normal`."""
+    """Return a triangle's axes after the smallest rotation into the plane across `normal`."""
     n = (basis[2, 0], basis[2, 1], basis[2, 2])
     c = _dot(n, normal)
     sign = 1.0 if c >= 0.0 else -1.0
@@ -154,13 +154,13 @@ def _rotate_axes(basis, normal):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def vertex_strain(faces, point_index, places, kind, basis, area, change, to_uv):
-    """Average triangles at vertices, weighed by their rest areas.
+    """Average triangles at vertices, weighted by their rest areas.
 
     Parameters
     ----------
     faces : (F, 3) int64
     point_index : (V,) int64
-        Which vertices are one on the skin: equal numbers below ``places``.
+        Point of the skin of each vertex: numbers below ``places``.
     places : int
     kind, basis, area, change, to_uv
         Of `triangle_strain`; triangles that oppose a vertex's texture become `TURNED`.
@@ -192,7 +192,7 @@ def vertex_strain(faces, point_index, places, kind, basis, area, change, to_uv):
         if widest[w] < 0:
             continue
         length = math.sqrt(_dot(normal[w], normal[w]))
-        if length <= 1e-6 * area[widest[w]]:  # triangles that face all ways
+        if length <= 1e-6 * area[widest[w]]:  # normals that cancel
             normal[w] = basis[widest[w], 2]
         else:
             for m in range(3):
@@ -202,7 +202,7 @@ def vertex_strain(faces, point_index, places, kind, basis, area, change, to_uv):
             axes[w, 0, m], axes[w, 1, m] = first[m], second[m]
     tensor_at = np.zeros((places, 3))
     weight = np.zeros(places)
-    # textures seen from both sides apart: what is folded there would cancel
+    # the two orientations of the texture separately: a fold would cancel in one sum
     both = np.zeros((count, 2, 2, 2))
     share = np.zeros((count, 2))
     for f in range(faces.shape[0]):
@@ -259,7 +259,7 @@ def vertex_strain(faces, point_index, places, kind, basis, area, change, to_uv):
             continue
         t = tensor_at[w] / weight[w]
         m = both[vertex, side] / share[vertex, side]
-        # m = metric turn: the turn closest to m, a mirror image where the texture is one
+        # polar decomposition m = metric rotation; the rotation is a reflection where m mirrors
         if side == 0:
             c, s = m[0, 0] + m[1, 1], m[1, 0] - m[0, 1]
         else:
@@ -274,7 +274,7 @@ def vertex_strain(faces, point_index, places, kind, basis, area, change, to_uv):
         tensor[vertex, 0] = o00 * o00 * t[0] + 2.0 * o00 * o01 * t[1] + o01 * o01 * t[2]
         tensor[vertex, 1] = o00 * o10 * t[0] + (o00 * o11 + o01 * o10) * t[1] + o01 * o11 * t[2]
         tensor[vertex, 2] = o10 * o10 * t[0] + 2.0 * o10 * o11 * t[1] + o11 * o11 * t[2]
-        # ratios from what the vertices of one place share, for the same ones to the bit
+        # from the shared tensor, so that vertices of one point have bit-identical ratios
         mean, h, ax, ay = principal_values(t[0], t[1], t[2])
         stretch[vertex, 0] = max(1.0 + mean + h, 0.0)
         stretch[vertex, 1] = max(1.0 + mean - h, 0.0)

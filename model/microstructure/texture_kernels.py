@@ -1,4 +1,4 @@
-"""Strain of vertices drawn into a texture, compiled."""
+"""Rasterize the strain of vertices into a texture, compiled."""
 
 # mypy: allow-untyped-defs
 
@@ -10,16 +10,16 @@ from numba import njit, prange
 from model.microstructure.strain_kernels import ISOTROPY_TOL, principal_values
 
 BAND_ROWS = 32
-"""Rows of the texture filled by one thread at a time."""
+"""Rows of the texture per thread at a time."""
 
 EMPTY, COVERED, PADDED = range(3)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def fill_texture(faces, places, values, valid, window, size, found):
-    """Fill a window of a texture: tensors between vertices, their principal axes at each pixel.
+    """Fill a window of a texture: interpolate tensors and decompose them at each pixel.
 
-    The triangle of the lowest number has a pixel that several hold. What a pixel becomes does
+    A pixel in several triangles belongs to the one of the lowest number. The result at a pixel does
     not depend on the window.
 
     Parameters
@@ -76,7 +76,7 @@ def fill_texture(faces, places, values, valid, window, size, found):
                         b = min(b, -at / slope)
                     elif at < -1e-9:
                         b = -np.inf
-                # pixels on an edge belong to both sides: the first triangle has them
+                # pixels on an edge are in both triangles: the first one keeps them
                 begin = max(math.ceil(a + x[i] - 1e-6), left) if b >= a - 2e-6 else left
                 end = min(math.floor(b + x[i] + 1e-6), left + columns - 1) if b >= a - 2e-6 else -1
                 for column in range(begin, end + 1):
@@ -115,14 +115,14 @@ def fill_texture(faces, places, values, valid, window, size, found):
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def pad_once(state, before, stretch, axes, scale):
-    """Give empty pixels the values of a neighbour that had some; `before` is a copy of `state`."""
+    """Copy values of a filled neighbor to empty pixels; `before` is a copy of `state`."""
     rows, columns = state.shape
     for r in prange(rows):
         for c in range(columns):
             if before[r, c] != EMPTY:
                 continue
             found = False
-            for straight in (True, False):  # sides before corners, then in order
+            for straight in (True, False):  # edge neighbors before corner neighbors
                 for dr in range(-1, 2):
                     for dc in range(-1, 2):
                         y, x = r + dr, c + dc
@@ -153,7 +153,7 @@ def look_up_kernels(
     sigma_lines : (2, 2) float64
         Of sigma, in the length of `scale`, below and above a ratio of 1.
     ends, limits : (2,) float64
-        Ratios are held within the first, alpha within the second.
+        Ratios are clamped to the first, alpha to the second.
     alpha, sigma : (2, m, n) float32, written
     """
     for r in prange(state.shape[0]):

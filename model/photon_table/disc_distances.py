@@ -1,8 +1,8 @@
-"""How far apart two points of two round fibre ends are: averages over finite cores.
+"""Average radial profiles over two fiber cores by the distribution of point distances.
 
-A detector's reading is the reflectance profile averaged over all pairs of a point of the source's
-core and one of the detector's. The average over four coordinates needs only the distribution of
-the distance; a few Gauss nodes of that distribution give it for a whole family of profiles.
+A detector measures the reflectance profile averaged over all pairs of a point of the source's core
+and one of the detector's. This average over four coordinates depends only on the distribution of
+the pairs' distance; a few Gauss nodes of that distribution serve a whole family of profiles.
 """
 
 from functools import lru_cache
@@ -12,8 +12,8 @@ import numpy as np
 from model.arrays import Float64Array, Int64Array
 from model.checks import Checks
 
-_MIN_CORE_RATIO = 1e-6  # cores below this part of the largest length are points
-# centre distances over the sum of core radii at which fewer nodes do
+_MIN_CORE_RATIO = 1e-6  # cores below this fraction of the largest length are points
+# center distances over the sum of core radii from which fewer nodes suffice
 _NEAR_RATIO, _FAR_RATIO = 3.0, 10.0
 _NODE_COUNTS = (8, 5, 3)  # relative error below 1e-5 for the profiles of tissue: see the tests
 _RINGS, _ANGLES = 48, 96
@@ -28,15 +28,15 @@ def distance_rule(
     Parameters
     ----------
     radius_mm
-        Distance of the cores' centres in mm, >= 0.
+        Distance of the cores' centers in mm, >= 0.
     core_mm, source_core_mm
         Diameters of the two cores in mm, >= 0; 0 is a point.
 
     Returns
     -------
     distances_mm, weights : ndarray
-        At most 8 nodes in mm and their weights, which add up to 1. Exact for polynomials of the
-        distance over the distance, so that profiles like 1/r near 0 are averaged well.
+        At most 8 nodes in mm and their weights, of sum 1. Exact for polynomials of the distance
+        divided by the distance, so that profiles like 1/r near 0 are averaged accurately.
 
     Examples
     --------
@@ -49,14 +49,13 @@ def distance_rule(
     Checks().broadcast_together(
         "[0, inf)", radius_mm=radius_mm, core_mm=core_mm, source_core_mm=source_core_mm
     )
-    # squares of lengths in a unit near the largest neither vanish nor overflow; by a power of two
-    # no digit changes
+    # scaled to the largest length, squares neither underflow nor overflow; a power of two is exact
     exponent = int(np.frexp(max(radius_mm, core_mm, source_core_mm))[1])
     radius, core, source = (
         float(np.ldexp(length, -exponent)) for length in (radius_mm, core_mm, source_core_mm)
     )
     a, b = 0.5 * core, 0.5 * source
-    # its share of a squared distance, 1e-12, is lost in the recurrence of the Gauss rule
+    # its part of a squared distance, 1e-12, is lost in the recurrence of the Gauss rule
     least = _MIN_CORE_RATIO * max(radius, a, b)
     a, b = (0.0 if half < least else half for half in (a, b))
     reach = a + b
@@ -75,20 +74,19 @@ def distance_rule(
 def distance_rules(
     radii_mm: Float64Array, core_mm: float, source_core_mm: float
 ) -> tuple[Int64Array, Float64Array, Float64Array]:
-    """Return the rules of several radii after one another, as compiled loops take them.
+    """Return the rules of several radii concatenated, for compiled loops.
 
     Parameters
     ----------
     radii_mm
-        Distances of the cores' centres in mm, shape (n,), > 0 where both cores are points.
+        Distances of the cores' centers in mm, shape (n,), > 0 where both cores are points.
     core_mm, source_core_mm
         Diameters of the two cores in mm, >= 0.
 
     Returns
     -------
     starts, log_distances, weights : ndarray
-        Radius k has the nodes from starts[k], shape (n + 1,), up to starts[k + 1]; natural
-        logarithms of mm.
+        Radius k has the nodes starts[k] to starts[k + 1], shape (n + 1,); natural logarithms of mm.
 
     Raises
     ------
@@ -121,7 +119,8 @@ def _offsets(a: float, b: float) -> tuple[Float64Array, Float64Array]:
         s = large * node
         return s, 2.0 * s / large * weight
     inner, outer = large - small, large + small
-    # The lens that two discs share ends in roots at both ends of (inner, outer): s by a cosine.
+    # The lens of two discs has square-root ends at inner and outer: a cosine substitution for s
+    # makes it smooth.
     bend = 0.5 * (1.0 - np.cos(np.pi * node))
     s = np.concatenate([inner * node, inner + (outer - inner) * bend])
     ds = np.concatenate(
@@ -133,13 +132,12 @@ def _offsets(a: float, b: float) -> tuple[Float64Array, Float64Array]:
 
 
 def _shared_area(s: Float64Array, small: float, large: float) -> Float64Array:
-    """Return the area that two discs share whose centres are `s` apart."""
+    """Return the area of overlap of two discs whose centers are `s` apart."""
     square = (small + large - s) * (s + small - large) * (s - small + large) * (s + small + large)
     kite = np.sqrt(np.maximum(square, 0.0))
     first = np.arctan2(kite, s**2 + small**2 - large**2)
     second = np.arctan2(kite, s**2 + large**2 - small**2)
-    # the large disc's segment, in terms that are small where the other disc is: a sector less a
-    # triangle would leave nothing of their digits
+    # the large disc's segment in small terms: sector less triangle would cancel all digits
     sine = np.sin(second)
     return np.asarray(
         small**2 * (first - np.sin(first) * np.cos(first))

@@ -1,4 +1,4 @@
-"""The compiled evaluation of the photon table (see `model.photon_table`)."""
+"""Evaluate the photon table, compiled (see `model.photon_table`)."""
 
 # mypy: allow-untyped-defs
 
@@ -9,7 +9,7 @@ from numba import njit, types
 RADIUS_START, RADIUS_STEP, RADIUS_COUNT = log(0.005), 0.25, 41
 """Cubic B-splines over ln(r sigma_s'): first knot, distance of knots, coefficients."""
 ROOT_SCALE, ROOT_STEP, ROOT_COUNT = 0.1, log(41.0) / 24.0, 27
-"""The same over ln(1 + u/0.1) with u = sqrt(sigma_a/sigma_s') in [0, 4]."""
+"""Likewise over ln(1 + u/0.1) with u = sqrt(sigma_a/sigma_s') in [0, 4]."""
 ROOT_END = 4.0
 _READ_1, _READ_2 = (types.Array(types.float64, n, "C", readonly=True) for n in (1, 2))
 _COEFFICIENT_TYPES = (_READ_1, _READ_1, _READ_2, _READ_1)
@@ -17,8 +17,8 @@ _RULE_TYPES = (
     *(types.Array(types.int64, n, "C", readonly=True) for n in (2, 1)),
     *(_READ_1, _READ_1),
 )
-_MAX_ROOT = 1e6  # exp(-u^2) is 0 long before, and u^4 still a number
-_ROOT_FLOOR = 1e-6  # slopes by sigma_a at 0 are limits; here they are reached to 1e-12
+_MAX_ROOT = 1e6  # upper clamp of u: exp(-u^2) has underflowed, u^4 is still finite
+_ROOT_FLOOR = 1e-6  # lower clamp of u: slopes by sigma_a at 0 are limits, reached here to 1e-12
 
 
 @njit(inline="always")
@@ -47,18 +47,18 @@ def _basis(t):
 def evaluate(
     sigma_a, sigma_s_prime, coefficients, decay, groups, starts, log_distance, weight, out
 ):
-    """Evaluate profiles and their slopes by both coefficients.
+    """Evaluate profiles and their derivatives by both coefficients.
 
     Parameters
     ----------
     sigma_a, sigma_s_prime
         1/mm, shape (N,); sigma_s_prime > 0.
     coefficients
-        Of ln of the reduced reflectance, shape (RADIUS_COUNT, ROOT_COUNT).
+        Splines of ln of the reduced reflectance, shape (RADIUS_COUNT, ROOT_COUNT).
     decay
         B-spline coefficients of kappa/u, shape (ROOT_COUNT,).
     groups
-        Which radius each column of a row has, shape (1, F) for all rows alike or (N, F).
+        Index of each column's radius, shape (1, F) for all rows or (N, F).
     starts, log_distance, weight
         Radius k is averaged over the distances starts[k] to starts[k + 1]: logarithms of mm, and
         weights.
@@ -86,10 +86,10 @@ def evaluate(
         k = b0 * decay[j] + b1 * decay[j + 1] + b2 * decay[j + 2] + b3 * decay[j + 3]
         k_slope = c0 * decay[j] + c1 * decay[j + 1] + c2 * decay[j + 2] + c3 * decay[j + 3]
         kappa = u_in * k
-        if inside:  # slopes by sigma_a/sigma_s' = u^2
+        if inside:  # derivatives by sigma_a/sigma_s' = u^2
             kappa_kappa_slope = kappa * (k + u * k_slope * place_slope) / (2.0 * u)
             root_slope = place_slope / (2.0 * u)
-        else:  # all light decays like exp(-sigma_t s), whatever scatters
+        else:  # strong absorption: light decays like exp(-sigma_t s), whatever the scattering
             kappa += u * u - ROOT_END * ROOT_END
             kappa_kappa_slope = kappa
             root_slope = 0.0
@@ -114,9 +114,9 @@ def evaluate(
                 p = (x - RADIUS_START) / RADIUS_STEP
                 rho2 = exp(2.0 * x)
                 beyond = 0.0
-                if p < 0.0:  # light scattered once: 1/r
+                if p < 0.0:  # near the source single scattering dominates: 1/r
                     beyond, p = p, 0.0
-                elif p > row - 3.0:  # far from it the diffusion's law
+                elif p > row - 3.0:  # far from the source: diffusion
                     p = row - 3.0
                     beyond = 1.0
                 i = min(int(p), row - 4)

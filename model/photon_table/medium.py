@@ -1,6 +1,6 @@
-"""One medium of the photon table, interpolated over eta and g, and its light's decay far away.
+"""Interpolate one medium of the photon table over eta and g, with its asymptotic decay.
 
-See `model.photon_table` for what is stored.
+See `model.photon_table` for the stored quantities.
 """
 
 from dataclasses import dataclass
@@ -22,12 +22,12 @@ _LEGENDRE_ORDERS = 600  # Legendre orders for kappa: exact to rounding up to g =
 
 
 class TableDomainError(ValueError):
-    """A medium or a collection that the table does not hold."""
+    """Error for a medium or a collection that is not in the table."""
 
 
 @dataclass(frozen=True, slots=True)
 class Medium:
-    """One (eta, g, collection) of the table, ready for `model.photon_table.kernels.evaluate`."""
+    """One (eta, g, collection) of the table, for `model.photon_table.kernels.evaluate`."""
 
     coefficients: Float64Array
     """B-spline coefficients of ln of the reduced reflectance, shape (radii, roots)."""
@@ -38,7 +38,7 @@ class Medium:
 
 
 def stored_asymmetries() -> tuple[float, ...]:
-    """Return the values of g that the table holds, increasing; others between are interpolated.
+    """Return the stored values of g, increasing; values between them are interpolated.
 
     Examples
     --------
@@ -55,7 +55,7 @@ def prepare_medium(eta: float, g: float, collection: Collection) -> Medium:
     Raises
     ------
     TableDomainError
-        For an eta, g or collection that the table does not hold.
+        For an eta, g or collection that is not in the table.
     """
     stored = _stored()
     Checks(TableDomainError).choice("collection", collection, ("all", "fibre"))
@@ -84,8 +84,8 @@ def decay_coefficients(g: float) -> Float64Array:
 def asymptotic_decay(absorption_ratio: float, g: float) -> float:
     """Return kappa/sigma_s' of the light far from any source, for sigma_a/sigma_s' > 0.
 
-    The largest eigenvalue 1/kappa of the equations of the Legendre moments of the radiance; it
-    tends to the diffusion's sqrt(3 sigma_a (sigma_a + sigma_s')) for weak absorption.
+    1/kappa is the largest eigenvalue of the equations of the radiance's Legendre moments; for weak
+    absorption kappa tends to the diffusion's sqrt(3 sigma_a (sigma_a + sigma_s')).
 
     References
     ----------
@@ -121,10 +121,10 @@ def asymptotic_decay(absorption_ratio: float, g: float) -> float:
 
 
 def root_spline_matrix() -> Float64Array:
-    """Return what makes B-spline coefficients over the roots from values at the knots and two 0s.
+    """Return the matrix from values at the knots and two 0s to B-spline coefficients.
 
-    The last two rows: no slope at sigma_a = 0 (reflectance is even in the root up to its cube),
-    and one cubic over the last two intervals.
+    Its last two conditions: slope 0 at sigma_a = 0 (reflectance is even in the root up to its
+    cube), and one cubic over the last two intervals (not-a-knot).
     """
     count = kernels.ROOT_COUNT
     matrix = np.zeros((count, count))
@@ -147,7 +147,7 @@ def _lagrange(name: str, nodes: NDArray[np.generic], value: float) -> Float64Arr
     x = nodes.astype(np.float64)
     if not x[0] - 1e-9 <= value <= x[-1] + 1e-9:
         raise TableDomainError(
-            f"{name}: got {value}, expected {x[0]:g} to {x[-1]:g}, which the photon table holds"
+            f"{name}: got {value}, expected {x[0]:g} to {x[-1]:g}, the range of the photon table"
         )
     weight = np.zeros(x.size)
     count = min(4, x.size)

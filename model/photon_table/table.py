@@ -1,15 +1,16 @@
-"""Reflectance around a beam by transport: a white Monte Carlo table of semi-infinite media.
+"""Reflectance around a beam from a white Monte Carlo table of semi-infinite media.
 
-Diffusion fails within a few transport lengths of the source and under strong absorption; this
-table does not. With lengths in units of 1/sigma_s' the profile depends on sigma_a/sigma_s', the
+Unlike diffusion, the table is also valid within a few transport lengths of the source and under
+strong absorption. With lengths in units of 1/sigma_s' the profile depends on sigma_a/sigma_s', the
 asymmetry g of the Henyey-Greenstein phase function and the index of refraction only::
 
     R(r) = sigma_s'^2 Rhat(r sigma_s', sigma_a/sigma_s'; eta, g)
 
 Stored is ln of Rhat over (1 + kappa d)/d^3 exp(-kappa d) with d^2 = (r sigma_s')^2 + 1 and the
-exact asymptotic decay kappa, as a bicubic spline over ln(r sigma_s') and
-ln(1 + 10 sqrt(sigma_a/sigma_s')): smooth, positive, with exact slopes for least squares, and right
-far away. tools/make_photon_table.py makes model/data/photon_table.npz and says how.
+exact asymptotic decay kappa, as a bicubic spline over ln(r sigma_s') and ln(1 + 10
+sqrt(sigma_a/sigma_s')): smooth, positive, with exact derivatives for least squares and the right
+asymptotic decay. tools/make_photon_table.py makes model/data/photon_table.npz and describes the
+method.
 """
 
 from typing import TypedDict, Unpack
@@ -26,7 +27,7 @@ from model.photon_table.disc_distances import distance_rules
 from model.photon_table.medium import Collection, prepare_medium
 
 NUMERICAL_APERTURE = 0.22
-"""Of the source and of the detectors in the collection "fibre", in air."""
+"""Numerical aperture of the source and of the detectors in the collection "fibre", in air."""
 MAX_QUANTITY = 1e50
 """Largest length, mm, and coefficient, 1/mm: their squares and cubes are still finite numbers."""
 MIN_SCATTERING_PER_MM = 1e-100
@@ -37,11 +38,11 @@ MAX_ABSORPTION_RATIO = 10.0
 MIN_REDUCED_RADIUS, MAX_REDUCED_RADIUS = 0.02, 50.0
 """Range of r sigma_s' in the domain."""
 MAX_RELATIVE_ERROR = 0.03
-"""Standard error of the table itself, relative, up to which a point is in the domain."""
+"""Largest relative standard error of the table itself in the domain."""
 
 
 class PhotonTableOptics(TypedDict, total=False):
-    """What `reflectance` and `derivatives` assume of skin and fibers."""
+    """Optical properties of skin and fibers in `reflectance` and `derivatives`."""
 
     eta: float
     g: float
@@ -61,7 +62,7 @@ def reflectance(
     Parameters
     ----------
     radius_mm
-        Distance from the beam, or between the centres of the fibres, mm, 0 to 1e50; at least 1e-50
+        Distance from the beam, or between the centers of the fibers, mm, 0 to 1e50; at least 1e-50
         when both cores are points. Broadcast with the coefficients; fastest with the radii on the
         last axis and coefficients of length 1 there.
     sigma_a_per_mm, sigma_s_prime_per_mm
@@ -69,9 +70,9 @@ def reflectance(
     eta
         Refractive index of the medium over that of its surroundings, 1 to 1.6.
     g
-        Mean cosine of the Henyey-Greenstein phase function, see `asymmetries`.
+        Mean cosine of the Henyey-Greenstein phase function, see `stored_asymmetries`.
     collection
-        "all": a pencil beam at right angles and the light that leaves at any angle, 1/mm^2.
+        "all": a pencil beam at normal incidence and the light that leaves at any angle, 1/mm^2.
         "fibre": source and detector of numerical aperture 0.22, the source's cone evenly filled;
         power within the detector's cone over incident power, area and NA^2, which is the same
         quantity where the light leaves like from a Lambertian surface.
@@ -81,12 +82,12 @@ def reflectance(
     Returns
     -------
     ndarray
-        R in 1/mm^2; 0 where there is no scattering. Outside `is_in_domain` it is an extrapolation.
+        R in 1/mm^2; 0 without scattering. Outside `is_in_domain` it is an extrapolation.
 
     Raises
     ------
     TableDomainError
-        For an eta, g or collection that the table does not hold.
+        For an eta, g or collection that is not in the table.
     ValueError
         For arguments that are negative, not finite or too large, or a radius below 1e-50 between
         points (R is infinite at 0).
@@ -114,7 +115,7 @@ def derivatives(
 ) -> ProfileDerivatives:
     """Return the reflectance and its derivatives by both coefficients.
 
-    Parameters and errors as :func:`reflectance`. The derivatives are those of the spline itself;
+    Parameters and errors as :func:`reflectance`. The derivatives are those of the spline;
     without scattering both are 0.
 
     Examples
@@ -178,8 +179,8 @@ def relative_error(
 ) -> Float64Array:
     """Return the standard error of the table itself over its value, broadcast.
 
-    From the scatter of independent batches of photons; infinite outside the table and where no
-    photons came. The errors of neighbouring radii and absorptions are correlated.
+    Estimated from independent batches of photons; infinite outside the table and where no photons
+    were detected. The errors of neighboring radii and absorptions are correlated.
 
     Examples
     --------
@@ -211,7 +212,7 @@ def is_in_domain(
     g: float = 0.8,
     collection: Collection = "all",
 ) -> BoolArray:
-    """Return where the table holds: r sigma_s', sigma_a/sigma_s' in range and its error <= 3 %.
+    """Return the mask of valid points: r sigma_s', sigma_a/sigma_s' in range and error <= 3 %.
 
     Examples
     --------

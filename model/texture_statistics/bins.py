@@ -1,4 +1,4 @@
-"""Color axes and bin edges that suit a population of textures.
+"""Choose color axes and bin edges for a population of textures.
 
 References
 ----------
@@ -13,19 +13,19 @@ from model.checks import Checks
 from model.texture_statistics.histograms import HISTOGRAM_BINS
 
 OPPONENT_AXES = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 0.0], [1.0, 1.0, -2.0]])
-"""Brightness, red less green, yellow less blue: the axes where colors do not vary."""
+"""Brightness, red less green, yellow less blue: the default axes for colors without variance."""
 OPPONENT_AXES /= np.linalg.norm(OPPONENT_AXES, axis=1, keepdims=True)
 _RANGE_MARGIN = 0.05
 
 
 def principal_axes(covariance: Float64Array, unit: float) -> Float64Array:
-    """Return eigenvectors as rows by falling variance, well defined without variance too.
+    """Return eigenvectors as rows by decreasing variance, unique even without variance.
 
     Parameters
     ----------
     covariance : ndarray, shape (C, C)
     unit : float
-        Largest value of the colors, whose rounding is no variance.
+        Largest value of the colors; variance at the level of its rounding is ignored.
 
     Returns
     -------
@@ -41,22 +41,22 @@ def principal_axes(covariance: Float64Array, unit: float) -> Float64Array:
     Checks().within("colors of covariance", C, "[1, inf)")
     Checks().numbers("covariance", covariance, (C, C))
     preferred = OPPONENT_AXES if C == 3 else np.eye(C)
-    # orders directions without variance; about that of the rounding of float32
+    # orders directions without variance; about float32's rounding variance
     least = 1e-9 * np.trace(covariance) + 1e-13 * unit**2
     ordered = covariance + least * preferred.T @ np.diag(np.arange(C, 0.0, -1.0)) @ preferred
     axes = np.linalg.eigh(ordered)[1].T[::-1]
-    # of equal components the first decides the sign
+    # among equal components the first one decides the sign
     largest = axes[np.arange(C), (np.abs(axes) - 1e-3 * np.arange(C)).argmax(axis=1)]
     return np.ascontiguousarray(axes * np.sign(largest)[:, None])
 
 
 def make_bin_edges(quantiles: ArrayLike, unit: float) -> Float64Array:
-    """Return 257 edges: half of the bins spread evenly, half by how often values occur.
+    """Return 257 edges: half of the bins uniform in value, half uniform in frequency.
 
     Parameters
     ----------
     quantiles : array_like
-        Even quantiles of the values of every image; all count the same.
+        Even quantiles of the values of every image, with equal weights.
     unit : float
         Largest value of the images, above 0; a range far below it is widened.
 
@@ -81,7 +81,7 @@ def make_bin_edges(quantiles: ArrayLike, unit: float) -> Float64Array:
     occurrence = np.concatenate([[0.0], (np.arange(values.size) + 0.5) / values.size, [1.0]])
     share = 0.5 * (at - low) / (high - low) + 0.5 * occurrence
     widths = np.diff(np.interp(np.linspace(0.0, 1.0, HISTOGRAM_BINS + 1), share, at))
-    # a value that occurs very often holds several edges: keep them apart
+    # several edges can coincide at a frequent value: separate them
     least = max(1e-12 * (high - low), 4.0 * float(np.spacing(max(abs(low), abs(high)))))
     widths = np.maximum(widths, least)
     widths *= (high - low) / widths.sum()

@@ -1,9 +1,9 @@
-"""The statistics of a texture as one vector, and textures that have given statistics.
+"""Measure texture statistics as one vector, and match textures to given statistics.
 
 Histograms of an image and of its steerable-pyramid responses, in decorrelated channels, describe a
-stochastic texture; matching them in turn, starting from an image or from noise, makes another
-texture with them. `model.texture_statistics.space` says how the vector is laid out and what a
-population shares.
+stochastic texture; matching them in turn, from an image or noise, makes another texture with the
+same statistics. `model.texture_statistics.space` documents the vector's layout and a population's
+common parameters.
 
 References
 ----------
@@ -30,54 +30,54 @@ from model.texture_statistics.steerable_pyramid import Responses, thread_count
 Weights = tuple[FloatArray, tuple[FloatArray, ...]] | None
 T = TypeVar("T")
 MATCH_TOL = 1e-4
-"""A response no farther from its target, in spreads, is left alone: rounding would only shuffle
-its rare values."""
+"""A response within this distance of its target, in population spans, is unchanged: rounding would
+only reorder its rare values."""
 _MIN_PARALLEL_PIXELS = 128 * 128
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TextureStatistics:
-    """The vector of one texture, and how far to trust it."""
+    """Statistics vector of one texture, and its uncertainty."""
 
     vector: Float64Array
-    """(23808,) for RGB at full depth: shares of 256 bins, histogram after histogram."""
+    """(23808,) for RGB at full depth: fractions of 256 bins, histogram after histogram."""
     clipped: Float64Array
-    """(C, responses): share of samples outside the space's edges, counted in the end bins."""
+    """(C, responses): fraction of samples outside the space's edges, counted in the end bins."""
     n_effective: Float64Array
-    """(C, responses): independent samples at most; neighbors are correlated."""
+    """(C, responses): upper bound of independent samples; neighbors are correlated."""
 
     def stderr(self) -> Float64Array:
-        """Return the least standard error of the vector: binomial, of `n_effective` samples."""
+        """Return a lower bound of the standard error: binomial, of `n_effective` samples."""
         h = self.vector.reshape(*self.n_effective.shape, -1)
         return np.sqrt(h * (1.0 - h) / self.n_effective[..., None]).reshape(-1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedTexture:
-    """What matching made, and how it went."""
+    """Result of matching, and its convergence."""
 
     image: FloatArray
-    """As the image given; texels outside the mask or the region as they were."""
+    """Shape and type of the given image; texels outside the mask or the region are unchanged."""
     distances: Float64Array
-    """(iterations + 1, C, responses): how far the values of each response are from the target's, in
-    spreads of the population (`model.texture_statistics.histograms.histogram_distance`): at the
+    """(iterations + 1, C, responses): distance of each response's histogram from the target's, in
+    spans of the population (`model.texture_statistics.histograms.histogram_distance`): at the
     start, then after each iteration."""
     clipped: Float64Array
-    """(C, responses): share of the result's samples outside the space's edges."""
+    """(C, responses): fraction of the result's samples outside the space's edges."""
 
     @property
     def before(self) -> Float64Array:
-        """(C, responses): distances at the start, with noise added."""
+        """Return (C, responses): distances at the start, with noise added."""
         return self.distances[0]
 
     @property
     def after(self) -> Float64Array:
-        """(C, responses): distances of the result."""
+        """Return (C, responses): distances of the result."""
         return self.distances[-1]
 
 
 class StatisticsSettings(TypedDict, total=False):
-    """What of an image is described, and in which space."""
+    """Region and space of the statistics of an image."""
 
     space: TextureSpace | None
     valid: BoolArray | None
@@ -88,7 +88,7 @@ class StatisticsSettings(TypedDict, total=False):
 def describe(image: ArrayLike, **sampled: Unpack[StatisticsSettings]) -> Float64Array:
     """Return the statistics of a texture as a row vector, (23808,) for RGB.
 
-    The vector of `statistics`, with its parameters.
+    It is the vector of `statistics`; parameters are the same.
 
     Examples
     --------
@@ -116,10 +116,10 @@ def statistics(
     space : TextureSpace or None
         Color space and edges of a population; None: `TextureSpace.standard`, for 0...1.
     valid : ndarray of bool, shape (H, W), or None
-        Texels that are known. The others are continued smoothly before filtering and never
-        counted; responses near them weigh less (`model.texture_statistics.masks.response_weights`).
+        Texels that are known. The others are continued smoothly before filtering and not counted;
+        responses near them have lower weight (`model.texture_statistics.masks.response_weights`).
     region : array_like, shape (H, W), or None
-        Bool, or weights 0...1: where to count (beard, or no beard). Filters reach over its border
+        Bool, or weights 0...1: where to count (beard, or no beard). Filters extend over its border
         to valid texels.
     workers : int or None
         Threads; None: one a core, 4 at most.
@@ -131,7 +131,7 @@ def statistics(
     Raises
     ------
     TextureError
-        For an image, mask or region that fits nothing, an empty mask, valid texels that are not
+        For an image, mask or region of a wrong shape, an empty mask, valid texels that are not
         finite, a region without valid texels.
     """
     colors, mask = check_image(image, valid)
@@ -171,11 +171,11 @@ def match(
     Parameters
     ----------
     image : array_like, shape (H, W) or (H, W, C)
-        The source; with ``start="noise"`` it only says how large, and what stands outside.
+        The source; with ``start="noise"`` it gives only the size and the texels outside the region.
     target : array_like, shape (n,), or an image (H, W[, C])
         A vector of ``space``, or a texture to take it from.
     space : TextureSpace or None
-        None: fitted to a target image (and the source), the standard space for a vector.
+        None: fitted to a target image (and the source), or the standard space for a vector.
     iterations : int
         At least 0; each matches the image, then all responses of its pyramid.
     noise : float
@@ -195,7 +195,7 @@ def match(
     Returns
     -------
     MatchedTexture
-        A texture with the target's statistics already comes back as it is, to rounding.
+        A texture that already has the target's statistics is returned unchanged, to rounding.
 
     Raises
     ------
@@ -216,7 +216,7 @@ def match(
     Checks(TextureError).within("noise", noise, "[0, inf)")
     Checks(TextureError).choice("start", start, ("image", "noise"))
     if (noise > 0.0 or start == "noise") and rng is None:
-        raise TextureError("rng: got None, expected a generator: noise is drawn from it")
+        raise TextureError("rng: got None, expected a generator; give one to draw noise")
     if np.ndim(target) == 1:
         used = TextureSpace.opponent(colors.shape[2]) if space is None else space
         wanted = used.check(target)
@@ -232,7 +232,7 @@ def match(
         )
     _check_channels(colors, used)
     weights = _weights(mask, region, used.levels)
-    # what changes; the other valid texels stay as surroundings of the filters
+    # texels that change; other valid texels are input of the filters only
     blend = (mask if weights is None else weights[0]).astype(colors.dtype)
     channels = used.to_channels(fill_smoothly(colors, mask))
     distances = np.empty((iterations + 1, used.channels, len(used.responses)))
@@ -336,14 +336,14 @@ def _move(
 def _map_in_threads(
     pool: ThreadPoolExecutor, one: Callable[..., T], *items: Iterable[Any], large: bool
 ) -> list[T]:
-    """Do all items: in threads when images are large enough to be worth them."""
+    """Process all items, in threads for large images."""
     return list((pool.map if large else map)(one, *items))
 
 
 def _blend_masked(
     original: FloatArray, new: FloatArray, blend: FloatArray, mask: BoolArray
 ) -> FloatArray:
-    """Keep the original where nothing is to change, and continue the result past the mask."""
+    """Restore the original outside the region, and continue the result past the mask."""
     if mask.all() and blend.min() >= 1.0:
         return new.astype(original.dtype, copy=False)
     mixed = (original + blend * (new - original)).astype(original.dtype, copy=False)

@@ -1,4 +1,4 @@
-"""Loops over the values of one response: counting them in bins, moving them to other ranks."""
+"""Count the values of one response in bins and move them to other ranks, compiled."""
 
 # mypy: allow-untyped-defs
 
@@ -6,24 +6,24 @@ import numpy as np
 from numba import njit
 
 TABLE_CELLS = 16384
-"""Even cells over the edges, in each of which a table bounds the bin."""
+"""Uniform cells over the edges; a table bounds the bins of each cell."""
 FRACTION_TOL = 1e-12
-"""Shares that differ by less are rounding: far below the share of one texel."""
+"""Fractions that differ by less are equal up to rounding: far below the weight of one texel."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def bound_bins(edges, count, scale, min_bin, max_bin):
-    """Bound the bin of all values in each cell.
+    """Compute the range of bins of the values in each cell.
 
     Parameters
     ----------
     edges : (n,) float64
-        Not falling; the first ``count`` count.
+        Non-decreasing; the first ``count`` are used.
     scale : float
         Cells per unit from the first edge on.
     min_bin, max_bin : (TABLE_CELLS,) int, written
-        A value's cell and an edge's are found by the same arithmetic, which keeps their order:
-        edges of cells before are certainly below the value, those of later ones above.
+        Cells of values and of edges are computed by the same arithmetic, which preserves their
+        order: edges in earlier cells are certainly below the value, edges in later cells above it.
     """
     passed = 0
     for cell in range(TABLE_CELLS):
@@ -35,7 +35,7 @@ def bound_bins(edges, count, scale, min_bin, max_bin):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_edge(x, edges, scale, min_bin, max_bin):
-    """Return which edge is the last at or below ``x``; the first if none is.
+    """Return the index of the last edge at or below ``x``; 0 if there is none.
 
     Parameters as of `bound_bins`.
     """
@@ -54,7 +54,7 @@ def find_edge(x, edges, scale, min_bin, max_bin):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count(values, edges, scale, min_bin, max_bin, sums):
-    """Count values in bins; the end bins take what lies beyond.
+    """Count values in bins; the end bins include values beyond the edges.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def count(values, edges, scale, min_bin, max_bin, sums):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count_weighted(values, weights, edges, scale, min_bin, max_bin, sums):
-    """Add the weights of values to their bins; values of weight 0 are no values.
+    """Add the weights of values to their bins; values of weight 0 are ignored.
 
     Parameters as of `count`; ``weights`` is (n,) float. Returns weights below and above, least
     and largest value, sum of squared weights.
@@ -105,15 +105,15 @@ def count_weighted(values, weights, edges, scale, min_bin, max_bin, sums):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def plan_transport(source, target, edges, begin, end, to, slope):
-    """Lay out the rising, piecewise straight map from one distribution to another.
+    """Build the increasing, piecewise linear map from one distribution to another.
 
     Parameters
     ----------
     source, target : (B + 1,) float64
-        Cumulated shares at the edges, from 0 to 1, straight in between.
+        Cumulative fractions at the edges, from 0 to 1, linear in between.
     edges : (B + 1,) float64
     begin, end, to, slope : (2 B + 2,) float64, written
-        Pieces: values from ``begin`` to ``end`` go to ``to`` and on with ``slope``.
+        Pieces: values from ``begin`` to ``end`` map to ``to`` plus ``slope`` times the distance.
 
     Returns
     -------
@@ -129,7 +129,7 @@ def plan_transport(source, target, edges, begin, end, to, slope):
         if target[j + 1] <= rank + FRACTION_TOL:
             j += 1
             continue
-        # ends that differ by rounding are one: else bins left empty would be crossed
+        # ends that differ by rounding are merged, or mass would be moved across empty bins
         until = source[i + 1]
         if target[j + 1] < until - FRACTION_TOL:
             until = target[j + 1]
@@ -156,7 +156,7 @@ def move_values(values, source, target, edges, out):
     ----------
     values : (n,) float
     source, target, edges
-        As of `plan_transport`; the edges reach to where the values end.
+        As of `plan_transport`; the edges include all values.
     out : (n,) float, written
     """
     size = 2 * edges.size

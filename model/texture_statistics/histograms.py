@@ -1,4 +1,4 @@
-"""Histograms over fixed, uneven bins: counting, distances, matching, valid ones nearby."""
+"""Histograms over fixed non-uniform bins: counts, distances, matching, projection."""
 
 from __future__ import annotations
 
@@ -18,40 +18,40 @@ HISTOGRAM_BINS = 256
 
 
 class TextureHistogramError(ValueError):
-    """Edges, histograms or groups that fit nothing."""
+    """Error for edges, histograms or groups of a wrong shape or range."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HistogramCount:
-    """One histogram and what it was counted from."""
+    """One histogram and the properties of its samples."""
 
     fractions: Float64Array
     """(256,), sums to 1."""
     below: float
-    """Share of values below the edges; it is in the first bin."""
+    """Fraction of values below the edges, counted in the first bin."""
     above: float
-    """Share of values above the edges; it is in the last bin."""
+    """Fraction of values above the edges, counted in the last bin."""
     min_value: float
     """Least value."""
     max_value: float
     """Largest value."""
     n_effective: float
-    """Samples of equal weight that would tell as much."""
+    """Number of equally weighted samples with the same variance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bins:
-    """256 bins, and a table that finds the bin of a value quickly."""
+    """256 bins with a look-up table from values to bins."""
 
     edges: Float64Array
-    """(257,), rising; a bin holds its lower edge."""
+    """(257,), increasing; a bin includes its lower edge."""
     scale: float
     min_bin: NDArray[np.int16]
     max_bin: NDArray[np.int16]
 
     @classmethod
     def from_edges(cls, edges: ArrayLike) -> Bins:
-        """Make the table of some edges."""
+        """Make bins with the given edges."""
         e = np.ascontiguousarray(edges, np.float64)
         _check_edges(e, (HISTOGRAM_BINS + 1,))
         scale = histogram_kernels.TABLE_CELLS / float(e[-1] - e[0])
@@ -65,9 +65,8 @@ class Bins:
 
         Examples
         --------
-        >>> found = Bins.over(np.arange(257.0)).count(np.array([-1.0, 0.0, 3.5, 256.0]))
-        >>> found.shares[[0, 3, 255]].tolist(), found.below
-        ([0.5, 0.25, 0.25], 0.25)
+        >>> found = Bins.from_edges(np.arange(257.0)).count(np.array([-1.0, 0.0, 3.5, 256.0]))
+        >>> found.fractions[[0, 3, 255]].tolist(), found.below ([0.5, 0.25, 0.25], 0.25)
         """
         flat = np.ascontiguousarray(values).reshape(-1)
         sums = np.zeros(HISTOGRAM_BINS)
@@ -102,27 +101,27 @@ class Bins:
         values
             Of any shape.
         source
-            What `count` said about them.
+            Result of `count` for them.
         target : ndarray, shape (256,)
             At least 0, sums to 1.
         out : ndarray or None
-            Where to write, contiguous; may be ``values`` itself.
+            Output array, contiguous; may be ``values`` itself.
 
         Returns
         -------
         ndarray, shape and dtype of values
-            Under the identical histogram the same values, to rounding.
+            For an identical histogram the same values, to rounding.
 
         Raises
         ------
-        HistogramError
-            For values that are not finite, and a target of another shape, with a negative share or
-            without any above 0.
+        TextureHistogramError
+            For values that are not finite, and a target of another shape, with a negative fraction
+            or without any above 0.
 
         Notes
         -----
-        A density is even inside a bin, so that the outcome has no steps. Values beyond the edges
-        widen the end bins of both histograms to where they reach.
+        The density is uniform within a bin, so that the mapping has no steps. Values beyond the
+        edges widen the end bins of both histograms up to those values.
         """
         flat = np.ascontiguousarray(values).reshape(-1)
         _check_fractions("target", target, HISTOGRAM_BINS)
@@ -148,12 +147,12 @@ def _check_edges(edges: Float64Array, shape: tuple[int | str, ...]) -> None:
 
 
 def cumulate_fractions(fractions: ArrayLike) -> Float64Array:
-    """Return the cumulated shares at all edges, (..., 257), from 0 to exactly 1.
+    """Return the cumulative fractions at all edges, (..., 257), from 0 to exactly 1.
 
     Raises
     ------
-    HistogramError
-        For shares that are not finite, negative, or all 0.
+    TextureHistogramError
+        For fractions that are not finite, negative, or all 0.
     """
     h = _check_fractions("fractions", fractions)
     run = np.concatenate([np.zeros((*h.shape[:-1], 1)), np.cumsum(h, axis=-1)], axis=-1)
@@ -162,7 +161,7 @@ def cumulate_fractions(fractions: ArrayLike) -> Float64Array:
 
 
 def histogram_distance(a: ArrayLike, b: ArrayLike, edges: ArrayLike) -> Float64Array:
-    """Return how far values must move, on average, to make one histogram of another.
+    """Return the earth mover's distance of two histograms, in widths of the middle bins.
 
     Parameters
     ----------
@@ -173,13 +172,13 @@ def histogram_distance(a: ArrayLike, b: ArrayLike, edges: ArrayLike) -> Float64A
     Returns
     -------
     ndarray, shape (...)
-        The earth mover's distance over the width of the middle half of the bins. In a fitted
-        space that is about the spread of the population.
+        Mean distance by which values must move, over the width of the middle half of the bins; in a
+        fitted space that width is about the span of the population.
 
     Raises
     ------
-    HistogramError
-        For shares that are not finite, negative or all 0, and edges that do not rise.
+    TextureHistogramError
+        For fractions that are not finite, negative or all 0, and edges that do not increase.
 
     Examples
     --------
@@ -199,7 +198,7 @@ def histogram_distance(a: ArrayLike, b: ArrayLike, edges: ArrayLike) -> Float64A
 
 
 def project_to_histograms(vectors: ArrayLike) -> Float64Array:
-    """Return the nearest vectors (least squares) whose histograms are all valid.
+    """Return the nearest vectors (least squares) of valid histograms.
 
     Parameters
     ----------
@@ -209,12 +208,12 @@ def project_to_histograms(vectors: ArrayLike) -> Float64Array:
     Returns
     -------
     ndarray of float64, same shape
-        At least 0; every run of 256 sums to 1. A valid vector comes back as it is, to rounding.
+        At least 0; every run of 256 sums to 1. A valid vector is returned unchanged, to rounding.
 
     Notes
     -----
-    Each histogram is projected on the simplex: a constant is taken off and what is negative set
-    to 0 (Held, Wolfe, Crowder 1974, doi:10.1007/BF01580223).
+    Each histogram is projected on the simplex: a constant is subtracted and negative results are
+    set to 0 (Held, Wolfe, Crowder 1974, doi:10.1007/BF01580223).
 
     Examples
     --------
@@ -238,13 +237,13 @@ class GroupHistograms:
     names: tuple[str, ...]
     """The G groups."""
     mean: Float64Array
-    """(G, channels, B): every image counts the same; each sums to 1."""
+    """(G, channels, B): mean over images of equal weight; each sums to 1."""
     stderr: Float64Array
-    """(G, channels, B): of the mean over the group; NaN in groups of one."""
+    """(G, channels, B): standard error of the mean over the group; NaN in groups of one."""
     members: Int64Array
     """(G,)"""
     clipped: Float64Array
-    """(G, channels): share that lies outside the edges and was counted in the end bins."""
+    """(G, channels): fraction outside the edges, counted in the end bins."""
 
 
 def rgb_histograms(
@@ -260,13 +259,13 @@ def rgb_histograms(
     Parameters
     ----------
     images : sequence of (H, W, C)
-        One size is not needed; finite where valid.
+        Sizes may differ; finite where valid.
     groups : mapping of str to bool array, shape (images,)
         Members; an image may be in several.
     valid : sequence of (H, W) bool, or None
         Texels that count.
     reach : tuple of float
-        First and last edge; the bins between are even.
+        First and last edge; the bins between have equal widths.
     bins : int
         At least 2.
 

@@ -1,4 +1,4 @@
-"""Masked textures before a pyramid: what stands outside the mask, and which responses count."""
+"""Prepare masked textures for a pyramid: fill outside the mask, and weight the responses."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,10 +11,10 @@ _BINOMIAL_FILTER = np.array([1.0, 4.0, 6.0, 4.0, 1.0], np.float32) / 16.0
 
 
 def fill_smoothly(image: FloatArray, valid: BoolArray) -> FloatArray:
-    """Continue a texture smoothly to where it is not valid, periodically.
+    """Fill invalid texels smoothly from valid ones, periodically.
 
-    Means of 2 x 2 texels, level by level, until nothing is missing; then back with linear
-    interpolation, so that a filled texel has the color of its surroundings and no detail.
+    Means of 2 x 2 texels are taken level by level until none is missing, then interpolated back
+    linearly, so that a filled texel has the color of its surroundings without detail.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ def fill_smoothly(image: FloatArray, valid: BoolArray) -> FloatArray:
     Returns
     -------
     ndarray, shape (H, W, C)
-        Valid texels as they were.
+        Valid texels are unchanged.
 
     Raises
     ------
@@ -54,13 +54,13 @@ def fill_smoothly(image: FloatArray, valid: BoolArray) -> FloatArray:
 
 
 def _halved(a: FloatArray) -> FloatArray:
-    """Add up 2 x 2 texels; a last odd row or column stands alone."""
+    """Add up 2 x 2 texels; a last odd row or column is summed alone."""
     padded = np.pad(a, ((0, a.shape[0] % 2), (0, a.shape[1] % 2), (0, 0)))
     return np.asarray(padded[::2, ::2] + padded[1::2, ::2] + padded[::2, 1::2] + padded[1::2, 1::2])
 
 
 def _doubled(a: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Interpolate linearly between the middles of 2 x 2 texels, periodically."""
+    """Interpolate linearly between the centers of 2 x 2 texels, periodically."""
     for axis in (0, 1):
         before = 0.75 * a + 0.25 * np.roll(a, 1, axis)
         after = 0.75 * a + 0.25 * np.roll(a, -1, axis)
@@ -88,9 +88,9 @@ def response_weights(
     texels : ndarray of float32, shape (H, W)
         The region where valid.
     samples : tuple of ndarray of float32
-        A sample weighs the region's mean over its own cell, times the part of its surroundings
-        that is valid (binomial weights over 5 x 5 cells): the reach of the filters. The first
-        is of the high-pass and the first level.
+        A sample's weight is the region's mean over its own cell, times the valid fraction of its
+        surroundings (binomial weights over 5 x 5 cells, the reach of the filters). The first array
+        serves the high-pass and the first level.
     """
     texels = valid.astype(np.float32)
     inside = texels if region is None else texels * np.asarray(region, np.float32)
@@ -114,7 +114,7 @@ def _cell_means(texels: FloatArray, size: tuple[int, int]) -> FloatArray:
         begins = np.searchsorted(cell, np.arange(cell[-1] + 1))
         sums = np.add.reduceat(found, begins, axis=axis)
         count = np.bincount(cell).astype(np.float32)
-        if len(count) > coarse:  # the last texels are nearest to the first sample, around the end
+        if len(count) > coarse:  # periodic: the last texels are nearest to the first sample
             sums, rest = np.split(sums, [coarse], axis=axis)
             first = [slice(None)] * 2
             first[axis] = slice(0, 1)

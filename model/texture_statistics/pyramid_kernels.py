@@ -1,4 +1,4 @@
-"""Loops of the steerable pyramid over half spectra, several orientations in one pass."""
+"""Filter half spectra of the steerable pyramid, several orientations per pass, compiled."""
 
 # mypy: allow-untyped-defs
 
@@ -7,14 +7,14 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def split(spectrum, rows, weight, fy, fx, toward, factor, out, begin, end):
-    """Cut the orientations of one level out of a spectrum.
+    """Extract the orientation bands of one level from a spectrum.
 
     Parameters
     ----------
     spectrum : (H, W // 2 + 1) complex
         Of the whole image.
     rows : (h,) int64
-        Where the rows of the level lie in ``spectrum``.
+        Rows of the level in ``spectrum``.
     weight : (h, w // 2 + 1) float
         The level's radial filter over the K - 1 th power of the radius.
     fy, fx : (h,), (w // 2 + 1,) float

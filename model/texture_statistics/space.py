@@ -1,4 +1,4 @@
-"""What the texture statistics of a population have in common: color space and bin edges.
+"""Texture space of a population: common color axes and bin edges of texture statistics.
 
 A texture is described by one row vector: 256-bin histograms of the image itself and of the 30
 responses of its steerable pyramid, in each of three decorrelated channels: 23,808 numbers,
@@ -37,7 +37,7 @@ _N_QUANTILES = 2049
 
 
 class TextureError(ValueError):
-    """A texture, mask, vector or file that no texture statistics can be made of."""
+    """Error for a texture, mask, vector or file without valid texture statistics."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,13 +47,13 @@ class TextureSpace:
     mean: Float64Array
     """(C,): the population's mean color, unit of the images."""
     axes: Float64Array
-    """(C, C): orthonormal rows, by falling variance; channel = axes @ (color - mean)."""
+    """(C, C): orthonormal rows, by decreasing variance; channel = axes @ (color - mean)."""
     edges: Float64Array
-    """(C, responses, 257): rising; responses as in the vector, so 31 of them at full depth."""
+    """(C, responses, 257): increasing; responses as in the vector, 31 at full depth."""
     levels: int
     orientations: int
     images: int
-    """How many images it was fitted to; 0: the standard space."""
+    """Number of images it was fitted to; 0: the standard space."""
 
     def __post_init__(self) -> None:
         """Check shapes, axes and edges."""
@@ -69,16 +69,16 @@ class TextureSpace:
         if np.abs(self.axes @ self.axes.T - np.eye(C)).max() > 1e-9:
             raise TextureError("TextureSpace.axes: got rows that are not orthonormal")
         if not (np.diff(self.edges, axis=-1) > 0.0).all():
-            raise TextureError("TextureSpace.edges: got edges that do not rise")
+            raise TextureError("TextureSpace.edges: got edges that do not increase")
 
     @property
     def channels(self) -> int:
-        """Number of channels C."""
+        """Return the number of channels C."""
         return len(self.mean)
 
     @property
     def responses(self) -> tuple[str, ...]:
-        """Names of the histograms of a channel, in the vector's order."""
+        """Return the names of a channel's histograms in the vector's order."""
         bands = [
             f"level {level} orientation {k}"
             for level in range(self.levels)
@@ -88,16 +88,16 @@ class TextureSpace:
 
     @property
     def size(self) -> int:
-        """Length of a vector."""
+        """Return the length of a vector."""
         return self.channels * len(self.responses) * HISTOGRAM_BINS
 
     def part(self, channel: int, response: int | str) -> slice:
-        """Return where one histogram lies in a vector.
+        """Return the slice of one histogram in a vector.
 
         Parameters
         ----------
         channel : int
-            0 to C - 1, by falling variance.
+            0 to C - 1, by decreasing variance.
         response : int or str
             Index or name out of `responses`.
 
@@ -125,14 +125,13 @@ class TextureSpace:
         return v.reshape(*v.shape[:-1], self.channels, len(self.responses), HISTOGRAM_BINS)
 
     def check(self, vector: ArrayLike) -> Float64Array:
-        """Return a vector as histograms (C, responses, 256) after checking that each is one.
+        """Return a vector as histograms (C, responses, 256) after checking each.
 
         Raises
         ------
         TextureError
-            For a wrong length, negative shares, or histograms that do not sum to 1 within 1e-6:
-            `model.texture_statistics.histograms.project_to_histograms` makes valid ones of edited
-            ones.
+            For a wrong length, negative fractions, or histograms that do not sum to 1 within 1e-6:
+            `model.texture_statistics.histograms.project_to_histograms` makes edited ones valid.
         """
         Checks(TextureError).shape("vector", vector, (self.size,))
         h = self.histograms(vector)
@@ -161,10 +160,10 @@ class TextureSpace:
 
     @classmethod
     def opponent(cls, channels: int = 3) -> TextureSpace:
-        """Return the space for reflectances 0...1 of which no population is known.
+        """Return the standard space for reflectances 0...1 without a population.
 
         Channels are brightness, red less green and yellow less blue (RGB), or the image itself
-        (1 channel). Bins of the image and low-pass are even; those of the bands grow
+        (1 channel). Bins of the image and low-pass are uniform; those of the bands grow
         exponentially away from 0. A fitted space describes a population much better.
         """
         if channels not in (1, 3):
@@ -192,7 +191,7 @@ class TextureSpace:
         orientations: int = ORIENTATIONS,
         workers: int | None = None,
     ) -> TextureSpace:
-        """Fit color axes and bin edges to a population; every image counts the same.
+        """Fit color axes and bin edges to a population, with equal weights of the images.
 
         Parameters
         ----------
@@ -217,10 +216,10 @@ class TextureSpace:
         Notes
         -----
         Axes are the principal axes of the mean covariance of the images' colors about the common
-        mean; directions without variance are turned to brightness and opponent colors. Half of
-        the bins of a response is spread evenly over its range in the population (and 5 % more),
-        half by how often values occur, so that neither rare extremes nor the crowd at 0 fall
-        into a few bins. A response without variance gets narrow bins about its value.
+        mean; directions without variance are set to brightness and opponent colors. Half of the
+        bins of a response are uniform over its range in the population (and 5 % more), half follow
+        the frequency of values, so that neither rare extremes nor the many values at 0 fall into a
+        few bins. A response without variance gets narrow bins about its value.
         """
         count = len(images)
         if not count or (valid is not None and len(valid) != count):
@@ -257,7 +256,7 @@ class TextureSpace:
         return cls(mean, axes, edges, levels, orientations, count)
 
     def save(self, path: str | Path) -> None:
-        """Write the space as npz, exactly; ``path`` is used as it is."""
+        """Write the space as npz without loss; ``path`` is used unchanged."""
         with Path(path).open("wb") as file:
             np.savez_compressed(
                 file,
@@ -269,7 +268,7 @@ class TextureSpace:
 
     @classmethod
     def load(cls, path: str | Path) -> TextureSpace:
-        """Read what `save` wrote; TextureError when it is not that."""
+        """Read a file of `save`; raise TextureError for any other file."""
         try:
             with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as stored:
                 mean, axes, edges = (stored[name] for name in ("mean", "axes", "edges"))
@@ -280,7 +279,7 @@ class TextureSpace:
 
 
 def check_image(image: ArrayLike, valid: ArrayLike | None) -> tuple[FloatArray, BoolArray]:
-    """Return an image as (H, W, C), float64 if it was and float32 if not, and its mask."""
+    """Return an image as (H, W, C), in float64 if given so, else in float32, and its mask."""
     values = np.asarray(image)
     values = values.astype(np.float64 if values.dtype == np.float64 else np.float32, copy=False)
     if values.ndim == 2:
@@ -317,6 +316,6 @@ def _quantiles(
 def response_weight(
     weights: tuple[FloatArray, tuple[FloatArray, ...]], response: int, orientations: int
 ) -> FloatArray:
-    """Return the weights of the samples of a response out of those of all levels."""
+    """Return the weights of a response's samples out of those of all levels."""
     texels, samples = weights
     return texels if response == 0 else samples[max(response - 2, 0) // orientations]

@@ -1,12 +1,12 @@
-"""Steerable pyramid: an image as responses of oriented band-pass filters, and back.
+"""Steerable pyramid: split an image into responses of oriented band-pass filters, and invert.
 
 Polar-separable filters in the frequency domain: raised cosines over the logarithm of the radius,
-powers of a cosine over the angle. Their squares sum to 1, so that the same filters put the image
-together again. A response keeps the unit of the image (an image of constant 0.4 has a low-pass of
-0.4) and its level's own, smaller grid.
+powers of a cosine over the angle. Their squares sum to 1, so that applying the same filters again
+reconstructs the image. A response keeps the unit of the image (an image of constant 0.4 has a
+low-pass of 0.4) and its level's own, smaller grid.
 
-The image counts as periodic. Every size has every level: level l has ceil(N / 2^l) samples along
-an axis of N, which always holds the frequencies of its band, and a level below the lowest
+The image is treated as periodic. Every size has every level: level l has ceil(N / 2^l) samples
+along an axis of N, which always include the frequencies of its band, and a level below the lowest
 frequency of a small image is exactly 0.
 
 References
@@ -32,12 +32,12 @@ from model.checks import Checks
 from model.texture_statistics import pyramid_kernels
 
 LEVELS, ORIENTATIONS = 7, 4
-"""Depth and filters a level (Weyrich et al. 2006, section 10.2)."""
+"""Levels, and filters per level (Weyrich et al. 2006, section 10.2)."""
 _CHUNK_ROWS = 128
 
 
 class PyramidError(ValueError):
-    """An image, a depth or a set of responses that makes no pyramid."""
+    """Error for an image, a depth or a set of responses that do not make a pyramid."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,12 +47,12 @@ class Responses:
     shape: tuple[int, int]
     """(H, W) of the image."""
     high: FloatArray
-    """(H, W): what lies above the first level."""
+    """(H, W): high-pass above the first level."""
     bands: tuple[FloatArray, ...]
-    """(K, h, w) a level, finest first. Orientation k answers to waves that run at the angle
+    """(K, h, w) per level, finest first. Orientation k responds to waves that run at the angle
     k pi / K from +x (columns) towards +y (down the rows)."""
     low: FloatArray
-    """(h, w): what lies below the last level, the mean with it."""
+    """(h, w): low-pass below the last level, including the mean."""
 
     def __post_init__(self) -> None:
         """Check that every response has the size of its level."""
@@ -67,7 +67,7 @@ class Responses:
             raise PyramidError(f"Responses: got {kinds}, expected all float32 or all float64")
 
     def __iter__(self) -> Iterator[FloatArray]:
-        """Give the responses one by one: high-pass, bands by level and orientation, low-pass."""
+        """Yield the responses: high-pass, bands by level and orientation, low-pass."""
         yield self.high
         for band in self.bands:
             yield from band
@@ -76,7 +76,7 @@ class Responses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Level:
-    """Where a level lies in the spectrum, and its filter."""
+    """Position of a level in the spectrum, and its filter."""
 
     rows: Int64Array
     columns: int
@@ -111,7 +111,7 @@ def analyze(
     levels, orientations : int
         At least 1 each; levels x orientations + 2 responses.
     workers : int or None
-        Threads; None: one a core, 4 at most.
+        Threads; None: one per core, 4 at most.
 
     Returns
     -------
@@ -159,19 +159,19 @@ def analyze(
 
 
 def synthesize(responses: Responses, *, workers: int | None = None) -> FloatArray:
-    """Put an image together from responses, edited or not.
+    """Reconstruct an image from responses, edited or not.
 
     Parameters
     ----------
     responses
-        As `analyze` gives them.
+        Result of `analyze`.
     workers : int or None
-        Threads; None: one a core, 4 at most.
+        Threads; None: one per core, 4 at most.
 
     Returns
     -------
     ndarray, shape (H, W)
-        In the precision of the responses. Of untouched responses it is the image again, to
+        In the precision of the responses. From unedited responses it is the original image, to
         about 1e-6 (float32) or 1e-15 (float64) of its largest value.
     """
     shape, threads = responses.shape, thread_count(workers)
@@ -200,7 +200,7 @@ def _inverse(spectra: Any, size: tuple[int, int], threads: int) -> FloatArray:
 
 
 def thread_count(workers: int | None) -> int:
-    """Return how many threads to use: what was asked for, or one a core and 4 at most."""
+    """Return the number of threads: the requested one, or one per core and 4 at most."""
     if workers is None:
         return min(4, os.cpu_count() or 1)
     Checks(PyramidError).within("workers", workers, "[1, inf)")
@@ -231,7 +231,7 @@ def _by_rows(
     filters: _Filters,
     factor: Any,
 ) -> None:
-    """Run a kernel over a level's rows, in threads; no two write the same row."""
+    """Run a kernel over a level's rows in threads, each writing its own rows."""
     common = (level.rows, level.weight, level.fy, level.fx, filters.toward, factor, out)
     height = len(level.rows)
     if height <= _CHUNK_ROWS:
@@ -249,7 +249,7 @@ def _by_rows(
 def _filters(shape: tuple[int, int], levels: int, orientations: int, kind: str) -> _Filters:
     """Make the filters of an image size; they are the same for all images."""
     order = orientations - 1
-    # the squares of cos^order at `orientations` angles sum to this over 1
+    # the squares of cos^order at K even angles sum to a constant (K > order); divide by it
     level_gain = math.sqrt(
         4.0**order * math.factorial(order) ** 2 / (orientations * math.factorial(2 * order))
     )
@@ -278,9 +278,9 @@ def _filters(shape: tuple[int, int], levels: int, orientations: int, kind: str) 
 
 
 def _make_level(shape: tuple[int, int], number: int) -> _Level:
-    """Return where the low frequencies of a level lie; its filter is still empty."""
+    """Return the positions of a level's low frequencies, with an empty filter."""
     height, width = size = _size(shape, number)
-    # signed frequencies of the level's rows, in cycles an image, and where the spectrum has them
+    # signed frequencies of the level's rows, in cycles per image, and their rows in the spectrum
     cycles = np.rint(np.fft.fftfreq(height) * height).astype(np.int64)
     columns = width // 2 + 1
     fy, fx = 2.0 * cycles / shape[0], 2.0 * np.arange(columns) / shape[1]

@@ -1,8 +1,8 @@
-"""Adding-doubling: the exact diffuse reflectance of a stack of plane layers.
+"""Compute the exact diffuse reflectance of a stack of plane layers by adding-doubling.
 
-Light is followed in a fixed set of directions. A layer is a pair of matrices (r, t) that turn the
-radiance falling on it into the radiance that leaves it; they are known in closed form for a thin
-layer, doubled until the layer has its thickness, and layers are added from the bottom up.
+Radiance is discretized in a fixed set of directions. A layer is a pair of matrices (r, t) from
+incident to reflected and transmitted radiance. They are known in closed form for a thin layer,
+which is doubled up to the full thickness; layers are then added from the bottom up.
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ from model.checks import Checks
 
 _SERIES_TERMS = 9  # cosh(1) to 1e-16
 _CHUNK_LAYERS = 2048  # layers per batch: a few MB
-_MAX_DOUBLINGS = 60  # 1e18 starting layers: even without absorption nothing comes through
-_SERIES_END = 1e-12  # Legendre moment at which the phase function's series ends
-_TRAPPED_LOSS = 1e-14  # share that total reflection loses, see quadrature
+_MAX_DOUBLINGS = 60  # 1e18 starting layers: opaque even without absorption
+_SERIES_END = 1e-12  # Legendre moment below which the phase function's series is truncated
+_TRAPPED_LOSS = 1e-14  # fraction lost in total reflection, see quadrature
 _MIN_TRANSMITTANCE = 1e-13  # transmittance at which a layer counts as semi-infinite
 
 
@@ -55,7 +55,7 @@ def reflectance(
         Refractive index of all layers relative to the air above (and below a finite stack).
     anisotropy
         Mean cosine g of the Henyey-Greenstein phase function in [0, 1), one for all layers or one
-        a layer; the scattering coefficient is sigma_s'/(1 - g). At 0 the scattering is isotropic
+        per layer; the scattering coefficient is sigma_s'/(1 - g). At 0 the scattering is isotropic
         (similarity).
     directions
         Number of directions in half a sphere, even, at least 4.
@@ -107,10 +107,10 @@ def reflectance(
     Checks().within("anisotropy", g, "[0, 1)")
     stack = np.stack([sigma_a_per_mm, sigma_s_prime_per_mm, thickness_mm], axis=-1)
     stack = stack.reshape(stack.shape[0], 3 * layers)
-    below: Float64Array | None = None  # reflection matrices of what lies below, one a unique row
+    below: Float64Array | None = None  # reflection matrices of the layers below, one per unique row
     below_rows = np.zeros(stack.shape[0], dtype=np.intp)
     for layer in range(layers - 1, -1, -1):
-        # Stacks that share their lower layers (a table's dermis) are computed once.
+        # Lower layers common to several stacks (a table's dermis) are computed once.
         rows, inverse = np.unique(stack[:, 3 * layer :], axis=0, return_inverse=True)
         owner = np.zeros(rows.shape[0], dtype=np.intp)
         owner[inverse.ravel()] = np.arange(stack.shape[0])
@@ -128,29 +128,29 @@ def reflectance(
 
 @lru_cache(maxsize=32)
 def quadrature(eta: float, directions: int) -> Quadrature:
-    """Return the directions for an index of refraction: half of them beyond the critical angle."""
+    """Return the directions for a refractive index: half of them beyond the critical angle."""
     if directions < 4 or directions % 2:
         raise ValueError(f"directions: expected an even number of at least 4, got {directions}")
     Checks().within("eta", eta, f"[1, {fresnel.MAX_INDEX}]")
     mu_c = np.sqrt(1.0 - 1.0 / eta**2)
-    if mu_c < 1e-3:  # matched: a single range
+    if mu_c < 1e-3:  # index-matched: a single range
         mu, weight = _radau(directions)
     else:
         half = directions // 2
         node, node_weight = legendre.leggauss(half)
-        # The surface's transmittance starts like a square root at the critical angle: with
+        # The surface's transmittance has a square-root onset at the critical angle: with
         # mu = mu_c + (1 - mu_c) s^2 it is smooth in s, and the rule converges quickly.
         s, s_weight = _radau(half)
         mu = np.concatenate([0.5 * mu_c * (node + 1.0), mu_c + (1.0 - mu_c) * s**2])
         weight = np.concatenate([0.5 * mu_c * node_weight, 2.0 * (1.0 - mu_c) * s * s_weight])
-    # Total reflection loses 1e-14, else light trapped in a clear slab makes a singular matrix.
+    # Total reflection loses 1e-14: otherwise trapped light in a clear slab gives a singular matrix.
     surface = np.minimum(fresnel.reflectance(mu, 1.0 / eta), 1.0 - _TRAPPED_LOSS)
     return Quadrature(mu, weight, surface)
 
 
 def _radau(count: int) -> tuple[Float64Array, Float64Array]:
     """Return nodes and weights on (0, 1] with a node at 1."""
-    # Roots of (P_{n-1} + P_n)/(1 + x) on [-1, 1], which has its fixed node at -1, mirrored.
+    # Roots of (P_{n-1} + P_n)/(1 + x) on [-1, 1]: Radau rule with fixed node -1, here mirrored.
     p_before = np.zeros(count + 1)
     p_before[count - 1 : count + 1] = 1.0
     free = legendre.legroots(p_before)
@@ -164,7 +164,7 @@ def _radau(count: int) -> tuple[Float64Array, Float64Array]:
 def _index_of(
     stack: Float64Array, layer: int, layers: int, owner: NDArray[np.intp]
 ) -> NDArray[np.intp]:
-    """Return, for the owners' rows, which unique row of the layers below each one stands on."""
+    """Return, for each owner's row, the index of the unique row of layers below it."""
     if layer == layers - 1:
         return np.zeros(owner.size, dtype=np.intp)
     _, inverse = np.unique(stack[:, 3 * (layer + 1) :], axis=0, return_inverse=True)
@@ -187,7 +187,7 @@ def _layer(
     empty = sigma_t <= 0.0
     albedo = np.where(empty, 0.0, sigma_s / np.where(empty, 1.0, sigma_t))
     infinite = np.isinf(thickness)
-    # An infinite empty layer returns nothing: it is a black one.
+    # An infinite layer without scattering and absorption returns no light: treat it as black.
     sigma_t = np.where(empty & infinite, 1.0, sigma_t)
     start = rule.mu[0]  # optical thickness up to which the series below is exact
     tau = np.where(infinite, 2.0 * start, sigma_t * np.where(infinite, 1.0, thickness))
@@ -218,7 +218,7 @@ def _thin_layer(
     """Solve the discrete transport equation exactly for layers of tau <= 2 mu_min.
 
     With S and D the sum and difference of downward and upward radiance, S' = -X D and D' = -Y S,
-    where X and Y hold extinction less the scattering of odd and of even Legendre order. About the
+    where X and Y are extinction less the scattering of odd and of even Legendre order. About the
     middle of the layer S = cosh(z sqrt(XY)) s, D = -Y z sinhc(z sqrt(XY)) s, and likewise with X
     and Y exchanged; both are power series in X Y.
     """
@@ -243,10 +243,10 @@ def _phase_matrices(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the sum and difference of forward and backward phase function, halved, (m, m).
 
-    The Henyey-Greenstein function is averaged over azimuth by its whole Legendre series. What the
-    quadrature misses of its forward peak stays in the direction it came from, so that no energy is
-    lost; this takes the place of delta-M, whose cut series is wrong for light that is scattered
-    once, and that is what strongly absorbing skin returns.
+    The Henyey-Greenstein function is averaged over azimuth by its full Legendre series. The part of
+    its forward peak that the quadrature does not resolve stays in the incident direction, which
+    conserves energy. This replaces delta-M, whose truncated series is wrong for singly scattered
+    light, the main part of what strongly absorbing skin reflects.
     """
     rule = quadrature(eta, directions)
     count = 1 if anisotropy == 0.0 else int(np.ceil(np.log(_SERIES_END) / np.log(anisotropy))) + 1
@@ -276,7 +276,7 @@ def _right_divide(numerator: Float64Array, denominator: Float64Array) -> Float64
 
 
 def _add(r: Float64Array, t: Float64Array, below: Float64Array) -> Float64Array:
-    """Return the reflection matrix of layers (r, t) that lie on `below`."""
+    """Return the reflection matrix of layers (r, t) on top of `below`."""
     identity = np.eye(r.shape[-1])
     return np.asarray(r + t @ np.linalg.solve(identity - below @ r, below @ t))
 
@@ -284,9 +284,11 @@ def _add(r: Float64Array, t: Float64Array, below: Float64Array) -> Float64Array:
 def _escape(
     below: Float64Array, rows: NDArray[np.intp], rule: Quadrature, eta: float
 ) -> Float64Array:
-    """Let a unit beam in through the surface and return what comes out again, per stack."""
+    """Return the fraction of a unit beam that exits through the surface again, per stack."""
     identity = np.eye(rule.mu.size)
-    beam = below[:, :, -1:]  # upward radiance before the surface reflects any of it back
+    beam = below[
+        :, :, -1:
+    ]  # upward radiance at the surface, internal reflection included by (1 - R F)^-1
     upward = np.linalg.solve(identity - below * rule.surface, beam)[:, :, 0]
     flux = rule.mu * rule.weight
     out = upward @ (flux * (1.0 - rule.surface)) / flux[-1]

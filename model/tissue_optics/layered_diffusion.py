@@ -1,4 +1,4 @@
-"""Diffusion theory of plane layers in closed form: the fast tier of layered reflectance."""
+"""Compute the reflectance of plane layers by diffusion theory in closed form (fast tier)."""
 
 import numpy as np
 
@@ -6,8 +6,8 @@ from model import fresnel
 from model.arrays import Float64Array
 from model.checks import Checks
 
-_MIN_EXTINCTION_PER_MM = 1e-9  # extinction below which a layer is empty for every purpose here
-_MIN_DECAY = 1e-4  # kappa d below which a term's limit for kappa = 0 is reached to 1e-9
+_MIN_EXTINCTION_PER_MM = 1e-9  # extinction below which a layer counts as empty
+_MIN_DECAY = 1e-4  # kappa d below which a term equals its limit for kappa = 0 to 1e-9
 
 
 def reflectance(
@@ -42,11 +42,11 @@ def reflectance(
     -----
     The fluence phi solves D phi'' = sigma_a phi - sigma_s' exp(-tau), D = 1/(3 (sigma_a +
     sigma_s')), with the extrapolated boundary phi = 2 A D phi' at the surface. From the bottom up
-    each interface is described by two numbers, the flux it draws and the flux it returns,
-    D phi' = q b - G phi, where b is the power of the beam that arrives there. All exponents are
-    negative, so that thick and strongly absorbing layers do not overflow. Diffusion needs
-    scattering well above absorption: for skin it is off by 1 to 15 percent, and by more where
-    melanin or blood absorb strongly.
+    each interface is described by two numbers, a conductance G and a source q, D phi' = q b - G
+    phi, where b is the power of the beam that arrives there. All exponents are negative, so that
+    thick and strongly absorbing layers do not overflow. Diffusion needs scattering well above
+    absorption: for skin it is off by 1 to 15 percent, and by more where melanin or blood absorb
+    strongly.
 
     References
     ----------
@@ -96,7 +96,7 @@ def _cover(
     sigma_s_prime: Float64Array,
     thickness: Float64Array,
 ) -> tuple[Float64Array, Float64Array]:
-    """Lay one layer over an interface (draw, give) and return the new interface's values.
+    """Add one layer on top of an interface (G, q) and return the values of the new interface.
 
     With psi the solution of D psi'' = sigma_a psi that is 1 at the layer's top and meets the
     interface below (D psi' = -G psi), Green's identity gives G = -D psi'(0) and
@@ -104,14 +104,14 @@ def _cover(
     """
     infinite = np.isinf(thickness)
     d = np.where(infinite, 0.0, thickness)
-    # Written so that kappa = 0 divides nothing: f = exp(-kappa d), s = (1 - f^2)/kappa.
+    # Without division by kappa, which may be 0: f = exp(-kappa d), s = (1 - f^2)/kappa.
     f = np.exp(-kappa * d)
     s = 2.0 * d * _unit_decay(2.0 * kappa * d)
     coupling = draw / diffusion
     norm = 1.0 + f**2 + coupling * s
     draw_finite = (diffusion * kappa**2 * s + draw * (1.0 + f**2)) / norm
     # int exp(-sigma_t z) cosh and sinh(kappa (d - z))/kappa dz, times 2 f. The second is even in
-    # kappa but for the factor f, so that a small kappa stands for an even smaller one.
+    # kappa except for the factor f, so that kappa can be clamped from below.
     decaying, growing = _beam_integrals(kappa, sigma_t, d)
     k = np.maximum(
         kappa, np.divide(_MIN_DECAY, d, out=np.full_like(d, _MIN_DECAY), where=d > _MIN_DECAY)

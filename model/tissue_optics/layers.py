@@ -1,4 +1,4 @@
-"""From chromophores to the absorption, scattering and reflectance of layered skin."""
+"""Compute absorption, scattering and reflectance of layered skin from its chromophores."""
 
 from typing import Literal
 
@@ -17,19 +17,19 @@ Tier = Literal["adding_doubling", "diffusion"]
 C_M_MAX = 0.5  # volume fraction of melanosomes in the epidermis
 C_HD_MAX = 0.32  # volume fraction of blood in the dermis
 C_HE_MAX = 0.1  # volume fraction of blood in the epidermis
-BETA_M = 0.61  # share of eumelanin in melanin
+BETA_M = 0.61  # fraction of eumelanin in melanin
 C_HE_PER_C_HD = 0.25  # epidermal blood per dermal blood
 
 ANISOTROPY_SKIN = 0.8
 """Mean cosine g of scattering in skin: van Gemert et al. 1989, doi:10.1109/10.42108.
 
-The papers' skin model knows reduced scattering only, that is g = 0, and this is the default
+The papers' skin model has reduced scattering only, that is g = 0, and this is the default
 below. Where absorption is weak it makes little difference. Dark skin scatters only a few times
-before it absorbs: with g = 0.8 and the same sigma_s' it returns less, half at C_m = 0.5.
+before it absorbs: with g = 0.8 and the same sigma_s' it reflects less, half at C_m = 0.5.
 """
 
 # Donner et al. 2008, doi:10.1145/1409060.1409093.
-OXYGEN_SATURATION = 0.75  # share of oxygenated hemoglobin
+OXYGEN_SATURATION = 0.75  # fraction of oxygenated hemoglobin
 EPIDERMIS_MM = 0.25  # thickness; the dermis below is semi-infinite
 DERMIS_SCATTERING = 0.5  # reduced scattering of the dermis relative to the epidermis
 
@@ -37,7 +37,7 @@ TIER_NAMES: tuple[Tier, ...] = ("adding_doubling", "diffusion")
 
 
 class TissueError(ValueError):
-    """A chromophore or an optical property lies outside what tissue can be."""
+    """Error for a chromophore or an optical property outside the range of tissue."""
 
 
 _check = Checks(TissueError).within
@@ -53,7 +53,7 @@ def blood_absorption(
     wavelength_nm
         Wavelengths in nm, any shape, 380 to 780.
     oxygenation
-        Share of oxygenated hemoglobin in [0, 1].
+        Fraction of oxygenated hemoglobin in [0, 1].
 
     Returns
     -------
@@ -90,11 +90,11 @@ def skin_layers(
     c_m, c_hd
         Volume fractions of melanin (epidermis) and blood (dermis), broadcast together.
     beta_m
-        Share of eumelanin in melanin, in [0, 1].
+        Fraction of eumelanin in melanin, in [0, 1].
     c_he
-        Volume fraction of blood in the epidermis; None stands for c_hd/4.
+        Volume fraction of blood in the epidermis; None: c_hd/4.
     oxygenation
-        Share of oxygenated hemoglobin in [0, 1].
+        Fraction of oxygenated hemoglobin in [0, 1].
 
     Returns
     -------
@@ -168,18 +168,18 @@ def two_layer_reflectance(
         Volume fractions of melanin (epidermis) and blood (dermis), broadcast together; Jimenez
         2010, Table 1 has 0 to 0.5 and 0 to 0.32.
     beta_m
-        Share of eumelanin in melanin, in [0, 1].
+        Fraction of eumelanin in melanin, in [0, 1].
     c_he
-        Volume fraction of blood in the epidermis; None stands for c_hd/4.
+        Volume fraction of blood in the epidermis; None: c_hd/4.
     oxygenation
-        Share of oxygenated hemoglobin in [0, 1].
+        Fraction of oxygenated hemoglobin in [0, 1].
     eta
         Refractive index of skin relative to air.
     tier
         "adding_doubling" (exact transport) or "diffusion" (closed form, about a thousand times
         faster, off by -2 to +21 percent of transport with g = 0 over Table 1).
     anisotropy, directions
-        As in `layer_stack_reflectance`; `ANISOTROPY_SKIN` is what skin has.
+        As in `layer_stack_reflectance`; skin has `ANISOTROPY_SKIN`.
 
     Returns
     -------
@@ -243,8 +243,8 @@ def layer_stack_reflectance(
         Mean cosine g of the Henyey-Greenstein phase function in [0, 1), one for all layers or one
         a layer; the scattering is sigma_s'/(1 - g). At 0 it is isotropic. Diffusion ignores it.
     directions
-        Directions of adding-doubling in half a sphere, even; None stands for 12 when scattering is
-        isotropic (within 3e-6 of the limit) and for 20 else (within 6e-5 at g = 0.8).
+        Directions of adding-doubling in half a sphere, even; None: 12 when scattering is isotropic
+        (within 3e-6 of the limit), else 20 (within 6e-5 at g = 0.8).
 
     Returns
     -------

@@ -1,7 +1,8 @@
-"""Sets that samples must stay in: mixtures without negative shares, and histograms.
+"""Feasible sets of samples: non-negative mixtures, and histograms.
 
-Both are convex, and what falls outside is put on the nearest place inside. Such a projection never
-moves two points apart, which bounds what an edit and its opposite leave: see `model.traits`.
+Both are convex, and a sample outside is projected to the nearest point inside. Such a projection
+never increases the distance of two points, which bounds the residual of an edit and its opposite:
+see `model.traits`.
 """
 
 from collections.abc import Mapping
@@ -17,17 +18,17 @@ from model.traits import nonnegative_kernels
 from model.vectors import project_to_simplex
 
 FEASIBLE_TOL = 1e-5
-"""What float32 leaves of a sum of one, and of a share of zero."""
+"""Tolerances of float32 samples for a sum of one, and for a weight of zero."""
 HISTOGRAM_BINS = 256
 
 
 class FeasibleError(ValueError):
-    """A sample outside the set that it should lie in."""
+    """Error for a sample outside its feasible set."""
 
 
 @dataclass(frozen=True, slots=True)
 class UnconstrainedSet:
-    """Everything finite."""
+    """Set of all finite samples."""
 
     def contains(self, samples: ArrayLike) -> BoolArray:
         """Return whether each sample (..., d) lies in the set, (...)."""
@@ -42,13 +43,13 @@ class UnconstrainedSet:
         return np.array(vector, np.float64)
 
     def document(self) -> dict[str, Any]:
-        """Return what `from_document` reads."""
+        """Return the JSON document for `from_document`."""
         return {"set": "free"}
 
 
 @dataclass(frozen=True, slots=True)
 class NonNegativeSet:
-    """Samples of shares that are at least 0."""
+    """Set of samples of weights that are at least 0."""
 
     def contains(self, samples: ArrayLike) -> BoolArray:
         """Return whether each sample (..., d) lies in the set, (...)."""
@@ -63,8 +64,8 @@ class NonNegativeSet:
         ----------
         samples : array_like, shape (..., d)
         metric : ndarray, shape (d,) or (d, d), optional
-            What a difference counts, as weights or as a matrix of products. A weight moves nothing.
-            By a matrix, what one share lacks others of its kind make up for.
+            Metric of differences, as weights or as a matrix of products. Weights do not change the
+            projection. With a matrix, correlated weights compensate a clipped one.
 
         Returns
         -------
@@ -90,7 +91,7 @@ class NonNegativeSet:
         return np.array(vector, np.float64)
 
     def document(self) -> dict[str, Any]:
-        """Return what `from_document` reads."""
+        """Return the JSON document for `from_document`."""
         return {"set": "non-negative"}
 
 
@@ -102,7 +103,7 @@ class HistogramSet:
     """Bins of each histogram."""
 
     def __post_init__(self) -> None:
-        """Refuse histograms without bins."""
+        """Raise for histograms without bins."""
         Checks(FeasibleError).within("block", self.block, "[1, inf)")
 
     def contains(self, samples: ArrayLike) -> BoolArray:
@@ -115,7 +116,7 @@ class HistogramSet:
         return np.asarray(good.all(axis=(-1, -2)))
 
     def project(self, samples: ArrayLike, metric: Float64Array | None = None) -> Float64Array:
-        """Return the nearest samples of the set, all bins counting the same.
+        """Return the nearest samples of the set, with equal weights of the bins.
 
         Parameters
         ----------
@@ -129,8 +130,8 @@ class HistogramSet:
 
         Notes
         -----
-        Each histogram loses the same from all bins that keep something: with bins in falling order
-        u, the loss is the last of (u_1 + ... + u_j - 1) / j that is below u_j (Held, Wolfe and
+        The same amount is subtracted from all bins that stay above 0: with bins in decreasing order
+        u, it is the last of (u_1 + ... + u_j - 1) / j that is below u_j (Held, Wolfe and
         Crowder 1974, doi:10.1007/BF01580223).
 
         Examples
@@ -149,7 +150,7 @@ class HistogramSet:
         return np.asarray((s - s.mean(axis=-1, keepdims=True)).reshape(np.shape(vector)))
 
     def document(self) -> dict[str, Any]:
-        """Return what `from_document` reads."""
+        """Return the JSON document for `from_document`."""
         return {"set": "histograms", "block": self.block}
 
     def _blocks(self, samples: ArrayLike) -> Float64Array:
@@ -180,7 +181,7 @@ def from_document(document: Mapping[str, Any]) -> FeasibleSet:
 
 
 def smallest_feasible_set(samples: Float64Array) -> FeasibleSet:
-    """Return the smallest set that holds samples (n, d): histograms of 256, non-negative, free.
+    """Return the smallest set that contains samples (n, d): histograms, non-negative, or free.
 
     Examples
     --------

@@ -1,9 +1,9 @@
-"""Histograms described by their quantiles, in which a shift is a shift.
+"""Describe histograms by quantiles, and shift histograms by changes of their quantiles.
 
-The mean of two histograms has two humps; the mean of their quantile functions has one, between
-them (the barycenter of optimal transport on a line). A change of quantiles moves what a histogram
-counts to other values, whichever histogram it is applied to, never makes a share negative, and the
-opposite change brings it back.
+The mean of two unimodal histograms can be bimodal; the mean of their quantile functions is one mode
+between them (the barycenter of optimal transport on a line). A change of quantiles moves the mass
+of any histogram to other values, never makes a fraction negative, and is undone by the opposite
+change.
 
 References
 ----------
@@ -17,32 +17,32 @@ from model.arrays import Float64Array
 from model.checks import Checks
 
 N_QUANTILES = 256
-"""Quantiles of a histogram, at even shares (k + 1/2) / 256."""
+"""Number of quantiles of a histogram, at levels (k + 1/2) / 256."""
 
 
 class HistogramTransportError(ValueError):
-    """Histograms, edges or changes that do not fit each other."""
+    """Error for histograms, edges or changes that do not fit each other."""
 
 
 def quantile_levels() -> Float64Array:
-    """Return the shares at which quantiles are taken, (256,)."""
+    """Return the levels of the quantiles, (256,)."""
     return (np.arange(N_QUANTILES) + 0.5) / N_QUANTILES
 
 
 def quantiles(histograms: ArrayLike, edges: ArrayLike) -> Float64Array:
-    """Return the quantiles of histograms whose bins are filled evenly.
+    """Return the quantiles of histograms with a uniform density in each bin.
 
     Parameters
     ----------
     histograms
         (..., bins), at least 0, each of sum 1.
     edges
-        (..., bins + 1), rising; the same leading axes.
+        (..., bins + 1), increasing; the same leading axes.
 
     Returns
     -------
     ndarray of float64, shape (..., 256)
-        Rising, in the unit of the edges.
+        Increasing, in the unit of the edges.
 
     Examples
     --------
@@ -60,7 +60,7 @@ def quantiles(histograms: ArrayLike, edges: ArrayLike) -> Float64Array:
 
 
 def widen_edges(histograms: ArrayLike, edges: ArrayLike, change: ArrayLike) -> Float64Array:
-    """Return edges stretched so far that nothing leaves them when quantiles change.
+    """Return edges widened so that shifted quantiles stay inside.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def widen_edges(histograms: ArrayLike, edges: ArrayLike, change: ArrayLike) -> F
     Returns
     -------
     ndarray of float64, shape (..., bins + 1)
-        The edges themselves where nothing leaves them.
+        The edges themselves where all quantiles stay inside.
     """
     h, e = _checked(histograms, edges)
     by = _change(histograms, change)
@@ -93,23 +93,22 @@ def shift_quantiles(
     *,
     target_edges: ArrayLike | None = None,
 ) -> Float64Array:
-    """Return histograms with what they count moved by a change of their quantiles.
+    """Return histograms after a change of their quantiles.
 
     Parameters
     ----------
     histograms, edges
         As of `quantiles`.
     change
-        (..., 256): by how much each quantile is to move, in the unit of the edges.
+        (..., 256): shift of each quantile, in the unit of the edges.
     onto
         Edges of the result, the histograms' own by default.
 
     Returns
     -------
     ndarray of float64, shape (..., bins)
-        At least 0, each of sum 1. Where a change would exchange the order of values, they come to
-        lie together; what would leave the edges is counted in the last bin. A change of 0 is the
-        identity.
+        At least 0, each of sum 1. Values whose order a change would swap are merged; mass beyond
+        the edges is counted in the last bin. A change of 0 is the identity.
 
     Examples
     --------
@@ -127,7 +126,7 @@ def shift_quantiles(
             continue
         filled = np.concatenate([[0.0], np.cumsum(h[k])])
         filled /= filled[-1]
-        # both ends of an empty stretch move as the quantiles beside them do
+        # both ends of an empty interval move with their neighboring quantiles
         place = np.maximum.accumulate(e[k] + np.interp(filled, at, by[k]))
         span = e[k][-1] - e[k][0]
         apart = place + 1e-12 * span * np.arange(len(place))
@@ -156,9 +155,9 @@ def _checked(histograms: ArrayLike, edges: ArrayLike) -> tuple[Float64Array, Flo
 
 
 def _rising(filled: Float64Array, place: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Leave out what does not rise, so that an empty stretch has no quantiles in it.
+    """Omit repeated levels, so that an empty interval contains no quantiles.
 
-    Of a run of equal shares its two ends count, the second a little later.
+    Of a run of equal levels both ends are kept, the second slightly increased.
     """
     step = np.diff(filled) > 0
     keep = np.concatenate([[step[0]], step[:-1] | step[1:], [step[-1]]])

@@ -1,20 +1,19 @@
-"""Traits of surface BRDFs added to maps of lobes: lotion on a face, texel by texel.
+"""Apply traits of surface BRDFs, such as lotion, to weight maps of basis BRDFs.
 
-A face's maps are shares of few lobes, each a mixture of many materials; a trait is a signed mixture
-of the same materials. What it adds may be a lobe that the face lacks, what it takes away must be
-taken off lobes that are there. So an edit brings at most one lobe for each trait: of some
-candidates the one with which all texels come nearest to what was asked, if that is worth it.
-Candidates are what is positive in the trait's mixture, and what remains of it when a texel of
-usual shares gives off what it can.
+A face's maps are weights of a few lobes (basis BRDFs), each a mixture of many materials; a trait is
+a signed mixture of the same materials. It may add a lobe that the face lacks, but can only subtract
+from existing lobes. So an edit adds at most one lobe per trait: the candidate with the smallest
+error over all texels, if it reduces the error enough. Candidates are the positive part of the
+trait's mixture, and its remainder after a texel of mean weights has given off what it can.
 
-On the lobes, the trait is the signed shares z that come nearest to it, lengths being those of
-BRDFs over directions; the shares t of a texel become the non-negative ones nearest to t + a z:
-t + a z itself, unless a lobe is used up, when its kin make up for it. The opposite edit, on lobes
-that hold the trait already, comes back wherever nothing was used up.
+On the lobes, the trait is the nearest vector of signed weights z, with the norm of BRDFs over
+directions. The weights t of a texel become the non-negative ones nearest to t + a z: t + a z
+itself, or, where a lobe is used up, a compensation by similar lobes. The opposite edit, on lobes
+that include the trait's, restores the source wherever no lobe was used up.
 
 Two other ways were measured on simulated faces (`skinrig bench --stage traits` measures this one):
-the best lobe when any amount may be taken off the others lies so close to them that all is used up
-at once, and the population's common mixtures, eight more lobes, do no better.
+the best lobe under unlimited subtraction from the others is so similar to them that they are used
+up at once, and the population's common mixtures, eight more lobes, are not better.
 
 References
 ----------
@@ -36,34 +35,34 @@ from model.traits.space import TraitSpace
 from model.traits.vectors import TraitError
 
 MIN_ERROR_GAIN = 0.05
-"""A trait brings a lobe when that lowers the error of its edit by more than this share of it."""
+"""A trait adds a lobe if that reduces the error of its edit by more than this fraction."""
 CANDIDATE_WEIGHTS = (0.3, 1.0, 3.0)
-"""Times the mean shares that a candidate assumes can be taken off."""
+"""Multiples of the mean weights that a candidate assumes can be subtracted."""
 TRIAL_TEXELS = 1000
 """Texels on which candidates are tried."""
 MAX_LOBES = 15
-"""More lobes than this, with those of traits, are refused."""
+"""Largest number of lobes, including those of traits."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LobeEdit:
-    """Edited maps of lobes, and what was not possible.
+    """Edited lobe weights, and the part of the edit that was not possible.
 
     Attributes
     ----------
     weights : ndarray, shape (T, K')
-        Shares of the lobes, at least 0; those of the source first, as many as it had.
+        Weights of the lobes, at least 0; those of the source first.
     mix : ndarray of float64, shape (K', d)
         The lobes as mixtures of the materials.
     moved : ndarray of float64, shape (T,)
-        Length of the change asked for.
+        Length of the requested change.
     clipped : ndarray of float64, shape (T,)
-        Length of what could not be taken off.
+        Length of the part that could not be subtracted.
     return_bound : ndarray of float64, shape (T,)
-        The opposite edit comes back to the source's BRDF within this: what was clipped, and what
-        of the traits the lobes cannot show.
+        Bound of the distance to the source's BRDF after the opposite edit: the clipped part, and
+        the part of the traits that the lobes cannot represent.
     misfit : mapping of str to float
-        Share of each trait's vector that the lobes cannot show.
+        Fraction of each trait's vector that the lobes cannot represent.
     """
 
     weights: FloatArray
@@ -75,7 +74,7 @@ class LobeEdit:
 
     @property
     def clipped_fraction(self) -> float:
-        """Share of the change over all texels that could not be taken off, RMS."""
+        """Return the fraction of the change that could not be subtracted, RMS over texels."""
         asked = float(np.sqrt(np.mean(self.moved**2))) if len(self.moved) else 0.0
         return float(np.sqrt(np.mean(self.clipped**2))) / asked if asked > 0.0 else 0.0
 
@@ -88,20 +87,20 @@ def edit_weights(
     *,
     materials: tuple[str, ...] = (),
 ) -> LobeEdit:
-    """Add traits of surface BRDFs to shares of lobes.
+    """Add traits of surface BRDFs to weights of lobes.
 
     Parameters
     ----------
     weights : array_like, shape (T, K)
-        Shares of the lobes, at least 0 and finite.
+        Weights of the lobes, at least 0 and finite.
     mix : array_like, shape (K, d)
         Each lobe as a mixture of the space's materials, at least 0.
     space : TraitSpace
-        Of mixtures of the same d materials.
+        Space of mixtures of the same d materials.
     amounts : mapping of str to float or array_like, shape (T,)
-        Times each trait's vector, the same for all texels or one each.
+        Factors of each trait's vector, the same for all texels or one per texel.
     materials : tuple of str
-        Of the d columns of `mix`; checked against the space's names where both are given.
+        Names of the d columns of `mix`; checked against the space's names where both are given.
 
     Returns
     -------
@@ -111,7 +110,7 @@ def edit_weights(
     Raises
     ------
     TraitError
-        For shapes or materials that do not fit, shares below 0, unknown traits, amounts that are
+        For shapes or materials that do not fit, weights below 0, unknown traits, amounts that are
         not finite, and more than 15 lobes.
 
     Examples
@@ -133,13 +132,17 @@ def edit_weights(
     if not asked:
         return LobeEdit(given.astype(dtype), lobes, zero, zero, zero, {})
     vectors = {name: space.trait(name).vector for name in asked}
-    with threadpool_limits(limits=1, user_api="blas"):  # many small matrices
+    with threadpool_limits(
+        limits=1, user_api="blas"
+    ):  # many small matrices: BLAS threads would only add overhead
         for name, vector in vectors.items():
             some = np.flatnonzero(asked[name])
             tried = some[:: -(-len(some) // TRIAL_TEXELS)]
             lobes = _Trial(t[tried], vector, asked[name][tried], space.metric).with_lobe(lobes)
     if len(lobes) > max(MAX_LOBES, t.shape[1]):
-        raise TraitError(f"lobes: got {len(lobes)} with those of traits, expected {MAX_LOBES}")
+        raise TraitError(
+            f"lobes: got {len(lobes)} with those of traits, expected at most {MAX_LOBES}"
+        )
     gram = reduced_spaces.times_metric(lobes, space.metric) @ lobes.T
     change = np.zeros((len(t), len(lobes)))
     misfit, unseen = {}, zero.copy()
@@ -184,7 +187,7 @@ def _padded(t: Float64Array, count: int) -> Float64Array:
 def _project_on_lobes(
     lobes: Float64Array, vector: Float64Array, metric: Float64Array | None
 ) -> Float64Array:
-    """Return the signed shares of lobes that come nearest to a vector."""
+    """Return the signed weights of lobes nearest to a vector."""
     products = reduced_spaces.times_metric(lobes, metric)
     gram = products @ lobes.T
     size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
@@ -194,7 +197,7 @@ def _project_on_lobes(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Trial:
-    """A trait to be added by some amounts to some texels' shares."""
+    """A trait to add by given amounts to the weights of some texels."""
 
     shares: Float64Array
     vector: Float64Array
@@ -202,7 +205,7 @@ class _Trial:
     metric: Float64Array | None
 
     def with_lobe(self, lobes: Float64Array) -> Float64Array:
-        """Return the lobes and, where it is worth it, one more for the trait."""
+        """Return the lobes, with one more for the trait where it reduces the error enough."""
         vector, metric = self.vector, self.metric
         strength = float(np.sqrt(np.mean(self.amount**2)))
         size = strength * float(reduced_spaces.metric_lengths(vector, metric))
@@ -223,7 +226,7 @@ class _Trial:
         return sets[best] if errors[0] - errors[best] > MIN_ERROR_GAIN else lobes
 
     def _error(self, lobes: Float64Array) -> float:
-        """Return the RMS length by which edits on some lobes miss what was asked."""
+        """Return the RMS length of the error of edits on some lobes."""
         z = _project_on_lobes(lobes, self.vector, self.metric)
         source, amount = _padded(self.shares, len(lobes)), self.amount[:, None]
         gram = reduced_spaces.times_metric(lobes, self.metric) @ lobes.T

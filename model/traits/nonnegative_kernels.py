@@ -1,7 +1,7 @@
-"""The non-negative mixtures nearest to mixtures with negative shares, compiled.
+"""Project signed mixtures to the nearest non-negative ones (active sets), compiled.
 
 Active sets through the materials' matrix of products (Lawson and Hanson 1974, Solving Least Squares
-Problems, chapter 23), started from the shares that are positive.
+Problems, chapter 23), started from the positive weights.
 """
 
 # mypy: allow-untyped-defs
@@ -14,21 +14,22 @@ from numba import njit, prange
 from model.arrays import Float64Array
 
 INDEPENDENCE_TOL = 1e-12
-"""A material whose part outside those in use is a smaller share of its square is not used."""
+"""A material is dependent, and not used, if its residual on those in use is below this fraction of
+its square."""
 JOIN_TOL = 1e-10
-"""A material joins while it would lower the misfit by more than this share of the mixture."""
-BLOCK_ROWS = 512  # rows that share their working memory
+"""A material is added while it reduces the misfit by more than this fraction of the mixture."""
+BLOCK_ROWS = 512  # rows per block of working memory
 
 
 def nearest_mixtures(gram: Float64Array, wanted: Float64Array) -> Float64Array:
-    """Return the non-negative mixtures x that are nearest: least (x - t)' G (x - t).
+    """Return the nearest non-negative mixtures x, which minimize (x - t)' G (x - t).
 
     Parameters
     ----------
     gram : ndarray, shape (K, K)
         Products of the materials, symmetric and positive semidefinite.
     wanted : ndarray, shape (T, K)
-        The mixtures t. Rows without a negative share come back as they are.
+        The mixtures t. Rows without a negative weight are returned unchanged.
 
     Returns
     -------
@@ -120,7 +121,9 @@ def _solve_row(gram, t, x, rhs, active, low, y, refused):
                 if gone < 0:
                     break
                 if active[gone] == entering:
-                    refused[entering] = True  # it came in and went at once: not again
+                    refused[entering] = (
+                        True  # added and removed at once: exclude it, which prevents cycling
+                    )
             x[active[gone]] = 0.0
             used -= 1
             for i in range(gone, used):

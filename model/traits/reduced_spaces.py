@@ -1,4 +1,4 @@
-"""Few coordinates for samples of many numbers: principal components, or non-negative mixtures.
+"""Reduce long samples to few coordinates: principal components or non-negative mixtures.
 
 References
 ----------
@@ -21,16 +21,16 @@ from model.traits.vectors import Trait, TraitError, scale_exponent
 SpaceKind = Literal["pca", "nmf"]
 
 N_HALVINGS = 20
-"""Random halvings of the people that choose the number of components."""
+"""Random halvings of the people for choosing the number of components."""
 MIN_SCORE_RATIO = 1.05
-"""Few components are taken when their score is more than this times that of all."""
+"""A reduced number of components is chosen if its score exceeds this times that of all."""
 MIN_SCORE = 0.5
-"""Scores below this tell too little to drop a component for."""
+"""Smallest score at which components are dropped."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reduction:
-    """A reduced space and where the samples lie in it.
+    """A reduced space and the samples' coordinates in it.
 
     Attributes
     ----------
@@ -38,15 +38,15 @@ class Reduction:
     center : ndarray, shape (d,)
         Mean of the samples.
     basis : ndarray, shape (K, d)
-        Directions of the space: orthonormal under the metric and in falling order (PCA), or
+        Directions of the space: orthonormal under the metric and in decreasing order (PCA), or
         non-negative mixtures (NMF).
     whole, scores : ndarray, shape (n, r)
-        The samples, and what the space holds of them, in one frame that is orthonormal under the
-        metric: for what needs lengths.
+        The samples, and their projections to the space, in one frame that is orthonormal under the
+        metric, for computing lengths.
     coordinates : ndarray, shape (n, K)
         The samples in the basis; from the center (PCA) or from 0 (NMF).
     lost : float
-        Root of the squared part of the samples' differences that the space does not hold.
+        Root of the squared fraction of the samples' differences outside the space.
     """
 
     kind: SpaceKind
@@ -59,7 +59,7 @@ class Reduction:
 
 
 def check_metric(metric: ArrayLike | None, length: int) -> Float64Array | None:
-    """Return a metric as float64; refuse one that is none of samples of this length."""
+    """Return a metric as float64; raise unless it fits samples of this length."""
     if metric is None:
         return None
     g = Checks(TraitError).numbers("metric", metric, (length,), (length, length))
@@ -68,7 +68,7 @@ def check_metric(metric: ArrayLike | None, length: int) -> Float64Array | None:
         return g
     size = np.diag(g)
     if not np.allclose(g, g.T, rtol=1e-9, atol=1e-12 * float(np.abs(g).max())):
-        raise TraitError("metric: got a matrix that is not symmetric")
+        raise TraitError("metric: got a matrix that is not symmetric, expected a symmetric one")
     if not (size > 0.0).all() or float(np.linalg.eigvalsh(g)[0]) < -1e-6 * float(size.max()):
         raise TraitError("metric: got a matrix of products that is not positive semidefinite")
     return np.asarray(0.5 * (g + g.T))
@@ -110,9 +110,9 @@ def principal_components(
     Parameters
     ----------
     samples : ndarray, shape (n, d)
-        Finite, in any unit; d may be far larger than n: the work grows with n^2 d.
+        Finite, in any unit; d may be far larger than n: time is proportional to n^2 d.
     traits
-        What the number of components is chosen for.
+        Traits for which the number of components is chosen.
     components : int or None
         At most the rank of the samples' differences; None: see `choose_component_count`.
     metric
@@ -123,7 +123,7 @@ def principal_components(
     Raises
     ------
     TraitError
-        When all samples are the same, have fewer independent differences than asked for, or are
+        When all samples are the same, have fewer independent differences than requested, or are
         not finite.
     """
     exponent = scale_exponent(samples)
@@ -132,21 +132,21 @@ def principal_components(
     center = samples.mean(axis=0)
     off = samples - center
     y = to_euclidean_frame(off, metric)
-    # The triangle of a QR factorization has the same values and left vectors, and is small.
+    # X^T = Q R: the small triangle R has the singular values of X.
     small = np.asarray(np.linalg.qr(y.T, mode="r")).T if d > n else y
     u, s, _ = scipy.linalg.svd(small, full_matrices=False)
     eps = float(np.finfo(np.float64).eps)
-    # What rounding leaves of directions that are not there, and of the mean taken off
+    # rounding level of null directions, and of the subtracted mean
     floor = max(max(n, d) * s[0], 8.0 * np.sqrt(n) * float(metric_lengths(center, metric))) * eps
     rank = int(np.count_nonzero(s > floor))
     if rank == 0:
-        raise TraitError(f"samples: all {n} are the same, nothing can be learned from them")
+        raise TraitError(f"samples: all {n} are the same; add people who differ")
     if components is not None:
         what = f"components (the {n} samples differ in {rank})"
         Checks(TraitError).within(what, components, f"[1, {rank}]")
     scores = u[:, :rank] * s[:rank]
     kept = choose_component_count(scores, traits, rng=rng) if components is None else components
-    # A basis as sums of the samples needs no inverse of the metric.
+    # A basis of sums of samples avoids an inverse of the metric.
     basis = (u[:, :kept] / s[:kept]).T @ off
     held = np.where(np.arange(rank) < kept, scores, 0.0)
     lost = float(np.sqrt(np.sum(s[kept:] ** 2) / np.sum(s**2)))
@@ -157,25 +157,26 @@ def principal_components(
 def choose_component_count(
     scores: Float64Array, traits: Sequence[Trait], *, rng: np.random.Generator
 ) -> int:
-    """Return how many components make trait vectors that hold for other people.
+    """Return the number of components whose trait vectors generalize best to other people.
 
     Parameters
     ----------
     scores : ndarray, shape (n, r)
         The samples in all their components; finite.
     traits
-        Binary ones with at least 2 faces on both sides count; without any, all components stay.
+        Binary ones with at least 2 faces on both sides are used; without any, all components are
+        kept.
     rng
         Halves the people.
 
     Notes
     -----
     Both groups of a trait are halved at random. One half gives a vector in its own first k
-    components, the other a plain difference of means. As that one errs independently, the cosine
-    between both is, but for a factor that does not depend on k, the cosine to the truth. The k
-    of the largest mean over traits and 20 halvings wins when it is better than all components by
-    more than a twentieth: dropping components helps where noise is spread over many and the trait
-    is not, and loses a trait that is smaller than what people differ in anyway.
+    components, the other a plain difference of means. As the errors of both are independent, their
+    cosine is the cosine to the true vector, up to a factor that does not depend on k. The k of the
+    largest mean over traits and 20 halvings is chosen if it exceeds that of all components by more
+    than a twentieth. Dropping components helps where noise is distributed over many components and
+    the trait is not; it loses a trait that is smaller than other differences between people.
     """
     n, rank = scores.shape
     used = [t for t in traits if t.kind == "binary" and 2 <= t.members <= n - 2]
@@ -221,7 +222,7 @@ def fit_mixtures(
     samples : ndarray, shape (n, d)
         Finite, in any unit.
     basis : array_like, shape (K, d)
-        Finite values of at least 0, as `reconstruction.brdf_basis.reduce` gives them.
+        Finite values of at least 0, from `reconstruction.brdf_basis.reduce`.
     metric
         See `check_metric`.
 
@@ -239,7 +240,7 @@ def fit_mixtures(
     d = samples.shape[1]
     b = Checks(TraitError).numbers("basis", basis, ("K", d), interval="[0, inf)")
     if not (b.max(axis=1) > 0.0).all():
-        raise TraitError("basis: got a mixture of nothing")
+        raise TraitError("basis: got a mixture of weight 0, expected weights above 0")
     exponent = scale_exponent(samples)
     samples = np.ldexp(samples, -exponent)
     coordinates = mixture_coordinates(samples, b, metric)
@@ -249,7 +250,7 @@ def fit_mixtures(
     spread = float(np.linalg.norm(metric_lengths(samples - center, metric)))
     rounding = 8.0 * len(samples) * float(metric_lengths(center, metric)) * np.finfo(np.float64).eps
     if spread <= rounding:
-        raise TraitError(f"samples: all {len(samples)} are the same, nothing can be learned")
+        raise TraitError(f"samples: all {len(samples)} are the same; add people who differ")
     gone = off - off.mean(axis=0)
     lost = float(np.linalg.norm(metric_lengths(gone, metric))) / spread
     whole, held = to_euclidean_frame(samples, metric), to_euclidean_frame(mixed, metric)
@@ -262,14 +263,14 @@ def fit_mixtures(
 def mixture_coordinates(
     samples: Float64Array, basis: Float64Array, metric: Float64Array | None
 ) -> Float64Array:
-    """Return the non-negative shares (n, K) of a basis (K, d) that come nearest to samples.
+    """Return the non-negative weights (n, K) of a basis (K, d) nearest to samples.
 
-    Both finite, each in any unit; what is narrower than double precision is widened.
+    Both finite, each in any unit; computed in double precision.
 
     Raises
     ------
     TraitError
-        For what is not finite, and a metric that is none of samples of this length.
+        For values that are not finite, and a metric that does not fit samples of this length.
     """
     samples, basis = np.asarray(samples, np.float64), np.asarray(basis, np.float64)
     unit, own = scale_exponent(samples), scale_exponent(basis)

@@ -1,8 +1,8 @@
-"""Edit faces by traits: more lotion, more tan, a younger skin.
+"""Learn trait vectors from labeled samples and edit samples by them (lotion, tan, age).
 
-A population of samples, user-assigned labels, and differences of the means of those with a trait
-and without. An edit adds such vectors to a sample, or mixes it with the means of groups, and keeps
-it a possible one. What of a sample the reduced space does not hold is kept, so an edit of amount 0
+A trait vector is the difference of the means of samples with and without a user-assigned label. An
+edit adds such vectors to a sample, or mixes it with the means of groups, and projects the result to
+the feasible set. The part of a sample outside the reduced space is kept, so an edit of amount 0
 changes nothing.
 
 References
@@ -37,18 +37,18 @@ NO_TRAITS: Mapping[str, ArrayLike] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EditOutcome:
-    """An edited sample, and what of the edit was not possible.
+    """An edited sample, and the part of the edit that was not possible.
 
     Attributes
     ----------
     sample : ndarray, shape (..., d)
     moved : ndarray, shape (...)
-        Length of the change asked for, under the space's metric.
+        Length of the requested change, under the space's metric.
     clipped : ndarray, shape (...)
-        Length of what the feasible set did not allow of it.
+        Length of its part outside the feasible set.
     return_bound : ndarray, shape (...)
-        The linear edit by the opposite amounts comes back to the source within this, under the
-        metric: a projection onto a convex set never moves points apart.
+        Bound of the distance to the source, under the metric, after the linear edit by the opposite
+        amounts: a projection onto a convex set never increases distances.
     """
 
     sample: FloatArray
@@ -58,7 +58,7 @@ class EditOutcome:
 
     @property
     def clipped_fraction(self) -> Float64Array:
-        """Share of the change that was not possible; 0 where nothing was asked for."""
+        """Return the fraction of the change that was not possible; 0 for a change of 0."""
         asked = np.where(self.moved > 0.0, self.moved, 1.0)
         return np.where(self.moved > 0.0, self.clipped / asked, 0.0)
 
@@ -76,17 +76,17 @@ class TraitSpace:
         See `model.traits.reduced_spaces.Reduction`.
     traits : mapping of str to TraitVector
     feasible : FeasibleSet
-        Where samples must stay.
+        Feasible set of the samples.
     metric : ndarray, shape (d,) or (d, d), or None
-        What differences of samples count; None: the sum of squares.
+        Metric of differences of samples; None: the sum of squares.
     samples : int
         n.
     lost : float
-        Share of the samples' differences that the reduced space does not hold, RMS.
+        Fraction of the samples' differences outside the reduced space, RMS.
     seed : int
-        Of everything random in the fit.
+        Seed of all random numbers in the fit.
     names : tuple of str
-        Of the d numbers; empty when they have none.
+        Names of the d numbers; may be empty.
     """
 
     kind: SpaceKind
@@ -100,12 +100,12 @@ class TraitSpace:
     seed: int
     names: tuple[str, ...] = ()
     notes: Mapping[str, str] = field(default_factory=dict)
-    """What else to know about the samples."""
+    """Further properties of the samples."""
     storage_error: Mapping[str, float] = field(default_factory=dict)
-    """Relative error that storing has left in each trait's vector; empty in a fresh space."""
+    """Relative error of each trait's vector by storage; empty in a new space."""
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not fit each other."""
+        """Raise for arrays that do not fit each other."""
         d = len(self.center)
         check = Checks(TraitError).shape
         check("basis", self.basis, (None, d))
@@ -131,36 +131,36 @@ class TraitSpace:
         names: tuple[str, ...] = (),
         seed: int = 0,
     ) -> TraitSpace:
-        """Learn trait vectors from labelled samples.
+        """Learn trait vectors from labeled samples.
 
         Parameters
         ----------
         samples : array_like, shape (n, d)
-            One sample a face: a histogram vector (d = 23,808), or a mean mixture of materials.
+            One sample per face: a histogram vector (d = 23,808), or a mean mixture of materials.
         labels : mapping of str to array_like of bool, shape (n,)
-            Whether each face has the trait; it may be given any name.
+            Whether each face has the trait; any name is allowed.
         space : {"pca", "nmf"}
             Principal components of the samples, or non-negative mixtures of `basis`.
         continuous : mapping of str to array_like, shape (n,)
             Values such as an age; their vectors are changes per unit.
         basis : array_like, shape (K, d)
-            For "nmf": non-negative mixtures, as `reconstruction.brdf_basis.reduce` gives them.
+            For "nmf": non-negative mixtures, from `reconstruction.brdf_basis.reduce`.
         components : int, optional
-            For "pca"; by default all, or fewer where their vectors hold better for other people,
-            see `model.traits.reduced_spaces.choose_component_count`.
+            For "pca"; by default all, or fewer where their vectors generalize better, see
+            `model.traits.reduced_spaces.choose_component_count`.
         metric : array_like, shape (d,) or (d, d), optional
-            What differences count. For mixtures of materials give their products over directions
-            (`brdf_products`): their shares alone are no measure of what is seen.
+            Metric of differences. For mixtures of materials give their products over directions
+            (`brdf_products`): differences of weights do not measure visible differences.
         feasible : FeasibleSet, optional
-            Where samples must stay; by default the smallest of histograms of 256 bins, values of
-            at least 0 and everything that holds all samples.
+            Feasible set; by default the smallest one that contains all samples, out of histograms
+            of 256 bins, values of at least 0 and all finite values.
         contrast : {"means", "regression"}
-            "means": differences of complement means, the paper's. "regression": what a trait adds
-            beside all other traits given.
+            "means": differences of complement means, the paper's. "regression": a trait's effect
+            with all other traits as covariates.
         names : tuple of str
-            Of the d numbers.
+            Names of the d numbers.
         seed : int
-            Of the halvings, exchanges and resamplings.
+            Seed of the halvings, permutations and resamplings.
 
         Raises
         ------
@@ -209,19 +209,19 @@ class TraitSpace:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What to know before trusting the traits, a sentence each."""
+        """Return the warnings of all traits, one sentence each."""
         return tuple(w for trait in self.traits.values() for w in trait.warnings)
 
     def trait(self, name: str) -> TraitVector:
-        """Return a trait's vector; raises `TraitError` for a trait that is not there."""
+        """Return a trait's vector; raise `TraitError` for an unknown trait."""
         if name not in self.traits:
             raise TraitError(f"trait: got {name!r}, expected one of {', '.join(self.traits)}")
         return self.traits[name]
 
     def mean_with(self, name: str) -> Float64Array:
-        """Return the mean sample of those with a binary trait, (d,), as far as the space holds it.
+        """Return the mean sample of those with a binary trait, (d,), projected to the space.
 
-        The nearest sample of the feasible set, where the space is too small to hold the mean.
+        The nearest sample of the feasible set if that projection is outside it.
         """
         trait = self.trait(name)
         if trait.kind != "binary":
@@ -236,7 +236,7 @@ class TraitSpace:
     def coordinates(self, samples: ArrayLike) -> Float64Array:
         """Return samples (..., d) in the reduced space, (..., K).
 
-        From the center in principal components, else shares of the basis, at least 0.
+        Principal components are relative to the center; weights of a basis are at least 0.
         """
         s = self._checked(samples)
         if self.kind == "pca":
@@ -248,7 +248,7 @@ class TraitSpace:
         return found.reshape(*s.shape[:-1], -1)
 
     def reduced(self, samples: ArrayLike) -> Float64Array:
-        """Return the part of samples (..., d) that the reduced space holds, (..., d)."""
+        """Return samples (..., d) projected to the reduced space, (..., d)."""
         inside = self.coordinates(samples) @ self.basis
         return np.asarray(inside + self.center if self.kind == "pca" else inside)
 
@@ -268,16 +268,16 @@ class TraitSpace:
     def edit_with_outcome(
         self, sample: ArrayLike, amounts: Mapping[str, float], *, mode: Mode = "linear"
     ) -> EditOutcome:
-        """Edit samples by traits, and say what was not possible.
+        """Edit samples by traits and report the part that was not possible.
 
         Parameters
         ----------
         sample : array_like, shape (..., d)
             In the feasible set.
         amounts : mapping of str to float
-            "linear": times the trait's vector, added; 1 makes somebody without a trait like those
-            with it, negative amounts take it away; continuous traits in their unit.
-            "convex": share of the mean of those with the trait, at least 0 and together at most 1,
+            "linear": factor of the added trait vector; 1 changes a face without the trait to the
+            mean of those with it, negative amounts reduce it; continuous traits in their unit.
+            "convex": weight of the mean of those with the trait, at least 0 and together at most 1,
             the rest being the sample; only for traits with a group.
         mode : {"linear", "convex"}
 
@@ -289,15 +289,17 @@ class TraitSpace:
         Raises
         ------
         TraitError
-            For traits that are not there, amounts that are not finite or make no convex
-            combination, and samples outside the feasible set.
+            For unknown traits, amounts that are not finite or make no convex combination, and
+            samples outside the feasible set.
         """
         Checks(TraitError).choice("mode", mode, ("linear", "convex"))
         given = np.asarray(sample)
         dtype = given.dtype if np.issubdtype(given.dtype, np.floating) else np.dtype(np.float64)
         s = self._checked(given)
         if not self.feasible.contains(s).all():
-            raise TraitError(f"sample: is not in the set {self.feasible} where samples must stay")
+            raise TraitError(
+                f"sample: is not in the feasible set {self.feasible}; project it first"
+            )
         for name, amount in amounts.items():
             self.trait(name)
             Checks(TraitError).within(f"amount of {name}", amount)
@@ -316,7 +318,7 @@ class TraitSpace:
         return EditOutcome(found.astype(dtype), moved, clipped, clipped)
 
     def _products(self) -> Float64Array | None:
-        """Return the metric where it joins several numbers; weights alone move no projection."""
+        """Return the metric if it is a matrix; weights alone do not change a projection."""
         return self.metric if self.metric is not None and self.metric.ndim == 2 else None
 
     def _mixed(self, s: Float64Array, amounts: Mapping[str, float]) -> Float64Array:
@@ -359,16 +361,16 @@ def _vectors(
     contrast: Contrast,
     rng: np.random.Generator,
 ) -> dict[str, TraitVector]:
-    """Return the vectors of traits in a reduced space, with what they are worth."""
+    """Return the vectors of traits in a reduced space, with their confidence."""
     related = trait_vectors.correlations(traits)
     found = {}
     for k, trait in enumerate(traits):
-        beside = tuple(t for t in traits if t is not trait) if contrast == "regression" else ()
+        covariates = tuple(t for t in traits if t is not trait) if contrast == "regression" else ()
         sure = trait_vectors.direction_confidence(
-            trait, reduced.scores, whole=reduced.whole, covariates=beside, rng=rng
+            trait, reduced.scores, whole=reduced.whole, covariates=covariates, rng=rng
         )
-        left = trait_vectors.residuals(trait, x, covariates=beside)
-        weights = trait_vectors.error_weights(trait, left[:, -1], 2 + len(beside))
+        left = trait_vectors.residuals(trait, x, covariates=covariates)
+        weights = trait_vectors.error_weights(trait, left[:, -1], 2 + len(covariates))
         others = [
             (t.name, float(r))
             for t, r in zip(traits, related[k], strict=True)

@@ -1,7 +1,7 @@
-"""Trait spaces in one file: arrays as npz, what they are as JSON inside.
+"""Read and write trait spaces as one npz file of arrays with a JSON document inside.
 
-Spaces of long samples can be stored in fewer bits. What that changes in each trait's vector is
-measured while writing and told by the document.
+Spaces of long samples can be stored in fewer bits. The resulting error of each trait's vector is
+measured while writing and stored in the document.
 """
 
 import io
@@ -31,12 +31,12 @@ PACKAGED_FILE = "trait_space.npz"
 _SPACE_KEYS = ("kind", "samples", "lost", "seed")
 _TRAIT_KEYS = ("name", "kind", "members", "others")
 SCALE_BLOCK = 256
-"""Numbers that share one scale in 8 bits."""
-_MIN_REDUCED_LENGTH = 1024  # samples at least so long are stored in fewer bits
+"""Numbers per common scale in 8 bits."""
+_MIN_REDUCED_LENGTH = 1024  # samples of at least this length are stored in fewer bits
 
 
 class TraitFileError(ValueError):
-    """A file that holds no trait spaces, or damaged ones."""
+    """Error for a file without trait spaces, or with damaged ones."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,13 +46,13 @@ class TraitLibrary:
     Attributes
     ----------
     spaces : mapping of str to TraitSpace
-        By what their samples are, such as "surface" and "albedo".
+        By kind of sample, such as "surface" and "albedo".
     source : {"simulated", "measured"}
-        What the population is.
+        Origin of the population.
     parameters : mapping of str to JSON values
         How the samples were made.
     files : mapping of str to bytes
-        What belongs to the samples, such as a texture space.
+        Files of the samples, such as a texture space.
     """
 
     spaces: Mapping[str, TraitSpace]
@@ -61,16 +61,16 @@ class TraitLibrary:
     files: Mapping[str, bytes] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse another source."""
+        """Raise for another source."""
         Checks(TraitError).choice("source", self.source, ("simulated", "measured"))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All traits of all spaces, in alphabetical order."""
+        """Return all traits of all spaces in alphabetical order."""
         return tuple(sorted({name for space in self.spaces.values() for name in space.traits}))
 
     def spaces_with(self, trait: str) -> dict[str, TraitSpace]:
-        """Return the spaces that have a trait; raises `TraitError` when none has."""
+        """Return the spaces that have a trait; raise `TraitError` if none has."""
         found = {name: space for name, space in self.spaces.items() if trait in space.traits}
         if not found:
             raise TraitError(f"trait: got {trait!r}, expected one of {', '.join(self.names)}")
@@ -82,8 +82,8 @@ class TraitLibrary:
         Parameters
         ----------
         precision : {"float64", "float32", "float16", "int8"}
-            Of long samples (1024 numbers and more); shorter ones are stored as they are. "int8":
-            each run of 256 numbers in steps of 1/127 of its largest.
+            Precision of long samples (1024 numbers and more); shorter ones are stored in float64.
+            "int8": each run of 256 numbers in steps of 1/127 of its largest.
 
         Examples
         --------
@@ -115,7 +115,7 @@ class TraitLibrary:
         return stream.getvalue()
 
     def save(self, path: str | Path, *, precision: Precision = "float32") -> None:
-        """Write the file that `load` reads; ``path`` is used as it is."""
+        """Write the file for `load`; ``path`` is used unchanged."""
         Path(path).write_bytes(self.to_bytes(precision=precision))
 
 
@@ -123,8 +123,8 @@ class TraitLibrary:
 def load_packaged_traits() -> TraitLibrary:
     """Return the packaged traits, learned from a simulated population.
 
-    `tools/make_trait_space.py` makes them; `parameters` says of whom, and how near they come to
-    what the simulator truly changed.
+    `tools/make_trait_space.py` makes them; `parameters` describes the population and the cosines to
+    the simulator's ground truth.
     """
     return from_bytes(resources.files("model").joinpath("data", PACKAGED_FILE).read_bytes())
 
@@ -135,7 +135,7 @@ def load(path: str | Path) -> TraitLibrary:
     Raises
     ------
     TraitFileError
-        For a file that cannot be read or holds none.
+        For a file that cannot be read or does not contain any.
     """
     try:
         content = Path(path).read_bytes()
@@ -153,7 +153,7 @@ def from_bytes(content: bytes) -> TraitLibrary:
     Raises
     ------
     TraitFileError
-        For bytes that hold none, or another version's.
+        For bytes that do not contain any, or another version's.
     """
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as stored:
@@ -162,7 +162,7 @@ def from_bytes(content: bytes) -> TraitLibrary:
         schema = document["schema"]
     except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise TraitFileError(
-            "got no trait spaces, expected a file that `skinrig fit traits` wrote"
+            "got no trait spaces, expected a file of `skinrig fit traits`"
         ) from error
     if schema != SCHEMA:
         raise TraitFileError(
@@ -194,7 +194,7 @@ def _packed(
         "stderr": np.array([t.stderr for t in found]).reshape(len(found), -1),
     }
     for key, value in values.items():
-        # The center alone is no small difference: 8 bits would change what it is.
+        # The center is not a small difference like the directions: 8 bits would change it visibly.
         bits: Precision = "float16" if precision == "int8" and key == "center" else precision
         arrays.update(_encoded(prefix + key, value, bits))
     arrays[prefix + "coordinates"] = np.array([t.coordinates for t in found])

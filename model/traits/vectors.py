@@ -1,9 +1,9 @@
-"""What a trait changes, from people with and without it, and how sure that is.
+"""Estimate trait vectors from people with and without a trait, and their confidence.
 
 A trait vector is a weighted sum of the samples, its *contrast* c: the mean of those with the trait
 minus the mean of those without, or the slope over a continuous trait (one formula: the contrast is
-t - mean(t) over the sum of its squares). Everything about its confidence follows from the contrast
-and the n samples in an orthonormal frame of at most n coordinates, however long they are.
+t - mean(t) over the sum of its squares). Its confidence is computed from the contrast and the n
+samples in an orthonormal frame of at most n coordinates, for samples of any length.
 
 References
 ----------
@@ -28,39 +28,39 @@ Kind = Literal["binary", "continuous"]
 Contrast = Literal["means", "regression"]
 
 MIN_GROUP_SIZE = 5
-"""A group of fewer people gets a warning."""
+"""Smallest group without a warning."""
 IDENTITY_CORRELATION = 1.0 - 1e-9
-"""Traits correlated by more than this are one and the same."""
+"""Correlation above which two traits count as identical."""
 MAX_CORRELATION = 0.5
-"""Traits correlated by more than this get a warning."""
+"""Correlation above which two traits get a warning."""
 MAX_P_VALUE = 0.05
 MIN_COSINE = 0.95
 _CHUNK_TRAITS = 64
 
 
 class TraitError(ValueError):
-    """Traits, samples or amounts from which nothing can be made."""
+    """Error for invalid traits, samples or amounts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Confidence:
-    """How sure the direction of a trait vector is, in the reduced space.
+    """Confidence in the direction of a trait vector in the reduced space.
 
     Attributes
     ----------
     p_value : float
-        Share of random exchanges of the labels that give whole samples a difference at least as
-        long: even over (0, 1] where there is no trait. 1 where nothing can be exchanged. (In a
-        space that was chosen for these labels it would not be even.)
+        Fraction of random permutations of the labels with a difference of whole samples at least as
+        long: uniform over (0, 1] without a trait. 1 where nothing can be permuted. (In a space that
+        was chosen for these labels it would not be uniform.)
     expected_cosine : float
-        Cosine between this vector and the true one of the whole samples, with what the errors of
-        both lengths make of it taken off: sqrt(1 - noise^2 / length^2) where the space holds all,
-        less by what it does not hold. 0 where the noise exceeds the length, or is not known.
+        Expected cosine between this vector and the true one of the whole samples, corrected for the
+        noise in both lengths: sqrt(1 - noise^2 / length^2) in a complete space, reduced by the part
+        outside the space. 0 where the noise exceeds the length, or is unknown.
     bootstrap_cosine : (float, float, float)
-        16th, 50th and 84th percentile of the cosine to vectors with their residuals drawn anew;
-        zeros where no residuals are known.
+        16th, 50th and 84th percentile of the cosine to vectors with resampled residuals; zeros
+        without residuals.
     relative_noise : float
-        noise / length; inf where the length is 0 or the noise not known.
+        noise / length; inf where the length is 0 or the noise unknown.
     """
 
     p_value: float
@@ -71,7 +71,7 @@ class Confidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TraitVector:
-    """What one trait changes in a sample.
+    """Change of a sample by one trait.
 
     Attributes
     ----------
@@ -80,14 +80,15 @@ class TraitVector:
     vector : ndarray of float64, shape (d,)
         Change of a sample by the trait (binary), or per unit of it (continuous).
     stderr : ndarray of float64, shape (d,)
-        Of each number before the space was reduced; 0 where `confidence.relative_noise` is inf.
+        Standard error of each number before the reduction; 0 where `confidence.relative_noise` is
+        inf.
     coordinates : ndarray of float64, shape (K,)
         The vector in the reduced space.
     members, others : int
         People with the trait and without; for a continuous one all people and 0.
     confidence : Confidence
     confounded : tuple of (str, float)
-        Other traits and the correlation with them, beyond 0.5, largest first.
+        Other traits with a correlation beyond 0.5, largest first.
     warnings : tuple of str
     """
 
@@ -119,7 +120,7 @@ class TraitVector:
 
     @property
     def warning(self) -> str:
-        """All warnings, one sentence each; empty without one."""
+        """Return all warnings, one sentence each; empty without any."""
         return "; ".join(self.warnings)
 
 
@@ -136,7 +137,7 @@ class Trait:
 
     @property
     def members(self) -> int:
-        """People with the trait; all for a continuous one."""
+        """Return the number of people with the trait; all for a continuous one."""
         return int(self.values.sum()) if self.kind == "binary" else len(self.values)
 
 
@@ -152,14 +153,15 @@ def parse_traits(
     Parameters
     ----------
     labels : mapping of str to array_like of bool, shape (n,)
-        User-assigned: whether each of the people has the trait.
+        User-assigned: whether each person has the trait.
     continuous : mapping of str to array_like, shape (n,)
         Values such as an age; finite.
     count : int
         n, at least 2.
     contrast : {"means", "regression"}
-        "means": differences of complement means, whatever else differs between the groups.
-        "regression": what a trait adds beside all other traits given, by least squares.
+        "means": differences of complement means, without correction for other differences of the
+        groups. "regression": a trait's effect with all other traits as covariates, by least
+        squares.
 
     Returns
     -------
@@ -169,7 +171,7 @@ def parse_traits(
     ------
     TraitError
         For a trait that nobody or everybody has, a value that does not vary, or shapes that do not
-        fit; by regression also for traits that cannot be told apart.
+        fit; by regression also for traits that are linearly dependent.
 
     Examples
     --------
@@ -204,7 +206,7 @@ def parse_traits(
         if np.linalg.matrix_rank(design) < design.shape[1]:
             raise TraitError(
                 f"traits: {', '.join(name for name, _, _ in values)} of {count} people cannot be "
-                "told apart by regression; leave out those that follow from the others, or use "
+                "separated by regression; omit those that follow from the others, or use "
                 "differences of means"
             )
         found = list(np.linalg.pinv(design)[1:] / scale[:, None])
@@ -221,7 +223,7 @@ def _label(name: str, given: ArrayLike, count: int) -> Float64Array:
         who = "everybody" if value[0] else "nobody"
         raise TraitError(
             f"label {name!r}: {who} of {count} has it, expected some with and some without; label "
-            "other faces, or leave the trait out"
+            "other faces, or omit the trait"
         )
     return value
 
@@ -237,8 +239,8 @@ def _value(name: str, given: ArrayLike, count: int) -> Float64Array:
 def scale_exponent(*values: Float64Array) -> int:
     """Return the power of two that scales numbers to sizes up to 1; 0 where all are 0.
 
-    What does not depend on a unit is computed of ``numpy.ldexp(values, -exponent)``, exactly the
-    same numbers but for their unit, whose squares neither overflow nor vanish.
+    Unit-independent results are computed from ``numpy.ldexp(values, -exponent)``: exactly the same
+    numbers in another unit, whose squares neither overflow nor underflow.
 
     Parameters
     ----------
@@ -272,11 +274,11 @@ def correlations(traits: tuple[Trait, ...]) -> Float64Array:
 def residuals(
     trait: Trait, samples: Float64Array, *, covariates: tuple[Trait, ...] = ()
 ) -> Float64Array:
-    """Return what the trait leaves of samples (n, d), and each one's leverage in a last column.
+    """Return the residuals of samples (n, d), with each one's leverage in a last column.
 
     Parameters
     ----------
-    beside
+    covariates
         Other traits in the same regression; none for a difference of means.
     """
     columns = [np.ones(len(samples)), *(t.values - t.values.mean() for t in (trait, *covariates))]
@@ -288,8 +290,8 @@ def residuals(
 def error_weights(trait: Trait, leverage: Float64Array, parameters: int) -> Float64Array:
     """Return the weights of squared residuals in the vector's squared standard errors, (n,).
 
-    One's own for people whom the trait's group leaves free (HC2); the mean of all others' for the
-    only one of a group, whose residual is 0. All 0 where no residual is free.
+    HC2 weights c_i^2 / (1 - leverage_i); the only person of a group has leverage 1 and residual 0
+    and gets the mean squared residual of the others instead. All 0 where no residual is free.
     """
     free = leverage < 1.0 - 1e-9
     count = int(np.count_nonzero(free))
@@ -312,28 +314,28 @@ def direction_confidence(
     resamples: int = 400,
     rng: np.random.Generator,
 ) -> Confidence:
-    """Return how sure a trait's direction is.
+    """Return the confidence in a trait's direction.
 
     Parameters
     ----------
     trait
         See `parse_traits`.
     scores : ndarray, shape (n, r)
-        What the reduced space holds of the samples, in an orthonormal frame; finite.
+        The samples projected to the reduced space, in an orthonormal frame; finite.
     whole : ndarray, shape (n, r), optional
         The samples in the same frame; as `scores` by default.
-    beside
+    covariates
         Other traits in the same regression.
     permutations, resamples : int
-        Random exchanges of labels and of residuals, at least 1.
+        Numbers of random permutations of labels and of resamplings of residuals, at least 1.
     rng
-        Draws them.
+        Draws permutations and resamplings.
 
     Notes
     -----
-    Exchanges are exact for a difference of means. By regression, what is left of the samples when
-    the other traits have explained what they can is exchanged (Freedman and Lane 1983,
-    doi:10.1080/07350015.1983.10509354), else their effects would pass for noise.
+    Permutation tests are exact for a difference of means. By regression, the residuals of the
+    samples under the other traits are permuted (Freedman and Lane 1983,
+    doi:10.1080/07350015.1983.10509354); otherwise the other traits' effects would count as noise.
     """
     n = len(scores)
     c = trait.contrast
@@ -378,36 +380,36 @@ def direction_confidence(
 def list_warnings(
     trait: Trait, confidence: Confidence, confounded: tuple[tuple[str, float], ...]
 ) -> tuple[str, ...]:
-    """Return what to warn of, a sentence each."""
-    said = []
+    """Return the warnings of a trait, one sentence each."""
+    warnings = []
     if trait.kind == "binary":
         others = len(trait.values) - trait.members
         for count, which in ((trait.members, "with"), (others, "without")):
             if count < MIN_GROUP_SIZE:
-                said.append(
+                warnings.append(
                     f"{trait.name}: only {count} faces {which} it, expected "
                     f"{MIN_GROUP_SIZE} or more"
                 )
     elif len(trait.values) < MIN_GROUP_SIZE:
-        said.append(
+        warnings.append(
             f"{trait.name}: only {len(trait.values)} faces, expected {MIN_GROUP_SIZE} or more"
         )
     if np.isinf(confidence.relative_noise):
-        said.append(f"{trait.name}: its error is not known, too few faces")
+        warnings.append(f"{trait.name}: its error is unknown, too few faces")
     elif confidence.p_value > MAX_P_VALUE:
-        said.append(
-            f"{trait.name}: shuffled labels give as much (p = {confidence.p_value:.2g}); it may"
+        warnings.append(
+            f"{trait.name}: random labels do as well (p = {confidence.p_value:.2g}); it may"
             f" be noise"
         )
     elif confidence.expected_cosine < MIN_COSINE:
-        said.append(
+        warnings.append(
             f"{trait.name}: noisy, its cosine to the true direction is about "
             f"{confidence.expected_cosine:.2f}"
         )
     for other, r in confounded:
-        said.append(
-            f"{trait.name}: the same faces as {other}, cannot be told apart"
+        warnings.append(
+            f"{trait.name}: the same faces as {other}, cannot be separated"
             if abs(r) > IDENTITY_CORRELATION
             else f"{trait.name}: goes along with {other} (correlation {r:+.2f})"
         )
-    return tuple(said)
+    return tuple(warnings)

@@ -1,8 +1,8 @@
-"""Textures in blocks of 4 x 4: one channel in 8 bytes (BC4), two (BC5, "3Dc"), colors (BC1, BC3).
+"""Encode textures in 4 x 4 blocks: one channel in 8 bytes (BC4), two (BC5), colors (BC1, BC3).
 
-A block holds two end values and, for each texel, its step on the straight line between them.
-Decoding is exact arithmetic on the stored integers; encoding searches ends by least squares and
-then by single steps, which is close to the best block and not guaranteed to be it.
+A block contains two end values and, per texel, its step on the line between them. Decoding is exact
+integer arithmetic; encoding searches the ends by least squares and then by single steps, which is
+close to the optimum but not guaranteed to reach it.
 
 References
 ----------
@@ -15,17 +15,17 @@ from model.arrays import Float64Array, FloatArray, Int64Array, UInt8Array
 from model.checks import Checks
 
 BLOCK_SIDE = 4
-"""Texels a side of a block."""
+"""Texels per side of a block."""
 CHUNK_BLOCKS = 32_768
 """Blocks that are encoded at once."""
 RANGE_INSETS = (0.0, 0.06, 0.12)
-"""Parts of a block's range by which its ends are drawn in at first."""
+"""Fractions of a block's range by which its ends are moved inward at first."""
 FIT_ROUNDS = 4
 """Rounds of least squares on the ends of a block."""
 
 
 class BlockError(ValueError):
-    """A texture that blocks cannot hold, or blocks that are no texture."""
+    """Error for a texture that cannot be encoded, or blocks that cannot be decoded."""
 
 
 def block_grid_shape(shape: tuple[int, int]) -> tuple[int, int]:
@@ -34,7 +34,7 @@ def block_grid_shape(shape: tuple[int, int]) -> tuple[int, int]:
 
 
 def encode_bc4(values: FloatArray) -> UInt8Array:
-    """Encode one channel.
+    """Encode one channel as BC4 blocks.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def encode_bc4(values: FloatArray) -> UInt8Array:
 
 
 def decode_bc4(blocks: UInt8Array, shape: tuple[int, int]) -> Float64Array:
-    """Return the channel (h, w) in [0, 1] that blocks hold, in either of the format's modes."""
+    """Return the channel (h, w) in [0, 1] of blocks in either of the format's modes."""
     data = _checked(blocks, 8, shape).astype(np.int64)
     r0, r1 = data[..., 0], data[..., 1]
     bits = (data[..., 2:] << (8 * np.arange(6))).sum(axis=-1)
@@ -79,7 +79,7 @@ def encode_bc5(values: FloatArray) -> UInt8Array:
 
 
 def decode_bc5(blocks: UInt8Array, shape: tuple[int, int]) -> Float64Array:
-    """Return the two channels (h, w, 2) in [0, 1] that blocks hold."""
+    """Return the two channels (h, w, 2) in [0, 1] of blocks."""
     data = _checked(blocks, 16, shape)
     return np.stack([decode_bc4(data[..., :8], shape), decode_bc4(data[..., 8:], shape)], axis=-1)
 
@@ -97,14 +97,14 @@ def encode_bc1(colors: FloatArray) -> UInt8Array:
 def decode_bc1(
     blocks: UInt8Array, shape: tuple[int, int], *, always_four: bool = False
 ) -> Float64Array:
-    """Return the colors (h, w, 3) in [0, 1] that blocks hold.
+    """Return the colors (h, w, 3) in [0, 1] of blocks.
 
     Parameters
     ----------
     blocks : ndarray of uint8, shape (ceil(h/4), ceil(w/4), 8)
     shape : (int, int)
     always_four : bool
-        True as part of BC3. False: blocks whose first end is not the larger hold three colors
+        True as part of BC3. False: blocks whose first end is not the larger one have three colors
         and black.
     """
     data = _checked(blocks, 8, shape).astype(np.int64)
@@ -126,7 +126,7 @@ def encode_bc3(values: FloatArray) -> UInt8Array:
 
 
 def decode_bc3(blocks: UInt8Array, shape: tuple[int, int]) -> Float64Array:
-    """Return the four channels (h, w, 4) in [0, 1] that blocks hold."""
+    """Return the four channels (h, w, 4) in [0, 1] of blocks."""
     data = _checked(blocks, 16, shape)
     last = decode_bc4(data[..., :8], shape)
     colors = decode_bc1(data[..., 8:], shape, always_four=True)
@@ -188,7 +188,7 @@ def _better(
 
 
 def _least_squares_ends(v: Float64Array, part: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Return ends whose line fits best, given each texel's part of the second end."""
+    """Return the least-squares ends, given each texel's weight of the second end."""
     axes = (slice(None), slice(None), *([None] * (v.ndim - 2)))
     p, q = (1.0 - part)[axes], part[axes]
     aa, ab, bb = (p * p).sum(axis=1), (p * q).sum(axis=1), (q * q).sum(axis=1)
@@ -230,7 +230,7 @@ def _bc1_chunk(v: Float64Array) -> UInt8Array:
         a, b = _least_squares_ends(v, best[2] / 3.0)
     assert best is not None  # noqa: S101
     first, second, steps = best
-    swap = first < second  # four colors are told by the larger end coming first
+    swap = first < second  # the larger end comes first: this order selects the mode of four colors
     first, second = np.where(swap, second, first), np.where(swap, first, second)
     steps = np.where(swap[:, None], 3 - steps, steps)
     steps[first == second] = 0

@@ -1,8 +1,8 @@
-"""The alternative to partial derivatives: differences of normals added to the base normals.
+"""Add differences of normals to the base normals: the alternative to partial derivatives.
 
-It keeps ordinary normal maps and slopes beyond 45 degrees, needs three channels for two, and is
-exact only for a weight of 1 on the base that it was made for: between, normals are blended along
-a chord instead of relief being scaled.
+It supports ordinary normal maps and slopes beyond 45 degrees, needs three channels instead of two,
+and is exact only for a weight of 1 on its own base: other weights blend normals along a chord
+instead of scaling the relief.
 
 References
 ----------
@@ -33,7 +33,7 @@ from model.wrinkles.masks import Masks, mask_stack, zone_strength
 
 @dataclass(frozen=True, slots=True)
 class NormalDifference:
-    """A difference of normals as a texture of [0, 1] holds it.
+    """A difference of normals, encoded for a texture of [0, 1].
 
     Attributes
     ----------
@@ -42,8 +42,8 @@ class NormalDifference:
     valid : ndarray of bool, shape (h, w)
         Both normals are finite and not zero.
     clamped_fraction : float
-        Of the valid texels: a component of w - b was beyond [-1, 1], as opposite slopes of more
-        than 30 degrees are.
+        Fraction of the valid texels with a component of w - b beyond [-1, 1], as for opposite
+        slopes of more than 30 degrees.
     """
 
     values: FloatArray
@@ -97,8 +97,8 @@ def combine(
     masks, weights, clamp, table
         As of `wrinkles.combine`.
     renormalize : bool
-        Return unit vectors, as the paper advises for compressed differences; otherwise what the
-        sum gives, shorter or longer.
+        Return unit vectors, as the paper advises for compressed differences; otherwise the sum,
+        shorter or longer.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""A face with its wrinkles: evaluated for any weights, and kept as maps of an appearance.
+"""Evaluate a face with wrinkles for any weights, and convert it to maps of an appearance.
 
 Maps are `wrinkle_base` (n_x/n_z, n_y/n_z, 0), `wrinkle_map` in the same form and
 `wrinkle_mask_<zone>` of the first wrinkle map, `wrinkle_<k>_map` and `wrinkle_<k>_mask_<zone>`
@@ -40,19 +40,18 @@ NO_ERRORS: Mapping[str, tuple[float, ...]] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True)
 class WrinkledNormals:
-    """What a model gives for some weights.
+    """Normals of a model for given weights.
 
     Attributes
     ----------
     normals : ndarray, shape (H, W, 3)
         Tangent-space unit normals; 0 where not valid.
     valid : ndarray of bool, shape (H, W)
-        The base was measured there; a wrinkle map's own hole adds nothing and is not counted.
+        The base was measured there; holes of a wrinkle map add nothing and are not counted.
     zone_sums, zone_weights : tuple of ndarray, shape (Z,)
         Each layer's sums over blend shapes before and after the clamp.
     clamped_fraction : float
-        Part of the texture that lies in a zone whose sum the clamp changed, in any layer: the
-        largest of the layers' parts.
+        Fraction of the texture in zones whose sum was clamped: the largest one of all layers.
     """
 
     normals: FloatArray
@@ -80,7 +79,7 @@ class WrinkleModel:
         Standard error of `base`.
     weight_stderr : mapping of str to tuple of float
         Standard error of the rows of the first layer's table that were fitted; infinite for a
-        weight that nothing determined.
+        weight that was not determined.
     """
 
     base: FloatArray
@@ -91,7 +90,7 @@ class WrinkleModel:
     weight_stderr: Mapping[str, tuple[float, ...]] = field(default_factory=lambda: NO_ERRORS)
 
     def __post_init__(self) -> None:
-        """Refuse shapes that do not fit; put 0 where nothing was measured."""
+        """Raise for shapes that do not fit; set unmeasured values to 0."""
         base = np.asarray(self.base)
         Checks(WrinkleError).shape("base", base, ("H", "W", 2))
         finite = np.asarray(np.isfinite(base).all(axis=2))
@@ -107,12 +106,12 @@ class WrinkleModel:
         object.__setattr__(self, "weight_stderr", MappingProxyType(errors))
 
     def evaluate(self, weights: Weights) -> WrinkledNormals:
-        """Return the normals of the face with some weights.
+        """Return the normals of the face for given weights.
 
         Parameters
         ----------
         weights : mapping of str to float, or array_like, shape (Z,)
-            Blend shapes by name, or sums of the zones, as `wrinkles.combine_layers` takes them.
+            Blend shapes by name, or sums of the zones, as in `wrinkles.combine_layers`.
 
         Examples
         --------
@@ -133,7 +132,7 @@ class WrinkleModel:
         return WrinkledNormals(normals, self.valid, sums, held, max(parts, default=0.0))
 
     def to_maps(self) -> tuple[dict[str, SkinMap], bytes]:
-        """Return the maps and the bytes of `WRINKLE_FILE` that :meth:`from_maps` reads."""
+        """Return the maps and the bytes of `WRINKLE_FILE` for :meth:`from_maps`."""
         maps = {"wrinkle_base": _map(self.base, self.base_stderr, self.valid, "neutral")}
         layers: list[dict[str, Any]] = []
         for k, layer in enumerate(self.layers):
@@ -168,12 +167,12 @@ class WrinkleModel:
 
     @classmethod
     def from_maps(cls, maps: Mapping[str, SkinMap], document: bytes) -> WrinkleModel:
-        """Read what :meth:`to_maps` gave.
+        """Read a model from the maps and file of :meth:`to_maps`.
 
         Raises
         ------
         WrinkleError
-            For a document of another kind, or a map that it names and is not there.
+            For a document of another kind, or a missing map.
         """
         try:
             given: Any = json.loads(document)
@@ -226,5 +225,5 @@ def _layer(entry: Mapping[str, Any], maps: Mapping[str, SkinMap]) -> WrinkleLaye
 
 def _require_map(maps: Mapping[str, SkinMap], name: str) -> SkinMap:
     if name not in maps:
-        raise WrinkleError(f"{WRINKLE_FILE}: names the map {name!r}, which is not there")
+        raise WrinkleError(f"{WRINKLE_FILE}: map {name!r} is missing; export the model again")
     return maps[name]

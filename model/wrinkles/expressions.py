@@ -1,4 +1,4 @@
-"""Which zones of the face an expression wrinkles, and how blend shapes add up in a zone.
+"""Weights of wrinkle zones by expression, and their sums over blend shapes.
 
 References
 ----------
@@ -27,7 +27,7 @@ ZONE_SUM_LIMITS: Mapping[str, tuple[float, float]] = MappingProxyType(
     {"unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
 )
 """Range of a zone's sum over blend shapes: "unit" is the paper's [0, 1], in which an expression
-that only flattens (anger's forehead) leaves nothing; "signed" keeps the sign."""
+that only flattens (anger's forehead) has no effect; "signed" keeps the sign."""
 
 ROW_OF_STATE: Mapping[str, str | None] = MappingProxyType(
     {
@@ -43,26 +43,26 @@ ROW_OF_STATE: Mapping[str, str | None] = MappingProxyType(
         "alcohol": None,
     }
 )
-"""Which row of table 1.1 stands for a state of facial color; None: it moves nothing. The table
-has no smile: joy is nearest, and wrinkles the forehead more than a posed smile would."""
+"""Row of table 1.1 for each state of facial color; None: no wrinkles. The table has no smile: joy
+is nearest, but wrinkles the forehead more than a posed smile."""
 
 
 class WrinkleError(ValueError):
-    """Maps, masks, tables or weights of wrinkles that do not fit together."""
+    """Error for maps, masks, tables or weights of wrinkles that do not fit together."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExpressionTable:
-    """Weights of zones, a row an expression.
+    """Weights of zones, one row per expression.
 
     Attributes
     ----------
     zones : tuple of str
         Names of the zones in the order of the masks.
     rows : mapping of str to tuple of float
-        One finite number a zone; a weight of 1 shows the wrinkle map as it is.
+        One finite number per zone; a weight of 1 adds the wrinkle map unscaled.
     source : str
-        Where the numbers come from.
+        Source of the numbers.
 
     Examples
     --------
@@ -75,7 +75,7 @@ class ExpressionTable:
     source: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse repeated zones and rows of another length or without numbers."""
+        """Raise for repeated zones and rows of another length or without numbers."""
         zones = tuple(str(zone) for zone in self.zones)
         if not zones or len(set(zones)) != len(zones):
             raise WrinkleError(f"zones: got {zones}, expected names that differ")
@@ -94,7 +94,7 @@ class ExpressionTable:
         """Return the weights of one expression, (Z,)."""
         if expression not in self.rows:
             near = difflib.get_close_matches(expression, self.rows, n=1)
-            hint = f"; {near[0]!r} is near" if near else ""
+            hint = f"; did you mean {near[0]!r}?" if near else ""
             raise WrinkleError(
                 f"expression: got {expression!r}, expected one of {', '.join(self.rows)}{hint}"
             )
@@ -102,12 +102,12 @@ class ExpressionTable:
 
 
 def read_table(text: str) -> ExpressionTable:
-    r"""Read a table of weights: a head ``expression,<zone>,...``, then a row an expression.
+    r"""Read a table of weights: a header ``expression,<zone>,...``, then one row per expression.
 
     Parameters
     ----------
     text : str
-        CSV; lines that begin with # say the source.
+        CSV; lines that begin with # are comments and become the source.
 
     Raises
     ------
@@ -132,7 +132,7 @@ def read_table(text: str) -> ExpressionTable:
     try:
         weights = {row[0].strip(): tuple(float(cell) for cell in row[1:]) for row in rows[1:]}
     except ValueError as error:
-        raise WrinkleError(f"table: got a weight that is no number: {error}") from error
+        raise WrinkleError(f"table: got a weight that is not a number: {error}") from error
     return ExpressionTable(tuple(cell.strip() for cell in rows[0][1:]), weights, source)
 
 
@@ -158,7 +158,7 @@ def zone_sums(weights: Weights, table: Table = JIMENEZ2011_TABLE) -> Float64Arra
     Parameters
     ----------
     weights : mapping of str to float, or array_like, shape (Z,)
-        Weight of each blend shape that is a row of the table, as many as there are; or the sums.
+        Weight of each blend shape that is a row of the table, any number of them; or the sums.
     table : ExpressionTable or mapping of str to Z floats
 
     Returns
@@ -182,7 +182,7 @@ def zone_sums(weights: Weights, table: Table = JIMENEZ2011_TABLE) -> Float64Arra
 
 
 def clamp_sums(sums: ArrayLike, clamp: Clamp = "unit") -> Float64Array:
-    """Return sums held in the range of `ZONE_SUM_LIMITS`; the caller reports where it changes them.
+    """Return sums clamped to the range of `ZONE_SUM_LIMITS`; callers report changed sums.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-"""The compiled sum of wrinkle maps on a base map (see `model.wrinkles`).
+"""Add wrinkle maps to a base map, compiled (see `model.wrinkles`).
 
-Textures are widened to the base's columns beforehand, so that the inner loop only blends two
-rows of each and runs without look-ups. Kernels are parallel over rows and called from one thread.
+Textures are resampled to the base's columns beforehand, so that the inner loop only blends two rows
+of each, without look-ups. Kernels are parallel over rows and called from one thread.
 """
 
 # mypy: allow-untyped-defs
@@ -15,12 +15,12 @@ import numpy as np
 from numba import njit, prange
 
 MIN_PARALLEL_PIXELS = 500_000
-"""Pixels below which one thread is sooner done than several are brought in."""
+"""Pixels below which one thread is faster than several."""
 
 
 @contextmanager
 def choose_thread_count(pixels: int) -> Iterator[None]:
-    """Keep to one thread while few pixels are computed."""
+    """Return the number of threads: one for few pixels."""
     before = numba.get_num_threads()
     if pixels < MIN_PARALLEL_PIXELS:
         numba.set_num_threads(1)
@@ -41,9 +41,9 @@ def add(total, wx, wy, w_rows, w_part, a, a_rows, a_part):
     wx, wy : (h, W) real
         Wrinkle derivatives, widened to W columns.
     w_rows, w_part : (H,) int64 and real
-        Upper texel row of each row, and the part of the row below it.
+        Upper texel row of each row, and the weight of the row below it.
     a, a_rows, a_part
-        The same of the zones' summed strength.
+        Likewise for the zones' summed strength.
     """
     rows, columns = total.shape[0], total.shape[1]
     for y in prange(rows):
@@ -75,7 +75,7 @@ def add_and_normalize(base, wx, wy, w_rows, w_part, a, a_rows, a_part, normals):
             p = base[y, x, 0] + s * (wx[w0, x] + f * (wx[w1, x] - wx[w0, x]))
             q = base[y, x, 1] + s * (wy[w0, x] + f * (wy[w1, x] - wy[w0, x]))
             z = one / sqrt(p * p + q * q + one)
-            good = z > zero  # false for NaN and infinity
+            good = z > zero  # False for NaN and infinity
             normals[y, x, 0] = p * z if good else zero
             normals[y, x, 1] = q * z if good else zero
             normals[y, x, 2] = z if good else zero

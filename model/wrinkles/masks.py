@@ -1,4 +1,4 @@
-"""Masks of wrinkle zones: as planes, as RGBA textures of four each, and summed by their weights."""
+"""Convert masks of wrinkle zones between planes and RGBA textures, and sum them by weight."""
 
 import math
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ Masks: TypeAlias = FloatArray | Sequence[FloatArray]
 
 
 def mask_stack(masks: Masks) -> FloatArray:
-    """Return masks as (Z, h, w), from that or from RGBA textures (h, w, 4), four zones each.
+    """Return masks as (Z, h, w), given so or as RGBA textures (h, w, 4) of four zones each.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def mask_textures(masks: Masks) -> FloatArray:
 def zone_strength(masks: FloatArray, sums: FloatArray) -> FloatArray:
     """Return masks (Z, h, w) summed with their zones' weights (Z,): (h, w), float64.
 
-    Bilinear reading is linear, so that one map is read instead of as many as there are zones.
+    Interpolation is linear, so one summed map is resampled instead of one per zone.
     """
     if sums.shape[0] != masks.shape[0]:
         last = masks.shape[2] == sums.shape[0]

@@ -1,9 +1,9 @@
-"""Wrinkles added to a face's normals: partial derivative maps, masked zones, signed weights.
+"""Add wrinkles to a face's normals: partial derivative maps, masked zones, signed weights.
 
-A tangent-space normal n is stored as (n_x/n_z, n_y/n_z), whose sum adds up relief as
-displacement would: the base map, plus one wrinkle map times the strength of its zones. Frames:
-+X right, +Y up, +Z outward; row 0 is the top. For a height h over x right and y up the stored
-values are -dh/dx and -dh/dy (the paper drops the sign of the original encoding twice).
+A tangent-space normal n is stored as (n_x/n_z, n_y/n_z), whose sum is that of the summed
+displacements: the base map, plus one wrinkle map times the strength of its zones. Frames: +X right,
++Y up, +Z outward; row 0 is the top. For a height h over x right and y up the stored values are
+-dh/dx and -dh/dy (the paper drops the sign of the original encoding twice).
 
 Examples
 --------
@@ -43,12 +43,12 @@ from model.wrinkles.masks import Masks, mask_stack, real_array, zone_strength
 
 ZONE_NAMES = JIMENEZ2011_TABLE.zones
 MAX_DERIVATIVE = 1.0
-"""Largest derivative that a texture of [0, 1] holds: slopes of 45 degrees along x and y."""
+"""Largest derivative in a texture of [0, 1]: slopes of 45 degrees along x and y."""
 
 
 @dataclass(frozen=True, slots=True)
 class EncodedDerivatives:
-    """Derivatives with what was lost on the way.
+    """Encoded derivatives with masks of invalid and clamped pixels.
 
     Attributes
     ----------
@@ -57,9 +57,9 @@ class EncodedDerivatives:
     valid : ndarray of bool, shape (...)
         The normal is finite and points out of the surface (n_z > 0).
     clamped : ndarray of bool, shape (...)
-        A derivative was held at the limit; valid pixels only.
+        A derivative was clamped to the limit; valid pixels only.
     clamped_fraction : float
-        Of the valid pixels; 0 where there is none.
+        Fraction of the valid pixels; 0 without any.
     """
 
     derivatives: FloatArray
@@ -76,15 +76,15 @@ def encode(normals: ArrayLike, *, limit: float | None = MAX_DERIVATIVE) -> Float
     normals : array_like, shape (..., 3)
         +X right, +Y up, +Z outward, of any positive length.
     limit : float, optional
-        Derivatives are clamped to [-limit, limit]; None keeps them as they are. How many were
-        clamped says :func:`encode_with_report`, which has masks, and 0 in place of NaN.
+        Derivatives are clamped to [-limit, limit]; None keeps them unchanged.
+        :func:`encode_with_report` returns masks of clamped pixels, and 0 in place of NaN.
 
     Returns
     -------
     ndarray, shape (..., 2)
         Dimensionless; float32 for float32 and float16 normals, float64 otherwise. NaN where a
-        normal is not finite, zero, or does not point outward: nothing represents it, and 0
-        would be a flat surface. :func:`decode` gives (0, 0, 0) there.
+        normal is not finite, zero, or does not point outward: it has no derivative, and 0 would be
+        a flat surface. :func:`decode` gives (0, 0, 0) there.
 
     Examples
     --------
@@ -99,7 +99,7 @@ def encode(normals: ArrayLike, *, limit: float | None = MAX_DERIVATIVE) -> Float
 def encode_with_report(
     normals: ArrayLike, *, limit: float | None = MAX_DERIVATIVE
 ) -> EncodedDerivatives:
-    """Encode as :func:`encode` does, and say which pixels were clamped or have no derivative.
+    """Encode as :func:`encode`, with masks of clamped pixels and of pixels without a derivative.
 
     Examples
     --------
@@ -113,7 +113,7 @@ def encode_with_report(
         Checks(WrinkleError).within("limit", limit, "(0, inf]")
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         d = n[..., :2] / n[..., 2:]
-        # an infinite quotient is a slope beyond any limit; without one nothing represents it
+        # an infinite quotient is a slope beyond any limit; without a limit it is not valid
         outward = np.asarray(np.isfinite(n).all(axis=-1) & (n[..., 2] > 0))
         valid = outward if limit is not None else np.asarray(outward & np.isfinite(d).all(axis=-1))
         beyond = np.zeros(valid.shape, np.bool_)
@@ -148,7 +148,7 @@ def decode(derivatives: ArrayLike) -> FloatArray:
         np.multiply(d, z[..., None], out=out[..., :2])
         out[..., 2] = z
     lost = np.asarray(~np.isfinite(squares))
-    if lost.any():  # squares overflow before derivatives do: scale these few first
+    if lost.any():  # squares overflow before derivatives do: scale large ones first
         out[lost] = _decoded_huge(d[lost])
     return out
 
@@ -169,14 +169,14 @@ def to_unit(derivatives: ArrayLike, *, limit: float = MAX_DERIVATIVE) -> FloatAr
 
 
 def from_unit(values: ArrayLike, *, limit: float = MAX_DERIVATIVE) -> FloatArray:
-    """Return the derivatives that texture values in [0, 1] stand for (listing 1.1)."""
+    """Return the derivatives encoded by texture values in [0, 1] (listing 1.1)."""
     t = real_array(values)
     return (t * t.dtype.type(2.0) - t.dtype.type(1.0)) * t.dtype.type(limit)
 
 
 @dataclass(frozen=True, slots=True)
 class WrinkleLayer:
-    """One wrinkle map with its zones, and what expressions ask of them.
+    """One wrinkle map with its zones, and their weights by expression.
 
     Attributes
     ----------
@@ -185,10 +185,10 @@ class WrinkleLayer:
     masks : ndarray, shape (Z, h, w)
         Or RGBA textures, see :func:`mask_stack`; any resolution.
     table : ExpressionTable or mapping
-        Rows of Z weights; expressions that other layers know and this does not are refused
-        unless listed, so give them rows of 0.
+        Rows of Z weights; an expression that is missing here but in other layers' tables is an
+        error, so give it a row of 0.
     stderr : ndarray, shape (h, w, 2), optional
-        Standard error of `wrinkle`; None for one that was painted or is a truth.
+        Standard error of `wrinkle`; None for one that was painted or is ground truth.
     valid : ndarray of bool, shape (h, w), optional
         Where `wrinkle` was measured; elsewhere it is 0. None: everywhere.
     """
@@ -200,7 +200,7 @@ class WrinkleLayer:
     valid: BoolArray | None = None
 
     def __post_init__(self) -> None:
-        """Refuse maps of other shapes or with NaN."""
+        """Raise for maps of other shapes or with NaN."""
         object.__setattr__(self, "wrinkle", _derivative_map("wrinkle", self.wrinkle, finite=True))
         object.__setattr__(self, "masks", mask_stack(self.masks))
         shape = self.wrinkle.shape
@@ -217,7 +217,7 @@ def combine(
     clamp: Clamp = "unit",
     table: Table = JIMENEZ2011_TABLE,
 ) -> FloatArray:
-    """Return the normals of a base map with wrinkles: listing 1.1.
+    """Return the normals of a base map with wrinkles (listing 1.1).
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def combine(
     weights : mapping of str to float, or array_like, shape (8,)
         Any number of blend shapes by name, or the zones' sums.
     clamp : {"unit", "signed"}
-        Each zone's sum over blend shapes is held in [0, 1], the paper's words, or in [-1, 1].
+        Range of each zone's sum over blend shapes: [0, 1], as in the paper, or [-1, 1].
     table : ExpressionTable or mapping, optional
         Zones' weights of each blend shape.
 
@@ -240,12 +240,12 @@ def combine(
     -------
     ndarray, shape (..., H, W, 3)
         Unit tangent-space normals of the base's type; (0, 0, 0) where the base is not finite
-        (or beyond 1e18, whose square float32 does not hold) or a normal of it points inward.
+        (or beyond 1e18, whose square overflows float32) or a normal of it points inward.
 
     Raises
     ------
     WrinkleError
-        For shapes that fit nothing, and for wrinkles or masks that are not finite.
+        For shapes that do not fit, and for wrinkles or masks that are not finite.
 
     Examples
     --------
@@ -286,7 +286,7 @@ def combine_layers(
     layers : sequence of Layer
         Any number, none included.
     weights : mapping of str to float, or array_like (Z,)
-        Blend shapes by name, looked up in each layer's table; or sums that hold for every layer,
+        Blend shapes by name, looked up in each layer's table; or sums that apply to every layer,
         whose numbers of zones must then agree.
     clamp : {"unit", "signed"}
 
@@ -317,7 +317,7 @@ def combine_layers(
 
 
 def to_kernel_planes(planes: FloatArray, shape: tuple[int, int], dtype: Any) -> tuple[Any, ...]:
-    """Return what the kernels read of a texture: planes with the base's columns, rows' taps.
+    """Return a texture for the kernels: planes with the base's columns, and row taps.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
-"""What wrinkle maps and masks cost in bytes, and what storing them costs in degrees.
+"""Compute the size of stored wrinkle maps and masks, and the error of their encodings.
 
 Examples
 --------
 The paper's figure of 96 KB: a block-compressed 256 x 256 map and two 64 x 64 masks, times 4/3
-for their mip-maps; the base map, which the face has anyway, is not counted.
+for their mip-maps; the base map, which every face has, is not counted.
 
 >>> paper_footprint().total_bytes / 1024
 96.0
@@ -32,13 +32,13 @@ MapEncoding: TypeAlias = Literal["float32", "float16", "unit8", "bc5"]
 MaskEncoding: TypeAlias = Literal["float32", "float16", "unit8", "bc3"]
 
 MAP_BYTES: Mapping[str, int] = MappingProxyType({"float32": 8, "float16": 4, "unit8": 2, "bc5": 1})
-"""Bytes a texel of two derivatives; "unit8" is 8 bits of [0, 1], "bc5" 16 bytes a block."""
+"""Bytes per texel of two derivatives; "unit8" is 8 bits of [0, 1], "bc5" 16 bytes per block."""
 MASK_BYTES: Mapping[str, int] = MappingProxyType(
     {"float32": 16, "float16": 8, "unit8": 4, "bc3": 1}
 )
-"""Bytes a texel of four zones."""
+"""Bytes per texel of four zones."""
 MIP_FACTOR = 4 / 3
-"""All mip levels over the first, in the limit of many levels."""
+"""Size of all mip levels over the first, in the limit of many levels."""
 WRINKLE_SIDE, MASK_SIDE, BASE_SIDE = 256, 64, 2048
 """The paper's resolutions."""
 
@@ -61,12 +61,12 @@ class Footprint:
 
     @property
     def total_bytes(self) -> float:
-        """All textures with their mip-maps."""
+        """Return the bytes of all textures with their mip-maps."""
         return (self.wrinkle_bytes + self.mask_bytes) * self.mip_factor
 
 
 def texture_bytes(shape: tuple[int, int], bytes_per_texel: int, *, in_blocks: bool = False) -> int:
-    """Return the bytes of one level; blocks of 4 x 4 are whole."""
+    """Return the bytes of one level; partial 4 x 4 blocks count as whole ones."""
     h, w = shape
     if in_blocks:
         rows, columns = blocks.block_grid_shape(shape)
@@ -83,7 +83,7 @@ def footprint(
     zones: int = 8,
     mip_maps: bool = True,
 ) -> Footprint:
-    """Return what one wrinkle map and its masks take.
+    """Return the bytes of one wrinkle map and its masks.
 
     Parameters
     ----------
@@ -92,13 +92,13 @@ def footprint(
     maps, masks : str
         Keys of `MAP_BYTES` and `MASK_BYTES`.
     zones : int
-        At least 1; four a mask texture.
+        At least 1; four per mask texture.
     mip_maps : bool
 
     Raises
     ------
     WrinkleError
-        For an encoding that does not exist, or a size or number below 1.
+        For an unknown encoding, or a size or number below 1.
     """
     for name, encoding, known in (("maps", maps, MAP_BYTES), ("masks", masks, MASK_BYTES)):
         Checks(WrinkleError).choice(name, encoding, known)
@@ -113,17 +113,17 @@ def footprint(
 
 
 def paper_footprint() -> Footprint:
-    """Return the paper's: 64 KB of map and 8 KB of masks, times 4/3."""
+    """Return the paper's footprint: 64 KB of map and 8 KB of masks, times 4/3."""
     return footprint((WRINKLE_SIDE, WRINKLE_SIDE), (MASK_SIDE, MASK_SIDE))
 
 
 def round_trip_map(derivatives: FloatArray, encoding: MapEncoding) -> FloatArray:
-    """Return derivatives as they come back from a texture.
+    """Return derivatives after encoding to a texture and decoding.
 
     Parameters
     ----------
     derivatives : ndarray, shape (h, w, 2)
-        "unit8" and "bc5" hold [-1, 1] and refuse others: clamp them with `wrinkles.encode`, or
+        "unit8" and "bc5" are limited to [-1, 1]; clamp larger values with `wrinkles.encode`, or
         scale map and table.
     encoding : {"float32", "float16", "unit8", "bc5"}
 
@@ -146,14 +146,14 @@ def round_trip_map(derivatives: FloatArray, encoding: MapEncoding) -> FloatArray
 
 
 def round_trip_masks(masks: Masks, encoding: MaskEncoding) -> FloatArray:
-    """Return masks (Z, h, w), float32, as they come back from RGBA textures.
+    """Return masks (Z, h, w), float32, after encoding to RGBA textures and decoding.
 
-    "unit8" and "bc3" hold [0, 1]; the others what their numbers hold.
+    "unit8" and "bc3" are limited to [0, 1]; the others to the range of their type.
 
     Raises
     ------
     WrinkleError
-        For an encoding that does not exist, and masks that it does not hold.
+        For an unknown encoding, and masks outside its range.
     """
     Checks(WrinkleError).choice("masks", encoding, MASK_BYTES)
     stack = mask_stack(masks)

@@ -1,4 +1,4 @@
-"""A dome as it was built: near the drawing, never on it."""
+"""Draw an actual dome: nominal geometry with manufacturing tolerances."""
 
 import dataclasses
 import math
@@ -13,17 +13,17 @@ from capture.rig import Rig, View
 from rigsim.arrays import Float64Array
 
 UNDISTORT_STEPS: Final = 12
-"""Newton steps from image to ray; each doubles the right digits."""
+"""Newton steps from image to ray; each doubles the number of correct digits."""
 
 
 @dataclass(frozen=True, slots=True)
 class DomeTolerances:
-    """Standard deviations of what a workshop leaves; 0 builds to the drawing."""
+    """Standard deviations of manufacturing errors; 0 gives the nominal rig."""
 
     camera_mm: float = 1.5
-    """Camera's centre of projection, mm, per axis."""
+    """Camera's center of projection, mm, per axis."""
     camera_deg: float = 0.3
-    """Turn of a camera about each of its axes, degrees."""
+    """Rotation of a camera about each of its axes, degrees."""
     focal: float = 0.003
     """Relative, of the focal length."""
     distortion: float = 0.0
@@ -31,9 +31,9 @@ class DomeTolerances:
     gain: float = 0.01
     """Relative, of a camera's response."""
     light_mm: float = 2.5
-    """Place of a light, mm, per axis."""
+    """Position of a light, mm, per axis."""
     light_deg: float = 1.0
-    """Turn of a light's axis, degrees, per axis."""
+    """Rotation of a light's axis, degrees, per axis."""
     power: float = 0.05
     """Relative, of a light's power."""
     lobe_deg: float = 1.0
@@ -48,12 +48,12 @@ class DomeTolerances:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ActualDome:
-    """The truth about a rig; what its file says is ``nominal``."""
+    """Ground truth of a rig; the values of its file are ``nominal``."""
 
     nominal: Rig
     """As drawn."""
     rig: Rig
-    """As it stands: places, focal lengths, powers and lobes; the names are the nominal ones."""
+    """The actual rig: positions, focal lengths, powers and lobes; names are the nominal ones."""
     axis: Float64Array
     """Unit vectors in which the lights shine, shape (L, 3)."""
     distortion: Mapping[str, Float64Array] = field(default_factory=dict)
@@ -61,26 +61,26 @@ class ActualDome:
     gain: Mapping[str, float] = field(default_factory=dict)
     """Response by view; 1 where not named."""
     dead: frozenset[str] = frozenset()
-    """Lights that give none."""
+    """Lights that are dead."""
     wiring: tuple[int, ...] = ()
-    """Light that answers to each channel of the box; empty: each to its own."""
+    """Light driven by each channel of the controller; empty: each channel drives its own."""
 
     def light_of_channel(self, channel: int) -> int:
-        """Return the light that a channel of the box drives."""
+        """Return the light that a channel of the controller drives."""
         return self.wiring[channel] if self.wiring else channel
 
 
 def build_dome(rig: Rig, *, seed: int, tolerances: DomeTolerances | None = None) -> ActualDome:
-    """Draw a dome as built; the same seed builds each named part the same in any subset.
+    """Draw an actual dome; with the same seed each named part is the same in any subset.
 
     Parameters
     ----------
     rig
         As drawn.
     seed
-        Seed of what the workshop left.
+        Seed of the manufacturing errors.
     tolerances
-        Standard deviations; None takes the usual ones.
+        Standard deviations; None: the defaults.
     """
     size = tolerances or DomeTolerances()
     views, distortion, gain = [], {}, {}
@@ -130,7 +130,7 @@ def _shifted(view: View, size: DomeTolerances, rng: np.random.Generator) -> View
 
 
 def distort(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
-    """Return where a lens puts rays: slopes across the axis to slopes on the sensor, (..., 2)."""
+    """Return the distorted image slopes of rays given by their undistorted slopes, (..., 2)."""
     slopes = np.asarray(xy, np.float64)
     k1, k2, p1, p2, k3 = np.asarray(distortion, np.float64)
     square = np.sum(slopes * slopes, axis=-1, keepdims=True)
@@ -146,7 +146,7 @@ def distort(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
 
 
 def undistort(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
-    """Return the ray that a lens puts at ``xy``: the inverse of `distort`, by Newton's method."""
+    """Return the ray of an image position ``xy``: the inverse of `distort`, by Newton's method."""
     wanted = np.asarray(xy, np.float64)
     found = wanted.copy()
     if not np.any(distortion):
@@ -168,7 +168,9 @@ def pixel_corner_rays(view: View, distortion: ArrayLike) -> Float64Array:
 
     Rig frame; lengths are such that the component along the optical axis is 1.
     """
-    columns = np.arange(view.width_px + 1) - view.width_px / 2  # corners lie half a pixel off
+    columns = (
+        np.arange(view.width_px + 1) - view.width_px / 2
+    )  # corners are half a pixel off the centers
     rows = np.arange(view.height_px + 1) - view.height_px / 2
     x, y = np.meshgrid(columns / view.focal_px, rows / view.focal_px)
     slopes = undistort(np.stack([x, y], axis=-1), distortion)
@@ -177,7 +179,7 @@ def pixel_corner_rays(view: View, distortion: ArrayLike) -> Float64Array:
 
 
 def project_points(view: View, distortion: ArrayLike, points_mm: ArrayLike) -> Float64Array:
-    """Return column and row where points appear, shape (..., 2); NaN behind the camera."""
+    """Return column and row of points in the image, shape (..., 2); NaN behind the camera."""
     offset = np.asarray(points_mm, np.float64) - view.position_mm
     right, up, back = (np.array(axis) for axis in view.axes)
     depth = -(offset @ back)

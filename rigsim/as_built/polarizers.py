@@ -1,4 +1,4 @@
-"""The polarizing films of a simulated rig as they really are: leaky, and not quite aligned."""
+"""Actual polarizers of a simulated rig: finite extinction and a small misalignment."""
 
 import hashlib
 import math
@@ -14,23 +14,23 @@ from rigsim.shading import axis_in_plane
 Polarizer = Literal["parallel", "crossed"]
 
 POLARIZER_READING_DEG = {"parallel": 0.0, "crossed": 90.0}
-"""Reading of the analyser's rotator in each state."""
+"""Reading of the analyzer's rotator in each state."""
 
 
 class PolarizerError(ValueError):
-    """A film or a state of the polarizers is described wrongly."""
+    """Error for invalid values of a polarizer or its state."""
 
 
 @dataclass(frozen=True, slots=True)
 class Polarizers:
-    """Truth about the films; calibration has to find it out."""
+    """Ground truth of the polarizers, which calibration estimates."""
 
     light_extinction: float
-    """Extinction ratio of the film before each light, > 1; real film has 1e3 to 1e4."""
+    """Extinction ratio of the polarizer in front of each light, > 1; real ones have 1e3 to 1e4."""
     analyser_extinction: float
-    """Extinction ratio of the film before the camera, > 1."""
+    """Extinction ratio of the analyzer in front of the camera, > 1."""
     analyser_zero_deg: float
-    """What the rotator's reading lacks to the true angle, degrees, -10 to 10."""
+    """True angle less the rotator's reading, degrees, -10 to 10."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -44,7 +44,7 @@ class Polarizers:
             )
 
     def analyzer_axis_deg(self, view: View, polarizer: str, analyser_deg: float | None) -> float:
-        """Return the true passing axis of the analyser, degrees from the image's x axis.
+        """Return the true transmission axis of the analyzer, degrees from the image's x axis.
 
         Parameters
         ----------
@@ -68,11 +68,11 @@ class Polarizers:
 
 
 IDEAL_POLARIZERS = Polarizers(math.inf, math.inf, 0.0)
-"""Films that leak nothing and stand exactly."""
+"""Ideal polarizers: infinite extinction, perfectly aligned."""
 
 
 def draw_polarizers(rig: Rig) -> Polarizers:
-    """Return the films of a rig; they follow from its cameras' serial numbers.
+    """Draw the polarizers of a rig, seeded by its cameras' serial numbers.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def draw_polarizers(rig: Rig) -> Polarizers:
 
     Returns
     -------
-    Films
+    Polarizers
         Extinction ratios of 1500 to 6000 and a zero within about a degree.
     """
     serials = "|".join(view.serial for view in rig.views)
@@ -93,7 +93,7 @@ def draw_polarizers(rig: Rig) -> Polarizers:
 
 
 def absorbing_axis(light: Light) -> Float64Array:
-    """Return the absorbing axis of a light's film, which faces the rig's origin; shape (3,)."""
+    """Return the absorbing axis of a light's polarizer, facing the rig's origin; shape (3,)."""
     if light.polarizer_axis_deg is None:
         raise PolarizerError(
             f"light {light.name!r}: has no polarizer; give it a polarizer_axis_deg"

@@ -1,4 +1,4 @@
-"""A fibre probe as it was built: gains, spots before the camera, cross-talk and stray light."""
+"""Draw an actual fiber probe: gains, spots in the image, crosstalk and stray light."""
 
 import dataclasses
 import math
@@ -12,39 +12,40 @@ from capture.rig import Rig, View
 from rigsim.arrays import Float32Array, Float64Array
 
 SPOT_RADIUS_PX: Final = 12.0
-"""Nominal radius of a fibre's end in the camera's image."""
+"""Nominal radius of a fiber's end in the camera's image."""
 
 FIBER_END_UNEVENNESS: Final = 0.05
-"""Standard deviation of the tilt and of the curvature of the light over a fibre's end, relative:
+"""Standard deviation of the tilt and of the curvature of the light over a fiber's end, relative:
 its modes are not filled alike."""
 
 
 class ProbeBuildError(ValueError):
-    """A probe is described wrongly."""
+    """Error for invalid values of a probe."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProbeTolerances:
-    """What a workshop leaves; 0 builds to the drawing. This project's choices."""
+    """Manufacturing tolerances; 0 gives the nominal probe. Values are this project's choice."""
 
     gain: float = 0.05
-    """Relative standard deviation of the fibres' transmissions; none is off by more than twice."""
+    """Relative standard deviation of the fibers' transmissions; errors are at most twice as
+    large."""
     position_px: float = 0.6
-    """Standard deviation of a spot's place, pixels, per axis."""
+    """Standard deviation of a spot's position, pixels, per axis."""
     shift_px: float = 1.0
     """Standard deviation of the row's common shift, pixels, per axis."""
     rotation_deg: float = 0.2
-    """Standard deviation of the row's turn about the image's middle, degrees."""
+    """Standard deviation of the row's rotation about the image's center, degrees."""
     radius: float = 0.02
     """Relative standard deviation of the spots' radii."""
     crosstalk: float = 1e-3
-    """Median share of a fibre's light that leaks into each neighbour; a tenth into the next."""
+    """Median fraction of a fiber's light that leaks into each neighbor; a tenth into the next."""
     edge_px: float = 1.2
     """Softness of the spots' edges, the lens's included, pixels, > 0."""
     wings: float = 5e-3
-    """Share of the light that the lens puts into its wide wings."""
+    """Fraction of the light in the wide wings of the lens's point spread."""
     veil: float = 3e-5
-    """Share of all light in the image that a spot's area gets as a veil."""
+    """Fraction of all light in the image that a spot's area gets as veiling glare."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -55,16 +56,16 @@ class ProbeTolerances:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ActualProbe:
-    """The truth about the fibres, in the order of the rig."""
+    """Ground truth of the fibers, in the order of the rig."""
 
     spot_px: Float64Array
     """Middles of the spots, pixels, x right and y down from the first pixel's middle, (F, 2)."""
     radius_px: Float64Array
     """Radii of the spots at half height, pixels, > 0, shape (F,)."""
     gain: Float64Array
-    """Transmission relative to the drawing's, > 0, shape (F,)."""
+    """Transmission relative to nominal, > 0, shape (F,)."""
     crosstalk: Float64Array
-    """Share of fibre j's light that comes out of fibre i, shape (F, F) at [i, j]; columns sum
+    """Share of fiber j's light that comes out of fiber i, shape (F, F) at [i, j]; columns sum
     to 1."""
     unevenness: Float64Array
     """Light over a spot: 1 + a u + b v + c (2 (u^2 + v^2) - 1) of u, v in radii, shape (F, 3)."""
@@ -75,7 +76,7 @@ class ActualProbe:
     veil: float
     """Share of all light that a nominal spot's area gets anywhere, 0 to 0.01."""
     cover_leak: float = 1e-5
-    """What a covered fibre still passes, 0 to 1."""
+    """Transmittance of a covered fiber, 0 to 1."""
     ripple: float = 1e-3
     """Relative standard deviation of the source's energy from opening to opening, 0 to 0.1."""
 
@@ -106,24 +107,24 @@ class ActualProbe:
 
 
 def build_probe(rig: Rig, *, seed: int, tolerances: ProbeTolerances | None = None) -> ActualProbe:
-    """Draw a probe as built.
+    """Draw an actual probe.
 
     Parameters
     ----------
     rig
         The drawing; it must have a probe and one view.
     seed
-        Seed of what the workshop left; 0 or more.
+        Seed of the manufacturing errors; 0 or more.
     tolerances
-        How far off; None takes the usual ones.
+        Tolerances; None: the defaults.
 
     Returns
     -------
-    ProbeBuild
+    ActualProbe
 
     Raises
     ------
-    BuildError
+    ProbeBuildError
         The rig has no probe.
 
     Examples
@@ -167,10 +168,10 @@ def build_probe(rig: Rig, *, seed: int, tolerances: ProbeTolerances | None = Non
 
 
 def fiber_unit_images(build: ActualProbe, view: View) -> Float32Array:
-    """Return the image of each fibre's light, wings and veil included.
+    """Return the image of each fiber's light, wings and veil included.
 
-    All images have one flux, to what the wings throw beside the sensor: that of an even spot of
-    nominal radius that is 1 high in its middle, pi (radius^2 + edge^2).
+    All images have the same flux, up to losses of the wings outside the sensor: that of a uniform
+    spot of nominal radius and height 1, pi (radius^2 + edge^2).
 
     Parameters
     ----------
@@ -182,7 +183,7 @@ def fiber_unit_images(build: ActualProbe, view: View) -> Float32Array:
     Returns
     -------
     ndarray of float32
-        Shape (F, H, W), >= 0, for light that comes out of one fibre each.
+        Shape (F, H, W), >= 0, for light that comes out of one fiber each.
     """
     y = np.arange(view.height_px, dtype=np.float64)[:, None]
     x = np.arange(view.width_px, dtype=np.float64)[None, :]
@@ -206,7 +207,7 @@ def fiber_unit_images(build: ActualProbe, view: View) -> Float32Array:
 
 
 def _draw_truncated_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> Float64Array:
-    """Return standard normal numbers of at most 2; a workshop throws the others away."""
+    """Return standard normal numbers truncated to [-2, 2]: outliers are rejected parts."""
     return np.asarray(np.clip(rng.standard_normal(shape), -2.0, 2.0))
 
 

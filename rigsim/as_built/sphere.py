@@ -1,4 +1,4 @@
-"""A sphere of polarized LEDs as it was built: near the drawing, never on it."""
+"""Draw an actual sphere of polarized LEDs: nominal geometry with manufacturing errors."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from rigsim.as_built.polarizers import absorbing_axis
 from rigsim.shading import axis_in_plane
 
 MOMENT_NAMES: Final = ("1", "x", "y", "z")
-"""What each LED's light is weighted with; every lighting condition is a sum of these four."""
+"""Weights of the LEDs by moment; every lighting condition is a sum of these four."""
 
 PATTERN_WEIGHTS: Final[dict[str, tuple[float, float, float, float]]] = {
     "full": (1.0, 0.0, 0.0, 0.0),
@@ -28,7 +28,7 @@ PATTERN_WEIGHTS: Final[dict[str, tuple[float, float, float, float]]] = {
 
 
 class SphereError(ValueError):
-    """A sphere is described wrongly."""
+    """Error for invalid values of a sphere."""
 
 
 INTENSITY_DEVIATION: Final = 0.05
@@ -36,21 +36,21 @@ INTENSITY_DEVIATION: Final = 0.05
 
 POSITION_DEVIATION_MM: Final = 1.0
 AXIS_DEVIATION_DEG: Final = 1.0
-"""Standard deviations of an LED's place along each axis, and of its film's turn."""
+"""Standard deviations of an LED's position along each axis, and of its polarizer's rotation."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ActualSphere:
-    """The truth about the LEDs, in the order of the rig."""
+    """Ground truth of the LEDs, in the order of the rig."""
 
     nominal: Rig
-    """As drawn; the box weighs the LEDs by the directions in it."""
+    """The nominal rig; the controller weights the LEDs by its directions."""
     position_mm: Float64Array
-    """Where the LEDs are, mm, rig frame, shape (L, 3)."""
+    """Positions of the LEDs, mm, rig frame, shape (L, 3)."""
     intensity: Float64Array
-    """Power over the mean of the drawing's, shape (L,), >= 0; 0 is dead."""
+    """Power over the nominal mean, shape (L,), >= 0; 0 is dead."""
     absorbs: Float64Array
-    """Absorbing axes of the films, unit vectors, shape (L, 3)."""
+    """Absorbing axes of the polarizers, unit vectors, shape (L, 3)."""
     radius_mm: Float64Array
     """Radii of the LEDs' discs, mm, shape (L,)."""
 
@@ -71,14 +71,14 @@ class ActualSphere:
 
     @property
     def weights(self) -> Float64Array:
-        """Return what the moments weigh each LED with, shape (L, 4): 1 and nominal direction."""
+        """Return the weights of each LED in the moments, shape (L, 4): 1 and nominal direction."""
         place = np.array([light.position_mm for light in self.nominal.lights])
         direction = place / np.linalg.norm(place, axis=1, keepdims=True)
         return np.column_stack([np.ones(len(place)), direction])
 
     @property
     def dead(self) -> tuple[str, ...]:
-        """Return the names of LEDs that give no light."""
+        """Return the names of dead LEDs."""
         return tuple(
             light.name
             for light, power in zip(self.nominal.lights, self.intensity, strict=True)
@@ -87,17 +87,17 @@ class ActualSphere:
 
 
 def nominal_sphere(rig: Rig) -> ActualSphere:
-    """Return a sphere that stands exactly as its drawing says.
+    """Return a sphere without manufacturing errors.
 
     Parameters
     ----------
     rig
-        The drawing; its lights must be LEDs with polarizers and share one spectrum.
+        The nominal rig; its lights must be LEDs with polarizers and one common spectrum.
 
     Raises
     ------
     SphereError
-        A light is no LED, or the spectra differ.
+        When a light is not an LED, or the spectra differ.
     """
     spectra_names = {light.illuminant for light in rig.lights}
     if len(spectra_names) > 1:
@@ -117,20 +117,20 @@ def nominal_sphere(rig: Rig) -> ActualSphere:
 def build_sphere(
     rig: Rig, *, seed: int, dead: tuple[str, ...] = (), weak: tuple[str, ...] = ()
 ) -> ActualSphere:
-    """Draw a sphere as built; the same seed builds each LED the same in any subset.
+    """Draw an actual sphere; with the same seed each LED is the same in any subset.
 
     Parameters
     ----------
     rig
         The drawing.
     seed
-        Seed of what the workshop left.
+        Seed of the manufacturing errors.
     dead, weak
-        Names of LEDs that give nothing, and a third of their light.
+        Names of LEDs that give no light, and a third of their light.
 
     Returns
     -------
-    BuiltSphere
+    ActualSphere
     """
     drawn = nominal_sphere(rig)
     for name in (*dead, *weak):
@@ -154,7 +154,7 @@ def build_sphere(
 
 def _power(light: Light) -> float:
     if light.power_w is None:
-        raise SphereError(f"light {light.name!r}: is no LED, it has no power_w")
+        raise SphereError(f"light {light.name!r}: is not an LED; give it a power_w")
     return light.power_w
 
 
@@ -172,9 +172,10 @@ def diffuser_radiance(
     sphere
         The LEDs; they shine at the origin.
     x_mm, y_mm
-        Places, any shape, mm.
+        Positions, any shape, mm.
     extinction
-        Of the LEDs' films, > 1; what a film passes of unpolarized light is at least half.
+        Extinction ratio of the LEDs' polarizers, > 1; they transmit at least half of unpolarized
+        light.
 
     Returns
     -------

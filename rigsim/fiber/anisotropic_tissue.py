@@ -1,11 +1,11 @@
-"""Tissue whose fibres run one way, like abdominal skin: profiles that depend on the direction.
+"""Anisotropic tissue with aligned fibers, as in abdominal skin: direction-dependent profiles.
 
-Scattering from a direction w into w' has the density
-``sigma_s a(w) a(w') p(w . w')`` with ``a(w) = 1 + strength ((w . t)^2 - 1/3)``, t the axis in the
-surface along which the fibres run and p the Henyey-Greenstein function. It is the same both ways,
-so light is reciprocal. As p keeps a second-order harmonic with the factor g^2, the coefficient is
-``sigma_s a(w) (1 + strength g^2 ((w . t)^2 - 1/3))`` in closed form. A negative strength scatters
-light less along the fibres than across: it goes farther along them.
+Scattering from a direction w into w' has the density ``sigma_s a(w) a(w') p(w . w')`` with ``a(w) =
+1 + strength ((w . t)^2 - 1/3)``, t the axis in the surface along which the fibers run and p the
+Henyey-Greenstein function. It is the same both ways, so light is reciprocal. As p keeps a
+second-order harmonic with the factor g^2, the coefficient is ``sigma_s a(w) (1 + strength g^2 ((w .
+t)^2 - 1/3))`` in closed form. With a negative strength light is scattered less along the fibers
+than across, so it travels farther along them.
 """
 
 from dataclasses import dataclass
@@ -26,12 +26,12 @@ from rigsim.tissue.tissue_mc import TransportError
 OVERLAP_NODES: Final = 2000
 
 MAX_HARMONIC: Final = 8
-"""Highest angular harmonic that is kept by default; light that has been scattered knows few."""
+"""Default highest angular harmonic; scattered light has only few."""
 
 
 @dataclass(frozen=True, slots=True)
 class AnisotropicTissue:
-    """A half-space under air that scatters by direction."""
+    """A half-space under air whose scattering depends on direction."""
 
     sigma_a_per_mm: float
     """Absorption coefficient, 1/mm, > 0."""
@@ -44,7 +44,7 @@ class AnisotropicTissue:
     strength: float = -1.0
     """Weight of the second-order harmonic, -1.5 < strength < 3; 0 for isotropic tissue."""
     axis_rad: float = 0.0
-    """Direction of the fibres in the surface, rad from +x towards +y."""
+    """Direction of the fibers in the surface, rad from +x towards +y."""
 
     def __post_init__(self) -> None:
         for name, holds, expected in (
@@ -70,27 +70,27 @@ def trace_anisotropic_profile(
     batches: int = tissue_mc.MIN_BATCHES,
     threads: int = 1,
 ) -> profiles.FiberProfile:
-    """Trace light to lines of fibres that stand on the tissue in several directions.
+    """Trace light to lines of fibers on the tissue in several directions.
 
     Parameters
     ----------
     tissue
         The tissue.
-    fibres
-        The fibres of one line.
+    fibers
+        The fibers of one line.
     azimuth_rad
         Directions of the line, rad from +x towards +y, shape (A,).
     photons, rng, batches, threads
         As in `rigsim.fiber.profile.trace_fiber_profile`.
     harmonics
         Even order up to which the dependence on the direction is scored, in rings, by its Fourier
-        series: the tissue's mirror symmetry leaves even ones only. ``None`` scores fibres where
-        they stand (and in their mirror images): no series, but ten and more times the noise far
+        series: the tissue's mirror symmetry leaves even ones only. ``None`` scores fibers at their
+        positions (and mirror images): without a series, but with ten and more times the noise far
         away.
 
     Returns
     -------
-    FibreProfile
+    FiberProfile
         `reflectance_per_mm2` of shape (F, A).
 
     Raises
@@ -162,7 +162,7 @@ def trace_anisotropic_profile(
     )
     each = np.empty((batches, radii.size, angles.size))
     if harmonics is None:
-        flat = each.reshape(batches, far.size)  # the same memory
+        flat = each.reshape(batches, far.size)  # shares the memory
         flat[:, order] = np.array(rows)[..., 0]
     else:
         orders = np.arange(0, harmonics + 4, 2)[: rings.shape[2]]
@@ -184,7 +184,7 @@ def _overlap(fibres: profiles.FiberGeometry) -> tuple[Float64Array, float]:
 
 
 def _harmonics(radius_mm: float, fibres: profiles.FiberGeometry, max_harmonic: int) -> Float64Array:
-    """Return the even harmonics of a fibre's density over the direction to the exit, by radius."""
+    """Return the even harmonics of a fiber's density over the direction to the exit, by radius."""
     detector, source = 0.5 * fibres.core_mm, 0.5 * fibres.source_core_mm
     both = detector + source
     low = max(0.0, radius_mm - both)

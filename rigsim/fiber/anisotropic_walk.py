@@ -1,4 +1,4 @@
-"""The compiled walk of photons through tissue that scatters by direction (see there)."""
+"""Trace photons through anisotropic tissue, compiled (see `rigsim.fiber.anisotropic_tissue`)."""
 
 from math import exp, log, sqrt
 
@@ -11,7 +11,7 @@ from rigsim.tissue.photon_walk import draw_disc_point, draw_uniform, fresnel, sc
 
 @njit(inline="always")
 def _scatter_direction(s0, s1, s2, s3, ux, uy, uz, g, strength, most):  # type: ignore[no-untyped-def]
-    """Draw by Henyey and Greenstein, kept with the weight of the new direction."""
+    """Draw a Henyey-Greenstein direction; accept it with the weight a(w') of the new direction."""
     while True:
         s0, s1, s2, s3, vx, vy, vz = scatter_direction(s0, s1, s2, s3, ux, uy, uz, g)
         s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
@@ -23,30 +23,30 @@ def _scatter_direction(s0, s1, s2, s3, ux, uy, uz, g, strength, most):  # type: 
 def walk_anisotropic(  # type: ignore[no-untyped-def]
     medium, sines, core_centers, bins, rings, window, per_mm, photons, seed, found
 ):
-    """Trace photons from a point source in a cone and score fibres where they stand.
+    """Trace photons from a point source in a cone and score fibers at their positions.
 
     Parameters
     ----------
     medium
         sigma_a, sigma_s (1/mm), g, eta, strength; the preferred axis is x. float64, shape (5,).
     sines
-        Numerical apertures of the source and of the fibres.
+        Numerical apertures of the source and of the fibers.
     spots
-        Places, x and y of the fibres in mm, by growing distance, float64, shape (F, 2); density of
-        (point in one core - point in the other) in 1/mm^2 by distance from the mean, the last node
-        0, shape (nodes,); and its nodes per mm.
+        Positions, x and y of the fibers in mm, by increasing distance, float64, shape (F, 2);
+        density of (point in one core - point in the other) in 1/mm^2 by distance from the mean, the
+        last node 0, shape (nodes,); and its nodes per mm.
     bins
-        First fibre and number of fibres that reach each bin of exit radius, and bins per mm.
+        First fiber and number of fibers that reach each bin of exit radius, and bins per mm.
     rings
         For each of some distances: first exit radius (mm), nodes per mm and, by node, the density's
-        even harmonics over the direction; then light is scored by harmonics, and `bins`
-        tell distances. float64, shape (R, 1 + nodes, H); R = 0 for light scored in places.
+        even harmonics over the direction; then light is scored by harmonics, and `bins` are those
+        of distances. float64, shape (R, 1 + nodes, H); R = 0 for light scored in places.
     window, photons, seed
         As in `rigsim.fiber.walk.walk_to_fibers`.
     per_mm
         Cells of `window` per mm, and growth of the kept weight per mm of depth.
     found
-        What is added to: light by fibre, shape (F, 1), or by distance and harmonic, shape (R, H);
+        What is added to: light by fiber, shape (F, 1), or by distance and harmonic, shape (R, H);
         and the weight that visited each distance, see there.
     """
     source_sine, fibre_sine = sines
@@ -86,7 +86,7 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
                     reflected, _mu = fresnel(-uz, eta, 1.0)
                     s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
                     if u > reflected:
-                        break  # seen already: all light that leaves comes straight from a collision
+                        break  # already scored: all exiting light comes directly from a collision
                     uz = -uz
                     continue
                 x += step * ux

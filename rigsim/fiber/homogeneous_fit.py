@@ -1,14 +1,14 @@
-"""The homogeneous medium whose profile is nearest to a given one.
+"""Fit the homogeneous medium whose profile is nearest to a given one.
 
 Definition: of all half spaces of g = 0.8 and eta = 1.4 under air, the one whose reflectance in the
-fibre, by the stored Monte Carlo of `rigsim.fiber.white_fiber`, is up to a factor nearest to the
-given one: the logarithms of the ratios have the least variance over the fibres, all of one weight;
-fibres that take less than `MIN_REFLECTANCE_PER_MM2` are left out, as no camera of the probe tells
-them from noise. The factor is for what pigment in a thin layer on top takes from light on its way
-in and out, at all distances alike. Tissue without layers that scatters by direction has no such
-factor: with one its nearest media jump between far valleys from one direction to the next. Of dark
-skin the nearest medium scatters without bounds: its profile is that of a dipole at the surface,
-which tells sigma_tr and no more; the search ends at `MAX_SCATTERING_PER_MM`.
+fiber, by the stored Monte Carlo of `rigsim.fiber.white_fiber`, is up to a factor nearest to the
+given one: the logarithms of the ratios have the smallest variance over the fibers, with equal
+weights; fibers below `MIN_REFLECTANCE_PER_MM2` are omitted, as the probe's camera cannot detect
+them above noise. The factor accounts for pigment in a thin layer on top, which absorbs light on its
+way in and out equally at all distances. Anisotropic tissue without layers has no such factor: with
+one, the nearest medium jumps between distant minima from one direction to the next. For dark skin
+the scattering of the nearest medium is unbounded: its profile is that of a dipole at the surface,
+which determines only sigma_tr; the search ends at `MAX_SCATTERING_PER_MM`.
 """
 
 import math
@@ -28,7 +28,7 @@ MIN_REFLECTANCE_PER_MM2: Final = 1e-7
 noise: about ten standard errors of a spot's sum."""
 
 MIN_BRIGHT_FIBERS: Final = 4
-"""Fibres that must be bright enough."""
+"""Smallest number of fibers that are bright enough."""
 
 SEARCH_STARTS_PER_MM: Final = (
     (0.03, 1.0),
@@ -39,37 +39,37 @@ SEARCH_STARTS_PER_MM: Final = (
     (0.005, 20.0),
     (0.004, 60.0),
 )
-"""sigma_a and sigma_s' in 1/mm from which the search begins; the best end counts. Layers dim near
-fibres less than far ones, which looks like more scattering than tissue has."""
+"""Starting values of the search, sigma_a and sigma_s' in 1/mm; the best result is used. Layers dim
+near fibers less than far ones, which looks like more scattering than tissue has."""
 MAX_SCATTERING_PER_MM: Final = 200.0
 """Of the search, 1/mm."""
 OFF_TABLE_RESIDUAL: Final = 1e3
-"""Residual of media that the table does not hold."""
+"""Residual of media outside the table."""
 
 
 class FitError(ValueError):
-    """A profile that no homogeneous medium can be fitted to."""
+    """Error for a profile that no homogeneous medium can be fitted to."""
 
 
 @dataclass(frozen=True, slots=True)
 class HomogeneousFit:
-    """The nearest homogeneous medium, and how near it is."""
+    """The nearest homogeneous medium, and its misfit."""
 
     sigma_a_per_mm: float
     """Absorption coefficient, 1/mm."""
     sigma_s_prime_per_mm: float
     """Reduced scattering coefficient, 1/mm."""
     factor: float
-    """R_f over that of the medium, geometric mean over the fibres used."""
+    """R_f over that of the medium, geometric mean over the fibers used."""
     residual: float
-    """Standard deviation of log(R_f / R_f of the medium) over the fibres used; its root mean
+    """Standard deviation of log(R_f / R_f of the medium) over the fibers used; its root mean
     square where the factor is 1 by definition."""
     fibres: int
-    """How many were used."""
+    """Number of fibers used."""
 
     @property
     def sigma_tr_per_mm(self) -> float:
-        """Effective transport coefficient sqrt(3 sigma_a (sigma_a + sigma_s')), 1/mm."""
+        """Return the effective transport coefficient sqrt(3 sigma_a (sigma_a + sigma_s')), 1/mm."""
         a = self.sigma_a_per_mm
         return math.sqrt(3.0 * a * (a + self.sigma_s_prime_per_mm))
 
@@ -82,11 +82,11 @@ def fit_homogeneous_medium(
     Parameters
     ----------
     reflectance_per_mm2
-        R_f of the fibres, 1/mm^2, shape (F,).
-    fibres
-        The fibres.
+        R_f of the fibers, 1/mm^2, shape (F,).
+    fibers
+        The fibers.
     dimmed
-        Whether a layer on top may take a share of the light: the factor is free, else 1.
+        Whether a layer on top may absorb light: the factor is fitted, else 1.
 
     Returns
     -------
@@ -96,7 +96,7 @@ def fit_homogeneous_medium(
     Raises
     ------
     FitError
-        Fewer than `MIN_BRIGHT_FIBERS` fibres are bright enough, or the best medium lies at the
+        Fewer than `MIN_BRIGHT_FIBERS` fibers are bright enough, or the best medium lies at the
         table's end.
 
     Examples
@@ -144,7 +144,7 @@ def fit_homogeneous_medium(
         for a, s in SEARCH_STARTS_PER_MM
     ]
     best = min(ends, key=lambda end: float(end.cost))
-    # at the most scattering sigma_tr alone shapes the profile: it stays what it is
+    # at the limit of scattering only sigma_tr determines the profile: keep it
     if best.x[1] - bounds[0, 1] < 1e-3:
         raise FitError(f"sigma_s': got {math.exp(best.x[1]):.3g} 1/mm, the table's end")
     scattering = math.exp(best.x[1])

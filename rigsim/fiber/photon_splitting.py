@@ -1,4 +1,4 @@
-"""Where photons are split, merged and scored, so that fibres near and far are seen alike.
+"""Choose splitting, roulette and scoring of photons for equal statistics at all fibers.
 
 A photon is kept at a target weight that depends on its distance from the entry and on its depth.
 The targets are learned from pilot runs and change the cost of a result, never its expectation.
@@ -15,14 +15,15 @@ WINDOW_CELLS: Final = 256
 SMOOTHING_CELLS: Final = 8  # to each side
 MIN_TRACKS: Final = 50.0
 MAX_TRACKS: Final = 30.0
-"""Collisions at a distance, as a multiple of the most anywhere without splitting: where nearly all
-light is too deep to be scored, splitting it further is not worth its time."""
+"""Limit of collisions at a distance, as a multiple of the maximum without splitting: where nearly
+all light is too deep to be scored, splitting it further is not worth its time."""
 FULL_SCORING_OPTICAL_DEPTH: Final = 1.5
-"""Optical depth above which every collision is scored; below, fewer and fewer with more weight."""
+"""Optical depth down to which every collision is scored; deeper ones are scored less often, with
+more weight."""
 
 
 def uniform_window(reach_mm: float, farthest_mm: float) -> Float64Array:
-    """Return weights of 1 up to the farthest fibre, and more beyond."""
+    """Return target weights: 1 up to the farthest fiber, larger beyond."""
     s = (np.arange(WINDOW_CELLS + 1) + 0.5) * reach_mm / WINDOW_CELLS
     return np.asarray(np.maximum(1.0, (s / farthest_mm) ** 3))
 
@@ -30,7 +31,7 @@ def uniform_window(reach_mm: float, farthest_mm: float) -> Float64Array:
 def adapt_window(
     visited: Float64Array, used: Float64Array, reach_mm: float, farthest_mm: float
 ) -> Float64Array:
-    """Return target weights in proportion to how much weight passes each distance."""
+    """Return target weights in proportion to the weight that passes each distance."""
     s = (np.arange(len(used)) + 0.5) * reach_mm / WINDOW_CELLS
     kernel = np.ones(2 * SMOOTHING_CELLS + 1)
     around = np.convolve(np.ones(WINDOW_CELLS), kernel, "same")
@@ -41,16 +42,16 @@ def adapt_window(
     least, _ = _falling(every[: edge + 1], tracks[1][: edge + 1])
     window = np.ones(len(used))
     window[peak : edge + 1] = np.maximum(wanted, least / MAX_TRACKS)[peak:]
-    # Beyond the fibres light comes back the less the farther it is.
+    # Beyond the fibers the fraction of light that returns decreases with distance.
     window[edge:] = window[edge] * (s[edge:] / s[edge]) ** 3
     return window
 
 
 def _falling(weight: Float64Array, tracks: Float64Array) -> tuple[Float64Array, int]:
-    """Return weights by distance over their largest, and where that is.
+    """Return weights by distance over their maximum, and its position.
 
-    From where too few tracks came to tell, they go on as they fell before, less steeply, as a fall
-    that chance made too steep would have photons split for minutes.
+    Where tracks are too few, weights are extrapolated with a reduced slope: a slope that is too
+    steep by chance would split photons for minutes.
     """
     enough = tracks > MIN_TRACKS
     reached = len(enough) if enough.all() else int(np.argmin(enough))
@@ -68,7 +69,7 @@ def _falling(weight: Float64Array, tracks: Float64Array) -> tuple[Float64Array, 
 
 
 def transport_depth_mm(table: Float64Array) -> float:
-    """Return the depth to which light goes before it has turned or been absorbed once."""
+    """Return the depth of light after one transport mean free path (scattered or absorbed)."""
     left = 1.0
     for top, bottom, sigma_t, albedo, g in table[1:-1, :5]:
         turned = sigma_t * (1.0 - albedo * g)

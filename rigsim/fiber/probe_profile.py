@@ -1,6 +1,6 @@
-"""What the probe's fibres take from a tissue, by Monte Carlo, kept for a whole series.
+"""Cache Monte Carlo profiles of a tissue under the probe's fibers for a series of captures.
 
-Noise of traced profiles lowered by what is known of them: they are smooth in the distance.
+The noise of traced profiles is reduced by smoothing over distance.
 """
 
 import dataclasses
@@ -27,19 +27,19 @@ from rigsim.fiber.profile import (
 from rigsim.fiber.white_fiber import ETA, HENYEY_GREENSTEIN_G, FiberTable
 
 MAX_KEPT_PROFILES: Final = 64
-"""Profiles and runs of photons that are kept."""
+"""Number of cached profiles and photon runs."""
 
 DIRECTIONS_PER_HALF_TURN: Final = 16
-"""Directions over half a turn in which anisotropic tissue is traced; it has harmonics to the 8th,
-so that those between follow from them exactly."""
+"""Directions over half a turn in which anisotropic tissue is traced; its harmonics up to the 8th
+are so that those between follow from them exactly."""
 
 SUCTION_STEP_MBAR: Final = 0.1
-"""Suctions nearer than half of it share a profile: the blood differs by less than a 1000th."""
+"""Step to which suction is rounded: within half of it blood differs by less than a 1000th."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BandProfile:
-    """Reflectance in the fibres in the camera's bands."""
+    """Reflectance in the fibers in the camera's bands."""
 
     reflectance_per_mm2: Float64Array
     """R_f in 1/mm^2, shape (F, 3), >= 0."""
@@ -53,14 +53,13 @@ class ProfileCache:
     Parameters
     ----------
     rig
-        The drawing; it must have a probe, one view and one light.
+        The nominal rig; it must have a probe, one view and one light.
     tissue
-        What the probe sits on.
+        Tissue under the probe.
     photons
         Photons for one site and angle.
     seed
-        Of the photons; a profile depends on it and on the tissue alone, not on what was asked
-        before.
+        Seed of the photons; a profile depends only on it and the tissue, not on earlier calls.
     threads
         Threads of the photons; the result does not depend on it.
     """
@@ -81,20 +80,20 @@ class ProfileCache:
         self._profiles: LruCache[tuple[object, ...], BandProfile] = LruCache(lambda _: most)
 
     def profile(self, site: str, angle_deg: float = 0.0, suction_mbar: float = 0.0) -> BandProfile:
-        """Return what the fibres take at a site.
+        """Return the fibers' reflectance at a site.
 
         Parameters
         ----------
         site
             Name of the site.
         angle_deg
-            Turn of the head about its axis, degrees.
+            Rotation of the head about its axis, degrees.
         suction_mbar
             Suction under the head, mbar.
 
         Returns
         -------
-        Profile
+        BandProfile
             The same for equal arguments and seeds.
 
         Raises
@@ -112,7 +111,7 @@ class ProfileCache:
         return self._profiles.get((site, angle_deg, suction), make)
 
     def _profile_at_angle(self, tissue: FibrousTissue, angle_deg: float) -> BandProfile:
-        """Return the profile along one direction, by the Fourier series of those traced."""
+        """Return the profile along one direction, by the Fourier series of the traced ones."""
         if self._by_turn is None:
             run = trace_anisotropic_profile(
                 tissue.medium(),
@@ -171,7 +170,7 @@ class ProfileCache:
         return BandProfile(value, error)
 
     def _look_up(self, optics: TissueOptics, kind: FiberGeometry) -> BandProfile | None:
-        """Return the profile of a homogeneous medium that the stored photons tell of."""
+        """Return the profile of a homogeneous medium from the stored table."""
         table = FiberTable.load()
         each = []
         for stack in optics.stacks:
@@ -188,7 +187,7 @@ class ProfileCache:
         weights = np.ones((1, 3))
         if optics.wavelength_nm:
             weights = self.spectral_stack(optics).band_weights
-        # errors of similar media are of the same photons: they add up
+        # errors of similar media are fully correlated (same photons): add them linearly
         value, error = (np.stack(part).T @ weights for part in zip(*each, strict=True))
         return BandProfile(value, error)
 
@@ -203,12 +202,12 @@ class ProfileCache:
 
 
 def probe_fibers(probe: Probe) -> FiberGeometry:
-    """Return the probe's fibres as the walk of photons wants them.
+    """Return the probe's fibers for the photon walk.
 
     Raises
     ------
     TissueError
-        The detection fibres are not all alike.
+        The detection fibers are not all alike.
     """
     first: Fiber = probe.fibres[0]
     for fibre in probe.fibres:
@@ -226,20 +225,20 @@ def probe_fibers(probe: Probe) -> FiberGeometry:
 SPLINE_PIECES = 6
 """Pieces of the cubic spline through the logarithm of a profile."""
 MAX_RELATIVE_ERROR = 0.3
-"""Relative error of a fibre that the spline is still fitted to."""
+"""Largest relative error of a fiber in the spline's fit."""
 MIN_SPLINE_FIBERS = 14
-"""Fibres that a spline is fitted to at least."""
+"""Smallest number of fibers for a spline."""
 
 
 def smooth_profile(
     radii_mm: Float64Array, batches: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Return profiles with the noise between neighbours taken out.
+    """Return profiles smoothed over distance, with jackknife errors.
 
     Parameters
     ----------
     radii_mm
-        Distances of the fibres, mm, increasing, shape (F,).
+        Distances of the fibers, mm, increasing, shape (F,).
     batches
         Reflectance of independent batches of photons, >= 0, shape (B, F, bands).
 
@@ -247,7 +246,7 @@ def smooth_profile(
     -------
     reflectance, stderr : ndarray
         Shape (F, bands): exp of a cubic spline fitted to log reflectance; its errors by leaving
-        out one batch at a time. Fibres with more than `MAX_RELATIVE_ERROR` of relative error, and
+        out one batch at a time. Fibers with more than `MAX_RELATIVE_ERROR` of relative error, and
         all where fewer than `MIN_SPLINE_FIBERS` have less, stay as they were.
 
     Examples

@@ -1,4 +1,4 @@
-"""What a fibre probe sits on: tissues by site, turn of the head and suction."""
+"""Tissues under a fiber probe, by site, rotation of the head and suction."""
 
 import dataclasses
 import json
@@ -21,8 +21,8 @@ from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError
 Kind: TypeAlias = Literal["homogeneous", "layered", "anisotropic"]
 
 MIN_SIGMA_A_PER_MM: Final = 1e-7
-"""Absorption that a medium without any is traced with, 1/mm: else photons wander for ever. A path
-of 1 m loses a ten-thousandth."""
+"""Smallest traced absorption, 1/mm: without absorption photons never end. A path of 1 m loses a
+ten-thousandth."""
 
 RESTING_BLOOD_FRACTION: Final[Mapping[str, float]] = {
     "forehead": 0.005,
@@ -36,48 +36,48 @@ PRESET_MELANIN_FRACTION: Final = 0.25
 """Of the presets' melanin: theirs colors the faces of other rigs, while spectra of forearms ask for
 about 0.003 (`rigsim.tissue.skin_table`), and so do the paper's sigma_tr. This project's choice."""
 INCOMPRESSIBLE_BLOOD_FRACTION: Final = 0.25
-"""Share of the blood at rest that no pressure presses out."""
+"""Fraction of the blood at rest that pressure does not displace."""
 CAPILLARY_PRESSURE_MBAR: Final = 30.0
-"""Pressure in capillaries that the head's works against, mbar: about 23 mm of mercury."""
+"""Pressure in capillaries, against that of the head, mbar: about 23 mm of mercury."""
 CONTACT_PRESSURE_MBAR: Final = 3.0
-"""Pressure under a head that is laid on without suction, mbar."""
+"""Pressure under a head without suction, mbar."""
 
 SKIN_WAVELENGTHS_NM: Final = (440.0, 465.0, 490.0, 515.0, 540.0, 560.0, 580.0, 600.0, 620.0, 650.0)
 """Wavelengths that skin is traced at, nm; between them reflectance is linear."""
 PHANTOM_WAVELENGTHS_NM: Final = tuple(float(nm) for nm in range(400, 701, 20))
-"""The same of the phantom."""
+"""Wavelengths of the phantom, nm."""
 PHANTOM_DEVIATIONS: Final = (0.8, -0.7)
-"""By how many standard uncertainties the phantom is off its certificate: sigma_a, sigma_s'."""
+"""Deviations of the phantom from its certificate, in standard uncertainties: sigma_a, sigma_s'."""
 
 
 class TissueError(ValueError):
-    """A tissue is described wrongly or asked for a site that it has not."""
+    """Error for invalid parameters of a tissue, or an unknown site."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TissueOptics:
-    """What light meets under the head."""
+    """Optical properties under the head."""
 
     wavelength_nm: tuple[float, ...]
     """Wavelengths of the stacks, nm; empty for a gray tissue, which has one stack."""
     stacks: tuple[LayerStack, ...]
-    """Layers at each wavelength, with the least of the absorber that comes and goes."""
+    """Layers at each wavelength, with the smallest amount of the variable absorber."""
     absorber: Float64Array | None
     """Absorption of that absorber in each layer per amount, 1/mm, shape (wavelengths, layers);
     None where none does."""
     amount: float
-    """How much of it there is above the least, >= 0."""
+    """Amount of the absorber above the smallest, >= 0."""
 
 
 class ProbedTissue(Protocol):
-    """What the probe's scene wants to know of a tissue."""
+    """Interface of a tissue for the probe's scene."""
 
     @property
     def kind(self) -> Kind:
-        """What its truth is."""
+        """Return the kind of its ground truth."""
 
     def optics(self, site: str, angle_deg: float, suction_mbar: float) -> TissueOptics:
-        """Return what light meets; equal stacks for equal sites and angles."""
+        """Return the optical properties; equal stacks for equal sites and angles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,7 @@ class HomogeneousTissue:
         return "homogeneous"
 
     def optics(self, site: str, angle_deg: float, suction_mbar: float) -> TissueOptics:
-        """Return the material; nothing changes it."""
+        """Return the material, which is the same everywhere."""
         del site, angle_deg, suction_mbar
         sigma_a, scattering = np.broadcast_arrays(
             np.atleast_1d(self.sigma_a_per_mm), np.atleast_1d(self.sigma_s_prime_per_mm)
@@ -132,7 +132,7 @@ class HomogeneousTissue:
 
 @dataclass(frozen=True, slots=True)
 class FibrousTissue:
-    """A gray half space whose fibres run one way, as in abdominal skin; the same at every site."""
+    """A gray half space with aligned fibers, as in abdominal skin; the same at every site."""
 
     sigma_a_per_mm: float
     """Absorption coefficient, 1/mm, > 0."""
@@ -141,7 +141,7 @@ class FibrousTissue:
     strength: float = -1.0
     """See `rigsim.fiber.anisotropic_tissue.AnisotropicTissue`; below 0 light goes farther along."""
     axis_deg: float = 0.0
-    """Direction of the fibres: the head's angle at which its line lies along them, degrees."""
+    """Direction of the fibers: the head's angle at which its line lies along them, degrees."""
 
     def __post_init__(self) -> None:
         try:
@@ -155,7 +155,7 @@ class FibrousTissue:
         return "anisotropic"
 
     def medium(self) -> AnisotropicTissue:
-        """Return the tissue as photons meet it."""
+        """Return the anisotropic medium for the photon walk."""
         return AnisotropicTissue(
             self.sigma_a_per_mm,
             self.sigma_s_prime_per_mm / (1.0 - SKIN_ANISOTROPY),
@@ -166,7 +166,7 @@ class FibrousTissue:
         )
 
     def optics(self, site: str, angle_deg: float, suction_mbar: float) -> TissueOptics:
-        """Return the material without its direction, which `medium` tells."""
+        """Return the material without its direction; see `medium` for that."""
         del site, angle_deg, suction_mbar
         stack = half_space(self.sigma_a_per_mm, self.sigma_s_prime_per_mm, SKIN_ANISOTROPY, ETA)
         return TissueOptics((), (stack,), None, 0.0)
@@ -190,8 +190,8 @@ def half_space(
 class SkinTissue:
     """Skin of two layers: an epidermis with melanin on a dermis with blood.
 
-    Layers and coefficients are those of `rigsim.tissue.skin_layers`. Under a head the blood that is
-    not held back is pressed out: of the blood at rest there is left
+    Layers and coefficients are those of `rigsim.tissue.skin_layers`. Pressure under a head
+    displaces part of the blood; the remaining fraction of the blood at rest is
 
         BLOOD_KEPT + (1 - BLOOD_KEPT) exp(-pressure / CAPILLARY_MBAR),
 
@@ -281,7 +281,7 @@ class SkinTissue:
             stack = skin_layers.skin_layer_stack(wavelength, melanin, least)
             top = dataclasses.replace(stack.layers[0], thickness_mm=thickness)
             stacks.append(dataclasses.replace(stack, layers=(top, *stack.layers[1:])))
-            # more blood is less of the bloodless rest
+            # blood replaces bloodless tissue
             dermis = skin_layers.blood_per_mm(wavelength) - skin_layers.baseline_per_mm(wavelength)
             absorber.append([skin_layers.EPIDERMAL_BLOOD_RATIO * dermis, dermis])
         amount = self.blood(site, suction_mbar) - least
@@ -313,14 +313,14 @@ def phantom_certificate() -> Mapping[str, Any]:
 def make_phantom(
     certificate: Mapping[str, Any], *, deviations: tuple[float, float] = PHANTOM_DEVIATIONS
 ) -> HomogeneousTissue:
-    """Return a block as it was made, near its certificate.
+    """Return a block with given deviations from its certificate.
 
     Parameters
     ----------
     certificate
         Of schema ``skinrig.phantom/1``.
     deviations
-        By how many of its standard uncertainties sigma_a and sigma_s' are off.
+        Deviations of sigma_a and sigma_s', in their standard uncertainties.
 
     Returns
     -------
@@ -353,7 +353,7 @@ def make_phantom(
 
 
 def parse_tissue(text: str, *, seed: int = 0) -> ProbedTissue:
-    """Return the tissue that a subject's text names.
+    """Return the tissue of a subject's text.
 
     Parameters
     ----------
@@ -395,4 +395,4 @@ def parse_tissue(text: str, *, seed: int = 0) -> ProbedTissue:
 
 
 PHANTOM_BLOCK: Final = make_phantom(phantom_certificate())
-"""The solid block that sessions of target "phantom" are of, as made."""
+"""The actual solid block in sessions of target "phantom"."""

@@ -1,14 +1,14 @@
-"""What fibres on tissue take from a source fibre: Monte Carlo transport scored in their cones.
+"""Trace light from a source fiber to fibers on tissue: Monte Carlo scored in their cones.
 
-The quantity is the reflectance in the fibre R_f in 1/mm^2: the power that a detection fibre takes,
-divided by the source's power, the area of the fibre's core and the square of its aperture. Where
-the light that leaves is Lambertian, it is the exitance per source power, averaged over the core.
+The quantity is the reflectance in the fiber R_f in 1/mm^2: the power in a detection fiber, divided
+by the source's power, the area of the fiber's core and the square of its aperture. Where the light
+that leaves is Lambertian, it is the exitance per source power, averaged over the core.
 
-Three things make it cheap. Light is scored at every collision instead of where photons happen to
-leave. A plane stack is the same everywhere, so photons start at a point and are scored in rings,
-with the exact share of the pairs of points, one in each core, that lie so far apart. And photons
-are split where few arrive and merged by roulette where many do, so that every distance is visited
-alike; weights keep all of it unbiased.
+Three methods reduce the variance. Light is scored at every collision instead of at random exits. A
+plane stack is translation invariant, so photons start at a point and are scored in rings, with the
+exact fraction of point pairs, one in each core, at that distance. And photons are split where few
+arrive and terminated by roulette where many do, so that all distances are visited equally; weights
+keep the result unbiased.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ from rigsim.tissue import tissue_mc
 from rigsim.tissue.tissue_mc import LayerStack, TransportError
 
 PATH_SCALE_MM: Final = 0.05
-"""Path length above which the nodes of a path histogram are spaced by their logarithm."""
+"""Path length above which the nodes of a path histogram are logarithmic."""
 
 PATH_STEP: Final = 0.006
 """Relative spacing of those nodes; a reweighted score is off by (sigma path step)^2 / 8 of it."""
@@ -41,26 +41,26 @@ MAX_PATH_MM: Final = 20_000.0
 """Longer paths count as this one when they are reweighted: exp(-sigma 20 m) is 0 for all tissue."""
 
 PILOT_FRACTION: Final = 0.01
-"""Photons that each of `PILOT_RUNS` runs spends to learn how many arrive where, of those traced."""
+"""Fraction of photons in each of `PILOT_RUNS` runs, which estimate the arrivals by distance."""
 
 PILOT_RUNS: Final = 3
-"""Each pilot sees farther than the one before it."""
+"""Number of pilots; each reaches farther than the one before."""
 
 
 @dataclass(frozen=True, slots=True)
 class FiberGeometry:
-    """A source fibre and detection fibres that stand on the surface."""
+    """A source fiber and detection fibers on the surface."""
 
     radii_mm: tuple[float, ...]
-    """Distances of the detection fibres' axes from the source's, mm, >= 0, at least one."""
+    """Distances of the detection fibers' axes from the source's, mm, >= 0, at least one."""
     core_mm: float = 0.2
-    """Diameter of the detection fibres' cores, mm, > 0."""
+    """Diameter of the detection fibers' cores, mm, > 0."""
     source_core_mm: float = 0.2
-    """Diameter of the source fibre's core, mm, >= 0."""
+    """Diameter of the source fiber's core, mm, >= 0."""
     numerical_aperture: float = 0.22
-    """Numerical aperture of the detection fibres, in (0, 1]; 1 in air takes all angles."""
+    """Numerical aperture of the detection fibers, in (0, 1]; 1 in air accepts all angles."""
     source_numerical_aperture: float = 0.22
-    """Numerical aperture of the source fibre, in [0, 1]; 0 for parallel light."""
+    """Numerical aperture of the source fiber, in [0, 1]; 0 for parallel light."""
 
     def __post_init__(self) -> None:
         if not self.radii_mm:
@@ -85,7 +85,7 @@ class SpectralStack:
     stacks: tuple[LayerStack, ...]
     """The layers at each wavelength; as many in each."""
     band_weights: Float64Array
-    """Share of each wavelength in each band, >= 0, shape (wavelengths, bands): the light source's
+    """Weight of each wavelength in each band, >= 0, shape (wavelengths, bands): the light source's
     spectrum times the band's sensitivity, each column of sum 1 for a reflectance."""
 
     def __post_init__(self) -> None:
@@ -110,35 +110,35 @@ class SpectralStack:
 
 @dataclass(frozen=True, slots=True)
 class FiberProfile:
-    """Reflectance in the fibre by distance, with one-sigma standard errors."""
+    """Reflectance in the fiber by distance, with one-sigma standard errors."""
 
     radii_mm: Float64Array
-    """Distances as asked for, mm, shape (F,)."""
+    """Distances of the fibers, mm, shape (F,)."""
     reflectance_per_mm2: Float64Array
     """R_f in 1/mm^2, shape (F,), or (F, bands) of a `SpectralStack`."""
     stderr: Float64Array
-    """Standard error of `reflectance_per_mm2`, same shape. Neighbours' errors are correlated."""
+    """Standard error of `reflectance_per_mm2`, same shape. Neighbors' errors are correlated."""
     batch_reflectance_per_mm2: Float64Array
     """`reflectance_per_mm2` of each independent batch, shape (batches, F[, bands])."""
     photons: int
-    """Photons traced, those of the pilot left out."""
+    """Photons traced, without the pilots'."""
 
     @property
     def batches(self) -> int:
-        """Independent batches behind the standard errors."""
+        """Return the number of independent batches of the standard errors."""
         return len(self.batch_reflectance_per_mm2)
 
 
 @dataclass(frozen=True, slots=True)
 class FiberPaths:
-    """Light in the fibres by the path that it took through one absorber.
+    """Light in the fibers by its path length through one absorber.
 
-    More of the absorber weakens a path by the factor exp(-sigma path) and changes no collision, so
-    one run serves every concentration above that of the run.
+    More of the absorber attenuates a path by exp(-sigma path) without changing collisions, so one
+    run serves every higher concentration.
     """
 
     radii_mm: Float64Array
-    """Distances as asked for, mm, shape (F,)."""
+    """Distances of the fibers, mm, shape (F,)."""
     path_mm: Float64Array
     """Nodes of the path in the counted absorber, mm, increasing from 0, shape (nodes,)."""
     score: Float32Array
@@ -157,7 +157,7 @@ class FiberPaths:
 
         Returns
         -------
-        FibreProfile
+        FiberProfile
 
         Raises
         ------
@@ -184,7 +184,7 @@ def trace_fiber_profile(
     batches: int = tissue_mc.MIN_BATCHES,
     threads: int = 1,
 ) -> FiberProfile:
-    """Trace light from a source fibre to detection fibres on the same surface.
+    """Trace light from a source fiber to detection fibers on the same surface.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def trace_fiber_profile(
         Layers and the media around them, at one wavelength or at several in bands. The source
         shines uniformly over its core and over the projected solid angle of its cone.
     radii_mm
-        Distances of the detection fibres from the source, mm, >= 0, shape (F,).
+        Distances of the detection fibers from the source, mm, >= 0, shape (F,).
     photons
         Photons to trace, rounded up to a multiple of `batches` (times wavelengths).
     rng
@@ -200,7 +200,7 @@ def trace_fiber_profile(
     core_mm, source_core_mm
         Diameters of the cores, mm.
     numerical_aperture, source_numerical_aperture
-        Apertures of the fibres, n sin(half angle).
+        Apertures of the fibers, n sin(half angle).
     batches
         Independent batches, at least 20.
     threads
@@ -208,14 +208,14 @@ def trace_fiber_profile(
 
     Returns
     -------
-    FibreProfile
-        R_f with standard errors. Light that left the source and was never scattered, only
-        reflected by inner interfaces, is included; what the surface itself mirrors is not.
+    FiberProfile
+        R_f with standard errors. Light that left the source and was never scattered, only reflected
+        by inner interfaces, is included; specular reflection of the surface is not.
 
     Raises
     ------
     TransportError
-        When the request makes no sense; the message names the field.
+        When an argument is out of range; the message names it.
 
     Examples
     --------
@@ -249,14 +249,14 @@ def trace_fiber_paths(
     batches: int = tissue_mc.MIN_BATCHES,
     threads: int = 1,
 ) -> FiberPaths:
-    """Trace light as `trace_fiber_profile` does and keep its paths through one absorber.
+    """Trace light as `trace_fiber_profile` and store its paths through one absorber.
 
     Parameters
     ----------
     stack, photons, rng, batches, threads
         As in `trace_fiber_profile`. Take the smallest absorption of interest.
-    fibres
-        The fibres.
+    fibers
+        The fibers.
     absorber
         Share of the counted absorber in each layer, >= 0 and somewhere > 0, shape (layers,) or
         (wavelengths, layers): 1 everywhere (the default) for absorption that is added to all
@@ -264,12 +264,12 @@ def trace_fiber_paths(
 
     Returns
     -------
-    FibrePaths
+    FiberPaths
 
     Raises
     ------
     TransportError
-        When the request makes no sense; the message names the field.
+        When an argument is out of range; the message names it.
 
     Examples
     --------
@@ -360,7 +360,7 @@ Rings = tuple[Float64Array, Int64Array, Int64Array]
 
 
 class _Plan:
-    """What the walk needs of one stack and its fibres."""
+    """Input of the walk for one stack and its fibers."""
 
     def __init__(
         self, stack: LayerStack, fibres: FiberGeometry, rings: Rings, absorber: Float64Array | None
@@ -386,7 +386,7 @@ class _Plan:
     def trace(
         self, count: int, batches: int, seeds: NDArray[np.uint64], threads: int
     ) -> list[Float64Array]:
-        """Return the sums of each batch's scores, its photons split as pilots have learned."""
+        """Return the sums of each batch's scores, with the splitting of the pilots."""
         window = uniform_window(self.reach_mm, self.farthest_mm)
         pilot = max(200, round(PILOT_FRACTION * count * batches))
         for seed in seeds[batches:]:
@@ -399,7 +399,7 @@ class _Plan:
     def _run(
         self, window: Float64Array, photons: int, seed: NDArray[np.uint64]
     ) -> tuple[Float64Array, Float64Array]:
-        """Return the sums of the fibres' scores and of the weights that visited each distance."""
+        """Return the sums of the fibers' scores and of the weights at each distance."""
         fibres = len(self.rings[0])
         tally = np.zeros(fibres)
         histogram = np.zeros((fibres, _path_nodes()) if self.counts_paths else (0, 0))

@@ -1,6 +1,6 @@
-"""How much of the light that leaves at a distance from its entry a fibre takes: two discs, a ring.
+"""Densities with which fibers collect light by distance: overlap of two discs on a ring.
 
-Source and detection fibre are discs whose centres are a given distance apart. The densities here
+Source and detection fiber are discs whose centers are a given distance apart. The densities here
 are those of the displacement between a point in the one and a point in the other.
 """
 
@@ -12,13 +12,13 @@ import numpy as np
 from rigsim.arrays import Float64Array, Int64Array
 
 KERNEL_NODES: Final = 400
-"""Nodes of a fibre's density over the distance that it takes light from."""
+"""Nodes of a fiber's density over distance."""
 
 
 def ring_kernels(
     radii_mm: Float64Array, detector_mm: float, source_mm: float
 ) -> tuple[Float64Array, Int64Array, Int64Array]:
-    """Return the densities with which fibres take light by its distance from the entry."""
+    """Return the densities with which fibers collect light by its distance from the entry."""
     both = detector_mm + source_mm
     radii = radii_mm
     farthest = radii[-1] + both
@@ -29,7 +29,7 @@ def ring_kernels(
         rho = np.linspace(low, radius + both, KERNEL_NODES)
         row[:3] = low, (KERNEL_NODES - 1) / (rho[-1] - rho[0]), bins_per_mm
         density = _ring_density(rho, radius, detector_mm, source_mm)
-        # The walk interpolates: what the interpolant holds in total must be 1.
+        # The walk interpolates linearly: normalize the integral of the interpolant to 1.
         a, b = rho[:-1], rho[1:]
         da, db = density[:-1], density[1:]
         held = 2.0 * pi * np.sum((b - a) / 6.0 * (da * (2.0 * a + b) + db * (a + 2.0 * b)))
@@ -54,7 +54,7 @@ def _ring_density(
         inside = rho_mm + radius_mm <= detector_mm
         cosine = np.where(inside, -1.0, np.nan_to_num(np.clip(cosine, -1.0, 1.0), nan=1.0))
         return np.asarray(np.arccos(cosine) / pi / (pi * detector_mm**2))
-    # Directions that reach the overlap, densely: the integrand is continuous and zero at its ends.
+    # Dense directions over the overlap: the integrand is continuous and zero at its ends.
     both = detector_mm + source_mm
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = (rho_mm**2 + radius_mm**2 - both**2) / (2.0 * rho_mm * radius_mm)
@@ -74,7 +74,7 @@ def _ring_density(
 
 
 def disc_overlap_area(distance: Float64Array, a: float, b: float) -> Float64Array:
-    """Return the area that two discs of radii a and b share at a distance of their centres."""
+    """Return the overlap of two discs of radii a and b at a distance of their centers."""
     small = min(a, b)
     d = np.clip(distance, abs(a - b) + 1e-12, a + b)
     first = np.arccos(np.clip((d * d + a * a - b * b) / (2.0 * d * a), -1.0, 1.0))

@@ -1,11 +1,11 @@
-"""The compiled walk of photons that are seen by fibres (see `rigsim.fiber.profile`).
+"""Trace photons and score them in fibers, compiled (see `rigsim.fiber.profile`).
 
-At each collision the light that would go straight into a fibre's cone is scored: its chance to be
-scattered there, to reach the surface and to pass it. So photons need not happen to leave within a
-narrow cone. Where scattering is more forward than that cone is narrow, such scores are rare and
-large; so both ways share each direction by their densities (the balance heuristic of Veach and
-Guibas 1995, doi:10.1145/218380.218498): photons that leave within the cone straight from a
-collision count for the rest. After a reflection at some interface they count in full.
+At each collision the direct light into a fiber's cone is scored (next-event estimation): the
+probability of scattering into the cone, times transmittance to and through the surface. Where the
+phase function is narrower than the cone, such scores are rare and large; so this estimator and
+random exits are combined by their densities (the balance heuristic of Veach and Guibas 1995,
+doi:10.1145/218380.218498): photons that exit within the cone directly from a collision get the
+remaining weight. After a reflection at an interface they get full weight.
 """
 
 from math import copysign, exp, log, sqrt
@@ -17,17 +17,17 @@ from rigsim.tissue.photon_walk import draw_disc_point, draw_uniform, fresnel, sc
 
 TABLE_COLUMNS = 8
 """Columns of the layer table: top, bottom (mm), sigma_t (1/mm), albedo, g, eta, optical depth of
-the top below the surface, share of the counted absorber."""
+the top below the surface, fraction of the counted absorber."""
 
-STACK_DEPTH = 512  # copies of photons that wait; when full, photons are not split further
-MAX_COPIES = 16  # of one photon at one collision
-MAX_DEPTH_GAIN = 30.0  # most that the depth raises the weight at which photons are kept
+STACK_DEPTH = 512  # capacity for waiting copies; when full, photons are not split further
+MAX_COPIES = 16  # largest number of copies of one photon at one collision
+MAX_DEPTH_GAIN = 30.0  # largest factor of the kept weight by depth
 _STATE_SIZE = 9  # x, y, z, ux, uy, uz, weight, path, layer
 
 
 @njit(inline="always")
 def _score_fibers(rho, value, path, rings, paths, tally, histogram):  # type: ignore[no-untyped-def]
-    """Add light that leaves at a distance to the fibres that reach there."""
+    """Add light that exits at a distance to the fibers within reach."""
     kernels, starts, counts = rings
     log_step, path_scale = paths
     bin_ = int(rho * kernels[0, 2])
@@ -66,7 +66,7 @@ def _score_fibers(rho, value, path, rings, paths, tally, histogram):  # type: ig
 def walk_to_fibers(  # type: ignore[no-untyped-def]
     table, sines, rings, window, chances, per_mm, paths, photons, seed, found
 ):
-    """Trace photons from a point source in a cone and score what fibres take.
+    """Trace photons from a point source in a cone and score the light in fibers.
 
     Parameters
     ----------
@@ -74,11 +74,11 @@ def walk_to_fibers(  # type: ignore[no-untyped-def]
         Row 0 the medium above, rows 1 to n the layers, row n + 1 the medium below; see
         `TABLE_COLUMNS`. float64, shape (n + 2, 8).
     sines
-        Numerical apertures of the source and of the fibres.
+        Numerical apertures of the source and of the fibers.
     rings
-        Kernels, one row a fibre, in the order of their distance: smallest exit radius it takes
+        Kernels, one row a fiber, in the order of their distance: smallest exit radius it takes
         (mm), nodes per mm, bins of `starts` per mm, then its density (1/mm^2) at the nodes.
-        float64, shape (F, 3 + nodes + 1), the last value 0; first fibre and number of fibres that
+        float64, shape (F, 3 + nodes + 1), the last value 0; first fiber and number of fibers that
         reach each bin of exit radius, int64, shape (bins,).
     window
         Weight at which photons are kept, by their distance from the entry; lighter ones play,
@@ -96,7 +96,7 @@ def walk_to_fibers(  # type: ignore[no-untyped-def]
     seed
         State of the generator, not all zero, uint64, shape (4,).
     found
-        What is added to. Light in each fibre per area, aperture^2 and photon in 1/mm^2, float64,
+        What is added to. Light in each fiber per area, aperture^2 and photon in 1/mm^2, float64,
         shape (F,), when the histogram is empty; the histogram, the same by the path in the counted
         absorber, each score shared by the two nodes around it so that its mean path is kept.
         float64, shape (F, nodes) or (0, 0); the weight of scored collisions by distance from the
@@ -208,7 +208,8 @@ def walk_to_fibers(  # type: ignore[no-untyped-def]
                                 row[3], row[4], row[5] = ux, uy, uz
                                 row[6], row[7], row[8] = weight, path, layer
                                 alive += 1
-                    # The light that goes straight on from here has been scored, in part.
+                    # The direct light from here was scored in part: weight the exit by the balance
+                    # heuristic.
                     direct = True
                     was_x, was_y, was_z = ux, uy, uz
                     s0, s1, s2, s3, ux, uy, uz = scatter_direction(s0, s1, s2, s3, ux, uy, uz, g)

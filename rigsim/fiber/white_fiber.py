@@ -1,10 +1,10 @@
-"""Reflectance in the fibre of homogeneous half spaces, from a stored Monte Carlo table.
+"""Look up fiber reflectance of homogeneous half spaces in a stored Monte Carlo table.
 
-Lengths are counted in 1 / sigma_s', so that one table over the distance and sigma_a / sigma_s'
+Lengths are in units of 1 / sigma_s', so that one table over the distance and sigma_a / sigma_s'
 serves every medium of g = 0.8 and eta = 1.4 under air: R_f = sigma_s'^2 F(r sigma_s', sigma_a /
 sigma_s'). The table is package data made by ``tools/make_white_fibre.py`` from the photons of
 `rigsim.fiber.profile`, for a source that is a point of numerical aperture 0.22 and for points of
-detection of the same aperture; the fibres' cores are averaged over here.
+detection of the same aperture; the fibers' cores are averaged over here.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ MAX_CONTINUED_ABSORPTION: Final = 0.01
 is that of diffusion to a thousandth."""
 
 DIFFUSION_BLEND_RANGE: Final = (12.0, 20.0)
-"""Distances between which what photons told of each goes over into what all of them tell of
+"""Range of distances over which estimates of each node are blended into the common estimate of
 diffused light (`log_diffuse_reflectance`)."""
 MEAN_SQUARE_DEPTH: Final = 17.5
 """Mean square depth of that light's source and its image, in 1 / sigma_s'^2: from the photons of
-sigma_a / sigma_s' of 0.003 to 0.009, which alone would say 17.0 to 17.4, and less surely 19.5 of
+sigma_a / sigma_s' of 0.003 to 0.009, which alone give 17.0 to 17.4, and with less certainty 19.5 of
 none."""
 NODES_PER_KNOT: Final = 4.0
-"""Nodes of distance that share their error: the knots that photons are smoothed with."""
+"""Nodes of distance with a common error: the knots of the smoothing spline."""
 DISC_RADII, DISC_TURNS = 2, 6
 """Points in a core: rings, and points on each."""
 
 
 class FiberTableError(ValueError):
-    """A medium or a distance outside the table."""
+    """Error for a medium or a distance outside the table."""
 
 
 def decay_rate(absorption: ArrayLike) -> Float64Array:
-    """Return about what the logarithm of F falls by per unit of distance, far away.
+    """Return the approximate decay of log F per unit of distance, far away.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def absorption_axis(absorption: ArrayLike) -> Float64Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FiberTable:
-    """The table."""
+    """Table of fiber reflectance over distance and absorption."""
 
     distance: Float64Array
     """Nodes in 1 / sigma_s', increasing, > 0, shape (D,)."""
@@ -85,7 +85,7 @@ class FiberTable:
     relative_error: Float64Array
     """Relative standard error of F, shape (D, A)."""
     recipe: Mapping[str, Any]
-    """What it was made with."""
+    """Parameters of the table's Monte Carlo."""
 
     @staticmethod
     @cache
@@ -105,7 +105,7 @@ class FiberTable:
     def covers(
         self, sigma_a_per_mm: float, sigma_s_prime_per_mm: float, fibers: FiberGeometry
     ) -> bool:
-        """Return whether a medium under some fibres is inside the table."""
+        """Return whether a medium under some fibers is inside the table."""
         if not sigma_s_prime_per_mm > 0.0:
             return False
         both = 0.5 * (fibers.core_mm + fibers.source_core_mm)
@@ -124,24 +124,24 @@ class FiberTable:
     def profile(
         self, sigma_a_per_mm: float, sigma_s_prime_per_mm: float, fibers: FiberGeometry
     ) -> tuple[Float64Array, Float64Array]:
-        """Return what fibres take.
+        """Return the fibers' reflectance on a homogeneous medium.
 
         Parameters
         ----------
         sigma_a_per_mm, sigma_s_prime_per_mm
             Coefficients, 1/mm.
-        fibres
-            The fibres; both apertures 0.22.
+        fibers
+            The fibers; both apertures 0.22.
 
         Returns
         -------
         reflectance_per_mm2, stderr : ndarray
-            R_f in 1/mm^2 and its standard error, shape (F,). Errors of neighbours, and of similar
+            R_f in 1/mm^2 and its standard error, shape (F,). Errors of neighbors, and of similar
             media, are correlated.
 
         Raises
         ------
-        WhiteFibreError
+        FiberTableError
             Outside the table.
 
         Examples
@@ -164,7 +164,7 @@ class FiberTable:
         y = np.full_like(x, float(absorption_axis(a)))
         fall = float(decay_rate(a))
         log_f = shape.ev(x, y) - np.log(held) - fall * scaled
-        # beyond the table: log_f has gone on with the fall of the last distance
+        # beyond the table: log_f is extrapolated with the slope of the last distance
         log_f += (log_diffuse_reflectance(scaled, a) + fall * scaled) - (
             log_diffuse_reflectance(held, a) + fall * held
         )
@@ -175,7 +175,7 @@ class FiberTable:
 
 
 def log_diffuse_reflectance(distance: Float64Array, absorption: float) -> Float64Array:
-    """Return the logarithm of diffused light far from its source, up to a constant.
+    """Return the logarithm of diffuse light far from its source, up to a constant.
 
     That of a dipole in the depth: (1 + k d) exp(-k d) / d^3 with d^2 = distance^2 +
     `MEAN_SQUARE_DEPTH`, and k of transport theory to the second order of the phase function.
@@ -194,7 +194,7 @@ def log_diffuse_reflectance(distance: Float64Array, absorption: float) -> Float6
 
 
 def _pool_far_nodes(table: FiberTable) -> tuple[Float64Array, Float64Array]:
-    """Return shape and error with far nodes of weak absorption told by all of them together."""
+    """Return shape and error with far nodes of weak absorption estimated jointly."""
     shape, error = table.shape.copy(), table.relative_error.copy()
     near, far = DIFFUSION_BLEND_RANGE
     rows = table.distance > near
@@ -221,17 +221,17 @@ def _splines() -> tuple[RectBivariateSpline, RegularGridInterpolator]:
 
 @lru_cache(maxsize=8)
 def core_distances(fibers: FiberGeometry) -> tuple[Float64Array, Float64Array]:
-    """Return distances of pairs of points, one in each core, and their shares.
+    """Return distances of pairs of points, one in each core, and their weights.
 
     Parameters
     ----------
-    fibres
-        The fibres.
+    fibers
+        The fibers.
 
     Returns
     -------
     distance_mm, share : ndarray
-        Shape (F, pairs), mm, and shares that sum to 1 in each row.
+        Shape (F, pairs), mm, and weights that sum to 1 in each row.
 
     Examples
     --------
@@ -250,7 +250,7 @@ def core_distances(fibers: FiberGeometry) -> tuple[Float64Array, Float64Array]:
 
 
 def disc_quadrature(rings: int, points_per_ring: int) -> tuple[Float64Array, Float64Array]:
-    """Return points in the unit disc, shape (rings turns, 2), and their shares of its area.
+    """Return points in the unit disc, shape (rings turns, 2), and their fractions of its area.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The surface of a mesh laid out in its texture: what lies under each texel."""
+"""Rasterize a mesh into its texture: surface point, frame and stretch of each texel."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Atlas:
     """Surface point, frame and stretch under each texel; row 0 is the top, v = 1."""
 
     prim: Int32Array
-    """Triangle under the texel's centre, shape (N, N); -1 where there is none."""
+    """Triangle under the texel's center, shape (N, N); -1 without one."""
     position_mm: Float32Array
     """Surface point, shape (N, N, 3), rig frame."""
     normal: Float32Array
@@ -29,12 +29,12 @@ class Atlas:
 
     @property
     def covered(self) -> BoolArray:
-        """Texels with a surface under their centre, shape (N, N)."""
+        """Return the texels with a surface under their center, shape (N, N)."""
         return self.prim >= 0
 
     @property
     def size(self) -> int:
-        """Texels along one side."""
+        """Return the number of texels along one side."""
         return int(self.prim.shape[0])
 
     def texel_mm(self) -> tuple[Float32Array, Float32Array]:
@@ -57,7 +57,7 @@ class Atlas:
 
 
 def unwrap(mesh: Mesh, size: int) -> Atlas:
-    """Lay the surface of a mesh out in its texture.
+    """Rasterize the surface of a mesh into its texture.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def unwrap(mesh: Mesh, size: int) -> Atlas:
     Returns
     -------
     Atlas
-        What lies under each texel.
+        Surface under each texel.
     """
     if size < 8:
         raise ValueError(f"size: got {size}, expected at least 8 texels")
@@ -138,7 +138,7 @@ def sample(texture: Float32Array, uv: Float32Array, mask: BoolArray) -> Float32A
 
 
 def dilate_texture(texture: Float32Array, covered: BoolArray, *, steps: int = 4) -> Float32Array:
-    """Fill texels beside the covered ones with their neighbours' mean, so that sampling may blend.
+    """Fill texels next to covered ones with their neighbors' mean, for bilinear sampling.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def dilate_texture(texture: Float32Array, covered: BoolArray, *, steps: int = 4)
         count = np.zeros(known.shape, np.float32)
         for dy, dx in ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1)):
             to, source = _shifted(known.shape, dy, dx)
-            total[to] += filled[source]  # unknown texels hold zero
+            total[to] += filled[source]  # unknown texels are zero
             count[to] += known[source]
         new = ~known & (count > 0)
         filled[new] = total[new] / count[new, None]
@@ -188,7 +188,7 @@ def _vertex_tangents(mesh: Mesh) -> tuple[Float32Array, Float32Array]:
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     d1, d2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     determinant = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
-    # Faces without area in the texture say nothing about its stretch.
+    # Faces without area in the texture do not determine its stretch.
     flat = np.abs(determinant) < 1e-15
     inverse = np.where(flat, 0.0, 1.0 / np.where(flat, 1.0, determinant))[:, None]
     du = (e1 * d2[:, 1:] - e2 * d1[:, 1:]) * inverse

@@ -1,4 +1,4 @@
-"""Triangle meshes in millimetres with texture coordinates: checks, normals, files."""
+"""Triangle meshes in millimeters with texture coordinates: checks, normals, files."""
 
 import zipfile
 from collections.abc import Mapping
@@ -12,15 +12,15 @@ from numpy.typing import ArrayLike
 from rigsim.arrays import Float32Array, Int32Array
 
 EXTENT_RANGE_MM: Final = (1.0, 5000.0)
-"""Longest side of a mesh that is believed to be in millimetres."""
+"""Range of a mesh's longest side, mm; outside it the unit is wrong."""
 
 
 class MeshError(ValueError):
-    """A mesh cannot be used; the message names what, where and what to do."""
+    """Error for a mesh that cannot be used; the message names the field and the remedy."""
 
 
 class MeshFileError(MeshError, OSError):
-    """A mesh file cannot be read."""
+    """Error for a mesh file that cannot be read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Mesh:
     normals: Float32Array
     """Unit shading normals, shape (V, 3), outward."""
     shapes: Mapping[str, Float32Array] = field(default_factory=dict)
-    """Blend shapes that came with the mesh: how each vertex moves at weight 1, mm, (V, 3) each."""
+    """Blend shapes of the mesh: displacement of each vertex at weight 1, mm, (V, 3) each."""
 
     def __post_init__(self) -> None:
         """Check shapes, ranges and finiteness."""
@@ -87,7 +87,7 @@ def check_triangles(
     if not low <= extent <= high:
         raise MeshError(
             f"vertices_mm: got an extent of {extent:g}, expected {low:g} to {high:g} mm; "
-            "scale the mesh to millimetres"
+            "scale the mesh to millimeters"
         )
 
 
@@ -194,19 +194,19 @@ def vertex_normals(vertices_mm: ArrayLike, faces: ArrayLike) -> Float32Array:
 
 
 def load_mesh(path: str | Path) -> Mesh:
-    """Read a mesh in millimetres from an .npz or .obj file.
+    """Read a mesh in millimeters from an .npz or .obj file.
 
     Parameters
     ----------
     path
         An .npz with arrays ``vertices_mm`` (V, 3), ``faces`` (F, 3) and ``uv`` (V, 2), and, where
         it has blend shapes, ``shape_names`` (S,) and ``shape_deltas_mm`` (S, V, 3); or an .obj with
-        texture coordinates whose unit is the millimetre.
+        texture coordinates whose unit is the millimeter.
 
     Returns
     -------
     Mesh
-        The mesh as it stands in the file; see `center_face` to move it to the rig's origin.
+        The mesh in the file's frame; see `center_face` to move it to the rig's origin.
 
     Raises
     ------
@@ -224,19 +224,19 @@ def load_mesh(path: str | Path) -> Mesh:
 
 
 def center_face(mesh: Mesh, *, nose_tip_mm: tuple[float, float, float] = (0.0, -8.0, 25.0)) -> Mesh:
-    """Move a face mesh so that the rig's cameras look at its middle.
+    """Translate a face mesh so that the rig's cameras look at its center.
 
     Parameters
     ----------
     mesh
         A face that looks towards +z; its foremost vertex is taken as the tip of the nose.
     nose_tip_mm
-        Where that vertex goes, rig frame.
+        Target position of that vertex, mm, rig frame.
 
     Returns
     -------
     Mesh
-        The mesh moved, not turned or scaled.
+        The mesh, translated only.
     """
     foremost = mesh.vertices_mm[int(np.argmax(mesh.vertices_mm[:, 2]))]
     shift = np.array(nose_tip_mm, np.float32) - foremost
@@ -245,7 +245,7 @@ def center_face(mesh: Mesh, *, nose_tip_mm: tuple[float, float, float] = (0.0, -
 
 def _load_npz(path: Path) -> Mesh:
     if path.is_file() and not zipfile.is_zipfile(path):
-        # NumPy would take it for a pickle, and advise to allow that
+        # NumPy would treat it as a pickle and suggest allow_pickle=True, which is unsafe
         raise MeshFileError(f"{path}: cannot be read as .npz: expected an archive of arrays")
     try:
         with np.load(path, allow_pickle=False) as arrays:
@@ -260,9 +260,9 @@ def _load_npz(path: Path) -> Mesh:
     except MeshError:
         raise
     except FileNotFoundError as error:
-        raise MeshFileError(f"{path}: cannot be read: there is no such file") from error
+        raise MeshFileError(f"{path}: cannot be read: the file does not exist") from error
     except Exception as error:  # zip, pickle and header errors have no common base
-        # of objects of Python NumPy says how to read them; nobody's face is worth that
+        # NumPy suggests allow_pickle=True for object arrays; never unpickle untrusted files
         pickled = "allow_pickle" in str(error)
         why = "holds objects, expected arrays of numbers" if pickled else error
         raise MeshFileError(f"{path}: cannot be read as .npz: {why}") from error
@@ -273,7 +273,7 @@ def _load_obj(path: Path) -> Mesh:
 
     try:
         loaded = trimesh.load(path, process=False, force="mesh")
-    except Exception as error:  # the reader raises whatever its parser meets
+    except Exception as error:  # the reader raises errors of many types
         raise MeshFileError(f"{path}: cannot be read as .obj: {error}") from error
     uv = getattr(loaded.visual, "uv", None)
     if uv is None or len(uv) != len(loaded.vertices):

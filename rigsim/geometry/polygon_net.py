@@ -15,14 +15,14 @@ from rigsim.arrays import Float32Array, Float64Array
 def polygon_edge_distance(
     x: Float64Array, y: Float64Array, *, jitter: float, seed: int
 ) -> tuple[Float32Array, Float32Array]:
-    """Return how far points are from the edges of a polygon net.
+    """Return the distance of points from the edges of a polygon net.
 
     Parameters
     ----------
     x, y
-        Positions in units of the mean distance between polygon centres, same shape.
+        Positions in units of the mean distance between polygon centers, same shape.
     jitter
-        How irregular the polygons are: 0 is a square lattice, 1 moves centres over whole cells.
+        How irregular the polygons are: 0 is a square lattice, 1 moves centers over whole cells.
     seed
         Any integer.
 

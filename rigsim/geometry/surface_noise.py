@@ -69,7 +69,7 @@ def vessel_network(
     Returns
     -------
     ndarray of float32
-        Shape (...), 1 on a line's middle, falling to 0 beside it.
+        Shape (...), 1 on a line's center, falling to 0 on both sides.
     """
     flat = _flat(points_mm)
     # Lines are the zero crossings of smooth noise; its slope is about 1.6 units per cell.
@@ -106,8 +106,8 @@ def random_spots(
     softness
         Exponent of the edge: 2 is soft, 8 is crisp.
     smallest_mm
-        Spots are not drawn smaller than this, shape (...) or a number; what they gain in area they
-        lose in strength.
+        Spots are not drawn smaller than this, shape (...) or a number; their strength is reduced by
+        the gain in area.
 
     Returns
     -------
@@ -199,6 +199,6 @@ def _spots(points, density, floor, cell, r_low, r_high, softness, salt):  # type
                     d2 = (dx * dx + dy * dy + dz * dz) / (drawn * drawn)
                     spot = (radius / drawn) ** 2 / (1.0 + d2 ** (0.5 * softness))
                     best = max(best, spot)
-        # The tail of a spot ends where its cell's neighbours end.
+        # The tail of a spot ends where its cell's neighbors end.
         out[n] = best if best > 0.01 else 0.0
     return out

@@ -1,4 +1,4 @@
-"""What is wrong with the triangles of real scans, and the file they come in."""
+"""Add the mesh defects of real scans, and encode meshes as binary PLY."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -18,7 +18,7 @@ def add_mesh_defects(
     edge_mm
         Typical length of an edge.
     rng
-        Source of where the flaws are.
+        Random positions of the defects.
 
     Returns
     -------
@@ -84,7 +84,7 @@ def _punch(
     radius_mm: tuple[float, float],
     rng: np.random.Generator,
 ) -> Int64Array:
-    """Take away discs of triangles, as where a highlight outshines the stripes."""
+    """Remove discs of triangles, as where a highlight saturates the stripes."""
     centers = vertices[faces].mean(axis=1)
     lost = np.zeros(len(faces), np.bool_)
     for at in rng.choice(len(faces), count):
@@ -95,7 +95,7 @@ def _punch(
 def _fins(
     vertices: Float64Array, faces: Int64Array, count: int, edge_mm: float, rng: np.random.Generator
 ) -> tuple[Float64Array, Int64Array]:
-    """Raise triangles on edges that have two already."""
+    """Add triangles to edges that already have two."""
     base = faces[rng.choice(len(faces), count)]
     corners = vertices[base]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -108,7 +108,7 @@ def _fins(
 def _islands(
     vertices: Float64Array, faces: Int64Array, count: int, edge_mm: float, rng: np.random.Generator
 ) -> tuple[Float64Array, Int64Array]:
-    """Let scraps of surface float before the face."""
+    """Add small floating components in front of the face."""
     parts, rows = [vertices], []
     first = len(vertices)
     for at in rng.choice(len(vertices), count):
@@ -125,7 +125,7 @@ def _islands(
 def _slivers(
     vertices: Float64Array, faces: Int64Array, count: int, rng: np.random.Generator
 ) -> tuple[Float64Array, Int64Array]:
-    """Lay triangles without area along edges."""
+    """Add triangles without area along edges."""
     base = faces[rng.choice(len(faces), count)]
     middle = vertices[base[:, :2]].mean(axis=1)
     new = len(vertices) + np.arange(count)
@@ -135,7 +135,7 @@ def _slivers(
 def _pinch(
     vertices: Float64Array, faces: Int64Array, count: int, edge_mm: float, rng: np.random.Generator
 ) -> tuple[Float64Array, Int64Array]:
-    """Join a corner of a triangle to a vertex nearby that is none of its neighbours."""
+    """Move a corner of a triangle to a nearby vertex that is not its neighbor."""
     tree = cKDTree(vertices)
     out = faces.copy()
     for row in rng.choice(len(faces), count):
@@ -153,7 +153,7 @@ def _pinch(
 def _unweld(
     vertices: Float64Array, faces: Int64Array, count: int, rng: np.random.Generator
 ) -> tuple[Float64Array, Int64Array]:
-    """Give some triangles vertices of their own at the same places."""
+    """Give some triangles their own vertices at the same positions."""
     rows = rng.choice(len(faces), count, replace=False)
     out = faces.copy()
     out[rows] = len(vertices) + np.arange(3 * count).reshape(-1, 3)

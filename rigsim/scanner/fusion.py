@@ -1,4 +1,4 @@
-"""Range images of several cameras joined into one surface, as scanners do it.
+"""Fuse range images of several cameras into one surface.
 
 Signed distances along the rays are averaged in voxels (Curless and Levoy 1996, doi
 10.1145/237170.237269); the surface is the dual one, a vertex in each voxel cell that it passes
@@ -18,12 +18,12 @@ from scipy import ndimage
 from rigsim.arrays import Float64Array, Int32Array, Int64Array
 
 TRUNCATION_VOXELS: Final = 3.0
-"""Voxels that lie deeper under the surface than this many sides know nothing of it."""
+"""Truncation depth: voxels deeper below the surface than this many sides are ignored."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeImage:
-    """Distances from a pinhole camera to what it sees."""
+    """Distances along the rays of a pinhole camera."""
 
     center_mm: Float64Array
     axes: Float64Array
@@ -31,15 +31,15 @@ class RangeImage:
     pitch: float
     """Side of a pixel at unit distance."""
     range_mm: Float64Array
-    """Distance along the ray, shape (N, N), row 0 at the top; NaN where there is none."""
+    """Distance along the ray, shape (N, N), row 0 at the top; NaN without a surface."""
     weight: Float64Array
-    """Trust in each range, shape (N, N), 0 to 1; also the slope of distance to the surface."""
+    """Weight of each range, (N, N), 0 to 1: product of the cosines at camera and projector."""
 
     @classmethod
     def from_view(
         cls, center_mm: Float64Array, target_mm: Float64Array, side: int, pitch: float
     ) -> RangeImage:
-        """Return an image that sees nothing yet."""
+        """Return an image without ranges."""
         back = (center_mm - target_mm) / np.linalg.norm(center_mm - target_mm)
         right = np.cross([0.0, 1.0, 0.0], back)
         right /= np.linalg.norm(right)
@@ -60,12 +60,12 @@ class RangeImage:
         return replace(self, range_mm=range_mm, weight=weight)
 
     def points(self) -> Float64Array:
-        """Return the points seen, shape (K, 3)."""
+        """Return the visible points, shape (K, 3)."""
         seen = np.isfinite(self.range_mm)
         return self.center_mm + self.range_mm[seen][:, None] * self.rays()[seen]
 
     def signed_distances(self, points: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Return how far each point lies before the surface, and its weight; NaN where unseen."""
+        """Return each point's signed surface distance, and its weight; NaN if not visible."""
         local = (points - self.center_mm) @ self.axes.T
         middle = 0.5 * (len(self.range_mm) - 1)
         x = middle + local[:, 0] / -local[:, 2] / self.pitch
@@ -74,18 +74,19 @@ class RangeImage:
         seen = ndimage.map_coordinates(self.range_mm, [y, x], **words)
         weight = ndimage.map_coordinates(self.weight, [y, x], **words)
         before = seen - np.linalg.norm(points - self.center_mm, axis=1)
+        # sqrt(weight) is about the cosine from ray distance to perpendicular distance
         return before * np.sqrt(weight), weight
 
 
 def fuse_range_images(
     images: Sequence[RangeImage], voxel_mm: float
 ) -> tuple[Float64Array, Int32Array]:
-    """Join range images into a triangle mesh.
+    """Fuse range images into a triangle mesh.
 
     Parameters
     ----------
     images
-        What each camera saw.
+        Range image of each camera.
     voxel_mm
         Side of a voxel.
 
@@ -104,7 +105,7 @@ def fuse_range_images(
     distance = np.full(size, np.nan)
     deep = TRUNCATION_VOXELS * voxel_mm
     y, z = np.meshgrid(np.arange(size[1]), np.arange(size[2]), indexing="ij")
-    for i in range(size[0]):  # a slab at a time
+    for i in range(size[0]):  # one slab at a time limits memory
         points = low + voxel_mm * np.stack([np.full_like(y, i), y, z], axis=-1).reshape(-1, 3)
         total, weights = np.zeros(len(points)), np.zeros(len(points))
         for image in images:
@@ -130,7 +131,7 @@ def _surface_net(
 
     near = np.ones(shape, np.bool_)
     for corner in corners:
-        # cells beside the unknown, or between a surface and the space before it, hold no surface
+        # cells next to unknown voxels, or at the truncation limit, contain no surface
         near &= np.abs(np.nan_to_num(at(corner), nan=np.inf)) < 0.999 * deep
     total, count = np.zeros((*shape, 3)), np.zeros(shape)
     for a, b in itertools.combinations(corners, 2):

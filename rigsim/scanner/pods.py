@@ -1,8 +1,8 @@
-"""The face scanner beside the dome: two pods, each a projector of stripes between two cameras.
+"""Simulate the dome's face scanner: two pods, each a stripe projector between two cameras.
 
-What a scanner gives is not the surface: ranges are noisy and blurred over a millimetre, skin that
-no camera sees together with its pod's projector is missing, clothes are there too, the triangles
-are flawed, and all of it stands in the scanner's own frame.
+A scan differs from the surface: ranges are noisy and blurred over a millimeter, skin that is not
+visible to both a camera and its pod's projector is missing, clothes are included, triangles have
+defects, and the mesh is in the scanner's own frame.
 """
 
 import math
@@ -21,42 +21,42 @@ from rigsim.scanner.flaws import add_mesh_defects, encode_binary_ply
 from rigsim.scanner.fusion import RangeImage, fuse_range_images
 
 POD_AZIMUTH_DEG: Final = (-38.0, 38.0)
-"""Where the pods stand around the subject, from the front."""
+"""Azimuths of the pods around the subject, from the front."""
 CAMERA_OFFSET_DEG: Final = ((-9.0, 13.0), (9.0, -13.0))
 """Azimuth and elevation of a pod's cameras from its projector."""
 WORKING_DISTANCE_MM: Final = 900.0
 TARGET_MM: Final = (0.0, 0.0, -40.0)
 """Point that all devices face."""
 MIN_INCIDENCE_COSINE: Final = 0.25
-"""Stripes that arrive or are seen at a flatter angle are not decoded: 76 degrees."""
+"""Smallest cosine of projection and of view at which stripes are decoded: 76 degrees."""
 MAX_RANGE_JUMP_MM: Final = 4.0
-"""Neighbouring pixels whose ranges differ by more are at an edge and are dropped."""
+"""Neighboring pixels whose ranges differ by more are at an edge and are omitted."""
 WRAP_NOISE_FRACTION: Final = 0.4
-"""Part of a range's noise that a wrapped template keeps."""
+"""Fraction of a range's noise in a wrapped template."""
 WRAP_TANGENTIAL_STD_MM: Final = 0.25
 """Deviation along the surface of a wrapped template from the same skin, mm in each direction."""
 COARSE_VOXELS_MM: Final = (8.0, 5.0)
-"""Voxels of two rough passes, which tell how many triangles a fine one gives."""
+"""Voxel sizes of two rough passes, which predict the number of triangles of a fine one."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScannerSettings:
-    """What a scanner does to the surface."""
+    """Resolution, noise and defects of a scanner."""
 
     triangles: int = 40_000
-    """About so many triangles in the result, 500 to 400,000."""
+    """Approximate number of triangles in the result, 500 to 400,000."""
     resolution_mm: float = 1.0
     """Width at half height of the blur, mm, > 0."""
     noise_mm: float = 0.15
-    """Deviation of a single range at normal incidence, mm, >= 0, before the blur."""
+    """Standard deviation of a single range at normal incidence, mm, >= 0, before the blur."""
     warp_mm: float = 0.03
-    """Deviation of slow errors over a camera's field, mm, >= 0."""
+    """Standard deviation of slow errors over a camera's field, mm, >= 0."""
     offset_mm: float = 5.0
     """Length of the shift between the frames of scanner and dome, mm, >= 0."""
     offset_deg: float = 2.0
-    """Angle of the turn between them, degrees, 0 to 20."""
+    """Angle of the rotation between them, degrees, 0 to 20."""
     flaws: bool = True
-    """Whether triangles are flawed: holes, islands, doubled and degenerate ones, fins."""
+    """Whether triangles have defects: holes, islands, doubled and degenerate ones, fins."""
     clothes: bool = True
     """Whether the subject wears a collar that is scanned too."""
 
@@ -75,12 +75,12 @@ class ScannerSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanResult:
-    """What the scanner delivers, and what only the simulation knows."""
+    """Mesh of the scanner, with ground truth of the simulation."""
 
     ply: bytes
     """The mesh in the scanner's frame, mm: a binary PLY."""
     to_dome: Float64Array
-    """Truth: takes points of the scan into the rig frame, shape (4, 4)."""
+    """Ground truth: transform from scanner to rig frame, shape (4, 4)."""
     vertices_mm: Float32Array
     """Positions in the PLY, shape (V, 3), scanner frame."""
     faces: Int32Array
@@ -96,7 +96,7 @@ def scan_face(
     scanner: ScannerSettings | None = None,
     relief_um: Float32Array | None = None,
 ) -> ScanResult:
-    """Scan a face.
+    """Simulate a scan of a face.
 
     Parameters
     ----------
@@ -111,12 +111,12 @@ def scan_face(
 
     Returns
     -------
-    Scan
+    ScanResult
 
     Raises
     ------
     MeshError
-        The scanner sees nothing of the mesh.
+        When the mesh is not visible to the scanner.
     """
     scanner = scanner or ScannerSettings()
     worn = _with_collar(mesh) if scanner.clothes else mesh
@@ -146,12 +146,12 @@ def scan_face(
 def wrap_template(
     mesh: Mesh, *, rng: np.random.Generator, scanner: ScannerSettings | None = None
 ) -> ScanResult:
-    """Scan a face and wrap a template onto the scan, as people do to compare expressions.
+    """Simulate a scan of a face with a template wrapped onto it, to compare expressions.
 
-    The template has the triangles and the texture coordinates of the mesh, whatever the face does;
-    so scans of several states share one texture. Wrapping closes holes and drops clothes; what it
-    leaves is an error across the surface, from the scanner, and one along it, as skin without
-    features can be matched only roughly.
+    The template has the triangles and the texture coordinates of the mesh in every expression, so
+    all scans share one texture. Wrapping closes holes and omits clothes; the remaining errors are
+    one across the surface, from the scanner, and one along it, as skin without features is matched
+    only roughly.
 
     Parameters
     ----------
@@ -164,13 +164,13 @@ def wrap_template(
 
     Returns
     -------
-    Scan
+    ScanResult
         With texture coordinates in its PLY.
     """
     scanner = scanner or ScannerSettings()
     seed = int(rng.integers(2**31))
     points = mesh.vertices_mm
-    # a template of the resolution's stiffness averages the noise of many ranges
+    # the template's stiffness averages the noise of many ranges
     fit = WRAP_NOISE_FRACTION * scanner.noise_mm * smooth_noise(points, (4.0,), seed=seed)
     fit += scanner.warp_mm * smooth_noise(points, (60.0,), seed=seed + 1)
     slide = np.stack([smooth_noise(points, (25.0,), seed=seed + 2 + k) for k in range(3)], axis=-1)
@@ -189,7 +189,7 @@ def wrap_template(
 
 
 def _voxel_size_for(images: list[RangeImage], triangles: int) -> float:
-    """Return the side of voxels that give so many triangles.
+    """Return the side of voxels for a number of triangles.
 
     A surface of area A with rims of length R gives about (a A - b R h) / h^2 of them: cells at
     the rims are lost.
@@ -197,6 +197,7 @@ def _voxel_size_for(images: list[RangeImage], triangles: int) -> float:
     counts = np.array([len(fuse_range_images(images, side)[1]) for side in COARSE_VOXELS_MM])
     if not counts.all():
         raise MeshError("scan: got no triangle, expected a face that looks towards +z")
+    # Two coarse counts n h^2 = a A - b R h give both constants; then solve the quadratic for h.
     h = np.array(COARSE_VOXELS_MM)
     area, rim = np.linalg.solve(np.stack([np.ones(2), -h], axis=1), counts * h**2)
     rim = max(float(rim), 0.0)
@@ -258,7 +259,7 @@ def _range_image(
 
 
 def _smooth_around(ranges: Float64Array, good: BoolArray) -> BoolArray:
-    """Return the pixels whose good neighbours are at about the same range."""
+    """Return the pixels whose good neighbors are at about the same range."""
     far = ndimage.maximum_filter(np.where(good, ranges, -np.inf), 3)
     near = ndimage.minimum_filter(np.where(good, ranges, np.inf), 3)
     with np.errstate(invalid="ignore"):

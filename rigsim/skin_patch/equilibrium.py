@@ -1,4 +1,4 @@
-"""Equilibrium of a stiff layer with a relief, bonded to a soft half-space that is stretched.
+"""Find the equilibrium of a stiff layer with relief on a stretched soft half-space.
 
 The layer is a shell over material coordinates X: a node moves to x = F X + u(X) in the plane and to
 the height w(X). Its energy against the neutral state (u = 0, F = 1, w = h) is
@@ -12,11 +12,11 @@ factor z, so that without a layer the relief would be z h; deviations from that 
 affine stretch cost the energy of a linear elastic half-space (Johnson 1985, "Contact Mechanics",
 ch. 2; doi:10.1017/CBO9781139171731), at the wave vectors of the stretched surface. Because the
 surface is tilted, the stress of the stretched tissue pulls on it with -P grad h (P the nominal
-in-plane stress): ridges follow a stretch less than furrows do.
+in-plane stress): ridges follow a stretch less than grooves do.
 
-Unit of energy: modulus E of the tissue times um; of length: um. Left out: that stretched tissue is
-stiffer along than across (it softens towards Biot's instability at r = 0.54), contact of a furrow's
-walls, layers below the half-space's first.
+Unit of energy: modulus E of the tissue times um; of length: um. Not modeled: the anisotropy of
+stretched tissue (it softens towards Biot's instability at r = 0.54), contact of a groove's walls,
+layers below the half-space's first.
 """
 
 from collections import deque
@@ -44,28 +44,29 @@ Pairs = deque[tuple[Float32Array, Float32Array, float]]
 
 
 SQUEEZED_DEPTH_UM: Final = 10.0
-"""Depth of tissue that resists the squeeze of a furrow beyond the linear half-space, um. As in a
-compressible neo-Hookean solid, -log J keeps neighbouring points from changing sides; this project's
-choice, small beside the wavelengths of the relief."""
+"""Depth of tissue that resists the compression of a groove beyond the linear half-space, um. As in
+a compressible neo-Hookean solid, -log J keeps neighboring points from changing sides; this
+project's choice, small against the wavelengths of the relief."""
 
 
 MIN_PARALLEL_NODES: Final = 400_000
-"""Patches with fewer nodes are computed by one thread."""
+"""Patches with fewer nodes use one thread."""
 
 
 class EquilibriumError(RuntimeError):
-    """No equilibrium was found within the allowed steps."""
+    """Error for an equilibrium that was not reached within the allowed steps."""
 
 
 def surface_rise_factor(stretch_s: float, stretch_t: float, poisson: float) -> float:
-    """Return by what factor the free surface of stretched tissue rises.
+    """Return the factor by which the free surface of stretched tissue rises.
 
     Parameters
     ----------
     stretch_s, stretch_t
         Principal stretches in the plane, > 0.
     poisson
-        Of the tissue, 0 to 0.5; at 0.5 its volume is kept and the result is 1 / (s t).
+        Poisson's ratio of the tissue, 0 to 0.5; at 0.5 its volume is constant and the result is 1 /
+        (s t).
 
     Examples
     --------
@@ -80,13 +81,14 @@ def surface_rise_factor(stretch_s: float, stretch_t: float, poisson: float) -> f
     lame = 2.0 * poisson / (1.0 - 2.0 * poisson)
     if lame == 0.0 or area == 1.0:
         return 1.0
+    # free surface of a compressible neo-Hookean solid: z^2 - 1 + (lambda / mu) log J = 0, J = s t z
     low, high = min(1.0, 1.0 / area), max(1.0, 1.0 / area)
     return float(brentq(lambda z: z * z - 1.0 + lame * np.log(area * z), low, high, xtol=1e-13))
 
 
 @dataclass(frozen=True, slots=True)
 class Convergence:
-    """How the search for the equilibrium went; entries of the tuples belong together."""
+    """Convergence history of the search; entries of the tuples correspond."""
 
     evaluations: int
     residual: float
@@ -124,7 +126,7 @@ class LayerProblem:
             1 if self.neutral_um.size < MIN_PARALLEL_NODES else min(2, get_num_threads())
         )
         left, stretches, right = np.linalg.svd(self.gradient)
-        # factor of a relief without a layer
+        # factor by which a relief without a layer rises
         self.rise = surface_rise_factor(float(stretches[0]), float(stretches[1]), self.poisson)
         shear = 0.5 / (1.0 + self.poisson)
         self._bulk = shear * SQUEEZED_DEPTH_UM
@@ -145,7 +147,8 @@ class LayerProblem:
         kx, ky = np.broadcast_arrays(kx, ky)
         inverse = np.linalg.inv(self.gradient)
         area = float(np.linalg.det(self.gradient))
-        # Wave vector on the stretched surface, where the half-space feels it.
+        # Wave vector on the stretched surface, k = F^-T K: the half-space deforms at this
+        # wavelength.
         sx = inverse[0, 0] * kx + inverse[1, 0] * ky
         sy = inverse[0, 1] * kx + inverse[1, 1] * ky
         s = np.hypot(sx, sy)
@@ -284,16 +287,16 @@ class LayerProblem:
 def find_equilibrium(
     problem: LayerProblem, *, tolerance: float = 1e-3, steps: int = 400, memory: int = 6
 ) -> tuple[Float64Array, Convergence]:
-    """Minimise the energy by L-BFGS in preconditioned Fourier coefficients.
+    """Minimize the energy by L-BFGS in preconditioned Fourier coefficients.
 
     Parameters
     ----------
     problem
-        What is minimised, from its affine state.
+        Problem to minimize, from its affine state.
     tolerance
         Out-of-balance force relative to the affine state's at which the search ends.
     steps
-        Most steps.
+        Largest number of steps.
     memory
         Pairs of the quasi-Newton matrix, kept in single precision.
 
@@ -306,7 +309,7 @@ def find_equilibrium(
     Raises
     ------
     EquilibriumError
-        `steps` did not suffice.
+        When `steps` are not enough.
 
     References
     ----------
@@ -318,7 +321,7 @@ def find_equilibrium(
     energies, residuals = [energy], [1.0]
     evaluations = 1
     pairs: Pairs = deque(maxlen=memory)
-    # Below this the sum's rounding is what is left: nothing pulls.
+    # Below this the force is rounding error of the sum: already in equilibrium.
     if first < 1e-12 * (1.0 + float(problem.membrane_um.mean())):
         return problem.state(q), Convergence(1, 0.0, (energy,), (0.0,))
     for _ in range(steps):
@@ -386,7 +389,7 @@ def _single(a: ComplexArray) -> Float32Array:
 def _parabola_step_factor(
     energy: float, along: float, energy_change: float, length: float
 ) -> float:
-    """Return the factor to the minimum of the parabola through what is known, 0.1 to 0.5."""
+    """Return the step factor to the minimum of a fitted parabola, clamped to 0.1 to 0.5."""
     curve = energy_change - energy - along * length
     return float(np.clip(-0.5 * along * length / curve, 0.1, 0.5)) if curve > 0.0 else 0.5
 

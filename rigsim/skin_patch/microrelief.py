@@ -1,17 +1,17 @@
-"""A patch of facial skin at ten micrometres: furrows, pores, plateaus, cells, pigment, layer.
+"""Generate a patch of facial skin at ten micrometers: grooves, pores, plateaus, cells, pigment.
 
 Everything is a function of the position and the seed, so a larger patch of the same seed contains
-the smaller one at its centre. Vellus hair is left out.
+the smaller one at its center. Vellus hair is omitted.
 
-Figures. Primary furrows are 20 to 100 um deep, secondary ones 5 to 40 um (Pierard, Uhoda,
+Sources. Primary grooves are 20 to 100 um deep, secondary ones 5 to 40 um (Pierard, Uhoda,
 Pierard-Franchimont 2003, doi:10.1111/j.1473-2130.2003.00012.x). The horny layer is 16.8 um thick on
 the cheek (Egawa, Hirao, Takahashi 2007, doi:10.2340/00015555-0183), thinner when counted in layers.
 Indented upright, horny layer and epidermis have 1 to 2 MPa alike (Geerligs et al. 2011,
-doi:10.1016/j.jbiomech.2011.01.015), so a layer is only a few times stiffer than what bears it
-as long as it is moist; dry ones are an order stiffer (Yuan and Verma 2006,
+doi:10.1016/j.jbiomech.2011.01.015), so a layer is only a few times stiffer than what bears it as
+long as it is moist; dry ones are an order stiffer (Yuan and Verma 2006,
 doi:10.1016/j.colsurfb.2005.12.013). Relief governs how skin folds at such moderate ratios
-(Leyva-Mendivil et al. 2018, doi:10.1039/c7sm01969f). What distinguishes the three sites, and every
-number without a citation, is this project's choice, within those figures.
+(Leyva-Mendivil et al. 2018, doi:10.1039/c7sm01969f). The differences of the three sites, and all
+numbers without a citation, are this project's choice, within those ranges.
 """
 
 import math
@@ -32,7 +32,7 @@ from rigsim.tissue.skin_table import SkinTable
 
 SiteName = Literal["forehead", "cheek", "chin"]
 PATCH_BLOOD_FRACTION: Final = 0.035
-"""Volume fraction of blood that decides how far light spreads in the patch."""
+"""Volume fraction of blood for the patch's lateral scattering."""
 SITE_NAMES: Final = get_args(SiteName)
 """Names of the sites."""
 
@@ -40,12 +40,11 @@ TEXEL_RANGE_UM: Final = (2.0, 40.0)
 SIZE_RANGE_MM: Final = (0.1, 40.0)
 MAX_TEXELS: Final = 4096
 CAMERA_BAND_NM: Final = (450.0, 650.0)
-"""What a monochrome camera sees of white LEDs, as one equally weighted band; this project's
-choice."""
+"""Band of a monochrome camera under white LEDs, equally weighted; this project's choice."""
 
 
 class MicroSkinError(ValueError):
-    """A patch is asked for that cannot be made, or that contradicts itself."""
+    """Error for a patch that cannot be made, or with inconsistent values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +75,7 @@ _SITE_PARAMETERS: Final = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MicroSkin:
-    """A patch in its neutral state; maps are (N, N), row 0 is +y, N even, centre at the origin."""
+    """A patch in its neutral state; maps are (N, N), row 0 is +y, N even, center at the origin."""
 
     site: str
     """One of `SITE_NAMES`."""
@@ -92,7 +91,7 @@ class MicroSkin:
     alpha: Float32Array
     """GGX roughness of facets below 10 um, 0.1 to 0.5."""
     layer_um: Float32Array
-    """Thickness of the stiff layer, um, > 0; thinner in furrows."""
+    """Thickness of the stiff layer, um, > 0; thinner in grooves."""
     stiffness_ratio: float
     """Modulus of the layer over that of the tissue that bears it, > 0."""
     poisson: float
@@ -122,12 +121,12 @@ class MicroSkin:
 
     @property
     def size_mm(self) -> float:
-        """Side of the patch, mm."""
+        """Return the side of the patch, mm."""
         return self.height_um.shape[0] * self.texel_um * 1e-3
 
     @property
     def melanin_fraction(self) -> float:
-        """Volume fraction of melanosomes around which the patch varies."""
+        """Return the mean volume fraction of melanosomes of the patch."""
         return MELANIN_PRESETS[self.preset] if self.melanin is None else self.melanin
 
 
@@ -149,12 +148,12 @@ def make_micro_skin(
     seed
         Seed of every pattern, >= 0.
     size_mm
-        Side of the patch, 0.1 to 40 mm, rounded up to an even number of texels. How much a field
-        of view needs tells `rigsim.skin_patch.stretch.required_size_mm`.
+        Side of the patch, 0.1 to 40 mm, rounded up to an even number of texels. See
+        `rigsim.skin_patch.stretch.required_size_mm` for the size that a field of view needs.
     texel_um
-        Distance of texels, 2 to 40 um; detail finer than two texels is left out.
+        Distance of texels, 2 to 40 um; detail finer than two texels is omitted.
     preset
-        How dark the skin is, one of `rigsim.subject.pigment.MELANIN_PRESETS`.
+        Melanin of the skin, one of `rigsim.subject.pigment.MELANIN_PRESETS`.
     melanin
         Volume fraction of melanosomes instead of the preset's, 0.005 to 0.45.
 
@@ -165,7 +164,7 @@ def make_micro_skin(
     Raises
     ------
     MicroSkinError
-        An argument is outside its range.
+        When an argument is outside its range.
 
     Examples
     --------
@@ -190,7 +189,7 @@ def make_micro_skin(
         raise MicroSkinError(f"size_mm: got {size_mm}, expected {SIZE_RANGE_MM}")
     count = max(8, 2 * math.ceil(size_mm * 500.0 / texel_um - 1e-9))
     if count > MAX_TEXELS:
-        raise MicroSkinError(f"size_mm: got {count} texels a side, expected <= {MAX_TEXELS}")
+        raise MicroSkinError(f"size_mm: got {count} texels per side, expected <= {MAX_TEXELS}")
     where = _SITE_PARAMETERS[site]
     places = (np.arange(count) - 0.5 * (count - 1)) * texel_um * 1e-3
     points = np.zeros((count, count, 3), np.float32)
@@ -215,11 +214,12 @@ def make_micro_skin(
 def _relief(
     where: _Site, points: Float32Array, texel_mm: float, seed: int
 ) -> tuple[Float32Array, Float32Array]:
-    """Return height in um and how much each texel lies in a furrow, 0 to 1."""
+    """Return height in um and each texel's groove weight, 0 to 1."""
     salt = 1000 * seed
     angle = math.radians(where.direction_deg)
     cell = where.spacing_mm
-    # Lines wander: positions are moved by smooth noise before the nets are drawn.
+    # Domain warping: smooth noise displaces positions before the nets are drawn, so lines are not
+    # straight.
     x = points[..., 0] + 0.06 * cell * smooth_noise(points, (1.3 * cell, 0.45 * cell), seed=salt)
     y = points[..., 1] + 0.06 * cell * smooth_noise(
         points, (1.3 * cell, 0.45 * cell), seed=salt + 1
@@ -237,7 +237,7 @@ def _relief(
         return np.asarray(distance * scale * cell, np.float32), number
 
     def furrow_of(distance: Float32Array, width_mm: float) -> Float32Array:
-        # Rounded at the bottom, then like the flank of a fold.
+        # Groove profile: rounded at the bottom, with the flank of a fold.
         round_mm = 0.35 * width_mm
         return np.asarray(
             np.exp(-(np.sqrt(distance**2 + round_mm**2) - round_mm) / (0.5 * width_mm)), np.float32
@@ -255,7 +255,7 @@ def _relief(
     height -= where.second_um * vary_second * shallow * (1.0 - 0.6 * deep)
     if 0.4 * where.width_mm > 1.5 * texel_mm:
         height -= where.fine_um * fine * (1.0 - 0.6 * deep)
-    # Plateaus: every small polygon at its own level, bulging towards its middle.
+    # Plateaus: each small polygon has its own level and bulges towards its center.
     height += where.dome_um * (level - 0.5) * (1.0 - shallow)
     height += 2.0 * where.dome_um * np.minimum(first / cell, 0.5)
     pores = random_spots(
@@ -281,7 +281,7 @@ def _relief(
     if grain:
         height += 1.4 * where.cells_um * smooth_noise(points, grain, seed=salt + 9)
     thin = np.maximum(np.maximum(deep, 0.5 * shallow), 0.6 * pores)
-    # Mean of what was drawn, for a height about zero that does not depend on the patch's size.
+    # The expected mean, not the patch's, so that height does not depend on the patch's size.
     return np.asarray(height + 0.45 * where.depth_um, np.float32), np.asarray(
         np.clip(thin, 0.0, 1.0), np.float32
     )
@@ -319,7 +319,7 @@ def _albedo(points: Float32Array, furrow: Float32Array, melanin: float, seed: in
 
 
 def _alpha(where: _Site, points: Float32Array, seed: int) -> Float32Array:
-    """Return GGX roughness: films of oil smooth some places."""
+    """Return GGX roughness: films of oil lower it locally."""
     oil = smooth_noise(points, (2.5, 0.7), seed=1000 * seed + 900)
     return np.asarray(np.clip(where.alpha * (1.0 + 0.07 * oil), 0.1, 0.5), np.float32)
 

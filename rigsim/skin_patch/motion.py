@@ -1,4 +1,4 @@
-"""How a taped patch of skin lies under the camera: never twice alike, and never quite still."""
+"""Motion of a taped skin patch under the camera: placement, drift and jumps."""
 
 import math
 from collections.abc import Mapping
@@ -15,12 +15,12 @@ DRIFT_HZ: Final = (0.11, 0.23, 0.37)
 
 
 class PatchMotionError(ValueError):
-    """A motion is described wrongly."""
+    """Error for invalid parameters of a motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchPose:
-    """Where the skin's own origin is, and how the skin is turned."""
+    """Position of the skin's origin, and rotation of the skin."""
 
     x_mm: float
     y_mm: float
@@ -35,19 +35,19 @@ class PatchMotion:
     seed: int
     """Any integer >= 0."""
     angle_um: float = 60.0
-    """Standard deviation of the place after each taping, um, per axis."""
+    """Standard deviation of the position after each taping, um, per axis."""
     angle_turn_deg: float = 0.3
-    """Standard deviation of the turn after each taping, degrees."""
+    """Standard deviation of the rotation after each taping, degrees."""
     state_um: float = 12.0
-    """Standard deviation of the shift with each state, um, per axis."""
+    """Standard deviation of the shift at each caliper state, um, per axis."""
     state_turn_deg: float = 0.05
-    """Standard deviation of the turn with each state, degrees."""
+    """Standard deviation of the rotation at each caliper state, degrees."""
     drift_um: float = 1.0
     """Standard deviation of the slow drift with time, um, per axis."""
     jumps_um: Mapping[float, tuple[float, float]] = field(
         default_factory=lambda: MappingProxyType({})
     )
-    """Sudden shifts in x and y by the world time, s, from which on they last."""
+    """Permanent shifts in x and y by their start, world time, s."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -59,7 +59,7 @@ class PatchMotion:
             raise PatchMotionError(f"seed: got {self.seed}, expected >= 0")
 
     def pose(self, angle_deg: float, step: int) -> PatchPose:
-        """Return where the skin lies in a state of the caliper, drift and jumps aside."""
+        """Return the skin's pose at a state of the caliper, without drift and jumps."""
         taping = np.random.default_rng([self.seed, 1, round(1e3 * angle_deg)]).standard_normal(3)
         state = np.random.default_rng([self.seed, 2, round(1e3 * angle_deg), step + 1000])
         moved = state.standard_normal(3)
@@ -85,7 +85,7 @@ class PatchMotion:
 def shift_image(
     image: Float32Array, shift_mm: tuple[float, float], *, pixel_um: float, border_px: int
 ) -> Float32Array:
-    """Return a picture without its border after what it shows has moved.
+    """Return an image without its border after a shift of its content.
 
     Parameters
     ----------
@@ -101,8 +101,8 @@ def shift_image(
     Returns
     -------
     ndarray of float32
-        Shape (H, W); interpolated by polynomials through six pixels along each axis, which a
-        picture that a lens has blurred to 3 pixels a period bears to 1 %.
+        Shape (H, W); interpolated by polynomials through six pixels along each axis, accurate to 1
+        % for an image whose finest period is 3 pixels.
     """
     dx, dy = 1e3 * shift_mm[0] / pixel_um, -1e3 * shift_mm[1] / pixel_um
     reach = border_px - 3

@@ -1,6 +1,6 @@
-"""A patch of skin stretched or compressed between jaws, and its surface at any point of the rig.
+"""Stretch or compress a patch of skin between jaws, and sample its surface in the rig frame.
 
-What holds the patch together and how it settles is in `rigsim.skin_patch.equilibrium`.
+The mechanics and the search for equilibrium are in `rigsim.skin_patch.equilibrium`.
 """
 
 import math
@@ -23,13 +23,13 @@ Compensation = Literal["volume", "none"] | float
 
 STRETCH_RANGE: Final = (0.5, 2.0)
 FORCE_TOLERANCE: Final = 5e-3
-"""Out-of-balance force, relative to that of a relief without a layer, that is accepted."""
+"""Accepted out-of-balance force, relative to that of a relief without a layer."""
 BLEND_UM: Final = 320.0
-"""Beyond its border the patch goes on as its mirror image, over so much at least; um."""
+"""Smallest width of the mirror image that continues the patch beyond its border, um."""
 
 
 class StretchError(ValueError):
-    """A stretch is asked for that skin cannot take, or that the patch cannot show."""
+    """Error for a stretch outside the range of skin, or one that the patch does not cover."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +45,9 @@ class SurfaceSample:
     albedo: Float32Array
     """Diffuse reflectance, 0 to 1."""
     alpha: Float32Array
-    """GGX roughness of what is finer than 10 um."""
+    """GGX roughness of facets below 10 um."""
     inside: BoolArray
-    """Whether the patch reaches the point."""
+    """Whether the point is on the patch."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +69,7 @@ class StretchedSkin:
     """On the same grid."""
     alpha: Float32Array
     displacement_um: Float32Array
-    """How far the neutral texels are from F X, in the rig's x and y, (N, N, 2), um."""
+    """Displacement of the neutral texels from F X, in the rig's x and y, (N, N, 2), um."""
     excess_length: float
     """Mean length of lines along the jaws' axis over their projection, less 1."""
     neutral_excess_length: float
@@ -80,7 +80,7 @@ class StretchedSkin:
 
     @property
     def membrane_strain(self) -> float:
-        """By how much lines of the surface along the jaws' axis are longer than before.
+        """Return the relative elongation of surface lines along the jaws' axis.
 
         0 if the relief's excess length alone followed the jaws, `stretch_s` - 1 if none did.
         """
@@ -135,14 +135,13 @@ def principal_stretches(
     stretch
         Along the axis, 0.5 to 2.
     compensation
-        What the skin does across: "none" keeps its width; "volume" gives r^-1/2, as a block of
-        constant volume does that may change its thickness as well; a number p, 0 to 1, gives
-        r^-p (1 keeps the area).
+        Stretch across the axis: "none" keeps the width; "volume" gives r^-1/2, as for a block of
+        constant volume and free thickness; a number p, 0 to 1, gives r^-p (1 keeps the area).
 
     Raises
     ------
     StretchError
-        An argument is outside its range.
+        When an argument is outside its range.
 
     Examples
     --------
@@ -175,7 +174,7 @@ def mean_gradient(
     s, t = principal_stretches(stretch, compensation)
     if not math.isfinite(angle_deg):
         raise StretchError(f"angle_deg: got {angle_deg}, expected a finite angle")
-    # A quarter turn is exact, so that states at 0 and 90 degrees have no shear at all.
+    # A quarter turn is computed exactly, so that states at 0 and 90 degrees have no shear.
     quarter = {0: (1.0, 0.0), 90: (0.0, 1.0)}.get(angle_deg % 180.0)  # type: ignore[call-overload]
     angle = math.radians(angle_deg)
     c, d = quarter or (math.cos(angle), math.sin(angle))
@@ -190,18 +189,18 @@ def required_size_mm(
     angle_deg: float | None = None,
     shift_mm: float = 0.0,
 ) -> float:
-    """Return how large a patch must be to fill a square field of view, mm.
+    """Return the size of a patch that fills a square field of view, mm.
 
     Parameters
     ----------
     field_mm
         Side of the field, mm.
     stretch
-        The stretch, or all that occur; the smallest one asks for most skin.
+        The stretch, or all that occur; the smallest one needs the largest patch.
     angle_deg
         Of the jaws; None allows any.
     shift_mm
-        How far the skin's middle may be off the field's.
+        Largest distance of the skin's center from the field's.
 
     Examples
     --------
@@ -227,7 +226,7 @@ def stretch_skin(
     compensation: Compensation = "volume",
     tolerance: float = FORCE_TOLERANCE,
 ) -> StretchedSkin:
-    """Stretch a patch along an axis and let it settle.
+    """Stretch a patch along an axis and find its equilibrium.
 
     Parameters
     ----------
@@ -238,7 +237,7 @@ def stretch_skin(
     angle_deg
         Direction of the axis from +x towards +y, degrees.
     compensation
-        What happens across: see `principal_stretches`.
+        Stretch across the axis: see `principal_stretches`.
     tolerance
         Out-of-balance force at which the search for the equilibrium ends, relative to that of the
         affinely deformed relief, 1e-8 to 0.5.
@@ -252,14 +251,13 @@ def stretch_skin(
     StretchError
         An argument is outside its range, or the surface would fold over.
     rigsim.skin_patch.equilibrium.EquilibriumError
-        No equilibrium was found.
+        When no equilibrium was found.
 
     Notes
     -----
-    Beyond its border the patch goes on as its mirror image, so its border neither sticks nor is
-    free. The layer's modulus is `skin.stiffness_ratio` times the tissue's, its thickness
-    `skin.layer_um`; both are incompressible when strained quickly, the tissue drains as
-    `skin.poisson` says.
+    The patch is continued by its mirror image, so its border is neither fixed nor free. The layer's
+    modulus is `skin.stiffness_ratio` times the tissue's, its thickness `skin.layer_um`; both are
+    incompressible when strained quickly; `skin.poisson` describes the drained tissue.
 
     Examples
     --------
@@ -312,7 +310,7 @@ def stretch_skin(
 
 
 _SPLINE_MARGIN: Final = 16
-"""Texels of the periodic neighbourhood that splines see around a patch."""
+"""Margin of the periodic continuation for splines around a patch, texels."""
 
 
 def layer_problem(skin: MicroSkin, gradient: Float64Array) -> LayerProblem:
@@ -321,7 +319,7 @@ def layer_problem(skin: MicroSkin, gradient: Float64Array) -> LayerProblem:
     Parameters
     ----------
     skin
-        The neutral patch; its mean height is taken away.
+        The neutral patch; its mean height is subtracted.
     gradient
         Mean deformation gradient F, (2, 2).
 
@@ -346,7 +344,7 @@ def layer_problem(skin: MicroSkin, gradient: Float64Array) -> LayerProblem:
 
 
 def _periodic(values: Float64Array, texel_um: float) -> Float64Array:
-    """Continue a patch by its mirror images until it joins itself."""
+    """Continue a patch by its mirror images to a periodic grid."""
     count = values.shape[0]
     least = count + min(count // 2 * 2, max(8, math.ceil(BLEND_UM / texel_um)))
     total = least
@@ -377,7 +375,7 @@ def _spline_coefficients(values: Float64Array) -> Float64Array:
 def _pull_back(
     displacement_um: Float64Array, gradient: Float64Array, texel_um: float, count: int
 ) -> tuple[Float64Array, Float64Array]:
-    """Return where the neutral skin lies that is now at F Y, for Y on the texels.
+    """Return the neutral position X of the skin that is now at F Y, for Y on the texels.
 
     Rows and columns of the padded periodic grid, flat, by Newton's method.
     """
@@ -386,7 +384,9 @@ def _pull_back(
     bent = 1.0 + np.gradient(moved[0], axis=1), 1.0 + np.gradient(moved[1], axis=0)
     shear = np.gradient(moved[0], axis=0) * np.gradient(moved[1], axis=1)
     if (bent[0] * bent[1] - shear).min() <= 0.0:
-        raise StretchError("stretch: the surface would fold over its own furrows")
+        raise StretchError(
+            "stretch: the surface would fold over its own grooves; give a stretch nearer to 1"
+        )
     along, up = _spline_coefficients(moved[0]), _spline_coefficients(moved[1])
     goal_row, goal_column = (
         m.reshape(-1).astype(np.float64) + _SPLINE_MARGIN for m in np.mgrid[0:count, 0:count]
@@ -406,7 +406,9 @@ def _pull_back(
         column -= (br * miss_c - ar * miss_r) / det
         row -= (ac * miss_r - bc * miss_c) / det
     if not far <= 1e-4:
-        raise StretchError("stretch: the patch is moved by more than its margin")
+        raise StretchError(
+            "stretch: the patch is displaced by more than its margin; give a larger patch"
+        )
     return row, column
 
 
@@ -429,6 +431,6 @@ def _excess_length(
     h = height_um.astype(np.float64)
     by_y, by_x = -np.gradient(h, texel_um, axis=0), np.gradient(h, texel_um, axis=1)
     angle = math.radians(angle_deg)
-    # A step along the axis on the stretched surface, in neutral coordinates.
+    # d/ds along the axis of the stretched surface, in neutral coordinates: F^-1 times the axis.
     step = np.linalg.inv(gradient) @ np.array([math.cos(angle), math.sin(angle)])
     return float(np.mean(np.sqrt(1.0 + (by_x * step[0] + by_y * step[1]) ** 2)) - 1.0)

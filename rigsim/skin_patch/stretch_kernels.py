@@ -1,4 +1,4 @@
-"""Compiled kernels of a stretched surface layer: energy and forces on a periodic grid of nodes."""
+"""Compute energy and forces of a stretched surface layer on a periodic grid, compiled."""
 
 import math
 
@@ -7,7 +7,7 @@ from numba import njit, prange
 
 # Energies are sums over nodes; the caller divides by their number. Rows grow with y. Every square
 # of four nodes is covered by its four corner triangles with weight one quarter each (flat finite
-# elements over both diagonals): no mode of the grid is free of energy.
+# elements over both diagonals): so no mode of the grid has zero energy.
 
 
 @njit(cache=True, inline="always")
@@ -62,7 +62,7 @@ def add_membrane_forces(v, neutral, stiffness, f, bulk, texel, force):  # type: 
     h = 1.0 / texel
     fxx, fxy, fyx, fyy = f[0, 0], f[0, 1], f[1, 0], f[1, 1]
     whole = fxx * fyy - fxy * fyx
-    # Rows of squares touch two rows of nodes: even ones first, then odd ones, never two at once.
+    # A row of squares writes two rows of nodes: even rows first, then odd ones, which avoids races.
     for parity in range(2):
         for half in prange(rows // 2):
             i = 2 * half + parity
@@ -190,7 +190,7 @@ def add_bending_forces(height, neutral, stiffness, texel, moment, force):  # typ
 
 @njit(parallel=True, cache=True, fastmath=True)
 def rotate_coefficients(q, scale, unit, out):  # type: ignore[no-untyped-def]
-    """Turn scaled coefficients along and across each wave, and upright, into those of x, y, z.
+    """Rotate scaled coefficients from (along, across, normal) of each wave to x, y, z.
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ def add_tissue_forces(hat, elastic, unit, weight, force):  # type: ignore[no-unt
         Stiffness of normal, across and mixed motion.
     unit : ndarray (2, N, K)
     weight : ndarray (N, K)
-        How often a coefficient counts: 2 where the other half is left out.
+        Multiplicity of a coefficient: 2 where the conjugate half is omitted.
     force : ndarray (3, N, K) of complex128
         Forces' coefficients are added.
     """
@@ -255,7 +255,7 @@ def add_tissue_forces(hat, elastic, unit, weight, force):  # type: ignore[no-unt
 
 @njit(parallel=True, cache=True, fastmath=True)
 def gather_coefficient_forces(hat, scale, unit, weight, out):  # type: ignore[no-untyped-def]
-    """Turn forces on x, y, z into the derivative by scaled coefficients.
+    """Convert forces on x, y, z to derivatives by scaled coefficients.
 
     This is the adjoint of `rotate_coefficients`.
     """
@@ -291,9 +291,9 @@ def evaluate_spline(coefficients, row, column, want_slope, value, along_row, alo
     coefficients : ndarray (N, M)
         Of `scipy.ndimage.spline_filter` with mode "mirror".
     row, column : ndarray (P,)
-        Places in texels; a place outside gives NaN.
+        Positions in texels; a position outside gives NaN.
     want_slope : bool
-        False leaves the derivatives alone.
+        False skips the derivatives.
     value, along_row, along_column : ndarray (P,)
         Results, derivatives per texel.
     """

@@ -1,4 +1,4 @@
-"""Calibration targets that stand where the subject's face would be."""
+"""Flat calibration targets at the position of the subject's face."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ BACKDROP_REFLECTANCE: Final = 0.35  # gray board behind the chart
 
 
 class TargetError(KeyError, ValueError):
-    """There is no target of that name."""
+    """Error for an unknown target name."""
 
     def __str__(self) -> str:
         return str(self.args[0])
@@ -46,7 +46,7 @@ class Target:
     name: str
     """Name, one of `TARGET_NAMES`."""
     kind: Literal["diffuse", "metal", "source", "cap"]
-    """How light comes back, see above."""
+    """Kind of reflection, see above."""
     mesh: Mesh
     """A rectangle in mm, rig frame."""
     palette: Float64Array
@@ -62,14 +62,14 @@ class Target:
         Parameters
         ----------
         camera, light
-            Names known to `model.spectra`.
+            Names of `model.spectra`.
         """
         colors = spectra.band_average(self.palette, camera, light, wavelength_nm=WAVELENGTH_NM)
         return np.asarray(colors[self.index], np.float32)
 
 
 def make_target(name: str) -> Target:
-    """Make a target.
+    """Make a calibration target by name.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def make_target(name: str) -> Target:
     Raises
     ------
     TargetError
-        There is no such target.
+        When the name is unknown.
 
     Examples
     --------
@@ -98,7 +98,7 @@ def make_target(name: str) -> Target:
 
 
 def patch_centers_mm() -> Float64Array:
-    """Return where the chart's patches are, shape (24, 2): x, y in mm, row-major from the top."""
+    """Return the centers of the chart's patches, (24, 2): x, y in mm, row-major from the top."""
     x = (np.arange(CHART_COLUMNS) - 0.5 * (CHART_COLUMNS - 1)) * PATCH_PITCH_MM
     y = (0.5 * (CHART_ROWS - 1) - np.arange(CHART_ROWS)) * PATCH_PITCH_MM
     return np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""A small ball of black glass in a sphere of LEDs: every LED's spot, as the camera sees it.
+"""Render a small ball of black glass in a sphere of LEDs: the camera's image of every LED.
 
 The ball is smooth, so that each LED's disc is mirrored in one place, which depends on where in the
 lens's pupil the ray goes: spots far from the axis lie out of the plane in focus and are blurred.
@@ -22,18 +22,18 @@ ETA: Final = 1.52
 """Of crown glass."""
 
 NOMINAL_CENTER_MM: Final = (0.0, 0.0, -3.0)
-"""Where the ball's middle is on average: the spots near the axis, half a radius before the middle,
-are then in focus."""
+"""Mean position of the ball's center: the spots near the axis, half a radius in front of the
+center, are then in focus."""
 
 BALL_PLACEMENT_DEVIATION_MM: Final = 0.3
-"""Standard deviation of where an operator puts it, per axis."""
+"""Standard deviation of its placement, per axis."""
 
 PUPIL_POINTS: Final = 37
 RAYS_PER_SIDE: Final = 4
 
 
 def draw_ball_center_mm(seed: int) -> Float64Array:
-    """Return where the ball's middle is, mm, rig frame, shape (3,)."""
+    """Return the position of the ball's center, mm, rig frame, shape (3,)."""
     rng = np.random.default_rng([seed, 12])
     return np.array(NOMINAL_CENTER_MM) + BALL_PLACEMENT_DEVIATION_MM * rng.standard_normal(3)
 
@@ -41,7 +41,7 @@ def draw_ball_center_mm(seed: int) -> Float64Array:
 def render_ball_stokes(
     view: View, sphere: ActualSphere, *, extinction: float, center_mm: Float64Array
 ) -> Float32Array:
-    """Return the picture of the ball for each moment of the light, each pixel averaged.
+    """Return the Stokes image of the ball for each lighting moment, averaged over each pixel.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def render_ball_stokes(
     sphere
         The LEDs.
     extinction
-        Of the LEDs' films, > 1.
+        Extinction ratio of the LEDs' polarizers, > 1.
     center_mm
         Middle of the ball.
 
@@ -97,14 +97,14 @@ def _pupil(view: View) -> Float64Array:
     phi = math.pi * (1.0 + math.sqrt(5.0)) * k
     right, up, _ = (np.array(axis) for axis in view.axes)
     points = (r * np.cos(phi))[:, None] * right + (r * np.sin(phi))[:, None] * up
-    # a few points are not even about the middle, which would shift all that is out of focus
+    # the mean of few points is not exactly the center, which would shift defocused spots
     return np.asarray(points - points.mean(axis=0))
 
 
 def _mirrored(
     view: View, place: Float64Array, center: Float64Array, absorbs: Float64Array, extinction: float
 ) -> Float64Array:
-    """Return the Stokes vector of an LED's reflection over the radiance before its film."""
+    """Return the Stokes vector of an LED's reflection over the radiance before its polarizer."""
     eye = np.array(view.position_mm, np.float64)
     point = reflection_point(eye, place, center, GLASS_BALL_RADIUS_MM)
     to_light, to_camera = place - point, eye - point
@@ -159,7 +159,7 @@ def _box(
 
 @njit(cache=True, nogil=True)
 def _add_spot(part, box, pitch, shape, pupil, ball, light):  # type: ignore[no-untyped-def]
-    """Add which part of each pixel's rays, over pixel and pupil, ends on a lamp's disc."""
+    """Add the fraction of each pixel's rays, over pixel and pupil, that end on a lamp's disc."""
     center, radius = ball
     lamp, beam, lamp_radius = light
     share = 1.0 / (RAYS_PER_SIDE * RAYS_PER_SIDE * pupil.shape[0])

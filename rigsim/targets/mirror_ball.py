@@ -1,7 +1,7 @@
-"""A polished ball before the dome's cloth: its outline, and every lit LED in it.
+"""Render a polished ball in front of the dome's cloth, with the reflection of every lit LED.
 
-The cloth is a sphere around the rig; it is lit by the LEDs themselves, once, and both the ball and
-the gap beside it show it. An LED is a flat disc of even radiance.
+The cloth is a sphere around the rig; it is lit directly by the LEDs, without interreflection, and
+is visible in the ball and around it. An LED is a flat disc of uniform radiance.
 """
 
 from typing import Final, TypeAlias
@@ -12,7 +12,8 @@ from numba import njit
 from rigsim.arrays import Float32Array, Float64Array
 
 CHROMIUM_REFLECTANCE: Final = 0.62
-"""Of polished chromium in the visible, at all angles (Fresnel's rise near the rim is left out)."""
+"""Reflectance of polished chromium in the visible, at all angles (without the Fresnel increase near
+the rim)."""
 
 CLOTH_MM: Final = 1200.0
 """Radius of the cloth around the rig's origin."""
@@ -22,18 +23,18 @@ CLOTH_ROWS: Final = 48
 
 
 LampArrays: TypeAlias = tuple[Float64Array, Float64Array, Float64Array, Float64Array]
-"""Lights that are on: places in mm (L, 3), axes (L, 3), exponents (L,) and strengths (L,)."""
+"""Lights that are on: positions in mm (L, 3), axes (L, 3), exponents (L,) and strengths (L,)."""
 
 BallArrays: TypeAlias = tuple[Float64Array, float, float]
 """Middle in mm, shape (3,), radius in mm and reflectance of a ball."""
 
 LedArrays: TypeAlias = tuple[Float64Array, Float64Array, float, float, float]
-"""Place in mm, axis, exponent, radius in mm and strength of one of the lights."""
+"""Position in mm, axis, exponent, radius in mm and strength of one of the lights."""
 
 
 @njit(cache=True, nogil=True)
 def cloth_radiance(lamps: LampArrays) -> Float64Array:
-    """Return the light that the cloth sends back, shape (`CLOTH_ROWS`, 2 `CLOTH_ROWS`).
+    """Return the radiance of the cloth, shape (`CLOTH_ROWS`, 2 `CLOTH_ROWS`).
 
     In the unit of a white's signal; rows by elevation from +y down, columns by azimuth
     atan2(x, z) from -pi.
@@ -66,7 +67,7 @@ def cloth_radiance(lamps: LampArrays) -> Float64Array:
 def reflection_point(
     eye_mm: Float64Array, lamp_mm: Float64Array, ball_mm: Float64Array, radius_mm: float
 ) -> Float64Array:
-    """Return where a ball shows a lamp to an eye, by halving the angle (Alhazen's problem)."""
+    """Return the reflection point of a lamp on a ball by bisection (Alhazen's problem)."""
     to_eye, to_lamp = eye_mm - ball_mm, lamp_mm - ball_mm
     e = to_eye / np.sqrt(np.sum(to_eye**2))
     across = to_lamp - np.sum(to_lamp * e) * e
@@ -92,7 +93,7 @@ def reflection_point(
 
 @njit(cache=True, nogil=True)
 def _cloth_at(place: Float64Array, direction: Float64Array, cloth: Float64Array) -> float:
-    """Return the cloth's light where a ray from inside it ends; bilinear."""
+    """Return the cloth's radiance at the end of a ray from inside it, bilinear."""
     length = np.sqrt(np.sum(direction * direction))
     along = np.sum(place * direction) / length
     t = -along + np.sqrt(max(along * along - np.sum(place * place) + CLOTH_MM * CLOTH_MM, 0.0))
@@ -113,7 +114,7 @@ def _cloth_at(place: Float64Array, direction: Float64Array, cloth: Float64Array)
 
 @njit(cache=True, nogil=True)
 def _ball_distance(eye, ray, ball, radius):  # type: ignore[no-untyped-def]
-    """Return the distance in lengths of ``ray`` to the ball; negative: the ray passes it."""
+    """Return the distance in lengths of ``ray`` to the ball; negative: the ray misses it."""
     ox, oy, oz = eye[0] - ball[0], eye[1] - ball[1], eye[2] - ball[2]
     a = ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2]
     b = ox * ray[0] + oy * ray[1] + oz * ray[2]
@@ -126,7 +127,7 @@ def _ball_distance(eye, ray, ball, radius):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _bounce(eye, ray, t, ball, place, out):  # type: ignore[no-untyped-def]
-    """Write where a ray meets the ball and where it goes from there."""
+    """Write the intersection of a ray with the ball and the reflected direction."""
     n0, n1, n2 = 0.0, 0.0, 0.0
     for k in range(3):
         place[k] = eye[k] + t * ray[k]
@@ -151,14 +152,14 @@ def _inside(rays, i, j, y, x, ray):  # type: ignore[no-untyped-def]
 def render_cloth(
     rays: Float64Array, eye_mm: Float64Array, ball: BallArrays, cloth: Float64Array, subpixels: int
 ) -> Float32Array:
-    """Return the cloth as each pixel sees it, past the ball and in it; without the LEDs.
+    """Return each pixel's view of the cloth, direct and in the ball, without the LEDs.
 
     Parameters
     ----------
     rays
         Directions through the corners of pixels, shape (H + 1, W + 1, 3).
     eye_mm
-        Centre of projection, shape (3,).
+        Center of projection, shape (3,).
     ball
         The ball; a radius of 0 shows the cloth alone.
     cloth
@@ -246,8 +247,8 @@ def add_lamp(  # type: ignore[no-untyped-def]
                         continue
                     square = 0.0
                     for k in range(3):
-                        beside = place[k] + gap / facing * away[k] - lamp_mm[k]
-                        square += beside * beside
+                        lateral = place[k] + gap / facing * away[k] - lamp_mm[k]
+                        square += lateral * lateral
                     if square < lamp_radius_mm * lamp_radius_mm:
                         # radiance of a flat disc: intensity over its area seen from there
                         total += (facing / np.sqrt(length)) ** (lamp_exponent - 1.0)

@@ -1,4 +1,4 @@
-"""Flat targets: a ChArUco board and a white plate with markers at its edge.
+"""Render flat targets: a ChArUco board and a white plate with markers at its edge.
 
 Every edge of print lies on a lattice, so that a plate is a small raster of reflectances.
 """
@@ -37,7 +37,7 @@ PLATE_MARGIN_CELLS: Final = 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plate:
-    """A flat diffuse target; x right, y down as seen from its front, z into it."""
+    """A flat diffuse target; x right, y down in front view, z into it."""
 
     reflectance: Float64Array
     """Of each lattice cell, shape (rows, columns); row 0 is the top."""
@@ -46,7 +46,7 @@ class Plate:
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """Width and height."""
+        """Return width and height, mm."""
         rows, columns = self.reflectance.shape
         return columns * CELL_MM, rows * CELL_MM
 
@@ -119,7 +119,7 @@ def _print_marker(light: BoolArray, number: int, top: int, left: int) -> None:
 def render_plate(  # type: ignore[no-untyped-def]
     rays, eye_mm, rotation, position_mm, paper, lights, subpixels
 ):
-    """Return what each pixel sees of a plate: sum of ``strength lobe cos / d^2`` x reflectance.
+    """Return each pixel's signal of a plate: sum of ``strength lobe cos / d^2`` x reflectance.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def render_plate(  # type: ignore[no-untyped-def]
     eye_mm
         Centre of projection, shape (3,).
     rotation, place_mm
-        From the plate's axes to the rig frame, and where its top left corner is.
+        From the plate's axes to the rig frame, and the position of its top left corner.
     paper
         Reflectance, side of its cells in mm, and waviness, as of `Plate`.
     lights
@@ -139,7 +139,7 @@ def render_plate(  # type: ignore[no-untyped-def]
     Returns
     -------
     ndarray of float32
-        Shape (H, W); 0 beside the plate and behind it.
+        Shape (H, W); 0 outside the plate and behind it.
     """
     reflectance, cell_mm, waviness = paper
     lamp_mm, lamp_axis, lamp_exponent, lamp_strength = lights
@@ -152,7 +152,7 @@ def render_plate(  # type: ignore[no-untyped-def]
     axes = lamp_axis @ rotation
     rows, columns = reflectance.shape
     turned = np.ascontiguousarray(rotation.T)
-    # where the corners of pixels meet the plate's plane, in cells; far outside when they do not
+    # intersections of the pixel corners' rays with the plate's plane, in cells; far outside if none
     hit = np.empty((height + 1, width + 1, 2))
     for i in range(height + 1):
         for j in range(width + 1):

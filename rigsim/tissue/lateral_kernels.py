@@ -1,4 +1,4 @@
-"""Radial spread of light in skin, per channel, and its description as a sum of Gaussians."""
+"""Lateral scattering kernels of skin per channel, and their fit by sums of Gaussians."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ GAUSSIAN_SIGMAS_MM = (0.004, 0.01, 0.025, 0.06, 0.15, 0.35, 0.8, 1.8, 4.0)
 
 
 SIGMAS_MM: Final = (0.02, 0.06, 0.15, 0.35, 0.8, 1.8, 4.0)
-"""Widths of the Gaussians that stand for the lateral profiles, mm."""
+"""Widths of the Gaussians fitted to the lateral profiles, mm."""
 
 
 @dataclass(frozen=True, slots=True)
 class GaussianSum:
-    """Isotropic Gaussians of common widths whose weighted sum stands for each channel's kernel.
+    """Isotropic Gaussians of common widths whose weighted sum approximates each channel's kernel.
 
     ``K(r) = sum_k weights[k] exp(-r^2 / (2 sigma_k^2)) / (2 pi sigma_k^2)``, each channel's
     weights sum to 1.
@@ -37,7 +37,7 @@ class GaussianSum:
 
 @dataclass(frozen=True, slots=True)
 class LateralKernels:
-    """Where light leaves that entered at a point: radial densities, normalised to 1."""
+    """Radial densities of the exit points of light that entered at a point, normalized to 1."""
 
     ring_edges_mm: Float64Array
     """Edges of the rings in mm, shape (n + 1,)."""
@@ -64,7 +64,7 @@ class LateralKernels:
         Raises
         ------
         ValueError
-            When the shapes disagree or a channel holds no light.
+            When the shapes disagree or a channel has no light.
 
         Examples
         --------
@@ -123,7 +123,8 @@ class LateralKernels:
             raise ValueError(f"sigmas_mm: expected widths > 0 on one axis, got {sigmas.tolist()}")
         outer = self.ring_edges_mm[1:, None]
         inside = -np.expm1(-0.5 * (outer / sigmas) ** 2)
-        # A heavy extra row holds the weights' sum at 1; the rest is the encircled fraction.
+        # A heavily weighted extra row constrains the sum to 1; the other rows fit encircled
+        # fractions.
         heavy = 1e3
         system = np.vstack([inside, np.full(sigmas.size, heavy)])
         weights = np.array([nnls(system, np.append(row, heavy))[0] for row in self.encircled])

@@ -1,7 +1,7 @@
-"""The walk of `rigsim.tissue.tissue_mc` for many photons side by side, compiled by Dr.Jit.
+"""Trace the walk of `rigsim.tissue.tissue_mc` for many photons in parallel with Dr.Jit.
 
-Each lane of the processor's vectors traces photons one after another, so that no lane waits for
-the longest walk of its neighbours. Directions and places are float32, counted from the top of the
+Each lane of the processor's vectors traces photons one after another, so that no lane waits for the
+longest walk of its neighbors. Directions and positions are float32, relative to the top of the
 photon's layer, so that thin and deep layers keep their digits; sums are float64.
 """
 
@@ -17,27 +17,25 @@ from rigsim.render.variant import choose_variant
 from rigsim.tissue.photon_walk import ROULETTE_MAX_WEIGHT, ROULETTE_SURVIVAL, TALLY_COUNT
 
 PHOTONS_PER_LANE: Final = (32, 256)
-"""Fewest and most photons that a lane traces in turn: with more, lanes wait less at the end."""
+"""Range of photons per lane: with more, lanes idle less at the end."""
 
 PHOTONS_PER_CALL: Final = 1 << 22
-"""Photons whose exits are kept at once, 8 bytes each, batches whole."""
+"""Photons whose exits are stored at once, 8 bytes each, in whole batches."""
 
 MIN_LANES: Final = 1 << 16
 """Lanes that keep the threads busy; Dr.Jit gives 16,384 of them to each."""
 
 INFINITE_MM: Final = 1e30
-"""Stands for an infinite thickness or free path in float32."""
+"""Replaces an infinite thickness or free path in float32."""
 
-MAX_ISOTROPIC_G: Final = (
-    1e-4  # |g| below which float32 cannot tell the phase function from a constant
-)
+MAX_ISOTROPIC_G: Final = 1e-4  # |g| below which the phase function is constant in float32
 
 _UNIFORM_STEP: Final = 2.0**-23
 
 
 @dataclass(frozen=True, slots=True)
 class LaneTallies:
-    """Sums over the photons of each batch, as `rigsim.tissue.photon_walk.walk` gives them."""
+    """Sums over the photons of each batch, as in `rigsim.tissue.photon_walk.walk`."""
 
     tally: Float64Array
     """Shape (batches, TALLIES + layers + rings)."""
@@ -81,7 +79,7 @@ def walk_lanes(
 def _trace_batches(
     table: Float64Array, ring_edges2: Float64Array, photons: int, seed: NDArray[np.uint64], of: int
 ) -> LaneTallies:
-    """Trace some of all batches; lanes are shared out by the number of all."""
+    """Trace some of the batches; lanes are allocated by the total number of batches."""
     import drjit as dr
 
     load_mitsuba(choose_variant("mono"))
@@ -156,7 +154,7 @@ def _run(
         return dr.fma(Float(word >> 9), _UNIFORM_STEP, 0.5 * _UNIFORM_STEP)
 
     def body(*state: Any) -> tuple[Any, ...]:
-        """Take every lane one step further, and begin with its next photon where one ends."""
+        """Advance every lane by one step, and start its next photon where one ends."""
         *s, x, y, z, ux, uy, uz, weight, layer, scattered, at, lost = state[:15]
         absorbed = state[15:]
         if single:
@@ -191,7 +189,8 @@ def _run(
         cosine = dr.clip(cosine, -1.0, 1.0)
         sine = dr.sqrt(dr.maximum(1.0 - cosine * cosine, 0.0))
         sin_phi, cos_phi = dr.sincos((2.0 * dr.pi) * draw(s))
-        # A frame around the direction without a seam (Duff et al. 2017, JCGT 6(1)).
+        # An orthonormal frame about the direction without a singularity (Duff et al. 2017, JCGT
+        # 6(1)).
         sign = dr.select(uz >= 0.0, Float(1.0), Float(-1.0))
         a = -1.0 / (sign + uz)
         b = ux * uy * a
@@ -211,7 +210,8 @@ def _run(
         cos_i = dr.abs(uz)
         sin2_t = ratio * ratio * (1.0 - cos_i * cos_i)
         cos_t = dr.sqrt(dr.maximum(1.0 - sin2_t, 0.0))
-        # Both polarizations over their common denominator, which is not divided by.
+        # R = ((s-/s+)^2 + (p-/p+)^2) / 2: compare 2 chance (s+ p+)^2 with
+        # (s- p+)^2 + (p- s+)^2, which avoids divisions.
         s_minus, s_plus = eta * cos_i - eta_beyond * cos_t, eta * cos_i + eta_beyond * cos_t
         p_minus, p_plus = eta_beyond * cos_i - eta * cos_t, eta_beyond * cos_i + eta * cos_t
         mixed, other = s_minus * p_plus, p_minus * s_plus
@@ -222,7 +222,7 @@ def _run(
         crosses = ~collides & ~mirrored
         leaves = crosses & ((beyond == 0) | (beyond == n_layers + 1))
 
-        # Rare in each vector of lanes, so that the branch is worth its while.
+        # Rare in a vector of lanes, so that the branch saves time.
         index = at
 
         def leave(w: Any, r2: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The compiled random walk of photons through plane layers (see `rigsim.tissue.tissue_mc`)."""
+"""Trace photons through plane layers, compiled (see `rigsim.tissue.tissue_mc`)."""
 
 from math import copysign, log, sqrt
 
@@ -9,8 +9,8 @@ TALLY_COUNT = 5
 """Scores ahead of the layers and rings: diffuse and unscattered reflectance, diffuse and
 unscattered transmittance, weight removed minus weight added by the roulette."""
 
-ROULETTE_MAX_WEIGHT = 1e-2  # weight under which a photon has to play
-ROULETTE_SURVIVAL = 0.1  # probability to go on, with the weight divided by it
+ROULETTE_MAX_WEIGHT = 1e-2  # weight below which a photon plays Russian roulette
+ROULETTE_SURVIVAL = 0.1  # survival probability; survivors' weights are divided by it
 
 _UNIFORM_STEP = 2.0**-53
 _UINT64_TWO = np.uint64(2)
@@ -33,7 +33,7 @@ def draw_uniform(s0, s1, s2, s3):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def draw_disc_point(s0, s1, s2, s3):  # type: ignore[no-untyped-def]
-    """Draw a point in the unit disc, evenly."""
+    """Draw a uniform point in the unit disc."""
     while True:
         s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
         p = 2.0 * u - 1.0
@@ -45,7 +45,7 @@ def draw_disc_point(s0, s1, s2, s3):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def fresnel(mu_i, eta_i, eta_t):  # type: ignore[no-untyped-def]
-    """Unpolarized reflectance and cosine of the refracted ray; (1, 0) at total reflection."""
+    """Return unpolarized reflectance and the refracted ray's cosine; (1, 0) at total reflection."""
     ratio = eta_i / eta_t
     sin2_t = ratio * ratio * (1.0 - mu_i * mu_i)
     if sin2_t >= 1.0:
@@ -58,7 +58,7 @@ def fresnel(mu_i, eta_i, eta_t):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def scatter_direction(s0, s1, s2, s3, ux, uy, uz, g):  # type: ignore[no-untyped-def]
-    """Turn a direction by the Henyey-Greenstein phase function of mean cosine g."""
+    """Scatter a direction by the Henyey-Greenstein phase function of mean cosine g."""
     s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
     if g == 0.0:
         cos_theta = 2.0 * u - 1.0
@@ -88,7 +88,7 @@ def scatter_direction(s0, s1, s2, s3, ux, uy, uz, g):  # type: ignore[no-untyped
         ux = vx
         uy = vy
     else:
-        # Along the axis: any azimuth's origin will do.
+        # Along the axis the origin of the azimuth is arbitrary.
         bend = sqrt(sin2_theta)
         ux = bend * cos_phi
         uy = bend * sin_phi

@@ -1,7 +1,7 @@
-"""Camera color of simulated skin: the Monte Carlo spectra seen by one camera under one light.
+"""Camera color of simulated skin: Monte Carlo spectra in a camera's bands under one light.
 
-The table here belongs to the simulated world. It is made from photons, for every camera and light
-anew, and shares nothing with the table that estimators invert.
+The table is part of the simulation. It is built from Monte Carlo spectra per camera and light,
+independently of the table that estimators invert.
 """
 
 from dataclasses import dataclass
@@ -50,9 +50,9 @@ class SkinColor:
     def nearest_fractions(
         self, rgb: Float32Array, c_m: Float32Array, c_hd: Float32Array, *, steps: int = 12
     ) -> tuple[Float32Array, Float32Array]:
-        """Return the fractions whose color is nearest to a given one, in log reflectance.
+        """Return the volume fractions whose color is nearest to a given one in log reflectance.
 
-        This says what blurred skin looks like to somebody who knows everything but the blur.
+        These are the estimates from blurred skin by a model that is exact except for the blur.
 
         Parameters
         ----------
@@ -85,7 +85,7 @@ def skin_color(camera: str, light: str) -> SkinColor:
     Parameters
     ----------
     camera, light
-        Names known to `model.spectra`.
+        Names of `model.spectra`.
 
     Returns
     -------
@@ -164,7 +164,7 @@ def _approach(log_rgb, target, melanin, blood, steps):  # type: ignore[no-untype
             aa += damp
             bb += damp
             determinant = aa * bb - ab * ab
-            # Steps of at most a tenth of the range keep the walk inside the region it knows.
+            # Steps are limited to a tenth of the range: the linearization is valid only nearby.
             step_m = (bb * ra - ab * rb) / determinant
             step_h = (aa * rb - ab * ra) / determinant
             melanin[n] = min(max(melanin[n] + min(max(step_m, -0.1), 0.1), 0.0), 1.0)

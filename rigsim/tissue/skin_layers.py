@@ -1,8 +1,8 @@
-"""The two-layer skin of the simulated subjects: absorption and scattering against wavelength.
+"""Two-layer skin of the simulated subjects: absorption and scattering by wavelength.
 
 An epidermis with melanin and a little blood lies on a semi-infinite dermis with blood. The
-coefficients are evaluated here, on their own, so that the simulated world does not share an
-equation with the estimators that are judged by it; only tabulated data are shared.
+coefficients are evaluated independently of the estimators, so that the simulation does not share an
+equation with the estimators evaluated on it; only tabulated data are shared.
 """
 
 from math import exp, inf, isfinite, log
@@ -99,7 +99,7 @@ def skin_layer_stack(wavelength_nm: float, c_m: float, c_hd: float) -> LayerStac
     c_m
         Volume fraction of melanosomes in the epidermis, 0 to 0.5.
     c_hd
-        Volume fraction of blood in the dermis, 0 to 0.32; the epidermis holds a quarter of it.
+        Volume fraction of blood in the dermis, 0 to 0.32; the epidermis has a quarter of it.
 
     Returns
     -------

@@ -35,11 +35,11 @@ from rigsim.tissue.lateral_kernels import LateralKernels
 from rigsim.tissue.skin_layers import MAX_C_HD, MAX_C_M
 
 _TABLE_FILE = "skin_reflectance_mc.npz"
-EMPTY_RING_FRACTION = 1e-9  # share that stands for a far ring that no photon reached
+EMPTY_RING_FRACTION = 1e-9  # fraction assigned to a far ring without photons
 
 
 class SkinTableError(ValueError):
-    """A request outside the table."""
+    """Error for a request outside the table."""
 
 
 def c_m_axis(nodes: int) -> Float64Array:
@@ -83,11 +83,11 @@ class SkinTable:
     _patches: Float64Array
     """log R with its slopes and twist per cell edge, shape (n_m, n_h, 4, n_wavelength)."""
     _log_shares: Float64Array
-    """log of each ring's share of `lateral`, shape (k_m, k_h, rings, n_wavelength)."""
+    """log of each ring's fraction of `lateral`, shape (k_m, k_h, rings, n_wavelength)."""
 
     @classmethod
     def load(cls) -> SkinTable:
-        """Return the table of the package; it is read once."""
+        """Return the packaged table; it is read once."""
         return _load()
 
     def spectra(self, c_m: ArrayLike, c_hd: ArrayLike) -> Float64Array:
@@ -139,7 +139,7 @@ class SkinTable:
     def lateral_kernels(
         self, c_m: float, c_hd: float, band_weights: ArrayLike | None = None
     ) -> LateralKernels:
-        """Return where light leaves that entered at a point, per camera channel.
+        """Return the lateral scattering kernels per camera channel.
 
         Parameters
         ----------
@@ -152,7 +152,7 @@ class SkinTable:
         Returns
         -------
         LateralKernels
-            Radial densities, each normalised to 1 within the largest ring.
+            Radial densities, each normalized to 1 within the largest ring.
 
         Raises
         ------
@@ -161,13 +161,13 @@ class SkinTable:
 
         Notes
         -----
-        Cubic splines of the logarithm of the ring shares over the cube roots of the fractions.
-        The light of a channel is weighted by how much of it comes back at each wavelength.
+        Cubic splines of the logarithm of the ring fractions over the cube roots of the volume
+        fractions. Wavelengths of a channel are weighted by their reflectance.
 
         Examples
         --------
         >>> kernels = SkinTable.load().lateral_kernels(0.01, 0.03)
-        >>> bool(kernels.rms_mm[-1] > kernels.rms_mm[14])  # red light spreads farther than green
+        >>> bool(kernels.rms_mm[-1] > kernels.rms_mm[14])  # red light scatters farther than green
         True
         """
         n = self.wavelength_nm.size
@@ -180,7 +180,8 @@ class SkinTable:
         log_share = self._log_shares
         for name, value, limit in (("c_m", c_m, MAX_C_M), ("c_hd", c_hd, MAX_C_HD)):
             at = float(_fractions(name, np.asarray(value), limit)[0])
-            # Smooth in the fraction itself, so flat in its cube root at zero.
+            # Smooth in c itself: d/d(cbrt c) = 3 cbrt(c)^2 d/dc, so the slope over cbrt c is 0 at
+            # 0.
             flat = (1, np.zeros(log_share.shape[1:]))
             nodes = np.linspace(0.0, 1.0, log_share.shape[0])
             log_share = CubicSpline(nodes, log_share, bc_type=(flat, "not-a-knot"))(at)
@@ -212,7 +213,7 @@ def _log_shares(rings: Float64Array) -> Float64Array:
 
 
 def _hermite_patches(reflectance: Float64Array) -> Float64Array:
-    """Value, two slopes and twist of log R at the nodes, per unit of node index."""
+    """Return value, two slopes and twist of log R at the nodes, per unit of node index."""
     value = np.log(reflectance)
     by_m, by_h = (
         PchipInterpolator(np.arange(value.shape[axis]), value, axis=axis).derivative()(

@@ -1,10 +1,10 @@
-"""Monte Carlo transport of light in plane layers of tissue.
+"""Simulate light transport in plane layers of tissue by Monte Carlo.
 
-A pencil beam falls at right angles on a stack of homogeneous layers. Photons scatter by the
+A pencil beam is incident normally on a stack of homogeneous layers. Photons scatter by the
 Henyey-Greenstein phase function with its real asymmetry, refract and reflect at every change of the
-refractive index, and lose weight to absorption at each collision; Russian roulette ends the light
-ones without bias. The random numbers of a batch depend on nothing but the caller's generator and
-the batch's index, so a result is the same for any number of threads.
+refractive index, and lose weight to absorption at each collision; Russian roulette ends photons of
+low weight without bias. The random numbers of a batch depend on nothing but the caller's generator
+and the batch's index, so a result is the same for any number of threads.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,12 +22,12 @@ from rigsim.tissue.photon_walk import TALLY_COUNT, walk
 
 _T = TypeVar("_T")
 
-MIN_LANE_PHOTONS = 100_000  # photons above which Dr.Jit's start pays
-MIN_BATCHES = 20  # fewer give a standard error that is itself off by more than 16 %
+MIN_LANE_PHOTONS = 100_000  # photons from which Dr.Jit is faster, including its start
+MIN_BATCHES = 20  # with fewer, the standard error itself is uncertain by more than 16 %
 
 
 class TransportError(ValueError):
-    """A layer stack or a request that cannot be simulated."""
+    """Error for a layer stack or a request that cannot be simulated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,27 +85,28 @@ class LayerStack:
 
     @property
     def specular_reflectance(self) -> float:
-        """Fresnel reflectance of the first surface at normal incidence, dimensionless."""
+        """Return the Fresnel reflectance of the first surface at normal incidence."""
         eta = self.layers[0].eta
         return float(((eta - self.eta_above) / (eta + self.eta_above)) ** 2)
 
 
 @dataclass(frozen=True, slots=True)
 class TransportResult:
-    """Where the light of a pencil beam of unit power goes, with one-sigma standard errors.
+    """Reflected, transmitted and absorbed fractions of a pencil beam, with standard errors.
 
-    All fractions are of the incident power, the mirror reflection of the first surface included,
-    so that the parts add up to 1 within the error of the roulette.
+    All fractions are of the incident power, including the specular reflection of the first surface,
+    so that they sum to 1 within the error of the roulette.
     """
 
     specular: float
     """Reflected by the surfaces without ever being scattered, in [0, 1]."""
     reflectance: float
-    """Diffuse reflectance: scattered and left upwards, without the specular part, in [0, 1]."""
+    """Diffuse reflectance: scattered light that exits upwards, without the specular part, in [0,
+    1]."""
     reflectance_stderr: float
     """Standard error of `reflectance`."""
     transmittance: float
-    """Left downwards, scattered or not, in [0, 1]; 0 for a semi-infinite stack."""
+    """Transmittance, scattered or not, in [0, 1]; 0 for a semi-infinite stack."""
     transmittance_stderr: float
     """Standard error of `transmittance`."""
     absorbed: Float64Array
@@ -127,28 +128,28 @@ class TransportResult:
 
     @property
     def reflectance_per_mm2(self) -> Float64Array:
-        """Mean radial density R(r) of each ring in 1/mm^2, shape (rings,)."""
+        """Return the mean radial density R(r) of each ring in 1/mm^2, shape (rings,)."""
         return np.asarray(self.ring_reflectance / _ring_areas(self.ring_edges_mm))
 
     @property
     def reflectance_per_mm2_stderr(self) -> Float64Array:
-        """Standard error of `reflectance_per_mm2` in 1/mm^2, shape (rings,)."""
+        """Return the standard error of `reflectance_per_mm2` in 1/mm^2, shape (rings,)."""
         return np.asarray(self.ring_reflectance_stderr / _ring_areas(self.ring_edges_mm))
 
     @property
     def balance(self) -> float:
-        """Sum of all parts, roulette included: 1 up to rounding."""
+        """Return the sum of all parts, including roulette: 1 up to rounding."""
         parts = (self.specular, self.reflectance, self.transmittance, self.roulette)
         return float(sum(parts) + self.absorbed.sum())
 
 
 @dataclass(frozen=True, slots=True)
 class EscapePaths:
-    """Photons of one batch that left upwards, for reweighting to other absorptions.
+    """Photons of one batch that exited upwards, for reweighting to other absorptions.
 
-    A photon that left with `weight` in a stack of absorption sigma_a leaves with
-    ``weight * exp(-sum((sigma_a' - sigma_a) * path_mm))`` in one of absorption sigma_a' and equal
-    scattering: both have the same collisions and the ratio of the path probabilities is that.
+    A photon that left with `weight` in a stack of absorption sigma_a leaves with ``weight *
+    exp(-sum((sigma_a' - sigma_a) * path_mm))`` in one of absorption sigma_a' and equal scattering:
+    both have the same collisions, and this factor is the ratio of the path probabilities.
     """
 
     weight: Float64Array
@@ -171,7 +172,7 @@ def trace_photons(
     threads: int = 1,
     engine: Literal["numba", "drjit", "auto"] = "numba",
 ) -> TransportResult:
-    """Trace a pencil beam that falls at right angles on a stack of layers.
+    """Trace a pencil beam at normal incidence on a stack of layers.
 
     Parameters
     ----------
@@ -189,18 +190,18 @@ def trace_photons(
         Threads to use; the result does not depend on it. Dr.Jit uses those of the renderer.
     engine
         ``"drjit"`` traces photons in the lanes of the processor's vectors, in float32: about five
-        times as many a second, and a second to start. ``"auto"`` takes it where it works and enough
-        photons are asked for, else ``"numba"``. The engines draw other random numbers.
+        times as many per second, and a second to start. ``"auto"`` selects it where available and
+        for enough photons, else ``"numba"``. The engines draw different random numbers.
 
     Returns
     -------
-    Transport
+    TransportResult
         Reflectance, transmittance, absorption and radial profile with standard errors.
 
     Raises
     ------
     TransportError
-        When the request makes no sense; the message names the field.
+        When an argument is out of range; the message names it.
 
     References
     ----------
@@ -264,7 +265,7 @@ def trace_escape_paths(
     batches: int = MIN_BATCHES,
     threads: int = 1,
 ) -> tuple[EscapePaths, ...]:
-    """Trace a pencil beam and keep the paths of the scattered photons that come back.
+    """Trace a pencil beam and store the paths of the diffusely reflected photons.
 
     Parameters
     ----------
@@ -280,7 +281,7 @@ def trace_escape_paths(
     Raises
     ------
     TransportError
-        When the request makes no sense; the message names the field.
+        When an argument is out of range; the message names it.
 
     Examples
     --------
@@ -320,7 +321,7 @@ def _walk_lanes(
 
 
 def layer_table(stack: LayerStack) -> Float64Array:
-    """Return what `rigsim.tissue.photon_walk.walk` needs of the layers and the media around them.
+    """Return the table of layers and surrounding media for `rigsim.tissue.photon_walk.walk`.
 
     Columns top, bottom, sigma_t, albedo, g, eta; shape (layers + 2, 6).
     """
@@ -335,12 +336,12 @@ def layer_table(stack: LayerStack) -> Float64Array:
 
 
 def batch_seeds(rng: np.random.Generator, batches: int) -> NDArray[np.uint64]:
-    """Return the states from which the batches' generators start, shape (batches, 4)."""
+    """Return the initial states of the batches' generators, shape (batches, 4)."""
     return rng.integers(1, 2**64, size=(batches, 4), dtype=np.uint64)
 
 
 def run_in_threads(run: Callable[[int], _T], batches: int, threads: int) -> list[_T]:
-    """Return what `run` gives for each batch, in order; it must release the interpreter."""
+    """Return the results of `run` for each batch, in order; it must release the GIL."""
     if threads == 1:
         return [run(batch) for batch in range(batches)]
     with ThreadPoolExecutor(threads) as pool:
@@ -353,7 +354,7 @@ def photons_per_batch(photons: int, batches: int, threads: int) -> int:
     Raises
     ------
     TransportError
-        When one of the three is too small.
+        When one of the three arguments is too small.
     """
     _require("photons", photons, photons >= 1, ">= 1")
     _require("batches", batches, batches >= MIN_BATCHES, f">= {MIN_BATCHES}")

@@ -185,7 +185,7 @@ def test_white_plate_under_constant_light_renders_albedo():
         ({"faces": [[0, 1, 7]]}, "faces: got indices"),
         ({"uv": np.full((4, 2), 1.5)}, "uv: got"),
         ({"vertices_mm": np.full((4, 3), np.nan)}, "not finite"),
-        ({"vertices_mm": 1e-3 * np.eye(4, 3)}, "scale the mesh to millimetres"),
+        ({"vertices_mm": 1e-3 * np.eye(4, 3)}, "scale the mesh to millimeters"),
     ],
 )
 def test_a_wrong_mesh_is_named(change, word):

@@ -119,7 +119,7 @@ def test_maps_are_not_asked_of_a_session(tmp_path, capsys):
 def test_a_folder_that_is_not_there_is_named(tmp_path, capsys):
     code, said = run(capsys, "export", tmp_path / "no", "--to", "maps", "--out", tmp_path / "out")
     assert code == 3
-    assert "is no APPEARANCE/ folder" in said.err
+    assert "is not an APPEARANCE/ folder" in said.err
 
 
 def test_simulated_maps_need_no_use(tmp_path, capsys):

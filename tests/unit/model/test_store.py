@@ -58,7 +58,7 @@ def test_a_failed_write_leaves_the_old_folder(tmp_path, appearance):
 def test_somebody_elses_folder_is_not_replaced(tmp_path, appearance):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "thesis.txt").write_text("years of work")
-    with pytest.raises(store.StoreError, match=r"is no APPEARANCE/"):
+    with pytest.raises(store.StoreError, match=r"is not an APPEARANCE/"):
         store.write(tmp_path / "a", appearance)
     assert (tmp_path / "a" / "thesis.txt").read_text() == "years of work"
 
@@ -120,7 +120,7 @@ def test_missing_map_error_lists_available_maps(tmp_path, appearance):
 
 
 def test_folder_that_is_not_appearance_is_reported(tmp_path):
-    with pytest.raises(store.StoreError, match=r"is no APPEARANCE/ folder"):
+    with pytest.raises(store.StoreError, match=r"is not an APPEARANCE/ folder"):
         store.read(tmp_path)
 
 

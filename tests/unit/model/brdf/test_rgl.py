@@ -132,7 +132,7 @@ def test_invalid_isotropic_material_error_names_field(rng, tmp_path):
     path = tmp_path / "a.bsdf"
     for change, message in [
         ({"phi_i": np.zeros(8, np.float32)}, "anisotropic"),
-        ({"rgb": None}, "no field rgb"),
+        ({"rgb": None}, "field rgb is missing"),
         ({"vndf": np.ones((5, 11, 6), np.float32)}, "vndf: got 3 dimensions"),
         ({"luminance": np.ones((1, 5, 6, 6), np.float32)}, "luminance: got shape"),
         ({"vndf": np.zeros((1, 5, 2, 2), np.float32)}, "vndf: got an elevation without"),
@@ -144,7 +144,7 @@ def test_invalid_isotropic_material_error_names_field(rng, tmp_path):
         with pytest.raises(RglFileError, match=message):
             rgl.read(path)
     path.write_bytes(b"II*\0" * 30)
-    with pytest.raises(TensorFileError, match="no tensor file"):
+    with pytest.raises(TensorFileError, match="not a tensor file"):
         rgl.read(path)
 
 

@@ -92,9 +92,9 @@ def test_regression_separates_correlated_traits(rng):
 def test_duplicate_traits_are_reported_and_refused_by_regression(rng):
     samples, tan, _ = population(rng)
     space = TraitSpace.fit(samples, {"tan": tan, "brown": tan, "pale": ~tan})
-    assert "cannot be told apart" in space.trait("tan").warning
+    assert "cannot be separated" in space.trait("tan").warning
     assert space.trait("tan").confounded[1][1] == pytest.approx(-1.0)
-    with pytest.raises(TraitError, match="cannot be told apart by regression"):
+    with pytest.raises(TraitError, match="cannot be separated by regression"):
         TraitSpace.fit(samples, {"tan": tan, "brown": tan}, contrast="regression")
 
 
@@ -219,7 +219,7 @@ def test_two_faces_make_trait_of_unknown_error(rng):
     found = space.trait("old")
     assert found.confidence.p_value == 1.0
     assert found.confidence.expected_cosine == 0.0
-    assert "error is not known" in found.warning
+    assert "error is unknown" in found.warning
     assert len(space.basis) == 1
 
 
@@ -351,7 +351,7 @@ def test_histogram_projection_is_nearest_histogram(rng):
 def test_samples_outside_their_set_are_refused(rng):
     samples, label = histograms(rng)
     space = TraitSpace.fit(samples, {"tan": label})
-    with pytest.raises(TraitError, match="not in the set"):
+    with pytest.raises(TraitError, match="not in the feasible set"):
         space.edit(samples[0] * 1.01, {"tan": 0.5})
     bad = np.vstack([samples[:-1], samples[-1:] * 1.01])
     with pytest.raises(TraitError, match="1 of 30 are not in the set"):

@@ -82,7 +82,7 @@ def test_a_document_of_another_kind_is_refused(face):
     fields = json.loads(document)
     broken = {
         "expected 'skinrig.wrinkles/1'": {**fields, "schema": "skinrig.wrinkles/2"},
-        "which is not there": {**fields, "layers": [{**fields["layers"][0], "map": "tea"}]},
+        "is missing; export": {**fields, "layers": [{**fields["layers"][0], "map": "tea"}]},
         "wrong kind": {**fields, "layers": [{}]},
         "clamp: got 'tight'": {**fields, "clamp": "tight"},
     }

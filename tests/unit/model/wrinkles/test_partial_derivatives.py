@@ -220,7 +220,7 @@ def test_user_table_sums_any_number_of_blend_shapes():
 
 
 def test_unknown_expression_error_suggests_nearest_name():
-    with pytest.raises(WrinkleError, match="'surprise' is near"):
+    with pytest.raises(WrinkleError, match="did you mean 'surprise'"):
         zone_sums({"suprise": 1.0})
 
 
@@ -237,7 +237,7 @@ def test_nonfinite_weights_are_refused():
         ("", "expected expression"),
         ("name,a\nx,1\n", "expected expression"),
         ("expression,a\nx,1\nx,2\n", "each once"),
-        ("expression,a\nx,one\n", "no number"),
+        ("expression,a\nx,one\n", "not a number"),
         ("expression,a,b\nx,1\n", "2 finite weights"),
         ("expression,a,a\nx,1,1\n", "names that differ"),
     ],
