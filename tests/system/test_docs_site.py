@@ -21,7 +21,6 @@ LONG_LINES: dict[str, int] = {}
 """Prose lines above the limit per page; the counts may only fall."""
 
 WIDE_TABLES = {
-    "concepts/gradient-optics.md": 1,
     "decisions/0011-patches-are-cut-not-blended.md": 1,
     "validation/benchmarks.md": 1,
     "validation/exports.md": 1,
