@@ -22,8 +22,6 @@ LONG_LINES: dict[str, int] = {}
 
 WIDE_TABLES = {
     "decisions/0011-patches-are-cut-not-blended.md": 1,
-    "validation/benchmarks.md": 1,
-    "validation/exports.md": 1,
 }
 """Tables above the limit per page; the counts may only fall."""
 
