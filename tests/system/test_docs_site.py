@@ -21,14 +21,7 @@ LONG_LINES: dict[str, int] = {}
 """Prose lines above the limit per page; the counts may only fall."""
 
 WIDE_TABLES = {
-    "concepts/gradient-optics.md": 1,
     "decisions/0011-patches-are-cut-not-blended.md": 1,
-    "validation/benchmarks.md": 1,
-    "validation/exports.md": 1,
-    "validation/flash-rig.md": 3,
-    "validation/gradient-rig.md": 2,
-    "validation/light-dome.md": 1,
-    "validation/moving-face.md": 1,
 }
 """Tables above the limit per page; the counts may only fall."""
 
