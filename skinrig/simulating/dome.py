@@ -75,7 +75,7 @@ def simulate_dome(order: DomeOrder) -> SimulationResult:
 
     def prompt(world: Any, text: str) -> None:
         # "pose 3" and "sphere 1": the operator puts the target there
-        scene.show(int(text.rpartition(" ")[2]))
+        scene.set_pose(int(text.rpartition(" ")[2]))
 
     # nobody sits in front of a target; a face is asked to close its eyes where that is needed
     safe = order.target is not None or light["open_eyes"] != "allowed"

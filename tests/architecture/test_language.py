@@ -194,7 +194,9 @@ def is_lone_adverb_or_participle(name: str) -> bool:
     if "_" in name or identifier_words(name).count(" "):
         return False
     ending = re.fullmatch(r"\w{2,}(ly|[^e]ed)", word) is not None
-    return word in PARTICIPLES or (ending and word not in {"assembly", "seed", "speed", "apply", "reply"})
+    return word in PARTICIPLES or (
+        ending and word not in {"assembly", "seed", "speed", "apply", "reply"}
+    )
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ def write(path, acknowledged):
         session = Session.create(path, plan=PLAN, rig=RIG, devices={}, subject=Subject("P1"),
                                  source="simulated", session_id="killed")
     os.write(acknowledged, b"started ")
-    for step, camera in session.todo():
+    for step, camera in session.pending_frames():
         values = np.full((96, 128), 600 + int(step.id[1:]), np.uint16)
         blob = raw.encode_dng(values, pattern="RGGB", black=512, white=16383,
                               step_id=step.id, session_id=session.id)

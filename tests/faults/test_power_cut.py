@@ -316,7 +316,7 @@ def record(root, disk, plan):
     """Capture a whole session on ``disk``, noting what was acknowledged and when."""
     session = create(root / "s", plan, disk)
     disk.note("acknowledged", "created")
-    for number, (step, _) in enumerate(session.todo()):
+    for number, (step, _) in enumerate(session.pending_frames()):
         commit(session, step.id)
         disk.note("acknowledged", step.id)
         if number == 0:

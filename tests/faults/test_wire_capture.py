@@ -77,7 +77,7 @@ def capture(world, session, plan=None):
 
 def check(world, session):
     """Fail where a frame is not lit by exactly the pop that it names."""
-    assert session.todo() == []
+    assert session.pending_frames() == []
     made = Counter(pop.token for pop in world.pops)
     assert all(count == 1 for count in made.values())
     for record in session.frames():

@@ -171,7 +171,7 @@ def noisy_run(ledger, world, url, requests):
     while port.statistics.requests < requests:
         step += 1
         angle_deg = float(step % 181)
-        box.set_analyser(angle_deg)
+        box.set_analyzer(angle_deg)
         assert unit.angle_deg == angle_deg
         assert box.analyser_deg() == angle_deg
         box.ping()

@@ -100,7 +100,7 @@ def test_nothing_moves_unarmed_unlimited_or_unhomed(bench):
 def test_angle_is_stretched_and_compressed_moves_reported(bench):
     box = bench.box
     hold(box, angle_deg=45.0)
-    assert (box.angle_deg(), box.attached(), box.status().homed) == (45.0, True, True)
+    assert (box.angle_deg(), box.is_attached(), box.status().homed) == (45.0, True, True)
     forces = {}
     for step in (-1, -2, 0, 1, 2):
         report = box.move_to(step)
@@ -126,7 +126,7 @@ def test_stretching_ends_where_the_skin_comes_off(bench):
     reports = [box.move_to(step) for step in (2, 8)]
     assert [report.ended for report in reports] == ["reached", "detached"]
     assert 10.0 < reports[1].reading_mm < 12.0
-    assert not box.attached()
+    assert not box.is_attached()
     assert box.move_to(0).ended == "reached"
 
 
@@ -156,7 +156,7 @@ def test_listening_keeps_skin_held_and_silence_releases(bench):
     hold(box)
     box.move_to(1)
     box.listen(0.4)
-    assert box.attached()
+    assert box.is_attached()
     box.port.listen(0.45)
     assert box.status().tripped
     assert not box.attached()

@@ -30,7 +30,7 @@ def test_settings_come_back_as_they_were_set(bench):
     box = bench.box()
     box.set_polarizer("crossed")
     assert (box.polarizer(), box.analyser_deg()) == ("crossed", 90.0)
-    box.set_analyser(22.5)
+    box.set_analyzer(22.5)
     assert box.analyser_deg() == 22.5
     box.set_power(0.0625)
     assert box.power() == 0.0625
@@ -121,7 +121,7 @@ def test_refusals_are_queued_read_and_cleared(bench):
     box = bench.box()
     for angle_deg in (200.0, -1.0):
         with pytest.raises(CommandRefused) as caught:
-            box.set_analyser(angle_deg)
+            box.set_analyzer(angle_deg)
         assert caught.value.code == Code.OUT_OF_RANGE
     assert box.status().errors_waiting
     assert [code for code, _ in box.errors()] == [Code.OUT_OF_RANGE] * 2
@@ -136,7 +136,7 @@ def test_analyzer_rotates_and_settles(bench):
     box = bench.box()
     for way in ("crossed", "parallel") * 8:  # on a real line a busy machine may ask when it is over
         box.set_polarizer(way)
-        turning = not box.settled()
+        turning = not box.is_settled()
         box.port.listen(0.15)
         if turning:
             break
@@ -262,7 +262,7 @@ def test_controller_of_other_kind_is_refused(rig, monkeypatch):
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_nonfinite_numbers_are_never_sent(liar, value):
     box = liar("")
-    for send in (box.set_power, box.set_analyser, box.lamp_on):
+    for send in (box.set_power, box.set_analyzer, box.lamp_on):
         with pytest.raises(ValueError, match="finite"):
             send(value)
     with pytest.raises(ValueError, match="polarizer"):

@@ -158,10 +158,10 @@ def test_patterns_go_out_by_themselves_and_by_command(bench):
 def test_analyzer_rotates_to_stops_and_any_reading(bench):
     box = bench.box
     box.set_polarizer("crossed")
-    assert not box.settled() or not bench.world.virtual
+    assert not box.is_settled() or not bench.world.virtual
     box.wait_settled()
     assert (box.settled(), box.analyser_deg(), box.status().turning) == (True, 90.0, False)
-    box.set_analyser(87.125)
+    box.set_analyzer(87.125)
     box.wait_settled()
     assert box.analyser_deg() == 87.125
     box.set_polarizer("parallel")
@@ -170,7 +170,7 @@ def test_analyzer_rotates_to_stops_and_any_reading(bench):
     with pytest.raises(ValueError, match="'parallel' or 'crossed'"):
         box.set_polarizer("none")
     with pytest.raises(ValueError, match="finite"):
-        box.set_analyser(float("inf"))
+        box.set_analyzer(float("inf"))
 
 
 def test_gains_are_sent_whole_and_forgotten(bench):

@@ -101,7 +101,7 @@ def test_shutter_opens_pulses_camera_line_and_closes_autonomously(bench):
     assert bench.events("SHUT:END") == [f"1,TIMED,{opened_us},{opened_us + 500_000}"]
     assert bench.ask("SHUT:LAST?") == f"1,TIMED,{opened_us},{opened_us + 500_000}"
     (seen,) = bench.world.switched
-    assert (seen.level, seen.fibre) == (0.8, None)
+    assert (seen.level, seen.fiber) == (0.8, None)
     assert (seen.t_on_s, seen.t_off_s) == pytest.approx((begin_s + 0.001, begin_s + 0.501))
 
 
@@ -220,7 +220,7 @@ def test_cover_takes_time_and_leaves_single_fiber(bench):
     assert bench.ask("*OPC?") == "1"  # it is there
     open_for(bench, 100)
     bench.wait(0.2)
-    assert bench.world.switched[0].fibre == 12
+    assert bench.world.switched[0].fiber == 12
     bench.ask("*RST")
     assert bench.ask("FIB?") == "ALL"
 
@@ -343,7 +343,7 @@ def test_suction_ends_on_time_despite_silent_host(bench):
     bench.ask("PUMP ON,3000,60")
     bench.silence(4.9)
     assert bench.box.armed
-    times = [t for t, _ in bench.world.heads]
+    times = [t for t, _ in bench.world.head_history]
     assert times[-1] == pytest.approx(1.0 + 3.0, abs=1e-9)
     assert bench.world.head_at(bench.now).suction_mbar < 0.1
 
@@ -427,7 +427,7 @@ def test_silent_host_means_dark_and_vented_within_lease(bench):
     bench.silence(2.0)
     (seen,) = bench.world.switched
     assert seen.t_off_s <= silent_s + 0.3 + 0.010
-    vented_s = [t for t, _ in bench.world.heads][-1]
+    vented_s = [t for t, _ in bench.world.head_history][-1]
     assert vented_s <= silent_s + 0.3 + 0.010
     assert bench.world.head_at(silent_s + 0.3 + 0.3).suction_mbar < 1.0
     assert [name for name, _ in bench.said][-1] in ("WDOG:TRIP", "SHUT:END", "PUMP:END")
@@ -487,7 +487,7 @@ def test_dead_gauge_bars_pump_and_ends_suction():
     assert bench.now < 4.0
     bench.wait(2.0)
     assert bench.events("PUMP:END")[0].split(",")[1] == "GAUGE"
-    assert bench.world.heads[-2][0] <= 4.0 + PUMP_CONTROL_PERIOD_S + 1e-9
+    assert bench.world.head_history[-2][0] <= 4.0 + PUMP_CONTROL_PERIOD_S + 1e-9
     for text in ("PRES?", "PUMP ON,5000,60"):
         bench.ask("HEAD:SITE cheek,0")
         bench.wait(PROBE.rest_s)
@@ -538,7 +538,7 @@ def test_large_time_step_equals_many_small_steps():
         until = bench.now + 4.9
         while bench.now < until - 1e-9:
             bench.silence(min(step_s, until - bench.now))
-        return bench.said, bench.world.switched, bench.world.heads
+        return bench.said, bench.world.switched, bench.world.head_history
 
     (said, lights, heads), (said_finely, lights_finely, heads_finely) = play(4.9), play(0.0031)
     assert said == said_finely

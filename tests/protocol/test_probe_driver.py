@@ -106,7 +106,7 @@ def test_controller_reports_identity_and_limits(bench):
     assert (
         box.placement() is box.last_suction() is box.last_opening() is box.uncovered_fiber() is None
     )
-    assert (box.level(), box.openings(), box.dose_ws()) == (0.0, 0, 0.0)
+    assert (box.level(), box.count_openings(), box.dose_ws()) == (0.0, 0, 0.0)
     assert abs(box.pressure_mbar()) < 5.0
     assert box.camera_c() == pytest.approx(5.0, abs=0.2)
 
@@ -213,7 +213,7 @@ def test_single_uncovered_fiber_is_revealed_by_light(bench):
         assert box.uncovered_fiber() == fibre
         box.open_shutter(0.05)
         box.listen(0.1)
-    assert [seen.fibre for seen in bench.world.switched] == [3, 27, None]
+    assert [seen.fiber for seen in bench.world.switched] == [3, 27, None]
     assert refused(box.cover, 28) == Code.OUT_OF_RANGE
 
 
@@ -297,7 +297,7 @@ def test_stuck_shutter_is_refused_and_jammed_shutter_reported(alone):
     world, box = alone(shutter_stuck=1.0)
     light(box)
     assert refused(box.open_shutter, 0.1) == Code.HARDWARE
-    assert (box.openings(), box.last_opening(), world.switched) == (1, None, [])
+    assert (box.count_openings(), box.last_opening(), world.switched) == (1, None, [])
     box.close()
     world, box = alone(shutter_jam=1.0)
     light(box)

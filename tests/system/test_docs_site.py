@@ -20,9 +20,7 @@ MAX_TABLE_COLUMNS = 5
 LONG_LINES: dict[str, int] = {}
 """Prose lines above the limit per page; the counts may only fall."""
 
-WIDE_TABLES = {
-    "decisions/0011-patches-are-cut-not-blended.md": 1,
-}
+WIDE_TABLES = {"decisions/0011-patches-are-cut-not-blended.md": 1}
 """Tables above the limit per page; the counts may only fall."""
 
 SEARCHED = {

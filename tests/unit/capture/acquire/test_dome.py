@@ -163,7 +163,7 @@ def test_full_plan_takes_about_25_seconds_of_rig(make):
 def test_kept_frames_are_correct_under_any_fault(make, faults):
     bench = make(**faults)
     done = bench.run()
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
     check_frames(bench)
     spoilt = {"drop_frame", "wrong_camera", "wrong_exposure"} & set(faults)
     assert (done.retakes > 0) == bool(spoilt)
@@ -240,7 +240,7 @@ def test_rig_ends_dark_disarmed_second_run_takes_missing(make):
     bench.session = Session.resume(path)
     done = bench.run()
     assert done.frames == 2 * len(bench.plan.steps) - kept
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
     check_frames(bench)
 
 

@@ -37,7 +37,7 @@ class Box:
     def set_polarizer(self, polarizer):
         self.polarizer = polarizer
 
-    def set_analyser(self, angle_deg):
+    def set_analyzer(self, angle_deg):
         self.polarizer = "other"
 
     def set_sync_delay(self, seconds):
@@ -228,7 +228,7 @@ def test_lost_link_ends_dark_second_run_takes_missing(plan, session):
     assert log[-1] == "dark"
     done = run(plan, session, Box(log), Camera())
     assert done.steps == 2
-    assert session.todo() == []
+    assert session.pending_frames() == []
 
 
 def test_an_interrupt_ends_dark(plan, session):

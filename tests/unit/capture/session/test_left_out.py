@@ -41,13 +41,13 @@ def commit(session, step_id):
 
 
 def commit_all(session):
-    for step, _ in session.todo():
+    for step, _ in session.pending_frames():
         commit(session, step.id)
 
 
 def test_omitted_steps_are_not_pending_and_session_completes(session):
     session.leave_out(["S002", "S003"], reason=WHY, about={"aperture_mm": 5.6}, t_host_s=7.0)
-    assert [step.id for step, _ in session.todo()] == ["D000", "S000", "S001"]
+    assert [step.id for step, _ in session.pending_frames()] == ["D000", "S000", "S001"]
     commit_all(session)
     session.close()
     again = Session.open(session.path)

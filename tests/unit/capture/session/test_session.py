@@ -56,7 +56,7 @@ def commit(session, step_id, *, fill=600, **changes):
 
 
 def commit_all(session):
-    for number, (step, _) in enumerate(session.todo()):
+    for number, (step, _) in enumerate(session.pending_frames()):
         commit(session, step.id, fill=600 + number)
 
 
@@ -108,9 +108,9 @@ def test_committed_frames_read_back_bit_for_bit(closed):
 
 
 def test_todo_is_plan_minus_completed_steps(session):
-    assert [step.id for step, _ in session.todo()] == [step.id for step in PLAN.steps]
+    assert [step.id for step, _ in session.pending_frames()] == [step.id for step in PLAN.steps]
     commit(session, "S001")
-    assert [step.id for step, _ in session.todo()] == ["D000", "S000", "S002", "S003"]
+    assert [step.id for step, _ in session.pending_frames()] == ["D000", "S000", "S002", "S003"]
 
 
 def test_frames_are_found_by_kind_and_index(closed):
@@ -322,7 +322,7 @@ def test_manifest_records_subject_plan_devices_and_source(tmp_path):
 
 def test_the_content_hash_vouches_for_every_commit(session):
     seen = {session.content_hash}
-    for step, _ in session.todo():
+    for step, _ in session.pending_frames():
         commit(session, step.id)
         assert session.content_hash not in seen
         assert session.content_hash.startswith("sha256:")

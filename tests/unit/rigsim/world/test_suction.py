@@ -41,7 +41,7 @@ def integrated(law, wanted_mbar, leak, times_s, dt_s=2e-5):
 
 def test_regulated_pump_approaches_target_as_one_exponential():
     sucked = head()
-    sucked.draw(60.0, 1.0)
+    sucked.start_suction(60.0, 1.0)
     volume = 2.0 / 1013.25 + 6e-4
     tau_s, ends_mbar = volume / 8.1e-3, 60.0 * 8.0 / 8.1
     for t_s in (0.0, 0.05, 0.3, 1.0, 3.0):
@@ -53,7 +53,7 @@ def test_regulated_pump_approaches_target_as_one_exponential():
 
 def test_pump_asked_beyond_capacity_first_gives_free_flow():
     sucked = head()
-    sucked.draw(150.0, 0.0)
+    sucked.start_suction(150.0, 0.0)
     times_s = np.array([0.02, 0.1, 0.2, 0.4, 1.0, 2.0])
     found = [sucked.suction_mbar(t) for t in times_s]
     np.testing.assert_allclose(found, integrated(LAW, 150.0, 1e-4, times_s), atol=0.02)
@@ -70,21 +70,21 @@ def test_pump_asked_beyond_capacity_first_gives_free_flow():
 def test_a_leak_makes_the_suction_settle_lower(leak):
     law = dataclasses.replace(LAW, leak_ml_per_s_mbar=8e-3 * leak)
     sucked = head(law)
-    sucked.draw(60.0, 0.0)
+    sucked.start_suction(60.0, 0.0)
     assert sucked.suction_mbar(20.0) == pytest.approx(60.0 / (1.0 + leak), rel=1e-6)
 
 
 def test_large_leak_keeps_full_speed_pump_below_target():
     law = dataclasses.replace(LAW, leak_ml_per_s_mbar=0.02)
     sucked = head(law)
-    sucked.draw(150.0, 0.0)
+    sucked.start_suction(150.0, 0.0)
     # free flow = leak + what the dead head takes off: 0.8 = (0.02 + 0.8 / 300) p
     assert sucked.suction_mbar(20.0) == pytest.approx(0.8 / (0.02 + 0.8 / 300.0), rel=1e-6)
 
 
 def test_vented_cup_fills_as_one_exponential():
     sucked = head()
-    sucked.draw(60.0, 0.0)
+    sucked.start_suction(60.0, 0.0)
     from_mbar = sucked.suction_mbar(5.0)
     sucked.vent(5.0)
     tau_s = LAW.compliance_ml_per_mbar / (0.05 + 1e-4)
@@ -96,13 +96,13 @@ def test_vented_cup_fills_as_one_exponential():
 
 def test_dead_pump_gives_no_suction():
     sucked = head(pump_dead=True)
-    sucked.draw(60.0, 0.0)
+    sucked.start_suction(60.0, 0.0)
     assert sucked.suction_mbar(10.0) == 0.0
 
 
 def test_detached_head_loses_suction_at_once():
     sucked = head(lifts_after_s=3.0)
-    sucked.draw(60.0, 1.0)
+    sucked.start_suction(60.0, 1.0)
     held_mbar = sucked.suction_mbar(4.0 - 1e-9)
     assert held_mbar > 58.0
     tau_s = LAW.compliance_ml_per_mbar / (OPEN_RIM_LEAK_ML_PER_S_MBAR + 8e-3)
@@ -129,7 +129,7 @@ def test_one_big_time_step_equals_many_small_ones():
                 now = min(now + step_s, until)
                 sucked.advance(now)
             if act == "draw":
-                sucked.draw(150.0, until)
+                sucked.start_suction(150.0, until)
             elif act == "vent":
                 sucked.vent(until)
         return [sucked.state_at(t) for t in np.linspace(0.0, 9.0, 301)], sucked.change_times_s
@@ -208,7 +208,7 @@ def test_invalid_parameter_is_named():
     with pytest.raises(SuctionError, match="angle_deg"):
         sucked.place("cheek", 360.0, 1.0)
     with pytest.raises(SuctionError, match="target_mbar"):
-        sucked.draw(0.0, 1.0)
+        sucked.start_suction(0.0, 1.0)
     sucked.draw(60.0, 1.0)
     with pytest.raises(SuctionError, match="vented first"):
         sucked.place("cheek", 0.0, 2.0)
@@ -217,7 +217,7 @@ def test_invalid_parameter_is_named():
 def test_zero_leak_and_zero_skin_compliance_work():
     law = dataclasses.replace(LAW, leak_ml_per_s_mbar=0.0, skin_ml_per_mbar=0.0)
     sucked = head(law, pump_dead=True)
-    sucked.draw(60.0, 0.0)
+    sucked.start_suction(60.0, 0.0)
     assert sucked.suction_mbar(1e3) == 0.0
     sucked = head(law)
     sucked.draw(60.0, 0.0)

@@ -213,7 +213,7 @@ def test_each_angle_is_taped_by_itself(make):
 def test_full_plan_ends_at_buckling_detachment_every_angle(make):
     bench = make(gradient_plan(RIG))
     bench.run()
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
     check_frames(bench.session)
     ends = {
         (line.about["angle"], line.about["end"])
@@ -253,7 +253,7 @@ def test_targets_need_neither_caliper_nor_force(make, target):
     bench = make(gradient_calibration_plan(RIG, target))
     bench.caliper.close()
     bench.run(force_limit_n=None, eyes="open")
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
     check_frames(bench.session)
     assert bench.asked == []
     assert len({r.actual["token"] for r in bench.session.frames()}) >= 1
@@ -269,7 +269,7 @@ def test_compression_ends_at_buckling_and_stretching_at_detachment(make):
     reached = check_frames(bench.session)  # no frame of buckled skin is among them
     assert set(reached) >= {"a000_n0", "a000_m1", "a000_m2", "a000_p1", "a000_p2", "a000_p3"}
     assert len(reached) < 13
-    missing = set(bench.session.left_out())
+    missing = set(bench.session.omitted_steps())
     assert {s.id for s in bench.plan.steps if strain_state(s) not in {None, *reached}} == missing
     abouts = [bench.session.omission_line(step).about for step in sorted(missing)]
     assert {about["end"] for about in abouts} == {"buckled", "detached"}
@@ -288,7 +288,7 @@ def test_frames_of_buckled_skin_are_never_kept(make, seed):
     bench = make(short(steps=(-4, 0), patterns=["full"]), seed=seed)
     bench.run()
     check_frames(bench.session)
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
     (reason,) = set(bench.session.left_out().values())
     assert "buckled" in reason
 
@@ -308,9 +308,9 @@ def test_force_limit_ends_only_its_own_direction(make):
     reached = check_frames(bench.session)
     assert {"a000_m1", "a000_p1"} <= set(reached)
     assert "a000_p6" not in reached
-    (reason,) = set(bench.session.left_out().values())
+    (reason,) = set(bench.session.omitted_steps().values())
     assert "force limit" in reason
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
 
 
 def test_skin_detached_at_first_step_keeps_neutral_compression(make):
@@ -319,7 +319,7 @@ def test_skin_detached_at_first_step_keeps_neutral_compression(make):
     bench.world.skin._fixed = dataclasses.replace(law, detaches_at=1.05)
     bench.run()
     assert set(check_frames(bench.session)) == {"a000_n0", "a000_m1"}
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
 
 
 PUSHES = [  # force at neutral and at each step, and the first step that is not to be had
@@ -374,7 +374,7 @@ def test_capture_resumes_after_any_interruption(make, number):
     bench.resume()
     bench.build()
     bench.run()
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
     tapings = check_frames(bench.session)
     assert set(tapings) == {name for name, _ in group_by_state(bench.plan)}
     assert bench.at_rest
@@ -413,7 +413,7 @@ def test_new_taping_is_counted_and_its_neutral_imaged(make):
 
 def test_skin_travel_limits_are_restored_after_resume(make):
     bench = make(short(steps=(-4, 1), patterns=["full"]))
-    honest = bench.session.leave_out
+    honest = bench.session.omit_steps
 
     def leave_out(*args, **words):
         honest(*args, **words)
@@ -445,7 +445,7 @@ def test_a_stop_between_states_ends_dark_and_released(make):
     assert 0 < len(bench.session.frames()) < len(bench.plan.steps)
     bench.resume()
     bench.run()
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
     check_frames(bench.session)
 
 
@@ -476,7 +476,7 @@ def test_lost_controller_ends_dark_released_keeps_captured_frames(make):
 def test_kept_frames_are_correct_under_any_fault(make, faults):
     bench = make(short(steps=(-1, 1)), **faults)
     done = bench.run()
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
     check_frames(bench.session)
     spoilt = {"drop_frame", "wrong_camera", "wrong_exposure"} & set(faults)
     assert (done.retakes > 0) == bool(spoilt)
@@ -521,14 +521,14 @@ def test_skin_released_by_silent_host_is_taped_again(make):
     bench.run()
     assert bench.asked == ["tape the skin at 0 degrees"] * 2
     assert check_frames(bench.session) == {"a000_n0": 1, "a000_p1": 2}
-    assert bench.session.left_out() == {}
+    assert bench.session.omitted_steps() == {}
     assert bench.at_rest
 
 
 def test_stalled_motor_is_homed_and_skin_taped_again(make):
     bench = make(short(steps=(0, 2)), jaw_stall=0.15)
     bench.run()
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
     check_frames(bench.session)
     assert bench.session.left_out() == {}
 

@@ -57,7 +57,7 @@ class Witness:
     def exposure(self, view_name, *, pops, exposure_s, seed, head):
         rng = np.random.default_rng(seed)
         light_s = sum(pop.level * (pop.t_off_s - pop.t_on_s) for pop in pops)
-        only = {pop.fibre for pop in pops}
+        only = {pop.fiber for pop in pops}
         electrons = np.full(ROWS.shape, 2.0 * exposure_s)
         for number, fibre in enumerate(PROBE.fibres):
             if only - {None} and number not in only:
@@ -276,7 +276,7 @@ def test_longer_exposures_are_omitted_once_all_fibers_measured(make):
     last_s = frames[-1].settings["exposure_s"]
     assert 0.5 <= peak * last_s
     assert peak * frames[-2].settings["exposure_s"] < 0.52
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
     bench.session.close()
     assert verify(bench.session.path).ok
 
@@ -419,7 +419,7 @@ def test_camera_still_warm_is_waited_for(make):
     honest, count = bench.box.camera_c, itertools.count()
     bench.box.camera_c = lambda: honest() + (12.0 if next(count) < 5 else 0.0)
     bench.run()
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
     check_frames(bench.session)
 
 
@@ -432,7 +432,7 @@ def test_occasional_frame_failures_leave_sound_session(make, faults):
     done = bench.run(all_brackets=True)
     assert done.stale + done.retakes > 0
     check_frames(bench.session)
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
 
 
 @pytest.mark.parametrize("part", ["_stuck", "_jam"])
@@ -453,7 +453,7 @@ def test_occasional_shutter_failures_leave_sound_session(make, part):
     done = bench.run(all_brackets=True)
     assert done.retakes == 3
     check_frames(bench.session)
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
     tries = [record.actual["tries"] for record in bench.session.frames("fibres")]
     assert tries == [1, 2, 1, 1, 3, 1, 1, 1]
 
@@ -546,8 +546,8 @@ def kill_at(bench, owner, name, number):
         ("box", "open_shutter", 4),
         ("box", "open_shutter", 6),
         ("box", "suck", 2),
-        ("session", "leave_out", 1),
-        ("session", "leave_out", 2),
+        ("session", "omit_steps", 1),
+        ("session", "omit_steps", 2),
     ],
 )
 def test_capture_resumes_after_any_interruption(make, owner, name, number):
@@ -560,7 +560,7 @@ def test_capture_resumes_after_any_interruption(make, owner, name, number):
     bench.build()
     asked = len(bench.placings)
     bench.run()
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
     check_frames(bench.session)
     assert bench.at_rest
     # a series that was whole is not touched again; the head is placed anew for each other one
@@ -600,7 +600,7 @@ def test_operator_stop_between_exposures_leaves_all_dark(make):
     bench.resume()
     bench.build()
     bench.run()
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
     check_frames(bench.session)
 
 
@@ -612,7 +612,7 @@ def test_phantom_is_placed_once_fibers_uncovered_singly(make):
     bench = make(plan, Witness(bright=20.0, fall_mm=2.0))
     bench.run()
     assert bench.placings == ["place the head on the phantom at 0 degrees"]
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
     assert set(check_frames(bench.session).values()) == {1}
     by_fibre = {}
     for record in bench.session.frames("mask"):
@@ -668,7 +668,7 @@ def test_mask_choice_continues_after_resume_without_choosing_again(make):
     bench.build()
     bench.run()
     assert bench.session.left_out() == left_out
-    assert bench.session.todo() == []
+    assert bench.session.pending_frames() == []
     placed = check_frames(bench.session)
     assert (placed["phantom at 0 degrees"], placed["fibre 0"], placed["fibre 5"]) == (1, 1, 2)
 

@@ -373,7 +373,7 @@ def test_impossible_scene_requests_are_refused(rig, face, scene):
 
 
 def test_omitted_effects_are_named_and_built_are_not(rig, face, scene):
-    names = {name for name, _ in scene.left_out}
+    names = {name for name, _ in scene.omitted}
     assert {"interreflection", "movement of the head"} <= names
     moving = {name for name, _ in direct(rig, face, motion=draw_head_motion(0)).omitted}
     assert "movement of the head" not in moving

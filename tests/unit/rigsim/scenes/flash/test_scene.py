@@ -268,7 +268,7 @@ def test_omitted_effects_are_reported_with_reason(real, ideal, rig):
     for scene in (real, ideal, scene_of(rig, make_target("white"))):
         assert len(scene.omitted) >= 3
         assert all(what and why for what, why in scene.omitted)
-    assert len(ideal.left_out) == len(real.left_out) + 2  # spreading, and the lens
+    assert len(ideal.omitted) == len(real.omitted) + 2  # spreading, and the lens
 
 
 def test_invalid_options_are_named(rig, face, real):

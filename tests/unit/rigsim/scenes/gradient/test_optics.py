@@ -57,7 +57,7 @@ def test_a_circle_in_focus_has_the_closed_form(lens):
     s = np.linspace(0.0, 1.2, 49)
     inside = np.minimum(s, 1.0)
     expected = 2.0 / math.pi * (np.arccos(inside) - inside * np.sqrt(1.0 - inside**2))
-    np.testing.assert_allclose(green.transfer(s * cutoff), expected, atol=1e-4)
+    np.testing.assert_allclose(green.otf(s * cutoff), expected, atol=1e-4)
 
 
 def test_defocus_follows_stokseth_s_limit_of_geometry(lens):
@@ -69,7 +69,7 @@ def test_defocus_follows_stokseth_s_limit_of_geometry(lens):
     diameter_mm = depth_mm * green.magnification / green.working_f_number
     f = np.linspace(0.2, 2.5, 20)
     x = math.pi * diameter_mm * f
-    np.testing.assert_allclose(green.transfer(f, depth_mm=depth_mm), 2.0 * j1(x) / x, atol=0.03)
+    np.testing.assert_allclose(green.otf(f, depth_mm=depth_mm), 2.0 * j1(x) / x, atol=0.03)
     assert green.transfer(f, depth_mm=0.0).min() > 0.9
 
 
@@ -81,7 +81,7 @@ def test_blurred_waves_keep_phase_with_otf_amplitude(lens, subpixels):
     wave = np.broadcast_to(1.0 + 0.5 * np.cos(phase * x), (side * subpixels,) * 2)
     seen = blur_images(wave[None].astype(np.float32), lens, subpixels=subpixels)[0]
     f = 1e3 / (period_px * lens.pixel_on_subject_um)
-    left = float(lens.transfer(f)) * np.sinc(1.0 / period_px)
+    left = float(lens.otf(f)) * np.sinc(1.0 / period_px)
     expected = 1.0 + 0.5 * left * np.cos(phase * np.arange(side))
     np.testing.assert_allclose(seen[side // 2, 16:-16], expected[16:-16], atol=2e-3)
 
@@ -114,7 +114,7 @@ def test_slope_transfer_matches_lens_and_pixel_mtf(lens):
     periods = [60.0, 30.0, 20.0]
     found = slope_transfer(periods)
     f = 1e3 / np.array(periods)
-    expected = lens.transfer(f) * np.sinc(f * 1e-3 * lens.pixel_on_subject_um)
+    expected = lens.otf(f) * np.sinc(f * 1e-3 * lens.pixel_on_subject_um)
     np.testing.assert_allclose(found, expected, atol=0.02)
 
 
