@@ -1,4 +1,4 @@
-"""How ``skinrig --help`` lists commands: by what people come for, each with its whole summary."""
+"""Help and command-line parsing: sections of commands, commands per rig, types of options."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -9,14 +9,14 @@ from typer.core import TyperCommand, TyperGroup
 from skinrig.errors import UnusableError, UsageError
 
 HELP_SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
-    ("Begin", ("demo", "doctor")),
+    ("Start here", ("demo", "doctor")),
     (
-        "Capture, on a rig or its simulation",
+        "Capture with a rig or its simulation",
         ("plan", "simulate", "capture", "serve", "calibrate", "import", "verify"),
     ),
-    ("From captures to models", ("reconstruct", "fit", "apply", "edit", "analyse")),
-    ("Look, and hand on", ("report", "view", "render", "export")),
-    ("Measure", ("bench",)),
+    ("Reconstruct and model", ("reconstruct", "fit", "apply", "edit", "analyse")),
+    ("Report, render and export", ("report", "view", "render", "export")),
+    ("Measure errors and run times", ("bench",)),
 )
 OTHER_SECTION: Final = "More"
 
@@ -25,19 +25,19 @@ _TYPE_LABELS: Final = (
     (re.compile(r"<list\[(\w+)\]>"), r"<\1>"),
     (re.compile("<%Y-%m-%d>"), "<date>"),
 )
-"""How Typer writes kinds of arguments after Python's types, and what is written instead."""
+"""Typer's labels of types, after Python's, and the labels that the help shows instead."""
 
 
 class Command(TyperCommand):
-    """A command whose help names kinds of arguments without Python's words for them."""
+    """A command whose help labels types of values without Python's names."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write arguments and options, those that are repeated as what one of them is."""
+        """Write arguments and options; repeatable ones with the type of a single value."""
         super().format_options(ctx, cast(Any, _WithoutTypes(formatter)))
 
 
 class _WithoutTypes:
-    """A formatter of help that writes lists of definitions without Python's types."""
+    """A help formatter that writes definition lists without Python's type names."""
 
     def __init__(self, formatter: Any) -> None:
         self._formatter = formatter
@@ -52,7 +52,7 @@ class _WithoutTypes:
 
 
 def format_argument(name: str) -> str:
-    """Return how an argument is listed, with what one of it is.
+    """Return an argument's label in the help, with the type of a single value.
 
     Examples
     --------
@@ -65,10 +65,10 @@ def format_argument(name: str) -> str:
 
 
 class Commands(TyperGroup):
-    """A group that lists its commands under the headings of `HELP_SECTIONS`, nothing cut off."""
+    """A group that lists its commands under the headings of `HELP_SECTIONS`, untruncated."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the headings and the commands below them."""
+        """Write the headings, each with its commands."""
         for title, rows in self._sections(ctx):
             with formatter.section(title):
                 formatter.write_dl(rows)
@@ -88,20 +88,20 @@ class Commands(TyperGroup):
 
 
 class Subcommands(TyperGroup):
-    """A group within the group: one list, nothing cut off."""
+    """A group within the group, with one untruncated list of commands."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the commands with their whole summaries."""
+        """Write the commands with their full summaries."""
         found = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
         with formatter.section("Commands"):
             formatter.write_dl([(name, summary(one)) for name, one in found if one is not None])
 
 
 class RigCommand(Command):
-    """A command of one rig, which refuses options of other rigs by their names."""
+    """A command of one rig; an option of other rigs is refused with their names."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Read the arguments; an option of another rig is a usage error that names the rigs."""
+        """Parse the arguments; raise `UsageError` for an option of another rig."""
         try:
             return super().parse_args(ctx, args)
         except Exception as error:  # Typer does not export the class of unknown options
@@ -111,16 +111,16 @@ class RigCommand(Command):
             if not others:
                 raise
             raise UsageError(
-                f"{option}: the {self.name} rig knows nothing of it; leave it out (it is for "
-                f"{', '.join(others)})"
+                f"{option}: not an option of the {self.name} rig (only of {', '.join(others)}); "
+                "remove it"
             ) from error
 
 
 class RigGroup(Subcommands):
-    """Commands of one verb, one a rig; options may also stand before the rig."""
+    """Commands of one verb, one per rig; options may also precede the rig."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Move the rig before the options, where Typer expects a command."""
+        """Move the rig in front of the options, where Typer expects a command."""
         options: dict[str, Any] = {}
         for command in self.commands.values():
             options |= _options(command)
@@ -135,21 +135,21 @@ class RigGroup(Subcommands):
         return super().parse_args(ctx, args)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """Return the command of the rig that is named first."""
+        """Return the command of the rig named by the first argument."""
         if args[0] in self.commands or ctx.resilient_parsing:
             return cast(tuple[str | None, Any, list[str]], super().resolve_command(ctx, args))
         return args[0], self.commands[self.kind_of(args[0])], args[1:]
 
     def kind_of(self, rig: str) -> str:
-        """Return the command for a rig of another name than those of the commands."""
+        """Return the command of a rig that is not a command's name; here, raise."""
         raise UnusableError(f"rig: got {rig!r}, expected one of {', '.join(self.commands)}")
 
 
 class RigFileGroup(RigGroup):
-    """Commands of one verb, one a rig, which also take a rig's own TOML file."""
+    """Commands of one verb, one per rig, which also accept a rig's TOML file."""
 
     def kind_of(self, rig: str) -> str:
-        """Return which of the four rigs a file describes."""
+        """Return the kind of rig, one of four, that a TOML file describes."""
         from capture.rig import load_rig
 
         described = load_rig(rig)
@@ -160,13 +160,13 @@ class RigFileGroup(RigGroup):
 
 
 def _options(command: Any) -> dict[str, Any]:
-    """Return the options of a command by each of their spellings."""
+    """Return the options of a command, keyed by each spelling."""
     return {
         name: option for option in command.params for name in (*option.opts, *option.secondary_opts)
     }
 
 
 def summary(command: Any) -> str:
-    """Return the first paragraph of a command's help on one line, without its full stop."""
+    """Return the first paragraph of a command's help on one line, without its period."""
     text = (command.short_help or command.help or "").split("\n\n")[0]
     return " ".join(text.split()).rstrip(".")

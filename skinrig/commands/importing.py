@@ -1,4 +1,4 @@
-"""The commands below `skinrig import`."""
+"""`skinrig import`: sessions from photographs, meshes and light lists."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from skinrig.console import Console, format_count, select_attributes
 from skinrig.next_steps import shell_quote
 
 import_app = typer.Typer(
-    cls=Subcommands, help="Bring in what other devices made.", no_args_is_help=True
+    cls=Subcommands, help="Import data of other devices.", no_args_is_help=True
 )
 
 
@@ -26,7 +26,7 @@ def import_photos(
     consent_expires: ConsentExpires = None,
     json: Json = False,
 ) -> None:
-    """Turn RAW, TIFF, EXR, PNG or JPEG photographs into a session.
+    """Convert RAW, TIFF, EXR, PNG or JPEG photographs to a session.
 
     Example: skinrig import photos portraits --out session-portraits
 
@@ -35,7 +35,7 @@ def import_photos(
     directory
         Folder of photographs, or one file.
     rig
-        Rig whose camera took them, so that its calibrations hold.
+        Rig whose camera took the photographs, so that its calibrations apply; default: none.
     subject
         Pseudonym of the subject.
     """
@@ -48,7 +48,7 @@ def import_photos(
     done = bring_in(directory, out=out, rig=None if rig is None else load_rig(rig), subject=person)
     console.each("assumed", done.assumed)
     console.each("ignored", done.ignored)
-    console.say(
+    console.print_line(
         f"{done.path}: {format_count(done.frames, 'photograph')}, states {', '.join(done.states)}"
     )
     place = shell_quote(out)
@@ -57,9 +57,11 @@ def import_photos(
         state = "" if shown == "neutral" else f" --state {shown}"
         after = f"reconstruct {place} --want melanin,hemoglobin --out appearance{state}"
     else:
-        console.say("left out: melanin and hemoglobin: gray pictures hold no color to tell them by")
+        console.print_line(
+            "left out: melanin and hemoglobin: they need color images, not grayscale"
+        )
         after = f"verify {place}"
-    console.say(f"next: skinrig {after}")
+    console.print_line(f"next: skinrig {after}")
     console.document(
         "skinrig.import/1",
         select_attributes(done, "path", "frames", "assumed", "states", "ignored"),
@@ -82,21 +84,23 @@ def import_mesh(
     session
         Session that gets the mesh.
     out
-        New folder for a copy, where it is closed.
+        New folder for a copy of the session; required if the session is closed.
     unit
-        Unit of the file: mm, cm, m or inch.
+        Length unit of the file: mm, cm, m or inch.
     """
     from capture.importers.meshes import import_mesh as bring_in
 
     console = Console(json)
     done = bring_in(file, session=session, out=out, unit=unit)
     size = " x ".join(f"{side:.0f}" for side in done.extent_mm)
-    console.say(
+    console.print_line(
         f"{done.path}: {done.vertices} vertices, {done.faces} triangles, {size} mm, "
         f"{'with' if done.has_uv else 'without'} texture coordinates"
     )
     after = f"reconstruct {shell_quote(done.path)} --want normals --out appearance"
-    console.say(f"next: skinrig {after if done.reopened else f'verify {shell_quote(done.path)}'}")
+    console.print_line(
+        f"next: skinrig {after if done.reopened else f'verify {shell_quote(done.path)}'}"
+    )
     console.document(
         "skinrig.import/1",
         select_attributes(done, "path", "vertices", "faces", "has_uv", "extent_mm", "reopened"),
@@ -115,22 +119,23 @@ def import_lp(
     mm_per_px: float | None = None,
     json: Json = False,
 ) -> None:
-    """Turn pictures of one object under many lights, with their light list, into a session.
+    """Convert images of one object under many lights, with their light list, to a session.
 
     Example: skinrig import lp rti-folder --out session-rti
 
     Parameters
     ----------
     directory
-        Folder of pictures, one a light.
+        Folder of images, one per light.
     lights
-        .lp, list of directions, or folder of a chrome ball.
+        Light list: .lp file, list of directions, or folder of a chrome ball's images; default: the
+        .lp file of the folder.
     mask
-        Picture that is bright at the object.
+        Image that is bright at the object; default: the whole image.
     encoding
-        How 8-bit and PNG values code light: auto, sRGB or linear.
+        Transfer function of 8-bit and PNG values: auto, sRGB or linear.
     mm_per_px
-        Size of a pixel; then the list's rows are positions in mm.
+        Pixel size on the object, mm; the light list then gives positions in mm.
     """
     from capture.importers import import_light_list
 
@@ -144,8 +149,10 @@ def import_lp(
         mm_per_px=mm_per_px,
     )
     console.each("assumed", done.assumed)
-    console.say(f"{done.path}: {format_count(done.frames, 'picture')}, lights of {done.lights}")
-    console.say(
+    console.print_line(
+        f"{done.path}: {format_count(done.frames, 'picture')}, lights of {done.lights}"
+    )
+    console.print_line(
         f"next: skinrig reconstruct {shell_quote(out)} --want normals,albedo --out appearance"
     )
     console.document(

@@ -1,4 +1,4 @@
-"""The commands that choose plans, one a rig."""
+"""`skinrig plan`: minimal acquisitions for required errors, one command per rig."""
 
 import json as json_text
 from dataclasses import dataclass
@@ -18,20 +18,20 @@ from skinrig.unit_format import format_quantity
 plan_app = typer.Typer(
     cls=RigGroup,
     subcommand_metavar="RIG [ARGS]...",
-    help="Choose the smallest plan that reaches an error, and say what it leaves out.",
+    help="Choose the smallest plan that reaches given errors, and list what it omits.",
 )
 
 
 def _want(example: str) -> typer.models.OptionInfo:
     """Return the option --want of a rig."""
     return option(
-        f"Medians that must be reached: {example}. Empty: what the whole rig, or --forecast, "
-        "will give."
+        f"Median errors to reach: {example}; default: forecast the errors of the complete rig, "
+        "or of --forecast."
     )
 
 
 PlanWidth = Annotated[
-    int | None, option("Pixels across the cameras; default: the rig's own.", "--width")
+    int | None, option("Image width of the cameras, pixels; default: the rig's own.", "--width")
 ]
 
 
@@ -42,15 +42,15 @@ class PlanOptions:
     Attributes
     ----------
     valid_share
-        Of what the whole rig gives an estimate, so much must keep it.
+        Minimum fraction of the complete rig's valid pixels that stay valid, above 0 to 1.
     forecast
-        A plan, JSON: say what it will give instead.
+        Forecast the errors of this plan file, JSON, instead of choosing a plan.
     confirm
-        Folder: simulate the plan, reconstruct, and compare with the forecast.
+        Simulate and reconstruct the plan in this folder, and compare with the forecast.
     seed
-        Seed of the face.
+        Random seed of the simulated face.
     out
-        File for the plan, JSON.
+        Plan file to write, JSON; default: print only.
     """
 
     subject: Subject = "III"
@@ -70,7 +70,7 @@ def plan_dome(
     width: PlanWidth = None,
     most_lights: int | None = None,
 ) -> None:
-    """Choose the dome's lights and cameras that reach an error, and say what is left out.
+    """Choose the fewest lights and cameras of the dome that reach given errors.
 
     Example: skinrig plan dome --want "normals<=1deg,r_d<=3%" --out plan.json
 
@@ -79,7 +79,7 @@ def plan_dome(
     Parameters
     ----------
     most_lights
-        No more lights than these.
+        Maximum number of lights; default: all.
     """
     _plan("dome", common, want, width, most_lights)
 
@@ -91,7 +91,7 @@ def plan_flash(
     want: Annotated[str, _want("melanin<=12%,hemoglobin<=25%")] = "",
     width: PlanWidth = None,
 ) -> None:
-    """Choose the flash rig's pairs and powers that reach an error, and say what is left out.
+    """Choose the fewest image pairs and flash powers of the flash rig that reach given errors.
 
     Example: skinrig plan flash --want "melanin<=12%,hemoglobin<=25%" --subject II
     """
@@ -103,7 +103,7 @@ def plan_flash(
 def plan_gradient(
     common: PlanOptions, want: Annotated[str, _want("normals<=2deg")] = "", width: PlanWidth = None
 ) -> None:
-    """Choose the gradient sphere's scan that reaches an error, and say what is left out.
+    """Choose the shortest scan of the gradient sphere that reaches given errors.
 
     Example: skinrig plan gradient --want "normals<=2.5deg" --out plan.json
     """
@@ -113,7 +113,7 @@ def plan_gradient(
 @plan_app.command("probe", cls=RigCommand)
 @command
 def plan_probe(common: PlanOptions, want: Annotated[str, _want("sigma_tr<=3%")] = "") -> None:
-    """Choose the probe's sites, placements and brackets that reach an error.
+    """Choose the fewest sites, placements and brackets of the probe that reach given errors.
 
     Example: skinrig plan probe --want "sigma_tr<=4%" --out plan.json
     """
@@ -127,7 +127,7 @@ def _plan(
     width: int | None = None,
     most_lights: int | None = None,
 ) -> None:
-    """Choose a plan, print it, and write it."""
+    """Choose a plan, print its forecast and write it."""
     from skinrig.planning.plans import choose, format_choice
     from skinrig.simulating.subject_records import find_unused_subject_keys
 
@@ -135,13 +135,14 @@ def _plan(
     subject, seed = common.subject, common.seed
     if not 0 < common.valid_share <= 1:
         raise errors.UnusableError(
-            f"--valid-share: got {common.valid_share:g}, expected above 0, up to 1"
+            f"--valid-share: got {common.valid_share:g}, expected above 0 and at most 1; give 0.9, "
+            "for example"
         )
     unused = find_unused_subject_keys(subject, rig, console.progress)
     asked = select_attributes(common, "subject", "seed", "valid_share", "forecast")
     choice = choose(rig, want, width_px=width, most_lights=most_lights, **asked)
     for line in format_choice(choice):
-        console.say(line)
+        console.print_line(line)
     document = choice.to_document()
     if unused:
         document["subject_unused"] = list(unused)
@@ -154,14 +155,14 @@ def _plan(
         )
         document["confirmation"] = found
         for row in found:
-            console.say(
+            console.print_line(
                 f"measured: {row['name']}"
                 f" {format_quantity(format(row['median'], '.3g'), row['unit'])}, "
                 f"{'within' if row['within'] else 'OUTSIDE'} the forecast's interval"
             )
     if (out := common.out) is not None:
         write_atomically(out, json_text.dumps(choice.plan.to_json(), indent=1) + "\n")
-        console.say(f"next: skinrig capture {rig} --plan {shell_quote(out)} --out session")
+        console.print_line(f"next: skinrig capture {rig} --plan {shell_quote(out)} --out session")
     console.document(document.pop("schema"), document)
     if not reached:
         raise typer.Exit(errors.LIMIT_MISSED)

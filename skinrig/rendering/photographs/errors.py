@@ -365,7 +365,7 @@ class Comparison:
 def print_comparison(console: Console, record: Mapping[str, Any]) -> None:
     """Print a record of `evaluate_folders`."""
     for assumption in record["assumed"]:
-        console.say(f"assumed: {assumption}")
+        console.print_line(f"assumed: {assumption}")
     full = record[FULL_MODEL]
     held_out = {f"{name} held out": row for name, row in record["by_kind"].items()}
     rows = {FULL_MODEL: full, **held_out, **record["ablation"]}
@@ -378,12 +378,12 @@ def print_comparison(console: Console, record: Mapping[str, Any]) -> None:
         ],
     )
     for band, row in record["by_band"].items():
-        console.say(f"{band} skin: {100 * row['median']:.2f} %, {row['pixels']} pixels")
+        console.print_line(f"{band} skin: {100 * row['median']:.2f} %, {row['pixels']} pixels")
     word = "kept" if record["passed"] else "MISSED"
-    console.say(
+    console.print_line(
         f"{word}: median relative error of the luminance on lit pixels: "
         f"{100 * full['median']:.2f} % (< {100 * record['limit']:g}); noise alone makes "
         f"{100 * full['noise']:.2f} %"
     )
-    console.say(f"{record['out']}: {', '.join(record['files'])}, {record['seconds']:.1f} s")
+    console.print_line(f"{record['out']}: {', '.join(record['files'])}, {record['seconds']:.1f} s")
     console.document(record["schema"], {k: v for k, v in record.items() if k != "schema"})
