@@ -76,18 +76,18 @@ def suggest_after_session(
     Examples
     --------
     >>> suggest_after_session("flash", "session-flash", None)
-    'skinrig reconstruct session-flash --want melanin,hemoglobin --out appearance'
+    'skinrig reconstruct session-flash --maps melanin,hemoglobin --out appearance'
     >>> suggest_after_session("probe", "session-phantom", "phantom")
     'skinrig calibrate fibre session-phantom --out calibration'
     """
     place, store = shell_quote(session), shell_quote(calibration)
     if target == "sequence":
-        return f"skinrig reconstruct {place} --want perfusion_curves --out appearance"
+        return f"skinrig reconstruct {place} --maps perfusion_curves --out appearance"
     if not target:
         calibrated = rig in DEFAULT_WANTS and rig not in UNCALIBRATED_RIGS
         needs = f" --calibration {store}" if calibrated else ""
         want = DEFAULT_WANTS.get(rig, DEFAULT_WANTS["photographs"])
-        return f"skinrig reconstruct {place} --want {want}{needs} --out appearance"
+        return f"skinrig reconstruct {place} --maps {want}{needs} --out appearance"
     kind = CALIBRATION_BY_TARGET.get(rig, {}).get(target)
     if kind is None:
         return f"skinrig verify {place}"

@@ -203,7 +203,7 @@ class ReliefEvaluator:
         if max(pixels_um) > (1.0 + PIXEL_SIZE_TOL) * min(pixels_um):
             raise ApplyError(
                 f"sites: reliefs with pixels of {sorted(pixels_um)} um, expected one size; "
-                "choose one with --site"
+                "choose one with --relief-site"
             )
         rng, scale = np.random.default_rng(asked.seed), _scale(self.mesh)
         shape = f"{asked.size_px} x {asked.size_px}"
@@ -323,7 +323,7 @@ def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> Float64Array | None:
     if unknown:
         raise ApplyError(
             f"sites: no region is known for {unknown[0]!r}, expected {', '.join(SITE_REGIONS)}; "
-            "choose one with --site"
+            "choose one with --relief-site"
         )
     atlas = _atlas(mesh)
     masks = region_masks(to_mean_head(atlas.position_mm, _face(mesh)))

@@ -6,7 +6,7 @@ from typing import Annotated, Any, get_args
 import typer
 
 from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Json, Out, command, option
+from skinrig.commands.options import Json, Out, choice, command, option
 from skinrig.console import Console
 from skinrig.errors import UnusableError, UsageError, one_of
 
@@ -28,9 +28,9 @@ def analyse_brdf(
     *,
     out: Out,
     labels: Labels = None,
-    basis: Path | None = None,
+    merl_basis: Path | None = None,
     points: int | None = None,
-    method: str = "shares",
+    method: Annotated[str, choice("shares", "brdf")] = "shares",
     seed: int = 0,
     json: Json = False,
 ) -> None:
@@ -46,7 +46,7 @@ def analyse_brdf(
     ----------
     appearances
         APPEARANCE/ folders of dome sessions with basis BRDFs; none: simulated faces.
-    basis
+    merl_basis
         Folder of the MERL tables used in the reconstruction; default: built-in materials.
     points
         Texels per measured face, default 2000; simulated: points of the single subject and of the
@@ -65,11 +65,11 @@ def analyse_brdf(
     console = Console(json)
     if appearances:
         each = points or analysing_brdf.N_POINTS_PER_FACE
-        given: dict[str, Any] = {"labels": labels, "basis": basis, "method": how, "seed": seed}
+        given: dict[str, Any] = {"labels": labels, "basis": merl_basis, "method": how, "seed": seed}
         found = analysing_brdf.analyze_measured(out, appearances, points_each=each, **given)
-    elif labels is not None or basis is not None:
+    elif labels is not None or merl_basis is not None:
         raise UsageError(
-            "--labels, --basis: apply to measured faces only; name APPEARANCE/ folders"
+            "--labels, --merl-basis: apply to measured faces only; name APPEARANCE/ folders"
         )
     else:
         some = points or analysing_brdf.N_POINTS_PER_DATASET

@@ -11,7 +11,7 @@ import typer
 from skinrig import errors
 from skinrig.commands import options
 from skinrig.commands.help import RigCommand, RigFileGroup
-from skinrig.commands.options import command, option, target_option
+from skinrig.commands.options import choice, command, target_option
 from skinrig.console import Console, format_count, select_attributes
 
 if TYPE_CHECKING:
@@ -28,9 +28,7 @@ serve_app = typer.Typer(
     help="Serve a simulated rig, given by name or TOML file, to any client.",
 )
 
-Eyes = Annotated[
-    str, option("State of the subject's eyes under LEDs: open, closed or shielded.", "--eyes")
-]
+Eyes = Annotated[str, choice("open", "closed", "shielded")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +38,7 @@ class CaptureOptions:
     Attributes
     ----------
     out
-        SESSION/ folder to write; required except with --dry-run.
+        SESSION/ folder to write; without it, the plan is only printed.
     plan
         Plan file, JSON; default: the rig's own plan.
     subject
@@ -118,6 +116,11 @@ def capture_dome(
     """Capture with a dome: a face under one light at a time (OLAT), or a target.
 
     Example: skinrig capture dome --dry-run
+
+    Parameters
+    ----------
+    eyes
+        State of the subject's eyes under LEDs.
     """
     from skinrig.capturing.option_values import parse_eye_state
 
@@ -141,8 +144,10 @@ def capture_gradient(
 
     Parameters
     ----------
+    eyes
+        State of the subject's eyes under LEDs.
     force_limit
-        Maximum force of the caliper on this skin, N; required for skin.
+        Maximum force of the caliper on this skin, N; required with a caliper.
     """
     from skinrig.capturing.option_values import parse_eye_state, parse_floats, parse_range
 
@@ -204,6 +209,8 @@ class ServeOptions:
         Serve each controller on a pseudo terminal.
     tcp
         Address of cameras and, without --pty, of controllers; port 0: any free port.
+    scale
+        Scale of the simulation: small (quick) or full (all of the rig); gradient: small only.
     allow_remote
         Accept connections from other machines.
     resume
@@ -215,7 +222,7 @@ class ServeOptions:
     tcp: str = "127.0.0.1:0"
     allow_remote: bool = False
     subject: options.Subject = "III"
-    size: options.Size = "small"
+    scale: options.Scale = "small"
     seed: options.Seed = 0
     resume: Path | None = None
     json: options.Json = False
@@ -268,8 +275,8 @@ def _serve(context: typer.Context, common: ServeOptions, site: str | None = None
     """Serve a simulated rig until interrupted."""
     from skinrig.simulating.serving import ServeOrder, serve_rig
 
-    options = ("pty", "tcp", "allow_remote", "subject", "size", "seed", "resume")
-    order = ServeOrder(site=site, **select_attributes(common, *options))
+    options = ("pty", "tcp", "allow_remote", "subject", "seed", "resume")
+    order = ServeOrder(site=site, size=common.scale, **select_attributes(common, *options))
     serve_rig(str(context.info_name), order, Console(common.json))
 
 

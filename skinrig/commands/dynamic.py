@@ -12,7 +12,7 @@ import typer
 
 from reconstruction.correspondence import landmark_table
 from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Json, NewMaps, command
+from skinrig.commands.options import Json, NewMaps, choice, command
 from skinrig.console import Console, select_attributes
 from skinrig.errors import UsageError, one_of
 from skinrig.next_steps import shell_quote
@@ -102,7 +102,7 @@ def fit_wrinkles(
     /,
     out: NewMaps,
     mask: list[Path] | None = None,
-    size: int = 256,
+    size_px: int = 256,
     mask_size: int = 64,
     seed: int = 0,
     json: Json = False,
@@ -117,7 +117,7 @@ def fit_wrinkles(
         APPEARANCE/ folders of dome sessions: the neutral face and expressions as STATE=FOLDER.
     mask
         RGBA image of four zones; give twice for eight; default: zones are estimated.
-    size
+    size_px
         Width and height of the wrinkle map, texels.
     mask_size
         Width and height of estimated zone masks, texels.
@@ -128,7 +128,7 @@ def fit_wrinkles(
     from skinrig.fitting.wrinkles import summarize_expressions, zone_names
 
     console = Console(json)
-    found = fit(appearances, out=out, masks=mask, size=size, mask_size=mask_size, seed=seed)
+    found = fit(appearances, out=out, masks=mask, size=size_px, mask_size=mask_size, seed=seed)
     console.rows(("expression", *zone_names(found).values()), summarize_expressions(found))
     console.print_line(
         f"{out}: wrinkles explain {100 * found.fit.explained:.0f} % of normal differences"
@@ -181,9 +181,9 @@ class ReliefOptions:
 
     Attributes
     ----------
-    size
+    size_px
         Width and height of the displacement map, pixels.
-    site
+    relief_site
         Site whose microrelief is used; default: the first one fitted.
     synthesize
         Neutral relief: patches (measured texture, synthesized) or noise (procedural, 3D).
@@ -193,10 +193,10 @@ class ReliefOptions:
         Random seed of the synthesized relief.
     """
 
-    size: int = 4096
-    site: str | None = None
-    synthesize: str = "patches"
-    extrapolate: str = "hold"
+    size_px: int = 4096
+    relief_site: str | None = None
+    synthesize: Annotated[str, choice("patches", "noise")] = "patches"
+    extrapolate: Annotated[str, choice("hold", "formula")] = "hold"
     seed: int = 0
 
     def relief(
@@ -211,8 +211,8 @@ class ReliefOptions:
         """Return the options as a request."""
         from skinrig.applying.relief import ReliefRequest
 
-        given = select_attributes(self, "site", "extrapolate", "seed")
-        return ReliefRequest(size_px=self.size, source=self.synthesize, **given)
+        given = select_attributes(self, "size_px", "extrapolate", "seed")
+        return ReliefRequest(site=self.relief_site, source=self.synthesize, **given)
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,7 +231,7 @@ class ExpressionOptions:
         Redden the whole face for anger, pale it for fear.
     gain
         Factor of the blood volume fraction.
-    onto
+    target_face
         Target face: APPEARANCE/ folder with hemoglobin and melanin; default: the fitted face.
     landmarks
         CSV table name,x,y: first of the fitted face, then of the target face.
@@ -239,10 +239,10 @@ class ExpressionOptions:
 
     parts: str | None = None
     normalize: bool = False
-    clamp: str = "unit"
+    clamp: Annotated[str, choice("unit", "signed")] = "unit"
     emotional: bool = False
     gain: float = 1.0
-    onto: Path | None = None
+    target_face: Path | None = None
     landmarks: list[Path] | None = None
 
     def expression(self, weights: Mapping[str, float]) -> ExpressionRequest:
@@ -255,7 +255,7 @@ class ExpressionOptions:
             clamp=one_of("--clamp", self.clamp, ("unit", "signed")),
             emotional=self.emotional,
             gain=self.gain,
-            onto=_read_target_face(self.onto, self.landmarks or []),
+            onto=_read_target_face(self.target_face, self.landmarks or []),
         )
 
 
@@ -346,7 +346,7 @@ def _read_target_face(onto: Path | None, landmarks: list[Path]) -> TargetFace | 
 
     if onto is None:
         if landmarks:
-            raise UsageError("--landmarks: applies to a target face only; add --onto")
+            raise UsageError("--landmarks: applies to a target face only; add --target-face")
         return None
     if len(landmarks) not in (0, 2):
         raise UsageError(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 from skinrig.commands.analysing import Labels
 from skinrig.commands.dynamic import print_fit
-from skinrig.commands.options import Json, NewMaps, Out, Seed, command, option
+from skinrig.commands.options import Json, NewMaps, Out, Seed, choice, command, option
 from skinrig.console import Console, select_attributes
 from skinrig.errors import UsageError, one_of
 from skinrig.next_steps import shell_quote
@@ -62,7 +62,7 @@ class EditOptions:
     spots: str | None = None
     parts: str | None = None
     landmarks: Path | None = None
-    basis: MerlFolder = None
+    merl_basis: MerlFolder = None
     iterations: int = 5
     seed: Seed = 0
 
@@ -75,7 +75,8 @@ class EditOptions:
             traits=parse_amounts(_split_names(self.trait), "--trait"),
             parts=parse_names(self.parts),
             spots=parse_spots(self.spots),
-            **select_attributes(self, "region", "mask", "landmarks", "basis", "iterations", "seed"),
+            basis=self.merl_basis,
+            **select_attributes(self, "region", "mask", "landmarks", "iterations", "seed"),
         )
 
 
@@ -117,10 +118,10 @@ def fit_traits(
     labels: Path,
     out: Path,
     landmarks: LandmarkFolder = None,
-    vectors: str = "quantiles",
-    contrast: str = "means",
-    size: CommonSize = None,
-    basis: MerlFolder = None,
+    vectors: Annotated[str, choice("quantiles", "histograms")] = "quantiles",
+    contrast: Annotated[str, choice("means", "regression")] = "means",
+    size_px: CommonSize = None,
+    merl_basis: MerlFolder = None,
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
@@ -153,8 +154,8 @@ def fit_traits(
         landmarks=landmarks,
         vectors=one_of("--vectors", vectors, get_args(VectorKind)),
         contrast=one_of("--contrast", contrast, get_args(Contrast)),
-        size=size,
-        basis=basis,
+        size=size_px,
+        basis=merl_basis,
         seed=seed,
         progress=console.progress,
     )
@@ -185,7 +186,7 @@ def analyse_albedo(
     labels: Labels = None,
     landmarks: LandmarkFolder = None,
     people: int = 87,
-    size: CommonSize = None,
+    size_px: CommonSize = None,
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
@@ -209,7 +210,7 @@ def analyse_albedo(
             appearances,
             labels=labels,
             landmarks=landmarks,
-            size=size,
+            size=size_px,
             progress=console.progress,
         )
     elif labels is not None or landmarks is not None:

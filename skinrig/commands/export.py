@@ -3,9 +3,9 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
-from skinrig.commands.options import Json, Out, command
+from skinrig.commands.options import Json, Out, choice, command
 from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import UnusableError, one_of
 from skinrig.exporting.options import ExportSettings, SkinPosition
@@ -21,6 +21,13 @@ NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
     "lp": "skinrig import lp DIR --out SESSION reads the folder back",
 }
 """Next step after an export, by format."""
+
+
+FORMATS: Final = (
+    *("maps", "mtlx", "gltf", "usd", "spectral", "metahuman", "merl", "rgl"),
+    *("mhl", "frames", "lp", "stokes", "event-model"),
+)
+"""Formats of appearances, then of sessions; the writers are imported with the chosen one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +48,7 @@ class DeliveryOptions:
         Names to export: maps (maps), up to three states (metahuman), states (stokes).
     mesh
         Mesh with the maps' texture coordinates and blend shapes, mm.
-    onto
+    target_face
         Target face: APPEARANCE/ folder of a dome session whose texture gets the colors
         (metahuman).
     landmarks
@@ -49,13 +56,13 @@ class DeliveryOptions:
         (metahuman).
     """
 
-    unit: str | None = None
-    normal_y: str = "gl"
-    udim: str = "none"
+    unit: Annotated[str | None, choice("m", "cm", "mm")] = None
+    normal_y: Annotated[str, choice("gl", "dx")] = "gl"
+    udim: Annotated[str, choice("none", "dot", "underscore")] = "none"
     with_errors: bool = False
     only: str | None = None
     mesh: Path | None = None
-    onto: Path | None = None
+    target_face: Path | None = None
     landmarks: list[Path] | None = None
 
     @property
@@ -65,9 +72,13 @@ class DeliveryOptions:
 
     def delivery(self, **more: Any) -> ExportSettings:
         """Return the options as settings of an export, with `more` of them."""
-        same = select_attributes(self, "unit", "normal_y", "udim", "with_errors", "mesh", "onto")
+        same = select_attributes(self, "unit", "normal_y", "udim", "with_errors", "mesh")
         return ExportSettings(
-            only=self.names, landmarks=tuple(self.landmarks or ()), **same, **more
+            only=self.names,
+            onto=self.target_face,
+            landmarks=tuple(self.landmarks or ()),
+            **same,
+            **more,
         )
 
 
@@ -101,7 +112,7 @@ def export(
     source: Path,
     /,
     *,
-    to: str,
+    to: Annotated[str, choice(*FORMATS, metavar="FORMAT")],
     out: Out,
     use: str | None = None,
     how: DeliveryOptions,

@@ -1,11 +1,14 @@
 """Help and command-line parsing: sections of commands, commands per rig, types of options."""
 
 import re
-from collections.abc import Iterable, Iterator
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from copy import copy
 from typing import Any, Final, cast
 
 from typer.core import TyperCommand, TyperGroup
 
+from skinrig.commands.renamed_options import format_notice, renamed_options_of, replace_former_names
 from skinrig.errors import UnusableError, UsageError
 
 HELP_SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
@@ -29,7 +32,31 @@ _TYPE_LABELS: Final = (
 
 
 class Command(TyperCommand):
-    """A command whose help labels types of values without Python's names."""
+    """A command that accepts former option names; its help hides Python's type names."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Replace former names of options, each with a notice on stderr, and parse."""
+        if not ctx.resilient_parsing:
+            renamed = _renamed(self, ctx.parent)
+            args, found = replace_former_names(args, renamed, _options(self))
+            for former in found:
+                print(format_notice(former, renamed[former]), file=sys.stderr, flush=True)
+        return super().parse_args(ctx, args)
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the parameters; for completion, those of renamed options also by former name."""
+        params = super().get_params(ctx)
+        if not ctx.resilient_parsing:
+            return params
+        former_by_present: dict[str, list[str]] = {}
+        for former, present in _renamed(self, ctx.parent).items():
+            former_by_present.setdefault(present, []).append(former)
+        return [_with_names(param, former_by_present) for param in params]
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
+        """Complete names of options; former names are not offered."""
+        renamed = _renamed(self, ctx.parent)
+        return [one for one in super().shell_complete(ctx, incomplete) if one.value not in renamed]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write arguments and options; repeatable ones with the type of a single value."""
@@ -107,7 +134,11 @@ class RigCommand(Command):
         except Exception as error:  # Typer does not export the class of unknown options
             option = getattr(error, "option_name", None)
             group = ctx.parent.command.commands if option and ctx.parent else {}
-            others = [rig for rig, command in group.items() if option in _options(command)]
+            others = [
+                rig
+                for rig, command in group.items()
+                if option in _options(command) or option in _renamed(command, ctx.parent)
+            ]
             if not others:
                 raise
             raise UsageError(
@@ -123,7 +154,9 @@ class RigGroup(Subcommands):
         """Move the rig in front of the options, where Typer expects a command."""
         options: dict[str, Any] = {}
         for command in self.commands.values():
-            options |= _options(command)
+            own = _options(command)
+            former = renamed_options_of(self.name, command.name)
+            options |= own | {old: own[new] for old, new in former.items()}
         place = 0
         while place < len(args) and args[place].startswith("-"):
             option = options.get(args[place])
@@ -164,6 +197,22 @@ def _options(command: Any) -> dict[str, Any]:
     return {
         name: option for option in command.params for name in (*option.opts, *option.secondary_opts)
     }
+
+
+def _renamed(command: Any, parent: Any) -> Mapping[str, str]:
+    """Return the renamed options of a command, below the context of its group or the root."""
+    is_nested = parent is not None and parent.parent is not None
+    return renamed_options_of(parent.command.name if is_nested else None, command.name)
+
+
+def _with_names(param: Any, further: Mapping[str, Iterable[str]]) -> Any:
+    """Return a parameter that also has further names, listed by one of its own."""
+    names = [name for own in param.opts for name in further.get(own, ())]
+    if not names:
+        return param
+    named = copy(param)
+    named.opts = [*param.opts, *names]
+    return named
 
 
 def summary(command: Any) -> str:

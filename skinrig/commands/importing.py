@@ -1,11 +1,12 @@
 """`skinrig import`: sessions from photographs, meshes and light lists."""
 
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
 from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Consent, ConsentExpires, Json, Out, command
+from skinrig.commands.options import Consent, ConsentExpires, Json, Out, choice, command
 from skinrig.console import Console, format_count, select_attributes
 from skinrig.next_steps import shell_quote
 
@@ -55,7 +56,7 @@ def import_photos(
     if done.color_states:
         shown = "neutral" if "neutral" in done.color_states else done.color_states[0]
         state = "" if shown == "neutral" else f" --state {shown}"
-        after = f"reconstruct {place} --want melanin,hemoglobin --out appearance{state}"
+        after = f"reconstruct {place} --maps melanin,hemoglobin --out appearance{state}"
     else:
         console.print_line(
             "left out: melanin and hemoglobin: they need color images, not grayscale"
@@ -71,7 +72,12 @@ def import_photos(
 @import_app.command("mesh", cls=Command)
 @command
 def import_mesh(
-    file: Path, /, session: Path, out: Path | None = None, unit: str = "mm", json: Json = False
+    file: Path,
+    /,
+    session: Path,
+    out: Path | None = None,
+    unit: Annotated[str, choice("mm", "cm", "m", "inch")] = "mm",
+    json: Json = False,
 ) -> None:
     """Attach a scanned mesh to a session.
 
@@ -97,7 +103,7 @@ def import_mesh(
         f"{done.path}: {done.vertices} vertices, {done.faces} triangles, {size} mm, "
         f"{'with' if done.has_uv else 'without'} texture coordinates"
     )
-    after = f"reconstruct {shell_quote(done.path)} --want normals --out appearance"
+    after = f"reconstruct {shell_quote(done.path)} --maps normals --out appearance"
     console.print_line(
         f"next: skinrig {after if done.reopened else f'verify {shell_quote(done.path)}'}"
     )
@@ -115,7 +121,7 @@ def import_lp(
     out: Out,
     lights: Path | None = None,
     mask: Path | None = None,
-    encoding: str = "auto",
+    encoding: Annotated[str, choice("auto", "sRGB", "linear")] = "auto",
     mm_per_px: float | None = None,
     json: Json = False,
 ) -> None:
@@ -128,10 +134,10 @@ def import_lp(
     directory
         Folder of images, one per light.
     lights
-        Light list: .lp file, list of directions, or folder of a chrome ball's images; default: the
-        .lp file of the folder.
+        Light list: .lp file, list of directions, or folder of a chrome ball's images; default:
+        found in the folder.
     mask
-        Image that is bright at the object; default: the whole image.
+        Image that is bright at the object; default: the folder's *mask* file, else the whole image.
     encoding
         Transfer function of 8-bit and PNG values: auto, sRGB or linear.
     mm_per_px
@@ -153,7 +159,7 @@ def import_lp(
         f"{done.path}: {format_count(done.frames, 'picture')}, lights of {done.lights}"
     )
     console.print_line(
-        f"next: skinrig reconstruct {shell_quote(out)} --want normals,albedo --out appearance"
+        f"next: skinrig reconstruct {shell_quote(out)} --maps normals,albedo --out appearance"
     )
     console.document(
         "skinrig.import/1",

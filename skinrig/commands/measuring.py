@@ -27,7 +27,7 @@ def bench(
     /,
     stage: Annotated[list[str] | None, typer.Option(autocompletion=completion.stages)] = None,
     budget: Annotated[float | None, typer.Option(show_default=False)] = None,
-    toy: bool = False,
+    smoke: bool = False,
     extremes: bool = False,
     out: Path | None = None,
     json: Json = False,
@@ -46,7 +46,7 @@ def bench(
 
     Parameters
     ----------
-    toy
+    smoke
         Run the smallest sizes only, without limits.
     extremes
         Run stiff and extreme cases instead of stages.
@@ -62,8 +62,8 @@ def bench(
     console = Console(json)
     # --stage takes one word only, so the names that follow it arrive as arguments
     stages = [*(stage or ()), *(more or ())] or None
-    if extremes and (toy or budget is not None):
-        what = "--toy" if toy else "--budget"
+    if extremes and (smoke or budget is not None):
+        what = "--smoke" if smoke else "--budget"
         raise errors.UsageError(f"{what}: not an option of --extremes; remove it")
     budget = BUDGET_S if budget is None else budget
     if not budget > 0:
@@ -80,7 +80,7 @@ def bench(
     else:
         from skinrig.benchmarks.stages import run_stages
 
-        document = run_stages(stages, budget_s=budget, toy=toy, out=out, console=console)
+        document = run_stages(stages, budget_s=budget, toy=smoke, out=out, console=console)
         if out is not None:
             bench_table.write(document, out)
     console.document(document.pop("schema"), document)

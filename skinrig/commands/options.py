@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type
 import typer
 
 from skinrig.commands import completion
-from skinrig.errors import UnusableError, UsageError
+from skinrig.errors import UnusableError, UsageError, one_of
 
 if TYPE_CHECKING:
     from skinrig.capturing.sequences import SequenceOrder
@@ -22,6 +22,27 @@ if TYPE_CHECKING:
 def option(text: str, *names: str, **settings: Any) -> Any:
     """Return an option of Typer; without names, it is named after its parameter."""
     return typer.Option(*names, help=text, **settings)
+
+
+def choice(*values: str, metavar: str | None = None) -> Any:
+    """Return an option with a closed set of values: shown in help, completed and checked.
+
+    Parameters
+    ----------
+    values
+        Valid values; any other raises `UnusableError`, which lists them.
+    metavar
+        Label of the value in help; None: the values.
+    """
+
+    def check(parameter: typer.CallbackParam, value: str | None) -> str | None:
+        return None if value is None else one_of(parameter.opts[0], value, values)
+
+    return typer.Option(
+        metavar=metavar or f"[{'|'.join(values)}]",
+        callback=check,
+        autocompletion=lambda incomplete: completion.filter_by_prefix(values, incomplete),
+    )
 
 
 Json = Annotated[bool, option("Print exactly one JSON document on stdout.", "--json")]
@@ -70,9 +91,7 @@ Subject = Annotated[
         autocompletion=completion.subjects,
     ),
 ]
-Size = Annotated[
-    str, option("Scale of the simulation: small or full.", autocompletion=completion.sizes)
-]
+Scale = Annotated[str, choice("small", "full")]
 Width = Annotated[int | None, option("Image width, pixels; default: that of the scale.")]
 Resume = Annotated[bool, option("Continue an interrupted session.", "--resume")]
 Site = Annotated[

@@ -22,8 +22,8 @@ plan_app = typer.Typer(
 )
 
 
-def _want(example: str) -> typer.models.OptionInfo:
-    """Return the option --want of a rig."""
+def _goals_option(example: str) -> typer.models.OptionInfo:
+    """Return the option --goals of a rig."""
     return option(
         f"Median errors to reach: {example}; default: forecast the errors of the complete rig, "
         "or of --forecast."
@@ -41,7 +41,7 @@ class PlanOptions:
 
     Attributes
     ----------
-    valid_share
+    min_valid_fraction
         Minimum fraction of the complete rig's valid pixels that stay valid, above 0 to 1.
     forecast
         Forecast the errors of this plan file, JSON, instead of choosing a plan.
@@ -54,7 +54,7 @@ class PlanOptions:
     """
 
     subject: Subject = "III"
-    valid_share: float = 0.9
+    min_valid_fraction: float = 0.9
     forecast: Path | None = None
     out: Annotated[Path | None, typer.Option("--out", callback=check_output_file)] = None
     confirm: Path | None = None
@@ -66,66 +66,70 @@ class PlanOptions:
 @command
 def plan_dome(
     common: PlanOptions,
-    want: Annotated[str, _want("normals<=1deg,r_d<=3%")] = "",
+    goals: Annotated[str, _goals_option("normals<=1deg,r_d<=3%")] = "",
     width: PlanWidth = None,
-    most_lights: int | None = None,
+    max_lights: int | None = None,
 ) -> None:
     """Choose the fewest lights and cameras of the dome that reach given errors.
 
-    Example: skinrig plan dome --want "normals<=1deg,r_d<=3%" --out plan.json
+    Example: skinrig plan dome --goals "normals<=1deg,r_d<=3%" --out plan.json
 
     Example: skinrig plan dome --forecast plan.json
 
     Parameters
     ----------
-    most_lights
+    max_lights
         Maximum number of lights; default: all.
     """
-    _plan("dome", common, want, width, most_lights)
+    _plan("dome", common, goals, width, max_lights)
 
 
 @plan_app.command("flash", cls=RigCommand)
 @command
 def plan_flash(
     common: PlanOptions,
-    want: Annotated[str, _want("melanin<=12%,hemoglobin<=25%")] = "",
+    goals: Annotated[str, _goals_option("melanin<=12%,hemoglobin<=25%")] = "",
     width: PlanWidth = None,
 ) -> None:
     """Choose the fewest image pairs and flash powers of the flash rig that reach given errors.
 
-    Example: skinrig plan flash --want "melanin<=12%,hemoglobin<=25%" --subject II
+    Example: skinrig plan flash --goals "melanin<=12%,hemoglobin<=25%" --subject II
     """
-    _plan("flash", common, want, width)
+    _plan("flash", common, goals, width)
 
 
 @plan_app.command("gradient", cls=RigCommand)
 @command
 def plan_gradient(
-    common: PlanOptions, want: Annotated[str, _want("normals<=2deg")] = "", width: PlanWidth = None
+    common: PlanOptions,
+    goals: Annotated[str, _goals_option("normals<=2deg")] = "",
+    width: PlanWidth = None,
 ) -> None:
     """Choose the shortest scan of the gradient sphere that reaches given errors.
 
-    Example: skinrig plan gradient --want "normals<=2.5deg" --out plan.json
+    Example: skinrig plan gradient --goals "normals<=2.5deg" --out plan.json
     """
-    _plan("gradient", common, want, width)
+    _plan("gradient", common, goals, width)
 
 
 @plan_app.command("probe", cls=RigCommand)
 @command
-def plan_probe(common: PlanOptions, want: Annotated[str, _want("sigma_tr<=3%")] = "") -> None:
+def plan_probe(
+    common: PlanOptions, goals: Annotated[str, _goals_option("sigma_tr<=3%")] = ""
+) -> None:
     """Choose the fewest sites, placements and brackets of the probe that reach given errors.
 
-    Example: skinrig plan probe --want "sigma_tr<=4%" --out plan.json
+    Example: skinrig plan probe --goals "sigma_tr<=4%" --out plan.json
     """
-    _plan("probe", common, want)
+    _plan("probe", common, goals)
 
 
 def _plan(
     rig: str,
     common: PlanOptions,
-    want: str,
+    goals: str,
     width: int | None = None,
-    most_lights: int | None = None,
+    max_lights: int | None = None,
 ) -> None:
     """Choose a plan, print its forecast and write it."""
     from skinrig.planning.plans import choose, format_choice
@@ -133,14 +137,21 @@ def _plan(
 
     console = Console(common.json)
     subject, seed = common.subject, common.seed
-    if not 0 < common.valid_share <= 1:
+    if not 0 < common.min_valid_fraction <= 1:
         raise errors.UnusableError(
-            f"--valid-share: got {common.valid_share:g}, expected above 0 and at most 1; give 0.9, "
-            "for example"
+            f"--min-valid-fraction: got {common.min_valid_fraction:g}, expected above 0 and at "
+            "most 1; give 0.9, for example"
         )
     unused = find_unused_subject_keys(subject, rig, console.progress)
-    asked = select_attributes(common, "subject", "seed", "valid_share", "forecast")
-    choice = choose(rig, want, width_px=width, most_lights=most_lights, **asked)
+    asked = select_attributes(common, "subject", "seed", "forecast")
+    choice = choose(
+        rig,
+        goals,
+        width_px=width,
+        most_lights=max_lights,
+        valid_share=common.min_valid_fraction,
+        **asked,
+    )
     for line in format_choice(choice):
         console.print_line(line)
     document = choice.to_document()

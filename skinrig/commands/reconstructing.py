@@ -92,12 +92,12 @@ def check_rank(rank: int | None, basis: Path | None) -> None:
 def reconstruct(
     sessions: Annotated[list[Path], typer.Argument(metavar="SESSION")],
     /,
-    want: Annotated[str, typer.Option(autocompletion=completion.complete_wants)],
+    maps: Annotated[str, typer.Option(autocompletion=completion.complete_wants)],
     out: Out,
     calibration: Path | None = None,
     state: str = "neutral",
     scan: Path | None = None,
-    basis: Path | None = None,
+    merl_basis: Path | None = None,
     landmarks: Path | None = None,
     hold_out: str | None = None,
     rank: int | None = None,
@@ -107,20 +107,19 @@ def reconstruct(
 
     Several sessions are reconstructed one by one, each into the folder OUT/NAME of its name.
 
-    Example: skinrig reconstruct session --want melanin,hemoglobin --out appearance
+    Example: skinrig reconstruct session --maps melanin,hemoglobin --out appearance
 
-    Example: skinrig reconstruct monday tuesday --want melanin --out appearances
+    Example: skinrig reconstruct monday tuesday --maps melanin --out appearances
 
     Parameters
     ----------
     calibration
-        CALIBRATION/ folder; default: nominal values, listed as assumed (required by dome, gradient
-        and probe).
+        CALIBRATION/ folder; default: nominal values, listed as assumed (flash, photographs).
     state
         Expression or condition to reconstruct.
     scan
         Face mesh, PLY in mm; default: the session's own scan (dome).
-    basis
+    merl_basis
         Folder of MERL tables for the basis BRDFs; default: built-in materials (dome).
     landmarks
         CSV table name,x,y of the sites, in pixels of the 256 x 256 face map (probe).
@@ -130,7 +129,7 @@ def reconstruct(
         Number of basis BRDFs; default 4 (dome).
     sessions
         SESSION/ folder; several are reconstructed one by one.
-    want
+    maps
         Maps to compute, separated by commas; an unknown name lists the valid ones.
     """
     from reconstruction.pipeline import recipes as pipeline
@@ -138,8 +137,8 @@ def reconstruct(
     from skinrig.appearances.state_truth import find_comparison_truth
 
     console = Console(json)
-    check_rank(rank, basis)
-    wants = [name.strip() for name in want.split(",") if name.strip()]
+    check_rank(rank, merl_basis)
+    wants = [name.strip() for name in maps.split(",") if name.strip()]
     made = []
     for session, folder in zip(sessions, assign_output_folders(sessions, out), strict=True):
         truth = find_comparison_truth(session, state)
@@ -154,7 +153,7 @@ def reconstruct(
             landmarks=landmarks,
             progress=console.progress,
             truth=truth.name if truth else "",
-            dome=DomeOptions(scan, basis, hold_out, rank),
+            dome=DomeOptions(scan, merl_basis, hold_out, rank),
         )
         console.each("assumed", done.assumed)
         console.print_line(f"run: {', '.join(done.ran) or 'nothing'}")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from skinrig import errors
-from skinrig.commands.options import Json, Out, command
+from skinrig.commands.options import Json, Out, choice, command
 from skinrig.console import Console, select_attributes
 from skinrig.errors import UnusableError, UsageError
 
@@ -38,11 +38,11 @@ class RenderOptions:
         Rig of the views and lights in --view and --light.
     calibration
         CALIBRATION/ folder; default: the rig's nominal geometry.
-    size
+    size_px
         Width of the image, pixels.
     fov
         Horizontal field of view of a camera given by its position, degrees.
-    target
+    look_at
         Point that a camera given by its position looks at, mm.
     samples
         Rays per pixel, a square number: 1, 4, 9, 16 ...
@@ -83,13 +83,13 @@ class RenderOptions:
     mesh: Path | None = None
     rig: str = "dome"
     calibration: Path | None = None
-    size: int = 512
+    size_px: int = 512
     fov: float = 25.0
-    target: str = "0,0,0"
+    look_at: str = "0,0,0"
     samples: int = 4
     shadow_samples: int = 4
     light_radius: float | None = None
-    subsurface: str = "dipole"
+    subsurface: Annotated[str, choice("dipole", "local", "none")] = "dipole"
     translucency: str | None = None
     components: bool = False
     bases: str | None = None
@@ -114,14 +114,9 @@ def render(appearance: list[Path], /, out: Out, asked: RenderOptions, json: Json
         APPEARANCE/ folder of a dome session with basis BRDFs; several with --bases.
     """
     from skinrig.rendering import figures
-    from skinrig.rendering.render import Subsurface
     from skinrig.rendering.request import parse_subpixels
 
     console = Console(json)
-    if asked.subsurface not in get_args(Subsurface):
-        raise UnusableError(
-            f"--subsurface: got {asked.subsurface!r}, expected {', '.join(get_args(Subsurface))}"
-        )
     if asked.exposure is not None and not asked.exposure > 0.0:
         raise UnusableError(
             f"--exposure: got {asked.exposure}, expected a factor above 0; raise it"
@@ -138,7 +133,7 @@ def render(appearance: list[Path], /, out: Out, asked: RenderOptions, json: Json
         _compare(appearance[0], asked.against, out, asked, console)
     elif asked.shadow_boundary:
         subject = figures.RenderModel.of(appearance[0], mesh=asked.mesh)
-        _report(console, figures.draw_shadow_boundary(subject, out, effort, size_px=asked.size))
+        _report(console, figures.draw_shadow_boundary(subject, out, effort, size_px=asked.size_px))
     else:
         _report(console, _draw(appearance, out, asked, effort))
 
@@ -174,7 +169,9 @@ def _draw(
     from skinrig.rendering.request import RenderRig, parse_lights
 
     stage = RenderRig.of(asked.rig, asked.calibration)
-    camera = stage.camera(asked.view, size_px=asked.size, target_mm=asked.target, fov_deg=asked.fov)
+    camera = stage.camera(
+        asked.view, size_px=asked.size_px, target_mm=asked.look_at, fov_deg=asked.fov
+    )
     lights = parse_lights(
         stage,
         asked.light or (),

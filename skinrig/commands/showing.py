@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from skinrig.commands import completion
 from skinrig.commands.options import STDOUT_MARK, Json, Page, check_output_file, command
 from skinrig.console import Console, select_attributes
 from skinrig.errors import UnusableError, UsageError
@@ -102,13 +103,13 @@ class HeadOptions:
         Skin type of the simulated head: I to VI, palest or darkest.
     seed
         Random seed of the simulated head.
-    size
+    size_px
         Width and height of textures, texels, 64 to 4096.
     """
 
-    preset: str = "III"
+    preset: Annotated[str, typer.Option(autocompletion=completion.subjects)] = "III"
     seed: int = 0
-    size: int = 2048
+    size_px: int = 2048
 
 
 @command
@@ -129,7 +130,7 @@ def view(
 
     Example: skinrig view demo/appearance-flash-moving-II -o face.html
 
-    Example: skinrig view demo/appearance-dome-III --size 1024 --port 0
+    Example: skinrig view demo/appearance-dome-III --size-px 1024 --port 0
 
     Parameters
     ----------
@@ -149,7 +150,7 @@ def view(
     if displacement is not None and port is None:
         raise UsageError("displacement: needs a served page; add --port 0")
     given = select_attributes(face, "mesh", "landmarks", "calibration")
-    given |= select_attributes(head, "preset", "seed", "size")
+    given |= select_attributes(head, "preset", "seed") | {"size": head.size_px}
     console.progress("making textures and tables")
     scene = faces.scene(appearance or [], **given)
     document: dict[str, Any]

@@ -46,12 +46,14 @@ class SimulateOptions:
 
     Attributes
     ----------
+    scale
+        Scale of the simulation: small (quick) or full (all of the rig).
     plan
         Plan file of `skinrig plan`, JSON; default: the rig's own plan.
     """
 
     out: options.Out
-    size: options.Size = "small"
+    scale: options.Scale = "small"
     seed: options.Seed = 0
     plan: Path | None = None
     consent: options.Consent = None
@@ -73,7 +75,7 @@ class SimulateOptions:
             person = parse_subject(name, self.consent or SIMULATED_USES, self.consent_expires)
         plan = None if self.plan is None else read_plan(self.plan)
         order = {"subject": subject, "plan": plan, "person": person, "progress": console.progress}
-        return order | select_attributes(self, "out", "size", "seed", "resume")
+        return order | select_attributes(self, "out", "seed", "resume") | {"size": self.scale}
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +88,7 @@ class SimulatedFaceOptions:
         Image width, pixels, even; default: that of the scale.
     mesh
         Face mesh, .npz or .obj; default: the built-in head.
-    leave_out
+    omit
         Effects not to simulate although they change pixels, separated by commas: lateral (or
         subsurface), interreflections, spectral, optics, relief_shadows.
     movement
@@ -96,14 +98,13 @@ class SimulatedFaceOptions:
     width: int | None = None
     mesh: Path | None = None
     movement: Annotated[bool, typer.Option("--movement/--no-movement")] = True
-    leave_out: str | None = None
+    omit: str | None = None
 
     def ordered(self) -> dict[str, Any]:
         """Return the fields that requests of faces share."""
         from skinrig.capturing.option_values import parse_names
 
-        leave_out = parse_names(self.leave_out) or ()
-        order = {"width_px": self.width, "leave_out": leave_out}
+        order = {"width_px": self.width, "leave_out": parse_names(self.omit) or ()}
         return order | select_attributes(self, "mesh", "movement")
 
 
@@ -117,7 +118,7 @@ def simulate_flash(
     target: Annotated[str | None, target_option("flash")] = None,
     repeats: options.Pairs = 1,
     state: States = None,
-    nearer: Annotated[float, typer.Option(metavar="MM")] = 0.0,
+    camera_offset_mm: float = 0.0,
     relaxation: float | None = None,
 ) -> None:
     """Simulate the flash rig: expressions of a face, a time sequence, or a target.
@@ -128,7 +129,7 @@ def simulate_flash(
     ----------
     relaxation
         Time constant of blood volume in a sequence, s; default 0.02, exercise 40, alcohol 1200.
-    nearer
+    camera_offset_mm
         Offset of the face from the white reference towards the camera, mm; negative: away.
     """
     from skinrig.simulating.orders import FlashOrder
@@ -140,7 +141,7 @@ def simulate_flash(
         target=target,
         states=tuple(state or ("neutral",)),
         repeats=repeats,
-        nearer_mm=nearer,
+        nearer_mm=camera_offset_mm,
         sequence=sequence.order(),
         relaxation_s=relaxation,
     )
@@ -223,7 +224,7 @@ def simulate_gradient(
     site: options.Site = None,
     angles: options.Angles = None,
     steps: options.Steps = None,
-    leave_out: str | None = None,
+    omit: str | None = None,
 ) -> None:
     """Simulate the gradient sphere: a patch of skin in a caliper, or a target.
 
@@ -231,7 +232,7 @@ def simulate_gradient(
 
     Parameters
     ----------
-    leave_out
+    omit
         Effects not to simulate although they change pixels, separated by commas: shadows, lateral,
         interreflections, optics.
     """
@@ -246,7 +247,7 @@ def simulate_gradient(
         site=site,
         angles=parse_floats(angles, "--angles"),
         steps=parse_range(steps, "--steps"),
-        leave_out=parse_names(leave_out) or (),
+        leave_out=parse_names(omit) or (),
     )
     _simulate(order, console, target)
 

@@ -177,7 +177,7 @@ def _measured(probe: SkinAppearance) -> dict[str, tuple[tuple[float, ...], tuple
     """Return sigma_tr and its standard error of each site by channel."""
     if SUBSURFACE_FILE not in probe.files:
         raise ProbeSiteError(
-            f"probe: has no {SUBSURFACE_FILE}; `skinrig reconstruct --want subsurface` makes it of "
+            f"probe: has no {SUBSURFACE_FILE}; `skinrig reconstruct --maps subsurface` makes it of "
             "a session of the fibre probe"
         )
     try:

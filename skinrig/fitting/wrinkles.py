@@ -181,7 +181,7 @@ def _normals(folder: Path, appearance: SkinAppearance) -> NormalMaps:
     if name is None or "position" not in maps:
         raise WrinkleInputError(
             f"{folder}: holds no normals with positions, expected a dome session reconstructed "
-            "with `skinrig reconstruct SESSION --want normals_refined`"
+            "with `skinrig reconstruct SESSION --maps normals_refined`"
         )
     normals, position = maps[name], maps["position"]
     valid = intersect_valid(normals, position)

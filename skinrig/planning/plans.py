@@ -189,7 +189,7 @@ def parse_wants(text: str, rig: str) -> dict[str, float]:
     for part in filter(str.strip, text.split(",")):
         match = _WANTED_LIMIT.fullmatch(part)
         if match is None:
-            raise PlanOptionsError(f"--want: got {part.strip()!r}, expected {known}")
+            raise PlanOptionsError(f"--goals: got {part.strip()!r}, expected {known}")
         name, number, unit = match.groups()
         if name not in units:
             close = difflib.get_close_matches(name, units, 1)
@@ -197,19 +197,19 @@ def parse_wants(text: str, rig: str) -> dict[str, float]:
             others = [other for other, gives in WANTED_UNITS.items() if name in gives]
             if others:
                 hint = f"; {name} is planned for {', '.join(others)}"
-            raise PlanningError(f"--want: got {name!r} of rig {rig!r}, expected {known}{hint}")
+            raise PlanningError(f"--goals: got {name!r} of rig {rig!r}, expected {known}{hint}")
         if unit not in (None, units[name]):
-            raise PlanOptionsError(f"--want: got {name} in {unit}, expected {units[name]}")
+            raise PlanOptionsError(f"--goals: got {name} in {unit}, expected {units[name]}")
         try:
             value = float(number)
         except ValueError:
             value = -1.0
         if not 0.0 < value < 1e6:
             raise PlanningError(
-                f"--want: got {name}<={number}{unit or ''}, expected a number above 0 and below 1e6"
+                f"--goals: got {name}<={number}{unit or ''}, expected above 0 and below 1e6"
             )
         if name in wants:
-            raise PlanOptionsError(f"--want: got {name} twice, expected it once")
+            raise PlanOptionsError(f"--goals: got {name} twice, expected it once")
         wants[name] = value
     return wants
 
@@ -292,9 +292,9 @@ def choose(
         # the gradient sphere keeps its pixels' size and gives up field, as its simulation does
         rig = rig.cropped(width_px) if rig_name == "gradient" else rig.resized(width_px)
     if most_lights is not None and most_lights < 1:
-        raise PlanningError(f"--most-lights: got {most_lights}, expected 1 or more")
+        raise PlanningError(f"--max-lights: got {most_lights}, expected 1 or more")
     if most_lights is not None and rig_name != "dome":
-        raise PlanOptionsError(f"--most-lights: is for the dome, not the {rig_name} rig")
+        raise PlanOptionsError(f"--max-lights: is for the dome, not the {rig_name} rig")
     if forecast is not None:
         plan = read_plan(forecast)
         if plan.rig != rig.name:

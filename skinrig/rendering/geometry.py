@@ -279,7 +279,7 @@ def read_own_mesh(appearance: SkinAppearance) -> Mesh:
         if name in appearance.files:
             return parse_mesh(appearance.files[name], name)
     raise GeometryError(
-        f"appearance: holds no {MESH_FILES[0]}; make it with `skinrig reconstruct SESSION --want "
+        f"appearance: holds no {MESH_FILES[0]}; make it with `skinrig reconstruct SESSION --maps "
         "normals,r_d,basis_weight_0`, or name a mesh with --mesh"
     )
 

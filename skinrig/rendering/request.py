@@ -74,7 +74,7 @@ class RenderRig:
         if place is not None:
             target = parse_triple(target_mm)
             if target is None:
-                raise UsageError(f"--target: got {target_mm!r}, expected three numbers, mm: 0,0,0")
+                raise UsageError(f"--look-at: got {target_mm!r}, expected three numbers, mm: 0,0,0")
             return rendering_camera.look_at(
                 place, target_mm=target, fov_deg=fov_deg, size_px=(size_px, size_px), name=text
             )

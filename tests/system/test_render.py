@@ -82,7 +82,7 @@ def folder(tmp_path_factory):
 
 def run(folder, monkeypatch, *words):
     monkeypatch.chdir(folder)
-    return main(["render", *words, "--size", "40"])
+    return main(["render", *words, "--size-px", "40"])
 
 
 def test_image_components_and_single_document_are_written(folder, monkeypatch, capsys):

@@ -180,7 +180,7 @@ def fit_facial_color(
         raise UnknownBloodError(
             "blood at rest: expected pixels that tell it, got a standard error of more than half "
             "of it all over the face, as of very dark skin or little light; take more light, or "
-            "melanin alone: skinrig reconstruct --want melanin"
+            "melanin alone: skinrig reconstruct --maps melanin"
         )
     tell("scale and bias maps")
     mask = {state: found.mask for state, found in blood.items()}

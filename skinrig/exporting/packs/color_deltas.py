@@ -106,7 +106,7 @@ def _colors(appearance: SkinAppearance, rig: Any, states: list[str], out: ImageF
     if out.delivery.onto is None:
         why = (
             "they lie on the flash camera's picture; name the "
-            "dome's maps with --onto, and two tables of landmarks"
+            "dome's maps with --target-face, and two tables of landmarks"
         )
         out.record_omission("colors on the face's texture", why)
         base, valid = resize_map(neutral, seen, COLOR_SIZE)
@@ -126,8 +126,8 @@ def _on_texture(
     """Return colors on another appearance's texture: its albedo, and changes carried over."""
     if delivery.onto is None or len(delivery.landmarks) != 2:
         raise ExportError(
-            f"--landmarks: got {len(delivery.landmarks)} tables, expected two with --onto: of the "
-            "flash picture, then of the texture"
+            f"--landmarks: got {len(delivery.landmarks)} tables, expected two with --target-face: "
+            "of the flash image, then of the texture; give both"
         )
     other = store.read(delivery.onto)
     albedo = other.maps.get("r_d")

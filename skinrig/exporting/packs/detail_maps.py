@@ -204,7 +204,7 @@ def write_scatter(out: ImageFolder) -> dict[str, Any]:
     """
     onto = out.delivery.onto
     if onto is None:
-        why = "it is of a model: name one of `skinrig fit reflectance` by --onto"
+        why = "it is of a model: name one of `skinrig fit reflectance` by --target-face"
         out.record_omission("scatter", why)
         return {}
     other = store.read(onto)

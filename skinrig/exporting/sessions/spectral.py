@@ -157,7 +157,7 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
     if not isinstance(told, dict) or not {"camera", "illuminant"} <= set(told):
         raise ExportError(
             "stokes: the maps do not say which camera and light they are of, so that bands have no "
-            "wavelength; make them again with `skinrig reconstruct --want diffuse,specular,melanin`"
+            "wavelength; make them again with `skinrig reconstruct --maps diffuse,specular,melanin`"
         )
     means = band_means_nm(str(told["camera"]), str(told["illuminant"]))
     valid = diffuse.mask & specular.mask

@@ -44,7 +44,7 @@ def test_errors_by_site_are_reported_with_colors():
 
 
 def test_rig_without_own_plans_is_reported(capsys):
-    assert main(["plan", "moon", "--want", "normals<=1deg"]) == 3
+    assert main(["plan", "moon", "--goals", "normals<=1deg"]) == 3
     assert "expected one of dome" in capsys.readouterr().err
 
 
@@ -117,7 +117,7 @@ def test_plan_keeps_promised_error_and_reports_omissions(tmp_path, capsys, monke
         [
             "plan",
             "dome",
-            "--want",
+            "--goals",
             "normals<=1.5deg",
             "--width",
             "320",
@@ -148,7 +148,7 @@ def test_unreachable_target_reports_reason(capsys, monkeypatch):
     monkeypatch.setattr(dome_observation, "FACE_POINTS", 200)
     assert (
         main(
-            ["plan", "dome", "--want", "normals<=0.05deg", "--width", "320", "--most-lights", "25"]
+            ["plan", "dome", "--goals", "normals<=0.05deg", "--width", "320", "--max-lights", "25"]
         )
         == 1
     )
