@@ -25,7 +25,7 @@ NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
 
 FORMATS: Final = (
     *("maps", "mtlx", "gltf", "usd", "spectral", "metahuman", "merl", "rgl"),
-    *("mhl", "frames", "lp", "stokes", "event-model"),
+    *("mhl", "frames", "event-model", "lp", "stokes"),
 )
 """Formats of appearances, then of sessions; the writers are imported with the chosen one."""
 
