@@ -1,4 +1,4 @@
-"""What the flash rig's crossed camera sees of a simulated face."""
+"""Simulated observation of a face by the flash rig's cross-polarized camera."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -107,10 +107,10 @@ def simulate_observation(
 
 
 def log_light_information() -> float:
-    """Return how well the prior tells the log of a pixel's light: Fisher's information of it.
+    """Return the Fisher information of the prior on the log of a pixel's light.
 
-    The prior has a steep edge, as hardly any skin gets more light than a tile in its place: it
-    tells more than its variance says.
+    It exceeds the inverse variance: the prior has a steep edge, as hardly any skin gets more light
+    than a white reference in its place.
     """
     prior = shading_prior.face_prior()
     slope = np.gradient(prior.density, prior.step)

@@ -1,8 +1,8 @@
-"""The smallest capture that reaches an error: what is wanted, what was chosen, what was left out.
+"""Minimal acquisition: goals, the chosen plan, its forecast and its omissions.
 
-A plan is judged by what it will give before anybody sits still for it. Each rig has a forecast of
-its own, the Fisher information of its samples with the part of the error that no sample removes,
-and knobs that it may turn; this module reads what is wanted and says what came of it.
+A plan is evaluated by the forecast of its errors, before a capture. Each rig has a forecast of its
+own: the Fisher information of its samples, and the part of the error that no sample removes. Each
+rig also has settings to choose from. This module parses the goals and reports the choice.
 """
 
 import difflib
@@ -392,17 +392,17 @@ def _format_site_errors(errors: Mapping[str, Sequence[float]]) -> str:
     Parameters
     ----------
     errors
-        Percent by site, red, green and blue; infinite where nothing is told.
+        Percent by site, red, green and blue; infinite where it is unknown.
 
     Examples
     --------
     >>> _format_site_errors({"chin": (0.444, 1.399, math.inf), "cheek": (0.5, 1.0, 2.0)})
-    'chin red 0.444 %, green 1.4 %, blue not told; cheek red 0.5 %, green 1 %, blue 2 %'
+    'chin red 0.444 %, green 1.4 %, blue unknown; cheek red 0.5 %, green 1 %, blue 2 %'
     """
     return "; ".join(
         f"{site} "
         + ", ".join(
-            f"{color} " + (f"{one:.3g} %" if math.isfinite(one) else "not told")
+            f"{color} " + (f"{one:.3g} %" if math.isfinite(one) else "unknown")
             for color, one in zip(("red", "green", "blue"), row, strict=True)
         )
         for site, row in errors.items()

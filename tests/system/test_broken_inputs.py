@@ -203,7 +203,7 @@ def test_blood_undetermined_without_white_reference_error_names_remedy(
     assert main(argv) == 3
     err = capsys.readouterr().err
     assert "no pixel is valid" in err
-    assert "a white calibration, which --calibration would bring" in err
+    assert "add a white calibration with --calibration" in err
 
 
 def test_session_without_neutral_state_is_refused_before_images(tmp_path, capsys):

@@ -40,7 +40,7 @@ def test_errors_by_site_are_reported_with_colors():
     knobs = {plans.PERCENT_BY_SITE: {"chin": [0.444, 1.399, math.inf]}}
     choice = plans.PlanChoice(rig, flash_plan(rig), (), 2.0, knobs, ())
     told = plans.format_choice(choice)
-    assert "percent by site: chin red 0.444 %, green 1.4 %, blue not told" in told
+    assert "percent by site: chin red 0.444 %, green 1.4 %, blue unknown" in told
 
 
 def test_rig_without_own_plans_is_reported(capsys):
@@ -154,4 +154,4 @@ def test_unreachable_target_reports_reason(capsys, monkeypatch):
     )
     said = capsys.readouterr().out
     assert "NOT REACHED" in said
-    assert "more pixels would help" in said
+    assert "use more pixels" in said
