@@ -256,7 +256,7 @@ def _explain_shortfall(
     r_d = 100.0 * _r_d_error(best, observation)
     if r_d > wants.get("r_d", math.inf):
         out.append(
-            f"r_d: all lights and cameras leave {r_d:.2g} %, in part by albedo finer than the pixel "
-            f"of {observation.pixel_mm:.2g} mm; use more pixels"
+            f"r_d: all lights and cameras leave {r_d:.2g} %, in part by albedo finer than a "
+            f"pixel of {observation.pixel_mm:.2g} mm; use more pixels"
         )
     return tuple(out)

@@ -290,7 +290,5 @@ def _explain_shortfall(
             f"model error alone, without any noise, leaves {model:.3g} %; {why}"
         )
     if not out and not _is_reached(best, best, request):
-        out.append(
-            "valid_share: too few valid skin pixels; lower --min-valid-fraction"
-        )
+        out.append("valid_share: too few valid skin pixels; lower --min-valid-fraction")
     return tuple(out)
