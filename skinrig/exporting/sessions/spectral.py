@@ -246,7 +246,7 @@ def write_stokes(session: Session, folder: Path, delivery: ExportSettings) -> li
     what = (
         "measured, by a picture along the analyser's axis and one across: S0 all light, S1 along "
         f"the axis minus across it; the axis lies {axis:g} degrees from x right towards y up; S2 "
-        "and S3 were not measured. Each band of the sensor at its mean wavelength, not a narrow line"
+        "and S3 were not measured. Wavelengths are the means of the sensor's broad bands"
     )
     files: dict[str, Any] = {}
     left_out: list[tuple[str, str]] = []
