@@ -195,7 +195,10 @@ class RigFileGroup(RigGroup):
 def _options(command: Any) -> dict[str, Any]:
     """Return the options of a command, keyed by each spelling."""
     return {
-        name: option for option in command.params for name in (*option.opts, *option.secondary_opts)
+        name: option
+        for option in command.params
+        for name in (*option.opts, *option.secondary_opts)
+        if name.startswith("-")  # arguments are listed by their bare names
     }
 
 

@@ -89,6 +89,11 @@ def test_value_equal_to_former_name_is_kept(capsys):
     assert "is now" not in capsys.readouterr().err
 
 
+def test_argument_named_as_its_parameter_is_kept(capsys):
+    assert main(["reconstruct", "sessions", "--want", "melanin", "--out", "x"]) == 3
+    assert format_notice("--want", "--maps") in capsys.readouterr().err
+
+
 def test_former_name_of_other_rig_is_refused(capsys):
     assert main(["simulate", "dome", "--out", "x", "--nearer", "3"]) == 2
     assert "--nearer: not an option of the dome rig (only of flash)" in capsys.readouterr().err
