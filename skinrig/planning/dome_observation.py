@@ -124,13 +124,16 @@ def simulate_observation(
     )
 
     white = np.array([white_intensity(light, view).mean() for light in rig.lights])
-    rate = r_d[:, None] * white * cos_light / light_mm**2  # full scales per second
+    # diffuse reflection of a point light: R_d I cos(theta) / d^2, in full scales per second
+    rate = r_d[:, None] * white * cos_light / light_mm**2
     chip = make_sensor(view)
     variance = _relative_variance(rate, chip.full_well_e, chip.read_noise_e)
     there = (lit & steep)[:, :, None] & (seen & facing)[:, None] & matte
+    # similar triangles: size on the subject = size on the sensor x distance / focal length; a cell
+    # of the color filter has two sensor pixels per side
     pixel = float(
         2.0 * np.median(np.linalg.norm(views, axis=-1)) * 1e-3 * view.pixel_um / view.focal_mm
-    )  # mm on the subject, of a cell of the color filter
+    )  # mm
     return DomeObservation(
         normal,
         to_light,
@@ -167,6 +170,8 @@ def _trace_to_positions(
 def _relative_variance(rate: Float64Array, full_well_e: float, read_noise_e: float) -> Float64Array:
     """Return the variance of merged brackets over the square of the light."""
     information = np.zeros(rate.shape)
+    # brackets are merged by inverse variance, so that the information of the unsaturated ones adds:
+    # (N / sigma)^2 with N electrons and sigma^2 = N (shot noise) + read noise^2
     for seconds in DOME_EXPOSURES_S:
         electrons = np.maximum(rate, 0.0) * seconds * full_well_e
         kept = (electrons > 0) & (electrons < 0.95 * full_well_e)

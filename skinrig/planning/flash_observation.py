@@ -107,12 +107,13 @@ def simulate_observation(
 
 
 def log_light_information() -> float:
-    """Return the Fisher information of the prior on the log of a pixel's light.
+    """Return the standard deviation of the log of a pixel's light by the prior's information.
 
-    It exceeds the inverse variance: the prior has a steep edge, as hardly any skin gets more light
-    than a white reference in its place.
+    It is below that of the prior itself: the prior has a steep edge, as hardly any skin gets more
+    light than a white reference in its place.
     """
     prior = shading_prior.face_prior()
+    # Fisher information of a shift of the density p(x): I = integral of p'(x)^2 / p(x) dx
     slope = np.gradient(prior.density, prior.step)
     return float(1.0 / np.sqrt(np.sum(slope**2 / prior.density) * prior.step))
 

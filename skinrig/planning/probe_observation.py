@@ -108,6 +108,8 @@ def reading_variance(
         Of the light source, 0 to 1.
     """
     rate = level * observation.unit * value  # full scales per second
+    # each unsaturated exposure is a reading of the rate, light / t, with variance spread / t^2, so
+    # that its information is t^2 / spread; a dark frame adds its share 1 / darks of the floor
     information = np.zeros(rate.shape)
     for seconds in exposures_s:
         gain, floor = observation.chip.noise_profile(seconds)

@@ -247,7 +247,7 @@ def directions(height: int, width: int) -> tuple[Float64Array, Float64Array]:
 def environment_lights(
     radiance: ArrayLike, count: int, *, rng: np.random.Generator
 ) -> tuple[Light, ...]:
-    """Draw far lights from a map, more where it is brighter, each at a place of its own.
+    """Sample distant lights from an environment map with probability proportional to power.
 
     Each represents an equal fraction of the map's power: stratified draws from the running sum of
     power along the map's rows, so that the sum over lights has less noise than separate draws.
@@ -259,7 +259,7 @@ def environment_lights(
     count
         Lights, at least 1.
     rng
-        Where in its share each light is drawn.
+        Generator of the positions in the strata.
 
     Returns
     -------
@@ -295,10 +295,13 @@ def environment_lights(
     order[1::2] = order[1::2, ::-1]
     order = order.reshape(-1)
     running = np.cumsum(power.reshape(-1)[order])
+    # stratified sampling: one draw per stratum of equal power, by inversion of the running sum
     at = (np.arange(count) + rng.random(count)) / count * running[-1]
     pixel = order[np.minimum(np.searchsorted(running, at, side="right"), power.size - 1)]
     chance = power.reshape(-1)[pixel] / running[-1]
-    share = solid.reshape(-1)[pixel] / (chance * count)  # solid angle represented by each light
+    # importance sampling: a pixel of solid angle w, drawn count x p times on average, represents
+    # w / (count p) per draw, so that the sum over lights is an unbiased integral of the map
+    share = solid.reshape(-1)[pixel] / (chance * count)
     color = image.reshape(-1, 3)[pixel] * (share / math.pi)[:, None]
     radius = np.minimum(np.sqrt(share / math.pi), MAX_LIGHT_RADIUS_RAD)
     return tuple(
