@@ -147,7 +147,7 @@ def assemble(
     found = next((name for name in NORMAL_MAPS if name in dome.maps), None)
     if found is None:
         raise SkinReflectanceError(
-            f"maps: got none of {' and '.join(NORMAL_MAPS)}; `skinrig reconstruct --want normals` "
+            f"maps: got none of {' and '.join(NORMAL_MAPS)}; `skinrig reconstruct --maps normals` "
             "makes them"
         )
     used = ["position", "r_d", found, *names]
@@ -211,7 +211,7 @@ def load_basis(appearance: SkinAppearance) -> BrdfBasis:
     """
     if BASIS_FILE not in appearance.files:
         raise SkinReflectanceError(
-            f"files: got no {BASIS_FILE}; `skinrig reconstruct --want {WEIGHT_PREFIX}0` makes it"
+            f"files: got no {BASIS_FILE}; `skinrig reconstruct --maps {WEIGHT_PREFIX}0` makes it"
         )
     try:
         with np.load(io.BytesIO(appearance.files[BASIS_FILE]), allow_pickle=False) as stored:
@@ -274,7 +274,7 @@ def _require(name: str, good: BoolArray, expected: str) -> None:
 def _map(appearance: SkinAppearance, name: str) -> SkinMap:
     if name not in appearance.maps:
         raise SkinReflectanceError(
-            f"maps: got no {name!r}; `skinrig reconstruct --want {name}` makes it"
+            f"maps: got no {name!r}; `skinrig reconstruct --maps {name}` makes it"
         )
     return appearance.maps[name]
 

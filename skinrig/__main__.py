@@ -1,4 +1,4 @@
-"""The command line as `python -m skinrig`: where the script is not on the path."""
+"""Command line `python -m skinrig`, for use if the script is not on the path."""
 
 from skinrig.cli import run
 

@@ -1,4 +1,4 @@
-"""Files and folders that are there whole or not at all."""
+"""Write files and replace folders atomically."""
 
 import os
 import shutil
@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file whole or not at all; its folder is made, an older file replaced.
+    """Write a file atomically; its folder is made and an older file is replaced.
 
     Parameters
     ----------
@@ -21,7 +21,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     Raises
     ------
     OSError
-        Naming the file that was asked for; nobody has heard of the part beside it.
+        With the name of `path`, not of the temporary file next to it.
     """
     part = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -36,9 +36,9 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def replace_folder_atomically(path: Path) -> Iterator[Path]:
-    """Yield an empty folder of that name, hidden beside, that replaces the older one in the end.
+    """Yield an empty temporary folder that replaces `path` when the block ends.
 
-    Where the block or the replacement fails, the older folder stays as it was.
+    If the block or the replacement fails, the older folder stays unchanged.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     shelter = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")

@@ -1,4 +1,4 @@
-"""The command line: what `skinrig` is, its demo, and how it ends."""
+"""Command line `skinrig`: its commands, the demo and exit codes."""
 
 import logging
 import os
@@ -34,8 +34,8 @@ from skinrig.next_steps import welcome
 app = typer.Typer(
     name="skinrig",
     cls=Commands,
-    help="Capture, calibrate and reconstruct skin appearance, with rigs that can be simulated.",
-    epilog=f"Begin with: skinrig demo\n\nExit codes: {errors.EXIT_CODE_HELP}",
+    help="Capture, calibrate and reconstruct skin appearance with real or simulated rigs.",
+    epilog=f"Start with: skinrig demo\n\nExit codes: {errors.EXIT_CODE_HELP}",
     invoke_without_command=True,
     pretty_exceptions_enable=False,
     add_completion=True,
@@ -55,7 +55,7 @@ def _version(shown: bool) -> None:
 def _root(
     context: typer.Context,
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which one.")
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
     verbose: Annotated[bool, option("Log details to stderr.", "--verbose")] = False,
 ) -> None:
@@ -78,14 +78,14 @@ def demo(
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
-    """Simulate, capture, calibrate, reconstruct and report, small; the place to begin.
+    """Simulate, calibrate, reconstruct and report all rigs at small scale; start here.
 
     Example: skinrig demo --out demo
 
     Parameters
     ----------
     rigs
-        Rigs, joined by commas: flash, dome, gradient, probe; default all.
+        Rigs, separated by commas: flash, dome, gradient, probe.
     """
     from skinrig.demo import run_demo
 
@@ -144,20 +144,22 @@ def main(argv: list[str] | None = None) -> int:
 def _report_failure(
     error: BaseException, code: int, arguments: Sequence[str], *, print_message: bool = True
 ) -> int:
-    """Tell people, and programs that asked for JSON, why a command ended; return its code."""
+    """Report why a command ended, on stderr and with --json as a document; return its code."""
     format_message = getattr(error, "format_message", None)
     if isinstance(error, KeyboardInterrupt):
-        told = errors.interruption(arguments)
+        message = errors.interruption(arguments)
     else:
-        told = (
+        message = (
             errors.sentence(error)
             if print_message or format_message is None
             else str(format_message())
         )
     if print_message:
-        print(f"skinrig: {told}", file=sys.stderr)
-    # none of a command's own came before: it is the last that a command prints
-    Console("--json" in arguments).document("skinrig.error/1", {"error": told, "exit_code": code})
+        print(f"skinrig: {message}", file=sys.stderr)
+    # still one document only: a command prints its own last, after all that can fail
+    Console("--json" in arguments).document(
+        "skinrig.error/1", {"error": message, "exit_code": code}
+    )
     return code
 
 

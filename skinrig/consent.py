@@ -1,4 +1,4 @@
-"""What subjects agreed to: said on the command line, carried by maps, asked for by exports."""
+"""Consent of subjects: parse it, keep it with maps and check it before an export."""
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, date, datetime
@@ -9,11 +9,11 @@ from capture.session.manifest import ANY_USE
 from skinrig.errors import UsageError
 
 CONSENT_KEY = "consent"
-"""Of an appearance's parameters: what the subject of each measured session agreed to."""
+"""Key in an appearance's parameters: the consent of each measured session's subject."""
 
 
 class HasProvenance(Protocol):
-    """What says where it is from: an appearance, its document, a library of traits."""
+    """An object with provenance: an appearance, its document or a library of traits."""
 
     @property
     def source(self) -> str:
@@ -21,27 +21,27 @@ class HasProvenance(Protocol):
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """Return how it was made."""
+        """Return the parameters of its computation."""
 
 
 def parse_subject(
     pseudonym: str, scopes: Sequence[str] | None, expires: datetime | date | None
 ) -> SubjectRecord:
-    """Return the subject that the options name.
+    """Return the subject record of the options.
 
     Parameters
     ----------
     pseudonym
-        Never a name.
+        Pseudonym, never a name.
     scopes
-        What the data may be used for; each may hold several, separated by commas.
+        Permitted uses; each text may list several, separated by commas.
     expires
-        Last day of the consent; None where it has no end.
+        Last day of the consent; None: unlimited.
 
     Raises
     ------
     SessionError
-        For a full name, or a scope that cannot be one.
+        For a full name, or an invalid scope.
 
     Examples
     --------
@@ -54,12 +54,12 @@ def parse_subject(
 
 
 def read_consent(appearance: HasProvenance) -> list[dict[str, Any]]:
-    """Return what the subjects of an appearance's measured sessions agreed to, each once.
+    """Return the consent records of an appearance's measured sessions, without duplicates.
 
     Parameters
     ----------
     appearance
-        Of a reconstruction, a fit, an edit or an evaluation.
+        Result of a reconstruction, a fit, an edit or an evaluation.
 
     Returns
     -------
@@ -70,8 +70,8 @@ def read_consent(appearance: HasProvenance) -> list[dict[str, Any]]:
     Examples
     --------
     >>> from model.skin import SkinAppearance
-    >>> told = {"pseudonym": "P042", "consent_scope": ["research"], "consent_expires": None}
-    >>> read_consent(SkinAppearance({}, "measured", {"consent": [told]})) == [told]
+    >>> record = {"pseudonym": "P042", "consent_scope": ["research"], "consent_expires": None}
+    >>> read_consent(SkinAppearance({}, "measured", {"consent": [record]})) == [record]
     True
     """
     found = [dict(one) for part in _sources(appearance) for one in part.get(CONSENT_KEY) or ()]
@@ -79,9 +79,9 @@ def read_consent(appearance: HasProvenance) -> list[dict[str, Any]]:
 
 
 def merge_consent(*appearances: HasProvenance) -> list[dict[str, Any]]:
-    """Return the record that what is made of several appearances must bear.
+    """Merge the consent records of the appearances that a result is made of.
 
-    One that was measured and says nothing counts as of a subject who agreed to nothing.
+    A measured appearance without records counts as one of a subject without consent.
 
     Examples
     --------
@@ -99,7 +99,7 @@ def merge_consent(*appearances: HasProvenance) -> list[dict[str, Any]]:
 
 
 def format_consent(records: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Format records of consent, a line a subject.
+    """Format consent records, one line per subject.
 
     Examples
     --------
@@ -119,37 +119,37 @@ def format_consent(records: Sequence[Mapping[str, Any]]) -> list[str]:
 def require_consent(
     appearance: HasProvenance, use: str | None, *, folder: str, today: date | None = None
 ) -> None:
-    """Raise where a subject has not agreed to a use of what was measured of it.
+    """Raise unless all subjects of an appearance have agreed to a use.
 
     Parameters
     ----------
     appearance
-        What is to be handed on. What was simulated needs no consent.
+        Data to export. Simulated data need no consent.
     use
-        What for, such as "research"; None: not said.
-    where
-        Folder, for messages.
+        Purpose, such as "research"; None: not given.
+    folder
+        Folder of the appearance, for messages.
     today
-        Day on which consent is judged; None: the present one, UTC.
+        Date of the check; None: the current date, UTC.
 
     Raises
     ------
     skinrig.errors.UsageError
-        When the use must be named, and is not.
+        If the use is required and not given.
     ConsentError
-        When it lies outside what was agreed to, the consent has ended, or measured maps do not
-        say what was agreed to.
+        If the use is outside the consent, the consent has expired, or measured maps lack consent
+        records.
     """
     records = read_consent(appearance)
     if _has_unknown_consent(appearance):
         raise ConsentError(
             "does not record what its subjects agreed to",
             where=folder,
-            advice="It was made before consent was kept with maps: make it again from its "
+            advice="An older version wrote it without consent records: compute it again from its "
             "sessions with `skinrig reconstruct` or `skinrig fit`.",
         )
     if records and use is None:
-        raise UsageError("--use: got none; say what the copy is for, e.g. research")
+        raise UsageError("--use: got none; name the purpose of the copy, e.g. research")
     day = today or datetime.now(UTC).date()
     for record in records:
         scope = [str(word) for word in record.get("consent_scope") or ()]
@@ -170,18 +170,19 @@ def _day(text: object, where: str) -> date:
         return date.fromisoformat(str(text))
     except ValueError as error:
         raise ConsentError(
-            f"last day of the consent: got {text!r}, expected a day such as 2031-01-31", where=where
+            f"last day of the consent: got {text!r}, expected a date such as 2031-01-31",
+            where=where,
         ) from error
 
 
 def _has_unknown_consent(appearance: HasProvenance) -> bool:
-    """Return whether anything in it was measured of somebody whose consent is not told."""
+    """Return whether any measured part lacks consent records."""
     parts = _sources(appearance)
     return any(part.get("source") == "measured" and not part.get(CONSENT_KEY) for part in parts)
 
 
 def _sources(appearance: HasProvenance) -> list[dict[str, Any]]:
-    """Return what an appearance, or each part of one that moves, says of where it is from."""
+    """Return the provenance of an appearance, or of each part of a moving one."""
     parts = appearance.parameters.get("parts")
     if isinstance(parts, dict) and parts:
         return [dict(part) for part in parts.values()]

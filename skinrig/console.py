@@ -1,4 +1,4 @@
-"""What commands print: results on stdout, progress on stderr, one document with --json."""
+"""Output of commands: results on stdout, progress on stderr, one document with --json."""
 
 import json
 import math
@@ -10,7 +10,7 @@ from typing import Any
 
 
 def to_json_value(value: Any) -> Any:
-    """Return ``value`` as something that JSON can hold; NaN and infinities become None.
+    """Convert a value to JSON types; NaN and infinities become None.
 
     Examples
     --------
@@ -26,14 +26,14 @@ def to_json_value(value: Any) -> Any:
         return {str(key): to_json_value(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
         return [to_json_value(item) for item in value]
-    # arrays and their scalars know it; NumPy itself would cost every command a tenth of a second
+    # duck-typed: importing NumPy here would add 0.1 s to the start of every command
     if hasattr(value, "tolist"):
         return to_json_value(value.tolist())
     return str(value)
 
 
 def select_attributes(source: object, *names: str) -> dict[str, Any]:
-    """Return some attributes of an object by their names.
+    """Return attributes of an object, keyed by name.
 
     Examples
     --------
@@ -44,7 +44,7 @@ def select_attributes(source: object, *names: str) -> dict[str, Any]:
 
 
 def format_count(number: int, noun: str) -> str:
-    """Return how many there are of what a noun with a plural in s names.
+    """Format a number with a noun whose plural ends in s.
 
     Examples
     --------
@@ -62,36 +62,35 @@ def _cell(value: object) -> str:
 
 @dataclass(slots=True)
 class Console:
-    """Where a command writes.
+    """Output streams of a command.
 
-    With ``as_json`` nothing but the one document of :meth:`document` reaches stdout; what a
-    person would read goes to stderr.
+    With ``as_json``, only the document of :meth:`document` goes to stdout; text goes to stderr.
     """
 
     as_json: bool = False
     started_s: float = field(default_factory=time.perf_counter)
 
-    def say(self, text: str = "") -> None:
-        """Print a result for a person."""
+    def print_line(self, text: str = "") -> None:
+        """Print a line of text."""
         print(text, file=sys.stderr if self.as_json else sys.stdout, flush=True)
 
     def progress(self, text: str) -> None:
-        """Print a line of progress with the seconds since the command began."""
+        """Print a line of progress with the time since the command's start, s."""
         seconds = time.perf_counter() - self.started_s
         print(f"[{seconds:6.1f} s] {text}", file=sys.stderr, flush=True)
 
     def rows(self, head: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
-        """Print a table with aligned columns; a dash stands where there is no number."""
+        """Print a table with aligned columns; NaN is printed as a dash."""
         cells = [[str(h) for h in head]] + [[_cell(value) for value in row] for row in rows]
         widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
         for row in cells:
             line = "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True))
-            self.say(line.rstrip())
+            self.print_line(line.rstrip())
 
     def figures(
         self, parts: Mapping[str, Mapping[str, object]], *kinds: type[int | float | str]
     ) -> None:
-        """Print the figures of each part that are of some kinds; nothing without any."""
+        """Print the figures of each part whose values have one of the given types."""
         rows = [
             (part, name, value)
             for part, figures in parts.items()
@@ -102,16 +101,16 @@ class Console:
             self.rows(("part", "figure", "value"), rows)
 
     def each(self, label: str, texts: Iterable[object]) -> None:
-        """Print texts for a person, a line each after a label."""
+        """Print each text on a line of its own, after a label."""
         for text in texts:
-            self.say(f"{label}: {text}")
+            self.print_line(f"{label}: {text}")
 
     def left_out(self, rows: Iterable[tuple[object, object]]) -> None:
-        """Print what was left out, and why."""
+        """Print what was omitted, with reasons."""
         self.each("left out", (f"{what}: {why}" for what, why in rows))
 
     def document(self, schema: str, content: Mapping[str, Any]) -> None:
-        """Print the one JSON document of the command, when it was asked for."""
+        """Print the command's JSON document if --json was given."""
         if self.as_json:
             print(
                 json.dumps({"schema": schema, **to_json_value(content)}, allow_nan=False),

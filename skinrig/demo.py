@@ -1,4 +1,4 @@
-"""The demo: simulate, capture, calibrate, reconstruct, measure and report, in one go."""
+"""Demo: simulate, capture, calibrate, reconstruct, measure and report in one run."""
 
 import json
 import multiprocessing
@@ -21,7 +21,7 @@ from skinrig.unit_format import format_unit
 from skinrig.workspace import scan
 
 MAX_JOBS = 2
-"""Rigs that run side by side: much of each is the work of one core, or waits for a compiler."""
+"""Rigs that run in parallel: much of each uses one core only, or waits for a compiler."""
 BENCH_STAGES = (
     "hdr",
     "normals",
@@ -35,17 +35,16 @@ BENCH_STAGES = (
     "skin-stretch",
     "normal-histogram",
 )
-"""Stages whose error is measured against run time, at their small size: of each rig some, which
-take about a second; `skinrig bench` measures all."""
+"""Stages measured at small size, a few per rig, about 1 s each; `skinrig bench` measures all."""
 BENCH_BUDGET_S = 8.0
 RIG_ORDER = ("gradient", "dome", "flash", "probe")
 SLEEPING_THREADS = {**PASSIVE_WAIT_SETTINGS, "OPENBLAS_NUM_THREADS": "1"}
-"""Environment of rigs side by side, where the user has not set it: the cores are shared."""
+"""Environment of parallel rigs, unless the user has set it: the rigs share the cores."""
 SecondsByStep = dict[str, float]
 
 
 class DemoError(ValueError):
-    """A demo that cannot run as asked."""
+    """Invalid arguments of the demo."""
 
 
 def run_demo(
@@ -62,22 +61,21 @@ def run_demo(
     Parameters
     ----------
     out
-        A folder that is new, empty, or of an earlier demo, which is replaced.
+        New or empty folder, or one of an earlier demo, which is replaced.
     rigs
-        Which rigs.
+        Names of rigs.
     seed
-        Of all that is drawn; what comes out does not depend on ``jobs``.
+        Random seed; results do not depend on ``jobs``.
     console
-        Where progress goes.
+        Receives progress.
     width_px
-        Pixels across the simulated camera; None: the small size.
+        Width of the simulated camera's images, pixels; None: that of the small scale.
     jobs
-        Rigs that run side by side, each in a process of its own; None: two, where there are two
-        cores.
+        Rigs that run in parallel, one process each; None: two if there are two cores.
     """
     unknown = [rig for rig in rigs if rig not in RIGS]
     if unknown or not rigs:
-        raise DemoError(f"rigs: got {(*unknown, 'none')[0]!r}, expected out of {', '.join(RIGS)}")
+        raise DemoError(f"rigs: got {(*unknown, 'none')[0]!r}, expected names of {', '.join(RIGS)}")
     if seed < 0:
         raise DemoError(f"seed: got {seed}, expected 0 or more")
     _make_room(out)
@@ -101,32 +99,32 @@ def run_demo(
             BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=console
         )
     spent = DemoResults()
-    title = "Seconds" + (", rigs side by side" if at_once > 1 else "")
+    title = "Seconds" + (", rigs in parallel" if at_once > 1 else "")
     spent.add_table(title, ["step", "seconds"], ((n, round(s, 2)) for n, s in shares.items()))
     document: dict[str, Any] = {"schema": "skinrig.demo/1", "title": "This demo"}
     document["tables"] = spent.tables + found.tables
-    # seconds differ from run to run: they stand in a document of their own, not in the maps
+    # run times differ from run to run, so they go to a document of their own, not into the maps
     (out / "demo.json").write_text(json.dumps(to_json_value(document), indent=1), encoding="utf-8")
     with _time_step("report", shares, console):
         from skinrig.report import build
 
         (out / "report.html").write_text(build([out], title="skinrig demo"), encoding="utf-8")
-    console.say("")
+    console.print_line("")
     console.rows(
         ("subject", "map", "error", "unit", "68 % interval covers, %", "masked, %"),
         [[*row[:3], format_unit(row[3]), *row[4:]] for row in found.errors],
     )
-    console.say("")
+    console.print_line("")
     by_rig = [
-        (f"all of {rig}", sum(s for name, s in shares.items() if name.startswith(f"{rig}: ")))
+        (f"{rig}: total", sum(s for name, s in shares.items() if name.startswith(f"{rig}: ")))
         for rig in asked
     ]
     console.rows(("step", "seconds"), [*shares.items(), *by_rig])
-    beside = f", {at_once} rigs side by side" if at_once > 1 else ""
+    parallel = f", {at_once} rigs in parallel" if at_once > 1 else ""
     total_s = time.perf_counter() - began
-    console.say(f"\nall of it: {total_s:.1f} s{beside}")
+    console.print_line(f"\ntotal: {total_s:.1f} s{parallel}")
     for step in suggest(scan(out), out):
-        console.say(f"next: {step.command}  ({step.why})")
+        console.print_line(f"next: {step.command}  ({step.why})")
     return {
         "out": out,
         "seconds": shares,
@@ -142,13 +140,13 @@ _Parts = dict[str, tuple[DemoResults, SecondsByStep]]
 
 
 def _run_in_processes(rigs: Sequence[str], order: _Order, at_once: int) -> _Parts:
-    """Run rigs in processes of their own; an error of one stops all."""
+    """Run each rig in a process of its own; an error in one stops all."""
     pool = ProcessPoolExecutor(
         at_once, mp_context=multiprocessing.get_context("spawn"), initializer=_die_when_interrupted
     )
     first = sorted(rigs, key=lambda rig: RIG_ORDER.index(rig) if rig in RIG_ORDER else 0)
     try:
-        with _environment(SLEEPING_THREADS):  # processes start as their work is handed in
+        with _environment(SLEEPING_THREADS):  # the pool starts its processes on submission
             futures = {rig: pool.submit(_run_rig, rig, *order) for rig in first}
         wait(futures.values(), return_when=FIRST_EXCEPTION)
         failed = [f for f in futures.values() if f.done() and f.exception() is not None]
@@ -166,7 +164,7 @@ def _run_in_processes(rigs: Sequence[str], order: _Order, at_once: int) -> _Part
 
 @contextmanager
 def _environment(defaults: Mapping[str, str]) -> Iterator[None]:
-    """Set variables that are not set, for processes that start meanwhile."""
+    """Set unset environment variables for the processes that start in this block."""
     added = {name: value for name, value in defaults.items() if name not in os.environ}
     os.environ.update(added)
     try:
@@ -177,7 +175,7 @@ def _environment(defaults: Mapping[str, str]) -> Iterator[None]:
 
 
 def _die_when_interrupted() -> None:
-    """Leave it to the parent to tell of an interruption."""
+    """Let SIGINT end this process silently; the parent reports the interruption."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -199,7 +197,7 @@ def _time_step(name: str, seconds: SecondsByStep, console: Console) -> Iterator[
 
 
 def _make_room(out: Path) -> None:
-    """Empty a folder that an earlier demo wrote; refuse any other that holds something."""
+    """Empty the folder of an earlier demo; refuse any other folder that is not empty."""
     mark = out / ".skinrig-demo"
     if out.exists() and not out.is_dir():
         raise DemoError(f"{out}: is a file, expected a folder; name another with --out")
@@ -207,8 +205,8 @@ def _make_room(out: Path) -> None:
     inside = list(out.iterdir())
     if inside and not mark.exists():
         raise DemoError(
-            f"{out}: holds files that are not of an earlier demo; nothing was touched: "
-            "name another folder with --out"
+            f"{out}: got a folder with other files, expected a new folder or one of an earlier "
+            "demo; nothing was changed; name another with --out"
         )
     for entry in inside:
         if entry.is_dir():

@@ -1,7 +1,7 @@
-"""What the demo does with each rig: simulate, capture, calibrate, reconstruct and measure.
+"""Demo of each rig: simulate, capture, calibrate, reconstruct and measure.
 
-Each rig runs in a process of its own, which compiles the kernels that it imports: what belongs to
-one rig is imported in its function.
+Each rig runs in a process of its own, which compiles the kernels it imports. Modules that only one
+rig needs are therefore imported in its function.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -30,11 +30,11 @@ from skinrig.simulating.orders import SimulationResult
 from skinrig.simulating.simulation import simulate_session
 
 FLASH_SUBJECTS = ("II", "IV")
-"""Skin types of the flash rig's faces: one light, one dark, so that errors by melanin show."""
+"""Skin types of the flash rig's faces, one light and one dark: errors depend on melanin."""
 FLASH_STATES = ("neutral", "anger")
-"""States of the first face: what a hemoglobin rig is fitted to."""
+"""Expressions of the first face, to which a hemoglobin rig is fitted."""
 FLASH_CALIBRATIONS = {"flat": "sensor", "white": "white", "chart": "color", "malus": "polarization"}
-"""The calibration that each target makes, in the order that they are made."""
+"""Calibration by target, in the order of computation."""
 FLASH_WANT = (
     *("melanin", "hemoglobin", "shading", "residual", "diffuse", "picture", "specular_picture"),
     *("tsumura_melanin", "tsumura_hemoglobin"),
@@ -45,17 +45,17 @@ DOME_WANT = (
     *(f"basis_weight_{lobe}" for lobe in range(4)),
 )
 DOME_HOLD_OUT = "lights=16,23"
-"""Lights, by number, whose photographs no fit sees: renderings are compared with them."""
+"""Numbers of held-out lights; renderings are compared with their photographs."""
 DOME_OMITTED_EFFECTS = ("subsurface",)
-"""Light that spreads sideways takes half a minute, and blurs less than its pixels of 2 mm."""
+"""Lateral scattering takes half a minute and blurs by less than a pixel of 2 mm."""
 N_COMPARED_PHOTOGRAPHS = 3
-"""How many of their photographs are compared."""
+"""Number of held-out photographs compared with renderings."""
 DOME_WIDTH_PX = 320
-"""Pixels across each of the dome's cameras, unless said otherwise."""
+"""Default image width of the dome's cameras."""
 
 PROBE_SUBJECT = "III"
 PROBE_MEDIUM = "homogeneous:0.08,1.2"
-"""A medium whose sigma_tr is known, 0.55 per mm: layers have one by definition only."""
+"""Homogeneous medium with known sigma_tr, 0.55 per mm; for layers it is a definition only."""
 PROBE_WANT = ("profiles", "subsurface", "translucency")
 GRADIENT_SITE = "forehead"
 GRADIENT_WANT = ("normals", "height", "crossed", "strain", "histograms", "kernels")
@@ -63,16 +63,16 @@ GRADIENT_WANT = ("normals", "height", "crossed", "strain", "histograms", "kernel
 
 @dataclass(slots=True)
 class DemoResults:
-    """What the rigs of a demo leave for its tables."""
+    """Errors and tables of the demo's rigs."""
 
     errors: list[list[Any]] = field(default_factory=list)
-    """Subject, map, error, coverage, share masked."""
+    """Subject, map, error, unit, coverage in %, masked fraction in %."""
     tables: list[dict[str, Any]] = field(default_factory=list)
 
     def add(
         self, name: str, quantity: str, error: float, unit: str, coverage: float, masked: float
     ) -> None:
-        """Add the error of a map; coverage and the share masked as shares of 1."""
+        """Add the error of a map; coverage and masked are fractions of 1."""
         self.errors.append([name, quantity, error, unit, 100 * coverage, 100 * masked])
 
     def add_table(self, title: str, head: list[str], rows: Iterable[Iterable[Any]]) -> None:
@@ -94,7 +94,7 @@ StepTimer = Callable[[str], AbstractContextManager[None]]
 
 @dataclass(frozen=True, slots=True)
 class RigDemo:
-    """A demo of one rig: where it writes, with which seed, and how it tells its steps."""
+    """Demo of one rig: output folder, seed, timer of steps, image width and results."""
 
     out: Path
     seed: int
@@ -107,7 +107,7 @@ class RigDemo:
         return simulate_session(rig, self.out / f"session-{rig}-{name}", seed=self.seed, **options)
 
     def calibrate(self, rig: str, kind: str, *targets: str) -> None:
-        """Make a calibration from sessions of targets."""
+        """Calibrate a rig from sessions of targets."""
         sessions = [self.out / f"session-{rig}-{target}" for target in targets]
         calibrate(kind, sessions, self.out / f"calibration-{rig}")
 
@@ -118,7 +118,7 @@ class RigDemo:
         want: tuple[str, ...],
         hold_out: str | None = None,
     ) -> tuple[str, Path, SkinAppearance, SkinAppearance]:
-        """Make the maps of a capture; return their name, folder, and maps and truth."""
+        """Reconstruct a capture; return the maps' name and folder, the maps and ground truth."""
         folder = self.out / capture.session.name.replace("session", "appearance")
         pipeline.reconstruct(
             capture.session,
@@ -133,7 +133,7 @@ class RigDemo:
 
 
 def _flash(run: RigDemo) -> None:
-    """Capture targets and two faces with the flash rig, down to melanin, blood and its changes."""
+    """Run the flash rig on targets and two faces, up to melanin, blood volume and its changes."""
     found, width = run.found, run.width_px
     with run.share("flash: capture the calibration targets"):
         for target in FLASH_CALIBRATIONS:
@@ -182,7 +182,7 @@ def _evaluate_states(appearance: Path, found: DemoResults) -> None:
 
 
 def _dome(run: RigDemo) -> None:
-    """Capture targets and a face with the light dome, down to normals, albedo and lobes."""
+    """Run the dome on targets and a face, up to normals, albedo and basis BRDFs."""
     from skinrig.evaluating import reflection
     from skinrig.rendering.photographs.evaluation import EvaluationSettings, evaluate_folders
 
@@ -231,7 +231,7 @@ def _dome(run: RigDemo) -> None:
 
 
 def _gradient(run: RigDemo) -> None:
-    """Capture a glass ball and stretched skin in the gradient sphere, down to kernels."""
+    """Run the gradient sphere on a glass ball and stretched skin, up to kernels."""
     found = run.found
     with run.share("gradient: capture a ball of black glass"):
         run.simulate("gradient", "ball", target="ball")
@@ -260,7 +260,7 @@ def _gradient(run: RigDemo) -> None:
 
 
 def _probe(run: RigDemo) -> None:
-    """Calibrate a fibre probe, and measure a medium and three sites of a face."""
+    """Run the fiber probe on a phantom, a medium and three sites of a face."""
     with run.share("probe: capture a phantom"):
         run.simulate("probe", "phantom", target="phantom")
     with run.share("probe: calibrate its fibers"):
@@ -287,4 +287,4 @@ RIGS: Mapping[str, Callable[[RigDemo], None]] = {
     "gradient": _gradient,
     "probe": _probe,
 }
-"""What the demo does with each rig, in this order."""
+"""Demo function of each rig, in the order of the report."""

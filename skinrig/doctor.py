@@ -1,4 +1,4 @@
-"""Say what is installed, what is missing, and how to mend it."""
+"""Check the installation, with a fix for each fault."""
 
 import importlib.metadata
 import importlib.util
@@ -10,15 +10,17 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class InstallationCheck:
-    """One thing that was looked at."""
+    """Result of one check."""
 
     what: str
     state: str
     fine: bool
-    mend: str = ""
-    """What to type when it is not fine; empty when nothing needs doing."""
+    fix: str = ""
+    """Command or action that removes the fault; empty if none is needed."""
 
 
+FIX_KEY = "mend"
+"""Key of `InstallationCheck.fix` in the document skinrig.doctor/1."""
 _OTHER_NAMES = {
     "serial": "pyserial",
     "cv2": "opencv-contrib-python-headless",
@@ -28,7 +30,7 @@ _OTHER_NAMES = {
     "jinja2": "Jinja2",
     "PIL": "pillow",
 }
-"""Distributions whose modules have other names, by module."""
+"""Distribution by module, where their names differ."""
 _REQUIRED_PACKAGES = {
     module: _OTHER_NAMES.get(module, module)
     for module in (
@@ -47,16 +49,16 @@ _EXTRA_PACKAGES = {
 
 
 def check_installation(*, probe_renderer: bool = True) -> list[InstallationCheck]:
-    """Look at Python, the packages, the renderer's variant, threads and serial ports.
+    """Check Python, packages, the renderer's variant, threads and serial ports.
 
     Parameters
     ----------
     probe_renderer
-        False skips the render probe, which takes a second or two.
+        Also load the renderer, which takes 1 to 2 s.
     """
     new_enough = sys.version_info >= (3, 11)
-    mend = "" if new_enough else "install Python 3.11 or newer"
-    findings = [InstallationCheck("Python", platform.python_version(), new_enough, mend)]
+    fix = "" if new_enough else "install Python 3.11 or newer"
+    findings = [InstallationCheck("Python", platform.python_version(), new_enough, fix)]
     for module, name in _REQUIRED_PACKAGES.items():
         present = importlib.util.find_spec(module) is not None
         state = importlib.metadata.version(name) if present else "missing"
@@ -66,8 +68,8 @@ def check_installation(*, probe_renderer: bool = True) -> list[InstallationCheck
     for module, extra in _EXTRA_PACKAGES.items():
         present = importlib.util.find_spec(module) is not None
         state = "installed" if present else "not installed"
-        mend = "" if present else f"pip install 'skinrig[{extra}]' when you need it"
-        findings.append(InstallationCheck(f"optional: {extra}", state, True, mend))
+        fix = "" if present else f"pip install 'skinrig[{extra}]' when you need it"
+        findings.append(InstallationCheck(f"optional: {extra}", state, True, fix))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     findings.append(InstallationCheck("cores", str(cores), True))
     if probe_renderer:
@@ -83,16 +85,16 @@ def _renderer() -> InstallationCheck:
 
     choice = variant.choose_variant()
     fast = choice.name.startswith("llvm")
-    mend = "" if fast else "for speed install LLVM 17 or newer: apt-get install libllvm19"
-    return InstallationCheck("Mitsuba variant", f"{choice.name} ({choice.why})", True, mend)
+    fix = "" if fast else "for speed install LLVM 17 or newer: apt-get install libllvm19"
+    return InstallationCheck("Mitsuba variant", f"{choice.name} ({choice.why})", True, fix)
 
 
 def _serial_ports() -> InstallationCheck:
     from capture.devices.port_url import serial_ports
 
     ports = serial_ports()
-    mend = "" if ports else "none is needed to simulate; plug the rig in and look again"
-    return InstallationCheck("serial ports", ", ".join(ports) or "none", True, mend)
+    fix = "" if ports else "not needed for simulation; connect the rig and run doctor again"
+    return InstallationCheck("serial ports", ", ".join(ports) or "none", True, fix)
 
 
 def _camera_producers() -> InstallationCheck:
@@ -103,5 +105,5 @@ def _camera_producers() -> InstallationCheck:
         state = ", ".join(file.name for file in producer_files("genicam", ""))
     except CameraUrlError:
         state = ""
-    mend = f"install the camera maker's software and set {PRODUCER_PATH_VARIABLE} to its folder"
-    return InstallationCheck("GenTL producers", state or "none", True, "" if state else mend)
+    fix = f"install the camera maker's software and set {PRODUCER_PATH_VARIABLE} to its folder"
+    return InstallationCheck("GenTL producers", state or "none", True, "" if state else fix)

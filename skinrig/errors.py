@@ -1,17 +1,17 @@
-"""From an exception to one sentence and an exit code.
+"""Errors of commands: one sentence and an exit code per exception.
 
-What a command ends with:
+Exit codes:
 
 === ================================================================================
 0   done
 1   a limit was missed
-2   the command line cannot be read: a command or an option that does not exist, an argument that
-    is missing or not of its form, or two that do not go together
-3   it can be read, but what it names or asks for is not known, out of range, damaged or cannot be
-    used: a name, a number, a file, a session
+2   invalid command line: an unknown command or option, an argument that is missing or malformed,
+    or two that exclude each other
+3   invalid input: a name, a number, a file or a session that is unknown, out of range, damaged or
+    unusable
 4   a device or a capture failed
 5   an optional part of the distribution is missing
-70  a fault of skinrig's own
+70  a defect of skinrig
 130 interrupted
 === ================================================================================
 """
@@ -31,14 +31,13 @@ EXTRA_MISSING = 5
 EXIT_BUG = 70
 EXIT_INTERRUPTED = 130
 EXIT_CODE_HELP = (
-    f"{EXIT_DONE} done; {LIMIT_MISSED} a limit was missed; {EXIT_USAGE} the command line cannot be "
-    f"read (an argument missing, not of its form, or at odds with another); {BAD_INPUT} what it "
-    f"names is not known, out of range, damaged or of no use; {DEVICE_FAILED} a device or a "
-    "capture failed; "
-    f"{EXTRA_MISSING} an optional part is missing; {EXIT_BUG} a fault of skinrig's own; "
+    f"{EXIT_DONE} done; {LIMIT_MISSED} a limit was missed; {EXIT_USAGE} invalid command line (an "
+    f"argument is missing, malformed or excluded by another); {BAD_INPUT} invalid input (unknown, "
+    f"out of range, damaged or unusable); {DEVICE_FAILED} a device or a capture failed; "
+    f"{EXTRA_MISSING} an optional part is missing; {EXIT_BUG} a defect of skinrig; "
     f"{EXIT_INTERRUPTED} interrupted."
 )
-"""What commands end with, as the help tells it; the module's text says it at length."""
+"""Exit codes as listed by ``skinrig --help``; the module's docstring has more detail."""
 
 
 class MissingExtra(ImportError):
@@ -51,26 +50,26 @@ class MissingExtra(ImportError):
 
 
 class UsageError(ValueError):
-    """An argument that is missing or not of its form, or that does not go with another."""
+    """An argument that is missing, malformed or excluded by another."""
 
 
 class UnusableError(ValueError):
-    """An argument that can be read, but names or asks for what is not there or cannot be used."""
+    """A well-formed argument whose value is unknown, out of range or unusable."""
 
 
 def one_of(
     name: str, value: str, choices: Iterable[Choice], error: type[Exception] = UnusableError
 ) -> Choice:
-    """Return a value that is one of the choices, else raise an error that names them.
+    """Return the value if it is one of the choices, else raise an error that lists them.
 
     Parameters
     ----------
     name
-        What the value is of: an option, a field.
+        Option or field, for the message.
     value
-        As it was given.
+        Given value.
     choices
-        What it may be.
+        Valid values.
     error
         Class of the error.
 
@@ -87,10 +86,10 @@ def one_of(
 
 
 def exit_code(error: BaseException) -> int:
-    """Return the exit code that stands for ``error``.
+    """Return the exit code of an exception.
 
-    Device errors are told from bad input by the package that raised them, so that this
-    module need not import the drivers.
+    Device errors are recognized by the package of their class, so that this module need not import
+    the drivers.
     """
     if isinstance(error, KeyboardInterrupt):
         return EXIT_INTERRUPTED
@@ -113,16 +112,16 @@ def exit_code(error: BaseException) -> int:
 
 _ADVICE_BY_ERROR = {
     errno.ENOENT: "check the name, and the folder that the command runs in",
-    errno.EEXIST: "something of that name is there already; name another",
+    errno.EEXIST: "a file or folder of that name exists; name another",
     errno.ENOTDIR: "a part of this path is a file, expected a folder; name another",
     errno.EISDIR: "expected a file; name another",
-    errno.EACCES: "no right to it; change its rights, or name another",
-    errno.EPERM: "no right to it; change its rights, or name another",
-    errno.EROFS: "the disk is mounted for reading alone; name another",
+    errno.EACCES: "no permission; change its permissions, or name another",
+    errno.EPERM: "no permission; change its permissions, or name another",
+    errno.EROFS: "the disk is mounted read-only; name another",
     errno.ENOSPC: "free space, or name another disk, then run the same command again",
     errno.EDQUOT: "free space, or name another disk, then run the same command again",
 }
-"""What to do, by the number of the system's error."""
+"""Advice by the operating system's error number."""
 _OWN_PACKAGES = ("capture", "reconstruction", "model", "rigsim", "skinrig")
 
 
@@ -131,25 +130,25 @@ RESUMABLE_COMMANDS = ("capture", "serve", "simulate")
 
 
 def interruption(given: Sequence[str]) -> str:
-    """Return what to print of a command that was interrupted.
+    """Return the message of an interrupted command.
 
     Parameters
     ----------
     given
-        Its name and arguments.
+        Name and arguments of the command.
 
     Examples
     --------
     >>> interruption(["simulate", "flash"])
-    'interrupted; the same command with --resume goes on'
+    'interrupted; run the same command with --resume to continue'
     >>> interruption(["bench", "--out", "bench"])
     'interrupted; bench.json in --out keeps what was measured'
     """
     command = next((word for word in given if not word.startswith("-")), "")
-    if command == "serve":  # what it is resumed with is not its own
-        return "interrupted; serve with --resume SESSION to go on with a session captured from it"
+    if command == "serve":  # it resumes from the session of its client, not from its own
+        return "interrupted; serve with --resume SESSION to continue a session captured from it"
     if command in RESUMABLE_COMMANDS:
-        return "interrupted; the same command with --resume goes on"
+        return "interrupted; run the same command with --resume to continue"
     kept = any(word == "--out" or word.startswith("--out=") for word in given)
     if command == "bench" and kept and "--extremes" not in given:
         return "interrupted; bench.json in --out keeps what was measured"
@@ -157,7 +156,7 @@ def interruption(given: Sequence[str]) -> str:
 
 
 def sentence(error: BaseException) -> str:
-    """Return what to print for ``error``, without a traceback."""
+    """Return the message of an exception, one sentence without a traceback."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
     if isinstance(error, OSError) and error.strerror and error.errno in _ADVICE_BY_ERROR:
@@ -167,13 +166,13 @@ def sentence(error: BaseException) -> str:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, UnicodeDecodeError):
         return (
-            f"a file that was to be UTF-8 text is not (byte {error.start} of it is "
-            f"{error.object[error.start]:#04x}); is another file meant?"
+            f"text file: got byte {error.object[error.start]:#04x} at {error.start}, expected "
+            "UTF-8; check that it is the right file"
         )
     text = str(error).strip() or type(error).__name__
     if exit_code(error) == EXIT_BUG:
         return (
-            f"this is a fault of skinrig, not yours ({type(error).__name__}: {text}); "
-            "run again with SKINRIG_TRACEBACK=1 and report what it prints"
+            f"defect of skinrig ({type(error).__name__}: {text}); "
+            "run again with SKINRIG_TRACEBACK=1 and report the output"
         )
     return text

@@ -1,4 +1,4 @@
-"""The environment of numerical libraries: where compiled kernels are kept, how threads wait."""
+"""Environment of numerical libraries: cache of compiled kernels, and waiting of threads."""
 
 import os
 import sys
@@ -6,32 +6,32 @@ from collections.abc import Mapping, MutableMapping
 from pathlib import Path
 
 PACKAGES_FOLDER = Path(__file__).parent.parent
-"""The folder that the packages are installed in."""
+"""Folder in which the packages are installed."""
 PASSIVE_WAIT_SETTINGS = {"OMP_WAIT_POLICY": "PASSIVE"}
-"""Threads that spin as they wait hold a core that other work of the machine could have. OpenMP
-reads it when it is loaded, which is before the first parallel loop."""
+"""Let waiting threads sleep: spinning ones occupy cores that other processes could use. OpenMP
+reads the variable when it is loaded, before the first parallel loop."""
 
 
 def user_cache(environment: Mapping[str, str]) -> Path:
-    """Return the folder of a user's caches, as Numba finds it.
+    """Return the user's cache folder, by Numba's rule.
 
     Parameters
     ----------
     environment
-        Variables; ``XDG_CACHE_HOME`` comes first, then ``HOME``.
+        Environment variables; ``XDG_CACHE_HOME`` takes precedence over ``HOME``.
 
     Examples
     --------
     >>> user_cache({"XDG_CACHE_HOME": "/scratch", "HOME": "/home/me"}).as_posix()
     '/scratch'
     """
-    if told := environment.get("XDG_CACHE_HOME"):
-        return Path(told)
+    if cache := environment.get("XDG_CACHE_HOME"):
+        return Path(cache)
     return Path(environment.get("HOME") or Path.home()) / ".cache"
 
 
 def is_writable(folder: Path) -> bool:
-    """Make a folder if it is missing and return whether files can be written into it.
+    """Create a folder if it is missing; return whether files can be written into it.
 
     Examples
     --------
@@ -48,31 +48,31 @@ def is_writable(folder: Path) -> bool:
 def provide_kernel_cache(
     environment: MutableMapping[str, str], packages: Path = PACKAGES_FOLDER
 ) -> Path | None:
-    """Name a private folder for compiled kernels where Numba would find none.
+    """Set a private cache folder for compiled kernels if Numba has no writable one.
 
-    Numba keeps them beside the sources or in the user's cache, and refuses to compile where it can
-    write neither: an installation of root's in a container whose home is read-only, say. The
-    folder goes when the process ends. It has a name that nobody can foresee, because whoever writes
-    there writes what this process runs.
+    Numba caches kernels next to the sources or in the user's cache. It refuses to compile if it can
+    write to neither, for example in a container with a read-only home. The folder is deleted when
+    the process ends. Its name is unpredictable, because whoever writes there controls the code that
+    this process runs.
 
     Parameters
     ----------
     environment
-        Variables of this process; ``NUMBA_CACHE_DIR`` is set, and nothing is done if it is already.
+        Variables of this process; ``NUMBA_CACHE_DIR`` is set unless it is set already.
     packages
-        Folder that the packages are installed in.
+        Folder in which the packages are installed.
 
     Returns
     -------
     Path or None
-        The folder; None where there is no need of one.
+        The folder; None if Numba needs none.
     """
     if sys.platform == "win32" or environment.get("NUMBA_CACHE_DIR"):
         return None
-    beside = packages / "model" / "__pycache__"
-    if is_writable(beside) or is_writable(user_cache(environment) / "numba"):
+    source_cache = packages / "model" / "__pycache__"
+    if is_writable(source_cache) or is_writable(user_cache(environment) / "numba"):
         return None
-    import atexit  # here: no other start of a command has to load them
+    import atexit  # imported here to keep the start of other commands fast
     import shutil
     import tempfile
 
@@ -83,12 +83,12 @@ def provide_kernel_cache(
 
 
 def set_passive_waiting(environment: MutableMapping[str, str]) -> None:
-    """Let threads sleep as they wait, unless the user has said how they shall.
+    """Let threads sleep while waiting, unless the user has set a policy.
 
     Parameters
     ----------
     environment
-        Variables of this process, before a numerical library is loaded; what is set stays.
+        Variables of this process, before a numerical library is loaded; set ones are kept.
 
     Examples
     --------

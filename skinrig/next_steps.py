@@ -1,4 +1,4 @@
-"""What to do next: after a session was captured, and with what lies in a folder."""
+"""Suggestions of the next command, after a session and for the contents of a folder."""
 
 import shlex
 import sys
@@ -21,7 +21,7 @@ CALIBRATION_BY_TARGET: Final[Mapping[str, Mapping[str, str]]] = {
     "gradient": {"ball": "lights", "flat": "sensor", "dark": "sensor"},
     "probe": {"phantom": "fibre"},
 }
-"""The calibration that each target of a rig makes."""
+"""Calibration by rig and target."""
 DEFAULT_WANTS: Final[Mapping[str, str]] = {
     "flash": "melanin,hemoglobin",
     "dome": "normals,r_d",
@@ -29,25 +29,25 @@ DEFAULT_WANTS: Final[Mapping[str, str]] = {
     "probe": "profiles,subsurface,translucency",
     "photographs": "melanin,hemoglobin",
 }
-"""What is usually wanted of a session of skin."""
+"""Maps usually reconstructed from a session of skin, by rig."""
 UNCALIBRATED_RIGS: Final = ("flash", "photographs")
-"""Rigs whose maps need no calibration; without one something is assumed, and said."""
+"""Rigs whose maps need no calibration; without one, nominal values are listed as assumed."""
 OPEN_COMMAND: Final = {"darwin": "open", "win32": "start"}.get(sys.platform, "xdg-open")
 DEMO_FOLDER: Final = "demo"
 MAX_STEPS: Final = 4
-"""Next steps that are named at once."""
+"""Maximum number of suggested steps."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A command and what it is for."""
+    """A command and its purpose."""
 
     command: str
     why: str
 
 
 def shell_quote(path: str | Path) -> str:
-    """Return a path as a shell takes it: in quotes where it holds a space or the like.
+    """Quote a path for a shell if it contains a space or another special character.
 
     Examples
     --------
@@ -60,52 +60,52 @@ def shell_quote(path: str | Path) -> str:
 def suggest_after_session(
     rig: str, session: str | Path, target: str | None, *, calibration: str | Path = "calibration"
 ) -> str:
-    """Return the command that a session is for, most likely.
+    """Return the most likely next command after a session.
 
     Parameters
     ----------
     rig
-        flash, dome, gradient or probe; another name is taken for photographs.
+        flash, dome, gradient or probe; another name counts as photographs.
     session
-        Its folder.
+        SESSION/ folder.
     target
-        The calibration target that it shows, "sequence" for one in time, None for skin.
+        Calibration target of the session; "sequence" for a time sequence, None for skin.
     calibration
-        Folder of calibrations that the command names.
+        CALIBRATION/ folder for the command.
 
     Examples
     --------
     >>> suggest_after_session("flash", "session-flash", None)
-    'skinrig reconstruct session-flash --want melanin,hemoglobin --out appearance'
+    'skinrig reconstruct session-flash --maps melanin,hemoglobin --out appearance'
     >>> suggest_after_session("probe", "session-phantom", "phantom")
     'skinrig calibrate fibre session-phantom --out calibration'
     """
     place, store = shell_quote(session), shell_quote(calibration)
     if target == "sequence":
-        return f"skinrig reconstruct {place} --want perfusion_curves --out appearance"
+        return f"skinrig reconstruct {place} --maps perfusion_curves --out appearance"
     if not target:
         calibrated = rig in DEFAULT_WANTS and rig not in UNCALIBRATED_RIGS
         needs = f" --calibration {store}" if calibrated else ""
         want = DEFAULT_WANTS.get(rig, DEFAULT_WANTS["photographs"])
-        return f"skinrig reconstruct {place} --want {want}{needs} --out appearance"
+        return f"skinrig reconstruct {place} --maps {want}{needs} --out appearance"
     kind = CALIBRATION_BY_TARGET.get(rig, {}).get(target)
     if kind is None:
         return f"skinrig verify {place}"
     given = place
-    if rig == "dome" and kind == "lights":  # one calibration of both
+    if rig == "dome" and kind == "lights":  # one calibration from two targets
         given = f"{place} SESSION-WHITE" if target == "mirror" else f"SESSION-MIRROR {place}"
     return f"skinrig calibrate {kind} {given} --out {store}"
 
 
 def suggest(found: Workspace, folder: Path) -> tuple[Step, ...]:
-    """Return what to do next with what lies in a folder, the nearest first.
+    """Return the next steps for the contents of a folder, most useful first.
 
     Parameters
     ----------
     found
-        By `workspace.scan`.
+        Contents, by `workspace.scan`.
     folder
-        As it is to be named in commands.
+        Folder, as written in commands.
     """
     steps: list[Step] = []
     here = shell_quote(folder)
@@ -114,7 +114,7 @@ def suggest(found: Workspace, folder: Path) -> tuple[Step, ...]:
         why = "the report in a browser: maps, errors, checks"
         steps.append(Step(f"{OPEN_COMMAND} {page}", why))
     elif found.appearances:
-        steps.append(Step(f"skinrig report {here}", "one page of all that lies here"))
+        steps.append(Step(f"skinrig report {here}", "one page on all results of this folder"))
     used = {d.get("parameters", {}).get("session") for d in found.appearances.values()}
     fresh = [
         (path, document)
@@ -129,37 +129,37 @@ def suggest(found: Workspace, folder: Path) -> tuple[Step, ...]:
         command = suggest_after_session(rig, path, None, calibration=where)
         if rig not in CALIBRATION_BY_TARGET:
             command += _state_option(document)
-        steps.append(Step(command, "maps with standard errors"))
+        steps.append(Step(command, "maps with standard uncertainties"))
     if found.appearances:
         seen = shell_quote(_most_complete(found.appearances, ("facial_color.json", "mesh.obj")))
-        steps.append(Step(f"skinrig view {seen}", "a page that shows the skin moving, under light"))
+        steps.append(Step(f"skinrig view {seen}", "an interactive page of the face, with lights"))
         given = _most_complete(found.appearances, ("mesh.obj",))
         measured = found.appearances[given].get("source") == "measured"
         use = " --use research" if measured else ""
         command = f"skinrig export {shell_quote(given)} --to maps{use} --out export"
-        steps.append(Step(command, "other programs"))
+        steps.append(Step(command, "files for other programs"))
     if found.photographs and not found.sessions:
         command = f"skinrig import photos {here} --out session"
-        steps.append(Step(command, "photographs become a session"))
+        steps.append(Step(command, "a session from the photographs"))
     if not steps:
         steps = [
-            Step("skinrig demo", "all four rigs, simulated, in under three minutes"),
-            Step("skinrig simulate flash --out session", "one virtual rig, by the real drivers"),
-            Step("skinrig import photos DIR --out session", "photographs of your own"),
-            Step("skinrig doctor", "what is installed, and how to mend what is not"),
+            Step("skinrig demo", "all four rigs, simulated, in less than three minutes"),
+            Step("skinrig simulate flash --out session", "one simulated rig, with real drivers"),
+            Step("skinrig import photos DIR --out session", "a session from your photographs"),
+            Step("skinrig doctor", "a check of the installation, with fixes"),
         ]
     return tuple(steps[:MAX_STEPS])
 
 
 def welcome(folder: Path, version: str) -> str:
-    """Return what a plain ``skinrig`` prints.
+    """Return the output of ``skinrig`` without arguments.
 
     Parameters
     ----------
     folder
-        Where it was typed, as commands are to name it; else the demo's folder in it.
+        Current folder, as written in commands; its demo folder is used if it has no results.
     version
-        Of skinrig.
+        Version of skinrig.
     """
     found = scan(folder)
     if not found.summary() and scan(folder / DEMO_FOLDER).summary():
@@ -168,7 +168,7 @@ def welcome(folder: Path, version: str) -> str:
     steps = suggest(found, folder)
     width = max(len(step.command) for step in steps)
     summary = found.summary()
-    lines = [f"skinrig {version}: skin appearance, captured, calibrated, reconstructed", ""]
+    lines = [f"skinrig {version}: capture, calibrate and reconstruct skin appearance", ""]
     if summary:
         lines += [f"In {folder}: {summary}" if folder.name else f"Here: {summary}", ""]
     lines.append("Next:")
@@ -178,14 +178,14 @@ def welcome(folder: Path, version: str) -> str:
 
 
 def _target(session: Mapping[str, Any]) -> str:
-    """Return the calibration target of a session, as far as its documents say one."""
+    """Return the calibration target of a session; empty if its documents name none."""
     simulated = session.get("extra", {}).get("simulation", {}).get("target")
     if simulated:
         return str(simulated)
     steps = session.get("plan", {}).get("steps", ())
     kinds = {step.get("kind") for step in steps}
     rig = session.get("rig", {}).get("name", "")
-    # the flash rig takes its white tile as it takes a face, as a state of that name
+    # the flash rig captures its white reference like a face, as a state named white
     states = {step.get("index", {}).get("state") for step in steps if step.get("kind") == "subject"}
     if rig == "flash" and states == {"white"}:
         return "white"
@@ -194,7 +194,7 @@ def _target(session: Mapping[str, Any]) -> str:
 
 
 def _state_option(session: Mapping[str, Any]) -> str:
-    """Return the option that chooses a photograph; empty where the usual state is there."""
+    """Return the option --state for imported photographs; empty if they include neutral."""
     views = session.get("rig", {}).get("views", ())
     colored = {view.get("name") for view in views if view.get("cfa") != "MONO"}
     states = [
@@ -206,14 +206,14 @@ def _state_option(session: Mapping[str, Any]) -> str:
 
 
 def _is_grayscale(session: Mapping[str, Any]) -> bool:
-    """Tell imported photographs without color, of which no map of skin can be made."""
+    """Return whether a session has grayscale photographs only, which yield no skin maps."""
     rig = session.get("rig", {})
     filters = {view.get("cfa") for view in rig.get("views", ())}
     return rig.get("name") not in CALIBRATION_BY_TARGET and filters == {"MONO"}
 
 
 def _most_complete(appearances: Mapping[Path, Mapping[str, Any]], files: Sequence[str]) -> Path:
-    """Return the appearance that holds the first of some files, else the next, most maps first."""
+    """Return the appearance with the first file of the list that any has, then the most maps."""
 
     def rank(path: Path) -> tuple[int, int]:
         document = appearances[path]

@@ -48,12 +48,12 @@ class Report:
 
 
 def build(paths: Sequence[str | Path], *, title: str = "skinrig report") -> str:
-    """Return the report of everything at ``paths`` as HTML, equal for equal input.
+    """Return a deterministic HTML report of everything at ``paths``.
 
     Parameters
     ----------
     paths
-        Folders or files that skinrig wrote: a demo's folder, sessions, appearances, truths,
+        Folders or files written by skinrig: a demo's folder, sessions, appearances, ground truths,
         benchmark documents.
     title
         Heading of the page.
@@ -61,7 +61,7 @@ def build(paths: Sequence[str | Path], *, title: str = "skinrig report") -> str:
     Raises
     ------
     ReportError
-        When a path does not exist, or nothing is found at all.
+        If a path does not exist, or nothing is found.
     """
     return make(paths, title=title, compare=False).html
 
@@ -78,7 +78,7 @@ def make(
     title
         Heading of the page.
     compare
-        Whether two runs are compared; None: by the rule of `run_comparison.sides`.
+        Whether two runs are compared; None: by the rule of `run_comparison.split_sides`.
 
     Raises
     ------

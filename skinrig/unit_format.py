@@ -1,4 +1,4 @@
-"""How people are told a number with its unit: one way for pages and for the terminal."""
+"""Format numbers with units, for pages and for the terminal."""
 
 from typing import Final
 
@@ -7,12 +7,12 @@ _SIGN_BY_UNIT: Final = {"deg": DEGREE_SIGN, "1": ""}
 
 
 def format_unit(unit: str) -> str:
-    """Return a unit as people read it; none where it stands for a plain number.
+    """Return the printed form of a unit; empty for a dimensionless number.
 
     Parameters
     ----------
     unit
-        As documents and maps name it.
+        Unit, as named by documents and maps.
 
     Examples
     --------
@@ -23,17 +23,17 @@ def format_unit(unit: str) -> str:
 
 
 def format_quantity(number: str, unit: str) -> str:
-    """Return a number with its unit.
+    """Join a number and its unit.
 
-    A space stands between them, and none before the sign of degrees: SI Brochure, 9th edition,
+    A space separates them, except before the sign of degrees: SI Brochure, 9th edition,
     section 5.4.3.
 
     Parameters
     ----------
     number
-        As it is to be read.
+        Formatted number.
     unit
-        As documents and maps name it.
+        Unit, as named by documents and maps.
 
     Examples
     --------

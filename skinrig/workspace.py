@@ -1,7 +1,7 @@
-"""What skinrig wrote into a folder, photographs there, and files that are whole or not at all.
+"""Find skinrig's results, and photographs, in a folder.
 
-Folders are told apart by their documents alone, and no map is read, so that a plain ``skinrig``
-answers at once.
+The kind of a result follows from its document alone. No map is read, so that ``skinrig`` without
+arguments answers at once.
 """
 
 import json
@@ -14,24 +14,24 @@ PHOTOGRAPH_SUFFIXES: Final = tuple(
     ".dng .nef .cr2 .cr3 .arw .raf .orf .rw2 .tif .tiff .jpg .jpeg".split()
 )
 REPORT_HEAD: Final = b"content=\"default-src 'none'; img-src data:; style-src 'sha256-"
-"""How the policy of a report's page begins; that of a live page allows a script."""
+"""Start of the content security policy of a report; the policy of a live page allows a script."""
 
 
 @dataclass(frozen=True, slots=True)
 class Workspace:
-    """What lies in a folder, each sorted by name."""
+    """Contents of a folder, each kind sorted by name."""
 
     sessions: Mapping[Path, Mapping[str, Any]] = field(default_factory=dict)
-    """With their session.json."""
+    """Parsed session.json by folder."""
     appearances: Mapping[Path, Mapping[str, Any]] = field(default_factory=dict)
-    """With their appearance.json, truths left out."""
+    """Parsed appearance.json by folder, without ground truths."""
     truths: tuple[Path, ...] = ()
     calibrations: tuple[Path, ...] = ()
     reports: tuple[Path, ...] = ()
     photographs: int = 0
 
     def summary(self) -> str:
-        """Return what is here in one line; empty where nothing of skinrig's is."""
+        """Return the number of each kind in one line; empty if there are none."""
         counts = [
             (len(self.sessions), "session"),
             (len(self.calibrations), "calibration"),
@@ -43,13 +43,13 @@ class Workspace:
 
 
 def scan(folder: Path) -> Workspace:
-    """Find what skinrig wrote into a folder, and photographs.
+    """Find skinrig's results and photographs in a folder.
 
     Parameters
     ----------
     folder
-        One that exists; the folders in it are looked into, not below. What cannot be read or is
-        damaged is passed over: the commands that use it say what is wrong.
+        Existing folder; its subfolders are read, but not theirs. Unreadable or damaged entries are
+        skipped: the commands that use them report the fault.
     """
     sessions, appearances, truths, calibrations = {}, {}, [], []
     try:
@@ -82,7 +82,7 @@ def _document(path: Path) -> dict[str, Any] | None:
 
 
 def _is_report(path: Path) -> bool:
-    """Tell a report, which runs no script, from a live page and from pages of others."""
+    """Return whether an HTML file is a report: its security policy allows no script."""
     try:
         with path.open("rb") as stream:
             head = stream.read(1000)

@@ -286,14 +286,14 @@ def _read_weights(
     try:
         lobes = surface_mixtures.read(appearance)
     except SurfaceMixtureError as error:
-        want = "--want r_d,basis_weight_0 --rank 24"
+        want = "--maps r_d,basis_weight_0 --rank 24"
         how = f"skinrig reconstruct SESSION {want} --out {shell_quote(folder)}"
         raise AnalysisError(f"{folder}: holds no lobes ({error}); make them by `{how}`") from error
     if lobes.materials != materials.names:
         raise AnalysisError(
             f"{folder}: its {len(lobes.mix)} lobes are of {len(lobes.materials)} materials "
             f"({lobes.materials[0]}, ...), expected {materials.size} ({materials.names[0]}, ...); "
-            "say --basis DIR where they were fitted with other files than the built-in ones"
+            "say --merl-basis DIR where they were fitted with other files than the built-in ones"
         )
     known = np.logical_and.reduce([valid_texels(one) for one in lobes.maps])
     at = rng.permutation(np.flatnonzero(known))[:count]

@@ -1,4 +1,4 @@
-"""What several readers take from an appearance: valid texels, assumptions, digest, versions."""
+"""Shared readers of an appearance: valid texels, assumptions, digest and versions."""
 
 import hashlib
 from collections.abc import Mapping

@@ -37,7 +37,7 @@ def check_target(out: Path) -> None:
 
 
 def add(out: Path, name: str, part: SkinAppearance) -> SkinAppearance:
-    """Write a part beside those that the folder holds already.
+    """Add a part to those in the folder.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def add(out: Path, name: str, part: SkinAppearance) -> SkinAppearance:
 def read(
     path: Path, *, parts: Sequence[str] = DYNAMIC_PARTS
 ) -> tuple[SkinAppearance, dict[str, Any]]:
-    """Return a dynamic appearance and what it says of its parts.
+    """Return a dynamic appearance and the documents of its parts.
 
     Parameters
     ----------
@@ -124,6 +124,6 @@ def _previous(out: Path) -> SkinAppearance | None:
 
 
 def describe_parts(appearance: SkinAppearance) -> dict[str, Any]:
-    """Return what an appearance says of its parts, by name; empty where it has none."""
+    """Return the documents of an appearance's parts by name; empty without parts."""
     parts = appearance.parameters.get("parts")
     return dict(parts) if isinstance(parts, dict) else {}

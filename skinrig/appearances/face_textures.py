@@ -107,7 +107,7 @@ class Face:
 
 
 def read(path: Path, landmarks: Path | None = None) -> Face:
-    """Read an appearance with its landmarks: of a table, else of the truth beside it.
+    """Read an appearance with its landmarks: of a table, else of its ground truth.
 
     Parameters
     ----------
@@ -127,14 +127,14 @@ def read(path: Path, landmarks: Path | None = None) -> Face:
     if landmarks is not None:
         return Face(name, path, found, read_landmarks(landmarks, face), landmarks.name)
     truth = _truth(path, found)
-    told = truth and store.read_document(truth).parameters.get(TRUE_LANDMARKS_KEY)
-    if not isinstance(told, dict):
+    known = truth and store.read_document(truth).parameters.get(TRUE_LANDMARKS_KEY)
+    if not isinstance(known, dict):
         return face
     try:
-        points = {str(n): _point([float(x) for x in place]) for n, place in told.items()}  # type: ignore[arg-type,union-attr]
+        points = {str(n): _point([float(x) for x in place]) for n, place in known.items()}  # type: ignore[arg-type,union-attr]
     except (TypeError, ValueError) as error:
         raise FaceError(
-            f"{truth}: {TRUE_LANDMARKS_KEY}: {json.dumps(told)[:80]}: {error}"
+            f"{truth}: {TRUE_LANDMARKS_KEY}: {json.dumps(known)[:80]}: {error}"
         ) from error
     return Face(name, path, found, points, "the simulation's own")
 
@@ -159,14 +159,14 @@ def read_landmarks(path: Path, face: Face) -> Landmarks:
     Raises
     ------
     landmark_table.LandmarkError
-        For what is no table.
+        For a file that is not a table.
     FaceError
         For a landmark outside the texture, or where it shows no surface.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise landmark_table.LandmarkError(f"{path}: is no UTF-8 text") from error
+        raise landmark_table.LandmarkError(f"{path}: expected UTF-8 text") from error
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     if lines and [c.strip() for c in lines[0].split(",")] == ["name", "x", "y", "z"]:
         found: Landmarks = {}
@@ -205,7 +205,7 @@ def valid_texels(skin_map: SkinMap) -> BoolArray:
 
 
 def choose_size(side_mm: float, texel_mm: float) -> int:
-    """Return how many pixels a side a map needs to show texels of a size: a power of two.
+    """Return the width in pixels, a power of two, of a map with texels of a given size.
 
     Examples
     --------
@@ -234,6 +234,6 @@ def _map(face: Face, name: str) -> SkinMap:
         have: Mapping[str, SkinMap] = face.appearance.maps
         raise FaceError(
             f"{face.path}: has no map {name!r} (it has {', '.join(sorted(have)) or 'none'}); "
-            f"`skinrig reconstruct SESSION --want {name}` of a dome session makes it"
+            f"`skinrig reconstruct SESSION --maps {name}` of a dome session makes it"
         )
     return face.appearance.maps[name]

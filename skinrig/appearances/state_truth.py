@@ -1,4 +1,4 @@
-"""Where the truth of a simulated session's state lies."""
+"""Find the ground truth of a simulated session's state."""
 
 from pathlib import Path
 from typing import Final
@@ -7,7 +7,7 @@ from model import store
 from skinrig.simulating.orders import truth_folder
 
 DEFAULT_STATE: Final = "neutral"
-"""The state that is meant where none is said."""
+"""State used if none is given."""
 
 
 def find_state_truth(session: Path, state: str) -> Path | None:

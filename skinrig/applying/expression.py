@@ -117,7 +117,7 @@ def parse_weights(text: str) -> dict[str, float]:
     Raises
     ------
     WeightsError
-        Naming the part that is no ``NAME=NUMBER``, or a name given twice.
+        If a part is not ``NAME=NUMBER``, or a name given twice.
 
     Examples
     --------
@@ -271,7 +271,7 @@ def _facial_color(
         "mean_hemoglobin": float(held[good].mean()) if good.any() else None,
     }
     if "melanin" not in maps:
-        done.left_out.append(("color", "there is no melanin map"))
+        done.left_out.append(("color", "it needs a melanin map"))
         return
     melanin = maps["melanin"]
     seen = good & intersect_valid(melanin)
@@ -330,8 +330,8 @@ def _wrinkles(
 def wrinkle_weights(model: WrinkleModel, weights: Mapping[str, float]) -> dict[str, float]:
     """Return the weights of a wrinkle model's own rows for weights of states.
 
-    A state stands for the row of its name, or for the paper's row that means it; a state of the
-    whole body moves nothing.
+    A state selects the row of its name, or the equivalent row of the paper. Conditions of the
+    whole body deform nothing.
 
     Raises
     ------

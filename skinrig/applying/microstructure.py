@@ -42,7 +42,7 @@ STATISTICS_SIDE_PX: Final = 1024
 MIN_SIGMA_PX: Final = 0.3
 """The discrete Gaussian of a narrower kernel leaves 99 % and more to the pixel itself."""
 ROWS_PER_DIGEST: Final = 256
-"""Rows of a map that are read at a time to tell one map from another."""
+"""Rows of a map that are hashed at a time to identify it."""
 
 
 class ApplyMicrostructureError(ValueError):
@@ -144,7 +144,7 @@ def apply_microstructure(
     Parameters
     ----------
     mesh : BlendShapeMesh
-        In mm: its texture's scale tells how wide kernels are in pixels.
+        Mesh, mm: its texture's scale determines the width of kernels in pixels.
     weights : mapping of str to float
         Of its shapes.
     neutral_height : array or memory map, shape (H, W)
@@ -158,10 +158,10 @@ def apply_microstructure(
     sampling : {"cubic", "linear"}
         As of `model.microstructure.convolution.convolve`.
     tile : int
-        Pixels a side that are computed at a time; the result does not depend on it.
+        Width and height of tiles, pixels; the result does not depend on it.
     out : path, optional
-        A .npy file for the result, written as a memory map. Beside it, ``<out>.tiles.json`` tells
-        which tiles are done until all are: the same call goes on where an interrupted one ended.
+        A .npy file for the result, written as a memory map. Until all tiles are
+        done, ``<out>.tiles.json`` lists them, so that the same call resumes an interrupted one.
     progress : callable, optional
         Called with the numbers of tiles done and in all.
 
@@ -172,7 +172,7 @@ def apply_microstructure(
     Raises
     ------
     ApplyMicrostructureError
-        For heights that are no map, or an `out` that belongs to another job.
+        If heights are not a map, or for an `out` that belongs to another job.
     rigsim.geometry.mesh.MeshError
         For shapes that the mesh lacks.
     """
@@ -352,7 +352,7 @@ class _Tiles:
 
 @dataclass(slots=True, eq=False)
 class _Journal(_Tiles):
-    """Which tiles of a file are done, kept beside it."""
+    """List of the finished tiles of a file, stored next to it."""
 
     path: Path
     job: str
@@ -364,9 +364,12 @@ class _Journal(_Tiles):
             raise ApplyMicrostructureError(f"out: got {out.name!r}, expected a name in .npy")
         if path.exists() and out.exists():
             try:
-                told = json.loads(path.read_text("utf-8"))
-                known = told["schema"] == JOURNAL_SCHEMA
-                same, done = told["job"] == job, [int(number) for number in told["finished"]]
+                document = json.loads(path.read_text("utf-8"))
+                known = document["schema"] == JOURNAL_SCHEMA
+                same, done = (
+                    document["job"] == job,
+                    [int(number) for number in document["finished"]],
+                )
             except (ValueError, KeyError, TypeError) as error:
                 raise ApplyMicrostructureError(f"{path}: not a list of tiles: {error}") from error
             if not (known and same):
@@ -390,8 +393,8 @@ class _Journal(_Tiles):
         self._write()
 
     def _write(self) -> None:
-        told = {"schema": JOURNAL_SCHEMA, "job": self.job, "finished": self.finished}
-        write_atomically(self.path, json.dumps(told))
+        document = {"schema": JOURNAL_SCHEMA, "job": self.job, "finished": self.finished}
+        write_atomically(self.path, json.dumps(document))
 
     def close(self) -> None:
         self.target.flush()

@@ -45,7 +45,7 @@ ROUGHNESS_POINTS: Final[Mapping[str, tuple[float, float, float]]] = {
     "right": (math.sqrt(0.5), 0.0, math.sqrt(0.5)),
     "top": (0.0, math.sqrt(0.5), math.sqrt(0.5)),
 }
-"""Points of the unit sphere whose roughness is told."""
+"""Points of the unit sphere at which roughness is reported."""
 
 
 class SphereError(ValueError):
@@ -174,13 +174,13 @@ class DeformedSphere:
         light : tuple of float
             Direction to the light.
         samples : int
-            Rays a pixel and axis.
+            Rays per pixel and axis.
 
         Returns
         -------
         ndarray, shape (size_px, size_px)
             Radiance, relative, by Cook and Torrance's model with Schlick's Fresnel term for 0.028,
-            without masking; row 0 is +y; 0 beside the sphere.
+            without masking; row 0 is +y; 0 outside the sphere.
         """
         count = size_px * samples
         at = 1.3 * ((np.arange(count) + 0.5) * 2.0 / count - 1.0)

@@ -34,13 +34,13 @@ from skinrig.console import select_attributes
 from skinrig.errors import one_of
 
 REGION_ATLAS_PX: Final = 256
-"""Texels a side of the maps that say whose relief is where, and how large pixels are."""
+"""Width of the maps of relief site and pixel size, texels."""
 SITE_REGIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "forehead": ("forehead", "brows", "temples"),
     "cheek": ("cheeks", "nose sides", "lids", "nose"),
     "chin": ("chin", "lips", "mouth corners", "neck"),
 }
-"""Regions of a face that a site's relief stands for."""
+"""Regions of a face covered by the relief of a site."""
 MIN_PATCH_PX: Final = 64
 MIN_WAVES_PER_MM: Final = 1.0
 """The relief's longest waves: longer ones are the face's own shape (Nagano2015, section 4)."""
@@ -55,7 +55,7 @@ RELIEF_SOURCES: Final = ("patches", "noise")
 Extrapolation = Literal["hold", "formula"]
 EXTRAPOLATION_MODES: Final[tuple[Extrapolation, ...]] = get_args(Extrapolation)
 MAX_EXR_SIDE_PX: Final = 8192
-"""Larger maps are written as .npy files beside the folder, tile by tile, and not as EXR."""
+"""Larger maps are written tile by tile as .npy files next to the folder, not as EXR."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class ReliefRequest:
     """What relief is asked for."""
 
     size_px: int
-    """Pixels a side of the map."""
+    """Width and height of the map."""
     site: str | None = None
     """Whose relief covers the whole mesh; None: of several each site its own region."""
     source: str = "patches"
@@ -125,7 +125,7 @@ class ReliefEvaluator:
     ) -> ReliefEvaluator:
         """Load the mesh and give it the shapes that states need.
 
-        Maps of more than `MAX_EXR_SIDE_PX` go to a folder beside ``out``, as .npy files.
+        Maps of more than `MAX_EXR_SIDE_PX` go to a folder next to ``out``, as .npy files.
 
         Raises
         ------
@@ -203,7 +203,7 @@ class ReliefEvaluator:
         if max(pixels_um) > (1.0 + PIXEL_SIZE_TOL) * min(pixels_um):
             raise ApplyError(
                 f"sites: reliefs with pixels of {sorted(pixels_um)} um, expected one size; "
-                "choose one with --site"
+                "choose one with --relief-site"
             )
         rng, scale = np.random.default_rng(asked.seed), _scale(self.mesh)
         shape = f"{asked.size_px} x {asked.size_px}"
@@ -323,7 +323,7 @@ def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> Float64Array | None:
     if unknown:
         raise ApplyError(
             f"sites: no region is known for {unknown[0]!r}, expected {', '.join(SITE_REGIONS)}; "
-            "choose one with --site"
+            "choose one with --relief-site"
         )
     atlas = _atlas(mesh)
     masks = region_masks(to_mean_head(atlas.position_mm, _face(mesh)))

@@ -60,13 +60,13 @@ def print_tables(document: Mapping[str, Any], console: Console) -> None:
         )
         for limit in stage["limits"]:
             word = "kept" if limit["passed"] else "MISSED"
-            console.say(
+            console.print_line(
                 f"{word}: {limit['name']}: {limit['got']:.4g} {limit['unit']} "
                 f"({limit['sense']} {limit['bound']:g})"
             )
         for what, why in stage["left_out"]:
-            console.say(f"left out: {what}: {why}")
-        console.say()
+            console.print_line(f"left out: {what}: {why}")
+        console.print_line()
     console.rows(
         (
             "stage",
@@ -82,12 +82,12 @@ def print_tables(document: Mapping[str, Any], console: Console) -> None:
         [_line(name, stage) for name, stage in document["stages"].items()],
     )
     if found := bands(document):
-        console.say()
+        console.print_line()
         console.rows(BAND_COLUMNS, found)
     for name, why in document["left_out"]:
-        console.say(f"left out: {name}: {why}")
+        console.print_line(f"left out: {name}: {why}")
     if document["not_judged"]:
-        console.say(
+        console.print_line(
             "limits not judged, since measured at small size: "
             f"{', '.join(document['not_judged'])}; `skinrig bench --stage NAME` judges them"
         )

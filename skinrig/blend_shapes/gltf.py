@@ -115,7 +115,7 @@ class _Gltf:
                 file = self.path.parent / unquote(uri)
                 if ".." in Path(unquote(uri)).parts or Path(unquote(uri)).is_absolute():
                     raise self.build_error(
-                        f"buffer {number}: got {uri!r}, expected a file beside it"
+                        f"buffer {number}: got {uri!r}, expected a file next to it"
                     )
                 try:
                     data = file.read_bytes()

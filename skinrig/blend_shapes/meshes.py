@@ -77,7 +77,7 @@ def load(path: Path | str) -> BlendShapeMesh:
     Parameters
     ----------
     path
-        .npz of `NPZ_KEYS` in mm; .obj, the neutral mesh in mm with one .obj for each shape beside
+        .npz of `NPZ_KEYS` in mm; .obj, the neutral mesh in mm with one .obj per shape next to
         it, or the folder of these; .gltf or .glb in m, with one mesh that has morph targets.
 
     Raises

@@ -210,13 +210,8 @@ def _noise(sessions: TargetSessions) -> tuple[CameraNoise, tuple[str, ...]]:
 def _packaged_certificate(session: Session) -> PhantomCertificate:
     if session.source != "simulated":
         raise CalibratingError(
-<<<<<<< HEAD
-            "phantom: its optics are not known; give the certificate of the block that was measured"
-            " as --phantom FILE.json (schema skinrig.phantom/1, see docs/how-to/calibrate-probe.md)"
-=======
             "phantom: its optics are not known; give its certificate with --phantom FILE.json"
-            " (schema skinrig.phantom/1, see docs/probe-calibration.md)"
->>>>>>> room-K
+            " (schema skinrig.phantom/1, see docs/how-to/calibrate-probe.md)"
         )
     return packaged_certificate()
 

@@ -88,13 +88,15 @@ def capture_session(
             )
     if order.out is None and not order.dry_run:
         raise UsageError("a capture needs --out SESSION; name a new folder, or add --dry-run")
-    console.say(f"{len(plan.steps)} steps, about {seconds:.0f} s")
+    console.print_line(f"{len(plan.steps)} steps, about {seconds:.0f} s")
     light: Mapping[str, Any] = {} if rig.leds is None else light_figures(plan, rig)
     for line in (*sequence_lines(plan), *(light_lines(plan, rig) if light else ())):
-        console.say(line)
+        console.print_line(line)
     if (file := order.plan_out) is not None:
         write_plan(plan, file)
-        console.say(f"{file}: the plan; edit it, then capture it with --plan {shell_quote(file)}")
+        console.print_line(
+            f"{file}: the plan; edit it, then capture it with --plan {shell_quote(file)}"
+        )
     if order.out is None or order.dry_run:
         steps = plan.steps
         settings = [" ".join(f"{k}={v}" for k, v in step.settings.items()) for step in steps]
@@ -151,10 +153,10 @@ def _run(
         session.close()
         omitted = dict(session.omitted_steps())
     if done.dead_lights:
-        console.say(f"dead lights: {', '.join(done.dead_lights)}; their frames are dark")
+        console.print_line(f"dead lights: {', '.join(done.dead_lights)}; their frames are dark")
     console.each("omitted", dict.fromkeys(omitted.values()))
-    console.say(f"{out}: {done.frames} frames in {done.steps} steps, {done.retakes} retaken")
-    console.say(f"next: skinrig verify {shell_quote(out)}")
+    console.print_line(f"{out}: {done.frames} frames in {done.steps} steps, {done.retakes} retaken")
+    console.print_line(f"next: skinrig verify {shell_quote(out)}")
     figures = {"session": out, "captured": done.frames, "retakes": done.retakes}
     figures |= {"stale_frames": done.stale, "steps": len(plan.steps)}
     return figures | {"dead_lights": done.dead_lights, "left_out": omitted}

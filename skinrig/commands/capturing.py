@@ -1,4 +1,4 @@
-"""The commands that drive rigs, serve simulated ones and check what was captured."""
+"""`skinrig capture`, `skinrig serve` and `skinrig verify`: sessions of rigs and their checks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import typer
 from skinrig import errors
 from skinrig.commands import options
 from skinrig.commands.help import RigCommand, RigFileGroup
-from skinrig.commands.options import command, option, target_option
+from skinrig.commands.options import choice, command, target_option
 from skinrig.console import Console, format_count, select_attributes
 
 if TYPE_CHECKING:
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 capture_app = typer.Typer(
     cls=RigFileGroup,
     subcommand_metavar="RIG [ARGS]...",
-    help="Run a plan on a rig, by its name or its TOML file: real, or served by `skinrig serve`.",
+    help="Run a plan on a rig, given by name or TOML file: real, or served by `skinrig serve`.",
 )
 serve_app = typer.Typer(
     cls=RigFileGroup,
     subcommand_metavar="RIG [ARGS]...",
-    help="Serve a simulated rig, by its name or its TOML file, to any client.",
+    help="Serve a simulated rig, given by name or TOML file, to any client.",
 )
 
-Eyes = Annotated[str, option("The subject's eyes among LEDs: open, closed or shielded.", "--eyes")]
+Eyes = Annotated[str, choice("open", "closed", "shielded")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,17 +38,17 @@ class CaptureOptions:
     Attributes
     ----------
     out
-        Folder of the session.
+        SESSION/ folder to write; without it, the plan is only printed.
     plan
-        Plan, JSON; default: the rig's own.
+        Plan file, JSON; default: the rig's own plan.
     subject
         Pseudonym of the subject.
     dry_run
-        Only print the plan.
+        Print the plan without capturing.
     plan_out
-        New file for the plan, JSON.
+        New file to write the plan to, JSON.
     port
-        Address of a box; repeatable.
+        Address of a controller; repeatable.
     camera
         Address of a camera; repeatable.
     """
@@ -66,7 +66,7 @@ class CaptureOptions:
     json: options.Json = False
 
     def order(self, **more: Any) -> CaptureOrder:
-        """Return the order of a capture, with what only some rigs have."""
+        """Return the options as a request for a capture, with a rig's own options `more`."""
         from skinrig.capturing.acquisition import CaptureOrder
         from skinrig.capturing.addresses import parse_addresses
         from skinrig.consent import parse_subject
@@ -91,7 +91,7 @@ def capture_flash(
     state: list[str] | None = None,
     repeats: options.Pairs = 1,
 ) -> None:
-    """Run a plan on a flash rig: states of a face, a sequence in time, or a target.
+    """Capture with a flash rig: expressions of a face, a time sequence, or a target.
 
     Example: skinrig capture flash --port flash=/dev/ttyUSB0 --camera cam=hotfolder:incoming
     --out session
@@ -99,7 +99,7 @@ def capture_flash(
     Parameters
     ----------
     state
-        State of the face, such as smile; repeatable.
+        Expression or condition of the face, such as smile; repeatable; default: neutral.
     """
     chosen = {"repeats": repeats, "sequence": sequence.order(), "states": tuple(state or ())}
     _capture(context, common, common.order(), target, **chosen)
@@ -113,9 +113,14 @@ def capture_dome(
     target: Annotated[str | None, target_option("dome")] = None,
     eyes: Eyes = "open",
 ) -> None:
-    """Run a plan on a dome: a face under one light after the other, or a target.
+    """Capture with a dome: a face under one light at a time (OLAT), or a target.
 
     Example: skinrig capture dome --dry-run
+
+    Parameters
+    ----------
+    eyes
+        State of the subject's eyes under LEDs.
     """
     from skinrig.capturing.option_values import parse_eye_state
 
@@ -133,14 +138,16 @@ def capture_gradient(
     angles: options.Angles = None,
     steps: options.Steps = None,
 ) -> None:
-    """Run a plan on a gradient sphere: a patch of skin in a caliper, or a target.
+    """Capture with a gradient sphere: a patch of skin in a caliper, or a target.
 
     Example: skinrig capture gradient --angles 0,90 --dry-run
 
     Parameters
     ----------
+    eyes
+        State of the subject's eyes under LEDs.
     force_limit
-        Greatest force of the caliper on this skin, newton; no default.
+        Maximum force of the caliper on this skin, N; required with a caliper.
     """
     from skinrig.capturing.option_values import parse_eye_state, parse_floats, parse_range
 
@@ -160,7 +167,7 @@ def capture_probe(
     angles: options.Directions = None,
     all_brackets: options.AllBrackets = False,
 ) -> None:
-    """Run a plan on a fibre probe: skin at some sites, or a target.
+    """Capture with a fiber probe: skin at several sites, or a target.
 
     Example: skinrig capture probe --sites cheek --dry-run
     """
@@ -181,7 +188,7 @@ def _capture(
     target: str | None,
     **chosen: Any,
 ) -> None:
-    """Capture by a rig's own plan, or that of a file."""
+    """Capture with the rig's own plan or the plan of a file."""
     from capture.rig import load_rig
     from skinrig.capturing.acquisition import capture_session
     from skinrig.capturing.plan_choice import choose_plan
@@ -199,21 +206,23 @@ class ServeOptions:
     Attributes
     ----------
     pty
-        Boxes on a pseudo terminal.
+        Serve each controller on a pseudo terminal.
     tcp
-        Address for cameras and, without --pty, boxes; port 0: a free one.
+        Address of cameras and, without --pty, of controllers; port 0: any free port.
+    scale
+        Scale of the simulation: small (quick) or full (all of the rig); gradient: small only.
     allow_remote
-        Let other machines connect.
+        Accept connections from other machines.
     resume
-        Session that was captured from an earlier server of this rig and seed and is to be gone on
-        with: noise of its shots does not come again.
+        Interrupted session captured from an earlier server with this rig and seed; continues its
+        noise sequence, so that shots differ from those on disk.
     """
 
     pty: bool = False
     tcp: str = "127.0.0.1:0"
     allow_remote: bool = False
     subject: options.Subject = "III"
-    size: options.Size = "small"
+    scale: options.Scale = "small"
     seed: options.Seed = 0
     resume: Path | None = None
     json: options.Json = False
@@ -224,8 +233,8 @@ class ServeOptions:
 def serve_flash(context: typer.Context, common: ServeOptions) -> None:
     """Serve a simulated flash rig; the first lines are the addresses.
 
-    Boxes and cameras are on TCP, with --pty boxes on a pseudo terminal each. With --json the
-    addresses are the one document, printed as soon as they can be opened.
+    Controllers and cameras are on TCP; with --pty, each controller is on a pseudo terminal. With
+    --json, the document lists the addresses and is printed when they accept connections.
 
     Example: skinrig serve flash --pty
     """
@@ -245,7 +254,7 @@ def serve_dome(context: typer.Context, common: ServeOptions) -> None:
 @serve_app.command("gradient", cls=RigCommand)
 @command
 def serve_gradient(context: typer.Context, common: ServeOptions, site: options.Site = None) -> None:
-    """Serve a simulated gradient sphere, small only; the first lines are the addresses.
+    """Serve a simulated gradient sphere at small scale; the first lines are the addresses.
 
     Example: skinrig serve gradient --site cheek
     """
@@ -255,7 +264,7 @@ def serve_gradient(context: typer.Context, common: ServeOptions, site: options.S
 @serve_app.command("probe", cls=RigCommand)
 @command
 def serve_probe(context: typer.Context, common: ServeOptions) -> None:
-    """Serve a simulated fibre probe on skin; the first lines are the addresses.
+    """Serve a simulated fiber probe on skin; the first lines are the addresses.
 
     Example: skinrig serve probe --subject IV
     """
@@ -263,17 +272,17 @@ def serve_probe(context: typer.Context, common: ServeOptions) -> None:
 
 
 def _serve(context: typer.Context, common: ServeOptions, site: str | None = None) -> None:
-    """Serve a rig until interrupted."""
+    """Serve a simulated rig until interrupted."""
     from skinrig.simulating.serving import ServeOrder, serve_rig
 
-    options = ("pty", "tcp", "allow_remote", "subject", "size", "seed", "resume")
-    order = ServeOrder(site=site, **select_attributes(common, *options))
+    options = ("pty", "tcp", "allow_remote", "subject", "seed", "resume")
+    order = ServeOrder(site=site, size=common.scale, **select_attributes(common, *options))
     serve_rig(str(context.info_name), order, Console(common.json))
 
 
 @command
 def verify(session: Path, /, json: options.Json = False) -> None:
-    """Check every byte of a session; exit code 3 names what is damaged.
+    """Check the digests of all files of a session; exit code 3 if one is damaged.
 
     Example: skinrig verify session
 
@@ -288,7 +297,7 @@ def verify(session: Path, /, json: options.Json = False) -> None:
     found = check(session)
     console.each("warning", found.warnings)
     console.each("damaged", found.problems)
-    console.say(
+    console.print_line(
         f"{session}: {'sound' if found.ok else 'DAMAGED'}, {format_count(found.frames, 'frame')}, "
         f"{found.bytes / 1e6:.1f} MB"
     )

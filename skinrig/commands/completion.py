@@ -1,7 +1,7 @@
-"""What the shell offers when Tab is pressed: names that an argument or option takes.
+"""Shell completion of arguments and options.
 
-Each function takes what is typed so far and returns what it may become. They are called by the
-shell's completion alone, so that what they import costs no command anything.
+Each function takes the incomplete word and returns its completions. Only the shell's completion
+calls them, so their imports do not slow down any command.
 """
 
 from collections.abc import Iterable
@@ -10,7 +10,7 @@ from skinrig.next_steps import CALIBRATION_BY_TARGET, DEFAULT_WANTS
 
 
 def complete_rig_list(incomplete: str) -> list[str]:
-    """Return lists of rigs, joined by commas.
+    """Complete a list of rigs, separated by commas.
 
     Examples
     --------
@@ -32,13 +32,13 @@ def target_completer(rig: str) -> tuple[str, ...]:
 
 
 def calibrations(incomplete: str) -> list[str]:
-    """Return kinds of calibration."""
+    """Complete a kind of calibration."""
     kinds = {kind for kinds in CALIBRATION_BY_TARGET.values() for kind in kinds.values()}
     return filter_by_prefix(kinds, incomplete)
 
 
 def complete_wants(incomplete: str) -> list[str]:
-    """Return what is usually wanted of sessions, joined by commas.
+    """Complete a list of maps that sessions are usually reconstructed to.
 
     Examples
     --------
@@ -50,46 +50,46 @@ def complete_wants(incomplete: str) -> list[str]:
 
 
 def subjects(incomplete: str) -> list[str]:
-    """Return presets of skin."""
+    """Complete a skin preset."""
     from rigsim.subject import PRESET_NAMES
 
     return filter_by_prefix(PRESET_NAMES, incomplete)
 
 
 def states(incomplete: str) -> list[str]:
-    """Return states of a simulated face."""
+    """Complete an expression or condition of a simulated face (flash and dome rigs)."""
     from rigsim.subject import STATE_NAMES
 
     return filter_by_prefix(STATE_NAMES, incomplete)
 
 
 def conditions(incomplete: str) -> list[str]:
-    """Return conditions of a simulated face."""
+    """Complete a surface condition of a simulated face (dome)."""
     from rigsim.population.conditions import CONDITION_NAMES
 
     return filter_by_prefix(CONDITION_NAMES, incomplete)
 
 
 def stages(incomplete: str) -> list[str]:
-    """Return stages that can be measured."""
+    """Complete a benchmark stage."""
     from skinrig.benchmarks.stages import STAGES
 
     return filter_by_prefix(STAGES, incomplete)
 
 
 def sizes(incomplete: str) -> list[str]:
-    """Return sizes of simulated pictures."""
+    """Complete a scale of a simulation."""
     return filter_by_prefix(("small", "full"), incomplete)
 
 
 def filter_by_prefix(names: Iterable[str], incomplete: str) -> list[str]:
-    """Return those of some names that begin with what is typed, in their order; sets by name."""
+    """Return the names that begin with the incomplete word, in their order; sets sorted."""
     ordered = sorted(names) if isinstance(names, (set, frozenset)) else names
     return [name for name in ordered if name.startswith(incomplete)]
 
 
 def complete_list(names: Iterable[str], incomplete: str) -> list[str]:
-    """Return the lists that what is typed, joined by commas, may become by one more name."""
+    """Return the completions of the last name of a list separated by commas, without repeats."""
     before, comma, last = incomplete.rpartition(",")
     taken = set(before.split(","))
     return [before + comma + name for name in filter_by_prefix(names, last) if name not in taken]

@@ -1,4 +1,4 @@
-"""`skinrig fit` and `skinrig apply`: models of a moving face, fitted and evaluated."""
+"""`skinrig fit` and `skinrig apply`: fit models of a moving face and evaluate them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import typer
 
 from reconstruction.correspondence import landmark_table
 from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Json, NewMaps, command
+from skinrig.commands.options import Json, NewMaps, choice, command
 from skinrig.console import Console, select_attributes
 from skinrig.errors import UsageError, one_of
 from skinrig.next_steps import shell_quote
@@ -39,9 +39,9 @@ def fit_facial_color(
     stored_size: int = 256,
     json: Json = False,
 ) -> None:
-    """Fit the hemoglobin rig: blood of each state as scale and bias of the neutral.
+    """Fit the hemoglobin rig: scale and bias of blood volume fraction per expression.
 
-    Nothing is left to chance: there is no --seed.
+    The fit is deterministic.
 
     Example: skinrig fit facial-color session-flash --calibration calibration --out moving
 
@@ -50,13 +50,13 @@ def fit_facial_color(
     sessions
         Flash sessions of one subject.
     calibration
-        CALIBRATION/ folder.
+        CALIBRATION/ folder; default: nominal values, listed as assumed.
     landmarks
-        Folder with STATE.csv (name,x,y) for each state.
+        Folder with STATE.csv (name,x,y, pixels) per expression.
     radius
-        Radius of the local statistics, px; default: side / 32.
+        Radius of the local statistics, px; default: image width / 32.
     stored_size
-        Cells a side of scale and bias maps.
+        Width and height of the scale and bias maps, cells.
     """
     from skinrig.fitting.facial_color import fit_facial_color as fit
     from skinrig.fitting.facial_color import summarize_states
@@ -73,13 +73,20 @@ def fit_facial_color(
     )
     rows = summarize_states(found)
     console.rows(
-        ("state", "change of blood, points", "change, %", "median scale", "place error, px"), rows
+        (
+            "state",
+            "blood volume change, points",
+            "change, %",
+            "median scale",
+            "registration error, px",
+        ),
+        rows,
     )
     console.left_out(found.omitted)
     states = ",".join(found.hemoglobin)
-    console.say(f"{out}: hemoglobin rig of {states}")
+    console.print_line(f"{out}: hemoglobin rig with states {states}")
     last = list(found.changes)[-1]
-    console.say(
+    console.print_line(
         f"next: skinrig apply expression {shell_quote(out)} --weights {last}=1 --out {last}"
     )
     found_values = {"states": list(found.hemoglobin), "radius_px": found.rig.radius_px}
@@ -95,35 +102,37 @@ def fit_wrinkles(
     /,
     out: NewMaps,
     mask: list[Path] | None = None,
-    size: int = 256,
+    size_px: int = 256,
     mask_size: int = 64,
     seed: int = 0,
     json: Json = False,
 ) -> None:
-    """Fit a wrinkle map, its zones and their weights to normals of expressions.
+    """Fit a wrinkle map, its zones and their weights to the normals of expressions.
 
     Example: skinrig fit wrinkles appearance-neutral surprise=appearance-surprise --out moving
 
     Parameters
     ----------
     appearances
-        Maps of dome sessions: neutral and expressions.
+        APPEARANCE/ folders of dome sessions: the neutral face and expressions as STATE=FOLDER.
     mask
-        RGBA picture of four zones; twice for eight.
-    size
-        Texels a side of the wrinkle map.
+        RGBA image of four zones; give twice for eight; default: zones are estimated.
+    size_px
+        Width and height of the wrinkle map, texels.
     mask_size
-        Texels a side of masks that are found.
+        Width and height of estimated zone masks, texels.
     seed
-        Seed of the search for zones.
+        Random seed of the zone estimation.
     """
     from skinrig.fitting.wrinkles import fit_wrinkles as fit
     from skinrig.fitting.wrinkles import summarize_expressions, zone_names
 
     console = Console(json)
-    found = fit(appearances, out=out, masks=mask, size=size, mask_size=mask_size, seed=seed)
+    found = fit(appearances, out=out, masks=mask, size=size_px, mask_size=mask_size, seed=seed)
     console.rows(("expression", *zone_names(found).values()), summarize_expressions(found))
-    console.say(f"{out}: wrinkles explain {100 * found.fit.explained:.0f} % of the differences")
+    console.print_line(
+        f"{out}: wrinkles explain {100 * found.fit.explained:.0f} % of normal differences"
+    )
     print_fit(
         console,
         "wrinkles",
@@ -137,18 +146,18 @@ def fit_wrinkles(
 def fit_microstructure(
     appearances: list[Path], /, out: NewMaps, paper_table: bool = False, json: Json = False
 ) -> None:
-    """Fit neutral microrelief and its table of kernels, site by site.
+    """Fit neutral microrelief and its table of stretch kernels, per site.
 
-    Nothing is left to chance: there is no --seed.
+    The fit is deterministic.
 
     Example: skinrig fit microstructure forehead=appearance-gradient --out moving
 
     Parameters
     ----------
     appearances
-        Maps of caliper sessions with heights and kernels.
+        Maps of gradient rig sessions with heights and kernels, as SITE=FOLDER.
     paper_table
-        The paper's forehead where kernels are too few.
+        Use the published forehead table for sites with too few kernels.
     """
     from skinrig.fitting.microstructure import fit_microstructure as fit
 
@@ -157,8 +166,8 @@ def fit_microstructure(
     for site, one in found.items():
         low, high = one.table.stretch_range
         how = f"{one.kernels} kernels" if one.kernels else "the paper's forehead table"
-        console.say(f"{site}: {how}, stretch {low:.2f} to {high:.2f}")
-    console.say(
+        console.print_line(f"{site}: {how}, stretch {low:.2f} to {high:.2f}")
+    console.print_line(
         f"next: skinrig apply microstructure {shell_quote(out)} --mesh MESH --weights SHAPE=1 "
         "--out DIR"
     )
@@ -168,76 +177,76 @@ def fit_microstructure(
 
 @dataclass(frozen=True, slots=True)
 class ReliefOptions:
-    """Options of the relief that moves with a mesh.
+    """Options of relief that follows the strain of a mesh.
 
     Attributes
     ----------
-    size
-        Pixels a side of the displacement map.
-    site
-        Whose microrelief; default: the first.
+    size_px
+        Width and height of the displacement map, pixels.
+    relief_site
+        Site whose microrelief is used; default: the first one fitted.
     synthesize
-        Neutral relief: patches (measured ones, grown) or noise (in space).
+        Neutral relief: patches (measured texture, synthesized) or noise (procedural, 3D).
     extrapolate
-        Beyond the table's stretch range: hold its ends, or formula.
+        Outside the table's stretch range: hold (clamp to its ends) or formula.
     seed
-        Seed of the grown relief.
+        Random seed of the synthesized relief.
     """
 
-    size: int = 4096
-    site: str | None = None
-    synthesize: str = "patches"
-    extrapolate: str = "hold"
+    size_px: int = 4096
+    relief_site: str | None = None
+    synthesize: Annotated[str, choice("patches", "noise")] = "patches"
+    extrapolate: Annotated[str, choice("hold", "formula")] = "hold"
     seed: int = 0
 
     def relief(
         self, mesh: Path, weights: Mapping[str, float], out: Path, console: Console
     ) -> ReliefEvaluator:
-        """Return what evaluates the relief on a mesh under weights of its shapes."""
+        """Return the relief evaluator of a mesh and its blend shape weights."""
         from skinrig.applying.relief import ReliefEvaluator
 
         return ReliefEvaluator.of(mesh, weights, self.request(), out=out, progress=console.progress)
 
     def request(self) -> ReliefRequest:
-        """Return the relief that is asked for."""
+        """Return the options as a request."""
         from skinrig.applying.relief import ReliefRequest
 
-        given = select_attributes(self, "site", "extrapolate", "seed")
-        return ReliefRequest(size_px=self.size, source=self.synthesize, **given)
+        given = select_attributes(self, "size_px", "extrapolate", "seed")
+        return ReliefRequest(site=self.relief_site, source=self.synthesize, **given)
 
 
 @dataclass(frozen=True, slots=True)
 class ExpressionOptions:
-    """Options of blood, color and wrinkles of an expression.
+    """Options of blood volume, color and wrinkles of an expression.
 
     Attributes
     ----------
     parts
-        Of facial_color,wrinkles,microstructure; default: all.
+        Parts to evaluate: facial_color,wrinkles,microstructure; default: all fitted.
     normalize
         Divide the weights by their sum.
     clamp
-        Range of a wrinkle zone's sum: unit is 0...1, signed -1...1.
+        Range of the summed weights of a wrinkle zone: unit (0 to 1) or signed (-1 to 1).
     emotional
-        Anger reddens, fear pales the whole face.
+        Redden the whole face for anger, pale it for fear.
     gain
-        One more factor of all blood.
-    onto
-        Maps of another face (hemoglobin, melanin) that the rig is applied to.
+        Factor of the blood volume fraction.
+    target_face
+        Target face: APPEARANCE/ folder with hemoglobin and melanin; default: the fitted face.
     landmarks
-        Table name,x,y of the rig's face; a second one of the other face.
+        CSV table name,x,y: first of the fitted face, then of the target face.
     """
 
     parts: str | None = None
     normalize: bool = False
-    clamp: str = "unit"
+    clamp: Annotated[str, choice("unit", "signed")] = "unit"
     emotional: bool = False
     gain: float = 1.0
-    onto: Path | None = None
+    target_face: Path | None = None
     landmarks: list[Path] | None = None
 
     def expression(self, weights: Mapping[str, float]) -> ExpressionRequest:
-        """Return the expression that is asked for."""
+        """Return the options as a request for an expression."""
         from skinrig.applying.expression import ExpressionRequest
 
         return ExpressionRequest(
@@ -246,7 +255,7 @@ class ExpressionOptions:
             clamp=one_of("--clamp", self.clamp, ("unit", "signed")),
             emotional=self.emotional,
             gain=self.gain,
-            onto=_read_target_face(self.onto, self.landmarks or []),
+            onto=_read_target_face(self.target_face, self.landmarks or []),
         )
 
 
@@ -263,18 +272,18 @@ def apply_expression(
     moving: ReliefOptions,
     json: Json = False,
 ) -> None:
-    """Evaluate blood, color, normals and displacement of an expression.
+    """Evaluate blood volume, color, normals and displacement of an expression.
 
     Example: skinrig apply expression moving --weights smile=0.7,anger=0.3 --out expression
 
     Parameters
     ----------
     appearance
-        Folder that `skinrig fit` made.
+        Folder written by `skinrig fit`.
     weights
-        States and their weights: smile=0.7,anger=0.3; they sum to one.
+        Weights of expressions, with sum 1: smile=0.7,anger=0.3.
     mesh
-        Mesh with blend shapes: .npz, OBJ or glTF; strain comes from it.
+        Mesh with blend shapes, whose strain deforms the microrelief: .npz, OBJ or glTF.
     """
     from skinrig.appearances.dynamic import DYNAMIC_PARTS
     from skinrig.applying import expression as applying
@@ -304,18 +313,18 @@ def apply_microstructure(
     moving: ReliefOptions,
     json: Json = False,
 ) -> None:
-    """Grow the measured relief over a mesh and let it follow the mesh's strain.
+    """Synthesize the measured microrelief over a mesh and deform it by the mesh's strain.
 
     Example: skinrig apply microstructure moving --mesh head.npz --weights smile=1 --out relief
 
     Parameters
     ----------
     appearance
-        Folder that `skinrig fit` made.
+        Folder written by `skinrig fit`.
     mesh
         Mesh with blend shapes: .npz, OBJ or glTF.
     weights
-        Blend shapes or states: jawOpen=0.5,smile=1.
+        Weights of blend shapes or expressions: jawOpen=0.5,smile=1.
     """
     from skinrig.appearances.dynamic import MICROSTRUCTURE
     from skinrig.applying import expression as applying
@@ -331,18 +340,18 @@ def apply_microstructure(
 
 
 def _read_target_face(onto: Path | None, landmarks: list[Path]) -> TargetFace | None:
-    """Return the face that a rig is applied to, with its landmarks."""
+    """Read the target face of a rig and both tables of landmarks; None without `onto`."""
     from model import store
     from skinrig.applying.expression import TargetFace
 
     if onto is None:
         if landmarks:
-            raise UsageError("--landmarks: is for --onto, another face, which is not given")
+            raise UsageError("--landmarks: applies to a target face only; add --target-face")
         return None
     if len(landmarks) not in (0, 2):
         raise UsageError(
-            f"--landmarks: got {len(landmarks)} tables, expected two, of the rig's face and of the "
-            "other, or none"
+            f"--landmarks: got {len(landmarks)} tables, expected two, of the fitted face and of "
+            "the target face; give both or none"
         )
     tables = [landmark_table.read_landmark_table(path) for path in landmarks]
     own, other = tables if tables else (None, None)
@@ -354,10 +363,10 @@ def _read_target_face(onto: Path | None, landmarks: list[Path]) -> TargetFace | 
 
 
 def _report(console: Console, out: Path, done: AppliedExpression) -> None:
-    """Print what an evaluation made."""
+    """Print the figures and maps of an evaluation."""
     console.figures(done.figures, int, float, str)
     console.left_out(done.left_out)
-    console.say(f"{out}: {', '.join(done.maps)}")
+    console.print_line(f"{out}: {', '.join(done.maps)}")
     document = {
         "out": out,
         "maps": list(done.maps),
@@ -367,7 +376,7 @@ def _report(console: Console, out: Path, done: AppliedExpression) -> None:
 
 
 def print_fit(console: Console, model: str, out: Path, found: Mapping[str, Any]) -> None:
-    """Print the document of a fit."""
+    """Print the JSON document of a fit."""
     console.document("skinrig.fit/1", {"model": model, "out": out, **found})
 
 
@@ -382,18 +391,18 @@ def fit_reflectance(
     landmarks: Annotated[Path | None, typer.Option("--landmarks", "--sites")] = None,
     json: Json = False,
 ) -> None:
-    """Put lobes, albedo, normals and translucency of a subject together as one model.
+    """Combine basis BRDFs, albedo, normals and translucency of a subject into one model.
 
     Example: skinrig fit reflectance appearance-dome appearance-probe --out model
 
     Parameters
     ----------
     dome
-        Maps of a dome session: normals, r_d, lobes.
+        Maps of a dome session: normals, r_d, basis BRDF weights.
     probe
-        Maps of a fibre probe session on the same subject.
+        Maps of a fiber probe session of the same subject; default: dome maps only.
     landmarks
-        Table name,x,y of the probe's sites in texels of the dome's maps.
+        CSV table name,x,y of the probe's sites, texels of the dome's maps.
     """
     from skinrig.fitting.reflectance import fit_reflectance as fit
     from skinrig.fitting.reflectance import summarize_medians
@@ -403,12 +412,12 @@ def fit_reflectance(
     rows = summarize_medians(found)
     console.rows(("median over valid texels", "red", "green", "blue"), rows)
     for site in found.placed.sites if found.placed is not None else ():
-        console.say(f"{site.name}: texel row {site.texel[0]}, column {site.texel[1]}")
+        console.print_line(f"{site.name}: texel row {site.texel[0]}, column {site.texel[1]}")
     console.each("assumed", found.assumed)
     console.left_out(found.left_out)
     valid = float(found.model.valid.mean())
-    console.say(f"{out}: reflectance model, {100 * valid:.0f} % of its texels valid")
-    console.say(f"next: skinrig render {shell_quote(out)} --light 1,1,2 --out picture")
+    console.print_line(f"{out}: reflectance model, {100 * valid:.0f} % of its texels valid")
+    console.print_line(f"next: skinrig render {shell_quote(out)} --light 1,1,2 --out picture")
     print_fit(
         console,
         "reflectance",

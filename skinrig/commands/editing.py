@@ -1,4 +1,4 @@
-"""`skinrig edit` and `skinrig fit traits`: faces with other traits, and where traits come from."""
+"""`skinrig edit`, `skinrig fit traits` and `skinrig analyse albedo`: traits of faces."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 from skinrig.commands.analysing import Labels
 from skinrig.commands.dynamic import print_fit
-from skinrig.commands.options import Json, NewMaps, Out, Seed, command, option
+from skinrig.commands.options import Json, NewMaps, Out, Seed, choice, command, option
 from skinrig.console import Console, select_attributes
 from skinrig.errors import UsageError, one_of
 from skinrig.next_steps import shell_quote
@@ -17,39 +17,42 @@ if TYPE_CHECKING:
     from skinrig.editing.edit import EditRequest
 
 MerlFolder = Annotated[
-    Path | None, option("Folder of MERL tables that the lobes were fitted with.")
+    Path | None,
+    option("Folder of the MERL tables used in the reconstruction; default: built-in materials."),
 ]
 LandmarkFolder = Annotated[
-    Path | None, option("Folder with NAME.csv of each face; default: a simulation's own.")
+    Path | None,
+    option("Folder with NAME.csv (name,x,y, texels) per face; default: the simulation's own."),
 ]
 CommonSize = Annotated[
-    int | None, option("Pixels a side of the common map; default: as the textures.")
+    int | None,
+    option("Width and height of the common map, texels; default: those of the textures."),
 ]
 
 
 @dataclass(frozen=True, slots=True)
 class EditOptions:
-    """What is done to a face.
+    """Options of an edit.
 
     Attributes
     ----------
     trait
-        Amounts, joined by commas: lotion=0.6,tan=-1; 1 is all of a trait.
+        Amounts of traits, separated by commas: lotion=0.6,tan=-1; 1 is the full trait.
     space
-        Traits that `skinrig fit traits` learned; default: the package's.
+        Trait library written by `skinrig fit traits`; default: the built-in library.
     region
-        Where: face, beard or no-beard; of spots also skin.
+        Edited region: face, beard or no-beard; for --spots also skin.
     mask
-        Where and how much: .png or .exr over the texture, 0 for nothing.
+        Weight of the edit per texel, 0 to 1: .png or .exr the size of the texture.
     spots
-        freckles, moles or follicles to add, KIND=PIGMENT[:NUMBER PER CM2], or with -1 to take away:
-        freckles=1:3,moles=-1.
+        Spots to add as KIND=PIGMENT[:NUMBER PER CM2], or to remove as KIND=-1; KIND is freckles,
+        moles or follicles: freckles=1:3,moles=-1.
     parts
-        Of albedo,surface; default: those that a trait is known to change.
+        Parts to edit: albedo,surface; default: those with a significant effect of the trait.
     landmarks
-        Table name,x,y (texels) or name,x,y,z (mm) of the face's points.
+        CSV table name,x,y (texels) or name,x,y,z (mm) of the face's landmarks.
     iterations
-        Of matching the albedo's statistics.
+        Iterations of the match of albedo statistics.
     """
 
     trait: str | None = None
@@ -59,12 +62,12 @@ class EditOptions:
     spots: str | None = None
     parts: str | None = None
     landmarks: Path | None = None
-    basis: MerlFolder = None
+    merl_basis: MerlFolder = None
     iterations: int = 5
     seed: Seed = 0
 
     def request(self) -> EditRequest:
-        """Return the edit that is asked for."""
+        """Return the options as a request for an edit."""
         from skinrig.capturing.option_values import parse_amounts, parse_names
         from skinrig.editing.edit import EditRequest
 
@@ -72,20 +75,21 @@ class EditOptions:
             traits=parse_amounts(_split_names(self.trait), "--trait"),
             parts=parse_names(self.parts),
             spots=parse_spots(self.spots),
-            **select_attributes(self, "region", "mask", "landmarks", "basis", "iterations", "seed"),
+            basis=self.merl_basis,
+            **select_attributes(self, "region", "mask", "landmarks", "iterations", "seed"),
         )
 
 
 @command
 def edit(appearance: Path, /, out: NewMaps, chosen: EditOptions, json: Json = False) -> None:
-    """Give a face more or less of some traits, or spots; other maps stay as they are.
+    """Change the traits or spots of a face; all other maps stay unchanged.
 
     Example: skinrig edit appearance-dome --trait lotion=0.6,tan=1 --out appearance-tanned
 
     Parameters
     ----------
     appearance
-        Fitted maps of the dome.
+        APPEARANCE/ folder of a dome session.
     """
     from skinrig.editing import edit as editing
     from skinrig.traits import regions
@@ -100,10 +104,10 @@ def edit(appearance: Path, /, out: NewMaps, chosen: EditOptions, json: Json = Fa
     console.figures(parts, int, float)
     for one in done.record.get("spots_done", []):
         what = f"{one['drawn']} drawn" if "drawn" in one else f"{one['found']} found"
-        console.say(f"{one['kind']}: {what}")
+        console.print_line(f"{one['kind']}: {what}")
     console.each("warning", done.warnings)
-    console.say(f"{out}: {', '.join(done.changed) or 'nothing'} changed")
-    console.say(f"next: skinrig render {shell_quote(out)} --out pictures")
+    console.print_line(f"{out}: {', '.join(done.changed) or 'nothing'} changed")
+    console.print_line(f"next: skinrig render {shell_quote(out)} --out pictures")
     console.document("skinrig.edit/1", {"out": out, **done.record})
 
 
@@ -114,29 +118,29 @@ def fit_traits(
     labels: Path,
     out: Path,
     landmarks: LandmarkFolder = None,
-    vectors: str = "quantiles",
-    contrast: str = "means",
-    size: CommonSize = None,
-    basis: MerlFolder = None,
+    vectors: Annotated[str, choice("quantiles", "histograms")] = "quantiles",
+    contrast: Annotated[str, choice("means", "regression")] = "means",
+    size_px: CommonSize = None,
+    merl_basis: MerlFolder = None,
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
-    """Learn what traits change, from faces labelled by you.
+    """Learn the effect of traits on skin from labeled faces.
 
     Example: skinrig fit traits appearance-a appearance-b --labels labels.csv --out traits.npz
 
     Parameters
     ----------
     appearances
-        Fitted maps of the dome, a face each.
+        APPEARANCE/ folders of dome sessions, one per face.
     labels
-        Table name,TRAIT,...: 0 or 1 whether a face has it, or a value.
+        CSV table name,TRAIT,... with 0, 1 or a value, one row per face.
     out
         File to write, such as traits.npz.
     vectors
-        What stands for an albedo: quantiles, or histograms as published.
+        Feature vector of an albedo: quantiles, or histograms (as published).
     contrast
-        means of faces with and without, or regression on all traits.
+        Effect of a trait: means (with minus without) or regression (on all traits).
     """
     from model.traits.vectors import Contrast
     from skinrig.fitting.traits import fit_traits as fit
@@ -150,20 +154,20 @@ def fit_traits(
         landmarks=landmarks,
         vectors=one_of("--vectors", vectors, get_args(VectorKind)),
         contrast=one_of("--contrast", contrast, get_args(Contrast)),
-        size=size,
-        basis=basis,
+        size=size_px,
+        basis=merl_basis,
         seed=seed,
         progress=console.progress,
     )
     head = ("part", "trait", "with", "without", "p value", "cosine to the true one")
     console.rows(head, found.rows)
     console.each("warning", found.warnings)
-    console.each("ignored", (f"{name} has labels and was not given" for name in found.ignored))
+    console.each("ignored", (f"{name} has labels but is not an input" for name in found.ignored))
     console.left_out(found.left_out)
     names = found.library.names
-    console.say(f"{out}: {len(names)} traits of {len(found.faces)} faces")
+    console.print_line(f"{out}: {len(names)} traits of {len(found.faces)} faces")
     after = f"--space {shell_quote(out)} --trait {names[0]}=1 --out edited"
-    console.say(f"next: skinrig edit APPEARANCE {after}")
+    console.print_line(f"next: skinrig edit APPEARANCE {after}")
     keys = ("part", "trait", "with", "without", "p_value", "expected_cosine")
     learned = {
         "faces": found.faces,
@@ -182,20 +186,20 @@ def analyse_albedo(
     labels: Labels = None,
     landmarks: LandmarkFolder = None,
     people: int = 87,
-    size: CommonSize = None,
+    size_px: CommonSize = None,
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
-    """Average the color histograms of groups of faces, and tell the components they differ by.
+    """Average color histograms of groups of faces and compute their principal components.
 
     Example: skinrig analyse albedo appearance-a appearance-b --labels labels.csv --out analysis
 
     Parameters
     ----------
     appearances
-        Fitted maps of the dome, a face each; none: simulated faces.
+        APPEARANCE/ folders of dome sessions, one per face; none: simulated faces.
     people
-        Simulated faces, of 87.
+        Number of simulated faces, at most 87.
     """
     from skinrig.analysing import albedo as analysing_albedo
 
@@ -206,11 +210,13 @@ def analyse_albedo(
             appearances,
             labels=labels,
             landmarks=landmarks,
-            size=size,
+            size=size_px,
             progress=console.progress,
         )
     elif labels is not None or landmarks is not None:
-        raise UsageError("--labels, --landmarks: are of measured faces; name their folders")
+        raise UsageError(
+            "--labels, --landmarks: apply to measured faces only; name APPEARANCE/ folders"
+        )
     else:
         found = analysing_albedo.analyze_simulated(
             out, people=people, seed=seed, progress=console.progress
@@ -225,22 +231,22 @@ def analyse_albedo(
     )
     for region, share in found.explained.items():
         first = ", ".join(f"{100 * s:.0f} %" for s in share[:4])
-        console.say(
-            f"{region}: components explain {first}; "
-            f"{document['components_for_90_percent'][region]} make 90 %"
+        console.print_line(
+            f"{region}: components explain {first} of the variance; "
+            f"{document['components_for_90_percent'][region]} explain 90 %"
         )
     console.left_out(found.left_out)
-    console.say(f"{out}: {', '.join(analysing_albedo.OUTPUT_FILES)}")
+    console.print_line(f"{out}: {', '.join(analysing_albedo.OUTPUT_FILES)}")
     console.document("skinrig.analyse-albedo/1", {"out": out, **document})
 
 
 def _split_names(text: str | None) -> list[str]:
-    """Return what commas part, nothing where nothing stands."""
+    """Split a list separated by commas; empty names are dropped."""
     return [word.strip() for word in (text or "").split(",") if word.strip()]
 
 
 def parse_spots(text: str | None) -> tuple[Any, ...]:
-    """Return the orders of ``KIND=AMOUNT[:DENSITY],...``.
+    """Parse spots to add or remove from ``KIND=AMOUNT[:DENSITY],...``.
 
     Examples
     --------
@@ -259,7 +265,8 @@ def parse_spots(text: str | None) -> tuple[Any, ...]:
             if isinstance(error, UsageError) or type(error) is not ValueError:
                 raise
             raise UsageError(
-                f"--spots: got {word!r}, expected KIND=AMOUNT or KIND=AMOUNT:NUMBER PER CM2"
+                f"--spots: got {word!r}, expected KIND=AMOUNT or KIND=AMOUNT:NUMBER PER CM2; "
+                "write freckles=1:3, for example"
             ) from error
         out.append(wanted)
     return tuple(out)

@@ -1,86 +1,99 @@
-"""The command that hands captures and appearances to other programs."""
+"""`skinrig export`: write sessions and appearances in the formats of other programs."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
-from skinrig.commands.options import Json, Out, command
+from skinrig.commands.options import Json, Out, choice, command
 from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import UnusableError, one_of
 from skinrig.exporting.options import ExportSettings, SkinPosition
 
 NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
     "maps": "read maps.json: units, ranges and frames; maps.mtlx holds the color spaces",
-    "mtlx": "load skin.mtlx on skin.obj; material.json has the scene unit and what was assumed",
-    "gltf": "open skin.glb; in Blender, run skin_in_blender.py for the light below the surface",
-    "usd": "open skin.usdc, in Blender by skin_in_blender.py; usd.json has what was assumed",
-    "spectral": "read spectral.json: what is measured and what is modelled",
-    "metahuman": "read delta_maps.json: layout and coding of the deltas",
-    "stokes": "read stokes.json: axis, channels, and what was not measured",
+    "mtlx": "load skin.mtlx on skin.obj; material.json lists the scene unit and assumptions",
+    "gltf": "open skin.glb; in Blender, run skin_in_blender.py for subsurface scattering",
+    "usd": "open skin.usdc, in Blender with skin_in_blender.py; usd.json lists assumptions",
+    "spectral": "read spectral.json: which bands are measured and which are modeled",
+    "metahuman": "read delta_maps.json: layout and encoding of the deltas",
+    "stokes": "read stokes.json: axis, channels, and components not measured",
     "lp": "skinrig import lp DIR --out SESSION reads the folder back",
 }
-"""What to do with each format."""
+"""Next step after an export, by format."""
+
+
+FORMATS: Final = (
+    *("maps", "mtlx", "gltf", "usd", "spectral", "metahuman", "merl", "rgl"),
+    *("mhl", "frames", "event-model", "lp", "stokes"),
+)
+"""Formats of appearances, then of sessions; the writers are imported with the chosen one."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeliveryOptions:
-    """How an appearance is delivered.
+    """Options of delivered files.
 
     Attributes
     ----------
     unit
         Scene unit: m (default), cm or mm (mtlx, usd).
     normal_y
-        Green of normal maps: gl is +Y up, dx is -Y (Unreal).
+        Sign of green in normal maps: gl (+Y) or dx (-Y, Unreal).
     udim
-        Names of textures: none, dot (.1001) or underscore (_1001).
+        UDIM suffix of textures: none, dot (.1001) or underscore (_1001).
     with_errors
-        Standard errors and masks beside the values.
+        Also write standard uncertainties and masks.
     only
-        Names of maps (maps), of up to three states (metahuman), of states (stokes).
+        Names to export: maps (maps), up to three states (metahuman), states (stokes).
     mesh
-        Mesh with the maps' texture coordinates and blend shapes, in mm.
-    onto
-        Dome's maps whose texture gets the colors (metahuman).
+        Mesh with the maps' texture coordinates and blend shapes, mm.
+    target_face
+        Target face: APPEARANCE/ folder of a dome session whose texture gets the colors
+        (metahuman).
     landmarks
-        Tables name,x,y of the flash picture, then of that texture.
+        CSV tables name,x,y: first of the flash image, then of the target face's texture
+        (metahuman).
     """
 
-    unit: str | None = None
-    normal_y: str = "gl"
-    udim: str = "none"
+    unit: Annotated[str | None, choice("m", "cm", "mm")] = None
+    normal_y: Annotated[str, choice("gl", "dx")] = "gl"
+    udim: Annotated[str, choice("none", "dot", "underscore")] = "none"
     with_errors: bool = False
     only: str | None = None
     mesh: Path | None = None
-    onto: Path | None = None
+    target_face: Path | None = None
     landmarks: list[Path] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of what is written; none: all that there are."""
+        """Names to export; empty: all."""
         return () if self.only is None else tuple(name.strip() for name in self.only.split(","))
 
     def delivery(self, **more: Any) -> ExportSettings:
-        """Return the same as an export takes it, with what other options say."""
-        same = select_attributes(self, "unit", "normal_y", "udim", "with_errors", "mesh", "onto")
+        """Return the options as settings of an export, with `more` of them."""
+        same = select_attributes(self, "unit", "normal_y", "udim", "with_errors", "mesh")
         return ExportSettings(
-            only=self.names, landmarks=tuple(self.landmarks or ()), **same, **more
+            only=self.names,
+            onto=self.target_face,
+            landmarks=tuple(self.landmarks or ()),
+            **same,
+            **more,
         )
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceOptions:
-    """The place on the skin whose BRDF is exported.
+    """Options of a position on the skin whose BRDF is exported.
 
     Attributes
     ----------
     at
-        Place on the skin, U,V in 0 to 1: its BRDF too (merl, rgl).
+        Also export the BRDF at the texture coordinate U,V, each 0 to 1 (merl, rgl).
     radius
-        Average around the place, mm.
+        Radius around U,V over which the BRDF is averaged, mm (merl, rgl).
     without_diffuse
-        The place's surface alone.
+        Export specular reflection only at U,V (merl, rgl).
     """
 
     at: str | None = None
@@ -88,7 +101,7 @@ class PlaceOptions:
     without_diffuse: bool = False
 
     def named(self) -> SkinPosition | None:
-        """Return the place; None without one."""
+        """Return the position; None without --at."""
         if self.at is None:
             return None
         return SkinPosition.parse(self.at, radius_mm=self.radius, diffuse=not self.without_diffuse)
@@ -99,7 +112,7 @@ def export(
     source: Path,
     /,
     *,
-    to: str,
+    to: Annotated[str, choice(*FORMATS, metavar="FORMAT")],
     out: Out,
     use: str | None = None,
     how: DeliveryOptions,
@@ -108,9 +121,9 @@ def export(
     calibration: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Hand a session or an appearance on to other programs, within the subject's consent.
+    """Export a session or an appearance to other programs, within the subject's consent.
 
-    All files are listed in an ASC MHL manifest.
+    An ASC MHL manifest lists all files.
 
     Example: skinrig export appearance --to gltf --out delivery
 
@@ -119,14 +132,14 @@ def export(
     source
         APPEARANCE/ or SESSION/ folder.
     to
-        Of an appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. Of a session: mhl,
+        Format. Appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. Session: mhl,
         frames, lp, stokes, event-model.
     use
-        What the copy is for; the subjects' consent must cover it.
+        Purpose of the copy, such as research; the subjects' consent must include it.
     camera
-        Whose pictures (lp); default: the one in front.
+        Camera whose images are exported (lp); default: the frontal one.
     calibration
-        CALIBRATION/ folder of lights and cameras (lp), of the sensor (stokes).
+        CALIBRATION/ folder: lights and cameras (lp) or sensor (stokes).
     """
     from skinrig.exporting import export as exporting
 
@@ -136,11 +149,13 @@ def export(
     delivery = how.delivery(place=place.named() if to in ("merl", "rgl") else None, **of_session)
     done = exporting.export(source, out, to, delivery, use=use)
     after = NEXT_STEP_BY_FORMAT.get(
-        to, "hand the folder on; `ascmhl verify` tells whether it is still whole"
+        to, "pass the folder on; `ascmhl verify` checks that it is complete and unchanged"
     )
     console.left_out(done.left_out)
-    console.say(f"{done.path}: {format_count(done.files, 'file')}, listed in {done.manifest}")
-    console.say(f"next: {after}")
+    console.print_line(
+        f"{done.path}: {format_count(done.files, 'file')}, listed in {done.manifest}"
+    )
+    console.print_line(f"next: {after}")
     document = select_attributes(done, "path", "files", "manifest") | {"to": to, "next": after}
     console.document("skinrig.export/1", document | select_attributes(done, "left_out"))
 
@@ -148,7 +163,7 @@ def export(
 def _check_format(
     to: str, source: Path, of_maps: Iterable[str], of_sessions: Iterable[str]
 ) -> None:
-    """Raise for a format that there is not, or that is not of what the source holds."""
+    """Raise for an unknown format, or one that the source's kind of folder does not have."""
     one_of("--to", to, (*of_maps, *of_sessions))
     for file, kind, fitting in (
         ("session.json", "a session", of_sessions),

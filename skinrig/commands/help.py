@@ -1,22 +1,25 @@
-"""How ``skinrig --help`` lists commands: by what people come for, each with its whole summary."""
+"""Help and command-line parsing: sections of commands, commands per rig, types of options."""
 
 import re
-from collections.abc import Iterable, Iterator
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from copy import copy
 from typing import Any, Final, cast
 
 from typer.core import TyperCommand, TyperGroup
 
+from skinrig.commands.renamed_options import format_notice, renamed_options_of, replace_former_names
 from skinrig.errors import UnusableError, UsageError
 
 HELP_SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
-    ("Begin", ("demo", "doctor")),
+    ("Start here", ("demo", "doctor")),
     (
-        "Capture, on a rig or its simulation",
+        "Capture with a rig or its simulation",
         ("plan", "simulate", "capture", "serve", "calibrate", "import", "verify"),
     ),
-    ("From captures to models", ("reconstruct", "fit", "apply", "edit", "analyse")),
-    ("Look, and hand on", ("report", "view", "render", "export")),
-    ("Measure", ("bench",)),
+    ("Reconstruct and model", ("reconstruct", "fit", "apply", "edit", "analyse")),
+    ("Report, render and export", ("report", "view", "render", "export")),
+    ("Measure errors and run times", ("bench",)),
 )
 OTHER_SECTION: Final = "More"
 
@@ -25,19 +28,43 @@ _TYPE_LABELS: Final = (
     (re.compile(r"<list\[(\w+)\]>"), r"<\1>"),
     (re.compile("<%Y-%m-%d>"), "<date>"),
 )
-"""How Typer writes kinds of arguments after Python's types, and what is written instead."""
+"""Typer's labels of types, after Python's, and the labels that the help shows instead."""
 
 
 class Command(TyperCommand):
-    """A command whose help names kinds of arguments without Python's words for them."""
+    """A command that accepts former option names; its help hides Python's type names."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Replace former names of options, each with a notice on stderr, and parse."""
+        if not ctx.resilient_parsing:
+            renamed = _renamed(self, ctx.parent)
+            args, found = replace_former_names(args, renamed, _options(self))
+            for former in found:
+                print(format_notice(former, renamed[former]), file=sys.stderr, flush=True)
+        return super().parse_args(ctx, args)
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the parameters; for completion, those of renamed options also by former name."""
+        params = super().get_params(ctx)
+        if not ctx.resilient_parsing:
+            return params
+        former_by_present: dict[str, list[str]] = {}
+        for former, present in _renamed(self, ctx.parent).items():
+            former_by_present.setdefault(present, []).append(former)
+        return [_with_names(param, former_by_present) for param in params]
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
+        """Complete names of options; former names are not offered."""
+        renamed = _renamed(self, ctx.parent)
+        return [one for one in super().shell_complete(ctx, incomplete) if one.value not in renamed]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write arguments and options, those that are repeated as what one of them is."""
+        """Write arguments and options; repeatable ones with the type of a single value."""
         super().format_options(ctx, cast(Any, _WithoutTypes(formatter)))
 
 
 class _WithoutTypes:
-    """A formatter of help that writes lists of definitions without Python's types."""
+    """A help formatter that writes definition lists without Python's type names."""
 
     def __init__(self, formatter: Any) -> None:
         self._formatter = formatter
@@ -52,7 +79,7 @@ class _WithoutTypes:
 
 
 def format_argument(name: str) -> str:
-    """Return how an argument is listed, with what one of it is.
+    """Return an argument's label in the help, with the type of a single value.
 
     Examples
     --------
@@ -65,10 +92,10 @@ def format_argument(name: str) -> str:
 
 
 class Commands(TyperGroup):
-    """A group that lists its commands under the headings of `HELP_SECTIONS`, nothing cut off."""
+    """A group that lists its commands under the headings of `HELP_SECTIONS`, untruncated."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the headings and the commands below them."""
+        """Write the headings, each with its commands."""
         for title, rows in self._sections(ctx):
             with formatter.section(title):
                 formatter.write_dl(rows)
@@ -88,42 +115,48 @@ class Commands(TyperGroup):
 
 
 class Subcommands(TyperGroup):
-    """A group within the group: one list, nothing cut off."""
+    """A group within the group, with one untruncated list of commands."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the commands with their whole summaries."""
+        """Write the commands with their full summaries."""
         found = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
         with formatter.section("Commands"):
             formatter.write_dl([(name, summary(one)) for name, one in found if one is not None])
 
 
 class RigCommand(Command):
-    """A command of one rig, which refuses options of other rigs by their names."""
+    """A command of one rig; an option of other rigs is refused with their names."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Read the arguments; an option of another rig is a usage error that names the rigs."""
+        """Parse the arguments; raise `UsageError` for an option of another rig."""
         try:
             return super().parse_args(ctx, args)
         except Exception as error:  # Typer does not export the class of unknown options
             option = getattr(error, "option_name", None)
             group = ctx.parent.command.commands if option and ctx.parent else {}
-            others = [rig for rig, command in group.items() if option in _options(command)]
+            others = [
+                rig
+                for rig, command in group.items()
+                if option in _options(command) or option in _renamed(command, ctx.parent)
+            ]
             if not others:
                 raise
             raise UsageError(
-                f"{option}: the {self.name} rig knows nothing of it; leave it out (it is for "
-                f"{', '.join(others)})"
+                f"{option}: not an option of the {self.name} rig (only of {', '.join(others)}); "
+                "remove it"
             ) from error
 
 
 class RigGroup(Subcommands):
-    """Commands of one verb, one a rig; options may also stand before the rig."""
+    """Commands of one verb, one per rig; options may also precede the rig."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Move the rig before the options, where Typer expects a command."""
+        """Move the rig in front of the options, where Typer expects a command."""
         options: dict[str, Any] = {}
         for command in self.commands.values():
-            options |= _options(command)
+            own = _options(command)
+            former = renamed_options_of(self.name, command.name)
+            options |= own | {old: own[new] for old, new in former.items()}
         place = 0
         while place < len(args) and args[place].startswith("-"):
             option = options.get(args[place])
@@ -135,21 +168,21 @@ class RigGroup(Subcommands):
         return super().parse_args(ctx, args)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """Return the command of the rig that is named first."""
+        """Return the command of the rig named by the first argument."""
         if args[0] in self.commands or ctx.resilient_parsing:
             return cast(tuple[str | None, Any, list[str]], super().resolve_command(ctx, args))
         return args[0], self.commands[self.kind_of(args[0])], args[1:]
 
     def kind_of(self, rig: str) -> str:
-        """Return the command for a rig of another name than those of the commands."""
+        """Return the command of a rig that is not a command's name; here, raise."""
         raise UnusableError(f"rig: got {rig!r}, expected one of {', '.join(self.commands)}")
 
 
 class RigFileGroup(RigGroup):
-    """Commands of one verb, one a rig, which also take a rig's own TOML file."""
+    """Commands of one verb, one per rig, which also accept a rig's TOML file."""
 
     def kind_of(self, rig: str) -> str:
-        """Return which of the four rigs a file describes."""
+        """Return the kind of rig, one of four, that a TOML file describes."""
         from capture.rig import load_rig
 
         described = load_rig(rig)
@@ -160,13 +193,32 @@ class RigFileGroup(RigGroup):
 
 
 def _options(command: Any) -> dict[str, Any]:
-    """Return the options of a command by each of their spellings."""
+    """Return the options of a command, keyed by each spelling."""
     return {
-        name: option for option in command.params for name in (*option.opts, *option.secondary_opts)
+        name: option
+        for option in command.params
+        for name in (*option.opts, *option.secondary_opts)
+        if name.startswith("-")  # arguments are listed by their bare names
     }
 
 
+def _renamed(command: Any, parent: Any) -> Mapping[str, str]:
+    """Return the renamed options of a command, below the context of its group or the root."""
+    is_nested = parent is not None and parent.parent is not None
+    return renamed_options_of(parent.command.name if is_nested else None, command.name)
+
+
+def _with_names(param: Any, further: Mapping[str, Iterable[str]]) -> Any:
+    """Return a parameter that also has further names, listed by one of its own."""
+    names = [name for own in param.opts for name in further.get(own, ())]
+    if not names:
+        return param
+    named = copy(param)
+    named.opts = [*param.opts, *names]
+    return named
+
+
 def summary(command: Any) -> str:
-    """Return the first paragraph of a command's help on one line, without its full stop."""
+    """Return the first paragraph of a command's help on one line, without its period."""
     text = (command.short_help or command.help or "").split("\n\n")[0]
     return " ".join(text.split()).rstrip(".")

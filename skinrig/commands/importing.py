@@ -1,16 +1,17 @@
-"""The commands below `skinrig import`."""
+"""`skinrig import`: sessions from photographs, meshes and light lists."""
 
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
 from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Consent, ConsentExpires, Json, Out, command
+from skinrig.commands.options import Consent, ConsentExpires, Json, Out, choice, command
 from skinrig.console import Console, format_count, select_attributes
 from skinrig.next_steps import shell_quote
 
 import_app = typer.Typer(
-    cls=Subcommands, help="Bring in what other devices made.", no_args_is_help=True
+    cls=Subcommands, help="Import data of other devices.", no_args_is_help=True
 )
 
 
@@ -26,7 +27,7 @@ def import_photos(
     consent_expires: ConsentExpires = None,
     json: Json = False,
 ) -> None:
-    """Turn RAW, TIFF, EXR, PNG or JPEG photographs into a session.
+    """Convert RAW, TIFF, EXR, PNG or JPEG photographs to a session.
 
     Example: skinrig import photos portraits --out session-portraits
 
@@ -35,7 +36,7 @@ def import_photos(
     directory
         Folder of photographs, or one file.
     rig
-        Rig whose camera took them, so that its calibrations hold.
+        Rig whose camera took the photographs, so that its calibrations apply; default: none.
     subject
         Pseudonym of the subject.
     """
@@ -48,18 +49,20 @@ def import_photos(
     done = bring_in(directory, out=out, rig=None if rig is None else load_rig(rig), subject=person)
     console.each("assumed", done.assumed)
     console.each("ignored", done.ignored)
-    console.say(
+    console.print_line(
         f"{done.path}: {format_count(done.frames, 'photograph')}, states {', '.join(done.states)}"
     )
     place = shell_quote(out)
     if done.color_states:
         shown = "neutral" if "neutral" in done.color_states else done.color_states[0]
         state = "" if shown == "neutral" else f" --state {shown}"
-        after = f"reconstruct {place} --want melanin,hemoglobin --out appearance{state}"
+        after = f"reconstruct {place} --maps melanin,hemoglobin --out appearance{state}"
     else:
-        console.say("left out: melanin and hemoglobin: gray pictures hold no color to tell them by")
+        console.print_line(
+            "left out: melanin and hemoglobin: they need color images, not grayscale"
+        )
         after = f"verify {place}"
-    console.say(f"next: skinrig {after}")
+    console.print_line(f"next: skinrig {after}")
     console.document(
         "skinrig.import/1",
         select_attributes(done, "path", "frames", "assumed", "states", "ignored"),
@@ -69,7 +72,12 @@ def import_photos(
 @import_app.command("mesh", cls=Command)
 @command
 def import_mesh(
-    file: Path, /, session: Path, out: Path | None = None, unit: str = "mm", json: Json = False
+    file: Path,
+    /,
+    session: Path,
+    out: Path | None = None,
+    unit: Annotated[str, choice("mm", "cm", "m", "inch")] = "mm",
+    json: Json = False,
 ) -> None:
     """Attach a scanned mesh to a session.
 
@@ -82,21 +90,23 @@ def import_mesh(
     session
         Session that gets the mesh.
     out
-        New folder for a copy, where it is closed.
+        New folder for a copy of the session; required if the session is closed.
     unit
-        Unit of the file: mm, cm, m or inch.
+        Length unit of the file: mm, cm, m or inch.
     """
     from capture.importers.meshes import import_mesh as bring_in
 
     console = Console(json)
     done = bring_in(file, session=session, out=out, unit=unit)
     size = " x ".join(f"{side:.0f}" for side in done.extent_mm)
-    console.say(
+    console.print_line(
         f"{done.path}: {done.vertices} vertices, {done.faces} triangles, {size} mm, "
         f"{'with' if done.has_uv else 'without'} texture coordinates"
     )
-    after = f"reconstruct {shell_quote(done.path)} --want normals --out appearance"
-    console.say(f"next: skinrig {after if done.reopened else f'verify {shell_quote(done.path)}'}")
+    after = f"reconstruct {shell_quote(done.path)} --maps normals --out appearance"
+    console.print_line(
+        f"next: skinrig {after if done.reopened else f'verify {shell_quote(done.path)}'}"
+    )
     console.document(
         "skinrig.import/1",
         select_attributes(done, "path", "vertices", "faces", "has_uv", "extent_mm", "reopened"),
@@ -111,26 +121,27 @@ def import_lp(
     out: Out,
     lights: Path | None = None,
     mask: Path | None = None,
-    encoding: str = "auto",
+    encoding: Annotated[str, choice("auto", "sRGB", "linear")] = "auto",
     mm_per_px: float | None = None,
     json: Json = False,
 ) -> None:
-    """Turn pictures of one object under many lights, with their light list, into a session.
+    """Convert images of one object under many lights, with their light list, to a session.
 
     Example: skinrig import lp rti-folder --out session-rti
 
     Parameters
     ----------
     directory
-        Folder of pictures, one a light.
+        Folder of images, one per light.
     lights
-        .lp, list of directions, or folder of a chrome ball.
+        Light list: .lp file, list of directions, or folder of a chrome ball's images; default:
+        found in the folder.
     mask
-        Picture that is bright at the object.
+        Image that is bright at the object; default: the folder's *mask* file, else the whole image.
     encoding
-        How 8-bit and PNG values code light: auto, sRGB or linear.
+        Transfer function of 8-bit and PNG values: auto, sRGB or linear.
     mm_per_px
-        Size of a pixel; then the list's rows are positions in mm.
+        Pixel size on the object, mm; the light list then gives positions in mm.
     """
     from capture.importers import import_light_list
 
@@ -144,9 +155,11 @@ def import_lp(
         mm_per_px=mm_per_px,
     )
     console.each("assumed", done.assumed)
-    console.say(f"{done.path}: {format_count(done.frames, 'picture')}, lights of {done.lights}")
-    console.say(
-        f"next: skinrig reconstruct {shell_quote(out)} --want normals,albedo --out appearance"
+    console.print_line(
+        f"{done.path}: {format_count(done.frames, 'picture')}, lights of {done.lights}"
+    )
+    console.print_line(
+        f"next: skinrig reconstruct {shell_quote(out)} --maps normals,albedo --out appearance"
     )
     console.document(
         "skinrig.import/1",

@@ -1,4 +1,4 @@
-"""The commands that measure error against run time, and that say what is installed."""
+"""`skinrig bench` and `skinrig doctor`: error against run time, and the installation."""
 
 import os
 from pathlib import Path
@@ -11,11 +11,11 @@ from skinrig.benchmarks import table as bench_table
 from skinrig.commands import completion
 from skinrig.commands.options import Json, command
 from skinrig.console import Console, select_attributes
-from skinrig.doctor import check_installation
+from skinrig.doctor import FIX_KEY, check_installation
 from skinrig.kernel_cache import set_passive_waiting
 
 BUDGET_S = 600.0
-"""Seconds of a benchmark that names none."""
+"""Default time of a benchmark."""
 
 
 @command
@@ -27,16 +27,16 @@ def bench(
     /,
     stage: Annotated[list[str] | None, typer.Option(autocompletion=completion.stages)] = None,
     budget: Annotated[float | None, typer.Option(show_default=False)] = None,
-    toy: bool = False,
+    smoke: bool = False,
     extremes: bool = False,
     out: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Measure error against run time; exit code 1 when a limit is missed.
+    """Measure error against run time; exit code 1 if a limit is missed.
 
-    Without --stage every stage is measured at its small size, and then, the quickest first, at full
-    size as long as the budget lasts. Limits are judged at full size alone. Nothing is left to
-    chance: every stage draws from seeds of its own, the same each time.
+    Without --stage, all stages run at small size, then at full size, the fastest first, until the
+    budget is spent. Limits apply at full size only. Each stage uses fixed seeds of its own, so
+    results are reproducible.
 
     Example: skinrig bench --json --out bench
 
@@ -46,32 +46,30 @@ def bench(
 
     Parameters
     ----------
-    toy
-        Smallest sizes, no limits judged.
+    smoke
+        Run the smallest sizes only, without limits.
     extremes
-        Try stiff and extreme cases instead.
+        Run stiff and extreme cases instead of stages.
     out
-        Folder for bench.json, a table and plots; or extremes.json.
+        Folder for bench.json, a table and plots, or for extremes.json; default: no files.
     more
-        Stages, like those of --stage; default all.
+        Stages to run, as with --stage; default: all.
     stage
-        Stage, or several; repeatable.
+        Stage to run; repeatable, further names may follow; default: all.
     budget
-        Seconds to spend, about; default 600.
+        Approximate time limit, seconds; default 600.
     """
     console = Console(json)
-    # one --stage takes one word, so that what follows it comes as arguments
+    # --stage takes one word only, so the names that follow it arrive as arguments
     stages = [*(stage or ()), *(more or ())] or None
-    if extremes and (toy or budget is not None):
-        what = "--toy" if toy else "--budget"
-        raise errors.UsageError(f"{what}: cases of --extremes have one size each; leave it out")
+    if extremes and (smoke or budget is not None):
+        what = "--smoke" if smoke else "--budget"
+        raise errors.UsageError(f"{what}: not an option of --extremes; remove it")
     budget = BUDGET_S if budget is None else budget
     if not budget > 0:
-        raise errors.UnusableError(f"--budget: got {budget:g}, expected seconds above 0")
+        raise errors.UnusableError(f"--budget: got {budget:g}, expected seconds above 0; raise it")
     if out is not None and out.exists() and not out.is_dir():
-        raise errors.UnusableError(
-            f"--out: {out} is a file, expected a folder, new or to be replaced"
-        )
+        raise errors.UnusableError(f"--out: {out} is a file, expected a folder; name another")
     set_passive_waiting(
         os.environ
     )  # before numerical libraries are loaded: one stage runs at a time
@@ -82,7 +80,7 @@ def bench(
     else:
         from skinrig.benchmarks.stages import run_stages
 
-        document = run_stages(stages, budget_s=budget, toy=toy, out=out, console=console)
+        document = run_stages(stages, budget_s=budget, toy=smoke, out=out, console=console)
         if out is not None:
             bench_table.write(document, out)
     console.document(document.pop("schema"), document)
@@ -91,17 +89,17 @@ def bench(
 
 
 def doctor(json: Json = False) -> None:
-    """Say what is installed, which renderer runs and why, and how to mend what is not.
+    """Check the installation: packages, renderer, threads and ports, and how to fix faults.
 
     Example: skinrig doctor
     """
     console = Console(json)
     findings = check_installation()
     console.rows(
-        ("", "what", "state", "to mend"),
-        [("ok" if f.fine else "!!", f.what, f.state, f.mend) for f in findings],
+        ("", "what", "state", "fix"),
+        [("ok" if f.fine else "!!", f.what, f.state, f.fix) for f in findings],
     )
-    rows = [select_attributes(f, "what", "state", "fine", "mend") for f in findings]
+    rows = [{**select_attributes(f, "what", "state", "fine"), FIX_KEY: f.fix} for f in findings]
     console.document("skinrig.doctor/1", {"findings": rows})
     if not all(f.fine for f in findings):
         raise typer.Exit(errors.EXTRA_MISSING)

@@ -1,4 +1,4 @@
-"""Options that several commands take."""
+"""Options shared by several commands, and commands made from functions with docstrings."""
 
 from __future__ import annotations
 
@@ -13,24 +13,45 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type
 import typer
 
 from skinrig.commands import completion
-from skinrig.errors import UnusableError, UsageError
+from skinrig.errors import UnusableError, UsageError, one_of
 
 if TYPE_CHECKING:
     from skinrig.capturing.sequences import SequenceOrder
 
 
 def option(text: str, *names: str, **settings: Any) -> Any:
-    """Return an option: its help, its names unless they are the parameter's, settings of Typer."""
+    """Return an option of Typer; without names, it is named after its parameter."""
     return typer.Option(*names, help=text, **settings)
 
 
+def choice(*values: str, metavar: str | None = None) -> Any:
+    """Return an option with a closed set of values: shown in help, completed and checked.
+
+    Parameters
+    ----------
+    values
+        Valid values; any other raises `UnusableError`, which lists them.
+    metavar
+        Label of the value in help; None: the values.
+    """
+
+    def check(parameter: typer.CallbackParam, value: str | None) -> str | None:
+        return None if value is None else one_of(parameter.opts[0], value, values)
+
+    return typer.Option(
+        metavar=metavar or f"[{'|'.join(values)}]",
+        callback=check,
+        autocompletion=lambda incomplete: completion.filter_by_prefix(values, incomplete),
+    )
+
+
 Json = Annotated[bool, option("Print exactly one JSON document on stdout.", "--json")]
-Seed = Annotated[int, option("Seed of everything that is drawn.")]
+Seed = Annotated[int, option("Random seed.")]
 Out = Annotated[Path, option("Folder to write.", "--out")]
 
 
 def _check_output_folder(context: typer.Context, out: Path) -> Path:
-    """Refuse a folder that maps cannot go to before minutes are spent on them."""
+    """Refuse a folder that cannot be written, before the computation starts."""
     if not context.resilient_parsing:
         from model.store import require_free
 
@@ -41,84 +62,100 @@ def _check_output_folder(context: typer.Context, out: Path) -> Path:
 NewMaps = Annotated[
     Path, typer.Option("--out", callback=_check_output_folder, help="Folder to write.")
 ]
-"""An APPEARANCE/ folder, new or to be replaced."""
+"""An APPEARANCE/ folder, new or replaced."""
 
 
 def check_output_file(context: typer.Context, out: Path | None) -> Path | None:
-    """Refuse a folder where a file is to be written, before the work."""
+    """Refuse a folder as output file, before the computation starts."""
     if out is not None and not context.resilient_parsing and out.is_dir():
-        raise UnusableError(f"--out: {out} is a folder, expected a file to write")
+        raise UnusableError(f"--out: {out} is a folder, expected a file to write; name a file")
     return out
 
 
 def check_output_page(context: typer.Context, out: Path | None) -> Path | None:
-    """Refuse a folder, and the standard output, which has no name to be opened by."""
+    """Refuse a folder or the standard output, which a browser cannot open."""
     if out is not None and not context.resilient_parsing and str(out) == STDOUT_MARK:
-        raise UsageError("--out: got '-', expected a file to write")
+        raise UsageError("--out: got '-', expected a file to write; name a file")
     return check_output_file(context, out)
 
 
 STDOUT_MARK = "-"
-"""The standard output where a file is named."""
-Page = Annotated[Path, typer.Option("-o", "--out", callback=check_output_page, help="The page.")]
+"""File name of the standard output."""
+Page = Annotated[
+    Path, typer.Option("-o", "--out", callback=check_output_page, help="HTML file to write.")
+]
 Subject = Annotated[
     str,
     option(
-        "Whose skin: a preset, I to VI, palest or darkest, or a file NAME.toml.",
+        "Simulated subject: preset I to VI, palest or darkest, or a file NAME.toml.",
         autocompletion=completion.subjects,
     ),
 ]
-Size = Annotated[str, option("Of the pictures: small or full.", autocompletion=completion.sizes)]
-Width = Annotated[int | None, option("Pixels across, instead of the size.")]
-Resume = Annotated[bool, option("Go on with a session that was interrupted.", "--resume")]
-Site = Annotated[str | None, option("Where the skin is from: forehead (default), cheek or chin.")]
+Scale = Annotated[str, choice("small", "full")]
+Width = Annotated[int | None, option("Image width, pixels; default: that of the scale.")]
+Resume = Annotated[bool, option("Continue an interrupted session.", "--resume")]
+Site = Annotated[
+    str | None, option("Skin site in the caliper: forehead (default), cheek or chin (gradient).")
+]
 Sites = Annotated[
-    str | None, option("Where the probe is placed, joined by commas: forehead,cheek,chin.")
+    str | None,
+    option("Sites of the probe, separated by commas: forehead,cheek,chin; default: the plan's."),
 ]
-Pairs = Annotated[int, option("Image pairs a state.", "--repeats")]
-Placements = Annotated[int, option("Placements a site and direction.", "--repeats")]
+Pairs = Annotated[int, option("Image pairs per expression (flash).", "--repeats")]
+Placements = Annotated[int, option("Placements per site and direction (probe).", "--repeats")]
 AllBrackets = Annotated[
-    bool, option("Record every exposure, also such as show no more.", "--all-brackets")
+    bool, option("Record every exposure bracket (probe only).", "--all-brackets")
 ]
-Angles = Annotated[str | None, option("Angles of the caliper, degrees, joined by commas: 0,90.")]
-Directions = Annotated[str | None, option("How many directions of the head: 16.", "--angles")]
-Steps = Annotated[str | None, option("First and last position of the caliper: -2..3.")]
+Angles = Annotated[
+    str | None,
+    option("Angles of the caliper, degrees, separated by commas: 0,90; default: the plan's."),
+]
+Directions = Annotated[
+    str | None, option("Number of directions of the probe's head; default: the plan's.", "--angles")
+]
+Steps = Annotated[
+    str | None, option("First and last caliper position: -2..3; default: the plan's.")
+]
 Consent = Annotated[
     list[str] | None,
-    option("Use that the subject agreed to; repeatable, or by commas.", "--consent"),
+    option("Use the subject agreed to; repeatable, or separated by commas.", "--consent"),
 ]
 ConsentExpires = Annotated[
     datetime | None,
-    typer.Option("--consent-expires", formats=["%Y-%m-%d"], help="Last day of the consent."),
+    typer.Option(
+        "--consent-expires",
+        formats=["%Y-%m-%d"],
+        help="Last day of the consent; default: unlimited.",
+    ),
 ]
 
 
 def target_option(rig: str) -> Any:
-    """Return the option --target of a rig."""
+    """Return the option --target of a rig, with its closed set of targets."""
     names = completion.target_completer(rig)
     return option(
-        f"A target instead of a subject: {', '.join(names)}.",
+        f"Capture a calibration target instead of a subject: {', '.join(names)}.",
         autocompletion=lambda incomplete: completion.filter_by_prefix(names, incomplete),
     )
 
 
 @dataclass(frozen=True, slots=True)
 class SequenceOptions:
-    """Options of a sequence in time before the flash rig.
+    """Options of a time sequence (flash rig).
 
     Attributes
     ----------
     sequence
-        A sequence in time: an expression made and dropped by a sound, such as smile, or exercise or
-        alcohol, followed after the event.
+        Capture a time sequence: an expression prompted by a sound, such as smile, or the recovery
+        after exercise or alcohol.
     prompt_period
-        Of a sequence: seconds from sound to sound; default 5.
+        Time between sounds of a sequence, s; default 5.
     shot_period
-        Of a sequence: seconds from shot to shot; default 5.5, of alcohol 300.
+        Time between shots of a sequence, s; default 5.5, for alcohol 300.
     captures
-        Shots of a sequence by sounds; default: each phase, a tenth twice.
+        Number of shots of a prompted sequence; default: each phase once, a tenth of them twice.
     duration
-        Seconds an event is followed; default 60 for exercise, 3600 for alcohol.
+        Time after exercise or alcohol, s; default 60 for exercise, 3600 for alcohol.
     """
 
     sequence: str | None = None
@@ -128,7 +165,7 @@ class SequenceOptions:
     duration: str | None = None
 
     def order(self) -> SequenceOrder | None:
-        """Return the sequence that is asked for; None without one."""
+        """Return the options as a request for a sequence; None without --sequence."""
         from skinrig.capturing.option_values import parse_sequence
 
         return parse_sequence(
@@ -137,12 +174,12 @@ class SequenceOptions:
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
-    """Return a function as Typer takes a command: its docstring says what its options are.
+    """Return a function as a command of Typer, with help from its docstring.
 
-    A parameter that is positional only becomes an argument, any other an option, unless it is
-    annotated with one of Typer's; its help is what the section of parameters says of it.
-    A parameter that is annotated with a dataclass gets an object of it: the fields of the
-    dataclass, described in its section of attributes, are options in its place.
+    A positional-only parameter becomes an argument, any other an option, unless it is annotated
+    with one of Typer's. The docstring's section of parameters is its help. A parameter annotated
+    with a dataclass is replaced by options, one per field, with help from the section of
+    attributes; the function gets an instance.
     """
     types = get_type_hints(function, include_extras=True)
     groups: dict[str, Any] = {name: kind for name, kind in types.items() if is_dataclass(kind)}
@@ -173,7 +210,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def _options_of(group: Any) -> Iterator[Parameter]:
-    """Yield the fields of a dataclass as parameters of a command."""
+    """Yield the fields of a dataclass as a command's parameters."""
     hints = get_type_hints(group, include_extras=True)
     _, helps = split_docstring(group.__doc__)
     for one in fields(group):
@@ -188,7 +225,7 @@ def _options_of(group: Any) -> Iterator[Parameter]:
 def _annotate_parameter(
     name: str, kind: Any, helps: Mapping[str, str], *, argument: bool = False
 ) -> Any:
-    """Return a parameter's type with its option or argument; flags have no opposite."""
+    """Return a parameter's type annotated with its option or argument; flags lack --no-."""
     if name not in helps:
         return kind
     if get_origin(kind) is Annotated:
@@ -203,7 +240,7 @@ def _annotate_parameter(
 
 
 def split_docstring(docstring: str | None) -> tuple[str, dict[str, str]]:
-    r"""Return what a docstring says before its parameters or attributes, and of each of them.
+    r"""Split a docstring into its text and the help of each parameter or attribute.
 
     Examples
     --------

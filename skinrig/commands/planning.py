@@ -1,4 +1,4 @@
-"""The commands that choose plans, one a rig."""
+"""`skinrig plan`: minimal acquisitions for required errors, one command per rig."""
 
 import json as json_text
 from dataclasses import dataclass
@@ -18,20 +18,20 @@ from skinrig.unit_format import format_quantity
 plan_app = typer.Typer(
     cls=RigGroup,
     subcommand_metavar="RIG [ARGS]...",
-    help="Choose the smallest plan that reaches an error, and say what it leaves out.",
+    help="Choose the smallest plan that reaches given errors, and list what it omits.",
 )
 
 
-def _want(example: str) -> typer.models.OptionInfo:
-    """Return the option --want of a rig."""
+def _goals_option(example: str) -> typer.models.OptionInfo:
+    """Return the option --goals of a rig."""
     return option(
-        f"Medians that must be reached: {example}. Empty: what the whole rig, or --forecast, "
-        "will give."
+        f"Median errors to reach: {example}; default: forecast the errors of the complete rig, "
+        "or of --forecast."
     )
 
 
 PlanWidth = Annotated[
-    int | None, option("Pixels across the cameras; default: the rig's own.", "--width")
+    int | None, option("Image width of the cameras, pixels; default: the rig's own.", "--width")
 ]
 
 
@@ -41,20 +41,20 @@ class PlanOptions:
 
     Attributes
     ----------
-    valid_share
-        Of what the whole rig gives an estimate, so much must keep it.
+    min_valid_fraction
+        Minimum fraction of the complete rig's valid pixels that stay valid, above 0 to 1.
     forecast
-        A plan, JSON: say what it will give instead.
+        Forecast the errors of this plan file, JSON, instead of choosing a plan.
     confirm
-        Folder: simulate the plan, reconstruct, and compare with the forecast.
+        Simulate and reconstruct the plan in this folder, and compare with the forecast.
     seed
-        Seed of the face.
+        Random seed of the simulated face.
     out
-        File for the plan, JSON.
+        Plan file to write, JSON; default: print only.
     """
 
     subject: Subject = "III"
-    valid_share: float = 0.9
+    min_valid_fraction: float = 0.9
     forecast: Path | None = None
     out: Annotated[Path | None, typer.Option("--out", callback=check_output_file)] = None
     confirm: Path | None = None
@@ -66,82 +66,94 @@ class PlanOptions:
 @command
 def plan_dome(
     common: PlanOptions,
-    want: Annotated[str, _want("normals<=1deg,r_d<=3%")] = "",
+    goals: Annotated[str, _goals_option("normals<=1deg,r_d<=3%")] = "",
     width: PlanWidth = None,
-    most_lights: int | None = None,
+    max_lights: int | None = None,
 ) -> None:
-    """Choose the dome's lights and cameras that reach an error, and say what is left out.
+    """Choose the fewest lights and cameras of the dome that reach given errors.
 
-    Example: skinrig plan dome --want "normals<=1deg,r_d<=3%" --out plan.json
+    Example: skinrig plan dome --goals "normals<=1deg,r_d<=3%" --out plan.json
 
     Example: skinrig plan dome --forecast plan.json
 
     Parameters
     ----------
-    most_lights
-        No more lights than these.
+    max_lights
+        Maximum number of lights; default: all.
     """
-    _plan("dome", common, want, width, most_lights)
+    _plan("dome", common, goals, width, max_lights)
 
 
 @plan_app.command("flash", cls=RigCommand)
 @command
 def plan_flash(
     common: PlanOptions,
-    want: Annotated[str, _want("melanin<=12%,hemoglobin<=25%")] = "",
+    goals: Annotated[str, _goals_option("melanin<=12%,hemoglobin<=25%")] = "",
     width: PlanWidth = None,
 ) -> None:
-    """Choose the flash rig's pairs and powers that reach an error, and say what is left out.
+    """Choose the fewest image pairs and flash powers of the flash rig that reach given errors.
 
-    Example: skinrig plan flash --want "melanin<=12%,hemoglobin<=25%" --subject II
+    Example: skinrig plan flash --goals "melanin<=12%,hemoglobin<=25%" --subject II
     """
-    _plan("flash", common, want, width)
+    _plan("flash", common, goals, width)
 
 
 @plan_app.command("gradient", cls=RigCommand)
 @command
 def plan_gradient(
-    common: PlanOptions, want: Annotated[str, _want("normals<=2deg")] = "", width: PlanWidth = None
+    common: PlanOptions,
+    goals: Annotated[str, _goals_option("normals<=2deg")] = "",
+    width: PlanWidth = None,
 ) -> None:
-    """Choose the gradient sphere's scan that reaches an error, and say what is left out.
+    """Choose the shortest scan of the gradient sphere that reaches given errors.
 
-    Example: skinrig plan gradient --want "normals<=2.5deg" --out plan.json
+    Example: skinrig plan gradient --goals "normals<=2.5deg" --out plan.json
     """
-    _plan("gradient", common, want, width)
+    _plan("gradient", common, goals, width)
 
 
 @plan_app.command("probe", cls=RigCommand)
 @command
-def plan_probe(common: PlanOptions, want: Annotated[str, _want("sigma_tr<=3%")] = "") -> None:
-    """Choose the probe's sites, placements and brackets that reach an error.
+def plan_probe(
+    common: PlanOptions, goals: Annotated[str, _goals_option("sigma_tr<=3%")] = ""
+) -> None:
+    """Choose the fewest sites, placements and brackets of the probe that reach given errors.
 
-    Example: skinrig plan probe --want "sigma_tr<=4%" --out plan.json
+    Example: skinrig plan probe --goals "sigma_tr<=4%" --out plan.json
     """
-    _plan("probe", common, want)
+    _plan("probe", common, goals)
 
 
 def _plan(
     rig: str,
     common: PlanOptions,
-    want: str,
+    goals: str,
     width: int | None = None,
-    most_lights: int | None = None,
+    max_lights: int | None = None,
 ) -> None:
-    """Choose a plan, print it, and write it."""
+    """Choose a plan, print its forecast and write it."""
     from skinrig.planning.plans import choose, format_choice
     from skinrig.simulating.subject_records import find_unused_subject_keys
 
     console = Console(common.json)
     subject, seed = common.subject, common.seed
-    if not 0 < common.valid_share <= 1:
+    if not 0 < common.min_valid_fraction <= 1:
         raise errors.UnusableError(
-            f"--valid-share: got {common.valid_share:g}, expected above 0, up to 1"
+            f"--min-valid-fraction: got {common.min_valid_fraction:g}, expected above 0 and at "
+            "most 1; give 0.9, for example"
         )
     unused = find_unused_subject_keys(subject, rig, console.progress)
-    asked = select_attributes(common, "subject", "seed", "valid_share", "forecast")
-    choice = choose(rig, want, width_px=width, most_lights=most_lights, **asked)
+    asked = select_attributes(common, "subject", "seed", "forecast")
+    choice = choose(
+        rig,
+        goals,
+        width_px=width,
+        most_lights=max_lights,
+        valid_share=common.min_valid_fraction,
+        **asked,
+    )
     for line in format_choice(choice):
-        console.say(line)
+        console.print_line(line)
     document = choice.to_document()
     if unused:
         document["subject_unused"] = list(unused)
@@ -154,14 +166,14 @@ def _plan(
         )
         document["confirmation"] = found
         for row in found:
-            console.say(
+            console.print_line(
                 f"measured: {row['name']}"
                 f" {format_quantity(format(row['median'], '.3g'), row['unit'])}, "
                 f"{'within' if row['within'] else 'OUTSIDE'} the forecast's interval"
             )
     if (out := common.out) is not None:
         write_atomically(out, json_text.dumps(choice.plan.to_json(), indent=1) + "\n")
-        console.say(f"next: skinrig capture {rig} --plan {shell_quote(out)} --out session")
+        console.print_line(f"next: skinrig capture {rig} --plan {shell_quote(out)} --out session")
     console.document(document.pop("schema"), document)
     if not reached:
         raise typer.Exit(errors.LIMIT_MISSED)

@@ -1,4 +1,4 @@
-"""The commands that make calibrations, and maps."""
+"""`skinrig calibrate` and `skinrig reconstruct`: calibrations and maps from sessions."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,23 +24,23 @@ def calibrate(
     phantom: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Make a calibration from sessions of a target and say how it drifted.
+    """Calibrate a rig from sessions of a target; report the drift since the last calibration.
 
     Example: skinrig calibrate sensor session-flat --out calibration
 
     Parameters
     ----------
     sessions
-        Sessions of the target.
+        SESSION/ folders of the target.
     square_mm
-        Side of the squares of geometry's board, mm.
+        Side of the calibration board's squares, mm (dome, geometry).
     sphere_mm
-        Radius of the mirror sphere of lights, mm.
+        Radius of the mirror sphere, mm (dome, lights).
     phantom
-        Certificate (JSON) of the block fibre was measured on.
+        Certificate (JSON) of the phantom (probe, fibre).
     kind
-        Of the flash rig sensor, color, polarization, white; of the dome geometry, lights; of the
-        gradient sphere sensor, lights, polarization; of the probe fibre.
+        Calibration: sensor, color, polarization or white (flash); geometry or lights (dome);
+        sensor, lights or polarization (gradient); fibre (probe).
     """
     from skinrig.calibrating.calibrate import calibrate as make
     from skinrig.calibrating.dome import dome_targets
@@ -51,26 +51,26 @@ def calibrate(
     console.each("found", done.findings)
     for change in done.drift:
         if change.change and (change.sigmas is None or abs(change.sigmas) > 2):
-            console.say(f"drift: {change}")
-    console.say(f"{done.path}: valid until {done.calibration.valid_until}")
+            console.print_line(f"drift: {change}")
+    console.print_line(f"{done.path}: valid until {done.calibration.valid_until}")
     values = {"path": done.path, "values": dict(done.summary), "findings": done.findings}
     console.document("skinrig.calibrate/1", values | {"drift": [str(d) for d in done.drift]})
 
 
 def check_rank(rank: int | None, basis: Path | None) -> None:
-    """Raise unless a basis has as many materials as lobes are asked for.
+    """Raise if the number of basis BRDFs exceeds the number of materials.
 
     Parameters
     ----------
     rank
-        Lobes that a dome's points share; None: as many as usual.
+        Number of basis BRDFs of a dome's maps; None: the default number.
     basis
         Folder of MERL tables; None: the built-in materials.
 
     Raises
     ------
     skinrig.errors.UnusableError
-        More lobes than materials; that there are fewer than one is told by the reconstruction.
+        More basis BRDFs than materials. The reconstruction itself refuses numbers below 1.
     """
     if rank is None or (basis is not None and not basis.is_dir()):
         return
@@ -83,8 +83,8 @@ def check_rank(rank: int | None, basis: Path | None) -> None:
     if rank > most:
         where = "the built-in basis" if basis is None else str(basis)
         raise UnusableError(
-            f"--rank: got {rank}, expected at most {most}: lobes are mixtures of the "
-            f"{format_count(most, 'material')} of {where}"
+            f"--rank: got {rank}, expected at most {most}: basis BRDFs are mixtures of the "
+            f"{format_count(most, 'material')} of {where}; give a smaller number"
         )
 
 
@@ -92,58 +92,58 @@ def check_rank(rank: int | None, basis: Path | None) -> None:
 def reconstruct(
     sessions: Annotated[list[Path], typer.Argument(metavar="SESSION")],
     /,
-    want: Annotated[str, typer.Option(autocompletion=completion.complete_wants)],
+    maps: Annotated[str, typer.Option(autocompletion=completion.complete_wants)],
     out: Out,
     calibration: Path | None = None,
     state: str = "neutral",
     scan: Path | None = None,
-    basis: Path | None = None,
+    merl_basis: Path | None = None,
     landmarks: Path | None = None,
     hold_out: str | None = None,
     rank: int | None = None,
     json: Json = False,
 ) -> None:
-    """Make maps of a session; computes only what is wanted and not there yet.
+    """Compute maps of a session; stages that are up to date are reused.
 
-    Maps of several sessions, each by itself, go to folders of their names in the one of --out.
+    Several sessions are reconstructed one by one, each into the folder OUT/NAME of its name.
 
-    Example: skinrig reconstruct session --want melanin,hemoglobin --out appearance
+    Example: skinrig reconstruct session --maps melanin,hemoglobin --out appearance
 
-    Example: skinrig reconstruct monday tuesday --want melanin --out appearances
+    Example: skinrig reconstruct monday tuesday --maps melanin --out appearances
 
     Parameters
     ----------
     calibration
-        CALIBRATION/ folder.
+        CALIBRATION/ folder; default: nominal values, listed as assumed (flash, photographs).
     state
-        State of the subject.
+        Expression or condition to reconstruct.
     scan
-        Mesh of the face, PLY in mm, instead of a dome session's.
-    basis
-        Folder of MERL tables to fit a dome's lobes with.
+        Face mesh, PLY in mm; default: the session's own scan (dome).
+    merl_basis
+        Folder of MERL tables for the basis BRDFs; default: built-in materials (dome).
     landmarks
-        Table name,x,y of a probe's sites in pixels of its 256 x 256 map.
+        CSV table name,x,y of the sites, in pixels of the 256 x 256 face map (probe).
     hold_out
-        A dome's frames that no fit sees: lights=L007,L023,views=C03.
+        Frames excluded from all fits: lights=L007,L023,views=C03 (dome).
     rank
-        Lobes that a dome's points share; default 4.
+        Number of basis BRDFs; default 4 (dome).
     sessions
-        SESSION/ folder.
-    want
-        Maps, separated by commas; a wrong name lists those there are.
+        SESSION/ folder; several are reconstructed one by one.
+    maps
+        Maps to compute, separated by commas; an unknown name lists the valid ones.
     """
     from reconstruction.pipeline import recipes as pipeline
     from reconstruction.pipeline.inputs import DomeOptions
     from skinrig.appearances.state_truth import find_comparison_truth
 
     console = Console(json)
-    check_rank(rank, basis)
-    wants = [name.strip() for name in want.split(",") if name.strip()]
+    check_rank(rank, merl_basis)
+    wants = [name.strip() for name in maps.split(",") if name.strip()]
     made = []
     for session, folder in zip(sessions, assign_output_folders(sessions, out), strict=True):
         truth = find_comparison_truth(session, state)
         if len(sessions) > 1:
-            console.say(f"{session}:")
+            console.print_line(f"{session}:")
         done = pipeline.reconstruct(
             session,
             want=wants,
@@ -153,34 +153,34 @@ def reconstruct(
             landmarks=landmarks,
             progress=console.progress,
             truth=truth.name if truth else "",
-            dome=DomeOptions(scan, basis, hold_out, rank),
+            dome=DomeOptions(scan, merl_basis, hold_out, rank),
         )
         console.each("assumed", done.assumed)
-        console.say(f"run: {', '.join(done.ran) or 'nothing'}")
-        console.say(f"reused: {', '.join(done.reused) or 'nothing'}")
+        console.print_line(f"run: {', '.join(done.ran) or 'nothing'}")
+        console.print_line(f"reused: {', '.join(done.reused) or 'nothing'}")
         console.each("left out", (f"{what} ({why})" for what, why in done.omitted))
-        written = select_attributes(done, "ran", "reused", "left_out", "assumed", "work")
-        made.append({"path": folder, **written})
-    console.say(f"next: skinrig report {shell_quote(out)}")
+        written = select_attributes(done, "ran", "reused", "assumed", "work")
+        made.append({"path": folder, **written, "left_out": done.omitted})
+    console.print_line(f"next: skinrig report {shell_quote(out)}")
     console.document(
         "skinrig.reconstruct/1", made[0] if len(made) == 1 else {"path": out, "appearances": made}
     )
 
 
 def assign_output_folders(sessions: Sequence[Path], out: Path) -> list[Path]:
-    """Return where the maps of each session go.
+    """Return the output folder of each session's maps.
 
     Parameters
     ----------
     sessions
-        One or several.
+        SESSION/ folders.
     out
-        As given: the folder of one session's maps, else the one that holds theirs.
+        Output folder of a single session; parent of the output folders of several.
 
     Raises
     ------
     skinrig.errors.UnusableError
-        Where two sessions would go to one folder, or several into a folder of maps.
+        If two sessions have the same name, or `out` of several holds maps already.
 
     Examples
     --------
@@ -193,12 +193,12 @@ def assign_output_folders(sessions: Sequence[Path], out: Path) -> list[Path]:
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise UnusableError(
-            f"SESSION: got two of the name {twice!r}, whose maps would go to one folder;"
-            " reconstruct them one by one"
+            f"SESSION: got two folders named {twice!r}, expected different names;"
+            " reconstruct them one by one, each with its own --out"
         )
     if (out / "appearance.json").exists():
         raise UnusableError(
-            f"--out: {out} holds the maps of one session, expected a folder for those of"
-            f" {len(names)}; name another"
+            f"--out: {out} holds the maps of one session, expected a folder for the maps of"
+            f" {len(names)} sessions; name another folder"
         )
     return [out / name for name in names]

@@ -1,15 +1,15 @@
-"""`skinrig render`: pictures of a fitted skin model."""
+"""`skinrig render`: images of a fitted skin model."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from skinrig import errors
-from skinrig.commands.options import Json, Out, command
+from skinrig.commands.options import Json, Out, choice, command
 from skinrig.console import Console, select_attributes
 from skinrig.errors import UnusableError, UsageError
 
@@ -19,59 +19,61 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RenderOptions:
-    """What is seen, under which light, how much is computed, and which pictures are made.
+    """Options of the camera, the lights, the accuracy and the output images.
 
     Attributes
     ----------
     view
-        View of the rig, such as C03, or the camera's place in mm: 0,0,700.
+        View of the rig, such as C03, or camera position, mm: 0,0,700.
     light
-        Light of the rig (L017), direction towards it (1,1,2) or place in mm (at:300,200,600), with
-        *FACTOR or *R,G,B for its intensity; repeatable.
+        Light of the rig (L017), direction towards a light (1,1,2), or light position, mm
+        (at:300,200,600); add *FACTOR or *R,G,B to scale its intensity; repeatable.
     environment
-        Light from everywhere: latitude-longitude OpenEXR map.
+        Environment map: latitude-longitude OpenEXR file.
     environment_lights
-        Lights that are drawn from the environment.
+        Number of lights sampled from the environment map.
     mesh
-        Another mesh with the maps' texture coordinates: OBJ, PLY or .npz.
+        Mesh with the maps' texture coordinates: OBJ, PLY or .npz; default: the maps' own.
     rig
-        Rig whose views and lights are named.
+        Rig of the views and lights in --view and --light.
     calibration
-        CALIBRATION/ folder; default: the rig as drawn.
-    size
-        Columns of the picture.
+        CALIBRATION/ folder; default: the rig's nominal geometry.
+    size_px
+        Width of the image, pixels.
     fov
-        Of a camera given by its place: degrees across.
-    target
-        What that camera looks at, mm.
+        Horizontal field of view of a camera given by its position, degrees.
+    look_at
+        Point that a camera given by its position looks at, mm.
     samples
-        Rays a pixel: 1, 4, 9, 16 ...
+        Rays per pixel, a square number: 1, 4, 9, 16 ...
     shadow_samples
-        Points of each light's disc that a ray looks for.
+        Shadow rays per light and camera ray.
     light_radius
-        Of lights' discs, mm (far ones at 700 mm); default: the rig's, 10.
+        Radius of the lights' discs, mm (distant lights: at 700 mm); default: the rig's, 10.
     subsurface
-        dipole: light spreads in skin; local: it leaves where it entered; none: the surface alone.
+        Subsurface scattering: dipole (lateral), local (diffuse albedo without lateral scattering)
+        or none (specular reflection only).
     translucency
-        sigma_tr of red, green, blue everywhere, 1/mm: 0.3558,0.7932,1.5173.
+        sigma_tr of red, green and blue at all texels, 1/mm: 0.3558,0.7932,1.5173; default: the
+        map's.
     components
-        Light from inside and surface apart, too.
+        Also write subsurface and specular reflection as separate images.
     bases
-        Compare numbers of lobes: 1,2,4; more than were fitted cannot be had.
+        Compare numbers of basis BRDFs, at most the fitted number: 1,2,4.
     exposure
-        Factor of the PNGs; default: skin is shown well.
+        Exposure factor of the PNGs; default: set from the brightness of skin.
     against
-        Session whose photographs the model was not fitted to (reconstruct --hold-out): render what
-        they show, and compare; with --components take the photograph of --view and --light apart.
+        Session to compare with, of photographs not used in any fit (reconstruct --hold-out); with
+        --components, split the photograph of --view and --light.
     photographs
-        With --against: most photographs, even over those held out.
+        Maximum number of photographs, spread evenly over the held-out ones (with --against).
     seed
-        Of the environment's lights, and of --bases.
+        Random seed of the environment's lights and of --bases.
     shadow_boundary
-        A card's shadow on the forehead and on a flat patch, by least and greatest sigma_tr; brings
-        its own view and light.
+        Render a card's shadow on the forehead and on a flat patch for the smallest and largest
+        sigma_tr, with a fixed view and light.
     ablation
-        With --against: also compare without each part of the model.
+        Also compare with each part of the model removed (with --against).
     """
 
     view: str = "0,0,700"
@@ -81,13 +83,13 @@ class RenderOptions:
     mesh: Path | None = None
     rig: str = "dome"
     calibration: Path | None = None
-    size: int = 512
+    size_px: int = 512
     fov: float = 25.0
-    target: str = "0,0,0"
+    look_at: str = "0,0,0"
     samples: int = 4
     shadow_samples: int = 4
     light_radius: float | None = None
-    subsurface: str = "dipole"
+    subsurface: Annotated[str, choice("dipole", "local", "none")] = "dipole"
     translucency: str | None = None
     components: bool = False
     bases: str | None = None
@@ -101,7 +103,7 @@ class RenderOptions:
 
 @command
 def render(appearance: list[Path], /, out: Out, asked: RenderOptions, json: Json = False) -> None:
-    """Render a fitted skin model: radiance as OpenEXR, and a picture of it.
+    """Render a fitted skin model to radiance (OpenEXR) and an 8-bit image (PNG).
 
     Example: skinrig render appearance --view C03 --light L017 --calibration calibration --out
     picture --components
@@ -109,21 +111,18 @@ def render(appearance: list[Path], /, out: Out, asked: RenderOptions, json: Json
     Parameters
     ----------
     appearance
-        Fitted maps of the dome, with lobes; several for --bases.
+        APPEARANCE/ folder of a dome session with basis BRDFs; several with --bases.
     """
     from skinrig.rendering import figures
-    from skinrig.rendering.render import Subsurface
     from skinrig.rendering.request import parse_subpixels
 
     console = Console(json)
-    if asked.subsurface not in get_args(Subsurface):
-        raise UnusableError(
-            f"--subsurface: got {asked.subsurface!r}, expected {', '.join(get_args(Subsurface))}"
-        )
     if asked.exposure is not None and not asked.exposure > 0.0:
-        raise UnusableError(f"--exposure: got {asked.exposure}, expected a factor above 0")
+        raise UnusableError(
+            f"--exposure: got {asked.exposure}, expected a factor above 0; raise it"
+        )
     if len(appearance) > 1 and asked.bases is None:
-        raise UsageError("appearance: got several, expected one; several are for --bases")
+        raise UsageError("appearance: got several, expected one; name one, or add --bases")
     effort = figures.RenderSettings(
         subpixels=parse_subpixels(asked.samples),
         progress=console.progress,
@@ -134,7 +133,7 @@ def render(appearance: list[Path], /, out: Out, asked: RenderOptions, json: Json
         _compare(appearance[0], asked.against, out, asked, console)
     elif asked.shadow_boundary:
         subject = figures.RenderModel.of(appearance[0], mesh=asked.mesh)
-        _report(console, figures.draw_shadow_boundary(subject, out, effort, size_px=asked.size))
+        _report(console, figures.draw_shadow_boundary(subject, out, effort, size_px=asked.size_px))
     else:
         _report(console, _draw(appearance, out, asked, effort))
 
@@ -142,7 +141,7 @@ def render(appearance: list[Path], /, out: Out, asked: RenderOptions, json: Json
 def _compare(
     appearance: Path, session: Path, out: Path, asked: RenderOptions, console: Console
 ) -> None:
-    """Compare renderings with photographs of a session that no fit has seen."""
+    """Compare renderings with photographs of a session that were held out of all fits."""
     from skinrig.rendering.photographs import errors as photographs_errors
     from skinrig.rendering.photographs import evaluation
 
@@ -165,12 +164,14 @@ def _compare(
 def _draw(
     appearance: list[Path], out: Path, asked: RenderOptions, effort: RenderSettings
 ) -> dict[str, Any]:
-    """Draw a picture, a photograph beside its rendering, or one for each number of lobes."""
+    """Render an image, a photograph with its rendering, or one image per number of lobes."""
     from skinrig.rendering import figures
     from skinrig.rendering.request import RenderRig, parse_lights
 
     stage = RenderRig.of(asked.rig, asked.calibration)
-    camera = stage.camera(asked.view, size_px=asked.size, target_mm=asked.target, fov_deg=asked.fov)
+    camera = stage.camera(
+        asked.view, size_px=asked.size_px, target_mm=asked.look_at, fov_deg=asked.fov
+    )
     lights = parse_lights(
         stage,
         asked.light or (),
@@ -200,7 +201,10 @@ def _parse_ranks(text: str) -> list[int]:
     except ValueError:
         found = []
     if not found or min(found) < 1 or len(set(found)) < len(found):
-        raise UsageError(f"--bases: got {text!r}, expected numbers of lobes that differ, as 1,2,4")
+        raise UsageError(
+            f"--bases: got {text!r}, expected different numbers of basis BRDFs; write 1,2,4, "
+            "for example"
+        )
     return found
 
 
@@ -215,13 +219,15 @@ def _report(console: Console, done: dict[str, Any]) -> None:
     if "bases" in done:
         for row in done["bases"]:
             gap = next(v for k, v in row.items() if k.startswith("surface_difference"))
-            words = "nothing is lit" if gap is None else f"{100 * gap:.1f} %"
+            words = "an unknown amount: no texel is lit" if gap is None else f"{100 * gap:.1f} %"
             how = "fitted" if row["refitted"] else "reduced"
-            console.say(f"{row['lobes']} lobes, {how}: surface reflection differs by {words}")
+            console.print_line(
+                f"{row['lobes']} basis BRDFs, {how}: specular reflection differs by {words}"
+            )
     if "boundaries" in done:
         console.rows(
             ("skin", "sigma_tr, 1/mm", "90 to 10 % red, mm", "green", "blue"),
             ((row["skin"], _parse_sigma_tr(row), *row["rise_mm"]) for row in done["boundaries"]),
         )
-    console.say(f"{done['out']}: {', '.join(done['files'])}, {done['seconds']:.1f} s")
+    console.print_line(f"{done['out']}: {', '.join(done['files'])}, {done['seconds']:.1f} s")
     console.document(done["schema"], {k: v for k, v in done.items() if k != "schema"})

@@ -1,4 +1,4 @@
-"""The commands that show what was measured: one page, or a face drawn live."""
+"""`skinrig report` and `skinrig view`: HTML pages of results and of a live face."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from skinrig.commands import completion
 from skinrig.commands.options import STDOUT_MARK, Json, Page, check_output_file, command
 from skinrig.console import Console, select_attributes
 from skinrig.errors import UnusableError, UsageError
@@ -25,10 +26,10 @@ def report(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Write one self-contained HTML page about what lies at PATHS.
+    """Write a self-contained HTML report on everything at PATHS.
 
-    Two sets of maps, two benchmarks, two folders of pictures or two of runs are compared; truths
-    beside them serve both. Anything else is shown one after the other.
+    Exactly two sets of maps, two benchmarks, two folders of images or two folders of runs are
+    compared; both use the ground truths found next to them. Other inputs are reported one by one.
 
     Example: skinrig report demo -o report.html
 
@@ -37,11 +38,11 @@ def report(
     Parameters
     ----------
     paths
-        Folders that skinrig wrote.
+        Folders or files written by skinrig.
     out
-        The page; - is the standard output.
+        HTML file to write; - is the standard output.
     compare
-        Put two runs side by side; default: where PATHS are exactly two of one kind.
+        Compare two runs side by side; default: if PATHS are exactly two of one kind.
     """
     from skinrig.atomic_file import write_atomically
     from skinrig.report import make
@@ -50,7 +51,7 @@ def report(
     if piped and json:
         raise UsageError("--out: got '-' with --json, whose document goes there; name a file")
     console = Console(json)
-    talk = Console(json or piped)  # where the page goes nothing else does
+    talk = Console(json or piped)  # messages go to stderr if the page goes to stdout
     done = make(paths, compare=compare)
     if piped:
         typer.echo(done.html, nl=False)
@@ -58,11 +59,13 @@ def report(
         write_atomically(out, done.html)
     size = len(done.html.encode())
     if done.compared is None:
-        talk.say(done.verdict)
+        talk.print_line(done.verdict)
     else:
-        talk.say(f"compared {' with '.join(done.compared)}; --no-compare shows all of both")
+        talk.print_line(
+            f"compared {' with '.join(done.compared)}; --no-compare reports both in full"
+        )
     if not piped:
-        talk.say(f"{out}: {size / 1e6:.2f} MB; open it in a browser")
+        talk.print_line(f"{out}: {size / 1e6:.2f} MB; open it in a browser")
     missed = sum(not check.passed for check in done.checks)
     figures = {"path": out, "bytes": size, "checks": len(done.checks), "missed": missed}
     console.document("skinrig.report/1", {**figures, "compared": done.compared})
@@ -70,19 +73,19 @@ def report(
 
 @dataclass(frozen=True, slots=True)
 class ViewFaceOptions:
-    """Geometry and color of the face that is drawn.
+    """Geometry and color of the displayed face.
 
     Attributes
     ----------
     mesh
-        The face's geometry: .npz, .obj (or a folder of them), .gltf or .glb, with blend shapes or
-        without.
+        Face geometry, with or without blend shapes: .npz, .obj (or a folder of them), .gltf or
+        .glb; default: the maps' own.
     landmarks
-        Table name,x,y of the flash rig's neutral picture, to lay its maps on the mesh; a simulation
-        has its own.
+        CSV table name,x,y of the flash rig's neutral image, which registers its maps to the mesh;
+        default: the simulation's own.
     calibration
-        CALIBRATION/ folder with the color of a dome's cameras; else the one its maps were made
-        with, or what its session says of the sensor.
+        CALIBRATION/ folder with the color of the dome's cameras; default: that of the
+        reconstruction, or the sensor data of its session.
     """
 
     mesh: Path | None = None
@@ -92,21 +95,21 @@ class ViewFaceOptions:
 
 @dataclass(frozen=True, slots=True)
 class HeadOptions:
-    """The simulated head, and the size of all textures.
+    """Options of the simulated head and of texture size.
 
     Attributes
     ----------
     preset
-        Skin type of a simulated head: I to VI, palest or darkest.
+        Skin type of the simulated head: I to VI, palest or darkest.
     seed
-        Seed of a simulated head.
-    size
-        Texels a side of the textures, 64 to 4096.
+        Random seed of the simulated head.
+    size_px
+        Width and height of textures, texels, 64 to 4096.
     """
 
-    preset: str = "III"
+    preset: Annotated[str, typer.Option(autocompletion=completion.subjects)] = "III"
     seed: int = 0
-    size: int = 2048
+    size_px: int = 2048
 
 
 @command
@@ -121,40 +124,39 @@ def view(
     head: HeadOptions,
     json: Json = False,
 ) -> None:
-    """Write one self-contained page that draws a face live: expressions, blood, light, traits.
+    """Write a self-contained interactive page of a face: expressions, blood, light, traits.
 
     Example: skinrig view -o page.html
 
     Example: skinrig view demo/appearance-flash-moving-II -o face.html
 
-    Example: skinrig view demo/appearance-dome-III --size 1024 --port 0
+    Example: skinrig view demo/appearance-dome-III --size-px 1024 --port 0
 
     Parameters
     ----------
     appearance
-        Folders of one face: what `skinrig fit` wrote, or a dome's maps; none: a simulated head.
+        Folders of one face, by `skinrig fit`, or maps of a dome session; none: a simulated head.
     port
-        Serve the page and its large displacement on this port of this machine alone, 0: any free
-        one, in place of writing it.
+        Serve the page on this local port instead of writing a file; 0: any free port.
     displacement
-        With --port: heights of microstructure, um, in the mesh's texture: a .npy file, 4096 or
-        16384 px a side, as `skinrig apply microstructure` writes.
+        Heights of microstructure, um, over the mesh's texture (with --port): .npy file of
+        `skinrig apply microstructure`, 4096 x 4096 or 16384 x 16384.
     """
     from skinrig.viewer import faces, page, server
 
     console = Console(json)
     if port is not None and not 0 <= port <= MAX_PORT:
-        raise UnusableError(f"--port: got {port}, expected 0 to {MAX_PORT}")
+        raise UnusableError(f"--port: got {port}, expected 0 to {MAX_PORT}; name another")
     if displacement is not None and port is None:
-        raise UsageError("displacement: a page in a file cannot fetch it; add --port 0")
+        raise UsageError("displacement: needs a served page; add --port 0")
     given = select_attributes(face, "mesh", "landmarks", "calibration")
-    given |= select_attributes(head, "preset", "seed", "size")
+    given |= select_attributes(head, "preset", "seed") | {"size": head.size_px}
     console.progress("making textures and tables")
     scene = faces.scene(appearance or [], **given)
     document: dict[str, Any]
     if port is None:
         document = page.write(scene, out)
-        console.say(
+        console.print_line(
             f"{out}: {document['bytes'] / 1e6:.2f} MB, {document['textures']} textures, "
             f"{document['blend_shapes']} blend shapes; open it in a browser"
         )

@@ -1,4 +1,4 @@
-"""The commands that simulate captures, one a rig."""
+"""`skinrig simulate`: simulated captures, one command per rig."""
 
 from __future__ import annotations
 
@@ -20,19 +20,23 @@ if TYPE_CHECKING:
 simulate_app = typer.Typer(
     cls=RigGroup,
     subcommand_metavar="RIG [ARGS]...",
-    help="Capture a simulated subject or target through the real drivers into SESSION/.",
+    help="Capture a simulated subject or target into SESSION/ with the real drivers.",
 )
 
 States = Annotated[
     list[str] | None,
     option(
-        "State of the face, such as smile or exercise; repeatable.",
+        "Expression or condition of the face, such as smile or exercise; repeatable; "
+        "default: neutral.",
         autocompletion=completion.states,
     ),
 ]
 OneState = Annotated[
     list[str] | None,
-    option("State of the face, such as smile or exercise; one.", autocompletion=completion.states),
+    option(
+        "Expression or condition of the face, such as smile or exercise; default: neutral.",
+        autocompletion=completion.states,
+    ),
 ]
 
 
@@ -42,12 +46,14 @@ class SimulateOptions:
 
     Attributes
     ----------
+    scale
+        Scale of the simulation: small (quick) or full (all of the rig).
     plan
-        What is captured of the subject, by `skinrig plan`.
+        Plan file of `skinrig plan`, JSON; default: the rig's own plan.
     """
 
     out: options.Out
-    size: options.Size = "small"
+    scale: options.Scale = "small"
     seed: options.Seed = 0
     plan: Path | None = None
     consent: options.Consent = None
@@ -56,20 +62,20 @@ class SimulateOptions:
     json: options.Json = False
 
     def request_fields(self, subject: str, console: Console) -> dict[str, Any]:
-        """Return what every order has, by name."""
+        """Return the fields that requests of all rigs share."""
         from skinrig.capturing.plan_choice import read_plan
         from skinrig.consent import parse_subject
         from skinrig.simulating.orders import SIMULATED_USES
         from skinrig.simulating.subject_records import pseudonym
 
-        # a resumed session keeps what it was begun with, unless something else is said
+        # a resumed session keeps its subject record unless an option replaces it
         person = None
         if not self.resume or self.consent or self.consent_expires is not None:
             name = pseudonym(subject, self.seed)
             person = parse_subject(name, self.consent or SIMULATED_USES, self.consent_expires)
         plan = None if self.plan is None else read_plan(self.plan)
         order = {"subject": subject, "plan": plan, "person": person, "progress": console.progress}
-        return order | select_attributes(self, "out", "size", "seed", "resume")
+        return order | select_attributes(self, "out", "seed", "resume") | {"size": self.scale}
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,27 +85,26 @@ class SimulatedFaceOptions:
     Attributes
     ----------
     width
-        Pixels across, instead of the size; even.
+        Image width, pixels, even; default: that of the scale.
     mesh
-        Face mesh, .npz or .obj.
-    leave_out
-        What of skin is not built although it changes pixels, joined by commas: lateral (or
+        Face mesh, .npz or .obj; default: the built-in head.
+    omit
+        Effects not to simulate although they change pixels, separated by commas: lateral (or
         subsurface), interreflections, spectral, optics, relief_shadows.
     movement
-        Whether the face moves and wrinkles with its states, or its blood changes only.
+        Deform the face with its expressions, or change its blood volume only.
     """
 
     width: int | None = None
     mesh: Path | None = None
     movement: Annotated[bool, typer.Option("--movement/--no-movement")] = True
-    leave_out: str | None = None
+    omit: str | None = None
 
     def ordered(self) -> dict[str, Any]:
-        """Return what orders of faces have, by name."""
+        """Return the fields that requests of faces share."""
         from skinrig.capturing.option_values import parse_names
 
-        leave_out = parse_names(self.leave_out) or ()
-        order = {"width_px": self.width, "leave_out": leave_out}
+        order = {"width_px": self.width, "leave_out": parse_names(self.omit) or ()}
         return order | select_attributes(self, "mesh", "movement")
 
 
@@ -113,19 +118,19 @@ def simulate_flash(
     target: Annotated[str | None, target_option("flash")] = None,
     repeats: options.Pairs = 1,
     state: States = None,
-    nearer: Annotated[float, typer.Option(metavar="MM")] = 0.0,
+    camera_offset_mm: float = 0.0,
     relaxation: float | None = None,
 ) -> None:
-    """Simulate the flash rig: a face in one or more states, a sequence in time, or a target.
+    """Simulate the flash rig: expressions of a face, a time sequence, or a target.
 
     Example: skinrig simulate flash --out session-flash --subject IV
 
     Parameters
     ----------
     relaxation
-        Time constant of a sequence's blood, s; default 0.02, of exercise 40, of alcohol 1200.
-    nearer
-        How much nearer to the camera than the white tile the face stands, mm; below 0 farther.
+        Time constant of blood volume in a sequence, s; default 0.02, exercise 40, alcohol 1200.
+    camera_offset_mm
+        Offset of the face from the white reference towards the camera, mm; negative: away.
     """
     from skinrig.simulating.orders import FlashOrder
 
@@ -136,7 +141,7 @@ def simulate_flash(
         target=target,
         states=tuple(state or ("neutral",)),
         repeats=repeats,
-        nearer_mm=nearer,
+        nearer_mm=camera_offset_mm,
         sequence=sequence.order(),
         relaxation_s=relaxation,
     )
@@ -162,31 +167,31 @@ def simulate_dome(
         typer.Option(metavar="NAME[=AMOUNT]", autocompletion=completion.conditions),
     ] = None,
 ) -> None:
-    """Simulate the dome: a face in one state, with a scan of it, or a target.
+    """Simulate the dome: a face with one expression and its scan, or a target.
 
-    Lights and cameras of a plan are those of targets, too.
+    With --plan, targets are captured with the lights and cameras of the plan.
 
     Example: skinrig simulate dome --out session-dome --subject IV --condition sweat=0.5
 
     Parameters
     ----------
     lights
-        How many lights; default 48, full all 150.
+        Number of lights; default 48, at full scale all 150.
     views
-        How many cameras; default 6, full all 16.
+        Number of cameras; default 6, at full scale all 16.
     move
-        The face moves.
+        Simulate head motion during the capture.
     wrapped
-        The scan is a template wrapped onto the face: one texture for all states.
+        Scan with a template mesh, so that all expressions share one texture.
     subsurface
-        Light spreads sideways in the skin, even where no pixel shows it.
+        Simulate subsurface scattering even if it changes no pixel visibly.
     interreflections
-        Light goes from skin to skin, even where no pixel shows it.
+        Simulate interreflection of skin even if it changes no pixel visibly.
     subject
-        Preset, I to VI, palest or darkest, a file NAME.toml, or P01 to P87 of the simulated
-        population.
+        Simulated subject: preset I to VI, palest or darkest, a file NAME.toml, or P01 to P87 of
+        the simulated population.
     condition
-        Condition of the face, by up to 1 of it: cold, hot, sweat, lotion, makeup, powder;
+        Surface condition with amount 0 to 1, default 1: cold, hot, sweat, lotion, makeup, powder;
         repeatable.
     """
     from skinrig.capturing.option_values import parse_amounts
@@ -219,7 +224,7 @@ def simulate_gradient(
     site: options.Site = None,
     angles: options.Angles = None,
     steps: options.Steps = None,
-    leave_out: str | None = None,
+    omit: str | None = None,
 ) -> None:
     """Simulate the gradient sphere: a patch of skin in a caliper, or a target.
 
@@ -227,8 +232,8 @@ def simulate_gradient(
 
     Parameters
     ----------
-    leave_out
-        What of skin is not built although it changes pixels, joined by commas: shadows, lateral,
+    omit
+        Effects not to simulate although they change pixels, separated by commas: shadows, lateral,
         interreflections, optics.
     """
     from skinrig.capturing.option_values import parse_floats, parse_names, parse_range
@@ -242,7 +247,7 @@ def simulate_gradient(
         site=site,
         angles=parse_floats(angles, "--angles"),
         steps=parse_range(steps, "--steps"),
-        leave_out=parse_names(leave_out) or (),
+        leave_out=parse_names(omit) or (),
     )
     _simulate(order, console, target)
 
@@ -258,15 +263,16 @@ def simulate_probe(
     angles: options.Directions = None,
     all_brackets: options.AllBrackets = False,
 ) -> None:
-    """Simulate the fibre probe: tissue at some sites, or a target.
+    """Simulate the fiber probe: tissue at several sites, or a target.
 
     Example: skinrig simulate probe --out session-probe --sites cheek
 
     Parameters
     ----------
     subject
-        Preset, I to VI, palest or darkest, a file NAME.toml, or a medium, homogeneous:A,S[,G] or
-        anisotropic:A,S[,STRENGTH[,AXIS]] with A sigma_a and S sigma_s', 1/mm, and AXIS in degrees.
+        Simulated subject: preset I to VI, palest or darkest, a file NAME.toml, or a medium,
+        homogeneous:A,S[,G] or anisotropic:A,S[,STRENGTH[,AXIS]] with A = sigma_a and S = sigma_s',
+        1/mm, and AXIS in degrees.
     """
     from skinrig.capturing.option_values import parse_floats, parse_names
     from skinrig.simulating.orders import ProbeOrder
@@ -284,11 +290,11 @@ def simulate_probe(
 
 
 def _simulate(order: SimulationOrder, console: Console, target: str | None) -> None:
-    """Simulate an order, and print what was made and the next step."""
+    """Simulate a request; print the outputs and the next step."""
     from skinrig.simulating.simulation import simulate
 
     done = simulate(order)
-    truth = f", truth in {done.truth}" if done.truth else ""
-    console.say(f"{done.session}: {format_count(done.frames, 'frame')}{truth}")
-    console.say(f"next: {suggest_after_session(order.rig, order.out, target)}")
+    truth = f", ground truth in {done.truth}" if done.truth else ""
+    console.print_line(f"{done.session}: {format_count(done.frames, 'frame')}{truth}")
+    console.print_line(f"next: {suggest_after_session(order.rig, order.out, target)}")
     console.document("skinrig.simulate/1", done.document())

@@ -41,8 +41,8 @@ class AlbedoEdit:
     clipped
         Share of the change of statistics that was not possible.
     before, after
-        Mean distance of the histograms that tell something from those wanted, before matching
-        and after.
+        Mean distance of the informative histograms from the target ones, before and after
+        matching.
     """
 
     factor: Float32Array
@@ -136,12 +136,12 @@ def edit_albedo(
     texels, _ = chart.read(filled)
     spread = texture_fill.push_pull(texels, chart.on_surface.astype(np.float32)).values  # gutters
     most = -np.log(MIN_ALBEDO_FACTOR)
-    told = albedo_vectors.informative_responses(space.texture)
+    informative = albedo_vectors.informative_responses(space.texture)
     return AlbedoEdit(
         np.exp(np.clip(spread, -most, most)).astype(np.float32),
         clipped,
-        float(found.before[told].mean()),
-        float(found.after[told].mean()),
+        float(found.before[informative].mean()),
+        float(found.after[informative].mean()),
     )
 
 

@@ -34,10 +34,10 @@ from skinrig.traits.regions import LibraryParts
 
 EDITABLE_PARTS: Final = ("albedo", "surface")
 MAX_TRAIT_AMOUNT: Final = 10.0
-"""Of a trait. The strongest of the package's change R_d by a factor of 1.3 (tan) to 1.9 (powder) an
-amount: at 10 they reach the least or greatest factor of an edit, and more says nothing more."""
+"""Of a trait. The strongest of the package's change R_d by a factor of 1.3 (tan) to 1.9 (powder)
+per amount: at 10 they reach the smallest or largest factor of an edit."""
 MAX_RESIDUAL_DISTANCE: Final = 0.5
-"""Share of the distance to the wanted histograms that is left, from which on it is told."""
+"""Fraction of the distance to the target histograms above which the residual is reported."""
 STALE_MAPS: Final = {"lobe_residual": "is of the lobes before the edit"}
 """Maps that an edit of the lobes leaves without meaning."""
 
@@ -57,7 +57,7 @@ class EditRequest:
     region
         One of `common_regions.REGION_NAMES` that the library has: "face", "beard" or "no-beard".
     parts
-        Of `EDITABLE_PARTS`; None: where the library tells a trait from chance.
+        Of `EDITABLE_PARTS`; None: those with a significant effect of the trait.
     mask
         Picture of the texture, see `edit_masks.read`.
     spots
@@ -90,8 +90,8 @@ class EditRequest:
             if not abs(amount) <= MAX_TRAIT_AMOUNT:
                 raise EditError(
                     f"trait {name}: got {amount:g}, expected -{MAX_TRAIT_AMOUNT:g} to "
-                    f"{MAX_TRAIT_AMOUNT:g}; faces with a trait and without it differ by 1, and "
-                    "beyond there are no faces that it was learned from"
+                    f"{MAX_TRAIT_AMOUNT:g}; faces with and without the trait differ by 1, and "
+                    "no face of the training data lies beyond; give a smaller amount"
                 )
         for part in self.parts or ():
             one_of("parts", part, EDITABLE_PARTS, EditError)
@@ -195,7 +195,7 @@ def edit_face(
     progress: Callable[[str], None] | None = None,
 ) -> EditResult:
     """Edit an appearance in memory; see `edit_folder`."""
-    tell = progress or (lambda text: None)
+    report = progress or (lambda text: None)
     source = face.appearance
     parts = _open_library(request, library)
     shape = _texture_shape(source, face)
@@ -206,14 +206,14 @@ def edit_face(
     if asked and parts is not None:
         chosen = _select_traits(asked, parts, work)
         if chosen["albedo"]:
-            tell(f"albedo: {', '.join(chosen['albedo'])}")
+            report(f"albedo: {', '.join(chosen['albedo'])}")
             _edit_albedo(work, parts, chosen["albedo"])
         if chosen["surface"]:
-            tell(f"lobes: {', '.join(chosen['surface'])}")
+            report(f"lobes: {', '.join(chosen['surface'])}")
             _edit_surface(work, parts, chosen["surface"])
     spots = [spot for spot in request.spots if spot.amount]
     if spots:
-        _edit_spots(work, spots, tell)
+        _edit_spots(work, spots, report)
     changed = sorted(
         {n for n, m in work.maps.items() if source.maps.get(n) is not m}
         | {n for n in source.maps if n not in work.maps}
@@ -296,7 +296,7 @@ def _select_traits(
             for p in possible if use else []:
                 if p not in use:
                     chance = have[p][name].confidence.p_value
-                    why = f"the trait is not told from chance there (p = {chance:.2g})"
+                    why = f"the effect of the trait is not significant (p = {chance:.2g})"
                     work.left_out.append((f"{name} in {p}", f"{why}; --parts {p} edits it"))
             use = use or possible
         if not use:
@@ -397,9 +397,9 @@ def _edit_spots(
     frame = editing_spots.spot_frame(face)
     chart = face.chart(frame)
     skin = masks.region_weights("skin" if order.region == "face" else order.region, frame, chart)
-    # a picture says itself where spots may be; without one they keep off eyes, brows and lips
+    # a mask image limits spots itself; without one they avoid eyes, brows and lips
     share = skin if mask is None else (mask if order.region == "face" else mask * skin)
-    told = []
+    reports = []
     for number, spot in enumerate(spots):
         progress(f"{spot.kind}: {spot.amount:+g}")
         source = work.maps["r_d"]
@@ -415,7 +415,7 @@ def _edit_spots(
                 off = np.abs(values - source.values)
                 moved = dataclasses.replace(moved, stderr=np.hypot(moved.stderr, off))
             work.maps["r_d"] = dataclasses.replace(moved, valid=good)
-        told.append({**dataclasses.asdict(spot), **one})
+        reports.append({**dataclasses.asdict(spot), **one})
         least = pigment_spots.SPOT_KINDS[spot.kind].diameter_mm
         if face.texel_mm() > least:
             work.warnings.append(
@@ -423,7 +423,7 @@ def _edit_spots(
                 "and only darken it by their share"
             )
     _warn_without_landmarks(work)
-    work.record["spots_done"] = told
+    work.record["spots_done"] = reports
 
 
 def _warn_without_landmarks(work: _EditState) -> None:

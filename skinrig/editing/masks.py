@@ -1,4 +1,4 @@
-"""Masks that say where an edit holds: pictures laid over a texture, and regions of the face."""
+"""Masks of edits: images over a texture, and regions of the face."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ FEATHER_MM = 6.0
 
 
 class MaskError(ValueError):
-    """A picture that is no mask of a texture."""
+    """An image that is not a mask of a texture."""
 
 
 def read(path: Path, shape: tuple[int, int]) -> Float32Array:
@@ -38,7 +38,7 @@ def read(path: Path, shape: tuple[int, int]) -> Float32Array:
     Raises
     ------
     MaskError
-        For a file that is no picture, values outside 0 to 1, another aspect, and one that is
+        For a file that is not an image, values outside 0 to 1, another aspect, and one that is
         0 everywhere.
     """
     kind = path.suffix.lower()

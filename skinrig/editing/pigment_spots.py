@@ -115,7 +115,7 @@ def draw(
     kind
         One of `SPOT_KINDS`.
     r_d
-        (H, W, 3), whose median color in the mask says what the skin holds.
+        (H, W, 3), whose median color in the mask determines the chromophores of the skin.
     position_mm
         (H, W, 3), rig frame.
     surface
@@ -127,7 +127,7 @@ def draw(
     density_per_cm2
         At least 0; as `SPOT_KINDS` has it by default.
     rng
-        Says where they are.
+        Generator of their positions.
     table
         Colors of skin; by default of the dome's camera and light.
 
@@ -180,7 +180,7 @@ def _transmitted(
     """Return what `added` melanin leaves of each channel of the median color, (3,)."""
     usable = colors[(colors > 0).all(axis=1)]
     if not len(usable):
-        raise SpotError("r_d: is 0 all over the mask, there is no skin to color")
+        raise SpotError("r_d: got 0 all over the mask, expected skin; choose another mask")
     color = np.median(usable, axis=0)
     size = table.size
     apart = np.abs(np.log(table.rgb) - np.log(color)).sum(axis=-1)
@@ -257,7 +257,7 @@ def _profile(
         wide = np.hypot(radius, half_texel)
         near = np.asarray(tree.query_ball_point(center, 1.35 * wide), np.intp)
         away = points[near] - center
-        # an outline that is not quite round: three waves in space, shallow beside the radius
+        # an outline that is not quite round: three waves in space, shallow relative to the radius
         waves = np.sin(away @ way.T * (2.0 / wide) + start).mean(axis=1)
         reach = np.linalg.norm(away, axis=1) / (wide * (1.0 + 0.25 * waves))
         soft = max(edge, half_texel / wide)

@@ -88,7 +88,7 @@ def read(appearance: SkinAppearance) -> SurfaceMixtures:
     """
     if BASIS_FILE not in appearance.files:
         raise SurfaceMixtureError(
-            f"files: got no {BASIS_FILE}; `skinrig reconstruct --want {WEIGHT_PREFIX}0` makes it"
+            f"files: got no {BASIS_FILE}; `skinrig reconstruct --maps {WEIGHT_PREFIX}0` makes it"
         )
     try:
         with np.load(io.BytesIO(appearance.files[BASIS_FILE]), allow_pickle=False) as file:
@@ -140,7 +140,7 @@ def load_materials(
         where = "this package" if folder is None else str(folder)
         raise SurfaceMixtureError(
             f"materials: the lobes are mixtures of {len(names)} materials ({names[0]}, ...) that "
-            f"are not those of {where}; name the folder that they were fitted with: --basis DIR"
+            f"are not those of {where}; name the fitted materials with --merl-basis"
         )
     return found
 

@@ -1,1 +1,1 @@
-"""What is handed to other programs: sessions, maps, materials, meshes and reflection tables."""
+"""Exports to other programs: sessions, maps, materials, meshes and reflectance tables."""

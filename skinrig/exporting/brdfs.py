@@ -32,7 +32,7 @@ def write_rgl(appearance: SkinAppearance, folder: Path, delivery: ExportSettings
 
 
 def write(appearance: SkinAppearance, folder: Path, place: SkinPosition | None, to: str) -> None:
-    """Write each lobe as lobe_K, and the BRDF of a place as place, with a document that tells all.
+    """Write each lobe as lobe_K, the BRDF of a position as place, and a document of all files.
 
     Parameters
     ----------
@@ -56,9 +56,9 @@ def write(appearance: SkinAppearance, folder: Path, place: SkinPosition | None, 
     suffix, light = BRDF_SUFFIXES[to], lobes.light_radius_rad
     files: dict[str, object] = {}
     for k in range(lobes.size):
-        told = f"lobe {k}, equal in all channels: highlights have the light's color"
-        _write(to, folder / f"lobe_{k}{suffix}", _lobe(lobes, k), told, light)
-        files[f"lobe_{k}{suffix}"] = {"what": told, "light_from_inside": False}
+        description = f"lobe {k}, equal in all channels: highlights have the light's color"
+        _write(to, folder / f"lobe_{k}{suffix}", _lobe(lobes, k), description, light)
+        files[f"lobe_{k}{suffix}"] = {"what": description, "light_from_inside": False}
     if place is not None:
         at, entry = _place(appearance, lobes, place)
         _write(to, folder / f"place{suffix}", at, str(entry["what"]), light)
@@ -103,7 +103,7 @@ def _lobe(lobes: BrdfBasis, k: int) -> Brdf:
 def _place(
     appearance: SkinAppearance, lobes: BrdfBasis, place: SkinPosition
 ) -> tuple[Brdf, dict[str, object]]:
-    """Return the mean BRDF over the texels of a place, and what to tell of it."""
+    """Return the mean BRDF over the texels around a position, and its description."""
     model = skin_reflectance.assemble(appearance)
     row, column = _nearest_valid(model.valid, place)
     near = np.zeros_like(model.valid)

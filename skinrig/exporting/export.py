@@ -1,4 +1,4 @@
-"""What skinrig hands to other programs: the formats, the consent, and the sealed folder."""
+"""Export: formats, consent of the subjects and the sealed folder."""
 
 from collections.abc import Mapping
 from datetime import date, datetime
@@ -129,7 +129,7 @@ def _appearance(path: str | Path, use: str | None, today: date | None) -> SkinAp
 def _session(path: str | Path, use: str | None, today: date | None) -> Session:
     """Open an undamaged session whose subject agreed to a use."""
     if use is None:
-        raise UsageError("--use: got none; say what the copy of a session is for, e.g. research")
+        raise UsageError("--use: got none; name the purpose of the copy, e.g. research")
     session = Session.open(path)
     session.require_consent(use, today=today)
     found = verify(path)

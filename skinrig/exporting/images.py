@@ -1,7 +1,7 @@
 """Images as other programs read them: float EXR and 16-bit PNG, each described in one record.
 
-An EXR says its unit and color space in its header. A PNG can hold neither numbers below 0 nor
-above 1: its record says how codes become values again, and which share of the pixels was clipped.
+The header of an EXR has its unit and color space. A PNG cannot store numbers below 0 or above 1:
+its record has the decoding of codes to values, and the fraction of clipped pixels.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ DATA_SPACE: Final = "data"
 REC709_CHROMATICITIES: Final = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 """Chromaticities of sRGB's primaries and D65, for headers."""
 EMPTY_TILE_PX: Final = 8
-"""Texels a side of a tile where nothing was measured."""
+"""Width and height of a tile without measurements, texels."""
 PNG_RANGES: Final[Mapping[str, tuple[float, float]]] = {
     "melanin": (0.0, 0.5),
     "hemoglobin": (0.0, 0.25),
@@ -139,9 +139,9 @@ class ImageFolder:
         """
 
         def put(path: Path, one: ExportImage) -> dict[str, Any]:
-            codes, told = encode_png_codes(one)
+            codes, record = encode_png_codes(one)
             path.write_bytes(png.encode(codes, quick=True))
-            return told
+            return record
 
         low, high = png_code_range(image)
         return self._tiled(replace(image, low=low, high=high), folder, "png", put)
@@ -158,7 +158,7 @@ class ImageFolder:
                 self.write_exr(image, folder)
 
     def document(self, file: str, appearance: SkinAppearance, content: Mapping[str, Any]) -> None:
-        """Write the document that says where an export is from, and what each file holds."""
+        """Write the document of an export: provenance, and the content of each file."""
         files = dict(sorted(self.records.items()))
         write_json(self.root / file, {**describe_provenance(appearance), **content, "files": files})
 
@@ -200,15 +200,15 @@ def encode_png_codes(image: ExportImage, *, depth: int = 16) -> tuple[NDArray[An
     Returns
     -------
     codes : ndarray of uint8 or uint16, shape of the values
-    told : dict
+    record : dict
         JSON values: encoding, range, share of valid values that were clipped.
 
     Examples
     --------
     >>> ramp = ExportImage(name="a", values=np.array([[0.0, 1.0, 3.0]]), unit="mm", low=0.0,
     ...     high=2.0)
-    >>> codes, told = encode_png_codes(ramp)
-    >>> codes.tolist(), told["clipped_share"] > 0.3
+    >>> codes, record = encode_png_codes(ramp)
+    >>> codes.tolist(), record["clipped_share"] > 0.3
     ([[0, 32768, 65535]], True)
     """
     dtype: Any = {8: np.uint8, 16: np.uint16}[depth]
@@ -224,14 +224,14 @@ def encode_png_codes(image: ExportImage, *, depth: int = 16) -> tuple[NDArray[An
         encoding = f"value = low + (high - low) * code / {top}; import as raw, Non-Color"
     slack = 0.5 / top * (high - low)
     clipped = (shown < low - slack) | (shown > high + slack)
-    told = {
+    record = {
         "encoding": encoding,
         "low": low,
         "high": high,
         "step": (high - low) / top,
         "clipped_share": float(clipped.mean()) if clipped.size else 0.0,
     }
-    return np.round(position * top).astype(dtype), told
+    return np.round(position * top).astype(dtype), record
 
 
 def png_code_range(image: ExportImage) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Every map of an appearance as float EXR and 16-bit PNG, with one document that says it all."""
+"""Export all maps of an appearance as float EXR and 16-bit PNG, with one document."""
 
 from collections.abc import Iterator
 from dataclasses import replace

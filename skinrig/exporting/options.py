@@ -1,4 +1,4 @@
-"""How the receiver of an export wants it: scene unit, green of normal maps, tiles, a place."""
+"""Settings of an export: scene unit, green of normal maps, tiles, position on the skin."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NORMAL_Y: Final[Mapping[str, float]] = {"gl": 1.0, "dx": -1.0}
 FIRST_TILE: Final = 1001
 """UDIM tile of texture coordinates 0 to 1, which maps are of."""
 TILE_SEPARATORS: Final[Mapping[str, str]] = {"none": "", "dot": ".", "underscore": "_"}
-"""What stands between a texture's name and the number of its tile."""
+"""Separator of a texture's name and the number of its tile."""
 
 _NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
@@ -84,7 +84,7 @@ class ExportSettings:
     udim
         Of `TILE_SEPARATORS`. Maps are those of tile 1001; a mesh may reach over more.
     with_errors
-        Whether standard errors and masks are written beside the values.
+        Whether standard uncertainties and masks are written, too.
     only
         Names of the maps, or of the states, to write; empty: all that there are.
     mesh
@@ -99,8 +99,8 @@ class ExportSettings:
     camera
         Name of the view whose images are exported; None: the one that looks most along -z.
     calibration
-        CALIBRATION/ of a session's lights, cameras and sensor; None: as the rig was drawn, and
-        as noisy as frames say of themselves.
+        CALIBRATION/ of a session's lights, cameras and sensor; None: the nominal
+        rig, with the noise recorded by the frames.
     """
 
     unit: str | None = None

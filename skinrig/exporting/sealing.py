@@ -85,7 +85,7 @@ def describe_provenance(appearance: SkinAppearance) -> dict[str, Any]:
     Parameters
     ----------
     appearance
-        Any; of one that moves, what is told by its parts.
+        Any appearance; of a moving one, its parts are listed.
 
     Examples
     --------
@@ -93,11 +93,11 @@ def describe_provenance(appearance: SkinAppearance) -> dict[str, Any]:
     >>> found["source"], found["seed"], found["assumed"], found["consent"]
     ('simulated', 7, ['a'], [])
     """
-    told: list[Any] = [appearance.parameters.get("assumed")]
+    assumptions: list[Any] = [appearance.parameters.get("assumed")]
     parts = appearance.parameters.get("parts")
     if isinstance(parts, dict):
-        told += [part.get("assumed") for part in parts.values() if isinstance(part, dict)]
-    assumed = [str(text) for one in told if isinstance(one, list | tuple) for text in one]
+        assumptions += [part.get("assumed") for part in parts.values() if isinstance(part, dict)]
+    assumed = [str(text) for one in assumptions if isinstance(one, list | tuple) for text in one]
     return {
         "source": appearance.source,
         "inputs": dict(appearance.inputs),

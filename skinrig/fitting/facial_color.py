@@ -79,8 +79,8 @@ def fit_facial_color(
         if subject.has_white:
             raise
         raise FacialColorInputError(
-            f"{error}; a white calibration, which --calibration would bring, tells how light "
-            "lies on the face and so which blood"
+            f"{error}; add a white calibration with --calibration, which "
+            "separates illumination from blood"
         ) from error
     maps, document = facial_color_document.to_maps(found.rig)
     maps["melanin"] = found.melanin
@@ -139,7 +139,7 @@ def _landmarks(
     if folder is not None:
         if not folder.is_dir():
             raise FacialColorInputError(
-                f"landmarks: {folder} is no folder; expected one with STATE.csv for each state"
+                f"landmarks: got {folder}, expected a folder with STATE.csv per state"
             )
         found = {
             state: landmark_table.read_landmark_table(folder / f"{state}.csv")
@@ -162,7 +162,7 @@ def _landmarks(
 
 
 def _truths(subject: SubjectImages, sessions: Sequence[Path]) -> dict[str, Path | None]:
-    """Return the folder with each state's truth, beside the session that shows it first."""
+    """Return the folder of each state's ground truth, next to the first session of the state."""
     return {
         state: find_state_truth(sessions[subject.images_of_state(state)[0].session], state)
         for state in subject.states

@@ -137,7 +137,7 @@ def _fit_site(
         if KERNEL_FILE not in appearance.files:
             raise MicrostructureFitError(
                 f"{path}: holds no {KERNEL_FILE}, expected a caliper session reconstructed with "
-                "`skinrig reconstruct SESSION --want height,kernels`"
+                "`skinrig reconstruct SESSION --maps height,kernels`"
             )
         document = json.loads(appearance.files[KERNEL_FILE])
         points += [fit for fit in document["fits"] if fit["valid"]]
@@ -171,6 +171,6 @@ def _neutral(path: Path, appearance: SkinAppearance) -> tuple[SkinMap, float]:
     if name not in appearance.maps or not isinstance(pixel_um, int | float):
         raise MicrostructureFitError(
             f"{path}: has no height of the neutral state, expected a caliper session reconstructed "
-            "with `--want height,kernels`"
+            "with `--maps height,kernels`"
         )
     return appearance.maps[name], float(pixel_um)

@@ -1,4 +1,4 @@
-"""Where a fibre probe was set down on a scanned face, and what it measured in between."""
+"""Sites of a fiber probe on a scanned face, and interpolation of sigma_tr between them."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class ProbeSite:
     ----------
     name
     sigma_tr_per_mm, stderr_per_mm
-        Of each channel; NaN and infinity where there is no valid fit.
+        Of each channel; NaN and infinity without a valid fit.
     texel
         Row and column on the face's texture.
     position_mm
@@ -72,7 +72,7 @@ class PlacedTranslucency:
     sites
         Those it rests on.
     left_out
-        Site, with or without its channel, and why it has no say.
+        Site, with or without its channel, and why it is not used.
     conflicts
         Site and channel whose repeats contradict each other, and how.
     assumed
@@ -177,7 +177,7 @@ def _measured(probe: SkinAppearance) -> dict[str, tuple[tuple[float, ...], tuple
     """Return sigma_tr and its standard error of each site by channel."""
     if SUBSURFACE_FILE not in probe.files:
         raise ProbeSiteError(
-            f"probe: has no {SUBSURFACE_FILE}; `skinrig reconstruct --want subsurface` makes it of "
+            f"probe: has no {SUBSURFACE_FILE}; `skinrig reconstruct --maps subsurface` makes it of "
             "a session of the fibre probe"
         )
     try:

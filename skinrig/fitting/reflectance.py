@@ -58,8 +58,8 @@ def fit_reflectance(
     dome
         APPEARANCE/ of a dome session with normals, R_d and lobes.
     probe
-        APPEARANCE/ of a session of the fibre probe on the same subject; None: the mean of people
-        stands in, with their spread as standard error.
+        APPEARANCE/ of a session of the fibre probe on the same subject; None: the
+        population mean is used, with its standard deviation as standard uncertainty.
     out
         Folder to write.
     landmarks

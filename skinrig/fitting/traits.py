@@ -30,7 +30,7 @@ from skinrig.traits.labels import TraitLabels
 MAX_SURFACE_RANK: Final = 8
 """Lobes of a population's surface (Weyrich et al. 2005, figure 15)."""
 MIN_REGION_PIXELS: Final = 200
-"""Valid pixels of the common map below which a region says nothing."""
+"""Valid pixels of the common map required of a region."""
 
 
 class TraitFitError(ValueError):
@@ -89,11 +89,11 @@ def fit_traits(
     landmarks
         Folder with a table ``NAME.csv`` for each face; None: those of simulations.
     vectors
-        What stands for an albedo, see `albedo_vectors`.
+        Feature vector of an albedo, see `albedo_vectors`.
     contrast
         "means" of those with and without, or "regression" on all traits together.
     size
-        Pixels a side of the common map; by default what the coarsest texture shows.
+        Width and height of the common map, pixels; None: those of the coarsest texture.
     basis
         Folder of MERL files that the lobes were fitted with.
     seed
@@ -106,15 +106,15 @@ def fit_traits(
     TraitFitError, FaceError, UnusableError, TraitError, ParameterizationError
         Naming what is missing or does not fit.
     """
-    tell = progress or (lambda text: None)
+    report = progress or (lambda text: None)
     faces = read_faces(appearances, landmarks)
     table = trait_labels.read(labels, [face.name for face in faces])
     frame = face_textures.common_frame(faces, size)
-    tell(f"common map: {frame.size} pixels of {frame.pixel_mm:.2f} mm, {len(frame.names)} marks")
+    report(f"common map: {frame.size} pixels of {frame.pixel_mm:.2f} mm, {len(frame.names)} marks")
     samples = []
     for face in faces:
         samples.append(albedo_sample(face, frame))
-        tell(f"{face.name}: {100 * samples[-1].valid.mean():.0f} % of the common map")
+        report(f"{face.name}: {100 * samples[-1].valid.mean():.0f} % of the common map")
     left_out: list[tuple[str, str]] = []
     spaces = fit_albedo_spaces(
         samples, table, frame, vectors, contrast=contrast, seed=seed, left_out=left_out
@@ -214,8 +214,8 @@ def summarize_traits(
         for part, space in library.spaces.items()
         for name, trait in space.traits.items()
     )
-    said = [f"{part}: {w}" for part, space in library.spaces.items() for w in space.warnings]
-    return rows, tuple(dict.fromkeys(said))
+    warnings = [f"{part}: {w}" for part, space in library.spaces.items() for w in space.warnings]
+    return rows, tuple(dict.fromkeys(warnings))
 
 
 def read_faces(appearances: Sequence[Path], landmarks: Path | None) -> list[Face]:
@@ -226,12 +226,12 @@ def read_faces(appearances: Sequence[Path], landmarks: Path | None) -> list[Face
     skinrig.errors.UsageError
         For fewer than two.
     TraitFitError
-        For names that are the same, or faces without landmarks, saying what to do.
+        For names that are the same, or faces without landmarks, with a remedy.
     """
     if len(appearances) < 2:
         raise UsageError(f"appearances: got {len(appearances)}, expected two or more faces")
     if landmarks is not None and not landmarks.is_dir():
-        raise TraitFitError(f"landmarks: {landmarks} is no folder; expected one with NAME.csv each")
+        raise TraitFitError(f"landmarks: got {landmarks}, expected a folder with NAME.csv per face")
     faces: list[Face] = []
     for path in appearances:
         name = path.resolve().name.removeprefix("appearance-")
@@ -242,7 +242,9 @@ def read_faces(appearances: Sequence[Path], landmarks: Path | None) -> list[Face
     names = [face.name for face in faces]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise TraitFitError(f"appearances: two are called {twice!r}; labels could not tell them")
+        raise TraitFitError(
+            f"appearances: got two named {twice!r}, expected different names; rename one"
+        )
     _require_landmarks(faces)
     return faces
 
@@ -266,7 +268,7 @@ def _surface(
     seed: int,
     left_out: list[tuple[str, str]],
 ) -> TraitSpace | None:
-    """Learn the traits of mean mixtures, or say why not."""
+    """Learn the traits of mean mixtures; append the reason to `left_out` if it is not possible."""
     try:
         found = [surface_mixtures.read(face.appearance) for face in faces]
     except SurfaceMixtureError as error:

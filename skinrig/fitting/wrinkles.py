@@ -58,13 +58,13 @@ def fit_wrinkles(
     appearances
         APPEARANCE/ folders of dome sessions of one subject, with normals and positions on one
         texture: the neutral and at least one expression. ``STATE=FOLDER`` names the state,
-        otherwise the folder says it.
+        otherwise its document does.
     out
         Folder of the dynamic appearance; other parts in it stay.
     masks
         Two RGBA pictures of the zones; None: zones are found in the data.
     size, mask_size
-        Texels a side of wrinkle map and masks.
+        Width and height of wrinkle map and masks, texels.
     seed
         Of the search for zones.
 
@@ -88,8 +88,8 @@ def fit_wrinkles(
     measured = {state: _normals(folder, one) for state, (folder, one) in read.items()}
     shapes = {state: one.normals.shape for state, one in measured.items()}
     if len(set(shapes.values())) > 1:
-        told = ", ".join(f"{state} {shape[:2]}" for state, shape in shapes.items())
-        raise WrinkleInputError(f"appearances: textures of sizes {told}, expected one size")
+        sizes = ", ".join(f"{state} {shape[:2]}" for state, shape in shapes.items())
+        raise WrinkleInputError(f"appearances: got textures of sizes {sizes}, expected one size")
     neutral = measured.pop("neutral")
     side = min(neutral.normals.shape[:2])
     zones = None
@@ -103,7 +103,7 @@ def fit_wrinkles(
         stack = _read_masks(masks)
     found = fit_wrinkle_map(neutral, measured, stack, size=(min(size, side), min(size, side)))
     maps, document = found.model().to_maps()
-    why = "whether its texture is that of the others: no mesh lies beside its maps"
+    why = "match of its texture with the others not checked: it has no mesh"
     part = derive_appearance(
         *(one for _, one in read.values()),
         maps=maps,
@@ -130,14 +130,14 @@ def _parse_state(appearance: Path) -> tuple[str, Path]:
     state, equals, path = str(appearance).partition("=")
     if equals and STATE_PATTERN.fullmatch(state):
         return state, Path(path)
-    told = store.read_document(appearance).parameters.get("state")
-    if not isinstance(told, str) or not told:
-        raise WrinkleInputError(f"{appearance}: says no state; name it as STATE={appearance}")
-    return told, appearance
+    recorded = store.read_document(appearance).parameters.get("state")
+    if not isinstance(recorded, str) or not recorded:
+        raise WrinkleInputError(f"{appearance}: has no state; name it as STATE={appearance}")
+    return recorded, appearance
 
 
 def _check_textures(appearances: Mapping[str, SkinAppearance]) -> list[str]:
-    """Refuse faces that are unwrapped differently; return those that no mesh lies beside.
+    """Refuse faces that are unwrapped differently; return those without a mesh.
 
     A texel would be other skin in each. Faces on one texture need not have all triangles in
     common: each scan is cropped for itself.
@@ -181,7 +181,7 @@ def _normals(folder: Path, appearance: SkinAppearance) -> NormalMaps:
     if name is None or "position" not in maps:
         raise WrinkleInputError(
             f"{folder}: holds no normals with positions, expected a dome session reconstructed "
-            "with `skinrig reconstruct SESSION --want normals_refined`"
+            "with `skinrig reconstruct SESSION --maps normals_refined`"
         )
     normals, position = maps[name], maps["position"]
     valid = intersect_valid(normals, position)

@@ -25,7 +25,7 @@ def confirm_choice(
     subject, seed
         The simulated face.
     progress
-        Is told each step.
+        Called with a line per step.
     """
     rig = load_planner(choice.rig.name)
     steps = rig.rehearsal(choice)
@@ -85,7 +85,7 @@ def calibrate_simulated(
     seed
         Of the sessions.
     progress
-        Is told each target.
+        Called with a line per target.
     """
     for target, options in targets.items():
         if progress is not None:

@@ -1,8 +1,8 @@
-"""Plans of the light dome: which of its lights and cameras a subject needs.
+"""Plan the light dome: choose the lights and cameras that a subject needs.
 
-The forecast follows a face of the rig's simulation: which points each light and camera reach, how
-much light comes back, how noisy the sensor is. What no sample removes is taken from what the
-reconstruction itself states: samples misplaced by part of a pixel, and relief too fine for it.
+The forecast simulates a face: visibility of its points for each light and camera, reflected light
+and sensor noise. Errors that no sample removes are those that the reconstruction states: samples
+misplaced by part of a pixel, and relief too fine for it.
 """
 
 import math
@@ -54,13 +54,13 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
         )
     observation = simulate_observation(rig, request.subject, seed=request.seed)
     every_view, every_light = list(range(len(rig.views))), list(range(len(rig.lights)))
-    told = observation.information(every_view)
-    best = light_selection.predict_errors(told, every_light, min_lights=least)
+    information = observation.information(every_view)
+    best = light_selection.predict_errors(information, every_light, min_lights=least)
     if not request.wants:
         return _choice(rig, observation, (every_light, every_view), best, request)
     share = request.valid_share * best.valid_fraction
     selected = light_selection.select_lights(
-        told,
+        information,
         median_rad=_target_rad(request),
         valid_fraction=share,
         min_lights=least,
@@ -69,7 +69,7 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
     lights, prediction = list(selected.lights), selected.prediction
     while not _is_r_d_reached(prediction, observation, request) and len(lights) < len(rig.lights):
         selected = light_selection.select_lights(
-            told,
+            information,
             median_rad=0.0,
             valid_fraction=2.0,
             min_lights=least,
@@ -102,9 +102,9 @@ def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
             f"least {surface_estimates.MIN_LIGHTS} and {surface_estimates.MIN_VIEWS}"
         )
     observation = simulate_observation(rig, request.subject, seed=request.seed)
-    told = observation.information(views)
+    information = observation.information(views)
     prediction = light_selection.predict_errors(
-        told, lights, min_lights=surface_estimates.MIN_LIGHTS
+        information, lights, min_lights=surface_estimates.MIN_LIGHTS
     )
     return _choice(rig, observation, (lights, views), prediction, request, plan=plan)
 
@@ -243,20 +243,20 @@ def _remove_views(
 def _explain_shortfall(
     best: ErrorPrediction, observation: DomeObservation, request: PlanRequest
 ) -> tuple[str, ...]:
-    """Say why no number of lights gives what is wanted, where that is so."""
+    """Return the reasons why no number of lights reaches the goals; empty if one does."""
     out, wants = [], request.wants
     normals = math.degrees(best.median_rad)
     if normals > wants.get("normals", math.inf):
         floor = math.degrees(light_selection.rayleigh_mixture_median(observation.systematic_rad))
         out.append(
             f"normals: all lights and cameras leave {normals:.2f}°, {floor:.2f}° of it by "
-            f"misplaced samples and fine relief at {observation.pixel_mm:.2g} mm a pixel; "
-            "more pixels would help, more lights will not"
+            f"misplaced samples and fine relief at {observation.pixel_mm:.2g} mm per pixel; "
+            "use more pixels, not more lights"
         )
     r_d = 100.0 * _r_d_error(best, observation)
     if r_d > wants.get("r_d", math.inf):
         out.append(
-            f"r_d: all lights and cameras leave {r_d:.2g} %; at {observation.pixel_mm:.2g} mm a "
-            "pixel albedo too fine for it is part of that"
+            f"r_d: all lights and cameras leave {r_d:.2g} %, in part by albedo finer than a "
+            f"pixel of {observation.pixel_mm:.2g} mm; use more pixels"
         )
     return tuple(out)

@@ -1,4 +1,4 @@
-"""What the dome's lights and cameras reach of a simulated face, and how noisily."""
+"""Simulated observation of a face by the dome: visibility and noise per light and camera."""
 
 import math
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ LIGHT_ERROR = 0.015
 left out, a light's intensity, a shadow's edge."""
 BLUR_PX = 1.0
 """Standard deviation, in each direction, of what an estimate of the albedo averages over, px:
-pixels and their interpolation, obliqueness, samples beside their place. R_d of simulated faces of
+pixels and their interpolation, obliqueness, misplaced samples. R_d of simulated faces of
 seeds 1 to 3 (types V, I and IV) came nearest to the truth blurred by 0.9 to 1.05 of it."""
 TEXTURE_TEXELS = 512
 """Along one side of the face's maps: albedo finer than pixels must be in them."""
@@ -45,11 +45,11 @@ class DomeObservation:
     to_light: Float64Array
     """(P, L, 3)."""
     variance: Float64Array
-    """(P, L, V): variance of a sample over its square; infinite where it tells nothing."""
+    """(P, L, V): variance of a sample over its square; infinite where it has no information."""
     lit: BoolArray
-    """(P, L): nothing stands between the point and the light."""
+    """(P, L): the point is visible from the light."""
     seen: BoolArray
-    """(P, V): nothing stands between the point and the camera."""
+    """(P, V): the point is visible from the camera."""
     area_mm2: Float64Array
     """(P,)."""
     systematic_rad: Float64Array
@@ -61,7 +61,7 @@ class DomeObservation:
     pixel_mm: float
 
     def information(self, views: Sequence[int]) -> FisherInformation:
-        """Return what each light tells of each point through some of the cameras."""
+        """Return the Fisher information of each point per light, over a subset of the cameras."""
         seen = self.variance[..., list(views)]
         with np.errstate(divide="ignore"):
             noise = 1.0 / np.sum(1.0 / seen, axis=-1)
@@ -124,13 +124,16 @@ def simulate_observation(
     )
 
     white = np.array([white_intensity(light, view).mean() for light in rig.lights])
-    rate = r_d[:, None] * white * cos_light / light_mm**2  # full scales per second
+    # diffuse reflection of a point light: R_d I cos(theta) / d^2, in full scales per second
+    rate = r_d[:, None] * white * cos_light / light_mm**2
     chip = make_sensor(view)
     variance = _relative_variance(rate, chip.full_well_e, chip.read_noise_e)
     there = (lit & steep)[:, :, None] & (seen & facing)[:, None] & matte
+    # similar triangles: size on the subject = size on the sensor x distance / focal length; a cell
+    # of the color filter has two sensor pixels per side
     pixel = float(
         2.0 * np.median(np.linalg.norm(views, axis=-1)) * 1e-3 * view.pixel_um / view.focal_mm
-    )  # mm on the subject, of a cell of the color filter
+    )  # mm
     return DomeObservation(
         normal,
         to_light,
@@ -166,13 +169,15 @@ def _trace_to_positions(
 
 def _relative_variance(rate: Float64Array, full_well_e: float, read_noise_e: float) -> Float64Array:
     """Return the variance of merged brackets over the square of the light."""
-    told = np.zeros(rate.shape)
+    information = np.zeros(rate.shape)
+    # brackets are merged by inverse variance, so that the information of the unsaturated ones adds:
+    # (N / sigma)^2 with N electrons and sigma^2 = N (shot noise) + read noise^2
     for seconds in DOME_EXPOSURES_S:
         electrons = np.maximum(rate, 0.0) * seconds * full_well_e
         kept = (electrons > 0) & (electrons < 0.95 * full_well_e)
-        told += np.where(kept, electrons**2 / (electrons + read_noise_e**2), 0.0)
+        information += np.where(kept, electrons**2 / (electrons + read_noise_e**2), 0.0)
     with np.errstate(divide="ignore"):
-        return np.asarray(np.where(told > 0, 1.0 / told, np.inf))
+        return np.asarray(np.where(information > 0, 1.0 / information, np.inf))
 
 
 def _gaussian_mean(r_d: FloatArray, atlas: Any, sigma_mm: float) -> Float64Array:

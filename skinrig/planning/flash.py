@@ -1,8 +1,8 @@
-"""Plans of the flash rig: how many frames, how much light and how many darks a face needs.
+"""Plan the flash rig: choose the frames, flash power and dark frames that a face needs.
 
 The forecast is the Cramer-Rao bound of both chromophores at every pixel of a simulated face: the
 sensor's noise at the light that comes back, the model error and the prior of the light, as in the
-report; what noise leaves beside the model error is what the knobs can change.
+report. The settings change only the part of the error that is noise.
 """
 
 from collections.abc import Iterator, Mapping
@@ -36,9 +36,10 @@ POWER_CHOICES = (0.03125, 0.0625, 0.125, 0.25, 0.5, 1.0)
 FORECAST_RELATIVE_SD: Mapping[str, float] = {"melanin": 0.2, "hemoglobin": 0.15}
 """Relative deviation of measured from predicted medians, see docs/validation/forecasts.md."""
 ERROR_OVER_BOUND: Mapping[str, float] = {"melanin": 1.1, "hemoglobin": 1.0}
-"""Errors over their bounds, medians of sessions. Melanin's exceed it as the light's prior tells
-less of most pixels than its information says in the mean (2 to 10 %), as the model error of a face
-is not that of faces in general (up to 10 %), and as color bends over errors of its size."""
+"""Errors over their bounds, medians of sessions. Melanin's exceed it for three
+reasons: the light's prior has less information for most pixels than its mean (2 to 10 %), the model
+error of a face differs from that of faces in general (up to 10 %), and color is nonlinear over
+errors of its size."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,10 +95,10 @@ def predict(
     for name, truth, bound in zip(
         CHROMOPHORE_NAMES, (observation.melanin, observation.hemoglobin), bounds, strict=True
     ):
-        told = np.full(skin.shape, np.inf)
-        told[skin] = ERROR_OVER_BOUND[name] * bound
-        sigma[name] = told
-        valid[name] = is_detectable(truth, np.where(skin, told, 0.0) * truth, skin)
+        deviation = np.full(skin.shape, np.inf)
+        deviation[skin] = ERROR_OVER_BOUND[name] * bound
+        sigma[name] = deviation
+        valid[name] = is_detectable(truth, np.where(skin, deviation, 0.0) * truth, skin)
     return FlashPrediction(sigma, valid, observation.skin)
 
 
@@ -131,11 +132,11 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
             return _choice(rig, observation, plan, settings, request, path=tuple(path))
     least = next(one for one in _candidates(rig) if one["power"] == 1.0)
     reasons = _explain_shortfall(best, observation, request)
-    # what cannot be reached is not worth sixteen frames: the plan keeps those that still tell more
-    told = [name for name in request.wants if np.isfinite(best.median(name))]
-    for settings in _candidates(rig) if told else ():  # less tells nothing as well
+    # an unreachable goal does not justify sixteen frames: keep the fewest within 5 % of the best
+    estimable = [name for name in request.wants if np.isfinite(best.median(name))]
+    for settings in _candidates(rig) if estimable else ():  # else fewer frames are as good
         now = predict(observation, **settings)
-        if all(now.median(name) <= 1.05 * best.median(name) for name in told):
+        if all(now.median(name) <= 1.05 * best.median(name) for name in estimable):
             least = settings
             break
     plan = crossed_plan(rig, **least)
@@ -271,7 +272,7 @@ def _choice(
 def _explain_shortfall(
     best: FlashPrediction, observation: FlashObservation, request: PlanRequest
 ) -> tuple[str, ...]:
-    """Say why no number of frames gives what is wanted."""
+    """Return the reasons why no number of frames reaches the goals."""
     out = []
     for name, value in request.wants.items():
         now = 100.0 * best.median(name)
@@ -280,7 +281,7 @@ def _explain_shortfall(
         still = replace(observation, gain=0.0, floor=0.0)
         model = 100.0 * predict(still, repeats=1, power=1.0, darks=0).median(name)
         why = (
-            "more frames will not help; a camera whose colors tell the two apart better might"
+            "more frames will not help; use a camera whose bands separate the chromophores better"
             if model > value
             else f"more than {REPEAT_CHOICES[-1]} frames would be needed"
         )
@@ -289,5 +290,5 @@ def _explain_shortfall(
             f"model error alone, without any noise, leaves {model:.3g} %; {why}"
         )
     if not out and not _is_reached(best, best, request):
-        out.append("valid_share: too little of the skin keeps an estimate")
+        out.append("valid_share: too few valid skin pixels; lower --min-valid-fraction")
     return tuple(out)

@@ -1,4 +1,4 @@
-"""What the flash rig's crossed camera sees of a simulated face."""
+"""Simulated observation of a face by the flash rig's cross-polarized camera."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -107,12 +107,13 @@ def simulate_observation(
 
 
 def log_light_information() -> float:
-    """Return how well the prior tells the log of a pixel's light: Fisher's information of it.
+    """Return the standard deviation of the log of a pixel's light by the prior's information.
 
-    The prior has a steep edge, as hardly any skin gets more light than a tile in its place: it
-    tells more than its variance says.
+    It is below that of the prior itself: the prior has a steep edge, as hardly any skin gets more
+    light than a white reference in its place.
     """
     prior = shading_prior.face_prior()
+    # Fisher information of a shift of the density p(x): I = integral of p'(x)^2 / p(x) dx
     slope = np.gradient(prior.density, prior.step)
     return float(1.0 / np.sqrt(np.sum(slope**2 / prior.density) * prior.step))
 

@@ -1,9 +1,9 @@
-"""Plans of the gradient sphere: which patterns, and how long, the normals of skin need.
+"""Plan the gradient sphere: choose the patterns and exposures that skin normals need.
 
 The forecast propagates the sensor's noise through the reconstruction itself, on the pictures of a
 small patch of simulated skin: moments, Wiener filter and lookup state a standard error for each
-pixel. What measured patches were off beyond it is added, and what the lens takes from the relief is
-told beside.
+pixel. The excess error of measured patches is added. The relief lost by the lens is reported
+separately.
 """
 
 import math
@@ -38,8 +38,8 @@ PATTERN_SETS: tuple[tuple[str, ...], ...] = (
     ("full", "x", "y", "z", "-x", "-y", "-z"),
     tuple(LIGHT_PATTERNS),
 )
-"""Patterns that tell light and three gradients: one complement instead of full, which lowers the
-noise more; all complements; and dark."""
+"""Patterns that determine total light and three gradients: one complement instead of full, which
+lowers the noise more; all complements; and dark."""
 EXPOSURE_CHOICES = (0.125, 0.25, 0.5, 1.0, 1.5, 2.0)
 """Of the rig's own exposure."""
 MAX_SIGNAL_FRACTION = 0.98
@@ -55,7 +55,7 @@ WHOLE_READOUT_S = PATTERN_DWELL_S - PATTERN_EXPOSURE_S
 
 @dataclass(frozen=True, slots=True)
 class GradientScanSettings:
-    """What of a plan the normals of one state hang on."""
+    """Settings of a plan that determine the normals of one strain step."""
 
     patterns: tuple[str, ...]
     exposure_s: float
@@ -226,12 +226,12 @@ def candidates(
 
 
 def read_settings(plan: Plan) -> GradientScanSettings:
-    """Return what the normals of a plan's first neutral state hang on.
+    """Return the settings of a plan's first neutral strain step.
 
     Raises
     ------
     plans.PlanningError
-        Where its pictures do not tell light and three gradients, in both polarizations.
+        If its images do not determine total light and three gradients in both polarizations.
     """
     shots = [step for step in plan.steps if step.kind == "gradient" and strain_state(step)]
     neutral = [step for step in shots if int(step.index.get("caliper", 1)) == 0]

@@ -1,4 +1,4 @@
-"""What the gradient sphere's camera sees of a small patch of simulated skin."""
+"""Simulated observation of a small patch of skin by the gradient sphere's camera."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

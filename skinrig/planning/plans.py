@@ -1,8 +1,8 @@
-"""The smallest capture that reaches an error: what is wanted, what was chosen, what was left out.
+"""Minimal acquisition: goals, the chosen plan, its forecast and its omissions.
 
-A plan is judged by what it will give before anybody sits still for it. Each rig has a forecast of
-its own, the Fisher information of its samples with the part of the error that no sample removes,
-and knobs that it may turn; this module reads what is wanted and says what came of it.
+A plan is evaluated by the forecast of its errors, before a capture. Each rig has a forecast of its
+own: the Fisher information of its samples, and the part of the error that no sample removes. Each
+rig also has settings to choose from. This module parses the goals and reports the choice.
 """
 
 import difflib
@@ -189,7 +189,7 @@ def parse_wants(text: str, rig: str) -> dict[str, float]:
     for part in filter(str.strip, text.split(",")):
         match = _WANTED_LIMIT.fullmatch(part)
         if match is None:
-            raise PlanOptionsError(f"--want: got {part.strip()!r}, expected {known}")
+            raise PlanOptionsError(f"--goals: got {part.strip()!r}, expected {known}")
         name, number, unit = match.groups()
         if name not in units:
             close = difflib.get_close_matches(name, units, 1)
@@ -197,19 +197,19 @@ def parse_wants(text: str, rig: str) -> dict[str, float]:
             others = [other for other, gives in WANTED_UNITS.items() if name in gives]
             if others:
                 hint = f"; {name} is planned for {', '.join(others)}"
-            raise PlanningError(f"--want: got {name!r} of rig {rig!r}, expected {known}{hint}")
+            raise PlanningError(f"--goals: got {name!r} of rig {rig!r}, expected {known}{hint}")
         if unit not in (None, units[name]):
-            raise PlanOptionsError(f"--want: got {name} in {unit}, expected {units[name]}")
+            raise PlanOptionsError(f"--goals: got {name} in {unit}, expected {units[name]}")
         try:
             value = float(number)
         except ValueError:
             value = -1.0
         if not 0.0 < value < 1e6:
             raise PlanningError(
-                f"--want: got {name}<={number}{unit or ''}, expected a number above 0 and below 1e6"
+                f"--goals: got {name}<={number}{unit or ''}, expected above 0 and below 1e6"
             )
         if name in wants:
-            raise PlanOptionsError(f"--want: got {name} twice, expected it once")
+            raise PlanOptionsError(f"--goals: got {name} twice, expected it once")
         wants[name] = value
     return wants
 
@@ -292,9 +292,9 @@ def choose(
         # the gradient sphere keeps its pixels' size and gives up field, as its simulation does
         rig = rig.cropped(width_px) if rig_name == "gradient" else rig.resized(width_px)
     if most_lights is not None and most_lights < 1:
-        raise PlanningError(f"--most-lights: got {most_lights}, expected 1 or more")
+        raise PlanningError(f"--max-lights: got {most_lights}, expected 1 or more")
     if most_lights is not None and rig_name != "dome":
-        raise PlanOptionsError(f"--most-lights: is for the dome, not the {rig_name} rig")
+        raise PlanOptionsError(f"--max-lights: is for the dome, not the {rig_name} rig")
     if forecast is not None:
         plan = read_plan(forecast)
         if plan.rig != rig.name:
@@ -392,17 +392,17 @@ def _format_site_errors(errors: Mapping[str, Sequence[float]]) -> str:
     Parameters
     ----------
     errors
-        Percent by site, red, green and blue; infinite where nothing is told.
+        Percent by site, red, green and blue; infinite where it is unknown.
 
     Examples
     --------
     >>> _format_site_errors({"chin": (0.444, 1.399, math.inf), "cheek": (0.5, 1.0, 2.0)})
-    'chin red 0.444 %, green 1.4 %, blue not told; cheek red 0.5 %, green 1 %, blue 2 %'
+    'chin red 0.444 %, green 1.4 %, blue unknown; cheek red 0.5 %, green 1 %, blue 2 %'
     """
     return "; ".join(
         f"{site} "
         + ", ".join(
-            f"{color} " + (f"{one:.3g} %" if math.isfinite(one) else "not told")
+            f"{color} " + (f"{one:.3g} %" if math.isfinite(one) else "unknown")
             for color, one in zip(("red", "green", "blue"), row, strict=True)
         )
         for site, row in errors.items()

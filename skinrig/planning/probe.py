@@ -1,6 +1,6 @@
-"""Plans of the fibre probe: which exposures, placements and sites sigma_tr needs.
+"""Plan the fiber probe: choose the exposures, placements and sites that sigma_tr needs.
 
-What readings of a plan are worth is forecast in `skinrig.planning.probe_forecast`.
+The information of a plan's readings is forecast in `skinrig.planning.probe_forecast`.
 """
 
 import itertools
@@ -58,7 +58,7 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
         return (
             found.valid_share >= valid_share * whole.valid_share
             and found.median <= target
-            # a site that is left out must be told by the others as well as is wanted
+            # the other sites must predict an omitted one within the goal
             and (not left.size or plans.median_magnitude(left) <= target)
         )
 
@@ -149,7 +149,7 @@ def remove_sites(
     *,
     memory: Memory | None = None,
 ) -> tuple[ProbeSettings, Plan]:
-    """Take off sites that the others, and people in general, tell of as well as is wanted.
+    """Omit sites that the others and the population prior predict within the goal.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def remove_sites(
 
 
 def read_settings(plan: Plan) -> ProbeSettings:
-    """Return what of a plan sigma_tr hangs on.
+    """Return the settings of a plan that determine sigma_tr.
 
     Raises
     ------
@@ -225,7 +225,7 @@ def _choice(
         "probe",
         (fewer > 0, "exposures", fewer, N_BRACKETS),
         (longest_s < 0.99 * MAX_EXPOSURE_S, "longest", longest_s),
-        *((not told, "site", site, error) for site, error, told in sites),
+        *((not measured, "site", site, error) for site, error, measured in sites),
         ("angle" not in turned, "directions"),
     )
     knobs = {
@@ -245,7 +245,7 @@ def _choice(
 
 
 def _explain_shortfall(observation: ProbeObservation, whole: ProbePrediction, target: float) -> str:
-    """Say why no plan reaches what is wanted."""
+    """Return the reasons why no plan reaches the goal."""
     stays = 100.0 * plans.median_magnitude(whole.misfit)
     calibration = 100.0 * plans.median_magnitude(whole.common)
     return (

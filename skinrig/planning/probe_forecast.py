@@ -1,8 +1,7 @@
-"""What a series of exposures under the fibre probe tells of sigma_tr.
+"""Forecast of sigma_tr from a series of exposures of the fiber probe.
 
-The inversion itself is asked what readings are worth: Fisher's information by the derivatives of
-the photon table, the misfit of layers, and the certificate of the phantom, which no exposure
-removes.
+The forecast uses the inversion itself: Fisher information by the derivatives of the photon table,
+the misfit of layers, and the certificate of the phantom, which no exposure removes.
 """
 
 import math
@@ -37,7 +36,7 @@ MAP_PX = 32
 
 @dataclass(frozen=True, slots=True)
 class ProbeSettings:
-    """What of a plan sigma_tr hangs on."""
+    """Settings of a plan that determine sigma_tr."""
 
     sites: tuple[str, ...]
     exposures_s: tuple[float, ...]
@@ -55,7 +54,7 @@ class ProbePrediction:
     sigma: Float64Array
     """(S, 3) standard error: readings, misfit, certificate; of sites that are not measured what
     the others and people in general leave open. What a fit without noise is off on this skin is
-    one draw of the misfit that this states, and not counted beside it."""
+    one sample of the misfit that this states, and not counted again."""
     shared: Float64Array
     """(T, S, 3) the calibration's part, certificate and far cross-talk: what each of its errors
     does to all sites and colors together, which no median averages out."""
@@ -107,8 +106,8 @@ class ProbePrediction:
 
 
 Memory = dict[tuple[Any, ...], Sequence[Any]]
-"""Fits of one `ProbeObservation` by what they hang on: plans that differ in placements alone share
-them, and without noise nearly all do."""
+"""Cache of fits of one `ProbeObservation`, keyed by all that they depend on: plans that differ in
+placements only share them, and without noise nearly all plans do."""
 
 
 def predict(
@@ -167,10 +166,10 @@ def _fits(
     """Return the fits of each site's profile as a plan would read it, or without its noise."""
     how = (setting.exposures_s, setting.darks, setting.level)
     read = [reading_variance(observation, observation.reflectance[k], *how) for k in sites]
-    # of the readings' noise a fit without it asks only which fibres are read at all
-    told = np.array(read) if noise else np.isfinite(read)
+    # a noise-free fit depends on the readings' noise only by which fibers are read at all
+    weights = np.array(read) if noise else np.isfinite(read)
     count = len(setting.exposures_s)
-    key = (noise, tuple(sites), count, told.tobytes())
+    key = (noise, tuple(sites), count, weights.tobytes())
     if key not in memory:
         memory[key] = _fit_noisy_profiles(observation, read, sites, count, noise=noise)
     return memory[key]
@@ -199,8 +198,8 @@ def _fit_noisy_profiles(
         value = observation.reflectance[k]
         valid = np.isfinite(own)
         variance = np.where(valid, own, 0.0) if noise else np.zeros_like(own)
-        told = (value, observation.phantom, value / observation.phantom)
-        doubt, shared = mixed.matrix_variance(*told), mixed.shared_changes(*told)
+        optics = (value, observation.phantom, value / observation.phantom)
+        doubt, shared = mixed.matrix_variance(*optics), mixed.shared_changes(*optics)
         common = np.concatenate([value * observation.common, shared])
         variance += gain * value**2 + doubt
         reflectance = FiberReflectance(names, radius, value, variance, common, valid, ~valid)

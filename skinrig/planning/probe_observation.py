@@ -1,4 +1,4 @@
-"""What the fibres of the probe take from simulated skin, and how noisily the camera reads it."""
+"""Simulated observation of skin by the fiber probe: light per fiber, and camera noise."""
 
 import math
 from collections.abc import Sequence
@@ -108,11 +108,15 @@ def reading_variance(
         Of the light source, 0 to 1.
     """
     rate = level * observation.unit * value  # full scales per second
-    told = np.zeros(rate.shape)
+    # each unsaturated exposure is a reading of the rate, light / t, with variance spread / t^2, so
+    # that its information is t^2 / spread; a dark frame adds its share 1 / darks of the floor
+    information = np.zeros(rate.shape)
     for seconds in exposures_s:
         gain, floor = observation.chip.noise_profile(seconds)
         light = rate * seconds
         spread = gain * np.maximum(light, 0.0) + floor * (1.0 + 1.0 / darks)
-        told += np.where(light < MAX_READ_FRACTION, seconds**2 / spread, 0.0)
+        information += np.where(light < MAX_READ_FRACTION, seconds**2 / spread, 0.0)
     with np.errstate(divide="ignore"):
-        return np.asarray(1.0 / (told * observation.pixels * np.square(level * observation.unit)))
+        return np.asarray(
+            1.0 / (information * observation.pixels * np.square(level * observation.unit))
+        )

@@ -41,7 +41,7 @@ def reduce_lobes(model: SkinReflectance, rank: int, *, rng: np.random.Generator)
     if not 1 <= rank <= model.lobes.size:
         raise RenderingError(
             f"bases: got {rank}, but the model has {model.lobes.size} lobes; fit more with "
-            f"`skinrig reconstruct SESSION --rank {rank} --want basis_weight_0,r_d,normals`"
+            f"`skinrig reconstruct SESSION --rank {rank} --maps basis_weight_0,r_d,normals`"
         )
     if rank == model.lobes.size:
         return model

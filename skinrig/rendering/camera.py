@@ -69,14 +69,14 @@ def look_at(
     columns, rows = size_px
     if not (2 <= columns <= MAX_SIDE_PX and 2 <= rows <= MAX_SIDE_PX):
         raise RenderingError(
-            f"size: got {columns} x {rows}, expected 2 to {MAX_SIDE_PX} pixels a side"
+            f"size: got {columns} x {rows}, expected 2 to {MAX_SIDE_PX} pixels per side"
         )
     back = place - target
     right = np.cross(upward, back)
     if not np.linalg.norm(back) > 0.0 or not np.linalg.norm(right) > 1e-9 * np.linalg.norm(back):
         raise RenderingError(
-            f"view: from {place.tolist()} to {target.tolist()} with {upward.tolist()} up "
-            "there is no image; move it, or name another target"
+            f"view: from {place.tolist()} to {target.tolist()} and {upward.tolist()} up do "
+            "not define an image; change --view or --look-at"
         )
     back /= np.linalg.norm(back)
     right /= np.linalg.norm(right)
@@ -111,7 +111,7 @@ def bin_pixels(camera: Camera, factor: float) -> Camera:
     columns, rows = (int(side / factor + 1e-6) for side in camera.image_size)
     if not (1 <= columns <= MAX_SIDE_PX and 1 <= rows <= MAX_SIDE_PX):
         raise RenderingError(
-            f"size: got {columns} x {rows}, expected 1 to {MAX_SIDE_PX} pixels a side"
+            f"size: got {columns} x {rows}, expected 1 to {MAX_SIDE_PX} pixels per side"
         )
     return dataclasses.replace(camera, matrix=matrix, image_size=(columns, rows))
 

@@ -1,4 +1,4 @@
-"""What `skinrig render` draws: a picture, its components, fewer lobes, a shadow boundary."""
+"""Figures of `skinrig render`: image, components, fewer basis BRDFs, shadow boundary."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from skinrig.rendering.request import read_model
 from skinrig.rendering.shadow import MAX_SIGMA_TR_PER_MM, MIN_SIGMA_TR_PER_MM, ShadowBoundary
 
 RADIANCE_UNIT = (
-    "radiance over that of a perfect white Lambertian patch that faces a light of intensity 1; "
+    "radiance over that of a perfect white Lambertian patch facing a light of intensity 1; "
     "camera RGB, white balanced"
 )
 
@@ -74,7 +74,7 @@ class RenderModel:
         return RenderModel(path, appearance, laid, str(mesh))
 
     def record(self) -> dict[str, Any]:
-        """Return what a rendering's record says of the model."""
+        """Return the model's part of a rendering's record."""
         valid = self.model.valid & self.surface.atlas.covered
         return {
             "appearance": self.path,
@@ -117,7 +117,7 @@ class RenderRequest:
         return self.effort.exposure or choose_exposure(rendering.radiance, rendering.coverage)
 
     def record(self, subjects: Sequence[RenderModel], rendering: Rendering) -> dict[str, Any]:
-        """Return what the record of a rendering says of it."""
+        """Return the record of a rendering."""
         own: Mapping[str, Any] = subjects[0].record()
         names = [light.name for light in self.lights]
         columns, rows = self.camera.image_size
@@ -244,9 +244,9 @@ def draw_photograph(
         "coverage": seen.coverage,
     }
     pictures = {"components": encode_sheet([component_panels(seen, exposure, photo)])}
-    told = {"kind": "components", "exposure": exposure, "held_out": shot.held_out}
+    facts = {"kind": "components", "exposure": exposure, "held_out": shot.held_out}
     record = asked.record([subject], seen)
-    return drawing.write(images, pictures, record, session=session, **told)
+    return drawing.write(images, pictures, record, session=session, **facts)
 
 
 def component_panels(
@@ -332,9 +332,9 @@ def draw_bases(
         }
         for rank, (subject, laid) in models.items()
     ]
-    told = {"kind": "bases", "exposure": exposure, "bases": bases}
+    facts = {"kind": "bases", "exposure": exposure, "bases": bases}
     record = request.record(subjects, seen)
-    return drawing.write(images, {"bases": encode_sheet(rows)}, record, **told)
+    return drawing.write(images, {"bases": encode_sheet(rows)}, record, **facts)
 
 
 def draw_shadow_boundary(
@@ -382,16 +382,16 @@ def draw_shadow_boundary(
         "Shadow boundary by sigma_tr of red, green, blue in 1/mm; the least sigma_tr is the most "
         f"translucent skin; {shadow.BOUNDARY_WIDTH_MM:g} mm across"
     )
-    told = {
+    facts = {
         "kind": "shadow boundary",
         "unit": RADIANCE_UNIT,
         "boundaries": widths,
         "samples": effort.subpixels**2,
-        "labels": "the paper's figures 17 and 18 say translucency, 1/sigma_tr, and print "
-        "sigma_tr: here everything is labelled by sigma_tr",
+        "labels": "the paper's figures 17 and 18 are labeled translucency, 1/sigma_tr, but "
+        "print sigma_tr: here all labels are sigma_tr",
     }
     pictures = {"shadow_boundary": encode_sheet(rows, title=title)}
-    return drawing.write(images, pictures, subject.record(), **told)
+    return drawing.write(images, pictures, subject.record(), **facts)
 
 
 def _reduce_subjects(

@@ -79,7 +79,7 @@ class Panel:
 
 
 def encode_sheet(rows: Sequence[Sequence[Panel]], *, title: str = "") -> bytes:
-    """Return a PNG of labelled pictures beside each other, not resampled.
+    """Return a PNG of labeled images side by side, not resampled.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def check(out: Path) -> None:
         out.is_dir() and not (out / DOCUMENT_FILE).is_file() and any(out.iterdir())
     ):
         raise RenderingError(
-            f"{out}: exists and is no rendering; nothing was written: name another folder"
+            f"{out}: got other files, expected a new folder or a rendering; name another"
         )
 
 
@@ -168,7 +168,7 @@ def write(
     pictures
         PNG files by name without extension.
     document
-        What the record says.
+        Content of the record.
 
     Returns
     -------

@@ -124,7 +124,7 @@ class FittedSurface:
             raise GeometryError(
                 f"mesh: its points lie {median:.0f} mm (median) from where the maps have them, "
                 f"expected less than {MAX_LAYOUT_DISTANCE_MM:.0f} mm; its texture coordinates are "
-                "not those of the maps, or it stands elsewhere"
+                "not those of the maps, or it is in another frame"
             )
         moved = rest is not None and (
             mesh.vertices_mm.shape != rest.vertices_mm.shape
@@ -169,9 +169,9 @@ class FittedSurface:
     ) -> SurfacePointSamples:
         """Look the maps up at points of the mesh.
 
-        Bilinearly among valid texels of the same place. Where there are none, what is known around
-        stands in, with the mesh's normal: a texture filled from its own neighbors would bring in
-        other parts of the face where charts are small.
+        Bilinearly among valid texels of the same place. Without any, valid surroundings
+        on the mesh are used, with its normal: neighbors in the texture would add other parts of
+        the face where charts are small.
 
         Parameters
         ----------
@@ -279,7 +279,7 @@ def read_own_mesh(appearance: SkinAppearance) -> Mesh:
         if name in appearance.files:
             return parse_mesh(appearance.files[name], name)
     raise GeometryError(
-        f"appearance: holds no {MESH_FILES[0]}; make it with `skinrig reconstruct SESSION --want "
+        f"appearance: holds no {MESH_FILES[0]}; make it with `skinrig reconstruct SESSION --maps "
         "normals,r_d,basis_weight_0`, or name a mesh with --mesh"
     )
 

@@ -22,7 +22,7 @@ from skinrig.errors import one_of
 Vector = tuple[float, float, float]
 
 FAR_LIGHT_MM: Final = 1e5
-"""Where the disc of a light stands that is far away: shadow rays end there."""
+"""Distance of the disc of a distant light, at which shadow rays end, mm."""
 MAX_UNDIVIDED_RAD: Final = 0.04
 """Seen larger than this (half its width) a light is shaded in parts: lobes change across it."""
 LIGHT_PARTS: Final = 16
@@ -107,7 +107,7 @@ class Light:
         Raises
         ------
         LightError
-            There is no such light, or its calibration is not valid.
+            The light is unknown, or its calibration is invalid.
         """
         row = table.names.index(one_of("light", name, table.names, LightError))
         if not table.valid[row]:
@@ -151,7 +151,7 @@ class Light:
         offset = np.asarray(self.position_mm) - points
         distance = np.linalg.norm(offset, axis=-1, keepdims=True)
         if not (distance > 0.0).all():
-            raise LightError(f"light {self.name!r}: stands on the surface that it should light")
+            raise LightError(f"light {self.name!r}: got a position on the lit surface; move it")
         direction = offset / distance
         strength = (self._reference / distance) ** 2
         if self.exponent > 0.0 and self.axis is not None:
@@ -162,7 +162,7 @@ class Light:
     def disc(self) -> tuple[Float64Array, float]:
         """Return the centre of the disc, mm, shape (3,), and its radius, mm: shadow rays end there.
 
-        A light that is far away stands at `FAR_LIGHT_MM`.
+        The disc of a distant light is at `FAR_LIGHT_MM`.
         """
         if self.direction is not None:
             return np.asarray(self.direction) * FAR_LIGHT_MM, FAR_LIGHT_MM * math.tan(self.radius)
@@ -218,7 +218,7 @@ def _unit(owner: str, name: str, vector: Vector) -> Vector:
 
 
 MAX_LIGHT_RADIUS_RAD: Final = 0.35
-"""Largest angular radius of a light that stands for a part of the map."""
+"""Largest angular radius of a light sampled from an environment map."""
 MAX_LIGHTS: Final = 65_536
 
 
@@ -247,9 +247,9 @@ def directions(height: int, width: int) -> tuple[Float64Array, Float64Array]:
 def environment_lights(
     radiance: ArrayLike, count: int, *, rng: np.random.Generator
 ) -> tuple[Light, ...]:
-    """Draw far lights from a map, more where it is brighter, each at a place of its own.
+    """Sample distant lights from an environment map with probability proportional to power.
 
-    Each stands for an equal share of the map's power: stratified draws from the running sum of
+    Each represents an equal fraction of the map's power: stratified draws from the running sum of
     power along the map's rows, so that the sum over lights has less noise than separate draws.
 
     Parameters
@@ -259,18 +259,18 @@ def environment_lights(
     count
         Lights, at least 1.
     rng
-        Where in its share each light is drawn.
+        Generator of the positions in the strata.
 
     Returns
     -------
     tuple of Light
-        Their angular radius is that of the solid angle that each stands for, at most
+        Their angular radius is that of the solid angle that each represents, at most
         `MAX_LIGHT_RADIUS_RAD`.
 
     Raises
     ------
     LightError
-        The map is no such image, or dark.
+        The map is not such an image, or it is dark.
 
     Examples
     --------
@@ -295,10 +295,13 @@ def environment_lights(
     order[1::2] = order[1::2, ::-1]
     order = order.reshape(-1)
     running = np.cumsum(power.reshape(-1)[order])
+    # stratified sampling: one draw per stratum of equal power, by inversion of the running sum
     at = (np.arange(count) + rng.random(count)) / count * running[-1]
     pixel = order[np.minimum(np.searchsorted(running, at, side="right"), power.size - 1)]
     chance = power.reshape(-1)[pixel] / running[-1]
-    share = solid.reshape(-1)[pixel] / (chance * count)  # solid angle that each light stands for
+    # importance sampling: a pixel of solid angle w, drawn count x p times on average, represents
+    # w / (count p) per draw, so that the sum over lights is an unbiased integral of the map
+    share = solid.reshape(-1)[pixel] / (chance * count)
     color = image.reshape(-1, 3)[pixel] * (share / math.pi)[:, None]
     radius = np.minimum(np.sqrt(share / math.pi), MAX_LIGHT_RADIUS_RAD)
     return tuple(

@@ -1,8 +1,8 @@
 """Render a fitted model of skin: rays by the renderer, then the fitted maps at what they meet.
 
 Geometry, texture coordinates and shadows come from `rigsim.render`; what a point reflects comes
-from `model.skin_reflectance`, direct light only. Radiance is given over what a perfect white
-Lambertian patch that faces a light of intensity 1 would show, at the place and distance where the
+from `model.skin_reflectance`, direct light only. Radiance is relative to that of a perfect
+white Lambertian patch facing a light of intensity 1, at the position and distance where the
 light's intensity is stated (see `skinrig.rendering.lights`)::
 
     L = sum over lights of  w V cos(theta) (pi f_surface + F_t(light) F_t(view) R_d)
@@ -64,7 +64,7 @@ class Rendering:
     lit
         Covered pixels of which every ray sees the whole of a light that it faces.
     uv
-        Mean texture coordinates, (H, W, 2); (0, 0) beside the skin.
+        Mean texture coordinates, (H, W, 2); (0, 0) outside the skin.
     subsurface
         How light from inside was treated.
     """
@@ -211,12 +211,12 @@ def _require_outside(out: int, inside: int, camera: Camera) -> None:
     place = ", ".join(f"{x:.0f}" for x in camera.center_mm)
     if out + inside == 0:
         raise RenderingError(
-            f"view {camera.serial!r}: the camera at {place} mm sees nothing of the mesh; "
-            "turn it towards the face, which stands at the rig's origin and looks along +z"
+            f"view {camera.serial!r}: the camera at {place} mm has no view of the mesh; "
+            "point it at the face, which is at the rig's origin and looks along +z"
         )
     if out < MIN_OUTSIDE_FRACTION * (out + inside):
         raise RenderingError(
-            f"view {camera.serial!r}: the camera at {place} mm stands behind the head and sees "
+            f"view {camera.serial!r}: the camera at {place} mm is behind the head and views "
             "the inside of the mesh; move it to the front, z > 0"
         )
 

@@ -1,4 +1,4 @@
-"""What the words of `skinrig render` mean: views, lights and models."""
+"""Parse the arguments of `skinrig render`: views, lights and models."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ class RenderRig:
         Raises
         ------
         UnusableError
-            `calibration` is no folder.
+            `calibration` is not a folder.
         """
         if calibration is not None and not calibration.is_dir():
-            raise UnusableError(f"--calibration: {calibration} is no folder")
+            raise UnusableError(f"--calibration: got {calibration}, expected a folder")
         return RenderRig(load_rig(rig), calibration, [])
 
     def camera(
@@ -74,7 +74,7 @@ class RenderRig:
         if place is not None:
             target = parse_triple(target_mm)
             if target is None:
-                raise UsageError(f"--target: got {target_mm!r}, expected three numbers, mm: 0,0,0")
+                raise UsageError(f"--look-at: got {target_mm!r}, expected three numbers, mm: 0,0,0")
             return rendering_camera.look_at(
                 place, target_mm=target, fov_deg=fov_deg, size_px=(size_px, size_px), name=text
             )
@@ -85,7 +85,7 @@ class RenderRig:
                 f"--view: {error}; or give a place in mm, as 0,0,700"
             ) from error
         camera = Camera.nominal(view)
-        found = self._calibration("geometry", f"camera {text} stands as the rig's file draws it")
+        found = self._calibration("geometry", f"camera {text} is at its nominal pose")
         if found is not None:
             camera = geometry.cameras_from_calibration(found, self.rig.subset(views=[text]))[text]
         camera = dataclasses.replace(camera, serial=text)
@@ -131,7 +131,7 @@ class RenderRig:
             ) from error
         rig = self.rig.subset(lights=[what])
         table = LightTable.nominal(rig)
-        found = self._calibration("lights", f"light {what} stands as the rig's file draws it")
+        found = self._calibration("lights", f"light {what} is at its nominal position")
         if found is not None:
             table = LightTable.from_calibration(found, rig)
         lamp = Light.from_table(
@@ -196,7 +196,7 @@ def read_model(
     Raises
     ------
     UsageError
-        `translucency` is no three numbers above 0.
+        `translucency` is not three numbers above 0.
     model.skin_reflectance.SkinReflectanceError
         It lacks what the model is made of; the message names it.
     """
@@ -214,7 +214,7 @@ def parse_sigma_tr(text: str) -> Vector:
     Raises
     ------
     UsageError
-        It is no three numbers above 0.
+        It is not three numbers above 0.
 
     Examples
     --------
@@ -245,7 +245,7 @@ def parse_subpixels(samples: int) -> int:
     """
     side = round(samples**0.5) if samples > 0 else 0
     if side < 1 or side * side != samples or side > 16:
-        raise UnusableError(f"--samples: got {samples}, expected 1, 4, 9, 16 ... 256 rays a pixel")
+        raise UnusableError(f"--samples: got {samples}, expected 1, 4, 9, ... 256 rays per pixel")
     return side
 
 
@@ -262,7 +262,7 @@ def parse_triple(text: str) -> Vector | None:
 
 
 def _unreadable_error(text: str) -> type[UsageError] | type[UnusableError]:
-    """Return what to raise for a text that is no name: numbers are joined by commas."""
+    """Return the error of an unknown name: `UsageError` for numbers separated by commas."""
     return UsageError if "," in text else UnusableError
 
 

@@ -1,4 +1,4 @@
-"""What is true of a simulated face, in the form of a fitted model: for tests and benchmarks.
+"""Ground truth of a simulated face as a fitted model, for tests and benchmarks.
 
 The simulator's surface is put on tables at some roughnesses, with and without oil; shares between
 them are linear. Nothing is fitted: what a rendering of it misses is the renderer's own error.

@@ -66,7 +66,7 @@ class Texture:
         if max(shape[-3:-1]) > MAX_TEXTURE_PX:
             raise SceneError(
                 f"texture: got {shape}, expected at most {MAX_TEXTURE_PX} texels a side; "
-                "choose a smaller --size"
+                "choose a smaller --size-px"
             )
         if self.values.dtype != np.float32 or not np.isfinite(self.values).all():
             raise SceneError(f"texture: got {self.values.dtype} or NaN, expected finite float32")

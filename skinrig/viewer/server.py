@@ -142,7 +142,9 @@ def serve_scene(
                 "displacement_px": None if pyramid is None else pyramid.size,
                 "left_out": [list(row) for row in scene.left_out],
             }
-            console.say(f"{served.url}: open it in a browser on this machine; Ctrl-C ends it")
+            console.print_line(
+                f"{served.url}: open it in a browser on this machine; Ctrl-C ends it"
+            )
             console.document("skinrig.view-served/1", document)
             try:
                 served.wait()

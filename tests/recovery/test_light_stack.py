@@ -41,7 +41,7 @@ def write(folder, images, lights, inside):
 
 def made(tmp_path, folder, capsys):
     assert main(["import", "lp", str(folder), "--out", str(tmp_path / "s")]) == 0
-    argv = ["reconstruct", str(tmp_path / "s"), "--want", "normals,albedo", "--out"]
+    argv = ["reconstruct", str(tmp_path / "s"), "--maps", "normals,albedo", "--out"]
     assert main([*argv, str(tmp_path / "a")]) == 0
     capsys.readouterr()
     return store.read(tmp_path / "a")

@@ -60,7 +60,7 @@ def test_uncalibrated_fibers_error_gives_next_command(bench, capsys):
     with pytest.raises((InputsError, StageError), match="calibrate fibre"):
         pipeline.reconstruct(bench / "session", want=("subsurface",), out=bench / "bare")
     assert not (bench / "bare").exists()
-    command = ["reconstruct", str(bench / "session"), "--want", "subsurface"]
+    command = ["reconstruct", str(bench / "session"), "--maps", "subsurface"]
     assert main([*command, "--out", str(bench / "bare")]) == 3
     assert "Traceback" not in capsys.readouterr().err
 

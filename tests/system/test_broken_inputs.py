@@ -161,7 +161,7 @@ def test_verify_finds_the_damage(session, damage, capsys):
 @pytest.mark.parametrize("damage", BREAKS, ids=lambda f: f.__name__)
 def test_reconstruct_refuses_damage_or_is_unaffected(session, damage, capsys, tmp_path):
     damage(session)
-    code = main(["reconstruct", str(session), "--want", "melanin", "--out", str(tmp_path / "maps")])
+    code = main(["reconstruct", str(session), "--maps", "melanin", "--out", str(tmp_path / "maps")])
     out, err = capsys.readouterr()
     assert code == 3, out + err
     assert err.count("skinrig: ") == 1
@@ -175,13 +175,13 @@ def test_reconstruct_refuses_damage_or_is_unaffected(session, damage, capsys, tm
         (["fit", "facial-color", "SESSION", "--radius", "-3"], "radius: got -3 px, expected more"),
         (["fit", "facial-color", "SESSION", "--radius", "nan"], "radius: got nan px"),
         (["fit", "facial-color", "SESSION", "--stored-size", "0"], "stored size: got 0 cells"),
-        (["reconstruct", "SESSION", "--want", "melanin", "--scan", "x.ply"], "scan: "),
+        (["reconstruct", "SESSION", "--maps", "melanin", "--scan", "x.ply"], "scan: "),
         (
-            ["reconstruct", "SESSION", "--want", "melanin", "--rank", "3"],
+            ["reconstruct", "SESSION", "--maps", "melanin", "--rank", "3"],
             "got a session of another rig",
         ),
         (
-            ["reconstruct", "SESSION", "--want", "melanin", "--landmarks", "x.csv"],
+            ["reconstruct", "SESSION", "--maps", "melanin", "--landmarks", "x.csv"],
             "landmarks: got x.csv, expected a file",
         ),
     ],
@@ -206,7 +206,7 @@ def test_blood_undetermined_without_white_reference_error_names_remedy(
     assert main(argv) == 3
     err = capsys.readouterr().err
     assert "no pixel is valid" in err
-    assert "a white calibration, which --calibration would bring" in err
+    assert "add a white calibration with --calibration" in err
 
 
 def test_session_without_neutral_state_is_refused_before_images(tmp_path, capsys):
@@ -243,7 +243,7 @@ def test_broken_rig_file_is_refused_with_all_faults(text, says, tmp_path, capsys
 
 
 def test_calibration_folder_without_rig_calibrations_is_refused(session, tmp_path, capsys):
-    order = ["reconstruct", str(session), "--want", "melanin", "--out", str(tmp_path / "maps")]
+    order = ["reconstruct", str(session), "--maps", "melanin", "--out", str(tmp_path / "maps")]
     assert main([*order, "--calibration", str(session)]) == 3
     assert f"{session} holds none, expected sensor, color" in capsys.readouterr().err
     other = tmp_path / "calibration-dome"
@@ -257,7 +257,7 @@ def test_calibration_folder_without_rig_calibrations_is_refused(session, tmp_pat
 @pytest.mark.parametrize(
     "order",
     [
-        ["reconstruct", "SESSION", "--want", "melanin", "--out", "OUT"],
+        ["reconstruct", "SESSION", "--maps", "melanin", "--out", "OUT"],
         ["fit", "facial-color", "SESSION", "--out", "OUT"],
         ["apply", "expression", "nothing", "--weights", "anger=1", "--out", "OUT"],
         ["edit", "nothing", "--trait", "tan=1", "--out", "OUT"],
@@ -295,16 +295,16 @@ def test_zero_count_is_refused_not_replaced_by_default(option, tmp_path, capsys)
     ("order", "code", "words"),
     [
         (["bench", "--budget", "-1"], 3, "--budget: got -1, expected seconds above 0"),
-        (["bench", "--extremes", "--toy"], 2, "--toy: cases of --extremes have one size each"),
-        (
-            ["bench", "--extremes", "--budget", "5"],
-            2,
-            "--budget: cases of --extremes have one size",
-        ),
+        (["bench", "--extremes", "--smoke"], 2, "--smoke: not an option of --extremes"),
+        (["bench", "--extremes", "--budget", "5"], 2, "--budget: not an option of --extremes"),
         (["bench", "--budget", "nan"], 3, "--budget: got nan, expected seconds above 0"),
         (["bench", "--out", "FILE"], 3, "is a file, expected a folder"),
-        (["plan", "flash", "--valid-share", "7"], 3, "--valid-share: got 7, expected above 0"),
-        (["plan", "flash", "--valid-share", "nan"], 3, "--valid-share: got nan"),
+        (
+            ["plan", "flash", "--min-valid-fraction", "7"],
+            3,
+            "--min-valid-fraction: got 7, expected above 0",
+        ),
+        (["plan", "flash", "--min-valid-fraction", "nan"], 3, "--min-valid-fraction: got nan"),
         (["plan", "flash", "--out", "FOLDER"], 3, "is a folder, expected a file"),
         (["view", "--out", "FOLDER"], 3, "is a folder, expected a file"),
         (["report", "FOLDER", "--out", "FOLDER"], 3, "is a folder, expected a file"),

@@ -47,4 +47,4 @@ def test_imported_photographs_lack_power_required_for_white_reference(tmp_path, 
     assert main(["calibrate", "white", str(session), "--out", str(calibration)]) == 3
     said = capsys.readouterr().err
     assert "frame P000 of rig 'imported' lacks its power" in said
-    assert "fault of skinrig" not in said
+    assert "defect of skinrig" not in said

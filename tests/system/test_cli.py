@@ -84,7 +84,7 @@ def test_rig_help_lists_its_own_options_only(verb, capsys):
         "--condition": {"dome"},
         "--steps": {"gradient"},
         "--all-brackets": {"probe"},
-        "--most-lights": {"dome"},
+        "--max-lights": {"dome"},
         "--force-limit": {"gradient"},
     }
     for option, rigs in owners.items():
@@ -97,7 +97,7 @@ def test_rig_help_lists_its_own_options_only(verb, capsys):
         (["simulate", "flash", "--out", "x", "--steps", "-1..2"], "gradient"),
         (["simulate", "--steps", "-1..2", "flash", "--out", "x"], "gradient"),
         (["capture", "probe", "--dry-run", "--sequence", "smile"], "flash"),
-        (["plan", "gradient", "--most-lights", "3"], "dome"),
+        (["plan", "gradient", "--max-lights", "3"], "dome"),
         (["serve", "dome", "--site", "cheek"], "gradient"),
     ],
 )
@@ -109,7 +109,7 @@ def test_option_of_other_rig_error_names_option_rigs(argv, rigs, capsys, tmp_pat
         word for word in argv if word.startswith("--") and word[2:5] not in ("out", "dry")
     )
     told = capsys.readouterr().err
-    assert f"{option}: the {rig} rig knows nothing of it; leave it out (it is for {rigs})" in told
+    assert f"{option}: not an option of the {rig} rig (only of {rigs}); remove it" in told
     assert not (tmp_path / "x").exists()
 
 
@@ -134,7 +134,7 @@ def test_own_rig_file_is_captured_by_kind_command(capsys, tmp_path, monkeypatch)
     assert main(["capture", "mine.toml", "--dry-run", "--sites", "cheek", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["plan"]["rig"] == "probe"
     assert main(["capture", "mine.toml", "--dry-run", "--eyes", "closed"]) == 2
-    assert "--eyes: the probe rig knows nothing of it" in capsys.readouterr().err
+    assert "--eyes: not an option of the probe rig" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_own_rig_file_is_captured_by_kind_command(capsys, tmp_path, monkeypatch)
         (["verify", "nothing"], 3, "nothing"),
         (["report", "nothing"], 3, "does not exist"),
         (["simulate", "teapot", "--out", "x"], 3, "teapot"),
-        (["simulate", "flash", "--out", "x", "--size", "huge"], 3, "huge"),
+        (["simulate", "flash", "--out", "x", "--scale", "huge"], 3, "huge"),
         (["simulate", "flash", "--out", "x", "--target", "moon"], 3, "moon"),
         (["simulate", "dome", "--out", "x", "--condition", "mud"], 3, "mud"),
         (["simulate", "dome", "--out", "x", "--condition", "hot=much"], 2, "hot=much"),
@@ -153,14 +153,25 @@ def test_own_rig_file_is_captured_by_kind_command(capsys, tmp_path, monkeypatch)
         (["simulate", "dome", "--out", "x", "--target", "white", "--condition", "hot"], 2, "hot"),
         (["simulate", "dome", "--out", "x", "--subject", "P99"], 3, "P01 to P87"),
         (["simulate", "flash", "--out", "x", "--subject", "green"], 3, "green"),
-        (["reconstruct", "nothing", "--want", "melanin", "--out", "x"], 3, "nothing"),
+        (["reconstruct", "nothing", "--maps", "melanin", "--out", "x"], 3, "nothing"),
         (
-            ["reconstruct", "s", "--want", "normals", "--out", "x", "--rank", "1000"],
+            ["reconstruct", "s", "--maps", "normals", "--out", "x", "--rank", "1000"],
             3,
             "--rank: got 1000, expected at most 59",
         ),
         (
-            ["reconstruct", "s", "--want", "normals", "--out", "x", "--rank", "3", "--basis", "."],
+            [
+                "reconstruct",
+                "s",
+                "--maps",
+                "normals",
+                "--out",
+                "x",
+                "--rank",
+                "3",
+                "--merl-basis",
+                ".",
+            ],
             3,
             "expected at most 0",
         ),
@@ -269,7 +280,7 @@ def test_interrupted_command_suggests_resuming_where_possible():
     ("argv", "kept"),
     [
         (["--out", "b"], True),
-        (["--out=b", "--toy"], True),
+        (["--out=b", "--smoke"], True),
         ([], False),
         (["--extremes", "--out", "b"], False),
     ],
@@ -301,7 +312,7 @@ def test_benchmark_threads_sleep_unless_user_sets_wait_policy(own, expected, mon
         return {"schema": "skinrig.bench/2", "passed": True}
 
     monkeypatch.setattr("skinrig.benchmarks.stages.run_stages", look)
-    assert main(["bench", "--toy"]) == 0
+    assert main(["bench", "--smoke"]) == 0
     assert found == [expected]
 
 
@@ -315,7 +326,7 @@ def test_benchmark_sets_thread_wait_policy_before_library_loads():
         "import skinrig.commands.measuring as measuring\n"
         "measuring.wait_asleep = look\n"
         "from skinrig.cli import main\n"
-        "main(['bench', '--toy'])"
+        "main(['bench', '--smoke'])"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert run.stdout.strip() == "[]", run.stderr

@@ -61,7 +61,7 @@ def test_expression_is_evaluated_and_reported_in_single_document(moving, tmp_pat
         (["--weights", "smile"], "NAME=NUMBER"),
         (["--weights", "smile=1", "--clamp", "none"], "--clamp"),
         (["--weights", "smile=1", "--parts", "hair"], "parts"),
-        (["--weights", "smile=1", "--landmarks", "a.csv"], "--onto"),
+        (["--weights", "smile=1", "--landmarks", "a.csv"], "--target-face"),
         (["--weights", "smile=1", "--mesh", "nowhere.npz"], "nowhere.npz"),
     ],
 )

@@ -56,7 +56,7 @@ def test_of_several_photographs_the_states_there_are_named(photos, tmp_path, cap
     photograph(photos / "b.png")
     session, out = tmp_path / "session", tmp_path / "appearance"
     assert bring(photos, session) == 0
-    assert main(["reconstruct", str(session), "--want", "melanin", "--out", str(out)]) == 3
+    assert main(["reconstruct", str(session), "--maps", "melanin", "--out", str(out)]) == 3
     said = capsys.readouterr().err
     assert "has no photograph of state 'neutral'; it has those of a, b" in said
     assert "--state a" in said
@@ -168,7 +168,7 @@ def test_several_sessions_are_reconstructed_into_folders_by_name(tmp_path, capsy
 
     monkeypatch.setattr("reconstruction.pipeline.recipes.reconstruct", reconstruct)
     monday, tuesday, out = tmp_path / "monday", tmp_path / "tuesday", tmp_path / "maps"
-    command = ["reconstruct", "--want", "melanin", "--out", str(out), "--json"]
+    command = ["reconstruct", "--maps", "melanin", "--out", str(out), "--json"]
     assert main([*command, str(monday), str(tuesday)]) == 0
     assert asked == [("monday", out / "monday"), ("tuesday", out / "tuesday")]
     told = json.loads(capsys.readouterr().out)
@@ -186,7 +186,7 @@ def test_several_sessions_are_reconstructed_into_folders_by_name(tmp_path, capsy
 
 
 def test_quantity_unplanned_for_rig_lists_rigs_planning(capsys):
-    assert main(["plan", "flash", "--want", "normals<=1deg,hemoglobin<=5%"]) == 3
+    assert main(["plan", "flash", "--goals", "normals<=1deg,hemoglobin<=5%"]) == 3
     said = capsys.readouterr().err
     assert "got 'normals' of rig 'flash'" in said
     assert "normals is planned for dome, gradient" in said

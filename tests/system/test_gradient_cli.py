@@ -75,7 +75,7 @@ def test_target_is_simulated_and_next_step_printed(capsys, tmp_path):
 
 
 def test_a_large_rig_is_not_served(capsys):
-    assert main(["serve", "gradient", "--size", "full"]) == errors.BAD_INPUT
+    assert main(["serve", "gradient", "--scale", "full"]) == errors.BAD_INPUT
     assert "expected small" in capsys.readouterr().err
 
 

@@ -82,7 +82,7 @@ def folder(tmp_path_factory):
 
 def run(folder, monkeypatch, *words):
     monkeypatch.chdir(folder)
-    return main(["render", *words, "--size", "40"])
+    return main(["render", *words, "--size-px", "40"])
 
 
 def test_image_components_and_single_document_are_written(folder, monkeypatch, capsys):
@@ -230,7 +230,7 @@ def test_unrenderable_request_is_refused_with_single_clear_message(
 
 def test_a_folder_of_something_else_is_not_replaced(folder, monkeypatch, capsys):
     assert run(folder, monkeypatch, "face", "--light", "1,1,1", "--out", "matt") == 3
-    assert "no rendering" in capsys.readouterr().err
+    assert "expected a new folder or a rendering" in capsys.readouterr().err
     assert (folder / "matt" / "appearance.json").exists()
 
 

@@ -8,7 +8,7 @@ import pytest
 from model import store
 from skinrig.cli import main
 
-QUICK = ["--width", "64", "--leave-out", "lateral,interreflections,relief_shadows"]
+QUICK = ["--width", "64", "--omit", "lateral,interreflections,relief_shadows"]
 """What becomes of a file's skin is judged elsewhere: here of its words and numbers."""
 FILE = 'schema = "skinrig.subject/1"\npreset = "II"\nmelanin = {melanin}\nfreckles = 0.0\n'
 
@@ -65,7 +65,7 @@ def killed(here, capsys, monkeypatch):
 
 def test_session_is_not_resumed_with_changed_subject_file(here, capsys, killed):
     (here / "ann.toml").write_text(FILE.format(melanin=0.03), encoding="utf-8")
-    assert main([*killed, "--resume", "--nearer", "5", "--seed", "1"]) == 3
+    assert main([*killed, "--resume", "--camera-offset-mm", "5", "--seed", "1"]) == 3
     said = capsys.readouterr().err
     assert "resume with the same settings" in said
     told = [line.strip() for line in said.splitlines() if "begun" in line]

@@ -182,7 +182,7 @@ def fit_facial_color(
         raise UnknownBloodError(
             "blood at rest: got a standard error above half of it all over the face, expected "
             "pixels that determine it; take more light or, for very dark skin, estimate melanin "
-            "alone: skinrig reconstruct --want melanin"
+            "alone: skinrig reconstruct --maps melanin"
         )
     report("scale and bias maps")
     mask = {state: found.mask for state, found in blood.items()}

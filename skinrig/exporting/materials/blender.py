@@ -32,11 +32,11 @@ class Import:
     Attributes
     ----------
     file
-        Beside the script, .glb or .usdc.
+        File next to the script, .glb or .usdc.
     radius_mm
         Mean free path at a texture of 1, or the longest of `channels`, mm.
     channels
-        Share of it in red, green and blue; None where a texture says it.
+        Fraction of it in red, green and blue; None: a texture has it.
     textures
         Input of the Principled BSDF to the texture's name below the folder, and the factor of its
         values.

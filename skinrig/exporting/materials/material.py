@@ -166,10 +166,10 @@ class Material:
                 "underscore"
             )
         holes = self.mesh.count_holes()
-        told = [
+        omissions = [
             (f"the surface at {holes} holes", "the scan has none there; --mesh takes a whole one")
         ]
-        return (told if holes else []) + [
+        return (omissions if holes else []) + [
             (f"maps of tile {tile}", f"maps are of tile {FIRST_TILE}: medians and flat normals")
             for tile in self.tiles[1:]
         ]
@@ -197,7 +197,7 @@ class Material:
         }
 
     def facts(self, appearance: SkinAppearance) -> dict[str, Any]:
-        """Return what every document beside an exported material says of it, as JSON values."""
+        """Return the part that documents of all exported materials share, as JSON values."""
         subsurface = {**self.sigma_tr(), "mapping": MAP_NOTES["subsurface_radius"]}
         return {
             "base_color": f"{MAP_NOTES['base_color']}; {COLOR_NOTE}",
@@ -208,7 +208,7 @@ class Material:
         }
 
     def figures(self) -> dict[str, Any]:
-        """Return how well the material stands for the model, as JSON values."""
+        """Return the errors of the material as an approximation of the model, as JSON values."""
         on = self.valid if self.valid.any() else np.ones_like(self.valid)
         weight, color = self.surface.weight[on], self.base_color[on]
         return {

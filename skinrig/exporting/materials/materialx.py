@@ -83,7 +83,7 @@ def facts(
     schema: str,
     scale: float,
 ) -> dict[str, Any]:
-    """Return what a document beside an exported material says of it.
+    """Return the document of an exported material.
 
     Parameters
     ----------
@@ -96,9 +96,9 @@ def facts(
     scale
         Radius of subsurface scattering, mm.
     """
-    told = material.facts(appearance)
+    facts = material.facts(appearance)
     return {
-        **told,
+        **facts,
         "schema": schema,
         "scene_unit": delivery.scene_unit,
         "mm_per_scene_unit": 1.0 / delivery.units_per_mm,
@@ -106,7 +106,7 @@ def facts(
         "udim": {"tiles": list(material.tiles), "measured": [material.tiles[0]]},
         "frame": "+x right, +y up, +z towards the main camera",
         "subsurface": {
-            **told["subsurface"],
+            **facts["subsurface"],
             "radius_in_scene_units": scale * delivery.units_per_mm,
         },
     }

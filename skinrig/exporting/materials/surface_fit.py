@@ -135,7 +135,7 @@ def _products(lobes: BrdfBasis, eta: float) -> tuple[Float64Array, Float64Array,
 def _directions() -> tuple[tuple[Float64Array, ...], Float64Array, BoolArray]:
     """Return cosines of light, view, half vector and difference angle where nodes count.
 
-    Beside them the solid angle of each node times both cosines, up to a factor, and which count.
+    Also return the solid angle of each node times both cosines, up to a factor, and which count.
     """
     d, phi, h = brdf_tables.grid_nodes()
     picked = np.meshgrid(d[::STRIDE_D], phi[::STRIDE_PHI], h[::STRIDE_H], indexing="ij")

@@ -24,7 +24,7 @@ from skinrig.exporting.materials.udim import TiledMesh
 
 MIN_VECTOR_LENGTH = 1e-12
 MIN_FRAME_VOLUME = 1e-6
-"""Of a frame: below it the texture is folded, and no normal is told."""
+"""Of a frame: below it the texture is folded and the normal is undefined."""
 MIN_TANGENT_Z = 1e-3
 
 
@@ -69,7 +69,7 @@ class FramedMesh:
         uv = mesh.uv.astype(np.float64)
         along_u, turn = _face_tangents(points[mesh.faces], uv[mesh.faces])
         sign = np.where(turn >= 0.0, 1, -1)
-        # a vertex that mirrored and plain charts share stands for two
+        # a vertex shared by mirrored and plain charts becomes two vertices
         corner_keys = 2 * mesh.faces.astype(np.int64) + (sign < 0)[:, None]
         keys, faces = np.unique(corner_keys.reshape(-1), return_inverse=True)
         source, signs = keys // 2, np.where(keys % 2 == 1, -1.0, 1.0)
@@ -116,7 +116,7 @@ class FramedMesh:
         return "\n".join(lines) + "\n"
 
     def count_holes(self) -> int:
-        """Return how many rims connected surfaces have beside one each, seams of charts apart.
+        """Return the number of rims in excess of one per connected surface, seams of charts apart.
 
         Examples
         --------
@@ -149,7 +149,7 @@ class FramedMesh:
         Parameters
         ----------
         size
-            Texels a side.
+            Width and height, texels.
 
         Returns
         -------

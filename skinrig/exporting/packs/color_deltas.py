@@ -60,7 +60,7 @@ def write(appearance: SkinAppearance, out: ImageFolder) -> tuple[dict[str, Any],
 
     Returns
     -------
-    told : dict
+    document : dict
         JSON values: layout, states by map, largest deltas.
     states : list of str
         All that the rig has.
@@ -85,8 +85,13 @@ def write(appearance: SkinAppearance, out: ImageFolder) -> tuple[dict[str, Any],
         shown = np.abs(delta[colors.valid])
         largest[name] = float(shown.max()) if shown.size else 0.0
     out.errors([ExportImage("color_mask", colors.valid.astype(float))])
-    told = {"layout": colors.layout, "space": colors.space, "maps": names, "largest_delta": largest}
-    return {"size": COLOR_SIZE, **told, "valid_share": float(colors.valid.mean())}, have
+    document = {
+        "layout": colors.layout,
+        "space": colors.space,
+        "maps": names,
+        "largest_delta": largest,
+    }
+    return {"size": COLOR_SIZE, **document, "valid_share": float(colors.valid.mean())}, have
 
 
 def _colors(appearance: SkinAppearance, rig: Any, states: list[str], out: ImageFolder) -> Colors:
@@ -106,7 +111,7 @@ def _colors(appearance: SkinAppearance, rig: Any, states: list[str], out: ImageF
     if out.delivery.onto is None:
         why = (
             "they lie on the flash camera's picture; name the "
-            "dome's maps with --onto, and two tables of landmarks"
+            "dome's maps with --target-face, and two tables of landmarks"
         )
         out.record_omission("colors on the face's texture", why)
         base, valid = resize_map(neutral, seen, COLOR_SIZE)
@@ -126,8 +131,8 @@ def _on_texture(
     """Return colors on another appearance's texture: its albedo, and changes carried over."""
     if delivery.onto is None or len(delivery.landmarks) != 2:
         raise ExportError(
-            f"--landmarks: got {len(delivery.landmarks)} tables, expected two with --onto: of the "
-            "flash picture, then of the texture"
+            f"--landmarks: got {len(delivery.landmarks)} tables, expected two with --target-face: "
+            "of the flash image, then of the texture; give both"
         )
     other = store.read(delivery.onto)
     albedo = other.maps.get("r_d")
@@ -144,10 +149,10 @@ def _on_texture(
     for state in states:
         # a ratio of colors is the skin's own; a difference would be that of another exposure
         ratio = np.divide(colors[state], neutral, out=np.ones_like(neutral), where=neutral > 1e-3)
-        carried, told = _sample_map(ratio - 1.0, visible, source)
+        carried, known = _sample_map(ratio - 1.0, visible, source)
         deltas[state] = base * carried
-        deltas[state][~told] = 0.0
-        valid &= told
+        deltas[state][~known] = 0.0
+        valid &= known
     layout = f"the texture of {delivery.onto.name}, by landmarks"
     return Colors(base, deltas, valid, layout, CAMERA_SPACE)
 
@@ -195,8 +200,8 @@ def _sample_map(
         map_coordinates(np.where(visible, values[..., c], 0.0), at, order=1, cval=0.0)
         for c in range(values.shape[-1])
     ]
-    told = share >= MIN_KNOWN_FRACTION
-    return np.stack(layers, axis=-1) / np.where(told, share, 1.0)[..., None], told
+    known = share >= MIN_KNOWN_FRACTION
+    return np.stack(layers, axis=-1) / np.where(known, share, 1.0)[..., None], known
 
 
 def select_states(available: list[str], quantity: str, out: ImageFolder) -> list[str]:

@@ -3,11 +3,11 @@
 Laid out as engines' face materials want it: a base color with up to three animated color maps
 (cm1 to cm3), a normal map with up to three animated wrinkle maps (wm1 to wm3), masks of their
 zones, and cavity, scatter and micro normal maps. Animated maps are deltas: colors of 512 x 512,
-normals of 1024 x 1024. How deltas are coded is ours, since no engine publishes a coding;
-``delta_maps.json`` says it, and the EXR files hold the numbers themselves.
+normals of 1024 x 1024. The encoding of deltas is ours, since no engine publishes one;
+``delta_maps.json`` has it, and the EXR files have unencoded numbers.
 
-Colors come from the hemoglobin rig, whose maps lie on the flash camera's picture. They lie on a
-face's texture only where another appearance and landmarks of both tell how one lies on the other.
+Colors come from the hemoglobin rig, whose maps are registered to the flash camera's image. They are
+mapped to a face's texture only if another appearance and landmarks of both are given.
 """
 
 from collections.abc import Mapping
@@ -78,21 +78,21 @@ def write(
             "wrinkles` and `skinrig fit microstructure` make them"
         )
     out = ImageFolder(folder, delivery)
-    told: dict[str, Any] = {}
+    document: dict[str, Any] = {}
     known: set[str] = set()
     if FACIAL_COLOR in parts:
-        told["color"], states = color_deltas.write(appearance, out)
+        document["color"], states = color_deltas.write(appearance, out)
         known |= set(states)
     if WRINKLES in parts:
-        told["wrinkles"], rows = _write_wrinkles(appearance, parts, out)
+        document["wrinkles"], rows = _write_wrinkles(appearance, parts, out)
         known |= set(rows)
     if MICROSTRUCTURE in parts:
-        told |= detail_maps.micro_normals(appearance, parts[MICROSTRUCTURE], out)
+        document |= detail_maps.micro_normals(appearance, parts[MICROSTRUCTURE], out)
     for part, what in PART_MAPS.items():
         if part not in parts:
             fit = f"skinrig fit {part.replace('_', '-')}"
             out.record_omission(what, f"the folder holds no {part}: run `{fit}`")
-    told |= detail_maps.write_scatter(out)
+    document |= detail_maps.write_scatter(out)
     unknown = [name for name in delivery.only if name not in known]
     if unknown:
         raise ExportError(
@@ -107,7 +107,7 @@ def write(
             "normal_y": delivery.green_direction,
             "color_coding": COLOR_CODING,
             "normal_coding": NORMAL_CODING,
-            **told,
+            **document,
             "left_out": [list(row) for row in out.left_out],
         },
     )
@@ -145,9 +145,9 @@ def _write_wrinkles(
         for zone, mask in enumerate(layer.masks):
             name = f"wrinkle_mask_{number}_{zone}"
             sized = resample(np.asarray(mask, np.float64), (NORMAL_SIZE, NORMAL_SIZE))
-            told = zones[zone] if zone < len(zones) else str(zone)
-            out.write_png(ExportImage(name, sized, low=0.0, high=1.0, what=f"zone {told}"))
-            masks[name] = told
+            zone_name = zones[zone] if zone < len(zones) else str(zone)
+            out.write_png(ExportImage(name, sized, low=0.0, high=1.0, what=f"zone {zone_name}"))
+            masks[name] = zone_name
     hollows = detail_maps.write_cavity(np.asarray(model.base, np.float64), known, NORMAL_SIZE, out)
     out.errors([ExportImage("normal_mask", valid.astype(float))])
     return {

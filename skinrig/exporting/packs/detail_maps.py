@@ -1,4 +1,4 @@
-"""What stands beside color and normal deltas in a pack: cavity, scatter and micro normal maps.
+"""Cavity, scatter and micro normal maps of a pack, next to color and normal deltas.
 
 Each is made of something that was measured, or left out: cavity of the neutral wrinkle normals,
 scatter of the translucency of a fitted model, micro normals of relief from the gradient sphere.
@@ -100,7 +100,7 @@ def write_cavity(
     valid
         (H, W), where they mean something.
     size
-        Texels a side to write.
+        Width and height to write, texels.
     out
         Where to.
 
@@ -144,7 +144,7 @@ def ambient_visibility(height: ArrayLike, part: ArrayLike) -> Float64Array:
     height
         (H, W), texels.
     part
-        (H, W), number of the connected part, -1 outside. Heights of other parts say nothing.
+        (H, W), number of the connected part, -1 outside. Heights of different parts are unrelated.
 
     Returns
     -------
@@ -204,7 +204,7 @@ def write_scatter(out: ImageFolder) -> dict[str, Any]:
     """
     onto = out.delivery.onto
     if onto is None:
-        why = "it is of a model: name one of `skinrig fit reflectance` by --onto"
+        why = "it is of a model: name one of `skinrig fit reflectance` by --target-face"
         out.record_omission("scatter", why)
         return {}
     other = store.read(onto)
@@ -244,7 +244,7 @@ def micro_normals(
     appearance
         With the part microstructure.
     part
-        What it says of its sites.
+        Its document of sites.
     out
         Where to.
 
@@ -253,7 +253,7 @@ def micro_normals(
     dict
         JSON values; sites whose relief is not known are left out.
     """
-    told: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     green = out.delivery.green_direction
     for site, entry in sorted(part.get("sites", {}).items()):
         relief = appearance.maps[entry["map"]]
@@ -270,7 +270,7 @@ def micro_normals(
         what = f"relief of {site} at rest, tangent space, {green}, repeats without a seam"
         out.write_exr_and_png(ExportImage.from_normals(name, normals, out.delivery, what))
         slope = normals[..., :2] / normals[..., 2:]
-        told[name] = {
+        entries[name] = {
             "site": site,
             "tile_mm": _size_mm(tile, pixel_um),
             "pixel_um": pixel_um,
@@ -280,7 +280,7 @@ def micro_normals(
             "faded_share": 1.0 - (1.0 - 1.0 / FADE_DIVISOR) ** 2,  # so that it repeats
             "valid_share": float(valid.mean()),
         }
-    return {"micro": told} if told else {}
+    return {"micro": entries} if entries else {}
 
 
 def _size_mm(height: Float64Array, pixel_um: float) -> list[float]:

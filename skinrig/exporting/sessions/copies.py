@@ -21,7 +21,7 @@ FRAMES_FOLDER, DOCUMENTS_FILE = "frames", "documents.jsonl"
 def write_session_document(
     path: Path, inputs: Inputs, content: Mapping[str, Any], left_out: Sequence[tuple[str, str]]
 ) -> None:
-    """Write what a document beside a session's images says, and of whom and what they are."""
+    """Write the document of a session's exported images, with their provenance."""
     session = inputs.session
     origin = {
         "source": session.source,
@@ -133,7 +133,7 @@ def _start(session: Session, uid: str, time_s: float) -> dict[str, Any]:
 
 
 def _data(record: FrameRecord) -> dict[str, Value]:
-    """Return what stands beside a frame, each name saying where it is from."""
+    """Return the settings of a frame; prefixes of names mark their source."""
     asked = {f"set_{key}": value for key, value in record.settings.items()}
     actual = {f"actual_{key}": value for key, value in record.actual.items()}
     index = {f"index_{key}": value for key, value in record.index.items()}

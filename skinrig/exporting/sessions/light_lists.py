@@ -96,7 +96,7 @@ def write(session: Session, folder: Path, delivery: ExportSettings) -> list[tupl
     (folder / LIST_FILE).write_text(f"{len(rows)}\n" + "\n".join(rows) + "\n", encoding="ascii")
     near = "".join(f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in places)
     (folder / POSITIONS_FILE).write_text(near, encoding="ascii")
-    told = {
+    document = {
         "schema": SCHEMA,
         "frame": "x right, y up, z towards the camera; directions from the rig's origin",
         "encoding": f"linear camera values: fraction of full scale, per second of light where "
@@ -108,7 +108,7 @@ def write(session: Session, folder: Path, delivery: ExportSettings) -> list[tupl
         "near_lights": f"{POSITIONS_FILE}: mm around the rig's origin; `skinrig import lp DIR "
         f"--lights DIR/{POSITIONS_FILE} --mm-per-px {dome.pixel_mm:.6g}`",
     }
-    write_session_document(folder / DOCUMENT_FILE, inputs, told, left_out)
+    write_session_document(folder / DOCUMENT_FILE, inputs, document, left_out)
     return left_out
 
 
@@ -138,7 +138,7 @@ def _view(names: tuple[str, ...], cameras: Any, requested: str | None) -> int:
 
 
 def _imported(session: Session, view: str, light: str) -> tuple[Float32Array, BoolArray]:
-    """Return a picture that came with a light list, which need not say its exposure."""
+    """Return a picture that came with a light list, which need not have an exposure."""
     record = next(one for one in session.frames("olat", light=light) if one.camera == view)
     frame = session.read(record)
     time = float(record.settings.get("exposure_s", 0.0)) * float(record.settings.get("iso", 100.0))

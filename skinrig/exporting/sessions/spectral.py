@@ -85,13 +85,13 @@ def write_spectra(
             if name in maps and maps[name].valid is not None:
                 mask = np.asarray(maps[name].valid, np.float32)
                 write_channels(folder / f"{name}_valid.exr", {"Y": mask}, {"unit": "1"})
-    told: dict[str, Any] = {
+    document: dict[str, Any] = {
         "schema": SPECTRAL_SCHEMA,
         "orientation": IMAGE_ORIENTATION,
         "files": files,
     }
-    told["left_out"] = [list(row) for row in left_out]
-    write_json(folder / SPECTRAL_DOCUMENT, {**describe_provenance(appearance), **told})
+    document["left_out"] = [list(row) for row in left_out]
+    write_json(folder / SPECTRAL_DOCUMENT, {**describe_provenance(appearance), **document})
     return left_out
 
 
@@ -153,13 +153,13 @@ def _reflectance(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
 
 def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
     diffuse, specular = appearance.maps["diffuse"], appearance.maps["specular"]
-    told = appearance.parameters.get("color_table")
-    if not isinstance(told, dict) or not {"camera", "illuminant"} <= set(told):
+    recorded = appearance.parameters.get("color_table")
+    if not isinstance(recorded, dict) or not {"camera", "illuminant"} <= set(recorded):
         raise ExportError(
-            "stokes: the maps do not say which camera and light they are of, so that bands have no "
-            "wavelength; make them again with `skinrig reconstruct --want diffuse,specular,melanin`"
+            "stokes: the maps have no camera and illuminant, so bands have no "
+            "wavelength; make them with `skinrig reconstruct --maps diffuse,specular,melanin`"
         )
-    means = band_means_nm(str(told["camera"]), str(told["illuminant"]))
+    means = band_means_nm(str(recorded["camera"]), str(recorded["illuminant"]))
     valid = diffuse.mask & specular.mask
     s0 = np.where(valid[..., None], diffuse.values + specular.values, 0.0)
     s1 = np.where(valid[..., None], specular.values, 0.0)
@@ -179,8 +179,8 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
         "origin": "measured",
         "unit": "white tile = 1",
         "channels": list(channels),
-        "camera": told["camera"],
-        "illuminant": told["illuminant"],
+        "camera": recorded["camera"],
+        "illuminant": recorded["illuminant"],
         "valid_share": float(valid.mean()),
     }
 
@@ -211,8 +211,8 @@ def write_stokes(session: Session, folder: Path, delivery: ExportSettings) -> li
     folder
         Existing folder.
     delivery
-        Its ``only`` names states such as "a000_n0"; with errors, standard errors are written
-        beside each image, and the mask of each state; its calibration is of the sensor.
+        Its ``only`` names states such as "a000_n0"; with errors, standard uncertainties
+        of each image are written, and the mask of each state; its calibration is of the sensor.
 
     Returns
     -------
@@ -240,13 +240,13 @@ def write_stokes(session: Session, folder: Path, delivery: ExportSettings) -> li
     axis = session.rig.view(camera).analyser_axis_deg
     if axis is None:
         raise ExportError(
-            f"{session.path}: the rig does not say how its analyser lies; give the view "
-            "analyser_axis_deg"
+            f"{session.path}: the rig has no axis of its analyzer; add analyser_axis_deg "
+            "to the view"
         )
     what = (
         "measured, by a picture along the analyser's axis and one across: S0 all light, S1 along "
-        f"the axis less across it; the axis lies {axis:g} degrees from x right towards y up; S2 "
-        "and S3 were not measured. A band of the sensor at its mean wavelength, not a narrow line"
+        f"the axis minus across it; the axis lies {axis:g} degrees from x right towards y up; S2 "
+        "and S3 were not measured. Wavelengths are the means of the sensor's broad bands"
     )
     files: dict[str, Any] = {}
     left_out: list[tuple[str, str]] = []
@@ -260,7 +260,7 @@ def write_stokes(session: Session, folder: Path, delivery: ExportSettings) -> li
             f"{session.path}: no pattern was taken both along and across the analyser's axis, "
             "expected `skinrig plan gradient` with both polarizations"
         )
-    told = {
+    document = {
         "schema": SCHEMA,
         "what": what,
         "unit": "fraction of the sensor's full scale, darks subtracted, exposure as taken",
@@ -272,7 +272,7 @@ def write_stokes(session: Session, folder: Path, delivery: ExportSettings) -> li
         "leakage": "not taken off: what crossed films let through is in S0 and lowers S1",
         "files": files,
     }
-    write_session_document(folder / DOCUMENT_FILE, inputs, told, left_out)
+    write_session_document(folder / DOCUMENT_FILE, inputs, document, left_out)
     return left_out
 
 
@@ -296,8 +296,8 @@ def _write_state(
         figures = _figures(*found, stderr, patterns.valid)
         files[f"{stem}.exr"] = {"state": state, "pattern": pattern, **figures}
         if with_errors:
-            told = {"unit": "1", "comments": "standard error of S0 and of S1, 68 %"}
-            write_channels(folder / f"{stem}.stderr.exr", {"Y": stderr}, told)
+            header = {"unit": "1", "comments": "standard error of S0 and of S1, 68 %"}
+            write_channels(folder / f"{stem}.stderr.exr", {"Y": stderr}, header)
     if with_errors:
         mask = patterns.valid.astype(np.float32)
         write_channels(folder / f"stokes_{state}.valid.exr", {"Y": mask}, {"unit": "1"})
@@ -307,7 +307,7 @@ def _write_state(
 def _noise(inputs: Any, camera: str) -> Any:
 
     serial = inputs.session.rig.view(camera).serial
-    found = inputs.load("sensor", [serial], "the frames are as noisy as they say of themselves")
+    found = inputs.load("sensor", [serial], "noise as recorded by the frames")
     if found is None:
         return None
     known = SensorCalibration.from_calibration(found, serial)

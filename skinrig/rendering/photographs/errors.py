@@ -1,4 +1,4 @@
-"""How far a rendering is from a photograph of the same camera and light.
+"""Errors of renderings against photographs with the same camera and light.
 
 Both are white-balanced linear camera RGB over what a perfect white Lambertian patch at the rig's
 origin shows that faces the light. The luminance is that of ITU-R BT.709 with the camera's channels
@@ -66,7 +66,7 @@ class Photograph:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairErrors:
-    """A rendering beside a photograph.
+    """A rendering compared with a photograph.
 
     Attributes
     ----------
@@ -181,8 +181,9 @@ def tone_map(rgb: ArrayLike, white: float) -> Float64Array:
 def similarity(photograph: ArrayLike, rendering: ArrayLike, skin: BoolArray) -> float:
     """Return the mean structural similarity over the skin of a tone-mapped pair.
 
-    Both are exposed so that `WHITE_PERCENTILE` of the photograph's skin is white, and black beside
-    the skin. Windows are Gaussian, 1.5 pixels (Wang et al. 2004, doi:10.1109/TIP.2003.819861).
+    Both are exposed so that `WHITE_PERCENTILE` of the photograph's skin is white, and black
+    outside the skin. Windows are Gaussian, 1.5 pixels (Wang et al. 2004,
+    doi:10.1109/TIP.2003.819861).
     """
     from skimage.metrics import structural_similarity
 
@@ -297,7 +298,7 @@ FULL_MODEL: Final = "full model"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """What the photographs say of a model.
+    """Errors of a model over all photographs.
 
     Attributes
     ----------
@@ -308,7 +309,7 @@ class Comparison:
     by_kind
         The same by why the photographs were not in the fit: "light", "view", ...
     ablation
-        The same without parts; the key says what stands in.
+        The same without parts; the key names the replacement.
     by_band
         Lit pixels and median error by band of skin color, see `skinrig.evaluating.skin_bands`.
     typology_angle_deg
@@ -316,7 +317,7 @@ class Comparison:
     typology_of
         "truth" or "r_d".
     shots
-        What each photograph says: view, light, held_out, median, lit pixels, noise, ssim.
+        Result of each photograph: view, light, held_out, median, lit pixels, noise, ssim.
     assumed
         What was taken for granted.
     subsurface
@@ -344,14 +345,14 @@ class Comparison:
 
     def document(self) -> dict[str, Any]:
         """Return this as JSON values."""
-        told = dataclasses.asdict(self)
-        told[FULL_MODEL], told["photographs"] = told.pop("full"), told.pop("shots")
-        told["by_band"] = {
+        document = dataclasses.asdict(self)
+        document[FULL_MODEL], document["photographs"] = document.pop("full"), document.pop("shots")
+        document["by_band"] = {
             band: {"pixels": pixels, "median": median}
             for band, (pixels, median) in self.by_band.items()
         }
         return {
-            **told,
+            **document,
             "band": str(classify_typology(self.typology_angle_deg)),
             "lit_pixels": (
                 "pixel and neighbors wholly on measured skin, every ray sees the whole light, not "
@@ -365,7 +366,7 @@ class Comparison:
 def print_comparison(console: Console, record: Mapping[str, Any]) -> None:
     """Print a record of `evaluate_folders`."""
     for assumption in record["assumed"]:
-        console.say(f"assumed: {assumption}")
+        console.print_line(f"assumed: {assumption}")
     full = record[FULL_MODEL]
     held_out = {f"{name} held out": row for name, row in record["by_kind"].items()}
     rows = {FULL_MODEL: full, **held_out, **record["ablation"]}
@@ -378,12 +379,12 @@ def print_comparison(console: Console, record: Mapping[str, Any]) -> None:
         ],
     )
     for band, row in record["by_band"].items():
-        console.say(f"{band} skin: {100 * row['median']:.2f} %, {row['pixels']} pixels")
+        console.print_line(f"{band} skin: {100 * row['median']:.2f} %, {row['pixels']} pixels")
     word = "kept" if record["passed"] else "MISSED"
-    console.say(
+    console.print_line(
         f"{word}: median relative error of the luminance on lit pixels: "
         f"{100 * full['median']:.2f} % (< {100 * record['limit']:g}); noise alone makes "
         f"{100 * full['noise']:.2f} %"
     )
-    console.say(f"{record['out']}: {', '.join(record['files'])}, {record['seconds']:.1f} s")
+    console.print_line(f"{record['out']}: {', '.join(record['files'])}, {record['seconds']:.1f} s")
     console.document(record["schema"], {k: v for k, v in record.items() if k != "schema"})

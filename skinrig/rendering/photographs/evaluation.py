@@ -38,7 +38,7 @@ from skinrig.rendering.render import Rendering, Subsurface, render_surface
 from skinrig.rendering.request import read_model
 
 N_PICTURES: Final = 6
-"""Photographs that are drawn beside their renderings, even over all."""
+"""Number of photographs drawn with their renderings, evenly spread over all."""
 MAX_SHOWN_ERROR: Final = 0.2
 """Relative error at the end of the pictures' scale."""
 
@@ -77,7 +77,7 @@ class _Surface:
     def render_ablations(
         self, made: Rendering, shot: HeldOutShot, fewer: Mapping[str, _Surface]
     ) -> Iterator[tuple[str, Float32Array]]:
-        """Yield renderings without parts, beside that of the whole."""
+        """Yield the renderings with a part removed, from that of the full model."""
         yield "without the surface", made.diffuse
         yield "without light from inside", made.surface
         if made.subsurface == "dipole":
@@ -108,7 +108,7 @@ def evaluate_photographs(
     how
         Light from inside, number of photographs, whether parts are left out.
     truth
-        Of the face, where it is simulated; tells its skin color only.
+        Of the face, if it is simulated; used for bands of skin color only.
     model
         The appearance's model, where something of it is to be another; None: as it is.
 
@@ -116,7 +116,7 @@ def evaluate_photographs(
     -------
     comparison : Comparison
     pictures : dict of str to bytes
-        PNG files by name: photograph, rendering and relative error beside each other.
+        PNG files by name: photograph, rendering and relative error side by side.
 
     Raises
     ------
@@ -155,9 +155,9 @@ def evaluate_photographs(
         if pair.lit.any():
             kinds.setdefault(shot.held_out, []).append(pair)
         bands.append(_bands(whole, made))
-        told = {name: getattr(pair, name) for name in ("median", "noise", "ssim", "total_error")}
+        figures = {name: getattr(pair, name) for name in ("median", "noise", "ssim", "total_error")}
         lit = int(np.count_nonzero(pair.lit))
-        rows.append({**dataclasses.asdict(shot), **told, "lit_pixels": lit})
+        rows.append({**dataclasses.asdict(shot), **figures, "lit_pixels": lit})
         for name, image in surface.render_ablations(made, shot, fewer) if settings.ablation else ():
             parts.setdefault(name, []).append(_compare(photo, made, image))
         if shot in drawn:
@@ -190,7 +190,7 @@ def evaluate_folders(
 ) -> dict[str, Any]:
     """Compare an APPEARANCE/ with a SESSION/ and write pictures and record to ``out``.
 
-    The truth is found beside the appearance where it names one.
+    The ground truth is the folder next to the appearance that it names, if any.
 
     Returns
     -------
@@ -201,8 +201,12 @@ def evaluate_folders(
     read, model = read_model(appearance, translucency=translucency)
     photographs = HeldOutPhotographs.of(session, read, calibration=calibration)
     named = str(read.parameters.get("truth", "") or "")
-    beside = appearance.resolve().parent / named
-    found = store.read(beside) if named and (beside / store.DOCUMENT_FILE).is_file() else None
+    truth_folder = appearance.resolve().parent / named
+    found = (
+        store.read(truth_folder)
+        if named and (truth_folder / store.DOCUMENT_FILE).is_file()
+        else None
+    )
     comparison, pictures = evaluate_photographs(
         read, photographs, settings, truth=found, model=model
     )
@@ -221,7 +225,7 @@ def _compare(photo: Photograph, made: Rendering, image: Float32Array) -> PairErr
 
 
 def _bands(model: SkinReflectance, made: Rendering) -> NDArray[np.str_]:
-    """Return the band of skin color of each pixel, "" beside measured skin."""
+    """Return the band of skin color of each pixel, "" outside measured skin."""
     height, width = made.covered.shape
     r_d = sample(np.asarray(model.r_d), made.uv.reshape(-1, 2), made.covered.reshape(-1))
     angle = typology_angle_deg(r_d * normal_reflectance_ratio(model.eta)).reshape(height, width)

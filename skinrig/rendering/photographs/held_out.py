@@ -105,8 +105,8 @@ class HeldOutPhotographs:
         assumed = list(inputs.assumed)
         away = tuple(float(r) for r in np.linalg.norm(dome.table.position_mm, axis=1))
         if not same:
-            dome, told = _fitted_head_frame(dome, appearance)
-            assumed.append(told)
+            dome, assumption = _fitted_head_frame(dome, appearance)
+            assumed.append(assumption)
         motion = appearance.parameters.get("motion", {})
         if isinstance(motion, dict) and motion.get("still") is False:
             moved = float(motion.get("displacement_mm_max", 0.0))

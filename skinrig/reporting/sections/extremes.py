@@ -38,15 +38,15 @@ def run_extremes(
         run_cases(stages, progress=lambda name: console.progress(f"extreme: {name}"))
     )
     for case in document["cases"]:
-        console.say(
+        console.print_line(
             f"{'held' if case['passed'] else 'FAILED'}: {case['stage']}: {case['name']} "
             f"({case['extreme']}); expected: {case['expected']}"
         )
         for name in INPUT_PRECISIONS:
             if not case["passed"] or name == "float64":
-                console.say(f"    {name}: {case[name]['got']}")
+                console.print_line(f"    {name}: {case[name]['got']}")
     failed = sum(not case["passed"] for case in document["cases"])
-    console.say(f"{len(document['cases'])} extremes, {failed or 'none'} failed")
+    console.print_line(f"{len(document['cases'])} extremes, {failed or 'none'} failed")
     if out is not None:
         text = json.dumps(to_json_value(document), indent=1, sort_keys=True)
         write_atomically(out / "extremes.json", text + "\n")

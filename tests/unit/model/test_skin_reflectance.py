@@ -85,9 +85,9 @@ def test_translucency_comes_from_values_or_maps_any_size(lobes):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"without": ("r_d",)}, "--want r_d"),
+        ({"without": ("r_d",)}, "--maps r_d"),
         ({"without": ("basis_weight_2",)}, "basis_weight_2"),
-        ({"normals": ()}, "--want normals"),
+        ({"normals": ()}, "--maps normals"),
         ({"file": b"PK\3\4 damaged"}, "cannot be read"),
         ({"file": b""}, "cannot be read"),
         ({"r_d": SkinMap(np.ones((3, 3, 3)), "1")}, r"got shape \(3, 3\), expected \(12, 12\)"),

@@ -34,7 +34,7 @@ def offered(words):
         ("simulate dome --condi", ["--condition"]),
         ("calibrate ge", ["geometry"]),
         ("demo --rigs flash,p", ["flash,probe"]),
-        ("reconstruct session --want normals,r", ["normals,r_d"]),
+        ("reconstruct session --maps normals,r", ["normals,r_d"]),
         ("rep", ["report"]),
     ],
 )

@@ -7,7 +7,7 @@ from skinrig.console import Console
 
 def test_json_is_the_only_thing_on_stdout(capsys):
     console = Console(as_json=True)
-    console.say("for people")
+    console.print_line("for people")
     console.progress("working")
     console.rows(("a", "b"), [(1, 2.0)])
     console.document("skinrig.x/1", {"value": np.float32(2), "gone": float("nan")})
@@ -19,7 +19,7 @@ def test_json_is_the_only_thing_on_stdout(capsys):
 
 def test_results_on_stdout_are_readable_without_json(capsys):
     console = Console()
-    console.say("done")
+    console.print_line("done")
     console.document("skinrig.x/1", {})
     assert capsys.readouterr().out == "done\n"
 

@@ -27,11 +27,11 @@ def test_producers_of_industrial_cameras_are_reported(with_harvesters, tmp_path,
     (tmp_path / "maker.cti").touch()
     monkeypatch.setenv("GENICAM_GENTL64_PATH", str(tmp_path))
     (finding,) = producers()
-    assert (finding.state, finding.mend) == ("maker.cti", "")
+    assert (finding.state, finding.fix) == ("maker.cti", "")
 
 
 def test_missing_producers_report_variable_to_set(with_harvesters, monkeypatch):
     monkeypatch.delenv("GENICAM_GENTL64_PATH", raising=False)
     (finding,) = producers()
     assert finding.state == "none"
-    assert "GENICAM_GENTL64_PATH" in finding.mend
+    assert "GENICAM_GENTL64_PATH" in finding.fix

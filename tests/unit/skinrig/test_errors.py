@@ -28,7 +28,7 @@ def test_each_kind_of_failure_has_its_exit_code(error, code):
 
 def test_internal_fault_is_admitted_in_single_line():
     text = errors.sentence(ZeroDivisionError("division by zero"))
-    assert "fault of skinrig" in text
+    assert "defect of skinrig" in text
     assert "\n" not in text
 
 
@@ -39,7 +39,7 @@ def test_internal_fault_is_admitted_in_single_line():
         (FileExistsError(17, "File exists", "out"), "name another"),
         (NotADirectoryError(20, "Not a directory", "file/out"), "expected a folder"),
         (IsADirectoryError(21, "Is a directory", "out"), "expected a file"),
-        (PermissionError(13, "Permission denied", "out"), "rights"),
+        (PermissionError(13, "Permission denied", "out"), "permission"),
         (OSError(30, "Read-only file system", "out"), "name another"),
         (OSError(28, "No space left on device", "out"), "free space"),
     ],
@@ -54,7 +54,7 @@ def test_non_text_file_is_reported_without_codec_terms():
     with pytest.raises(UnicodeDecodeError) as caught:
         b"ok\xff".decode()
     assert errors.sentence(caught.value) == (
-        "a file that was to be UTF-8 text is not (byte 2 of it is 0xff); is another file meant?"
+        "text file: got byte 0xff at 2, expected UTF-8; check that it is the right file"
     )
 
 

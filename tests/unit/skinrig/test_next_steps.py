@@ -66,7 +66,7 @@ def test_skin_session_is_reconstructed_with_own_calibration():
     Path("calibration-dome").mkdir()
     Path("calibration-flash").mkdir()
     assert commands()[0] == (
-        "skinrig reconstruct session-a --want normals,r_d --calibration calibration-dome "
+        "skinrig reconstruct session-a --maps normals,r_d --calibration calibration-dome "
         "--out appearance"
     )
 

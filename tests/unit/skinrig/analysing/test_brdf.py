@@ -195,7 +195,7 @@ def test_faces_without_usable_lobes_are_named(tmp_path, basis, capsys):
     out = tmp_path / "out"
     with pytest.raises(AnalysisError, match="bare: holds no lobes"):
         analysing_brdf.analyze_measured(out, [tmp_path / "appearance-bare"])
-    with pytest.raises(AnalysisError, match="--basis DIR"):
+    with pytest.raises(AnalysisError, match="--merl-basis DIR"):
         analysing_brdf.analyze_measured(out, [tmp_path / "appearance-other"])
     for argv, says in (
         ([], "Missing"),

@@ -147,7 +147,7 @@ def test_a_rig_is_applied_to_another_faces_blood(face, tmp_path):
     assert found.values.shape == other.shape
     ratio = found.values[found.valid] / other[found.valid]
     assert np.median(ratio) == pytest.approx(1.5, abs=0.03)
-    assert ("color", "there is no melanin map") in done.left_out
+    assert ("color", "it needs a melanin map") in done.left_out
     empty = TargetFace(SkinAppearance({}, "measured"))
     with pytest.raises(ApplyError, match="hemoglobin"):
         apply_expression(folder, ExpressionRequest({"smile": 1.0}, onto=empty), out=tmp_path / "no")

@@ -60,7 +60,7 @@ def test_four_frames_halve_noise_error(look):
 def test_plan_omits_exposures_unneeded_for_wanted_errors(small, tmp_path, capsys):
     file = tmp_path / "plan.json"
     want = "melanin<=8%,hemoglobin<=20%"
-    assert main(["plan", "flash", "--want", want, "--out", str(file), "--json"]) == 0
+    assert main(["plan", "flash", "--goals", want, "--out", str(file), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     plan = Plan.from_json(file.read_text())
     assert {step.index["polarizer"] for step in plan.steps} == {"crossed"}
@@ -81,7 +81,7 @@ def test_plan_omits_exposures_unneeded_for_wanted_errors(small, tmp_path, capsys
 
 
 def test_dominant_model_error_does_not_request_more_frames(small, capsys):
-    assert main(["plan", "flash", "--want", "melanin<=1%"]) == 1
+    assert main(["plan", "flash", "--goals", "melanin<=1%"]) == 1
     said = capsys.readouterr().out
     assert "more frames will not help" in said
     assert "NOT REACHED" in said
@@ -113,7 +113,7 @@ def test_plan_without_crossed_frames_or_foreign_is_refused(rig, small, tmp_path,
     file.write_text(json.dumps(whole.to_json()))
     assert main(["plan", "gradient", "--forecast", str(file)]) == 3
     assert "expected 'gradient'" in capsys.readouterr().err
-    assert main(["plan", "flash", "--most-lights", "3"]) == 2
+    assert main(["plan", "flash", "--max-lights", "3"]) == 2
 
 
 @pytest.mark.long

@@ -45,7 +45,7 @@ def test_complements_and_longer_exposures_lower_the_error(look):
 def test_quickest_scan_reaching_error_is_chosen(small, tmp_path, capsys):
     file = tmp_path / "plan.json"
     assert (
-        main(["plan", "gradient", "--want", "normals<=2.5deg", "--out", str(file), "--json"]) == 0
+        main(["plan", "gradient", "--goals", "normals<=2.5deg", "--out", str(file), "--json"]) == 0
     )
     document = json.loads(capsys.readouterr().out)
     plan = Plan.from_json(file.read_text())
@@ -64,7 +64,7 @@ def test_quickest_scan_reaching_error_is_chosen(small, tmp_path, capsys):
 def test_unreachable_error_reports_reason(small, capsys, monkeypatch):
     monkeypatch.setattr(gradient, "PATTERN_SETS", PATTERN_SETS[:1])
     monkeypatch.setattr(gradient, "EXPOSURE_CHOICES", (1.0,))
-    assert main(["plan", "gradient", "--want", "normals<=0.1deg"]) == 1
+    assert main(["plan", "gradient", "--goals", "normals<=0.1deg"]) == 1
     said = capsys.readouterr().out
     assert "the best scan leaves" in said
     assert "the lens shows" in said

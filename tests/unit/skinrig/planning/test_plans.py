@@ -40,11 +40,11 @@ def test_errors_by_site_are_reported_with_colors():
     knobs = {plans.PERCENT_BY_SITE: {"chin": [0.444, 1.399, math.inf]}}
     choice = plans.PlanChoice(rig, flash_plan(rig), (), 2.0, knobs, ())
     told = plans.format_choice(choice)
-    assert "percent by site: chin red 0.444 %, green 1.4 %, blue not told" in told
+    assert "percent by site: chin red 0.444 %, green 1.4 %, blue unknown" in told
 
 
 def test_rig_without_own_plans_is_reported(capsys):
-    assert main(["plan", "moon", "--want", "normals<=1deg"]) == 3
+    assert main(["plan", "moon", "--goals", "normals<=1deg"]) == 3
     assert "expected one of dome" in capsys.readouterr().err
 
 
@@ -117,7 +117,7 @@ def test_plan_keeps_promised_error_and_reports_omissions(tmp_path, capsys, monke
         [
             "plan",
             "dome",
-            "--want",
+            "--goals",
             "normals<=1.5deg",
             "--width",
             "320",
@@ -148,10 +148,10 @@ def test_unreachable_target_reports_reason(capsys, monkeypatch):
     monkeypatch.setattr(dome_observation, "FACE_POINTS", 200)
     assert (
         main(
-            ["plan", "dome", "--want", "normals<=0.05deg", "--width", "320", "--most-lights", "25"]
+            ["plan", "dome", "--goals", "normals<=0.05deg", "--width", "320", "--max-lights", "25"]
         )
         == 1
     )
     said = capsys.readouterr().out
     assert "NOT REACHED" in said
-    assert "more pixels would help" in said
+    assert "use more pixels" in said

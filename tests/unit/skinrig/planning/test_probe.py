@@ -97,7 +97,7 @@ def test_reading_variance_follows_photons_and_saturation(look):
 
 def test_quickest_plan_reaching_error_omits_exposures(small, tmp_path, capsys):
     file = tmp_path / "plan.json"
-    assert main(["plan", "probe", "--want", "sigma_tr<=4%", "--out", str(file), "--json"]) == 0
+    assert main(["plan", "probe", "--goals", "sigma_tr<=4%", "--out", str(file), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     plan = Plan.from_json(file.read_text())
     assert document["reached"]
@@ -110,7 +110,7 @@ def test_quickest_plan_reaching_error_omits_exposures(small, tmp_path, capsys):
 
 
 def test_certificate_limit_reports_more_exposures_will_not_help(small, capsys):
-    assert main(["plan", "probe", "--want", "sigma_tr<=0.001%"]) == 1
+    assert main(["plan", "probe", "--goals", "sigma_tr<=0.001%"]) == 1
     said = capsys.readouterr().out
     assert "will not help" in said
     assert "certificate" in said

@@ -29,7 +29,7 @@ def test_rig_light_is_at_nominal_position_and_scale(stage):
     np.testing.assert_allclose(lamp.position_mm, drawn.position_mm)
     np.testing.assert_allclose(white, 0.5)
     np.testing.assert_allclose(towards[0] @ drawn.position_mm, np.linalg.norm(drawn.position_mm))
-    assert stage.assumed == ["light L017 stands as the rig's file draws it"]
+    assert stage.assumed == ["light L017 is at its nominal position"]
 
 
 def test_calibrated_light_matches_its_table_everywhere():

@@ -178,7 +178,7 @@ def test_rendering_replaces_only_older_rendering(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["picture"]
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "letter.txt").write_text("dear")
-    with pytest.raises(RenderingError, match="no rendering"):
+    with pytest.raises(RenderingError, match="expected a new folder or a rendering"):
         folder.write(tmp_path / "other", images={}, pictures={}, document={})
     assert (tmp_path / "other" / "letter.txt").read_text() == "dear"
 

@@ -300,7 +300,7 @@ def test_unmeasured_texels_are_distinguished_from_measured(matt):
 
 @pytest.mark.parametrize(
     ("place", "says"),
-    [((0.0, 0.0, -700.0), "behind the head"), ((0.0, 3000.0, 700.0), "sees nothing")],
+    [((0.0, 0.0, -700.0), "behind the head"), ((0.0, 3000.0, 700.0), "has no view")],
 )
 def test_camera_missing_face_is_refused(matt, place, says):
     mesh = plane()

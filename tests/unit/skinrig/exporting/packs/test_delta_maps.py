@@ -101,7 +101,7 @@ def test_base_color_plus_delta_gives_expression_color(moving, tmp_path):
         decoded = 2.0 * codes[..., ::-1] / 65535.0 - 1.0
         np.testing.assert_allclose(decoded, read(tmp_path / f"exr/{name}_delta.exr"), atol=2e-5)
     assert "stretched" in told["layout"]
-    assert "--onto" in left_out["colors on the face's texture"]
+    assert "--target-face" in left_out["colors on the face's texture"]
 
 
 @pytest.mark.parametrize(("normal_y", "y"), [("gl", 1.0), ("dx", -1.0)])
@@ -186,7 +186,7 @@ def test_colors_are_carried_onto_a_texture_by_landmarks(moving, tmp_path, rng):
         np.testing.assert_allclose(found, at, atol=0.01)
         assert np.abs(at - 1.0).max() > 0.03
     np.testing.assert_allclose(base[64, 64], 0.923188 * albedo[0, 0], rtol=1e-4)
-    with pytest.raises(ExportError, match="expected two with --onto"):
+    with pytest.raises(ExportError, match="expected two with --target-face"):
         delta_maps.write(moving, out, ExportSettings(onto=dome))
 
 
