@@ -238,7 +238,7 @@ def test_move_report_names_emergency_stop_as_end(alone):
 def test_a_caliper_that_never_arrives_is_given_up(alone, monkeypatch):
     _, box = alone()
     ready(box)
-    monkeypatch.setattr(emulated.CaliperUnit, "busy", lambda self, now: True)
+    monkeypatch.setattr(emulated.CaliperUnit, "is_busy", lambda self, now: True)
     with pytest.raises(PortTimeout, match="still moves"):
         box._wait(0.5)
     box.port.close()

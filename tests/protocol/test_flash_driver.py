@@ -230,7 +230,7 @@ def liar(rig):
         ("power", (), "nan"),
         ("power", (), "full"),
         ("polarizer", (), "LEFT"),
-        ("settled", (), "2"),
+        ("is_settled", (), "2"),
         ("count", (), ""),
         ("ping", (), "inf"),
         ("last_pop", (), "a,1,0.5,PAR,0"),

@@ -312,7 +312,7 @@ def test_stuck_shutter_is_refused_and_jammed_shutter_reported(alone):
 
 def test_a_cover_that_never_arrives_is_given_up(alone, monkeypatch):
     _, box = alone()
-    monkeypatch.setattr(ProbeUnit, "busy", lambda self, now: True)
+    monkeypatch.setattr(ProbeUnit, "is_busy", lambda self, now: True)
     with pytest.raises(PortTimeout, match="still moves"):
         box.cover(3)
     box.port.close()
