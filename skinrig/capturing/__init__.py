@@ -1,1 +1,1 @@
-"""Options of capture: addresses, acquisition, light safety and sequences."""
+"""Capture of sessions: addresses, plans, acquisition, light safety and sequences."""

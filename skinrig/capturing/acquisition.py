@@ -1,4 +1,4 @@
-"""Run a plan on a rig by the addresses of its boxes and cameras, whatever answers there."""
+"""Capture a plan into a SESSION/ folder with the devices at the given addresses."""
 
 import contextlib
 import math
@@ -28,46 +28,54 @@ from skinrig.next_steps import shell_quote
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CaptureOrder:
-    """What a capture is asked for, besides its rig and plan."""
+    """Options of a capture besides its rig and plan.
+
+    Raises
+    ------
+    UnusableError
+        For a force limit that is not finite or not above 0 N.
+    """
 
     out: Path | None
+    """New SESSION/ folder; None is allowed only with `dry_run`."""
     boxes: Mapping[str, str]
-    """Address of each box."""
+    """Address of each controller."""
     cameras: Mapping[str, str]
     """Address of each camera."""
     subject: SubjectRecord
     dry_run: bool = False
-    """Only print the plan."""
+    """Print the plan without opening a device."""
     plan_out: Path | None = None
-    """New file for the plan."""
+    """New JSON file for the plan."""
     resume: bool = False
     eyes: Eyes = "open"
-    """What a person says of the subject's eyes."""
+    """State of the subject's eyes, as declared by the operator."""
     force_limit_n: float | None = None
-    """Of a caliper, N."""
+    """Maximum force of the caliper, N."""
     all_brackets: bool = False
-    """Of a probe: record every exposure."""
+    """Record every exposure bracket (probe only)."""
 
     def __post_init__(self) -> None:
         if self.force_limit_n is not None and not 0.0 < self.force_limit_n < math.inf:
             raise UnusableError(
-                f"--force-limit: got {self.force_limit_n:g}, expected more than 0 newton"
+                f"--force-limit: got {self.force_limit_n:g}, expected more than 0 newton; give "
+                "the force that this skin may bear"
             )
 
 
 def capture_session(
     rig: Rig, plan: Plan, order: CaptureOrder, console: Console
 ) -> Mapping[str, Any]:
-    """Capture a plan into a session's folder and return the command's document.
+    """Capture a plan into a session's folder and return the command's JSON document.
 
     Raises
     ------
     UsageError
-        For an address that is none, or a missing one, or a missing force limit.
+        For a malformed or missing address, or a missing force limit.
     CaptureError
-        For a plan file that exists.
+        If `plan_out` exists.
     DeviceError
-        When a box or camera fails; what was captured stays and can be resumed.
+        If a controller or camera fails; recorded frames are kept and the session can be resumed.
     """
     seconds = plan.estimate_duration_s(rig)
     needed = needed_boxes(rig, plan)
@@ -75,22 +83,22 @@ def capture_session(
         require_addresses(rig, order.boxes, order.cameras, needed=needed)
         if "caliper" in needed and order.force_limit_n is None:
             raise UsageError(
-                "a capture with the caliper needs --force-limit N: how much force this skin may "
-                "bear is for a person to decide, and there is no default"
+                "a capture with the caliper needs --force-limit N: the operator decides how much "
+                "force this skin may bear; there is no default"
             )
     if order.out is None and not order.dry_run:
-        raise UsageError("a capture needs --out SESSION")
+        raise UsageError("a capture needs --out SESSION; name a new folder, or add --dry-run")
     console.say(f"{len(plan.steps)} steps, about {seconds:.0f} s")
     light: Mapping[str, Any] = {} if rig.leds is None else light_figures(plan, rig)
     for line in (*sequence_lines(plan), *(light_lines(plan, rig) if light else ())):
         console.say(line)
     if (file := order.plan_out) is not None:
         write_plan(plan, file)
-        console.say(f"{file}: the plan; change it and hand it over with --plan {shell_quote(file)}")
+        console.say(f"{file}: the plan; edit it, then capture it with --plan {shell_quote(file)}")
     if order.out is None or order.dry_run:
         steps = plan.steps
-        told = [" ".join(f"{k}={v}" for k, v in step.settings.items()) for step in steps]
-        rows = [(s.id, s.kind, text) for s, text in zip(steps, told, strict=True)]
+        settings = [" ".join(f"{k}={v}" for k, v in step.settings.items()) for step in steps]
+        rows = [(s.id, s.kind, text) for s, text in zip(steps, settings, strict=True)]
         console.rows(("step", "kind", "settings"), rows)
         figures = {"steps": len(steps), "estimated_s": seconds, "captured": 0, "light": light}
         return figures | {"plan": plan.to_json()}
@@ -100,7 +108,7 @@ def capture_session(
 def _run(
     rig: Rig, plan: Plan, out: Path, order: CaptureOrder, console: Console
 ) -> Mapping[str, Any]:
-    """Run a plan through the drivers into a session, new or gone on with."""
+    """Run a plan through the drivers into a new or resumed session."""
     with contextlib.ExitStack() as stack:
         boxes, cameras = _open_devices(stack, rig, plan, order, console)
         width, _ = next(iter({(c.info.width_px, c.info.height_px) for c in cameras.values()}))
@@ -141,21 +149,21 @@ def _run(
                 all_brackets=order.all_brackets,
             )
         session.close()
-        left_out = dict(session.omitted_steps())
+        omitted = dict(session.omitted_steps())
     if done.dead_lights:
         console.say(f"dead lights: {', '.join(done.dead_lights)}; their frames are dark")
-    console.each("left out", dict.fromkeys(left_out.values()))
+    console.each("omitted", dict.fromkeys(omitted.values()))
     console.say(f"{out}: {done.frames} frames in {done.steps} steps, {done.retakes} retaken")
     console.say(f"next: skinrig verify {shell_quote(out)}")
     figures = {"session": out, "captured": done.frames, "retakes": done.retakes}
     figures |= {"stale_frames": done.stale, "steps": len(plan.steps)}
-    return figures | {"dead_lights": done.dead_lights, "left_out": left_out}
+    return figures | {"dead_lights": done.dead_lights, "left_out": omitted}
 
 
 def _open_devices(
     stack: contextlib.ExitStack, rig: Rig, plan: Plan, order: CaptureOrder, console: Console
 ) -> tuple[dict[str, Box], dict[str, Camera]]:
-    """Open the boxes that a plan needs and all cameras; the stack closes them."""
+    """Open the controllers that a plan needs and all cameras; the stack closes them."""
     boxes: dict[str, Box] = {}
     for kind in needed_boxes(rig, plan):
         opening = partial(open_box, kind, order.boxes[kind])
@@ -170,45 +178,46 @@ def _open_devices(
 
 
 def prompt_operator(progress: Callable[[str], None], instruction: str) -> None:
-    """Say what the operator has to make ready, and wait for Enter where there is a keyboard."""
+    """Show an instruction to the operator and, at a terminal, wait for Enter."""
     instruction = (
         instruction
         if instruction.startswith(("step ", "tape ", "place ", "put "))
-        else f"make ready: {instruction}"
+        else f"prepare: {instruction}"
     )
     if sys.stdin is None or not sys.stdin.isatty():
-        progress(instruction)
+        progress(instruction)  # nobody can press Enter: continue at once
         return
     progress(f"{instruction}; then press Enter")
     sys.stdin.readline()
 
 
 def signal_subject(progress: Callable[[str], None], instruction: str) -> None:
-    """Ring the terminal's bell and say what the subject shall change to; wait for nothing."""
+    """Ring the terminal bell and show the subject's next expression, without waiting."""
     progress(f"\a{instruction}")
 
 
 @contextlib.contextmanager
 def _discard_unused_session(session: Session, fresh: bool, console: Console) -> Iterator[None]:
-    """Take a new session away again when a device failed before its first frame."""
+    """Remove a new session if a device fails before its first frame."""
     try:
         yield
     except Exception:
         if not session.frames():
             session.release()
             remove_unused(session.path, with_folder=fresh)
-            console.progress(f"no frame was recorded: {session.path} was removed")
+            console.progress(f"{session.path}: removed, because no frame was recorded")
         raise
 
 
 def remove_unused(path: Path, *, with_folder: bool) -> None:
-    """Remove what a session without frames consists of; without ``with_folder`` only its content.
+    """Remove the files of a session without frames, and with ``with_folder`` its folder.
 
-    The manifest goes first: without it there is no session, whatever else is interrupted.
+    The manifest is removed first: a folder without it is not a session, even if the rest fails.
     """
     for name in ("session.json", "journal.jsonl"):
         (path / name).unlink()
-    with contextlib.suppress(OSError):  # what is not the session's own stays, and its folder
+    # rmdir fails on a folder that holds foreign files: those and their folder are kept
+    with contextlib.suppress(OSError):
         for part in (path / "frames").glob("*.part"):
             part.unlink()
         (path / "frames").rmdir()
@@ -219,16 +228,16 @@ def remove_unused(path: Path, *, with_folder: bool) -> None:
 
 @contextlib.contextmanager
 def _stop_on_signal() -> Iterator[Any]:
-    """Turn the first Ctrl-C into a stop between two steps; a second one interrupts at once."""
-    asked: list[int] = []
+    """Turn the first Ctrl-C into a stop between two steps; the second interrupts at once."""
+    received: list[int] = []
 
-    def note(number: int, frame: object) -> None:
-        if asked:
+    def record_signal(number: int, frame: object) -> None:
+        if received:
             raise KeyboardInterrupt
-        asked.append(number)
+        received.append(number)
 
-    before = signal.signal(signal.SIGINT, note)
+    previous = signal.signal(signal.SIGINT, record_signal)
     try:
-        yield lambda: bool(asked)
+        yield lambda: bool(received)
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, previous)

@@ -1,4 +1,4 @@
-"""Where the boxes and cameras of a capture are: NAME=URL pairs, and devices that are still held."""
+"""Parse the NAME=URL addresses of controllers and cameras, and open the devices at them."""
 
 from __future__ import annotations
 
@@ -14,14 +14,20 @@ if TYPE_CHECKING:
     from capture.devices.box import Box
 
 RETRY_TIMEOUT_S = 10.0
-"""How long a device that is held, or reads out a frame of before, is asked for again."""
+"""Retry period, s, of a device that another program holds or that still reads out a frame."""
 RETRY_PAUSE_S = 0.5
+"""Pause between two attempts, s."""
 
 _T = TypeVar("_T")
 
 
 def parse_addresses(pairs: Sequence[str], option: str) -> dict[str, str]:
-    """Return NAME=URL pairs as a mapping.
+    """Parse NAME=URL pairs into addresses by name.
+
+    Raises
+    ------
+    UsageError
+        For a pair of another form, or a name given twice.
 
     Examples
     --------
@@ -32,9 +38,9 @@ def parse_addresses(pairs: Sequence[str], option: str) -> dict[str, str]:
     for text in pairs:
         name, equals, url = text.partition("=")
         if not (equals and name and url):
-            raise UsageError(f"{option}: got {text!r}, expected NAME=URL")
+            raise UsageError(f"{option}: got {text!r}, expected NAME=URL, such as flash=URL")
         if name in found:
-            raise UsageError(f"{option}: {name!r} is given twice")
+            raise UsageError(f"{option}: {name!r} is given twice; remove one of them")
         found[name] = url
     return found
 
@@ -46,7 +52,9 @@ def require_addresses(
     *,
     needed: Sequence[str] | None = None,
 ) -> None:
-    """Raise, naming all that is missing, unless each box and camera has an address of a known kind.
+    """Raise unless each controller and camera has an address of a known scheme.
+
+    The message lists every missing address.
 
     Parameters
     ----------
@@ -54,11 +62,12 @@ def require_addresses(
     boxes, cameras
         Addresses by name.
     needed
-        Boxes that are used; None: all of the rig.
+        Controllers that are used; None: all of the rig.
 
     Raises
     ------
     UsageError
+        For a missing address, or a camera address of an unknown scheme.
     """
     from capture.devices.camera import CameraUrlError, check_address
 
@@ -69,7 +78,7 @@ def require_addresses(
             f"the rig {rig.name!r} needs {' '.join(missing)}; --dry-run needs none, and "
             "skinrig serve prints those of a simulation"
         )
-    for view in rig.views:  # before any box is opened, and its light switched
+    for view in rig.views:  # checked before a controller is opened, which switches its light
         try:
             check_address(cameras[view.name])
         except CameraUrlError as error:
@@ -77,7 +86,7 @@ def require_addresses(
 
 
 def open_box(kind: str, address: str, **settings: Any) -> Box:
-    """Return the driver of a box at an address: its module's ``DRIVER``.
+    """Return the driver of a controller at an address: its module's ``DRIVER``.
 
     Parameters
     ----------
@@ -86,7 +95,7 @@ def open_box(kind: str, address: str, **settings: Any) -> Box:
     address
         URL or name of its port.
     **settings
-        Of the port.
+        Settings of the port.
     """
     from capture.devices.port import Port
 
@@ -102,9 +111,14 @@ def open_with_retry(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> _T:
-    """Open a device, asking again for a few seconds while another program holds it.
+    """Open a device, retrying for a few seconds while another program holds it.
 
-    What was killed a moment ago may still hold its ports.
+    A process that was killed a moment ago may still hold its ports.
+
+    Raises
+    ------
+    CameraBusy, PortBusy
+        If the device is still held after `retry_s`.
     """
     from capture.devices.camera import CameraBusy
     from capture.devices.port import PortBusy

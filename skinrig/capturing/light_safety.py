@@ -1,4 +1,4 @@
-"""What the light of LEDs will be for the subject, said before it is given."""
+"""Report the flicker and light dose of a plan before the subject is exposed to them."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -14,32 +14,32 @@ LIGHT_FIGURE_LABELS: Final[Mapping[str, str]] = {
     "flashes_per_s": "flashes in the worst second",
     "flicker_rms": "flicker of 3 to 65 Hz, root mean square over the mean",
     "open_eyes": "open eyes",
-    "led": "LED that gives most",
+    "led": "LED with the highest energy",
     "led_ws": "energy from that LED, Ws",
-    "limit_ws": "energy from an LED that is allowed, Ws",
-    "blue_share": "of the blue-light limit of one that is stared at, %",
-    "eye_j_m2": "light at the eyes, J/m²",
-    "state_s": "light in a state of the skin, s",
-    "duty": "mean level of an LED",
-    "placement_ws": "energy in a placement, Ws",
-    "skin_w_m2": "light into the skin, W/m²",
-    "stare_s": "until an eye at the bare fibre would be at its blue-light limit, s",
+    "limit_ws": "allowed energy from one LED, Ws",
+    "blue_share": "fraction of the blue-light limit, staring into that LED, %",
+    "eye_j_m2": "radiant exposure at the eyes, J/m²",
+    "state_s": "light per strain step, s",
+    "duty": "highest mean level of an LED",
+    "placement_ws": "energy per placement, Ws",
+    "skin_w_m2": "irradiance of the skin, W/m²",
+    "stare_s": "time to the blue-light limit, staring into the bare fiber, s",
 }
-"""What the figures of `light_figures` are, for tables that people read."""
+"""Labels of the figures of `light_figures`, for tables."""
 
 
 def light_rows(figures: Mapping[str, float | str]) -> list[tuple[str, float | str]]:
-    """Return figures of `light_figures` in words, with units, for a table.
+    """Label the figures of `light_figures` with quantity and unit, for a table.
 
     Parameters
     ----------
     figures
-        By the names that `light_figures` gives them.
+        Values by the keys of `light_figures`; fractions become percent.
 
     Examples
     --------
     >>> light_rows({"open_eyes": "allowed", "blue_share": 0.25})
-    [('open eyes', 'allowed'), ('of the blue-light limit of one that is stared at, %', 25.0)]
+    [('open eyes', 'allowed'), ('fraction of the blue-light limit, staring into that LED, %', 25.0)]
     """
     return [
         (LIGHT_FIGURE_LABELS[name], 100 * float(value) if name == "blue_share" else value)
@@ -48,11 +48,12 @@ def light_rows(figures: Mapping[str, float | str]) -> list[tuple[str, float | st
 
 
 def light_figures(plan: Plan, rig: Rig) -> Mapping[str, float | str]:
-    """Return flicker and dose of a plan as JSON values, units in the names.
+    """Compute flicker and light dose of a plan as JSON values, with units in the keys.
 
-    Of patterns on skin also the light of a state, and the most mean level of an LED; open eyes are
-    refused whatever the figures say, because the patch may lie beside an eye. Of the fibre probe,
-    whose light stays under its head, the dose, and how long an eye could bear the bare fibre.
+    For patterns on skin, the light per strain step and the highest mean level of an LED are added.
+    Open eyes are then refused in every case, because the patch may be next to an eye. For the
+    fiber probe, whose light stays under its head, the result is the dose and the time to the
+    blue-light limit of an eye at the bare fiber.
 
     Examples
     --------
@@ -69,7 +70,7 @@ def light_figures(plan: Plan, rig: Rig) -> Mapping[str, float | str]:
     flicker, dose = flicker_report(plan, rig), dose_report(plan, rig)
     limits = rig.leds or LedLimits()
     skin: dict[str, float | str] = {}
-    for _, steps in group_by_state(plan):  # one is like the other
+    for _, steps in group_by_state(plan):  # all states get the same light: the first is enough
         light_s = sum(float(step.settings["dwell_s"]) for step in steps)
         skin = {"state_s": light_s, "duty": scan_duty(steps, rig)}
         break
@@ -83,7 +84,7 @@ def light_figures(plan: Plan, rig: Rig) -> Mapping[str, float | str]:
 
 
 def light_lines(plan: Plan, rig: Rig) -> list[str]:
-    """Return the same as sentences, for the person who asks the subject.
+    """Describe the figures of `light_figures` in sentences, for the operator.
 
     Examples
     --------
@@ -97,25 +98,25 @@ def light_lines(plan: Plan, rig: Rig) -> list[str]:
     if rig.probe is not None:
         return [
             f"light into the skin: at most {1e3 * float(figures['placement_ws']):.3g} mWs at one "
-            f"placement, {float(figures['led_ws']):.3g} Ws in all, {limits.dose_ws:g} Ws allowed; "
-            f"{float(figures['skin_w_m2']):.0f} W/m2 over {SKIN_APERTURE_MM:g} mm",
-            f"the fibre is not to be looked into: an eye would be at its blue-light limit after "
-            f"{float(figures['stare_s']):.1f} s; the shutter opens only while the head is held on",
+            f"placement, {float(figures['led_ws']):.3g} Ws in total, {limits.dose_ws:g} Ws "
+            f"allowed; {float(figures['skin_w_m2']):.0f} W/m2 over {SKIN_APERTURE_MM:g} mm",
+            f"do not look into the fiber: an eye reaches its blue-light limit after "
+            f"{float(figures['stare_s']):.1f} s; the shutter opens only under suction",
         ]
     verdict = "may be open" if figures["open_eyes"] == "allowed" else "must be closed or shielded"
     more = []
     if "state_s" in figures:
-        verdict += ": the patch may lie beside one"
+        verdict += ": the patch may be next to an eye"
         more = [
-            f"patterns: {figures['state_s']:.2f} s of light a state of the skin, mean level of an "
-            f"LED at most {figures['duty']:.3f} over {limits.duty_window_s:g} s, "
+            f"patterns: {figures['state_s']:.2f} s of light per strain step, mean level of an LED "
+            f"at most {figures['duty']:.3f} over {limits.duty_window_s:g} s, "
             f"{limits.max_duty:g} allowed"
         ]
     return [
         f"flicker at the eyes: {figures['flashes_per_s']:.1f} flashes in the worst second, rms "
         f"{figures['flicker_rms']:.2f} of 3 to 65 Hz; eyes {verdict}",
         f"light dose: at most {figures['led_ws']:.3g} Ws from one LED ({figures['led']}), "
-        f"{limits.dose_ws:g} Ws allowed; under {100 * float(figures['blue_share']):.2g} % of the "
-        f"blue-light limit of one that is stared at; {figures['eye_j_m2']:.2g} J/m2 at the eyes",
+        f"{limits.dose_ws:g} Ws allowed; under {100 * float(figures['blue_share']):.2g} % of its "
+        f"blue-light limit for staring eyes; {figures['eye_j_m2']:.2g} J/m2 at the eyes",
         *more,
     ]

@@ -1,4 +1,4 @@
-"""Values of options: texts of the command line, read."""
+"""Parse the values of command-line options."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,17 +10,18 @@ from skinrig.errors import UsageError, one_of
 
 
 def parse_eye_state(text: str) -> Eyes:
-    """Return what is said of the subject's eyes.
+    """Parse the state of the subject's eyes: open, closed or shielded.
 
     Raises
     ------
     UnusableError
+        For any other text.
     """
     return one_of("--eyes", text, get_args(Eyes))
 
 
 def parse_floats(text: str | None, option: str) -> tuple[float, ...] | None:
-    """Return numbers joined by commas; None for None.
+    """Parse numbers separated by commas; None for None.
 
     Examples
     --------
@@ -30,17 +31,18 @@ def parse_floats(text: str | None, option: str) -> tuple[float, ...] | None:
     Raises
     ------
     UsageError
+        For a part that is not a number.
     """
     if text is None:
         return None
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError as exc:
-        raise UsageError(f"{option}: got {text!r}, expected numbers joined by commas") from exc
+        raise UsageError(f"{option}: got {text!r}, expected numbers separated by commas") from exc
 
 
 def parse_names(text: str | None) -> tuple[str, ...] | None:
-    """Return names joined by commas; None for None.
+    """Parse names separated by commas; None for None.
 
     Examples
     --------
@@ -57,23 +59,23 @@ def parse_amounts(
     default: float | None = None,
     error: type[UsageError] = UsageError,
 ) -> dict[str, float]:
-    """Return the amounts of ``NAME=AMOUNT``, each name once.
+    """Parse ``NAME=AMOUNT`` texts into amounts by name.
 
     Parameters
     ----------
     texts
-        As they were typed.
+        Texts as typed.
     option
-        Where, for messages.
+        Name of the option, for messages.
     default
-        What a name alone stands for; None: it needs an amount.
+        Amount of a name without one; None: each name needs an amount.
     error
         Class of the error.
 
     Raises
     ------
     UsageError
-        For another form, and a name given twice.
+        For a text of another form, or a name given twice.
 
     Examples
     --------
@@ -89,14 +91,14 @@ def parse_amounts(
             if not name or name in found:
                 raise ValueError(name)
         except ValueError as exc:
-            said = f"{option}: got {text.strip()!r}, expected {form}, each name once"
-            raise error(said) from exc
+            message = f"{option}: got {text.strip()!r}, expected {form}, each name once"
+            raise error(message) from exc
         found[name] = value
     return found
 
 
 def parse_range(text: str | None, option: str) -> tuple[int, int] | None:
-    """Return the first and last number of ``FIRST..LAST``; None for None.
+    """Parse the first and last whole number of ``FIRST..LAST``; None for None.
 
     Examples
     --------
@@ -106,6 +108,7 @@ def parse_range(text: str | None, option: str) -> tuple[int, int] | None:
     Raises
     ------
     UsageError
+        For a text of another form.
     """
     if text is None:
         return None
@@ -125,7 +128,7 @@ def parse_sequence(
     captures: int | None,
     duration: str | None,
 ) -> SequenceOrder | None:
-    """Return the sequence that options ask for; None without one.
+    """Return the sequence that the options describe; None if none is requested.
 
     Examples
     --------
@@ -135,18 +138,19 @@ def parse_sequence(
     Raises
     ------
     UsageError
-        For options without a sequence, or of another kind of it, or that are no numbers.
+        For options without ``--sequence``, options of the other kind of sequence, or texts that
+        are not numbers.
     """
     if state is None:
         if any(option is not None for option in (prompt_period, shot_period, captures, duration)):
             raise UsageError(
-                "--prompt-period, --shot-period, --captures, --duration: are for a sequence; add "
-                "--sequence STATE"
+                "--prompt-period, --shot-period, --captures, --duration: options of a sequence; "
+                "add --sequence STATE"
             )
         return None
     seconds = {"prompt-period": prompt_period, "shot-period": shot_period, "duration": duration}
     for option, text in seconds.items():
-        try:  # the plan keeps the digits as they were given
+        try:  # only checked: the plan keeps the decimals as typed, without rounding
             float(text or 0)
         except ValueError as exc:
             raise UsageError(f"--{option}: got {text!r}, expected seconds, such as 5.5") from exc
@@ -154,7 +158,9 @@ def parse_sequence(
         state=state, shot_period_s=shot_period, captures=captures, duration_s=duration
     )
     if order.is_prompted and duration is not None:
-        raise UsageError(f"--duration: is for an event; {state} goes by --captures")
+        raise UsageError(f"--duration: an option of events; use --captures for {state}")
     if not order.is_prompted and (prompt_period is not None or captures is not None):
-        raise UsageError(f"--prompt-period, --captures: {state} is no expression; use --duration")
+        raise UsageError(
+            f"--prompt-period, --captures: options of expressions; use --duration for {state}"
+        )
     return order if prompt_period is None else replace(order, prompt_period_s=prompt_period)

@@ -1,4 +1,4 @@
-"""The plan of a capture: a file's, or the rig's own for a target or a subject."""
+"""Choose the plan of a capture: from a file, or the rig's default for a target or a subject."""
 
 import json
 from collections.abc import Sequence
@@ -23,39 +23,39 @@ FLASH_CALIBRATION_TARGETS = ("dark", "flat", "chart", "malus")
 
 
 class CaptureError(ValueError):
-    """A capture that cannot start as asked."""
+    """A capture that cannot start with the given options."""
 
 
 def read_plan(file: Path) -> Plan:
-    """Return the plan in a JSON file, as ``--plan-out`` and `skinrig plan` write it."""
+    """Read a plan from a JSON file that ``--plan-out`` or `skinrig plan` wrote."""
     return Plan.from_json(file.read_bytes(), where=str(file))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DefaultPlan:
-    """What a rig's own plan is of.
+    """Options of a rig's default plan.
 
     Raises
     ------
     CaptureError
-        For a target that the rig has not, when the plan is made.
+        By :meth:`of`, for a target that the rig does not have.
     """
 
     target: str | None = None
-    """What stands in the rig; None: a subject."""
+    """Calibration target in the rig; None: a subject."""
     angles: Sequence[float] | None = None
-    """Of a caliper; None: all. Of a probe one number, of directions."""
+    """Caliper: angles, degrees; None: all. Probe: one number, the count of directions."""
     steps: tuple[int, int] | None = None
-    """Of a caliper: first and last; None: all."""
+    """Caliper: first and last strain step; None: all."""
     sites: Sequence[str] | None = None
-    """Of a probe; None: the usual ones."""
+    """Probe: sites of the skin; None: forehead, cheek and chin."""
     repeats: int = 1
-    """Of a probe's placements, or of a subject's states before the flash rig, all in turn."""
+    """Repeats of the probe's placements, or of the flash rig's expressions, interleaved."""
     states: Sequence[str] = ()
-    """Of a subject before the flash rig; none: neutral."""
+    """Flash rig: expressions of the subject; empty: neutral."""
 
     def of(self, rig: Rig) -> Plan:
-        """Return the plan of a rig."""
+        """Return the default plan of a rig for these options."""
         if "gradient_sphere" in rig.boxes:
             if self.target is None:
                 return gradient_plan(rig, angles=self.angles, steps=self.steps)
@@ -91,17 +91,17 @@ def choose_plan(
     sequence: SequenceOrder | None = None,
     **details: Any,
 ) -> Plan:
-    """Return the plan in ``file``, or the rig's own for a target, or for a subject.
+    """Return the plan in ``file``, or the rig's default for a target or a subject.
 
     Parameters
     ----------
     rig
     file
-        A plan, JSON.
+        A plan, JSON; None: the rig's default plan.
     target
-        What stands in the rig; None: a subject.
+        Calibration target in the rig; None: a subject.
     sequence
-        In time, of the flash rig.
+        Sequence in time (flash rig only).
     details
         Further fields of `DefaultPlan`.
 
@@ -110,32 +110,40 @@ def choose_plan(
     CaptureError
         For an unknown target.
     UsageError
-        For what the rig does not know, or that a plan in a file has already.
+        For an option that is not of this rig, or that a plan in a file fixes already.
     """
-    asked = DefaultPlan(target=target, **details)
-    own = file is None and target is None
+    options = DefaultPlan(target=target, **details)
+    default = file is None and target is None
     if sequence is not None:
-        if not own or "flash" not in rig.boxes:
-            raise UsageError("--sequence: is for the flash rig's own plan of a subject")
+        if not default or "flash" not in rig.boxes:
+            raise UsageError(
+                "--sequence: an option of the flash rig's default plan of a subject; remove it, or "
+                "remove --plan and --target"
+            )
         return sequence_plan(rig, sequence)
-    turns = rig.caliper or (rig.probe and not asked.steps)
-    if (asked.angles or asked.steps) and not (own and turns):
+    has_angles = rig.caliper or (rig.probe and not options.steps)
+    if (options.angles or options.steps) and not (default and has_angles):
         raise UsageError(
-            "--angles, --steps: are for the gradient rig's own plan of skin, --angles for the "
-            "probe's, too"
+            "--angles, --steps: options of the gradient rig's default plan of skin, --angles of "
+            "the probe's too; remove them"
         )
-    if asked.sites and not (own and rig.probe):
-        raise UsageError("--sites: is for the probe's own plan of skin")
-    flash = own and "flash" in rig.boxes
-    if asked.states and not flash:
-        raise UsageError("--state: is for the flash rig's own plan of a subject")
-    if asked.repeats != 1 and not flash and (file is not None or rig.probe is None):
-        raise UsageError("--repeats: is for the probe's own plans and the flash rig's states")
-    return asked.of(rig) if file is None else read_plan(file)
+    if options.sites and not (default and rig.probe):
+        raise UsageError("--sites: an option of the probe's default plan of skin; remove it")
+    flash = default and "flash" in rig.boxes
+    if options.states and not flash:
+        raise UsageError(
+            "--state: an option of the flash rig's default plan of a subject; remove it"
+        )
+    if options.repeats != 1 and not flash and (file is not None or rig.probe is None):
+        raise UsageError(
+            "--repeats: an option of the default plans of the probe, and of the flash rig for a "
+            "subject; remove it"
+        )
+    return options.of(rig) if file is None else read_plan(file)
 
 
 def parse_direction_count(angles: Sequence[float] | None) -> int:
-    """Return how many directions of the probe's head ``--angles N`` asks for; 1 for None.
+    """Return the number of probe directions that ``--angles N`` requests; 1 for None.
 
     Raises
     ------
@@ -152,24 +160,24 @@ def parse_direction_count(angles: Sequence[float] | None) -> int:
     if len(angles) != 1 or not float(angles[0]).is_integer():
         text = ",".join(f"{angle:g}" for angle in angles)
         raise UsageError(
-            f"--angles: got {text!r}, expected how many directions of the probe's head, such as 16"
+            f"--angles: got {text!r}, expected the number of directions of the probe, such as 16"
         )
     return int(angles[0])
 
 
 def needed_boxes(rig: Rig, plan: Plan) -> tuple[str, ...]:
-    """Return the boxes of a rig that a plan uses: a caliper only where it holds skin."""
+    """Return the names of the controllers that a plan uses: the caliper only with strain steps."""
     skin = any(strain_state(step) is not None for step in plan.steps)
     return tuple(name for name in rig.boxes if skin or name != "caliper")
 
 
 def write_plan(plan: Plan, file: Path) -> None:
-    """Write a plan as ``--plan`` takes it; a file that exists may hold somebody's changes.
+    """Write a plan as JSON for ``--plan``, without replacing an existing, perhaps edited, file.
 
     Raises
     ------
     CaptureError
-        Where `file` exists.
+        If `file` exists.
     """
     text = json.dumps(plan.to_json(), indent=1) + "\n"
     try:

@@ -1,4 +1,4 @@
-"""Sequences in time of the flash rig: what is asked for, its plan, and what is said of it."""
+"""Describe and plan sequences in time on the flash rig: prompted expressions and events."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,44 +11,44 @@ from capture.rig import Rig
 EVENT_STATES = ("exercise", "alcohol")
 """States that follow an event instead of prompts."""
 EVENT_DURATIONS_S = {"exercise": "60", "alcohol": "3600"}
-"""How long they are followed by default, s: Jimenez et al. 2010, section 3."""
+"""Default duration of the observation, s: Jimenez et al. 2010, section 3."""
 EVENT_SHOT_PERIODS_S = {"exercise": "5.5", "alcohol": "300"}
-"""Time from shot to shot, s."""
+"""Default time from shot to shot, s."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SequenceOrder:
-    """A sequence that is asked for; times are the decimals that a user wrote."""
+    """Options of a sequence; times are kept as the decimal text that the user typed."""
 
     state: str
-    """An expression that is made and dropped by prompts, or one of :data:`EVENT_STATES`."""
+    """An expression that prompts start and end, or one of :data:`EVENT_STATES`."""
     prompt_period_s: str = "5"
     """Time from prompt to prompt, s."""
     shot_period_s: str | None = None
-    """Time from shot to shot, s; None: 5.5, or of the event."""
+    """Time from shot to shot, s; None: 5.5, or as :data:`EVENT_SHOT_PERIODS_S`."""
     captures: int | None = None
     """Shots of a prompted sequence; None: every phase, a tenth of them twice."""
     duration_s: str | None = None
-    """How long an event is followed, s; None: as :data:`EVENT_DURATIONS_S`."""
+    """Duration of the observation after an event, s; None: as :data:`EVENT_DURATIONS_S`."""
     reaction_s: float | None = None
-    """Mean time from prompt to movement of the person that is simulated, s; None: the simulator's
-    usual one. A real person has their own."""
+    """Mean reaction time from prompt to movement, s, of the simulated subject; None: the
+    simulator's default. Not used with a real subject."""
 
     @property
     def is_prompted(self) -> bool:
-        """Whether prompts make the course, and not an event."""
+        """Whether prompts, not an event, control the sequence."""
         return self.state not in EVENT_STATES
 
     def document(self) -> dict[str, Any]:
-        """Return this as JSON values."""
-        told: dict[str, Any] = {
+        """Return the sequence as JSON values."""
+        values: dict[str, Any] = {
             "state": self.state,
             "prompt_period_s": self.prompt_period_s if self.is_prompted else None,
             "shot_period_s": self.shot_period_s,
             "captures": self.captures,
             "duration_s": self.duration_s,
         }
-        return told if self.reaction_s is None else told | {"reaction_s": self.reaction_s}
+        return values if self.reaction_s is None else values | {"reaction_s": self.reaction_s}
 
 
 def sequence_plan(rig: Rig, order: SequenceOrder, *, darks: int = 4) -> Plan:
@@ -57,7 +57,7 @@ def sequence_plan(rig: Rig, order: SequenceOrder, *, darks: int = 4) -> Plan:
     Raises
     ------
     PlanError
-        Where it cannot be planned: `capture.plan.multiplexed.ReadOutError` for a camera too slow.
+        If it cannot be planned: `capture.plan.multiplexed.ReadOutError` for too slow a camera.
 
     Examples
     --------
@@ -85,7 +85,7 @@ def sequence_plan(rig: Rig, order: SequenceOrder, *, darks: int = 4) -> Plan:
 
 
 def sequence_lines(plan: Plan) -> list[str]:
-    """Return what is to be said of a sequence before it begins; nothing of other plans.
+    """Describe the phase coverage of a prompted sequence in one line; empty for other plans.
 
     Examples
     --------

@@ -18,7 +18,7 @@ def test_a_face_makes_no_white_reference(subject, tmp_path, capsys):
     calibration = tmp_path / "calibration"
     assert main(["calibrate", "white", str(tmp_path / "face"), "--out", str(calibration)]) == 3
     said = capsys.readouterr().err
-    assert "frame S001 of state 'neutral' shows no white tile" in said
+    assert "frame S001 of state 'neutral' does not show a white reference" in said
     assert not calibration.exists()
 
 
@@ -32,11 +32,11 @@ def test_small_simulated_white_reference_works_partial_is_reported(tmp_path, cap
     monkeypatch.setattr(white_reference, "even_fraction", lambda rgb, valid: 0.9)
     assert main(command) == 0
     assert (
-        "found: frame S001 of state 'white': 90 % of the picture is even" in capsys.readouterr().out
+        "found: frame S001 of state 'white': 90 % of the image is even" in capsys.readouterr().out
     )
     monkeypatch.setattr(white_reference, "even_fraction", lambda rgb, valid: 0.3)
     assert main(command) == 3
-    assert "shows no white tile: 30 %" in capsys.readouterr().err
+    assert "does not show a white reference: 30 %" in capsys.readouterr().err
 
 
 def test_imported_photographs_lack_power_required_for_white_reference(tmp_path, capsys):

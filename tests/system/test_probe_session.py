@@ -47,18 +47,18 @@ def test_dry_run_prints_plan_time_light_without_address(capsys):
     assert document["light"]["led_ws"] < document["light"]["limit_ws"]
     assert main(arguments[:-1]) == errors.EXIT_DONE
     printed = capsys.readouterr()
-    assert "not to be looked into" in printed.out + printed.err
+    assert "do not look into the fiber" in printed.out + printed.err
 
 
 @pytest.mark.parametrize(
     ("arguments", "code", "match"),
     [
-        (["--angles", "0,90"], errors.EXIT_USAGE, "how many directions"),
+        (["--angles", "0,90"], errors.EXIT_USAGE, "number of directions"),
         (["--steps", "-1..1"], errors.EXIT_USAGE, "--steps"),
         (["--sites", "cheek,cheek"], errors.BAD_INPUT, "none twice"),
         (["--repeats", "0"], errors.BAD_INPUT, "repeats"),
         (["--target", "ball"], errors.BAD_INPUT, "expected one of phantom, dark"),
-        (["--target", "phantom", "--sites", "cheek"], errors.EXIT_USAGE, "own plan of skin"),
+        (["--target", "phantom", "--sites", "cheek"], errors.EXIT_USAGE, "default plan of skin"),
     ],
 )
 def test_a_wrong_option_is_named(capsys, arguments, code, match):

@@ -80,7 +80,7 @@ def test_two_balls_rigs_or_other_kinds_are_refused(tmp_path):
     lit = {"pattern": "full", "level": 0.1, "exposure_s": 0.018, "polarizer": "parallel"}
     frames = [("ball", lit, np.full((128, 128), 64, np.uint16))]
     two = [Shelf(frames=frames, name="A"), Shelf(frames=frames, name="B")]
-    with pytest.raises(CalibratingError, match="has moved"):
+    with pytest.raises(CalibratingError, match="ball moves"):
         calibrate_gradient("lights", TargetSessions(two, tmp_path, MADE))
     other = Shelf(dataclasses.replace(RIG, name="other"))
     with pytest.raises(CalibratingError, match="expected one rig"):

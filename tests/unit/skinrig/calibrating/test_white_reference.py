@@ -82,5 +82,5 @@ def test_face_before_uniform_wall_is_not_a_tile(rng):
     inside = x**2 / 0.3**2 + y**2 / 0.45**2 < 1  # a sixth of the picture
     skin = np.sqrt(np.clip(1 - x**2 / 0.3**2 - y**2 / 0.45**2, 0, 1))[..., None] * (0.5, 0.4, 0.2)
     picture = np.where(inside[..., None], skin, picture)
-    with pytest.raises(NoWhiteReferenceError, match="frame 1 shows no white tile"):
+    with pytest.raises(NoWhiteReferenceError, match="frame 1 does not show a white reference"):
         check_white_reference(picture, np.ones((256, 384), bool), "frame 1")

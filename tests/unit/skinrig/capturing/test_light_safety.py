@@ -23,5 +23,5 @@ def test_every_figure_is_described_with_percent(name, plan_of):
     told = dict(rows)
     assert told["energy from that LED, Ws"] == figures["led_ws"]
     if "blue_share" in figures:
-        share = "of the blue-light limit of one that is stared at, %"
+        share = "fraction of the blue-light limit, staring into that LED, %"
         assert told[share] == 100 * figures["blue_share"]

@@ -24,8 +24,8 @@ def test_patterns_on_skin_require_closed_or_shielded_eyes():
     assert figures["state_s"] == pytest.approx(0.5, rel=0.02)
     assert figures["duty"] <= RIG.leds.max_duty
     first, _, last = light_lines(plan, RIG)
-    assert first.endswith("eyes must be closed or shielded: the patch may lie beside one")
-    assert last.startswith("patterns: 0.50 s of light a state")
+    assert first.endswith("eyes must be closed or shielded: the patch may be next to an eye")
+    assert last.startswith("patterns: 0.50 s of light per strain step")
 
 
 def test_sphere_targets_may_be_viewed_with_open_eyes():
