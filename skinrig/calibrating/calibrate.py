@@ -1,4 +1,4 @@
-"""From sessions of targets to CALIBRATION/: hands the frames of a session to the estimators."""
+"""Estimate calibrations from sessions of targets and save them in CALIBRATION/."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ CALIBRATION_KINDS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SavedCalibration(CalibrationResult):
-    """A calibration that was made, and how it differs from the one before it."""
+    """A saved calibration and its drift from the one that it replaced."""
 
     path: Path
     drift: tuple[store.CalibrationDrift, ...]
@@ -51,7 +51,7 @@ def calibrate(
     targets: dome.DomeTargets | None = None,
     phantom: str | Path | None = None,
 ) -> SavedCalibration:
-    """Make one kind of calibration from target sessions and save it.
+    """Estimate one kind of calibration from target sessions and save it.
 
     Parameters
     ----------
@@ -61,26 +61,27 @@ def calibrate(
         Folders; frames of all of them are pooled. They must come from one camera, those of a
         dome's "geometry" and "lights" from one rig.
     out
-        The CALIBRATION/ folder; an older calibration of the kind is compared, then replaced.
+        The CALIBRATION/ folder. An older calibration of the kind is replaced, and the drift
+        between the two is reported.
     created
         Date of the calibration; None: that of the latest session.
     targets
-        What stood in the dome.
+        Sizes of the targets in the dome.
     phantom
-        Certificate of the block that a probe's "fibre" was measured on; None: of a simulated
-        session the simulated block's.
+        Certificate of the phantom that a probe's "fibre" was measured on; None: that of the
+        simulated phantom, for simulated sessions only.
 
     Raises
     ------
     CalibratingError
         When a needed kind of frame is missing, or the sessions come from several cameras.
-    NoTileError
-        When the frames for "white" show something else than a white tile.
+    NoWhiteReferenceError
+        When the frames for "white" do not show a white reference.
     """
     one_of("kind", kind, CALIBRATION_KINDS, CalibratingError)
     opened = [Session.open(path) for path in sessions]
     if not opened:
-        raise CalibratingError("sessions: got none, expected at least one folder")
+        raise CalibratingError("sessions: got none, expected at least one folder; name it")
     made_on = created or max(s.manifest.created_at.date() for s in opened)
     given = TargetSessions(opened, Path(out), made_on)
     if kind == probe.FIBER_CALIBRATION_KIND:
@@ -126,30 +127,30 @@ class _Frames:
         self.findings: list[str] = []
 
     def require_frames(self, kind: str, **index: str | int | float) -> Shots:
-        """Return records with their frames, or raise where there are none."""
+        """Return records with their raw frames; raise if there are none."""
         found = self._targets.require_frames("flash", kind, **index)
         return [(record, session.read(record)) for record, session in found]
 
     def read_setting(self, record: FrameRecord, name: str) -> float:
-        """Return a number that a frame was taken with."""
+        """Return a numeric setting that a frame was captured with."""
         try:
             return float(record.settings[name])
         except KeyError:
             raise CalibratingError(
                 f"sessions: frame {record.step_id} of rig {self.rig.name!r} lacks its {name};"
-                " photographs that were imported never do: capture the target with the rig"
+                " imported photographs have none: capture the target with the rig"
                 " (`skinrig capture flash --target ...`)"
             ) from None
 
     def dark_level(self) -> Float32Array | float:
-        """Return what a frame without light shows above its black level, (h, w, 3)."""
+        """Return the mean dark signal above the black level, (h, w, 3); 0 without dark frames."""
         found = self._targets.frames("dark")
         darks = [image.rgb for image in _linear([(r, session.read(r)) for r, session in found])]
         return np.mean(darks, axis=0, dtype=np.float32) if darks else 0.0
 
 
 def _linear(shots: Shots) -> list[raw.LinearImage]:
-    """Return camera RGB of frames at half their resolution."""
+    """Return linear camera RGB of frames at half the sensor's resolution."""
     return [raw.linear_rgb(frame, demosaic="centered") for _, frame in shots]
 
 
@@ -176,28 +177,29 @@ def _white(frames: _Frames) -> store.Calibration:
         frames.findings += white_reference.check_white_reference(
             image.rgb - dark, image.valid, what
         )
-    # the tile depolarizes: crossed filters pass half of its light, the diffuse total is twice that
+    # The reference depolarizes: its diffuse light D splits evenly over both polarizations, so the
+    # crossed image is D / 2. Hence D = 2 I_crossed, and var(D) = 4 var(I_crossed).
     reference = white.white_reference(
         [2.0 * (image.rgb - dark) for image in linear],
         variances=[4.0 * image.variance for image in linear],
         valid=[image.valid for image in linear],
         lights=powers,
         reflectance=WHITE_REFERENCE_REFLECTANCE,
-        # every pixel by itself: what the pixels' own gains differ by must cancel in the ratio
+        # no smooth fit: the gain of each pixel (PRNU) must cancel in the ratio to the reference
         degree=None,
     )
     return reference.to_calibration(**frames.about)
 
 
 WHITE_REFERENCE_REFLECTANCE = 0.99
-"""Of the white tile, pressed PTFE or the like, between 400 and 700 nm."""
+"""Reflectance of the white reference (pressed PTFE or similar) from 400 to 700 nm."""
 
 
 def _color(frames: _Frames) -> store.Calibration:
     dark = frames.dark_level()
     linear = _linear(frames.require_frames("chart", polarizer="crossed"))
-    image = np.mean([picture.rgb - dark for picture in linear], axis=0)
-    valid = np.logical_and.reduce([picture.valid for picture in linear])
+    image = np.mean([each.rgb - dark for each in linear], axis=0)
+    valid = np.logical_and.reduce([each.valid for each in linear])
     centers = chart.find_chart(image)
     patches = chart.measure_patches(image, centers, valid=valid)
     neutral = color.neutral_white(patches.rgb, valid=patches.valid)
@@ -217,12 +219,15 @@ def _polarization(frames: _Frames) -> store.Calibration:
     shots = frames.require_frames("malus")
     angles = np.deg2rad([frames.read_setting(record, "analyser_deg") for record, _ in shots])
     linear = _linear(shots)
-    images = [picture.rgb - dark for picture in linear]
-    valid = np.logical_and.reduce([picture.valid for picture in linear])
+    images = [each.rgb - dark for each in linear]
+    valid = np.logical_and.reduce([each.valid for each in linear])
     chosen = polarization.find_modulated_pixels(angles, images, valid=valid)
     count = int(np.count_nonzero(chosen))
     if not count:
-        raise CalibratingError("malus frames: no pixel follows the analyser; check the target")
+        raise CalibratingError(
+            "malus frames: no pixel follows the analyser; capture bare rough metal"
+        )
+    # mean over n independent pixels: its variance is sum(var) / n^2
     mean = np.array([image[chosen].mean(axis=0) for image in images])
     variance = np.array([p.variance[chosen].sum(axis=0) for p in linear]) / count**2
     fit = polarization.fit_malus(angles, mean, variance=variance)

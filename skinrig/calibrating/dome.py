@@ -1,4 +1,4 @@
-"""Sessions of the dome's targets to its calibrations: geometry, and lights."""
+"""Calibrate the geometry and the lights of a dome from sessions of its targets."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -25,14 +25,14 @@ from skinrig.calibrating.outcome import (
 
 DOME_CALIBRATION_KINDS = ("geometry", "lights")
 LIGHT_TOLERANCE_MM = 5.0
-"""Standard deviation of the lights about the drawing: it matters only where few highlights were
-seen."""
-SESSION_STEP = 1000  # poses of the k-th session are numbered from k times this
+"""Standard deviation of light positions about nominal: a prior that matters only for lights with
+few observed highlights."""
+SESSION_STEP = 1000  # poses of session k are numbered from k * SESSION_STEP, so none coincide
 
 
 @dataclass(frozen=True, slots=True)
 class DomeTargets:
-    """What stood in the dome; the values are those of the simulated targets."""
+    """Sizes of the dome's targets; the defaults are those of the simulated targets."""
 
     board: Board = field(
         default_factory=lambda: Board.of(("charuco", 7, 5, "4X4_50"), square_mm=36.0)
@@ -42,7 +42,7 @@ class DomeTargets:
 
 
 def dome_targets(square_mm: float, sphere_radius_mm: float) -> DomeTargets:
-    """Return targets of other sizes: side of the board's squares, radius of the sphere, mm."""
+    """Return targets of other sizes: side of the board's squares and radius of the sphere, mm."""
     board = Board.of(("charuco", 7, 5, "4X4_50"), square_mm=square_mm)
     return DomeTargets(board, sphere_radius_mm)
 
@@ -50,29 +50,32 @@ def dome_targets(square_mm: float, sphere_radius_mm: float) -> DomeTargets:
 def calibrate_dome(
     kind: str, sessions: TargetSessions, targets: DomeTargets | None = None
 ) -> CalibrationResult:
-    """Make the calibration "geometry" or "lights" of a dome.
+    """Estimate the calibration "geometry" or "lights" of a dome.
 
     Parameters
     ----------
     kind
         One of :data:`DOME_CALIBRATION_KINDS`.
-    given
-        For "geometry" sessions of the board; for "lights" of the mirror sphere, the white plate,
-        or both. Lights need the folder's geometry; what moved is told from its last geometry.
+    sessions
+        For "geometry", sessions of the board; for "lights", of the mirror sphere, the white plate,
+        or both. "lights" needs the folder's geometry; "geometry" is compared with the folder's
+        previous one, and cameras that moved are reported.
     targets
         Sizes of the targets.
 
     Raises
     ------
     CalibratingError
-        When the frames that are needed are missing.
+        When required frames are missing, or the sessions are not of one dome.
     """
     rigs = {session.rig.name for session in sessions.sessions}
     if len(rigs) != 1:
-        raise CalibratingError(f"sessions: got rigs {sorted(rigs)}, expected one")
+        raise CalibratingError(
+            f"sessions: got rigs {sorted(rigs)}, expected one; calibrate each rig separately"
+        )
     if "dome" not in sessions.rig.boxes:
         raise CalibratingError(
-            f"kind {kind!r}: got a session of rig {rigs.pop()!r}, expected one of a dome"
+            f"kind {kind!r}: got a session of rig {rigs.pop()!r}, expected one of a dome; name one"
         )
     return (_geometry if kind == "geometry" else _lights)(sessions, targets or DomeTargets())
 
@@ -80,7 +83,7 @@ def calibrate_dome(
 def _frames(
     sessions: TargetSessions, kind: str, index_name: str
 ) -> Iterator[tuple[int, Session, FrameRecord]]:
-    """Yield frames with the number of their place, over all sessions."""
+    """Yield the frames of all sessions with their pose number, unique over the sessions."""
     for number, session in enumerate(sessions.sessions):
         for record in session.frames(kind):
             yield SESSION_STEP * number + int(record.index[index_name]), session, record
@@ -100,7 +103,7 @@ def _geometry(sessions: TargetSessions, targets: DomeTargets) -> CalibrationResu
     if not sightings:
         raise CalibratingError(
             f"sessions: the board was found in none of {without} frames of kind 'charuco'; capture"
-            " it (`skinrig simulate dome --target charuco`), or say its squares"
+            " it (`skinrig simulate dome --target charuco`), or give the side of its squares"
         )
     start = geometry.nominal_cameras(rig)
     findings = _describe_movement(sightings, targets.board, sessions.folder, rig)
@@ -113,10 +116,10 @@ def _geometry(sessions: TargetSessions, targets: DomeTargets) -> CalibrationResu
     ]
     for name, camera in found.cameras.items():
         center, error = camera.center_mm, np.sqrt(np.diag(found.center_covariance_mm2[name]))
-        place = ", ".join(f"{c:.2f} ± {e:.2f}" for c, e in zip(center, error, strict=True))
+        position = ", ".join(f"{c:.2f} ± {e:.2f}" for c, e in zip(center, error, strict=True))
         focal, focal_error = camera.matrix[0, 0], camera.matrix_stderr[0, 0]
-        told = f"centre {place} mm; f {focal:.1f} ± {focal_error:.1f} px"
-        summary.append((f"{name} ({camera.serial})", f"{found.rms_px[name]:.3f} px; {told}"))
+        text = f"center {position} mm; f {focal:.1f} ± {focal_error:.1f} px"
+        summary.append((f"{name} ({camera.serial})", f"{found.rms_px[name]:.3f} px; {text}"))
     calibration = geometry.to_calibration(
         found.cameras, reprojection_px=found.rms_px, **sessions.provenance()
     )
@@ -126,7 +129,7 @@ def _geometry(sessions: TargetSessions, targets: DomeTargets) -> CalibrationResu
 def _describe_movement(
     sightings: Mapping[tuple[str, int], CornerObservation], board: Board, folder: Path, rig: Rig
 ) -> tuple[str, ...]:
-    """Return what moved since the geometry in a folder; nothing without one."""
+    """Describe the cameras that moved since the geometry in a folder; empty without one."""
     try:
         previous = geometry.cameras_from_calibration(store.load(folder, "geometry"), rig)
         return tuple(str(moved) for moved in bundle.find_moved_cameras(sightings, board, previous))
@@ -144,29 +147,35 @@ def _lights(sessions: TargetSessions, targets: DomeTargets) -> CalibrationResult
     kinds = {record.kind for session in sessions.sessions for record in session.frames()}
     if not kinds & {"mirror", "white"}:
         raise CalibratingError(
-            "sessions: hold no frames of kind 'mirror' or 'white'; capture a target (`skinrig"
+            "sessions: got no frames of kind 'mirror' or 'white'; capture a target (`skinrig"
             " simulate dome --target mirror`, `--target white`)"
         )
     if "mirror" in kinds:
-        places = _mirror(sessions, cameras, targets)
+        positions = _mirror(sessions, cameras, targets)
+        # lights are mounted facing the rig's origin, so the axis is minus the position
         table = replace(
             table,
-            position_mm=places.position_mm,
-            position_stderr_mm=places.stderr_mm,
-            axis=-places.position_mm,
-            valid=places.valid,
+            position_mm=positions.position_mm,
+            position_stderr_mm=positions.stderr_mm,
+            axis=-positions.position_mm,
+            valid=positions.valid,
         )
-        error = np.linalg.norm(places.stderr_mm[places.valid], axis=1)
+        error = np.linalg.norm(positions.stderr_mm[positions.valid], axis=1)
         summary += [
-            ("lights placed", f"{int(places.valid.sum())} of {len(rig.lights)}"),
-            ("standard error of a place", f"{np.median(error):.2f} mm, worst {error.max():.2f} mm"),
-            ("noise of a highlight", f"{places.sigma_px:.3f} px"),
+            ("lights placed", f"{int(positions.valid.sum())} of {len(rig.lights)}"),
+            (
+                "standard error of a place",
+                f"median {np.median(error):.2f} mm, worst {error.max():.2f} mm",
+            ),
+            ("noise of a highlight", f"{positions.sigma_px:.3f} px"),
         ]
-        few = [n for n, ok in zip(places.names, places.valid, strict=True) if not ok]
+        few = [n for n, ok in zip(positions.names, positions.valid, strict=True) if not ok]
         if few:
-            findings.append(f"seen by too few cameras to be placed, left out: {', '.join(few)}")
-        findings += [f"light {a} shone at the place of {b}" for a, b in places.swapped.items()]
-        findings += [f"light {name} was never seen in a sphere" for name in places.unobserved]
+            findings.append(f"observed by too few cameras to locate, omitted: {', '.join(few)}")
+        findings += [
+            f"light {a} shone at the position of {b}" for a, b in positions.swapped.items()
+        ]
+        findings += [f"light {name} was not observed in a sphere" for name in positions.unobserved]
     else:
         notes["positions"] = "nominal: no session of the mirror sphere was given"
     if "white" in kinds:
@@ -176,9 +185,7 @@ def _lights(sessions: TargetSessions, targets: DomeTargets) -> CalibrationResult
         lit = table.intensity[table.valid]
         relative = table.intensity_stderr[table.valid] / np.where(lit > 0, lit, 1.0)
         count = int((table.intensity > 0).all(axis=1).sum())
-        shared = (
-            f"{100 * targets.plate.reflectance_stderr:.1f} % in common: the plate's reflectance"
-        )
+        shared = f"{100 * targets.plate.reflectance_stderr:.1f} % common to all: plate reflectance"
         summary += [
             ("lights measured", f"{count} of {len(rig.lights)}, in {fit.frames} frames"),
             ("standard error of an intensity", f"{100 * np.median(relative):.2f} % (and {shared})"),
@@ -191,7 +198,7 @@ def _lights(sessions: TargetSessions, targets: DomeTargets) -> CalibrationResult
         findings += [f"light {name} is dead" for name in fit.dead]
         findings += [f"light order: {a} shows the shading of {b}" for a, b in fit.swapped.items()]
         if fit.unobserved:
-            findings.append(f"the plate never faced {', '.join(fit.unobserved)}: left out")
+            findings.append(f"the plate never faced {', '.join(fit.unobserved)}: omitted")
     else:
         notes["intensities"] = "nominal and relative: no session of the white plate was given"
     calibration = table.to_calibration(
@@ -203,7 +210,7 @@ def _lights(sessions: TargetSessions, targets: DomeTargets) -> CalibrationResult
 def _mirror(
     sessions: TargetSessions, cameras: Mapping[str, geometry.CameraPose], targets: DomeTargets
 ) -> mirror_lights.LightPositions:
-    """Return the lights' places from the frames of mirror spheres."""
+    """Locate the lights from their highlights in the frames of mirror spheres."""
     lights = sessions.rig.lights
     outlines: dict[int, dict[str, Float64Array]] = {}
     colors: dict[str, Float64Array] = {}
@@ -218,15 +225,15 @@ def _mirror(
             outlines.setdefault(sphere, {})[record.camera] = edges
     if not outlines:
         raise CalibratingError(
-            "sessions: no outline of a mirror sphere was found; its frames of the lit dome (index"
-            " light = 'outline') must show it darker than what is behind it"
+            "sessions: no outline of a mirror sphere was found; capture it with the lit dome (index"
+            " light = 'outline'), darker than the background"
         )
     spheres = {
         number: mirror_sphere.locate_sphere(edges, cameras, targets.sphere_radius_mm)
         for number, edges in outlines.items()
     }
     windows: dict[tuple[str, int], mirror_lights.SphereWindow] = {}
-    seen = []
+    highlights = []
     for sphere, session, record in _frames(sessions, "mirror", "sphere"):
         lit_dome = record.index.get("light") == "outline"
         if lit_dome or sphere not in spheres or record.camera not in colors:
@@ -236,9 +243,10 @@ def _mirror(
             windows[key] = mirror_lights.SphereWindow.of(cameras[record.camera], spheres[sphere])
         image = neutral_mosaic(session.read(record), colors[record.camera])
         pixels = mirror_lights.find_highlights(image, windows[key])
-        seen.append(mirror_lights.Highlights(record.camera, sphere, _lit_lights(record), pixels))
+        lit = _lit_lights(record)
+        highlights.append(mirror_lights.Highlights(record.camera, sphere, lit, pixels))
     return mirror_lights.locate_lights(
-        seen,
+        highlights,
         cameras,
         spheres,
         {light.name: np.array(light.position_mm) for light in lights},
@@ -248,15 +256,15 @@ def _mirror(
 
 
 def _lit_lights(record: FrameRecord) -> tuple[str, ...]:
-    """Return the names of the lights that were on."""
-    several = str(record.settings.get("leds", ""))
-    return tuple(several.split("+")) if several else (str(record.settings["light"]),)
+    """Return the names of the lights that were on in a frame."""
+    joined = str(record.settings.get("leds", ""))
+    return tuple(joined.split("+")) if joined else (str(record.settings["light"]),)
 
 
 def _white(
     sessions: TargetSessions, cameras: Mapping[str, geometry.CameraPose], targets: DomeTargets
 ) -> list[PlateSamples]:
-    """Return the parts of the white plate in all frames lit by one light."""
+    """Return the samples of the white plate in all one-light-at-a-time frames."""
     markers: dict[tuple[str, int], CornerObservation] = {}
     for pose, session, record in _frames(sessions, "white", "pose"):
         if record.index.get("light") == "several":
@@ -266,26 +274,27 @@ def _white(
                 markers[record.camera, pose] = sighting
     if not markers:
         raise CalibratingError(
-            "sessions: the white plate's markers were found in no frame lit by several lights"
-            " (index light = 'several')"
+            "sessions: the white plate's markers were not found in any frame lit by several lights"
+            " (index light = 'several'); capture the plate with all four markers in view"
         )
-    places = {
+    poses = {
         pose: bundle.estimate_board_pose(markers, targets.plate, cameras, pose)
         for pose in {pose for _, pose in markers}
     }
     windows: dict[tuple[str, int], PlateWindow | None] = {}
     samples = []
     for pose, session, record in _frames(sessions, "white", "pose"):
-        if record.index.get("light") == "several" or pose not in places:
+        if record.index.get("light") == "several" or pose not in poses:
             continue
         key = (record.camera, pose)
         if key not in windows:
-            windows[key] = PlateWindow.of(cameras[record.camera], places[pose], targets.plate)
+            windows[key] = PlateWindow.of(cameras[record.camera], poses[pose], targets.plate)
         window = windows[key]
         if window is None:
             continue
         shot = raw.linear_rgb(session.read(record), demosaic="centered")
+        # pulse-width modulation: the light is on for the fraction `level` of the exposure
         on_s = float(record.settings["exposure_s"]) * float(record.settings["level"])
-        light, seen = str(record.settings["light"]), (shot.rgb, shot.variance, shot.valid)
-        samples.append(window.sample(*seen, view=record.camera, light=light, on_s=on_s))
+        light, image = str(record.settings["light"]), (shot.rgb, shot.variance, shot.valid)
+        samples.append(window.sample(*image, view=record.camera, light=light, on_s=on_s))
     return samples

@@ -1,4 +1,4 @@
-"""Sessions of the gradient sphere's targets to its calibrations: sensor, lights, polarization."""
+"""Calibrate sensor, lights and polarization of a gradient sphere from sessions of its targets."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -22,7 +22,7 @@ from skinrig.calibrating.outcome import (
 
 GRADIENT_CALIBRATION_KINDS = ("sensor", "lights", "polarization")
 ANALYZER_READING_DEG = {"parallel": 0.0, "crossed": 90.0}
-"""Reading of the analyser in each of its named states."""
+"""Reading of the analyzer, degrees, in each of its named settings."""
 
 
 def has_gradient_session(sessions: Sequence[Session]) -> bool:
@@ -31,33 +31,32 @@ def has_gradient_session(sessions: Sequence[Session]) -> bool:
 
 
 def calibrate_gradient(kind: str, sessions: TargetSessions) -> CalibrationResult:
-    """Make the calibration "sensor", "lights" or "polarization" of a gradient sphere.
+    """Estimate the calibration "sensor", "lights" or "polarization" of a gradient sphere.
 
     Parameters
     ----------
     kind
         One of :data:`GRADIENT_CALIBRATION_KINDS`.
-    given
-        For "sensor" sessions of the flat field; for the others of the ball of black glass, one
-        session. Lights are corrected by the flat field of the folder's sensor.
+    sessions
+        For "sensor", sessions of the flat field; otherwise one session of the black glass ball.
+        Light intensities are corrected by the flat field of the folder's sensor calibration.
 
     Raises
     ------
     CalibratingError
-        When the frames that are needed are missing, or are of several rigs or cameras.
+        When required frames are missing, or are of several rigs or cameras.
     BallError, PolarizationError
-        When the ball's frames do not tell what is wanted.
+        When the frames of the ball do not determine the result.
     """
     rigs = {session.rig.name for session in sessions.sessions}
     if len(rigs) != 1 or len(sessions.serials) != 1:
         raise CalibratingError(
             f"sessions: got rigs {sorted(rigs)} with cameras {sorted(sessions.serials)}, expected"
-            f" one"
-            " rig with one camera"
+            " one rig with one camera; calibrate each separately"
         )
     if kind not in GRADIENT_CALIBRATION_KINDS:
         known = ", ".join(GRADIENT_CALIBRATION_KINDS)
-        raise CalibratingError(f"kind: got {kind!r}, expected one of {known} of rig {rigs.pop()!r}")
+        raise CalibratingError(f"kind: got {kind!r}, expected {known} for rig {rigs.pop()!r}")
     if kind == "sensor":
         return _sensor(sessions)
     survey, notes = _survey(sessions)
@@ -74,21 +73,22 @@ def _survey(sessions: TargetSessions) -> tuple[SphereSurvey, tuple[str, ...]]:
     with_ball = {session.id for _, session in sessions.require_frames("gradient", "ball")}
     if len(with_ball) > 1:
         raise CalibratingError(
-            f"sessions: got {len(with_ball)} of the ball, expected one; between two the ball has"
-            " moved, so calibrate from each alone"
+            f"sessions: got {len(with_ball)} of the ball, expected one, because the ball moves"
+            " between sessions; name one of them"
         )
     flat, notes = _flat_field(sessions)
     shots = tuple(_shots(sessions, flat))
     if not shots:
         raise CalibratingError(
-            "sessions: hold no frames of the ball under pattern 'full' at a level above 0"
+            "sessions: got no frames of the ball under pattern 'full' at a level above 0; capture"
+            " the whole plan of `--target ball`"
         )
     view = sessions.rig.views[0].name
     return survey_sphere(shots, sessions.rig, view=view, target=GlassBall()), notes
 
 
 def _shots(sessions: TargetSessions, flat: Float64Array | float) -> Iterator[SpotImage]:
-    """Yield the exposures of the lit ball, the dark of their own exposure time taken off."""
+    """Yield the exposures of the lit ball, minus the mean dark frame of the same exposure time."""
     darks: dict[float, list[Float32Array]] = defaultdict(list)
     lit: list[tuple[FrameRecord, Session]] = []
     for record, session in sessions.require_frames("gradient", "ball"):
@@ -104,6 +104,7 @@ def _shots(sessions: TargetSessions, flat: Float64Array | float) -> Iterator[Spo
         exposure_s = float(record.settings["exposure_s"])
         dark = means.get(exposure_s)
         count = len(darks[exposure_s])
+        # noise profile: variance = scale * signal + offset; the mean of n darks has offset / n
         offset = 0.0 if frame.noise_profile is None else frame.noise_profile[1]
         yield make_spot_image(
             frame,
@@ -121,23 +122,23 @@ def _above_black(frame: RawFrame) -> Float32Array:
 
 
 def _light_s(record: FrameRecord) -> float:
-    """Return the seconds at full level that give as much light as a frame had."""
+    """Return the exposure, s, at full level that gives the same light as the frame's."""
     return float(record.settings["level"]) * float(record.settings["exposure_s"])
 
 
 def _reading_deg(record: FrameRecord) -> float:
-    asked = record.settings.get("analyser_deg")
-    if asked is not None:
-        return float(asked)
+    reading = record.settings.get("analyser_deg")
+    if reading is not None:
+        return float(reading)
     return ANALYZER_READING_DEG[str(record.settings["polarizer"])]
 
 
 def _flat_field(sessions: TargetSessions) -> tuple[Float64Array | float, tuple[str, ...]]:
-    """Return the camera's flat field, from the folder's sensor calibration where there is one."""
+    """Return the camera's flat field from the folder's sensor calibration, or 1 and a note."""
     known = sessions.sensor()
     if known is None:
         return 1.0, (
-            "the folder holds no sensor calibration: intensities hold the lens's own shading;"
+            "the folder has no sensor calibration: intensities include the lens's shading;"
             " calibrate sensor first",
         )
     view = sessions.rig.views[0]
@@ -181,34 +182,41 @@ def _lights_summary(survey: SphereSurvey) -> tuple[tuple[str, str], ...]:
     center = ", ".join(f"{c:+.3f} ± {e:.3f}" for c, e in zip(ball.center_mm, error, strict=False))
     angle = np.degrees(np.linalg.norm(table.directions_stderr, axis=1))[table.seen]
     shining = table.valid & ~table.dead
-    share = 100 * (table.intensities_stderr / np.maximum(table.intensities, 1e-9))[shining]
+    relative = 100 * (table.intensities_stderr / np.maximum(table.intensities, 1e-9))[shining]
     return (
         ("ball's middle", f"{center} mm"),
         ("ball's radius", f"{ball.radius_mm:.3f} ± {error[3]:.3f} mm"),
         ("lights seen", f"{int(table.seen.sum())} of {len(table.names)}"),
         ("lights off their places", f"{survey.light_scatter_mm:.2f} mm"),
-        ("standard error of a direction", f"{np.median(angle):.3f}°, worst {angle.max():.3f}°"),
+        (
+            "standard error of a direction",
+            f"median {np.median(angle):.3f}°, worst {angle.max():.3f}°",
+        ),
         (
             "intensities measured",
-            f"{int(shining.sum())}, scatter {100 * np.std(table.intensities[shining]):.1f} %",
+            f"{int(shining.sum())}, standard deviation"
+            f" {100 * np.std(table.intensities[shining]):.1f} %",
         ),
-        ("standard error of an intensity", f"{np.median(share):.2f} %, worst {share.max():.1f} %"),
+        (
+            "standard error of an intensity",
+            f"median {np.median(relative):.2f} %, worst {relative.max():.1f} %",
+        ),
     )
 
 
 def _polarizer_summary(survey: SphereSurvey) -> tuple[tuple[str, str], ...]:
-    films = survey.polarizers
-    zero, error = np.degrees([films.misalignment_rad, films.misalignment_stderr_rad])
-    leaked, glass = films.leakage, films.glass_leakage[films.valid]
+    fit = survey.polarizers
+    zero, error = np.degrees([fit.misalignment_rad, fit.misalignment_stderr_rad])
+    leaked, glass = fit.leakage, fit.glass_leakage[fit.valid]
     low = f"9 of 10 lights below {100 * np.quantile(leaked, 0.9):.2f} %"
     rows = {
         "analyser's misalignment": f"{zero:+.3f}° ± {error:.3f}°",
-        "extinction of the lights' films": _extinction(films.light_leak, films.light_leak_stderr),
-        "extinction of the analyser": _extinction(films.analyser_leak, films.analyser_leak_stderr),
+        "extinction of the lights' films": _extinction(fit.light_leak, fit.light_leak_stderr),
+        "extinction of the analyser": _extinction(fit.analyser_leak, fit.analyser_leak_stderr),
         "lights' polarizers off their axes": f"{np.degrees(survey.turn_scatter_rad):.2f}°",
         "glass leaks crossed": f"median {100 * np.median(glass):.2f} %,"
-        f" most {100 * glass.max():.1f} % of parallel",
-        f"skin (eta {films.eta:g}) will leak": f"median {100 * np.median(leaked):.3f} %, {low}",
+        f" highest {100 * glass.max():.1f} % of parallel",
+        f"skin (eta {fit.eta:g}) will leak": f"median {100 * np.median(leaked):.3f} %, {low}",
         "readings of the analyser": ", ".join(f"{r:g}" for r in survey.readings_deg),
     }
     return tuple(rows.items())

@@ -1,4 +1,4 @@
-"""What the calibrations of all rigs share: results, provenance, the camera's sensor."""
+"""Shared parts of all rigs' calibrations: results, target sessions, sensor calibration."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,34 +17,34 @@ from skinrig.arrays import UInt16Array
 
 
 class CalibratingError(ValueError):
-    """Sessions that do not hold what a calibration needs."""
+    """Sessions that lack frames or settings that a calibration needs."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationResult:
-    """A calibration and what to say of it."""
+    """A calibration with its summary and findings."""
 
     calibration: store.Calibration
     summary: tuple[tuple[str, str], ...]
-    """Quantity and value with standard error."""
+    """Rows of quantity and value with standard error."""
     findings: tuple[str, ...] = ()
-    """What is wrong with the rig."""
+    """Defects of the rig."""
 
 
 @dataclass(frozen=True, slots=True)
 class TargetSessions:
-    """Sessions of targets that a calibration is made of."""
+    """Sessions of targets that a calibration is estimated from."""
 
     sessions: Sequence[Session]
     """One or more, of one rig."""
     folder: Path
-    """CALIBRATION/, with what was calibrated before."""
+    """CALIBRATION/, with the previous calibrations."""
     created: date
     """Date of the calibration."""
 
     @property
     def rig(self) -> Rig:
-        """The rig, as of the first session."""
+        """The rig of the first session."""
         return self.sessions[0].rig
 
     @property
@@ -62,7 +62,7 @@ class TargetSessions:
         }
 
     def frames(self, kind: str, **index: str | int | float) -> list[tuple[FrameRecord, Session]]:
-        """Return the frames of a kind, of all sessions."""
+        """Return the frames of a kind in all sessions."""
         return [
             (record, session)
             for session in self.sessions
@@ -72,7 +72,13 @@ class TargetSessions:
     def require_frames(
         self, rig: str, kind: str, **index: str | int | float
     ) -> list[tuple[FrameRecord, Session]]:
-        """Return the frames of a kind, or raise where there are none and say how to get them."""
+        """Return the frames of a kind; raise if there are none.
+
+        Raises
+        ------
+        CalibratingError
+            With the commands that capture them.
+        """
         found = self.frames(kind, **index)
         if not found:
             wanted = " ".join([kind, *(f"{k}={v}" for k, v in index.items())])
@@ -84,7 +90,7 @@ class TargetSessions:
         return found
 
     def sensor(self) -> SensorCalibration | None:
-        """Return the folder's sensor calibration of the first camera; None: it has none."""
+        """Return the folder's sensor calibration of the first camera, or None."""
         serial = self.rig.views[0].serial
         try:
             found = store.load(self.folder, "sensor")
@@ -96,7 +102,7 @@ class TargetSessions:
 
 
 def number_findings(findings: Iterable[str]) -> Mapping[str, str]:
-    """Return findings as notes of a calibration.
+    """Return findings as numbered notes of a calibration file.
 
     Examples
     --------
@@ -109,12 +115,13 @@ def number_findings(findings: Iterable[str]) -> Mapping[str, str]:
 def photon_transfer(
     flats: Sequence[tuple[float, RawFrame]], darks: Sequence[tuple[float, RawFrame]]
 ) -> SensorCalibration:
-    """Return a sensor's calibration from flat frames with their light and darks with their time.
+    """Calibrate a sensor by the photon transfer method from flat and dark frames.
 
     Parameters
     ----------
     flats
-        Light, any unit, and frame; of equal light each two follow each other as a pair.
+        Light, any unit, and frame. Consecutive frames of equal light form pairs: the difference of
+        a pair is free of fixed-pattern noise.
     darks
         Exposure time, s, and frame.
     """

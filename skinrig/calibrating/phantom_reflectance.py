@@ -1,4 +1,4 @@
-"""What a fibre probe should take from a phantom, from its certificate by the photon table."""
+"""Predict the readings of a fiber probe on a phantom from the phantom's certificate."""
 
 from importlib.resources import files
 from pathlib import Path
@@ -18,24 +18,24 @@ from skinrig.arrays import Float64Array
 
 
 def expected_reflectance(certificate: PhantomCertificate, rig: Rig) -> ExpectedReflectance:
-    """Return what the fibres of a perfect probe take from a phantom, averaged over the bands.
+    """Predict the reflectance that a perfect probe's fibers collect, averaged over camera bands.
 
     Parameters
     ----------
     certificate
-        Of the phantom.
+        Certificate of the phantom.
     rig
         With a probe, a light of known illuminant and a camera of known sensitivity.
 
     Returns
     -------
     ExpectedReflectance
-        Two common causes: the certificate's absorption and its scattering.
+        With two errors common to all fibers: the certificate's absorption and its scattering.
 
     Raises
     ------
     CertificateError
-        Where the photon table does not hold the phantom.
+        If the phantom's coefficients are outside the photon table.
 
     Examples
     --------
@@ -50,10 +50,10 @@ def expected_reflectance(certificate: PhantomCertificate, rig: Rig) -> ExpectedR
     ((28, 3), (2, 28, 3))
     """
     if rig.probe is None:
-        raise CertificateError(f"rig {rig.name!r}: has no probe, expected one")
+        raise CertificateError(f"rig {rig.name!r}: has no probe, expected one; use the probe rig")
     probe = rig.probe
     light, camera = rig.lights[0].illuminant, rig.views[0].spectral_sensitivity
-    # a certificate of one wavelength calls the phantom gray: any wavelength stands for all
+    # one certified wavelength means a gray phantom: the same coefficients at every wavelength
     gray = len(certificate.wavelength_nm) == 1
     wavelength = np.array([550.0]) if gray else np.asarray(spectra.WAVELENGTH_NM, np.float64)
     weights = (
@@ -65,16 +65,16 @@ def expected_reflectance(certificate: PhantomCertificate, rig: Rig) -> ExpectedR
     cores: dict[str, Any] = {"core_mm": probe.fibres[0].core_mm}
     cores["source_core_mm"] = probe.source_core_mm
     try:
-        held = photon_table.is_in_domain(*at, **how)
+        inside = photon_table.is_in_domain(*at, **how)
         slopes = photon_table.derivatives(*at, **(cores | how))
         own = photon_table.relative_error(*at, **how)
     except photon_table.TableDomainError as exc:
         raise CertificateError(f"phantom: {exc}") from exc
-    if not held[:, :3].any():
+    if not inside[:, :3].any():
         raise CertificateError(
-            "phantom: the photon table does not hold its coefficients"
+            "phantom: its coefficients are outside the photon table"
             f" (sigma_a {sigma_a.min():g} to {sigma_a.max():g}, sigma_s'"
-            f" {sigma_s.min():g} to {sigma_s.max():g} per mm); use one like skin"
+            f" {sigma_s.min():g} to {sigma_s.max():g} per mm); use a phantom with optics like skin"
         )
 
     def band(values: Float64Array) -> Float64Array:
@@ -82,11 +82,14 @@ def expected_reflectance(certificate: PhantomCertificate, rig: Rig) -> ExpectedR
 
     value = slopes.reflectance_per_mm2
     mean = band(value)
-    # the table's errors at neighboring wavelengths are the same ones: they do not average out
+    # errors of the table at neighboring wavelengths are fully correlated: their weighted sum is
+    # taken, not the root of the sum of squares
     stderr = band(value * np.where(np.isfinite(own), np.minimum(own, 1.0), 1.0))
-    unsure = certificate.uncertainty
-    by_a = band(slopes.by_sigma_a * sigma_a[:, None]) * unsure.sigma_a / mean
-    by_s = band(slopes.by_sigma_s_prime * sigma_s[:, None]) * unsure.sigma_s_prime / mean
+    # first-order propagation: dR/R = (dR/d ln sigma) u_rel(sigma) / R, with dR/d ln sigma
+    # = sigma dR/d sigma; one relative uncertainty holds for all wavelengths and fibers
+    relative = certificate.uncertainty
+    by_a = band(slopes.by_sigma_a * sigma_a[:, None]) * relative.sigma_a / mean
+    by_s = band(slopes.by_sigma_s_prime * sigma_s[:, None]) * relative.sigma_s_prime / mean
     return ExpectedReflectance(mean, stderr, np.stack([by_a, by_s]))
 
 

@@ -1,4 +1,4 @@
-"""A session of a fibre probe on a phantom to its calibration: spots, gains, cross-talk."""
+"""Calibrate spots, gains and cross-talk of a fiber probe from a session on a phantom."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,39 +24,39 @@ from skinrig.calibrating.phantom_reflectance import expected_reflectance, packag
 
 FIBER_CALIBRATION_KIND: Final = "fibre"
 MIN_HEALTHY_GAIN: Final = 0.5
-"""Of the usual gain: a fibre below it is told of."""
+"""Fraction of the median gain below which a fiber is reported."""
 
 
 def calibrate_probe(
     sessions: TargetSessions, certificate: PhantomCertificate | None = None
 ) -> CalibrationResult:
-    """Make the calibration "fibre" of a probe from a session of target "phantom".
+    """Estimate the calibration "fibre" of a probe from a session of target "phantom".
 
     Parameters
     ----------
-    given
-        One session, with frames of the kinds dark and phantom, and better also mask. Gain and read
-        noise are those of the folder's sensor, where it holds one.
+    sessions
+        One session with frames of the kinds dark and phantom, and preferably mask. Gain and read
+        noise are those of the folder's sensor calibration, or else nominal.
     certificate
-        Of the phantom; None: for simulated sessions that of the simulated phantom.
+        Certificate of the phantom; None: the simulated phantom's, for simulated sessions only.
 
     Raises
     ------
     CalibratingError
-        When the frames that are needed are missing, or the phantom is not known.
+        When required frames are missing, or the phantom's optics are unknown.
     CalibrationError
-        When the frames do not tell what is wanted.
+        When the frames do not determine the calibration.
     """
     if len(sessions.sessions) != 1:
         raise CalibratingError(
-            f"sessions: got {len(sessions.sessions)}, expected one; between two the light may have"
-            " changed, so calibrate from each alone"
+            f"sessions: got {len(sessions.sessions)}, expected one, because the light may change"
+            " between sessions; name one of them"
         )
     session = sessions.sessions[0]
     rig = session.rig
     if rig.probe is None:
         raise CalibratingError(
-            f"kind 'fibre': got a session of rig {rig.name!r}, expected one with a fibre probe"
+            f"kind 'fibre': got a session of rig {rig.name!r}, expected a fiber probe's; name one"
         )
     paper = certificate or _packaged_certificate(session)
     noise, notes = _noise(sessions)
@@ -79,8 +79,8 @@ def calibrate_probe(
     if not masks:
         notes = (
             *notes,
-            "the session holds no frames with covered fibres: cross-talk and stray light are taken"
-            " to be none, and the far fibres' errors do not know of it",
+            "the session holds no frames with covered fibres: cross-talk and stray light are"
+            " assumed zero, and the standard errors of the far fibers do not include them",
         )
     findings = (*spots.findings, *notes, *_report_worn_fibers(fibres))
     made = fibres.to_calibration(
@@ -96,15 +96,15 @@ def calibrate_probe(
 
 
 class _Series:
-    """The series of exposures in a session of a phantom."""
+    """The exposure series in a session of a phantom."""
 
     def __init__(self, session: Session, noise: CameraNoise) -> None:
         self._session, self._noise = session, noise
         darks = session.frames("dark")
         if not darks:
             raise CalibratingError(
-                f"session {session.id}: holds no frames of kind 'dark', so the camera's dark signal"
-                " is not known; capture the phantom with darks"
+                f"session {session.id}: got no frames of kind 'dark', so the dark signal is"
+                " unknown; capture the phantom with dark frames"
             )
         self.darks: DarkModel = measure_darks(
             [session.read(record).cfa for record in darks],
@@ -115,34 +115,34 @@ class _Series:
         self._phantom = session.frames("phantom")
         if not self._phantom:
             raise CalibratingError(
-                f"session {session.id}: holds no frames of kind 'phantom'; capture that target"
+                f"session {session.id}: got no frames of kind 'phantom'; capture that target"
                 " (`skinrig simulate probe --target phantom`, or `skinrig capture probe --target"
                 " phantom`)"
             )
 
     def level(self) -> float:
-        """Return the source's level, the same in all frames."""
+        """Return the level of the source; raise if frames differ in it."""
         frames = [*self._phantom, *self._session.frames("mask")]
         levels = {float(record.settings.get("level", 1.0)) for record in frames}
         if len(levels) != 1:
             raise CalibratingError(
                 f"session {self._session.id}: got levels {sorted(levels)} of the source, expected"
-                " one"
+                " one; capture the phantom with one level"
             )
         return levels.pop()
 
     def phantoms(self) -> list[MergedSeries]:
-        """Return the series with all fibres uncovered, one for each placement."""
+        """Return the merged series with all fibers uncovered, one per placement."""
         groups = _grouped(self._phantom, "repeat")
         return [self._merge(records) for _, records in sorted(groups.items())]
 
     def masks(self) -> Mapping[int, MergedSeries]:
-        """Return the series with one fibre uncovered, by its number; merged when asked for."""
+        """Return the series with one fiber uncovered, by its number, each merged on access."""
         return _MergedSeries(_grouped(self._session.frames("mask"), "fibre"), self._merge)
 
     @property
     def counts(self) -> tuple[int, int, int]:
-        """Frames of dark, phantom and mask."""
+        """Numbers of dark, phantom and mask frames."""
         session = self._session
         dark, phantom, mask = (len(session.frames(kind)) for kind in ("dark", "phantom", "mask"))
         return dark, phantom, mask
@@ -158,7 +158,7 @@ class _Series:
 
 
 class _MergedSeries(Mapping[int, MergedSeries]):
-    """Series of a session by a number, of which one at a time is held."""
+    """Merged series by number; only the one in use is in memory."""
 
     def __init__(
         self,
@@ -193,16 +193,16 @@ def _light_s(record: FrameRecord) -> float:
 
 
 def _temperature(records: Sequence[FrameRecord]) -> float | None:
-    told = [float(record.actual["camera_c"]) for record in records if "camera_c" in record.actual]
-    return float(np.mean(told)) if told else None
+    degrees = [float(r.actual["camera_c"]) for r in records if "camera_c" in r.actual]
+    return float(np.mean(degrees)) if degrees else None
 
 
 def _noise(sessions: TargetSessions) -> tuple[CameraNoise, tuple[str, ...]]:
     known = sessions.sensor()
     if known is None:
         return CameraNoise.from_view(sessions.rig.views[0]), (
-            "the folder holds no sensor calibration: gain and read noise are the camera's nominal"
-            " ones",
+            "the folder has no sensor calibration: gain and read noise are nominal; calibrate"
+            " sensor first",
         )
     return CameraNoise.from_sensor(known), ()
 
@@ -210,19 +210,24 @@ def _noise(sessions: TargetSessions) -> tuple[CameraNoise, tuple[str, ...]]:
 def _packaged_certificate(session: Session) -> PhantomCertificate:
     if session.source != "simulated":
         raise CalibratingError(
-            "phantom: its optics are not known; give the certificate of the block that was measured"
-            " as --phantom FILE.json (schema skinrig.phantom/1, see docs/how-to/calibrate-probe.md)"
+            "phantom: its optics are not known; give its certificate with --phantom FILE.json"
+            " (schema skinrig.phantom/1, see docs/how-to/calibrate-probe.md)"
         )
     return packaged_certificate()
 
 
 def _mean(readings: Sequence[FiberReadings]) -> FiberReadings:
-    """Return the mean over placements, with their scatter where it is more than the noise."""
+    """Average readings over placements.
+
+    The variance of the mean is the propagated noise, or the scatter between placements where that
+    is larger.
+    """
     if len(readings) == 1:
         return readings[0]
     valid = np.logical_and.reduce([r.valid for r in readings])
     signal = np.where(valid, np.mean([r.signal for r in readings], axis=0), 0.0)
     count = len(readings)
+    # variance of a mean of n: mean(var) / n by the noise model, s^2 / n by the scatter
     noise = np.mean([r.variance for r in readings], axis=0) / count
     scatter = np.var([r.signal for r in readings], axis=0, ddof=1) / count
     return FiberReadings(
@@ -238,16 +243,18 @@ def _mean(readings: Sequence[FiberReadings]) -> FiberReadings:
 
 
 def _report_worn_fibers(fibres: FiberCalibration) -> tuple[str, ...]:
-    both = zip(fibres.gain.T, fibres.valid.T, strict=True)
-    usual = np.array([np.median(gain[good]) if good.any() else 1.0 for gain, good in both])
+    channels = zip(fibres.gain.T, fibres.valid.T, strict=True)
+    median = np.array([np.median(gain[good]) if good.any() else 1.0 for gain, good in channels])
     found = []
     for i, name in enumerate(fibres.names):
         if fibres.dead[i]:
-            found.append(f"{name} is dead: it gives no light")
+            found.append(f"{name} is dead: it gives no light; replace it")
         elif fibres.valid[i].any():
-            share = float(np.median((fibres.gain[i] / usual)[fibres.valid[i]]))
-            if share < MIN_HEALTHY_GAIN:
-                found.append(f"{name} passes {100 * share:.0f} % of what the others do: clean it")
+            relative = float(np.median((fibres.gain[i] / median)[fibres.valid[i]]))
+            if relative < MIN_HEALTHY_GAIN:
+                found.append(
+                    f"{name} passes {100 * relative:.0f} % of what the others do: clean it"
+                )
         elif fibres.spots.found[i]:
             found.append(f"{name}: too little light from the phantom to calibrate it")
     return tuple(found)
@@ -261,7 +268,7 @@ def _summary(
     across, down = spots.shift_px
     rows = {
         "spots found": f"{int(spots.found.sum())} of {len(fibres.names)}, {across:+.2f},"
-        f" {down:+.2f} px off their places, row turned {np.degrees(spots.rotation_rad):+.2f}°",
+        f" {down:+.2f} px from nominal, row rotated {np.degrees(spots.rotation_rad):+.2f}°",
         "standard error of a place": f"worst {spots.center_stderr_px[spots.found].max():.3f} px",
         "radius of spots, of apertures": f"{spots.radius_px[spots.found].mean():.2f},"
         f" {spots.aperture_px:.2f} px",
@@ -279,30 +286,30 @@ def _summary(
             "stray light": f"at most {strays:.1e} ± {strays_error:.0e} full scales per second",
             "covers let through": f"{mixed.cover_leak:.1e} ± {mixed.cover_leak_stderr:.0e}",
         }
-    dark, unsure = series.darks, paper.uncertainty
+    dark, relative = series.darks, paper.uncertainty
     rows |= {
         "dark current": f"{dark.mean_rate_dn_per_s:.3g} ± {dark.mean_rate_stderr:.1g} DN/s,"
         f" {int(dark.hot.sum())} hot pixels",
         "dead fibres": ", ".join(np.array(fibres.names)[fibres.dead]) or "none",
         "frames": f"{darks} dark, {phantom} phantom, {mask} mask",
-        "phantom": f"{paper.name or 'not named'}: uncertain by {100 * unsure.sigma_a:g}"
-        f" % of sigma_a, {100 * unsure.sigma_s_prime:g} % of sigma_s'",
+        "phantom": f"{paper.name or 'not named'}: standard uncertainty"
+        f" {100 * relative.sigma_a:g} % of sigma_a, {100 * relative.sigma_s_prime:g} % of sigma_s'",
     }
     return tuple(rows.items())
 
 
 def _gain_text(fibres: FiberCalibration, c: int) -> str:
-    """Return what is to be said of the gains of a channel."""
+    """Describe the range and the standard errors of a channel's gains."""
     good = fibres.valid[:, c]
     if not good.any():
-        return "no fibre calibrated"
+        return "no fiber calibrated"
     gain = fibres.gain[good, c]
     error = (fibres.gain_stderr / np.maximum(fibres.gain, 1e-300))[good, c]
     shape = np.hypot.reduce(np.abs(fibres.common[:, good, c]), axis=0).max(initial=0.0)
     worst = fibres.names[int(np.flatnonzero(good)[np.argmax(error)])]
     low, high = np.array([gain.min(), gain.max()]) / np.median(gain)
     return (
-        f"{low:.2f} to {high:.2f} of the usual, {int(good.sum())} fibres;"
+        f"{low:.2f} to {high:.2f} of the median, {int(good.sum())} fibers;"
         f" standard error median {100 * np.median(error):.2f} %, worst {100 * error.max():.2f} %"
-        f" ({worst}); in common up to {100 * shape:.1f} %"
+        f" ({worst}); common to all up to {100 * shape:.1f} %"
     )

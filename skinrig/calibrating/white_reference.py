@@ -1,4 +1,4 @@
-"""Whether a picture shows a white tile: one even, neutral surface, and not a face."""
+"""Check that an image shows a white reference: an even, neutral surface that fills it."""
 
 from typing import Final
 
@@ -8,49 +8,49 @@ from capture.calibration.sensor.transfer_curve import block_sums
 from skinrig.arrays import BoolArray, FloatArray
 
 BLOCKS_ACROSS: Final = 24
-"""Along the shorter side of the picture; the noise of a pixel is averaged away in them."""
+"""Blocks along the shorter side of the image; averaging over a block removes the pixel noise."""
 MIN_BLOCK_PX: Final = 4
-"""Pixels a side of a square, where a picture has room for three: 3 % noise becomes 0.8 %."""
+"""Minimum side of a block, px, if three fit into the image: 3 % noise becomes 0.8 %."""
 MAX_NEIGHBOR_DIFFERENCE: Final = 0.03
-"""Most that a block may differ from its four neighbors' mean, relative. Light of a lamp a metre
-away and the shading of a lens change over much of the field: even where they fall by 6 % from block
-to block they bend by 0.4 %. Cheeks, noses, hair and edges bend by tens of percent."""
+"""Maximum relative difference between a block and the mean of its four neighbors. Light from a lamp
+one meter away and lens shading vary slowly: where they fall by 6 % from block to block, this second
+difference is 0.4 %. Cheeks, noses, hair and edges give tens of percent."""
 MAX_COLOR_DIFFERENCE: Final = 0.1
-"""Most that red or blue over green may differ from its median over the field, relative. A tile has
-one color under one kind of light, of which a lens that tints its corners leaves a few percent."""
+"""Maximum relative difference of red or blue over green from its median over the image. A white
+reference has one color under one illuminant; color shading of a lens adds a few percent."""
 MIN_EVEN_FRACTION: Final = 0.8
-"""Share of the picture that must be even: a tile may leave a margin, or a holder cover one. A
-face that takes a sixth of the picture before an even wall leaves less, in the dark an eighth."""
+"""Minimum fraction of the image that must be even: a margin or a holder may take the rest. A face
+that fills a sixth of the image before an even wall, or an eighth in the dark, leaves less."""
 MIN_FILLED_FRACTION: Final = 0.95
-"""Share of the picture below which a tile is said not to fill it: a speck of dust, with the squares
-that border on it, is a hundredth."""
+"""Fraction of the image below which a warning reports a partly filled image: a speck of dust, with
+the blocks next to it, takes a hundredth."""
 
 
 class NoWhiteReferenceError(ValueError):
-    """A frame that is to show a white tile and shows something else."""
+    """A frame of target "white" that does not show a white reference."""
 
 
 def even_fraction(rgb: FloatArray, valid: BoolArray) -> float:
-    """Return the share of a picture that is as even and as neutral as a lit white tile.
+    """Return the fraction of an image that is as even and neutral as a lit white reference.
 
     Parameters
     ----------
     rgb
         Linear camera RGB without dark signal, (H, W, 3), any unit.
     valid
-        (H, W); saturated pixels are False and not judged.
+        (H, W); saturated pixels are False and not evaluated.
 
     Returns
     -------
     float
-        From 0 to 1; 1 too where nothing can be judged, such as a picture saturated all over.
+        From 0 to 1; also 1 if no block can be evaluated, such as in a fully saturated image.
 
     Notes
     -----
-    The picture is cut into squares. Such a one is even where its green light differs from the mean
-    of its four neighbors by less than `MAX_NEIGHBOR_DIFFERENCE`, and its red and blue over green
-    from those of the median square by less than `MAX_COLOR_DIFFERENCE`. How bright it is and which
-    color the light has play no part: both are what a white tile is to tell.
+    The image is divided into square blocks. A block is even if its green value differs from the
+    mean of its four neighbors by less than `MAX_NEIGHBOR_DIFFERENCE`, and its red and blue over
+    green from their medians by less than `MAX_COLOR_DIFFERENCE`. Brightness and color of the light
+    are ignored, because the reference measures them.
 
     Examples
     --------
@@ -62,58 +62,58 @@ def even_fraction(rgb: FloatArray, valid: BoolArray) -> float:
     shorter = min(valid.shape)
     side = max(shorter // BLOCKS_ACROSS, min(MIN_BLOCK_PX, shorter // 3), 1)
     count = block_sums(valid.astype(np.float64), side)
-    judged = count >= side * side / 2
+    evaluated = count >= side * side / 2
     sums = [block_sums(np.where(valid, rgb[..., k], 0.0), side) for k in range(3)]
     mean = np.stack(sums, axis=-1) / np.maximum(count, 1.0)[..., None]
-    lit = judged & (mean > 0).all(axis=-1)
+    lit = evaluated & (mean > 0).all(axis=-1)
+    # differences of logarithms are relative differences, independent of the light's level
     logs = np.log(np.where(lit[..., None], mean, 1.0))
     inner = np.s_[1:-1, 1:-1]
     cross = (np.s_[2:, 1:-1], np.s_[:-2, 1:-1], np.s_[1:-1, 2:], np.s_[1:-1, :-2])
-    whole = judged[inner] & np.logical_and.reduce([judged[place] for place in cross])
+    whole = evaluated[inner] & np.logical_and.reduce([evaluated[shift] for shift in cross])
     if not whole.any():
         return 1.0
-    bright = np.logical_and.reduce([lit[place] for place in (inner, *cross)])
+    bright = np.logical_and.reduce([lit[shift] for shift in (inner, *cross)])
     green = logs[..., 1]
-    around = sum((green[place] for place in cross), np.zeros_like(green[inner])) / len(cross)
+    around = sum((green[shift] for shift in cross), np.zeros_like(green[inner])) / len(cross)
     tint = logs[..., (0, 2)] - green[..., None]
-    usual = np.median(tint[lit], axis=0) if lit.any() else np.zeros(2)
+    typical = np.median(tint[lit], axis=0) if lit.any() else np.zeros(2)
     even = (np.abs(green[inner] - around) < MAX_NEIGHBOR_DIFFERENCE) & bright
-    even &= (np.abs(tint[inner] - usual) < MAX_COLOR_DIFFERENCE).all(axis=-1)
+    even &= (np.abs(tint[inner] - typical) < MAX_COLOR_DIFFERENCE).all(axis=-1)
     return float(np.count_nonzero(even & whole) / np.count_nonzero(whole))
 
 
 def check_white_reference(rgb: FloatArray, valid: BoolArray, image_name: str) -> tuple[str, ...]:
-    """Refuse a picture of something else than a white tile, and tell of one it does not fill.
+    """Raise unless an image shows a white reference; warn if the reference does not fill it.
 
     Parameters
     ----------
     rgb, valid
-        As of `even_fraction`.
-    what
-        What the picture is called.
+        See `even_fraction`.
+    image_name
+        Name of the image, for messages.
 
     Returns
     -------
     tuple of str
-        What is wrong with it; empty where nothing is.
+        Warnings; empty if the reference fills the image.
 
     Raises
     ------
-    NoTileError
+    NoWhiteReferenceError
+        If less than `MIN_EVEN_FRACTION` of the image is even and neutral.
     """
     even = even_fraction(rgb, valid)
-    share = f"{100 * even:.0f} % of the picture"
+    fraction = f"{100 * even:.0f} % of the image"
     if even < MIN_EVEN_FRACTION:
         raise NoWhiteReferenceError(
-            f"sessions: {image_name} shows no white tile: {share} is even and neutral, expected"
-            f" all of"
-            " it; give a session of a tile that fills the picture (`skinrig capture flash"
-            " --target white`, `skinrig simulate flash --target white`)"
+            f"sessions: {image_name} does not show a white reference: {fraction} is even and"
+            " neutral, expected all; give a session of a reference that fills the image"
+            " (`skinrig capture flash --target white`, `skinrig simulate flash --target white`)"
         )
     if even < MIN_FILLED_FRACTION:
         return (
-            f"{image_name}: {share} is even and neutral; where the tile does not reach, or is"
-            f" dirty or"
-            " shadowed, maps will be wrong",
+            f"{image_name}: {fraction} is even and neutral; maps will be wrong where the reference"
+            " is missing, dirty or shadowed: clean it, fill the image and capture it again",
         )
     return ()
