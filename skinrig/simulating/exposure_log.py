@@ -1,7 +1,7 @@
 """Log the world's state at each exposure of a simulation until the ground truth is written.
 
-The ground truth needs these states, also those of exposures before an interruption. They must not be
-in a session, so the log is a hidden file next to the folder of the ground truth.
+The ground truth needs these states, also those of exposures before an interruption. They must not
+be in a session, so the log is a hidden file next to the folder of the ground truth.
 """
 
 import json

@@ -102,8 +102,8 @@ def count_shots(session: Session) -> Mapping[str, int]:
 
     Notes
     -----
-    A step counts once per attempt that all its cameras recorded, and once per failed attempt. A step
-    that an interruption left incomplete is shot again by all its cameras with its old number. A
+    A step counts once per attempt that all its cameras recorded, and once per failed attempt. Steps
+    that an interruption left incomplete are shot again by all their cameras with the old number. A
     resumed session then has the same pixels as an uninterrupted one, if the same shots are made.
     With a caliper they are not, because skin is taped and imaged again: images of newly taped skin
     and omitted steps are counted too, so that no number occurs twice.
