@@ -123,7 +123,7 @@ def match_texels(
 
     for name, side in (("appearance", appearance), ("truth", truth)):
         if "position" not in side.maps:
-            raise SurfaceTruthError(f"{name}: has no map 'position'; add it with --want position")
+            raise SurfaceTruthError(f"{name}: has no map 'position'; compare maps of the dome")
     rows, columns = np.nonzero(intersect_valid(appearance.maps["position"]))
     place = appearance.maps["position"].values[rows, columns]
     true_place = truth.maps["position"]
