@@ -1,1 +1,1 @@
-"""Faces analysed together: spaces of reflectance and of albedo."""
+"""Analyze populations of faces: spaces of reflectance and of albedo."""

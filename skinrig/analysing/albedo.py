@@ -1,4 +1,4 @@
-"""What the albedo of faces has in common: color histograms of groups (fig. 16), and components."""
+"""Analyze the albedo of faces: color histograms of groups (fig. 16), and principal components."""
 
 import csv
 import dataclasses
@@ -34,31 +34,31 @@ from skinrig.traits.truth import ALBEDO_NOISE, CommonFaces, label_members
 HISTOGRAM_BINS: Final = 128
 ALL_GROUPS: Final = "all"
 VECTOR_KIND: Final = "quantiles"
-"""What the components are of, see `albedo_vectors`."""
+"""Kind of the vectors that are decomposed, see `albedo_vectors`."""
 CHANNEL_NAMES: Final = ("red", "green", "blue")
 OUTPUT_FILES: Final = ("figure-16.png", "histograms.csv", "components.csv", "analysis.json")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AlbedoAnalysis:
-    """Histograms by group and region, and how many components the vectors need.
+    """Albedo histograms by group and region, and principal components of the albedo vectors.
 
     Attributes
     ----------
     histograms
-        Region to histograms of R_d.
+        Histograms of R_d by region.
     explained
-        Region to the share of the vectors' variance in each component, falling.
+        Fraction of the vectors' variance in each component by region, descending.
     scores
-        Region to the faces' places along the first components, (n, k), in standard deviations.
+        Scores of the faces on the first components by region, (n, k), in standard deviations.
     names
-        Of the faces.
+        Names of the faces.
     left_out
-        What was not done, and why.
+        Omitted analyses, each with the reason.
     source
-        "measured" where any of the faces was, else "simulated".
+        "measured" if any face is measured, otherwise "simulated".
     consent
-        What the subjects of measured faces agreed to, see `skinrig.consent.merge_consent`.
+        Consent of the subjects of measured faces, see `skinrig.consent.merge_consent`.
     """
 
     histograms: Mapping[str, GroupHistograms]
@@ -70,7 +70,7 @@ class AlbedoAnalysis:
     consent: tuple[Mapping[str, Any], ...] = ()
 
     def document(self) -> dict[str, Any]:
-        """Return all of it but the histograms as JSON values."""
+        """Return the analysis without its histograms as JSON values."""
         return {
             "source": self.source,
             "consent": [dict(one) for one in self.consent],
@@ -105,27 +105,27 @@ def analyze_measured(
     size: int | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> AlbedoAnalysis:
-    """Analyse the albedo maps of fitted faces, in a common map by their landmarks.
+    """Analyze the albedo maps of fitted faces in a common map, aligned by landmarks.
 
     Parameters
     ----------
     out
-        Folder to write `OUTPUT_FILES` into.
+        Folder for `OUTPUT_FILES`.
     appearances
         APPEARANCE/ folders of dome sessions.
     labels
-        Table, see `trait_labels.read`; groups are its columns of 0 and 1, with and without.
+        Table, see `skinrig.traits.labels.read`; each binary column gives two groups.
     landmarks, size
         See `fitting_traits.fit_traits`.
     progress
-        Called with a line a step.
+        Called with one line per step.
 
     Raises
     ------
     TraitFitError, FaceError, UnusableError, ParameterizationError
-        Naming what is missing or does not fit.
+        For missing or mismatched inputs.
     """
-    tell = progress or (lambda text: None)
+    report = progress or (lambda text: None)
     faces = traits.read_faces(appearances, landmarks)
     frame = face_textures.common_frame(faces, size)
     names = tuple(face.name for face in faces)
@@ -135,7 +135,7 @@ def analyze_measured(
         groups |= add_complement_groups(table.binary)
     samples = []
     for face in faces:
-        tell(face.name)
+        report(face.name)
         samples.append(traits.albedo_sample(face, frame))
     seen = [face.appearance for face in faces]
     found = dataclasses.replace(
@@ -154,18 +154,18 @@ def analyze_simulated(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> AlbedoAnalysis:
-    """Analyse the simulated population of table 1; parameters as of `analyze_measured`.
+    """Analyze the simulated population of table 1; other parameters as in `analyze_measured`.
 
     Parameters
     ----------
     people
-        How many of the 87, drawn at random, at least 2.
+        Number of people, at least 2, sampled at random from the 87.
     size
-        Texels a side of a face.
+        Texels per side of a face's texture.
     seed
-        Of the population.
+        Seed of the sample.
     """
-    tell = progress or (lambda text: None)
+    report = progress or (lambda text: None)
     everybody = draw_population(seed=seed)
     if not 2 <= people <= len(everybody):
         raise TraitFitError(f"people: got {people}, expected 2 to {len(everybody)}")
@@ -175,7 +175,7 @@ def analyze_simulated(
     samples = []
     for k, person in enumerate(some):
         if k % 10 == 0:
-            tell(f"face {k} of {len(some)}")
+            report(f"face {k} of {len(some)}")
         rng = np.random.default_rng([seed, 2, k])
         samples.append(faces.albedo(person, noise=ALBEDO_NOISE, rng=rng))
     known = sorted({label for person in some for label in person.labels})
@@ -190,7 +190,7 @@ def analyze_simulated(
 
 
 def add_complement_groups(binary: Mapping[str, BoolArray]) -> dict[str, BoolArray]:
-    """Return each group that has members, and of those with a trait also those without."""
+    """Return the nonempty groups, and for each trait also the group without it."""
     out = {}
     for name, flags in binary.items():
         for group, members in ((name, flags), (f"no {name}", ~flags)):
@@ -205,7 +205,7 @@ def analyze(
     groups: Mapping[str, BoolArray],
     frame: CommonFrame,
 ) -> AlbedoAnalysis:
-    """Analyse albedo maps that lie in one common map."""
+    """Analyze albedo maps in one common map."""
     images = [one.r_d for one in samples]
     texture = TextureSpace.fit(
         [albedo_vectors.encode_albedo(image, VECTOR_KIND) for image in images],
@@ -218,7 +218,7 @@ def analyze(
         masks = [inside & one.valid for one in samples]
         fewest = min(int(mask.sum()) for mask in masks)
         if fewest < traits.MIN_REGION_PIXELS:
-            left_out.append((region, f"a face shows {fewest} pixels of it"))
+            left_out.append((region, f"one face has only {fewest} pixels of it"))
             continue
         most = max(np.quantile(i[m], 0.999) for i, m in zip(images, masks, strict=True))
         reach = (0.0, float(np.ceil(10 * most) / 10))
@@ -242,7 +242,7 @@ def analyze(
 
 
 def _write(out: Path, found: AlbedoAnalysis) -> AlbedoAnalysis:
-    """Write the files into a folder, all or none; other files in it stay."""
+    """Write the files into a folder, all or none; other files in it are kept."""
     document = {"schema": "skinrig.analyse-albedo/1", **found.document()}
     contents = (
         _figure(found),
@@ -277,8 +277,8 @@ def _histogram_rows(found: AlbedoAnalysis) -> Iterator[Sequence[object]]:
                 rows = zip(one.edges, one.edges[1:], one.mean[g, c], one.stderr[g, c], strict=False)
                 for low, high, share, error in rows:
                     numbers = (f"{low:.6g}", f"{high:.6g}", f"{share:.6g}")
-                    told = f"{error:.3g}" if np.isfinite(error) else ""
-                    yield region, group, int(one.members[g]), channel, *numbers, told
+                    error_text = f"{error:.3g}" if np.isfinite(error) else ""
+                    yield region, group, int(one.members[g]), channel, *numbers, error_text
 
 
 def _component_rows(found: AlbedoAnalysis) -> Iterator[Sequence[object]]:
@@ -289,7 +289,7 @@ def _component_rows(found: AlbedoAnalysis) -> Iterator[Sequence[object]]:
 
 
 def _figure(found: AlbedoAnalysis) -> bytes:
-    """Draw the histograms of the whole face by group, one panel a group."""
+    """Plot the histograms of the whole face, one panel per group."""
     region, one = next(iter(found.histograms.items()))
     columns = min(4, len(one.names))
     lines = -(-len(one.names) // columns)

@@ -1,4 +1,4 @@
-"""How many lobes the surfaces of faces need, simulated or measured ones; figures 14 and 15."""
+"""Analyze the number of basis BRDFs that surfaces of faces need (figures 14 and 15)."""
 
 import csv
 import dataclasses
@@ -30,15 +30,15 @@ SCHEMA: Final = "skinrig.analyse-brdf/1"
 N_POINTS_PER_DATASET: Final = 5_000
 N_POINTS_PER_FACE: Final = 2_000
 MAX_TRAINING_POINTS: Final = 5_000
-"""Points, at most, that common mixtures are made of."""
+"""Maximum number of points from which common mixtures are factored."""
 MAX_HELD_OUT_POINTS: Final = 5_000
-"""Points, at most, that they are tried on."""
+"""Maximum number of held-out points."""
 HELD_OUT_FRACTION: Final = 0.3
-"""Part of the points, or of the people, that are kept for that."""
+"""Fraction of the points, or of the people, that is held out."""
 
 
 class AnalysisError(ValueError):
-    """Appearances whose surface cannot be analysed."""
+    """Appearances whose surface cannot be analyzed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,18 +48,18 @@ class BrdfRankAnalysis:
     data: Dataset
     curve: SpaceCurve
     held_out: str
-    """What the mixtures were not made of: "points" or "people"."""
+    """Held-out units: "points" or "people"."""
     means: Mapping[str, Float64Array]
-    """Mean shares of the materials by label, (K,) each."""
+    """Mean weights of the materials by label, (K,) each."""
 
     @property
     def above_noise(self) -> int | None:
-        """The first rank whose error is below what noise alone leaves; None: none, or unknown."""
+        """First rank with an error below that of noise alone; None: none, or noise is unknown."""
         below = np.flatnonzero(self.curve.error <= self.data.noise)
         return self.curve.ranks[int(below[0])] if len(below) else None
 
     def document(self) -> dict[str, Any]:
-        """Return this as JSON values."""
+        """Return the curve and its means as JSON values."""
         found = self.curve
         tops = [rank for rank in (8, 12, 16) if rank in found.ranks]
         return {
@@ -97,32 +97,33 @@ def analyze(
     method: brdf_space.Method = "shares",
     rng: np.random.Generator,
 ) -> BrdfRankAnalysis:
-    """Make the curve and the means of one dataset.
+    """Compute the error curve and the mean BRDFs of one dataset.
 
     Parameters
     ----------
     data
-        The points.
+        Dataset of points.
     basis
-        Their materials.
+        Basis BRDFs of the materials.
     by_label
-        True keeps all points of some labels (people) out of the mixtures, False some of all points.
+        True holds out all points of some labels (people), False some of all points.
     groups
-        Which labels are averaged together, by name, (labels,) bool each; None: each for itself.
+        Labels to average together, by name, (labels,) bool each; None: each label separately.
     ranks, method
         See `reconstruction.brdf_basis.space.compute_error_curve`.
     rng
-        Chooses the points.
+        Generator that samples the points.
 
     Raises
     ------
     AnalysisError
-        No point shows how it reflects.
+        With fewer than two points with weights.
     """
     count = len(data.weights)
     if count < 2:
         raise AnalysisError(
-            f"{data.name}: {count} points show how the surface reflects, expected 2 or more"
+            f"{data.name}: got {count} points with specular reflection, expected 2 or more; "
+            "use more points"
         )
     present = np.unique(data.label)
     if by_label and len(present) > 2:
@@ -163,22 +164,22 @@ def analyze_simulated(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[BrdfRankAnalysis, ...]:
-    """Analyse one simulated person, dataset A and dataset B, and write the figures.
+    """Analyze one simulated person, dataset A and dataset B, and write the figures.
 
     Parameters
     ----------
     out
-        Folder to write: ``figure-14.png``, ``figure-15.png``, ``curves.csv``, ``analysis.json``.
+        Folder for ``figure-14.png``, ``figure-15.png``, ``curves.csv``, ``analysis.json``.
     points
-        Points of the one person, and of all conditions of dataset A together.
+        Points of the one person, and of all conditions of dataset A in total.
     points_each
-        Points of each of the 87 people of dataset B.
+        Points per person of the 87 of dataset B.
     method
         See `reconstruction.brdf_basis.space.compute_error_curve`.
     seed
-        Of points, noise and factorizations.
+        Seed of points, noise and factorizations.
     progress
-        Called with a line for each face.
+        Called with one line per face.
     """
     basis = brdf_tables.default_basis()
     rng = np.random.default_rng([seed, 70])
@@ -205,39 +206,41 @@ def analyze_measured(
     method: brdf_space.Method = "shares",
     seed: int = 0,
 ) -> tuple[BrdfRankAnalysis, ...]:
-    """Analyse the lobes of measured faces, and write the figures.
+    """Analyze the basis BRDFs of measured faces, and write the figures.
 
     Parameters
     ----------
     out
-        Folder to write, see `analyze_simulated`.
+        Output folder, see `analyze_simulated`.
     folders
         APPEARANCE/ folders of dome sessions with lobes.
     labels
-        Table ``name,TRAIT,...``, see `skinrig.traits.labels.read`: fig. 14 then shows the mean of
-        each trait's faces; None: of each folder.
+        Table ``name,TRAIT,...``, see `skinrig.traits.labels.read`: fig. 14 then shows the mean BRDF
+        of each trait's faces; None: of each folder.
     basis
-        Folder of the MERL files that the lobes were fitted with; None: the built-in materials.
+        Folder of the MERL files of the fit; None: the built-in materials.
     points_each
-        Texels of each face.
+        Texels per face.
     method, seed
         See `analyze_simulated`.
 
     Raises
     ------
     AnalysisError
-        A folder has no lobes, or of other materials.
+        If a folder has no lobes, or lobes of other materials.
     skinrig.errors.UnusableError
-        The table does not fit.
+        If the table does not match the folders.
 
     Notes
     -----
-    A face's texels hold no more kinds of lobes than it was reconstructed with: its own curve ends
-    there. `skinrig reconstruct --rank 24` keeps more.
+    The rank of a face's weights is at most that of its reconstruction, so its curve ends there.
+    `skinrig reconstruct --rank 24` keeps more.
     """
     names = [folder.name.removeprefix("appearance-") for folder in folders]
     if len(set(names)) < len(names):
-        raise UnusableError(f"appearances: got {', '.join(names)}, one of them twice")
+        raise UnusableError(
+            f"appearances: got {', '.join(names)}, one of them twice; name each folder once"
+        )
     table = None if labels is None else trait_labels.read(labels, names)
     materials = brdf_tables.default_basis() if basis is None else brdf_tables.load(basis)
     rng = np.random.default_rng([seed, 71])
@@ -259,9 +262,9 @@ def analyze_measured(
     )
     for data in sets[len(lobes) :]:
         done += (analyze(data, materials, by_label=True, groups=groups, **how),)
-    told = [store.read_document(folder) for folder in folders]
-    source = "measured" if any(one.source == "measured" for one in told) else "simulated"
-    agreed = consent.merge_consent(*told)
+    documents = [store.read_document(folder) for folder in folders]
+    source = "measured" if any(one.source == "measured" for one in documents) else "simulated"
+    agreed = consent.merge_consent(*documents)
     _write(out, done, materials, spheres=done[-1], method=method, source=source, agreed=agreed)
     return done
 
@@ -269,7 +272,7 @@ def analyze_measured(
 def _analyze_face(
     data: Dataset, materials: BrdfBasis, lobes: int, **options: Any
 ) -> BrdfRankAnalysis:
-    """Analyse one face up to the lobes it was reconstructed with, and say why no further."""
+    """Analyze one face up to the rank of its reconstruction, and record why higher ranks lack."""
     ranks = [rank for rank in brdf_space.CURVE_RANKS if rank <= lobes]
     one = analyze(data, materials, by_label=False, ranks=ranks, **options)
     why = f"the face has {lobes} lobes; `skinrig reconstruct --rank 24` keeps more"
@@ -281,7 +284,7 @@ def _analyze_face(
 def _read_weights(
     folder: Path, materials: BrdfBasis, count: int, rng: np.random.Generator
 ) -> tuple[Float64Array, int, int]:
-    """Return shares of the materials at random texels, how many are no use, and its lobes."""
+    """Return material weights at random texels, the count of invalid ones, and of the lobes."""
     appearance = store.read(folder)
     try:
         lobes = surface_mixtures.read(appearance)
@@ -293,12 +296,14 @@ def _read_weights(
         raise AnalysisError(
             f"{folder}: its {len(lobes.mix)} lobes are of {len(lobes.materials)} materials "
             f"({lobes.materials[0]}, ...), expected {materials.size} ({materials.names[0]}, ...); "
-            "say --merl-basis DIR where they were fitted with other files than the built-in ones"
+            "name the files of the fit with --merl-basis DIR"
         )
     known = np.logical_and.reduce([valid_texels(one) for one in lobes.maps])
     at = rng.permutation(np.flatnonzero(known))[:count]
     if not len(at):
-        raise AnalysisError(f"{folder}: none of its texels has valid lobes")
+        raise AnalysisError(
+            f"{folder}: got no texel with valid lobes; reconstruct it with more lights"
+        )
     mixed = lobes.weights().reshape(-1, len(lobes.mix))[at] @ lobes.mix
     kept_rows = brdf_space.is_constrained(mixed, materials)
     return mixed[kept_rows], int(np.count_nonzero(~kept_rows)), len(lobes.mix)

@@ -1,8 +1,8 @@
-"""Points of simulated faces before a dome, and what an estimator makes of them: datasets A and B.
+"""Simulate datasets A and B: BRDF samples at points of faces in a dome, and their fitted weights.
 
-A point is a random texel of bare skin with its own normal, seen by a dome's cameras under its
-lights (without shadows). Samples have noise; R_d is estimated as the dome does and subtracted, what
-is left is fitted by the tabulated materials.
+A point is a random texel of bare skin with its own normal, observed by a dome's cameras under its
+lights, without shadows. Samples have noise. R_d is estimated as with the dome and subtracted; the
+weights of the tabulated materials are fitted to the rest.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from skinrig.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 MIN_COS_LIGHT: Final = 0.12
 MIN_COS_VIEW: Final = 0.25
 RADIANCE_NOISE: Final = 0.02
-"""Standard deviation of a sample's radiance, as a share of itself and of 2 % of white."""
+"""Standard deviation of a sample's radiance, as a fraction of its sum with 2 % of white."""
 NOISE_FLOOR_OF_WHITE: Final = 0.02
 SAMPLES_PER_POINT: Final = 160
-"""Pairs of light and view of a point, drawn among all that are above the horizon."""
+"""Pairs of light and view per point, sampled from those above the horizon."""
 POINTS_PER_FIT: Final = 1000
-"""Points that are worked on at a time."""
+"""Points per batch of the fit."""
 MAX_REPEATED_POINTS: Final = 100
-"""Points of a label, at most, that are fitted twice to tell what noise alone leaves."""
+"""Maximum number of points per label that are fitted twice to estimate the error of noise."""
 DATASET_TEXELS: Final = 256
 DATASET_A_MEMBER: Final = 4
-"""Member of table 1 whose face dataset A is of."""
+"""Member of table 1 whose face is used for dataset A."""
 
 
 class DatasetError(ValueError):
-    """A dataset is asked for that cannot be made."""
+    """A dataset with these options cannot be created."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class CapturedSamples:
     """The samples without noise, (P, M, 3), 1/sr."""
 
     def again(self, count: int, *, rng: np.random.Generator) -> CapturedSamples:
-        """Return the first points with other noise."""
+        """Return the first points with independent noise."""
         part = {name: getattr(self, name)[:count] for name in self.__dataclass_fields__}
         sigma = np.sqrt(part["variance"])
         noise = sigma * rng.standard_normal(sigma.shape)
@@ -73,20 +73,20 @@ class CapturedSamples:
 
 @dataclass(frozen=True, slots=True)
 class Dataset:
-    """Mixtures of the materials at points, and whose they are."""
+    """Weights of the materials at points, with the labels of the points."""
 
     name: str
     weights: Float64Array
-    """(P, K), at least 0."""
+    """Weights of the materials, (P, K), at least 0."""
     label: Int64Array
     """Index into `labels` of each point."""
     labels: tuple[str, ...]
     """Conditions or people."""
     noise: float
-    """How far two fits of one point with different noise lie apart, over root 2, relative to the
-    mixtures' BRDFs: what no basis should explain. NaN where it was not measured."""
+    """Error of noise alone, relative to the BRDFs: the difference of two fits of one point with
+    independent noise over sqrt(2). No basis should explain it. NaN if it was not measured."""
     lost: int
-    """Points without a fit."""
+    """Number of points without a fit."""
 
 
 def sample_surface(
@@ -103,22 +103,22 @@ def sample_surface(
     Parameters
     ----------
     surface
-        How it reflects.
+        Reflectance of the face.
     position_mm
-        Its texels, (N, N, 3), rig frame.
-    where
-        Texels to choose from, (N, N).
+        Positions of its texels, (N, N, 3), rig frame.
+    mask
+        Texels to sample from, (N, N).
     count
         Number of points P.
     samples
-        Pairs of light and view a point.
+        Pairs of light and view per point.
     rng
-        Of everything random.
+        Generator of texels, pairs and noise.
 
     Raises
     ------
     DatasetError
-        No texel has as many pairs.
+        If no texel has this many pairs.
 
     Notes
     -----
@@ -128,7 +128,7 @@ def sample_surface(
     lights = np.array([light.position_mm for light in rig.lights])
     views = np.array([view.position_mm for view in rig.views])
     texels = np.flatnonzero(mask)
-    # A third more than needed: some lie too flat to lights or cameras.
+    # A third more than needed, because some are too oblique to lights or cameras.
     few = max(count + count // 3, 64)
     drawn = rng.choice(texels, few, replace=few > len(texels)) if len(texels) else texels
     normal = surface.normal.reshape(-1, 3)[drawn].astype(np.float64)
@@ -141,8 +141,8 @@ def sample_surface(
     able = np.flatnonzero(pairs >= samples)
     if not len(able):
         raise DatasetError(
-            f"samples: got {samples} a point, expected at most the {int(pairs.max(initial=0))} "
-            f"pairs of light and view that the best of {len(drawn)} points has"
+            f"samples: got {samples} per point, expected at most {int(pairs.max(initial=0))}, the "
+            f"pairs of light and view at the best of {len(drawn)} points"
         )
     chosen = able[:count] if len(able) >= count else rng.choice(able, count)
     normal, place = normal[chosen], place[chosen]
@@ -175,7 +175,7 @@ def sample_surface(
 def fit_materials(
     captured: CapturedSamples, basis: brdf_tables.BrdfBasis
 ) -> brdf_basis.BasisWeights:
-    """Fit the materials to what is left of samples after their estimated diffuse part."""
+    """Fit the materials' weights to samples minus their estimated diffuse part."""
     samples = (captured.f, captured.light, captured.view, captured.normals)
     known: dict[str, Any] = {"eta": fresnel.ETA_SKIN, "variance": captured.variance}
     found = diffuse_albedo.estimate(*samples, **known)
@@ -184,7 +184,7 @@ def fit_materials(
 
 
 def sample_one_person(points: int, *, rng: np.random.Generator) -> Dataset:
-    """Return points of the face of dataset A as it usually is."""
+    """Return points of dataset A's face without a condition."""
     person = draw_population()[DATASET_A_MEMBER]
     return _collect_points("one person", {"normal": points}, lambda _: _skin(person, {}), rng=rng)
 
@@ -196,22 +196,23 @@ def build_dataset_a(
     progress: Callable[[str], None] | None = None,
     rng: np.random.Generator,
 ) -> Dataset:
-    """Return points of one face under seven conditions, evenly spread over them.
+    """Return points of one face under seven conditions, as many of each.
 
     Parameters
     ----------
     points
-        How many in all.
+        Number of points in total.
     conditions
         Of `rigsim.population.conditions.CONDITION_NAMES`, each of amount 1.
     progress
         Called with each condition's name.
     rng
-        Of everything random.
+        Generator of points, pairs and noise.
     """
     if not conditions or points < len(conditions):
         raise DatasetError(
-            f"points: got {points} for {len(conditions)} conditions, expected one each or more"
+            f"points: got {points} for {len(conditions)} conditions, expected at least one per "
+            "condition"
         )
     person = draw_population()[DATASET_A_MEMBER]
     share = np.diff(np.linspace(0, points, len(conditions) + 1).round().astype(int))
@@ -233,17 +234,19 @@ def build_dataset_b(
     Parameters
     ----------
     points
-        How many of each.
+        Number of points per member.
     members
         None: the 87 of `rigsim.population.population.draw_population`.
     progress
         Called with each member's name.
     rng
-        Of everything random.
+        Generator of points, pairs and noise.
     """
     people = draw_population() if members is None else tuple(members)
     if not people or points < 1:
-        raise DatasetError(f"points: got {points} of {len(people)} people, expected 1 of 1 or more")
+        raise DatasetError(
+            f"points: got {points} for {len(people)} people, expected 1 or more of each"
+        )
     counts = dict.fromkeys((person.name for person in people), points)
     return _collect_points("dataset B", counts, lambda k: _skin(people[k], None), progress, rng=rng)
 
@@ -252,7 +255,7 @@ Skin = tuple[SkinSurface, Float32Array, BoolArray]
 
 
 def _skin(member: Member, conditions: dict[str, float] | None) -> Skin:
-    """Return surface, places and bare skin of a member, under its own conditions or others."""
+    """Return reflectance, positions and bare-skin mask of a member under conditions."""
     rig = load_rig("dome")
     camera, light = rig.views[0].spectral_sensitivity, rig.lights[0].illuminant
     worn = dict(member.applied) if conditions is None else conditions
@@ -269,7 +272,7 @@ def _collect_points(
     *,
     rng: np.random.Generator,
 ) -> Dataset:
-    """Return points of some labels, as many of each as is said."""
+    """Return the dataset of points with the given counts per label."""
     basis = brdf_tables.default_basis()
     weights, label = [], []
     twice: tuple[list[Float64Array], list[Float64Array]] = ([], [])
@@ -313,6 +316,6 @@ def _unit(vectors: Float64Array) -> Float64Array:
 def _cosines_above_horizon(
     positions_mm: Float64Array, points_mm: Float64Array, normals: Float64Array
 ) -> Float64Array:
-    """Return cosines to the normals of the ways from points to places, (points, places)."""
+    """Return cosines between normals and directions to positions, (points, positions)."""
     way = _unit(positions_mm[None] - points_mm[:, None])
     return np.einsum("pkc,pc->pk", way, normals)

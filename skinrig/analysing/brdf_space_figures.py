@@ -1,4 +1,4 @@
-"""The two figures of the space of surface BRDFs: error against rank, and mean BRDFs on spheres."""
+"""Plot the space of surface BRDFs: error against rank, and mean BRDFs on spheres."""
 
 import io
 from collections.abc import Mapping
@@ -15,25 +15,25 @@ SPHERE_LIGHTS: Final = (
     ((-0.5, 0.5, 0.70710678), "light from the left"),
     ((0.85, 0.35, -0.39), "light from behind right"),
 )
-"""The two directions that spheres are lit from."""
+"""Light directions of the spheres, each with its label."""
 SPHERE_PX: Final = 160
 DISPLAY_GAMMA: Final = 2.2
 SPHERE_WHITE_PERCENTILE: Final = 99.0
-"""Percentile of all spheres' lit pixels that is shown as white."""
+"""Percentile of all spheres' lit pixels that is rendered white."""
 
 
 def curves(found: Mapping[str, SpaceCurve]) -> bytes:
-    """Draw errors over the number of mixtures, each over that of its first rank.
+    """Plot errors against rank, each relative to the error of rank 1.
 
     Parameters
     ----------
     found
-        Name to curve.
+        Curves by name.
 
     Returns
     -------
     bytes
-        PNG. In-sample errors are joined by lines, those out of sample dashed; a ring marks the
+        PNG. In-sample errors have solid lines, held-out errors dashed lines; a ring marks the
         plateau.
     """
     figure, axes = new_figure(6.4, 4.0, 1, 1)
@@ -49,22 +49,22 @@ def curves(found: Mapping[str, SpaceCurve]) -> bytes:
         above = {"xytext": (0, 8), "textcoords": "offset points", "ha": "center"}
         plot.annotate(str(rank), (rank, at), color=color, fontsize=8, **above)
     plot.set_xlabel("common mixtures")
-    plot.set_ylabel("relative error over that of one mixture")
+    plot.set_ylabel("error relative to that of one basis BRDF")
     plot.set_ylim(bottom=0.0)
-    plot.set_title("Error against number of mixtures (dashed: not used for them)", fontsize=10)
+    plot.set_title("Error against number of basis BRDFs (dashed: held out)", fontsize=10)
     plot.legend(fontsize=8, frameon=False)
     return encode_figure(figure)
 
 
 def draw_spheres(means: Mapping[str, Float64Array], basis: BrdfBasis) -> bytes:
-    """Draw mean BRDFs on spheres, lit from two directions.
+    """Render mean BRDFs on spheres under two light directions.
 
     Parameters
     ----------
     means
-        Label to shares of the materials, (K,).
+        Weights of the materials by label, (K,).
     basis
-        The K materials.
+        Basis BRDFs of the K materials.
 
     Returns
     -------
@@ -89,7 +89,7 @@ def draw_spheres(means: Mapping[str, Float64Array], basis: BrdfBasis) -> bytes:
 def render_spheres(
     means: Mapping[str, Float64Array], basis: BrdfBasis
 ) -> dict[str, tuple[Float64Array, ...]]:
-    """Return each label's sphere under each of `SPHERE_LIGHTS`, (SPHERE_PX, SPHERE_PX), 1/sr."""
+    """Render each label's sphere under each of `SPHERE_LIGHTS`, (SPHERE_PX, SPHERE_PX), 1/sr."""
     return {
         name: tuple(
             brdf_basis.render_lit_sphere(shares, basis, light_dir=way, size_px=SPHERE_PX)
@@ -100,7 +100,7 @@ def render_spheres(
 
 
 def new_figure(width_in: float, height_in: float, rows: int, columns: int) -> tuple[Any, Any]:
-    """Return a figure and its (rows, columns) axes; sizes in inches."""
+    """Create a figure with (rows, columns) axes; sizes in inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -110,7 +110,7 @@ def new_figure(width_in: float, height_in: float, rows: int, columns: int) -> tu
 
 
 def encode_figure(figure: Any, dpi: int = 140) -> bytes:
-    """Return a figure as the bytes of a PNG."""
+    """Encode a figure as the bytes of a PNG."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=dpi, metadata={"Software": None})
     return stream.getvalue()

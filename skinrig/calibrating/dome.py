@@ -275,7 +275,7 @@ def _white(
     if not markers:
         raise CalibratingError(
             "sessions: the white plate's markers were not found in any frame lit by several lights"
-            " (index light = 'several'); capture the plate with all four markers in view"
+            " (index light = 'several'); capture the plate with its markers in view"
         )
     poses = {
         pose: bundle.estimate_board_pose(markers, targets.plate, cameras, pose)
@@ -293,7 +293,7 @@ def _white(
         if window is None:
             continue
         shot = raw.linear_rgb(session.read(record), demosaic="centered")
-        # pulse-width modulation: the light is on for the fraction `level` of the exposure
+        # exposure at full level that gives the same light: exposure time times level
         on_s = float(record.settings["exposure_s"]) * float(record.settings["level"])
         light, image = str(record.settings["light"]), (shot.rgb, shot.variance, shot.valid)
         samples.append(window.sample(*image, view=record.camera, light=light, on_s=on_s))

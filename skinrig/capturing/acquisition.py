@@ -84,7 +84,7 @@ def capture_session(
         if "caliper" in needed and order.force_limit_n is None:
             raise UsageError(
                 "a capture with the caliper needs --force-limit N: the operator decides how much "
-                "force this skin may bear; there is no default"
+                "force this skin may bear; no default exists"
             )
     if order.out is None and not order.dry_run:
         raise UsageError("a capture needs --out SESSION; name a new folder, or add --dry-run")
@@ -94,11 +94,7 @@ def capture_session(
         console.print_line(line)
     if (file := order.plan_out) is not None:
         write_plan(plan, file)
-        console.print_line(
-            f"{file}: the plan; edit it, then capture it with --plan {shell_quote(file)}"
-        )
-            f"{file}: the plan; edit it, then capture it with --plan {shell_quote(file)}"
-        )
+        console.print_line(f"{file}: the plan; edit it, then capture it with --plan {shell_quote(file)}")
     if order.out is None or order.dry_run:
         steps = plan.steps
         settings = [" ".join(f"{k}={v}" for k, v in step.settings.items()) for step in steps]

@@ -1,1 +1,1 @@
-"""How far maps are from the truth, and how honest their errors."""
+"""Evaluate maps against ground truth: their errors, and the coverage of their intervals."""

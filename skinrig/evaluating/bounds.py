@@ -1,4 +1,4 @@
-"""The least error that maps of chromophores could have had, at the true chromophores."""
+"""Cramér-Rao bounds of the standard errors of chromophore maps at the true chromophores."""
 
 import numpy as np
 
@@ -15,23 +15,23 @@ def chromophore_bounds(
 ) -> dict[str, Float64Array]:
     """Return relative bounds of the standard errors of melanin and hemoglobin, each (H, W).
 
-    Fisher's information of a pixel's three channels about both cube roots and the log of its
-    light, at the true chromophores: from the noise that the diffuse picture states, from the
-    model error, and from the prior of the light through its variance. What the prior's shape tells
-    beyond its variance is not in it.
+    The bound is the inverse of the Fisher information of a pixel's three channels about both cube
+    roots and the log of the light, at the true chromophores. It includes the noise variance of the
+    diffuse image, the model error, and the variance of the light's prior, but not the prior's
+    shape.
 
     Parameters
     ----------
     appearance
-        With the map ``diffuse`` and its standard error, and the color table that was used.
+        With the map ``diffuse``, its standard error, and the parameters of its color table.
     truth
         With ``melanin_blurred`` and ``hemoglobin_blurred``.
 
     Returns
     -------
     dict
-        By "melanin" and "hemoglobin": NaN where there is no truth or no picture. Empty when what
-        is needed is not at hand.
+        "melanin" and "hemoglobin"; NaN without ground truth or image. Empty if a required map or
+        parameter is missing.
     """
     built = appearance.parameters.get("color_table")
     diffuse = appearance.maps.get("diffuse")
@@ -68,7 +68,7 @@ def relative_bounds(
     log_shading_std: float,
     model_scale: float = 1.0,
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the smallest relative standard errors of melanin and hemoglobin, each (n,).
+    """Return the Cramér-Rao bounds of melanin and hemoglobin, relative, each (n,).
 
     Parameters
     ----------
@@ -78,13 +78,13 @@ def relative_bounds(
         (n,) true volume fractions, above 0.
     relative_variance
         (n, 3) noise variance of a pixel's channels over their squares.
-    shading_spread
-        Standard deviation of the log of the light that is known beforehand.
+    log_shading_std
+        Prior standard deviation of the log of the light.
     model_scale
-        Of the model error's variance.
+        Scale of the model error's variance.
     """
     color = table.lookup(c_m, c_hd)
-    # by the logarithm of each fraction, so that errors come out relative
+    # d ln color / d c; multiplied by c it is the derivative by ln c, so that errors are relative
     gradient = table.jacobian(c_m, c_hd) / color[..., None]
     gradient = gradient * np.stack([c_m, c_hd], axis=-1)[:, None, :]
     known = model_scale * model_error.load_covariance() + log_shading_std**2

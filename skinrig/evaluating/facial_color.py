@@ -1,4 +1,4 @@
-"""A fitted hemoglobin rig against the true blood of each state, and against simpler ways."""
+"""Evaluate a hemoglobin rig against the true blood of expressions and simpler methods."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,30 +14,30 @@ from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import BoolArray, FloatArray
 
 PREDICTION_METHODS: Final = ("measured map", "rig, eq. (6)", "one gain", "neutral map")
-"""How a state's blood can be had: as measured, by the rig, by one factor of the neutral map, or
-by not changing it at all."""
+"""Predictions of an expression's blood volume fraction: as measured, by the rig, by one gain of the
+neutral map, or the neutral map unchanged."""
 MAX_LEVEL_ERROR: Final = 0.15
-"""Largest median relative error of a state's blood that counts as kept, as of other maps."""
+"""Limit of the median relative error of an expression's blood, the same as that of other maps."""
 
 
 @dataclass(frozen=True, slots=True)
 class PredictionAccuracy:
-    """How well one way gives one state's blood.
+    """Accuracy of one method for the blood volume fraction of one expression.
 
     Attributes
     ----------
     state, method
-        Name of the state; one of `PREDICTION_METHODS`.
+        Name of the expression; one of `PREDICTION_METHODS`.
     median_relative, interval
         Median of |found - true| / true and its 68 % bootstrap interval.
     rms
-        Of found less true, volume fraction.
+        Root mean square of found minus true, volume fraction.
     bias
         Median of (found - true) / true.
     coverage
-        Share of true values within the 68 % interval; NaN where the way states no error.
+        Fraction of true values within the 68 % interval; NaN for a method without standard error.
     pixels
-        How many were compared: where all ways and the truth are valid.
+        Number of compared pixels: those where all methods and the truth are valid.
     """
 
     state: str
@@ -52,18 +52,18 @@ class PredictionAccuracy:
 
 @dataclass(frozen=True, slots=True)
 class BloodChangeAccuracy:
-    """How well the change of one state's mean blood over the face was found.
+    """Accuracy of the change of one expression's mean blood over the face.
 
     Attributes
     ----------
     state
-        Its name.
+        Name of the expression.
     true, found
         Mean change over the compared pixels, volume fraction.
     rms
-        Of the change's map less the true one, volume fraction.
+        Root mean square of the change's map minus the true one, volume fraction.
     coverage
-        Share of true changes within the 68 % interval.
+        Fraction of true changes within the 68 % interval.
     """
 
     state: str
@@ -74,11 +74,11 @@ class BloodChangeAccuracy:
 
 
 def true_blood(truth: SkinAppearance) -> SkinMap | None:
-    """Return a state's true blood on the face at rest, after light has spread where that is told.
+    """Return an expression's true blood on the face at rest, blurred by lateral scattering.
 
-    Pictures show blood through skin: what can be measured is the blurred map. Where a truth has it
-    of the face as it moved alone, there is none at rest: a sharp map less a blurred one of another
-    state would show the skin's fine structure as a change.
+    Images show blood through skin, so that only the blurred map can be measured. If the truth has
+    a blurred map of the moved face only, the result is None: the difference between a sharp map and
+    a blurred one of another expression would show the skin's fine structure as a change.
     """
     at_rest = "" if truth.parameters.get("state") == NEUTRAL else "_at_rest"
     spread = "_blurred" if "hemoglobin_blurred" in truth.maps else ""

@@ -1,4 +1,4 @@
-"""Estimated maps against their truth: error, coverage and share masked, by melanin band."""
+"""Evaluate maps against ground truth: error, coverage and masked fraction by melanin band."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -24,32 +24,32 @@ MELANIN_RANGES: tuple[tuple[float, float], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class MapAccuracy:
-    """How one map compares with one truth, over one band of melanin.
+    """Accuracy of one map against one ground truth in one band of melanin.
 
     Attributes
     ----------
     name
-        Of the map.
+        Name of the map.
     against
-        "sharp" (what the subject is made of) or "blurred" (after lateral transport).
+        Ground truth: "sharp" (the subject's own) or "blurred" (after lateral scattering).
     band
         Bounds of the true melanin fraction; None: all pixels.
     pixels, masked
-        Pixels with a truth, and the share of them without a valid estimate.
+        Pixels with ground truth, and the fraction of them without a valid estimate.
     median_relative, interval
         Median of |estimate - truth| / truth and its 68 % bootstrap interval.
     bias
         Median of (estimate - truth) / truth.
     coverage
-        Share of truths inside the 68 % interval of the estimate.
+        Fraction of true values in the 68 % interval of the estimate.
     median_stderr
-        Median of the relative standard error, estimate's: half the interval's width.
+        Median of the relative half-width of the estimate's 68 % interval.
     noise_coverage
-        Share of truths inside the interval that noise alone would leave, without model error;
-        NaN where no map says it.
+        Fraction of true values in the interval of noise alone, without model error; NaN if no map
+        has it.
     median_bound
-        Median of the relative Cramer-Rao bound at the true chromophores, of noise, model error
-        and the light's prior; NaN where it cannot be told.
+        Median of the relative Cramér-Rao bound at the true chromophores, of noise, model error
+        and the light's prior; NaN if it is unknown.
     """
 
     name: str
@@ -67,7 +67,7 @@ class MapAccuracy:
 
     @property
     def band_name(self) -> str:
-        """The band as text."""
+        """Label of the band."""
         return "all" if self.band is None else f"melanin {self.band[0]:g}–{self.band[1]:g}"
 
 
@@ -77,17 +77,17 @@ BOUND_FACTOR = 1.3
 
 
 def limit(row: MapAccuracy) -> float:
-    """Return the largest median relative error that counts as kept.
+    """Return the limit of the median relative error.
 
-    15 % where the Cramer-Rao bound at the truth is below 10 %, elsewhere 1.3 times that bound. An
-    estimate's own standard error stands for the bound only where the truth cannot give it.
+    The limit is 15 % if the Cramér-Rao bound at the truth is below 10 %, and otherwise 1.3 times
+    that bound. The estimate's own standard error replaces the bound only if the bound is unknown.
     """
     least = bound(row)
     return MAX_MEDIAN_MELANIN_ERROR if least < MIN_BOUND_ERROR else BOUND_FACTOR * least
 
 
 def bound(row: MapAccuracy) -> float:
-    """Return the relative bound that a row is held to, see `limit`."""
+    """Return the relative bound that sets a row's limit, see `limit`."""
     return row.median_bound if np.isfinite(row.median_bound) else row.median_stderr
 
 
@@ -98,17 +98,17 @@ def compare(
     names: tuple[str, ...] = ("melanin", "hemoglobin"),
     rng: np.random.Generator,
 ) -> list[MapAccuracy]:
-    """Compare maps with their truths, over all pixels and in each band of melanin.
+    """Compare maps with their ground truth, over all pixels and in each band of melanin.
 
     Parameters
     ----------
     appearance
         Estimated maps with standard errors.
     truth
-        Maps of the same size; ``NAME`` is sharp, ``NAME_blurred`` has the lateral transport
-        of light in it, ``mask`` tells where there is skin. ``melanin`` is needed.
+        Maps of the same size: ``NAME`` is sharp, ``NAME_blurred`` includes lateral scattering,
+        ``mask`` is True on skin. ``melanin`` is required.
     names
-        Which maps.
+        Names of the maps to compare.
     rng
         For the bootstrap intervals.
 
@@ -118,7 +118,7 @@ def compare(
         When sizes differ or the truth has no melanin.
     """
     if "melanin" not in truth.maps:
-        raise ValueError("truth: has no map 'melanin', which the bands are made from")
+        raise ValueError("truth: has no map 'melanin' for the bands; name a ground truth with it")
     melanin = truth.maps["melanin"].values
     bounds = chromophore_bounds(appearance, truth)
     rows = []
@@ -133,7 +133,7 @@ def compare(
             if true_map.values.shape != estimate.values.shape:
                 raise ValueError(
                     f"{name}: got an estimate of shape {estimate.values.shape} and a truth of "
-                    f"shape {true_map.values.shape}, expected the same"
+                    f"shape {true_map.values.shape}, expected the same; compare maps of one session"
                 )
             skin = _skin(truth, true_map.values)
             floors = appearance.maps.get(name + NOISE_STDERR_SUFFIX), bounds.get(name)
@@ -161,7 +161,7 @@ def _figures(
     noise: SkinMap | None,
     bound: Float64Array | None,
 ) -> dict[str, Any]:
-    """Return the figures of a `MapAccuracy` over some pixels."""
+    """Compute the figures of a `MapAccuracy` over chosen pixels."""
     valid = chosen & intersect_valid(estimate)
     pixels = int(np.count_nonzero(chosen))
     value = estimate.values[valid].astype(np.float64)
@@ -179,7 +179,7 @@ def _figures(
     noise_held = float("nan")
     if noise is not None:
         noise_held = metrics.coverage(value, noise.values[valid], true_value).fraction
-    told = np.empty(0) if bound is None else bound[valid & np.isfinite(bound)]
+    finite = np.empty(0) if bound is None else bound[valid & np.isfinite(bound)]
     return {
         "pixels": pixels,
         "masked": 1.0 - valid.sum() / pixels if pixels else float("nan"),
@@ -189,5 +189,5 @@ def _figures(
         "coverage": held,
         "median_stderr": spread,
         "noise_coverage": noise_held,
-        "median_bound": float(np.median(told)) if told.size else float("nan"),
+        "median_bound": float(np.median(finite)) if finite.size else float("nan"),
     }

@@ -1,4 +1,4 @@
-"""Normals, heights, strain and kernels of stretched skin against their truths."""
+"""Evaluate normals, heights, strain and kernels of stretched skin against ground truth."""
 
 import math
 from collections.abc import Mapping
@@ -22,33 +22,35 @@ from skinrig.evaluating.surface import RAYLEIGH_68
 
 MAX_NORMAL_ERROR_DEG = 1.5
 MAX_HEIGHT_ERROR = 0.05
-"""Error of the height, of the relief's own root mean square."""
+"""Limit of the height's error, as a fraction of the relief's root mean square."""
 MAX_STRAIN_ERROR = 0.005
 MAX_HISTOGRAM_DISTANCE = 0.5
-"""Distance of histograms with the fitted kernel, of that with the neutral only stretched."""
+"""Limit of the histogram distance with the fitted kernel, as a fraction of the distance with the
+neutral relief only stretched."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReliefAccuracy:
-    """How normals and height of one state compare with the truth.
+    """Accuracy of the normals and the height of one strain step.
 
     Attributes
     ----------
     state
-        Name.
+        Name of the strain step.
     pixels, masked
-        Pixels of skin with a truth, and the share of them without a valid estimate.
+        Pixels of skin with ground truth, and the fraction of them without a valid estimate.
     mean_deg, median_deg, interval_deg
-        Angle to the true normal as the lens shows it: mean, median with its 68 % interval.
+        Angle to the true normal at the lens's resolution: mean, median with its 68 % interval.
     unblurred_deg
-        Mean angle to the true normal at the pixel itself, which this aperture does not resolve.
+        Mean angle to the true normal at full resolution, which this aperture does not resolve.
     stderr_deg, coverage
-        Median standard error in one direction, and the share of truths inside the 68 % region.
+        Median standard error in one direction, and the fraction of true normals in the 68 % region.
     height_um, relief_um
-        Root mean square error of the height, and of the true relief itself, both without what is
-        wider than a millimetre; NaN where no height was asked for.
+        Root mean square error of the height, and root mean square of the true relief, both
+        high-passed at 1 mm; NaN without a height.
     height_coverage
-        Share of true heights within the standard error; the relief that the lens hides is no noise.
+        Fraction of true heights within the standard error. Relief below the lens's resolution is
+        not part of the standard error.
     """
 
     state: str
@@ -66,13 +68,13 @@ class ReliefAccuracy:
 
     @property
     def height_relative(self) -> float:
-        """Error of the height over the relief."""
+        """Error of the height relative to the relief."""
         return self.height_um / self.relief_um if self.relief_um > 0 else math.nan
 
 
 @dataclass(frozen=True, slots=True)
 class StretchAccuracy:
-    """What caliper, images and truth say of a state's stretch along the jaws."""
+    """Stretch of one strain step along the jaws: by caliper, by images, and true."""
 
     state: str
     reading: float
@@ -82,12 +84,12 @@ class StretchAccuracy:
 
     @property
     def error(self) -> float:
-        """Found less true."""
+        """Found minus true."""
         return self.found - self.truth
 
 
 def find_states(appearance: SkinAppearance) -> list[str]:
-    """Return the names of the states that an appearance holds normals or heights of."""
+    """Return the names of the strain steps with normals or heights."""
     return sorted(
         {
             name.removeprefix(kind)
@@ -101,14 +103,14 @@ def find_states(appearance: SkinAppearance) -> list[str]:
 def compare(
     appearance: SkinAppearance, truth: SkinAppearance, *, rng: np.random.Generator
 ) -> list[ReliefAccuracy]:
-    """Compare the normals and heights of every state with their truths, pixel by pixel.
+    """Compare the normals and heights of every strain step with the ground truth, per pixel.
 
     Parameters
     ----------
     appearance, truth
-        On the camera's pixels.
+        Maps on the camera's pixels.
     rng
-        Of the bootstrap.
+        Generator of the bootstrap.
     """
     pixel_um = float(str(appearance.parameters.get("pixel_um", "nan")))
     rows = []
@@ -153,9 +155,9 @@ def _height(
 
 
 def true_relief(appearance: SkinAppearance, truth: SkinAppearance, state: str) -> Float32Array:
-    """Return the true height of a state without what is wider than a millimetre, um.
+    """Return the true height of a strain step, high-passed at 1 mm, um.
 
-    It has gone through the filter that the estimate went through, over the same pixels.
+    The filter and its pixels are those of the estimate.
     """
     true, found = truth.maps[f"height_{state}"], appearance.maps[f"height_{state}"]
     pixel_um = float(str(appearance.parameters["pixel_um"]))
@@ -166,7 +168,7 @@ def true_relief(appearance: SkinAppearance, truth: SkinAppearance, state: str) -
 
 
 def compare_stretch(appearance: SkinAppearance, truth: SkinAppearance) -> list[StretchAccuracy]:
-    """Compare the stretch of every state, as the caliper and the images say it, with the truth."""
+    """Compare the stretch by caliper and by images with the true one, for every strain step."""
     measured = read_document(appearance, STRAIN_FILE)
     known = truth.parameters.get("states")
     if measured is None or not isinstance(known, list):
@@ -190,7 +192,7 @@ def compare_stretch(appearance: SkinAppearance, truth: SkinAppearance) -> list[S
 
 
 def distances(appearance: SkinAppearance) -> list[tuple[str, float, float, float]]:
-    """Return state, stretch, and the distance of histograms before and after the fitted kernel."""
+    """Return strain step, stretch, and histogram distance without and with the fitted kernel."""
     fitted = read_document(appearance, KERNEL_FILE)
     if fitted is None:
         return []
@@ -207,7 +209,7 @@ def distances(appearance: SkinAppearance) -> list[tuple[str, float, float, float
 def normal_variances(
     appearance: SkinAppearance,
 ) -> Mapping[float, list[tuple[float, float, float, float]]]:
-    """Return, by the caliper's angle, stretch and variance of n along the jaws, with errors.
+    """Return stretch and variance of n along the jaws, with errors, by the caliper's angle.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Reflection in directions that no light of the capture had: predicted against the truth."""
+"""Evaluate the predicted reflection in held-out light directions against ground truth."""
 
 import io
 import math
@@ -25,17 +25,17 @@ MAX_HELD_OUT_ERROR = 0.05
 
 @dataclass(frozen=True, slots=True)
 class HeldOutAccuracy:
-    """How well reflection is predicted.
+    """Accuracy of the predicted reflection in held-out directions.
 
     Attributes
     ----------
     points, directions
-        How many were compared.
+        Numbers of compared points and directions.
     median, interval
-        Of |predicted - true| / true over points, directions and channels, with its 68 % bootstrap
-        interval over points.
+        Median of |predicted - true| / true over points, directions and channels, with its 68 %
+        bootstrap interval over points.
     highlights
-        The same where the surface gives more than the light from inside; NaN if nowhere.
+        The same where specular reflection exceeds subsurface scattering; NaN if nowhere.
     """
 
     points: int
@@ -46,7 +46,7 @@ class HeldOutAccuracy:
 
 
 def read_basis(appearance: SkinAppearance) -> BrdfBasis | None:
-    """Return the reduced basis that an appearance's weights are shares of, or None."""
+    """Return the reduced basis of an appearance's weights, or None."""
     if BASIS_FILE not in appearance.files:
         return None
     with np.load(io.BytesIO(appearance.files[BASIS_FILE]), allow_pickle=False) as stored:
@@ -60,7 +60,7 @@ def read_basis(appearance: SkinAppearance) -> BrdfBasis | None:
 def compare(
     appearance: SkinAppearance, truth: SkinAppearance, *, rng: np.random.Generator
 ) -> HeldOutAccuracy | None:
-    """Predict the reflection at the test's points and directions, and compare.
+    """Predict the reflection at the test's points and directions, and compare it with the truth.
 
     Parameters
     ----------
@@ -73,8 +73,8 @@ def compare(
 
     Returns
     -------
-    HeldOut or None
-        None where one of the two lacks what it takes.
+    HeldOutAccuracy or None
+        None if a required map or file is missing.
     """
     held = _read_test(appearance, truth)
     if held is None or not held[1].size:
@@ -100,15 +100,15 @@ def compare(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceTest:
-    """What the surface alone gives off at the test's points, by the lobes and in truth.
+    """Specular reflection at the test's points, by the fitted lobes and in truth.
 
     Attributes
     ----------
     texels
         Flat indices into the appearance, (S,).
     fitted, true
-        f_r of the surface times the light's cosine at the appearance's normal, (S, K), 1/sr; 0 for
-        directions below that horizon.
+        f_r of the surface times the light's cosine at the appearance's normal, (S, K), 1/sr; 0
+        below that normal's horizon.
     """
 
     texels: NDArray[np.intp]
@@ -117,7 +117,7 @@ class SurfaceTest:
 
 
 def surface_test(appearance: SkinAppearance, truth: SkinAppearance) -> SurfaceTest | None:
-    """Return what lobes say of the surface's light at the test's points, beside the truth.
+    """Return the specular reflection of the lobes and of the truth at the test's points.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def surface_test(appearance: SkinAppearance, truth: SkinAppearance) -> SurfaceTe
     Returns
     -------
     SurfaceTest or None
-        None where one of the two lacks what it takes.
+        None if a required map or file is missing.
     """
     held = _read_test(appearance, truth)
     if held is None:
@@ -143,7 +143,7 @@ def surface_test(appearance: SkinAppearance, truth: SkinAppearance) -> SurfaceTe
 def _read_test(
     appearance: SkinAppearance, truth: SkinAppearance
 ) -> tuple[BrdfBasis, NDArray[np.intp], dict[str, Float64Array]] | None:
-    """Return basis, texels and the test at the points that the appearance holds; None: no test."""
+    """Return basis, texels and test at the points that the appearance covers; None: no test."""
     basis = read_basis(appearance)
     if basis is None or TEST_FILE not in truth.files or "r_d" not in appearance.maps:
         return None
@@ -162,7 +162,7 @@ def _lobes(
     light: Float64Array,
     view: Float64Array,
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return f_r of the lobes, 1/sr, and cosines of light and view, each (S, K)."""
+    """Return f_r of the lobes, 1/sr, and the cosines of light and view, each (S, K)."""
     normals = read_normals(appearance, texels)
     weights = np.stack(
         [appearance.maps[name].values.reshape(-1)[texels] for name in weight_names(basis.size)],
@@ -182,14 +182,14 @@ def predict(
     light: Float64Array,
     view: Float64Array,
 ) -> Float64Array:
-    """Return f_r as an appearance has it, shape (S, K, 3), 1/sr; NaN below the horizon.
+    """Return f_r of an appearance, shape (S, K, 3), 1/sr; NaN below the horizon.
 
     Parameters
     ----------
     appearance
-        With "r_d", weights and normals, refined ones if there are.
+        With "r_d", weights and normals; refined normals are preferred.
     basis
-        Of the weights, see `read_basis`.
+        Basis of the weights, see `read_basis`.
     texels
         Flat indices, shape (S,).
     light, view
@@ -203,7 +203,7 @@ def predict(
 
 
 def read_normals(appearance: SkinAppearance, texels: NDArray[np.integer]) -> Float64Array:
-    """Return normals at flat texel indices, (S, 3): refined ones where there are some."""
+    """Return normals at flat texel indices, (S, 3); refined ones are preferred."""
 
     def flat(name: str) -> Float64Array:
         return appearance.maps[name].values.reshape(-1, 3)[texels].astype(np.float64)
@@ -217,9 +217,10 @@ def read_normals(appearance: SkinAppearance, texels: NDArray[np.integer]) -> Flo
 def render_spheres(
     appearance: SkinAppearance, truth: SkinAppearance
 ) -> list[tuple[str, Float64Array, Float64Array | None]]:
-    """Return the reflection of some sites on spheres: name, truth and estimate.
+    """Render the reflection of the test's sites on spheres: name, truth and estimate.
 
-    The estimate is None at sites that it does not reach; without a test file nothing is returned.
+    The estimate is None at sites that the appearance does not cover. The list is empty without a
+    test file.
     """
     basis = read_basis(appearance)
     if basis is None or TEST_FILE not in truth.files or "r_d" not in appearance.maps:
@@ -245,7 +246,7 @@ def render_spheres(
 def _nearest_texels(
     texels: NDArray[np.integer], appearance: SkinAppearance, truth: SkinAppearance
 ) -> NDArray[np.intp]:
-    """Return the nearest texel of an appearance to each texel of the truth, -1 for none near."""
+    """Return the appearance's texel nearest to each texel of the truth; -1 if none is near."""
     from scipy.spatial import cKDTree
 
     place = appearance.maps["position"]

@@ -1,4 +1,4 @@
-"""True reflection, asked of a simulated face in directions that no light had, and on spheres."""
+"""Sample the true reflection of a simulated face in held-out directions, and on spheres."""
 
 import io
 from collections.abc import Callable, Mapping, Sequence
@@ -13,12 +13,12 @@ from skinrig.arrays import BoolArray, Float32Array, Float64Array
 
 TEST_FILE: Final = "reflection_test.npz"
 MIN_TEST_COSINE: Final = 0.3
-"""Directions nearer to the horizon are not asked for: 73 degrees."""
+"""Minimum cosine of the sampled directions: at most 73 degrees from the normal."""
 SPHERE_PX: Final = 96
 
 
 class TrueReflection(Protocol):
-    """What a simulated face tells of its reflection."""
+    """Reflection of a simulated face."""
 
     def brdf(
         self, uv: ArrayLike, to_light: ArrayLike, to_camera: ArrayLike
@@ -35,20 +35,20 @@ def make_test(
     points: int = 600,
     directions: int = 24,
 ) -> bytes:
-    """Draw points and directions, and ask the simulated face how it reflects there.
+    """Sample points and directions, and evaluate the simulated face's reflection there.
 
     Parameters
     ----------
     scene
         The simulated face.
     truth
-        Its maps: "position" and "normals".
+        Its maps "position" and "normals".
     rng
-        Draws texels and directions, evenly over the half sphere down to `MIN_TEST_COSINE`.
+        Generator of texels and directions, uniform in solid angle down to `MIN_TEST_COSINE`.
     sites
-        Places on the face, mm, whose reflection is drawn on spheres.
+        Positions on the face, mm, whose reflection is rendered on spheres.
     points, directions
-        How many.
+        Number of points S and of directions K.
 
     Returns
     -------
@@ -105,14 +105,14 @@ def render_sphere(
     *,
     light_dir: tuple[float, float, float] = (0.5, 0.5, 0.70710678),
 ) -> tuple[Float64Array, BoolArray]:
-    """Draw the reflection of one spot on a sphere seen from +z, far away.
+    """Render the reflection of one spot on a sphere viewed from +z at infinity.
 
     Parameters
     ----------
     reflect
         f_r of the spot, (N, 3), by unit vectors to light and camera, (N, 3) each.
     normal
-        Of the spot, in the frame of those vectors.
+        Normal of the spot, in the frame of those vectors.
     light_dir
         Unit vector to the sphere's light; +x right, +y up.
 
@@ -139,9 +139,10 @@ def render_sphere(
 def _rotate_direction(
     direction: Float64Array, outward: Float64Array, normal: Float64Array
 ) -> Float64Array:
-    """Return a direction seen from points of a sphere as seen from a spot: outward to normal.
+    """Rotate a direction by the shortest rotation from a sphere's outward normals to the spot's.
 
-    The turn is the shortest one, Rodrigues' formula for two unit vectors.
+    With unit vectors a, b, v = a x b and c = a . b, Rodrigues' formula is
+    R d = c d + v x d + v (v . d) / (1 + c).
     """
     cosine = outward @ normal
     axis = np.cross(outward, normal)
@@ -153,7 +154,7 @@ def _rotate_direction(
 
 
 def _sample_directions(normals: Float64Array, count: int, rng: np.random.Generator) -> Float64Array:
-    """Draw directions around normals, even in solid angle down to `MIN_TEST_COSINE`, (S, K, 3)."""
+    """Sample directions about normals, uniform in solid angle to `MIN_TEST_COSINE`, (S, K, 3)."""
     shape = (len(normals), count)
     z = rng.uniform(MIN_TEST_COSINE, 1.0, shape)
     turn = rng.uniform(0.0, 2.0 * np.pi, shape)

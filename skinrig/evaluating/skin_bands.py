@@ -1,4 +1,4 @@
-"""Skin in bands: by the individual typology angle of its reflectance, and by its melanin."""
+"""Classify skin into bands by individual typology angle and by melanin."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -12,7 +12,7 @@ from skinrig.arrays import Float64Array
 
 TYPOLOGY_NAMES: Final = ("very light", "light", "intermediate", "tan", "brown", "dark")
 TYPOLOGY_EDGES_DEG: Final = (55.0, 41.0, 28.0, 10.0, -30.0)
-"""Angles above which each but the last begins (Chardon et al. 1991, see `model.metrics`)."""
+"""Lower edges of all bands but the last, degrees (Chardon et al. 1991, see `model.metrics`)."""
 
 SRGB_TO_XYZ: Final = (
     (0.4124564, 0.3575761, 0.1804375),
@@ -28,7 +28,7 @@ def typology_angle_deg(reflectance: ArrayLike) -> Float64Array:
     Parameters
     ----------
     reflectance
-        (..., 3), camera RGB over that of a perfect white, taken for linear sRGB.
+        (..., 3), camera RGB over that of a perfect white, interpreted as linear sRGB.
 
     Returns
     -------
@@ -51,7 +51,7 @@ def typology_angle_deg(reflectance: ArrayLike) -> Float64Array:
 
 
 def classify_typology(angle_deg: ArrayLike) -> NDArray[np.str_]:
-    """Return the names of the bands that angles lie in.
+    """Return the names of the typology bands of angles, degrees.
 
     Examples
     --------
@@ -64,30 +64,30 @@ def classify_typology(angle_deg: ArrayLike) -> NDArray[np.str_]:
 
 @dataclass(frozen=True, slots=True)
 class MelaninBand:
-    """A third of all skin by its melanin, with a typical person who stands for it."""
+    """Band of skin by melanin, with a typical simulated person."""
 
     preset: str
-    """Of `rigsim.subject.pigment.MELANIN_PRESETS`: the simulated person."""
+    """Preset of the typical person, of `rigsim.subject.pigment.MELANIN_PRESETS`."""
     melanin: float
-    """Volume fraction of that person's epidermis."""
+    """Melanosome volume fraction of that person's epidermis."""
     melanin_range: tuple[float, float]
-    """Volume fractions of the band."""
+    """Range of melanosome volume fractions of the band."""
     sigma_a_per_mm: float
-    """Absorption that a fibre probe sees in red light, 1/mm: dark skin absorbs more."""
+    """Absorption in red light as measured by a fiber probe, 1/mm; higher in dark skin."""
     sigma_s_prime_per_mm: float
-    """Reduced scattering there, 1/mm."""
+    """Reduced scattering in red light, 1/mm."""
     hemoglobin: float = 0.05
-    """Volume fraction of that person's dermis."""
+    """Blood volume fraction of that person's dermis."""
 
     def reflectance(self) -> Float64Array:
         """Return the diffuse albedo of the typical person, (3,), linear sRGB under D65.
 
-        By the layered model of `model.tissue_optics`.
+        Computed by the layered model of `model.tissue_optics`.
         """
         return _reflectance(self.melanin, self.hemoglobin)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what a document says of the band."""
+        """Return the band as JSON values."""
         return {
             "melanin": list(self.melanin_range),
             "typical_melanin": self.melanin,
@@ -101,7 +101,7 @@ MELANIN_BANDS: Final = {
     "medium": MelaninBand("IV", 0.047, (0.02, 0.07), 0.08, 1.2),
     "dark": MelaninBand("VI", 0.17, (0.07, 0.51), 0.3, 1.0),
 }
-"""From light to dark, in the units of `rigsim.subject.pigment` (an epidermis of 0.25 mm)."""
+"""Bands from light to dark; melanin as in `rigsim.subject.pigment` (0.25 mm epidermis)."""
 
 
 @cache
@@ -116,7 +116,7 @@ def _reflectance(melanin: float, hemoglobin: float) -> Float64Array:
 
 
 def classify_melanin(melanin: ArrayLike) -> NDArray[np.str_]:
-    """Return the names of the bands that volume fractions of melanin lie in.
+    """Return the names of the melanin bands of melanosome volume fractions.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Radial profiles and sigma_tr of a fibre probe against their truths."""
+"""Evaluate radial profiles and sigma_tr of a fiber probe against ground truth."""
 
 import json
 import math
@@ -14,26 +14,26 @@ from reconstruction.pipeline.probe.stages import CHANNEL_NAMES, PROFILE_FILE, SU
 from skinrig.arrays import Float64Array
 
 MAX_MEDIAN_ERROR, MAX_WORST_ERROR = 0.03, 0.08
-"""Relative error of sigma_tr on homogeneous media, median and worst."""
+"""Limits of the relative error of sigma_tr on homogeneous media: median and worst."""
 RECOMMENDED_METHOD = METHOD_NAMES[0]
 MIN_SIGNAL_TO_NOISE = 10.0
-"""A fibre's reading tells something of the profile from here on."""
+"""Minimum ratio of a fiber's signal to its standard error for a comparison."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProfileAccuracy:
-    """How one measured profile compares with the true one.
+    """Accuracy of one measured radial profile.
 
     Attributes
     ----------
     name, channel
-        Of the measurement.
+        Name and channel of the measurement.
     median, worst
-        Relative error over the fibres whose signal is ten times its standard error.
+        Relative error over the fibers with a signal of at least ten standard errors.
     fibres
-        How many those are.
+        Number of those fibers.
     coverage
-        Share of them within one standard error, the truth's own statistical error included.
+        Fraction of them within one standard error, which includes the truth's statistical error.
     """
 
     name: str
@@ -46,40 +46,40 @@ class ProfileAccuracy:
 
 @dataclass(frozen=True, slots=True)
 class FitAccuracy:
-    """How one fitted sigma_tr compares with the truth."""
+    """Accuracy of one fitted sigma_tr."""
 
     name: str
     channel: str
     method: str
     kind: str
-    """Of the tissue: "homogeneous", "layered" or "anisotropic"."""
+    """Kind of tissue: "homogeneous", "layered" or "anisotropic"."""
     truth: float
-    """1/mm; of layers that of the homogeneous medium whose profile fits best."""
+    """True sigma_tr, 1/mm; for layers that of the best-fitting homogeneous medium."""
     found: float
     stderr: float
     interval: tuple[float, float]
-    """68 % interval, 1/mm."""
+    """68 % interval of the fit, 1/mm."""
     valid: bool
 
     @property
     def relative(self) -> float:
-        """Found less true, over the true."""
+        """Relative error: found minus true, over true."""
         return (self.found - self.truth) / self.truth
 
     @property
     def covered(self) -> bool:
-        """Whether the truth lies in the 68 % interval."""
+        """Whether the 68 % interval contains the truth."""
         return self.interval[0] <= self.truth <= self.interval[1]
 
 
 def read_document(appearance: SkinAppearance, name: str) -> Mapping[str, Any] | None:
-    """Return one of the JSON files of an appearance, or None."""
+    """Return a JSON file of an appearance, or None if it is missing."""
     blob = appearance.files.get(name)
     return None if blob is None else json.loads(blob)
 
 
 def true_profiles(truth: SkinAppearance | None) -> Mapping[str, Mapping[str, Any]]:
-    """Return the true profiles by the name of the measurement."""
+    """Return the true profiles by name of the measurement."""
     known = None if truth is None else truth.parameters.get("profiles")
     if not isinstance(known, list):
         return {}
@@ -98,7 +98,7 @@ def format_measurement_name(entry: Mapping[str, Any]) -> str:
 
 
 def compare_profiles(appearance: SkinAppearance, truth: SkinAppearance) -> list[ProfileAccuracy]:
-    """Compare the profiles of every measurement and channel with the true ones."""
+    """Compare the profiles of all measurements and channels with the true ones."""
     measured, known = read_document(appearance, PROFILE_FILE), true_profiles(truth)
     rows: list[ProfileAccuracy] = []
     for entry in [] if measured is None else measured["measurements"]:
@@ -146,21 +146,21 @@ def compare_fits(appearance: SkinAppearance, truth: SkinAppearance) -> list[FitA
 
 @dataclass(frozen=True, slots=True)
 class MethodAccuracy:
-    """Errors of one method over many fits."""
+    """Accuracy of one method over many fits."""
 
     method: str
     fits: int
     median: float
-    """Median of the relative error's size."""
+    """Median of the absolute relative error."""
     worst: float
     bias: float
     """Mean relative error."""
     coverage: float
-    """Share of truths within the 68 % interval."""
+    """Fraction of true values in the 68 % interval."""
 
 
 def summarize_methods(rows: Sequence[FitAccuracy]) -> list[MethodAccuracy]:
-    """Return the errors of each method over its valid fits."""
+    """Summarize the errors of each method over its valid fits."""
     found = []
     for method in METHOD_NAMES:
         chosen = [row for row in rows if row.method == method and row.valid]
@@ -174,10 +174,10 @@ def summarize_methods(rows: Sequence[FitAccuracy]) -> list[MethodAccuracy]:
 
 
 def parse_number(value: object) -> float:
-    """Return a number of a document; null becomes NaN."""
+    """Convert a number of a JSON document to float; null becomes NaN."""
     return math.nan if value is None else float(str(value))
 
 
 def parse_numbers(values: Sequence[object]) -> Float64Array:
-    """Return numbers of a document, float64; null becomes NaN."""
+    """Convert numbers of a JSON document to float64; null becomes NaN."""
     return np.array([parse_number(value) for value in values], np.float64)

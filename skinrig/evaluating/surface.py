@@ -1,4 +1,4 @@
-"""Maps on a mesh against the truth on another: nearest points, then errors with intervals."""
+"""Evaluate maps on a mesh against ground truth on another mesh, at nearest points."""
 
 import math
 from dataclasses import dataclass
@@ -13,32 +13,33 @@ from skinrig.arrays import BoolArray, Float64Array
 from skinrig.evaluating import skin_bands
 
 MAX_MATCH_DISTANCE_MM = 3.0
-"""Farther than this from the true surface a point has no truth."""
+"""Maximum distance of an evaluated point from the true surface, mm."""
 CHANNEL_NAMES = ("red", "green", "blue")
 NORMAL_MAPS = ("half_vector_normals", "normals", "normals_refined")
 
 MAX_NORMAL_ERROR_DEG = 1.0
 MAX_EVALUATED_PIXEL_MM = 1.1
-"""Size of a pixel on the face up to which the limit of normals is promised: coarser ones average
-eyelids, nostrils and lips over more than they are wide."""
+"""Maximum size of a pixel on the face, mm, for the limit of normals: larger pixels average over
+eyelids, nostrils and lips."""
 MAX_ALBEDO_ERROR = 0.03
 
 Banded = tuple[str, str, str, int, float, float, float]
 """Map, unit, band, points, masked %, median and 95th percentile of the absolute error."""
 MIN_POINTS = 20
-"""Of a band that is told."""
+"""Minimum number of points of a reported band."""
 
-# of an error with the same deviation in two directions, the length that 68.27 % stay below
+# An error with independent Gaussian components of equal standard deviation s in two directions has
+# Rayleigh-distributed length: P(length < r) = 1 - exp(-r^2 / 2 s^2) = 0.6827 at r = RAYLEIGH_68 s.
 RAYLEIGH_68 = math.sqrt(-2.0 * math.log(1.0 - 0.6827))
 
 
 class SurfaceTruthError(ValueError):
-    """An appearance and a truth that cannot be compared."""
+    """An appearance and a ground truth that cannot be compared."""
 
 
 @dataclass(frozen=True, slots=True)
 class TexelMatch:
-    """Which texel of the truth lies nearest to each texel of an estimate.
+    """Nearest texel of the ground truth for each texel of an estimate.
 
     Attributes
     ----------
@@ -47,7 +48,7 @@ class TexelMatch:
     truth
         Flat index into the truth's texels, shape (N,).
     distance_mm
-        Between the two, shape (N,).
+        Distance between the two, mm, shape (N,).
     """
 
     rows: NDArray[np.intp]
@@ -58,22 +59,22 @@ class TexelMatch:
 
 @dataclass(frozen=True, slots=True)
 class SurfaceAccuracy:
-    """How one map of a surface, or one channel of it, compares with the truth.
+    """Accuracy of one map of a surface, or of one of its channels.
 
     Attributes
     ----------
     name
-        Of the map, with its channel.
+        Name of the map, with its channel.
     unit
         "deg", or "%" of the truth.
     points, masked
-        Texels with a truth, and the share of them without a valid estimate.
+        Texels with ground truth, and the fraction of them without a valid estimate.
     mean, median, interval, high
-        Of the absolute error: mean, median with its 68 % bootstrap interval, 95th percentile.
+        Absolute error: mean, median with its 68 % bootstrap interval, 95th percentile.
     bias
         Median of the signed error; NaN for angles.
     coverage
-        Share of truths inside the 68 % region of the estimate.
+        Fraction of true values in the 68 % region of the estimate.
     median_stderr
         Median of the standard error, in ``unit``.
     """
@@ -92,7 +93,7 @@ class SurfaceAccuracy:
 
     @property
     def limit_check(self) -> tuple[str, float, float]:
-        """What is held to a limit: its name, the value and the limit, in ``unit``."""
+        """Quantity with a limit: its name, value and limit, in ``unit``."""
         if self.unit == "deg":
             return "mean error", self.mean, MAX_NORMAL_ERROR_DEG
         return "median error", self.median, 100.0 * MAX_ALBEDO_ERROR
@@ -110,36 +111,37 @@ def match_texels(
     ----------
     appearance, truth
         Both with a map "position", mm, in the rig's frame.
-    near_mm
-        Texels farther from every true one are left out: no truth is known of them.
+    max_distance_mm
+        Texels farther from every true one are omitted.
 
     Raises
     ------
     SurfaceTruthError
-        Where a position map is missing or no texel has a true one near by.
+        If a position map is missing, or no texel is within this distance.
     """
     from scipy.spatial import cKDTree
 
     for name, side in (("appearance", appearance), ("truth", truth)):
         if "position" not in side.maps:
-            raise SurfaceTruthError(f"{name}: has no map 'position', which texels are matched by")
+            raise SurfaceTruthError(f"{name}: has no map 'position'; compare maps of the dome")
     rows, columns = np.nonzero(intersect_valid(appearance.maps["position"]))
     place = appearance.maps["position"].values[rows, columns]
     true_place = truth.maps["position"]
     usable = intersect_valid(true_place)
     if "mask" in truth.maps:
         usable = usable & (truth.maps["mask"].values > 0.5)
-    # a texel whose nearest true one does not count, under a brow, has no truth either
+    # masked true texels take part in the search: a texel nearest to one, such as under an
+    # eyebrow, has no truth
     known = np.flatnonzero(usable | np.any(true_place.values != 0.0, axis=-1))
     if not usable.any():
-        raise SurfaceTruthError("truth: no texel of it is valid")
+        raise SurfaceTruthError("truth: got no valid texel, expected some; check its mask")
     tree = cKDTree(true_place.values.reshape(-1, 3)[known])
     distance, index = tree.query(place, workers=1)
     near = (distance <= max_distance_mm) & usable.reshape(-1)[known[index]]
     if not near.any():
         raise SurfaceTruthError(
             f"position: no texel lies within {max_distance_mm:g} mm of the true surface; nearest "
-            f"{distance.min() if len(distance) else math.nan:.1f} mm: is the scan registered?"
+            f"{distance.min() if len(distance) else math.nan:.1f} mm; register the scan"
         )
     return TexelMatch(rows[near], columns[near], known[index[near]], distance[near])
 
@@ -147,15 +149,15 @@ def match_texels(
 def compare(
     appearance: SkinAppearance, truth: SkinAppearance, *, rng: np.random.Generator
 ) -> list[SurfaceAccuracy]:
-    """Compare normals and albedo with their truths.
+    """Compare normals and albedo with the ground truth.
 
     Parameters
     ----------
     appearance
-        Maps of :data:`NORMAL_MAPS` and "r_d", those that are there; a normal's standard error is
-        the angle in each of two directions across it, rad, the same in all three channels.
+        Any of the maps :data:`NORMAL_MAPS` and "r_d". A normal's standard error is the angle in
+        each of two perpendicular directions, rad, the same in all three channels.
     truth
-        With "position", "normals", "r_d" and, where part of it does not count, "mask".
+        With "position", "normals", "r_d" and optionally "mask".
     rng
         For the bootstrap intervals.
     """
@@ -172,9 +174,10 @@ def compare(
 def matched_errors(
     name: str, appearance: SkinAppearance, truth: SkinAppearance, pairs: TexelMatch
 ) -> Float64Array:
-    """Return a map's error at each matched texel, NaN where it is not valid.
+    """Return a map's error at each matched texel; NaN if the estimate is not valid.
 
-    Angles in degrees for normals; else relative to the truth, in %, mean of the channels.
+    Errors of normals are angles, degrees; others are relative to the truth, %, averaged over
+    channels.
     """
     estimate = appearance.maps[name]
     values = estimate.values[pairs.rows, pairs.columns].astype(np.float64)
@@ -191,12 +194,12 @@ def matched_errors(
 
 
 def errors_by_band(appearance: SkinAppearance, truth: SkinAppearance) -> list[Banded]:
-    """Return errors of normals and R_d by skin color, from light to dark; R_d, mean of channels.
+    """Return errors of normals and R_d (mean of channels) by skin color, from light to dark.
 
     Parameters
     ----------
     appearance, truth
-        As for `section`; a truth without "r_d" has no color to tell bands by.
+        See `compare`; a truth without "r_d" has no skin color, and the result is empty.
     """
     if "r_d" not in truth.maps:
         return []
@@ -210,12 +213,12 @@ def errors_by_band(appearance: SkinAppearance, truth: SkinAppearance) -> list[Ba
         error = np.abs(matched_errors(key, appearance, truth, pairs))
         for band in skin_bands.TYPOLOGY_NAMES:
             own = error[bands == band]
-            told = own[np.isfinite(own)]
-            if len(own) < MIN_POINTS or not len(told):
+            finite = own[np.isfinite(own)]
+            if len(own) < MIN_POINTS or not len(finite):
                 continue
             unit = "%" if key == "r_d" else "°"
-            masked = 100.0 * (1.0 - len(told) / len(own))
-            middle, high = np.percentile(told, [50, 95])
+            masked = 100.0 * (1.0 - len(finite) / len(own))
+            middle, high = np.percentile(finite, [50, 95])
             rows.append((key, unit, band, len(own), masked, float(middle), float(high)))
     return rows
 

@@ -1,1 +1,1 @@
-"""Sessions of simulated rigs, through the drivers of real ones."""
+"""Simulate sessions of all rigs through the drivers of the real devices."""

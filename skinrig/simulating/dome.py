@@ -1,4 +1,4 @@
-"""The light dome simulated: a face or a target, a scan of the face, and the truth."""
+"""Simulate captures with the light dome: a face or a target, a scan, and the ground truth."""
 
 from __future__ import annotations
 
@@ -43,18 +43,19 @@ if TYPE_CHECKING:
     from rigsim.population.population import Member
 
 TEXTURE_TEXELS = 512
-"""Along one side of a face's maps."""
+"""Texels per side of a face's maps."""
 WIDTHS_PX = {"small": 320, "full": 1300}
 LIGHT_COUNTS = {"small": 48, "full": None}
 VIEW_COUNTS = {"small": 6, "full": None}
 TEST_SITES = ("forehead", "nose bridge", "cheek left", "cheek right", "chin")
-"""Where the truth keeps pictures of the reflection."""
+"""Landmarks whose reflection the ground truth stores as sphere images."""
 MIN_FRONT_COSINE = -0.3
-"""Cosine from +z beyond which a light stands too far behind the face to be chosen among few."""
+"""Minimum cosine between a light's direction and +z, for a subset of few lights: others are too
+far behind the face."""
 SCAN_FILE = "scan.ply"
 TRUE_MESH_FILE = "mesh.ply"
 BLEND_SHAPES_FILE = "expressions.npz"
-"""The face at rest with the movement of each expression, see `rigsim.geometry.mesh.load_mesh`."""
+"""Neutral face with the displacement of each expression, see `rigsim.geometry.mesh.load_mesh`."""
 SCAN_TRIANGLES = {"small": 12_000, "full": 40_000}
 TRACKING_EVERY = 24
 
@@ -67,20 +68,20 @@ def simulate_dome(order: DomeOrder) -> SimulationResult:
     planned = order.plan if order.target is None else None
     plan = planned or _plan(rig, order.target, order.size)
     light = driving.announce_light(plan, rig, order)
-    asked = _manifest_settings(order, rig, conditions)
+    settings = _manifest_settings(order, rig, conditions)
     scene = _scene(rig, order, plan)
-    session = driving.open_session(order, plan, rig, asked, scene)
+    session = driving.open_session(order, plan, rig, settings, scene)
     with driving.release_on_error(session):
         scan = _attach_scan(session, scene, order) if order.target is None else {}
 
     def prompt(world: Any, text: str) -> None:
-        # "pose 3" and "sphere 1": the operator puts the target there
+        # prompts such as "pose 3" and "sphere 1": the operator moves the target there
         scene.set_pose(int(text.rpartition(" ")[2]))
 
-    # nobody sits in front of a target; a face is asked to close its eyes where that is needed
-    safe = order.target is not None or light["open_eyes"] != "allowed"
+    # a target has no eyes; a subject closes them if the plan refuses open eyes
+    closed = order.target is not None or light["open_eyes"] != "allowed"
     rig_seconds = driving.drive_plan(
-        order, session, rig, scene, prompt, eyes="closed" if safe else "open"
+        order, session, rig, scene, prompt, eyes="closed" if closed else "open"
     )
     truth = None
     if order.target is None:
@@ -102,8 +103,8 @@ def simulate_dome(order: DomeOrder) -> SimulationResult:
 def _manifest_settings(
     order: DomeOrder, rig: Rig, conditions: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Return the settings of a simulation as its session's manifest keeps them."""
-    asked: dict[str, Any] = {
+    """Return the settings of a simulation for its session's manifest."""
+    settings: dict[str, Any] = {
         "width_px": rig.views[0].width_px,
         "mesh": str(order.mesh or ""),
         "lights": len(rig.lights),
@@ -112,14 +113,14 @@ def _manifest_settings(
         **select_attributes(order, "move", "state", "movement", "wrapped"),
     }
     if order.target is None:
-        asked |= select_attributes(order, "subsurface", "interreflections")
+        settings |= select_attributes(order, "subsurface", "interreflections")
     if conditions:
-        asked["conditions"] = conditions
-    return driving.manifest_settings(order, **asked)
+        settings["conditions"] = conditions
+    return driving.manifest_settings(order, **settings)
 
 
 def _conditions(order: DomeOrder) -> dict[str, float]:
-    """Return the conditions of the face, checked."""
+    """Return the validated conditions of the face."""
     try:
         return validate_conditions(order.conditions)
     except ConditionError as error:
@@ -127,11 +128,11 @@ def _conditions(order: DomeOrder) -> dict[str, float]:
 
 
 def _member(order: DomeOrder) -> Member | None:
-    """Return the member of the simulated population that is asked for; None: a preset is."""
+    """Return the requested member of the simulated population; None for a preset or a target."""
     if order.target is not None or not re.fullmatch(r"P\d+", order.subject):
         return None
     if order.mesh is not None:
-        raise SimulationOptionsError(f"mesh: {order.subject} has a head already; leave it out")
+        raise SimulationOptionsError(f"mesh: {order.subject} has its own head; remove it")
     try:
         return get_member(order.subject)
     except PopulationError as error:
@@ -139,7 +140,7 @@ def _member(order: DomeOrder) -> Member | None:
 
 
 def _truth_files(scene: Any, truth: SkinAppearance, seed: int) -> dict[str, bytes]:
-    """Return the true mesh, its expressions, and how it reflects where no light is."""
+    """Return the true mesh, its expressions, and the reflection in held-out directions."""
     mesh, landmarks = scene.subject.mesh, scene.subject.landmarks_mm()
     return {
         TRUE_MESH_FILE: encode_binary_ply(mesh.vertices_mm, mesh.faces),
@@ -160,7 +161,7 @@ def _landmarks(subject: Any) -> dict[str, list[float]]:
 
 
 def _blend_shapes(subject: Any) -> bytes:
-    """Return the face at rest and how each expression moves it, as the bytes of an .npz."""
+    """Return the neutral face and each expression's displacements as the bytes of an .npz."""
     rest = subject.mesh if subject.rest is None else subject.rest.mesh
     shapes = subject.blend_shapes()
     out = io.BytesIO()
@@ -178,20 +179,20 @@ def _blend_shapes(subject: Any) -> bytes:
 def small_dome(
     rig: Rig, *, lights: int | None = None, views: int | None = None, width_px: int | None = None
 ) -> Rig:
-    """Return a dome with fewer lights, cameras and pixels, those kept spread evenly.
+    """Return a dome with an even subset of lights and cameras, and with fewer pixels.
 
     Parameters
     ----------
     rig : Rig
     lights, views : int, optional
-        How many to keep, 1 to all; all by default.
+        Number to keep, 1 to all; default all.
     width_px : int, optional
-        Pixels across each camera.
+        Width of each camera's image, px.
 
     Raises
     ------
     SimulationError
-        For a number that the rig cannot give.
+        For a number that is not in this range.
 
     Examples
     --------
@@ -206,17 +207,20 @@ def small_dome(
             continue
         if not 1 <= count <= len(rows):
             raise SimulationError(f"{field}: got {count}, expected 1 to {len(rows)}")
-        places = np.array([row.position_mm for row in rows])
-        # few lights stand where they reach a face; many stand all around
-        use = np.flatnonzero(places[:, 2] >= MIN_FRONT_COSINE * np.linalg.norm(places, axis=1))
+        positions = np.array([row.position_mm for row in rows])
+        # a small subset is chosen from the lights that reach the face, a large one from all
+        in_front = positions[:, 2] >= MIN_FRONT_COSINE * np.linalg.norm(positions, axis=1)
+        use = np.flatnonzero(in_front)
         use = use if len(use) >= count else np.arange(len(rows))
-        kept[field] = [rows[use[k]].name for k in farthest_point_sample(places[use], count)]
+        kept[field] = [rows[use[k]].name for k in farthest_point_sample(positions[use], count)]
     rig = rig.subset(lights=kept["lights"], views=kept["views"])
     return rig if width_px in (None, rig.views[0].width_px) else rig.resized(int(width_px or 0))
 
 
 def farthest_point_sample(directions: np.ndarray[Any, Any], count: int) -> list[int]:
-    """Return the numbers of ``count`` directions, each next one the farthest from those before.
+    """Return the indices of ``count`` directions by farthest-point sampling.
+
+    Each next direction has the largest angle to the nearest one chosen before.
 
     Parameters
     ----------
@@ -230,17 +234,18 @@ def farthest_point_sample(directions: np.ndarray[Any, Any], count: int) -> list[
     >>> farthest_point_sample(np.array([[1.0, 0, 0], [0, 0, 1], [-1, 0, 0], [0.9, 0, 0.1]]), 3)
     [1, 0, 2]
     """
-    way = directions / np.linalg.norm(directions, axis=1)[:, None]
-    chosen = [int(np.argmax(way[:, 2]))]
+    unit = directions / np.linalg.norm(directions, axis=1)[:, None]
+    chosen = [int(np.argmax(unit[:, 2]))]
     while len(chosen) < count:
-        nearest = (way @ way[chosen].T).max(axis=1)
+        # the largest cosine is that of the nearest chosen direction; the minimum over all is next
+        nearest = (unit @ unit[chosen].T).max(axis=1)
         nearest[chosen] = np.inf
         chosen.append(int(np.argmin(nearest)))
     return chosen
 
 
 def _rig(order: DomeOrder) -> Rig:
-    """Return the dome with the lights, cameras and pixels of an order."""
+    """Return the dome with the lights, cameras and image size of an order."""
     width_px = order.width_px or WIDTHS_PX[order.size]
     dome = load_rig("dome")
     if order.plan is None:
@@ -249,10 +254,10 @@ def _rig(order: DomeOrder) -> Rig:
             dome, lights=order.lights or lights, views=order.views or views, width_px=width_px
         )
     lit = {name for step in order.plan.steps for name in step_lights(step)}
-    seen = {name for step in order.plan.steps for name in step.cameras}
+    used = {name for step in order.plan.steps for name in step.cameras}
     return dome.subset(
         lights=[x.name for x in dome.lights if x.name in lit],
-        views=[v.name for v in dome.views if v.name in seen],
+        views=[v.name for v in dome.views if v.name in used],
     ).resized(width_px)
 
 
@@ -299,23 +304,23 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
 
 
 def _skin_light_effects(order: DomeOrder) -> dict[str, Any]:
-    """Return what of a face is built though it shows in no pixel, and what is not though it does.
+    """Return the requested switches of a face's light effects: True built, False omitted.
 
-    What changes pixels is built where nothing is asked for.
+    An effect without a request, None, is built if it changes pixels.
     """
-    asked: dict[str, bool | None] = {
+    requested: dict[str, bool | None] = {
         "subsurface": order.subsurface or None,
         "interreflections": order.interreflections or None,
     }
     without = order.scene_switches()
     for name in without:
-        if asked.get(name):
-            raise SimulationOptionsError(f"leave_out: {name} was asked for, too")
-    return {**asked, **without}
+        if requested.get(name):
+            raise SimulationOptionsError(f"leave_out: {name} is also requested; remove one of them")
+    return {**requested, **without}
 
 
 def _attach_scan(session: Any, scene: Any, order: DomeOrder) -> dict[str, Any]:
-    """Scan the face into the session; return what the truth keeps of it."""
+    """Attach a scan of the face to the session; return its true pose for the ground truth."""
     scanner = ScannerSettings(triangles=SCAN_TRIANGLES[order.size])
     mesh = scene.subject.mesh
     if order.wrapped:

@@ -1,4 +1,4 @@
-"""Drive a simulated rig through a plan into a session."""
+"""Run plans on simulated rigs and record their sessions and ground truth."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -32,19 +32,19 @@ Log = TypeVar("Log", bound=SceneLog)
 
 
 def list_effects(scene: Any) -> tuple[Mapping[str, Any], ...]:
-    """Return what a scene builds and what not, as its manifest and `SimulationResult` hold it."""
+    """List the effects that a scene builds and omits, for the manifest and `SimulationResult`."""
     return tuple(scene.needs.document())
 
 
 def manifest_settings(order: SimulationOrder, **rig_settings: Any) -> dict[str, Any]:
-    """Return the settings of a simulation as its session's manifest keeps them.
+    """Return the settings of a simulation for its session's manifest.
 
     Parameters
     ----------
     order
-        What every rig's order has.
-    own
-        Settings of the rig.
+        Options common to all rigs.
+    rig_settings
+        Settings of this rig.
     """
     asked: dict[str, Any] = {
         "rig": order.rig,
@@ -60,7 +60,7 @@ def manifest_settings(order: SimulationOrder, **rig_settings: Any) -> dict[str, 
 
 @contextmanager
 def release_on_error(session: Session) -> Iterator[None]:
-    """Release a session where what follows fails."""
+    """Release a session if the block raises."""
     try:
         yield
     except BaseException:
@@ -76,7 +76,7 @@ def open_logged_session(
     scene: Any,
     kind: type[Log],
 ) -> tuple[Session, Log]:
-    """Open the session of an order, and the log that stands before its scene."""
+    """Open the session of an order and the log that wraps its scene."""
     session = open_session(order, plan, rig, settings, scene)
     with release_on_error(session):
         return session, kind(scene, truth_folder(order.out), resume=order.resume, session=session)
@@ -85,7 +85,7 @@ def open_logged_session(
 def open_session(
     order: SimulationOrder, plan: Plan, rig: Rig, settings: Mapping[str, Any], scene: Any
 ) -> Session:
-    """Begin the session of an order, or go on with it where it was begun with the same settings."""
+    """Create the session of an order, or resume it if its settings are the same."""
     if order.resume:
         session = Session.resume(order.out)
         lines = list_refusals(session, settings, order.seed, order.person)
@@ -93,7 +93,7 @@ def open_session(
             session.release()
             differing = "".join(f"\n  {line}" for line in lines)
             raise SimulationError(
-                f"{order.out}: cannot be gone on with as asked{differing}\n"
+                f"{order.out}: cannot be resumed with these settings{differing}\n"
                 "  resume with the same settings, or name another folder"
             )
         return session
@@ -117,7 +117,7 @@ def open_session(
 
 
 def announce_light(plan: Plan, rig: Rig, order: SimulationOrder) -> Mapping[str, float | str]:
-    """Return figures of the LEDs' light, and report them before anything is captured."""
+    """Compute flicker and light dose of a plan, and report them before the capture."""
     if order.progress is not None:
         for line in light_lines(plan, rig):
             order.progress(line)
@@ -133,20 +133,20 @@ def write_truth(
     files: Mapping[str, bytes] | None = None,
     **own_parameters: Any,
 ) -> None:
-    """Write the truth of a session, with its parameters and those of its simulation.
+    """Write the ground truth of a session, with its parameters and those of its simulation.
 
     Parameters
     ----------
     folder
-        Of the truth.
+        Folder of the ground truth.
     order, session
-        What was simulated; the session is closed.
+        Order and closed session of the simulation.
     appearance
-        The truth as the scene has it.
+        Ground truth of the scene.
     files
-        What goes along.
-    about
-        Further parameters; those of the appearance replace them.
+        Further files by name.
+    own_parameters
+        Further parameters; those of the appearance take precedence.
     """
     parameters = {
         "kind": "truth",
@@ -168,7 +168,7 @@ def build_result(
     truth: Path | None,
     **more: Any,
 ) -> SimulationResult:
-    """Return what a simulation left behind; `more` are fields that only some rigs have."""
+    """Return the result of a simulation; `more` are fields that only some rigs have."""
     return SimulationResult(
         order.out,
         truth,
@@ -192,23 +192,23 @@ def drive_plan(
     run_id: str | None = None,
     **run: Any,
 ) -> float:
-    """Run a session's plan through the drivers, on a world registered under its id, and close it.
+    """Run a session's plan through the drivers in a world registered under its id, and close it.
 
     Parameters
     ----------
     order
-        Of the simulation: the world's seed, and where progress goes.
+        Order of the simulation, with the world's seed and the progress callback.
     session, rig
-        Open for writing; the rig as it is drawn.
+        Session, open for writing, and the nominal rig.
     scene
-        What the cameras see first.
+        First scene in front of the cameras.
     prompt
-        Called with the world and what the operator is asked for; None: nobody is needed.
+        Called with the world and the instruction to the operator; None: prompts are ignored.
     signal
-        Called with the world and what the subject of a sequence is asked for, at the time.
+        Called with the world and the expression that a sequence requests, at that time.
     begun_s
-        The host's time at which the world begins, s since 1970; None: the host's clock is not the
-        world's, but this computer's.
+        Host time at which the world begins, s since 1970; None: the host's clock is this
+        computer's, not the world's.
     run_id
         See `capture.acquire.Operator`; None: a new one.
     run
@@ -218,14 +218,14 @@ def drive_plan(
     Returns
     -------
     float
-        Time that has passed on the rig, s.
+        Time elapsed on the rig's clock, s.
     """
     world = World(
         rig, seed=order.seed, clock="virtual", scene=scene, shots_made=count_shots(session)
     )
     name = world.register(session.id)
     boxes = {
-        # a number of fixed length: with drawn ones the lines would take a little longer or shorter
+        # a fixed first number: random ones vary in length, and so would the time of a transfer
         kind: open_box(kind, f"sim://{kind}?world={name}", clock=world.clock, first_seq=1)
         for kind in rig.boxes
     }

@@ -1,4 +1,4 @@
-"""What a simulated scene is asked not to build, by the names that its list of effects shows."""
+"""Switches of the effects that a simulated scene can omit, by rig."""
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -12,14 +12,14 @@ SWITCHES_BY_RIG: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "probe": (),
     }
 )
-"""By rig: what can be left out, by the ``switch`` of its effect, see `rigsim.needs.effects`."""
+"""Omittable effects of each rig, by the ``switch`` of the effect, see `rigsim.needs.effects`."""
 
 LATERAL_SWITCHES: Final = frozenset({"lateral", "subsurface"})
-"""Names of light spreading sideways in skin: each rig's own, and the other's."""
+"""Names of lateral scattering in skin: the rigs use different ones, and each accepts both."""
 
 
 def omission_arguments(rig: str, names: Sequence[str]) -> dict[str, bool]:
-    """Return arguments for a rig's scene that leave effects out.
+    """Return the arguments of a rig's scene that omit effects.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def omission_arguments(rig: str, names: Sequence[str]) -> dict[str, bool]:
     Raises
     ------
     ValueError
-        Where a name is none that the rig's scenes can leave out.
+        For a name that is not an omittable effect of the rig.
 
     Examples
     --------
@@ -48,14 +48,14 @@ def omission_arguments(rig: str, names: Sequence[str]) -> dict[str, bool]:
     for name in names:
         own = next((k for k in known if k == name or {k, name} <= LATERAL_SWITCHES), None)
         if own is None:
-            expected = f"one of {', '.join(known)}" if known else "none: its scenes build all"
-            raise ValueError(f"leave_out: got {name!r}, expected of the {rig} rig {expected}")
+            expected = f"one of {', '.join(known)}" if known else "none; remove the option"
+            raise ValueError(f"leave_out: got {name!r}, expected for the {rig} rig {expected}")
         out[own] = False
     return out
 
 
 def is_omittable(switch: str) -> bool:
-    """Return whether some rig's scenes can leave the effect of a switch out.
+    """Return whether the scenes of any rig can omit the effect of a switch.
 
     Examples
     --------

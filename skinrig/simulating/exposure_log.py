@@ -1,7 +1,7 @@
-"""What each exposure of a simulation met, kept beside the session until the truth is written.
+"""Log the world's state at each exposure of a simulation until the ground truth is written.
 
-The truth needs the state of the world at each exposure, also of exposures before an interruption,
-and no session may contain it.
+The ground truth needs these states, also those of exposures before an interruption. They must not
+be in a session, so the log is a hidden file next to the folder of the ground truth.
 """
 
 import json
@@ -14,14 +14,14 @@ from skinrig.simulating.orders import SimulationError
 
 
 class ExposureLog:
-    """Entries of a file, a JSON line each.
+    """Log file with one JSON document per line.
 
     Parameters
     ----------
     path
-        The log.
+        File of the log.
     resume
-        Whether the session was begun before; else an older log is removed.
+        Whether the session is resumed; otherwise an older log is removed.
     """
 
     def __init__(self, path: Path, *, resume: bool) -> None:
@@ -35,46 +35,46 @@ class ExposureLog:
             stream.write(json.dumps(dict(entry)) + "\n")
 
     def read(self) -> list[dict[str, Any]]:
-        """Return all whole entries, the oldest first."""
+        """Return all complete entries, the oldest first."""
         if not self._path.is_file():
             return []
         lines = self._path.read_text(encoding="utf-8").splitlines(keepends=True)
-        # a last line may be cut off; its frame was not committed
+        # an interruption may truncate the last line; the frame of that line was not committed
         return [json.loads(line) for line in lines if line.endswith("}\n")]
 
     def remove(self) -> None:
-        """Remove the log: the truth is written."""
+        """Remove the log, after the ground truth was written."""
         self._path.unlink(missing_ok=True)
 
 
 class SceneLog(ExposureLog):
-    """A scene that notes what its exposures met, with the number of the run, beside the session.
+    """Scene wrapper that logs the world's state at each exposure, with the number of the run.
 
     Parameters
     ----------
     scene
-        What the cameras see.
+        Scene in front of the cameras.
     truth
-        Where the truth will be; the log lies beside it until then.
+        Folder of the ground truth; the log is a hidden file next to it.
     resume
-        Whether the session was begun before.
+        Whether the session is resumed.
     session
-        Open.
+        Open session.
 
     Raises
     ------
     SimulationError
-        When frames were captured before and their log is gone.
+        If the session has frames but their log is missing.
     """
 
     suffix: ClassVar[str]
-    """Of the log's name."""
+    """Suffix of the log's name."""
     kinds: ClassVar[tuple[str, ...]]
-    """Of frames whose exposures are logged."""
+    """Kinds of frames whose exposures are logged."""
     max_lag_s: ClassVar[float]
-    """Between an entry and the frame that it is of."""
-    lost_label: ClassVar[str] = "what was captured before"
-    """What has no truth without the log."""
+    """Maximum time between an entry and its frame, s."""
+    lost_label: ClassVar[str] = "the frames captured before"
+    """Frames that have no ground truth without the log, for messages."""
 
     def __init__(self, scene: Any, truth: Path, *, resume: bool, session: Session) -> None:
         super().__init__(truth.with_name(f".{truth.name}.{self.suffix}.jsonl"), resume=resume)
@@ -82,33 +82,39 @@ class SceneLog(ExposureLog):
         entries = self.read()
         if not entries and any(session.frames(kind) for kind in self.kinds):
             raise SimulationError(
-                f"{self._path}: is gone, and with it the truth of {self.lost_label}; simulate the "
-                "session anew"
+                f"{self._path}: is missing, so the ground truth of {self.lost_label} is lost; "
+                "simulate a new session"
             )
         self._run = 1 + max((int(entry["run"]) for entry in entries), default=0)
 
     @property
     def run_id(self) -> str:
-        """Begins the tokens of this run."""
+        """Prefix of the tokens of this run."""
         return f"sim{self._run}"
 
     def exposure(self, view_name: str, *, pops: Sequence[Any], **exposed: Any) -> Any:
-        """Expose the scene, and note what is lit."""
-        met = self.describe_exposure(exposed) if pops else None
-        if met is not None:
-            self.add({"run": self._run, "t_s": pops[0].t_on_s, **met})
+        """Expose the scene; log the state if a light was on."""
+        state = self.describe_exposure(exposed) if pops else None
+        if state is not None:
+            self.add({"run": self._run, "t_s": pops[0].t_on_s, **state})
         return self._scene.exposure(view_name, pops=pops, **exposed)
 
     def describe_exposure(self, exposed: Mapping[str, Any]) -> Mapping[str, Any] | None:
-        """Return what is noted of an exposure; None: nothing."""
+        """Return the state to log for an exposure; None: nothing is logged."""
         raise NotImplementedError
 
     def at(
         self, entries: Sequence[Mapping[str, Any]], run_id: str, record: FrameRecord, label: str
     ) -> Mapping[str, Any]:
-        """Return the entry of a frame, of a run."""
+        """Return the entry of a frame in a run.
+
+        Raises
+        ------
+        SimulationError
+            If the log has no entry within `max_lag_s` of the frame.
+        """
         run, time_s = int(run_id.removeprefix("sim")), float(record.line.t_box_s or 0.0)
         for entry in entries:
             if entry["run"] == run and abs(entry["t_s"] - time_s) < self.max_lag_s:
                 return entry
-        raise SimulationError(f"{self._path}: tells nothing of the {label}")
+        raise SimulationError(f"{self._path}: has no entry for {label}; simulate a new session")

@@ -1,4 +1,4 @@
-"""The flash rig simulated: a face or a target, its plan, its truth."""
+"""Simulate captures with the flash rig: a face or a target, with the ground truth."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
     width = order.width_px or WIDTHS_PX[order.size]
     rig = load_rig("flash")
     rig = rig.resized(width) if width != rig.views[0].width_px else rig
-    asked = manifest_settings(
+    settings = manifest_settings(
         order,
         width_px=width,
         mesh=str(order.mesh or ""),
@@ -39,13 +39,13 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
             order, "repeats", "movement", *(["nearer_mm"] if order.nearer_mm else [])
         ),
     )
-    # what cannot be built must fail before a folder is made
+    # plan and scenes are built first, so that an error leaves no session folder
     plan = order.plan or DefaultPlan(**select_attributes(order, "target", "states", "repeats")).of(
         rig
     )
     scenes = _scenes(rig, order, plan)
     first = next(iter(scenes.values()))
-    session = open_session(order, plan, rig, asked, first)
+    session = open_session(order, plan, rig, settings, first)
 
     def prompt(world: Any, state: str) -> None:
         world.scene = scenes[state]

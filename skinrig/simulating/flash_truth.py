@@ -13,37 +13,43 @@ from skinrig.simulating.orders import SimulationError
 
 WIDTHS_PX = {"small": 768, "full": 3024}
 MAX_STANCE_FRACTION = 0.5
-"""Of the camera's distance: how far off the tile's place a face may stand, either way. Far beyond
-what a lens of f/11 shows with any sharpness."""
+"""Maximum offset of a face from the white reference's position, as a fraction of the camera's
+distance. It is far beyond the depth of field at f/11."""
 
 
 def _stance_offset_mm(rig: Rig, nearer_mm: float) -> tuple[float, float, float]:
-    """Return how far a face is off the tile's place that stands so much nearer to the camera."""
+    """Return the translation, mm, of a face that is nearer to the camera than the reference.
+
+    Raises
+    ------
+    SimulationError
+        For an offset of more than `MAX_STANCE_FRACTION` of the camera's distance.
+    """
     view = rig.views[0]
-    most = MAX_STANCE_FRACTION * view.distance_mm
-    if not abs(nearer_mm) < most:
+    limit = MAX_STANCE_FRACTION * view.distance_mm
+    if not abs(nearer_mm) < limit:
         raise SimulationError(
-            f"nearer: got {nearer_mm:g} mm, expected between {-most:g} and {most:g} mm: the camera "
-            f"is {view.distance_mm:g} mm from the tile's place"
+            f"nearer: got {nearer_mm:g} mm, expected {-limit:g} to {limit:g} mm, because the "
+            f"camera is {view.distance_mm:g} mm from the white reference"
         )
     x, y, z = (nearer_mm * axis for axis in view.axes[2])
     return x, y, z
 
 
 def _nearer_mm(scene: Any) -> float:
-    """Return how much nearer to its first camera than the tile's place a scene's face stands."""
+    """Return how much nearer, mm, a scene's face is to its first camera than the reference."""
     return float(np.dot(scene.subject.offset_mm, scene.rig.views[0].axes[2]))
 
 
 def to_superpixels(values: NDArray[Any], mask: BoolArray | None = None) -> NDArray[Any]:
-    """Average 2 x 2 pixels, over those inside ``mask`` only.
+    """Average blocks of 2 x 2 pixels, over the pixels inside ``mask`` only.
 
     Parameters
     ----------
     values
         (H, W) or (H, W, C) with even H and W.
     mask
-        (H, W); a block without any pixel inside is 0.
+        (H, W); a block without a pixel inside is 0.
 
     Examples
     --------
@@ -67,21 +73,23 @@ def to_superpixels(values: NDArray[Any], mask: BoolArray | None = None) -> NDArr
 
 
 _TRUTH_NAMES = {"diffuse": "diffuse_radiance", "specular": "specular_radiance", "shading": "light"}
-"""The simulator's light is in its own unit; an estimate's is relative to a white tile."""
+"""Names of the scene's maps in the ground truth. Light has its own unit in the simulator, but is
+relative to a white reference in an estimate, so it does not keep the name."""
 
 
 def scale_landmarks(pixels: Mapping[str, tuple[float, float]]) -> dict[str, list[float]]:
-    """Return where points are after 2 x 2 pixels have been averaged.
+    """Transform points from sensor pixels to superpixels of 2 x 2 pixels.
 
     Parameters
     ----------
     pixels
-        (x, y) on the sensor; the centre of pixel (0, 0) is (0, 0).
+        (x, y) on the sensor; the center of pixel (0, 0) is (0, 0).
 
     Returns
     -------
     dict
-        [x, y] on the averaged map, whose first pixel's centre lies amid four of the sensor's.
+        [x, y] on the averaged map. The center of its first pixel is at (0.5, 0.5) on the sensor, so
+        x' = (x - 0.5) / 2.
 
     Examples
     --------
@@ -94,11 +102,10 @@ def scale_landmarks(pixels: Mapping[str, tuple[float, float]]) -> dict[str, list
 def build_truth(
     scene: Any, seed: int, session: str, state: str, *, parameters: Mapping[str, Any] | None = None
 ) -> SkinAppearance:
-    """Return the truth of a scene of a face, at superpixels; `parameters` joins its parameters."""
+    """Return the ground truth of a face's scene at superpixels, with further `parameters`."""
     maps: Mapping[str, NDArray[Any]] = scene.truth()
     mask = np.asarray(maps["mask"], bool)
-    # a superpixel on the outline mixes skin and background: no truth is claimed for it
-    # and where hair covers the skin there is none
+    # a superpixel on the outline mixes skin and background, and hair covers skin: both are masked
     bare = mask & (np.asarray(maps["melanin"]) > 0)
     whole = to_superpixels(bare.astype(float)) == 1.0
     at_rest = np.asarray(maps.get("mask_at_rest", mask), bool)

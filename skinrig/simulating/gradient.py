@@ -1,4 +1,4 @@
-"""The gradient sphere simulated: a patch of skin in a caliper, or a target, and the truth."""
+"""Simulate captures with the gradient sphere: skin in a caliper, or a target, with the truth."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -26,16 +26,16 @@ WIDTHS_PX = {"small": 256, "full": 2048}
 ANGLES_DEG: dict[str, tuple[float, ...] | None] = {"small": (0.0,), "full": None}
 DEFAULT_SITE = "forehead"
 FORCE_LIMIT_N = 2.0
-"""What simulated skin bears."""
+"""Force limit of simulated skin, N."""
 STRETCH_RANGE = (0.66, 1.4)
-"""No simulated skin goes further before it buckles or comes off."""
+"""Range of the stretch ratio of simulated skin before it buckles or detaches."""
 MAX_SHIFT_MM = 0.3
-"""How far the patch may come to lie off the middle: five standard deviations of its motion."""
+"""Maximum offset of the patch from the center, mm: five standard deviations of its motion."""
 
 
 def simulate_gradient(order: GradientOrder) -> SimulationResult:
     """Simulate a capture with the gradient sphere; see `simulation.simulate`."""
-    # a ball of 12 mm fills the whole sensor, however small all else is kept
+    # the 12 mm ball needs the whole sensor at every size
     width_px = WIDTHS_PX["full" if order.target == "ball" else order.size]
     rig = load_rig("gradient").cropped(order.width_px or width_px)
     angles = ANGLES_DEG[order.size] if order.angles is None else order.angles
@@ -81,20 +81,20 @@ def make_scene(
     plan: Plan | None = None,
     without: Mapping[str, Any] | None = None,
 ) -> Any:
-    """Return what stands in the sphere, with LEDs as they were built.
+    """Return the scene of a target or a patch of skin in the sphere, with its actual LEDs.
 
     Parameters
     ----------
     rig : Rig
-        Cropped as it is used.
+        Rig with its cropped camera.
     target : str, optional
         "ball", "flat" or "dark"; a patch of skin by default.
     site, subject, seed
-        Of the skin; the seed also of the sphere and of the patch's motion.
+        Properties of the skin; the seed is also that of the sphere and of the patch's motion.
     plan : Plan, optional
-        By whose angles the skin must be large enough; any angle by default.
+        Plan whose caliper angles set the size of the skin; default any angle.
     without
-        What of the skin is not built, see `skinrig.simulating.effect_omission`.
+        Omitted effects of the skin, see `skinrig.simulating.effect_omission`.
     """
     sphere = build_sphere(rig, seed=seed)
     if target is not None:
@@ -122,18 +122,18 @@ def make_scene(
 
 
 class GripLog(SceneLog):
-    """A scene that notes what the caliper held at every exposure, beside the session."""
+    """Scene that logs the skin's grip by the caliper at each exposure."""
 
     suffix, kinds, max_lag_s = "grips", ("gradient",), 0.05
-    lost = "the states captured before"
+    lost_label = "the states captured before"
 
     def describe_exposure(self, exposed: Mapping[str, Any]) -> Mapping[str, Any] | None:
-        """Return the grip of what is lit."""
+        """Return the caliper's grip of the lit skin; None without skin."""
         grip = exposed["grip"]
         return {"grip": dataclasses.asdict(grip)} if grip.attached else None
 
     def list_grips(self, session: Session) -> list[Any]:
-        """Return what was held in each state that the session has, in the plan's order."""
+        """Return the grip in each recorded strain step, in the plan's order."""
         entries = self.read()
         found = []
         for name, steps in group_by_state(session.plan):

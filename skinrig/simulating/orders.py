@@ -1,4 +1,4 @@
-"""Orders of simulations, one class a rig, and what a simulation returns."""
+"""Orders and results of simulated captures, with one class of order per rig."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -18,55 +18,55 @@ from skinrig.simulating.effect_omission import omission_arguments
 
 PICTURE_SIZES = ("small", "full")
 SIMULATED_USES = ("research", "publication")
-"""What may be done with a face that is nobody's, unless said otherwise."""
+"""Default consent scope of simulated subjects."""
 MIN_WIDTH_PX = 16
 _COUNT_OPTIONS = {"width_px": "width", "lights": "lights", "views": "views"}
 """Fields that count something, and their names in messages."""
 
 
 class SimulationError(ValueError):
-    """A simulation that cannot be set up as asked."""
+    """A simulation that cannot be set up with the given options."""
 
 
 class SimulationOptionsError(SimulationError, UsageError):
-    """Options of a simulation that do not go together, or with its rig."""
+    """Options that exclude each other or do not apply to the rig."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimulationResult:
-    """What a simulated capture left behind."""
+    """Result of a simulated capture."""
 
     session: Path
     truth: Path | None
     frames: int
     rig_seconds: float
-    """Time that passed on the rig's own clock."""
+    """Time elapsed on the rig's clock, s."""
     left_out: tuple[tuple[str, str], ...]
-    """What the scene did not build, and why."""
+    """Effects that the scene omitted, each with the reason."""
     blur_mm: tuple[float, ...] = ()
-    """Width from 10 to 90 % of an edge that light spreading in the skin blurs, R, G, B, mm."""
+    """Width from 10 to 90 % of an edge blurred by lateral scattering in skin, R, G, B, mm."""
     light: Mapping[str, float | str] = field(default_factory=dict)
     """Figures of the LEDs' light, see `skinrig.capturing.light_safety`; empty for the flash rig."""
     effects: tuple[Mapping[str, Any], ...] = ()
-    """What the scene built and what not, with reasons, see `rigsim.needs.effects.Effect`."""
+    """Effects that the scene built or omitted, with reasons, see `rigsim.needs.effects.Effect`."""
 
     @property
     def truth_name(self) -> str:
-        """Name of the truth's folder; empty without one."""
+        """Name of the ground truth's folder; empty without one."""
         return self.truth.name if self.truth else ""
 
     def document(self) -> Mapping[str, Any]:
-        """Return this as JSON values."""
+        """Return the result as JSON values."""
         return {one.name: getattr(self, one.name) for one in fields(self)}
 
 
 def require_size(size: str) -> None:
-    """Raise for a size that no simulation has."""
+    """Raise unless a size is "small" or "full"."""
     one_of("size", size, PICTURE_SIZES, SimulationError)
 
 
 def truth_folder(session: Path) -> Path:
-    """Return the folder beside a session that holds its truth.
+    """Return the folder of a session's ground truth, next to the session.
 
     Examples
     --------
@@ -78,42 +78,42 @@ def truth_folder(session: Path) -> Path:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimulationOrder:
-    """What every simulation is asked for; each rig's order adds its own options.
+    """Options common to all simulations; each rig's order adds its own.
 
     Raises
     ------
     SimulationError
-        For a size, a seed, a target or a plan that the rig has not, and the like.
-    OptionsError
-        For options that do not go together.
+        For a size, a seed, a target, a plan or another value that the rig does not accept.
+    SimulationOptionsError
+        For options that exclude each other.
     """
 
     rig: ClassVar[str]
     targets: ClassVar[tuple[str, ...]]
-    """What can stand in the rig instead of a subject."""
+    """Targets that can replace the subject."""
 
     out: Path
-    """The session's folder; the truth goes to ``truth-NAME`` beside ``session-NAME``."""
+    """The session's folder ``session-NAME``; the ground truth goes to ``truth-NAME`` next to it."""
     size: str = "small"
     """"small" or "full"; each rig has its own meaning."""
     seed: int = 0
-    """Of the subject, the sensor and the boxes."""
+    """Seed of the subject, the sensor and the controllers."""
     subject: str = "III"
     """Preset of the skin, or a file NAME.toml, see `rigsim.population.files`."""
     target: str | None = None
     plan: Plan | None = None
-    """What is captured of the subject instead of the rig's own plan."""
+    """Plan to capture instead of the rig's default plan."""
     leave_out: tuple[str, ...] = ()
-    """Effects of skin that are not built: `skinrig.simulating.effect_omission`."""
+    """Omitted effects of skin, see `skinrig.simulating.effect_omission`."""
     resume: bool = False
-    """Go on with a session that was interrupted; what is on disk is kept."""
+    """Resume an interrupted session; its frames are kept."""
     created: datetime | None = None
     """Date of the session; None: now."""
     person: SubjectRecord | None = None
-    """Pseudonym and consent to record; None: one who agreed to :data:`SIMULATED_USES`, or, where a
-    session is gone on with, as it was begun. Others than it was begun with are refused."""
+    """Pseudonym and consent to record; None: consent to :data:`SIMULATED_USES`, or that of the
+    resumed session. A record that differs from the resumed session's is refused."""
     progress: Callable[[str], None] | None = None
-    """Called with one line a frame."""
+    """Called with one line per frame."""
 
     def __post_init__(self) -> None:
         for name, shown in _COUNT_OPTIONS.items():
@@ -132,45 +132,48 @@ class SimulationOrder:
         self.scene_switches()
 
     def check(self) -> None:
-        """Raise where options do not go together."""
+        """Raise if options exclude each other."""
         self.check_rig_of_plan()
         if self.plan is not None and self.exclusive_subject is not None:
             raise SimulationOptionsError(
-                "plan: is for a subject; targets and sequences have their own"
+                "plan: an option of subjects; targets and sequences have their own, so remove it"
             )
 
     def check_rig_of_plan(self) -> None:
         """Raise for a plan of another rig."""
         if self.plan is not None and self.plan.rig != self.rig:
-            raise SimulationError(f"plan: got one of {self.plan.rig!r}, expected {self.rig!r}")
+            raise SimulationError(
+                f"plan: got one of rig {self.plan.rig!r}, expected {self.rig!r}; name a plan of it"
+            )
 
     @property
     def exclusive_subject(self) -> str | None:
-        """What is simulated instead of skin at rest or in a state; None for such skin."""
+        """Name of a subject other than skin at rest or with an expression; None for such skin."""
         return None if self.target is None else "a target"
 
     def refuse_options(self, subject: str, *names: str) -> None:
-        """Raise where something was asked for that `subject` has not."""
+        """Raise if an option is set that does not apply to `subject`."""
         unset = {one.name: one.default for one in fields(self)}
         for name in names:
             if getattr(self, name) != unset[name]:
                 raise SimulationOptionsError(
-                    f"{name}: the {subject} rig knows nothing of it; leave it out"
+                    f"{name}: not an option of the {subject} rig; remove it"
                 )
 
     def scene_switches(self) -> dict[str, Any]:
-        """Return arguments of a scene of skin that leave out what is to be left out.
+        """Return the arguments of a scene of skin that omit the effects in `leave_out`.
 
         Raises
         ------
         SimulationError
-            Where the rig's scenes cannot, or a target or a sequence is ordered.
+            If the rig's scenes cannot omit one of them, or for a target or a sequence.
         """
         if not self.leave_out:
             return {}
         if self.exclusive_subject is not None:
             raise SimulationOptionsError(
-                f"leave_out: is of skin at rest or in a state, not of {self.exclusive_subject}"
+                f"leave_out: an option of skin at rest or with an expression, not of "
+                f"{self.exclusive_subject}; remove it"
             )
         try:
             return dict(omission_arguments(self.rig, self.leave_out))
@@ -180,139 +183,142 @@ class SimulationOrder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FaceOrder(SimulationOrder):
-    """A face before a rig."""
+    """Order of a face in front of a rig."""
 
     width_px: int | None = None
-    """Pixels across each camera, instead of ``size``."""
+    """Width of each camera's image, px, instead of that of ``size``."""
     mesh: str | Path | None = None
-    """A face mesh to wear the skin instead of the procedural head."""
+    """Face mesh that replaces the procedural head."""
     states: tuple[str, ...] = ("neutral",)
-    """Expressions and physiological states: one after the other before the flash rig, one alone in
-    the dome."""
+    """Expressions and physiological conditions: any number for the flash rig, one for the dome."""
     movement: bool = True
-    """Whether the face moves and wrinkles with its states; else they change the blood only."""
+    """Whether the face moves and wrinkles with its expressions; else only the blood changes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlashOrder(FaceOrder):
-    """A face or a target before the flash rig; "small" is 768 pixels across, "full" 3024."""
+    """Order of a face or a target for the flash rig; "small" is 768 px wide, "full" 3024 px."""
 
     rig: ClassVar[str] = "flash"
     targets: ClassVar[tuple[str, ...]] = ("white", "chart", "flat", "dark", "malus")
 
     repeats: int = 1
-    """Image pairs a state."""
+    """Image pairs per expression."""
     nearer_mm: float = 0.0
-    """How much nearer to the camera than the white tile's place the face stands, mm; below 0
-    farther. The flashes are then as much nearer, and the lens is focused on the tile."""
+    """Distance, mm, by which the face is nearer to the camera than the white reference; below 0
+    farther. The flashes are nearer by the same distance; the lens focuses on the reference."""
     sequence: SequenceOrder | None = None
-    """A sequence in time instead of ``states``."""
+    """Sequence in time instead of ``states``."""
     relaxation_s: float | None = None
-    """Time constant of its blood, s; None: of the state, see `rigsim.subject.perfusion_course`."""
+    """Time constant of the sequence's blood volume fraction, s; None: that of the expression, see
+    `rigsim.subject.perfusion_course`."""
 
     @property
     def exclusive_subject(self) -> str | None:
-        """What is simulated instead of skin at rest or in a state; None for such skin."""
+        """Name of a subject other than skin at rest or with an expression; None for such skin."""
         if self.target is not None:
             return "a target"
         return None if self.sequence is None else "a sequence"
 
     def check(self) -> None:
-        """Raise where options do not go together."""
+        """Raise if options exclude each other."""
         if not math.isfinite(self.nearer_mm):
-            raise SimulationError(f"nearer: got {self.nearer_mm}, expected finite millimetres")
+            raise SimulationError(f"nearer: got {self.nearer_mm}, expected a finite distance, mm")
         if self.nearer_mm != 0.0 and self.exclusive_subject is not None:
             raise SimulationOptionsError(
-                f"nearer: is of a face at rest or in a state, not of {self.exclusive_subject}"
+                f"nearer: an option of faces at rest or with an expression, not of "
+                f"{self.exclusive_subject}; remove it"
             )
         SimulationOrder.check(self)
         if self.sequence is not None:
             self.refuse_options(self.rig, "target", "repeats", "states")
         elif self.relaxation_s is not None:
-            raise SimulationOptionsError("relaxation: is for a sequence")
+            raise SimulationOptionsError("relaxation: an option of sequences; remove it")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DomeOrder(FaceOrder):
-    """A face or a target in the dome.
+    """Order of a face or a target for the dome.
 
-    "small" is 6 cameras, 320 pixels across, and 48 lights; "full" is all that it has. The subject
-    may also be a member of the simulated population, P01 to P87
-    (`rigsim.population.population.draw_population`), with what it wears. Lights and cameras of a
-    plan are those of targets, too.
+    "small" is 6 cameras, 320 px wide, and 48 lights; "full" is the whole dome. The subject may also
+    be a member of the simulated population, P01 to P87
+    (`rigsim.population.population.draw_population`), with its own conditions. The lights and
+    cameras of a plan are also used with targets.
     """
 
     rig: ClassVar[str] = "dome"
     targets: ClassVar[tuple[str, ...]] = get_args(DomeTarget)
 
     lights: int | None = None
-    """So many lights, spread evenly; None: as many as ``size`` says."""
+    """Number of evenly distributed lights; None: that of ``size``."""
     views: int | None = None
-    """So many cameras, spread evenly; None: as many as ``size`` says."""
+    """Number of evenly distributed cameras; None: that of ``size``."""
     move: bool = False
     """Whether the face drifts and twitches during the capture."""
     wrapped: bool = False
-    """Whether the scan of the face is a template wrapped onto it, of the same triangles and texture
-    coordinates in every state, so that maps of states share one texture."""
+    """Whether the scan is a template wrapped onto the face, with the same triangles and texture
+    coordinates for every expression, so that maps of expressions share one texture."""
     subsurface: bool = False
-    """True: light spreads sideways inside the skin even where that changes no pixel; False: where
-    it does, see `rigsim.needs.effects`."""
+    """True: lateral scattering in skin is always built; False: only if it changes pixels, see
+    `rigsim.needs.effects`."""
     interreflections: bool = False
-    """True: light goes from skin to skin even where that changes no pixel; False: where it does."""
+    """True: interreflection of skin is always built; False: only if it changes pixels."""
     conditions: Mapping[str, float] = field(default_factory=dict)
     """Conditions of the face with their amounts, see `rigsim.population.conditions`."""
 
     @property
     def state(self) -> str:
-        """The state of the face."""
+        """The expression of the face."""
         return self.states[0]
 
     def check(self) -> None:
-        """Raise where options do not go together; a dome's plan is for targets, too."""
+        """Raise if options exclude each other; a dome's plan also applies to targets."""
         if len(self.states) != 1:
             raise SimulationOptionsError(
                 f"states: got {', '.join(self.states) or 'none'}, expected one; a session of the "
-                "dome shows one face, capture each state into a session of its own"
+                "dome has one expression, so capture each into its own session"
             )
         if self.plan is not None and (self.lights, self.views) != (None, None):
-            raise SimulationOptionsError("lights, views: a plan names its own; leave them out")
+            raise SimulationOptionsError("lights, views: a plan has its own; remove them")
         self.check_rig_of_plan()
         if self.target is None:
             return
         if self.state != "neutral":
-            raise SimulationOptionsError(f"state: got {self.state!r}, but a target has none")
+            raise SimulationOptionsError(
+                f"state: got {self.state!r}, but a target has none; remove it"
+            )
         if self.conditions:
             raise SimulationOptionsError(
-                f"condition: got {', '.join(self.conditions)}, but a target has none"
+                f"condition: got {', '.join(self.conditions)}, but a target has none; remove it"
             )
         if self.subsurface or self.interreflections:
             raise SimulationOptionsError(
-                "subsurface, interreflections: are of a face; a target has neither"
+                "subsurface, interreflections: options of faces, not of targets; remove them"
             )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GradientOrder(SimulationOrder):
-    """A patch of skin in a caliper, or a target, in the gradient sphere.
+    """Order of a patch of skin in a caliper, or a target, for the gradient sphere.
 
-    "small" is the middle 256 pixels and one angle of the caliper; "full" is all 2048, which the
-    ball always takes, and all angles.
+    "small" is the middle 256 pixels and one angle of the caliper; "full" is all 2048 pixels, which
+    the ball always uses, and all angles.
     """
 
     rig: ClassVar[str] = "gradient"
     targets: ClassVar[tuple[str, ...]] = get_args(GradientTarget)
 
     width_px: int | None = None
-    """Pixels across, instead of ``size``."""
+    """Width of the image, px, instead of that of ``size``."""
     site: str | None = None
-    """Where the skin is from: "forehead" (the default), "cheek", "chin"."""
+    """Site of the skin: "forehead" (the default), "cheek", "chin"."""
     angles: tuple[float, ...] | None = None
-    """Angles of the caliper, degrees; None: as ``size`` says."""
+    """Angles of the caliper, degrees; None: those of ``size``."""
     steps: tuple[int, int] | None = None
-    """First and last position of the caliper; None: all. Where the skin ends is found out."""
+    """First and last strain step; None: all, up to the travel limit found in the capture."""
 
     def check(self) -> None:
-        """Raise where options do not go together."""
+        """Raise if options exclude each other."""
         SimulationOrder.check(self)
         if self.target is not None:
             self.refuse_options("target of the gradient", "site", "angles", "steps")
@@ -320,7 +326,7 @@ class GradientOrder(SimulationOrder):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProbeOrder(SimulationOrder):
-    """Tissue under the fibre probe, or a target; "full" has more photons in its truth.
+    """Order of tissue or a target for the fiber probe; "full" traces more photons for the truth.
 
     The subject may also be "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G]" in 1/mm.
     """
@@ -329,16 +335,16 @@ class ProbeOrder(SimulationOrder):
     targets: ClassVar[tuple[str, ...]] = get_args(ProbeTarget)
 
     sites: tuple[str, ...] | None = None
-    """Where the probe is placed; None: forehead, cheek and chin."""
+    """Sites of the probe; None: forehead, cheek and chin."""
     repeats: int = 1
-    """Placements a site and direction."""
+    """Placements per site and direction."""
     angles: tuple[float, ...] | None = None
-    """One number: how many directions of the head; None: 1."""
+    """One number, the count of directions of the head; None: 1."""
     all_brackets: bool = False
-    """Whether the probe takes exposures that can show no more."""
+    """Record every exposure bracket, also those that add no information."""
 
     def check(self) -> None:
-        """Raise where options do not go together."""
+        """Raise if options exclude each other."""
         SimulationOrder.check(self)
         if self.target is not None:
             self.refuse_options("target of the probe", "sites", "angles")
@@ -347,25 +353,25 @@ class ProbeOrder(SimulationOrder):
 ORDER_BY_RIG: Mapping[str, type[SimulationOrder]] = {
     kind.rig: kind for kind in (FlashOrder, DomeOrder, GradientOrder, ProbeOrder)
 }
-"""The class of each rig's orders."""
+"""Class of each rig's orders."""
 
 
 def order_for(rig: str, **options: Any) -> SimulationOrder:
-    """Return a rig's order out of options by name.
+    """Create a rig's order from options by name.
 
     Parameters
     ----------
     rig
         A key of :data:`ORDER_BY_RIG`.
     options
-        Fields of its order; those of another rig's are refused, unless they ask for nothing.
+        Fields of its order; a field of another rig's order is refused unless it has its default.
 
     Raises
     ------
     SimulationError
-        For an unknown rig, or as the order does.
-    OptionsError
-        For another rig's option.
+        For an unknown rig or an invalid value.
+    SimulationOptionsError
+        For an option of another rig.
 
     Examples
     --------
@@ -379,7 +385,5 @@ def order_for(rig: str, **options: Any) -> SimulationOrder:
         default = foreign[name].default
         if options.pop(name) not in ({} if default is MISSING else default, None):
             shown = name.removesuffix("_mm")
-            raise SimulationOptionsError(
-                f"{shown}: the {rig} rig knows nothing of it; leave it out"
-            )
+            raise SimulationOptionsError(f"{shown}: not an option of the {rig} rig; remove it")
     return ORDER_BY_RIG[rig](**options)

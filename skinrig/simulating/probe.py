@@ -1,4 +1,4 @@
-"""The fibre probe simulated: tissue at several sites, or a target, and the truth."""
+"""Simulate captures with the fiber probe: tissue at several sites or a target, with the truth."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -19,14 +19,14 @@ from skinrig.simulating.exposure_log import SceneLog
 from skinrig.simulating.orders import ProbeOrder, SimulationError, SimulationResult, truth_folder
 
 TRUTH_PHOTONS = {"small": 60_000, "full": 2_000_000}
-"""Of each site and angle of skin: about two percent in the far fibres, or a third of one."""
+"""Photons per site and angle of skin: noise of about 2 %, or a third of 1 %, in the far fibers."""
 
 
 def simulate_probe(order: ProbeOrder) -> SimulationResult:
     """Simulate a capture with the fibre probe; see `simulation.simulate`.
 
-    Either size has all sites, brackets and pixels, which cost little; what "full" has more of are
-    the photons of the truth.
+    Both sizes have all sites, brackets and pixels, which are fast to simulate; "full" traces more
+    photons for the ground truth.
     """
     rig = load_rig("probe")
     asked_plan = DefaultPlan(**select_attributes(order, "target", "sites", "repeats", "angles"))
@@ -45,7 +45,7 @@ def simulate_probe(order: ProbeOrder) -> SimulationResult:
         _check_sites(scene.tissue, order.sites or PROBE_SITES, rig)
     light = driving.announce_light(plan, rig, order)
     session, log = driving.open_logged_session(order, plan, rig, asked, scene, HeadLog)
-    # nobody has to place the head: the box is told where it is, and with it the world
+    # nobody places the head: a placement is sent to the controller, which passes it to the world
     rig_seconds = driving.drive_plan(
         order, session, rig, log, run_id=log.run_id, all_brackets=order.all_brackets
     )
@@ -59,7 +59,7 @@ def simulate_probe(order: ProbeOrder) -> SimulationResult:
 
 
 def _check_sites(tissue: Any, sites: Sequence[str], rig: Rig) -> None:
-    """Raise where the tissue has no such site, before anything is captured."""
+    """Raise for a site that the tissue does not have, before the capture begins."""
     suction_mbar = rig.probe.suction_mbar if rig.probe is not None else 0.0
     for site in sites:
         try:
@@ -69,25 +69,25 @@ def _check_sites(tissue: Any, sites: Sequence[str], rig: Rig) -> None:
 
 
 def make_scene(rig: Rig, target: str | None, *, subject: str, seed: int, photons: int) -> Any:
-    """Return what the head is placed on, before fibres as they were built.
+    """Return the scene of a tissue or a target under the probe's actual fibers.
 
     Parameters
     ----------
     rig : Rig
-        The probe's.
+        Rig of the probe.
     target : str or None
         "phantom" or "dark"; None: skin, or another tissue.
     subject : str
         Preset of the skin, or "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G]" in 1/mm.
     seed : int
-        Of the subject, the photons and the sensor's noise; the probe itself is the same for all.
+        Seed of the subject, the photons and the sensor's noise; the probe is the same for all.
     photons : int
-        Of each site and angle.
+        Photons per site and angle.
 
     Raises
     ------
     SimulationError
-        For a subject that is none.
+        For an unknown or malformed subject.
     """
     try:
         tissue = BLOCK if target == "phantom" else subject_file.load_tissue(subject, seed=seed)
@@ -97,19 +97,20 @@ def make_scene(rig: Rig, target: str | None, *, subject: str, seed: int, photons
 
 
 class HeadLog(SceneLog):
-    """A scene that notes under which suction the head was lit, beside the session.
+    """Scene that logs the suction of the head at each exposure.
 
-    The gauge that a session records has a zero of its own; the truth needs the actual suction.
+    The pressure that a session records has the gauge's offset; the ground truth needs the actual
+    suction.
     """
 
     suffix, kinds, max_lag_s = "heads", ("fibres", PHANTOM_SITE), 1e-3
 
     def describe_exposure(self, exposed: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the suction of what is lit."""
+        """Return the suction of the lit head."""
         return {"suction_mbar": exposed["head"].suction_mbar}
 
     def list_placements(self, session: Session) -> list[Any]:
-        """Return the placements that the session has series of, in the plan's order."""
+        """Return the placements with a recorded series, in the plan's order."""
         entries = self.read()
         frames = {record.step_id: record for record in session.frames()}
         suctions: dict[HeadPlacement, list[float]] = {}
@@ -120,6 +121,6 @@ class HeadLog(SceneLog):
                     entry = self.at(entries, run_id, record, f"step {step.id}")
                     suctions.setdefault(placement, []).append(float(entry["suction_mbar"]))
         return [
-            ProbePlacement(place.site, place.repeat, place.angle_deg, sum(found) / len(found))
-            for place, found in suctions.items()
+            ProbePlacement(head.site, head.repeat, head.angle_deg, sum(mbar) / len(mbar))
+            for head, mbar in suctions.items()
         ]

@@ -1,4 +1,4 @@
-"""Whether and from where a simulated session may be gone on with: settings and shot numbers."""
+"""Check whether a simulated session can be resumed, and count the shots that it has made."""
 
 from collections import defaultdict
 from collections.abc import Mapping
@@ -7,30 +7,30 @@ from typing import Any
 from capture.session import Session, SubjectRecord
 
 _MAX_SHOWN_CHARACTERS = 60
-"""Characters of a value that are shown; of a plan nobody reads more."""
+"""Maximum number of characters of a value in a message."""
 
 
 def describe_differences(
     recorded: Mapping[str, Any], requested: Mapping[str, Any], *, of: str = ""
 ) -> tuple[str, ...]:
-    """Return what of two settings differs, a line each.
+    """Describe the differences between two settings, one line each.
 
     Parameters
     ----------
-    begun, asked
-        JSON values by name, as a session's manifest and an order hold them. A record of a file,
-        with its ``file`` and ``sha256``, is told by its name where that stayed.
+    recorded, requested
+        JSON values by name, of a session's manifest and of an order. A changed file, a record with
+        ``file`` and ``sha256``, is reported by its name if that is the same.
     of
-        What they are settings of, where they lie inside another.
+        Name of the parent setting, for nested settings.
 
     Examples
     --------
     >>> describe_differences({"width_px": 64, "mesh": ""}, {"width_px": 96, "mesh": "",
     ...     "nearer_mm": 5.0})
-    ('width_px: begun with 64, got 96', 'nearer_mm: begun without, got 5.0')
+    ('width_px: recorded with 64, got 96', 'nearer_mm: recorded without, got 5.0')
     >>> describe_differences({"map": {"file": "m.npy", "sha256": "a"}},
     ...             {"map": {"file": "m.npy", "sha256": "b"}}, of="subject")
-    ('subject map: the file m.npy was changed since',)
+    ('subject map: the file m.npy has changed since',)
     """
     lines: list[str] = []
     for key in dict.fromkeys((*recorded, *requested)):
@@ -40,40 +40,42 @@ def describe_differences(
             continue
         if isinstance(was, Mapping) and isinstance(now, Mapping) and key != "plan":
             if "sha256" in was and was.get("file") == now.get("file"):
-                lines.append(f"{name}: the file {was['file']} was changed since")
+                lines.append(f"{name}: the file {was['file']} has changed since")
             else:
                 file = was.get("file")
                 same = file is not None and file == now.get("file")
                 lines += describe_differences(was, now, of=f"{name} {file}" if same else name)
         elif key == "plan" and was and now:
-            lines.append(f"{name}: begun with {_shorten_value(was)}, got another")
+            lines.append(f"{name}: recorded with {_shorten_value(was)}, got another")
         else:
             old = f"with {_shorten_value(was)}" if key in recorded else "without"
             new = _shorten_value(now) if key in requested else "none"
-            lines.append(f"{name}: begun {old}, got {new}")
+            lines.append(f"{name}: recorded {old}, got {new}")
     return tuple(lines)
 
 
 def list_refusals(
     session: Session, requested: Mapping[str, Any], seed: int, person: SubjectRecord | None
 ) -> tuple[str, ...]:
-    """Return why a session cannot be gone on with as asked, a line each; empty where it can.
+    """List the reasons why a session cannot be resumed as requested, one line each.
 
     Parameters
     ----------
     session
-        Begun by a simulation, or by something else, which is told too.
-    asked
+        Session to resume; one that is not of a simulation is a reason, too.
+    requested
         Settings of the simulation.
     seed
-        Of subject, sensor and boxes.
+        Seed of subject, sensor and controllers.
     person
-        Pseudonym and consent; None: nothing is said of them, and those of the session stay.
+        Pseudonym and consent; None: those of the session.
     """
-    begun = session.manifest.extra.get("simulation")
-    if not isinstance(begun, Mapping):
-        return ("it was not begun by a simulation",)
-    lines = list(describe_differences({**begun, "seed": session.seed}, {**requested, "seed": seed}))
+    recorded = session.manifest.extra.get("simulation")
+    if not isinstance(recorded, Mapping):
+        return ("it was not created by a simulation",)
+    lines = list(
+        describe_differences({**recorded, "seed": session.seed}, {**requested, "seed": seed})
+    )
     if person is not None:
         lines += describe_differences(
             _consent_record(session.manifest.subject), _consent_record(person)
@@ -82,29 +84,29 @@ def list_refusals(
 
 
 def count_shots(session: Session) -> Mapping[str, int]:
-    """Return how many shots each camera has made for a session, as far as anything came of them.
+    """Count the shots that each camera has made for a session, as far as they were recorded.
 
-    The noise of a simulated frame is seeded by the number of the shot. A world that is made anew
-    for the rest of a session must not begin at 0 again: later frames would bear the noise of
-    earlier ones, and averages over them would be noisier than their errors say.
+    The number of the shot seeds the noise of a simulated frame. A new world that resumes a session
+    must not restart at 0: later frames would repeat the noise of earlier ones, and the noise of
+    their averages would exceed its stated standard error.
 
     Parameters
     ----------
     session
-        As it is before more is captured.
+        Session before it is resumed.
 
     Returns
     -------
     mapping
-        Shots by name of the view; 0 of one that has made none.
+        Shots by name of the view; 0 for a view without any.
 
     Notes
     -----
-    A step counts as often as all its cameras kept it, and once more for each try that failed: a
-    step that a kill left with some of its cameras is shot again with all, under the number that it
-    had. So a session that was interrupted holds the pixels of one that was not, where the same
-    shots are made. A caliper's are not: skin is taped and pictured anew. There more is counted
-    (pictures of newly taped skin, steps that were left out later), so that no number comes twice.
+    A step counts once per attempt that all its cameras recorded, and once per failed attempt. Steps
+    that an interruption left incomplete are shot again by all their cameras with the old number. A
+    resumed session then has the same pixels as an uninterrupted one, if the same shots are made.
+    With a caliper they are not, because skin is taped and imaged again: images of newly taped skin
+    and omitted steps are counted too, so that no number occurs twice.
     """
     counts: defaultdict[str, int] = defaultdict(int)
     attempts: defaultdict[str, dict[str, int]] = defaultdict(dict)
@@ -126,7 +128,7 @@ def count_shots(session: Session) -> Mapping[str, int]:
 
 
 def _consent_record(person: SubjectRecord) -> dict[str, Any]:
-    """Return whom a session is of; uses sorted, since their order says nothing."""
+    """Return pseudonym and consent for a comparison; uses are sorted, as their order is free."""
     day = person.consent_expires
     return {
         "pseudonym": person.pseudonym,
@@ -136,7 +138,7 @@ def _consent_record(person: SubjectRecord) -> dict[str, Any]:
 
 
 def _shorten_value(value: Any) -> str:
-    """Return a value as people read it: of files their name, of lists their members."""
+    """Format a value for a message: files by name, lists by their members, long texts cut."""
     if isinstance(value, Mapping) and "file" in value:
         return str(value["file"])
     if isinstance(value, Mapping) and "steps" in value:

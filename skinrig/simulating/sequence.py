@@ -1,4 +1,4 @@
-"""A sequence in time before the flash rig simulated: prompts, blood that follows, its truth."""
+"""Simulate sequences in time with the flash rig: prompts, perfusion, and the ground truth."""
 
 import dataclasses
 import json
@@ -31,9 +31,9 @@ from skinrig.simulating.orders import (
 )
 
 COURSE_FILE = "perfusion_course.json"
-"""In the truth: the blood of each frame at its own time."""
+"""File of the ground truth with the blood volume fraction at the time of each frame."""
 LANDMARKS_FILE = "landmarks.csv"
-"""In the truth: named points of the face at rest, px of its superpixels."""
+"""File of the ground truth with the landmarks of the neutral face, px of superpixels."""
 COURSE_LANDMARKS = {
     "forehead": "forehead",
     "cheek": "cheek left",
@@ -41,14 +41,15 @@ COURSE_LANDMARKS = {
     "chin": "chin",
     "temple": "temple left",
 }
-"""The five places of Jimenez et al. 2010, figure 7, and the landmarks they lie on."""
+"""The five positions of Jimenez et al. 2010, figure 7, with their landmarks."""
 DISC_RADIUS_FRACTION = 0.02
-"""Radius of a place's disc, of the picture's width."""
+"""Radius of the disc at a position, as a fraction of the image width."""
 TEXTURE_TEXELS_BY_WIDTH = (256, 512)
-"""Of the face's texture: for pictures up to `MAX_COARSE_WIDTH_PX` across, and for larger ones."""
+"""Texels per side of the face's texture: for images up to `MAX_COARSE_WIDTH_PX` wide, and for
+wider ones."""
 MAX_COARSE_WIDTH_PX = 384
 INTERRUPTION_S = 10.0
-"""Time on the host's clock that a simulated interruption takes, s."""
+"""Duration of a simulated interruption on the host's clock, s."""
 
 
 def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationResult:
@@ -75,7 +76,7 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
         raise SimulationError(f"reaction: got {reaction_s}, expected seconds >= 0")
     if reaction_s is not None and not sequence.is_prompted:
         raise SimulationOptionsError(
-            f"reaction: is for prompts, and {sequence.state} follows an event"
+            f"reaction: an option of prompted sequences, not of {sequence.state}; remove it"
         )
     if sequence.is_prompted:
         own = {"rise_s": constant_s, "fall_s": constant_s, "reaction_s": reaction_s}
@@ -94,7 +95,7 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
     log: ExposureLog | None = None
 
     def note(flash: FlashEvent) -> None:
-        if log is not None:  # nothing flashes before the session is open
+        if log is not None:  # None until the session is open; flashes begin later
             log.add(dataclasses.asdict(flash))
 
     scene = FlashCourseScene(rig, person, course, seed=seed, movement=order.movement, on_flash=note)
@@ -103,7 +104,7 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
     before_s = _event_s(session)
     begun_s = time.time() if before_s is None else _last_s(session) + INTERRUPTION_S
     if before_s is not None and not sequence.is_prompted:
-        course.tell(before_s - begun_s, sequence.state)  # it was over before this world began
+        course.tell(before_s - begun_s, sequence.state)  # the event ended before this world began
 
     def prompt(world: Any, text: str) -> None:
         if text == sequence.state:
@@ -121,7 +122,7 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
 
 
 def _event_s(session: Session) -> float | None:
-    """Return the host's time of a sequence's time 0, s; None before its first frame."""
+    """Return the host time of a sequence's time 0, s; None before its first frame."""
     for record in session.frames("subject"):
         if "time_s" in record.line.actual:
             return record.line.t_host_s - float(record.line.actual["time_s"])
@@ -141,7 +142,7 @@ def _write_truth(
     seed: int,
     parameters: Mapping[str, Any],
 ) -> None:
-    """Write the truth at rest, and with it what each frame's blood was; and that of the state."""
+    """Write the ground truth at rest with the perfusion at each frame, and that of the state."""
     poses = sorted({"neutral", *(str(flash["pose"]) for flash in flashes.values())})
     radius_px = DISC_RADIUS_FRACTION * session.rig.views[0].width_px / 2
     places = {pose: scale_landmarks(scene.landmarks_px(pose)) for pose in poses}
@@ -201,7 +202,7 @@ def _constants(course: Any) -> dict[str, float]:
 def disc_mean(
     values: Float64Array, valid: BoolArray, center_px: Sequence[float], radius: float
 ) -> float | None:
-    """Return the mean of a map's valid pixels within a disc about (x, y), px; None without any."""
+    """Return the mean of the valid pixels in a disc about (x, y), px; None if there are none."""
     rows, columns = np.indices(values.shape)
     near = (columns - center_px[0]) ** 2 + (rows - center_px[1]) ** 2 <= radius**2
     inside = valid & near

@@ -1,4 +1,4 @@
-"""Serve a simulated rig with a face before it, until interrupted."""
+"""Serve a simulated rig with a subject on local ports until interrupted."""
 
 from __future__ import annotations
 
@@ -33,30 +33,30 @@ if TYPE_CHECKING:
     from rigsim.scenes.probe.scene import ProbeScene
 
 GRADIENT_WIDTH_PX = 96
-"""Pixels across the served camera of the gradient rig."""
+"""Width of the gradient rig's image when served, px."""
 PROBE_PHOTONS = 20_000
-"""Photons a site of the served probe: some seconds each, and a few per cent of noise, more in the
-farthest fibres; `skinrig simulate probe` has its truth from ten times as many and more."""
+"""Photons per site of the served probe: a few seconds per site, and noise of a few percent, more in
+the farthest fibers. The ground truth of `skinrig simulate probe` uses ten times as many or more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServeOrder:
-    """What a served rig is asked for."""
+    """Options of a served rig."""
 
     pty: bool = False
-    """Boxes on pseudo terminals; cameras are on TCP in either case."""
+    """Serve controllers on pseudo terminals; cameras always use TCP."""
     tcp: str = "127.0.0.1:0"
     """HOST:PORT; port 0 chooses a free one."""
     allow_remote: bool = False
-    """Permit an address that other machines reach."""
+    """Allow an address that other machines can reach."""
     subject: str = "III"
     size: str = "small"
     seed: int = 0
     site: str | None = None
-    """Of the gradient rig's skin."""
+    """Site of the skin (gradient rig only)."""
     resume: Path | None = None
-    """Session of which an earlier server of the same seed made the frames that there are: noise is
-    drawn by the number of a shot, and shots are counted on from those. None: from 0 on."""
+    """Session with frames of an earlier server of the same seed. The number of the shot seeds the
+    noise, and counting continues after those frames. None: from 0."""
 
     def __post_init__(self) -> None:
         require_size(self.size)
@@ -65,61 +65,61 @@ class ServeOrder:
 
 
 def serve_rig(rig_name: str, order: ServeOrder, console: Console) -> None:
-    """Print the addresses of boxes and cameras, one ``NAME URL`` a line, and serve.
+    """Print the addresses of controllers and cameras, one ``NAME URL`` per line, and serve.
 
-    A dome is served with all its lights and cameras at either size: who captures from it uses the
-    rig file, which must fit. Skin in the gradient sphere is served small only: its pictures are
-    made while its caliper waits for the host. The fibre probe lies on skin, or on the
-    phantom where it is told so; its pictures have one size.
+    A dome is served with all its lights and cameras at both sizes, so that it matches the rig file
+    of the host. The gradient sphere is served small only, because images are rendered while the
+    caliper waits for the host. The fiber probe is on skin, or on the phantom if the host places it
+    there; its images have one size.
 
     Parameters
     ----------
     rig_name
         "flash", or a rig's TOML file.
     order
-        What is served.
+        Options of the served rig.
     console
-        With ``as_json`` the addresses are one JSON document, with the next step.
+        With ``as_json`` the addresses and the next step are one JSON document.
     """
     rig = load_rig(rig_name)
     made = _shots_made(order.resume, rig)
     if order.site is not None and rig.caliper is None:
-        raise SimulationOptionsError("site: only the gradient rig knows of it; leave it out")
+        raise SimulationOptionsError("site: an option of the gradient rig only; remove it")
     rig, scene = _build_served_rig(rig, order)
-    asked = select_attributes(order, "pty", "tcp", "allow_remote", "seed")
-    with serve_world(rig, scene=scene, shots_made=made, **asked) as served:
-        after = _next_step(rig_name, rig, served.addresses, order.resume)
+    options = select_attributes(order, "pty", "tcp", "allow_remote", "seed")
+    with serve_world(rig, scene=scene, shots_made=made, **options) as served:
+        command = _next_step(rig_name, rig, served.addresses, order.resume)
         if console.as_json:
-            addresses = {"addresses": dict(served.addresses), "next": after}
+            addresses = {"addresses": dict(served.addresses), "next": command}
             console.document("skinrig.serve/1", addresses)
         else:
             for name, url in served.addresses.items():
                 print(f"{name} {url}", flush=True)
-        print(f"next: {after}\nCtrl-C ends it", file=sys.stderr)
+        print(f"next: {command}\nCtrl-C stops serving", file=sys.stderr)
         try:
             served.wait()
         except KeyboardInterrupt:
-            print("no longer served; the lights are dark", file=sys.stderr)
-            if console.as_json:  # its one document stands there already
+            print("stopped serving; the lights are off", file=sys.stderr)
+            if console.as_json:  # the one document of the command is already printed
                 raise SystemExit(EXIT_INTERRUPTED) from None
             raise
 
 
 def _build_served_rig(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
-    """Return a rig as it is served, and what stands in it."""
+    """Return the served rig and its scene."""
     subject, seed = order.subject, order.seed
-    # a rig's own file may have any name: what it sees hangs on what it is built of
+    # a rig file may have any name, so the kind of the rig follows from its parts
     kind = "gradient" if "gradient_sphere" in rig.boxes else "probe" if rig.probe else "other"
     find_unused_subject_keys(subject, kind, lambda text: print(text, file=sys.stderr))
     if kind == "gradient":
         if order.size != "small":
             raise SimulationError(
                 f"size: got {order.size!r}, expected small: larger pictures take longer to make "
-                "than the caliper waits for its host; skinrig simulate gradient makes them"
+                "than the caliper waits for its host; use skinrig simulate gradient for them"
             )
         rig = rig.cropped(GRADIENT_WIDTH_PX)
         scene = gradient.make_scene(rig, site=order.site, subject=subject, seed=seed)
-        # what all states share is made before anybody asks, so that no client waits for it
+        # rendered before the first request, so that no client waits for it
         scene.lighting()
         return rig, scene
     if rig.probe is not None:
@@ -140,20 +140,21 @@ def _next_step(rig_name: str, rig: Rig, urls: Mapping[str, str], resume: Path | 
 
 
 def _shots_made(session: Path | None, rig: Rig) -> Mapping[str, int]:
-    """Return the shots that a session's cameras have made; none without a session."""
+    """Count the shots that a session's cameras have made; empty without a session."""
     if session is None:
         return {}
     opened = Session.open(session)
     if opened.rig.name != rig.name:
         raise SimulationError(
-            f"resume: got a session of rig {opened.rig.name!r}, expected one of {rig.name!r}"
+            f"resume: got a session of rig {opened.rig.name!r}, expected one of {rig.name!r}; "
+            "name one"
         )
     return count_shots(opened)
 
 
 def _flash_scene(rig: Rig, subject: str, seed: int) -> Any:
     scene = FlashScene(rig, subject_file.load_subject(subject).face(seed=seed), seed=seed)
-    # rendered before anybody asks, so that no client waits for it
+    # rendered before the first request, so that no client waits for it
     scene.radiance("crossed")
     return scene
 
@@ -168,8 +169,8 @@ def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int) -> Any:
         simulating_probe.make_scene(rig, of, subject=subject, seed=seed, photons=PROBE_PHOTONS)
         for of in (None, "phantom")
     )
-    # the photons of the usual places are traced before anybody asks: the box holds the head on the
-    # skin meanwhile, and waits for its host for some seconds only
+    # photons of the default sites are traced before the first request: during one, the head is
+    # under suction, and the controller waits for its host for a few seconds only
     for site in (*PROBE_SITES, PHANTOM_SITE):
         scene = block if site == PHANTOM_SITE else skin
         scene.fiber_radiance(HeadState(site, 0.0, True, probe.suction_mbar, probe.camera_c))
@@ -177,7 +178,7 @@ def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int) -> Any:
 
 
 class _SkinAndBlock:
-    """Somebody's skin, and the block of known optics where the head is told to be on it."""
+    """Scene of a subject's skin, and of the phantom when the head is placed on it."""
 
     def __init__(self, skin: ProbeScene, block: ProbeScene, block_site: str) -> None:
         self._skin, self._block, self._block_site = skin, block, block_site

@@ -1,4 +1,4 @@
-"""Simulated captures: a world of boxes and a scene, driven through the real drivers by URL."""
+"""Simulate captures: drive a world of simulated devices and a scene through the real drivers."""
 
 import importlib
 from pathlib import Path
@@ -8,26 +8,26 @@ from skinrig.simulating.orders import SimulationOrder, SimulationResult, order_f
 
 
 def simulate(order: SimulationOrder) -> SimulationResult:
-    """Simulate a capture into SESSION/, and write its truth beside it.
+    """Simulate a capture into SESSION/ and write its ground truth next to it.
 
     Parameters
     ----------
     order
-        Of one of the four rigs.
+        Order of one of the four rigs.
 
     Raises
     ------
     SimulationError
-        For what the rig cannot simulate.
+        For an order that the rig cannot simulate.
     """
-    # a module a rig, so that a run loads what its own rig needs
+    # one module per rig, imported on use, so that a run loads only its own rig
     rig = importlib.import_module(f"skinrig.simulating.{order.rig}")
     done: SimulationResult = getattr(rig, f"simulate_{order.rig}")(order)
     return done
 
 
 def simulate_session(rig: str, out: str | Path, **options: Any) -> SimulationResult:
-    """Simulate a capture with a rig by its name; see `simulate`.
+    """Simulate a capture with the rig of a name; see `simulate`.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def simulate_session(rig: str, out: str | Path, **options: Any) -> SimulationRes
     out
         The session's folder.
     options
-        Fields of the rig's order; lists stand for tuples.
+        Fields of the rig's order; lists are converted to tuples.
     """
     given = {name: tuple(v) if isinstance(v, list) else v for name, v in options.items()}
     return simulate(order_for(rig, out=Path(out), **given))

@@ -1,4 +1,4 @@
-"""What manifests and truths of simulated captures hold of whom they show."""
+"""Records of simulated subjects in manifests and ground truths."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 from rigsim.population import files as subject_file
 
 SUBJECT_FILE_SUFFIX = ".toml"
-"""Of a subject's file, see `rigsim.population.files`."""
+"""Suffix of a subject file, see `rigsim.population.files`."""
 
 
 def pseudonym(subject: str, seed: int) -> str:
@@ -18,51 +18,51 @@ def pseudonym(subject: str, seed: int) -> str:
     >>> pseudonym("III", 0), pseudonym("homogeneous:0.04,1.5", 2), pseudonym("people/ann.toml", 0)
     ('simulated-III-0', 'simulated-homogeneous-0.04-1.5-2', 'simulated-ann-0')
     """
-    said = Path(subject).stem if subject.endswith(SUBJECT_FILE_SUFFIX) else subject
-    name = "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "-" for c in said)
+    label = Path(subject).stem if subject.endswith(SUBJECT_FILE_SUFFIX) else subject
+    name = "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "-" for c in label)
     return f"simulated-{name}-{seed}"
 
 
 def manifest_record(subject: str) -> str | dict[str, Any]:
-    """Return a subject as a session's manifest holds it: a preset, or all that its file says."""
+    """Return a subject for a session's manifest: a preset's name, or the content of its file."""
     return subject_file.record_subject(subject)
 
 
 def find_unused_subject_keys(
     subject: str, rig: str, progress: Callable[[str], None] | None = None
 ) -> tuple[str, ...]:
-    """Return the keys of a subject's file of which a rig sees nothing; none of a preset.
+    """Return the keys of a subject file that do not affect a rig; empty for a preset.
 
     Parameters
     ----------
     subject
-        As the command line has it.
+        Preset or file of the command line.
     rig
         Name of the rig.
-    tell
-        Told of them, in one line, where there are any.
+    progress
+        Called with one line that lists them, if there are any.
     """
     if not subject_file.is_subject_file(subject):
         return ()
     keys = subject_file.read_subject_file(subject).unused_keys(rig)
     if keys and progress is not None:
-        progress(f"{subject}: the {rig} rig sees nothing of {', '.join(keys)}")
+        progress(f"{subject}: without effect on the {rig} rig: {', '.join(keys)}")
     return keys
 
 
 def truth_parameters(
     subject: str, rig: str, progress: Callable[[str], None] | None
 ) -> dict[str, Any]:
-    """Return parameters of a truth that tell of a subject's file; none of a preset.
+    """Return the ground truth's parameters from a subject file; empty for a preset.
 
     Parameters
     ----------
     subject
-        As the command line has it.
+        Preset or file of the command line.
     rig
         Name of the rig.
     progress
-        Told what the file says and the rig does not see.
+        Called with one line that lists the keys without effect on the rig.
     """
     if not subject_file.is_subject_file(subject):
         return {}

@@ -1,1 +1,1 @@
-"""What traits of faces are learned from and held against."""
+"""Data for learning traits of faces, and ground truth to evaluate them."""

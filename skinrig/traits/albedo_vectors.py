@@ -1,8 +1,9 @@
-"""The albedo of a face as a vector that traits can be learned from and added to.
+"""Represent the albedo of a face as a vector for learning and editing traits.
 
-Two kinds: histograms of R_d, as published, or quantiles of its logarithm, in which a darker skin
-lies between a light and a dark one and not half on each, and pigment is a factor on every skin.
-Vectors of quantiles are in units of each response's spread in the population, so that all count.
+There are two kinds: histograms of R_d, as published, and quantiles of its logarithm. A mean of
+quantiles is one intermediate skin, whereas a mean of histograms is a mixture of two; and pigment is
+a factor on R_d, hence an offset of quantiles. Quantiles are scaled by each response's standard
+range in the population, so that all responses have similar weight.
 """
 
 import dataclasses
@@ -25,9 +26,9 @@ VectorKind = Literal["quantiles", "histograms"]
 
 VECTOR_KINDS: Final = ("quantiles", "histograms")
 MIN_RELATIVE_SCALE: Final = 1e-3
-"""Spread of a response, over that of the first channel of the image, that tells nothing."""
+"""Range of a response, relative to the first channel's, below which it carries no information."""
 MIN_REFLECTANCE: Final = 1e-3
-"""Reflectance below which a logarithm is taken of this; no skin is as dark."""
+"""Lower clip of the reflectance before the logarithm; no skin is as dark."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +38,7 @@ class AlbedoTraits:
     Attributes
     ----------
     kind
-        What the vectors of `traits` hold.
+        Kind of the vectors of `traits`.
     texture
         Color space and bin edges of the population, for R_d (histograms) or its logarithm.
     traits
@@ -49,7 +50,7 @@ class AlbedoTraits:
     traits: TraitSpace
 
     def __post_init__(self) -> None:
-        """Refuse another kind, and vectors of another length."""
+        """Raise for an unknown kind, or vectors of another length."""
         one_of("vectors", self.kind, VECTOR_KINDS)
         if len(self.traits.center) != self.texture.size:
             raise UnusableError(
@@ -59,23 +60,23 @@ class AlbedoTraits:
     def target(
         self, histograms: ArrayLike, amounts: Mapping[str, float]
     ) -> tuple[Float64Array, TextureSpace, float]:
-        """Return a histogram vector with more or less of some traits.
+        """Return a histogram vector with changed amounts of traits.
 
         Parameters
         ----------
         histograms
-            (23808,), as `model.texture_statistics.describe` gives it of `encode_albedo` albedo.
+            (23808,), by `model.texture_statistics.describe` of `encode_albedo` albedo.
         amounts
-            Trait to amount.
+            Amount by trait.
 
         Returns
         -------
         vector : ndarray, shape (23808,)
-            A valid one. All amounts 0: as given.
+            A valid histogram vector; the input if all amounts are 0.
         texture : TextureSpace
-            What its bins are: the population's, with edges as far apart as the edit needs them.
+            Its bins: the population's, with the edges widened as the edit requires.
         clipped : float
-            Share of the change that was not possible.
+            Fraction of the change that was not possible.
         """
         given = np.asarray(histograms, np.float64)
         if not any(amounts.values()):
@@ -105,7 +106,7 @@ class AlbedoTraits:
 
 
 def encode_albedo(r_d: ArrayLike, kind: VectorKind) -> Float64Array:
-    """Return what statistics are taken of: R_d for histograms, its logarithm for quantiles."""
+    """Return the values whose statistics are taken: R_d for histograms, ln R_d for quantiles."""
     given = np.asarray(r_d, np.float64)
     if one_of("vectors", kind, VECTOR_KINDS) == "histograms":
         return given
@@ -113,11 +114,11 @@ def encode_albedo(r_d: ArrayLike, kind: VectorKind) -> Float64Array:
 
 
 def response_scale(texture: TextureSpace) -> Float64Array:
-    """Return the scale of each response in a population, (C, responses): middle half its edges.
+    """Return the range of each response in a population, (C, responses): middle half of its edges.
 
-    Edges lie half evenly and half by how often values occur, so that the middle half of them spans
-    what is common. Responses of next to no spread (rounding errors, levels larger than the
-    face) get `MIN_RELATIVE_SCALE` of the first, so that they count for nothing.
+    Half of the edges are evenly spaced and half are quantiles, so the middle half spans the common
+    values. Responses with a negligible range (rounding errors, pyramid levels larger than the face)
+    get at least `MIN_RELATIVE_SCALE` of the first channel's range.
     """
     e = texture.edges
     bins = e.shape[-1] - 1
@@ -126,7 +127,7 @@ def response_scale(texture: TextureSpace) -> Float64Array:
 
 
 def informative_responses(texture: TextureSpace) -> BoolArray:
-    """Return the responses of more than negligible spread, (C, responses)."""
+    """Return which responses have more than a negligible range, (C, responses)."""
     scale = response_scale(texture)
     return np.asarray(scale > 1.001 * MIN_RELATIVE_SCALE * scale[0, 0], np.bool_)
 
@@ -170,7 +171,7 @@ def fit_albedo_traits(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AlbedoSample:
-    """One face's albedo in the common map."""
+    """Albedo of one face in the common map."""
 
     r_d: Float32Array
     """(N, N, 3)."""

@@ -1,4 +1,4 @@
-"""What a user says of faces: a table of names, of traits that they have or not, and of values."""
+"""Read tables of face labels: binary traits and continuous values by name."""
 
 import csv
 import math
@@ -19,13 +19,13 @@ class TraitLabels:
     Attributes
     ----------
     names
-        Of the faces, n.
+        Names of the faces, n.
     binary
         Trait to (n,) bool.
     continuous
         Trait to (n,) float.
     ignored
-        Names in the table without a face.
+        Names of the table that are not among the faces.
     """
 
     names: tuple[str, ...]
@@ -35,33 +35,32 @@ class TraitLabels:
 
 
 def read(path: Path, faces: Sequence[str]) -> TraitLabels:
-    """Read a table of labels for some faces.
+    """Read a table of labels for the given faces.
 
     Parameters
     ----------
     path
-        CSV with the header ``name,TRAIT,...``: a column of 0 and 1 alone is a trait that a face has
-        or not, any other one of numbers is a value such as an age. Lines that begin with ``#``
-        are skipped.
+        CSV with the header ``name,TRAIT,...``. A column of only 0 and 1 is a binary trait, any
+        other column of numbers a value such as an age. Lines that begin with ``#`` are skipped.
     faces
-        Names that the table must have, in the order of the result.
+        Names that the table must contain, in the order of the result.
 
     Raises
     ------
     UnusableError
-        Naming line and column.
+        With line and column.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise UnusableError(f"{path}: is no UTF-8 text") from error
+        raise UnusableError(f"{path}: is not UTF-8 text; save it as UTF-8 CSV") from error
     rows = [
         (number, [cell.strip() for cell in next(csv.reader([line]))])
         for number, line in enumerate(text.splitlines(), start=1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
     if not rows:
-        raise UnusableError(f"{path}: is empty, expected a line name,TRAIT,...")
+        raise UnusableError(f"{path}: is empty, expected a line name,TRAIT,...; add it")
     header = rows[0][1]
     traits = header[1:]
     if header[0] != "name" or not traits:
@@ -70,15 +69,17 @@ def read(path: Path, faces: Sequence[str]) -> TraitLabels:
         )
     if len(set(header)) < len(header) or not all(header):
         twice = next(c for c in header if header.count(c) > 1 or not c)
-        raise UnusableError(f"{path}: column {twice!r} is there twice or has no name")
+        raise UnusableError(f"{path}: column {twice!r} occurs twice or has no name; rename it")
     values: dict[str, list[float]] = {}
     for number, cells in rows[1:]:
         where = f"{path}, line {number}"
         if len(cells) != len(header):
-            raise UnusableError(f"{where}: got {len(cells)} cells, expected {len(header)}")
+            raise UnusableError(
+                f"{where}: got {len(cells)} cells, expected {len(header)}; correct the line"
+            )
         cells[0] = cells[0].removeprefix("appearance-")
         if cells[0] in values:
-            raise UnusableError(f"{where}: {cells[0]!r} is there twice")
+            raise UnusableError(f"{where}: {cells[0]!r} occurs twice; remove one line")
         values[cells[0]] = [
             _number(cell, f"{where}, column {trait}")
             for cell, trait in zip(cells[1:], traits, strict=True)
@@ -86,8 +87,9 @@ def read(path: Path, faces: Sequence[str]) -> TraitLabels:
     missing = [name for name in faces if name not in values]
     if missing:
         raise UnusableError(
-            f"{path}: has no line for {', '.join(missing)}; its names are those of the folders, "
-            f"with or without appearance-: {', '.join(list(values)[:5])}, ..."
+            f"{path}: has no line for {', '.join(missing)}, only for "
+            f"{', '.join(list(values)[:5])}, ...; use the names of the folders, with or without "
+            "appearance-"
         )
     table = np.array([values[name] for name in faces], np.float64)
     whole = np.array(list(values.values()), np.float64)
@@ -104,7 +106,9 @@ def _number(cell: str, location: str) -> float:
     try:
         value = float(cell)
     except ValueError as error:
-        raise UnusableError(f"{location}: got {cell!r}, expected 0, 1 or a number") from error
+        raise UnusableError(
+            f"{location}: got {cell!r}, expected 0, 1 or a number; correct it"
+        ) from error
     if not math.isfinite(value):
-        raise UnusableError(f"{location}: got {cell!r}, expected a finite number")
+        raise UnusableError(f"{location}: got {cell!r}, expected a finite number; correct it")
     return value

@@ -1,4 +1,4 @@
-"""Which space of a trait library belongs to which region, and how its samples were made."""
+"""Open trait libraries: their spaces by facial region, and the parameters of their samples."""
 
 import hashlib
 import io
@@ -24,11 +24,11 @@ SURFACE_SPACE: Final = "surface"
 ALBEDO_SPACE: Final = "albedo"
 TEXTURE_SPACE_FILE: Final = "texture_space.npz"
 DEFAULT_SIDE_MM, DEFAULT_SIZE_PX = 240.0, 256
-"""Of the common map of a library that does not tell its own."""
+"""Side and size of the common map, for a library that does not record them."""
 
 
 def space_name(region: str) -> str:
-    """Return what the space of a region's albedo is called.
+    """Return the name of the space of a region's albedo.
 
     Examples
     --------
@@ -39,12 +39,12 @@ def space_name(region: str) -> str:
 
 
 def library_parameters(frame: CommonFrame, kind: VectorKind, **more: Any) -> dict[str, Any]:
-    """Return what a library says of its samples."""
+    """Return the parameters of a library's samples."""
     return {"vectors": kind, "frame": frame.to_document(), **more}
 
 
 def texture_bytes(space: TextureSpace) -> bytes:
-    """Return a texture space as the bytes of a file."""
+    """Encode a texture space as the bytes of a file."""
     stream = io.BytesIO()
     np.savez_compressed(
         stream,
@@ -58,14 +58,14 @@ def texture_bytes(space: TextureSpace) -> bytes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LibraryParts:
-    """A library, opened.
+    """Decoded parts of a trait library.
 
     Attributes
     ----------
     surface
-        Traits of mean mixtures; None where the library has none.
+        Traits of mean mixtures of materials, or None.
     albedo
-        Region to its traits.
+        Albedo traits by region.
     frame
         The common map.
     """
@@ -83,19 +83,19 @@ class LibraryParts:
 
 
 def open_library(library: TraitLibrary) -> LibraryParts:
-    """Open a library.
+    """Decode the parts of a trait library.
 
     Raises
     ------
     UnusableError
-        When its albedo traits come without the texture space that they are of.
+        If its albedo traits lack their texture space.
     """
-    told = library.parameters
-    stated = told.get("vectors", "histograms")
+    parameters = library.parameters
+    stated = parameters.get("vectors", "histograms")
     kind = one_of("vectors", stated, get_args(VectorKind))
     frame = (
-        CommonFrame.from_document(told["frame"])
-        if isinstance(told.get("frame"), dict)
+        CommonFrame.from_document(parameters["frame"])
+        if isinstance(parameters.get("frame"), dict)
         else common_regions.standard_frame(
             side_mm=DEFAULT_SIDE_MM, center_mm=(0.0, 0.0), size=DEFAULT_SIZE_PX
         )
@@ -114,7 +114,7 @@ def _texture(library: TraitLibrary) -> TextureSpace:
     if content is None:
         raise UnusableError(
             f"files: got {json.dumps(sorted(library.files))}, expected {TEXTURE_SPACE_FILE}: "
-            "traits of the albedo mean nothing without the texture space they are of"
+            "albedo traits need their texture space; learn the library again"
         )
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as stored:
@@ -122,23 +122,25 @@ def _texture(library: TraitLibrary) -> TextureSpace:
             levels, orientations, images = (int(n) for n in stored["counts"])
         return TextureSpace(mean, axes, edges, levels, orientations, images)
     except (OSError, KeyError, ValueError, EOFError, TextureError) as error:
-        raise UnusableError(f"{TEXTURE_SPACE_FILE}: cannot be read: {error}") from error
+        raise UnusableError(
+            f"{TEXTURE_SPACE_FILE}: cannot be read: {error}; learn the library again"
+        ) from error
 
 
 def load(path: Path | None) -> tuple[TraitLibrary, str]:
-    """Read a library and the hash of its file; None: the one that comes with this package.
+    """Read a library and the hash of its file; None: the library of this package.
 
     Raises
     ------
     UnusableError
-        When none comes with it.
+        For None, if this package has no library.
     """
     if path is not None:
         return trait_storage.load(path), digest(path)
     packaged = resources.files("model").joinpath("data", trait_storage.PACKAGED_FILE)
     if not packaged.is_file():
         raise UnusableError(
-            "traits: no library comes with this package; name one with --space FILE "
-            "(`skinrig fit traits` learns one)"
+            "traits: this package has no library; name one with --space FILE (`skinrig fit "
+            "traits` learns one)"
         )
     return trait_storage.load_packaged_traits(), hashlib.sha256(packaged.read_bytes()).hexdigest()

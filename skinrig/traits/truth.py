@@ -1,13 +1,13 @@
-"""Simulated populations whose traits are known: samples as measured, and what is true of them.
+"""Simulate populations with known traits: noisy samples and ground truth.
 
-Samples of the surface are mean mixtures of materials fitted to noisy light from points of a face;
-those of the albedo are noisy R_d maps in a common map. The truth comes from the simulator alone:
-the light of the same points without noise, with the trait and without.
+Surface samples are mean mixtures of materials fitted to noisy BRDF samples at points of a face.
+Albedo samples are noisy R_d maps in a common map. The ground truth is from the simulator alone: the
+reflection of the same points without noise, with and without the trait.
 
-What of the surface's light looks like light from inside cannot be told from it: eq. (6) of Weyrich
-et al. gives R_d the least of pi f / (T T), floor of the surface included. The true change of the
-surface is therefore that beyond its floor. It matters for powder alone, whose grains scatter nearly
-evenly.
+Constant specular reflection cannot be separated from subsurface scattering: eq. (6) of Weyrich et
+al. estimates R_d as the minimum of pi f / (T T), which includes the specular minimum (floor). The
+true change of the surface is therefore the change beyond this floor. The difference matters only
+for powder, whose grains scatter nearly uniformly.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ LabelMasks = dict[str, BoolArray]
 TRUTH_CAMERA: Final = "Nikon 5100 (NPL)"
 TRUTH_ILLUMINANT: Final = "D55"
 TRUTH_TEXELS: Final = 64
-"""Texels a side of the textures that points of the surface are drawn from."""
+"""Texels per side of the textures from which points of the surface are sampled."""
 ETA: Final = 1.4
 MIN_SAMPLED_COSINE: Final = 0.12
 MIN_BARE_FRACTION: Final = 0.98
@@ -52,18 +52,18 @@ def assign_conditions(
     amounts: tuple[float, float] = (0.8, 1.0),
     rng: np.random.Generator,
 ) -> tuple[Member, ...]:
-    """Give each person one condition in turn, instead of those they had, in random order.
+    """Assign one condition to each person, in turn over a random order, replacing their own.
 
     Parameters
     ----------
     members
         The population.
     conditions
-        Of `rigsim.population.conditions.CONDITION_NAMES`; "normal" is nothing.
+        Of `rigsim.population.conditions.CONDITION_NAMES`; "normal" is without a condition.
     amounts
-        Range of even draws.
+        Range of the uniformly distributed amounts.
     rng
-        Draws order and amounts.
+        Generator of order and amounts.
     """
     order = rng.permutation(len(members))
     given: list[Member] = list(members)
@@ -76,12 +76,12 @@ def assign_conditions(
 
 
 def label_members(members: Sequence[Member], names: Sequence[str]) -> LabelMasks:
-    """Return which members have which labels, (n,) each."""
+    """Return the members with each label, (n,) bool by label."""
     return {name: np.array([name in person.labels for person in members]) for name in names}
 
 
 def surface_points(person: Member, count: int, *, rng: np.random.Generator) -> Float32Array:
-    """Return what `count` random places of a face's bare skin reflect by, (count, 7 or 11)."""
+    """Return reflectance parameters at `count` random points of bare skin, (count, 7 or 11)."""
     surface = person.surface(TRUTH_TEXELS, TRUTH_CAMERA, TRUTH_ILLUMINANT)
     packed = surface.packed()
     length = np.linalg.norm(surface.normal, axis=-1)
@@ -97,20 +97,20 @@ def mean_mixture(
     noise: float = 0.02,
     rng: np.random.Generator,
 ) -> Float64Array:
-    """Fit materials to points of a face and return their mean mixture, (59,).
+    """Fit the materials' weights at points of a face and return their mean, (59,).
 
     Parameters
     ----------
     points
         See `surface_points`.
     basis
-        The materials.
+        Basis BRDFs of the materials.
     pairs
-        Of light and view at each point; R_d is estimated from the same samples.
+        Pairs of light and view per point; R_d is estimated from the same samples.
     noise
-        Standard deviation of a sample as a fraction of the radiance plus 2 % of white's.
+        Standard deviation of a sample, as a fraction of its radiance plus 2 % of white's.
     rng
-        Draws directions and noise.
+        Generator of directions and noise.
     """
     shape = (len(points), pairs)
     light, view = sample_directions(shape, rng=rng), sample_directions(shape, rng=rng)
@@ -128,7 +128,7 @@ def mean_mixture(
 
 
 def sample_directions(shape: tuple[int, ...], *, rng: np.random.Generator) -> Float64Array:
-    """Draw unit vectors (..., 3) evenly over the cap above the horizon about +z."""
+    """Sample unit vectors (..., 3) uniformly in solid angle over a cap about +z."""
     z = rng.uniform(MIN_SAMPLED_COSINE, 1.0, shape)
     turn = rng.uniform(0.0, 2.0 * np.pi, shape)
     ring = np.sqrt(1.0 - z * z)
@@ -137,7 +137,7 @@ def sample_directions(shape: tuple[int, ...], *, rng: np.random.Generator) -> Fl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LobeChange:
-    """What a trait truly changes in what surfaces reflect.
+    """True change of specular reflection by a trait.
 
     Attributes
     ----------
@@ -153,7 +153,7 @@ class LobeChange:
     radiance: Float64Array
 
     def cosine(self, vector: ArrayLike, basis: BrdfBasis) -> float:
-        """Return the cosine between the truth and what a mixture of materials (59,) reflects."""
+        """Return the cosine between the true change and that of a mixture of materials, (59,)."""
         shown = basis.evaluate(self.light, self.view, [0.0, 0.0, 1.0]) @ np.asarray(vector)
         shown = shown * self.light[:, 2]
         size = float(np.linalg.norm(shown) * np.linalg.norm(self.radiance))
@@ -168,18 +168,18 @@ def lobe_changes(
     pairs: int = 1000,
     rng: np.random.Generator,
 ) -> dict[str, LobeChange]:
-    """Return the mean changes of the surface's light between the same people twice.
+    """Return the mean change of specular reflection by each trait, over the same people.
 
     Parameters
     ----------
     before, after
-        The same people without any trait, and with each of several.
+        The same people without traits, and with each trait.
     points
-        Of each face.
+        Points per face.
     pairs
-        Of light and view.
+        Pairs of light and view.
     rng
-        Draws points and directions.
+        Generator of points and directions.
     """
     light, view = sample_directions((pairs,), rng=rng), sample_directions((pairs,), rng=rng)
     heights = zip(light[:, 2], view[:, 2], strict=True)
@@ -189,7 +189,7 @@ def lobe_changes(
     def mean(people: Sequence[Member]) -> Float64Array:
         total = np.zeros(pairs)
         for person, stream in zip(people, streams, strict=True):
-            # the same stream draws the same points of the same face again
+            # the same seed samples the same points of a face with and without the trait
             packed = surface_points(person, points, rng=np.random.default_rng(stream))
             floors = surface_brdf.min_surface_reflection(packed) / np.pi
             for one, floor in zip(packed, floors, strict=True):
@@ -203,15 +203,15 @@ def lobe_changes(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CommonFaces:
-    """The heads of a population laid out in one common map.
+    """Heads of a population in one common map.
 
     Attributes
     ----------
     frame : CommonFrame
     charts : mapping of int to Chart
-        Of each head.
+        Chart of each head.
     size : int
-        Texels a side of the faces' textures.
+        Texels per side of the faces' textures.
     """
 
     frame: CommonFrame
@@ -220,14 +220,14 @@ class CommonFaces:
 
     @classmethod
     def of(cls, members: Sequence[Member], *, size: int, common: int) -> CommonFaces:
-        """Lay out the heads of some members, by their true landmarks.
+        """Map the heads of members into a common map by their true landmarks.
 
         Parameters
         ----------
         size
-            Texels a side of the faces' textures.
+            Texels per side of the faces' textures.
         common
-            Pixels a side of the common map.
+            Pixels per side of the common map.
         """
         by_head = {person.head: person for person in members}
         faces = {head: person.face(size) for head, person in by_head.items()}
@@ -252,7 +252,7 @@ class CommonFaces:
         return cls(frame, charts, size)
 
     def albedo(self, person: Member, *, noise: float, rng: np.random.Generator) -> AlbedoSample:
-        """Return a face's R_d in the common map, with relative noise at each pixel."""
+        """Return a face's R_d in the common map, with relative noise per pixel."""
         r_d, skin = person.r_d(self.size, TRUTH_CAMERA, TRUTH_ILLUMINANT)
         image, valid = self.charts[person.head].gather(r_d, skin)
         image = image * (1.0 + noise * rng.standard_normal(image.shape).astype(np.float32))

@@ -135,7 +135,7 @@ def test_interrupted_simulation_resumes_same_settings_and_complete_truth(
 
 def test_truth_with_lost_log_is_not_invented(made, tmp_path):
     session = Session.open(made.session)
-    with pytest.raises(SimulationError, match="simulate the session anew"):
+    with pytest.raises(SimulationError, match="simulate a new session"):
         GripLog(None, tmp_path / "truth-skin", resume=True, session=session)
 
 
@@ -143,7 +143,7 @@ def test_log_of_other_times_is_refused(made, tmp_path):
     session = Session.open(made.session)
     truth = tmp_path / "truth-skin"
     (tmp_path / ".truth-skin.grips.jsonl").write_text('{"run": 1, "t_s": -5.0, "grip": {}}\n')
-    with pytest.raises(SimulationError, match="tells nothing of the state a000_n0"):
+    with pytest.raises(SimulationError, match="has no entry for state a000_n0"):
         GripLog(None, truth, resume=True, session=session).list_grips(session)
 
 

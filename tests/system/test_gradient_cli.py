@@ -58,7 +58,7 @@ def test_missing_address_is_reported_target_needs_no_caliper(capsys, tmp_path):
         (["--steps", "1-2"], errors.EXIT_USAGE, "FIRST..LAST"),
         (["--steps", "-9..0"], errors.BAD_INPUT, "steps"),
         (["--target", "chart"], errors.BAD_INPUT, "expected one of ball, dark, flat"),
-        (["--target", "ball", "--angles", "0"], errors.EXIT_USAGE, "own plan of skin"),
+        (["--target", "ball", "--angles", "0"], errors.EXIT_USAGE, "default plan of skin"),
     ],
 )
 def test_a_wrong_option_is_named(capsys, arguments, code, match):

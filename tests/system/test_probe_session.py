@@ -79,7 +79,10 @@ def test_other_rigs_reject_probe_options(capsys, tmp_path, option):
         (["--width", "64"], "--width: not an option of the probe rig"),
         (["--site", "cheek"], "site: not an option of the probe rig"),
         (["--target", "chart"], "expected one of phantom, dark"),
-        (["--target", "dark", "--sites", "cheek"], "sites: the target of the probe rig"),
+        (
+            ["--target", "dark", "--sites", "cheek"],
+            "sites: not an option of the target of the probe rig",
+        ),
     ],
 )
 def test_unsimulatable_request_is_reported_and_nothing_written(capsys, tmp_path, arguments, match):

@@ -68,11 +68,11 @@ def test_session_is_not_resumed_with_changed_subject_file(here, capsys, killed):
     assert main([*killed, "--resume", "--camera-offset-mm", "5", "--seed", "1"]) == 3
     said = capsys.readouterr().err
     assert "resume with the same settings" in said
-    told = [line.strip() for line in said.splitlines() if "begun" in line]
+    told = [line.strip() for line in said.splitlines() if "recorded" in line]
     assert told == [
-        "subject ann.toml melanin: begun with 0.02, got 0.03",
-        "seed: begun with 0, got 1",
-        "nearer_mm: begun without, got 5.0",
+        "subject ann.toml melanin: recorded with 0.02, got 0.03",
+        "seed: recorded with 0, got 1",
+        "nearer_mm: recorded without, got 5.0",
     ]
     (here / "ann.toml").write_text(FILE.format(melanin=0.02), encoding="utf-8")
     assert main([*killed, "--resume"]) == 0
@@ -84,17 +84,17 @@ def test_session_is_not_resumed_with_changed_subject_file(here, capsys, killed):
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (["--consent", "research"], ["consent: begun with research, teaching, got research"]),
+        (["--consent", "research"], ["consent: recorded with research, teaching, got research"]),
         (
             ["--consent", "research,teaching", "--consent-expires", "2031-01-01"],
-            ["consent_expires: begun with no end, got 2031-01-01"],
+            ["consent_expires: recorded with no end, got 2031-01-01"],
         ),
     ],
 )
 def test_a_session_is_not_resumed_with_another_consent(here, capsys, killed, options, told):
     assert main([*killed, "--resume", *options]) == 3
     said = capsys.readouterr().err.splitlines()
-    assert [line.strip() for line in said if "begun" in line] == told
+    assert [line.strip() for line in said if "recorded" in line] == told
 
 
 def test_a_consent_is_the_same_in_any_order(killed):
@@ -112,7 +112,7 @@ def test_effects_invisible_to_rig_are_reported_before_work(here, capsys, monkeyp
     monkeypatch.setattr("skinrig.simulating.gradient.make_scene", stopped)
     assert main([command, "gradient", "--subject", "ann.toml"]) == 130
     said = capsys.readouterr().err
-    assert "ann.toml: the gradient rig sees nothing of freckles, oil" in said
+    assert "ann.toml: without effect on the gradient rig: freckles, oil" in said
     if command == "serve":
         assert "the same command" not in said
 

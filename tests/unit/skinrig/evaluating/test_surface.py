@@ -82,5 +82,5 @@ def test_texels_far_from_true_points_are_omitted(rng):
 
 def test_a_scan_that_is_not_registered_is_named(rng):
     truth, maps = plane(10, rng), plane(10, rng, shift_mm=80.0)
-    with pytest.raises(evaluation.SurfaceTruthError, match="is the scan registered"):
+    with pytest.raises(evaluation.SurfaceTruthError, match="register the scan"):
         evaluation.match_texels(appearance(maps), appearance(truth))

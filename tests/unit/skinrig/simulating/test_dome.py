@@ -117,7 +117,7 @@ def test_unsupported_dome_options_are_refused_before_folder_creation(tmp_path, m
 
 
 def test_flash_rig_refuses_choice_of_lights(tmp_path):
-    with pytest.raises(SimulationError, match="lights: the flash rig knows nothing of it"):
+    with pytest.raises(SimulationError, match="lights: not an option of the flash rig"):
         simulate_session("flash", tmp_path / "s", lights=12)
 
 

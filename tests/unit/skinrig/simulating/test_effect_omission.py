@@ -34,10 +34,10 @@ def test_omitted_flash_effects_are_reported_by_name(tmp_path):
 @pytest.mark.parametrize(
     ("rig", "more", "match"),
     [
-        ("flash", {"leave_out": ("shadow",)}, "'shadow', expected of the flash rig one of lat"),
+        ("flash", {"leave_out": ("shadow",)}, "'shadow', expected for the flash rig one of lat"),
         ("gradient", {"leave_out": ("spectral",)}, "one of shadows, lateral, interreflections,"),
-        ("probe", {"leave_out": ("optics",)}, "none: its scenes build all"),
-        ("dome", {"leave_out": ("lateral",), "subsurface": True}, "subsurface was asked for, too"),
+        ("probe", {"leave_out": ("optics",)}, "expected for the probe rig none; remove"),
+        ("dome", {"leave_out": ("lateral",), "subsurface": True}, "subsurface is also requested"),
         ("flash", {"leave_out": ("optics",), "target": "white"}, "not of a target"),
         ("dome", {"leave_out": ("optics",), "target": "white"}, "not of a target"),
     ],

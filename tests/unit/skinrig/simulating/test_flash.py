@@ -29,11 +29,11 @@ def test_face_position_is_in_session_and_truth(tmp_path):
 @pytest.mark.parametrize(
     ("rig", "asked", "told"),
     [
-        ("flash", {"nearer_mm": 500.0}, "got 500 mm, expected between -500 and 500 mm"),
-        ("flash", {"nearer_mm": float("nan")}, "got nan, expected finite millimetres"),
+        ("flash", {"nearer_mm": 500.0}, "got 500 mm, expected -500 to 500 mm"),
+        ("flash", {"nearer_mm": float("nan")}, "got nan, expected a finite distance"),
         ("flash", {"nearer_mm": 9.0, "target": "white"}, "not of a target"),
-        ("dome", {"nearer_mm": 9.0}, "the dome rig knows nothing of it"),
-        ("probe", {"nearer_mm": 9.0}, "the probe rig knows nothing of it"),
+        ("dome", {"nearer_mm": 9.0}, "not an option of the dome rig"),
+        ("probe", {"nearer_mm": 9.0}, "not an option of the probe rig"),
     ],
 )
 def test_impossible_face_position_is_refused_before_folder_creation(tmp_path, rig, asked, told):
