@@ -25,7 +25,7 @@ def stage():
 def test_rig_light_is_at_nominal_position_and_scale(stage):
     lamp = stage.light("L017*0.5")
     drawn = load_rig("dome").light("L017")
-    towards, white = lamp.reach([[0.0, 0.0, 0.0]])
+    towards, white = lamp.directions_and_irradiance([[0.0, 0.0, 0.0]])
     np.testing.assert_allclose(lamp.position_mm, drawn.position_mm)
     np.testing.assert_allclose(white, 0.5)
     np.testing.assert_allclose(towards[0] @ drawn.position_mm, np.linalg.norm(drawn.position_mm))
