@@ -140,7 +140,7 @@ class Light:
         Examples
         --------
         >>> lamp = Light(name="near", position_mm=(0.0, 0.0, 100.0))
-        >>> towards, white = lamp.reach([[0.0, 0.0, 0.0], [0.0, 0.0, 50.0]])
+        >>> towards, white = lamp.directions_and_irradiance([[0.0, 0.0, 0.0], [0.0, 0.0, 50.0]])
         >>> towards[1].tolist(), white[1].tolist()
         ([0.0, 0.0, 1.0], [4.0, 4.0, 4.0])
         """

@@ -164,7 +164,7 @@ def test_several_sessions_are_reconstructed_into_folders_by_name(tmp_path, capsy
 
     def reconstruct(session, *, want, out, **settings):
         asked.append((session.name, out))
-        return SimpleNamespace(ran=("a",), reused=(), left_out=(), assumed=(), work=())
+        return SimpleNamespace(ran=("a",), reused=(), omitted=(), assumed=(), work=())
 
     monkeypatch.setattr("reconstruction.pipeline.recipes.reconstruct", reconstruct)
     monday, tuesday, out = tmp_path / "monday", tmp_path / "tuesday", tmp_path / "maps"
@@ -177,7 +177,7 @@ def test_several_sessions_are_reconstructed_into_folders_by_name(tmp_path, capsy
     assert asked[-1] == ("monday", out)
     assert json.loads(capsys.readouterr().out)["path"] == str(out)
     assert main([*command, str(monday), str(tmp_path / "other" / "monday")]) == 3
-    assert "two of the name 'monday'" in capsys.readouterr().err
+    assert "two folders named 'monday'" in capsys.readouterr().err
     out.mkdir()
     (out / "appearance.json").write_text("{}")
     assert main([*command, str(monday), str(tuesday)]) == 3

@@ -202,7 +202,7 @@ def test_gltf_targets_are_mm_in_scene_frame(tmp_path, kind):
         (lambda d: d["meshes"][1]["extras"].update(targetNames=["pull"]), "names"),
         (lambda d: d["nodes"][1].update(children=[0]), "circles"),
         (lambda d: d["buffers"][0].update(byteLength=10**6), "cut short"),
-        (lambda d: d["buffers"][0].update(uri="../face.bin"), "beside"),
+        (lambda d: d["buffers"][0].update(uri="../face.bin"), "next to"),
         (lambda d: d["buffers"][0].update(uri="gone.bin"), "cannot be read"),
         (lambda d: d["buffers"][0].update(uri="data:;base64,?"), "data URI"),
     ],

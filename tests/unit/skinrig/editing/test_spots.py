@@ -139,5 +139,5 @@ def test_orders_that_cannot_be_drawn_are_refused(cheek):
     with pytest.raises(SpotError, match="at most"):
         drawn(cheek, density_per_cm2=1e9)
     position, skin, on = cheek
-    with pytest.raises(SpotError, match="no skin"):
+    with pytest.raises(SpotError, match="expected skin"):
         pigment_spots.draw("moles", 0 * skin, position, on, on, rng=np.random.default_rng(0))
