@@ -94,7 +94,9 @@ def capture_session(
         console.print_line(line)
     if (file := order.plan_out) is not None:
         write_plan(plan, file)
-        console.print_line(f"{file}: the plan; edit it, then capture it with --plan {shell_quote(file)}")
+        console.print_line(
+            f"{file}: the plan; edit it, then capture it with --plan {shell_quote(file)}"
+        )
     if order.out is None or order.dry_run:
         steps = plan.steps
         settings = [" ".join(f"{k}={v}" for k, v in step.settings.items()) for step in steps]
