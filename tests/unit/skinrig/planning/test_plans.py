@@ -31,7 +31,7 @@ def test_invalid_want_is_reported(text, word):
 
 
 def test_invalid_wanted_number_is_reported_as_written():
-    with pytest.raises(plans.PlanningError, match="got melanin<=0%, expected a number above 0"):
+    with pytest.raises(plans.PlanningError, match="got melanin<=0%, expected above 0"):
         plans.parse_wants("melanin<=0%", "flash")
 
 
