@@ -24,7 +24,7 @@ from capture.documents import (
 )
 from capture.plan import Value
 from capture.rig import ID_RULE, is_id
-from capture.session.errors import SessionDamage
+from capture.session.errors import SessionDamage, SessionError
 
 MAX_LINE_BYTES = 65_536
 ATTACHMENT_RULE = f"{ID_RULE}, not ending in .part"
@@ -188,6 +188,20 @@ def seal_line(previous: str, line: Line) -> tuple[bytes, str]:
     record = canonical_json({"type": kind, **to_json_table(line)})
     digest = hashlib.sha256(previous.encode("ascii") + record).hexdigest()
     return b'{"h":"' + digest.encode("ascii") + b'","r":' + record + b"}\n", digest
+
+
+def seal_bounded_line(previous: str, line: Line) -> tuple[bytes, str]:
+    """Return `seal_line` of a line; raise SessionError when it cannot be written or is too long."""
+    try:
+        text, head = seal_line(previous, line)
+    except (TypeError, ValueError, RecursionError) as exc:
+        path = "about" if isinstance(line, AttachmentLine | OmissionLine) else "settings, actual"
+        faults = [Fault(path, str(exc), "texts, finite numbers, true or false")]
+        raise SessionError("the journal line cannot be written", faults=faults) from exc
+    if len(text) > MAX_LINE_BYTES:
+        faults = [Fault("line", f"{len(text)} bytes", f"at most {MAX_LINE_BYTES}")]
+        raise SessionError("its metadata are too long", faults=faults)
+    return text, head
 
 
 def walk_journal(data: bytes, *, seal: str, where: str) -> JournalWalk:

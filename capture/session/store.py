@@ -26,16 +26,14 @@ from capture.session.errors import SessionDiskError, SessionError, SessionLocked
 from capture.session.folder import DiskErrors, make_folder, move_orphans, write_new
 from capture.session.journal import (
     ATTACHMENT_RULE,
-    MAX_LINE_BYTES,
     AttachmentLine,
     CloseLine,
     FrameLine,
-    Line,
     OmissionLine,
     attachment_path,
     frame_path,
     is_attachment_name,
-    seal_line,
+    seal_bounded_line,
 )
 from capture.session.manifest import (
     CalibrationRef,
@@ -342,14 +340,14 @@ class Session(SessionView):
         line = OmissionLine(
             steps=tuple(step_ids), reason=reason, about=dict(about or {}), t_host_s=float(t_host_s)
         )
-        text, head = self._seal(line)
+        text, head = seal_bounded_line(self._head, line)
         with self._acknowledging(head):
             self._append(descriptor, text)
         self._left_out.update(dict.fromkeys(line.steps, line))
 
     def _write(self, descriptor: int, line: FrameLine | AttachmentLine, blob: bytes) -> None:
         """Write a file and then its line of the journal to the medium."""
-        text, head = self._seal(line)
+        text, head = seal_bounded_line(self._head, line)
         target = self.path / line.file
         part = target.with_name(target.name + ".part")
         with self._acknowledging(head):
@@ -399,7 +397,7 @@ class Session(SessionView):
             raise SessionError(what, where=str(self.path), faults=faults, advice=advice)
         frames = sum(len(lines) for lines in self._lines.values())
         line = CloseLine(frames=frames, missing=missing, reason=missing_reason if missing else "")
-        text, head = self._seal(line)
+        text, head = seal_bounded_line(self._head, line)
         try:
             with DiskErrors(self.path):
                 self._append(descriptor, text)
@@ -448,20 +446,6 @@ class Session(SessionView):
             what = f"frame of step {step_id!r}, camera {camera!r} is already committed"
             raise SessionError(what, where=str(self.path), faults=faults, advice=advice)
         check_blob(blob, step_id, self.id)
-
-    def _seal(self, line: Line) -> tuple[bytes, str]:
-        try:
-            text, head = seal_line(self._head, line)
-        except (TypeError, ValueError, RecursionError) as exc:
-            path = (
-                "about" if isinstance(line, AttachmentLine | OmissionLine) else "settings, actual"
-            )
-            faults = [Fault(path, str(exc), "texts, finite numbers, true or false")]
-            raise SessionError("the journal line cannot be written", faults=faults) from exc
-        if len(text) > MAX_LINE_BYTES:
-            faults = [Fault("line", f"{len(text)} bytes", f"at most {MAX_LINE_BYTES}")]
-            raise SessionError("its metadata are too long", faults=faults)
-        return text, head
 
     def _append(self, descriptor: int, text: bytes) -> None:
         self._disk.write(descriptor, text)

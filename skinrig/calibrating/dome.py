@@ -295,6 +295,6 @@ def _white(
         shot = raw.linear_rgb(session.read(record), demosaic="centered")
         # exposure at full level that gives the same light: exposure time times level
         on_s = float(record.settings["exposure_s"]) * float(record.settings["level"])
-        light, image = str(record.settings["light"]), (shot.rgb, shot.variance, shot.valid)
-        samples.append(window.sample(*image, view=record.camera, light=light, on_s=on_s))
+        light, pixels = str(record.settings["light"]), (shot.rgb, shot.variance, shot.valid)
+        samples.append(window.sample(*pixels, view=record.camera, light=light, on_s=on_s))
     return samples

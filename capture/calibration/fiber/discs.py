@@ -3,6 +3,7 @@
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.optimize import least_squares
 from scipy.special import erfc
@@ -121,30 +122,8 @@ def fit_disc(
         for v in levels
     ]
 
-    def split(p: Float64Array) -> tuple[list[Float64Array], list[Float64Array], Float64Array]:
-        """Return residuals of each color's best linear model, and their amplitudes.
-
-        A fiber's modes are not filled evenly: light over the disc has slopes and curvature.
-        """
-        u, v = (px - p[0]) / p[2], (py - p[1]) / p[2]
-        d = np.hypot(u, v)
-        disc = 0.5 * erfc((d - 1.0) * (p[2] / (np.sqrt(2.0) * p[3])))
-        bend = np.minimum(d, 1.2) ** 2 - 0.5
-        design = np.stack([disc, disc * u, disc * v, disc * bend, np.ones_like(disc)])
-        residuals, priors = [], []
-        amplitude = np.zeros(len(parts))
-        for c, at in enumerate(parts):
-            rows = design[:, at] / sigma[at]
-            value = data[at] / sigma[at]
-            normal = rows @ rows.T + np.diag(stiff[c] ** 2)
-            found = np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(5), rows @ value)
-            residuals.append(value - found @ rows)
-            priors.append((stiff[c] * found)[1:4])
-            amplitude[c] = found[0]
-        return residuals, priors, amplitude
-
     def misfit(p: Float64Array) -> Float64Array:
-        residuals, priors, _ = split(p)
+        residuals, priors, _ = _solve_colors(p, px, py, data / sigma, sigma, parts, stiff)
         return np.concatenate([*residuals, *priors])
 
     begin = np.array([*position, start_radius, max(0.1 * start_radius, 0.7)])
@@ -154,7 +133,7 @@ def fit_disc(
     )
     begin = np.clip(begin, low + 1e-6, high - 1e-6)
     done = least_squares(misfit, begin, bounds=(low, high), x_scale=[1, 1, 1, 0.5], max_nfev=30)
-    amplitude = split(done.x)[2]
+    amplitude = _solve_colors(done.x, px, py, data / sigma, sigma, parts, stiff)[2]
     at_bound = bool(((done.x <= low + 1e-3) | (done.x >= high - 1e-3))[:2].any())
     if at_bound or amplitude.max() <= 0:
         return None
@@ -162,6 +141,37 @@ def fit_disc(
     if error is None or error[:2].max() > MAX_CENTER_STDERR_PITCH * pitch:
         return None
     return done.x, error, start_radius
+
+
+def _solve_colors(
+    disc: Float64Array,
+    px: Float64Array,
+    py: Float64Array,
+    weighted: Float64Array,
+    sigma: Float64Array,
+    parts: list[NDArray[np.intp]],
+    stiff: list[Float64Array],
+) -> tuple[list[Float64Array], list[Float64Array], Float64Array]:
+    """Return residuals of each color's best linear model, its priors, and the amplitudes.
+
+    A fiber's modes are not filled evenly: light over the disc has slopes and curvature.
+    """
+    u, v = (px - disc[0]) / disc[2], (py - disc[1]) / disc[2]
+    d = np.hypot(u, v)
+    inside = 0.5 * erfc((d - 1.0) * (disc[2] / (np.sqrt(2.0) * disc[3])))
+    bend = np.minimum(d, 1.2) ** 2 - 0.5
+    design = np.stack([inside, inside * u, inside * v, inside * bend, np.ones_like(inside)])
+    residuals, priors = [], []
+    amplitude = np.zeros(len(parts))
+    for c, at in enumerate(parts):
+        rows = design[:, at] / sigma[at]
+        normal = rows @ rows.T + np.diag(stiff[c] ** 2)
+        ridge = 1e-12 * np.trace(normal) * np.eye(5)
+        found = np.linalg.solve(normal + ridge, rows @ weighted[at])
+        residuals.append(weighted[at] - found @ rows)
+        priors.append((stiff[c] * found)[1:4])
+        amplitude[c] = found[0]
+    return residuals, priors, amplitude
 
 
 def _standard_errors(done: Any, freedom: int) -> Float64Array | None:
