@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Axes: TypeAlias = tuple[int | str | None, ...]
-FINITE = "(-inf, inf)"
+FINITE_RANGE = "(-inf, inf)"
 """Interval of all finite numbers."""
 
 
@@ -35,7 +35,7 @@ class Checks:
         if not condition:
             raise self.error(f"{name}: got {got}, expected {expected}")
 
-    def within(self, name: str, given: Any, interval: str = FINITE) -> None:
+    def within(self, name: str, given: Any, interval: str = FINITE_RANGE) -> None:
         """Raise for numbers outside an interval such as ``"(0, 1]"``; "inf)" means finite.
 
         Parameters
@@ -53,7 +53,7 @@ class Checks:
         inside &= values <= high if interval[-1] == "]" else values < high
         if inside.all():
             return
-        what = "finite numbers" if interval == FINITE else f"numbers in {interval}"
+        what = "finite numbers" if interval == FINITE_RANGE else f"numbers in {interval}"
         if values.ndim == 0:
             raise self.error(f"{name}: got {given}, expected a {what.replace('numbers', 'number')}")
         wrong = values[~inside]
@@ -86,7 +86,7 @@ class Checks:
             raise self.error(f"{name}: got shape {got}, expected {shapes}")
 
     def numbers(
-        self, name: str, given: Any, *expected: Axes, interval: str = FINITE
+        self, name: str, given: Any, *expected: Axes, interval: str = FINITE_RANGE
     ) -> NDArray[np.float64]:
         """Return an array in float64; raise for other shapes and numbers outside an interval."""
         array = np.asarray(given, np.float64)

@@ -4,7 +4,12 @@ The plan decides what to capture, the session which frames are missing, and the 
 a frame is accepted. Drivers decide nothing, and this package knows nothing of bytes.
 """
 
-from capture.acquire.outcome import AcquisitionError, AcquisitionResult, Interrupted, Operator
+from capture.acquire.outcome import (
+    AcquisitionError,
+    AcquisitionResult,
+    CaptureInterrupted,
+    Operator,
+)
 from capture.acquire.run import run_plan
 
-__all__ = ["AcquisitionError", "AcquisitionResult", "Interrupted", "Operator", "run_plan"]
+__all__ = ["AcquisitionError", "AcquisitionResult", "CaptureInterrupted", "Operator", "run_plan"]

@@ -25,7 +25,7 @@ class AcquisitionError(DeviceError, RuntimeError):
     """Raised when a plan could not be carried out; captured frames are safe in the session."""
 
 
-class Interrupted(KeyboardInterrupt):
+class CaptureInterrupted(KeyboardInterrupt):
     """Raised when the operator stopped the capture; the session can be resumed."""
 
 
@@ -95,9 +95,9 @@ class Operator:
     timer: Clock = SYSTEM_CLOCK
 
     def stop_if_asked(self) -> None:
-        """Raise `Interrupted` when the operator has asked for a stop."""
+        """Raise `CaptureInterrupted` when the operator has asked for a stop."""
         if self.interrupted():
-            raise Interrupted
+            raise CaptureInterrupted
 
 
 @dataclass(slots=True)

@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from model import fresnel
 from model.arrays import Float32Array, Float64Array, Int32Array
-from model.checks import FINITE, Checks
+from model.checks import FINITE_RANGE, Checks
 from model.dipole import gather_kernels as dipole_gather_kernels
 from model.dipole import source_tree_kernels
 from model.dipole.direct_sum import SOURCE_RADIUS_PER_SIDE, DipoleMedia
@@ -281,7 +281,7 @@ def gather(
 
 
 def _expect(
-    name: str, values: Float64Array, shape: tuple[int, ...], interval: str = FINITE
+    name: str, values: Float64Array, shape: tuple[int, ...], interval: str = FINITE_RANGE
 ) -> None:
     Checks(GatherError).shape(name, values, shape)
     Checks(GatherError).within(f"{name} (leave points without it out)", values, interval)

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import ndtr
 
-from model.checks import FINITE, Checks
+from model.checks import FINITE_RANGE, Checks
 from reconstruction.arrays import Float32Array, Float64Array, FloatArray
 
 MIN_CONTAMINATION: Final = 0.01
@@ -65,7 +65,9 @@ class ContaminatedNormal:
     def __post_init__(self) -> None:
         """Refuse invalid parameters."""
         check = Checks()
-        check.settings(self, mean=FINITE, sd="(0, inf)", contamination="(0, 1]", low=FINITE)
+        check.settings(
+            self, mean=FINITE_RANGE, sd="(0, inf)", contamination="(0, 1]", low=FINITE_RANGE
+        )
         check.settings(self, high=f"({self.low}, inf)", stderr="[0, inf)")
 
     @property

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from model.checks import FINITE, Checks
+from model.checks import FINITE_RANGE, Checks
 from model.translucency_population import weyrich_2005
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.subsurface.models import blas_threads
@@ -79,7 +79,7 @@ class TranslucencyPrior:
         shape, check = np.shape(self.log_mean), Checks(TranslucencyError)
         for name in ("log_mean", "person_deviation", "place_deviation"):
             values = np.array(getattr(self, name), np.float64)
-            interval = FINITE if name == "log_mean" else "(0, inf)"
+            interval = FINITE_RANGE if name == "log_mean" else "(0, inf)"
             check.require(values.ndim == 1, name, f"shape {values.shape}", "(C,)")
             check.shape(name, values, shape)
             check.within(name, values, interval)

@@ -25,7 +25,7 @@ from rigsim.boxes.command import (
 )
 from rigsim.boxes.device import Device
 
-FIRMWARE = "1.0"
+FIRMWARE_VERSION = "1.0"
 MAX_CACHED_REPLIES = 8
 MAX_QUEUED_ERRORS = 16
 CAPABILITY_CHUNK_CHARS = 48
@@ -102,7 +102,7 @@ class Controller:
             output += self._device_events()
             if self._announce and due >= self._ready_at:
                 self._announce = False
-                output += f"{self.device.model} {FIRMWARE} ready\n".encode()
+                output += f"{self.device.model} {FIRMWARE_VERSION} ready\n".encode()
                 output += self._event("BOOT", "POWER")
             if self._under_way is not None and due >= self._under_way[1].at_s:
                 (request, later), self._under_way = self._under_way, None
@@ -236,7 +236,7 @@ class Controller:
 
     def _own_commands(self) -> dict[str, Command]:
         acts: dict[str, CommandHandler] = {
-            "*IDN?": lambda *_: f"RIGSIM,{self.device.model},{self.serial},{FIRMWARE}",
+            "*IDN?": lambda *_: f"RIGSIM,{self.device.model},{self.serial},{FIRMWARE_VERSION}",
             "*RST": self._reset,
             "*CLS": lambda *_: self._errors.clear(),
             "*OPC?": lambda _, now: "0" if self.device.is_busy(now) else "1",
@@ -256,7 +256,7 @@ class Controller:
         return build_command_table("any", acts)
 
     def _hello(self) -> str:
-        return f"{self._protocol},{self.device.kind},{self.serial},{FIRMWARE}"
+        return f"{self._protocol},{self.device.kind},{self.serial},{FIRMWARE_VERSION}"
 
     def _reset(self, _: str, now: float) -> None:
         self._disarm(now)

@@ -50,7 +50,7 @@ def confirm_choice(
         truth=done.truth_name,
     )
     appearance, truth = store.read(out / "appearance"), store.read(out / "truth-face")
-    measured = rig.measured(choice, appearance, truth, seed)
+    measured = rig.measure_errors(choice, appearance, truth, seed)
     rows = []
     for one in choice.forecasts:
         if one.name in measured:

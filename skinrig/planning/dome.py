@@ -120,7 +120,7 @@ def rehearsal(choice: PlanChoice) -> plans.Rehearsal:
     )
 
 
-def measured(
+def measure_errors(
     choice: PlanChoice, appearance: SkinAppearance, truth: SkinAppearance, _: int
 ) -> dict[str, tuple[float, float]]:
     """Return median error and valid share of normals and R_d over the face."""

@@ -170,7 +170,7 @@ def rehearsal(choice: PlanChoice) -> plans.Rehearsal:
     return plans.Rehearsal(targets, calibrations, CHROMOPHORE_NAMES, width)
 
 
-def measured(
+def measure_errors(
     _: PlanChoice, appearance: SkinAppearance, truth: SkinAppearance, seed: int
 ) -> dict[str, tuple[float, float]]:
     """Return median error, percent, and valid share of the chromophores over the face."""

@@ -172,7 +172,7 @@ def rehearsal(choice: PlanChoice) -> plans.Rehearsal:
     return plans.Rehearsal({"flat": width, "ball": {}}, calibrations, ("normals",), width)
 
 
-def measured(
+def measure_errors(
     choice: PlanChoice, appearance: SkinAppearance, truth: SkinAppearance, _: int
 ) -> dict[str, tuple[float, float]]:
     """Return median error, degrees, and valid share of the neutral skin's normals."""

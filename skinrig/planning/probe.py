@@ -106,7 +106,7 @@ def rehearsal(_: PlanChoice) -> plans.Rehearsal:
     return plans.Rehearsal({"phantom": {}}, (("fibre", ("phantom",)),), ("subsurface",))
 
 
-def measured(
+def measure_errors(
     _choice: PlanChoice, appearance: SkinAppearance, truth: SkinAppearance, _: int
 ) -> dict[str, tuple[float, float]]:
     """Return median error, percent, and valid share of sigma_tr over sites and colors."""

@@ -21,9 +21,9 @@ MAX_PANELS: Final = 4
 WIDTH_PX: Final = 280
 MARGIN_PX: Final = 3
 """Around the valid pixels of a map, to which its image is cropped."""
-CAPTURED: Final = "captured image"
+CAPTURED_IMAGE: Final = "captured image"
 KEYS_BY_QUANTITY: Final = {
-    CAPTURED: r"picture|crossed_a\d+_n0",
+    CAPTURED_IMAGE: r"picture|crossed_a\d+_n0",
     "melanosome volume fraction": "melanin",
     "blood volume fraction": "hemoglobin",
     "surface normals": r"normals_refined|normals|normals_a\d+_n0",
@@ -77,7 +77,7 @@ class Candidate:
         elif truth is not None and other is not None and key.startswith("height_"):
             relief = microrelief.true_relief(found, truth, key.removeprefix("height_"))
             other = replace(other, values=relief)
-        labels = "captured" if re.fullmatch(KEYS_BY_QUANTITY[CAPTURED], key) else "estimate"
+        labels = "captured" if re.fullmatch(KEYS_BY_QUANTITY[CAPTURED_IMAGE], key) else "estimate"
         places = found.maps.get("position"), maps.get("position")
         return Candidate(name, key, estimate, places[0], other, places[1], (labels, "ground truth"))
 
@@ -112,7 +112,7 @@ def strip(
     yield from _view(panels)
 
 
-def compared(
+def compare_first_screens(
     pairs: Iterable[tuple[str, SkinAppearance, SkinAppearance]], labels: tuple[str, str]
 ) -> Iterator[page.Block]:
     """Yield the images of two runs, each quantity from the first pair that has it in both."""
@@ -193,14 +193,14 @@ def _drawn(
         return draw, f"linear RGB, white: {bright:.2g}"
     ends = map_images.shared_range([image[mask] for _, image, mask in shown])
     low, high = (float(f"{end:.2g}") for end in ends)
-    colors = "gray" if title == CAPTURED else "viridis"
+    colors = "gray" if title == CAPTURED_IMAGE else "viridis"
     draw = [
         map_images.MapDrawing(title, unit, mask, WIDTH_PX).draw_scalar(
             label, image, low, high, colors
         )
         for label, image, mask in shown
     ]
-    return draw, "relative radiance" if title == CAPTURED else ""
+    return draw, "relative radiance" if title == CAPTURED_IMAGE else ""
 
 
 def _uncertainty(

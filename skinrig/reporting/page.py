@@ -182,7 +182,7 @@ class Plots(Block):
 
 
 @dataclass(frozen=True, slots=True)
-class Folded(Block):
+class Collapsible(Block):
     """Blocks that open when their title is clicked, and are open when printed."""
 
     title: str

@@ -60,7 +60,7 @@ def section(appearance: SkinAppearance) -> Iterator[page.Block]:
     }
     listed = page.facts(settings, caption="Parameters recorded in the folder")
     title = f"Provenance: inputs, versions and {len(settings)} parameters"
-    yield page.Folded(title, [origin, listed])
+    yield page.Collapsible(title, [origin, listed])
 
 
 def shorten_digest(digest: str) -> str:

@@ -30,7 +30,7 @@ CONNECTION_TIMEOUT_S: Final = 30.0
 
 
 @dataclass(frozen=True, slots=True)
-class Served:
+class PageServer:
     """A running server.
 
     Attributes
@@ -54,7 +54,7 @@ class Served:
 
 
 @contextmanager
-def serve(html: bytes, *, pyramid: Pyramid | None = None, port: int = 0) -> Iterator[Served]:
+def serve(html: bytes, *, pyramid: Pyramid | None = None, port: int = 0) -> Iterator[PageServer]:
     """Serve a page, and the tiles of a displacement, until the block ends.
 
     Parameters
@@ -89,7 +89,7 @@ def serve(html: bytes, *, pyramid: Pyramid | None = None, port: int = 0) -> Iter
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1})
     thread.start()
     try:
-        yield Served(f"http://{LOOPBACK_HOST}:{number}/", number, requests, ended)
+        yield PageServer(f"http://{LOOPBACK_HOST}:{number}/", number, requests, ended)
     finally:
         server.shutdown()
         server.server_close()

@@ -48,7 +48,7 @@ def test_served_page_and_tiles_exist_until_end(plate, tmp_path, capsys, monkeypa
             seen["tile"] = answer.read()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(server.Served, "wait", wait)
+    monkeypatch.setattr(server.PageServer, "wait", wait)
     server.serve_scene(plate, 0, [], console=Console(True), displacement=path)
     document = json.loads(capsys.readouterr().out)
     assert document["schema"] == "skinrig.view-served/1"

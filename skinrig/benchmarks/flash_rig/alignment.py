@@ -205,7 +205,7 @@ def farthest_point_sample(mask: BoolArray, count: int) -> NDArray[np.intp]:
     return places[chosen]
 
 
-def aligned(stage: BenchmarkStage) -> None:
+def measure_alignment(stage: BenchmarkStage) -> None:
     """Align moved faces by landmarks few and many, by features, with and without dense flow."""
     side = 128 if stage.toy else 512
     rng = np.random.default_rng(1)
@@ -249,7 +249,7 @@ def _on_skin(preset: str, side: int) -> ErrorEstimate:
 MISALIGNMENTS_PX = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
 
 
-def misaligned(stage: BenchmarkStage) -> None:
+def measure_misalignment(stage: BenchmarkStage) -> None:
     """Blend from maps that were put in a wrong place on purpose, beside interpolating them.
 
     The paper's claim (Jimenez et al. 2010, section 4.2) is that local statistics bear alignments

@@ -29,7 +29,7 @@ from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 from skinrig.evaluating.skin_bands import MelaninBand
 
 CHANNEL_NOISE = 0.01
-SHADINGS: dict[str, Literal["known"] | None] = {"known": "known", "free": None}
+SHADING_MODES: dict[str, Literal["known"] | None] = {"known": "known", "free": None}
 MIN_MELANIN = 0.004
 """Volume fraction of the palest skin that is drawn."""
 
@@ -46,14 +46,14 @@ def inversion(stage: BenchmarkStage) -> None:
     noisy = (color * (1 + CHANNEL_NOISE * rng.standard_normal(color.shape))).astype(np.float32)
     picture = noisy.reshape(side, side, 3)
     variance = (CHANNEL_NOISE * color.reshape(side, side, 3)).astype(np.float32) ** 2
-    for shading in SHADINGS:
+    for shading in SHADING_MODES:
         for size in (16, 128) if stage.toy else (16, 32, 64, 128):
             coarse = color_table.build(
                 "Nikon 5100 (NPL)", "D55", size=size, anisotropy=ANISOTROPY_SKIN
             )
             timing, found = stage.time(
                 lambda: chromophores.invert(
-                    picture, coarse, shading=SHADINGS[shading], variance=variance
+                    picture, coarse, shading=SHADING_MODES[shading], variance=variance
                 )
             )
             outcome = _error(found, c_m, rng)
@@ -111,7 +111,7 @@ LIGHT_CHANGE = 0.05
 FULL_SIDE_PX = 1024
 
 
-def shared(stage: BenchmarkStage) -> None:
+def measure_shared_melanin(stage: BenchmarkStage) -> None:
     """Invert 1 to 7 states together, the light free or smooth, beside each state alone."""
     side = 64 if stage.toy else 192
     model = _ChromophoreModel(table(), shading_prior.face_prior(), model_error.load_covariance())

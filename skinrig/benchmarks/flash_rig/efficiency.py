@@ -48,7 +48,7 @@ class TypicalSkin:
     sigma_s_per_mm: float
 
 
-SUBJECTS: Final = {
+TYPICAL_SKINS: Final = {
     "palest": TypicalSkin(0.005, 0.03, 0.6, 0.02, 1.4),
     "II": TypicalSkin(0.014, 0.05, 0.5, 0.03, 1.3),
     "III": TypicalSkin(0.028, 0.05, 0.4, 0.05, 1.2),
@@ -85,7 +85,9 @@ def efficiency(stage: BenchmarkStage) -> None:
             outcome = ErrorEstimate.symmetric(ratio, spread, 1.0)
             stage.add(knobs, timing, outcome, {"judged": judged})
             if judged:
-                ratios[str(classify_melanin(SUBJECTS[subject].melanin))].append((ratio, spread))
+                ratios[str(classify_melanin(TYPICAL_SKINS[subject].melanin))].append(
+                    (ratio, spread)
+                )
         stage.left_out += _excluded_subjects(name, stage.points)
         for band, pairs in ratios.items():
             if not pairs:
@@ -108,7 +110,7 @@ def _excluded_subjects(name: str, points: Sequence[Point]) -> list[tuple[str, st
         f"a fraction is nearer to 0 than {MIN_EVALUATED_SIGMAS:g} bounds even at "
         f"{100 * CHANNEL_NOISES[-1]:g} % of noise"
     )
-    return [(f"{name}, {subject}", why) for subject in SUBJECTS if subject not in judged]
+    return [(f"{name}, {subject}", why) for subject in TYPICAL_SKINS if subject not in judged]
 
 
 def _chromophores(
@@ -128,7 +130,7 @@ def _chromophores(
         value = getattr(found, name)
         return np.square(np.asarray(value, np.float64)[found.valid] - true)
 
-    for number, (subject, skin) in enumerate(SUBJECTS.items()):
+    for number, (subject, skin) in enumerate(TYPICAL_SKINS.items()):
         truth = skin.melanin, skin.hemoglobin
         color = table.lookup(*truth).reshape(3)
         slopes = differentiate(lambda p: table.lookup(p[0], p[1]).reshape(3), np.array(truth))
@@ -159,7 +161,7 @@ def _normals(draws: int) -> Iterator[tuple[str, EstimatorTrial]]:
     normal[2] = np.sqrt(1.0 - normal @ normal)
     lit = lights @ normal
     lights, lit = lights[lit > 0.15], lit[lit > 0.15]
-    for subject, skin in SUBJECTS.items():
+    for subject, skin in TYPICAL_SKINS.items():
         albedo = skin.r_d
         # shot noise of 20,000 electrons at full scale, read noise of 5
         sigma = np.sqrt(albedo * lit / 20_000 + (5 / 20_000) ** 2)
@@ -188,7 +190,7 @@ def _albedo(draws: int) -> Iterator[tuple[str, EstimatorTrial]]:
     light, view = ways / np.linalg.norm(ways, axis=-1, keepdims=True)
     through = np.prod([1.0 - fresnel.reflectance(way[:, 2], 1.4) for way in (light, view)], axis=0)
     up = np.array([0.0, 0.0, 1.0])
-    for subject, skin in SUBJECTS.items():
+    for subject, skin in TYPICAL_SKINS.items():
         albedo = skin.r_d
         value = albedo * through / np.pi
         sigma = ALBEDO_NOISE * value
@@ -215,7 +217,7 @@ def _albedo(draws: int) -> Iterator[tuple[str, EstimatorTrial]]:
 def _subsurface(draws: int) -> Iterator[tuple[str, EstimatorTrial]]:
     radius = np.linspace(1.0, 15.0, 28)
     count = draws // 20
-    for number, (subject, skin) in enumerate(SUBJECTS.items()):
+    for number, (subject, skin) in enumerate(TYPICAL_SKINS.items()):
         truth = np.array([skin.sigma_a_per_mm, skin.sigma_s_per_mm])
         profile = photon_table.reflectance(radius, *truth)
         sigma = FIBER_NOISE * profile + 1e-3 * profile.max() * FIBER_NOISE

@@ -32,7 +32,7 @@ GROOVES_PER_FACE = 16
 MAX_SLOPE = 0.6
 FULL_SIDE_PX = 2048
 NORMAL_NOISE_RAD = 0.02
-ENCODINGS: tuple[tuple[Any, Any], ...] = (
+STORED_TYPES: tuple[tuple[Any, Any], ...] = (
     ("float32", "float32"),
     ("float16", "float16"),
     ("unit8", "unit8"),
@@ -255,7 +255,7 @@ def storing(stage: BenchmarkStage) -> None:
     whole = wrinkles.combine(base.astype(np.float64), wrinkle, masks, weights, table=table)
     for at in (64, 32) if stage.toy else (512, 256, 128, 64):
         small = _resized(wrinkle, at)
-        for maps_as, masks_as in ENCODINGS if at in (64, 256) else ENCODINGS[:1]:
+        for maps_as, masks_as in STORED_TYPES if at in (64, 256) else STORED_TYPES[:1]:
             layer = WrinkleLayer(
                 wrinkle_storage.round_trip_map(small, maps_as),
                 wrinkle_storage.round_trip_masks(masks, masks_as),

@@ -27,7 +27,7 @@ def _variance(state: StretchedSkin, half_mm: float) -> float:
     return float(np.var(along, dtype=np.float64))
 
 
-def stretched(stage: BenchmarkStage) -> None:
+def measure_stretch(stage: BenchmarkStage) -> None:
     """Stop the search for the equilibrium at forces of several sizes; then time whole series."""
     size = 0.3 if stage.toy else 1.6
     half = 0.4 * size

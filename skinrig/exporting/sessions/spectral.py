@@ -198,7 +198,7 @@ def stokes_header(description: str) -> dict[str, str]:
 DOCUMENT_FILE: Final = "stokes.json"
 SCHEMA: Final = "skinrig.export.stokes/1"
 PARALLEL, CROSSED = "parallel", "crossed"
-CHANNELS: Final = [format_channel_name(kind, 1e3 * WAVELENGTH_UM) for kind in ("S0", "S1")]
+STOKES_CHANNELS: Final = [format_channel_name(kind, 1e3 * WAVELENGTH_UM) for kind in ("S0", "S1")]
 
 
 def write_stokes(session: Session, folder: Path, delivery: ExportSettings) -> list[tuple[str, str]]:
@@ -264,7 +264,7 @@ def write_stokes(session: Session, folder: Path, delivery: ExportSettings) -> li
         "schema": SCHEMA,
         "what": what,
         "unit": "fraction of the sensor's full scale, darks subtracted, exposure as taken",
-        "channels": CHANNELS,
+        "channels": STOKES_CHANNELS,
         "reference_axis_deg": axis,
         "image_frame": "against the picture's x axis S1 is "
         f"{math.cos(math.radians(2 * axis)):.9g} of what was measured along the analyser",
@@ -290,7 +290,7 @@ def _write_state(
         stem = file_stem(state, pattern)
         one, other = patterns.values[along], patterns.values[across]
         found = one + other, one - other
-        channels = dict(zip(CHANNELS, found, strict=True))
+        channels = dict(zip(STOKES_CHANNELS, found, strict=True))
         write_channels(folder / f"{stem}.exr", channels, stokes_header(description))
         stderr = np.sqrt(patterns.variance[along] + patterns.variance[across])
         figures = _figures(*found, stderr, patterns.valid)

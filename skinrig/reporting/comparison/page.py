@@ -52,7 +52,7 @@ def lead(a: ComparedRun, b: ComparedRun, found: Sequence[MapsPair]) -> Iterator[
         sentences.append("The runs have neither checks nor maps with uncertainties in common.")
     bad = any(row.verdict_change == "worse" for row in changed)
     yield page.Paragraph(" ".join(sentences), f"verdict {'bad' if bad else ''}")
-    yield from first_screen.compared(
+    yield from first_screen.compare_first_screens(
         [(pair.name, pair.a, pair.b) for pair in found], (a.label, b.label)
     )
     yield page.Paragraph(
@@ -114,7 +114,7 @@ def _pair(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Block
     yield page.view("compared_maps", maps=sorted(pair.differences, key=_sort_key))
     if pair.refused:
         table = page.table(("map", "reason"), pair.refused, caption="Maps that were not subtracted")
-        yield page.Folded(f"{len(pair.refused)} maps not subtracted", [table])
+        yield page.Collapsible(f"{len(pair.refused)} maps not subtracted", [table])
     yield from _images(a, b, pair)
     yield from _by_band(pair)
     yield from _errors(a, b, pair)

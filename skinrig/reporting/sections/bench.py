@@ -70,7 +70,7 @@ def _left_out(document: Mapping[str, Any]) -> Iterator[page.Block]:
     ]
     if rows:
         table = page.table(("setting", "reason"), rows, caption="Settings that were not measured")
-        yield page.Folded(f"{len(rows)} settings not measured", [table])
+        yield page.Collapsible(f"{len(rows)} settings not measured", [table])
     if document.get("not_judged"):
         yield page.note(
             "Measured at small size; their limits are not checked: "

@@ -23,7 +23,7 @@ MAX_LISTED_QUANTITIES = 60
 """Rows beyond which values stay in their file."""
 
 
-AGGREGATES: Mapping[str, Callable[[Float64Array], float]] = {
+AGGREGATE_BY_NAME: Mapping[str, Callable[[Float64Array], float]] = {
     "largest": lambda values: float(np.max(np.abs(values))),
     "mean": lambda values: float(np.mean(values)),
 }
@@ -46,7 +46,7 @@ def _quality_figures() -> dict[str, list[Figure]]:
     table = resources.files("skinrig").joinpath("data/calibration_figures.csv")
     found: dict[str, list[Figure]] = {}
     for row in csv.DictReader(table.read_text(encoding="utf-8").splitlines()):
-        of = AGGREGATES[row["of"]]
+        of = AGGREGATE_BY_NAME[row["of"]]
         worst = {"min": min, "max": max}[row["worst"]]
         words = row["quantity"], row["words"], row["unit"]
         found.setdefault(row["kind"], []).append(Figure(*words, of, float(row["factor"]), worst))
@@ -85,7 +85,7 @@ def section(
         return
     ages: list[tuple[object, ...]] = []
     figures: list[tuple[object, ...]] = []
-    values: list[page.Folded] = []
+    values: list[page.Collapsible] = []
     for folder in folders:
         left: list[float] = []
         for path in sorted(folder.glob("*.json")):
@@ -192,7 +192,7 @@ def _figures(folder: str, found: Calibration) -> list[tuple[object, ...]]:
     return rows
 
 
-def _values(folder: str, found: Calibration) -> page.Folded:
+def _values(folder: str, found: Calibration) -> page.Collapsible:
     rows = [
         (serial, name, _numbers(quantity.value), _numbers(quantity.stderr))
         for serial, names in sorted(found.values.items())
@@ -209,7 +209,7 @@ def _values(folder: str, found: Calibration) -> page.Folded:
             caption=f"Values of {folder}, {found.kind}, {found.created}",
         )
     noted = page.facts(dict(sorted(found.notes.items())), caption="Notes of the calibration")
-    return page.Folded(f"{folder}, {found.kind}: notes and values", [noted, listed])
+    return page.Collapsible(f"{folder}, {found.kind}: notes and values", [noted, listed])
 
 
 def _numbers(values: object) -> str:

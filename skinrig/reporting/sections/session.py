@@ -117,7 +117,7 @@ def omissions(sessions: Sequence[Path]) -> Iterator[page.Block]:
         title = f"{', '.join(names)}: {len(effects) - out} of {len(effects)} effects simulated"
         head = ("effect", "treatment", "reason", "change over noise", "option name")
         table = page.table(head, rows, caption="Optical effects of the scene")
-        yield page.Folded(title, [table])
+        yield page.Collapsible(title, [table])
 
 
 def _effect_row(effect: Mapping[str, Any]) -> tuple[str, str, str, str, str]:

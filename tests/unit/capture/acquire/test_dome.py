@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from fixtures.operators import by_operator
 
-from capture.acquire import AcquisitionError, Interrupted, run_plan
+from capture.acquire import AcquisitionError, CaptureInterrupted, run_plan
 from capture.acquire.dome import check_safety
 from capture.devices.camera import CameraError, Trigger, open_camera
 from capture.devices.dome import DomeBox
@@ -229,7 +229,7 @@ def test_rig_ends_dark_disarmed_second_run_takes_missing(make):
         asked.append(bench.world.now)
         return len(asked) > 2
 
-    with pytest.raises(Interrupted):
+    with pytest.raises(CaptureInterrupted):
         bench.run(interrupted=stop)
     assert not bench.unit.lit
     assert not bench.world.box("dome").armed
@@ -259,7 +259,7 @@ def test_subject_dose_starts_with_session_and_continues_resumed(make):
     bench = make()
     bench.unit.bank._dose_ws[:] = 7.0
     stops = iter([False, False, True, True])
-    with pytest.raises(Interrupted):
+    with pytest.raises(CaptureInterrupted):
         bench.run(interrupted=lambda: next(stops))
     after_first = bench.unit.bank.dose_ws(0)
     assert 0.0 < after_first < 1.0

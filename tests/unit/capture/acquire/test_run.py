@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from fixtures.operators import by_operator
 
-from capture.acquire import AcquisitionError, Interrupted, run_plan
+from capture.acquire import AcquisitionError, CaptureInterrupted, run_plan
 from capture.devices.camera import (
     CameraError,
     CameraInfo,
@@ -233,7 +233,7 @@ def test_lost_link_ends_dark_second_run_takes_missing(plan, session):
 
 def test_an_interrupt_ends_dark(plan, session):
     log = []
-    with pytest.raises(Interrupted):
+    with pytest.raises(CaptureInterrupted):
         run(plan, session, Box(log), Camera(), interrupted=lambda: len(log) > 2)
     assert log[-1] == "dark"
 

@@ -190,7 +190,7 @@ def test_imported_session_is_complete_closed_and_reports_assumptions(picture, tm
     json.dumps(done.assumed)
 
 
-def test_names_tell_states_and_polarizers(picture, tmp_path):
+def test_file_names_give_states_and_polarizers(picture, tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()
     for name in ("anna smile parallel", "anna smile crossed", "bob_crossed", "bob-parallel"):

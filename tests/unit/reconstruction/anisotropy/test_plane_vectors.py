@@ -25,7 +25,7 @@ def test_axis_error_is_circular_scatter_of_sampled_vectors(length, rng):
         assert told == pytest.approx(0.5 / length, rel=0.15)
 
 
-def test_lengths_scatter_as_their_errors_tell(rng):
+def test_lengths_scatter_by_their_standard_errors(rng):
     """Tolerance: a standard deviation of 100,000 draws is known to 0.22 %, asked within 5 sigma."""
     covariance = np.array([[0.04, 0.018], [0.018, 0.02]]) * 1e-4
     mean = np.array([0.6, -0.8])

@@ -87,7 +87,7 @@ def test_isotropic_tissue_profiles_are_flagged_at_stated_rate(rng):
     assert (found.p_value < 0.05).sum() >= stats.binom.ppf(1e-6, 800, 0.05)
 
 
-def test_profiles_tell_the_ratio_within_its_standard_error(rng):
+def test_profiles_give_ratio_within_its_standard_error(rng):
     truth, _ = turned_profiles(1.15, 2.5)
     seen, variance = read(rng, truth, 500)
     found = estimate_from_profiles(SIXTEEN, RADIUS_MM, seen, variance, **MEDIUM)

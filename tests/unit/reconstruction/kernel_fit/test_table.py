@@ -91,7 +91,7 @@ def test_single_sided_points_make_single_sided_table():
     assert sigma_um == pytest.approx(22.0)
 
 
-def test_points_that_tell_no_table_are_refused():
+def test_points_that_determine_no_table_are_refused():
     with pytest.raises(KernelTableFitError, match="stretching"):
         fit_table([0.8, 0.9, 1.1], [-1, -0.5, 0.3], [10, 12, 14])
     with pytest.raises(KernelTableFitError, match="point 1"):

@@ -63,7 +63,7 @@ def test_initial_reading_reaches_strains_beyond_search_range(pigment):
     assert np.abs(found.gradient - gradient).max() < 0.005
 
 
-def test_standard_errors_say_how_far_strains_scatter(pigment):
+def test_standard_errors_match_the_scatter_of_strains(pigment):
     """Squared normalized errors of 12 x 4 entries: 48 expected, chi-square at 1e-4 on either side.
 
     The lower bound is wider: what neighbors share can only make standard errors larger.

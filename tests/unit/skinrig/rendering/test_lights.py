@@ -62,13 +62,13 @@ def test_lights_are_read_from_words(stage, words, place, direction, color):
 
 
 @pytest.mark.parametrize("words", ["L999", "1,2", "at:1,2", "1,1,2*x", "1,1,2*-1", "0,0,nan"])
-def test_words_that_are_no_light_are_refused(stage, words):
+def test_unknown_light_names_are_refused(stage, words):
     with pytest.raises(UnusableError if words == "L999" else UsageError, match="--light"):
         stage.light(words)
 
 
 @pytest.mark.parametrize("words", ["C99", "1,2", "front"])
-def test_words_that_are_no_view_are_refused(stage, words):
+def test_unknown_view_names_are_refused(stage, words):
     with pytest.raises(UsageError if "," in words else UnusableError, match="--view"):
         stage.camera(words, size_px=64)
 

@@ -62,7 +62,7 @@ def panels_of(appearances, truths=None):
 
 
 @pytest.mark.parametrize("rig", RIGS)
-def test_first_screen_of_each_rig_has_no_empty_frame(rig, rng):
+def test_first_screen_has_no_empty_frame(rig, rng):
     panels, html = panels_of({rig: appearance_of(RIGS[rig], rng)})
     assert len(panels) == min(len(RIGS[rig]), len({one.title for one in panels}))
     assert panels
@@ -92,14 +92,14 @@ def test_probe_alone_shows_its_radial_profile():
     assert "<img" not in html
 
 
-def test_normals_and_albedo_of_a_light_stack_are_drawn(rng):
+def test_light_stack_shows_normals_and_albedo(rng):
     blocks = list(panels(appearance_of(RIGS["stereo"], rng), None))
     assert [one.text for one in blocks if isinstance(one, page.Heading)] == ["albedo", "normals"]
     titles = [[i.title for i in one.images] for one in blocks if isinstance(one, page.Images)]
     assert titles == [["estimate", "standard uncertainty"]] * 2
 
 
-def test_without_maps_there_is_no_strip(rng):
+def test_first_screen_without_maps_has_no_strip(rng):
     nothing = SkinMap(np.zeros(SHAPE), MAP_UNITS["melanin"], None, np.zeros(SHAPE, bool))
     assert panels_of({"empty": SkinAppearance({"melanin": nothing}, "simulated")})[1].strip() == ""
 
@@ -132,7 +132,7 @@ def test_collection_takes_each_quantity_from_the_best_set(rng):
     ]
 
 
-def test_captured_image_is_compared_at_its_own_white_balance(rng):
+def test_captured_image_keeps_its_own_white_balance(rng):
     radiance = 0.1 + 0.2 * rng.random((*SHAPE, 3))
     captured = SkinAppearance({"picture": SkinMap(radiance * [1.2, 0.6, 0.8], "1")}, "simulated")
     truth = SkinAppearance({"diffuse_radiance": SkinMap(radiance, "1")}, "simulated")
@@ -186,19 +186,19 @@ def texts_of(html):
 
 
 @pytest.mark.parametrize("word", BANNED)
-def test_no_text_of_a_report_has_a_banned_word(reports, word):
+def test_report_texts_have_no_banned_word(reports, word):
     for name, html in reports.items():
         found = re.search(rf".{{0,60}}\b{word}\b.{{0,40}}", texts_of(html))
         assert found is None, f"{name}: {found[0]}"
 
 
-def test_every_truth_in_a_report_is_a_ground_truth(reports):
+def test_report_texts_write_ground_truth(reports):
     for html in reports.values():
         results = texts_of(html).split("provenance")[0]  # behind it: names of parameters
         assert not re.search(r"(?<!ground )\btruths?\b", results)
 
 
-def test_sentences_of_a_report_have_at_most_25_words(reports):
+def test_report_sentences_have_at_most_25_words(reports):
     for html in reports.values():
         for text in re.findall(r"<(?:p|li|caption|h2|h3)\b[^>]*>(.*?)</", html, re.DOTALL):
             for sentence in re.split(r"[.;:] ", markup.unescape(re.sub(r"<[^>]+>", "", text))):

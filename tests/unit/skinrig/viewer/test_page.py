@@ -124,7 +124,7 @@ def test_maps_unusable_on_face_are_refused_with_remedy(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["panel", "controls", "costs", "drag", "probes", "tiles"])
-def test_texts_of_the_page_use_terms_of_the_field(name):
+def test_page_texts_use_field_terms(name):
     code = Path(page.__file__).with_name("js").joinpath(f"{name}.js").read_text(encoding="utf-8")
     code = re.sub(r"^\s*//.*$|\$\{[^}]*\}", "", code, flags=re.MULTILINE)
     texts = [text for text in re.findall(r'"[^"\n]*"|`[^`]*`', code) if " " in text]

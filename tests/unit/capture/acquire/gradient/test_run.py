@@ -8,7 +8,7 @@ import pytest
 from fixtures.operators import by_operator
 
 from capture import raw
-from capture.acquire import AcquisitionError, Interrupted, run_plan
+from capture.acquire import AcquisitionError, CaptureInterrupted, run_plan
 from capture.acquire.gradient.skin_states import ForceMonitor, StrainLimitReached
 from capture.acquire.pattern_scan import analyzer_reading_deg
 from capture.devices.caliper import CaliperBox, MoveReport
@@ -438,7 +438,7 @@ def test_skin_travel_limits_are_restored_after_resume(make):
 def test_a_stop_between_states_ends_dark_and_released(make):
     bench = make(short(steps=(-2, 1)))
     asked = itertools.count()
-    with pytest.raises(Interrupted):
+    with pytest.raises(CaptureInterrupted):
         bench.run(interrupted=lambda: next(asked) >= 3)
     assert bench.at_rest
     assert not bench.world.box("caliper").armed

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from fixtures.operators import by_operator
 
-from capture.acquire import AcquisitionError, Interrupted, run_plan
+from capture.acquire import AcquisitionError, CaptureInterrupted, run_plan
 from capture.devices.camera import CameraError, Trigger, open_camera
 from capture.devices.port import CommandRefused, DeviceError, Port
 from capture.devices.probe import ProbeBox
@@ -594,7 +594,7 @@ def test_a_series_of_two_placements_would_not_pass(make):
 def test_operator_stop_between_exposures_leaves_all_dark(make):
     bench = make()
     count = itertools.count()
-    with pytest.raises(Interrupted):
+    with pytest.raises(CaptureInterrupted):
         bench.run(interrupted=lambda: next(count) > 7)
     assert bench.at_rest
     bench.resume()

@@ -91,7 +91,7 @@ def test_a_white_reference_survives_the_disk(tmp_path):
     assert not again.valid[0, 0]
 
 
-def test_unusable_tiles_say_why():
+def test_unusable_tiles_state_the_reason():
     image, variance, valid = tile(np.random.default_rng(6))
     with pytest.raises(ValueError, match="saturated"):
         white_reference([image], variances=[variance], valid=[~valid])

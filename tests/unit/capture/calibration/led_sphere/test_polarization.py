@@ -131,7 +131,7 @@ def test_single_outlier_light_does_not_rotate_analyzer(rng):
     assert abs(np.degrees(fit.axis_error_rad[7]) - 8.0) < 0.1
 
 
-def test_dead_lights_have_no_strength_and_no_say(rng):
+def test_dead_lights_have_no_strength_and_no_weight(rng):
     readings, rates, variance, good, truth = spots(rng, zero_deg=0.5, turn_deg=0.2)
     rates[:, :13] = rng.standard_normal((len(readings), 13)) * np.sqrt(variance[:, :13])
     fit = fit_polarizers(readings, rates, variance, good, GLASS)

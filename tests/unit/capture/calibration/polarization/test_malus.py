@@ -85,7 +85,7 @@ def test_the_scatter_of_the_light_is_found(fits):
     assert np.median(jitter) == pytest.approx(0.005, rel=0.15)
 
 
-def test_weights_make_the_dark_angles_tell_the_extinction():
+def test_weights_let_dark_angles_determine_the_extinction():
     """Unsteady light moves the bright angles most: unweighted, the leak is far less certain."""
     weighted, plain = [], []
     for seed in range(40):
