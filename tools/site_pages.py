@@ -196,7 +196,7 @@ def _help(text: str | None) -> list[str]:
 
 def _options(command: Any) -> list[str]:
     """Return a table of a command's arguments and options."""
-    from skinrig.commands.help import plain
+    from skinrig.commands.help import format_argument
 
     context = command.make_context(command.name, [], resilient_parsing=True)
     rows = []
@@ -204,7 +204,7 @@ def _options(command: Any) -> list[str]:
         record = parameter.get_help_record(context)
         if record is None:
             continue
-        spelling, text = plain(record[0]), record[1]
+        spelling, text = format_argument(record[0]), record[1]
         default = re.search(r" *\[default: (.*?)\]", text, re.DOTALL)
         required = "[required]" in text
         text = re.sub(r" *\[(default: .*?|required)\]", "", text, flags=re.DOTALL)
@@ -361,18 +361,18 @@ def map_names_page() -> str:
 
     from capture.plan.rig_kinds import RIG_KINDS
     from model.skin import MAP_UNITS
-    from reconstruction.pipeline.recipes import light_list
+    from reconstruction.pipeline.recipes import light_list_recipe
 
     made: dict[str, list[str]] = {}
     for rig in RIG_KINDS:
         for name in importlib.import_module(f"reconstruction.pipeline.{rig}.recipe").RECIPE.maps:
             made.setdefault(name, []).append(rig)
-    for name in light_list().maps:
+    for name in light_list_recipe().maps:
         made.setdefault(name, []).append("images under listed lights")
     lines = [
         "# Names of maps",
         "",
-        "`skinrig reconstruct --want` takes these names. [Maps](maps.md) explains each of them.",
+        "`skinrig reconstruct --maps` takes these names. [Maps](maps.md) explains each of them.",
         "",
         "| map | made from | unit |",
         "| --- | --- | --- |",
