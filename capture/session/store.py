@@ -390,9 +390,7 @@ class Session(SessionView):
         missing = tuple(dict.fromkeys(step.id for step, _ in self.pending_frames()))
         if missing and not missing_reason:
             faults = [Fault("steps", f"{len(missing)} missing, first {missing[0]!r}", "none")]
-            advice = (
-                "Capture them, release() the session to continue later, or give missing_reason."
-            )
+            advice = "Capture them, release() the session until later, or give missing_reason."
             what = "the session is not complete"
             raise SessionError(what, where=str(self.path), faults=faults, advice=advice)
         frames = sum(len(lines) for lines in self._lines.values())

@@ -66,7 +66,8 @@ class Bins:
         Examples
         --------
         >>> found = Bins.from_edges(np.arange(257.0)).count(np.array([-1.0, 0.0, 3.5, 256.0]))
-        >>> found.fractions[[0, 3, 255]].tolist(), found.below ([0.5, 0.25, 0.25], 0.25)
+        >>> found.fractions[[0, 3, 255]].tolist(), found.below
+        ([0.5, 0.25, 0.25], 0.25)
         """
         flat = np.ascontiguousarray(values).reshape(-1)
         sums = np.zeros(HISTOGRAM_BINS)

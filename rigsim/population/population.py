@@ -106,7 +106,8 @@ class Member:
                 )
         if len({name for name, _ in self.applied}) < len(self.applied):
             raise PopulationError(
-                f"applied to {self.name}: got {self.applied}, expected each condition once"
+                f"applied to {self.name}: got {self.applied}, expected each condition once; "
+                "remove one"
             )
         validate_conditions(dict(self.applied))
 

@@ -189,8 +189,7 @@ def _run(
         cosine = dr.clip(cosine, -1.0, 1.0)
         sine = dr.sqrt(dr.maximum(1.0 - cosine * cosine, 0.0))
         sin_phi, cos_phi = dr.sincos((2.0 * dr.pi) * draw(s))
-        # An orthonormal frame about the direction without a singularity (Duff et al. 2017, JCGT
-        # 6(1)).
+        # An orthonormal frame without a singularity (Duff et al. 2017, JCGT 6(1)).
         sign = dr.select(uz >= 0.0, Float(1.0), Float(-1.0))
         a = -1.0 / (sign + uz)
         b = ux * uy * a
@@ -210,8 +209,7 @@ def _run(
         cos_i = dr.abs(uz)
         sin2_t = ratio * ratio * (1.0 - cos_i * cos_i)
         cos_t = dr.sqrt(dr.maximum(1.0 - sin2_t, 0.0))
-        # R = ((s-/s+)^2 + (p-/p+)^2) / 2: compare 2 chance (s+ p+)^2 with
-        # (s- p+)^2 + (p- s+)^2, which avoids divisions.
+        # R = ((s-/s+)^2 + (p-/p+)^2) / 2, compared without its divisions.
         s_minus, s_plus = eta * cos_i - eta_beyond * cos_t, eta * cos_i + eta_beyond * cos_t
         p_minus, p_plus = eta_beyond * cos_i - eta * cos_t, eta_beyond * cos_i + eta * cos_t
         mixed, other = s_minus * p_plus, p_minus * s_plus

@@ -103,7 +103,7 @@ class ErrorEstimate:
 
         Examples
         --------
-        >>> ErrorEstimate.around(2.0, 0.5).error_interval
+        >>> ErrorEstimate.symmetric(2.0, 0.5).error_interval
         (1.5, 2.5)
         """
         return cls(error, (error - half, error + half), bound)

@@ -102,7 +102,7 @@ class BenchmarkStage:
         --------
         >>> stage = BenchmarkStage("hdr", toy=True)
         >>> stage.measure({"n": 9}, lambda: sum(range(9)),
-        ...     lambda s: ErrorEstimate.around(s - 30.0, 1))
+        ...     lambda s: ErrorEstimate.symmetric(s - 30.0, 1))
         ErrorEstimate(error=6.0, error_interval=(5.0, 7.0), cramer_rao_bound=None)
         """
         timing, made = self.time(call, repeats=repeats, memory=memory)

@@ -110,7 +110,7 @@ def _wrong_unit(real: InputPrecision) -> str:
     return expect_error(
         lambda: build_mesh(points, np.array([[0, 1, 2]]), np.zeros((3, 2))),
         MeshError,
-        "millimetres",
+        "millimeters",
     )
 
 

@@ -74,9 +74,9 @@ while True:
     if box.listen(0.1):
         print("at work", flush=True)
 """,
-    at_work=lambda world: world.box("dome").device.running,
+    at_work=lambda world: world.box("dome").device.is_running,
     # between two lights it is dark while it runs
-    over=lambda world: not (world.box("dome").device.running or world.box("dome").device.lit),
+    over=lambda world: not (world.box("dome").device.is_running or world.box("dome").device.lit),
     ended_s=lambda world: {"dome": world.switched[-1].t_off_s},
 )
 
@@ -104,7 +104,9 @@ while True:
     if sphere.listen(0.1):
         print("at work", flush=True)
 """,
-    at_work=lambda world: world.box("gradient_sphere").device.running and world.skin.state.attached,
+    at_work=lambda world: (
+        world.box("gradient_sphere").device.is_running and world.skin.state.attached
+    ),
     over=lambda world: not (world.box("gradient_sphere").device.lit or world.skin.state.attached),
     ended_s=lambda world: {
         "gradient_sphere": world.switched[-1].t_off_s,
@@ -135,7 +137,7 @@ while True:
     over=lambda world: (
         not (world.box("probe").device.lit or world.box("probe").device.pump.is_pumping)
     ),
-    ended_s=lambda world: {"probe": max(world.switched[-1].t_off_s, world.heads[-1][0])},
+    ended_s=lambda world: {"probe": max(world.switched[-1].t_off_s, world.head_history[-1][0])},
 )
 
 WORK = {"flash": FLASH, "dome": DOME, "gradient": GRADIENT, "probe": PROBE}

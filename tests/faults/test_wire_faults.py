@@ -110,7 +110,7 @@ def test_stalled_controller_fills_line_and_times_out(world):
 
 @pytest.mark.parametrize(
     ("faults", "match"),
-    [({"serial": "FL-0666"}, "got the flash box FL-0666"), ({"protocol": 2}, "protocol 2")],
+    [({"serial": "FL-0666"}, "got the flash controller FL-0666"), ({"protocol": 2}, "protocol 2")],
 )
 def test_wrong_controller_or_firmware_is_refused_before_sending(world, faults, match):
     simulated, url = world(**faults)

@@ -358,9 +358,9 @@ RING = sphere_lights.SphereLights(np.concatenate([np.eye(3), -np.eye(3)]))
 )
 @example(view=(0.0, 0.0, 1.0), eta=2.0, vector=(0.0, 0.0, 2.7e-204), mirror=False)
 def test_lobe_response_to_lights_is_finite_in_domain(view, eta, vector, mirror):
-    across = 1.0 - unit(view)[1] ** 2  # of the analyser, squared: 1 where it faces the view
+    across = 1.0 - unit(view)[1] ** 2  # of the analyzer, squared: 1 where it faces the view
     if abs(unit(view)[1]) > 0.9999995:
-        with pytest.raises(sphere_lights.SphereLightsError, match="analyser"):
+        with pytest.raises(sphere_lights.SphereLightsError, match="analyzer"):
             lobe_response.facet_reflectance(RING, unit(view), eta)
     else:
         sent = lobe_response.facet_reflectance(RING, unit(view), eta)

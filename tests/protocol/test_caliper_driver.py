@@ -116,7 +116,7 @@ def test_angle_is_stretched_and_compressed_moves_reported(bench):
     assert forces[-2] < forces[-1] < 0.0 < forces[1] < forces[2]
     assert [number for number, _ in enumerate(bench.world.box("caliper").device.moves)][-1] == 5
     box.release()
-    assert not box.attached()
+    assert not box.is_attached()
     assert not bench.world.skin.state.attached
 
 
@@ -159,7 +159,7 @@ def test_listening_keeps_skin_held_and_silence_releases(bench):
     assert box.is_attached()
     box.port.listen(0.45)
     assert box.status().tripped
-    assert not box.attached()
+    assert not box.is_attached()
     assert not bench.world.skin.state.attached
     with pytest.raises(CommandRefused) as caught:
         box.move_to(0)

@@ -274,7 +274,9 @@ def test_led_warms_as_rc_circuit_and_trips():
 
 
 def test_overheated_led_goes_out_despite_all_limits(bench, monkeypatch):
-    monkeypatch.setattr(bench.unit.bank, "require", lambda wanted, now: (0.0, 0.0, 0.0))
+    monkeypatch.setattr(
+        bench.unit.bank, "require_within_limits", lambda wanted, now: (0.0, 0.0, 0.0)
+    )
     led = behind(1)[0]
     bench.ask("SYST:ARM")
     bench.unit.bank._heat[led] = 0.59

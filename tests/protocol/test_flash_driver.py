@@ -141,7 +141,7 @@ def test_analyzer_rotates_and_settles(bench):
         if turning:
             break
     assert turning
-    assert box.settled()
+    assert box.is_settled()
     assert not box.status().turning
 
 

@@ -160,12 +160,12 @@ def test_steps_after_event_are_skipped_once_time_passed(tmp_path):
     taken = len(broken.frames("subject"))
     session, _, _ = run(tmp_path / "s", plan, resume=True, host_s=1e9 + 40.0)
     kept = [r for r in session.frames("subject") if "time_s" in r.line.actual]
-    assert len(session.left_out()) > 0
-    assert len(session.left_out()) + len(session.frames("subject")) == 12
+    assert len(session.omitted_steps()) > 0
+    assert len(session.omitted_steps()) + len(session.frames("subject")) == 12
     assert len(kept) + 1 > taken
     late = [r.line.actual["time_s"] - r.step.settings["start_s"] for r in kept]
     assert np.max(np.abs(late)) < 0.05
-    assert all("passed" in why for why in session.left_out().values())
+    assert all("passed" in why for why in session.omitted_steps().values())
 
 
 def test_shots_before_event_have_no_time_come_first(tmp_path):

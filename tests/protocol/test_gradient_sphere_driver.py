@@ -160,7 +160,7 @@ def test_analyzer_rotates_to_stops_and_any_reading(bench):
     box.set_polarizer("crossed")
     assert not box.is_settled() or not bench.world.virtual
     box.wait_settled()
-    assert (box.settled(), box.analyser_deg(), box.status().turning) == (True, 90.0, False)
+    assert (box.is_settled(), box.analyser_deg(), box.status().turning) == (True, 90.0, False)
     box.set_analyzer(87.125)
     box.wait_settled()
     assert box.analyser_deg() == 87.125

@@ -173,6 +173,6 @@ def test_impossible_sequences_are_refused_before_folder_creation(tmp_path):
     ):
         with pytest.raises((SimulationError, InputsError, ValueError)):
             simulate(tmp_path, order)
-    with pytest.raises(SimulationError, match="knows nothing"):
+    with pytest.raises(SimulationError, match="not an option of the dome rig"):
         simulate_session("dome", tmp_path / "d", sequence=SequenceOrder(state="smile"))
     assert list(tmp_path.iterdir()) == []

@@ -84,7 +84,7 @@ def test_text_disguised_as_image_error_names_image_format(name, kind, photos, tm
     (photos / name).write_bytes(b"text")
     assert bring(photos, tmp_path / "session") == 3
     said = capsys.readouterr().err
-    assert f"is no {kind}" in said
+    assert f"not a {kind}" in said
     assert "b'text'" in said
     assert "LibRaw" not in said
 

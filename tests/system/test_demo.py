@@ -25,7 +25,7 @@ def test_unknown_rig_error_lists_available_rigs(rigs, tmp_path, capsys):
     out = tmp_path / "demo"
     assert main(["demo", "--rigs", rigs, "--out", str(out)]) == 3
     said = capsys.readouterr().err
-    assert "expected out of flash, dome" in said
+    assert "expected names of flash, dome" in said
     assert "Traceback" not in said
     assert not out.exists()
 
@@ -33,7 +33,7 @@ def test_unknown_rig_error_lists_available_rigs(rigs, tmp_path, capsys):
 def test_folder_not_from_demo_is_left_unchanged(tmp_path):
     kept = tmp_path / "thesis.txt"
     kept.write_text("three years of work")
-    with pytest.raises(DemoError, match="name another folder with --out"):
+    with pytest.raises(DemoError, match="name another"):
         run_demo(tmp_path, ["dome"], console=Console(False))
     assert kept.read_text() == "three years of work"
     assert list(tmp_path.iterdir()) == [kept]

@@ -64,7 +64,7 @@ def test_extremes_command_writes_table_and_report_includes_table(tmp_path, capsy
     assert document["schema"] == extremes.SCHEMA
     assert {case["stage"] for case in document["cases"]} == {"hdr"}
     assert json.loads((tmp_path / "extremes.json").read_text())["cases"]
-    assert "Stiff and extreme cases" in build([tmp_path])
+    assert "Extreme cases" in build([tmp_path])
 
 
 def test_unknown_stage_error_lists_valid_stages(capsys):

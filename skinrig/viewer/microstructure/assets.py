@@ -94,7 +94,7 @@ def find_largest_square(height: Float32Array, valid: BoolArray) -> Float32Array:
         if (inside == n * n).any():
             top, left = np.argwhere(inside == n * n)[0]
             return np.ascontiguousarray(height[top : top + n, left : left + n])
-    raise SceneError("relief: got no valid pixel, expected some millimetres")
+    raise SceneError("relief: got no valid pixel, expected some millimeters; use a larger patch")
 
 
 SAMPLE_PX: Final = 512

@@ -13,7 +13,7 @@ KERNEL = """
 import os, sys
 from pathlib import Path
 from skinrig import kernel_cache
-place = kernel_cache.provide(os.environ, Path("/proc/packages"))
+place = kernel_cache.provide_kernel_cache(os.environ, Path("/proc/packages"))
 print(place, flush=True)
 import numba
 @numba.njit(cache=True)

@@ -46,7 +46,7 @@ def commit_all(session):
 
 
 def test_omitted_steps_are_not_pending_and_session_completes(session):
-    session.leave_out(["S002", "S003"], reason=WHY, about={"aperture_mm": 5.6}, t_host_s=7.0)
+    session.omit_steps(["S002", "S003"], reason=WHY, about={"aperture_mm": 5.6}, t_host_s=7.0)
     assert [step.id for step, _ in session.pending_frames()] == ["D000", "S000", "S001"]
     commit_all(session)
     session.close()
@@ -61,7 +61,7 @@ def test_omitted_steps_are_not_pending_and_session_completes(session):
 
 
 def test_omitted_steps_survive_interruption(session):
-    session.leave_out(["S003"], reason=WHY, t_host_s=0.0)
+    session.omit_steps(["S003"], reason=WHY, t_host_s=0.0)
     session.release()
     with Session.resume(session.path) as again:
         assert again.omitted_steps() == {"S003": WHY}
@@ -77,7 +77,7 @@ def test_omitted_steps_survive_interruption(session):
 
 def test_frames_of_later_omitted_step_stay_uncounted(session):
     commit_all(session)
-    session.leave_out(["S001"], reason=WHY, t_host_s=0.0)
+    session.omit_steps(["S001"], reason=WHY, t_host_s=0.0)
     assert "S001" not in [r.step_id for r in session.frames()]
     assert (session.path / "frames" / "S001+cam.dng").is_file()
     session.close()
@@ -86,7 +86,7 @@ def test_frames_of_later_omitted_step_stay_uncounted(session):
 
 
 def test_other_missing_steps_still_need_reason(session):
-    session.leave_out(["S003"], reason=WHY, t_host_s=0.0)
+    session.omit_steps(["S003"], reason=WHY, t_host_s=0.0)
     with pytest.raises(SessionError, match="4 missing"):
         session.close()
     session.close(missing_reason="the subject left")
@@ -94,12 +94,12 @@ def test_other_missing_steps_still_need_reason(session):
 
 
 def test_omitted_step_is_neither_captured_nor_omitted_again(session):
-    session.leave_out(["S003"], reason=WHY, t_host_s=0.0)
+    session.omit_steps(["S003"], reason=WHY, t_host_s=0.0)
     before = (session.path / "journal.jsonl").read_bytes()
     with pytest.raises(SessionError, match="was omitted"):
         commit(session, "S003")
     with pytest.raises(SessionError, match="not omitted before"):
-        session.leave_out(["S002", "S003"], reason=WHY, t_host_s=0.0)
+        session.omit_steps(["S002", "S003"], reason=WHY, t_host_s=0.0)
     assert (session.path / "journal.jsonl").read_bytes() == before
 
 
@@ -114,12 +114,12 @@ def test_omitted_step_is_neither_captured_nor_omitted_again(session):
 )
 def test_impossible_omission_leaves_no_trace(session, steps, reason, error):
     with pytest.raises(error):
-        session.leave_out(steps, reason=reason, t_host_s=0.0)
+        session.omit_steps(steps, reason=reason, t_host_s=0.0)
     assert (session.path / "journal.jsonl").read_bytes() == b""
 
 
 def test_flipped_bit_in_reason_is_detected(session):
-    session.leave_out(["S003"], reason=WHY, t_host_s=0.0)
+    session.omit_steps(["S003"], reason=WHY, t_host_s=0.0)
     commit_all(session)
     session.close()
     file = session.path / "journal.jsonl"

@@ -113,7 +113,7 @@ def test_a_shift_of_lotion_reaches_the_surface(rng):
         ({"beard": -0.1}, "beard of P01"),
         ({"head": population.HEAD_SHAPES}, "head of P01"),
         ({"melanin": float("nan")}, "melanin of P01"),
-        ({"applied": (("lotion", 0.5), ("lotion", 0.6))}, "twice"),
+        ({"applied": (("lotion", 0.5), ("lotion", 0.6))}, "each condition once"),
         ({"applied": (("mud", 0.5),)}, "mud"),
     ],
 )

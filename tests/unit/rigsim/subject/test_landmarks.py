@@ -38,7 +38,7 @@ def test_landmarks_are_on_skin_at_mean_head_positions(face):
     assert set(points.names) == set(landmarks.POINTS_MM)
     wanted = np.array([(*landmarks.POINTS_MM[name], 0.0) for name in points.names])
     at = face_regions.from_mean_head(wanted, face.mesh)[:, :2]
-    places = points.on(face.mesh)
+    places = points.positions_on(face.mesh)
     np.testing.assert_allclose(places[:, :2], at, atol=1e-3)
     assert (places[:, 2] > -60.0).all()
     assert points.weights.min() > -1e-6
@@ -57,7 +57,7 @@ def test_position_map_gives_landmarks_at_their_superpixels(scenes, state):
     named = scale_landmarks(scene.landmarks_px())
     assert len(named) >= 20
     points = scene.subject.surface_landmarks()
-    places = dict(zip(points.names, points.on(scene.subject.mesh), strict=True))
+    places = dict(zip(points.names, points.positions_on(scene.subject.mesh), strict=True))
     position = to_superpixels(np.asarray(truth["position_mm"], np.float64), truth["mask"])
     whole = to_superpixels(truth["mask"].astype(float)) == 1.0
 
@@ -86,7 +86,7 @@ def test_expression_landmarks_shift_by_projected_movement(scenes, rig, face):
     points = face.surface_landmarks()
     deltas = displacement_mm(face.mesh, "smile", seed=face.seed)
     compared = 0
-    for name, place in zip(points.names, points.on(face.mesh), strict=True):
+    for name, place in zip(points.names, points.positions_on(face.mesh), strict=True):
         if name not in rest or name not in smile:
             continue
         nearest = np.argmin(np.linalg.norm(face.mesh.vertices_mm - place, axis=-1))
@@ -104,7 +104,7 @@ def test_expression_landmarks_shift_by_projected_movement(scenes, rig, face):
 
 def test_landmarks_hidden_by_head_are_not_visible(rig, face):
     caster = Caster(face.mesh, choice=EMBREE)
-    points = face.surface_landmarks().on(face.mesh)
+    points = face.surface_landmarks().positions_on(face.mesh)
     assert landmarks.is_visible(points, rig.views[0], caster).mean() > 0.9
     behind = points - np.array([0.0, 0.0, 30.0])
     assert landmarks.is_visible(behind, rig.views[0], caster).mean() < 0.1

@@ -18,7 +18,7 @@ from rigsim.subject.person import make_subject
 
 def prompted(course, period_s=5.0, count=10):
     for number in range(count):
-        course.tell(period_s * number, course.state if number % 2 == 0 else "neutral")
+        course.prompt(period_s * number, course.state if number % 2 == 0 else "neutral")
     return course
 
 

@@ -130,17 +130,17 @@ def test_a_world_without_a_scene_gives_black_frames(make):
 
 def test_head_history_starts_in_air_and_goes_forward(make):
     world, box = make()
-    assert world.heads == [(0.0, HeadState("", 0.0, False, 0.0, RIG.probe.camera_c))]
+    assert world.head_history == [(0.0, HeadState("", 0.0, False, 0.0, RIG.probe.camera_c))]
     box.arm()
     box.place("chin", 0.0)
     box.suck(100.0, 1.0)
     box.listen(2.0)
-    times = [t for t, _ in world.heads]
+    times = [t for t, _ in world.head_history]
     assert times == sorted(times)
     assert len(set(times)) == len(times)
-    for t_s, state in world.heads:
+    for t_s, state in world.head_history:
         assert world.head_at(t_s) == state
-    assert world.head_at(-1.0) == world.heads[0][1]
+    assert world.head_at(-1.0) == world.head_history[0][1]
     box.close()
 
 

@@ -59,7 +59,7 @@ def test_pump_asked_beyond_capacity_first_gives_free_flow():
     np.testing.assert_allclose(found, integrated(LAW, 150.0, 1e-4, times_s), atol=0.02)
     # at first the free flow, not what the regulator asks for
     first = head()
-    first.draw(150.0, 0.0)
+    first.start_suction(150.0, 0.0)
     slope = first.suction_mbar(1e-6) / 1e-6
     volume = LAW.compliance_ml_per_mbar
     assert slope == pytest.approx(0.8 / volume, rel=1e-4)
@@ -116,7 +116,7 @@ def test_detached_head_loses_suction_at_once():
     # put on again, it stays
     sucked.vent(5.0)
     sucked.place("cheek", 0.0, 6.0)
-    sucked.draw(60.0, 7.0)
+    sucked.start_suction(60.0, 7.0)
     assert sucked.suction_mbar(60.0) > 58.0
 
 
@@ -209,8 +209,8 @@ def test_invalid_parameter_is_named():
         sucked.place("cheek", 360.0, 1.0)
     with pytest.raises(SuctionError, match="target_mbar"):
         sucked.start_suction(0.0, 1.0)
-    sucked.draw(60.0, 1.0)
-    with pytest.raises(SuctionError, match="vented first"):
+    sucked.start_suction(60.0, 1.0)
+    with pytest.raises(SuctionError, match="vent it first"):
         sucked.place("cheek", 0.0, 2.0)
 
 
@@ -220,5 +220,5 @@ def test_zero_leak_and_zero_skin_compliance_work():
     sucked.start_suction(60.0, 0.0)
     assert sucked.suction_mbar(1e3) == 0.0
     sucked = head(law)
-    sucked.draw(60.0, 0.0)
+    sucked.start_suction(60.0, 0.0)
     assert sucked.suction_mbar(1e3) == pytest.approx(60.0, abs=1e-9)

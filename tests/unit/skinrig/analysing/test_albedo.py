@@ -55,7 +55,7 @@ def test_labels_without_faces_are_refused(lab, capsys):
     folder, _, labels = lab
     argv = ["analyse", "albedo", "--labels", str(labels), "--out", str(folder / "none")]
     assert main(argv) == 2
-    assert "name their folders" in capsys.readouterr().err
+    assert "name APPEARANCE/ folders" in capsys.readouterr().err
 
 
 @pytest.mark.long

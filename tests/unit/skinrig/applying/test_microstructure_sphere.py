@@ -112,7 +112,7 @@ def test_grown_sphere_is_shinier_in_its_image(states):
     """The highlight of a smoother surface is brighter and smaller."""
     peaks = {}
     for name in ("shrunk", "neutral", "grown"):
-        picture = states[name, True].picture(size_px=64)
+        picture = states[name, True].render(size_px=64)
         assert np.isfinite(picture).all()
         assert picture[0, 0] == 0.0
         peaks[name] = np.sort(picture.ravel())[-20:].mean()

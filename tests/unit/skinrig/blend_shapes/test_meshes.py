@@ -252,7 +252,7 @@ def arrays():
         ({"faces": np.array([[0.0, 1, 2]])}, "integers"),
         ({"faces": np.array([[0, 1, 3]])}, "indices"),
         ({"vertices_mm": np.full((3, 3), np.nan)}, "not finite"),
-        ({"vertices_mm": np.eye(3) * 1e-3}, "millimetres"),
+        ({"vertices_mm": np.eye(3) * 1e-3}, "millimeters"),
         ({"uv": np.zeros((2, 2))}, "uv"),
     ],
 )

@@ -293,7 +293,7 @@ def test_the_source_is_never_written_over(lab, capsys):
         ("name,tan\n0,1\n", "no line for 1"),
         ("face,tan\n", "expected name,TRAIT"),
         ("name,tan\n0,yes\n1,0\n", "line 2, column tan: got 'yes'"),
-        ("name,tan\n0,1\n0,1\n", "there twice"),
+        ("name,tan\n0,1\n0,1\n", "occurs twice"),
         ("name,tan\n0,1,1\n1,0\n", "got 3 cells"),
         ("name,tan\n0,0\n1,0\n", "nobody of 2 has it"),
         ("", "is empty"),

@@ -217,7 +217,7 @@ def test_full_plan_ends_at_buckling_detachment_every_angle(make):
     check_frames(bench.session)
     ends = {
         (line.about["angle"], line.about["end"])
-        for line in map(bench.session.omission_line, bench.session.left_out())
+        for line in map(bench.session.omission_line, bench.session.omitted_steps())
     }
     assert ends == {(a, end) for a in (0, 45, 90, 135) for end in ("buckled", "detached")}
     bench.session.close()
@@ -280,7 +280,7 @@ def test_compression_ends_at_buckling_and_stretching_at_detachment(make):
     bench.session.close()
     found = verify(bench.session.path)
     assert found.ok
-    assert sum("left out" in text for text in found.warnings) == 2
+    assert sum("omitted" in text for text in found.warnings) == 2
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -289,7 +289,7 @@ def test_frames_of_buckled_skin_are_never_kept(make, seed):
     bench.run()
     check_frames(bench.session)
     assert bench.session.pending_frames() == []
-    (reason,) = set(bench.session.left_out().values())
+    (reason,) = set(bench.session.omitted_steps().values())
     assert "buckled" in reason
 
 
@@ -415,14 +415,14 @@ def test_skin_travel_limits_are_restored_after_resume(make):
     bench = make(short(steps=(-4, 1), patterns=["full"]))
     honest = bench.session.omit_steps
 
-    def leave_out(*args, **words):
+    def omit_steps(*args, **words):
         honest(*args, **words)
         raise Killed
 
-    bench.session.leave_out = leave_out
+    bench.session.omit_steps = omit_steps
     with pytest.raises(Killed):
         bench.run()
-    before = bench.session.left_out()
+    before = bench.session.omitted_steps()
     assert before
     bench.resume()
     bench.build()
@@ -430,7 +430,7 @@ def test_skin_travel_limits_are_restored_after_resume(make):
     honest_move = bench.caliper.move_to
     bench.caliper.move_to = lambda step: moves.append(step) or honest_move(step)
     bench.run()
-    assert bench.session.left_out() == before
+    assert bench.session.omitted_steps() == before
     assert min(moves) >= 0  # compression is over and done with
     assert "a000_p1" in check_frames(bench.session)
 
@@ -530,7 +530,7 @@ def test_stalled_motor_is_homed_and_skin_taped_again(make):
     bench.run()
     assert bench.session.pending_frames() == []
     check_frames(bench.session)
-    assert bench.session.left_out() == {}
+    assert bench.session.omitted_steps() == {}
 
 
 def test_permanently_stalled_motor_ends_capture_with_instructions(make):

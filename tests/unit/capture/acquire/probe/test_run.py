@@ -248,7 +248,7 @@ def test_no_suction_lasts_longer_than_skin_bears(make):
     bench = make(probe_plan(RIG, sites=["cheek"], darks=0), Witness(bright=0.03))
     bench.run(all_brackets=True)
     held_since = None
-    for t_s, head in bench.world.heads:
+    for t_s, head in bench.world.head_history:
         if head.suction_mbar > 5.0 and held_since is None:
             held_since = t_s
         elif head.suction_mbar <= 5.0:
@@ -262,9 +262,9 @@ def test_no_suction_lasts_longer_than_skin_bears(make):
 def test_longer_exposures_are_omitted_once_all_fibers_measured(make):
     bench = make(short(brackets=10, longest_s=4.0), Witness(bright=10.0, fall_mm=7.0))
     bench.run()
-    (reason,) = set(bench.session.left_out().values())
+    (reason,) = set(bench.session.omitted_steps().values())
     match = re.fullmatch(
-        r"cheek at 0 degrees: bracket(?:s (\d+)-9| 9) left out: all 6 fibres above 50 % of full "
+        r"cheek at 0 degrees: bracket(?:s (\d+)-9| 9) omitted: all 6 fibers above 50 % of full "
         r"scale at ([\d.]+) s",
         reason,
     )
@@ -284,7 +284,7 @@ def test_longer_exposures_are_omitted_once_all_fibers_measured(make):
 def test_all_brackets_are_taken_on_request(make):
     bench = make(short(brackets=10, longest_s=4.0), Witness(bright=10.0, fall_mm=7.0))
     bench.run(all_brackets=True)
-    assert bench.session.left_out() == {}
+    assert bench.session.omitted_steps() == {}
     assert len(bench.session.frames("fibres")) == 10
 
 
@@ -298,7 +298,7 @@ def test_fibers_staying_in_noise_do_not_delay_others(make):
     scene = Witness(bright=3e4, fall_mm=0.25)  # bright near ones, and nothing at all far off
     bench = make(short(brackets=12, longest_s=0.1, step_ev=0.5), scene)
     bench.run()
-    reasons = set(bench.session.left_out().values())
+    reasons = set(bench.session.omitted_steps().values())
     assert all("would stay in the noise" in reason for reason in reasons)
 
 
@@ -566,7 +566,7 @@ def test_capture_resumes_after_any_interruption(make, owner, name, number):
     # a series that was whole is not touched again; the head is placed anew for each other one
     whole = 0
     for _, steps in group_by_series(bench.plan):
-        left = [step.id for step in steps if step.id not in bench.session.left_out()]
+        left = [step.id for step in steps if step.id not in bench.session.omitted_steps()]
         attempts = {r.attempt for r in bench.session.frames() if r.step_id in left}
         whole += set(left) <= set(before) and attempts == {1}
     assert len(bench.placings) - asked == 2 - whole
@@ -632,7 +632,7 @@ def test_phantom_is_placed_once_fibers_uncovered_singly(make):
         other = PROBE.fibres[(number + 2) % 6]
         assert bench.session.read(records[0]).cfa[y, round(other.spot_px[0])] < 120
         assert {r.actual["fibre"] for r in records} == {number}
-    (reason,) = {t for t in bench.session.left_out().values() if "covered" in t}
+    (reason,) = {t for t in bench.session.omitted_steps().values() if "covered" in t}
     assert reason in bench.told
 
 
@@ -662,12 +662,12 @@ def test_mask_choice_continues_after_resume_without_choosing_again(make):
     kill_at(bench, bench.box, "open_shutter", 8 + 7)
     with pytest.raises(Killed):
         bench.run()
-    left_out = bench.session.left_out()
+    left_out = bench.session.omitted_steps()
     assert left_out
     bench.resume()
     bench.build()
     bench.run()
-    assert bench.session.left_out() == left_out
+    assert bench.session.omitted_steps() == left_out
     assert bench.session.pending_frames() == []
     placed = check_frames(bench.session)
     assert (placed["phantom at 0 degrees"], placed["fibre 0"], placed["fibre 5"]) == (1, 1, 2)

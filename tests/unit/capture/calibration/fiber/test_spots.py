@@ -114,6 +114,6 @@ def test_spots_that_have_moved_since_are_followed(rng, fibre_camera, falling):
     camera = fibre_camera(rng)
     spots = find(camera, falling)
     later = fibre_camera(rng, places=camera.places + np.array([1.3, -0.7]))
-    followed, shift = spots.moved(merged(later, falling), "RGGB")
+    followed, shift = spots.track(merged(later, falling), "RGGB")
     np.testing.assert_allclose(shift, [1.3, -0.7], atol=0.03)
     np.testing.assert_allclose(followed.center_px, later.places, atol=0.1)

@@ -67,7 +67,7 @@ def test_parallel_and_crossed_transmission_sum_to_reflectance():
     both = reflection.transmit_through_analyzer([0.4, 0.4 + np.pi / 2], turn, 0.1, 0.0, leak).sum(
         axis=0
     )
-    whole = (reflection.fields(turn)[:, 0] ** 2).sum(axis=-1)
+    whole = (reflection.reflected_fields(turn)[:, 0] ** 2).sum(axis=-1)
     # rays meet the camera up to 1.2 degrees off its axis, where a film's axes are not quite at
     # right angles any more: by the square of that angle
     np.testing.assert_allclose(both, (1 + leak) * whole, rtol=np.radians(1.2) ** 2)

@@ -354,7 +354,7 @@ def test_a_condition_is_in_the_truth(rig, face):
 
 
 def test_impossible_scene_requests_are_refused(rig, face, scene):
-    with pytest.raises(SceneError, match="is no LED"):
+    with pytest.raises(SceneError, match="expected an LED"):
         direct(load_rig("flash").resized(64), face)
     with pytest.raises(SceneError, match="light: got 9"):
         scene.radiance("C", [9])

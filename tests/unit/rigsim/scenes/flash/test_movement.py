@@ -122,7 +122,7 @@ def test_unchanged_blood_is_laterally_scattered_as_at_rest(rig, face):
 def test_states_without_movement_change_blood_only_as_reported(rest, smile, still):
     np.testing.assert_array_equal(still.truth()["normals"], rest.truth()["normals"])
     assert (still.truth()["hemoglobin"] != rest.truth()["hemoglobin"]).any()
-    said = dict(still.left_out)
+    said = dict(still.omitted)
     assert said["movement of the face with the states"] == "movement=False requests it"
     assert "movement of the face with the states" not in dict(smile.left_out)
     assert smile.needs.builds("shadows of wrinkles")

@@ -111,7 +111,7 @@ def test_images_and_landmarks_follow_moved_face_truth(rig, places):
     here, there = (scene.landmarks_px() for scene in places)
     middle = 0.5 * np.array([view.width_px - 1, view.height_px - 1])
     points = places[0].subject.surface_landmarks()
-    for name, place in zip(points.names, points.on(places[0].subject.mesh), strict=True):
+    for name, place in zip(points.names, points.positions_on(places[0].subject.mesh), strict=True):
         if name in here and name in there:
             larger = (view.distance_mm - place[2]) / (view.distance_mm - place[2] - NEARER_MM)
             np.testing.assert_allclose(

@@ -70,7 +70,7 @@ def test_defocus_follows_stokseth_s_limit_of_geometry(lens):
     f = np.linspace(0.2, 2.5, 20)
     x = math.pi * diameter_mm * f
     np.testing.assert_allclose(green.otf(f, depth_mm=depth_mm), 2.0 * j1(x) / x, atol=0.03)
-    assert green.transfer(f, depth_mm=0.0).min() > 0.9
+    assert green.otf(f, depth_mm=0.0).min() > 0.9
 
 
 @pytest.mark.parametrize("subpixels", [1, 2, 3])
