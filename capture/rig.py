@@ -22,6 +22,7 @@ from capture.documents import (
     read_toml,
     suggest_key,
 )
+from capture.former_names import translate_names
 from capture.rig_parts import (
     AXIS_RULE,
     ID_RULE,
@@ -345,7 +346,7 @@ def rig_from_json(data: Mapping[str, Any], *, where: str = "rig") -> Rig:
     RigError
         With every fault's path, the value found and the value expected.
     """
-    return parse_document(Rig, data, where=where, error=RigError)
+    return parse_document(Rig, translate_names(data), where=where, error=RigError)
 
 
 def load_rig(name_or_path: str | Path) -> Rig:

@@ -22,7 +22,10 @@ from model.arrays import Float32Array
 from model.checks import Checks
 from model.skin import SkinAppearance, SkinMap
 
-SCHEMA = "skinrig.appearance/1"
+SCHEMA = "skinrig.appearance/2"
+READABLE_SCHEMAS = (SCHEMA, "skinrig.appearance/1")
+FORMER_MAP_NAMES = {"picture": "image", "specular_picture": "specular_image"}
+"""Present name of a map by its name in version 1, which is read as if it had the present one."""
 DOCUMENT_FILE = "appearance.json"
 _NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
@@ -50,7 +53,7 @@ class _MapEntry(_Strict):
 
 
 class _Document(_Strict):
-    schema_: Literal["skinrig.appearance/1"] = Field(alias="schema")
+    schema_: Literal["skinrig.appearance/2", "skinrig.appearance/1"] = Field(alias="schema")
     source: Literal["measured", "simulated"]
     seed: int | None
     maps: dict[str, _MapEntry]
@@ -195,8 +198,11 @@ def read_document(folder: Path) -> _Document:
     except ValueError as error:
         raise StoreError(f"{path}: is not JSON ({error}); the folder is damaged") from error
     version = loaded.get("schema") if isinstance(loaded, dict) else None
-    if version != SCHEMA:
-        raise StoreError(f"{path}: got schema {version!r}, expected {SCHEMA!r}")
+    if version not in READABLE_SCHEMAS:
+        raise StoreError(
+            f"{path}: got schema {version!r}, expected one of {', '.join(READABLE_SCHEMAS)}; "
+            "use the version of skinrig that wrote it"
+        )
     try:
         document = _Document.model_validate_json(raw)
     except ValidationError as error:
@@ -205,6 +211,9 @@ def read_document(folder: Path) -> _Document:
         raise StoreError(f"{path}: {where}: {first['msg']}") from error
     if _seal({k: v for k, v in loaded.items() if k != "seal"}) != document.seal:
         raise StoreError(f"{path}: was changed after it was written (its seal does not fit)")
+    if version != SCHEMA:
+        maps = {FORMER_MAP_NAMES.get(name, name): entry for name, entry in document.maps.items()}
+        document = document.model_copy(update={"maps": maps})
     return document
 
 

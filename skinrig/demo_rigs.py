@@ -36,7 +36,7 @@ FLASH_STATES = ("neutral", "anger")
 FLASH_CALIBRATIONS = {"flat": "sensor", "white": "white", "chart": "color", "malus": "polarization"}
 """Calibration by target, in the order of computation."""
 FLASH_WANT = (
-    *("melanin", "hemoglobin", "shading", "residual", "diffuse", "picture", "specular_picture"),
+    *("melanin", "hemoglobin", "shading", "residual", "diffuse", "image", "specular_image"),
     *("tsumura_melanin", "tsumura_hemoglobin"),
 )
 DOME_SUBJECT = "III"

@@ -31,12 +31,12 @@ def main() -> None:
         (folder / "portrait.png").write_bytes(png.encode(skimage.data.astronaut()))
         done = import_photos(folder / "portrait.png", out=folder / "session")
         outcome = pipeline.reconstruct(
-            folder / "session", want=["melanin", "hemoglobin", "picture"], out=folder / "maps"
+            folder / "session", want=["melanin", "hemoglobin", "image"], out=folder / "maps"
         )
         maps = store.read(folder / "maps").maps
     for text in dict.fromkeys((*done.assumed, *outcome.assumed)):
         print(f"assumed: {text}", file=sys.stderr)
-    picture = maps["picture"].values[FACE]
+    picture = maps["image"].values[FACE]
     panels = [png.srgb8(picture / np.percentile(picture, 99))]
     for name, high in SCALES.items():
         part = maps[name]

@@ -35,6 +35,7 @@ from capture.calibration.record import (
     require_plain_name,
 )
 from capture.calibration.validity import CalibrationDrift, measure_drift, require_valid
+from capture.former_names import FORMER_KINDS, FORMER_NAMES
 
 __all__ = [
     "CALIBRATION_KINDS",
@@ -56,7 +57,8 @@ __all__ = [
     "save",
 ]
 
-SCHEMA = "skinrig.calibration/1"
+SCHEMA = "skinrig.calibration/2"
+READABLE_SCHEMAS = (SCHEMA, "skinrig.calibration/1")
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -79,7 +81,7 @@ class _MapFile(_Strict):
 
 
 class _CalibrationFile(_Strict):
-    schema_: Literal["skinrig.calibration/1"] = Field(alias="schema")
+    schema_: Literal["skinrig.calibration/2", "skinrig.calibration/1"] = Field(alias="schema")
     kind: str
     rig: str
     serials: list[str]
@@ -171,22 +173,23 @@ def load(directory: str | Path, kind: str) -> Calibration:
         raise ValueError(f"kind: got {kind!r}, expected one of {CALIBRATION_KINDS}")
     folder = Path(directory)
     path = folder / f"{kind}.json"
+    former = folder / f"{FORMER_KINDS.get(kind, kind)}.json"
     try:
-        raw = path.read_bytes()
+        raw = (path if path.exists() else former).read_bytes()
     except OSError as exc:
         raise CalibrationMissing(
             f"{path}: no {kind} calibration there ({exc.strerror}); make one with"
             f" `skinrig calibrate {kind} SESSION --out {shlex.quote(str(folder))}`"
         ) from exc
     document = _parse(path, raw)
-    if document.kind != kind:
+    if FORMER_NAMES.get(document.kind, document.kind) != kind:
         raise CalibrationMismatch(
             f"{path}: contains kind {document.kind!r}, expected {kind!r}; "
             "rename the file or calibrate again"
         )
     try:
         return Calibration(
-            kind=document.kind,
+            kind=kind,
             rig=document.rig,
             serials=tuple(document.serials),
             created=date.fromisoformat(document.created),
@@ -244,9 +247,9 @@ def _parse(path: Path, raw: bytes) -> _CalibrationFile:
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as exc:
         raise CalibrationDamaged(f"{path}: not JSON ({exc}); calibrate again") from exc
     schema = document.get("schema") if isinstance(document, dict) else None
-    if schema != SCHEMA:
+    if schema not in READABLE_SCHEMAS:
         raise CalibrationDamaged(
-            f"{path}: schema is {schema!r}, this version reads {SCHEMA!r}; calibrate again or use"
+            f"{path}: got schema {schema!r}, expected {SCHEMA!r} or older; calibrate again or use"
             " the version that wrote it"
         )
     if document.get("sha256") != _seal(document):

@@ -18,6 +18,7 @@ from capture.documents import (
     short_repr,
     suggest_key,
 )
+from capture.former_names import translate_names
 from capture.plan.suction import suction_overhead_s
 from capture.rig import ID_RULE, Rig, is_id
 
@@ -249,7 +250,7 @@ class Plan(Document):
         """
         if isinstance(data, str | bytes):
             data = read_json(data, where=where, error=PlanError)
-        return parse_document(Plan, data, where=where, error=PlanError)
+        return parse_document(Plan, translate_names(data), where=where, error=PlanError)
 
 
 class StepSeries:

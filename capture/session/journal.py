@@ -22,6 +22,7 @@ from capture.documents import (
     short_repr,
     to_json_table,
 )
+from capture.former_names import translate_names
 from capture.plan import Value
 from capture.rig import ID_RULE, is_id
 from capture.session.errors import SessionDamage, SessionError
@@ -122,7 +123,7 @@ Line = FrameLine | AttachmentLine | OmissionLine | CloseLine
 _LINE_KINDS: Mapping[str, type[Any]] = {
     "frame": FrameLine,
     "attachment": AttachmentLine,
-    "left_out": OmissionLine,
+    "omission": OmissionLine,
     "close": CloseLine,
 }
 
@@ -249,10 +250,13 @@ def _unseal(text: bytes, head: str, where: str) -> tuple[Line | None, str]:
             return None, digest
         got = short_repr(content.get("h"))
         raise _damage_error(where, None, "hash", got, f"{digest}: the line is not what was written")
+    kind = "omission" if kind == "left_out" else kind  # its name in version 1
+    for part in {"settings", "actual"} & record.keys():
+        record[part] = translate_names(record[part])
     if isinstance(kind, str) and kind in _LINE_KINDS:
         return parse_document(_LINE_KINDS[kind], record, where=where, error=SessionDamage), digest
     raise _damage_error(
-        where, None, "type", short_repr(kind), '"frame", "attachment", "left_out" or "close"'
+        where, None, "type", short_repr(kind), '"frame", "attachment", "omission" or "close"'
     )
 
 

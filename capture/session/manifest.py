@@ -20,11 +20,13 @@ from capture.documents import (
     read_json,
     to_json_table,
 )
+from capture.former_names import translate_names
 from capture.plan import Plan
 from capture.rig import ID_RULE, Rig, is_id
 from capture.session.errors import SessionDamage, SessionError
 
-SCHEMA = "skinrig.session/1"
+SCHEMA = "skinrig.session/2"
+READABLE_SCHEMAS = (SCHEMA, "skinrig.session/1")
 ANY_USE = "any"
 Source = Literal["measured", "simulated"]
 
@@ -152,9 +154,9 @@ def decode(data: bytes, *, where: str) -> tuple[Manifest, str]:
         fault = Fault("", type(content).__name__, "a table")
         raise SessionDamage("is not a session manifest", where=where, faults=[fault])
     schema = content.pop("schema", None)
-    if schema != SCHEMA:
+    if schema not in READABLE_SCHEMAS:
         advice = "Read it with the version of skinrig that wrote it, or check the file."
-        faults = [Fault("schema", repr(schema), SCHEMA)]
+        faults = [Fault("schema", repr(schema), " or ".join(READABLE_SCHEMAS))]
         raise SessionError("has an unknown schema", where=where, faults=faults, advice=advice)
     found = content.pop(_SEAL_KEY, None)
     written, expected = seal({"schema": schema, **content})
@@ -164,6 +166,8 @@ def decode(data: bytes, *, where: str) -> tuple[Manifest, str]:
         advice = "Restore session.json from a copy: it was changed after it was written."
         faults = [Fault(_SEAL_KEY, got, expected)]
         raise SessionDamage("is damaged", where=where, faults=faults, advice=advice)
+    for part in {"plan", "rig", "calibrations"} & content.keys():
+        content[part] = translate_names(content[part])
     return parse_document(Manifest, content, where=where, error=SessionDamage), expected
 
 

@@ -8,6 +8,7 @@ import typer
 
 from skinrig.commands import completion
 from skinrig.commands.options import Json, Out, command
+from skinrig.commands.renamed_options import replace_former_values
 from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import UnusableError
 from skinrig.next_steps import shell_quote
@@ -42,10 +43,12 @@ def calibrate(
         Calibration: sensor, color, polarization or white (flash); geometry or lights (dome);
         sensor, lights or polarization (gradient); fibre (probe).
     """
+    from capture.former_names import FORMER_NAMES
     from skinrig.calibrating.calibrate import calibrate as make
     from skinrig.calibrating.dome import dome_targets
 
     console = Console(json)
+    (kind,) = replace_former_values([kind], FORMER_NAMES)
     done = make(kind, sessions, out, targets=dome_targets(square_mm, sphere_mm), phantom=phantom)
     console.rows(("quantity", "value"), done.summary)
     console.each("found", done.findings)
@@ -132,6 +135,7 @@ def reconstruct(
     maps
         Maps to compute, separated by commas; an unknown name lists the valid ones.
     """
+    from model.store import FORMER_MAP_NAMES
     from reconstruction.pipeline import recipes as pipeline
     from reconstruction.pipeline.inputs import DomeOptions
     from skinrig.appearances.state_truth import find_comparison_truth
@@ -139,6 +143,7 @@ def reconstruct(
     console = Console(json)
     check_rank(rank, merl_basis)
     wants = [name.strip() for name in maps.split(",") if name.strip()]
+    wants = replace_former_values(wants, FORMER_MAP_NAMES)
     made = []
     for session, folder in zip(sessions, assign_output_folders(sessions, out), strict=True):
         truth = find_comparison_truth(session, state)

@@ -1,5 +1,6 @@
-"""Former names of options: accepted with a notice until `REMOVAL_VERSION`."""
+"""Former names of options and values: accepted with a notice until `REMOVAL_VERSION`."""
 
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
@@ -105,3 +106,16 @@ def format_notice(former: str, present: str) -> str:
     'skinrig: --toy is now --smoke; the old name works until version 0.2'
     """
     return f"skinrig: {former} is now {present}; the old name works until version {REMOVAL_VERSION}"
+
+
+def replace_former_values(values: Sequence[str], renamed: Mapping[str, str]) -> list[str]:
+    """Return values by their present names; print a notice on stderr for each former name.
+
+    Examples
+    --------
+    >>> replace_former_values(["melanin", "image"], {"picture": "image"})
+    ['melanin', 'image']
+    """
+    for former in dict.fromkeys(value for value in values if value in renamed):
+        print(format_notice(former, renamed[former]), file=sys.stderr, flush=True)
+    return [renamed.get(value, value) for value in values]

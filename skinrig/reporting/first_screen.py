@@ -72,7 +72,7 @@ class Candidate:
         estimate = found.maps[key]
         maps = {} if truth is None else truth.maps
         other = maps.get(key, maps.get("normals") if "normals" in key else None)
-        if key == "picture" and "diffuse_radiance" in maps:
+        if key == "image" and "diffuse_radiance" in maps:
             other = _balanced(maps["diffuse_radiance"], estimate)
         elif truth is not None and other is not None and key.startswith("height_"):
             relief = microrelief.true_relief(found, truth, key.removeprefix("height_"))

@@ -21,8 +21,8 @@ MAP_WORDS: Final = {
     "translucency": "diffuse mean free path",
     "tsumura_melanin": "melanin, independent components",
     "tsumura_hemoglobin": "hemoglobin, independent components",
-    "picture": "captured image",
-    "specular_picture": "specular image",
+    "image": "captured image",
+    "specular_image": "specular image",
 }
 """Labels by the name in files; other names are labels already."""
 MIN_BAND_PIXELS: Final = 20

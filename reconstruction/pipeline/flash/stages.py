@@ -37,7 +37,7 @@ STAGE_REVISION = 7
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = tuple(
-    "melanin hemoglobin shading residual gamut_distance diffuse specular picture specular_picture "
+    "melanin hemoglobin shading residual gamut_distance diffuse specular image specular_image "
     "tsumura_melanin tsumura_hemoglobin melanin_noise_stderr hemoglobin_noise_stderr".split()
 )
 """Maps of a flash session."""
@@ -87,7 +87,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     by_color = table | model_error.data_hash()
     of_skin = "melanin hemoglobin shading residual gamut_distance"
     of_skin += " melanin_noise_stderr hemoglobin_noise_stderr"
-    both, shown = "diffuse specular", "picture specular_picture"
+    both, shown = "diffuse specular", "image specular_image"
     return [
         stage("frames", "", "parallel crossed", partial(_frames, rig), **which),
         stage("separation", "parallel crossed", both, partial(_separate, rig)),
@@ -360,6 +360,6 @@ def _pictures(rig: FlashRig, diffuse: SkinMap, specular: SkinMap) -> Mapping[str
     if rig.color is not None and rig.neutral is not None:
         picture = rig.color.to_linear_srgb(picture * rig.neutral)
     return {
-        "picture": SkinMap(picture.astype(np.float32), "1", valid=diffuse.valid),
-        "specular_picture": SkinMap(specular.values, "1", valid=specular.valid),
+        "image": SkinMap(picture.astype(np.float32), "1", valid=diffuse.valid),
+        "specular_image": SkinMap(specular.values, "1", valid=specular.valid),
     }

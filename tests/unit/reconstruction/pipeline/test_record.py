@@ -23,7 +23,7 @@ def graph(gain=2.0):
         PipelineStage(
             "invert", ("diffuse",), ("melanin",), lambda diffuse: {"melanin": diffuse.sum()}
         ),
-        PipelineStage("draw", ("diffuse",), ("picture",), lambda diffuse: {"picture": diffuse}),
+        PipelineStage("draw", ("diffuse",), ("image",), lambda diffuse: {"image": diffuse}),
     ]
 
 

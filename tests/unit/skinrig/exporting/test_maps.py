@@ -35,7 +35,7 @@ def picture(rng):
             "melanin": SkinMap(melanin, MAP_UNITS["melanin"], 0.1 * melanin, valid),
             "hemoglobin": SkinMap(blood, MAP_UNITS["hemoglobin"], valid=valid),
             "normals": SkinMap(normals, "1", description="towards the camera"),
-            "picture": SkinMap(rng.uniform(0, 1, (*shape, 3)), "1", valid=valid),
+            "image": SkinMap(rng.uniform(0, 1, (*shape, 3)), "1", valid=valid),
             "diffuse": SkinMap(rng.uniform(0, 1, (*shape, 3)), "1", valid=valid),
         },
         "simulated",
@@ -51,7 +51,7 @@ def test_every_map_is_exported_with_values_and_record(picture, tmp_path):
         np.testing.assert_array_equal(read(tmp_path / f"exr/{name}.exr"), one.values)
         assert told["files"][f"exr/{name}.exr"]["unit"] == one.unit
     spaces = {name: told["files"][f"exr/{name}.exr"]["color_space"] for name in picture.maps}
-    assert spaces["picture"] == "linear sRGB"
+    assert spaces["image"] == "linear sRGB"
     assert spaces["diffuse"].startswith("camera RGB")
     assert spaces["melanin"] == "data"
     assert (told["source"], told["assumed"]) == ("simulated", ["an even light"])

@@ -37,13 +37,13 @@ def flat_normals(rng):
 def map_of(name, rng):
     if name.startswith("normals"):
         return measured(flat_normals(rng), error=0.01)
-    if name in ("picture", "r_d", "translucency", "albedo"):
+    if name in ("image", "r_d", "translucency", "albedo"):
         return measured(0.2 + 0.1 * rng.random((*SHAPE, 3)), MAP_UNITS.get(name, "1"))
     return measured(0.02 + 0.1 * rng.random(SHAPE), MAP_UNITS.get(name, "um"))
 
 
 RIGS = {
-    "flash": ("picture", "melanin", "hemoglobin"),
+    "flash": ("image", "melanin", "hemoglobin"),
     "dome": ("r_d", "normals_refined"),
     "gradient": ("crossed_a000_n0", "normals_a000_n0", "height_a000_n0"),
     "moving": ("melanin", "hemoglobin", "hemoglobin_anger"),
@@ -120,7 +120,7 @@ def test_collection_takes_each_quantity_from_the_best_set(rng):
     sets = {
         "a-without-truth": appearance_of(("melanin",), rng),
         "dome": appearance_of(("normals_refined",), rng),
-        "flash": appearance_of(("picture", "melanin", "hemoglobin"), rng),
+        "flash": appearance_of(("image", "melanin", "hemoglobin"), rng),
     }
     truths = {"flash": SkinAppearance({"melanin": map_of("melanin", rng)}, "simulated")}
     panels, _ = panels_of(sets, truths)
@@ -134,7 +134,7 @@ def test_collection_takes_each_quantity_from_the_best_set(rng):
 
 def test_captured_image_keeps_its_own_white_balance(rng):
     radiance = 0.1 + 0.2 * rng.random((*SHAPE, 3))
-    captured = SkinAppearance({"picture": SkinMap(radiance * [1.2, 0.6, 0.8], "1")}, "simulated")
+    captured = SkinAppearance({"image": SkinMap(radiance * [1.2, 0.6, 0.8], "1")}, "simulated")
     truth = SkinAppearance({"diffuse_radiance": SkinMap(radiance, "1")}, "simulated")
     (panel,), _ = panels_of({"flash": captured}, {"flash": truth})
     assert [image.title for image in panel.images] == ["captured", "ground truth"]

@@ -73,7 +73,7 @@ def html(tmp_path_factory):
     store.write(
         tmp_path / "maps",
         SkinAppearance(
-            {"melanin": found, "picture": SkinMap(np.ones((30, 40, 3)), "1")},
+            {"melanin": found, "image": SkinMap(np.ones((30, 40, 3)), "1")},
             "simulated",
             parameters={"truth": "truth"},
             left_out=(("gloss", "no parallel frames"),),

@@ -1,0 +1,31 @@
+"""Names of version 1 of the file formats, translated when a file is read.
+
+Version 2 of SESSION/ and CALIBRATION/ writes ``fiber`` and ``omission`` where version 1 wrote
+``fibre`` and ``left_out``. Files of version 1 are read, never rewritten: hashes and seals are
+checked on the bytes as written, before the translation.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+FORMER_NAMES: Final[Mapping[str, str]] = {"fibre": "fiber", "fibres": "fibers"}
+"""Present name of a key, a kind of steps or a kind of calibrations, by its name in version 1."""
+FORMER_KINDS: Final = {present: former for former, present in FORMER_NAMES.items()}
+"""Kind of calibrations in version 1, which names the file, by its present name."""
+
+
+def translate_names(data: Any) -> Any:
+    """Return decoded JSON or TOML with present names for keys and for values of ``kind``.
+
+    Examples
+    --------
+    >>> translate_names({"kind": "fibres", "settings": {"fibre": 3}, "id": "fibre"})
+    {'kind': 'fibers', 'settings': {'fiber': 3}, 'id': 'fibre'}
+    """
+    if isinstance(data, list | tuple):
+        return [translate_names(item) for item in data]
+    if not isinstance(data, Mapping):
+        return data
+    table = {FORMER_NAMES.get(key, key): translate_names(value) for key, value in data.items()}
+    kind = table.get("kind")
+    return table | {"kind": FORMER_NAMES.get(kind, kind)} if isinstance(kind, str) else table
