@@ -211,7 +211,7 @@ class Fiber(Document):
     """Nominal center of its end in the camera's image, pixels, x right, y down."""
 
     def __post_init__(self) -> None:
-        checks = FaultCollector(f"Fibre {self.name!r}", RigError)
+        checks = FaultCollector(f"Fiber {self.name!r}", RigError)
         checks.check("name", self.name, is_id(self.name), ID_RULE)
         checks.check_finite(position_mm=self.position_mm, spot_px=self.spot_px)
         checks.check_positive(core_mm=self.core_mm, numerical_aperture=self.numerical_aperture)
@@ -233,7 +233,7 @@ class Probe(Document):
     along the line of fibers and +z out of the skin.
     """
 
-    fibres: tuple[Fiber, ...]
+    fibers: tuple[Fiber, ...]
     """Detection fibers, by growing distance from the source."""
     source_core_mm: float
     """Diameter of the source fiber's core, mm, > 0."""
@@ -260,14 +260,14 @@ class Probe(Document):
 
     def __post_init__(self) -> None:
         checks = FaultCollector("Probe", RigError)
-        names = tuple(fibre.name for fibre in self.fibres)
+        names = tuple(fiber.name for fiber in self.fibers)
         differ = len(set(names)) == len(names) > 0
-        checks.check("fibres", names, differ, "at least one, names that differ")
-        radii = tuple(fibre.radius_mm for fibre in self.fibres)
+        checks.check("fibers", names, differ, "at least one, names that differ")
+        radii = tuple(fiber.radius_mm for fiber in self.fibers)
         grow = all(a < b for a, b in zip((0.0, *radii), radii, strict=False))
-        checks.check("fibres", radii, grow, "growing distances > 0 from the source")
+        checks.check("fibers", radii, grow, "growing distances > 0 from the source")
         fields = [field.name for field in dataclasses.fields(self)]
-        free = ("fibres", "rest_s", "settle_s", "camera_c")
+        free = ("fibers", "rest_s", "settle_s", "camera_c")
         checks.check_positive(**{name: getattr(self, name) for name in fields if name not in free})
         na = self.source_numerical_aperture
         checks.check("source_numerical_aperture", na, na < 1, "0 < NA < 1")
@@ -292,4 +292,4 @@ class Probe(Document):
         >>> len(radii), radii[0], radii[-1]
         (28, 0.3, 7.05)
         """
-        return tuple(fibre.radius_mm for fibre in self.fibres)
+        return tuple(fiber.radius_mm for fiber in self.fibers)

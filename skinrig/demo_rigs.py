@@ -264,7 +264,7 @@ def _probe(run: RigDemo) -> None:
     with run.share("probe: capture a phantom"):
         run.simulate("probe", "phantom", target="phantom")
     with run.share("probe: calibrate its fibers"):
-        run.calibrate("probe", "fibre", "phantom")
+        run.calibrate("probe", "fiber", "phantom")
     with run.share("probe: capture a medium and three sites of a face"):
         captures = [
             run.simulate("probe", "medium", subject=PROBE_MEDIUM, sites=("cheek",)),
@@ -278,7 +278,7 @@ def _probe(run: RigDemo) -> None:
                 lost = np.mean([not fit.valid for fit in fits if fit.method == row.method])
                 what, error = f"sigma_tr, {row.method}", 100 * row.median
                 run.found.add(name, what, error, "%", row.coverage, float(lost))
-    run.found.add_omissions("fibre probe", captures[-1])
+    run.found.add_omissions("fiber probe", captures[-1])
 
 
 RIGS: Mapping[str, Callable[[RigDemo], None]] = {

@@ -19,7 +19,7 @@ CALIBRATION_BY_TARGET: Final[Mapping[str, Mapping[str, str]]] = {
     },
     "dome": {"charuco": "geometry", "mirror": "lights", "white": "lights"},
     "gradient": {"ball": "lights", "flat": "sensor", "dark": "sensor"},
-    "probe": {"phantom": "fibre"},
+    "probe": {"phantom": "fiber"},
 }
 """Calibration by rig and target."""
 DEFAULT_WANTS: Final[Mapping[str, str]] = {
@@ -78,7 +78,7 @@ def suggest_after_session(
     >>> suggest_after_session("flash", "session-flash", None)
     'skinrig reconstruct session-flash --maps melanin,hemoglobin --out appearance'
     >>> suggest_after_session("probe", "session-phantom", "phantom")
-    'skinrig calibrate fibre session-phantom --out calibration'
+    'skinrig calibrate fiber session-phantom --out calibration'
     """
     place, store = shell_quote(session), shell_quote(calibration)
     if target == "sequence":

@@ -30,7 +30,7 @@ def main(arguments: list[str]) -> None:
         simulate_session(
             "probe", out / "session-phantom", target="phantom", seed=first, size="full"
         )
-        calibrate("fibre", [out / "session-phantom"], out / "calibration")
+        calibrate("fiber", [out / "session-phantom"], out / "calibration")
     rows: list[evaluation.FitAccuracy] = []
     for seed in range(first, first + media):
         sigma_a, sigma_s_prime, g = medium(seed)

@@ -14,7 +14,7 @@ length L, and absorption is applied afterwards as exp(-sigma_a L). Variance redu
   the cloud are thinned by roulette. The importance is diffusion's exp(-3 r^2/(4 L)) to the power
   0.6, so that large radii and strong absorption get as many photons as weak absorption.
 - At the surface the expected transmittance is scored instead of a random choice.
-- "fibre": each shallow collision scores what it sends directly into the fiber's cone (next-event
+- "fiber": each shallow collision scores what it sends directly into the fiber's cone (next-event
   estimation), in one direction drawn inside the cone.
 - Paths longer than 3000 transport lengths are continued by the diffusion's L^(-5/2) law, whose
   constant is taken from the last factor of two of the histogram.
@@ -32,7 +32,7 @@ sigma_s', from leaving batches out; about twice that at 0.05 to 0.3):
 
     g       0      0.3    0.5    0.7    0.8    0.9    0.95
     all     0.25   0.28   0.30   0.22   0.14   0.22   0.29 %
-    fibre   0.18   0.18   0.20   0.24   0.20   0.33   0.73 %
+    fiber   0.18   0.18   0.20   0.24   0.20   0.33   0.73 %
 
 The sampler (the generator sfc64, the walk, the scoring) is written for this table alone; the
 simulated rigs have another one.
@@ -59,7 +59,7 @@ LOG_RADIUS_START, LOG_RADIUS_STEP, RADIUS_BINS = log(0.005), 0.1, 94  # 0.005 to
 LOG_PATH_START, LOG_PATH_STEP, PATH_BINS = log(0.005), 0.04, 333  # 0.005 to 3050
 PATH_END = 3000.0
 LATE_BIN = 316  # paths of 1541 and longer give the constant of the L^(-5/2) law
-COLLECTIONS = ("all", "fibre")
+COLLECTIONS = ("all", "fiber")
 # Photons per batch: about equal times except for g = 0 and 0.5, which need fewer.
 PHOTONS = {
     0.8: 250_000,
@@ -136,7 +136,7 @@ def _score(hist, e, radius2, path, weight):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def walk(photons, seed, g, fibre, etas, path_end, hist):
+def walk(photons, seed, g, fiber, etas, path_end, hist):
     """Trace photons into `hist`, (etas, radii, paths, 2): weights and weights times path."""
     state = np.empty(4, np.uint64)
     for k in range(3):
@@ -158,7 +158,7 @@ def walk(photons, seed, g, fibre, etas, path_end, hist):
         weight = 1.0
         for e in range(n_eta):
             v[e] = 1.0 - _reflected(1.0, etas[e])
-        if fibre:
+        if fiber:
             s2, density = _cone_sine2(state, aperture2)
             uz = sqrt(1.0 - s2)
             ux = sqrt(s2)
@@ -193,7 +193,7 @@ def walk(photons, seed, g, fibre, etas, path_end, hist):
                 for e in range(n_eta):
                     if v[e] > 0.0:
                         reflected = _reflected(mu, etas[e])
-                        if reflected < 1.0 and not fibre:
+                        if reflected < 1.0 and not fiber:
                             _score(hist, e, radius2, path, weight * v[e] * (1.0 - reflected))
                         v[e] *= reflected / reflected_top
                 if _draw(state) > reflected_top:
@@ -207,7 +207,7 @@ def walk(photons, seed, g, fibre, etas, path_end, hist):
                 alive = False
                 continue
             collisions += 1
-            if fibre and z * sigma < 14.0:
+            if fiber and z * sigma < 14.0:
                 s2, density = _cone_sine2(state, aperture2)
                 mu = sqrt(1.0 - s2)
                 tau = z * sigma / mu
@@ -305,8 +305,8 @@ def simulate(folder, g, collection, photons, batches):
         seed = np.random.SeedSequence(entropy).generate_state(3, np.uint64)
         hist = np.zeros((ETAS.size, RADIUS_BINS, PATH_BINS, 2))
         start = time.process_time()
-        walk(photons, seed, g, collection == "fibre", ETAS, PATH_END, hist)
-        more = SHORT_PHOTONS.get(g, 0) if collection == "fibre" else 0
+        walk(photons, seed, g, collection == "fiber", ETAS, PATH_END, hist)
+        more = SHORT_PHOTONS.get(g, 0) if collection == "fiber" else 0
         if more:
             short = np.zeros_like(hist)
             seed = np.random.SeedSequence((*entropy, 1)).generate_state(3, np.uint64)

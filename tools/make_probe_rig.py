@@ -12,20 +12,20 @@ are nearly as bright.
 
 from __future__ import annotations
 
-FIBRES = 28
+FIBERS = 28
 FIRST_MM, PITCH_MM = 0.3, 0.25
 SPOT_PITCH_PX, FIRST_SPOT_PX, ROW_PX = 42.0, 33.0, 63.5
 
 HEAD = """\
-# A contact probe of one source fibre and 28 detection fibres, after Weyrich et al. 2006, section 8
+# A contact probe of one source fiber and 28 detection fibers, after Weyrich et al. 2006, section 8
 # (doi 10.1145/1141911.1141987). Made by tools/make_probe_rig.py. Frame: mm, origin at the source
-# fibre's face, +x along the line of fibres, +z out of the skin. The camera looks at the fibres'
+# fiber's face, +x along the line of fibers, +z out of the skin. The camera looks at the fibers'
 # other ends in a box of its own: its place is not of that frame.
 name = "probe"
 boxes = ["probe"]
 recycle_s = 0.0              # no light is a flash
 
-[leds]                       # the white LED behind the source fibre
+[leds]                       # the white LED behind the source fiber
 max_on_s = 30.0
 max_duty = 1.0
 dose_ws = 10.0
@@ -47,12 +47,12 @@ camera_tolerance_c = 2.0
 name = "source"
 position_mm = [0.0, 0.0, 1.0]
 illuminant = "LED-B3"
-power_w = 0.001              # out of the fibre
+power_w = 0.001              # out of the fiber
 radius_mm = 0.1
 
 [[views]]
 name = "cam"
-camera_model = "skinrig fibre camera"
+camera_model = "skinrig fiber camera"
 serial = "SP-0001"
 position_mm = [0.0, 0.0, 100.0]
 target_mm = [0.0, 0.0, 0.0]
@@ -73,9 +73,9 @@ read_noise_e = 7.0
 """
 
 
-def fibre(number: int) -> str:
+def fiber(number: int) -> str:
     return f"""
-[[probe.fibres]]
+[[probe.fibers]]
 name = "F{number + 1:02d}"
 position_mm = [{FIRST_MM + PITCH_MM * number:.2f}, 0.0]
 core_mm = 0.2
@@ -85,4 +85,4 @@ spot_px = [{FIRST_SPOT_PX + SPOT_PITCH_PX * number:.1f}, {ROW_PX:.1f}]
 
 
 if __name__ == "__main__":
-    print(HEAD + "".join(fibre(number) for number in range(FIBRES)), end="")
+    print(HEAD + "".join(fiber(number) for number in range(FIBERS)), end="")

@@ -33,7 +33,7 @@ def freeze_arrays(
         object.__setattr__(row, name, array)
 
 
-CALIBRATION_KINDS = ("sensor", "color", "polarization", "white", "geometry", "lights", "fibre")
+CALIBRATION_KINDS = ("sensor", "color", "polarization", "white", "geometry", "lights", "fiber")
 DEFAULT_VALIDITY_DAYS = 90
 
 Source: TypeAlias = Literal["measured", "simulated"]

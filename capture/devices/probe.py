@@ -93,7 +93,7 @@ class ProbeStatus(BoxStatus):
 class ProbeBox(Box):
     """Driver of the contact probe's controller; see `capture.devices.box.Box`.
 
-    Keys of ``limits``: ``fibres``, ``level_steps``, ``shutter_min_ms``, ``shutter_max_ms``,
+    Keys of ``limits``: ``fibers``, ``level_steps``, ``shutter_min_ms``, ``shutter_max_ms``,
     ``shutter_lag_ms`` (command to open blades), ``cover_ms``, ``suction_min_mbar``,
     ``suction_max_mbar``, ``suction_min_ms``, ``suction_max_ms``, ``reach_ms`` (time in which the
     suction must be reached), ``rest_ms``, ``control_period_ms``, ``camera_c``, ``source_w``,

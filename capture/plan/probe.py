@@ -121,7 +121,7 @@ def probe_plan(
     for site in chosen:
         for repeat in range(repeats):
             for number in range(angles):
-                series.measure("fibres", site, repeat, 360.0 * number / angles)
+                series.measure("fibers", site, repeat, 360.0 * number / angles)
     return series.plan()
 
 
@@ -162,7 +162,7 @@ def probe_calibration_plan(
     >>> [step.id for step in plan.steps if step.kind != "mask"][11:13]
     ['dark-b22-r3', 'phantom-r0-a000-b00']
     >>> masks = [step for step in plan.steps if step.kind == "mask"]
-    >>> len(masks), masks[0].id, masks[-1].id, masks[-1].settings["fibre"]
+    >>> len(masks), masks[0].id, masks[-1].id, masks[-1].settings["fiber"]
     (196, 'mask-f00-b0', 'mask-f27-b6', 27)
     """
     targets = get_args(ProbeTarget)
@@ -212,7 +212,7 @@ def group_by_series(plan: Plan) -> Iterator[tuple[HeadPlacement, tuple[Step, ...
     [('cheek at 0 degrees', 3), ('chin at 0 degrees', 3)]
     """
     for (placement, _), group in groupby(
-        plan.steps, key=lambda step: (step_placement(step), step.settings.get("fibre"))
+        plan.steps, key=lambda step: (step_placement(step), step.settings.get("fiber"))
     ):
         if placement is not None:
             yield placement, tuple(group)
@@ -256,11 +256,11 @@ class _Series(StepSeries):
     def masks(self) -> None:
         longest_s = max(MAX_MASK_EXPOSURE_S, self._exposures_s[0])
         exposures_s = [t for t in self._exposures_s if t <= longest_s][::-MASK_INTERVAL][::-1]
-        for fibre in range(len(self._probe.fibres)):
+        for fiber in range(len(self._probe.fibers)):
             for bracket, exposure_s in enumerate(exposures_s):
-                index: Index = {"fibre": fibre, "bracket": bracket}
+                index: Index = {"fiber": fiber, "bracket": bracket}
                 held = {"exposure_s": exposure_s, "suction_mbar": self._probe.suction_mbar}
-                self.add(f"mask-f{fibre:02d}-b{bracket}", "mask", index, **held, fibre=fibre)
+                self.add(f"mask-f{fiber:02d}-b{bracket}", "mask", index, **held, fiber=fiber)
 
     def plan(self) -> Plan:
         require_argument(len(self._steps) > 0, "darks", 0, "something to capture")

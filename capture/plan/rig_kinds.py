@@ -22,7 +22,7 @@ RIG_KINDS: Final = {
     "flash": RigKind("flash", "subject"),
     "dome": RigKind("dome", "olat"),
     "gradient": RigKind("gradient_sphere", "gradient"),
-    "probe": RigKind("probe", "fibres"),
+    "probe": RigKind("probe", "fibers"),
 }
 
 

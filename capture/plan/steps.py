@@ -26,7 +26,7 @@ Value = str | int | float | bool
 Index = Mapping[str, str | int | float]
 FlashKind = Literal["dark", "flat", "chart", "malus", "subject"]
 DomeKind = Literal["olat", "tracking", "charuco", "mirror", "white"]
-Kind = Literal[FlashKind, DomeKind, "gradient", "ball", "fibres", "phantom", "mask"]
+Kind = Literal[FlashKind, DomeKind, "gradient", "ball", "fibers", "phantom", "mask"]
 Polarizer = Literal["parallel", "crossed"]
 
 Pattern = Literal["full", "x", "y", "z", "-x", "-y", "-z", "dark"]
@@ -49,7 +49,7 @@ _SETTING_RULES: Mapping[str, tuple[tuple[type, ...], Any, str]] = {
     "pattern": ((str,), lambda v: v in LIGHT_PATTERNS, f"one of {', '.join(LIGHT_PATTERNS)}"),
     "dwell_s": ((int, float), lambda v: 0 < v < math.inf, "seconds > 0"),
     "suction_mbar": ((int, float), lambda v: 0 < v < math.inf, "mbar > 0"),
-    "fibre": ((int,), lambda v: v >= 0, "a fiber's number >= 0, or none for all"),
+    "fiber": ((int,), lambda v: v >= 0, "a fiber's number >= 0, or none for all"),
     "start_s": ((int, float), lambda v: 0 <= v < math.inf, "seconds >= 0"),
 }
 
@@ -69,7 +69,7 @@ class Step(Document):
     kind : str
         Of the flash rig "flat", "chart", "malus" or "subject"; of the dome "olat" (one light at a
         time), "tracking" (several at once), "charuco", "mirror" or "white"; of the gradient sphere
-        "gradient" (skin) or "ball" (a ball of black glass); of the fiber probe "fibres" (skin),
+        "gradient" (skin) or "ball" (a ball of black glass); of the fiber probe "fibers" (skin),
         "phantom" (a block of known optics) or "mask" (the same with all fibers covered but one); of
         all "dark".
     index : mapping of str to str, int or float
@@ -79,7 +79,7 @@ class Step(Document):
         ``exposure_s`` (s), ``iso``; ``analyser_deg`` (rotator reading, degrees; 0 is parallel, 90
         crossed) takes precedence over ``polarizer``. On the dome ``light`` (its name), or ``leds``
         (names joined by +), at ``level`` (0 to 1) for ``dwell_s``; in the gradient sphere
-        ``pattern`` instead of lights; of the fiber probe ``suction_mbar`` and ``fibre`` (number of
+        ``pattern`` instead of lights; of the fiber probe ``suction_mbar`` and ``fiber`` (number of
         the only uncovered fiber). In a sequence ``start_s``, s after its beginning. Rigs may
         define further names.
     cameras : tuple of str

@@ -48,12 +48,12 @@ def step_placement(step: ProbeStep) -> HeadPlacement | None:
     --------
     >>> from capture.plan import Step
     >>> index = {"site": "cheek", "repeat": 0, "angle": 22.5, "bracket": 3}
-    >>> str(step_placement(Step("s", "fibres", index, {}, ("cam",))))
+    >>> str(step_placement(Step("s", "fibers", index, {}, ("cam",))))
     'cheek at 22.5 degrees'
     """
     if step.kind == "mask":
         return HeadPlacement("phantom", 0.0, 0)
-    if step.kind not in ("fibres", "phantom"):
+    if step.kind not in ("fibers", "phantom"):
         return None
     index = step.index
     return HeadPlacement(str(index["site"]), float(index["angle"]), int(index["repeat"]))

@@ -16,7 +16,7 @@ from model.arrays import Float64Array
 from model.checks import Checks
 from model.photon_table import kernels
 
-Collection = Literal["all", "fibre"]
+Collection = Literal["all", "fiber"]
 
 _LEGENDRE_ORDERS = 600  # Legendre orders for kappa: exact to rounding up to g = 0.95 and beyond
 
@@ -58,10 +58,10 @@ def prepare_medium(eta: float, g: float, collection: Collection) -> Medium:
         For an eta, g or collection that is not in the table.
     """
     stored = _stored()
-    Checks(TableDomainError).choice("collection", collection, ("all", "fibre"))
+    Checks(TableDomainError).choice("collection", collection, ("all", "fiber"))
     weight_g = _lagrange("g", stored["g"], float(g))
     weight_eta = _lagrange("eta", stored["eta"], float(eta))
-    which = ("all", "fibre").index(collection)
+    which = ("all", "fiber").index(collection)
     weight = weight_g[:, None] * weight_eta
     coefficients = np.einsum(
         "ge,gexy->xy", weight, stored["coefficients"][:, which].astype(np.float64)

@@ -27,7 +27,7 @@ from model.photon_table.disc_distances import distance_rules
 from model.photon_table.medium import Collection, prepare_medium
 
 NUMERICAL_APERTURE = 0.22
-"""Numerical aperture of the source and of the detectors in the collection "fibre", in air."""
+"""Numerical aperture of the source and of the detectors in the collection "fiber", in air."""
 MAX_QUANTITY = 1e50
 """Largest length, mm, and coefficient, 1/mm: their squares and cubes are still finite numbers."""
 MIN_SCATTERING_PER_MM = 1e-100
@@ -73,7 +73,7 @@ def reflectance(
         Mean cosine of the Henyey-Greenstein phase function, see `stored_asymmetries`.
     collection
         "all": a pencil beam at normal incidence and the light that leaves at any angle, 1/mm^2.
-        "fibre": source and detector of numerical aperture 0.22, the source's cone evenly filled;
+        "fiber": source and detector of numerical aperture 0.22, the source's cone evenly filled;
         power within the detector's cone over incident power, area and NA^2, which is the same
         quantity where the light leaves like from a Lambertian surface.
     core_mm, source_core_mm
@@ -95,7 +95,7 @@ def reflectance(
     Examples
     --------
     >>> radius = np.array([0.3, 1.0, 3.0])
-    >>> reflectance(radius, 0.05, 1.5, collection="fibre", core_mm=0.2, source_core_mm=0.2).shape
+    >>> reflectance(radius, 0.05, 1.5, collection="fiber", core_mm=0.2, source_core_mm=0.2).shape
     (3,)
     """
     slopes = derivatives(radius_mm, sigma_a_per_mm, sigma_s_prime_per_mm, **optics)

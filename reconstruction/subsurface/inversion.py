@@ -99,7 +99,7 @@ def invert(
         Relative deviation of each fiber due to the model, the method's own by default. A number
         also removes the systematic error of a closed form from that of sigma_tr.
     valid : array_like of bool, broadcast to the profiles, optional
-    collection : {"all", "fibre"}
+    collection : {"all", "fiber"}
         What was collected, "all" by default; the closed forms take both as exitance.
     core_mm, source_core_mm : float
         Core diameters of detection and source fiber, mm, for the table; 0 by default.
@@ -159,8 +159,8 @@ def nearest_medium(
     ----------
         See :func:`invert`; reflectance in units of 1/mm^2, as the definition omits fibers that
         collect too little.
-    collection : {"all", "fibre"}
-        What was collected, "fibre" by default.
+    collection : {"all", "fiber"}
+        What was collected, "fiber" by default.
 
     Returns
     -------
@@ -175,12 +175,12 @@ def nearest_medium(
     --------
     >>> from model.photon_table import table as photon_table
     >>> r = np.linspace(0.3, 7.05, 28)
-    >>> profile = 0.5 * photon_table.reflectance(r, 0.1, 2.0, collection="fibre", core_mm=0.2)
+    >>> profile = 0.5 * photon_table.reflectance(r, 0.1, 2.0, collection="fiber", core_mm=0.2)
     >>> fit = nearest_medium(r, profile, variance=(0.01 * profile) ** 2, core_mm=0.2)
     >>> float(fit.scale.round(2)), float(fit.sigma_s_prime_per_mm.round(1))
     (0.5, 2.0)
     """
-    settings = {"collection": "fibre"} | optics
+    settings = {"collection": "fiber"} | optics
     light = FiberOptics(eta, **settings, g=nearest.NEAREST_MEDIUM_G, g_error=0.0)
     _check_settings("photon_table", light)
     layout = _lay_out(radius_mm, reflectance_per_mm2, variance, valid)
@@ -274,7 +274,7 @@ def _lay_out(
     """Check profiles and lay them out as rows, see `invert`."""
     check = Checks(SubsurfaceError)
     y = np.asarray(reflectance_per_mm2, np.float64)
-    check.shape("reflectance_per_mm2", y, ("...", "fibres"))
+    check.shape("reflectance_per_mm2", y, ("...", "fibers"))
     shape, full = y.shape[:-1], y.shape
     radius = np.asarray(radius_mm, np.float64)
     if radius.shape != full[-1:]:
@@ -314,7 +314,7 @@ def _broadcast(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArra
 def _check_settings(method: str, optics: FiberOptics, **not_negative: float) -> None:
     check = Checks(SubsurfaceError)
     check.choice("method", method, FIT_METHODS)
-    check.choice("collection", optics.collection, ("all", "fibre"))
+    check.choice("collection", optics.collection, ("all", "fiber"))
     check.within("eta", optics.eta, "[1, inf)")
     for name in ("core_mm", "source_core_mm", "g", "g_error"):
         not_negative[name] = getattr(optics, name)

@@ -126,7 +126,7 @@ def _tabled(theta, radius, axes, grid, w, m, jac):  # type: ignore[no-untyped-de
     The grid is of log R + sigma_tr r. The second axis is log(1 + 10 sqrt(sigma_a/sigma_s')); axes =
     first node and spacing of each.
     """
-    n_s, n_u, n_g, fibres = grid.shape
+    n_s, n_u, n_g, fibers = grid.shape
     root = 10.0 * math.exp(0.5 * (theta[0] - theta[1]))
     slope = 0.5 * root / (1.0 + root) / axes[1, 1]
     x = (theta[1] - axes[0, 0]) / axes[0, 1]
@@ -150,7 +150,7 @@ def _tabled(theta, radius, axes, grid, w, m, jac):  # type: ignore[no-untyped-de
             for o in range(depth):
                 row = grid[i + p, j + q, h + o]
                 v, g_s, g_u, g_g = both * w[4, o], by_s * w[4, o], by_u * w[4, o], both * w[5, o]
-                for f in range(fibres):
+                for f in range(fibers):
                     m[f] += v * row[f]
                     jac[0, f] += g_u * row[f]
                     jac[1, f] += g_s * row[f]
@@ -159,7 +159,7 @@ def _tabled(theta, radius, axes, grid, w, m, jac):  # type: ignore[no-untyped-de
     t = a + s
     k = math.sqrt(3.0 * a * t)
     k_a, k_s = k * (a + t) / (2.0 * t), k * s / (2.0 * t)
-    for f in range(fibres):
+    for f in range(fibers):
         value = math.exp(max(m[f] + theta[2] - k * radius[f], -660.0))
         by_a = jac[0, f] * slope
         m[f] = value

@@ -142,10 +142,10 @@ def _fit_share(begin, end, curves, problem, found):  # type: ignore[no-untyped-d
     radius, y, logarithmic = curves.radius_mm, problem.y, problem.logarithmic
     model_error, prior, bounds = problem.model_error, problem.prior, problem.bounds
     theta, total = found.theta, found.total
-    fibres = radius.size
-    m, trial_m = np.empty(fibres), np.empty(fibres)
-    jac, trial_jac = np.empty((4, fibres)), np.empty((4, fibres))
-    weight, w = np.zeros(fibres), np.zeros((6, 4))
+    fibers = radius.size
+    m, trial_m = np.empty(fibers), np.empty(fibers)
+    jac, trial_jac = np.empty((4, fibers)), np.empty((4, fibers))
+    weight, w = np.zeros(fibers), np.zeros((6, 4))
     h, g, low = np.zeros((4, 4)), np.zeros(4), np.zeros((4, 4))
     x, trial, unit = np.zeros(4), np.zeros(4), np.zeros(4)
     active, chosen = np.zeros(4, np.int64), np.zeros(4, np.int64)
@@ -167,7 +167,7 @@ def _fit_share(begin, end, curves, problem, found):  # type: ignore[no-untyped-d
             close = max(LOG_STEP_TOL, 1e-2 * 0.01**round_) if changing else LOG_STEP_TOL
             extinction = math.exp(now[0]) + math.exp(now[1])
             base = model_error[0] ** 2 + (model_error[2] * math.exp(now[0] - now[1])) ** 2
-            for f in range(fibres):
+            for f in range(fibers):
                 v = problem.variance[n, f]
                 if not logarithmic and v < np.inf:
                     e = base

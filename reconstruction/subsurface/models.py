@@ -21,7 +21,7 @@ from reconstruction.subsurface import kernels
 
 Method = Literal["photon_table", "diffusion", "dipole"]
 FIT_METHODS: tuple[Method, ...] = ("photon_table", "diffusion", "dipole")
-Collection = Literal["all", "fibre"]
+Collection = Literal["all", "fiber"]
 G_SKIN, G_SKIN_SIGMA = 0.825, 0.072
 """Asymmetry of soft tissue: mean and standard deviation of 0.7...0.95, all equally likely."""
 

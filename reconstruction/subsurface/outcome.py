@@ -37,7 +37,7 @@ class FitOutcome(IntFlag):
     """Outcome of a fit; the first eight bits make it invalid, the others are remarks."""
 
     GOOD = 0
-    TOO_FEW_FIBRES = 1
+    TOO_FEW_FIBERS = 1
     NO_SIGNAL = 2
     NOT_CONVERGED = 4
     AT_BOUND = 8
@@ -50,7 +50,7 @@ class FitOutcome(IntFlag):
 
 _INVALID_CODE = 255
 _REASON_BY_CODE = {
-    FitOutcome.TOO_FEW_FIBRES: f"fewer than {MIN_FIBERS} usable fibers",
+    FitOutcome.TOO_FEW_FIBERS: f"fewer than {MIN_FIBERS} usable fibers",
     FitOutcome.NO_SIGNAL: f"fewer than {MIN_OBSERVED_FIBERS} fibers read above their noise",
     FitOutcome.NOT_CONVERGED: "the fit did not converge",
     FitOutcome.AT_BOUND: "sigma_a or sigma_s' is at its limit",
@@ -70,7 +70,7 @@ class SubsurfaceFit:
     ----------
     sigma_a_per_mm, sigma_s_prime_per_mm, sigma_tr_per_mm : ndarray, shape (...)
         Absorption, reduced scattering, and sqrt(3 sigma_a (sigma_a + sigma_s')), 1/mm; NaN where
-        the fibers do not suffice (`FitOutcome.TOO_FEW_FIBRES`, `FitOutcome.NO_SIGNAL`).
+        the fibers do not suffice (`FitOutcome.TOO_FEW_FIBERS`, `FitOutcome.NO_SIGNAL`).
     covariance : ndarray, shape (..., 2, 2)
         Of (sigma_a, sigma_s'), 1/mm^2, nuisances included; infinite where not identified.
     valid : ndarray of bool, shape (...)
@@ -159,7 +159,7 @@ class SubsurfaceFit:
         """Whether sigma_a and sigma_s' are identified separately; `valid` is of sigma_tr alone."""
         unclear = (
             FitOutcome.COEFFICIENTS_NOT_IDENTIFIED
-            | FitOutcome.TOO_FEW_FIBRES
+            | FitOutcome.TOO_FEW_FIBERS
             | FitOutcome.NO_SIGNAL
         )
         return np.asarray((self.outcome & np.uint16(unclear)) == 0)
@@ -222,7 +222,7 @@ def evaluate_fits(
     covariance[~known] = math.inf
 
     outcome = _outcomes(batch, fits, misfit, log_stderr, pair_stderr)
-    nothing = (outcome & np.uint16(FitOutcome.TOO_FEW_FIBRES | FitOutcome.NO_SIGNAL)) != 0
+    nothing = (outcome & np.uint16(FitOutcome.TOO_FEW_FIBERS | FitOutcome.NO_SIGNAL)) != 0
     for estimate in (a, s, sigma_tr, p_value):
         estimate[nothing] = math.nan
     covariance[nothing] = math.inf
@@ -271,7 +271,7 @@ def _outcomes(
     off = np.sqrt(square.sum(axis=1) / np.maximum(observed, 1))
     outcome = np.zeros(fibers.shape, np.uint16)
     for bit, where in (
-        (FitOutcome.TOO_FEW_FIBRES, fibers < MIN_FIBERS),
+        (FitOutcome.TOO_FEW_FIBERS, fibers < MIN_FIBERS),
         (FitOutcome.NO_SIGNAL, (fibers >= MIN_FIBERS) & (observed < MIN_OBSERVED_FIBERS)),
         (FitOutcome.NOT_CONVERGED, fits.steps < 0),
         (FitOutcome.AT_BOUND, fits.at_bound),
@@ -282,7 +282,7 @@ def _outcomes(
         (FitOutcome.COEFFICIENTS_NOT_IDENTIFIED, pair_stderr > MAX_PAIR_LOG_STDERR),
     ):
         outcome[where] |= np.uint16(bit)
-    alone = np.uint16(FitOutcome.TOO_FEW_FIBRES | FitOutcome.NO_SIGNAL)
+    alone = np.uint16(FitOutcome.TOO_FEW_FIBERS | FitOutcome.NO_SIGNAL)
     outcome[(outcome & alone) != 0] &= alone
     return outcome
 

@@ -123,8 +123,8 @@ def _below(bend: Float64Array, mass: Float64Array, variance: Float64Array, by: i
 def _whole(weight: Float64Array, penalty: Float64Array, strength: Float64Array) -> Float64Array:
     """Return the sum of the information of readings and smoothness, (N, F, F)."""
     whole = penalty / strength[:, None, None]
-    fibres = np.arange(penalty.shape[0])
-    whole[:, fibres, fibres] += weight
+    fibers = np.arange(penalty.shape[0])
+    whole[:, fibers, fibers] += weight
     return np.asarray(whole)
 
 

@@ -137,12 +137,12 @@ def build_probe(rig: Rig, *, seed: int, tolerances: ProbeTolerances | None = Non
     if rig.probe is None or len(rig.views) != 1:
         raise ProbeBuildError(f"rig {rig.name!r}: expected a contact probe and one view")
     size = ProbeTolerances() if tolerances is None else tolerances
-    view, fibres = rig.views[0], rig.probe.fibres
-    count = len(fibres)
+    view, fibers = rig.views[0], rig.probe.fibers
+    count = len(fibers)
     rng = np.random.default_rng([seed, 0x70726F62])
     turn = math.radians(size.rotation_deg) * float(rng.standard_normal())
     middle = 0.5 * np.array([view.width_px - 1.0, view.height_px - 1.0])
-    place = np.array([fibre.spot_px for fibre in fibres]) - middle
+    place = np.array([fiber.spot_px for fiber in fibers]) - middle
     c, s = math.cos(turn), math.sin(turn)
     place = place @ np.array([[c, s], [-s, c]]) + middle
     place += size.shift_px * _draw_truncated_normal(

@@ -89,7 +89,7 @@ class ProbeUnit(Device):
         """Return limits and counts; the names include the units."""
         probe = self._probe
         return {
-            "fibres": len(probe.fibres),
+            "fibres": len(probe.fibers),
             "level_steps": LEVEL_STEPS,
             "shutter_min_ms": MIN_OPENING_MS,
             "shutter_max_ms": round(probe.max_open_s * 1e3, 6),
@@ -124,7 +124,7 @@ class ProbeUnit(Device):
             "SHUT:LAST?": lambda *_: self.shutter.last_report or "NONE",
             "SHUT:COUN?": lambda *_: str(self.shutter.count),
             "FIB": self._cover,
-            "FIB?": lambda *_: "ALL" if self.shutter.fibre is None else str(self.shutter.fibre),
+            "FIB?": lambda *_: "ALL" if self.shutter.fiber is None else str(self.shutter.fiber),
             "CAM:TRIG": self._trigger_camera,
             "CAM:TEMP?": lambda _, now: (
                 f"{self._load.camera_c(now) + float(self._rng.normal(0.0, THERMOMETER_STD_C)):.2f}"
@@ -249,9 +249,9 @@ class ProbeUnit(Device):
             return
         if _WHOLE_PATTERN.fullmatch(arguments) is None:
             raise CommandRefused(Code.SYNTAX, "expected the number of a fiber, or ALL")
-        if int(arguments) >= self.shutter.fibres:
+        if int(arguments) >= self.shutter.fibers:
             raise CommandRefused(
-                Code.OUT_OF_RANGE, f"expected 0 to {self.shutter.fibres - 1} or ALL"
+                Code.OUT_OF_RANGE, f"expected 0 to {self.shutter.fibers - 1} or ALL"
             )
         self.shutter.cover(int(arguments), now)
 

@@ -63,7 +63,7 @@ class SourceShutter:
     def __init__(self, box: Device, wiring: Wiring) -> None:
         rig, faults, self._rng = wiring.rig, wiring.faults, wiring.rng
         self._box = box
-        self.fibres = 0 if rig.probe is None else len(rig.probe.fibres)
+        self.fibers = 0 if rig.probe is None else len(rig.probe.fibers)
         self._power_w = rig.lights[0].power_w or 0.0
         self.dose_limit_ws = (rig.leds or LedLimits()).dose_ws
         self._on_light, self._on_open = wiring.on_light, wiring.on_trigger
@@ -76,7 +76,7 @@ class SourceShutter:
         self.level = 0
         self.count = 0
         self.dose_ws = 0.0
-        self.fibre: int | None = None
+        self.fiber: int | None = None
         self.jammed = False
         self.last_report = ""
 
@@ -108,7 +108,7 @@ class SourceShutter:
         return max(0, math.ceil(left_s * 1e3)) if math.isfinite(left_s) else 0
 
     def _light_interval(self, t_on_s: float, t_off_s: float) -> SourceLight:
-        return SourceLight(self.level / LEVEL_STEPS * self._weak, t_on_s, t_off_s, self.fibre)
+        return SourceLight(self.level / LEVEL_STEPS * self._weak, t_on_s, t_off_s, self.fiber)
 
     # time -------------------------------------------------------------------------------------
 
@@ -242,17 +242,17 @@ class SourceShutter:
         else:
             self._put_out(now)
 
-    def cover(self, fibre: int | None, now: float) -> None:
+    def cover(self, fiber: int | None, now: float) -> None:
         """Begin to move the cover: over all detection fibers but one, or off all of them."""
         self.require_closed(now)
-        if fibre != self.fibre:
-            self.fibre = fibre
+        if fiber != self.fiber:
+            self.fiber = fiber
             self._settled_s = now + COVER_MOVE_S
 
     def forget(self, *, power_up: bool, now: float) -> None:
         """Restore the power-up settings; the source is dark already, no fiber covered."""
         if power_up:
             self.last_report = ""
-        if self.fibre is not None:
-            self.fibre = None
+        if self.fiber is not None:
+            self.fiber = None
             self._settled_s = now + COVER_MOVE_S

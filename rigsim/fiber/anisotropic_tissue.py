@@ -171,9 +171,9 @@ def trace_anisotropic_profile(
     return profiles.mean_and_stderr(radii, each, count * batches)
 
 
-def _overlap(fibres: profiles.FiberGeometry) -> tuple[Float64Array, float]:
+def _overlap(fibers: profiles.FiberGeometry) -> tuple[Float64Array, float]:
     """Return the density of (point in one core - point in the other) and its nodes per mm."""
-    detector, source = 0.5 * fibres.core_mm, 0.5 * fibres.source_core_mm
+    detector, source = 0.5 * fibers.core_mm, 0.5 * fibers.source_core_mm
     if source == 0.0:
         raise TransportError("source_core_mm: expected > 0 on anisotropic tissue, got 0")
     apart = np.linspace(0.0, detector + source, OVERLAP_NODES)
@@ -183,9 +183,9 @@ def _overlap(fibres: profiles.FiberGeometry) -> tuple[Float64Array, float]:
     return density, (OVERLAP_NODES - 1) / apart[-1]
 
 
-def _harmonics(radius_mm: float, fibres: profiles.FiberGeometry, max_harmonic: int) -> Float64Array:
+def _harmonics(radius_mm: float, fibers: profiles.FiberGeometry, max_harmonic: int) -> Float64Array:
     """Return the even harmonics of a fiber's density over the direction to the exit, by radius."""
-    detector, source = 0.5 * fibres.core_mm, 0.5 * fibres.source_core_mm
+    detector, source = 0.5 * fibers.core_mm, 0.5 * fibers.source_core_mm
     both = detector + source
     low = max(0.0, radius_mm - both)
     rho = np.linspace(low, radius_mm + both, KERNEL_NODES)

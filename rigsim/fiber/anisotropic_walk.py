@@ -49,7 +49,7 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
         What is added to: light by fiber, shape (F, 1), or by distance and harmonic, shape (R, H);
         and the weight that visited each distance, see there.
     """
-    source_sine, fibre_sine = sines
+    source_sine, fiber_sine = sines
     places, overlap, overlap_per_mm = core_centers
     starts, counts, bins_per_mm = bins
     cells_per_mm, deeper_per_mm = per_mm
@@ -101,8 +101,8 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
                 s0, s1, s2, s3, u = draw_uniform(s0, s1, s2, s3)
                 if u <= chance:
                     s0, s1, s2, s3, p, q = draw_disc_point(s0, s1, s2, s3)
-                    p *= fibre_sine / eta
-                    q *= fibre_sine / eta
+                    p *= fiber_sine / eta
+                    q *= fiber_sine / eta
                     mu = sqrt(1.0 - p * p - q * q)
                     turn = ux * p + uy * q - uz * mu
                     spread = 1.0 + g * g - 2.0 * g * turn
@@ -138,18 +138,18 @@ def walk_anisotropic(  # type: ignore[no-untyped-def]
                                 density = low + share * (high - low)
                                 tally[ring, k] += 4.0 * value * density * cosine
                                 cosine, before = 2.0 * double * cosine - before, cosine
-                        for fibre in range(
+                        for fiber in range(
                             starts[bin_], starts[bin_] + (0 if by_ring else counts[bin_])
                         ):
                             for image in range(4):
-                                dx = places[fibre, 0] - (x_out if image & 1 else -x_out)
-                                dy = places[fibre, 1] - (y_out if image & 2 else -y_out)
+                                dx = places[fiber, 0] - (x_out if image & 1 else -x_out)
+                                dy = places[fiber, 1] - (y_out if image & 2 else -y_out)
                                 at = sqrt(dx * dx + dy * dy) * overlap_per_mm
                                 node = int(at)
                                 if node < overlap.shape[0] - 1:
                                     low = overlap[node]
                                     share = at - node
-                                    tally[fibre, 0] += value * (
+                                    tally[fiber, 0] += value * (
                                         low + share * (overlap[node + 1] - low)
                                     )
                 target = window[cell] * deeper

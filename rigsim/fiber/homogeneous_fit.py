@@ -64,7 +64,7 @@ class HomogeneousFit:
     residual: float
     """Standard deviation of log(R_f / R_f of the medium) over the fibers used; its root mean
     square where the factor is 1 by definition."""
-    fibres: int
+    fibers: int
     """Number of fibers used."""
 
     @property
@@ -101,9 +101,9 @@ def fit_homogeneous_medium(
 
     Examples
     --------
-    >>> fibres = FiberGeometry(tuple(0.3 + 0.25 * k for k in range(28)))
-    >>> own, _ = FiberTable.load().profile(0.1, 2.0, fibres)
-    >>> fit = fit_homogeneous_medium(own, fibres)
+    >>> fibers = FiberGeometry(tuple(0.3 + 0.25 * k for k in range(28)))
+    >>> own, _ = FiberTable.load().profile(0.1, 2.0, fibers)
+    >>> fit = fit_homogeneous_medium(own, fibers)
     >>> round(fit.sigma_a_per_mm, 3), round(fit.sigma_s_prime_per_mm, 2)
     (0.1, 2.0)
     """

@@ -159,7 +159,7 @@ class ProfileCache:
         if stored is not None:
             return stored
         if not any(layer.sigma_s_per_mm for one in optics.stacks for layer in one.layers):
-            nothing = np.zeros((len(self.probe.fibres), 3))
+            nothing = np.zeros((len(self.probe.fibers), 3))
             return BandProfile(nothing, nothing)
         made = trace_fiber_profile(
             stack, photons=self.photons, rng=rng, threads=self.threads, **dataclasses.asdict(kind)
@@ -209,10 +209,10 @@ def probe_fibers(probe: Probe) -> FiberGeometry:
     TissueError
         The detection fibers are not all alike.
     """
-    first: Fiber = probe.fibres[0]
-    for fibre in probe.fibres:
-        if (fibre.core_mm, fibre.numerical_aperture) != (first.core_mm, first.numerical_aperture):
-            raise TissueError(f"fibre {fibre.name!r}: expected all detection fibres alike")
+    first: Fiber = probe.fibers[0]
+    for fiber in probe.fibers:
+        if (fiber.core_mm, fiber.numerical_aperture) != (first.core_mm, first.numerical_aperture):
+            raise TissueError(f"fiber {fiber.name!r}: expected all detection fibers alike")
     return FiberGeometry(
         probe.radius_mm,
         first.core_mm,

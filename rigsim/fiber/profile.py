@@ -228,15 +228,15 @@ def trace_fiber_profile(
     >>> bool(near_and_far.reflectance_per_mm2[0] > 10.0 * near_and_far.reflectance_per_mm2[1])
     True
     """
-    fibres = FiberGeometry(
+    fibers = FiberGeometry(
         tuple(np.atleast_1d(np.asarray(radii_mm, np.float64)).tolist()),
         core_mm,
         source_core_mm,
         numerical_aperture,
         source_numerical_aperture,
     )
-    each, traced = _trace(stack, fibres, photons, rng, batches, threads, None)
-    return mean_and_stderr(np.array(fibres.radii_mm), each, traced)
+    each, traced = _trace(stack, fibers, photons, rng, batches, threads, None)
+    return mean_and_stderr(np.array(fibers.radii_mm), each, traced)
 
 
 def trace_fiber_paths(
@@ -319,7 +319,7 @@ def mean_and_stderr(radii_mm: Float64Array, batches: Float64Array, photons: int)
 
 def _trace(
     stack: LayerStack | SpectralStack,
-    fibres: FiberGeometry,
+    fibers: FiberGeometry,
     photons: int,
     rng: np.random.Generator,
     batches: int,
@@ -329,9 +329,9 @@ def _trace(
     """Return scores by batch, shape (batches, F[, nodes][, bands]), and the photons traced."""
     spectral = _spectral(stack)
     tissue_mc.photons_per_batch(photons, batches, threads)
-    order = np.argsort(fibres.radii_mm, kind="stable")
+    order = np.argsort(fibers.radii_mm, kind="stable")
     rings = ring_kernels(
-        np.array(fibres.radii_mm)[order], 0.5 * fibres.core_mm, 0.5 * fibres.source_core_mm
+        np.array(fibers.radii_mm)[order], 0.5 * fibers.core_mm, 0.5 * fibers.source_core_mm
     )
     shares = spectral.band_weights.max(axis=1)
     shares = shares / shares.sum()
@@ -346,7 +346,7 @@ def _trace(
         count = -(-round(photons * float(shares[index])) // batches) or 1
         traced += count * batches
         row = None if absorber is None else absorber[index]
-        plan = _Plan(layers, fibres, rings, row)
+        plan = _Plan(layers, fibers, rings, row)
         for batch, score in enumerate(plan.trace(count, batches, seeds, threads)):
             for band in range(bands[0]):
                 weight = spectral.band_weights[index, band]
@@ -363,9 +363,9 @@ class _Plan:
     """Input of the walk for one stack and its fibers."""
 
     def __init__(
-        self, stack: LayerStack, fibres: FiberGeometry, rings: Rings, absorber: Float64Array | None
+        self, stack: LayerStack, fibers: FiberGeometry, rings: Rings, absorber: Float64Array | None
     ) -> None:
-        self.fibres, self.rings = fibres, rings
+        self.fibers, self.rings = fibers, rings
         table = tissue_mc.layer_table(stack)
         depth = np.zeros(len(table))
         share = np.zeros(len(table))
@@ -377,7 +377,7 @@ class _Plan:
             share[1:-1] = absorber
         self.table = np.column_stack([table, depth, share])
         self.counts_paths = absorber is not None
-        farthest = max(fibres.radii_mm) + 0.5 * (fibres.core_mm + fibres.source_core_mm)
+        farthest = max(fibers.radii_mm) + 0.5 * (fibers.core_mm + fibers.source_core_mm)
         self.reach_mm = 3.0 * max(farthest, 1.0)
         self.farthest_mm = max(farthest, 1.0)
         self.chances, self.chances_per_mm = scoring_probabilities(self.table)
@@ -400,11 +400,11 @@ class _Plan:
         self, window: Float64Array, photons: int, seed: NDArray[np.uint64]
     ) -> tuple[Float64Array, Float64Array]:
         """Return the sums of the fibers' scores and of the weights at each distance."""
-        fibres = len(self.rings[0])
-        tally = np.zeros(fibres)
-        histogram = np.zeros((fibres, _path_nodes()) if self.counts_paths else (0, 0))
+        fibers = len(self.rings[0])
+        tally = np.zeros(fibers)
+        histogram = np.zeros((fibers, _path_nodes()) if self.counts_paths else (0, 0))
         visited = np.zeros((2, len(window)))
-        sines = self.fibres.source_numerical_aperture, self.fibres.numerical_aperture
+        sines = self.fibers.source_numerical_aperture, self.fibers.numerical_aperture
         per_mm = WINDOW_CELLS / self.reach_mm, self.deeper_per_mm, self.chances_per_mm
         paths, found = (PATH_STEP, PATH_SCALE_MM), (tally, histogram, visited)
         how = (self.rings, window, self.chances, per_mm, paths, photons, seed.copy())

@@ -33,26 +33,26 @@ def _score_fibers(rho, value, path, rings, paths, tally, histogram):  # type: ig
     bin_ = int(rho * kernels[0, 2])
     if bin_ >= starts.shape[0]:
         return
-    for fibre in range(starts[bin_], starts[bin_] + counts[bin_]):
-        at = (rho - kernels[fibre, 0]) * kernels[fibre, 1]
+    for fiber in range(starts[bin_], starts[bin_] + counts[bin_]):
+        at = (rho - kernels[fiber, 0]) * kernels[fiber, 1]
         if at < 0.0:
             continue
         node = int(at)
         if node >= kernels.shape[1] - 4:
             continue
         share = at - node
-        low = kernels[fibre, 3 + node]
-        score = value * (low + share * (kernels[fibre, 4 + node] - low))
+        low = kernels[fiber, 3 + node]
+        score = value * (low + share * (kernels[fiber, 4 + node] - low))
         if histogram.shape[0] == 0:
-            tally[fibre] += score
+            tally[fiber] += score
         else:
             position = log(1.0 + path / path_scale) / log_step
             left = min(int(position), histogram.shape[1] - 2)
             start = path_scale * (exp(left * log_step) - 1.0)
             stop = path_scale * (exp((left + 1) * log_step) - 1.0)
             part = min((path - start) / (stop - start), 1.0)
-            histogram[fibre, left] += score * (1.0 - part)
-            histogram[fibre, left + 1] += score * part
+            histogram[fiber, left] += score * (1.0 - part)
+            histogram[fiber, left + 1] += score * part
 
 
 @njit(
@@ -102,7 +102,7 @@ def walk_to_fibers(  # type: ignore[no-untyped-def]
         float64, shape (F, nodes) or (0, 0); the weight of scored collisions by distance from the
         entry; of all, in units of the weight kept at their depth. float64, shape (2, cells).
     """
-    source_sine, fibre_sine = sines
+    source_sine, fiber_sine = sines
     cells_per_mm, deeper_per_mm, chances_per_mm = per_mm
     tally, histogram, visited = found
     s0, s1, s2, s3 = seed[0], seed[1], seed[2], seed[3]
@@ -158,16 +158,16 @@ def walk_to_fibers(  # type: ignore[no-untyped-def]
                             s0, s1, s2, s3, p, q = draw_disc_point(s0, s1, s2, s3)
                             norm = p * p + q * q
                             eta = table[layer, 5]
-                            p *= fibre_sine
-                            q *= fibre_sine
-                            norm *= fibre_sine * fibre_sine  # (eta sin)^2, kept by refraction
+                            p *= fiber_sine
+                            q *= fiber_sine
+                            norm *= fiber_sine * fiber_sine  # (eta sin)^2, kept by refraction
                             mu = sqrt(1.0 - norm / (eta * eta))
                             turn = (ux * p + uy * q) / eta - uz * mu
                             spread = 1.0 + g * g - 2.0 * g * turn
                             phase = (1.0 - g * g) / (4.0 * spread * sqrt(spread))  # times pi
-                            drawn = chance * eta * eta * mu / (fibre_sine * fibre_sine)
+                            drawn = chance * eta * eta * mu / (fiber_sine * fiber_sine)
                             value = weight * phase / (drawn + phase)
-                            value *= eta_above * eta_above / (fibre_sine * fibre_sine)
+                            value *= eta_above * eta_above / (fiber_sine * fiber_sine)
                             x_out = x
                             y_out = y
                             out_path = path
@@ -241,16 +241,16 @@ def walk_to_fibers(  # type: ignore[no-untyped-def]
                     uz = copysign(mu, uz)
                 if beyond == 0:
                     sine2 = (1.0 - uz * uz) * eta_above * eta_above
-                    if sine2 <= fibre_sine * fibre_sine:
+                    if sine2 <= fiber_sine * fiber_sine:
                         share = 1.0
                         if direct:
                             g = table[from_layer, 4]
                             eta = table[from_layer, 5]
                             spread = 1.0 + g * g - 2.0 * g * turn
                             phase = (1.0 - g * g) / (4.0 * spread * sqrt(spread))
-                            drawn = chance * eta * eta * abs(now_z) / (fibre_sine * fibre_sine)
+                            drawn = chance * eta * eta * abs(now_z) / (fiber_sine * fiber_sine)
                             share = phase / (drawn + phase)
-                        value = share * weight * eta_above * eta_above / (fibre_sine * fibre_sine)
+                        value = share * weight * eta_above * eta_above / (fiber_sine * fiber_sine)
                         rho = sqrt(x * x + y * y)
                         _score_fibers(rho, value, path, rings, paths, tally, histogram)
                     break

@@ -2,7 +2,7 @@
 
 Lengths are in units of 1 / sigma_s', so that one table over the distance and sigma_a / sigma_s'
 serves every medium of g = 0.8 and eta = 1.4 under air: R_f = sigma_s'^2 F(r sigma_s', sigma_a /
-sigma_s'). The table is package data made by ``tools/make_white_fibre.py`` from the photons of
+sigma_s'). The table is package data made by ``tools/make_white_fiber.py`` from the photons of
 `rigsim.fiber.profile`, for a source that is a point of numerical aperture 0.22 and for points of
 detection of the same aperture; the fibers' cores are averaged over here.
 """
@@ -27,7 +27,7 @@ from rigsim.fiber.profile import FiberGeometry
 HENYEY_GREENSTEIN_G: Final = 0.8
 ETA: Final = 1.4
 NUMERICAL_APERTURE: Final = 0.22
-TABLE_FILE: Final = "white_fibre_mc.npz"
+TABLE_FILE: Final = "white_fiber_mc.npz"
 
 MAX_CONTINUED_ABSORPTION: Final = 0.01
 """sigma_a / sigma_s' up to which the table is continued beyond its last distance: there its decay
@@ -153,7 +153,7 @@ class FiberTable:
         if not self.covers(sigma_a_per_mm, sigma_s_prime_per_mm, fibers):
             raise FiberTableError(
                 f"sigma_a, sigma_s': got {sigma_a_per_mm}, {sigma_s_prime_per_mm} 1/mm, expected "
-                "both, and the fibres, inside the table"
+                "both, and the fibers, inside the table"
             )
         apart, share = core_distances(fibers)
         scaled = apart * sigma_s_prime_per_mm

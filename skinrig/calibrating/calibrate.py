@@ -68,7 +68,7 @@ def calibrate(
     targets
         Sizes of the targets in the dome.
     phantom
-        Certificate of the phantom that a probe's "fibre" was measured on; None: that of the
+        Certificate of the phantom that a probe's "fiber" was measured on; None: that of the
         simulated phantom, for simulated sessions only.
 
     Raises

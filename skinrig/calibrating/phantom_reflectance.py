@@ -60,9 +60,9 @@ def expected_reflectance(certificate: PhantomCertificate, rig: Rig) -> ExpectedR
         np.ones((1, 3)) if gray else spectra.band_weights(camera, light, wavelength_nm=wavelength)
     )
     sigma_a, sigma_s = certificate.at(wavelength)
-    how: dict[str, Any] = {"eta": certificate.eta, "g": certificate.g, "collection": "fibre"}
+    how: dict[str, Any] = {"eta": certificate.eta, "g": certificate.g, "collection": "fiber"}
     at = (np.array(probe.radius_mm), sigma_a[:, None], sigma_s[:, None])
-    cores: dict[str, Any] = {"core_mm": probe.fibres[0].core_mm}
+    cores: dict[str, Any] = {"core_mm": probe.fibers[0].core_mm}
     cores["source_core_mm"] = probe.source_core_mm
     try:
         inside = photon_table.is_in_domain(*at, **how)

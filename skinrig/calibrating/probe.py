@@ -22,7 +22,7 @@ from skinrig.calibrating.outcome import (
 )
 from skinrig.calibrating.phantom_reflectance import expected_reflectance, packaged_certificate
 
-FIBER_CALIBRATION_KIND: Final = "fibre"
+FIBER_CALIBRATION_KIND: Final = "fiber"
 MIN_HEALTHY_GAIN: Final = 0.5
 """Fraction of the median gain below which a fiber is reported."""
 
@@ -30,7 +30,7 @@ MIN_HEALTHY_GAIN: Final = 0.5
 def calibrate_probe(
     sessions: TargetSessions, certificate: PhantomCertificate | None = None
 ) -> CalibrationResult:
-    """Estimate the calibration "fibre" of a probe from a session of target "phantom".
+    """Estimate the calibration "fiber" of a probe from a session of target "phantom".
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def calibrate_probe(
     rig = session.rig
     if rig.probe is None:
         raise CalibratingError(
-            f"kind 'fibre': got a session of rig {rig.name!r}, expected a fiber probe's; name one"
+            f"kind 'fiber': got a session of rig {rig.name!r}, expected a fiber probe's; name one"
         )
     paper = certificate or _packaged_certificate(session)
     noise, notes = _noise(sessions)
@@ -64,13 +64,13 @@ def calibrate_probe(
     phantoms = series.phantoms()
     level = series.level()
     masks = series.masks()
-    nominal = np.array([fibre.spot_px for fibre in rig.probe.fibres])
-    names = [fibre.name for fibre in rig.probe.fibres]
+    nominal = np.array([fiber.spot_px for fiber in rig.probe.fibers])
+    names = [fiber.name for fiber in rig.probe.fibers]
     spots = find_fiber_spots(phantoms[0], nominal, names=names, pattern=noise.pattern, masks=masks)
     readings = _mean([sum_spots(merged, spots, noise=noise) for merged in phantoms])
-    fibres = calibrate_fibers(
+    fibers = calibrate_fibers(
         readings,
-        {fibre: sum_spots(merged, spots, noise=noise) for fibre, merged in masks.items()},
+        {fiber: sum_spots(merged, spots, noise=noise) for fiber, merged in masks.items()},
         spots=spots,
         radius_mm=rig.probe.radius_mm,
         expected=expected_reflectance(paper, rig),
@@ -79,11 +79,11 @@ def calibrate_probe(
     if not masks:
         notes = (
             *notes,
-            "the session holds no frames with covered fibres: cross-talk and stray light are"
+            "the session holds no frames with covered fibers: cross-talk and stray light are"
             " assumed zero, and the standard errors of the far fibers do not include them",
         )
-    findings = (*spots.findings, *notes, *_report_worn_fibers(fibres))
-    made = fibres.to_calibration(
+    findings = (*spots.findings, *notes, *_report_worn_fibers(fibers))
+    made = fibers.to_calibration(
         serial=rig.views[0].serial,
         notes={
             **number_findings(findings),
@@ -92,7 +92,7 @@ def calibrate_probe(
         },
         **sessions.provenance(),
     )
-    return CalibrationResult(made, _summary(fibres, series, paper), findings)
+    return CalibrationResult(made, _summary(fibers, series, paper), findings)
 
 
 class _Series:
@@ -138,7 +138,7 @@ class _Series:
 
     def masks(self) -> Mapping[int, MergedSeries]:
         """Return the series with one fiber uncovered, by its number, each merged on access."""
-        return _MergedSeries(_grouped(self._session.frames("mask"), "fibre"), self._merge)
+        return _MergedSeries(_grouped(self._session.frames("mask"), "fiber"), self._merge)
 
     @property
     def counts(self) -> tuple[int, int, int]:
@@ -242,39 +242,39 @@ def _mean(readings: Sequence[FiberReadings]) -> FiberReadings:
     )
 
 
-def _report_worn_fibers(fibres: FiberCalibration) -> tuple[str, ...]:
-    channels = zip(fibres.gain.T, fibres.valid.T, strict=True)
+def _report_worn_fibers(fibers: FiberCalibration) -> tuple[str, ...]:
+    channels = zip(fibers.gain.T, fibers.valid.T, strict=True)
     median = np.array([np.median(gain[good]) if good.any() else 1.0 for gain, good in channels])
     found = []
-    for i, name in enumerate(fibres.names):
-        if fibres.dead[i]:
+    for i, name in enumerate(fibers.names):
+        if fibers.dead[i]:
             found.append(f"{name} is dead: it gives no light; replace it")
-        elif fibres.valid[i].any():
-            relative = float(np.median((fibres.gain[i] / median)[fibres.valid[i]]))
+        elif fibers.valid[i].any():
+            relative = float(np.median((fibers.gain[i] / median)[fibers.valid[i]]))
             if relative < MIN_HEALTHY_GAIN:
                 found.append(
                     f"{name} passes {100 * relative:.0f} % of what the others do: clean it"
                 )
-        elif fibres.spots.found[i]:
+        elif fibers.spots.found[i]:
             found.append(f"{name}: too little light from the phantom to calibrate it")
     return tuple(found)
 
 
 def _summary(
-    fibres: FiberCalibration, series: _Series, paper: PhantomCertificate
+    fibers: FiberCalibration, series: _Series, paper: PhantomCertificate
 ) -> tuple[tuple[str, str], ...]:
-    spots, mixed = fibres.spots, fibres.crosstalk
+    spots, mixed = fibers.spots, fibers.crosstalk
     darks, phantom, mask = series.counts
     across, down = spots.shift_px
     rows = {
-        "spots found": f"{int(spots.found.sum())} of {len(fibres.names)}, {across:+.2f},"
+        "spots found": f"{int(spots.found.sum())} of {len(fibers.names)}, {across:+.2f},"
         f" {down:+.2f} px from nominal, row rotated {np.degrees(spots.rotation_rad):+.2f}°",
         "standard error of a place": f"worst {spots.center_stderr_px[spots.found].max():.3f} px",
         "radius of spots, of apertures": f"{spots.radius_px[spots.found].mean():.2f},"
         f" {spots.aperture_px:.2f} px",
     }
-    for c, color in enumerate(("red", "green", "blue")[: fibres.gain.shape[1]]):
-        rows[f"gain {color}"] = _gain_text(fibres, c)
+    for c, color in enumerate(("red", "green", "blue")[: fibers.gain.shape[1]]):
+        rows[f"gain {color}"] = _gain_text(fibers, c)
     if mixed.measured:
         first, second = (np.diagonal(mixed.matrix, k) for k in (1, 2))
         error = np.median(np.diagonal(mixed.stderr, 1))
@@ -290,7 +290,7 @@ def _summary(
     rows |= {
         "dark current": f"{dark.mean_rate_dn_per_s:.3g} ± {dark.mean_rate_stderr:.1g} DN/s,"
         f" {int(dark.hot.sum())} hot pixels",
-        "dead fibres": ", ".join(np.array(fibres.names)[fibres.dead]) or "none",
+        "dead fibers": ", ".join(np.array(fibers.names)[fibers.dead]) or "none",
         "frames": f"{darks} dark, {phantom} phantom, {mask} mask",
         "phantom": f"{paper.name or 'not named'}: standard uncertainty"
         f" {100 * relative.sigma_a:g} % of sigma_a, {100 * relative.sigma_s_prime:g} % of sigma_s'",
@@ -298,15 +298,15 @@ def _summary(
     return tuple(rows.items())
 
 
-def _gain_text(fibres: FiberCalibration, c: int) -> str:
+def _gain_text(fibers: FiberCalibration, c: int) -> str:
     """Describe the range and the standard errors of a channel's gains."""
-    good = fibres.valid[:, c]
+    good = fibers.valid[:, c]
     if not good.any():
         return "no fiber calibrated"
-    gain = fibres.gain[good, c]
-    error = (fibres.gain_stderr / np.maximum(fibres.gain, 1e-300))[good, c]
-    shape = np.hypot.reduce(np.abs(fibres.common[:, good, c]), axis=0).max(initial=0.0)
-    worst = fibres.names[int(np.flatnonzero(good)[np.argmax(error)])]
+    gain = fibers.gain[good, c]
+    error = (fibers.gain_stderr / np.maximum(fibers.gain, 1e-300))[good, c]
+    shape = np.hypot.reduce(np.abs(fibers.common[:, good, c]), axis=0).max(initial=0.0)
+    worst = fibers.names[int(np.flatnonzero(good)[np.argmax(error)])]
     low, high = np.array([gain.min(), gain.max()]) / np.median(gain)
     return (
         f"{low:.2f} to {high:.2f} of the median, {int(good.sum())} fibers;"

@@ -10,6 +10,7 @@ from skinrig import errors
 from skinrig.benchmarks import table as bench_table
 from skinrig.commands import completion
 from skinrig.commands.options import Json, command
+from skinrig.commands.renamed_options import FORMER_STAGES, replace_former_values
 from skinrig.console import Console, select_attributes
 from skinrig.doctor import FIX_KEY, check_installation
 from skinrig.kernel_cache import set_passive_waiting
@@ -62,6 +63,7 @@ def bench(
     console = Console(json)
     # --stage takes one word only, so the names that follow it arrive as arguments
     stages = [*(stage or ()), *(more or ())] or None
+    stages = replace_former_values(stages, FORMER_STAGES) if stages else None
     if extremes and (smoke or budget is not None):
         what = "--smoke" if smoke else "--budget"
         raise errors.UsageError(f"{what}: not an option of --extremes; remove it")

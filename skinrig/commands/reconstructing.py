@@ -38,10 +38,10 @@ def calibrate(
     sphere_mm
         Radius of the mirror sphere, mm (dome, lights).
     phantom
-        Certificate (JSON) of the phantom (probe, fibre).
+        Certificate (JSON) of the phantom (probe, fiber).
     kind
         Calibration: sensor, color, polarization or white (flash); geometry or lights (dome);
-        sensor, lights or polarization (gradient); fibre (probe).
+        sensor, lights or polarization (gradient); fiber (probe).
     """
     from capture.former_names import FORMER_NAMES
     from skinrig.calibrating.calibrate import calibrate as make

@@ -39,6 +39,8 @@ RENAMED_OPTIONS: Final[Mapping[str, Mapping[str, str]]] = {
     "view": {"--size": "--size-px"},
 }
 """Present name by former name of an option, by command."""
+FORMER_STAGES: Final = {"fibre-readings": "fiber-readings"}
+"""Present name of a benchmark's stage by its former name."""
 
 
 def renamed_options_of(group: str | None, command: str | None) -> Mapping[str, str]:

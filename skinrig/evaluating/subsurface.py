@@ -30,7 +30,7 @@ class ProfileAccuracy:
         Name and channel of the measurement.
     median, worst
         Relative error over the fibers with a signal of at least ten standard errors.
-    fibres
+    fibers
         Number of those fibers.
     coverage
         Fraction of them within one standard error, which includes the truth's statistical error.
@@ -40,7 +40,7 @@ class ProfileAccuracy:
     channel: str
     median: float
     worst: float
-    fibres: int
+    fibers: int
     coverage: float
 
 

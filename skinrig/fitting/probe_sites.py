@@ -178,7 +178,7 @@ def _measured(probe: SkinAppearance) -> dict[str, tuple[tuple[float, ...], tuple
     if SUBSURFACE_FILE not in probe.files:
         raise ProbeSiteError(
             f"probe: has no {SUBSURFACE_FILE}; `skinrig reconstruct --maps subsurface` makes it of "
-            "a session of the fibre probe"
+            "a session of the fiber probe"
         )
     try:
         rows = json.loads(probe.files[SUBSURFACE_FILE])["sites"]

@@ -58,7 +58,7 @@ def fit_reflectance(
     dome
         APPEARANCE/ of a dome session with normals, R_d and lobes.
     probe
-        APPEARANCE/ of a session of the fibre probe on the same subject; None: the
+        APPEARANCE/ of a session of the fiber probe on the same subject; None: the
         population mean is used, with its standard deviation as standard uncertainty.
     out
         Folder to write.

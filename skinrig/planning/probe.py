@@ -23,7 +23,7 @@ from skinrig.planning.probe_forecast import Memory, ProbePrediction, ProbeSettin
 from skinrig.planning.probe_observation import ProbeObservation, simulate_observation
 
 MIN_EXPOSURE_S = exposure_series_s()[0]
-"""Of the rig's own series: the nearest fibre must not saturate in it."""
+"""Of the rig's own series: the nearest fiber must not saturate in it."""
 BRACKET_CHOICES = (3, 4, 6, 8, 12, N_BRACKETS)
 """How many exposures a series may have."""
 LONGEST_EXPOSURE_CHOICES_S = (0.5, 1.0, 2.0, 4.0, 8.0, 15.0, MAX_EXPOSURE_S)
@@ -103,7 +103,7 @@ def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
 
 def rehearsal(_: PlanChoice) -> plans.Rehearsal:
     """Return the probe's phantom."""
-    return plans.Rehearsal({"phantom": {}}, (("fibre", ("phantom",)),), ("subsurface",))
+    return plans.Rehearsal({"phantom": {}}, (("fiber", ("phantom",)),), ("subsurface",))
 
 
 def measure_errors(
@@ -182,7 +182,7 @@ def read_settings(plan: Plan) -> ProbeSettings:
     plans.PlanningError
         Where nothing is measured on skin, or no dark frame is there.
     """
-    shots = [step for step in plan.steps if step.kind == "fibres"]
+    shots = [step for step in plan.steps if step.kind == "fibers"]
     darks = [step for step in plan.steps if step.kind == "dark"]
     if not shots:
         raise plans.PlanningError("plan: got no series on skin, expected at least one")

@@ -24,7 +24,7 @@ from skinrig.planning.plans import median_magnitude
 from skinrig.planning.probe_observation import ProbeObservation, reading_variance
 
 CROSSTALK_ERROR = (0.0, 8.5e-6, 6.3e-6, 9.3e-7, 2.5e-7)
-"""Standard error of the share of a fibre's light in a spot so many places away, the last of all
+"""Standard error of the share of a fiber's light in a spot so many places away, the last of all
 farther ones: medians of twenty simulated calibrations of the shipped rig, seeds 0 to 19."""
 FORECAST_RELATIVE_SD = 0.2
 """Relative deviation of standard errors that sessions state from those that were forecast: those
@@ -184,7 +184,7 @@ def _fit_noisy_profiles(
     noise: bool,
 ) -> Sequence[Any]:
     """Return the fits of profiles with these variances of their readings."""
-    names = tuple(fibre.name for fibre in observation.probe.fibres)
+    names = tuple(fiber.name for fiber in observation.probe.fibers)
     radius = np.array(observation.probe.radius_mm)
     # gains are known from a series of all exposures on the phantom, as far as its light is known
     gain = (
@@ -213,7 +213,7 @@ def _fit_noisy_profiles(
 def _crosstalk(count: int) -> Any:
     """Return cross-talk of none, known as well as a calibration leaves it.
 
-    The nearest fibres are brighter than the farthest by a million times on skin and by a thousand
+    The nearest fibers are brighter than the farthest by a million times on skin and by a thousand
     on the phantom; what a calibration has wrong of their light in far spots cancels only as far as
     the two are alike.
     """

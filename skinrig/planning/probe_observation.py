@@ -26,7 +26,7 @@ MAX_READ_FRACTION = 0.95
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProbeObservation:
-    """What the fibres take from simulated skin, and what the camera makes of it."""
+    """What the fibers take from simulated skin, and what the camera makes of it."""
 
     sites: tuple[str, ...]
     reflectance: Float64Array
@@ -34,7 +34,7 @@ class ProbeObservation:
     phantom: Float64Array
     """(F, 3) of the block that the probe is calibrated with."""
     phantom_error: Float64Array
-    """(F, 3) relative error of what the block is expected to give, each fibre's own: the photon
+    """(F, 3) relative error of what the block is expected to give, each fiber's own: the photon
     table's."""
     common: Float64Array
     """(T, F, 3) relative errors of all gains together, by the certificate."""
@@ -50,7 +50,7 @@ class ProbeObservation:
 def simulate_observation(
     rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = PROBE_SITES
 ) -> ProbeObservation:
-    """Look at simulated skin through the fibres.
+    """Look at simulated skin through the fibers.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def simulate_observation(
         Where the head may be placed.
     """
     if rig.probe is None:
-        raise PlanningError(f"rig: got {rig.name!r} without a probe, expected one with fibres")
+        raise PlanningError(f"rig: got {rig.name!r} without a probe, expected one with fibers")
     tissue = subject_file.load_tissue(subject, seed=seed)
     profiles = ProfileCache(rig, tissue, photons=TRUTH_PHOTONS["small"], seed=seed)
     made = [profiles.profile(site, 0.0, rig.probe.suction_mbar) for site in sites]
@@ -99,7 +99,7 @@ def reading_variance(
     observation
         The skin's or the phantom's, see `simulate_observation`.
     value
-        Reflectance in the fibres, 1/mm^2, (F, 3).
+        Reflectance in the fibers, 1/mm^2, (F, 3).
     exposures_s
         Of a series, s.
     darks

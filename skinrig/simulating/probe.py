@@ -23,7 +23,7 @@ TRUTH_PHOTONS = {"small": 60_000, "full": 2_000_000}
 
 
 def simulate_probe(order: ProbeOrder) -> SimulationResult:
-    """Simulate a capture with the fibre probe; see `simulation.simulate`.
+    """Simulate a capture with the fiber probe; see `simulation.simulate`.
 
     Both sizes have all sites, brackets and pixels, which are fast to simulate; "full" traces more
     photons for the ground truth.
@@ -103,7 +103,7 @@ class HeadLog(SceneLog):
     suction.
     """
 
-    suffix, kinds, max_lag_s = "heads", ("fibres", PHANTOM_SITE), 1e-3
+    suffix, kinds, max_lag_s = "heads", ("fibers", PHANTOM_SITE), 1e-3
 
     def describe_exposure(self, exposed: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the suction of the lit head."""

@@ -172,7 +172,7 @@ def test_effective_transport_of_any_medium_is_a_number(sigma_a, sigma_s):
     sigma_s=st.floats(0.0, 50.0),
     eta=ETA,
     g=TABLE_G,
-    collection=st.sampled_from(["all", "fibre"]),
+    collection=st.sampled_from(["all", "fiber"]),
 )
 @example(radius=1.0, sigma_a=1.0, sigma_s=2.2e-311, eta=1.4, g=0.0, collection="all")
 def test_photon_table_is_finite_and_reports_validity(radius, sigma_a, sigma_s, eta, g, collection):

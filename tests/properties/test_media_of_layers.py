@@ -20,7 +20,7 @@ FEW = settings(derandomize=True, deadline=None, max_examples=6, database=None)
 def test_the_nearest_medium_of_a_medium_is_itself(sigma_a, sigma_s, factor, bad):
     radius = np.linspace(0.3, 7.05, 28)
     profile = factor * photon_table.reflectance(
-        radius, sigma_a, sigma_s, collection="fibre", core_mm=0.2
+        radius, sigma_a, sigma_s, collection="fiber", core_mm=0.2
     )
     variance = (0.005 * profile) ** 2
     valid = np.ones(28, bool)

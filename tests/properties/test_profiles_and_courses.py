@@ -382,17 +382,17 @@ def test_misfit_keeps_root_distance_line_with_lost_fibers(seed, line, lost):
 @CHEAP
 @given(
     seed=st.integers(0, 99),
-    fibres=st.integers(3, 30),
+    fibers=st.integers(3, 30),
     least=st.floats(1e-6, 1e6),
     level=st.floats(-10.0, 10.0),
     slope=st.floats(-10.0, 10.0),
 )
-def test_misfit_bend_posterior_ignores_level_and_slope(seed, fibres, least, level, slope):
+def test_misfit_bend_posterior_ignores_level_and_slope(seed, fibers, least, level, slope):
     rng = np.random.default_rng(seed)
-    place = np.cumsum(rng.uniform(0.02, 0.3, fibres))
+    place = np.cumsum(rng.uniform(0.02, 0.3, fibers))
     bend, mass = smooth_misfit._bends(place)
-    value = rng.standard_normal((2, fibres))
-    weight = least * 10.0 ** rng.uniform(0.0, 3.0, (2, fibres))
+    value = rng.standard_normal((2, fibers))
+    weight = least * 10.0 ** rng.uniform(0.0, 3.0, (2, fibers))
     found = smooth_misfit.log_posterior(bend, mass, value, weight)
     assert found.shape == (2, smooth_misfit.BEND_STRENGTHS.size)
     assert np.isfinite(found).all()

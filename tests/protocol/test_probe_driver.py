@@ -208,9 +208,9 @@ def test_skin_rests_between_two_times_of_suction(bench):
 def test_single_uncovered_fiber_is_revealed_by_light(bench):
     box = bench.box
     light(box)
-    for fibre in (3, 27, None):
-        box.cover(fibre)
-        assert box.uncovered_fiber() == fibre
+    for fiber in (3, 27, None):
+        box.cover(fiber)
+        assert box.uncovered_fiber() == fiber
         box.open_shutter(0.05)
         box.listen(0.1)
     assert [seen.fiber for seen in bench.world.switched] == [3, 27, None]

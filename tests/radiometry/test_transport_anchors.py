@@ -153,7 +153,7 @@ def test_all_angle_fibers_match_mcml_sample_rings(test_data):
 
 
 def all_light_in_a_cone(stack, photons, seed=1):
-    """pi times the radiance along the normal, of all the surface: a fibre that covers it."""
+    """pi times the radiance along the normal, of all the surface: a fiber that covers it."""
     core = 400.0 / stack.layers[0].sigma_s_per_mm
     run = trace_fiber_profile(
         stack,

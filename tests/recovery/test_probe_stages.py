@@ -1,4 +1,4 @@
-"""A medium under the simulated fibre probe: captured, calibrated, and its sigma_tr found again."""
+"""A medium under the simulated fiber probe: captured, calibrated, and its sigma_tr found again."""
 
 import json
 
@@ -24,7 +24,7 @@ MEDIUM = "homogeneous:0.0862,1.08,0.86"
 def bench(tmp_path_factory):
     out = tmp_path_factory.mktemp("probe")
     simulate_session("probe", out / "session-phantom", target="phantom", seed=4)
-    calibrate("fibre", [out / "session-phantom"], out / "calibration")
+    calibrate("fiber", [out / "session-phantom"], out / "calibration")
     simulate_session("probe", out / "session", subject=MEDIUM, sites=("cheek", "chin"), seed=4)
     return out
 
@@ -57,7 +57,7 @@ def test_full_session_recovers_sigma_tr_and_dipole_misses(bench):
 
 
 def test_uncalibrated_fibers_error_gives_next_command(bench, capsys):
-    with pytest.raises((InputsError, StageError), match="calibrate fibre"):
+    with pytest.raises((InputsError, StageError), match="calibrate fiber"):
         pipeline.reconstruct(bench / "session", want=("subsurface",), out=bench / "bare")
     assert not (bench / "bare").exists()
     command = ["reconstruct", str(bench / "session"), "--maps", "subsurface"]

@@ -1,6 +1,6 @@
-"""sigma_tr from Monte Carlo profiles in fibres, made by another code than what inverts them.
+"""sigma_tr from Monte Carlo profiles in fibers, made by another code than what inverts them.
 
-Media, readings and their errors are of the size of a session's: 1.2 % from fibre to fibre, 1 % in
+Media, readings and their errors are of the size of a session's: 1.2 % from fiber to fiber, 1 % in
 common, and a floor of noise in the dark.
 """
 
@@ -15,8 +15,8 @@ from rigsim.fiber.profile import trace_fiber_profile
 from rigsim.tissue.tissue_mc import Layer, LayerStack, trace_photons
 
 RADIUS = 0.3 + 0.25 * np.arange(28)
-FIBRE_ERROR, COMMON_ERROR, FLOOR = 0.012, 0.01, 1e-8
-FIBRES = {"collection": "fibre", "core_mm": 0.2, "source_core_mm": 0.2}
+FIBER_ERROR, COMMON_ERROR, FLOOR = 0.012, 0.01, 1e-8
+FIBERS = {"collection": "fiber", "core_mm": 0.2, "source_core_mm": 0.2}
 
 
 def medium(sigma_a, sigma_s_prime, g, eta=1.4, thickness=inf):
@@ -33,9 +33,9 @@ def readings(profile, rng, draws):
     """Draws (N, 28) of what a probe reads, and their variance, the simulation's own included."""
     clean = profile.reflectance_per_mm2
     noisy = clean * np.exp(COMMON_ERROR * rng.standard_normal((draws, 1)))
-    noisy = noisy * (1.0 + FIBRE_ERROR * rng.standard_normal((draws, 28)))
+    noisy = noisy * (1.0 + FIBER_ERROR * rng.standard_normal((draws, 28)))
     noisy += FLOOR * rng.standard_normal((draws, 28))
-    return noisy, (FIBRE_ERROR * clean) ** 2 + profile.stderr**2 + FLOOR**2
+    return noisy, (FIBER_ERROR * clean) ** 2 + profile.stderr**2 + FLOOR**2
 
 
 def fit(profiles, variance, method="photon_table", **settings):
@@ -45,7 +45,7 @@ def fit(profiles, variance, method="photon_table", **settings):
         variance=variance,
         method=method,
         common_error=COMMON_ERROR,
-        **(FIBRES | settings),
+        **(FIBERS | settings),
     )
 
 

@@ -27,10 +27,10 @@ def phantom(tmp_path_factory):
 
 def test_a_probe_is_calibrated_from_its_phantom(phantom, tmp_path, capsys):
     out = tmp_path / "calibration"
-    assert main(["calibrate", "fibre", str(phantom), "--out", str(out), "--json"]) == 0
+    assert main(["calibrate", "fiber", str(phantom), "--out", str(out), "--json"]) == 0
     said = document(capsys)
     assert said["values"]["spots found"].startswith("28 of 28")
-    assert said["values"]["dead fibres"] == "none"
+    assert said["values"]["dead fibers"] == "none"
     assert all("no sensor calibration" in text for text in said["findings"])
 
     rig = Session.open(phantom).rig
@@ -55,15 +55,15 @@ def test_a_probe_is_calibrated_from_its_phantom(phantom, tmp_path, capsys):
 def test_wrong_certificate_and_wrong_session_are_reported(phantom, tmp_path, capsys):
     paper = tmp_path / "block.json"
     paper.write_text('{"schema": "skinrig.phantom/1", "eta": 1.4}')
-    arguments = ["calibrate", "fibre", str(phantom), "--out", str(tmp_path / "c")]
+    arguments = ["calibrate", "fiber", str(phantom), "--out", str(tmp_path / "c")]
     assert main([*arguments, "--phantom", str(paper)]) == 3
     assert "sigma_a_per_mm" in capsys.readouterr().err
-    assert main(["calibrate", "fibre", str(phantom), str(phantom), "--out", str(tmp_path)]) == 3
+    assert main(["calibrate", "fiber", str(phantom), str(phantom), "--out", str(tmp_path)]) == 3
     assert "expected one" in capsys.readouterr().err
 
 
 def test_a_session_without_a_phantom_is_refused(tmp_path, capsys):
     dark = tmp_path / "dark"
     simulate_session("probe", dark, target="dark", seed=3)
-    assert main(["calibrate", "fibre", str(dark), "--out", str(tmp_path / "c")]) == 3
+    assert main(["calibrate", "fiber", str(dark), "--out", str(tmp_path / "c")]) == 3
     assert "no frames of kind 'phantom'" in capsys.readouterr().err

@@ -56,8 +56,8 @@ def test_served_probe_is_captured_by_printed_command(tmp_path):
             assert (session.closed, session.source) == (True, "simulated")
             assert session.pending_frames() == []
             assert verify(out).ok
-            # each exposure is twice the one before, and so is the light of the far fibres
-            frames = session.frames("fibres")
+            # each exposure is twice the one before, and so is the light of the far fibers
+            frames = session.frames("fibers")
             assert len(frames) == 5
             signal = [
                 session.read(record).cfa[:, RIG.views[0].width_px // 2 :].astype(float).mean() - 64

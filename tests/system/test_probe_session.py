@@ -1,4 +1,4 @@
-"""The fibre probe from the command line: refusals, simulated sessions, and their resume."""
+"""The fiber probe from the command line: refusals, simulated sessions, and their resume."""
 
 import functools
 import json
@@ -101,7 +101,7 @@ def test_tissue_is_captured_with_ground_truth_alongside(capsys, tmp_path):
     assert main([*simulate(out, "--sites", "cheek", "--seed", "3"), "--json"]) == errors.EXIT_DONE
     document = json.loads(capsys.readouterr().out)
     session = Session.open(out)
-    assert document["frames"] == len(session.frames()) == 3 + len(session.frames("fibres"))
+    assert document["frames"] == len(session.frames()) == 3 + len(session.frames("fibers"))
     assert verify(out).ok
     assert session.pending_frames() == []
     truth = store.read(tmp_path / "truth-probe")
@@ -110,7 +110,7 @@ def test_tissue_is_captured_with_ground_truth_alongside(capsys, tmp_path):
     assert (profile["site"], profile["repeat"], profile["angle_deg"]) == ("cheek", 0, 0.0)
     assert profile["sigma_a_per_mm"] == [0.05] * 3
     # what the truth says of the suction is not the gauge's word, but near it
-    record = session.frames("fibres")[0]
+    record = session.frames("fibers")[0]
     assert profile["suction_mbar"] != record.actual["suction_mbar"]
     assert abs(profile["suction_mbar"] - record.actual["suction_mbar"]) < 4.0
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
@@ -137,11 +137,11 @@ def test_phantom_is_captured_with_each_fiber_uncovered(capsys, tmp_path):
     out = tmp_path / "session-phantom"
     assert main(simulate(out, "--target", "phantom")) == errors.EXIT_DONE
     printed = capsys.readouterr()
-    assert f"skinrig calibrate fibre {out}" in printed.out + printed.err
+    assert f"skinrig calibrate fiber {out}" in printed.out + printed.err
     session = Session.open(out)
     assert verify(out).ok
-    assert {record.index["fibre"] for record in session.frames("mask")} == set(range(28))
-    assert {len(session.frames("mask", fibre=n)) for n in range(28)} <= {1, 2}
+    assert {record.index["fiber"] for record in session.frames("mask")} == set(range(28))
+    assert {len(session.frames("mask", fiber=n)) for n in range(28)} <= {1, 2}
     (profile,) = store.read(tmp_path / "truth-phantom").parameters["profiles"]
     assert profile["site"] == "phantom"
 
@@ -167,13 +167,13 @@ def test_simulation_resumed_mid_series_has_complete_truth(tmp_path, monkeypatch)
     with pytest.raises(Killed):
         main(words)
     monkeypatch.setattr(probe.HeadLog, "exposure", honest)
-    assert {r.index["site"] for r in Session.open(out).frames("fibres")} == {"forehead"}
+    assert {r.index["site"] for r in Session.open(out).frames("fibers")} == {"forehead"}
     assert main([*words, "--resume"]) == errors.EXIT_DONE
     session = Session.open(out)
     assert session.closed
     assert verify(out).ok
     assert {r.attempt for r in session.frames()} == {1}
-    runs = {r.index["site"]: r.actual["run"] for r in session.frames("fibres")}
+    runs = {r.index["site"]: r.actual["run"] for r in session.frames("fibers")}
     assert runs == {"forehead": "sim1", "cheek": "sim2"}
     sites = [p["site"] for p in store.read(tmp_path / "truth-probe").parameters["profiles"]]
     assert sites == ["forehead", "cheek"]
@@ -216,7 +216,7 @@ def test_simulation_killed_mid_series_is_resumed(tmp_path):
             time.sleep(0.01)
         os.kill(host.pid, signal.SIGKILL)
         host.wait()
-    before = {r.step_id for r in Session.open(out).frames("fibres")}
+    before = {r.step_id for r in Session.open(out).frames("fibers")}
     assert {step.split("-")[0] for step in before} == {"forehead"}
     done = subprocess.run([*command, "--resume", "--json"], capture_output=True, text=True)
     assert done.returncode == errors.EXIT_DONE, done.stderr
@@ -225,7 +225,7 @@ def test_simulation_killed_mid_series_is_resumed(tmp_path):
     assert session.closed
     assert verify(out).ok
     placements = {}
-    for record in session.frames("fibres"):
+    for record in session.frames("fibers"):
         placements.setdefault(record.index["site"], set()).add(record.actual["placement"])
     assert {len(one) for one in placements.values()} == {1}
     assert not log.exists()
@@ -288,7 +288,7 @@ def test_served_probe_is_captured_by_printed_command(tmp_path):
             assert session.closed
             assert session.source == "simulated"
             assert session.pending_frames() == []
-            assert len(session.frames("fibres")) == 9
+            assert len(session.frames("fibers")) == 9
             assert verify(out).ok
         finally:
             served.terminate()

@@ -138,8 +138,8 @@ class BracketSeries:
         signal = FiberSignal(self._probe, self._run.rig.view(wanted[0].cameras[0]))
         taken: list[_TakenExposure] = []
         self._head.require_placement(placement)
-        fibre = wanted[0].settings.get("fibre")
-        self._box.cover(None if fibre is None else int(fibre))
+        fiber = wanted[0].settings.get("fiber")
+        self._box.cover(None if fiber is None else int(fiber))
         for number, step in enumerate(wanted):
             self._operator.stop_if_asked()
             taken.append(self._take_exposure(placement, step))
@@ -150,7 +150,7 @@ class BracketSeries:
                 f"{float(actual['suction_mbar']):.1f} mbar"
             )
             left = wanted[number + 1 :]
-            if fibre is not None:
+            if fiber is not None:
                 continue
             first = exposed.frames[step.cameras[0]]
             signal.add_exposure(_pixels(first, step), float(step.settings["exposure_s"]))
@@ -191,8 +191,8 @@ class BracketSeries:
                 "suction_after_mbar": after_mbar,
                 "camera_c": 0.5 * (before_c + after_c),
             }
-            if "fibre" in step.settings:
-                actual["fibre"] = step.settings["fibre"]
+            if "fiber" in step.settings:
+                actual["fiber"] = step.settings["fiber"]
             return _TakenExposure(exposed, actual, attempt)
         if held:
             raise self._run.retry_limit_error(f"step {step.id}", why)

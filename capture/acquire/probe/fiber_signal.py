@@ -70,7 +70,7 @@ class FiberSignal:
     def __init__(self, probe: Probe, view: View) -> None:
         self.probe = probe
         self._view = view
-        spots = np.array([fibre.spot_px for fibre in probe.fibres])
+        spots = np.array([fiber.spot_px for fiber in probe.fibers])
         gaps = np.linalg.norm(spots[:, None] - spots[None, :], axis=-1)
         gaps[np.diag_indices(len(spots))] = math.inf
         pitch_px = float(gaps.min()) if len(spots) > 1 else float(view.height_px) / 2.0
@@ -105,23 +105,23 @@ class FiberSignal:
         self._looked += 1
         for color, around in enumerate(self._around):
             zero = float(np.median(pixels[around])) if len(around) else float(view.black_level)
-            for fibre, windows in enumerate(self._windows):
+            for fiber, windows in enumerate(self._windows):
                 values = pixels[windows[color]]
                 rank = max(len(values) - PEAK_RANK_PX, 0)
                 peak = float(np.partition(values, rank)[rank])
                 if peak >= view.white_level:
                     continue
-                self._always_saturated[fibre, color] = False
+                self._always_saturated[fiber, color] = False
                 signal = float(values.sum(dtype=np.float64)) - zero * len(values)
                 dn2 = noise_dn2 * len(values) + max(signal, 0.0) / view.gain_e_per_dn
                 dn2 += max(zero - view.black_level, 0.0) * len(values) / view.gain_e_per_dn
-                self._sum[fibre, color] += signal
-                self._variance[fibre, color] += dn2
-                self._seconds[fibre, color] += exposure_s
+                self._sum[fiber, color] += signal
+                self._variance[fiber, color] += dn2
+                self._seconds[fiber, color] += exposure_s
                 level = (peak - zero) / full
-                if level > self.level[fibre, color]:
-                    self.level[fibre, color] = level
-                    self.rate_per_s[fibre, color] = level / exposure_s
+                if level > self.level[fiber, color]:
+                    self.level[fiber, color] = level
+                    self.rate_per_s[fiber, color] = level / exposure_s
 
     @property
     def signal_to_noise(self) -> Float64Array:
@@ -170,7 +170,7 @@ def stop_reason(signal: FiberSignal, last: Step, remaining: Sequence[Step]) -> s
         return ""
     first, final = (int(remaining[k].index["bracket"]) for k in (0, -1))
     span = f"bracket {first}" if first == final else f"brackets {first}-{final}"
-    what = f"all {len(signal.probe.fibres)} fibers"
+    what = f"all {len(signal.probe.fibers)} fibers"
     what += " that can be measured" if verdict.hopeless or verdict.saturated else ""
     at_s = float(last.settings["exposure_s"])
     reason = (
@@ -196,9 +196,9 @@ def describe_fibers(pairs: Sequence[tuple[int, int]], probe: Probe) -> str:
     """
     parts = []
     for color, name in enumerate(COLOR_NAMES):
-        fibres = [probe.fibres[fibre].name for fibre, of in pairs if of == color]
-        if fibres:
-            span = f"{fibres[0]} to {fibres[-1]}" if len(fibres) > 3 else ", ".join(fibres)
+        fibers = [probe.fibers[fiber].name for fiber, of in pairs if of == color]
+        if fibers:
+            span = f"{fibers[0]} to {fibers[-1]}" if len(fibers) > 3 else ", ".join(fibers)
             parts.append(f"{name} of {span}")
     return "; ".join(parts)
 
@@ -229,7 +229,7 @@ def _in_color(
 
 
 def _pairs(mask: BoolArray) -> tuple[tuple[int, int], ...]:
-    return tuple((int(fibre), int(color)) for fibre, color in np.argwhere(mask))
+    return tuple((int(fiber), int(color)) for fiber, color in np.argwhere(mask))
 
 
 MAX_UNSATURATED_LEVEL = 0.7
@@ -253,19 +253,19 @@ def usable_exposures(steps: Sequence[Step], rate_per_s: Float64Array) -> set[str
     Examples
     --------
     >>> steps = [
-    ...     Step(f"m{k}", "mask", {"fibre": 0, "bracket": k},
-    ...          {"exposure_s": 0.01 * 4.0**k, "fibre": 0}, ("cam",)) for k in range(6)]
+    ...     Step(f"m{k}", "mask", {"fiber": 0, "bracket": k},
+    ...          {"exposure_s": 0.01 * 4.0**k, "fiber": 0}, ("cam",)) for k in range(6)]
     >>> sorted(usable_exposures(steps, np.array([[1.0, 3.0, 0.2]])))
     ['m2', 'm5']
     """
     kept: set[str] = set()
-    by_fibre: dict[int, list[Step]] = {}
+    by_fiber: dict[int, list[Step]] = {}
     for step in steps:
-        by_fibre.setdefault(int(step.settings["fibre"]), []).append(step)
-    for fibre, some in by_fibre.items():
+        by_fiber.setdefault(int(step.settings["fiber"]), []).append(step)
+    for fiber, some in by_fiber.items():
         ordered = sorted(some, key=lambda step: float(step.settings["exposure_s"]))
         seconds = np.array([float(step.settings["exposure_s"]) for step in ordered])
-        brightest = float(rate_per_s[fibre].max())
+        brightest = float(rate_per_s[fiber].max())
         own = max(int(np.count_nonzero(seconds * brightest <= MAX_UNSATURATED_LEVEL)) - 1, 0)
         # exposures are whole milliseconds on some controllers: leave some room
         others = int(np.count_nonzero(seconds <= 1.01 * MAX_OVEREXPOSURE * seconds[own])) - 1

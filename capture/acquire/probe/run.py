@@ -29,9 +29,9 @@ def check_probe(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
     probe = rig.probe
     if probe is None:
         raise AcquisitionError("probe: the rig file has none; use that of this rig")
-    if int(limits.get("fibres", 0)) != len(probe.fibres):
+    if int(limits.get("fibres", 0)) != len(probe.fibers):
         raise AcquisitionError(
-            f"fibers: the controller has {limits.get('fibres')}, the rig {len(probe.fibres)}; "
+            f"fibers: the controller has {limits.get('fibres')}, the rig {len(probe.fibers)}; "
             "nothing was lit: use the rig file of this controller"
         )
     low_s = float(limits["shutter_min_ms"]) / 1e3
@@ -48,10 +48,10 @@ def check_probe(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
                 f"step {step.id}: got suction_mbar {mbar:g}, the rig holds its head at "
                 f"{probe.suction_mbar:g} mbar; nothing was lit: change the plan, or the rig file"
             )
-        fibre = step.settings.get("fibre")
-        if fibre is not None and not int(fibre) < len(probe.fibres):
-            has = f"the rig has {len(probe.fibres)}, counted from 0"
-            raise step_limit_error(step, f"got fiber {fibre}, {has}")
+        fiber = step.settings.get("fiber")
+        if fiber is not None and not int(fiber) < len(probe.fibers):
+            has = f"the rig has {len(probe.fibers)}, counted from 0"
+            raise step_limit_error(step, f"got fiber {fiber}, {has}")
     if probe.suction_mbar > most_mbar:
         raise AcquisitionError(
             f"suction_mbar: the rig file has {probe.suction_mbar:g}, the controller allows at "

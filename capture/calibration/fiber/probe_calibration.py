@@ -124,7 +124,7 @@ class FiberCalibration:
         freeze_arrays(self, (count,), "dead", kind=np.bool_)
         if len(self.spots.names) != count or self.crosstalk.offset.shape != (count, colors):
             raise ValueError(
-                f"FibreCalibration: got {len(self.spots.names)} spots and cross-talk of "
+                f"FiberCalibration: got {len(self.spots.names)} spots and cross-talk of "
                 f"{self.crosstalk.offset.shape}, expected {count} fibers in {colors} colors"
             )
 
@@ -208,7 +208,7 @@ class FiberCalibration:
         return reasons
 
     def to_calibration(self, *, serial: str, **about: Unpack[Origin]) -> Calibration:
-        """Return this as a `Calibration` of kind "fibre", keyed by fiber and camera.
+        """Return this as a `Calibration` of kind "fiber", keyed by fiber and camera.
 
         Parameters
         ----------
@@ -245,11 +245,11 @@ class FiberCalibration:
         }
         notes = {
             "unit": "gain: full scales per second, summed over a spot, for a reflectance in the"
-            " fibre of 1/mm^2 with the source at level 1",
-            "crosstalk": "row: what this spot reads of each fibre's light",
+            " fiber of 1/mm^2 with the source at level 1",
+            "crosstalk": "row: what this spot reads of each fiber's light",
             "gain_common": "relative, at one standard uncertainty of each cause",
         }
-        return make_device_calibration("fibre", values, notes, **about)
+        return make_device_calibration("fiber", values, notes, **about)
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, rig: Rig, serial: str) -> FiberCalibration:
@@ -260,12 +260,12 @@ class FiberCalibration:
         CalibrationMismatch
             If the calibration is of another rig or camera, or lacks one of the rig's fibers.
         """
-        if calibration.kind != "fibre" or calibration.rig != rig.name or rig.probe is None:
+        if calibration.kind != "fiber" or calibration.rig != rig.name or rig.probe is None:
             raise CalibrationMismatch(
                 f"calibration: got kind {calibration.kind!r} of rig {calibration.rig!r}, "
-                f"expected 'fibre' of {rig.name!r}, a rig with a probe"
+                f"expected 'fiber' of {rig.name!r}, a rig with a probe"
             )
-        table = DeviceColumns(calibration, [fibre.name for fibre in rig.probe.fibres])
+        table = DeviceColumns(calibration, [fiber.name for fiber in rig.probe.fibers])
 
         def camera(name: str) -> Float64Array:
             return calibration.quantity(serial, name).value
@@ -314,9 +314,9 @@ class FiberCalibration:
             If it cannot be used.
         """
         serial = rig.view(view).serial
-        found = load(folder, "fibre")
+        found = load(folder, "fiber")
         if on is not None:
-            require_valid(found, rig=rig.name, serials=[serial], on_date=on, kind="fibre")
+            require_valid(found, rig=rig.name, serials=[serial], on_date=on, kind="fiber")
         return cls.from_calibration(found, rig, serial)
 
 

@@ -65,16 +65,16 @@ class FiberReadings:
         shape = np.shape(self.signal)
         if len(shape) != 2 or shape[0] != len(self.names):
             raise ValueError(
-                f"FibreReadings.signal: got shape {shape}, expected ({len(self.names)}, colors)"
+                f"FiberReadings.signal: got shape {shape}, expected ({len(self.names)}, colors)"
             )
         for name in ("variance", "valid", "saturated", "around"):
             if np.shape(getattr(self, name)) != shape:
                 raise ValueError(
-                    f"FibreReadings.{name}: got shape {np.shape(getattr(self, name))}, expected"
+                    f"FiberReadings.{name}: got shape {np.shape(getattr(self, name))}, expected"
                     f" {shape}"
                 )
         if not np.isfinite(self.signal).all() or not (np.asarray(self.variance) >= 0).all():
-            raise ValueError("FibreReadings: got a signal that is not finite or a variance < 0")
+            raise ValueError("FiberReadings: got a signal that is not finite or a variance < 0")
 
     @property
     def stderr(self) -> Float64Array:
@@ -108,7 +108,7 @@ def read_fibers(
     spots : FiberSpots
         Positions of the fibers' ends in these frames.
     darks : DarkModel
-        See `fibre_darks.measure_darks`.
+        See `fiber_darks.measure_darks`.
     noise : CameraNoise
     temperature_c : float, optional
         Temperature of the camera during the series, to which the dark current is extrapolated.
@@ -189,10 +189,10 @@ def sum_spots(merged: MergedSeries, spots: FiberSpots, *, noise: CameraNoise) ->
     )
 
 
-def _background_pixels(spots: FiberSpots, fibre: int, shape: tuple[int, ...]) -> BoolArray:
+def _background_pixels(spots: FiberSpots, fiber: int, shape: tuple[int, ...]) -> BoolArray:
     """Return the pixels above and below the row, near one spot."""
     height, width = shape[:2]
-    center = spots.center_px[fibre]
+    center = spots.center_px[fiber]
     gaps = np.linalg.norm(np.diff(spots.center_px, axis=0), axis=1)
     reach = BACKGROUND_HALF_WIDTH_PITCH * (float(np.median(gaps)) if len(gaps) else 40.0)
     mask = np.zeros((height, width), np.bool_)

@@ -78,7 +78,7 @@ class FiberSpots:
         freeze_arrays(self, (count,), "radius_px", "radius_stderr_px", "edge_px")
         freeze_arrays(self, (count,), "found", kind=np.bool_)
         if not (self.aperture_px > 0 and (self.radius_px > 0).all()):
-            raise ValueError("FibreSpots: got a radius or an aperture <= 0, expected pixels > 0")
+            raise ValueError("FiberSpots: got a radius or an aperture <= 0, expected pixels > 0")
 
     @property
     def overlapping(self) -> BoolArray:

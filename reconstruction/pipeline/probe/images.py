@@ -55,7 +55,7 @@ class ProbeImages:
     noise : CameraNoise
         Noise of its camera.
     kind : str
-        Kind of the steps: "fibres" on skin, "phantom".
+        Kind of the steps: "fibers" on skin, "phantom".
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class ProbeImages:
         When the session has no frames of that kind.
     """
 
-    def __init__(self, session: Session, *, noise: CameraNoise, kind: str = "fibres") -> None:
+    def __init__(self, session: Session, *, noise: CameraNoise, kind: str = "fibers") -> None:
         self._session = session
         self._noise = noise
         self._records: dict[HeadPlacement, list[FrameRecord]] = {}

@@ -95,8 +95,8 @@ def fit_profiles(
     setup: dict[str, Any] = {
         "variance": np.stack([p.reflectance.variance.T for p in profiles]),
         "valid": np.stack([p.reflectance.valid.T for p in profiles]),
-        "collection": "fibre",
-        "core_mm": probe.fibres[0].core_mm,
+        "collection": "fiber",
+        "core_mm": probe.fibers[0].core_mm,
         "source_core_mm": probe.source_core_mm,
     }
     fit = subsurface.invert(first.radius_mm, every, method=method, **setup)

@@ -73,7 +73,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     view = inputs.session.rig.views[0]
     nominal = "the camera's gain and read noise are those of the rig file"
     sensor = inputs.load("sensor", [view.serial], nominal)
-    fibres = _fibres(inputs)
+    fibers = _fibers(inputs)
     places = _places(inputs)
     stage = inputs.stage_maker(STAGE_REVISION)
     noise = CameraNoise.from_view(view)
@@ -81,10 +81,10 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
         noise = CameraNoise.from_sensor(SensorCalibration.from_calibration(sensor, view.serial))
     uncalibrated = (
         "the fibers are not calibrated: capture a phantom of known optics (`--target phantom`), "
-        "and give the folder that `skinrig calibrate fibre` makes of it as --calibration"
+        "and give the folder that `skinrig calibrate fiber` makes of it as --calibration"
     )
-    profiles = partial(_profiles, inputs, fibres, noise)
-    refused = "" if fibres is not None else uncalibrated
+    profiles = partial(_profiles, inputs, fibers, noise)
+    refused = "" if fibers is not None else uncalibrated
     fitted = f"_fits _sites {SUBSURFACE_FILE}"
     return [
         stage("profiles", "", f"_profiles {PROFILE_FILE}", profiles, refused),
@@ -94,10 +94,10 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     ]
 
 
-def _fibres(inputs: Inputs) -> FiberCalibration | None:
+def _fibers(inputs: Inputs) -> FiberCalibration | None:
     rig = inputs.session.rig
     serial = rig.views[0].serial
-    found = inputs.load("fibre", [serial], "nothing of the fibers")
+    found = inputs.load("fiber", [serial], "nothing of the fibers")
     if found is None:
         inputs.assumed.remove("nothing of the fibers")
         return None
@@ -105,9 +105,9 @@ def _fibres(inputs: Inputs) -> FiberCalibration | None:
 
 
 def _profiles(
-    inputs: Inputs, fibres: FiberCalibration | None, noise: CameraNoise
+    inputs: Inputs, fibers: FiberCalibration | None, noise: CameraNoise
 ) -> Mapping[str, Any]:
-    if fibres is None:
+    if fibers is None:
         raise InputsError("the fibers are not calibrated; give their calibration")
     images = ProbeImages(inputs.session, noise=noise)
     found = []
@@ -115,20 +115,20 @@ def _profiles(
         inputs.report_progress("profiles", number / len(images.measurements))
         merged = images.merged(measurement)
         # the camera may have moved relative to the fibers since the calibration
-        spots, _ = fibres.spots.track(merged, noise.pattern)
+        spots, _ = fibers.spots.track(merged, noise.pattern)
         readings = sum_spots(merged, spots, noise=noise)
         found.append(
-            MeasuredProfile(measurement, fibres.reflectance(readings, level=measurement.level))
+            MeasuredProfile(measurement, fibers.reflectance(readings, level=measurement.level))
         )
     return {"_profiles": found, PROFILE_FILE: stages.serialize_document(_profile_document(found))}
 
 
 def _profile_document(profiles: Sequence[MeasuredProfile]) -> dict[str, Any]:
     return {
-        "schema": "skinrig.profiles/1",
-        "unit": "1/mm^2, reflectance in the fibre",
+        "schema": "skinrig.profiles/2",
+        "unit": "1/mm^2, reflectance in the fiber",
         "radius_mm": profiles[0].reflectance.radius_mm,
-        "fibres": profiles[0].reflectance.names,
+        "fibers": profiles[0].reflectance.names,
         "measurements": [
             {
                 **_head(profile.measurement),

@@ -91,9 +91,9 @@ class ProbeScene(RigScene):
             raise SceneError(f"rig {rig.name!r}: expected a contact probe and one view")
         self.rig, self.tissue, self.seed = rig, tissue, seed
         self.build = build_probe(rig, seed=0) if build is None else build
-        if len(self.build.gain) != len(rig.probe.fibres):
+        if len(self.build.gain) != len(rig.probe.fibers):
             raise SceneError(
-                f"build: got {len(self.build.gain)} fibers, expected {len(rig.probe.fibres)}"
+                f"build: got {len(self.build.gain)} fibers, expected {len(rig.probe.fibers)}"
             )
         self._view = rig.views[0]
         dark = {"dark_e_per_s": DARK_CURRENT_E_PER_S, "vignetting": LENS_VIGNETTING}
@@ -290,7 +290,7 @@ def probe_truth(scene: ProbeScene, placements: Sequence[ProbePlacement]) -> Skin
         (fibers x 3, of the Monte Carlo), ``sigma_a_per_mm``, ``sigma_s_prime_per_mm``,
         ``sigma_tr_per_mm`` (3 each) and ``kind``; for tissue that is not homogeneous and gray the
         nearest medium by `rigsim.fiber.homogeneous_fit`, with ``fit_residual``, ``fit_factor`` and
-        ``fit_fibres``; ``spots_px``, ``gain``, ``crosstalk`` of the actual probe.
+        ``fit_fibers``; ``spots_px``, ``gain``, ``crosstalk`` of the actual probe.
     """
     profiles = [_profile(scene, probing) for probing in placements]
     build = scene.build
@@ -332,7 +332,7 @@ def _profile(scene: ProbeScene, probing: ProbePlacement) -> dict[str, object]:
         media = [(f.sigma_a_per_mm, f.sigma_s_prime_per_mm, f.sigma_tr_per_mm) for f in fits]
         out["fit_residual"] = [fit.residual for fit in fits]
         out["fit_factor"] = [fit.factor for fit in fits]
-        out["fit_fibres"] = [fit.fibres for fit in fits]
+        out["fit_fibers"] = [fit.fibers for fit in fits]
     for name, values in zip(
         ("sigma_a_per_mm", "sigma_s_prime_per_mm", "sigma_tr_per_mm"),
         zip(*media, strict=True),

@@ -66,7 +66,7 @@ down to the mean of 64 such pixels."""
 ALBEDO_NOISE = 0.02
 """Relative noise of a sample of the BRDF."""
 FIBER_NOISE = 0.01
-"""Relative noise of each fibre."""
+"""Relative noise of each fiber."""
 
 
 def efficiency(stage: BenchmarkStage) -> None:

@@ -1,4 +1,4 @@
-"""Trials of the fibre probe's intervals: media, skin of two layers, and directions."""
+"""Trials of the fiber probe's intervals: media, skin of two layers, and directions."""
 
 import json
 import shutil
@@ -41,7 +41,7 @@ def run_trials(
     skin: Mapping[int, str] | None = None,
     directed: Mapping[int, str] | None = None,
 ) -> Iterator[IntervalTrial]:
-    """Yield trials of what the fibre probe tells of media, of skin and of directions.
+    """Yield trials of what the fiber probe tells of media, of skin and of directions.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def _subject(folder: Path, subject: str, seed: int, **options: Any) -> Simulatio
     )
     paper = folder / "block.json"
     paper.write_text(json.dumps(draw_certificate(np.random.default_rng([seed, BLOCK_SEED_OFFSET]))))
-    calibrate("fibre", [phantom], folder / "calibration", phantom=paper)
+    calibrate("fiber", [phantom], folder / "calibration", phantom=paper)
     return resimulate("probe", folder, subject=subject, seed=seed, **options)
 
 

@@ -1,4 +1,4 @@
-"""Benchmark of reading a probe's fibres: errors over the number of exposures."""
+"""Benchmark of reading a probe's fibers: errors over the number of exposures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,11 +39,11 @@ class _ProbeCamera:
     rate: Float64Array
     """Light of each pixel, full scales per second, (H, W)."""
     truth: Float64Array
-    """Of each fibre and color, summed over its aperture, (F, 3)."""
+    """Of each fiber and color, summed over its aperture, (F, 3)."""
 
 
-def fibre_readings(stage: BenchmarkStage) -> None:
-    """Read 28 fibres whose light falls by seven decades with 1 to 23 exposures."""
+def fiber_readings(stage: BenchmarkStage) -> None:
+    """Read 28 fibers whose light falls by seven decades with 1 to 23 exposures."""
     bench = _bench(draws=2 if stage.toy else N_NOISE_DRAWS)
     for count in (1, 3, 8, 23) if stage.toy else EXPOSURE_COUNTS:
         chosen = _select_exposures(len(bench.times), count)
@@ -92,7 +92,7 @@ def _bench(*, draws: int) -> _ProbeCamera:
     rate = np.zeros(shape)
     for c, mask in enumerate(colors):
         rate[mask] = (np.tensordot(light[:, c], images, 1) * response)[mask]
-    names = tuple(fibre.name for fibre in rig.probe.fibres) if rig.probe else ()
+    names = tuple(fiber.name for fiber in rig.probe.fibers) if rig.probe else ()
     count = np.full(len(names), 1.0)
     spots = FiberSpots(
         names,
@@ -137,7 +137,7 @@ def _read(bench: _ProbeCamera, chosen: Sequence[int], draw: int) -> FiberReading
 
 
 def _minimum_variance(bench: _ProbeCamera, chosen: Sequence[int]) -> Float64Array:
-    """Return the least variance of each fibre's light, infinite where a pixel is saturated.
+    """Return the least variance of each fiber's light, infinite where a pixel is saturated.
 
     Of all pixels' light known from the frames that are not saturated, the dark signal known.
     """

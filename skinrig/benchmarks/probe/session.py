@@ -1,4 +1,4 @@
-"""Benchmark of the fibre probe from end to end: sigma_tr of media through simulated sessions."""
+"""Benchmark of the fiber probe from end to end: sigma_tr of media through simulated sessions."""
 
 import math
 import tempfile
@@ -34,7 +34,7 @@ def session(stage: BenchmarkStage) -> None:
         simulate_session(
             "probe", folder / "session-phantom", target="phantom", seed=FIRST_MEDIUM_SEED
         )
-        calibrate("fibre", [folder / "session-phantom"], folder / "calibration")
+        calibrate("fiber", [folder / "session-phantom"], folder / "calibration")
         like_skin = {
             name: _captured(
                 folder, name, (band.sigma_a_per_mm, band.sigma_s_prime_per_mm, BAND_G), seed

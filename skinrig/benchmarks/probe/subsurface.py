@@ -1,4 +1,4 @@
-"""Benchmarks of inverting radial profiles: model tier, fibres used, and batches beside SciPy."""
+"""Benchmarks of inverting radial profiles: model tier, fibers used, and batches beside SciPy."""
 
 from math import inf
 from typing import Any
@@ -21,7 +21,7 @@ from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
 FIBER_RADII_MM = 0.3 + 0.25 * np.arange(28)
 FIBER_CORE_MM = 0.2
 RELATIVE_FIBER_ERROR, RELATIVE_COMMON_ERROR = 0.012, 0.01
-"""Relative errors of a calibration: of each fibre, and common to all."""
+"""Relative errors of a calibration: of each fiber, and common to all."""
 DARK_NOISE_PER_MM2 = 1e-8
 """Noise of a reading in the dark."""
 N_BATCH_PROFILES = 30_000
@@ -30,7 +30,7 @@ N_PEER_FITS = 60
 
 
 def transport_profiles(*, toy: bool) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return true sigma_tr (N,), profiles in fibres and their errors (N, 28) by Monte Carlo.
+    """Return true sigma_tr (N,), profiles in fibers and their errors (N, 28) by Monte Carlo.
 
     sigma_tr from 0.3 to 3.0 per mm, and sigma_s', and g in turn; then the three bands of skin.
     """
@@ -57,7 +57,7 @@ def transport_profiles(*, toy: bool) -> tuple[Float64Array, Float64Array, Float6
 
 
 def tiers(stage: BenchmarkStage) -> None:
-    """Fit Monte Carlo profiles by the three models, with all fibres and with fewer."""
+    """Fit Monte Carlo profiles by the three models, with all fibers and with fewer."""
     rng = np.random.default_rng(1)
     sigma_tr, profiles, errors = transport_profiles(toy=stage.toy)
     spread = slice(0, len(sigma_tr) - len(MELANIN_BANDS))
@@ -84,7 +84,7 @@ def tiers(stage: BenchmarkStage) -> None:
                 noisy[..., part],
                 variance=variance[..., part],
                 method=method,
-                collection="fibre",
+                collection="fiber",
                 core_mm=FIBER_CORE_MM,
                 source_core_mm=FIBER_CORE_MM,
                 common_error=RELATIVE_COMMON_ERROR,
@@ -96,7 +96,7 @@ def tiers(stage: BenchmarkStage) -> None:
             stage.by_band |= dict(zip(MELANIN_BANDS, map(median_error, own), strict=True))
         error = np.abs(relative[:, spread])
         radius = FIBER_RADII_MM[part]
-        knobs: Knobs = {"model": method, "fibres": radius.size}
+        knobs: Knobs = {"model": method, "fibers": radius.size}
         knobs |= {"from mm": float(radius[0]), "to mm": float(radius[-1])}
         stage.add(knobs, timing, bootstrap_columns_median(error))
         if part == slice(None):
@@ -112,7 +112,7 @@ def tiers(stage: BenchmarkStage) -> None:
 def _tier_limits(
     method: Method, error: Float64Array, bias: Float64Array, inside: BoolArray, best: Float64Array
 ) -> LimitValues:
-    """Return what is found of a model with all fibres; `best` is the photon table's bias."""
+    """Return what is found of a model with all fibers; `best` is the photon table's bias."""
     if method == "dipole":
         over_table = float(np.median(np.abs(bias))) / max(float(np.median(np.abs(best))), 1e-9)
         return {
@@ -159,7 +159,7 @@ def _absorbs_like(sigma_a: Float64Array, band: MelaninBand) -> BoolArray:
 
 
 def batches(stage: BenchmarkStage) -> None:
-    """Fit batches of 28 fibres by diffusion; 30,000 beside a loop of SciPy's least_squares."""
+    """Fit batches of 28 fibers by diffusion; 30,000 beside a loop of SciPy's least_squares."""
     rng = np.random.default_rng(2)
     count = 200 if stage.toy else N_BATCH_PROFILES
     k = np.exp(rng.uniform(np.log(0.3), np.log(3.0), count))

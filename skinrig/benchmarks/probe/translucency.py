@@ -33,7 +33,7 @@ ETA = 1.4
 TRUE_RATIO, TRUE_AXIS_RAD = 1.1, 0.6
 """Greatest over least 1/sigma_tr."""
 COUPLING_ERROR, SINGLE_FIBER_ERROR, DARK_NOISE = 0.02, 0.01, 1e-7
-"""Relative deviations of a head set down anew and of each of its fibres; noise, 1/mm^2."""
+"""Relative deviations of a head set down anew and of each of its fibers; noise, 1/mm^2."""
 FALSE_ALARM_RATE = 0.01
 LIMIT_FALSE_ALARM_PROBABILITY = 1e-6
 """Chance that a count exceeds its limit though all is well."""

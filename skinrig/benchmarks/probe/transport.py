@@ -1,4 +1,4 @@
-"""Benchmark of photon transport: what a fibre sees, and photons a second, beside their peers."""
+"""Benchmark of photon transport: what a fiber sees, and photons a second, beside their peers."""
 
 from contextlib import suppress
 from functools import partial
@@ -21,7 +21,7 @@ from skinrig.evaluating.skin_bands import MelaninBand
 RED_MEDIUM_PER_MM = (
     0.04,
     1.5,
-)  # sigma_a and sigma_s' in 1/mm, issue of the fibre probe and rigs.md section 4
+)  # sigma_a and sigma_s' in 1/mm, issue of the fiber probe and rigs.md section 4
 MEDIUM_G = 0.8
 ETA = 1.4
 SPEED_MEDIUM = (0.05, 10.0, 0.9, 1.4)  # sigma_a, sigma_s (1/mm), g, eta
@@ -94,7 +94,7 @@ def trace_half_space(sigma_a, sigma_s, g, eta, photons, seed, sine, edges2, ring
 
 
 def photon_transport(stage: BenchmarkStage) -> None:
-    """Trace the probe's fibres by next event and by photons that leave in the cone; then peers."""
+    """Trace the probe's fibers by next event and by photons that leave in the cone; then peers."""
     probe = load_rig("probe").probe
     if probe is None:
         raise ValueError("rig: the probe's rig has no probe")
@@ -103,11 +103,11 @@ def photon_transport(stage: BenchmarkStage) -> None:
     timed = partial(stage.time, repeats=1, memory=None)
     for photons in (1000, 2000) if stage.toy else (5000, 20_000, 80_000, 320_000):
         timing, run = timed(lambda: _next_event(stack, radii, photons))
-        knobs: Knobs = {"quantity": "fibres", "score": "next event", "photons": photons}
+        knobs: Knobs = {"quantity": "fibers", "score": "next event", "photons": photons}
         stage.add(knobs, timing, _max_relative_stderr(run.stderr / run.reflectance_per_mm2))
     for photons in (1000, 2000) if stage.toy else (80_000, 320_000):
         timing, relative = timed(lambda: _cone_relative_stderr(radii, photons))
-        knobs = {"quantity": "fibres", "score": "leaves in the cone", "photons": photons}
+        knobs = {"quantity": "fibers", "score": "leaves in the cone", "photons": photons}
         stage.add(knobs, timing, _max_relative_stderr(relative))
     medium = LayerStack((Layer(inf, SPEED_MEDIUM[0], *SPEED_MEDIUM[1:]),))
     for engine in ("numba", "drjit"):
@@ -144,7 +144,7 @@ def _half_space(sigma_a: float, sigma_s_prime: float, eta: float = ETA) -> Layer
 
 
 def _next_event(stack: LayerStack, radii: Float64Array, photons: int) -> Any:
-    """Return what the fibres see by next event."""
+    """Return what the fibers see by next event."""
     rng = np.random.default_rng(1)
     return trace_fiber_profile(stack, radii_mm=radii, photons=photons, rng=rng, threads=LIMIT_CORES)
 
@@ -156,7 +156,7 @@ def _max_relative_stderr(relative: Float64Array) -> ErrorEstimate:
 
 
 def _cone_relative_stderr(radii: Float64Array, photons: int) -> Float64Array:
-    """Return relative standard errors of the plain walk in rings as wide as the fibres."""
+    """Return relative standard errors of the plain walk in rings as wide as the fibers."""
     rings = np.zeros((20, 2 * len(radii)))
     edges = np.sort(np.concatenate([radii - 0.1, radii + 0.1]))
     for batch, row in enumerate(rings):
@@ -190,7 +190,7 @@ def _one_percent(radii: Float64Array, stack: Any) -> LimitValues:
 
 
 def _against_volpath(radii: Float64Array) -> LimitValues:
-    """Compare at n = 1: a disc of light on the surface, seen along the normal, square by fibre."""
+    """Compare at n = 1: a disc of light on the surface, seen along the normal, square by fiber."""
     scene = volpath_scene(radii)
     try:
         radiance(scene, kind="mono", samples=16)
@@ -219,13 +219,13 @@ def _against_volpath(radii: Float64Array) -> LimitValues:
         )
     )
     ours = ours_s * float((100.0 * run.stderr / run.reflectance_per_mm2).max()) ** 2
-    # As if the peer's samples were shared out among the fibres in the best way.
+    # As if the peer's samples were shared out among the fibers in the best way.
     peers = peer_s * float((relative**2).mean())
     return {"over_volpath": peers / ours}
 
 
 def volpath_scene(radii: Float64Array) -> dict[str, Any]:
-    """Return Mitsuba's scene of a lit disc on a half-space and a row of square pixels, one a fibre.
+    """Return Mitsuba's scene of a lit disc on a half-space and a row of square pixels, one a fiber.
 
     The radiance times pi is the exitance per source power where the exit is Lambertian.
     """

@@ -220,7 +220,7 @@ def truth_errors(appearance: SkinAppearance, truth: SkinAppearance) -> list[Quan
     Parameters
     ----------
     appearance
-        Of a flash camera, a dome, a gradient sphere or a fibre probe.
+        Of a flash camera, a dome, a gradient sphere or a fiber probe.
     truth
         Of the same session.
     """

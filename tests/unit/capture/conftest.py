@@ -1,4 +1,4 @@
-"""A fibre probe's camera made of discs, Poisson numbers and nothing of the package's simulator."""
+"""A fiber probe's camera made of discs, Poisson numbers and nothing of the package's simulator."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ EXPOSURES_S = 30.0 * 2.0 ** (-(22 - np.arange(23)) * 2 / 3)
 RADIUS_PX, EDGE_PX = 13.0, 1.5
 
 
-class FibreCamera:
+class FiberCamera:
     """Discs with blurred edges on a Bayer sensor with dark current, hot pixels and offsets."""
 
     def __init__(
@@ -30,8 +30,8 @@ class FibreCamera:
         rig = load_rig("probe")
         view = rig.view("cam")
         self.rng, self.rig, self.view = rng, rig, view
-        self.nominal = np.array([fibre.spot_px for fibre in rig.probe.fibres])
-        self.names = tuple(fibre.name for fibre in rig.probe.fibres)
+        self.nominal = np.array([fiber.spot_px for fiber in rig.probe.fibers])
+        self.names = tuple(fiber.name for fiber in rig.probe.fibers)
         self.noise = CameraNoise.from_view(view)
         self.shape = (view.height_px, view.width_px)
         if places is None:
@@ -87,7 +87,7 @@ class FibreCamera:
         return measure_darks(frames, times, noise=self.noise, temperature_c=temperature_c)
 
     def own_light(self, light, spots):
-        """Return what each spot's aperture gets of its own fibre, full scales per second."""
+        """Return what each spot's aperture gets of its own fiber, full scales per second."""
         full = self.noise.gain_e_per_dn * self.noise.span_dn
         result = np.empty((28, 3))
         for i in range(28):
@@ -98,8 +98,8 @@ class FibreCamera:
 
 
 @pytest.fixture(scope="session")
-def fibre_camera():
-    return FibreCamera
+def fiber_camera():
+    return FiberCamera
 
 
 @pytest.fixture(scope="session")
@@ -115,5 +115,5 @@ def brackets_s():
 
 @pytest.fixture(scope="session")
 def five_decades():
-    """Electrons per second of a pixel: from fibre to fibre over five decades, colors differ."""
+    """Electrons per second of a pixel: from fiber to fiber over five decades, colors differ."""
     return np.geomspace(3e6, 30.0, 28)[:, None] * np.array([0.6, 1.0, 0.5])

@@ -1,4 +1,4 @@
-"""Plans of the fibre probe: series, rests, darks, light."""
+"""Plans of the fiber probe: series, rests, darks, light."""
 
 import dataclasses
 import itertools
@@ -28,7 +28,7 @@ PROBE = RIG.probe
 
 
 def test_series_has_23_exposures_lasting_88_seconds():
-    steps = [s for s in probe_plan(RIG, sites=["cheek"]).steps if s.kind == "fibres"]
+    steps = [s for s in probe_plan(RIG, sites=["cheek"]).steps if s.kind == "fibers"]
     seconds = np.array([step.settings["exposure_s"] for step in steps])
     assert len(seconds) == 23
     np.testing.assert_allclose(np.diff(np.log2(seconds)), 2.0 / 3.0, rtol=1e-12)
@@ -113,12 +113,12 @@ def test_calibration_has_whole_series_and_each_fiber_uncovered():
     plan = probe_calibration_plan(RIG)
     kinds = {kind: [s for s in plan.steps if s.kind == kind] for kind in ("phantom", "mask")}
     assert [s.settings["exposure_s"] for s in kinds["phantom"]] == list(exposure_series_s())
-    by_fibre = {}
+    by_fiber = {}
     for step in kinds["mask"]:
-        assert step.settings["fibre"] == step.index["fibre"]
-        by_fibre.setdefault(step.settings["fibre"], []).append(step.settings["exposure_s"])
-    assert sorted(by_fibre) == list(range(28))
-    for seconds in by_fibre.values():
+        assert step.settings["fiber"] == step.index["fiber"]
+        by_fiber.setdefault(step.settings["fiber"], []).append(step.settings["exposure_s"])
+    assert sorted(by_fiber) == list(range(28))
+    for seconds in by_fiber.values():
         np.testing.assert_allclose(np.diff(np.log2(seconds)), 2.0)
         assert MAX_MASK_EXPOSURE_S / 4 < seconds[-1] <= MAX_MASK_EXPOSURE_S
         assert set(seconds) <= set(exposure_series_s())

@@ -23,9 +23,9 @@ def recipe():
     return module
 
 
-def traced(recipe, seed, photons, fibre, path_end):
+def traced(recipe, seed, photons, fiber, path_end):
     hist = np.zeros((recipe.ETAS.size, recipe.RADIUS_BINS, recipe.PATH_BINS, 2))
-    recipe.walk(photons, seed, 0.8, fibre, recipe.ETAS, path_end, hist)
+    recipe.walk(photons, seed, 0.8, fiber, recipe.ETAS, path_end, hist)
     return hist / photons
 
 

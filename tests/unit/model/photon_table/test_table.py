@@ -94,13 +94,13 @@ def test_rings_agree_with_the_simulators_own_transport():
     assert np.max(np.abs(gaps + 0.1 * power[10] / error[10])) > 4.0  # a table 10 % off is found
 
 
-def fibres(sigma_a, sigma_s, g, photons, rng):
+def fibers(sigma_a, sigma_s, g, photons, rng):
     tissue = LayerStack((Layer(np.inf, sigma_a, sigma_s / (1.0 - g), g, 1.4),))
     return trace_fiber_profile(tissue, radii_mm=tuple(RADII), photons=photons, rng=rng)
 
 
 def z_scores(run, sigma_a, sigma_s, g, cores=(0.2, 0.2)):
-    options = {"collection": "fibre", "g": g}
+    options = {"collection": "fiber", "g": g}
     table = photon_table.reflectance(
         RADII, sigma_a, sigma_s, core_mm=cores[0], source_core_mm=cores[1], **options
     )
@@ -112,19 +112,19 @@ def test_fiber_signals_match_simulated_fibers():
     # Neither walk, scoring in the cone nor averages over the cores are shared. The errors of 20
     # batches follow Student's t with 19 degrees of freedom: beyond 5 once in 400 runs of 28.
     rng = np.random.default_rng(3)
-    run = fibres(0.2, 1.5, 0.8, 12_000, rng)
+    run = fibers(0.2, 1.5, 0.8, 12_000, rng)
     assert np.max(np.abs(z_scores(run, 0.2, 1.5, 0.8))) < 5.0
 
 
 @pytest.mark.long
 def test_table_of_other_optics_or_cores_is_detected():
     rng = np.random.default_rng(4)
-    run = fibres(0.3, 1.5, 0.8, 800_000, rng)
+    run = fibers(0.3, 1.5, 0.8, 800_000, rng)
     assert np.max(np.abs(z_scores(run, 0.3, 1.5, 0.8))) < 5.0
     assert np.max(np.abs(z_scores(run, 0.3, 1.5, 0.8, cores=(0.0, 0.6)))) > 5.0
 
 
-@pytest.mark.parametrize("collection", ["all", "fibre"])
+@pytest.mark.parametrize("collection", ["all", "fiber"])
 def test_reflectance_is_positive_and_falls_with_absorption(collection):
     radius = np.geomspace(0.02, 50.0, 80)
     absorption = np.concatenate([[0.0], np.geomspace(1e-6, 10.0, 60)])[:, None]
@@ -137,7 +137,7 @@ def test_reflectance_is_positive_and_falls_with_absorption(collection):
         assert np.all(np.diff(slopes.reflectance_per_mm2, axis=0)[holds[1:]] < 0.0)
 
 
-@pytest.mark.parametrize("collection", ["all", "fibre"])
+@pytest.mark.parametrize("collection", ["all", "fiber"])
 @pytest.mark.parametrize("cores", [(0.0, 0.0), (0.2, 0.2)])
 def test_slopes_are_those_of_the_reflectance(collection, cores):
     options = {"collection": collection, "core_mm": cores[0], "source_core_mm": cores[1]}
@@ -174,7 +174,7 @@ def test_lengths_scale_with_the_scattering():
 
 def test_rows_of_profiles_equal_single_evaluations(rng):
     a, s = rng.uniform(0.01, 1.0, (5, 2, 1)), rng.uniform(0.5, 3.0, (2, 1))
-    options = {"collection": "fibre", "core_mm": 0.2, "source_core_mm": 0.2}
+    options = {"collection": "fiber", "core_mm": 0.2, "source_core_mm": 0.2}
     rows = photon_table.reflectance(RADII, a, s, **options)
     assert rows.shape == (5, 2, RADII.size)
     full = np.broadcast_to(a, rows.shape)
@@ -186,7 +186,7 @@ def test_rows_of_profiles_equal_single_evaluations(rng):
 
 
 def test_the_kernel_equals_a_spline_of_scipy():
-    medium = photon_medium.prepare_medium(1.37, 0.83, "fibre")
+    medium = photon_medium.prepare_medium(1.37, 0.83, "fiber")
     radius, a, s = 2.3, 0.4, 1.7
     x = (np.log(radius * s) - kernels.RADIUS_START) / kernels.RADIUS_STEP
     u = np.sqrt(a / s)
@@ -197,7 +197,7 @@ def test_the_kernel_equals_a_spline_of_scipy():
     kappa = u * float(BSpline(np.arange(-3.0, columns + 1), medium.decay, 3)(y))
     d = np.hypot(radius * s, 1.0)
     expected = s**2 * (1.0 + kappa * d) / d**3 * np.exp(value - kappa * d)
-    got = photon_table.reflectance(radius, a, s, eta=1.37, g=0.83, collection="fibre")
+    got = photon_table.reflectance(radius, a, s, eta=1.37, g=0.83, collection="fiber")
     assert float(got) == pytest.approx(expected, rel=1e-12)
 
 
@@ -273,7 +273,7 @@ def test_indices_between_the_nodes_are_interpolated():
 
 
 def test_stated_errors_are_small_where_fibers_measure():
-    for collection in ("all", "fibre"):
+    for collection in ("all", "fiber"):
         near = photon_table.relative_error(
             np.geomspace(0.3, 10.0, 30), [[0.0], [0.03], [0.3]], 1.0, collection=collection
         )

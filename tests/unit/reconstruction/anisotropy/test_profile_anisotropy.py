@@ -35,13 +35,13 @@ def turned_profiles(ratio, axis_rad, angle=SIXTEEN):
     return photon_table.reflectance(RADIUS_MM, SIGMA_A, scattering[:, None]), sigma_tr
 
 
-def read(rng, truth, cases, *, coupling=0.03, fibre=0.01, gain=0.0):
+def read(rng, truth, cases, *, coupling=0.03, fiber=0.01, gain=0.0):
     """Readings (N, cases, F) of a head set down anew for each turn, and their variances."""
     shape = (len(truth), cases, truth.shape[-1])
     variance = np.broadcast_to(truth[:, None] ** 2 * 0.004**2 + (2e-6) ** 2, shape)
     seen = truth[:, None] * np.exp(coupling * rng.standard_normal((*shape[:2], 1)))
     seen = seen * np.exp(gain * rng.standard_normal((1, cases, shape[2])))
-    seen = seen * (1 + fibre * rng.standard_normal(shape))
+    seen = seen * (1 + fiber * rng.standard_normal(shape))
     return seen + np.sqrt(variance) * rng.standard_normal(shape), variance
 
 
@@ -78,7 +78,7 @@ def test_ten_percent_coefficient_errors_barely_change_ratio():
 
 def test_isotropic_tissue_profiles_are_flagged_at_stated_rate(rng):
     truth, _ = turned_profiles(1.0, 0.0)
-    seen, variance = read(rng, truth, 800, coupling=0.1, fibre=0.03)
+    seen, variance = read(rng, truth, 800, coupling=0.1, fiber=0.03)
     found = estimate_from_profiles(SIXTEEN, RADIUS_MM, seen, variance, **MEDIUM)
     assert found.valid.all()
     for rate in (0.05, 0.01):
@@ -106,7 +106,7 @@ def test_profiles_give_ratio_within_its_standard_error(rng):
 def test_noisy_far_fibers_do_not_bias_result(rng):
     truth, _ = turned_profiles(1.3, 0.7)
     seen, variance = read(rng, truth, 200)
-    noise = 3e-4  # the far half of the fibres, some of them read below 0
+    noise = 3e-4  # the far half of the fibers, some of them read below 0
     lost = seen + noise * rng.standard_normal(seen.shape)
     assert (lost < 0).any()
     found = estimate_from_profiles(SIXTEEN, RADIUS_MM, lost, variance + noise**2, **MEDIUM)
@@ -121,7 +121,7 @@ def test_readings_that_do_not_count_may_be_anything(rng):
     truth, _ = turned_profiles(1.3, 0.7)
     seen, variance = (a[:, 0] for a in read(rng, truth, 1))
     good = np.ones(seen.shape, bool)
-    good[:, 5] = False  # a dead fibre
+    good[:, 5] = False  # a dead fiber
     good[3] = False  # a turn without contact
     good[7, ::3] = False
     plain = estimate_from_profiles(SIXTEEN, RADIUS_MM, seen, variance, valid=good, **MEDIUM)

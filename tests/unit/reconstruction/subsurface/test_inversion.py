@@ -100,28 +100,28 @@ def test_nothing_but_zeros_has_no_signal():
     assert "above their noise" in fit.reason()
 
 
-FIBRES = {"collection": "fibre", "core_mm": 0.2, "source_core_mm": 0.2}
+FIBERS = {"collection": "fiber", "core_mm": 0.2, "source_core_mm": 0.2}
 
 
 def table(a, s, **settings):
-    """A profile in fibres of the photon table: consistent with the fit, so for errors only."""
-    return photon_table.reflectance(RADIUS, a, s, **({"g": 0.8} | FIBRES | settings))
+    """A profile in fibers of the photon table: consistent with the fit, so for errors only."""
+    return photon_table.reflectance(RADIUS, a, s, **({"g": 0.8} | FIBERS | settings))
 
 
 def noisy(clean, rng, shape=()):
-    """Readings with 1.2 % from fibre to fibre and noise in the dark, and their variance."""
+    """Readings with 1.2 % from fiber to fiber and noise in the dark, and their variance."""
     variance = (0.012 * clean) ** 2 + 1e-7**2
     return clean + np.sqrt(variance) * rng.standard_normal((*shape, *np.shape(clean))), variance
 
 
 def fit_table(profile, variance, **settings):
-    return subsurface.invert(RADIUS, profile, variance=variance, **(FIBRES | settings))
+    return subsurface.invert(RADIUS, profile, variance=variance, **(FIBERS | settings))
 
 
 @pytest.mark.parametrize(("g_error", "limit"), [(0.0, 5e-3), (0.07, 1.5e-2)])
 def test_the_tables_layout_is_the_table(g_error, limit):
     """Within the table's domain, but for diffused light; between its g its noise is larger."""
-    model = profile_model("photon_table", FiberOptics(g=0.825, g_error=g_error, **FIBRES), RADIUS)
+    model = profile_model("photon_table", FiberOptics(g=0.825, g_error=g_error, **FIBERS), RADIUS)
     rng = np.random.default_rng(5)
     theta = np.full((100, 4), [0.0, 0.0, 0.0, 0.825])
     theta[:, 1] = rng.uniform(np.log(0.1), np.log(7.0), 100)
@@ -144,8 +144,8 @@ def test_the_tables_layout_is_the_table(g_error, limit):
 
 @pytest.mark.parametrize("ratio", [1e-4, 3e-4, 2e-3])
 def test_far_weakly_absorbed_light_is_diffusion_to_factor(ratio):
-    """At up to 350 transport lengths, where no table reaches; the factor is the fibre's, 5 %."""
-    model = profile_model("photon_table", FiberOptics(g=0.8, g_error=0.0, **FIBRES), RADIUS)
+    """At up to 350 transport lengths, where no table reaches; the factor is the fiber's, 5 %."""
+    model = profile_model("photon_table", FiberOptics(g=0.8, g_error=0.0, **FIBERS), RADIUS)
     for scattering in (8.0, 20.0, 50.0):
         theta = np.array([[np.log(ratio * scattering), np.log(scattering), 0.0, 0.8]])
         exact = diffusion.reflectance(RADIUS, ratio * scattering, scattering, 1.4)
@@ -257,7 +257,7 @@ def test_noise_without_variance_is_found_from_residuals(rng):
     clean = table(0.1, 1.2)
     deviation = np.where(RADIUS > 5.0, 0.2, 0.01)
     readings = clean * np.exp(deviation * rng.standard_normal((400, 28)))
-    fit = subsurface.invert(RADIUS, readings, **FIBRES)
+    fit = subsurface.invert(RADIUS, readings, **FIBERS)
     truth = dipole.effective_transport(0.1, 1.2)
     scatter = fit.sigma_tr_per_mm.std()
     assert np.abs(fit.sigma_tr_per_mm / truth - 1.0).max() < 0.1
@@ -352,7 +352,7 @@ def test_negative_readings_far_out_are_used(rng):
 
 def test_too_few_fibers_are_refused():
     fit = subsurface.invert([1.0], [0.01], variance=[1e-8])
-    assert fit.outcome == FitOutcome.TOO_FEW_FIBRES
+    assert fit.outcome == FitOutcome.TOO_FEW_FIBERS
     assert not fit.valid
 
 

@@ -16,7 +16,7 @@ LAYERED = 0.05 * np.sin(1.3 * np.sqrt(RADIUS) * np.pi)
 
 
 def table(a, s):
-    return photon_table.reflectance(RADIUS, a, s, g=0.8, collection="fibre", **CORES)
+    return photon_table.reflectance(RADIUS, a, s, g=0.8, collection="fiber", **CORES)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def test_nearest_medium_matches_definition_under_any_noise(layered):
     assert (layered > MIN_REFLECTANCE_PER_MM2).all()
     told = by_definition(layered)
     for noise in (1e-4, 1e-3):
-        growing = noise * np.exp(0.3 * RADIUS)  # far fibres are the worse
+        growing = noise * np.exp(0.3 * RADIUS)  # far fibers are the worse
         fit = subsurface.nearest_medium(RADIUS, layered, variance=(growing * layered) ** 2, **CORES)
         assert np.log(fit.sigma_tr_per_mm) == pytest.approx(told, abs=5e-3)
         assert fit.valid
@@ -80,7 +80,7 @@ def test_noisy_far_fibers_keep_estimate_near_definition(layered):
     assert np.sqrt(np.mean((off / stated) ** 2)) < 1.5
     assert np.median(stated) < 0.06
 
-    # near fibres alone, as far as noise leaves them, find another medium: the test can fail
+    # near fibers alone, as far as noise leaves them, find another medium: the test can fail
     def residual(parameters):
         a, s, factor = np.exp(parameters)
         return (np.log(layered) - np.log(factor * table(a, s))) / np.hypot(noise, 0.02)
@@ -103,13 +103,13 @@ def test_fibers_below_definition_light_level_are_ignored():
     dark = 0.5 * table(0.6, 2.0) * np.exp(LAYERED)
     fit = subsurface.nearest_medium(RADIUS, dark, variance=(1e-3 * dark) ** 2, **CORES)
     assert 10 < fit.used.sum() < 28
-    # one fibre at the limit may be on either side of it
+    # one fiber at the limit may be on either side of it
     assert (fit.used != (dark >= MIN_REFLECTANCE_PER_MM2)).sum() <= 1
 
 
 def test_too_little_light_gives_no_estimate(layered):
     fit = subsurface.nearest_medium(RADIUS, layered, variance=(3.0 * layered) ** 2, **CORES)
     assert not fit.valid
-    assert fit.outcome & (FitOutcome.NO_SIGNAL | FitOutcome.TOO_FEW_FIBRES)
+    assert fit.outcome & (FitOutcome.NO_SIGNAL | FitOutcome.TOO_FEW_FIBERS)
     assert np.isnan(fit.sigma_tr_per_mm)
     assert np.isinf(fit.sigma_tr_stderr)

@@ -1,4 +1,4 @@
-"""Smooth curves through noisy fibres, against splines and kriging written anew."""
+"""Smooth curves through noisy fibers, against splines and kriging written anew."""
 
 import numpy as np
 import pytest

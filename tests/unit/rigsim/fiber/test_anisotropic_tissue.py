@@ -14,14 +14,14 @@ from rigsim.fiber.anisotropic_tissue import AnisotropicTissue, trace_anisotropic
 from rigsim.fiber.profile import FiberGeometry, trace_fiber_profile
 from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError
 
-FIBRES = FiberGeometry((0.3, 1.3, 3.3))
+FIBERS = FiberGeometry((0.3, 1.3, 3.3))
 ALONG = AnisotropicTissue(0.05, 7.5, strength=-1.2)
 
 
-def traced(tissue, azimuth_rad, *, seed, photons=40_000, fibres=FIBRES, **more):
+def traced(tissue, azimuth_rad, *, seed, photons=40_000, fibers=FIBERS, **more):
     return trace_anisotropic_profile(
         tissue,
-        fibres,
+        fibers,
         azimuth_rad=azimuth_rad,
         photons=photons,
         rng=np.random.default_rng(seed),
@@ -40,7 +40,7 @@ def test_anisotropic_walk_without_preferred_direction_is_isotropic(harmonics):
     run = traced(replace(ALONG, strength=0.0), (0.4,), seed=1, harmonics=harmonics)
     plain = trace_fiber_profile(
         LayerStack((Layer(inf, 0.05, 7.5, 0.8, 1.4),)),
-        radii_mm=FIBRES.radii_mm,
+        radii_mm=FIBERS.radii_mm,
         photons=40_000,
         rng=np.random.default_rng(2),
         threads=2,
@@ -52,7 +52,7 @@ def test_anisotropic_walk_without_preferred_direction_is_isotropic(harmonics):
 
 
 def test_light_travels_farther_along_fibers_than_across():
-    run = traced(ALONG, (0.0, 0.5 * pi), seed=3, photons=60_000, fibres=FiberGeometry((7.0,)))
+    run = traced(ALONG, (0.0, 0.5 * pi), seed=3, photons=60_000, fibers=FiberGeometry((7.0,)))
     along, across = run.reflectance_per_mm2[0]
     assert along - across > 4.5 * np.hypot(*run.stderr[0])
 
@@ -60,7 +60,7 @@ def test_light_travels_farther_along_fibers_than_across():
 def test_harmonics_agree_with_fibers_scored_at_their_positions():
     angles = (0.0, 0.5, 1.0, 0.5 * pi)
     assert worst(traced(ALONG, angles, seed=4), traced(ALONG, angles, seed=5, harmonics=None)) < 4.5
-    # The test can tell: a mean over the directions is not what the fibres see.
+    # The test can tell: a mean over the directions is not what the fibers see.
     mean = traced(ALONG, angles, seed=4, harmonics=0)
     assert worst(mean, traced(ALONG, angles, seed=5, harmonics=None)) > 4.5
 
@@ -72,14 +72,14 @@ def test_rotated_tissue_rotates_its_profile():
 
 
 def test_light_goes_both_ways_alike():
-    """Helmholtz: a wide source with a wide cone and a thin fibre, or the fibres exchanged."""
+    """Helmholtz: a wide source with a wide cone and a thin fiber, or the fibers exchanged."""
     runs = [
         traced(
             ALONG,
             (0.0, 1.0),
             seed=7 + k,
             photons=60_000,
-            fibres=FiberGeometry((0.3, 0.8), detector[0], source[0], detector[1], source[1]),
+            fibers=FiberGeometry((0.3, 0.8), detector[0], source[0], detector[1], source[1]),
         )
         for k, (source, detector) in enumerate((((0.4, 0.9), (0.2, 0.2)), ((0.2, 0.2), (0.4, 0.9))))
     ]

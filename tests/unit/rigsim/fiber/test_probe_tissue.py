@@ -113,7 +113,7 @@ def test_rotated_head_on_anisotropic_tissue_rotates_profile():
         for angle in (30.0, 120.0, 52.0, 210.0)
     )
     ratio = np.log(along / across)
-    # light comes out across the fibres near the source, and goes farther along them
+    # light comes out across the fibers near the source, and goes farther along them
     assert ratio[:4].mean() < -0.2
     assert ratio[20:].mean() > 0.2
     np.testing.assert_allclose(again, along, rtol=1e-9)

@@ -1,4 +1,4 @@
-"""Profiles seen by fibres against the all-angle walk, each other, closed forms and energy."""
+"""Profiles seen by fibers against the all-angle walk, each other, closed forms and energy."""
 
 import time
 from math import inf
@@ -180,7 +180,7 @@ def test_ring_fractions_match_random_points_in_cores(detector_mm, source_mm):
 
 
 def all_angle_z(layer, *, photons=40_000, radii_mm=(0.0, 0.3, 1.0), core_mm=0.2):
-    """Standard errors between fibres that take all angles and the exitance of the plain walk."""
+    """Standard errors between fibers that take all angles and the exitance of the plain walk."""
     stack = LayerStack((layer,))
     seen = trace_fiber_profile(
         stack,
@@ -213,7 +213,7 @@ def all_angle_z(layer, *, photons=40_000, radii_mm=(0.0, 0.3, 1.0), core_mm=0.2)
     ids=["eta 1", "eta 1.6", "g .99", "g -.9", "sigma_a = 10 sigma_s'"],
 )
 def test_extreme_media_agree_with_the_plain_walk(layer):
-    # |z| < 4.5 for three radii: false alarms below 8e-4 (t, 19 dof). Fibres touch the source.
+    # |z| < 4.5 for three radii: false alarms below 8e-4 (t, 19 dof). Fibers touch the source.
     dark = layer.sigma_a_per_mm > 1.0 or layer.g < 0.0
     radii = (0.0, 0.2, 0.3) if dark else (0.0, 0.2, 1.0)
     assert all_angle_z(layer, radii_mm=radii) < 4.5
@@ -305,7 +305,7 @@ def test_film_of_identical_tissue_changes_nothing():
 
 @pytest.mark.parametrize("stack", [RED, LAYERED])
 def test_light_goes_both_ways_alike(stack):
-    """Helmholtz: a wide source with a wide cone and a thin fibre, or the fibres exchanged."""
+    """Helmholtz: a wide source with a wide cone and a thin fiber, or the fibers exchanged."""
     wide, thin = (0.4, 0.9), (0.1, 0.2)
     runs = [
         trace_fiber_profile(

@@ -32,7 +32,7 @@ def rig():
 def test_gray_phantom_gives_table_reflectance_in_every_band(rig):
     expected = expected_reflectance(GRAY, rig)
     single = photon_table.reflectance(
-        rig.probe.radius_mm, 0.01, 1.0, g=0.8, collection="fibre", core_mm=0.2, source_core_mm=0.2
+        rig.probe.radius_mm, 0.01, 1.0, g=0.8, collection="fiber", core_mm=0.2, source_core_mm=0.2
     )
     np.testing.assert_allclose(expected.per_mm2, np.repeat(single[:, None], 3, axis=1), rtol=1e-9)
     flat = dataclasses.replace(

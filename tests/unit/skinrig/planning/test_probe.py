@@ -1,4 +1,4 @@
-"""The fibre probe's choice of exposures, placements and sites, on a simulated medium."""
+"""The fiber probe's choice of exposures, placements and sites, on a simulated medium."""
 
 import json
 from dataclasses import replace
@@ -137,7 +137,7 @@ def test_site_is_omitted_only_if_others_determine_quantity(look):
 
 def test_plans_without_skin_or_darks_are_refused(rig):
     plan = probe_plan(rig, sites=SITES)
-    for kind, word in (("fibres", "no series on skin"), ("dark", "without light")):
+    for kind, word in (("fibers", "no series on skin"), ("dark", "without light")):
         some = replace(plan, steps=tuple(s for s in plan.steps if s.kind != kind))
         with pytest.raises(plans.PlanningError, match=word):
             probe.read_settings(some)

@@ -14,11 +14,11 @@ EVERY = len(SERIES_S)
 
 
 def spots():
-    """Return the number of the fibre that lights each pixel, 28 for none, shape (H, W)."""
+    """Return the number of the fiber that lights each pixel, 28 for none, shape (H, W)."""
     rows, columns = np.mgrid[: VIEW.height_px, : VIEW.width_px]
-    found = np.full(rows.shape, len(PROBE.fibres))
-    for number, fibre in enumerate(PROBE.fibres):
-        x, y = fibre.spot_px
+    found = np.full(rows.shape, len(PROBE.fibers))
+    for number, fiber in enumerate(PROBE.fibers):
+        x, y = fiber.spot_px
         found[np.hypot(columns - x - 1, rows - y) < 8] = number
     return found
 
@@ -83,7 +83,7 @@ def test_fiber_saturated_in_shortest_exposure_is_distinguished(rng):
     rates[0] = 1e3
     verdict = looked(rates, rng, 5).verdict(SERIES_S[5:])
     assert verdict.enough
-    assert {fibre for fibre, _ in verdict.saturated} == {0}
+    assert {fiber for fiber, _ in verdict.saturated} == {0}
     assert verdict.hopeless == ()
 
 

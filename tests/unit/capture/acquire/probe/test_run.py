@@ -1,4 +1,4 @@
-"""Plans run on the fibre probe through its driver, on a world that tells."""
+"""Plans run on the fiber probe through its driver, on a world that tells."""
 
 import dataclasses
 import itertools
@@ -22,13 +22,13 @@ WHOLE = load_rig("probe")
 
 
 def cut(rig, every=5):
-    """The same rig with a few fibres only, side by side before a small camera."""
-    fibres = tuple(
-        dataclasses.replace(fibre, spot_px=(21.0 + 42.0 * number, 31.5))
-        for number, fibre in enumerate(rig.probe.fibres[::every])
+    """The same rig with a few fibers only, side by side before a small camera."""
+    fibers = tuple(
+        dataclasses.replace(fiber, spot_px=(21.0 + 42.0 * number, 31.5))
+        for number, fiber in enumerate(rig.probe.fibers[::every])
     )
-    view = dataclasses.replace(rig.views[0], width_px=42 * len(fibres), height_px=64)
-    probe = dataclasses.replace(rig.probe, fibres=fibres)
+    view = dataclasses.replace(rig.views[0], width_px=42 * len(fibers), height_px=64)
+    probe = dataclasses.replace(rig.probe, fibers=fibers)
     return dataclasses.replace(rig, probe=probe, views=(view,))
 
 
@@ -37,7 +37,7 @@ PROBE = RIG.probe
 NAMES = (f"acquire-probe-{number}" for number in itertools.count())
 SEED = 3
 BRIGHT = 40.0
-"""Peak of a fibre at the source in full scales per second."""
+"""Peak of a fiber at the source in full scales per second."""
 FALL_MM = 2.0
 SPOT_PX = 7
 SHIFT_PX = 1
@@ -59,12 +59,12 @@ class Witness:
         light_s = sum(pop.level * (pop.t_off_s - pop.t_on_s) for pop in pops)
         only = {pop.fiber for pop in pops}
         electrons = np.full(ROWS.shape, 2.0 * exposure_s)
-        for number, fibre in enumerate(PROBE.fibres):
+        for number, fiber in enumerate(PROBE.fibers):
             if only - {None} and number not in only:
                 continue
-            x, y = fibre.spot_px
+            x, y = fiber.spot_px
             disc = np.hypot(COLUMNS - x - SHIFT_PX, ROWS - y) < SPOT_PX
-            level = self.bright * np.exp(-fibre.radius_mm / self.fall_mm) * light_s
+            level = self.bright * np.exp(-fiber.radius_mm / self.fall_mm) * light_s
             electrons[disc] += 18000.0 * level
         electrons = rng.poisson(np.minimum(electrons, 1e6)) + rng.normal(0.0, 7.0, ROWS.shape)
         image = np.clip(np.round(64 + electrons / RIG.views[0].gain_e_per_dn), 0, 4095)
@@ -188,8 +188,8 @@ def check_frames(session):
                 assert abs(actual[name] - PROBE.suction_mbar) <= PROBE.suction_tolerance_mbar
             assert actual["open_s"] == pytest.approx(settings["exposure_s"], abs=1e-5)
             assert abs(actual["camera_c"] - PROBE.camera_c) <= PROBE.camera_tolerance_c
-            fibre = settings.get("fibre")
-            name = str(placement) if fibre is None else f"fibre {fibre}"
+            fiber = settings.get("fiber")
+            name = str(placement) if fiber is None else f"fiber {fiber}"
             placements.setdefault(name, set()).add(actual["placement"])
     for record in session.frames("dark"):
         assert session.read(record).cfa[0, 0] == 64
@@ -232,7 +232,7 @@ def test_whole_series_rests_once_and_takes_planned_time(make):
     plan = probe_plan(RIG, sites=["cheek"], darks=0)
     bench = make(plan, Witness(bright=0.03))
     bench.run(all_brackets=True)
-    assert len(bench.session.frames("fibres")) == 23
+    assert len(bench.session.frames("fibers")) == 23
     check_frames(bench.session)
     assert bench.world.box("probe").device.pump.count == 2
     lit = [source for source in bench.world.switched if source.level > 0]
@@ -270,8 +270,8 @@ def test_longer_exposures_are_omitted_once_all_fibers_measured(make):
     )
     assert match, reason
     assert reason in bench.told
-    frames = bench.session.frames("fibres")
-    # the farthest fibre reaches half of full scale within its last exposure
+    frames = bench.session.frames("fibers")
+    # the farthest fiber reaches half of full scale within its last exposure
     peak = 10.0 * np.exp(-6.55 / 7.0)
     last_s = frames[-1].settings["exposure_s"]
     assert 0.5 <= peak * last_s
@@ -285,13 +285,13 @@ def test_all_brackets_are_taken_on_request(make):
     bench = make(short(brackets=10, longest_s=4.0), Witness(bright=10.0, fall_mm=7.0))
     bench.run(all_brackets=True)
     assert bench.session.omitted_steps() == {}
-    assert len(bench.session.frames("fibres")) == 10
+    assert len(bench.session.frames("fibers")) == 10
 
 
 def test_exposures_continue_while_any_fiber_is_still_measurable(make):
     bench = make(short(brackets=10, longest_s=4.0), Witness(bright=10.0, fall_mm=1.0))
     bench.run()
-    assert len(bench.session.frames("fibres")) == 10
+    assert len(bench.session.frames("fibers")) == 10
 
 
 def test_fibers_staying_in_noise_do_not_delay_others(make):
@@ -356,7 +356,7 @@ def test_detached_head_is_placed_again_and_series_restarts(make):
     assert check_frames(bench.session) == {"cheek at 0 degrees": 2}
     assert len(bench.placings) == 2
     assert "again: the suction f" in bench.placings[1]
-    assert len(bench.session.frames("fibres")) == 8
+    assert len(bench.session.frames("fibers")) == 8
     assert {record.attempt for record in bench.session.frames()} == {1}
 
 
@@ -389,7 +389,7 @@ def test_exposure_with_drifting_suction_is_retaken_after_suction(make):
     done = bench.run(all_brackets=True)
     assert done.retakes == 2
     check_frames(bench.session)
-    tries = [record.actual["tries"] for record in bench.session.frames("fibres")]
+    tries = [record.actual["tries"] for record in bench.session.frames("fibers")]
     assert tries == [1, 1, 3, 1, 1, 1]
     assert bench.world.box("probe").device.pump.count == 3
     assert len(bench.placings) == 1
@@ -400,7 +400,7 @@ def test_three_drifts_refuse_the_measurement(make):
     bench.box = Drifting(bench.box, {2, 3, 4})
     with pytest.raises(AcquisitionError, match=r"the suction is \d+ mbar, expected 60"):
         bench.run(all_brackets=True)
-    assert bench.session.frames("fibres") == []
+    assert bench.session.frames("fibers") == []
     assert bench.at_rest
 
 
@@ -409,7 +409,7 @@ def test_warming_camera_is_refused_with_temperature(make):
     bench.world.advance(60.0)
     with pytest.raises(AcquisitionError, match=r"camera: still at \d+\.\d degrees.*cooling"):
         bench.run()
-    assert bench.session.frames("fibres") == []
+    assert bench.session.frames("fibers") == []
     assert any("waiting for it" in line for line in bench.told)
     assert bench.at_rest
 
@@ -454,7 +454,7 @@ def test_occasional_shutter_failures_leave_sound_session(make, part):
     assert done.retakes == 3
     check_frames(bench.session)
     assert bench.session.pending_frames() == []
-    tries = [record.actual["tries"] for record in bench.session.frames("fibres")]
+    tries = [record.actual["tries"] for record in bench.session.frames("fibers")]
     assert tries == [1, 2, 1, 1, 3, 1, 1, 1]
 
 
@@ -582,11 +582,11 @@ def test_a_series_of_two_placements_would_not_pass(make):
     with pytest.raises(Killed):
         bench.run(all_brackets=True)
     bench.resume()
-    series = {r.step_id: r.actual["placement"] for r in bench.session.frames("fibres")}
+    series = {r.step_id: r.actual["placement"] for r in bench.session.frames("fibers")}
     assert len(series) == 2
     bench.build()
     bench.run(all_brackets=True)
-    anew = {r.step_id: (r.attempt, r.actual["placement"]) for r in bench.session.frames("fibres")}
+    anew = {r.step_id: (r.attempt, r.actual["placement"]) for r in bench.session.frames("fibers")}
     assert {anew[step] for step in series} == {(2, 2)}
     assert {anew[step] for step in anew if step not in series} == {(1, 2)}
 
@@ -614,14 +614,14 @@ def test_phantom_is_placed_once_fibers_uncovered_singly(make):
     assert bench.placings == ["place the head on the phantom at 0 degrees"]
     assert bench.session.pending_frames() == []
     assert set(check_frames(bench.session).values()) == {1}
-    by_fibre = {}
+    by_fiber = {}
     for record in bench.session.frames("mask"):
-        by_fibre.setdefault(record.index["fibre"], []).append(record)
-    assert sorted(by_fibre) == list(range(6))
-    for number, records in by_fibre.items():
+        by_fiber.setdefault(record.index["fiber"], []).append(record)
+    assert sorted(by_fiber) == list(range(6))
+    for number, records in by_fiber.items():
         assert 1 <= len(records) <= 2
-        fibre = PROBE.fibres[number]
-        x, y = (round(v) for v in fibre.spot_px)
+        fiber = PROBE.fibers[number]
+        x, y = (round(v) for v in fiber.spot_px)
         peaks = [int(bench.session.read(r).cfa[y, x]) for r in records]
         exposures = [r.settings["exposure_s"] for r in records]
         longest = max(s.settings["exposure_s"] for s in plan.steps if s.kind == "mask")
@@ -629,9 +629,9 @@ def test_phantom_is_placed_once_fibers_uncovered_singly(make):
         assert peaks[0] < 4095 * 0.85
         assert peaks[0] > 64 + 0.05 * 4031 or exposures[0] == longest
         assert exposures[-1] >= min(8.0 * exposures[0], longest)
-        other = PROBE.fibres[(number + 2) % 6]
+        other = PROBE.fibers[(number + 2) % 6]
         assert bench.session.read(records[0]).cfa[y, round(other.spot_px[0])] < 120
-        assert {r.actual["fibre"] for r in records} == {number}
+        assert {r.actual["fiber"] for r in records} == {number}
     (reason,) = {t for t in bench.session.omitted_steps().values() if "covered" in t}
     assert reason in bench.told
 
@@ -670,7 +670,7 @@ def test_mask_choice_continues_after_resume_without_choosing_again(make):
     assert bench.session.omitted_steps() == left_out
     assert bench.session.pending_frames() == []
     placed = check_frames(bench.session)
-    assert (placed["phantom at 0 degrees"], placed["fibre 0"], placed["fibre 5"]) == (1, 1, 2)
+    assert (placed["phantom at 0 degrees"], placed["fiber 0"], placed["fiber 5"]) == (1, 1, 2)
 
 
 def test_capped_dark_frames_are_taken_after_controller_release(make):

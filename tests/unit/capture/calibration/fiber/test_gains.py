@@ -24,7 +24,7 @@ from capture.rig import load_rig
 FALSE_ALARM = 1e-5
 RIG = load_rig("probe")
 RADIUS = np.array(RIG.probe.radius_mm)
-NAMES = tuple(fibre.name for fibre in RIG.probe.fibres)
+NAMES = tuple(fiber.name for fiber in RIG.probe.fibers)
 DISTANCE = np.abs(np.subtract.outer(np.arange(28), np.arange(28)))
 PER_S = 3000.0  # signal of 1/mm^2
 
@@ -38,7 +38,7 @@ SKIN = profile([0.9, 1.3, 1.6])
 
 
 def spots(found=None):
-    place = np.array([fibre.spot_px for fibre in RIG.probe.fibres])
+    place = np.array([fiber.spot_px for fiber in RIG.probe.fibers])
     row = np.full(28, 13.0)
     found = np.ones(28, bool) if found is None else found
     return FiberSpots(NAMES, place, np.full((28, 2), 0.02), row, 0.01 * row, 0.1 * row, found, 17.0)
@@ -109,10 +109,10 @@ def test_reflectance_comes_back_within_its_errors():
         nothing = probe.calibrate(masks={}).reflectance(probe.read(SKIN))
         blind.append(np.abs(away(nothing, SKIN)).max())
     sigmas = np.concatenate(sigmas)
-    # the fibres of a run share errors of cross-talk, so of 28 x 3 some count as one
+    # the fibers of a run share errors of cross-talk, so of 28 x 3 some count as one
     assert 0.75 < np.sqrt((sigmas**2).mean()) < 1.25
     assert np.quantile(np.abs(sigmas), 0.999) < 5
-    # without the frames of covered fibres the far ones are off by many standard errors
+    # without the frames of covered fibers the far ones are off by many standard errors
     assert min(blind) > 10
 
 
@@ -145,7 +145,7 @@ def test_cover_leakage_is_not_stray_light(rng):
     assert found.cover_leak_stderr < 0.2e-5
     error = np.hypot(found.offset_stderr, found.offset_common)
     assert np.abs(found.offset / error).max() < 5
-    # taken for stray light it would be worth many standard errors in the far fibres of skin
+    # taken for stray light it would be worth many standard errors in the far fibers of skin
     assert (error < 1e-6).any(axis=0).all()
 
 
@@ -226,7 +226,7 @@ def test_certificate_scale_uncertainty_is_common_to_all_fibers(rng):
     ratio = result.reflectance_per_mm2[near] / SKIN[near]
     np.testing.assert_allclose(ratio, 1.03, rtol=0.01)
     own = np.sqrt(result.variance[near]) / SKIN[near]
-    assert (own < 0.01).all()  # the fibres agree with each other
+    assert (own < 0.01).all()  # the fibers agree with each other
     np.testing.assert_allclose((result.stderr / SKIN)[near], 0.03, rtol=0.1)
     covariance = result.covariance
     assert covariance.shape == (3, 28, 28)
@@ -279,7 +279,7 @@ def test_a_calibration_survives_its_file(rng, tmp_path):
     for name in ("reflectance_per_mm2", "variance", "common_per_mm2", "valid"):
         np.testing.assert_allclose(getattr(one, name), getattr(two, name), rtol=1e-12)
     assert back.names == made.names
-    with pytest.raises(CalibrationMismatch, match="expected 'fibre' of 'flash'"):
+    with pytest.raises(CalibrationMismatch, match="expected 'fiber' of 'flash'"):
         FiberCalibration.from_calibration(record, load_rig("flash"), "SP-0001")
 
 

@@ -1,4 +1,4 @@
-"""Brackets of a probe give each fibre's light over five decades, with variances that hold."""
+"""Brackets of a probe give each fiber's light over five decades, with variances that hold."""
 
 import dataclasses
 
@@ -44,8 +44,8 @@ def assert_consistent(away):
 
 
 @pytest.fixture(scope="module")
-def bench(fibre_camera, all_brackets_s, five_decades):
-    camera = fibre_camera(np.random.default_rng(7))
+def bench(fiber_camera, all_brackets_s, five_decades):
+    camera = fiber_camera(np.random.default_rng(7))
     return camera, camera.darks(), camera.series(five_decades, all_brackets_s)
 
 
@@ -65,10 +65,10 @@ def test_five_decades_are_read_within_their_errors(bench, all_brackets_s, five_d
     assert abs((raw.signal - truth) / raw.stderr).max() > 6
 
 
-def test_light_below_dark_signal_is_read_without_bias(fibre_camera, brackets_s):
+def test_light_below_dark_signal_is_read_without_bias(fiber_camera, brackets_s):
     away, level = [], []
     for seed in range(3):
-        camera = fibre_camera(np.random.default_rng(seed))
+        camera = fiber_camera(np.random.default_rng(seed))
         light = np.full((28, 3), 0.06)  # electrons per second: 1.8 in the longest exposure
         readings = read(camera, camera.series(light, brackets_s), brackets_s, camera.darks())
         truth = camera.own_light(light, spots_of(camera))
@@ -80,8 +80,8 @@ def test_light_below_dark_signal_is_read_without_bias(fibre_camera, brackets_s):
     assert abs(away.mean()) * np.sqrt(away.size) < 4.4  # one run in 1e5
 
 
-def test_no_light_gives_both_signs_with_a_variance(fibre_camera, brackets_s):
-    camera = fibre_camera(np.random.default_rng(3))
+def test_no_light_gives_both_signs_with_a_variance(fiber_camera, brackets_s):
+    camera = fiber_camera(np.random.default_rng(3))
     readings = read(
         camera, camera.series(np.zeros((28, 3)), brackets_s), brackets_s, camera.darks()
     )
@@ -92,8 +92,8 @@ def test_no_light_gives_both_signs_with_a_variance(fibre_camera, brackets_s):
     assert_consistent(readings.signal / readings.stderr)
 
 
-def test_series_saturated_in_shortest_exposure_is_flagged(fibre_camera, brackets_s, five_decades):
-    camera = fibre_camera(np.random.default_rng(5))
+def test_series_saturated_in_shortest_exposure_is_flagged(fiber_camera, brackets_s, five_decades):
+    camera = fiber_camera(np.random.default_rng(5))
     light = five_decades.copy()
     light[:3] *= 100.0
     frames = camera.series(light, brackets_s)
@@ -125,8 +125,8 @@ def test_the_order_of_the_frames_does_not_matter(bench, all_brackets_s, rng):
     np.testing.assert_allclose(one.signal, two.signal, rtol=1e-12)
 
 
-def test_warmed_camera_is_read_without_bias(fibre_camera, brackets_s):
-    camera = fibre_camera(np.random.default_rng(9))
+def test_warmed_camera_is_read_without_bias(fiber_camera, brackets_s):
+    camera = fiber_camera(np.random.default_rng(9))
     light = np.full((28, 3), 1.0)
     warm = camera.series(light, brackets_s, dark=2 ** (3 / 7))
     truth = camera.own_light(light, spots_of(camera))
@@ -141,8 +141,8 @@ def test_warmed_camera_is_read_without_bias(fibre_camera, brackets_s):
         darks.at(20.0)
 
 
-def test_dark_current_and_offsets_are_found(fibre_camera):
-    camera = fibre_camera(np.random.default_rng(11))
+def test_dark_current_and_offsets_are_found(fiber_camera):
+    camera = fiber_camera(np.random.default_rng(11))
     darks = camera.darks(repeats=4)
     rate_e = darks.mean_rate_dn_per_s * camera.noise.gain_e_per_dn
     assert rate_e == pytest.approx(0.2, abs=0.005)
@@ -155,8 +155,8 @@ def test_dark_current_and_offsets_are_found(fibre_camera):
     assert predicted < camera.bias_e.std()  # better than one number for all
 
 
-def test_single_exposure_darks_apply_to_that_exposure_only(fibre_camera, five_decades):
-    camera = fibre_camera(np.random.default_rng(13))
+def test_single_exposure_darks_apply_to_that_exposure_only(fiber_camera, five_decades):
+    camera = fiber_camera(np.random.default_rng(13))
     darks = camera.darks((30.0,))
     frames = camera.series(five_decades, (30.0,))
     assert read(camera, frames, (30.0,), darks).valid.any()
@@ -164,8 +164,8 @@ def test_single_exposure_darks_apply_to_that_exposure_only(fibre_camera, five_de
         read(camera, frames, (1.0,), darks)
 
 
-def test_missing_darks_and_mismatched_frames_are_reported(fibre_camera):
-    camera = fibre_camera(np.random.default_rng(13))
+def test_missing_darks_and_mismatched_frames_are_reported(fiber_camera):
+    camera = fiber_camera(np.random.default_rng(13))
     with pytest.raises(DarkError, match="at least one; capture darks first"):
         measure_darks([], [], noise=camera.noise)
     darks = camera.darks((1.0, 30.0), 1)
@@ -175,8 +175,8 @@ def test_missing_darks_and_mismatched_frames_are_reported(fibre_camera):
         read(camera, [np.zeros((64, 64), np.uint16)], [1.0], darks)
 
 
-def test_hot_pixels_in_a_spot_do_not_show(fibre_camera, brackets_s):
-    quiet = fibre_camera(np.random.default_rng(17), hot=0)
+def test_hot_pixels_in_a_spot_do_not_show(fiber_camera, brackets_s):
+    quiet = fiber_camera(np.random.default_rng(17), hot=0)
     x, y = quiet.places[20].round().astype(int)
     quiet.dark[y - 2, x + 3] = 300.0
     quiet.dark[y + 5, x - 4] = 90.0
@@ -186,8 +186,8 @@ def test_hot_pixels_in_a_spot_do_not_show(fibre_camera, brackets_s):
     assert_consistent(((readings.signal - truth) / readings.stderr)[20])
 
 
-def test_many_hot_pixels_make_a_spot_invalid(fibre_camera, brackets_s):
-    camera = fibre_camera(np.random.default_rng(17), hot=0)
+def test_many_hot_pixels_make_a_spot_invalid(fiber_camera, brackets_s):
+    camera = fiber_camera(np.random.default_rng(17), hot=0)
     x, y = camera.places[20].round().astype(int)
     camera.dark[y - 8 : y + 9, x - 8 : x + 9] = 300.0
     light = np.full((28, 3), 3.0)
@@ -217,8 +217,8 @@ def test_bright_light_merges_like_bracket_merge(bench, all_brackets_s):
     assert np.median(ratio) == pytest.approx(1.0, abs=0.02)
 
 
-def test_error_falls_with_exposure_as_electron_counts_predict(fibre_camera):
-    camera = fibre_camera(np.random.default_rng(19))
+def test_error_falls_with_exposure_as_electron_counts_predict(fiber_camera):
+    camera = fiber_camera(np.random.default_rng(19))
     light = np.full((28, 3), 100.0)
     darks = camera.darks()
     short, long = (
@@ -229,8 +229,8 @@ def test_error_falls_with_exposure_as_electron_counts_predict(fibre_camera):
     assert np.median(short / long) == pytest.approx(predicted, rel=0.05)
 
 
-def test_monochrome_camera_is_read_as_single_channel(fibre_camera, brackets_s):
-    camera = fibre_camera(np.random.default_rng(31))
+def test_monochrome_camera_is_read_as_single_channel(fiber_camera, brackets_s):
+    camera = fiber_camera(np.random.default_rng(31))
     gray = dataclasses.replace(camera.noise, pattern="MONO")
     light = np.full((28, 3), 50.0)
     frames = camera.series(light, brackets_s)
@@ -242,8 +242,8 @@ def test_monochrome_camera_is_read_as_single_channel(fibre_camera, brackets_s):
     assert_consistent((readings.signal - truth) / readings.stderr)
 
 
-def test_sums_scale_with_aperture_not_surrounding_light(fibre_camera):
-    camera = fibre_camera(np.random.default_rng(23), veil=1e-4)
+def test_sums_scale_with_aperture_not_surrounding_light(fiber_camera):
+    camera = fiber_camera(np.random.default_rng(23), veil=1e-4)
     light = np.full((28, 3), 100.0)
     times = (1.0, 10.0)
     merged = merge_series(
@@ -257,8 +257,8 @@ def test_sums_scale_with_aperture_not_surrounding_light(fibre_camera):
         assert np.median(readings.around) == pytest.approx(expected, rel=0.05)
 
 
-def test_light_durations_differing_from_exposures_give_same_rates(fibre_camera, rng):
-    camera = fibre_camera(rng)
+def test_light_durations_differing_from_exposures_give_same_rates(fiber_camera, rng):
+    camera = fiber_camera(rng)
     light = np.full((28, 3), 100.0)
     darks = camera.darks()
     exposures = np.array([1.0, 5.0, 20.0])
@@ -275,8 +275,8 @@ def test_light_durations_differing_from_exposures_give_same_rates(fibre_camera, 
         read(camera, frames, exposures, darks, light_s=[1.0, 5.0, 0.0])
 
 
-def test_unsteady_source_is_detected_in_frames(fibre_camera, brackets_s, five_decades):
-    camera = fibre_camera(np.random.default_rng(29))
+def test_unsteady_source_is_detected_in_frames(fiber_camera, brackets_s, five_decades):
+    camera = fiber_camera(np.random.default_rng(29))
     ripple = np.random.default_rng(1).normal(1, 0.01, 12)
     rate = camera.rate(five_decades)
     frames = [camera.expose(rate * f, t) for f, t in zip(ripple, brackets_s, strict=True)]

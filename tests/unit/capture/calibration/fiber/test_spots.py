@@ -1,4 +1,4 @@
-"""Spots of the fibres are found by themselves, in order, with errors that hold."""
+"""Spots of the fibers are found by themselves, in order, with errors that hold."""
 
 import numpy as np
 import pytest
@@ -26,8 +26,8 @@ def falling():
     return np.geomspace(1e5, 50.0, 28)[:, None] * np.array([0.6, 1.0, 0.5])
 
 
-def test_displaced_spots_on_rotated_row_found_within_errors(rng, fibre_camera, falling):
-    camera = fibre_camera(rng)
+def test_displaced_spots_on_rotated_row_found_within_errors(rng, fiber_camera, falling):
+    camera = fiber_camera(rng)
     spots = find(camera, falling)
     assert spots.found.all()
     assert spots.findings == ()
@@ -43,17 +43,17 @@ def test_displaced_spots_on_rotated_row_found_within_errors(rng, fibre_camera, f
 
 
 @pytest.mark.parametrize("shift", [(5.0, 5.0), (-5.0, -5.0), (-15.0, 8.0)])
-def test_row_shifted_as_whole_is_found(rng, fibre_camera, falling, shift):
-    camera = fibre_camera(rng, shift=shift)
+def test_row_shifted_as_whole_is_found(rng, fiber_camera, falling, shift):
+    camera = fiber_camera(rng, shift=shift)
     spots = find(camera, falling)
     np.testing.assert_allclose(spots.center_px, camera.places, atol=0.1)
     np.testing.assert_allclose(spots.shift_px, shift, atol=1.0)
 
 
-def test_dark_fiber_is_reported_at_its_expected_position(rng, fibre_camera, falling):
+def test_dark_fiber_is_reported_at_its_expected_position(rng, fiber_camera, falling):
     light = falling.copy()
     light[11] = 0.0
-    camera = fibre_camera(rng)
+    camera = fiber_camera(rng)
     spots = find(camera, light)
     assert np.flatnonzero(~spots.found).tolist() == [11]
     assert np.linalg.norm(spots.center_px[11] - camera.places[11]) < 4
@@ -61,16 +61,16 @@ def test_dark_fiber_is_reported_at_its_expected_position(rng, fibre_camera, fall
     assert "dark" in spots.findings[0]
 
 
-def test_foreign_spot_is_reported_with_position(rng, fibre_camera, falling):
-    camera = fibre_camera(rng)
+def test_foreign_spot_is_reported_with_position(rng, fiber_camera, falling):
+    camera = fiber_camera(rng)
     camera.places[20, 1] -= 38.0
-    other = fibre_camera(np.random.default_rng(3), places=camera.places)
+    other = fiber_camera(np.random.default_rng(3), places=camera.places)
     with pytest.raises(FiberSpotError, match=r"28 spots, of which 1 .*x 8\d\d, y 2\d px"):
         find(other, falling)
 
 
-def test_missing_light_and_too_few_spots_are_distinguished(rng, fibre_camera, falling):
-    camera = fibre_camera(rng)
+def test_missing_light_and_too_few_spots_are_distinguished(rng, fiber_camera, falling):
+    camera = fiber_camera(rng)
     with pytest.raises(FiberSpotError, match="found none"):
         find(camera, np.zeros((28, 3)))
     light = falling.copy()
@@ -79,12 +79,12 @@ def test_missing_light_and_too_few_spots_are_distinguished(rng, fibre_camera, fa
         find(camera, light)
 
 
-def test_merging_spots_are_resolved_by_single_uncovered_frames(rng, fibre_camera):
-    nominal = fibre_camera(rng, shift=(0, 0), turn_rad=0, jitter_px=0).places
+def test_merging_spots_are_resolved_by_single_uncovered_frames(rng, fiber_camera):
+    nominal = fiber_camera(rng, shift=(0, 0), turn_rad=0, jitter_px=0).places
     places = nominal.copy()
     places[8, 0] += 14.0
     places[9, 0] -= 14.0  # 14 px apart, each of a radius of 13
-    camera = fibre_camera(rng, places=places)
+    camera = fiber_camera(rng, places=places)
     light = np.full((28, 3), 2e3)
     masks = {}
     for i in (8, 9):
@@ -100,8 +100,8 @@ def test_merging_spots_are_resolved_by_single_uncovered_frames(rng, fibre_camera
     assert any("F09 and F10 end in one spot" in text for text in blind.findings)
 
 
-def test_cover_over_wrong_fiber_is_error(rng, fibre_camera, falling):
-    camera = fibre_camera(rng)
+def test_cover_over_wrong_fiber_is_error(rng, fiber_camera, falling):
+    camera = fiber_camera(rng)
     alone = np.zeros_like(falling)
     alone[5] = falling[5]
     with pytest.raises(
@@ -110,10 +110,10 @@ def test_cover_over_wrong_fiber_is_error(rng, fibre_camera, falling):
         find(camera, falling, masks={4: merged(camera, alone, (0.01, 0.1))})
 
 
-def test_spots_that_have_moved_since_are_followed(rng, fibre_camera, falling):
-    camera = fibre_camera(rng)
+def test_spots_that_have_moved_since_are_followed(rng, fiber_camera, falling):
+    camera = fiber_camera(rng)
     spots = find(camera, falling)
-    later = fibre_camera(rng, places=camera.places + np.array([1.3, -0.7]))
+    later = fiber_camera(rng, places=camera.places + np.array([1.3, -0.7]))
     followed, shift = spots.track(merged(later, falling), "RGGB")
     np.testing.assert_allclose(shift, [1.3, -0.7], atol=0.03)
     np.testing.assert_allclose(followed.center_px, later.places, atol=0.1)

@@ -1,4 +1,4 @@
-"""From profiles of a fibre probe to documents: errors that are shared, sites, directions."""
+"""From profiles of a fiber probe to documents: errors that are shared, sites, directions."""
 
 import json
 import math
@@ -25,8 +25,8 @@ def profile(site="cheek", *, angle=0.0, repeat=0, scale=1.0, common=0.0, noise=0
         RADIUS,
         *MEDIUM,
         g=0.825,
-        collection="fibre",
-        core_mm=PROBE.fibres[0].core_mm,
+        collection="fiber",
+        core_mm=PROBE.fibers[0].core_mm,
         source_core_mm=PROBE.source_core_mm,
     )
     value = np.repeat(scale * value[:, None], 3, axis=1)
@@ -36,7 +36,7 @@ def profile(site="cheek", *, angle=0.0, repeat=0, scale=1.0, common=0.0, noise=0
     return profile_fits.MeasuredProfile(
         Measurement(HeadPlacement(site, angle, repeat), 23, 1.0, 60.0, 5.0),
         FiberReflectance(
-            tuple(fibre.name for fibre in PROBE.fibres),
+            tuple(fiber.name for fiber in PROBE.fibers),
             RADIUS,
             value,
             (noise * value) ** 2,
@@ -156,7 +156,7 @@ def test_profile_dimmed_by_top_layer_fits_to_factor():
 
 
 def test_independently_outlying_fibers_do_not_indicate_layers():
-    """Twenty draws of 5 % a fibre, as of dirt since the calibration; none is stated as noise."""
+    """Twenty draws of 5 % a fiber, as of dirt since the calibration; none is stated as noise."""
     rng = np.random.default_rng(8)
     torn = [profile(noise=1e-3, repeat=k) for k in range(20)]
     for one in torn:

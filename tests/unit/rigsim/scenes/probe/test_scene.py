@@ -1,4 +1,4 @@
-"""From light in the fibres to raw frames of the fibre probe, against closed forms."""
+"""From light in the fibers to raw frames of the fiber probe, against closed forms."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def noiseless(scene):
     return ProbeScene(RIG, scene.tissue, build=build, sensor=quiet, photons=1)
 
 
-def lit(exposure_s, *, level=1.0, fibre=None):
-    return [SourceLight(level, 0.0, exposure_s, fibre)]
+def lit(exposure_s, *, level=1.0, fiber=None):
+    return [SourceLight(level, 0.0, exposure_s, fiber)]
 
 
 def test_spot_center_reaches_eight_tenths_in_shortest_exposure():
@@ -100,7 +100,7 @@ def test_spots_are_at_actual_positions_off_nominal(scene):
     flux = images.sum(axis=(1, 2))
     found = np.stack([(images * x).sum(axis=(1, 2)), (images * y).sum(axis=(1, 2))], axis=1)
     np.testing.assert_allclose(found / flux[:, None], scene.build.spot_px, atol=0.01)
-    nominal = np.array([fibre.spot_px for fibre in RIG.probe.fibres])
+    nominal = np.array([fiber.spot_px for fiber in RIG.probe.fibers])
     off = np.linalg.norm(scene.build.spot_px - nominal, axis=1)
     assert 0.5 < off.mean() < 6.0
 
@@ -242,7 +242,7 @@ def test_invalid_exposure_requests_are_refused(scene):
             "cam", pops=[SourceLight(1.0, 1.0, 0.5, None)], exposure_s=1.0, seed=0, head=CHEEK
         )
     with pytest.raises(SceneError, match="fiber: got 28"):
-        scene.exposure("cam", pops=lit(1.0, fibre=28), exposure_s=1.0, seed=0, head=CHEEK)
+        scene.exposure("cam", pops=lit(1.0, fiber=28), exposure_s=1.0, seed=0, head=CHEEK)
     with pytest.raises(SceneError, match="contact probe"):
         ProbeScene(load_rig("dome"), scene.tissue)
     with pytest.raises(ProbeBuildError, match="gain"):

@@ -20,25 +20,25 @@ from rigsim.scenes.probe.scene import probe_truth as ground_truth
 from rigsim.tissue.tissue_mc import Layer, LayerStack
 
 RIG = load_rig("probe")
-FIBRES = FiberGeometry(RIG.probe.radius_mm)
+FIBERS = FiberGeometry(RIG.probe.radius_mm)
 FALSE_ALARM = 4.5  # standard deviations; of some 100 normal values one in 1500 runs exceeds it
 
 
 @pytest.mark.parametrize(("sigma_a", "scattering"), [(0.04, 1.5), (0.3, 2.0)])
 def test_stored_profile_matches_traced_photons(sigma_a, scattering):
-    """28 z values; photons of their own with fibres of their own size against scaled points."""
+    """28 z values; photons of their own with fibers of their own size against scaled points."""
     layer = Layer(inf, sigma_a, scattering / 0.2, 0.8, 1.4)
     traced = trace_fiber_profile(
         LayerStack((layer,)),
-        radii_mm=FIBRES.radii_mm,
+        radii_mm=FIBERS.radii_mm,
         photons=15_000,
         rng=np.random.default_rng(7),
         batches=40,
     )
-    value, error = FiberTable.load().profile(sigma_a, scattering, FIBRES)
+    value, error = FiberTable.load().profile(sigma_a, scattering, FIBERS)
     z = (traced.reflectance_per_mm2 - value) / np.hypot(traced.stderr, error)
     assert np.abs(z).max() < FALSE_ALARM
-    wrong, _ = FiberTable.load().profile(1.3 * sigma_a, scattering, FIBRES)
+    wrong, _ = FiberTable.load().profile(1.3 * sigma_a, scattering, FIBERS)
     assert np.abs((traced.reflectance_per_mm2 - wrong) / traced.stderr).max() > FALSE_ALARM
 
 
@@ -46,32 +46,32 @@ def test_stored_profile_matches_traced_photons(sigma_a, scattering):
     ("sigma_a", "scattering"), [(0.02, 1.0), (0.1, 2.5), (0.5, 3.0), (0.9, 2.4)]
 )
 def test_nearest_medium_of_homogeneous_medium_is_itself(sigma_a, scattering):
-    """Photons' noise on every fibre; the fit's error is a fraction of one fibre's."""
-    value, _ = FiberTable.load().profile(sigma_a, scattering, FIBRES)
+    """Photons' noise on every fiber; the fit's error is a fraction of one fiber's."""
+    value, _ = FiberTable.load().profile(sigma_a, scattering, FIBERS)
     noise = 0.01
     noisy = value * (1.0 + noise * np.random.default_rng(3).standard_normal(28))
-    fit = fit_homogeneous_medium(noisy, FIBRES)
+    fit = fit_homogeneous_medium(noisy, FIBERS)
     true = math.sqrt(3.0 * sigma_a * (sigma_a + scattering))
-    # 1 % noise in 10 or more fibres over at least 2 mm: sigma_tr to well under a per cent
+    # 1 % noise in 10 or more fibers over at least 2 mm: sigma_tr to well under a per cent
     assert fit.sigma_tr_per_mm == pytest.approx(true, rel=0.02)
     assert abs(math.log(fit.sigma_a_per_mm / sigma_a)) < 0.1
     assert fit.residual == pytest.approx(noise, rel=0.6)
-    assert fit.fibres == int((value >= MIN_REFLECTANCE_PER_MM2).sum())
+    assert fit.fibers == int((value >= MIN_REFLECTANCE_PER_MM2).sum())
 
 
 def test_the_fit_finds_out_a_wrong_medium():
-    value, _ = FiberTable.load().profile(0.1, 2.0, FIBRES)
-    other, _ = FiberTable.load().profile(0.11, 2.0, FIBRES)
-    told = fit_homogeneous_medium(other, FIBRES)
+    value, _ = FiberTable.load().profile(0.1, 2.0, FIBERS)
+    other, _ = FiberTable.load().profile(0.11, 2.0, FIBERS)
+    told = fit_homogeneous_medium(other, FIBERS)
     assert abs(told.sigma_a_per_mm / 0.1 - 1.0) > 0.08
-    bent = fit_homogeneous_medium(value * (1.0 + 0.3 * np.cos(np.arange(28.0))), FIBRES)
+    bent = fit_homogeneous_medium(value * (1.0 + 0.3 * np.cos(np.arange(28.0))), FIBERS)
     assert bent.residual > 0.15
 
 
 def test_factor_is_free_only_where_layer_may_dim():
-    value, _ = FiberTable.load().profile(0.1, 2.0, FIBRES)
+    value, _ = FiberTable.load().profile(0.1, 2.0, FIBERS)
     free, fixed = (
-        fit_homogeneous_medium(0.5 * value, FIBRES, dimmed=dimmed) for dimmed in (True, False)
+        fit_homogeneous_medium(0.5 * value, FIBERS, dimmed=dimmed) for dimmed in (True, False)
     )
     assert free.factor == pytest.approx(0.5, rel=1e-3)
     assert free.residual < 1e-3
@@ -82,9 +82,9 @@ def test_factor_is_free_only_where_layer_may_dim():
 
 def test_unfittable_profile_is_refused():
     with pytest.raises(FitError, match="bright"):
-        fit_homogeneous_medium(np.full(28, 1e-9), FIBRES)
+        fit_homogeneous_medium(np.full(28, 1e-9), FIBERS)
     with pytest.raises(FiberTableError, match="inside the table"):
-        FiberTable.load().profile(0.1, 9.0, FIBRES)
+        FiberTable.load().profile(0.1, 9.0, FIBERS)
 
 
 def test_truth_of_gray_medium_is_its_own(tmp_path):

@@ -1,6 +1,6 @@
-"""Make ``rigsim/data/white_fibre_mc.npz``: light collected by fibers on half spaces.
+"""Make ``rigsim/data/white_fiber_mc.npz``: light collected by fibers on half spaces.
 
-    python tools/make_white_fibre.py WORK [--photons-scale 1] [--threads 1] [--seed 20600]
+    python tools/make_white_fiber.py WORK [--photons-scale 1] [--threads 1] [--seed 20600]
 
 A few media of increasing absorption are traced with sigma_s' = 1 per mm; their photons' path
 lengths give every larger absorption. The estimates of all media that are informative at an
