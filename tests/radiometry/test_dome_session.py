@@ -28,7 +28,8 @@ class Pulse:
 
 moving, cameras = sys.argv[1] == "moving", int(sys.argv[2])
 rig = load_rig("dome")
-scene = DomeScene(rig, make_subject("III", size=1024), motion=draw_head_motion(1) if moving else None,
+scene = DomeScene(rig, make_subject("III", size=1024),
+                  motion=draw_head_motion(1) if moving else None,
                   effects=SceneEffects(lateral=False, interreflections=False))
 start = time.perf_counter()
 peaks = []

@@ -89,7 +89,7 @@ def test_a_document_that_is_damaged_is_named(maps, capsys):
         (r"coverage below (\d+) %", 100 * verdict.MIN_COVERAGE),
         (r"or above (\d+) %", 100 * verdict.MAX_COVERAGE),
         (r"more than (\d+) % masked", 100 * verdict.MAX_UNREMARKED_MASK),
-        (r"more than (\d+) % of the pixels differ by more than 3", 100 * map_comparison.MAX_FRACTION_BEYOND),
+        (r"more than (\d+) % of the pixels differ", 100 * map_comparison.MAX_FRACTION_BEYOND),
         (r"within (\d+) mm in the median", run_comparison.MAX_SAME_POINT_MM),
         (r"have (\d+) colors", map_images.SCALE_COLORS),
         (r"faces from the front \| (\d+)", FRONT_VIEW_WIDTH_PX),
