@@ -30,7 +30,7 @@ import numpy as np
 from capture import raw
 from capture.plan import Plan, Step
 from capture.rig import load_rig
-from capture.session import Session, Subject
+from capture.session import Session, SubjectRecord
 
 logging.disable(logging.WARNING)
 RIG = load_rig("flash").resized(16)
@@ -42,7 +42,7 @@ def write(path, acknowledged):
     if (path / "session.json").exists():
         session = Session.resume(path)
     else:
-        session = Session.create(path, plan=PLAN, rig=RIG, devices={}, subject=Subject("P1"),
+        session = Session.create(path, plan=PLAN, rig=RIG, devices={}, subject=SubjectRecord("P1"),
                                  source="simulated", session_id="killed")
     os.write(acknowledged, b"started ")
     for step, camera in session.pending_frames():

@@ -15,7 +15,7 @@ import json, resource, sys, time
 from dataclasses import dataclass
 from capture.rig import load_rig
 from rigsim.needs.effects import SceneEffects
-from rigsim.subject.head_motion import head_motion
+from rigsim.subject.head_motion import draw_head_motion
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject.person import make_subject
 
@@ -28,7 +28,8 @@ class Pulse:
 
 moving, cameras = sys.argv[1] == "moving", int(sys.argv[2])
 rig = load_rig("dome")
-scene = DomeScene(rig, make_subject("III", size=1024), motion=head_motion(1) if moving else None,
+scene = DomeScene(rig, make_subject("III", size=1024),
+                  motion=draw_head_motion(1) if moving else None,
                   effects=SceneEffects(lateral=False, interreflections=False))
 start = time.perf_counter()
 peaks = []

@@ -327,7 +327,7 @@ def test_text_disguised_as_photograph_gives_single_error_sentence(tmp_path, caps
     (tmp_path / "in" / "a.jpg").write_text("no photograph")
     assert main(["import", "photos", str(tmp_path / "in"), "--out", str(tmp_path / "s")]) == 3
     told = capsys.readouterr().err
-    assert "a.jpg: not a JPEG (first bytes: b'no p')" in told
+    assert "not a JPEG (first bytes: b'no p'), expected a photograph" in told
     assert told.count("expected") == 1
 
 

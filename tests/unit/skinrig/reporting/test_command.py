@@ -86,13 +86,13 @@ def test_a_document_that_is_damaged_is_named(maps, capsys):
 @pytest.mark.parametrize(
     ("words", "value"),
     [
-        (r"fewer than (\d+) %", 100 * verdict.MIN_COVERAGE),
-        (r"coverage of more than (\d+) %", 100 * verdict.MAX_COVERAGE),
-        (r"more than (\d+) % are masked", 100 * verdict.MAX_UNREMARKED_MASK),
-        (r"more than (\d+) % of pixels exceed 3", 100 * map_comparison.MAX_FRACTION_BEYOND),
+        (r"coverage below (\d+) %", 100 * verdict.MIN_COVERAGE),
+        (r"or above (\d+) %", 100 * verdict.MAX_COVERAGE),
+        (r"more than (\d+) % masked", 100 * verdict.MAX_UNREMARKED_MASK),
+        (r"more than (\d+) % of the pixels differ", 100 * map_comparison.MAX_FRACTION_BEYOND),
         (r"within (\d+) mm in the median", run_comparison.MAX_SAME_POINT_MM),
-        (r"has (\d+) colors", map_images.SCALE_COLORS),
-        (r"faces from the front (\d+)", FRONT_VIEW_WIDTH_PX),
+        (r"have (\d+) colors", map_images.SCALE_COLORS),
+        (r"faces from the front \| (\d+)", FRONT_VIEW_WIDTH_PX),
     ],
 )
 def test_documentation_page_on_reports_matches_program_numbers(words, value):

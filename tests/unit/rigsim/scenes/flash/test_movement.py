@@ -124,7 +124,7 @@ def test_states_without_movement_change_blood_only_as_reported(rest, smile, stil
     assert (still.truth()["hemoglobin"] != rest.truth()["hemoglobin"]).any()
     said = dict(still.omitted)
     assert said["movement of the face with the states"] == "movement=False requests it"
-    assert "movement of the face with the states" not in dict(smile.left_out)
+    assert "movement of the face with the states" not in dict(smile.omitted)
     assert smile.needs.builds("shadows of wrinkles")
 
 
