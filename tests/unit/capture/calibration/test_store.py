@@ -142,7 +142,7 @@ def test_single_altered_pixel_is_detected(calibration, tmp_path):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda d: d.update(schema="skinrig.calibration/2"), "skinrig.calibration/2"),
+        (lambda d: d.update(schema="skinrig.calibration/3"), "skinrig.calibration/3"),
         (lambda d: d.update(surprise=1), "surprise"),
         (lambda d: d.pop("rig"), "rig"),
         (lambda d: d.update(created="yesterday"), "calibrate again"),

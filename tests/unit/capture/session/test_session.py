@@ -317,7 +317,7 @@ def test_manifest_records_subject_plan_devices_and_source(tmp_path):
     assert opened.manifest.created_at == NOON
     assert opened.manifest.devices["flash"]["idn"].startswith("SKINRIG")
     assert {"skinrig", "python", "numpy"} <= set(opened.manifest.versions)
-    assert json.loads((tmp_path / "s/session.json").read_text())["schema"] == "skinrig.session/1"
+    assert json.loads((tmp_path / "s/session.json").read_text())["schema"] == "skinrig.session/2"
 
 
 def test_the_content_hash_vouches_for_every_commit(session):

@@ -96,4 +96,4 @@ def test_calibration_is_identified_by_contents_not_folder_name(tmp_path, given):
     places = [folder] if given == "folder" else [folder / "maps", folder / "mine"]
     html = report.build([*places, folder / "session"])
     assert "valid, 83 days left" in html
-    assert ">skinrig.calibration/1<" not in html
+    assert ">skinrig.calibration/2<" not in html
