@@ -291,14 +291,14 @@ def recipes():
         "flash": "Maps of the flash rig",
         "dome": "Maps of the dome",
         "gradient": "Maps of the gradient rig",
-        "probe": "Maps of the fibre probe",
+        "probe": "Maps of the fiber probe",
     }
     assert headings.keys() == RIG_KINDS.keys()
     found = {
         heading: importlib.import_module(f"reconstruction.pipeline.{kind}.recipe").RECIPE
         for kind, heading in headings.items()
     }
-    return {**found, "Maps of pictures under listed lights": pipeline.light_list_recipe()}
+    return {**found, "Maps of images under listed lights": pipeline.light_list_recipe()}
 
 
 def test_maps_page_lists_every_map_of_every_recipe():
@@ -316,7 +316,7 @@ def test_maps_page_lists_accompanying_files():
             "Files of the flash rig",
             "Files of the dome",
             "Files of the gradient rig",
-            "Files of the fibre probe",
+            "Files of the fiber probe",
         )
         for row in rows(MAPS_PAGE, heading)
     }
