@@ -157,7 +157,7 @@ def _truth_files(scene: Any, truth: SkinAppearance, seed: int) -> dict[str, byte
 def _landmarks(subject: Any) -> dict[str, list[float]]:
     """Return named points of the skin, x, y, z in mm, rig frame."""
     points = subject.surface_landmarks()
-    return dict(zip(points.names, points.on(subject.mesh).round(4).tolist(), strict=True))
+    return dict(zip(points.names, points.positions_on(subject.mesh).round(4).tolist(), strict=True))
 
 
 def _blend_shapes(subject: Any) -> bytes:

@@ -87,6 +87,28 @@ def test_every_python_block_is_an_example_that_runs():
     assert silent == []
 
 
+def exists(dotted):
+    """Whether a dotted name of a package is a module or an attribute of one."""
+    parts = dotted.split(".")
+    for end in range(len(parts), 0, -1):
+        try:
+            found = importlib.import_module(".".join(parts[:end]))
+        except ModuleNotFoundError:
+            continue
+        for name in parts[end:]:
+            found = getattr(found, name, None)
+        return found is not None
+    return False
+
+
+@named(GUIDES)
+def test_python_names_in_text_exist(page):
+    dotted = re.compile(rf"({'|'.join(PACKAGES)})(\.\w+)+")
+    names = [match[0] for span in SPAN.findall(prose(page)) if (match := dotted.fullmatch(span))]
+    # an entry point's group is not a module
+    assert [name for name in names if name != "capture.cameras" and not exists(name)] == []
+
+
 # wire --------------------------------------------------------------------------------------------
 
 
@@ -298,7 +320,7 @@ def recipes():
         heading: importlib.import_module(f"reconstruction.pipeline.{kind}.recipe").RECIPE
         for kind, heading in headings.items()
     }
-    return {**found, "Maps of pictures under listed lights": pipeline.light_list_recipe()}
+    return {**found, "Maps of images under listed lights": pipeline.light_list_recipe()}
 
 
 def test_maps_page_lists_every_map_of_every_recipe():

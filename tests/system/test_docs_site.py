@@ -27,6 +27,7 @@ SEARCHED = {
     "subsurface scattering": (
         "concepts/fiber-probe-inversion.html",
         "concepts/skin-reflectance.html",
+        "how-to/fiber-probe.html",
         "reference/glossary.html",
     ),
     "ground truth": (
@@ -34,10 +35,55 @@ SEARCHED = {
         "reference/maps.html",
         "reference/glossary.html",
     ),
-    "interreflection": ("concepts/omissions.html", "reference/glossary.html"),
-    "credible interval": ("concepts/uncertainty.html", "validation/flash-rig.html"),
-    "blood volume fraction": ("reference/maps.html", "reference/glossary.html"),
-    "specular": ("concepts/dome-reconstruction.html", "reference/maps.html"),
+    "interreflection": (
+        "concepts/omissions.html",
+        "validation/omissions.html",
+        "reference/glossary.html",
+    ),
+    "credible interval": (
+        "concepts/uncertainty.html",
+        "reference/maps.html",
+        "reference/glossary.html",
+        "validation/flash-rig.html",
+    ),
+    "blood volume fraction": (
+        "how-to/flash-rig.html",
+        "reference/maps.html",
+        "reference/glossary.html",
+    ),
+    "specular": (
+        "concepts/dome-reconstruction.html",
+        "how-to/flash-rig.html",
+        "reference/maps.html",
+    ),
+    "illumination": (
+        "concepts/nagano2015.html",
+        "concepts/skin-reflectance.html",
+        "reference/glossary.html",
+    ),
+    "photometric stereo": (
+        "how-to/image-stacks.html",
+        "concepts/dome-reconstruction.html",
+        "reference/glossary.html",
+    ),
+    "olat": ("how-to/light-dome.html", "concepts/weyrich2006.html", "reference/glossary.html"),
+    "rti": (
+        "tutorials/rti-to-normals.html",
+        "how-to/image-stacks.html",
+        "reference/requirements.html",
+        "reference/glossary.html",
+    ),
+    "white reference": (
+        "how-to/calibrate-flash.html",
+        "how-to/flash-rig.html",
+        "reference/glossary.html",
+    ),
+    "basis brdf": (
+        "how-to/light-dome.html",
+        "concepts/dome-reconstruction.html",
+        "reference/maps.html",
+        "reference/glossary.html",
+    ),
 }
 """Terms of the field, and the pages where one looks for them."""
 
@@ -92,6 +138,25 @@ def test_rig_drawings_match_their_rig_files(tmp_path, monkeypatch):
     assert len(made) == 4
     for path in made:
         assert path.read_text("utf-8") == (DOCS / "images" / path.name).read_text("utf-8")
+
+
+def test_gallery_images_are_small_and_made_by_its_script():
+    page = (DOCS / "gallery/index.md").read_text("utf-8")
+    shown = set(re.findall(r"\.\./images/([\w.-]+)\)", page))
+    tools = [path.read_text("utf-8") for path in sorted((ROOT / "tools").glob("make_*.py"))]
+    named = [name for name in shown if not any(name in text for text in tools)]
+    # names of chromophores are filled in
+    assert set(named) <= {"gallery-melanin.png", "gallery-hemoglobin.png"}
+    assert sum((DOCS / "images" / name).stat().st_size for name in shown) < 1.5e6
+
+
+@pytest.mark.parametrize("term", SEARCHED)
+def test_terms_of_the_field_occur_on_their_pages(term):
+    texts = {
+        page: (DOCS / page).with_suffix(".md").read_text("utf-8").lower() for page in SEARCHED[term]
+    }
+    found = re.compile(rf"\b{term.replace(' ', chr(92) + 's+')}s?\b")
+    assert [page for page, text in texts.items() if not found.search(text)] == []
 
 
 # the built site ----------------------------------------------------------------------------------
@@ -167,7 +232,7 @@ def test_search_index_finds_terms_of_the_field(site):
         found = {
             entry["location"].partition("#")[0]
             for entry in index["docs"]
-            if term in f"{entry['title']} {entry['text']}".lower()
+            if re.search(rf"\b{term}s?\b", f"{entry['title']} {entry['text']}".lower())
         }
         missing += [(term, page) for page in pages if page not in found]
     assert missing == []
