@@ -36,7 +36,7 @@ def pareto_front(points: tuple[Point, ...]) -> tuple[int, ...]:
     return tuple(front)
 
 
-def knee(points: tuple[Point, ...]) -> int | None:
+def find_knee(points: tuple[Point, ...]) -> int | None:
     """Return the front point after which more seconds buy least, or None below 3 points.
 
     The point of the front that lies farthest below the straight line between its ends, on
@@ -51,14 +51,14 @@ def knee(points: tuple[Point, ...]) -> int | None:
     return front[int(np.argmax(line - log_e))]
 
 
-def fronts(stage: StageBenchmark) -> list[dict[str, Any]]:
+def find_fronts(stage: StageBenchmark) -> list[dict[str, Any]]:
     """Return the front and the knee of each condition that a stage measures.
 
     Returns
     -------
     list of dict
         ``condition``: knobs with the values that all its points share; ``points``: numbers of the
-        points on its front, the quickest first; ``knee``: number of one of them, or None.
+        points on its front, the quickest first; ``find_knee``: number of one of them, or None.
     """
     groups: dict[tuple[Any, ...], list[int]] = {}
     for number, point in enumerate(stage.points):
@@ -67,7 +67,7 @@ def fronts(stage: StageBenchmark) -> list[dict[str, Any]]:
     found = []
     for key, numbers in groups.items():
         some = tuple(stage.points[n] for n in numbers)
-        bend = knee(some)
+        bend = find_knee(some)
         found.append(
             {
                 "condition": dict(zip(stage.condition, key, strict=True)),
@@ -78,7 +78,7 @@ def fronts(stage: StageBenchmark) -> list[dict[str, Any]]:
     return found
 
 
-def machine() -> dict[str, Any]:
+def describe_machine() -> dict[str, Any]:
     """Say what ran the benchmark, without naming the machine."""
     return {
         "python": platform.python_version(),
@@ -93,7 +93,7 @@ def to_document(stages: Iterable[StageBenchmark]) -> dict[str, Any]:
     stages = list(stages)
     document: dict[str, Any] = {
         "schema": SCHEMA,
-        "machine": machine(),
+        "machine": describe_machine(),
         "skin_bands": {name: band.to_dict() for name, band in skin_bands.MELANIN_BANDS.items()},
         "stages": {stage.name: _stage(stage) for stage in stages},
     }
@@ -103,7 +103,7 @@ def to_document(stages: Iterable[StageBenchmark]) -> dict[str, Any]:
 
 
 def _stage(stage: StageBenchmark) -> dict[str, Any]:
-    found = fronts(stage)
+    found = find_fronts(stage)
     on_front = {number for front in found for number in front["points"]}
     knees = {front["knee"] for front in found}
     names = ("error_name", "reference", "reference_error", "reference_error_means", "interval_of")
@@ -119,7 +119,7 @@ def _stage(stage: StageBenchmark) -> dict[str, Any]:
         ],
         "fronts": found,
         "limits": [asdict(limit) | {"passed": limit.passed} for limit in stage.limits],
-        "left_out": [list(item) for item in stage.left_out],
+        "left_out": [list(item) for item in stage.omitted],
         "by_band": [_band(name, error) for name, error in stage.by_band.items()],
         "darkest_over_lightest": _dark_to_light_ratio(stage.by_band),
         "no_bands": stage.no_bands or None,
@@ -131,13 +131,13 @@ def _point(point: Point, *, squared: bool) -> dict[str, Any]:
     memory = point.timing.peak_memory_mb
     return {
         "knobs": dict(point.knobs),
-        "also": dict(point.also),
+        "also": dict(point.extra_values),
         "seconds": point.timing.seconds,
-        "seconds_spread": list(point.timing.spread_s),
+        "seconds_spread": list(point.timing.range_s),
         "cold_seconds": point.timing.cold_s,
         "peak_memory_mb": memory,
-        "memory_of": point.timing.memory_of if memory is not None else None,
-        "no_memory": None if memory is not None else point.timing.no_memory,
+        "memory_of": point.timing.memory_kind if memory is not None else None,
+        "no_memory": None if memory is not None else point.timing.no_memory_reason,
         "error": point.error,
         "error_interval": list(point.error_interval),
         "cramer_rao_bound": point.cramer_rao_bound,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from skinrig.drawing import figures, point_names
 
 
-def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
+def plot_error_against_time(stage: str, document: Mapping[str, Any]) -> str:
     """Draw one stage of a benchmark document: error against seconds, log-log.
 
     Parameters

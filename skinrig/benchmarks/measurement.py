@@ -72,10 +72,10 @@ def measure_and_keep(
     traced = memory is not None and (memory or min(seconds) < MAX_TRACED_CALL_S)
     timing = Timing(
         seconds=float(np.median(seconds)),
-        spread_s=(min(seconds), max(seconds)),
+        range_s=(min(seconds), max(seconds)),
         cold_s=cold,
         peak_memory_mb=_allocated_mb(call) if traced else rise.mb,
-        memory_of="allocated" if traced else "resident",
+        memory_kind="allocated" if traced else "resident",
     )
     return timing, made[0]
 
@@ -96,7 +96,7 @@ def measure_processor_time(call: Callable[[], Made], repeats: int = 1) -> tuple[
     return seconds, made
 
 
-def processor_seconds(call: Callable[[], object], repeats: int = 1) -> float:
+def measure_processor_seconds(call: Callable[[], object], repeats: int = 1) -> float:
     """Return the least processor time of some calls, s.
 
     Examples
@@ -125,7 +125,7 @@ def measure_once(call: Callable[[], Made]) -> tuple[Timing, Made]:
         start = time.perf_counter()
         made = call()
         seconds = time.perf_counter() - start
-    return Timing.single(seconds, rise.mb, memory_of="resident"), made
+    return Timing.single(seconds, rise.mb, memory_kind="resident"), made
 
 
 def _allocated_mb(call: Callable[[], Any]) -> float:

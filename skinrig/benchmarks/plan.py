@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from skinrig.benchmarks.stage import descriptions
+from skinrig.benchmarks.stage import read_descriptions
 
 TIME_SAFETY_FACTOR: Final = 1.25
 """A stage begins if so many times what it should take is left."""
@@ -80,12 +80,12 @@ def order_full_stages(
 
 
 SMALL_S: Final[dict[str, float]] = {
-    name: entry["small_s"] for name, entry in descriptions().items() if "small_s" in entry
+    name: entry["small_s"] for name, entry in read_descriptions().items() if "small_s" in entry
 }
 """Processor seconds at small size of the stages that take more than about one."""
 
 FULL_S: Final[dict[str, float]] = {
-    name: entry["full_s"] for name, entry in descriptions().items() if "full_s" in entry
+    name: entry["full_s"] for name, entry in read_descriptions().items() if "full_s" in entry
 }
 """About how many seconds each takes at full size on two cores that do nothing else: of a run alone,
 the processor seconds of the main thread and half of those of all others, which share two cores.

@@ -16,16 +16,16 @@ class Timing:
 
     seconds: float
     """Median of the warm calls, s."""
-    spread_s: tuple[float, float]
+    range_s: tuple[float, float]
     """Fastest and slowest warm call, s."""
     cold_s: float
     """The first call, with compilation and caches to fill, s."""
     peak_memory_mb: float | None
     """Most memory held during a call, MB; None: not measured."""
-    memory_of: Literal["allocated", "resident"] = "allocated"
+    memory_kind: Literal["allocated", "resident"] = "allocated"
     """Whether that is what Python and NumPy allocated, or how far the process's resident memory
     rose."""
-    no_memory: str = "this system does not tell"
+    no_memory_reason: str = "this system does not tell"
     """Why it was not measured, where it was not."""
 
     @classmethod
@@ -47,7 +47,7 @@ class Point:
     """68 % interval of ``error``."""
     cramer_rao_bound: float | None = None
     """Least error that any unbiased estimator could have, same unit; None: not known."""
-    also: Mapping[str, Knob] = field(default_factory=dict)
+    extra_values: Mapping[str, Knob] = field(default_factory=dict)
     """What else was measured at this setting; no knob."""
 
     def efficiency(self, *, squared: bool = False) -> tuple[float, float, float] | None:
@@ -133,7 +133,7 @@ class StageBenchmark:
     """How far the reference itself may be off, in the error's unit."""
     points: tuple[Point, ...] = ()
     limits: tuple[Limit, ...] = ()
-    left_out: tuple[tuple[str, str], ...] = ()
+    omitted: tuple[tuple[str, str], ...] = ()
     """What this run did not measure, and why."""
     by_band: Mapping[str, ErrorEstimate] = field(default_factory=dict)
     """Error by melanin band, from light to dark, same unit; see `skinrig.evaluating.skin_bands`."""

@@ -19,7 +19,7 @@ numbered braces of the limit's name; beside a value may stand its bound, where t
 
 
 @cache
-def descriptions() -> dict[str, dict[str, Any]]:
+def read_descriptions() -> dict[str, dict[str, Any]]:
     """Return the description of every stage by its name, in the order of the table."""
     return tomllib.loads(STAGES_TABLE.read_text(encoding="utf-8"))
 
@@ -37,11 +37,11 @@ class BenchmarkStage:
     """Those without a finding are not judged."""
     by_band: dict[str, ErrorEstimate] = field(default_factory=dict)
     """Errors by melanin band."""
-    left_out: list[tuple[str, str]] = field(default_factory=list)
+    omitted: list[tuple[str, str]] = field(default_factory=list)
     """What this run did not measure, and why, beside what no run does."""
     reference_error: float | None = None
     """How far the reference may be off; None: as described, or not at all."""
-    words: dict[str, object] = field(default_factory=dict)
+    description_values: dict[str, object] = field(default_factory=dict)
     """Fill the braces of the description."""
 
     def time(
@@ -66,11 +66,13 @@ class BenchmarkStage:
         knobs: Mapping[str, Knob],
         timing: Timing,
         outcome: ErrorEstimate,
-        also: Mapping[str, Knob] | None = None,
+        extra_values: Mapping[str, Knob] | None = None,
     ) -> ErrorEstimate:
         """Add a point, with what else was measured at its setting, and return its error."""
         low_to_high, bound = outcome.error_interval, outcome.cramer_rao_bound
-        self.points.append(Point(knobs, timing, outcome.error, low_to_high, bound, also or {}))
+        self.points.append(
+            Point(knobs, timing, outcome.error, low_to_high, bound, extra_values or {})
+        )
         return outcome
 
     def measure(
@@ -79,7 +81,7 @@ class BenchmarkStage:
         call: Callable[[], Made],
         error: Callable[[Made], ErrorEstimate],
         *,
-        also: Mapping[str, Knob] | None = None,
+        extra_values: Mapping[str, Knob] | None = None,
         repeats: int | None = None,
         memory: bool | None = True,
     ) -> ErrorEstimate:
@@ -106,9 +108,9 @@ class BenchmarkStage:
         ErrorEstimate(error=6.0, error_interval=(5.0, 7.0), cramer_rao_bound=None)
         """
         timing, made = self.time(call, repeats=repeats, memory=memory)
-        return self.add(knobs, timing, error(made), also)
+        return self.add(knobs, timing, error(made), extra_values)
 
-    def at(self, **knobs: Knob) -> Point:
+    def find_point(self, **knobs: Knob) -> Point:
         """Return the first point whose knobs are set to these."""
         return next(point for point in self.points if knobs.items() <= point.knobs.items())
 
@@ -118,15 +120,15 @@ class BenchmarkStage:
 
     def to_benchmark(self) -> StageBenchmark:
         """Return what was found so far with the stage's description."""
-        entry, error = descriptions()[self.name], self.reference_error
+        entry, error = read_descriptions()[self.name], self.reference_error
         return StageBenchmark(
             self.name,
             entry["error_name"],
-            entry["reference"].format(**self.words),
+            entry["reference"].format(**self.description_values),
             entry.get("reference_error", 0.0) if error is None else error,
             tuple(self.points),
             tuple(self._limit(entry["limits"], key) for key in self.limits),
-            (*((what, why) for what, why in entry.get("left_out", ())), *self.left_out),
+            (*((what, why) for what, why in entry.get("left_out", ())), *self.omitted),
             dict(self.by_band),
             entry.get("no_bands", ""),
             tuple(entry.get("condition", ())),
@@ -137,7 +139,7 @@ class BenchmarkStage:
     def _limit(self, table: Mapping[str, Mapping[str, Any]], key: str | tuple[Any, ...]) -> Limit:
         first, *parts = (key,) if isinstance(key, str) else key
         entry, found = table[first], self.limits[key]
-        name, unit = entry["name"].format(*parts, **self.words), entry.get("unit", "")
+        name, unit = entry["name"].format(*parts, **self.description_values), entry.get("unit", "")
         got, bound = found if isinstance(found, tuple) else (found, None)
         if "at_most" in entry:
             return Limit(name, got, entry["at_most"] if bound is None else bound, "<=", unit)

@@ -13,11 +13,11 @@ from skinrig.benchmarks import plan as bench_plan
 from skinrig.benchmarks import table as bench_table
 from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.results import StageBenchmark
-from skinrig.benchmarks.stage import BenchmarkStage, descriptions
+from skinrig.benchmarks.stage import BenchmarkStage, read_descriptions
 from skinrig.console import Console, to_json_value
 from skinrig.errors import EXTRA_MISSING, exit_code, sentence
 
-STAGES: dict[str, str] = {name: entry["run"] for name, entry in descriptions().items()}
+STAGES: dict[str, str] = {name: entry["run"] for name, entry in read_descriptions().items()}
 """Module and function of each; a module is imported, and its kernels compiled, when it is run."""
 
 
@@ -107,7 +107,7 @@ class _Run:
     done: dict[str, StageBenchmark] = field(default_factory=dict)
     size: dict[str, Size] = field(default_factory=dict)
     compile_s: dict[str, float] = field(default_factory=dict)
-    left_out: list[tuple[str, str]] = field(default_factory=list)
+    omitted: list[tuple[str, str]] = field(default_factory=list)
 
     def measure(self, name: str, size: Size) -> float:
         """Measure a stage, if there is time, and return the seconds that it took."""
@@ -126,7 +126,7 @@ class _Run:
 
     def _measure(self, name: str, size: Size, began: float) -> None:
         if began > self.deadline_s:
-            self.left_out.append((name, "the budget was used up"))
+            self.omitted.append((name, "the budget was used up"))
             return
         self.console.progress(f"bench {name}, {size} size")
         try:
@@ -137,7 +137,7 @@ class _Run:
         except ImportError as error:
             if self.asked or exit_code(error) != EXTRA_MISSING:
                 raise
-            self.left_out.append((name, sentence(error)))
+            self.omitted.append((name, sentence(error)))
             return
         self._take(name, made, size)
 
@@ -162,7 +162,7 @@ class _Run:
         """Return the document of the run."""
         document = to_document(list(self.done.values()))
         document["toy"] = self.toy
-        document["left_out"] = [list(item) for item in self.left_out]
+        document["left_out"] = [list(item) for item in self.omitted]
         document["left_out"] += [[name, INTERRUPTED_REASON] for name in self.to_do]
         document["not_judged"] = [name for name, size in self.size.items() if size == "small"]
         for name, made in self.done.items():

@@ -81,7 +81,7 @@ def print_tables(document: Mapping[str, Any], console: Console) -> None:
         ),
         [_line(name, stage) for name, stage in document["stages"].items()],
     )
-    if found := bands(document):
+    if found := list_band_rows(document):
         console.print_line()
         console.rows(BAND_COLUMNS, found)
     for name, why in document["left_out"]:
@@ -93,7 +93,7 @@ def print_tables(document: Mapping[str, Any], console: Console) -> None:
         )
 
 
-def bands(document: Mapping[str, Any]) -> list[tuple[object, ...]]:
+def list_band_rows(document: Mapping[str, Any]) -> list[tuple[object, ...]]:
     """Return the rows of :data:`BAND_COLUMNS`: errors of each stage from light skin to dark."""
     rows: list[tuple[object, ...]] = []
     for name, stage in document["stages"].items():
@@ -116,7 +116,7 @@ def bands(document: Mapping[str, Any]) -> list[tuple[object, ...]]:
     return rows
 
 
-def write(document: Mapping[str, Any], out: Path) -> None:
+def write_tables(document: Mapping[str, Any], out: Path) -> None:
     """Write one table of all points, ``bench.csv``, one by band, and a plot a stage.
 
     Parameters
@@ -145,10 +145,10 @@ def write(document: Mapping[str, Any], out: Path) -> None:
     ]
     head = ("stage", "size", "setting", "error is", *_POINT_COLUMNS, "low", "high", "front", "knee")
     write_atomically(out / "bench.csv", _csv(head, rows))
-    write_atomically(out / "bench-bands.csv", _csv(BAND_COLUMNS, bands(document)))
+    write_atomically(out / "bench-bands.csv", _csv(BAND_COLUMNS, list_band_rows(document)))
     for name, stage in document["stages"].items():
         if stage["points"]:
-            plot = bench_figures.error_against_seconds(name, stage)
+            plot = bench_figures.plot_error_against_time(name, stage)
             write_atomically(out / f"{name}.svg", plot + "\n")
 
 

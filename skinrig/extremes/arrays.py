@@ -22,13 +22,13 @@ from skinrig.extremes.expectations import (
     expect_valid_fraction,
     expect_within,
 )
-from skinrig.extremes.inputs import InputPrecision, ring
+from skinrig.extremes.inputs import InputPrecision, ring_directions
 
 NON_FINITE_VALUES = (np.nan, np.inf, -np.inf)
 
 
 def _no_numbers_in_light(real: InputPrecision) -> str:
-    lights = ring(8, 0.6)
+    lights = ring_directions(8, 0.6)
     for bad in NON_FINITE_VALUES:
         seen = real(np.tile(lights[:, 2:, None], (1, 2, 2)))
         seen[3, 0, 1] = bad
@@ -143,7 +143,7 @@ def _missed_range(_: InputPrecision) -> str:
 
 
 def _mirror_and_chalk(real: InputPrecision) -> str:
-    lights = np.concatenate([ring(24, 0.6), ring(12, 0.3)])
+    lights = np.concatenate([ring_directions(24, 0.6), ring_directions(12, 0.3)])
     seen = np.zeros((36, 1, 3))
     seen[5, 0, 0] = 1.0  # a mirror: one light of all is seen in it
     seen[:, 0, 1] = lights[:, 2]  # chalk

@@ -15,13 +15,13 @@ from skinrig.extremes.expectations import (
     expect_valid_fraction,
     expect_within,
 )
-from skinrig.extremes.inputs import InputPrecision, ring, sheet_faces, stretched_sheet
+from skinrig.extremes.inputs import InputPrecision, ring_directions, sheet_faces, stretched_sheet
 
 INVALID_COEFFICIENTS = (np.nan, np.inf, -1.0)
 
 
 def _far_lights(real: InputPrecision) -> str:
-    way = ring(8, np.pi / 6)
+    way = ring_directions(8, np.pi / 6)
     normal = np.array([0.1, -0.2, np.sqrt(0.95)])
     lit = real((way @ normal)[:, None, None])
     infinite = stereo.estimate_normals(lit, way)
@@ -42,7 +42,7 @@ def _far_lights(real: InputPrecision) -> str:
 
 def _one_photon(real: InputPrecision) -> str:
     rng = np.random.default_rng(9)
-    way = ring(24, np.arcsin(0.6))
+    way = ring_directions(24, np.arcsin(0.6))
 
     def seen(photons: float) -> stereo.NormalMaps:
         electrons = rng.poisson(photons, (24, 1, 1, 2000)) + rng.standard_normal((24, 1, 1, 2000))

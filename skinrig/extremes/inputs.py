@@ -26,7 +26,7 @@ class InputPrecision:
         return self.dtype is np.float32
 
 
-def ring(count: int, tilt_rad: float) -> Float64Array:
+def ring_directions(count: int, tilt_rad: float) -> Float64Array:
     """Return directions (count, 3) at a tilt from +z, evenly around it.
 
     Examples

@@ -19,7 +19,7 @@ from skinrig.extremes.expectations import (
     expect_valid_fraction,
     expect_within,
 )
-from skinrig.extremes.inputs import InputPrecision, ring
+from skinrig.extremes.inputs import InputPrecision, ring_directions
 
 UP_NORMAL = np.array([0.0, 0.0, 1.0])
 
@@ -53,14 +53,14 @@ def _collinear(real: InputPrecision) -> str:
 
 
 def _all_shadowed(real: InputPrecision) -> str:
-    lights = ring(8, 0.6)
+    lights = ring_directions(8, 0.6)
     found = stereo.estimate_normals(real(np.zeros((8, 3, 3))), lights)
     expect_finite(found.normals, found.valid, label="normals")
     return expect_valid_fraction(found.valid)
 
 
 def _two_lights_left(real: InputPrecision) -> str:
-    lights = ring(8, 0.6)
+    lights = ring_directions(8, 0.6)
     seen = np.zeros((8, 1, 1), bool)
     seen[:2] = True
     found = stereo.estimate_normals(_lit(lights, UP_NORMAL, real), lights, valid=seen)
@@ -88,7 +88,7 @@ def _nearly_coplanar(real: InputPrecision) -> str:
 
 
 def _grazing(real: InputPrecision) -> str:
-    lights = ring(12, np.radians(89.9))
+    lights = ring_directions(12, np.radians(89.9))
     every = np.vstack([lights, UP_NORMAL])
     found = stereo.estimate_normals(_lit(every, UP_NORMAL, real), every)
     expect_finite(found.normals, found.valid, label="normals")
@@ -99,7 +99,7 @@ def _grazing(real: InputPrecision) -> str:
 
 
 def _near_light(real: InputPrecision) -> str:
-    places = 1.0 * ring(8, 0.6)  # a millimetre from the skin
+    places = 1.0 * ring_directions(8, 0.6)  # a millimetre from the skin
     away = np.linalg.norm(places, axis=-1)
     lit = np.clip(places @ UP_NORMAL / away, 0, None) / away**2
     found = stereo.estimate_normals(
@@ -115,11 +115,11 @@ def _near_light(real: InputPrecision) -> str:
 
 
 def _far_light(real: InputPrecision) -> str:
-    places = 1e7 * ring(8, 0.6)
-    lit = np.clip(ring(8, 0.6) @ UP_NORMAL, 0, None) / 1e14
+    places = 1e7 * ring_directions(8, 0.6)
+    lit = np.clip(ring_directions(8, 0.6) @ UP_NORMAL, 0, None) / 1e14
     found = stereo.estimate_normals(
         real(1e14 * lit[:, None, None]),
-        ring(8, 0.6),
+        ring_directions(8, 0.6),
         light_positions_mm=places,
         points_mm=np.zeros((1, 1, 3)),
         light_intensity=np.full(8, 1e14),
@@ -131,7 +131,7 @@ def _far_light(real: InputPrecision) -> str:
 
 
 def _scales(real: InputPrecision) -> str:
-    lights = ring(8, 0.6)
+    lights = ring_directions(8, 0.6)
     tilted = np.array([0.3, -0.2, np.sqrt(1 - 0.13)])
     off = []
     for scale in (1e-12, 1e12):
@@ -206,7 +206,7 @@ def _relief_without_relief(real: InputPrecision) -> str:
 
 
 def _no_diffuse(real: InputPrecision) -> str:
-    lights = np.vstack([ring(20, 0.5), ring(20, 0.9)])
+    lights = np.vstack([ring_directions(20, 0.5), ring_directions(20, 0.9)])
     views = np.broadcast_to(UP_NORMAL, lights.shape)
     samples = np.zeros((1, 40, 3))
     found = diffuse_albedo.estimate(

@@ -39,14 +39,14 @@ BAND_ALBEDOS: dict[str, tuple[float, float, float]] = {
 of the others."""
 
 
-def albedo(stage: BenchmarkStage) -> None:
+def measure_diffuse_albedo(stage: BenchmarkStage) -> None:
     """Estimate R_d over noise and samples, by the fit and by the paper's minima."""
     rng = np.random.default_rng(0)
     count = 12 if stage.toy else 150
     for skin, r_d in BAND_ALBEDOS.items():
         for noise in (0.02,) if stage.toy else (0.005, 0.02, 0.08):
             for samples in (60,) if stage.toy else (60, 240, 900):
-                p = brdf_truth.dome(count, r_d=r_d, noise=noise, samples=samples, rng=rng)
+                p = brdf_truth.sample_dome(count, r_d=r_d, noise=noise, samples=samples, rng=rng)
                 for method in DIFFUSE_METHODS:
                     estimate = partial(diffuse_albedo.estimate, *p.samples, eta=ETA, method=method)
                     timing, found = stage.time(
@@ -71,7 +71,7 @@ def albedo(stage: BenchmarkStage) -> None:
                         stage.limits["error", skin] = outcome.error
 
 
-def surface(stage: BenchmarkStage) -> None:
+def measure_basis_fit(stage: BenchmarkStage) -> None:
     """Fit surface BRDFs, and predict lights that were left out; beside GGX and SciPy."""
     rng = np.random.default_rng(0)
     basis = brdf_tables.default_basis()
@@ -125,7 +125,7 @@ class _KnownPoints:
     def draw(
         cls, r_d: tuple[float, float, float], count: int, samples: int, rng: np.random.Generator
     ) -> _KnownPoints:
-        p = brdf_truth.dome(count, r_d=r_d, noise=0.02, samples=samples, rng=rng)
+        p = brdf_truth.sample_dome(count, r_d=r_d, noise=0.02, samples=samples, rng=rng)
         out = _held_out_samples(p, rng)
         known: dict[str, Any] = {"eta": ETA, "variance": p.variance, "valid": p.valid & ~out}
         # R_d as it would be known: estimated, from the same samples
@@ -224,7 +224,9 @@ def _compare_with_scipy(basis: BrdfBasis, *, toy: bool) -> tuple[float, float]:
     """Return how many times faster than SciPy, and the largest relative excess of the residual."""
     rng = np.random.default_rng(1)
     different, copies, subset = (20, 1, 3) if toy else (500, 10, 200)
-    p = brdf_truth.dome(different, r_d=BAND_ALBEDOS["light"], noise=0.02, samples=900, rng=rng)
+    p = brdf_truth.sample_dome(
+        different, r_d=BAND_ALBEDOS["light"], noise=0.02, samples=900, rng=rng
+    )
     p = dataclasses.replace(p, valid=p.valid & (p.light @ p.normals[..., None] > 0.12)[..., 0])
     s = brdf_basis.surface_samples(*p.samples, p.r_d, eta=ETA, variance=p.variance, valid=p.valid)
     many = brdf_basis.SurfaceSamples(
@@ -266,7 +268,7 @@ HELD_OUT_POINT_FRACTION: Final = 0.3
 """Part of the points that no mixture is made of."""
 
 
-def space(stage: BenchmarkStage) -> None:
+def measure_brdf_space(stage: BenchmarkStage) -> None:
     """Factor the mixtures of three datasets into ever more common ones, in two ways."""
     basis = brdf_tables.default_basis()
     ranks = (1, 2, 4) if stage.toy else SPACE_RANKS

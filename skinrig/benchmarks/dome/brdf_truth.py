@@ -52,7 +52,7 @@ class TruePoints(TrueSamples):
     """(P, 3)."""
 
 
-def dome(
+def sample_dome(
     points: int,
     *,
     r_d: tuple[float, float, float],

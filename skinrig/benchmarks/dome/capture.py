@@ -39,7 +39,7 @@ DARK_TIME_FRACTION = 0.3
 """Share of each light's time that is dark where lights do not overlap."""
 
 
-def light_order(stage: BenchmarkStage) -> None:
+def measure_light_order(stage: BenchmarkStage) -> None:
     """Time each order of the lights and take the flicker of one pass at open eyes."""
     rig = load_rig("dome")
     rig = rig.subset(lights=[light.name for light in rig.lights[::3]]) if stage.toy else rig
@@ -83,7 +83,7 @@ EXPOSURE_RANGE_S = (1e-3, 1.0)
 Frames = list[UInt16Array]
 
 
-def merging(stage: BenchmarkStage) -> None:
+def measure_hdr_merging(stage: BenchmarkStage) -> None:
     """Merge brackets of 2 to 23 frames over three decades of exposure, four of radiance."""
     side = 64 if stage.toy else FULL_SIDE_PX
     rng = np.random.default_rng(0)
@@ -165,7 +165,7 @@ SPHERE_RADIUS_MM = 50.0
 DOME_SEED = 5
 
 
-def geometry(stage: BenchmarkStage) -> None:
+def measure_geometry(stage: BenchmarkStage) -> None:
     """Adjust cameras to 4 to 12 places of a simulated board."""
     views = (
         ["C03", "C07", "C11", "C14"] if stage.toy else ["C03", "C05", "C07", "C10", "C11", "C14"]
@@ -199,7 +199,7 @@ def geometry(stage: BenchmarkStage) -> None:
         stage.add({"places": count}, timing, _rms(np.array(gaps), np.array(variances)))
 
 
-def lights(stage: BenchmarkStage) -> None:
+def measure_light_positions(stage: BenchmarkStage) -> None:
     """Place lights by one to four places of a simulated mirror sphere."""
     views = ["C05", "C07", "C14"] if stage.toy else ["C01", "C05", "C07", "C10", "C11", "C14"]
     dome_rig = load_rig("dome")

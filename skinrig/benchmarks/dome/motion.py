@@ -97,7 +97,7 @@ def _rms_mm(gap: Float64Array) -> float:
     return float(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
 
 
-def simulate(
+def simulate_drifting_capture(
     *,
     width_px: int,
     views: int,
@@ -162,13 +162,13 @@ def simulate(
     )
 
 
-def motion(stage: BenchmarkStage) -> None:
+def measure_head_motion(stage: BenchmarkStage) -> None:
     """Follow heads that drift little and much, with few and many tracks."""
     width, views, times = (
         (160, 2, (0.0, 8.0, 16.0)) if stage.toy else (484, 3, (0.0, 5.0, 12.5, 20.0))
     )
     texels = 128 if stage.toy else 512
-    drift = partial(simulate, width_px=width, views=views, texels=texels)
+    drift = partial(simulate_drifting_capture, width_px=width, views=views, texels=texels)
 
     for drift_mm in (1.0,) if stage.toy else (0.3, 1.0, 3.0):
         seen = drift(drift_mm=drift_mm, times_s=times)
@@ -176,11 +176,11 @@ def motion(stage: BenchmarkStage) -> None:
         for tracks in (30, 60, 120, 200) if stage.toy else (30, 100, 300):
             knobs = {"drift mm": drift_mm, "tracks": tracks}
             follow = partial(seen.estimate, tracks)
-            stage.measure(knobs, follow, seen.error, also={"moved_mm": moved_mm})
+            stage.measure(knobs, follow, seen.error, extra_values={"moved_mm": moved_mm})
 
     def on_skin(band: MelaninBand) -> ErrorEstimate:
         seen = drift(drift_mm=1.0, times_s=times[:3], preset=band.preset)
         return seen.error(seen.estimate(100))
 
     stage.measure_bands(on_skin)
-    stage.words = {"width": width // 2, "views": views}
+    stage.description_values = {"width": width // 2, "views": views}

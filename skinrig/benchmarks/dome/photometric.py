@@ -10,7 +10,11 @@ from threadpoolctl import threadpool_limits
 from model.metrics import angular_error_rad
 from reconstruction.photometric_stereo import NormalMaps, Robustness, estimate_normals
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.benchmarks.measurement import LIMIT_CORES, measure_processor_time, processor_seconds
+from skinrig.benchmarks.measurement import (
+    LIMIT_CORES,
+    measure_processor_seconds,
+    measure_processor_time,
+)
 from skinrig.benchmarks.resampling import bootstrap_interval
 from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -36,7 +40,7 @@ class BallScene:
     albedo: Float32Array
 
 
-def glossy_ball(
+def render_glossy_ball(
     side: int, lights: int, *, noise: float, rng: np.random.Generator, albedo: float = 0.5
 ) -> BallScene:
     """Make a ball with painted albedo, highlights, attached shadows and shadows of three posts.
@@ -83,7 +87,7 @@ def glossy_ball(
     return BallScene(images, towards, n, inside, matte, paint)
 
 
-def numpy_irls_l1(samples: Float64Array, lights: Float64Array) -> Float64Array:
+def fit_normals_with_numpy(samples: Float64Array, lights: Float64Array) -> Float64Array:
     """Fit pixels one by one by least absolute deviations, in plain NumPy.
 
     Iteratively reweighted least squares with weights 1 / max(|r|, 1e-6) from the least-squares
@@ -143,10 +147,10 @@ def _mean_deg(
     return ErrorEstimate(float(error.mean()), interval, _mean_bound_deg(scene, noise))
 
 
-def normals(stage: BenchmarkStage) -> None:
+def measure_normals(stage: BenchmarkStage) -> None:
     """Estimate the normals of a glossy ball: lights, robust steps, noise; then at full size."""
     rng = np.random.default_rng(0)
-    ball = partial(glossy_ball, 40 if stage.toy else 192, noise=SAMPLE_NOISE, rng=rng)
+    ball = partial(render_glossy_ball, 40 if stage.toy else 192, noise=SAMPLE_NOISE, rng=rng)
 
     def add(knobs: Knobs, scene: BallScene, noise: float = SAMPLE_NOISE, **options: Any) -> None:
         stage.measure(
@@ -180,14 +184,14 @@ def normals(stage: BenchmarkStage) -> None:
 def _full_size(rng: np.random.Generator) -> LimitValues:
     """Measure 1024 x 1024 x 150, and the NumPy fit on some of its pixels."""
     side = 1024
-    scene = glossy_ball(side, 150, noise=SAMPLE_NOISE, rng=rng)
+    scene = render_glossy_ball(side, 150, noise=SAMPLE_NOISE, rng=rng)
     estimate_normals(scene.images[:, :8, :8], scene.lights)
-    ours_s = processor_seconds(lambda: estimate_normals(scene.images, scene.lights), 3)
+    ours_s = measure_processor_seconds(lambda: estimate_normals(scene.images, scene.lights), 3)
     ours_s /= LIMIT_CORES
     places = np.sort(rng.choice(np.flatnonzero(scene.inside), 300, replace=False))
     some = scene.images.reshape(150, -1)[:, places].astype(np.float64)
     with threadpool_limits(1):
-        peer_s, theirs = measure_processor_time(lambda: numpy_irls_l1(some, scene.lights))
+        peer_s, theirs = measure_processor_time(lambda: fit_normals_with_numpy(some, scene.lights))
     peer_s *= side**2 / len(places)
     ours = estimate_normals(scene.images.reshape(150, -1)[:, places], scene.lights)
     truth = scene.normals.reshape(-1, 3)[places]

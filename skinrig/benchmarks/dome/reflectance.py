@@ -43,7 +43,9 @@ class FacePoints(TrueSamples):
     """(P, M, 3): true reflection, 1/sr."""
 
 
-def face_points(subject: str, *, points: int, samples: int, rng: np.random.Generator) -> FacePoints:
+def sample_face_points(
+    subject: str, *, points: int, samples: int, rng: np.random.Generator
+) -> FacePoints:
     """Draw points of a simulated face, and samples of them by the dome's lights and cameras.
 
     Parameters
@@ -95,14 +97,14 @@ def face_points(subject: str, *, points: int, samples: int, rng: np.random.Gener
     )
 
 
-def model(stage: BenchmarkStage) -> None:
+def measure_reflectance_model(stage: BenchmarkStage) -> None:
     """Fit the surface term with few and many lobes, and predict lights that were left out."""
     rng = np.random.default_rng(0)
     materials = brdf_tables.default_basis()
     count, samples = (10, 120) if stage.toy else (150, 400)
     usual: list[float] = []
     for subject in BAND_PRESETS if stage.toy else (*BAND_PRESETS, *EXTREME_PRESETS):
-        p = face_points(subject, points=count, samples=samples, rng=rng)
+        p = sample_face_points(subject, points=count, samples=samples, rng=rng)
         use = p.valid & ~p.left_out
         known: dict[str, Any] = {"eta": ETA, "variance": p.variance, "valid": use}
         albedo = diffuse_albedo.estimate(*p.samples, **known)

@@ -34,7 +34,7 @@ MEAN_SIGMA_TR_PER_MM: Final = (0.598, 1.069, 1.672)
 """Of a mean face, 1/mm: Weyrich et al. 2005, table 2."""
 
 
-def model(stage: BenchmarkStage) -> None:
+def measure_model_rendering(stage: BenchmarkStage) -> None:
     """Render a simulated face's true maps, and compare with the simulator's own pictures.
 
     Rays and textures are judged by the simulator at 36 rays a pixel, with every light from inside
@@ -85,7 +85,7 @@ def model(stage: BenchmarkStage) -> None:
     stage.limits["median"] = 100.0 * float(np.median(gap))
     stage.limits["sum"] = _relative(both, usual.radiance).error
     stage.reference_error = stage.points[len(rays) - 1].error * rays[-1] / fine
-    stage.words["rays"] = fine**2
+    stage.description_values["rays"] = fine**2
 
 
 @dataclass(frozen=True, slots=True)

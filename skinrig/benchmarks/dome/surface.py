@@ -30,7 +30,7 @@ N_ERROR_BLOCKS = 40
 """Of samples, whose means scatter independently."""
 
 
-def lumitexels(stage: BenchmarkStage) -> None:
+def measure_lumitexels(stage: BenchmarkStage) -> None:
     """Gather a Lambertian sphere, with tables in memory and on disk, of both precisions."""
     width, step = (130, 30) if stage.toy else (1300, 10)
     names = [f"L{k:03d}" for k in range(0, 150, step)]
@@ -82,7 +82,7 @@ def lumitexels(stage: BenchmarkStage) -> None:
     stage.limits = {"memory": timing.peak_memory_mb or 0.0, "hours": hours}
 
 
-def filling(stage: BenchmarkStage) -> None:
+def measure_texture_filling(stage: BenchmarkStage) -> None:
     """Fill a smooth texture of three channels of which a part of the texels is known."""
     side = 128 if stage.toy else 2048
     rng = np.random.default_rng(0)

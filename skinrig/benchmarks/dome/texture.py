@@ -24,7 +24,7 @@ _SKIN_COLOR = np.array([0.55, 0.38, 0.28])
 _DENSITY_COLORS = np.array([[0.5, 1.0, 1.4], [0.2, 1.0, 0.6], [1.0, 1.0, 1.0]])
 
 
-def skin_texture(side: int, *, spots: float, rng: np.random.Generator) -> Float32Array:
+def synthesize_skin_texture(side: int, *, spots: float, rng: np.random.Generator) -> Float32Array:
     """Make a periodic texture: blotches, fine streaks and dark spots of their own colors.
 
     Parameters
@@ -82,8 +82,11 @@ def _add(
 ) -> None:
     """Match plain skin to spotted skin; errors are at full depth, whatever depth is matched."""
     side, rng = int(knobs["side"]), np.random.default_rng(0)
-    target: Any = skin_texture(side, spots=10.0, rng=rng).astype(dtype)
-    sources = [0.9 * skin_texture(side, spots=0.0, rng=rng).astype(dtype) for _ in range(N_SOURCES)]
+    target: Any = synthesize_skin_texture(side, spots=10.0, rng=rng).astype(dtype)
+    sources = [
+        0.9 * synthesize_skin_texture(side, spots=0.0, rng=rng).astype(dtype)
+        for _ in range(N_SOURCES)
+    ]
     full = TextureSpace.fit([target, *sources])
     used = full if levels == full.levels else TextureSpace.fit([target, *sources], levels=levels)
     vector = describe(target, space=used)
@@ -99,7 +102,7 @@ def _add(
 
 
 def measure_efforts(stage: BenchmarkStage, knobs: Knobs) -> None:
-    """Measure pyramid depth and iterations (error: `matching`'s)."""
+    """Measure pyramid depth and iterations (error: `measure_texture_matching`'s)."""
     at = knobs | {"side": _side(stage)}
     depths, counts = ((1, 7), (0, 2)) if stage.toy else ((1, 3, 5, 7), (0, 1, 2, 10, 20))
     for n in depths:
@@ -112,7 +115,7 @@ def _side(stage: BenchmarkStage) -> int:
     return 48 if stage.toy else 256
 
 
-def matching(stage: BenchmarkStage) -> None:
+def measure_texture_matching(stage: BenchmarkStage) -> None:
     """Match textures: depth, iterations, precision, size, start; then one channel at full size."""
     measure_efforts(stage, {})
     usual: Knobs = {"side": _side(stage), "levels": 7, "iterations": 5}
@@ -128,13 +131,13 @@ def matching(stage: BenchmarkStage) -> None:
 def _same_process_distance(side: int) -> float:
     """Return how far apart two textures of one process are: what matching need not beat."""
     rng = np.random.default_rng(2)
-    textures = [skin_texture(side, spots=10.0, rng=rng) for _ in range(1 + N_SOURCES)]
-    plain = 0.9 * skin_texture(side, spots=0.0, rng=rng)
+    textures = [synthesize_skin_texture(side, spots=10.0, rng=rng) for _ in range(1 + N_SOURCES)]
+    plain = 0.9 * synthesize_skin_texture(side, spots=0.0, rng=rng)
     space = TextureSpace.fit([*textures, plain])
     return _error(textures[1:], describe(textures[0], space=space), space).error
 
 
-def peer_iterations(
+def iterate_with_peer(
     image: ArrayLike, target: ArrayLike, iterations: int
 ) -> Callable[[], Float64Array]:
     """Return Heeger and Bergen's matching of one channel out of pyrtools and scikit-image.
@@ -169,7 +172,7 @@ def peer_iterations(
     return run
 
 
-def peer_responses(image: ArrayLike) -> list[Float64Array]:
+def filter_with_peer(image: ArrayLike) -> list[Float64Array]:
     """Return pyrtools's responses in the order and unit of ours; its levels grow by 4 each."""
     from pyrtools.pyramids import SteerablePyramidFreq
 
@@ -184,17 +187,17 @@ def peer_responses(image: ArrayLike) -> list[Float64Array]:
 def compare_with_peer(stage: BenchmarkStage, side: int = FULL_SIDE_PX) -> None:
     """Match one channel by turns with the peer; take down limits, or what is left out and why."""
     try:
-        peer_responses(np.zeros((512, 512)))
+        filter_with_peer(np.zeros((512, 512)))
     except ImportError as error:
         why = f"the peer is missing ({error}); to measure it: pip install 'skinrig[peers]'"
-        stage.left_out.append((f"{MIN_SPEEDUP_OVER_PYRTOOLS:g} x {PEER_NAME}", why))
+        stage.omitted.append((f"{MIN_SPEEDUP_OVER_PYRTOOLS:g} x {PEER_NAME}", why))
         return
     rng = np.random.default_rng(0)
-    target = skin_texture(side, spots=10.0, rng=rng)[..., 1].copy()
-    source = 0.9 * skin_texture(side, spots=0.0, rng=rng)[..., 1]
+    target = synthesize_skin_texture(side, spots=10.0, rng=rng)[..., 1].copy()
+    source = 0.9 * synthesize_skin_texture(side, spots=0.0, rng=rng)[..., 1]
     space = TextureSpace.fit([target, source])
     vector = describe(target, space=space)
-    theirs = peer_iterations(source, target, 1)
+    theirs = iterate_with_peer(source, target, 1)
 
     def ours(iterations: int) -> Any:
         return match(source, vector, space=space, iterations=iterations).image
@@ -209,7 +212,7 @@ def compare_with_peer(stage: BenchmarkStage, side: int = FULL_SIDE_PX) -> None:
     off = [_error([one.astype(np.float32)], vector, space).error for one in (own, peer)]
     apart = [
         float(np.abs(a - b).max() / source.max())
-        for a, b in zip(steerable_pyramid.analyze(source), peer_responses(source), strict=True)
+        for a, b in zip(steerable_pyramid.analyze(source), filter_with_peer(source), strict=True)
     ]
     stage.limits = {
         ("speed_up", side): float(wall),

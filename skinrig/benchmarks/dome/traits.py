@@ -35,7 +35,7 @@ N_EDITED_FACES: Final = 4
 """Faces that are edited; the traits are learned of others."""
 
 
-def editing(stage: BenchmarkStage) -> None:
+def measure_editing(stage: BenchmarkStage) -> None:
     """Edit faces over iterations of matching, noise and kinds of vectors."""
     count, size = (4, 64) if stage.toy else (28, 192)
     # heads take long to build: one of them is enough to see that this runs
@@ -153,7 +153,7 @@ SPACE_KINDS: tuple[SpaceKind, ...] = ("pca", "nmf")
 VECTOR_KINDS: tuple[VectorKind, ...] = ("quantiles", "histograms")
 
 
-def traits(stage: BenchmarkStage) -> None:
+def measure_traits(stage: BenchmarkStage) -> None:
     """Learn lotion from fitted lobes and tan from albedo maps, over people, spaces and noise."""
     people = draw_population()
     rng = np.random.default_rng(0)

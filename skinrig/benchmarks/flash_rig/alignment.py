@@ -104,7 +104,7 @@ class DisplacedFace:
         return np.asarray(np.linalg.norm(found.source_px - self.source_px, axis=-1)[found.valid])
 
 
-def table() -> ColorTable:
+def load_color_table() -> ColorTable:
     """Return the color table that pictures are made with."""
     return color_table.build(TABLE_CAMERA, TABLE_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
 
@@ -156,7 +156,7 @@ def displace_face(
         back = -np.stack(
             [sample_displaced(displacement_px[..., k], back, 1) for k in range(2)], axis=-1
         )
-    colors = table()
+    colors = load_color_table()
     light = 0.75 * np.clip(face.normal[..., 2], 0.05, 1.0)
     rest = face.hemoglobin(state)
     mask = face_mask(side)
@@ -227,9 +227,9 @@ def measure_alignment(stage: BenchmarkStage) -> None:
         knobs = {"by": found.by, "landmarks": count, "rounds": rounds}
         stage.add(knobs, timing, _rms(error, side))
     stage.measure_bands(lambda band: _on_skin(band.preset, 128 if stage.toy else 256))
-    stage.words["moved_px"] = side / 50
+    stage.description_values["moved_px"] = side / 50
     if not stage.toy:
-        bare, dense = (stage.at(landmarks=24, rounds=n) for n in (0, 2))
+        bare, dense = (stage.find_point(landmarks=24, rounds=n) for n in (0, 2))
         stage.limits = {
             "false_motion": float(np.median(still.errors_px(still.align(24, 2)))),
             "covered": covered,
@@ -282,8 +282,8 @@ def measure_misalignment(stage: BenchmarkStage) -> None:
                 knobs |= {"radius_px": radius} if radius else {}
                 stage.add(knobs, timing, outcome)
         if not stage.toy:
-            kept = stage.at(state=state, off_px=2.0, way="interpolated")
-            blend = stage.at(state=state, off_px=2.0, radius_px=16.0)
+            kept = stage.find_point(state=state, off_px=2.0, way="interpolated")
+            blend = stage.find_point(state=state, off_px=2.0, radius_px=16.0)
             stage.limits["ratio", state] = kept.error / blend.error
 
 

@@ -21,8 +21,8 @@ from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.facial_color import shared_melanin
 from rigsim.subject import make_subject
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.flash_rig.alignment import face_mask, table
-from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
+from skinrig.benchmarks.flash_rig.alignment import face_mask, load_color_table
+from skinrig.benchmarks.measurement import LIMIT_CORES, measure_processor_seconds
 from skinrig.benchmarks.resampling import median_error
 from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -34,7 +34,7 @@ MIN_MELANIN = 0.004
 """Volume fraction of the palest skin that is drawn."""
 
 
-def inversion(stage: BenchmarkStage) -> None:
+def measure_inversion(stage: BenchmarkStage) -> None:
     """Invert a noisy picture with the shading known and free, through tables of several sizes."""
     side, pixels = (96, 8) if stage.toy else (2048, 40)
     rng = np.random.default_rng(0)
@@ -114,7 +114,9 @@ FULL_SIDE_PX = 1024
 def measure_shared_melanin(stage: BenchmarkStage) -> None:
     """Invert 1 to 7 states together, the light free or smooth, beside each state alone."""
     side = 64 if stage.toy else 192
-    model = _ChromophoreModel(table(), shading_prior.face_prior(), model_error.load_covariance())
+    model = _ChromophoreModel(
+        load_color_table(), shading_prior.face_prior(), model_error.load_covariance()
+    )
     seen = _StateImages.of("II", side, STATE_NAMES, model)
 
     def alone() -> Float64Array:
@@ -275,4 +277,4 @@ def _full_size(model: _ChromophoreModel) -> LimitValues:
     blood = 0.32 * rng.uniform(0.35, 0.5, (len(STATE_NAMES), band, FULL_SIDE_PX)) ** 3
     seen = simulate_colors(model.colors, melanin, blood, model.covariance, rng=rng)
     run = partial(model.invert, *seen, shading_window_px=shared_melanin.SHADING_WINDOW_PX)
-    return {"seconds": processor_seconds(run, 2) * FULL_SIDE_PX / band / LIMIT_CORES}
+    return {"seconds": measure_processor_seconds(run, 2) * FULL_SIDE_PX / band / LIMIT_CORES}

@@ -69,7 +69,7 @@ FIBER_NOISE = 0.01
 """Relative noise of each fibre."""
 
 
-def efficiency(stage: BenchmarkStage) -> None:
+def measure_efficiency(stage: BenchmarkStage) -> None:
     """Measure mean squared errors over Cramér-Rao bounds."""
     draws = 500 if stage.toy else 20_000
     worst = stage.by_band
@@ -88,7 +88,7 @@ def efficiency(stage: BenchmarkStage) -> None:
                 ratios[str(classify_melanin(TYPICAL_SKINS[subject].melanin))].append(
                     (ratio, spread)
                 )
-        stage.left_out += _excluded_subjects(name, stage.points)
+        stage.omitted += _excluded_subjects(name, stage.points)
         for band, pairs in ratios.items():
             if not pairs:
                 continue
@@ -104,7 +104,9 @@ def efficiency(stage: BenchmarkStage) -> None:
 def _excluded_subjects(name: str, points: Sequence[Point]) -> list[tuple[str, str]]:
     """Return the subjects of whom an estimator was not judged."""
     judged = {
-        p.knobs["subject"] for p in points if p.knobs["estimator"] == name and p.also["judged"]
+        p.knobs["subject"]
+        for p in points
+        if p.knobs["estimator"] == name and p.extra_values["judged"]
     }
     why = (
         f"a fraction is nearer to 0 than {MIN_EVALUATED_SIGMAS:g} bounds even at "

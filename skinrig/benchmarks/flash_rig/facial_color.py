@@ -10,7 +10,7 @@ from scipy import fft, ndimage
 from model.facial_color import HemoglobinRig, disc_statistics, histogram_matching, prediction_errors
 from rigsim import subject
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
-from skinrig.benchmarks.measurement import processor_seconds
+from skinrig.benchmarks.measurement import measure_processor_seconds
 from skinrig.benchmarks.resampling import median_error
 from skinrig.benchmarks.results import Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -29,7 +29,7 @@ CROP_SIDES_PX = {16: 256, 32: 160, 64: 96}
 """Sides of the crops on which scipy.ndimage.convolve is timed; its work goes with the pixels."""
 
 
-def rig(stage: BenchmarkStage) -> None:
+def measure_rig(stage: BenchmarkStage) -> None:
     """Predict states whose vessels dilated; then time discs of 2048 x 2048 beside libraries."""
     rng = np.random.default_rng(0)
     face = subject.make_subject("III", seed=3, size=96 if stage.toy else 512)
@@ -137,7 +137,7 @@ def _time_statistics(rng: np.random.Generator) -> LimitValues:
     h = np.asarray(0.03 + 0.02 * ndimage.gaussian_filter(white, 2.0), np.float32)
     limits: LimitValues = {}
     for radius in DISC_RADII_PX:
-        kernel = disc(radius)
+        kernel = disc_mask(radius)
         crop = np.ascontiguousarray(h[: CROP_SIDES_PX[radius], : CROP_SIDES_PX[radius]])
         ways: list[tuple[int, Callable[[], object]]] = [
             (PARALLEL_CORES, lambda: disc_statistics.measure(h, radius)),
@@ -149,8 +149,8 @@ def _time_statistics(rng: np.random.Generator) -> LimitValues:
         least = [np.inf] * len(ways)
         for _ in range(N_TIMING_ROUNDS):
             for index, (cores, way) in enumerate(ways):
-                least[index] = min(least[index], processor_seconds(way) / cores)
-        convolve_s = processor_seconds(lambda: disc_statistics_convolve(crop, kernel))
+                least[index] = min(least[index], measure_processor_seconds(way) / cores)
+        convolve_s = measure_processor_seconds(lambda: disc_statistics_convolve(crop, kernel))
         convolve_s *= h.size / crop.size
         ours_s, opencv_s, fft_s = least
         limits |= {
@@ -161,7 +161,7 @@ def _time_statistics(rng: np.random.Generator) -> LimitValues:
     return limits
 
 
-def disc(radius_px: int) -> Float32Array:
+def disc_mask(radius_px: int) -> Float32Array:
     """Return eq. (1)'s kernel."""
     y, x = np.mgrid[-radius_px : radius_px + 1, -radius_px : radius_px + 1]
     inside = (y * y + x * x <= radius_px**2).astype(np.float32)

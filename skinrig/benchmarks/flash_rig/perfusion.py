@@ -19,7 +19,7 @@ from reconstruction.facial_color.perfusion_fit import RelaxationFit, fit_cycle
 from rigsim.subject.perfusion_course import PromptedCourse
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.flash_rig.efficiency import differentiate
-from skinrig.benchmarks.measurement import processor_seconds
+from skinrig.benchmarks.measurement import measure_processor_seconds
 from skinrig.benchmarks.resampling import gaussian_rms
 from skinrig.benchmarks.results import ErrorEstimate
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -88,7 +88,7 @@ class ShotSequence:
         return float(np.sqrt(covariance[0, 0]) / scale[0])
 
 
-def scipy_fit(phase_s: Float64Array, value: Float64Array) -> tuple[float, float]:
+def fit_with_scipy(phase_s: Float64Array, value: Float64Array) -> tuple[float, float]:
     """Return time constant and standard error of one curve by scipy's curve_fit, its usual way."""
 
     def model(
@@ -109,7 +109,7 @@ def scipy_fit(phase_s: Float64Array, value: Float64Array) -> tuple[float, float]
     return float(found[3]), float(np.sqrt(covariance[3, 3]))
 
 
-def curves(stage: BenchmarkStage) -> None:
+def measure_curve_fits(stage: BenchmarkStage) -> None:
     """Fit five places: number of shots, together or each alone, and scipy's fit beside it."""
     trains = [ShotSequence(22, 5.5), ShotSequence(44, 10.25)]
     if not stage.toy:
@@ -123,7 +123,7 @@ def curves(stage: BenchmarkStage) -> None:
 
             def fitted_s(values: Float64Array) -> float:
                 if way == "best place, scipy":
-                    return scipy_fit(phase, values[-1])[0]
+                    return fit_with_scipy(phase, values[-1])[0]
                 places = values if way == "five places" else values[-1]
                 return fit_cycle(phase, places, cycle_s=CYCLE_S).time_constant_s
 
@@ -186,7 +186,7 @@ def _limits(stage: BenchmarkStage, runs: int) -> LimitValues:
         slow = fit_cycle(fine.phase_s, fine.draw(TIME_CONSTANT_S, rng), cycle_s=CYCLE_S)
         held += slow.interval_s[0] <= TIME_CONSTANT_S <= slow.interval_s[1]
     again = fine.draw(TIME_CONSTANT_S, rng)
-    spent_s = processor_seconds(lambda: fit_cycle(fine.phase_s, again, cycle_s=CYCLE_S))
+    spent_s = measure_processor_seconds(lambda: fit_cycle(fine.phase_s, again, cycle_s=CYCLE_S))
     five, _, by_scipy = (p.error for p in stage.points if p.knobs["captures"] == 44)
     # three binomial standard deviations beyond the stated rates
     beyond = 3 * float(

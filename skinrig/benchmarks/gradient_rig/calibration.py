@@ -21,7 +21,7 @@ from skinrig.benchmarks.stage import BenchmarkStage
 SPHERE_SEED = 7
 
 
-def sphere_lights(stage: BenchmarkStage) -> None:
+def measure_sphere_lights(stage: BenchmarkStage) -> None:
     """Survey a simulated sphere with two and four readings of the analyser, and large pixels."""
     for width_px in (192,) if stage.toy else (512, 1024):
         rig = load_rig("gradient").resized(width_px)

@@ -19,7 +19,7 @@ from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.subject.pigment import MELANIN_PRESETS
 from rigsim.world.taped_skin import GripState
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
+from skinrig.benchmarks.measurement import LIMIT_CORES, measure_processor_seconds
 from skinrig.benchmarks.resampling import bootstrap_interval
 from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -81,7 +81,7 @@ def pixel_geometry(rig: Rig) -> dict[str, Any]:
     return {"points_mm": points, "view": way / np.linalg.norm(way, axis=-1, keepdims=True)}
 
 
-def skin_patch(side: int, *, smooth: bool) -> SkinPatch:
+def render_skin_patch(side: int, *, smooth: bool) -> SkinPatch:
     """Picture a patch of cheek, as it is or smoothed, by all sixteen conditions."""
     rig = load_rig("gradient").cropped(side)
     size_mm = max(0.006 * side + 0.8, 1.2)
@@ -144,11 +144,11 @@ def _evaluate(normals: FloatArray, valid: BoolArray, truth: Float64Array) -> Err
     return ErrorEstimate(float(error.mean()), bootstrap_interval(parts, np.mean))
 
 
-def normals(stage: BenchmarkStage) -> None:
+def measure_normals(stage: BenchmarkStage) -> None:
     """Compute the normals of a patch of skin: patterns, corrections, filters; then all pixels."""
     rng = np.random.default_rng(0)
     side = 40 if stage.toy else 192
-    patch = skin_patch(side, smooth=False)
+    patch = render_skin_patch(side, smooth=False)
     noisy = add_sensor_noise(patch, rng)
     corrections = {"lights": patch.lights, **patch.geometry}
 
@@ -216,7 +216,7 @@ def _on_skin(patch: SkinPatch, band: MelaninBand) -> ErrorEstimate:
 
 
 def _limits(worst: float, rng: np.random.Generator) -> LimitValues:
-    smooth = skin_patch(128, smooth=True)
+    smooth = render_skin_patch(128, smooth=True)
     found = from_patterns(smooth.images, lights=smooth.lights, **smooth.geometry)
     against = {"lens' resolution": smooth.visible, "as it is": smooth.sharp}
     big = {
@@ -224,9 +224,9 @@ def _limits(worst: float, rng: np.random.Generator) -> LimitValues:
         for key, image in add_sensor_noise(smooth, rng).items()
     }
     options: dict[str, Any] = {"lights": smooth.lights, "alpha": 0.26, "variance": smooth.noise}
-    ours_s = processor_seconds(lambda: from_patterns(big, **options), 3) / LIMIT_CORES
+    ours_s = measure_processor_seconds(lambda: from_patterns(big, **options), 3) / LIMIT_CORES
     with threadpool_limits(1):
-        peer_s = processor_seconds(lambda: normals_without_corrections(big))
+        peer_s = measure_processor_seconds(lambda: normals_without_corrections(big))
     return {
         **{
             ("clean", name): _evaluate(found.normals, found.valid, true).error

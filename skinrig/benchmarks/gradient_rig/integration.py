@@ -18,7 +18,11 @@ from reconstruction.normal_integration.discontinuities import integrate_with_dis
 from reconstruction.normal_integration.height_filters import high_pass
 from reconstruction.normal_integration.relief_errors import expected_height_rms
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import LIMIT_CORES, measure_processor_time, processor_seconds
+from skinrig.benchmarks.measurement import (
+    LIMIT_CORES,
+    measure_processor_seconds,
+    measure_processor_time,
+)
 from skinrig.benchmarks.resampling import bootstrap_rms, split_squares
 from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -30,7 +34,7 @@ NORMAL_NOISE_RAD = np.radians(1.5)
 RELIEF_RMS_UM = 12.0
 
 
-def relief(side: int, *, rng: np.random.Generator) -> tuple[Float64Array, Float64Array]:
+def synthesize_relief(side: int, *, rng: np.random.Generator) -> tuple[Float64Array, Float64Array]:
     """Make a relief of ridged cells on a bulge, and its normals (y up) without noise.
 
     Periodic, of 90 um to 1 mm wavelength; slopes are exact derivatives of the height's waves.
@@ -100,11 +104,11 @@ def sparse_direct(normals: Float64Array, valid: BoolArray, *, pixel: float) -> F
     return height
 
 
-def integration(stage: BenchmarkStage) -> None:
+def measure_integration(stage: BenchmarkStage) -> None:
     """Integrate a relief's normals: tolerance, order, mask, noise, peers; then at full size."""
     rng = np.random.default_rng(0)
     side = 64 if stage.toy else 512
-    truth, clean = relief(side, rng=rng)
+    truth, clean = synthesize_relief(side, rng=rng)
     noisy = clean + NORMAL_NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(clean.shape)
     whole = np.ones((side, side), bool)
     disc = _disc(side)
@@ -172,7 +176,7 @@ def _disc(side: int) -> BoolArray:
 
 def _full_size(rng: np.random.Generator) -> LimitValues:
     """Measure 2048 x 2048 with a mask, and 1024 x 1024 with jumps."""
-    _, normals = relief(2048, rng=rng)
+    _, normals = synthesize_relief(2048, rng=rng)
     noisy = (normals + NORMAL_NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(normals.shape)).astype(
         np.float32
     )
@@ -183,7 +187,9 @@ def _full_size(rng: np.random.Generator) -> LimitValues:
     )
     small = np.ascontiguousarray(noisy[:1024, :1024])
     integrate_with_discontinuities(small[:64, :64])
-    broken_s = processor_seconds(lambda: integrate_with_discontinuities(small, pixel=PIXEL_UM), 3)
+    broken_s = measure_processor_seconds(
+        lambda: integrate_with_discontinuities(small, pixel=PIXEL_UM), 3
+    )
     part = _disc(512)
     flat = np.asarray(noisy[:512, :512], float)
     ours_s, mine = measure_processor_time(lambda: integrate(flat, pixel=PIXEL_UM, valid=part), 3)

@@ -16,7 +16,7 @@ from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
 from reconstruction.normal_histogram import relief_slopes
 from reconstruction.normal_histogram import statistics as normal_statistics
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
+from skinrig.benchmarks.measurement import LIMIT_CORES, measure_processor_seconds
 from skinrig.benchmarks.resampling import mean_error
 from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -28,7 +28,7 @@ N_PEER_CANDIDATES = 3
 """Candidates of the straightforward search that are timed; it is extrapolated to the grid."""
 
 
-def relief(side: int, *, rng: np.random.Generator) -> Float64Array:
+def synthesize_relief(side: int, *, rng: np.random.Generator) -> Float64Array:
     """Return heights of a skin-like relief, um: grain, ridges, and a network of furrows.
 
     Parameters
@@ -56,17 +56,17 @@ def strain_relief(height: Float64Array, *, rng: np.random.Generator) -> Float64A
     return np.asarray(deeper + 0.5 * grain)
 
 
-def numpy_distance(
+def distance_with_numpy(
     height: Float64Array, target: Float64Array, alpha: float, sigma_um: float
 ) -> float:
     """Return eq. (7)'s sum for one kernel, in vectorised NumPy and SciPy."""
     blurred = gaussian_filter1d(height, sigma_um / PIXEL_UM, axis=1)
     dy, dx = np.gradient((1.0 - alpha) * height + alpha * blurred, PIXEL_UM)
     dx /= STRETCH_RATIO
-    return float(np.abs(numpy_histogram(dx, -dy) - target).sum())
+    return float(np.abs(histogram_with_numpy(dx, -dy) - target).sum())
 
 
-def numpy_histogram(dx: Float64Array, dy: Float64Array) -> Float64Array:
+def histogram_with_numpy(dx: Float64Array, dy: Float64Array) -> Float64Array:
     """Return the shares of normals in 64 x 64 buckets, in vectorised NumPy."""
     w = 1.0 / np.sqrt(1.0 + dx * dx + dy * dy)
     edges = np.linspace(-1.0, 1.0, 65)
@@ -91,16 +91,16 @@ def _minimum_processor_s(call: Callable[[], object], repeats: int = 1) -> float:
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
-        return processor_seconds(call, repeats)
+        return measure_processor_seconds(call, repeats)
     finally:
         numba.set_num_threads(threads)
 
 
-def search(stage: BenchmarkStage) -> None:
+def measure_kernel_search(stage: BenchmarkStage) -> None:
     """Fit kernels: pixels used, search and its first sample; then 2000 x 2000 beside NumPy."""
     rng = np.random.default_rng(0)
     side = 64 if stage.toy else 256
-    height = relief(side, rng=rng)
+    height = synthesize_relief(side, rng=rng)
     target = _histogram(strain_relief(height, rng=rng))
     alphas, sigmas = (ALPHA_GRID[::50], SIGMAS_UM[::20]) if stage.toy else (ALPHA_GRID, SIGMAS_UM)
 
@@ -147,18 +147,18 @@ def _grid_of(
 
 def _full_size(rng: np.random.Generator) -> LimitValues:
     """Measure 2000 x 2000: the default search, and the exhaustive ones by some candidates."""
-    height = relief(FULL_SIDE_PX, rng=rng)
+    height = synthesize_relief(FULL_SIDE_PX, rng=rng)
     target = _histogram(strain_relief(height, rng=rng))
     few = SIGMAS_UM[[10, 60, 150]]
     whole = _grid_of(height, target, few)
     ours_s = _minimum_processor_s(lambda: kernel_search.search_exhaustively(whole))
     ours_s *= SIGMAS_UM.size / few.size
     tried = [(-1.5, 6.0), (-0.2, 31.0), (0.7, 76.0)][:N_PEER_CANDIDATES]
-    peer_s = _minimum_processor_s(lambda: [numpy_distance(height, target, *k) for k in tried])
+    peer_s = _minimum_processor_s(lambda: [distance_with_numpy(height, target, *k) for k in tried])
     peer_s *= ALPHA_GRID.size * SIGMAS_UM.size / len(tried)
     mismatch = max(
         abs(
-            numpy_distance(height, target, alpha, sigma)
+            distance_with_numpy(height, target, alpha, sigma)
             - float(whole.distances(sigma, np.array([alpha]))[0])
         )
         for alpha, sigma in tried
@@ -184,12 +184,12 @@ def _full_size(rng: np.random.Generator) -> LimitValues:
     }
 
 
-def histograms(stage: BenchmarkStage) -> None:
+def measure_histograms(stage: BenchmarkStage) -> None:
     """Make histograms of normals: pixels and buckets; beside numpy.histogram2d."""
     rng = np.random.default_rng(0)
     side = 96 if stage.toy else 1024
     truth_side = 256 if stage.toy else 2048
-    truth_map = relief(truth_side, rng=rng)
+    truth_map = synthesize_relief(truth_side, rng=rng)
     for bins in (32, 64) if stage.toy else (16, 32, 64, 128):
         truth = normal_statistics.measure_normals(truth_map, pixel=PIXEL_UM, bins=bins)
         for part in (side // 2, side) if stage.toy else (128, 256, 512, 1024):
@@ -207,7 +207,7 @@ def histograms(stage: BenchmarkStage) -> None:
             stage.add({"side": part, "bins": bins}, timing, mean_error(off))
     height = truth_map[:side, :side]
     dx, dy, _ = relief_slopes.slopes(height, pixel=PIXEL_UM)
-    theirs = partial(numpy_histogram, dx, dy)
+    theirs = partial(histogram_with_numpy, dx, dy)
     ours = partial(normal_histogram.from_slopes, dx, dy)
     repeats = 1 if stage.toy else 3
     times = _minimum_processor_s(theirs, repeats) / max(_minimum_processor_s(ours, repeats), 1e-9)
@@ -215,4 +215,4 @@ def histograms(stage: BenchmarkStage) -> None:
     stage.reference_error = float(
         normal_histogram.noise_floor(truth.histogram, truth.effective_samples, 1e12)
     )
-    stage.words["truth_side"] = truth_side
+    stage.description_values["truth_side"] = truth_side

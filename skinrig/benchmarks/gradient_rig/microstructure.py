@@ -29,7 +29,7 @@ from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import StretchedSkin, stretch_skin
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
+from skinrig.benchmarks.measurement import LIMIT_CORES, measure_processor_seconds
 from skinrig.benchmarks.resampling import mean_error
 from skinrig.benchmarks.results import Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -127,7 +127,7 @@ def _slope_errors(made: Float32Array, state: StretchedSkin) -> tuple[float, floa
     return distance, abs(math.log(ours[0].var() / there[0].var()))
 
 
-def truth(stage: BenchmarkStage) -> None:
+def measure_kernel_maps(stage: BenchmarkStage) -> None:
     """Judge convolved reliefs by skin whose stiff layer came to rest; then time the convolution."""
     patch = partial(
         make_micro_skin, "forehead", size_mm=0.8 if stage.toy else 2.4, texel_um=TEXEL_UM
@@ -215,7 +215,7 @@ def synthesize_kernel_fields(
     )
 
 
-def numpy_convolve(height: Float32Array, fields: tuple[Float32Array, ...]) -> Float32Array:
+def convolve_with_numpy(height: Float32Array, fields: tuple[Float32Array, ...]) -> Float32Array:
     """Return eqs. (4)-(6) in vectorised NumPy and SciPy, with bilinear samples."""
     axis_s, axis_t, alpha_s, sigma_s, alpha_t, sigma_t = fields
     y, x = np.mgrid[: height.shape[0], : height.shape[1]].astype(np.float32)
@@ -242,15 +242,19 @@ def _full_size() -> LimitValues:
     for sampling in both:
         run = partial(convolve, height, *fields, sampling=sampling)
         run()
-        own[sampling] = processor_seconds(run, 2) / LIMIT_CORES
+        own[sampling] = measure_processor_seconds(run, 2) / LIMIT_CORES
     strip = height[:PEER_ROWS]
     own_strip = tuple(values[:PEER_ROWS] for values in fields)
-    peer_s = processor_seconds(lambda: numpy_convolve(strip, own_strip)) * FULL_SIDE_PX / PEER_ROWS
+    peer_s = (
+        measure_processor_seconds(lambda: convolve_with_numpy(strip, own_strip))
+        * FULL_SIDE_PX
+        / PEER_ROWS
+    )
     mismatch = np.abs(
-        numpy_convolve(strip, own_strip) - convolve(strip, *own_strip, sampling="linear")
+        convolve_with_numpy(strip, own_strip) - convolve(strip, *own_strip, sampling="linear")
     ).max()
     del fields, height
-    raster_s = processor_seconds(_rasterized(FULL_SIDE_PX), 2) / LIMIT_CORES
+    raster_s = measure_processor_seconds(_rasterized(FULL_SIDE_PX), 2) / LIMIT_CORES
     tile_s, peak_mb = _tiles_of_16k()
     return {
         "speed_up": peer_s / own["cubic"],
@@ -301,7 +305,7 @@ def _tiles_of_16k() -> tuple[float, float]:
             fields_at,
             finished=[number for number in range(count) if number not in chosen],
         )
-        spent = processor_seconds(run)
+        spent = measure_processor_seconds(run)
         tracemalloc.start()
         try:
             run()
@@ -312,7 +316,7 @@ def _tiles_of_16k() -> tuple[float, float]:
     return spent / LIMIT_CORES * count / len(chosen), peak / 1e6
 
 
-def waves(
+def synthesize_waves(
     side: int, sigma_px: float, *, rng: np.random.Generator
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return wave vectors (N, 2), rad per px, amplitudes and phases of a relief of many waves.
@@ -363,7 +367,7 @@ def measure_two_pass_error(
     margin = round(10.0 * sigma_px)
     whole = side + 2 * margin
     y, x = np.mgrid[:whole, :whole].astype(np.float64) - 0.5 * (whole - 1)
-    vectors, amplitudes, phases = waves(side, sigma_px, rng=rng)
+    vectors, amplitudes, phases = synthesize_waves(side, sigma_px, rng=rng)
     angle = 0.4 + rotation_rad / sigma_px * (x * np.cos(0.9) + y * np.sin(0.9))
     sigma = sigma_px * (1.0 + 0.5 * np.sin(2.0 * growth / sigma_px * (0.9 * x - 0.44 * y)))
     axis_s = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -388,7 +392,7 @@ def measure_two_pass_error(
     return float(np.sqrt(np.mean(off**2) / np.mean(change**2))), call
 
 
-def passes(stage: BenchmarkStage) -> None:
+def measure_two_passes(stage: BenchmarkStage) -> None:
     """Compare two passes with the true convolution: turning axes, growing sigma, samples, sizes."""
     tried = [(0.0, 0.0), (0.1, 0.0), (0.0, 0.1)]
     if not stage.toy:
@@ -421,4 +425,4 @@ def passes(stage: BenchmarkStage) -> None:
             "growth": (0.0, some),
         }.items():
             varied = {"turn_rad_per_sigma": turn, "growth_per_sigma": growth}
-            stage.limits[name] = stage.at(sigma_px=3.0, sampling="cubic", **varied).error
+            stage.limits[name] = stage.find_point(sigma_px=3.0, sampling="cubic", **varied).error

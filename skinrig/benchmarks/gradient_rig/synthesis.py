@@ -13,7 +13,11 @@ from reconstruction import normal_histogram
 from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import make_micro_skin
 from skinrig.arrays import Float32Array, Float64Array
-from skinrig.benchmarks.measurement import measure, measure_processor_time, processor_seconds
+from skinrig.benchmarks.measurement import (
+    measure,
+    measure_processor_seconds,
+    measure_processor_time,
+)
 from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 
@@ -102,7 +106,7 @@ def skewness_of_curvature(height: Float32Array) -> float:
     return float(((inner - inner.mean()) ** 3).mean() / inner.std() ** 3)
 
 
-def growth(stage: BenchmarkStage) -> None:
+def measure_growth(stage: BenchmarkStage) -> None:
     """Grow a map: cells, what they share, windows tried; beside blending; then the largest map."""
     site = "forehead"
     count, size_mm, side = (2, 1.6, 200) if stage.toy else (4, 8.0, 2048)
@@ -135,7 +139,7 @@ def growth(stage: BenchmarkStage) -> None:
     )
     stage.add({"method": "blend", "cell": edge}, timing, _error(theirs, truth))
     stage.reference_error = normal_histogram.halved_distance(*halves)
-    stage.words = {"count": count, "size_mm": size_mm, "side": side}
+    stage.description_values = {"count": count, "size_mm": size_mm, "side": side}
     if not stage.toy:
         stage.limits = _evaluate_growth(patches, truth, theirs)
 
@@ -170,7 +174,7 @@ def _evaluate_growth(
     tile = layout.tile(0, 0)
     rows, columns = tile.shape
     timing = measure(lambda: layout.tile(rows, columns), repeats=1)
-    tile_s = processor_seconds(lambda: layout.tile(rows, columns))
+    tile_s = measure_processor_seconds(lambda: layout.tile(rows, columns))
     tiles = sum(1 for _ in layout.tiles())
     site = layout.sites[0]
     held = site.sources.heights.nbytes * 2 + site.sources.filled.nbytes

@@ -17,7 +17,7 @@ from reconstruction.wrinkles import fit as wrinkle_fit
 from reconstruction.wrinkles import texels as wrinkle_texels
 from reconstruction.wrinkles import weights as wrinkle_weights
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import measure_once, processor_seconds
+from skinrig.benchmarks.measurement import measure_once, measure_processor_seconds
 from skinrig.benchmarks.resampling import gaussian_rms, split_squares
 from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage
@@ -42,7 +42,7 @@ STORED_TYPES: tuple[tuple[Any, Any], ...] = (
 """Of maps and of masks."""
 
 
-def zone_masks(side: int) -> Float64Array:
+def make_zone_masks(side: int) -> Float64Array:
     """Return eight soft zones on a face's texture, (8, side, side), with sums of at most 1."""
     y, x = (np.mgrid[:side, :side] + 0.5) / side
     masks = np.stack(
@@ -79,7 +79,7 @@ def synthesize_wrinkled_face(
     bend = gaussian_filter(rng.standard_normal((side, side)), side / 20, mode="wrap")
     phase = 2 * np.pi * GROOVES_PER_FACE * (y + 0.012 * bend / bend.std())
     grain = gaussian_filter(rng.standard_normal((side, side)), 1.5, mode="wrap")
-    masks = zone_masks(side)
+    masks = make_zone_masks(side)
     rest = 0.15 * masks.sum(axis=0)
 
     def furrows(row: Float64Array) -> Float64Array:
@@ -107,7 +107,7 @@ def _resized(texture: FloatArray, side: int) -> FloatArray:
     return np.moveaxis(resampling.resample(np.moveaxis(texture, 2, 0), (side, side)), 0, 2)
 
 
-def numpy_combine(
+def combine_with_numpy(
     base: Float32Array, wrinkle: Float64Array, masks: Float64Array, sums: Float64Array
 ) -> Float64Array:
     """Return listing 1.1's normals in vectorised NumPy and SciPy: each texture sampled, summed."""
@@ -128,7 +128,7 @@ def numpy_combine(
     return np.asarray(n / np.linalg.norm(n, axis=-1, keepdims=True))
 
 
-def opencv_combine(
+def combine_with_opencv(
     base: Float32Array, wrinkle: Float64Array, masks: Float64Array, sums: Float64Array
 ) -> Float32Array:
     """Return the same with OpenCV's resize for the sampler and NumPy for the sums, float32."""
@@ -162,7 +162,7 @@ def _mean_error(model: Any, states: dict[str, Float64Array]) -> ErrorEstimate:
     return ErrorEstimate(float(np.mean([one.error for one in errors])), (low, high))
 
 
-def fitting(stage: BenchmarkStage) -> None:
+def measure_fitting(stage: BenchmarkStage) -> None:
     """Fit a map and weights to six expressions: sizes of map and masks, known masks or not."""
     side = 64 if stage.toy else 512
     neutral, states = synthesize_wrinkled_face(side, rng=np.random.default_rng(0))
@@ -172,7 +172,7 @@ def fitting(stage: BenchmarkStage) -> None:
         else ((512, 64), (256, 64), (128, 64), (64, 64), (256, 256), (256, 16))
     )
     for map_side, mask_side in sizes:
-        masks = zone_masks(mask_side)
+        masks = make_zone_masks(mask_side)
 
         def fit() -> wrinkle_fit.WrinkleFit:
             return wrinkle_fit.fit_wrinkle_map(
@@ -189,7 +189,7 @@ def fitting(stage: BenchmarkStage) -> None:
     stage.limits["best"] = min(point.error for point in stage.points) / rest
 
 
-def summing(stage: BenchmarkStage) -> None:
+def measure_summing(stage: BenchmarkStage) -> None:
     """Add half of a wrinkle's relief to a base: derivatives, differences of normals, NumPy."""
     rng = np.random.default_rng(1)
     side, coarse, mask_side = (256, 32, 8) if stage.toy else (FULL_SIDE_PX, 256, 64)
@@ -197,9 +197,9 @@ def summing(stage: BenchmarkStage) -> None:
     base *= 0.1 / base.std()
     wrinkle = gaussian_filter(rng.standard_normal((coarse, coarse, 2)), (2, 2, 0))
     wrinkle *= MAX_SLOPE / np.abs(wrinkle).max()
-    masks = zone_masks(mask_side)
+    masks = make_zone_masks(mask_side)
     row = np.full(8, 0.5)
-    truth = numpy_combine(base, wrinkle, masks, row)
+    truth = combine_with_numpy(base, wrinkle, masks, row)
     neutral = wrinkles.decode(base)
     low = _resized(base, coarse)
     difference = wrinkle_differences.difference_map(
@@ -216,8 +216,8 @@ def summing(stage: BenchmarkStage) -> None:
         "derivatives": by_derivatives,
         "differences": by_differences,
         "differences, not renormalized": lambda: by_differences(False),
-        "OpenCV and NumPy": lambda: opencv_combine(base, wrinkle, masks, row),
-        "NumPy": lambda: numpy_combine(base, wrinkle, masks, row),
+        "OpenCV and NumPy": lambda: combine_with_opencv(base, wrinkle, masks, row),
+        "NumPy": lambda: combine_with_numpy(base, wrinkle, masks, row),
     }
 
     for way, call in ways.items():
@@ -230,23 +230,26 @@ def summing(stage: BenchmarkStage) -> None:
         )
     if stage.toy:
         return
-    peer_s, own_s = processor_seconds(ways["NumPy"], 1), processor_seconds(by_derivatives, 5)
+    peer_s, own_s = (
+        measure_processor_seconds(ways["NumPy"], 1),
+        measure_processor_seconds(by_derivatives, 5),
+    )
     stage.limits = {
         "over_numpy": peer_s / own_s,
-        "over_opencv": processor_seconds(ways["OpenCV and NumPy"], 5) / own_s,
+        "over_opencv": measure_processor_seconds(ways["OpenCV and NumPy"], 5) / own_s,
         "difference": float(np.abs(by_derivatives() - truth).max()),
         "differences": stage.points[0].error / stage.points[1].error,
         "storage": wrinkle_storage.paper_footprint().total_bytes / 1024,
     }
 
 
-def storing(stage: BenchmarkStage) -> None:
+def measure_storage(stage: BenchmarkStage) -> None:
     """Store a wrinkle map at sizes and encodings, and show it: angle, bytes, seconds."""
     side = 64 if stage.toy else 512
     neutral, states = synthesize_wrinkled_face(side, rng=np.random.default_rng(0))
     base = wrinkles.encode(neutral).astype(np.float32)
     fitted = wrinkle_fit.fit_wrinkle_map(
-        neutral, states, zone_masks(16 if stage.toy else 64), size=(side, side), clamp="signed"
+        neutral, states, make_zone_masks(16 if stage.toy else 64), size=(side, side), clamp="signed"
     )
     wrinkle = np.clip(fitted.layer.wrinkle, -wrinkles.MAX_DERIVATIVE, wrinkles.MAX_DERIVATIVE)
     masks = fitted.layer.masks
@@ -273,7 +276,7 @@ def storing(stage: BenchmarkStage) -> None:
             )
 
 
-def weighing(stage: BenchmarkStage) -> None:
+def measure_weights(stage: BenchmarkStage) -> None:
     """Fit the weights of an expression that the model made, at several noises and sizes."""
     rng = np.random.default_rng(2)
     draws = 4 if stage.toy else 12
@@ -282,7 +285,7 @@ def weighing(stage: BenchmarkStage) -> None:
     for side in (64, 96) if stage.toy else (128, 256):
         base = 0.1 * rng.standard_normal((side, side, 2))
         wrinkle = gaussian_filter(rng.standard_normal((64, 64, 2)), (1.5, 1.5, 0))
-        layer = WrinkleLayer(0.5 * wrinkle / np.abs(wrinkle).max(), zone_masks(32))
+        layer = WrinkleLayer(0.5 * wrinkle / np.abs(wrinkle).max(), make_zone_masks(32))
         neutral = wrinkle_texels.measure_derivatives(wrinkles.decode(base))
         clean = wrinkles.combine_layers(base, [layer], true)
         for noise in (0.005, NORMAL_NOISE_RAD) if stage.toy else (0.005, NORMAL_NOISE_RAD, 0.08):

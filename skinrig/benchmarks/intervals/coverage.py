@@ -38,7 +38,7 @@ class IntervalTrial:
     factor_95: float
     """Half width of the 95 % interval over that of the 68 % one, as users are told to form it."""
 
-    def share(self, level: int) -> float:
+    def inside_fraction(self, level: int) -> float:
         """Return the share of truths in the intervals of a nominal level, %."""
         reach = {68: 1.0, 95: self.factor_95}[level]
         return float(np.mean(self.deviation <= reach))
@@ -52,7 +52,7 @@ class IntervalCoverage:
     band: str
     level: int
     """Nominal, %."""
-    share: float
+    inside_fraction: float
     """Mean of the subjects' shares."""
     interval: tuple[float, float]
     """Of the share, at the confidence that it was asked for; (0, 1) of a single subject."""
@@ -64,7 +64,7 @@ class IntervalCoverage:
     def verdict(self) -> str:
         """Whether the share is in its range: "kept", "open" (its interval is) or "missed"."""
         low, high = COVERAGE_RANGES[self.level]
-        if low <= self.share <= high:
+        if low <= self.inside_fraction <= high:
             return "kept"
         return "open" if self.interval[1] >= low and self.interval[0] <= high else "missed"
 
@@ -92,7 +92,7 @@ def pool_trials(
     --------
     >>> ones = [IntervalTrial("x", str(k), "any", np.array([0.5, 0.9, 2.5]), 1.0, "", 1.96)
     ...         for k in range(3)]
-    >>> round(pool_trials(ones, level=68).share, 3), pool_trials(ones, level=68).verdict
+    >>> round(pool_trials(ones, level=68).inside_fraction, 3), pool_trials(ones, level=68).verdict
     (0.667, 'kept')
     """
     quantities = {trial.quantity for trial in trials}
@@ -101,7 +101,7 @@ def pool_trials(
             f"trials: got {len(trials)} of {sorted(quantities)}, expected at least one, all of one "
             "quantity and each with truths"
         )
-    shares = np.array([trial.share(level) for trial in trials])
+    shares = np.array([trial.inside_fraction(level) for trial in trials])
     bands = {trial.band for trial in trials}
     return IntervalCoverage(
         trials[0].quantity,
@@ -136,7 +136,7 @@ def _interval(
     return max(min(middle - error, float(low)), 0.0), min(max(middle + error, float(high)), 1.0)
 
 
-def by_band(
+def group_by_band(
     trials: Sequence[IntervalTrial], *, level: int, confidence: float
 ) -> list[IntervalCoverage]:
     """Return the coverage of every quantity: over all subjects, then band by band.

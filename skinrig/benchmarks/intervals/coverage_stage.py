@@ -23,7 +23,7 @@ from skinrig.benchmarks.intervals.coverage import (
     COVERAGE_RANGES,
     IntervalCoverage,
     IntervalTrial,
-    by_band,
+    group_by_band,
 )
 from skinrig.benchmarks.intervals.trials import ANY_BAND
 from skinrig.benchmarks.measurement import measure_once
@@ -57,7 +57,7 @@ DOME_PRESETS: Final = ("I", "III", "V", "II", "IV", "VI")
 Trials = Iterable[IntervalTrial]
 
 
-def intervals(stage: BenchmarkStage) -> Iterator[None]:
+def measure_coverage(stage: BenchmarkStage) -> Iterator[None]:
     """Count how often 68 and 95 % intervals of every rig's maps hold the truth.
 
     Yields
@@ -79,14 +79,14 @@ def intervals(stage: BenchmarkStage) -> Iterator[None]:
 def _evaluate_trials(
     stage: BenchmarkStage, trials: Sequence[IntervalTrial], spent: Mapping[str, Timing]
 ) -> None:
-    counted = len(by_band(trials, level=68, confidence=0.95))
+    counted = len(group_by_band(trials, level=68, confidence=0.95))
     # one-sided at each end of the range, of two levels
     confidence = 1.0 - 2.0 * FALSE_ALARM_RATE / (4 * counted)
-    tried = (by_band(trials, level=level, confidence=confidence) for level in COVERAGE_RANGES)
+    tried = (group_by_band(trials, level=level, confidence=confidence) for level in COVERAGE_RANGES)
     rows = list(itertools.chain(*tried))
     stage.points = [_point(row, spent[row.quantity]) for row in rows]
     stage.limits = {key: found for row in rows for key, found in _limits(row).items()}
-    stage.left_out = [
+    stage.omitted = [
         (f"{trial.quantity}, {trial.subject}", "every pixel is masked")
         for trial in trials
         if not trial.deviation.size
@@ -127,7 +127,7 @@ def _small() -> Mapping[str, Callable[[Path], Trials]]:
 
 
 def _point(row: IntervalCoverage, timing: Timing) -> Point:
-    off = abs(100.0 * row.share - row.level)
+    off = abs(100.0 * row.inside_fraction - row.level)
     low, high = (100.0 * end - row.level for end in row.interval)
     # an interval of the coverage that holds the nominal one allows a distance of 0
     least = 0.0 if low <= 0.0 <= high else min(abs(low), abs(high))
@@ -136,7 +136,7 @@ def _point(row: IntervalCoverage, timing: Timing) -> Point:
             "quantity": row.quantity,
             "skin": row.band,
             "nominal %": row.level,
-            "covered %": round(100.0 * row.share, 1),
+            "covered %": round(100.0 * row.inside_fraction, 1),
             "at least %": round(100.0 * row.interval[0], 1),
             "at most %": round(100.0 * row.interval[1], 1),
             "subjects": row.subjects,

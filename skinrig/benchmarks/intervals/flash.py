@@ -41,7 +41,7 @@ _STANCE_STREAM: Final = 1
 """Beside a subject's seed: of the draw of its place."""
 
 
-def nearer_mm(seed: int) -> float:
+def draw_stance_offset_mm(seed: int) -> float:
     """Return how much nearer to the camera than the tile's place the subject of a seed stands.
 
     Examples
@@ -87,7 +87,7 @@ def run_trials(
             seed=seed,
             width_px=width_px,
             states=("neutral", state) if moving else ("neutral",),
-            nearer_mm=nearer_mm(seed),
+            nearer_mm=draw_stance_offset_mm(seed),
         )
         found, truth = reconstruct_maps(folder, done, ["melanin", "hemoglobin"])
         skin = truth.maps["mask"].values > 0.5

@@ -42,7 +42,7 @@ class _ProbeCamera:
     """Of each fibre and color, summed over its aperture, (F, 3)."""
 
 
-def fibre_readings(stage: BenchmarkStage) -> None:
+def measure_fiber_readings(stage: BenchmarkStage) -> None:
     """Read 28 fibres whose light falls by seven decades with 1 to 23 exposures."""
     bench = _bench(draws=2 if stage.toy else N_NOISE_DRAWS)
     for count in (1, 3, 8, 23) if stage.toy else EXPOSURE_COUNTS:

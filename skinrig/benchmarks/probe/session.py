@@ -27,7 +27,7 @@ BAND_G = 0.8
 """g of the media that stand for bands of skin."""
 
 
-def session(stage: BenchmarkStage) -> None:
+def measure_session(stage: BenchmarkStage) -> None:
     """Capture, calibrate and invert media whose sigma_tr is known; seconds are of the inversion."""
     with tempfile.TemporaryDirectory(prefix="skinrig-probe-") as name:
         folder = Path(name)
@@ -45,7 +45,7 @@ def session(stage: BenchmarkStage) -> None:
         rows = [row for some in of_bands.values() for row in some] if stage.toy else []
         last = like_skin["dark"]
         for seed in () if stage.toy else range(FIRST_MEDIUM_SEED, FIRST_MEDIUM_SEED + N_MEDIA):
-            last = _captured(folder, f"{seed}", medium(seed), seed)
+            last = _captured(folder, f"{seed}", draw_medium(seed), seed)
             rows += _invert(folder, last)
         stage.by_band |= {name: _default_method_error(some) for name, some in of_bands.items()}
         timing, _ = stage.time(lambda: _invert(folder, last, "again"), repeats=1, memory=False)
@@ -66,7 +66,7 @@ def session(stage: BenchmarkStage) -> None:
     }
 
 
-def medium(seed: int) -> tuple[float, float, float]:
+def draw_medium(seed: int) -> tuple[float, float, float]:
     """Return sigma_a and sigma_s' in 1/mm, and g, of a medium drawn by its seed.
 
     sigma_tr and sigma_s' are spread evenly in their logarithms, g evenly.

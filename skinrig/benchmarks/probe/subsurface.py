@@ -12,7 +12,7 @@ from reconstruction.subsurface.models import Method
 from rigsim.fiber.profile import trace_fiber_profile
 from rigsim.tissue.tissue_mc import Layer, LayerStack
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.benchmarks.measurement import processor_seconds
+from skinrig.benchmarks.measurement import measure_processor_seconds
 from skinrig.benchmarks.resampling import bootstrap_columns_median, median_error
 from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -29,7 +29,7 @@ N_PEER_FITS = 60
 """SciPy fits that are timed; their time is extrapolated to the batch."""
 
 
-def transport_profiles(*, toy: bool) -> tuple[Float64Array, Float64Array, Float64Array]:
+def simulate_profiles(*, toy: bool) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return true sigma_tr (N,), profiles in fibres and their errors (N, 28) by Monte Carlo.
 
     sigma_tr from 0.3 to 3.0 per mm, and sigma_s', and g in turn; then the three bands of skin.
@@ -56,10 +56,10 @@ def transport_profiles(*, toy: bool) -> tuple[Float64Array, Float64Array, Float6
     return sigma_tr, profiles, errors
 
 
-def tiers(stage: BenchmarkStage) -> None:
+def measure_tiers(stage: BenchmarkStage) -> None:
     """Fit Monte Carlo profiles by the three models, with all fibres and with fewer."""
     rng = np.random.default_rng(1)
-    sigma_tr, profiles, errors = transport_profiles(toy=stage.toy)
+    sigma_tr, profiles, errors = simulate_profiles(toy=stage.toy)
     spread = slice(0, len(sigma_tr) - len(MELANIN_BANDS))
     draws = 4 if stage.toy else 40
     shape = (draws, *profiles.shape)
@@ -158,7 +158,7 @@ def _absorbs_like(sigma_a: Float64Array, band: MelaninBand) -> BoolArray:
     return np.asarray(np.abs(np.log(sigma_a / band.sigma_a_per_mm)) < np.log(2.0))
 
 
-def batches(stage: BenchmarkStage) -> None:
+def measure_batches(stage: BenchmarkStage) -> None:
     """Fit batches of 28 fibres by diffusion; 30,000 beside a loop of SciPy's least_squares."""
     rng = np.random.default_rng(2)
     count = 200 if stage.toy else N_BATCH_PROFILES
@@ -214,9 +214,9 @@ def batches(stage: BenchmarkStage) -> None:
             above.append(float(found.chi2[n]) / (2.0 * theirs.cost) - 1.0)
             pair = np.array([found.sigma_a_per_mm[n], found.sigma_s_prime_per_mm[n]])
             apart.append(float(np.abs(np.log(pair) - theirs.x).max()))
-        theirs_s = processor_seconds(lambda: [peer(n) for n in range(N_PEER_FITS)], 2)
+        theirs_s = measure_processor_seconds(lambda: [peer(n) for n in range(N_PEER_FITS)], 2)
         theirs_s *= count / N_PEER_FITS
-        ours_s = processor_seconds(ours, 3)
+        ours_s = measure_processor_seconds(ours, 3)
         stage.limits = {
             "speed_up": theirs_s / ours_s,
             "chi2": float(max(above)),

@@ -12,7 +12,11 @@ from model.dipole.direct_sum import DipoleMedia, sum_exitance
 from model.dipole.gather import GATHER_TOL, SourceTree, gather
 from model.fresnel import ETA_SKIN
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import measure, measure_processor_time, processor_seconds
+from skinrig.benchmarks.measurement import (
+    measure,
+    measure_processor_seconds,
+    measure_processor_time,
+)
 from skinrig.benchmarks.resampling import bootstrap_rms
 from skinrig.benchmarks.results import ErrorEstimate, Knobs, Timing
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -40,7 +44,7 @@ class LitFace:
     translucency_mm: Float64Array
 
 
-def face(side: int) -> LitFace:
+def build_lit_face(side: int) -> LitFace:
     """Make a face of 160 mm x 220 mm as side x side texels, albedo and translucency varying."""
     u, v = np.meshgrid(np.linspace(-1, 1, side), np.linspace(1, -1, side))
     x, y = 80.0 * u, 110.0 * v
@@ -70,7 +74,7 @@ def edge_profile(x_mm: Float64Array, media: DipoleMedia) -> Float64Array:
     return np.asarray(np.where(x_mm >= 0.0, beyond, 1.0 - beyond))
 
 
-def gathering(stage: BenchmarkStage) -> None:
+def measure_gathering(stage: BenchmarkStage) -> None:
     """Gather light over a face: tolerance of the tree; then a shadow's edge: number of sources."""
     rng = np.random.default_rng(0)
     _tolerances(stage, rng)
@@ -82,7 +86,7 @@ def gathering(stage: BenchmarkStage) -> None:
 
 def _tolerances(stage: BenchmarkStage, rng: np.random.Generator) -> None:
     side, steps = (48, 3) if stage.toy else (256, 6)
-    scene = face(side)
+    scene = build_lit_face(side)
     at = rng.choice(len(scene.area), 40 if stage.toy else 100, replace=False)
     truth = _sum_directly(scene, at)
     for tolerance in (10.0 ** (1.0 - k) for k in range(steps)):
@@ -94,7 +98,7 @@ def _tolerances(stage: BenchmarkStage, rng: np.random.Generator) -> None:
     direct = measure(lambda: _sum_directly(scene, at[:10]), repeats=1, memory=False)
     seconds = direct.seconds * side**2 / 10
     why = "its seconds are extrapolated from those of 10 points"
-    timing = Timing(seconds, (seconds, seconds), direct.cold_s, None, no_memory=why)
+    timing = Timing(seconds, (seconds, seconds), direct.cold_s, None, no_memory_reason=why)
     knobs = {"scene": "face", "texels": side**2, "sum": "direct, NumPy, extrapolated"}
     stage.add(knobs, timing, ErrorEstimate.symmetric(0.0, 0.0))
 
@@ -180,9 +184,11 @@ def _rms(error: Float64Array, rng: np.random.Generator) -> ErrorEstimate:
 
 def _full_size(rng: np.random.Generator) -> LimitValues:
     """Gather 512 x 512 texels at as many exit points, and some of them directly."""
-    scene = face(FULL_SIDE_PX)
+    scene = build_lit_face(FULL_SIDE_PX)
     gathered = partial(_gathered, scene)
-    spent_s = processor_seconds(lambda: gathered(SourceTree.of(scene.position_mm, scene.area)), 2)
+    spent_s = measure_processor_seconds(
+        lambda: gathered(SourceTree.of(scene.position_mm, scene.area)), 2
+    )
     tree = SourceTree.of(scene.position_mm, scene.area)
     found = gathered(tree)
     at = rng.choice(len(scene.area), 80, replace=False)

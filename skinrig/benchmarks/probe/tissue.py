@@ -19,7 +19,7 @@ BAND_TABLE_SIZE = 64
 """Of the table that errors by band are of."""
 
 
-def layered_reflectance(stage: BenchmarkStage) -> None:
+def measure_layered_reflectance(stage: BenchmarkStage) -> None:
     """Compare the tiers of the layered reflectance with the simulator's Monte Carlo table."""
     rng = np.random.default_rng(0)
     truth = SkinTable.load()
@@ -52,7 +52,7 @@ def layered_reflectance(stage: BenchmarkStage) -> None:
     stage.by_band |= {band: median_error(off[bands == band]) for band in MELANIN_BANDS}
 
 
-def table(stage: BenchmarkStage) -> None:
+def measure_color_table(stage: BenchmarkStage) -> None:
     """Measure the color table's interpolation error in Delta E 2000 over its size."""
     rng = np.random.default_rng(0)
     count = 40 if stage.toy else 400

@@ -15,7 +15,7 @@ from reconstruction.subsurface import translucency
 from reconstruction.subsurface.probe_sites import SITE_UV
 from reconstruction.subsurface.translucency import TEXTURE_MM, TranslucencyPrior
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import processor_seconds
+from skinrig.benchmarks.measurement import measure_processor_seconds
 from skinrig.benchmarks.resampling import gaussian_rms
 from skinrig.benchmarks.results import ErrorEstimate
 from skinrig.benchmarks.stage import BenchmarkStage
@@ -117,7 +117,7 @@ def _bound(count: int, medium: Medium = MEDIUM_PER_MM) -> float:
     return 2.0 * of_one * math.sqrt(2.0 / count)
 
 
-def directions(stage: BenchmarkStage) -> None:
+def measure_directions(stage: BenchmarkStage) -> None:
     """Tell ratios from 5 to 64 directions, by fits of each and by comparing profiles."""
     rng = np.random.default_rng(0)
     cases = 12 if stage.toy else 200
@@ -158,7 +158,7 @@ def _evaluate_directions(stage: BenchmarkStage, rng: np.random.Generator) -> Non
     for way in ANISOTROPY_METHODS:
         alarms = float((_estimate_anisotropy(way, angle, null).p_value < FALSE_ALARM_RATE).sum())
         stage.limits["alarms", str(cases), way] = (alarms, most)
-    fits, profiles = (stage.at(way=way, directions=16).error for way in ANISOTROPY_METHODS)
+    fits, profiles = (stage.find_point(way=way, directions=16).error for way in ANISOTROPY_METHODS)
     stage.limits |= {"over_bound": profiles / _bound(16), "over_profiles": fits / profiles}
 
 
@@ -173,7 +173,7 @@ def _root(prior: TranslucencyPrior, uv: Float64Array) -> Float64Array:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def sites(stage: BenchmarkStage) -> None:
+def measure_sites(stage: BenchmarkStage) -> None:
     """Map 1/sigma_tr from 1 to 16 sites, beside scikit-learn."""
     rng = np.random.default_rng(0)
     whole = translucency.population_prior()
@@ -256,4 +256,6 @@ def _compare_with_scikit_learn(prior: TranslucencyPrior, uv: Float64Array) -> tu
         float(np.abs(found.log_stderr.reshape(-1) - deviation).max()),
     )
     with threadpool_limits(1, "blas"):
-        return processor_seconds(theirs, 2) / max(processor_seconds(ours, 5), 1e-6), mismatch
+        return measure_processor_seconds(theirs, 2) / max(
+            measure_processor_seconds(ours, 5), 1e-6
+        ), mismatch

@@ -93,7 +93,7 @@ def trace_half_space(sigma_a, sigma_s, g, eta, photons, seed, sine, edges2, ring
     return total
 
 
-def photon_transport(stage: BenchmarkStage) -> None:
+def measure_photon_transport(stage: BenchmarkStage) -> None:
     """Trace the probe's fibres by next event and by photons that leave in the cone; then peers."""
     probe = load_rig("probe").probe
     if probe is None:
@@ -191,7 +191,7 @@ def _one_percent(radii: Float64Array, stack: Any) -> LimitValues:
 
 def _against_volpath(radii: Float64Array) -> LimitValues:
     """Compare at n = 1: a disc of light on the surface, seen along the normal, square by fibre."""
-    scene = volpath_scene(radii)
+    scene = build_volpath_scene(radii)
     try:
         radiance(scene, kind="mono", samples=16)
     except (RenderError, RuntimeError):  # no variant with volumes here
@@ -224,7 +224,7 @@ def _against_volpath(radii: Float64Array) -> LimitValues:
     return {"over_volpath": peers / ours}
 
 
-def volpath_scene(radii: Float64Array) -> dict[str, Any]:
+def build_volpath_scene(radii: Float64Array) -> dict[str, Any]:
     """Return Mitsuba's scene of a lit disc on a half-space and a row of square pixels, one a fibre.
 
     The radiance times pi is the exitance per source power where the exit is Lambertian.

@@ -30,7 +30,7 @@ GRADIENT_PX = 128
 N_DOME_LIGHTS = 3
 
 
-def omissions(stage: BenchmarkStage) -> None:
+def measure_omissions(stage: BenchmarkStage) -> None:
     """Render scenes of each rig with and without what their rules decide on.
 
     A point is one effect of one scene: its seconds are those of the picture without the effect, its
@@ -39,7 +39,7 @@ def omissions(stage: BenchmarkStage) -> None:
     """
     found = list(_cases(stage.toy))
     for one in found:
-        timing = Timing.single(one.without_s, no_memory=NO_MEMORY_REASON)
+        timing = Timing.single(one.without_s, no_memory_reason=NO_MEMORY_REASON)
         knobs: Knobs = {"rig": one.rig, "subject": one.subject}
         knobs |= {"effect": one.effect, "verdict": one.verdict}
         also: Knobs = {"seconds saved": one.with_s - one.without_s}

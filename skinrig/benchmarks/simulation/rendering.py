@@ -27,7 +27,7 @@ from skinrig.benchmarks.stage import BenchmarkStage
 NO_MEMORY_REASON = "three ways take turns in one process, each with its scene held"
 
 
-def dome(stage: BenchmarkStage) -> None:
+def measure_dome(stage: BenchmarkStage) -> None:
     """Time one view of the dome, light after light, in three ways.
 
     The full size is that of the rig's cameras. Mitsuba's samples are stratified, which makes them
@@ -46,14 +46,14 @@ def dome(stage: BenchmarkStage) -> None:
         )
         for name in ("ours", "path", "direct"):
             way = getattr(found, name)
-            timing = Timing.single(way.seconds, no_memory=NO_MEMORY_REASON)
+            timing = Timing.single(way.seconds, no_memory_reason=NO_MEMORY_REASON)
             stage.add({"way": name, "rays": subpixels**2}, timing, _method_error(way))
     stage.measure_bands(lambda band: _on_skin(band.preset, 64 if stage.toy else 650, fine))
     stage.limits["over_path"] = found.speed_up(found.path)
     stage.limits["over_direct"] = found.speed_up(found.direct)
-    finest = stage.at(way="ours", rays=max(efforts) ** 2)
+    finest = stage.find_point(way="ours", rays=max(efforts) ** 2)
     stage.reference_error = finest.error * max(efforts) / fine
-    stage.words["rays"] = fine**2
+    stage.description_values["rays"] = fine**2
 
 
 def _method_error(method: dome_scenes.RenderTiming) -> ErrorEstimate:
@@ -81,7 +81,7 @@ def _on_skin(preset: str, width: int, fine: int) -> ErrorEstimate:
 REFERENCE_RAYS = 144
 
 
-def flash(stage: BenchmarkStage) -> None:
+def measure_flash(stage: BenchmarkStage) -> None:
     """Time both polarization images by closed forms and by Mitsuba's own polarizers."""
     efforts = ((1, 2), (2, 4)) if stage.toy else ((1, 4), (2, 16), (3, 64))
     width = 48 if stage.toy else 256
@@ -134,7 +134,7 @@ N_LIT_CONDITIONS = 14
 BEST_KNOBS: Knobs = {"way": "moments", "subpixels": 2, "sectors": 32, "table": 65}
 
 
-def gradient(stage: BenchmarkStage) -> None:
+def measure_gradient(stage: BenchmarkStage) -> None:
     """Picture one state of skin under all conditions, and gradient its conditions one by one.
 
     Both sides are judged against sums over the LEDs with a shadow ray to each. Seconds are
@@ -208,6 +208,6 @@ def _by_moments(
 def _add(
     stage: BenchmarkStage, knobs: Knobs, seconds: float, error: float, mb: float | None, pixels: int
 ) -> None:
-    timing = Timing.single(seconds, mb, memory_of="resident")
+    timing = Timing.single(seconds, mb, memory_kind="resident")
     outcome = ErrorEstimate.symmetric(100.0 * error, 100.0 * error / math.sqrt(2.0 * pixels))
     stage.add(knobs, timing, outcome)

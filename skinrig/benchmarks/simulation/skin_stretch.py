@@ -8,7 +8,7 @@ import numpy as np
 from rigsim.skin_patch.microrelief import SITE_NAMES, MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import FORCE_TOLERANCE, StretchedSkin, required_size_mm, stretch_skin
 from skinrig.arrays import Float32Array
-from skinrig.benchmarks.measurement import measure_processor_time, processor_seconds
+from skinrig.benchmarks.measurement import measure_processor_seconds, measure_processor_time
 from skinrig.benchmarks.resampling import mean_error
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 
@@ -67,7 +67,9 @@ def _limits() -> LimitValues:
         strains = (abs(s.membrane_strain / (r - 1.0)) for r, s in states.items())
         limits["strain", site] = max(strains)
     field = make_micro_skin("forehead", seed=1, size_mm=required_size_mm(12.3, 1.0, angle_deg=0.0))
-    limits["field_s"] = processor_seconds(lambda: stretch_skin(field, stretch=1.2, angle_deg=90.0))
+    limits["field_s"] = measure_processor_seconds(
+        lambda: stretch_skin(field, stretch=1.2, angle_deg=90.0)
+    )
     flat = stretch_skin(_flat(field), stretch=0.8, angle_deg=0.0)
     limits["flat"] = float(np.abs(flat.height_um).max())
     return limits

@@ -49,7 +49,7 @@ def calls(monkeypatch):
     )
     limits = {"kept at full size": {"name": "kept", "at_most": 1.0}}
     entry = {"error_name": "rms, %", "reference": "truth", "interval_of": "", "limits": limits}
-    monkeypatch.setattr(bench_stage, "descriptions", lambda: dict.fromkeys(NAMES, entry))
+    monkeypatch.setattr(bench_stage, "read_descriptions", lambda: dict.fromkeys(NAMES, entry))
     monkeypatch.setattr(bench_plan, "FULL_S", costs)
     made.append(functions)
     return made
@@ -162,7 +162,7 @@ def test_stage_named_twice_is_measured_once(calls, capsys):
 
 def test_table_of_points_and_stage_plots_are_written(calls, tmp_path, capsys):
     document = run(150.0, out=tmp_path)
-    bench_table.write(document, tmp_path)
+    bench_table.write_tables(document, tmp_path)
     with (tmp_path / "bench.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 4 * len(NAMES)

@@ -36,8 +36,8 @@ def trials(rng, **more):
 def test_time_constants_in_noise_have_stated_coverage(rng):
     """300 fits: 4 sigma of a share of 68 % is 11 points, of 95 % 5."""
     made = trials(rng, noise=4e-4)
-    assert abs(pool_trials(made, level=68).share - 0.683) < 0.11
-    assert abs(pool_trials(made, level=95).share - 0.95) < 0.05
+    assert abs(pool_trials(made, level=68).inside_fraction - 0.683) < 0.11
+    assert abs(pool_trials(made, level=95).inside_fraction - 0.95) < 0.05
 
 
 def test_intervals_half_as_wide_are_found_out(rng):
@@ -69,8 +69,8 @@ def told(known, best, inner, outer):
 def test_each_interval_counts_as_stated(inner, outer, held_68, held_95):
     fit = told("estimated", 35.0, inner, outer)
     one = fit_trial("x", [fit], CONSTANT_S, "a", "any")
-    assert one.share(68) == held_68
-    assert one.share(95) == held_95
+    assert one.inside_fraction(68) == held_68
+    assert one.inside_fraction(95) == held_95
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_bounds_are_one_sided_intervals(known, inner, outer, held):
         subject="a",
         band="any",
     )
-    assert (one.share(68), one.share(95)) == held
+    assert (one.inside_fraction(68), one.inside_fraction(95)) == held
     assert np.isnan(one.width)
 
 
@@ -121,5 +121,5 @@ def test_delays_count_by_their_own_interval(true_s, held_68, held_95):
         "delay_interval_s": [0.01, 0.51],
     }
     one = fit_trial("x", [fit], true_s, "a", "any", delay=True)
-    assert (one.share(68), one.share(95)) == (held_68, held_95)
+    assert (one.inside_fraction(68), one.inside_fraction(95)) == (held_68, held_95)
     assert one.width == pytest.approx(100 * 0.14 / true_s)
