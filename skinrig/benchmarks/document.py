@@ -1,4 +1,4 @@
-"""The one JSON schema of all benchmarks: fronts, knees, bands."""
+"""Build the JSON document of a benchmark run: Pareto fronts, knees, melanin bands."""
 
 import json
 import math
@@ -17,9 +17,9 @@ SCHEMA: Final = "skinrig.bench/2"
 
 
 def pareto_front(points: tuple[Point, ...]) -> tuple[int, ...]:
-    """Return the indices of points that no other beats in both seconds and error.
+    """Return the indices of points that no other point beats in both seconds and error.
 
-    A point whose error is not finite is on no front.
+    Points with a non-finite error are excluded.
 
     Examples
     --------
@@ -28,8 +28,8 @@ def pareto_front(points: tuple[Point, ...]) -> tuple[int, ...]:
     """
     front = []
     best = np.inf
-    told = [i for i, point in enumerate(points) if math.isfinite(point.error)]
-    for index in sorted(told, key=lambda i: (points[i].timing.seconds, points[i].error)):
+    finite = [i for i, point in enumerate(points) if math.isfinite(point.error)]
+    for index in sorted(finite, key=lambda i: (points[i].timing.seconds, points[i].error)):
         if points[index].error < best:
             best = points[index].error
             front.append(index)
@@ -37,28 +37,28 @@ def pareto_front(points: tuple[Point, ...]) -> tuple[int, ...]:
 
 
 def find_knee(points: tuple[Point, ...]) -> int | None:
-    """Return the front point after which more seconds buy least, or None below 3 points.
+    """Return the index of the knee of the Pareto front, or None below 3 points.
 
-    The point of the front that lies farthest below the straight line between its ends, on
-    log-log axes.
+    The knee is the front's point farthest below the chord between its ends, on log-log axes.
     """
     front = pareto_front(points)
     if len(front) < 3:
         return None
     log_s = np.log([max(points[i].timing.seconds, 1e-9) for i in front])
     log_e = np.log([max(points[i].error, 1e-300) for i in front])
+    # chord: log e = log e_0 + (log s - log s_0) (log e_n - log e_0) / (log s_n - log s_0)
     line = log_e[0] + (log_s - log_s[0]) * (log_e[-1] - log_e[0]) / (log_s[-1] - log_s[0])
     return front[int(np.argmax(line - log_e))]
 
 
 def find_fronts(stage: StageBenchmark) -> list[dict[str, Any]]:
-    """Return the front and the knee of each condition that a stage measures.
+    """Return the Pareto front and the knee of each condition of a stage.
 
     Returns
     -------
     list of dict
-        ``condition``: knobs with the values that all its points share; ``points``: numbers of the
-        points on its front, the quickest first; ``find_knee``: number of one of them, or None.
+        ``condition``: knobs whose values its points have in common; ``points``: indices of the
+        points on its front, the quickest first; ``knee``: one of these indices, or None.
     """
     groups: dict[tuple[Any, ...], list[int]] = {}
     for number, point in enumerate(stage.points):
@@ -79,7 +79,7 @@ def find_fronts(stage: StageBenchmark) -> list[dict[str, Any]]:
 
 
 def describe_machine() -> dict[str, Any]:
-    """Say what ran the benchmark, without naming the machine."""
+    """Return versions, architecture and core count, without the machine's name."""
     return {
         "python": platform.python_version(),
         "numpy": np.__version__,
@@ -98,7 +98,9 @@ def to_document(stages: Iterable[StageBenchmark]) -> dict[str, Any]:
         "stages": {stage.name: _stage(stage) for stage in stages},
     }
     document["passed"] = all(limit.passed for stage in stages for limit in stage.limits)
-    json.dumps(document, allow_nan=True)  # a value that is no JSON fails here, not at a reader
+    json.dumps(
+        document, allow_nan=True
+    )  # fail here, not in a reader, on a value without a JSON form
     return document
 
 
@@ -151,7 +153,7 @@ def _band(name: str, error: ErrorEstimate) -> dict[str, Any]:
 
 
 def _dark_to_light_ratio(by_band: Mapping[str, ErrorEstimate]) -> dict[str, Any] | None:
-    """Return the last band's error over the first's, with the ends that both intervals allow."""
+    """Return the last band's error over the first's, with the range that both intervals allow."""
     skins = list(by_band.values())
     if len(skins) < 2 or not skins[0].error > 0.0:
         return None

@@ -73,7 +73,7 @@ def draw_medium(seed: int) -> tuple[float, float, float]:
 
     Examples
     --------
-    >>> sigma_a, sigma_s_prime, g = medium(3)
+    >>> sigma_a, sigma_s_prime, g = draw_medium(3)
     >>> 0.3 <= math.sqrt(3 * sigma_a * (sigma_a + sigma_s_prime)) <= 3.0
     True
     """

@@ -122,12 +122,12 @@ def test_each_condition_has_own_front_and_knee():
         for s, error in zip(timing, errors, strict=True)
     ]
     alone = StageBenchmark("s", "rms", "r", 0.0, tuple(points), condition=("noise",))
-    told = to_document([alone])["stages"]["s"]
-    assert told["fronts"] == [
+    written = to_document([alone])["stages"]["s"]
+    assert written["fronts"] == [
         {"condition": {"noise": "low"}, "points": [0, 1, 2], "knee": 1},
         {"condition": {"noise": "high"}, "points": [3, 4], "knee": None},
     ]
-    assert [p["on_front"] for p in told["points"]] == [True] * 5 + [False]
+    assert [p["on_front"] for p in written["points"]] == [True] * 5 + [False]
     # in one front for all, what is measured with much noise would look like too little effort
     mixed = to_document([StageBenchmark("s", "rms", "r", 0.0, tuple(points))])["stages"]["s"]
     assert [p["on_front"] for p in mixed["points"]] == [True] * 3 + [False] * 3
@@ -145,10 +145,10 @@ def test_document_reports_error_ratio_on_dark_skin():
             "dark": ErrorEstimate(6.0, (4.0, 8.0), 3.0),
         },
     )
-    told = to_document([stage])["stages"]["s"]
-    assert [one["band"] for one in told["by_band"]] == ["light", "dark"]
-    assert told["darkest_over_lightest"] == {"ratio": 3.0, "interval": [1.0, 8.0]}
-    assert [row[1:7] for row in bench_table.list_band_rows({"stages": {"s": told}})] == [
+    written = to_document([stage])["stages"]["s"]
+    assert [one["band"] for one in written["by_band"]] == ["light", "dark"]
+    assert written["darkest_over_lightest"] == {"ratio": 3.0, "interval": [1.0, 8.0]}
+    assert [row[1:7] for row in bench_table.list_band_rows({"stages": {"s": written}})] == [
         ("light", 2.0, 1.0, 4.0, "", 1.0),
         ("dark", 6.0, 4.0, 8.0, 3.0, 3.0),
     ]
@@ -157,5 +157,5 @@ def test_document_reports_error_ratio_on_dark_skin():
 def test_memory_that_was_not_measured_has_its_reason():
     timing = Timing(1.0, (1.0, 1.0), 1.0, None, no_memory_reason="extrapolated")
     stage = StageBenchmark("s", "rms", "r", 0.0, (Point({}, timing, 1.0, (1.0, 1.0)),))
-    told = to_document([stage])["stages"]["s"]["points"][0]
-    assert (told["peak_memory_mb"], told["no_memory"]) == (None, "extrapolated")
+    written = to_document([stage])["stages"]["s"]["points"][0]
+    assert (written["peak_memory_mb"], written["no_memory"]) == (None, "extrapolated")

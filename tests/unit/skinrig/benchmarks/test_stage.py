@@ -1,4 +1,4 @@
-"""The table of stages: every entry is measured by a function and promises one bound a limit."""
+"""The table of stages: every entry has a function, and every limit has one bound."""
 
 import ast
 from importlib.util import find_spec

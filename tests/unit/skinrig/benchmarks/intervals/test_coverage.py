@@ -1,4 +1,4 @@
-"""Coverage over subjects whose pixels share their errors."""
+"""Coverage over subjects whose pixels have correlated errors."""
 
 import numpy as np
 import pytest
@@ -65,12 +65,12 @@ def test_bands_are_reported_and_subjects_without_truth_omitted(rng):
 
 def test_angles_of_two_gaussian_components_reach_68_percent(rng):
     angle = np.hypot(*rng.standard_normal((2, 200_000)))
-    # 4 sigma of the share
+    # 4 sigma of the fraction
     assert np.mean(angle <= RAYLEIGH_68) == pytest.approx(0.6827, abs=0.0042)
 
 
 def test_few_truths_all_inside_leave_coverage_open():
-    """Two subjects with two truths each, all inside: that is no proof of 95 % or more."""
+    """Two subjects with two truths each, all inside, do not prove 95 % or more."""
     trials = [
         IntervalTrial("x", str(k), "any", np.array([0.1, 0.2]), 1.0, "s", 1.96) for k in range(2)
     ]

@@ -1,4 +1,4 @@
-"""Trials of the flash rig: its subjects stand off the white tile's place as stated errors say."""
+"""Trials of the flash rig: subjects' distances from the white reference match the stated errors."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from skinrig.benchmarks.intervals import flash as trials
 
 
 def test_subject_distance_from_tile_matches_stated_light_error():
-    """Light goes with the square of the distance; chi-square of 400 draws, 1 % false alarms."""
+    """Light falls with the square of the distance; chi-square of 400 draws, 1 % false alarms."""
     distance_mm = 1000.0
     nearer = np.array([trials.draw_stance_offset_mm(seed) for seed in range(400)])
     light = -2.0 * np.log1p(-nearer / distance_mm)
