@@ -138,10 +138,10 @@ class StageBenchmark:
     by_band: Mapping[str, ErrorEstimate] = field(default_factory=dict)
     """Error by melanin band, from light to dark, same unit (`skinrig.evaluating.skin_bands`)."""
     no_bands: str = ""
-    """Reason why errors do not depend on melanin, where there are no bands."""
+    """Reason why errors do not depend on melanin, for stages without bands."""
     condition: tuple[str, ...] = ()
     """Knobs of the measured case (noise, subject) as opposed to its effort. Each set of their
-    values has its own front. A point that lacks such a knob has the condition ``None``."""
+    values has its own front; a point without such a knob has the condition ``None``."""
     interval_of: str = ""
     """Population over which errors vary within their intervals."""
     squared: bool = False

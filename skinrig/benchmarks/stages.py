@@ -51,7 +51,7 @@ def run_stages(
         Keys of :data:`STAGES`, each measured at full size. None: all at small size, then those
         that fit into the budget at full size, the quickest first.
     budget_s
-        Time budget, s. A stage that would begin after its end is omitted and listed.
+        Time budget in seconds; a stage that would begin after its end is omitted and listed.
     toy
         Whether to measure small sizes only, which checks that the benchmark runs.
     out

@@ -1,4 +1,4 @@
-"""Benchmark of height from normals, beside Frankot-Chellappa, cosines and a sparse direct solve."""
+"""Benchmark of normal integration against Frankot-Chellappa, cosines and a sparse direct solve."""
 
 from collections.abc import Callable
 from functools import partial
@@ -35,9 +35,9 @@ RELIEF_RMS_UM = 12.0
 
 
 def synthesize_relief(side: int, *, rng: np.random.Generator) -> tuple[Float64Array, Float64Array]:
-    """Make a relief of ridged cells on a bulge, and its normals (y up) without noise.
+    """Synthesize a periodic relief of ridged cells on a bulge, and its exact normals (y up).
 
-    Periodic, of 90 um to 1 mm wavelength; slopes are exact derivatives of the height's waves.
+    Wavelengths are 90 um to 1 mm. Slopes are spectral derivatives of the height.
 
     Returns
     -------
@@ -55,7 +55,7 @@ def synthesize_relief(side: int, *, rng: np.random.Generator) -> tuple[Float64Ar
     waves[0, 0] = 0.0
     waves *= RELIEF_RMS_UM / fft.irfft2(waves, (side, side)).std()
     waves[1, 1] += 0.25 * side * side * 60.0  # the bulge
-    # no derivative of the highest wave of an even number
+    # the derivative of the Nyquist wave is undefined and set to 0
     odd_x = np.where(theta_x >= np.pi - 1e-9, 0.0, theta_x)
     odd_y = np.where(np.abs(theta_y) >= np.pi - 1e-9, 0.0, theta_y)
     height = fft.irfft2(waves, (side, side))
@@ -66,9 +66,9 @@ def synthesize_relief(side: int, *, rng: np.random.Generator) -> tuple[Float64Ar
 
 
 def frankot_chellappa(normals: Float64Array, *, pixel: float) -> Float64Array:
-    """Integrate slopes of a periodic picture by the Fourier transform.
+    """Integrate the slopes of a periodic image by the Fourier transform.
 
-    Frankot and Chellappa 1988, doi 10.1109/34.3909.
+    Frankot and Chellappa 1988, doi 10.1109/34.3909: Z = -i (u P + v Q) / (u^2 + v^2).
     """
     gx, gy = -normals[..., 0] / normals[..., 2], normals[..., 1] / normals[..., 2]
     v = 2.0 * np.pi * np.fft.fftfreq(gx.shape[0])[:, None]
@@ -80,7 +80,7 @@ def frankot_chellappa(normals: Float64Array, *, pixel: float) -> Float64Array:
 
 
 def sparse_direct(normals: Float64Array, valid: BoolArray, *, pixel: float) -> Float64Array:
-    """Solve the same normal equations with SciPy's SuperLU; one connected part."""
+    """Solve the same normal equations with SciPy's SuperLU, for one connected region."""
     ax, ay, dx, dy = slope_fields.edges(slope_fields.from_normals(normals, valid=valid), order=4)
     number = np.full(ax.shape, -1)
     inside = np.pad(valid, 1)
@@ -95,7 +95,7 @@ def sparse_direct(normals: Float64Array, valid: BoolArray, *, pixel: float) -> F
         shape=(begin.size, int(number.max()) + 1),
     )
     A = (D.T @ D).tolil()
-    A[0, 0] += 1.0
+    A[0, 0] += 1.0  # fixes the free constant: the equations alone are singular
     x = splu(A.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(
         D.T @ wanted
     )
@@ -105,7 +105,7 @@ def sparse_direct(normals: Float64Array, valid: BoolArray, *, pixel: float) -> F
 
 
 def measure_integration(stage: BenchmarkStage) -> None:
-    """Integrate a relief's normals: tolerance, order, mask, noise, peers; then at full size."""
+    """Measure integration over tolerance, order, mask, noise and peers, then at full size."""
     rng = np.random.default_rng(0)
     side = 64 if stage.toy else 512
     truth, clean = synthesize_relief(side, rng=rng)
@@ -127,8 +127,8 @@ def measure_integration(stage: BenchmarkStage) -> None:
 
         def error(height: FloatArray) -> ErrorEstimate:
             off = _high_passed(height - truth, valid)
-            places = [at for at in split_squares(len(off)) if valid[at].any()]
-            tiles = [float(np.mean(off[at][valid[at]] ** 2)) for at in places]
+            squares = [at for at in split_squares(len(off)) if valid[at].any()]
+            tiles = [float(np.mean(off[at][valid[at]] ** 2)) for at in squares]
             low, high = bootstrap_rms(tiles, rng=rng).error_interval
             rms = float(np.sqrt(np.mean(off[valid] ** 2)))
             return ErrorEstimate(rms, (min(low, rms), max(high, rms)), bound)
@@ -175,7 +175,7 @@ def _disc(side: int) -> BoolArray:
 
 
 def _full_size(rng: np.random.Generator) -> LimitValues:
-    """Measure 2048 x 2048 with a mask, and 1024 x 1024 with jumps."""
+    """Measure 2048 x 2048 with a mask, and 1024 x 1024 with discontinuities."""
     _, normals = synthesize_relief(2048, rng=rng)
     noisy = (normals + NORMAL_NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(normals.shape)).astype(
         np.float32

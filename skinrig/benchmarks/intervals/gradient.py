@@ -2,9 +2,9 @@
 
 Kernels are compared with reference kernels of a larger area of the same skin, seven to ten times
 the patch. Those are fitted by the same definition, eq. (7), to true heights and the true stretch.
-The difference thus includes the variation between patches of the skin, as the standard errors do, and
-the errors of images, lens and strain. Both reliefs of the reference are of one piece of skin, as
-those of the patch are: histograms of other skin lead to narrower and stronger kernels.
+The difference thus includes the variation between patches of the skin, as the standard errors do,
+and the errors of images, lens and strain. Both reliefs of the reference are of one piece of skin,
+as those of the patch are: histograms of other skin lead to narrower and stronger kernels.
 """
 
 import tempfile

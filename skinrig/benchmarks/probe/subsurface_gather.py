@@ -1,4 +1,4 @@
-"""Benchmark of light gathered in skin, beside the direct sum in NumPy in the same run."""
+"""Benchmark of gathered subsurface light against the direct sum in NumPy in the same run."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -24,18 +24,18 @@ from skinrig.evaluating.skin_bands import MelaninBand
 
 FULL_SIDE_PX = 512
 MIN_RELATIVE_EXITANCE = 0.01
-"""Of the brightest exitance: what is darker is left out where errors are over the local value."""
+"""Fraction of the largest exitance below which points are excluded from locally relative errors."""
 MEAN_R_D = np.array([0.55, 0.35, 0.25])
 MEAN_TRANSLUCENCY_MM = 1.0 / np.array([0.598, 1.069, 1.672])
-"""Of a mean face, table 2 of Weyrich et al. 2005."""
+"""Diffuse mean free path of a mean face, mm: table 2 of Weyrich et al. 2005."""
 BAND_STEP_MM = 0.8
-"""Of the sources where errors are told by skin."""
+"""Spacing of the sources for errors by melanin band, mm."""
 EDGE_POSITIONS_MM = np.linspace(-3.0, 3.0, 60)
 
 
 @dataclass(frozen=True, slots=True)
 class LitFace:
-    """A face as texels, lit from one side, with a cast shadow."""
+    """Texels of a face, lit from one side, with a cast shadow."""
 
     position_mm: Float64Array
     area: Float64Array
@@ -45,7 +45,7 @@ class LitFace:
 
 
 def build_lit_face(side: int) -> LitFace:
-    """Make a face of 160 mm x 220 mm as side x side texels, albedo and translucency varying."""
+    """Build a face of 160 mm x 220 mm in side x side texels of varying albedo and translucency."""
     u, v = np.meshgrid(np.linspace(-1, 1, side), np.linspace(1, -1, side))
     x, y = 80.0 * u, 110.0 * v
     z = 80.0 * np.sqrt(1.3 - 0.8 * u**2 - 0.4 * v**2) + 20.0 * np.exp(-(x**2 + y**2) / 300.0)
@@ -64,18 +64,19 @@ def build_lit_face(side: int) -> LitFace:
 
 
 def edge_profile(x_mm: Float64Array, media: DipoleMedia) -> Float64Array:
-    """Return the share of even light on x < 0 that comes out at x, by a 1-D integral."""
+    """Return the exitance at x of uniform light on x < 0, relative to R_d, by a 1-D integral."""
     widest = 40.0 / float(media.sigma_tr_per_mm)
     t = widest * np.linspace(0.0, 1.0, 20_001) ** 3
     away = np.abs(x_mm)[:, None]
-    # a ring of radius r lies beyond a line at a distance x by acos(x / r) / pi; r^2 = x^2 + t^2
+    # the fraction acos(x / r) / pi of a ring of radius r is beyond a line at a distance x; the
+    # substitution r^2 = x^2 + t^2 gives 2 pi r dr acos(x / r) / pi = 2 t atan2(t, x) dt
     ring = 2.0 * t * np.arctan2(t, away) * dipole_sum.profile(np.hypot(away, t), media)
     beyond = np.trapezoid(ring, t, axis=1)
     return np.asarray(np.where(x_mm >= 0.0, beyond, 1.0 - beyond))
 
 
 def measure_gathering(stage: BenchmarkStage) -> None:
-    """Gather light over a face: tolerance of the tree; then a shadow's edge: number of sources."""
+    """Measure gathering over the tree's tolerance on a face and over sources at a shadow's edge."""
     rng = np.random.default_rng(0)
     _tolerances(stage, rng)
     _edges(stage, rng)
@@ -134,11 +135,11 @@ def _edge(
     *,
     skin: tuple[Float64Array, Float64Array] = (MEAN_R_D, MEAN_TRANSLUCENCY_MM),
 ) -> Float64Array:
-    """Return the profile of a shadow's edge from sources a step apart, (X, 3).
+    """Return the profile of a shadow's edge from sources at a spacing, (X, 3).
 
-    On skin of a diffuse albedo and a mean free path, mm.
+    `skin` is the diffuse albedo and the diffuse mean free path, mm.
     """
-    half = step_mm * round(10.0 / step_mm)  # so that no source lies on the edge
+    half = step_mm * round(10.0 / step_mm)  # a multiple of the step: no source is on the edge
     grid = np.arange(-half, half, step_mm) + 0.5 * step_mm
     x, y = np.meshgrid(grid, grid)
     place = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
@@ -183,7 +184,7 @@ def _rms(error: Float64Array, rng: np.random.Generator) -> ErrorEstimate:
 
 
 def _full_size(rng: np.random.Generator) -> LimitValues:
-    """Gather 512 x 512 texels at as many exit points, and some of them directly."""
+    """Measure 512 x 512 texels at as many exit points, and some of them by the direct sum."""
     scene = build_lit_face(FULL_SIDE_PX)
     gathered = partial(_gathered, scene)
     spent_s = measure_processor_seconds(
@@ -217,7 +218,7 @@ def _full_size(rng: np.random.Generator) -> LimitValues:
 
 
 def _plane_level() -> float:
-    """Return how far a plane's sum without normalization is from R_d at most, relative."""
+    """Return the largest relative error of a plane's sum without normalization from R_d."""
     step, half = 0.4, 30.0
     grid = np.arange(-half, half, step) + 0.5 * step
     x, y = np.meshgrid(grid, grid)
