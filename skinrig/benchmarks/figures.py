@@ -167,7 +167,7 @@ def plot_compared_fronts(
         SVG with an alternative text. Thin lines join settings that both benchmarks measured.
     """
     figure, axes = figures.canvas(5.2, 3.4)
-    places: list[dict[str, tuple[float, float]]] = []
+    positions: list[dict[str, tuple[float, float]]] = []
     summaries = []
     for number, (label, document) in enumerate((a, b)):
         points = [p for p in document["points"] if p["error"] > 0.0]
@@ -175,7 +175,7 @@ def plot_compared_fronts(
         error = np.array([p["error"] for p in points], float)
         mark = {"mfc": "none" if number else None, "color": figures.SERIES_COLORS[number]}
         axes.plot(seconds, error, "os"[number], ms=5, label=label, **mark)
-        places.append(
+        positions.append(
             {
                 str(p["knobs"]): (s, e)
                 for p, s, e in zip(points, seconds.tolist(), error.tolist(), strict=True)
@@ -185,8 +185,8 @@ def plot_compared_fronts(
             f"{label}: errors {figures.format_range(error)} in {figures.format_range(seconds)}"
             f" seconds"
         )
-    for knobs in sorted(places[0].keys() & places[1].keys()):
-        (s0, e0), (s1, e1) = places[0][knobs], places[1][knobs]
+    for knobs in sorted(positions[0].keys() & positions[1].keys()):
+        (s0, e0), (s1, e1) = positions[0][knobs], positions[1][knobs]
         axes.plot([s0, s1], [e0, e1], "-", color="0.5", lw=0.6, zorder=0)
     axes.margins(x=0.15, y=0.2)
     _set_up_axes(axes, stage, a[1]["error_name"])

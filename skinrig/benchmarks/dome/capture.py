@@ -187,8 +187,8 @@ def measure_geometry(stage: BenchmarkStage) -> None:
     start = nominal_cameras(rig)
     probes = np.random.default_rng(0).uniform(-70, 70, (300, 3))
     for count in counts:
-        seen = {key: s for key, s in sightings.items() if key[1] < count}
-        result = bundle.adjust(seen, CHARUCO_BOARD, start)
+        visible = {key: s for key, s in sightings.items() if key[1] < count}
+        result = bundle.adjust(visible, CHARUCO_BOARD, start)
         gaps, variances, projected = [], [], []
         for name, camera in result.cameras.items():
             view = dome.rig.view(name)
@@ -197,7 +197,7 @@ def measure_geometry(stage: BenchmarkStage) -> None:
             truth = project_points(view, dome.distortion[name], probes)
             projected.append(np.linalg.norm(camera.project(probes) - truth, axis=1).mean())
         stage.limits["reprojection"] = float(max(projected))
-        timing, _ = stage.time(lambda: bundle.adjust(seen, CHARUCO_BOARD, start), repeats=3)
+        timing, _ = stage.time(lambda: bundle.adjust(visible, CHARUCO_BOARD, start), repeats=3)
         stage.add({"places": count}, timing, _rms(np.array(gaps), np.array(variances)))
 
 
@@ -211,9 +211,9 @@ def measure_light_positions(stage: BenchmarkStage) -> None:
     scene = make_target_scene("mirror", rig, seed=DOME_SEED, dome=dome)
     cameras = {view.name: CameraPose.nominal(view) for view in dome.rig.views}
     spheres: dict[int, mirror_sphere.SpherePosition] = {}
-    seen: list[mirror_lights.Highlights] = []
-    most = 4
-    for number in range(most):
+    highlights: list[mirror_lights.Highlights] = []
+    max_poses = 4
+    for number in range(max_poses):
         scene.set_pose(number)
         outlines, colors = {}, {}
         for name, camera in cameras.items():
@@ -228,11 +228,11 @@ def measure_light_positions(stage: BenchmarkStage) -> None:
             window = mirror_lights.SphereWindow.of(camera, spheres[number])
             frame = _frame(scene, name, range(len(every)), 0.012, 0.002, number)
             spots = mirror_lights.find_highlights(neutral_mosaic(frame, colors[name]), window)
-            seen.append(mirror_lights.Highlights(name, number, tuple(every), spots))
+            highlights.append(mirror_lights.Highlights(name, number, tuple(every), spots))
     nominal = {light.name: np.array(light.position_mm) for light in rig.lights}
     truth = scene.truth()["position_mm"]
-    for count in range(1, most + 1):
-        rows = [row for row in seen if row.sphere < count]
+    for count in range(1, max_poses + 1):
+        rows = [row for row in highlights if row.sphere < count]
         some = {number: spheres[number] for number in range(count)}
 
         locate = partial(mirror_lights.locate_lights, rows, cameras, some, nominal)

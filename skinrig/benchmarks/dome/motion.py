@@ -171,16 +171,16 @@ def measure_head_motion(stage: BenchmarkStage) -> None:
     drift = partial(simulate_drifting_capture, width_px=width, views=views, texels=texels)
 
     for drift_mm in (1.0,) if stage.toy else (0.3, 1.0, 3.0):
-        seen = drift(drift_mm=drift_mm, times_s=times)
-        moved_mm = round(float(seen.true_motion_mm().mean()), 3)
+        captured = drift(drift_mm=drift_mm, times_s=times)
+        moved_mm = round(float(captured.true_motion_mm().mean()), 3)
         for tracks in (30, 60, 120, 200) if stage.toy else (30, 100, 300):
             knobs = {"drift mm": drift_mm, "tracks": tracks}
-            follow = partial(seen.estimate, tracks)
-            stage.measure(knobs, follow, seen.error, extra_values={"moved_mm": moved_mm})
+            follow = partial(captured.estimate, tracks)
+            stage.measure(knobs, follow, captured.error, extra_values={"moved_mm": moved_mm})
 
     def on_skin(band: MelaninBand) -> ErrorEstimate:
-        seen = drift(drift_mm=1.0, times_s=times[:3], preset=band.preset)
-        return seen.error(seen.estimate(100))
+        captured = drift(drift_mm=1.0, times_s=times[:3], preset=band.preset)
+        return captured.error(captured.estimate(100))
 
     stage.measure_bands(on_skin)
     stage.description_values = {"width": width // 2, "views": views}

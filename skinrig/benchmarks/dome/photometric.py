@@ -144,8 +144,8 @@ def _mean_deg(
     found: NormalMaps, scene: BallScene, noise: float, rng: np.random.Generator
 ) -> ErrorEstimate:
     """Return the mean error of normals with its bound, degrees."""
-    seen = scene.inside & found.valid
-    error = np.degrees(angular_error_rad(found.normals[seen], scene.normals[seen]))
+    visible = scene.inside & found.valid
+    error = np.degrees(angular_error_rad(found.normals[visible], scene.normals[visible]))
     some = rng.choice(error, min(error.size, 20_000), replace=False)
     interval = bootstrap_interval(some, np.mean, draws=100, rng=rng)
     return ErrorEstimate(float(error.mean()), interval, _mean_bound_deg(scene, noise))
@@ -192,13 +192,13 @@ def _full_size(rng: np.random.Generator) -> LimitValues:
     estimate_normals(scene.images[:, :8, :8], scene.lights)
     ours_s = measure_processor_seconds(lambda: estimate_normals(scene.images, scene.lights), 3)
     ours_s /= LIMIT_CORES
-    places = np.sort(rng.choice(np.flatnonzero(scene.inside), 300, replace=False))
-    some = scene.images.reshape(150, -1)[:, places].astype(np.float64)
+    chosen = np.sort(rng.choice(np.flatnonzero(scene.inside), 300, replace=False))
+    some = scene.images.reshape(150, -1)[:, chosen].astype(np.float64)
     with threadpool_limits(1):
         peer_s, theirs = measure_processor_time(lambda: fit_normals_with_numpy(some, scene.lights))
-    peer_s *= side**2 / len(places)
-    ours = estimate_normals(scene.images.reshape(150, -1)[:, places], scene.lights)
-    truth = scene.normals.reshape(-1, 3)[places]
+    peer_s *= side**2 / len(chosen)
+    ours = estimate_normals(scene.images.reshape(150, -1)[:, chosen], scene.lights)
+    truth = scene.normals.reshape(-1, 3)[chosen]
     both = ours.valid & (np.linalg.norm(theirs, axis=1) > 0)
     error = np.degrees(angular_error_rad(ours.normals[both], truth[both])).mean()
     peer_error = np.degrees(angular_error_rad(theirs[both], truth[both])).mean()

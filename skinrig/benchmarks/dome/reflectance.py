@@ -66,14 +66,14 @@ def sample_face_points(
     chosen = rng.permutation(np.flatnonzero(bare))[:points]
     packed = surface.packed().reshape(-1, 7)[chosen]
     normals = surface.normal.reshape(-1, 3)[chosen].astype(np.float64)
-    place = face.atlas.position_mm.reshape(-1, 3)[chosen].astype(np.float64)
+    position = face.atlas.position_mm.reshape(-1, 3)[chosen].astype(np.float64)
     ends = [np.array([one.position_mm for one in rows]) for rows in (rig.lights, rig.views)]
     every = rng.permuted(np.tile(np.arange(len(ends[0]) * len(ends[1])), (len(chosen), 1)), axis=1)
-    pair = _pairs_above_horizon(every, ends, place, normals)[:, :samples]
+    pair = _pairs_above_horizon(every, ends, position, normals)[:, :samples]
     which = np.divmod(pair, len(ends[1]))
-    to = [_unit(end[k] - place[:, None]) for end, k in zip(ends, which, strict=True)]
+    to = [_unit(end[k] - position[:, None]) for end, k in zip(ends, which, strict=True)]
     cosines = [np.einsum("pmk,pk->pm", way, normals) for way in to]
-    seen = (cosines[0] > MIN_COSINE) & (cosines[1] > MIN_COSINE)
+    visible = (cosines[0] > MIN_COSINE) & (cosines[1] > MIN_COSINE)
     count = pair.shape[1]
     total, specular = surface_brdf.evaluate_brdf(
         np.repeat(packed, count, axis=0),
@@ -90,7 +90,7 @@ def sample_face_points(
         to[0],
         to[1],
         normals,
-        seen,
+        visible,
         np.asarray(specular, np.float64).reshape(len(chosen), count),
         held[which[0]],
         clean,

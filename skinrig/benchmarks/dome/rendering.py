@@ -43,39 +43,39 @@ def measure_model_rendering(stage: BenchmarkStage) -> None:
     width, size, fine = (48, 128, 3) if stage.toy else (325, 512, REFERENCE_SUBPIXELS)
     rays = (1, 2) if stage.toy else (1, 2, 3, 4)
     rig = load_rig("dome").resized(width + width % 2).subset(views=[VIEW_NAME])
-    seen = _SimulatedFace.of("III", rig, size=size, subpixels=fine)
+    face = _SimulatedFace.of("III", rig, size=size, subpixels=fine)
     binnings = (1, 2) if stage.toy else (1, 2, 4, 8)
-    surfaces = {k: seen.fitted_surface(binning=k) for k in binnings}
+    surfaces = {k: face.fitted_surface(binning=k) for k in binnings}
 
     def add(knobs: Knobs, call: Callable[[], FloatArray], true: FloatArray, repeats: int) -> None:
         stage.measure(knobs, call, partial(_relative, true=true), repeats=repeats, memory=None)
 
     for k in rays:
         knobs: Knobs = {"vary": "rays", "rays": k**2}
-        add(knobs, lambda: seen.render(surfaces[1], subpixels=k).radiance, seen.true, 2)
+        add(knobs, lambda: face.render(surfaces[1], subpixels=k).radiance, face.true, 2)
     for k in binnings[1:]:
         knobs = {"vary": "texture", "texels": size // k}
-        add(knobs, lambda: seen.render(surfaces[k]).radiance, seen.true, 2)
+        add(knobs, lambda: face.render(surfaces[k]).radiance, face.true, 2)
     skin = surfaces[1].with_sigma_tr(MEAN_SIGMA_TR_PER_MM)
     inside = Interior.of(skin)
 
-    def spread(tolerance: float) -> FloatArray:
+    def render_scattered(tolerance: float) -> FloatArray:
         aimed = dataclasses.replace(inside, tolerance=tolerance)
-        return seen.render(skin, subsurface="dipole", interior=aimed, subpixels=1).diffuse
+        return face.render(skin, subsurface="dipole", interior=aimed, subpixels=1).diffuse
 
-    best = spread(0.001)
+    best = render_scattered(0.001)
     for tolerance in (0.1, 0.01) if stage.toy else (3.0, 1.0, 0.3, 0.1, 0.01):
         knobs = {"vary": "spreading", "tolerance": tolerance}
-        add(knobs, lambda: spread(tolerance), best, 1)
-    usual, true = seen.render(surfaces[1]), seen.true
+        add(knobs, lambda: render_scattered(tolerance), best, 1)
+    usual, true = face.render(surfaces[1]), face.true
     lit = usual.lit & usual.covered & (true.mean(axis=-1) > 0.0)
     gap = np.abs(usual.radiance - true).mean(axis=-1)[lit] / true.mean(axis=-1)[lit]
-    color = np.array(seen.light.intensity)
+    color = np.array(face.light.intensity)
     two = [
-        dataclasses.replace(seen.light, name=n, intensity=tuple((w * color).tolist()))
+        dataclasses.replace(face.light, name=n, intensity=tuple((w * color).tolist()))
         for n, w in (("a", 0.3), ("b", 0.7))
     ]
-    both = render_surface(surfaces[1], seen.camera, two, subpixels=2, caster=seen.caster).radiance
+    both = render_surface(surfaces[1], face.camera, two, subpixels=2, caster=face.caster).radiance
 
     def on_skin(band: MelaninBand) -> ErrorEstimate:
         other = _SimulatedFace.of(band.preset, rig, size=128 if stage.toy else 256, subpixels=fine)

@@ -40,7 +40,7 @@ def measure_lumitexels(stage: BenchmarkStage) -> None:
     lights = LightTable.nominal(rig)
     sphere = trimesh.creation.icosphere(subdivisions=4 if stage.toy else 6, radius=SPHERE_RADIUS_MM)
     caster = RayCaster(sphere.vertices, sphere.faces)
-    seen = [_visible_points(camera) for camera in cameras]
+    visible = [_visible_points(camera) for camera in cameras]
 
     def gathered(count: int, **table: Any) -> tuple[Timing, list[FloatArray]]:
         """Gather points; return time and memory, and relative errors of the samples."""
@@ -51,7 +51,7 @@ def measure_lumitexels(stage: BenchmarkStage) -> None:
         store = LumitexelStore(surface, cameras=cameras, lights=lights, caster=caster, **table)
         spent = time.perf_counter() - start
         for view, light in itertools.product(range(len(cameras)), range(len(names))):
-            image = _image(seen[view], lights, light)
+            image = _image(visible[view], lights, light)
             start = time.perf_counter()
             store.add(view, light, image, np.full_like(image, 1e-6))
             spent += time.perf_counter() - start

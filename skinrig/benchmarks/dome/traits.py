@@ -41,9 +41,9 @@ def measure_editing(stage: BenchmarkStage) -> None:
     # heads take long to build; the toy size uses one
     everybody = [p for p in draw_population() if not stage.toy or p.head == 0]
     order = np.random.default_rng(0).permutation(len(everybody))[: count + N_EDITED_FACES]
-    people = [dataclasses.replace(everybody[k], applied=()) for k in order]
-    faces = CommonFaces.of(people, size=size, common=64 if stage.toy else 128)
-    learned, edited = people[:count], people[count:]
+    subjects = [dataclasses.replace(everybody[k], applied=()) for k in order]
+    faces = CommonFaces.of(subjects, size=size, common=64 if stage.toy else 128)
+    learned, edited = subjects[:count], subjects[count:]
     tanned = [p if k % 2 else _add_tan(p) for k, p in enumerate(learned)]
     rng = np.random.default_rng(1)
     samples = [faces.albedo(p, noise=0.01, rng=rng) for p in tanned]
@@ -76,7 +76,7 @@ def measure_editing(stage: BenchmarkStage) -> None:
         first = partial(call, before[0].r_d, before[0].valid, 1.0)
         timing, _ = stage.time(first, memory=not stage.toy)
         if not stage.by_band:
-            stage.measure_bands(lambda band: _on_skin(call, faces, band.melanin, people[0]))
+            stage.measure_bands(lambda band: _on_skin(call, faces, band.melanin, subjects[0]))
         knobs: Knobs = {"vectors": kind, "iterations": iterations, "noise": noise}
         outcome = stage.add(knobs, timing, mean_error(errors))
         kept[kind, iterations, noise] = outcome.error, float(np.mean(back))
@@ -101,8 +101,8 @@ def _on_skin(
     sizes = 100 * np.abs(new / truth.r_d - 1)
     # errors of neighboring texels are correlated: medians of squares are independent, and the
     # standard error of a Gaussian median is sqrt(pi / 2) = 1.2533 that of the mean
-    places = [at for at in split_squares(len(good)) if good[at].any()]
-    medians = [float(np.median(sizes[at][good[at]])) for at in places]
+    squares = [at for at in split_squares(len(good)) if good[at].any()]
+    medians = [float(np.median(sizes[at][good[at]])) for at in squares]
     half = 1.2533 * float(np.std(medians)) / np.sqrt(len(medians))
     return ErrorEstimate.symmetric(float(np.median(sizes[good])), half)
 
@@ -126,9 +126,9 @@ def _edit(
 ) -> Float32Array:
     """Edit a map that is given in the common parameterization."""
     size = len(r_d)
-    place = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).astype(np.float64)
+    position = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).astype(np.float64)
     on = np.ones((size, size), np.bool_)
-    chart = TexelChart(size, place, on, on, np.zeros((size, size), np.float32))
+    chart = TexelChart(size, position, on, on, np.zeros((size, size), np.float32))
     found = editing_albedo.edit_albedo(
         r_d,
         valid,
@@ -156,20 +156,22 @@ VECTOR_KINDS: tuple[VectorKind, ...] = ("quantiles", "histograms")
 
 def measure_traits(stage: BenchmarkStage) -> None:
     """Learn lotion from fitted lobes and tan from albedo maps over subjects, spaces and noise."""
-    people = draw_population()
+    subjects = draw_population()
     rng = np.random.default_rng(0)
-    some = [people[i] for i in np.sort(rng.permutation(len(people))[: 8 if stage.toy else 40])]
+    some = [subjects[i] for i in np.sort(rng.permutation(len(subjects))[: 8 if stage.toy else 40])]
     _surface(stage, some)
     _albedo(stage, some)
 
 
-def _surface(stage: BenchmarkStage, people: Sequence[Member]) -> None:
+def _surface(stage: BenchmarkStage, subjects: Sequence[Member]) -> None:
     basis = brdf_tables.default_basis()
     strength = basis.strength()
     metric = basis.cosine_similarity() * np.outer(strength, strength)
-    dressed = shift_trait(people, "lotion", products={"lotion": 0.9}, rng=np.random.default_rng(1))
+    dressed = shift_trait(
+        subjects, "lotion", products={"lotion": 0.9}, rng=np.random.default_rng(1)
+    )
     label = np.array(["lotion" in person.marks for person in dressed])
-    compared = [people[i] for i in range(0, len(people), 4 if stage.toy else 8)]
+    compared = [subjects[i] for i in range(0, len(subjects), 4 if stage.toy else 8)]
     worn = shift_trait(
         compared, "lotion", products={"lotion": 0.9}, fraction=1.0, rng=np.random.default_rng(1)
     )
@@ -185,19 +187,19 @@ def _surface(stage: BenchmarkStage, people: Sequence[Member]) -> None:
 
     rng = np.random.default_rng(3)
     most = 4 if stage.toy else 20
-    seen = [trait_truth.surface_points(p, most, rng=rng) for p in dressed]
-    for noise, places in ((0.02, 4),) if stage.toy else ((0.2, 20), (0.02, 5), (0.02, 20)):
+    sampled = [trait_truth.surface_points(p, most, rng=rng) for p in dressed]
+    for noise, count in ((0.02, 4),) if stage.toy else ((0.2, 20), (0.02, 5), (0.02, 20)):
         means = np.array(
             [
                 trait_truth.mean_mixture(
-                    p[:places], basis, pairs=60 if stage.toy else 160, noise=noise, rng=rng
+                    p[:count], basis, pairs=60 if stage.toy else 160, noise=noise, rng=rng
                 )
-                for p in seen
+                for p in sampled
             ]
         )
         for group in (2, 3) if stage.toy else (3, 8, int(label.sum())):
             for kind in SPACE_KINDS:
-                knobs: Knobs = {"trait": "lotion", "space": kind, "noise": noise, "points": places}
+                knobs: Knobs = {"trait": "lotion", "space": kind, "noise": noise, "points": count}
                 fit = partial(_fitted, means, label, kind, metric, basis)
                 _add(stage, knobs, fit, label, group, trait_cosine)
     space = _fitted(means, label, "nmf", metric, basis, np.arange(len(means)))
@@ -309,15 +311,15 @@ def _round_trip_error(faces: Float64Array, space: TraitSpace, metric: Float64Arr
     }
 
 
-def _albedo(stage: BenchmarkStage, people: Sequence[Member]) -> None:
-    tanned = shift_trait(people, "tan", melanin=TAN_MELANIN_FACTOR, rng=np.random.default_rng(1))
+def _albedo(stage: BenchmarkStage, subjects: Sequence[Member]) -> None:
+    tanned = shift_trait(subjects, "tan", melanin=TAN_MELANIN_FACTOR, rng=np.random.default_rng(1))
     label = np.array(["tan" in person.marks for person in tanned])
-    faces = CommonFaces.of(people, size=64 if stage.toy else 128, common=48 if stage.toy else 80)
+    faces = CommonFaces.of(subjects, size=64 if stage.toy else 128, common=48 if stage.toy else 80)
     inside = common_regions.region_mask("face", faces.frame)
-    compared = list(range(0, len(people), 4))
-    seen = list(range(2, len(people), 4))
+    compared = list(range(0, len(subjects), 4))
+    recaptured = list(range(2, len(subjects), 4))
     after = shift_trait(
-        people, "tan", melanin=TAN_MELANIN_FACTOR, fraction=1.0, rng=np.random.default_rng(1)
+        subjects, "tan", melanin=TAN_MELANIN_FACTOR, fraction=1.0, rng=np.random.default_rng(1)
     )
     for noise in (0.01,) if stage.toy else (0.01, 0.1):
         maps = [
@@ -326,16 +328,16 @@ def _albedo(stage: BenchmarkStage, people: Sequence[Member]) -> None:
         ]
         clean = [
             [faces.albedo(group[i], noise=0.0, rng=np.random.default_rng(0)) for i in compared]
-            for group in (people, after)
+            for group in (subjects, after)
         ]
         # subjects that are captured without and with the trait; the ground truth is of others
         twice = [
             faces.albedo(group[i], noise=noise, rng=np.random.default_rng([9, i, k]))
-            for k, group in enumerate((people, after))
-            for i in seen
+            for k, group in enumerate((subjects, after))
+            for i in recaptured
         ]
         for kind in VECTOR_KINDS:
-            names = tuple(p.name for p in people)
+            names = tuple(p.name for p in subjects)
             spaces = fitting_traits.fit_albedo_spaces(
                 maps, TraitLabels(names, {"trait": label}, {}, ()), faces.frame, kind, left_out=[]
             )
@@ -353,12 +355,12 @@ def _albedo(stage: BenchmarkStage, people: Sequence[Member]) -> None:
                     asked = knobs | {"asked": components or "chosen"}
                     fit = partial(_learned, rows, label, components)
                     _add(stage, asked, fit, label, group, trait_cosine)
-            tan = np.arange(len(pairs)) >= len(seen)
+            tan = np.arange(len(pairs)) >= len(recaptured)
             fit, asked = partial(_learned, pairs, tan, None), knobs | {"asked": "seen twice"}
             error = _add(stage, asked, fit, tan, len(pairs), trait_cosine)
             # plain histograms miss this limit; their points give the error
             if noise == 0.01 and kind == "quantiles":
-                stage.limits["tan", kind, len(seen)] = 1.0 - error
+                stage.limits["tan", kind, len(recaptured)] = 1.0 - error
                 stage.limits["false_alarms", "albedo"] = _false_alarms(stage, rows, None)
 
 

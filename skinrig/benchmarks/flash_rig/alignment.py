@@ -212,7 +212,7 @@ def measure_alignment(stage: BenchmarkStage) -> None:
     rng = np.random.default_rng(1)
     face = make_subject("III", seed=2, size=side)
     away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
-    seen = displace_face(face, away, state="exercise", noise=0.005, landmarks=48, rng=rng)
+    displaced = displace_face(face, away, state="exercise", noise=0.005, landmarks=48, rng=rng)
     still = displace_face(face, np.zeros_like(away), state="exercise", noise=0.005, rng=rng)
     effort = [(8, 0), (24, 0), (48, 0), (24, 2)]
     if not stage.toy:
@@ -220,9 +220,9 @@ def measure_alignment(stage: BenchmarkStage) -> None:
         effort = [(8, 0), (8, 2), *((24, n) for n in (0, 1, 2, 4)), *both]
     for count, rounds in effort:
         timing, found = stage.time(
-            lambda: seen.align(count, rounds), repeats=1, memory=(count, rounds) == (24, 2)
+            lambda: displaced.align(count, rounds), repeats=1, memory=(count, rounds) == (24, 2)
         )
-        error = seen.errors_px(found)
+        error = displaced.errors_px(found)
         if (count, rounds) == (24, 2):
             covered = float((error < 2.0 * found.error_px[found.valid]).mean())
         knobs = {"by": found.by, "landmarks": count, "rounds": rounds}
@@ -243,8 +243,10 @@ def _on_skin(preset: str, side: int) -> ErrorEstimate:
     """Return the error on skin of a preset with 24 landmarks, dense flow and 1 % noise."""
     rng = np.random.default_rng(4)
     away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
-    seen = displace_face(make_subject(preset, seed=2, size=side), away, state="exercise", rng=rng)
-    return _rms(seen.errors_px(seen.align(24, 2)), side)
+    displaced = displace_face(
+        make_subject(preset, seed=2, size=side), away, state="exercise", rng=rng
+    )
+    return _rms(displaced.errors_px(displaced.align(24, 2)), side)
 
 
 MISALIGNMENTS_PX = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)

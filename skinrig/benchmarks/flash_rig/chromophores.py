@@ -117,28 +117,28 @@ def measure_shared_melanin(stage: BenchmarkStage) -> None:
     model = _ChromophoreModel(
         load_color_table(), shading_prior.face_prior(), model_error.load_covariance()
     )
-    seen = _StateImages.of("II", side, STATE_NAMES, model)
+    images = _StateImages.of("II", side, STATE_NAMES, model)
 
     def invert_separately() -> Float64Array:
         each = [
             chromophore_posterior.estimate(
-                seen.rgb[k],
+                images.rgb[k],
                 model.colors,
                 prior=model.prior,
-                variance=seen.variance[k],
+                variance=images.variance[k],
                 model_error=model.covariance,
-                valid=seen.mask,
+                valid=images.mask,
             )
             for k in (0, 1)
         ]
         return np.asarray(each[1].hemoglobin - each[0].hemoglobin, np.float64)
 
     def invert_jointly(count: int, window: float | None) -> shared_melanin.SharedMelanin:
-        return seen.invert_jointly(count, window, model)
+        return images.invert_jointly(count, window, model)
 
     def add(knobs: Knobs, call: Callable[[], Any], change: Callable[[Any], Float64Array]) -> None:
         timing, made = stage.time(call, repeats=1, memory=False)
-        stage.add(knobs, timing, _dense_error(seen.errors(change(made))))
+        stage.add(knobs, timing, _dense_error(images.errors(change(made))))
 
     add({"way": "each alone", "states": 2}, invert_separately, lambda made: made)
     settings: list[tuple[int, float | None]] = [(2, None), (3, None), (2, 3.0)]
@@ -150,10 +150,10 @@ def measure_shared_melanin(stage: BenchmarkStage) -> None:
     stage.measure_bands(lambda band: _on_skin(band.preset, side, model))
     if not stage.toy:
         found = invert_jointly(7, 3.0)
-        stated = found.stderr_change[1][seen.mask]
+        stated = found.stderr_change[1][images.mask]
         stage.limits = {
             "over_alone": stage.points[0].error / stage.points[4].error,
-            "within": float(np.mean(seen.errors(found.change[1]) < 2.0 * stated)),
+            "within": float(np.mean(images.errors(found.change[1]) < 2.0 * stated)),
             **_melanin_limits(model),
             **_full_size(model),
         }
@@ -183,15 +183,15 @@ def simulate_colors(
     shared = rng.multivariate_normal(np.zeros(3), covariance, melanin.shape)
     clean = colors.lookup(np.broadcast_to(melanin, blood.shape), blood)
     clean = clean * np.exp(shared) * light[..., None]
-    seen = clean * (1.0 + noise * rng.standard_normal(clean.shape))
-    return seen.astype(np.float32), ((noise * clean) ** 2).astype(np.float32)
+    noisy = clean * (1.0 + noise * rng.standard_normal(clean.shape))
+    return noisy.astype(np.float32), ((noise * clean) ** 2).astype(np.float32)
 
 
 def _on_skin(preset: str, side: int, model: _ChromophoreModel) -> ErrorEstimate:
     """Return the error of a smile's change of blood on a preset's skin, three states jointly."""
-    seen = _StateImages.of(preset, side, STATE_NAMES[:3], model)
-    found = seen.invert_jointly(3, 3.0, model)
-    return median_error(seen.errors(found.change[1]))
+    images = _StateImages.of(preset, side, STATE_NAMES[:3], model)
+    found = images.invert_jointly(3, 3.0, model)
+    return median_error(images.errors(found.change[1]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,8 +231,8 @@ class _StateImages:
         face = make_subject(preset, seed=3, size=side)
         blood = np.stack([face.hemoglobin(name) for name in names]).astype(np.float64)
         rng = np.random.default_rng(0)
-        seen = simulate_colors(model.colors, face.melanin, blood, model.covariance, rng=rng)
-        return cls(*seen, blood, face_mask(side))
+        noisy = simulate_colors(model.colors, face.melanin, blood, model.covariance, rng=rng)
+        return cls(*noisy, blood, face_mask(side))
 
     def invert_jointly(
         self, count: int, window: float | None, model: _ChromophoreModel
@@ -262,9 +262,9 @@ def _melanin_limits(model: _ChromophoreModel) -> LimitValues:
     variances = {}
     for count in (1, 7):
         clean = 0.6 * np.broadcast_to(model.colors.lookup(0.02, 0.025), (count, 4000, 3))
-        seen = clean * (1.0 + 2e-3 * rng.standard_normal(clean.shape))
+        noisy = clean * (1.0 + 2e-3 * rng.standard_normal(clean.shape))
         found = shared_melanin.estimate_shared_melanin(
-            seen, model.colors, prior=model.prior, variance=(2e-3 * clean) ** 2
+            noisy, model.colors, prior=model.prior, variance=(2e-3 * clean) ** 2
         )
         variances[count] = float(found.melanin.var())
     return {"melanin": variances[1] / variances[7]}
@@ -276,6 +276,6 @@ def _full_size(model: _ChromophoreModel) -> LimitValues:
     band = 96
     melanin = np.full((band, FULL_SIDE_PX), 0.02)
     blood = 0.32 * rng.uniform(0.35, 0.5, (len(STATE_NAMES), band, FULL_SIDE_PX)) ** 3
-    seen = simulate_colors(model.colors, melanin, blood, model.covariance, rng=rng)
-    run = partial(model.invert, *seen, shading_window_px=shared_melanin.SHADING_WINDOW_PX)
+    noisy = simulate_colors(model.colors, melanin, blood, model.covariance, rng=rng)
+    run = partial(model.invert, *noisy, shading_window_px=shared_melanin.SHADING_WINDOW_PX)
     return {"seconds": measure_processor_seconds(run, 2) * FULL_SIDE_PX / band / LIMIT_CORES}

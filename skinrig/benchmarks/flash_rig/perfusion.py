@@ -121,19 +121,19 @@ def measure_curve_fits(stage: BenchmarkStage) -> None:
     runs = 3 if stage.toy else 30
     for train in trains:
         phase = train.phase_s
-        for way in ("five places", "best place", "best place, scipy"):
+        for way in ("five regions", "best region", "best region, scipy"):
             rng = np.random.default_rng(0)
             draws = [train.draw(TIME_CONSTANT_S, rng) for _ in range(runs)]
 
             def fitted_s(values: Float64Array) -> float:
-                if way == "best place, scipy":
+                if way == "best region, scipy":
                     return fit_with_scipy(phase, values[-1])[0]
-                places = values if way == "five places" else values[-1]
-                return fit_cycle(phase, places, cycle_s=CYCLE_S).time_constant_s
+                curves = values if way == "five regions" else values[-1]
+                return fit_cycle(phase, curves, cycle_s=CYCLE_S).time_constant_s
 
             off = np.array([fitted_s(values) for values in draws]) - TIME_CONSTANT_S
             outcome = gaussian_rms(
-                off, bound=train.time_constant_bound_s() if way == "five places" else None
+                off, bound=train.time_constant_bound_s() if way == "five regions" else None
             )
             timing, _ = stage.time(lambda: fitted_s(draws[0]))
             knobs = {"captures": train.captures, "every s": train.shot_period_s, "fit": way}

@@ -122,7 +122,7 @@ def _rig_trials(
     neutral = truth_folder(done.session)
     truths = [neutral, neutral.with_name(f"{neutral.name}-{state}")]
     rest, moved = (
-        facial_color.true_blood(store.read(place)) if place.is_dir() else None for place in truths
+        facial_color.true_blood(store.read(path)) if path.is_dir() else None for path in truths
     )
     if blood is None or found is None or rest is None or moved is None:
         return

@@ -68,10 +68,10 @@ def run_trials(
             for key in found.maps
             if key.startswith("normals_a") and key.endswith("_n0")
         )
-        normals, seen = found.maps[f"normals_{state}"], truth.maps[f"normals_seen_{state}"]
-        good = intersect_valid(normals, seen)
+        normals, visible = found.maps[f"normals_{state}"], truth.maps[f"normals_seen_{state}"]
+        good = intersect_valid(normals, visible)
         if normals.stderr is not None:
-            angle = metrics.angular_error_rad(normals.values[good], seen.values[good])
+            angle = metrics.angular_error_rad(normals.values[good], visible.values[good])
             quantity, factor = "normals of the gradient sphere", FACTORS_95["normals"]
             yield subject.normal_trial(quantity, angle, normals.stderr[good], factor_95=factor)
         height = found.maps[f"height_{state}"]

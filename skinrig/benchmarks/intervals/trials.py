@@ -153,8 +153,8 @@ class TrialSubject:
 def resimulate(rig: str, folder: Path, **options: Any) -> SimulationResult:
     """Simulate a subject into a folder, after deleting the previous subject and its maps."""
     old = (folder / name for name in ("session-subject", "maps", "moving"))
-    for place in (*old, *folder.glob("truth-subject*")):
-        shutil.rmtree(place, ignore_errors=True)
+    for path in (*old, *folder.glob("truth-subject*")):
+        shutil.rmtree(path, ignore_errors=True)
     return simulate_session(rig, folder / "session-subject", **options)
 
 

@@ -49,13 +49,13 @@ def build_lit_face(side: int) -> LitFace:
     u, v = np.meshgrid(np.linspace(-1, 1, side), np.linspace(1, -1, side))
     x, y = 80.0 * u, 110.0 * v
     z = 80.0 * np.sqrt(1.3 - 0.8 * u**2 - 0.4 * v**2) + 20.0 * np.exp(-(x**2 + y**2) / 300.0)
-    place = np.stack([x, y, z], axis=-1)
-    across = np.cross(np.gradient(place, axis=1), -np.gradient(place, axis=0))
+    position = np.stack([x, y, z], axis=-1)
+    across = np.cross(np.gradient(position, axis=1), -np.gradient(position, axis=0))
     area = np.linalg.norm(across, axis=-1)
     lit = np.clip(across @ np.array([0.8, 0.3, 0.52]) / area, 0.0, None)
     lit[(x - y > 20.0) & (x - y < 50.0)] = 0.0
     return LitFace(
-        place.reshape(-1, 3),
+        position.reshape(-1, 3),
         area.ravel(),
         lit.reshape(-1, 1) * np.array([1.0, 0.9, 0.8]),
         MEAN_R_D * (1.0 + 0.1 * np.sin(x / 5.0)).reshape(-1, 1),
@@ -142,13 +142,13 @@ def _edge(
     half = step_mm * round(10.0 / step_mm)  # a multiple of the step: no source is on the edge
     grid = np.arange(-half, half, step_mm) + 0.5 * step_mm
     x, y = np.meshgrid(grid, grid)
-    place = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
-    lit = np.repeat(place[:, :1] < 0.0, 3, axis=1).astype(np.float64)
+    position = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    lit = np.repeat(position[:, :1] < 0.0, 3, axis=1).astype(np.float64)
     at = np.stack(
         [EDGE_POSITIONS_MM, 0.3 * EDGE_POSITIONS_MM, np.zeros_like(EDGE_POSITIONS_MM)], axis=-1
     )
     own = np.repeat(EDGE_POSITIONS_MM[:, None] < 0.0, 3, axis=1).astype(np.float64)
-    tree = SourceTree.of(place, np.full(len(place), step_mm**2))
+    tree = SourceTree.of(position, np.full(len(position), step_mm**2))
     found = gather(tree, lit, at, *skin, entered_at=own if exact_coefficients else None)
     return np.asarray(found.exitance / skin[0])
 
@@ -195,8 +195,8 @@ def _full_size(rng: np.random.Generator) -> LimitValues:
     at = rng.choice(len(scene.area), 80, replace=False)
     peer_s, truth = measure_processor_time(lambda: _sum_directly(scene, at))
     peer_s *= len(scene.area) / len(at)
-    seen = truth > MIN_RELATIVE_EXITANCE * (scene.r_d * scene.irradiance.max())[at]
-    relative = np.abs(found[at] / np.where(seen, truth, 1.0) - 1.0)[seen]
+    visible = truth > MIN_RELATIVE_EXITANCE * (scene.r_d * scene.irradiance.max())[at]
+    relative = np.abs(found[at] / np.where(visible, truth, 1.0) - 1.0)[visible]
     even = gather(
         tree,
         np.ones_like(scene.irradiance),
@@ -222,9 +222,11 @@ def _plane_level() -> float:
     step, half = 0.4, 30.0
     grid = np.arange(-half, half, step) + 0.5 * step
     x, y = np.meshgrid(grid, grid)
-    place = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
-    tree = SourceTree.of(place, np.full(len(place), step**2))
+    position = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    tree = SourceTree.of(position, np.full(len(position), step**2))
     offset = np.linspace(0.0, step, 9)
     at = np.stack(np.meshgrid(offset, offset, [0.0]), axis=-1).reshape(-1, 3)
-    found = gather(tree, np.ones_like(place), at, MEAN_R_D, MEAN_TRANSLUCENCY_MM, normalize=False)
+    found = gather(
+        tree, np.ones_like(position), at, MEAN_R_D, MEAN_TRANSLUCENCY_MM, normalize=False
+    )
     return float(np.max(np.abs(found.exitance / MEAN_R_D - 1.0)))

@@ -61,9 +61,9 @@ def _profiles(
     total = (sigma_a + sigma_s_prime) * ratio * sigma_tr**2
     truth = photon_table.reflectance(FIBER_RADII_MM, sigma_a, (total - sigma_a)[:, None], eta=ETA)
     shape = (angle.size, cases, FIBER_RADII_MM.size)
-    seen = truth[:, None] * np.exp(COUPLING_ERROR * rng.standard_normal((*shape[:2], 1)))
-    seen = seen * (1.0 + SINGLE_FIBER_ERROR * rng.standard_normal(shape))
-    return np.asarray(seen + DARK_NOISE * rng.standard_normal(shape))
+    readings = truth[:, None] * np.exp(COUPLING_ERROR * rng.standard_normal((*shape[:2], 1)))
+    readings = readings * (1.0 + SINGLE_FIBER_ERROR * rng.standard_normal(shape))
+    return np.asarray(readings + DARK_NOISE * rng.standard_normal(shape))
 
 
 def _estimate_anisotropy(
@@ -201,14 +201,16 @@ def measure_sites(stage: BenchmarkStage) -> None:
         root = _root(prior, np.concatenate([uv, pixels]))
         for _ in range(faces):
             log = prior.log_mean[0] + root @ rng.standard_normal(len(root))
-            seen = np.exp(-log[:count] + SITE_ERROR * rng.standard_normal(count))[:, None]
-            found = translucency.interpolate(uv, seen, SITE_ERROR * seen, (side, side), prior=prior)
+            measured = np.exp(-log[:count] + SITE_ERROR * rng.standard_normal(count))[:, None]
+            found = translucency.interpolate(
+                uv, measured, SITE_ERROR * measured, (side, side), prior=prior
+            )
             off = np.log(found.values.reshape(-1)) - log[count:]
             deviation = found.log_stderr.reshape(-1)
             squares.append((off**2).mean())
             stated.append((deviation.astype(np.float64) ** 2).mean())
             inside.append((np.abs(off) < deviation).mean())
-        three = np.repeat(seen, 3, axis=1)
+        three = np.repeat(measured, 3, axis=1)
         timing, _ = stage.time(
             lambda: translucency.interpolate(uv, three, SITE_ERROR * three, (size, size)),
             memory=not stage.toy,
@@ -246,12 +248,12 @@ def _compare_with_scikit_learn(prior: TranslucencyPrior, uv: Float64Array) -> tu
     ) * RBF(prior.length_mm, "fixed")
     center = (np.arange(side) + 0.5) / side
     u, v = np.meshgrid(center, 1.0 - center)
-    places = np.stack([u, v], axis=-1).reshape(-1, 2) * np.array(TEXTURE_MM)
+    positions = np.stack([u, v], axis=-1).reshape(-1, 2) * np.array(TEXTURE_MM)
 
     def theirs() -> tuple[Float64Array, Float64Array]:
         process = GaussianProcessRegressor(kernel, alpha=SITE_ERROR**2, optimizer=None)
         process.fit(uv * np.array(TEXTURE_MM), -np.log(sigma[:, 0]) - prior.log_mean[0])
-        mean, deviation = process.predict(places, return_std=True)
+        mean, deviation = process.predict(positions, return_std=True)
         return mean + prior.log_mean[0], deviation
 
     def ours() -> translucency.TranslucencyMap:

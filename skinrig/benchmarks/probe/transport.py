@@ -172,8 +172,8 @@ def _cone_relative_stderr(radii: Float64Array, photons: int) -> Float64Array:
             counted,
         )
         row[: counted.size] = counted
-    seen = rings[:, 0 : 2 * len(radii) : 2]
-    mean, error = seen.mean(axis=0), seen.std(axis=0, ddof=1) / sqrt(20.0)
+    counts = rings[:, 0 : 2 * len(radii) : 2]
+    mean, error = counts.mean(axis=0), counts.std(axis=0, ddof=1) / sqrt(20.0)
     return np.divide(error, mean, out=np.full(len(mean), np.nan), where=mean > 0)
 
 
@@ -201,8 +201,8 @@ def _against_volpath(radii: Float64Array) -> LimitValues:
             for seed in range(N_PEER_RUNS)
         ]
     )
-    seen = np.array(runs, np.float64)
-    mean, error = seen.mean(axis=0), seen.std(axis=0, ddof=1) / sqrt(N_PEER_RUNS)
+    images = np.array(runs, np.float64)
+    mean, error = images.mean(axis=0), images.std(axis=0, ddof=1) / sqrt(N_PEER_RUNS)
     # pixels with light in at most one run have an unknown error; 100 % is in the peer's favor
     relative = np.where(mean > 0.0, 100.0 * error / np.maximum(mean, 1e-30), 100.0)
     stack = _half_space(*RED_MEDIUM_PER_MM, eta=1.0)
