@@ -77,10 +77,8 @@ def run_stages(
                 f"stage: got {name!r}, expected one of {', '.join(STAGES)}; correct the name"
             )
     if out is not None:
-        out.mkdir(
-            parents=True, exist_ok=True
-        )  # an error of the folder is raised before any stage runs
-    run = _Run(console, time.perf_counter() + budget_s, asked=bool(names), toy=toy, out=out)
+        out.mkdir(parents=True, exist_ok=True)  # folder errors are raised before any stage runs
+    run = _Run(console, time.perf_counter() + budget_s, requested=bool(names), toy=toy, out=out)
     run.to_do = list(chosen)
     small = toy or not names
     for name in chosen:
@@ -102,7 +100,7 @@ class _Run:
     console: Console
     deadline_s: float
     """End of the budget on the clock of `time.perf_counter`, s."""
-    asked: bool
+    requested: bool
     """Whether stages were requested by name; a missing optional package is then an error."""
     toy: bool = False
     out: Path | None = None
@@ -140,7 +138,7 @@ class _Run:
                     self._take(name, made, size)
                     self.save()
         except ImportError as error:
-            if self.asked or exit_code(error) != EXTRA_MISSING:
+            if self.requested or exit_code(error) != EXTRA_MISSING:
                 raise
             self.omitted.append((name, sentence(error)))
             return

@@ -125,15 +125,17 @@ class _KnownPoints:
     def draw(
         cls, r_d: tuple[float, float, float], count: int, samples: int, rng: np.random.Generator
     ) -> _KnownPoints:
+        """Draw points and their samples; estimate R_d from samples that are not held out."""
         p = brdf_truth.sample_dome(count, r_d=r_d, noise=0.02, samples=samples, rng=rng)
         out = _held_out_samples(p, rng)
-        known: dict[str, Any] = {"eta": ETA, "variance": p.variance, "valid": p.valid & ~out}
+        options: dict[str, Any] = {"eta": ETA, "variance": p.variance, "valid": p.valid & ~out}
         # R_d is estimated from the same samples, as in a capture
-        found = diffuse_albedo.estimate(*p.samples, **known)
-        given = brdf_basis.surface_samples(*p.samples, found.r_d, **known)
+        found = diffuse_albedo.estimate(*p.samples, **options)
+        given = brdf_basis.surface_samples(*p.samples, found.r_d, **options)
         return cls(p, out, given, _diffuse(p, found.r_d), rng)
 
     def lobes(self, fit: brdf_basis.BasisWeights, basis: BrdfBasis) -> Float64Array:
+        """Return the fitted surface BRDF at every sample, (P, M)."""
         _, *where = self.truth.samples
         rows = zip(fit.weights, *where, strict=True)
         return np.stack([brdf_basis.evaluate(x, basis, *at) for x, *at in rows])
@@ -150,6 +152,7 @@ class _KnownPoints:
     def add(
         self, stage: BenchmarkStage, method: str, timing: Timing, lobe: Float64Array, **rank: int
     ) -> ErrorEstimate:
+        """Add a point for a method's surface BRDF `lobe`, (P, M), and return its error."""
         p = self.truth
         at = p.valid & self.held_out
         root = np.sqrt(np.mean((np.cbrt(lobe) - np.cbrt(p.surface))[at] ** 2))

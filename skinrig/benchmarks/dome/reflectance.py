@@ -106,9 +106,9 @@ def measure_reflectance_model(stage: BenchmarkStage) -> None:
     for subject in BAND_PRESETS if stage.toy else (*BAND_PRESETS, *EXTREME_PRESETS):
         p = sample_face_points(subject, points=count, samples=samples, rng=rng)
         use = p.valid & ~p.held_out
-        known: dict[str, Any] = {"eta": ETA, "variance": p.variance, "valid": use}
-        albedo = diffuse_albedo.estimate(*p.samples, **known)
-        given = brdf_basis.surface_samples(*p.samples, albedo.r_d, **known)
+        options: dict[str, Any] = {"eta": ETA, "variance": p.variance, "valid": use}
+        albedo = diffuse_albedo.estimate(*p.samples, **options)
+        given = brdf_basis.surface_samples(*p.samples, albedo.r_d, **options)
         full = brdf_basis.fit_weights(given, materials)
         for rank in LOBE_RANKS:
             if rank > min(count, materials.size):
@@ -139,8 +139,8 @@ def _errors(
     p: FacePoints, lobes: BrdfBasis, weights: Float64Array, r_d: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
     """Return relative errors of the surface term and of the total reflection by point, %."""
-    known = np.asarray(np.isfinite(r_d).all(axis=1))
-    at = p.valid & p.held_out & known[:, None]
+    finite = np.asarray(np.isfinite(r_d).all(axis=1))
+    at = p.valid & p.held_out & finite[:, None]
     some = np.flatnonzero(at.any(axis=1))
     surface, everything = [], []
     for point in some:

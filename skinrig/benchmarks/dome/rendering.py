@@ -100,6 +100,7 @@ class _SimulatedFace:
 
     @classmethod
     def of(cls, preset: str, rig: Rig, *, size: int, subpixels: int) -> _SimulatedFace:
+        """Simulate a face of a melanin preset under one light, and render its reference image."""
         face = make_subject(preset, seed=5, size=size)
         # the fitted model has neither lateral scattering nor interreflection
         direct = partial(DomeScene, effects=SceneEffects(lateral=False, interreflections=False))

@@ -61,11 +61,11 @@ def synthesize_skin_texture(side: int, *, spots: float, rng: np.random.Generator
 
 def _error(images: list[Any], target: Float64Array, space: TextureSpace) -> ErrorEstimate:
     """Return the mean histogram distance of images from a target, with its interval."""
-    wanted = space.histograms(target)
+    target_histograms = space.histograms(target)
     off = [
         float(
             histogram_distance(
-                space.histograms(describe(i, space=space)), wanted, space.edges
+                space.histograms(describe(i, space=space)), target_histograms, space.edges
             ).mean()
         )
         for i in images
@@ -152,22 +152,22 @@ def iterate_with_peer(
     from pyrtools.pyramids import SteerablePyramidFreq
     from skimage.exposure import match_histograms
 
-    start, wanted = np.asarray(image, np.float64), np.asarray(target, np.float64)
+    start, goal = np.asarray(image, np.float64), np.asarray(target, np.float64)
     pyramid = partial(
         SteerablePyramidFreq,
         height=steerable_pyramid.LEVELS,
         order=steerable_pyramid.ORIENTATIONS - 1,
     )
-    goals = pyramid(wanted).pyr_coeffs
+    goals = pyramid(goal).pyr_coeffs
 
     def run() -> Float64Array:
-        now = start
+        current = start
         for _ in range(iterations):
-            built = pyramid(now)
+            built = pyramid(current)
             for key, response in built.pyr_coeffs.items():
                 built.pyr_coeffs[key] = match_histograms(response, goals[key])
-            now = match_histograms(built.recon_pyr(), wanted)
-        return np.asarray(now)
+            current = match_histograms(built.recon_pyr(), goal)
+        return np.asarray(current)
 
     return run
 

@@ -205,6 +205,7 @@ class _ChromophoreModel:
     def invert(
         self, rgb: Float32Array, variance: Float32Array, **options: Any
     ) -> shared_melanin.SharedMelanin:
+        """Estimate one melanin map and the blood of each state from colors (S, H, W, 3)."""
         return shared_melanin.estimate_shared_melanin(
             rgb,
             self.colors,
@@ -228,6 +229,7 @@ class _StateImages:
     def of(
         cls, preset: str, side: int, names: Sequence[str], model: _ChromophoreModel
     ) -> _StateImages:
+        """Simulate the colors of a preset's face in the named states."""
         face = make_subject(preset, seed=3, size=side)
         blood = np.stack([face.hemoglobin(name) for name in names]).astype(np.float64)
         rng = np.random.default_rng(0)

@@ -88,7 +88,7 @@ def sparse_direct(normals: Float64Array, valid: BoolArray, *, pixel: float) -> F
     h, v = ax > 0, ay > 0
     begin = np.concatenate([number[h], number[v]])
     end = np.concatenate([number[np.roll(h, 1, axis=1)], number[np.roll(v, 1, axis=0)]])
-    wanted = np.concatenate([dx[h], dy[v]])
+    differences = np.concatenate([dx[h], dy[v]])
     ones, rows = np.ones(begin.size), np.arange(begin.size)
     D = sparse.csc_matrix(
         (np.concatenate([-ones, ones]), (np.tile(rows, 2), np.concatenate([begin, end]))),
@@ -97,7 +97,7 @@ def sparse_direct(normals: Float64Array, valid: BoolArray, *, pixel: float) -> F
     A = (D.T @ D).tolil()
     A[0, 0] += 1.0  # fixes the free constant: the equations alone are singular
     x = splu(A.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(
-        D.T @ wanted
+        D.T @ differences
     )
     height = np.zeros(valid.shape)
     height[valid] = pixel * (x - x.mean())

@@ -59,8 +59,8 @@ def run_trials(
         with tempfile.TemporaryDirectory(dir=folder) as name:
             own = Path(name)
             calibrate_simulated("gradient", own, {"ball": {}}, kinds, seed=seed)
-            asked: dict[str, Any] = {"site": site, "seed": seed, "width_px": width_px, **jaws}
-            done = resimulate("gradient", own, **asked)
+            options: dict[str, Any] = {"site": site, "seed": seed, "width_px": width_px, **jaws}
+            done = resimulate("gradient", own, **options)
             found, truth = reconstruct_maps(own, done, ["normals", "height", "strain", "kernels"])
         subject = TrialSubject(f"{site} {seed}")
         state = next(

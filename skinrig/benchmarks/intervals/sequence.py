@@ -108,7 +108,7 @@ def fit_trial(
     Time constants have an asymmetric 68 % and 95 % interval; delays have a standard error and a
     95 % interval. Bounds of a time constant count as intervals with one open end: without them, the
     sample would lack the largest values. Fits without information are omitted. Delays with a bound
-    only are omitted as well, as a delay is not defined where blood hardly changes.
+    only are omitted as well, as a delay is not defined without a change of blood.
 
     Parameters
     ----------

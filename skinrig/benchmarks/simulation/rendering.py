@@ -154,10 +154,10 @@ def measure_gradient(stage: BenchmarkStage) -> None:
                 image, seconds = gradient_scenes.render_pattern(
                     plain, pattern, samples=samples, seed=number
                 )
-            wanted = reference @ np.array(PATTERN_WEIGHTS[pattern])
+            expected = reference @ np.array(PATTERN_WEIGHTS[pattern])
             ways.append(
                 gradient_scenes.compare_with_reference(
-                    image.reshape(-1)[pixels].astype(np.float64), wanted, seconds
+                    image.reshape(-1)[pixels].astype(np.float64), expected, seconds
                 )
             )
         error = math.sqrt(sum(way.error**2 for way in ways) / 2.0)
