@@ -15,7 +15,7 @@ from pathlib import Path
 
 from model import store
 from reconstruction.pipeline import recipes as pipeline
-from skinrig.benchmarks.probe.session import medium
+from skinrig.benchmarks.probe.session import draw_medium
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import subsurface as evaluation
 from skinrig.simulating.orders import truth_folder
@@ -33,7 +33,7 @@ def main(arguments: list[str]) -> None:
         calibrate("fiber", [out / "session-phantom"], out / "calibration")
     rows: list[evaluation.FitAccuracy] = []
     for seed in range(first, first + media):
-        sigma_a, sigma_s_prime, g = medium(seed)
+        sigma_a, sigma_s_prime, g = draw_medium(seed)
         session = out / f"session-{seed}"
         if not truth_folder(session).exists():
             simulate_session(

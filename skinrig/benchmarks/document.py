@@ -1,4 +1,4 @@
-"""The one JSON schema of all benchmarks: fronts, knees, bands."""
+"""Build the JSON document of a benchmark run: Pareto fronts, knees, melanin bands."""
 
 import json
 import math
@@ -17,9 +17,9 @@ SCHEMA: Final = "skinrig.bench/2"
 
 
 def pareto_front(points: tuple[Point, ...]) -> tuple[int, ...]:
-    """Return the indices of points that no other beats in both seconds and error.
+    """Return the indices of points that no other point beats in both seconds and error.
 
-    A point whose error is not finite is on no front.
+    Points with a non-finite error are excluded.
 
     Examples
     --------
@@ -28,37 +28,37 @@ def pareto_front(points: tuple[Point, ...]) -> tuple[int, ...]:
     """
     front = []
     best = np.inf
-    told = [i for i, point in enumerate(points) if math.isfinite(point.error)]
-    for index in sorted(told, key=lambda i: (points[i].timing.seconds, points[i].error)):
+    finite = [i for i, point in enumerate(points) if math.isfinite(point.error)]
+    for index in sorted(finite, key=lambda i: (points[i].timing.seconds, points[i].error)):
         if points[index].error < best:
             best = points[index].error
             front.append(index)
     return tuple(front)
 
 
-def knee(points: tuple[Point, ...]) -> int | None:
-    """Return the front point after which more seconds buy least, or None below 3 points.
+def find_knee(points: tuple[Point, ...]) -> int | None:
+    """Return the index of the knee of the Pareto front, or None below 3 points.
 
-    The point of the front that lies farthest below the straight line between its ends, on
-    log-log axes.
+    The knee is the front's point farthest below the chord between its ends, on log-log axes.
     """
     front = pareto_front(points)
     if len(front) < 3:
         return None
     log_s = np.log([max(points[i].timing.seconds, 1e-9) for i in front])
     log_e = np.log([max(points[i].error, 1e-300) for i in front])
+    # chord: log e = log e_0 + (log s - log s_0) (log e_n - log e_0) / (log s_n - log s_0)
     line = log_e[0] + (log_s - log_s[0]) * (log_e[-1] - log_e[0]) / (log_s[-1] - log_s[0])
     return front[int(np.argmax(line - log_e))]
 
 
-def fronts(stage: StageBenchmark) -> list[dict[str, Any]]:
-    """Return the front and the knee of each condition that a stage measures.
+def find_fronts(stage: StageBenchmark) -> list[dict[str, Any]]:
+    """Return the Pareto front and the knee of each condition of a stage.
 
     Returns
     -------
     list of dict
-        ``condition``: knobs with the values that all its points share; ``points``: numbers of the
-        points on its front, the quickest first; ``knee``: number of one of them, or None.
+        ``condition``: knobs whose values its points have in common; ``points``: indices of the
+        points on its front, the quickest first; ``knee``: one of these indices, or None.
     """
     groups: dict[tuple[Any, ...], list[int]] = {}
     for number, point in enumerate(stage.points):
@@ -67,7 +67,7 @@ def fronts(stage: StageBenchmark) -> list[dict[str, Any]]:
     found = []
     for key, numbers in groups.items():
         some = tuple(stage.points[n] for n in numbers)
-        bend = knee(some)
+        bend = find_knee(some)
         found.append(
             {
                 "condition": dict(zip(stage.condition, key, strict=True)),
@@ -78,8 +78,8 @@ def fronts(stage: StageBenchmark) -> list[dict[str, Any]]:
     return found
 
 
-def machine() -> dict[str, Any]:
-    """Say what ran the benchmark, without naming the machine."""
+def describe_machine() -> dict[str, Any]:
+    """Return versions, architecture and core count, without the machine's name."""
     return {
         "python": platform.python_version(),
         "numpy": np.__version__,
@@ -93,17 +93,19 @@ def to_document(stages: Iterable[StageBenchmark]) -> dict[str, Any]:
     stages = list(stages)
     document: dict[str, Any] = {
         "schema": SCHEMA,
-        "machine": machine(),
+        "machine": describe_machine(),
         "skin_bands": {name: band.to_dict() for name, band in skin_bands.MELANIN_BANDS.items()},
         "stages": {stage.name: _stage(stage) for stage in stages},
     }
     document["passed"] = all(limit.passed for stage in stages for limit in stage.limits)
-    json.dumps(document, allow_nan=True)  # a value that is no JSON fails here, not at a reader
+    json.dumps(
+        document, allow_nan=True
+    )  # fail here, not in a reader, on a value without a JSON form
     return document
 
 
 def _stage(stage: StageBenchmark) -> dict[str, Any]:
-    found = fronts(stage)
+    found = find_fronts(stage)
     on_front = {number for front in found for number in front["points"]}
     knees = {front["knee"] for front in found}
     names = ("error_name", "reference", "reference_error", "reference_error_means", "interval_of")
@@ -119,7 +121,7 @@ def _stage(stage: StageBenchmark) -> dict[str, Any]:
         ],
         "fronts": found,
         "limits": [asdict(limit) | {"passed": limit.passed} for limit in stage.limits],
-        "left_out": [list(item) for item in stage.left_out],
+        "left_out": [list(item) for item in stage.omitted],
         "by_band": [_band(name, error) for name, error in stage.by_band.items()],
         "darkest_over_lightest": _dark_to_light_ratio(stage.by_band),
         "no_bands": stage.no_bands or None,
@@ -131,13 +133,13 @@ def _point(point: Point, *, squared: bool) -> dict[str, Any]:
     memory = point.timing.peak_memory_mb
     return {
         "knobs": dict(point.knobs),
-        "also": dict(point.also),
+        "also": dict(point.extra_values),
         "seconds": point.timing.seconds,
-        "seconds_spread": list(point.timing.spread_s),
+        "seconds_spread": list(point.timing.range_s),
         "cold_seconds": point.timing.cold_s,
         "peak_memory_mb": memory,
-        "memory_of": point.timing.memory_of if memory is not None else None,
-        "no_memory": None if memory is not None else point.timing.no_memory,
+        "memory_of": point.timing.memory_kind if memory is not None else None,
+        "no_memory": None if memory is not None else point.timing.no_memory_reason,
         "error": point.error,
         "error_interval": list(point.error_interval),
         "cramer_rao_bound": point.cramer_rao_bound,
@@ -151,7 +153,7 @@ def _band(name: str, error: ErrorEstimate) -> dict[str, Any]:
 
 
 def _dark_to_light_ratio(by_band: Mapping[str, ErrorEstimate]) -> dict[str, Any] | None:
-    """Return the last band's error over the first's, with the ends that both intervals allow."""
+    """Return the last band's error over the first's, with the range that both intervals allow."""
     skins = list(by_band.values())
     if len(skins) < 2 or not skins[0].error > 0.0:
         return None

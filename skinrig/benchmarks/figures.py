@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from skinrig.drawing import figures, point_names
 
 
-def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
-    """Draw one stage of a benchmark document: error against seconds, log-log.
+def plot_error_against_time(stage: str, document: Mapping[str, Any]) -> str:
+    """Plot error against seconds of one stage on log-log axes, as SVG.
 
     Parameters
     ----------
@@ -23,9 +23,9 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
     Returns
     -------
     str
-        An image with a name, as SVG. The Pareto front of each condition is joined, in a color of
-        its own, and its points are labelled with their effort where there is room for it; others
-        are hollow. Knees have a ring, and the Cramer-Rao bound a dash where it is known.
+        SVG with an alternative text. Each condition has a color. The points of its Pareto front are
+        joined and, where there is room, labeled with their settings; other points are hollow.
+        Knees have a ring; a dash marks the Cramér-Rao bound where it is known.
     """
     figure, axes = figures.canvas(5.2, 3.4)
     points, fronts = document["points"], document["fronts"]
@@ -89,24 +89,28 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
 
 
 def _measured(points: Sequence[Mapping[str, Any]]) -> tuple[NDArray[Any], ...]:
-    """Return seconds, errors, error bars (2, n) as a log axis can show them, and which are 0."""
-    # a log axis has no place for what is quicker than the clock tells
+    """Return seconds, errors and error bars (2, n) fit for log axes, and a mask of zero errors."""
+    # a log axis cannot show 0: times are at least the clock's resolution
     seconds = np.maximum(np.array([p["seconds"] for p in points], float), 1e-7)
     error = np.array([p["error"] for p in points], float)
     low, high = np.array([p["error_interval"] for p in points], float).T
     exact = ~(error > 0.0)
-    if exact.any() and not exact.all():  # a log axis has no place for 0: below the others
+    if (
+        exact.any() and not exact.all()
+    ):  # an error of 0 is drawn a decade below the least other error
         error = np.where(exact, error[~exact].min() / 10.0, error)
         low, high = np.where(exact, error, low), np.where(exact, error, high)
     bars = np.maximum(np.stack([error - low, high - error]), 0.0)
-    bars[0] = np.minimum(bars[0], 0.999 * error)  # a log axis has no room for zero
+    bars[0] = np.minimum(
+        bars[0], 0.999 * error
+    )  # the lower end of a bar stays above 0 on the log axis
     return seconds, error, bars, exact
 
 
 def _effort(
     points: Sequence[Mapping[str, Any]], index: int, condition: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the knobs of a point that no condition names and not all points share."""
+    """Return the knobs of a point that are not part of the condition and that differ by point."""
     return {
         k: v
         for k, v in points[index]["knobs"].items()
@@ -123,7 +127,7 @@ def _summary(front: Mapping[str, Any], seconds: NDArray[Any], error: NDArray[Any
 
 
 def _set_up_axes(axes: Any, title: str, error_name: str) -> None:
-    """Set log scales, title and names of the axes."""
+    """Set log scales, title and axis labels."""
     axes.set_xscale("log")
     axes.set_yscale("log")
     figures.format_log_axes(axes.xaxis, axes.yaxis)
@@ -133,7 +137,8 @@ def _set_up_axes(axes: Any, title: str, error_name: str) -> None:
 
 
 MAX_NAMED_FRONTS = 6
-"""Fronts that a plot has room to name; of more, only those of several points are labelled."""
+"""Largest number of fronts whose points are all labeled; of more, only fronts of several points
+are."""
 
 
 def _matches_condition(point: Mapping[str, Any], condition: Mapping[str, Any]) -> bool:
@@ -147,22 +152,22 @@ def _format_knobs(knobs: Mapping[str, Any]) -> str:
 def plot_compared_fronts(
     stage: str, a: tuple[str, Mapping[str, Any]], b: tuple[str, Mapping[str, Any]]
 ) -> str:
-    """Draw one stage of two benchmarks: error against seconds of all settings, log-log.
+    """Plot error against seconds of one stage of two benchmarks on log-log axes, as SVG.
 
     Parameters
     ----------
     stage
         Name, for the title.
     a, b
-        Label and stage's entry of a ``skinrig.bench/2`` document.
+        Label, and the stage's entry of a ``skinrig.bench/2`` document.
 
     Returns
     -------
     str
-        An image with a name, as SVG. Settings that both measured are joined by thin lines.
+        SVG with an alternative text. Thin lines join settings that both benchmarks measured.
     """
     figure, axes = figures.canvas(5.2, 3.4)
-    places: list[dict[str, tuple[float, float]]] = []
+    positions: list[dict[str, tuple[float, float]]] = []
     summaries = []
     for number, (label, document) in enumerate((a, b)):
         points = [p for p in document["points"] if p["error"] > 0.0]
@@ -170,7 +175,7 @@ def plot_compared_fronts(
         error = np.array([p["error"] for p in points], float)
         mark = {"mfc": "none" if number else None, "color": figures.SERIES_COLORS[number]}
         axes.plot(seconds, error, "os"[number], ms=5, label=label, **mark)
-        places.append(
+        positions.append(
             {
                 str(p["knobs"]): (s, e)
                 for p, s, e in zip(points, seconds.tolist(), error.tolist(), strict=True)
@@ -180,8 +185,8 @@ def plot_compared_fronts(
             f"{label}: errors {figures.format_range(error)} in {figures.format_range(seconds)}"
             f" seconds"
         )
-    for knobs in sorted(places[0].keys() & places[1].keys()):
-        (s0, e0), (s1, e1) = places[0][knobs], places[1][knobs]
+    for knobs in sorted(positions[0].keys() & positions[1].keys()):
+        (s0, e0), (s1, e1) = positions[0][knobs], positions[1][knobs]
         axes.plot([s0, s1], [e0, e1], "-", color="0.5", lw=0.6, zorder=0)
     axes.margins(x=0.15, y=0.2)
     _set_up_axes(axes, stage, a[1]["error_name"])

@@ -1,4 +1,4 @@
-"""Error against run time: how a stage is measured."""
+"""Time calls and measure their memory."""
 
 import time
 import tracemalloc
@@ -13,26 +13,26 @@ from skinrig.benchmarks.results import Timing
 Made = TypeVar("Made")
 
 LIMIT_CORES = 2
-"""Cores of limits in seconds; processor time does not count other programs on them."""
+"""Cores that limits in seconds assume; processor time excludes other programs on them."""
 
 MAX_TRACED_CALL_S = 0.1
-"""Calls that are quicker are run once more for their memory, asked or not."""
+"""Calls below this time are always repeated once to trace their memory, s."""
 
 
 def measure(call: Callable[[], Any], *, repeats: int = 3, memory: bool | None = True) -> Timing:
-    """Time ``call``: once cold, ``repeats`` times warm, and once more for its memory.
+    """Time ``call`` once cold and ``repeats`` times warm, and measure its peak memory.
 
     Parameters
     ----------
     call
-        Takes no argument; its result is dropped.
+        Function without arguments; its result is discarded.
     repeats
         Warm calls, at least 1.
     memory
-        False spares a call that takes long the extra one in which its allocations are traced:
-        then how far resident memory rose in a warm call is taken (None on systems that do not
-        tell). None never traces: for calls into the renderer, whose own threads free what Python
-        allocated, which tracing does not survive (one process in ten or so ends).
+        True repeats the call once more and traces its allocations. False avoids this extra call
+        where the call takes long and reports the growth of resident memory instead (None where the
+        system does not report it). None never traces: the renderer's threads free memory that
+        Python allocated, and tracing this crashes about one process in ten.
 
     Returns
     -------
@@ -49,7 +49,7 @@ def measure(call: Callable[[], Any], *, repeats: int = 3, memory: bool | None = 
 def measure_and_keep(
     call: Callable[[], Made], *, repeats: int = 3, memory: bool | None = True
 ) -> tuple[Timing, Made]:
-    """Time a call as `measure` does, and return what its last warm call made as well.
+    """Time a call with `measure`, and return timing and result of the last warm call.
 
     Examples
     --------
@@ -57,7 +57,7 @@ def measure_and_keep(
     4950
     """
     if repeats < 1:
-        raise ValueError(f"repeats: got {repeats}, expected at least 1")
+        raise ValueError(f"repeats: got {repeats}, expected at least 1; pass a positive number")
     start = time.perf_counter()
     call()
     cold = time.perf_counter() - start
@@ -72,16 +72,16 @@ def measure_and_keep(
     traced = memory is not None and (memory or min(seconds) < MAX_TRACED_CALL_S)
     timing = Timing(
         seconds=float(np.median(seconds)),
-        spread_s=(min(seconds), max(seconds)),
+        range_s=(min(seconds), max(seconds)),
         cold_s=cold,
         peak_memory_mb=_allocated_mb(call) if traced else rise.mb,
-        memory_of="allocated" if traced else "resident",
+        memory_kind="allocated" if traced else "resident",
     )
     return timing, made[0]
 
 
 def measure_processor_time(call: Callable[[], Made], repeats: int = 1) -> tuple[float, Made]:
-    """Return the least processor time of some calls, s, and what the last made.
+    """Return the least processor time of repeated calls, s, and the last result.
 
     Examples
     --------
@@ -96,25 +96,25 @@ def measure_processor_time(call: Callable[[], Made], repeats: int = 1) -> tuple[
     return seconds, made
 
 
-def processor_seconds(call: Callable[[], object], repeats: int = 1) -> float:
-    """Return the least processor time of some calls, s.
+def measure_processor_seconds(call: Callable[[], object], repeats: int = 1) -> float:
+    """Return the least processor time of repeated calls, s.
 
     Examples
     --------
-    >>> 0.0 <= processor_seconds(lambda: sum(range(100)), 2) < 1.0
+    >>> 0.0 <= measure_processor_seconds(lambda: sum(range(100)), 2) < 1.0
     True
     """
     return measure_processor_time(call, repeats)[0]
 
 
 def measure_once(call: Callable[[], Made]) -> tuple[Timing, Made]:
-    """Make something a single time, for a call too long to repeat: cold and warm are one.
+    """Time a single call that takes too long to repeat; it counts as cold and as warm.
 
     Returns
     -------
     timing : Timing
     made
-        What the call returned.
+        Result of the call.
 
     Examples
     --------
@@ -125,7 +125,7 @@ def measure_once(call: Callable[[], Made]) -> tuple[Timing, Made]:
         start = time.perf_counter()
         made = call()
         seconds = time.perf_counter() - start
-    return Timing.single(seconds, rise.mb, memory_of="resident"), made
+    return Timing.single(seconds, rise.mb, memory_kind="resident"), made
 
 
 def _allocated_mb(call: Callable[[], Any]) -> float:

@@ -1,45 +1,45 @@
-"""Which stages fit into a budget at full size, once all were measured at their small one.
+"""Select the stages that fit into a time budget at full size.
 
-Without names `skinrig bench` measures every stage: first at its small size, which takes
-1 to 18 seconds, so that none is missing; then, the quickest first, at full size as long as the
-budget lasts. Limits are promises about full sizes and are judged at no other.
+Without stage names, `skinrig bench` first measures every stage at small size, which takes 1 to 18
+seconds each, so that none is missing. It then measures at full size, the quickest first, while the
+budget lasts. Limits apply to full sizes and are evaluated at no other.
 """
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from skinrig.benchmarks.stage import descriptions
+from skinrig.benchmarks.stage import read_descriptions
 
 TIME_SAFETY_FACTOR: Final = 1.25
-"""A stage begins if so many times what it should take is left."""
+"""A stage starts if the time left is at least this multiple of its expected time."""
 REPORT_RESERVE_S: Final = 20.0
-"""What tables and plots take at the end."""
+"""Time reserved for tables and plots at the end, s."""
 MIN_PACE_SAMPLE_S: Final = 10.0
-"""Seconds of full sizes after which the pace of this machine counts as known."""
+"""Expected time of measured full-size stages above which the machine's pace is estimated, s."""
 DEFAULT_STAGE_S: Final = 120.0
-"""Seconds of a stage that :data:`FULL_S` lacks."""
+"""Expected time of a stage that :data:`FULL_S` lacks, s."""
 
 
 @dataclass(slots=True)
 class MachinePace:
-    """How much longer stages take on this machine than :data:`FULL_S` says."""
+    """Pace of this machine: measured over expected time (:data:`FULL_S`) of stages."""
 
     expected_s: float = 0.0
     measured_s: float = 0.0
 
     def add(self, expected_s: float, measured_s: float) -> None:
-        """Count a stage that was measured at full size."""
+        """Add a stage that was measured at full size."""
         self.expected_s += expected_s
         self.measured_s += measured_s
 
     @property
     def factor(self) -> float:
-        """Seconds taken over seconds told; 1 while too little was measured."""
+        """Measured over expected time; 1 below :data:`MIN_PACE_SAMPLE_S`."""
         return self.measured_s / self.expected_s if self.expected_s > MIN_PACE_SAMPLE_S else 1.0
 
     def fits(self, expected_s: float, left_s: float) -> bool:
-        """Return whether a stage will end within ``left_s``, with some to spare.
+        """Return whether a stage is expected to end within ``left_s``, with a safety factor.
 
         Examples
         --------
@@ -52,9 +52,9 @@ class MachinePace:
 
 
 def order_small_stages(names: Iterable[str]) -> list[str]:
-    """Return stages in the order of their small sizes, those that take about a second first.
+    """Return stages ordered by their time at small size, the quickest first.
 
-    Then a budget that is too small for all leaves the fewest out.
+    A budget that is too small for all of them then omits the fewest.
 
     Examples
     --------
@@ -67,7 +67,7 @@ def order_small_stages(names: Iterable[str]) -> list[str]:
 def order_full_stages(
     names: Iterable[str], seconds: Mapping[str, float]
 ) -> list[tuple[str, float]]:
-    """Return stages with what each should take at full size, the quickest first.
+    """Return stages with their expected seconds at full size, the quickest first.
 
     Examples
     --------
@@ -80,13 +80,13 @@ def order_full_stages(
 
 
 SMALL_S: Final[dict[str, float]] = {
-    name: entry["small_s"] for name, entry in descriptions().items() if "small_s" in entry
+    name: entry["small_s"] for name, entry in read_descriptions().items() if "small_s" in entry
 }
-"""Processor seconds at small size of the stages that take more than about one."""
+"""Processor seconds at small size, of stages that take more than about 1 s."""
 
 FULL_S: Final[dict[str, float]] = {
-    name: entry["full_s"] for name, entry in descriptions().items() if "full_s" in entry
+    name: entry["full_s"] for name, entry in read_descriptions().items() if "full_s" in entry
 }
-"""About how many seconds each takes at full size on two cores that do nothing else: of a run alone,
-the processor seconds of the main thread and half of those of all others, which share two cores.
-What errors by melanin band add to that is estimated from small sizes."""
+"""Approximate seconds at full size on two otherwise idle cores: processor time of the main thread
+plus half of that of all other threads, which run on two cores. The addition for errors by melanin
+band is estimated from small sizes."""

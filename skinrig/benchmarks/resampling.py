@@ -1,4 +1,4 @@
-"""Intervals of errors by drawing again: of medians over things, of root mean squares over tiles."""
+"""Bootstrap intervals of errors: medians over independent items, root mean squares over tiles."""
 
 import itertools
 from collections.abc import Callable
@@ -18,16 +18,16 @@ TILE_PX = 16
 def median_error(
     values: ArrayLike, bound: float | None = None, *, rng: np.random.Generator | None = None
 ) -> ErrorEstimate:
-    """Return the median of errors that are independent of each other, with its 68 % interval.
+    """Return the median of independent errors with its 68 % bootstrap interval.
 
     Parameters
     ----------
     values
-        Sizes of errors, any shape; NaN are dropped.
+        Absolute errors, any shape; NaN are omitted.
     bound
-        Least median that any unbiased estimator could have.
+        Least median error of an unbiased estimator.
     rng
-        Of the bootstrap; None: one of seed 0.
+        Generator of the bootstrap; None: one of seed 0.
 
     Examples
     --------
@@ -39,7 +39,7 @@ def median_error(
 
 
 def mean_error(values: ArrayLike) -> ErrorEstimate:
-    """Return the mean of independent errors with its standard error to both sides.
+    """Return the mean of independent errors plus and minus its standard error.
 
     Examples
     --------
@@ -59,7 +59,7 @@ def bootstrap_interval(
     draws: int = N_BOOTSTRAP_DRAWS,
     rng: np.random.Generator | None = None,
 ) -> tuple[float, float]:
-    """Return the bootstrap's 68 % interval of a statistic of independent values, (n,).
+    """Return the 68 % bootstrap interval of a statistic of independent values, (n,).
 
     Parameters
     ----------
@@ -68,9 +68,9 @@ def bootstrap_interval(
     statistic
         Called with draws (draws, n) and ``axis=1``.
     draws
-        How often n values are drawn.
+        Number of bootstrap samples of n values each.
     rng
-        Draws them; None: one of seed 0.
+        Generator of the bootstrap; None: one of seed 0.
 
     Examples
     --------
@@ -85,7 +85,7 @@ def bootstrap_interval(
 
 
 def bootstrap_median(values: ArrayLike, bound: float | None = None, **draws: Any) -> ErrorEstimate:
-    """Return the median of independent errors with the interval that `bootstrap_interval` gives.
+    """Return the median of independent errors with the interval of `bootstrap_interval`.
 
     Examples
     --------
@@ -99,7 +99,7 @@ def bootstrap_median(values: ArrayLike, bound: float | None = None, **draws: Any
 def bootstrap_columns_median(
     values: ArrayLike, bound: float | None = None, *, draws: int = N_BOOTSTRAP_DRAWS
 ) -> ErrorEstimate:
-    """Return the median of errors (draws, n) of which the n columns are independent.
+    """Return the median of errors (draws, n) whose n columns are independent.
 
     Examples
     --------
@@ -114,7 +114,7 @@ def bootstrap_columns_median(
 
 
 def bootstrap_rms(squared: ArrayLike, bound: float | None = None, **draws: Any) -> ErrorEstimate:
-    """Return the root of the mean of independent squares with the bootstrap's 68 % interval.
+    """Return the root of the mean of independent squares with its 68 % bootstrap interval.
 
     Examples
     --------
@@ -126,7 +126,7 @@ def bootstrap_rms(squared: ArrayLike, bound: float | None = None, **draws: Any) 
 
 
 def split_squares(side: int) -> list[tuple[slice, slice]]:
-    """Return the places of 8 x 8 squares of an image (or more, where 8 is no divisor).
+    """Return the slices of 8 x 8 squares of an image (more, where 8 does not divide its side).
 
     Examples
     --------
@@ -141,16 +141,16 @@ def split_squares(side: int) -> list[tuple[slice, slice]]:
 def gaussian_rms(
     errors: ArrayLike, *, bound: float | None = None, freedom: int | None = None
 ) -> ErrorEstimate:
-    """Return the root mean square of Gaussian errors, whose own relative error is 1/sqrt(2 n).
+    """Return the root mean square of Gaussian errors; its relative standard error is 1/sqrt(2 n).
 
     Parameters
     ----------
-    off
+    errors
         Errors, any shape.
     bound
-        Least root mean square that any unbiased estimator could have.
+        Least root mean square of an unbiased estimator.
     freedom
-        How many of the errors are independent; None: all.
+        Number of independent errors, n; None: all.
 
     Examples
     --------
@@ -167,22 +167,22 @@ def gaussian_rms(
 def bootstrap_tiled_rms(
     difference: FloatArray, mask: BoolArray, *, tile_px: int = TILE_PX
 ) -> ErrorEstimate:
-    """Return the root mean square of a picture's errors; the interval is over its tiles.
+    """Return the root mean square of an image's errors with a bootstrap interval over its tiles.
 
-    Neighboring pixels err alike, so that tiles are drawn again, not pixels.
+    Errors of neighboring pixels are correlated, so that tiles are resampled, not pixels.
 
     Parameters
     ----------
     difference
         (H, W) or (H, W, C).
-    where
-        (H, W), pixels that count; at least one.
+    mask
+        (H, W), pixels to include; at least one.
     tile_px
-        Side of the tiles.
+        Side of the tiles, pixels.
 
     Returns
     -------
-    BandError
+    ErrorEstimate
         In the unit of the difference.
 
     Examples
@@ -193,6 +193,7 @@ def bootstrap_tiled_rms(
     """
     squared = np.square(np.asarray(difference, np.float64))
     squared = squared if squared.ndim == 2 else squared.mean(axis=-1)
+    # a root of means over drawn tiles: tiles with fewer masked-in pixels have less weight
     rows, columns = np.nonzero(mask)
     _, which = np.unique(np.stack([rows, columns]) // tile_px, axis=1, return_inverse=True)
     sums, counts = np.bincount(which, squared[mask]), np.bincount(which)

@@ -1,7 +1,7 @@
-"""Most memory that the process held during a call, as the kernel counts it.
+"""Peak resident memory of the process during a call, as counted by the kernel.
 
-`tracemalloc` sees what Python and NumPy allocate and slows what allocates often; the kernel counts
-the pages of all libraries for nothing, but not those that were free in the heap already.
+`tracemalloc` counts allocations of Python and NumPy and slows code that allocates often. The kernel
+counts the pages of all libraries at no cost, except pages that were free in the heap before.
 """
 
 import ctypes
@@ -13,20 +13,20 @@ from pathlib import Path
 PROCESS_STATUS_PATH = Path("/proc/self/status")
 CLEAR_REFS_PATH = Path("/proc/self/clear_refs")
 PEAK_RESET_CODE = "5"
-"""What written to `clear_refs` sets the peak to what is held now (proc(5))."""
+"""Text for `clear_refs` that resets the peak to the current resident memory (proc(5))."""
 
 
 @dataclass(slots=True)
 class Peak:
-    """What :func:`track_peak` found."""
+    """Result of :func:`track_peak`."""
 
     mb: float | None = None
-    """Most resident memory above that at the start, MB; None: this system does not tell."""
+    """Peak resident memory above that at the start, MB; None: the system does not report it."""
 
 
 @contextmanager
 def track_peak() -> Iterator[Peak]:
-    """Measure how far resident memory rises within the block; free heap is given back before.
+    """Measure the growth of resident memory within the block, after free heap is released.
 
     Examples
     --------
@@ -45,7 +45,7 @@ def track_peak() -> Iterator[Peak]:
 
 
 def _reset() -> float | None:
-    # glibc alone has it; elsewhere heap that was freed before is not seen when used again
+    # malloc_trim exists in glibc only; elsewhere the reuse of freed heap is not counted
     with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
     try:

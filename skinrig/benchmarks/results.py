@@ -1,4 +1,4 @@
-"""What a benchmark keeps of a stage: points with errors and times, limits, errors by skin."""
+"""Results of a benchmark stage: points with errors and times, limits, errors by melanin band."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ class Timing:
 
     seconds: float
     """Median of the warm calls, s."""
-    spread_s: tuple[float, float]
-    """Fastest and slowest warm call, s."""
+    range_s: tuple[float, float]
+    """Shortest and longest warm call, s."""
     cold_s: float
-    """The first call, with compilation and caches to fill, s."""
+    """First call, which compiles kernels and fills caches, s."""
     peak_memory_mb: float | None
-    """Most memory held during a call, MB; None: not measured."""
-    memory_of: Literal["allocated", "resident"] = "allocated"
-    """Whether that is what Python and NumPy allocated, or how far the process's resident memory
-    rose."""
-    no_memory: str = "this system does not tell"
-    """Why it was not measured, where it was not."""
+    """Peak memory of a call, MB; None: not measured."""
+    memory_kind: Literal["allocated", "resident"] = "allocated"
+    """Kind of the peak: allocations of Python and NumPy, or growth of the process's resident
+    memory."""
+    no_memory_reason: str = "this system does not report it"
+    """Reason, where memory was not measured."""
 
     @classmethod
     def single(cls, seconds: float, peak_memory_mb: float | None = None, **memory: Any) -> Timing:
-        """Return the timing of a call made a single time: cold and warm are one."""
+        """Return the timing of a single call, which counts as cold and as warm."""
         return cls(seconds, (seconds, seconds), seconds, peak_memory_mb, **memory)
 
 
@@ -39,27 +39,27 @@ class Point:
     """One setting of a stage's effort knobs."""
 
     knobs: Mapping[str, Knob]
-    """What was set; the report labels the point with it."""
+    """Settings; they label the point in the report."""
     timing: Timing
     error: float
     """Error against the stage's reference, in the stage's unit."""
     error_interval: tuple[float, float]
     """68 % interval of ``error``."""
     cramer_rao_bound: float | None = None
-    """Least error that any unbiased estimator could have, same unit; None: not known."""
-    also: Mapping[str, Knob] = field(default_factory=dict)
-    """What else was measured at this setting; no knob."""
+    """Cramér-Rao bound: least error of an unbiased estimator, same unit; None: unknown."""
+    extra_values: Mapping[str, Knob] = field(default_factory=dict)
+    """Further values measured at this setting, which are not knobs."""
 
     def efficiency(self, *, squared: bool = False) -> tuple[float, float, float] | None:
-        """Return variance over the least variance, with its 68 % interval; None without a bound.
+        """Return variance over the Cramér-Rao bound with its 68 % interval; None without a bound.
 
-        1 is perfect. Where the error is a median or a mean the bound is that of a normal error,
-        so that the ratio of squares holds too.
+        1 is optimal. For a median or a mean of errors the bound is that of a normal error, so that
+        the ratio of squares applies as well.
 
         Parameters
         ----------
         squared
-            Whether error and bound are squares already.
+            Whether error and bound are squares (variances) already.
         """
         if self.cramer_rao_bound is None or not self.cramer_rao_bound > 0.0:
             return None
@@ -73,7 +73,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """A promise about a stage that this run checked."""
+    """Limit of a stage that a run evaluated."""
 
     name: str
     got: float
@@ -83,23 +83,23 @@ class Limit:
 
     @property
     def passed(self) -> bool:
-        """Whether ``got`` keeps to ``bound``; NaN does not."""
+        """Whether ``got`` satisfies ``bound``; NaN does not."""
         return self.got <= self.bound if self.sense == "<=" else self.got >= self.bound
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorEstimate:
-    """Error in one band of skin, with the setting that is usual."""
+    """Error with its 68 % interval and its Cramér-Rao bound."""
 
     error: float
     error_interval: tuple[float, float]
     """68 % interval of ``error``."""
     cramer_rao_bound: float | None = None
-    """Least error that any unbiased estimator could have there; None: not known."""
+    """Least error of an unbiased estimator, same unit; None: unknown."""
 
     @classmethod
     def symmetric(cls, error: float, half: float, bound: float | None = None) -> ErrorEstimate:
-        """Return an error whose interval reaches as far to both sides.
+        """Return an error whose interval is symmetric, of half width ``half``.
 
         Examples
         --------
@@ -110,7 +110,7 @@ class ErrorEstimate:
 
     @classmethod
     def nonnegative(cls, size: float, half: float) -> ErrorEstimate:
-        """Return the same of a size, which is never below 0.
+        """Return an error with a symmetric interval that is clipped at 0.
 
         Examples
         --------
@@ -122,34 +122,34 @@ class ErrorEstimate:
 
 @dataclass(frozen=True, slots=True)
 class StageBenchmark:
-    """All points of one stage."""
+    """Description and results of one stage."""
 
     name: str
     error_name: str
-    """What the error is, with its unit, for the axis of the plot."""
+    """Quantity and unit of the error, for the axis of the plot."""
     reference: str
-    """What the error is taken against."""
+    """Reference of the error."""
     reference_error: float = 0.0
-    """How far the reference itself may be off, in the error's unit."""
+    """Error of the reference itself, in the error's unit."""
     points: tuple[Point, ...] = ()
     limits: tuple[Limit, ...] = ()
-    left_out: tuple[tuple[str, str], ...] = ()
-    """What this run did not measure, and why."""
+    omitted: tuple[tuple[str, str], ...] = ()
+    """Settings that were not measured, with reasons."""
     by_band: Mapping[str, ErrorEstimate] = field(default_factory=dict)
-    """Error by melanin band, from light to dark, same unit; see `skinrig.evaluating.skin_bands`."""
+    """Error by melanin band, from light to dark, same unit (`skinrig.evaluating.skin_bands`)."""
     no_bands: str = ""
-    """Why errors do not depend on how dark skin is, where there are no bands."""
+    """Reason why errors do not depend on melanin, for stages without bands."""
     condition: tuple[str, ...] = ()
-    """Knobs that say what is measured (noise, subject), not with how much effort: each set of their
-    values has a front of its own. A point that lacks such a knob is of the condition ``None``."""
+    """Knobs of the measured case (noise, subject) as opposed to its effort. Each set of their
+    values has its own front; a point without such a knob has the condition ``None``."""
     interval_of: str = ""
-    """What errors scatter over within their intervals."""
+    """Population over which errors vary within their intervals."""
     squared: bool = False
     """Whether errors and bounds are squares (variances), not sizes."""
 
     @property
     def reference_error_means(self) -> str:
-        """What `reference_error` says."""
+        """Meaning of `reference_error`, for the report."""
         if self.reference_error == 0.0:
-            return "exact: the truth that the data were made of, or errors are defined by it"
-        return "how far the reference itself may be off, in the error's unit"
+            return "exact: the ground truth of the data, or the errors are defined by it"
+        return "error of the reference itself, in the error's unit"

@@ -1,4 +1,4 @@
-"""What stages measure and promise, as `data/benchmarks.toml` has it, with what a run finds."""
+"""Combine the description of a stage in `data/benchmarks.toml` with the results of a run."""
 
 import tomllib
 from collections.abc import Callable, Mapping
@@ -14,49 +14,49 @@ from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
 STAGES_TABLE = resources.files("skinrig").joinpath("data/benchmarks.toml")
 
 LimitValues = dict[str | tuple[Any, ...], float | tuple[float, float]]
-"""What was found of limits, by their keys in the table. What follows a key's first part fills the
-numbered braces of the limit's name; beside a value may stand its bound, where the run sets it."""
+"""Measured values of limits by their keys in the table. Further parts of a key fill the numbered
+braces of the limit's name. A pair is the value and its bound, for bounds that the run sets."""
 
 
 @cache
-def descriptions() -> dict[str, dict[str, Any]]:
-    """Return the description of every stage by its name, in the order of the table."""
+def read_descriptions() -> dict[str, dict[str, Any]]:
+    """Read the description of every stage, by name, in the order of the table."""
     return tomllib.loads(STAGES_TABLE.read_text(encoding="utf-8"))
 
 
 @dataclass(slots=True)
 class BenchmarkStage:
-    """A stage at one size, to which its function adds what it measures."""
+    """Results of a stage at one size, which its function fills."""
 
     name: str
     toy: bool = False
-    """Whether sizes are small: limits are then judged by nobody, and need not be found."""
+    """Whether sizes are small; limits are then not evaluated and may be missing."""
     points: list[Point] = field(default_factory=list)
-    """In the order in which they are shown."""
+    """Measured settings, in the order of the report."""
     limits: LimitValues = field(default_factory=dict)
-    """Those without a finding are not judged."""
+    """Measured values; a limit without one is not evaluated."""
     by_band: dict[str, ErrorEstimate] = field(default_factory=dict)
-    """Errors by melanin band."""
-    left_out: list[tuple[str, str]] = field(default_factory=list)
-    """What this run did not measure, and why, beside what no run does."""
+    """Error at the default setting by melanin band."""
+    omitted: list[tuple[str, str]] = field(default_factory=list)
+    """Settings that this run did not measure, with reasons; the table lists those of every run."""
     reference_error: float | None = None
-    """How far the reference may be off; None: as described, or not at all."""
-    words: dict[str, object] = field(default_factory=dict)
-    """Fill the braces of the description."""
+    """Error of the reference, in the stage's unit; None takes the table's, or 0."""
+    description_values: dict[str, object] = field(default_factory=dict)
+    """Values for the named braces of the description."""
 
     def time(
         self, call: Callable[[], Made], *, repeats: int | None = None, memory: bool | None = True
     ) -> tuple[Timing, Made]:
-        """Time a call as `measure_and_keep` does, and return what it made as well.
+        """Time a call with `measure_and_keep`, and return timing and result.
 
         Parameters
         ----------
         call
             Takes no argument.
         repeats
-            Warm calls; None: three, of small sizes one.
+            Warm calls; None: three, at small size one.
         memory
-            As of `measure`.
+            As in `skinrig.benchmarks.measurement.measure`.
         """
         warm = (1 if self.toy else 3) if repeats is None else repeats
         return measure_and_keep(call, repeats=warm, memory=memory)
@@ -66,11 +66,13 @@ class BenchmarkStage:
         knobs: Mapping[str, Knob],
         timing: Timing,
         outcome: ErrorEstimate,
-        also: Mapping[str, Knob] | None = None,
+        extra_values: Mapping[str, Knob] | None = None,
     ) -> ErrorEstimate:
-        """Add a point, with what else was measured at its setting, and return its error."""
+        """Add a point with its additional measured values, and return its error."""
         low_to_high, bound = outcome.error_interval, outcome.cramer_rao_bound
-        self.points.append(Point(knobs, timing, outcome.error, low_to_high, bound, also or {}))
+        self.points.append(
+            Point(knobs, timing, outcome.error, low_to_high, bound, extra_values or {})
+        )
         return outcome
 
     def measure(
@@ -79,24 +81,24 @@ class BenchmarkStage:
         call: Callable[[], Made],
         error: Callable[[Made], ErrorEstimate],
         *,
-        also: Mapping[str, Knob] | None = None,
+        extra_values: Mapping[str, Knob] | None = None,
         repeats: int | None = None,
         memory: bool | None = True,
     ) -> ErrorEstimate:
-        """Time a call, take its error and add the point; return the error.
+        """Time a call, evaluate its result and add the point; return the error.
 
         Parameters
         ----------
         knobs
-            What is set.
+            Settings of the point.
         call
-            What is timed.
+            Function to time, without arguments.
         error
-            Takes what the call made.
-        also
-            What else is reported.
+            Function of the call's result.
+        extra_values
+            Further values to report.
         repeats, memory
-            As of `time`.
+            As in `time`.
 
         Examples
         --------
@@ -106,27 +108,27 @@ class BenchmarkStage:
         ErrorEstimate(error=6.0, error_interval=(5.0, 7.0), cramer_rao_bound=None)
         """
         timing, made = self.time(call, repeats=repeats, memory=memory)
-        return self.add(knobs, timing, error(made), also)
+        return self.add(knobs, timing, error(made), extra_values)
 
-    def at(self, **knobs: Knob) -> Point:
-        """Return the first point whose knobs are set to these."""
+    def find_point(self, **knobs: Knob) -> Point:
+        """Return the first point whose knobs have these values."""
         return next(point for point in self.points if knobs.items() <= point.knobs.items())
 
     def measure_bands(self, error: Callable[[MelaninBand], ErrorEstimate]) -> None:
-        """Take the error on skin of each melanin band."""
+        """Evaluate the error on skin of each melanin band."""
         self.by_band |= {name: error(band) for name, band in MELANIN_BANDS.items()}
 
     def to_benchmark(self) -> StageBenchmark:
-        """Return what was found so far with the stage's description."""
-        entry, error = descriptions()[self.name], self.reference_error
+        """Return the results so far together with the stage's description."""
+        entry, error = read_descriptions()[self.name], self.reference_error
         return StageBenchmark(
             self.name,
             entry["error_name"],
-            entry["reference"].format(**self.words),
+            entry["reference"].format(**self.description_values),
             entry.get("reference_error", 0.0) if error is None else error,
             tuple(self.points),
             tuple(self._limit(entry["limits"], key) for key in self.limits),
-            (*((what, why) for what, why in entry.get("left_out", ())), *self.left_out),
+            (*((what, why) for what, why in entry.get("left_out", ())), *self.omitted),
             dict(self.by_band),
             entry.get("no_bands", ""),
             tuple(entry.get("condition", ())),
@@ -137,7 +139,7 @@ class BenchmarkStage:
     def _limit(self, table: Mapping[str, Mapping[str, Any]], key: str | tuple[Any, ...]) -> Limit:
         first, *parts = (key,) if isinstance(key, str) else key
         entry, found = table[first], self.limits[key]
-        name, unit = entry["name"].format(*parts, **self.words), entry.get("unit", "")
+        name, unit = entry["name"].format(*parts, **self.description_values), entry.get("unit", "")
         got, bound = found if isinstance(found, tuple) else (found, None)
         if "at_most" in entry:
             return Limit(name, got, entry["at_most"] if bound is None else bound, "<=", unit)

@@ -1,4 +1,4 @@
-"""Which stages can be measured, and running them."""
+"""Run the stages of `skinrig bench` within a time budget and collect one document."""
 
 import json
 import time
@@ -13,24 +13,25 @@ from skinrig.benchmarks import plan as bench_plan
 from skinrig.benchmarks import table as bench_table
 from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.results import StageBenchmark
-from skinrig.benchmarks.stage import BenchmarkStage, descriptions
+from skinrig.benchmarks.stage import BenchmarkStage, read_descriptions
 from skinrig.console import Console, to_json_value
 from skinrig.errors import EXTRA_MISSING, exit_code, sentence
 
-STAGES: dict[str, str] = {name: entry["run"] for name, entry in descriptions().items()}
-"""Module and function of each; a module is imported, and its kernels compiled, when it is run."""
+STAGES: dict[str, str] = {name: entry["run"] for name, entry in read_descriptions().items()}
+"""Module and function by stage. A module is imported, and its kernels are compiled, when the stage
+runs."""
 
 
 INTERRUPTED_REASON = "the run ended before all of it was measured"
-"""Of a stage in a document that a run left which was interrupted."""
+"""Reason recorded for each stage that an interrupted run did not measure."""
 
 
 class BenchError(ValueError):
-    """A stage that cannot be measured."""
+    """Stage name that the table of stages does not contain."""
 
 
 def _iterate_results(name: str, *, toy: bool) -> Iterator[StageBenchmark]:
-    """Yield what a stage has measured: once, or of a long one ever more until it is whole."""
+    """Yield the stage's results: a long stage after each of its parts, any stage at its end."""
     module, function = STAGES[name].rsplit(".", 1)
     stage = BenchmarkStage(name, toy=toy)
     run = getattr(import_module(f"skinrig.benchmarks.{module}"), function)
@@ -42,27 +43,27 @@ def _iterate_results(name: str, *, toy: bool) -> Iterator[StageBenchmark]:
 def run_stages(
     names: Sequence[str] | None, *, budget_s: float, toy: bool, out: Path | None, console: Console
 ) -> dict[str, Any]:
-    """Measure stages and return the document of the run.
+    """Measure stages within a budget, and return the document of the run.
 
     Parameters
     ----------
     names
-        Out of :data:`STAGES`, each at full size. None: all of them at their small size, and then
-        at full size those that fit into the budget, the quickest first.
+        Keys of :data:`STAGES`, each measured at full size. None: all at small size, then those
+        that fit into the budget at full size, the quickest first.
     budget_s
-        Seconds to spend. A stage that would begin after them is left out, and named.
+        Time budget in seconds; a stage that would begin after its end is omitted and listed.
     toy
-        Small sizes only: for checking that the benchmark runs.
+        Whether to measure small sizes only, which checks that the benchmark runs.
     out
         Folder for ``bench.json``; None writes nothing.
     console
-        Where results and progress go.
+        Receives results and progress.
 
     Returns
     -------
     dict
-        ``skinrig.bench/2``. Each stage says its ``size``; limits are judged at full size alone, and
-        ``not_judged`` names the stages whose limits were not.
+        Schema ``skinrig.bench/2``. Each stage has a ``size``. Limits are evaluated at full size
+        only; ``not_judged`` lists the stages measured at small size.
 
     Raises
     ------
@@ -72,10 +73,12 @@ def run_stages(
     chosen = list(dict.fromkeys(names)) if names else bench_plan.order_small_stages(STAGES)
     for name in chosen:
         if name not in STAGES:
-            raise BenchError(f"stage: got {name!r}, expected one of {', '.join(STAGES)}")
+            raise BenchError(
+                f"stage: got {name!r}, expected one of {', '.join(STAGES)}; correct the name"
+            )
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)  # a folder that cannot be is told before the work
-    run = _Run(console, time.perf_counter() + budget_s, asked=bool(names), toy=toy, out=out)
+        out.mkdir(parents=True, exist_ok=True)  # folder errors are raised before any stage runs
+    run = _Run(console, time.perf_counter() + budget_s, requested=bool(names), toy=toy, out=out)
     run.to_do = list(chosen)
     small = toy or not names
     for name in chosen:
@@ -92,25 +95,25 @@ Size = Literal["small", "full"]
 
 @dataclass(slots=True)
 class _Run:
-    """What was measured so far."""
+    """State of a run: results so far, stages to do, time left."""
 
     console: Console
     deadline_s: float
-    """When the budget ends, by `time.perf_counter`."""
-    asked: bool
-    """Whether stages were asked for by name: then what they need must be there."""
+    """End of the budget on the clock of `time.perf_counter`, s."""
+    requested: bool
+    """Whether stages were requested by name; a missing optional package is then an error."""
     toy: bool = False
     out: Path | None = None
-    """Where the document is kept, stage by stage; None: nowhere."""
+    """Folder of the document, which is written after each stage; None writes nothing."""
     to_do: list[str] = field(default_factory=list)
-    """What is still to be measured for the first time."""
+    """Stages that were not measured yet at any size."""
     done: dict[str, StageBenchmark] = field(default_factory=dict)
     size: dict[str, Size] = field(default_factory=dict)
     compile_s: dict[str, float] = field(default_factory=dict)
-    left_out: list[tuple[str, str]] = field(default_factory=list)
+    omitted: list[tuple[str, str]] = field(default_factory=list)
 
     def measure(self, name: str, size: Size) -> float:
-        """Measure a stage, if there is time, and return the seconds that it took."""
+        """Measure a stage if the budget allows, and return the elapsed seconds."""
         began = time.perf_counter()
         self._measure(name, size, began)
         if name in self.to_do:
@@ -119,14 +122,14 @@ class _Run:
         return time.perf_counter() - began
 
     def save(self) -> None:
-        """Write what there is: a run that is interrupted leaves what it measured."""
+        """Write the document so far, so that an interrupted run keeps its results."""
         if self.out is not None:
             text = json.dumps(to_json_value(self.document()), indent=1, sort_keys=True)
             write_atomically(self.out / "bench.json", text + "\n")
 
     def _measure(self, name: str, size: Size, began: float) -> None:
         if began > self.deadline_s:
-            self.left_out.append((name, "the budget was used up"))
+            self.omitted.append((name, "the budget was used up"))
             return
         self.console.progress(f"bench {name}, {size} size")
         try:
@@ -135,34 +138,34 @@ class _Run:
                     self._take(name, made, size)
                     self.save()
         except ImportError as error:
-            if self.asked or exit_code(error) != EXTRA_MISSING:
+            if self.requested or exit_code(error) != EXTRA_MISSING:
                 raise
-            self.left_out.append((name, sentence(error)))
+            self.omitted.append((name, sentence(error)))
             return
         self._take(name, made, size)
 
     def _take(self, name: str, made: StageBenchmark, size: Size) -> None:
         self.done[name], self.size[name] = made, size
         if name in self.to_do:
-            # the first time that its kernels are called; later ones find them compiled
+            # the first run of a stage compiles its kernels: cold minus warm time is compilation
             self.compile_s[name] = sum(
                 max(p.timing.cold_s - p.timing.seconds, 0.0) for p in made.points
             )
 
     def measure_full_sizes(self) -> None:
-        """Measure again at full size what fits into the rest of the budget."""
+        """Repeat stages at full size, the quickest first, while they fit into the budget."""
         pace = bench_plan.MachinePace()
-        for name, told_s in bench_plan.order_full_stages(self.done, bench_plan.FULL_S):
+        for name, expected_s in bench_plan.order_full_stages(self.done, bench_plan.FULL_S):
             left_s = self.deadline_s - bench_plan.REPORT_RESERVE_S - time.perf_counter()
-            if not pace.fits(told_s, left_s):
+            if not pace.fits(expected_s, left_s):
                 break
-            pace.add(told_s, self.measure(name, "full"))
+            pace.add(expected_s, self.measure(name, "full"))
 
     def document(self) -> dict[str, Any]:
-        """Return the document of the run."""
+        """Return the document of the run, complete or interrupted."""
         document = to_document(list(self.done.values()))
         document["toy"] = self.toy
-        document["left_out"] = [list(item) for item in self.left_out]
+        document["left_out"] = [list(item) for item in self.omitted]
         document["left_out"] += [[name, INTERRUPTED_REASON] for name in self.to_do]
         document["not_judged"] = [name for name, size in self.size.items() if size == "small"]
         for name, made in self.done.items():

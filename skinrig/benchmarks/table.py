@@ -1,4 +1,4 @@
-"""What a benchmark prints and writes beside its JSON: tables, verdicts, one plot a stage."""
+"""Print and write the tables, verdicts and plots of a benchmark."""
 
 import csv
 import io
@@ -28,18 +28,18 @@ BAND_COLUMNS = (
     "over lightest",
     "quantity",
 )
-"""Of the table of errors by band; "over lightest" is the error over that of the lightest band."""
+"""Columns of the errors by band; "over lightest" is the error over that of the lightest band."""
 
 
 def print_tables(document: Mapping[str, Any], console: Console) -> None:
-    """Print each stage's points and limits, then one line a stage and what was not judged.
+    """Print each stage's points and limits, a summary line per stage, and omitted stages.
 
     Parameters
     ----------
     document
-        ``skinrig.bench/2``, as `skinrig.benchmarks.stages.run_stages` makes it.
+        Schema ``skinrig.bench/2``, from `skinrig.benchmarks.stages.run_stages`.
     console
-        Where it is printed.
+        Receives the tables.
     """
     for name, stage in document["stages"].items():
         console.rows(
@@ -65,7 +65,7 @@ def print_tables(document: Mapping[str, Any], console: Console) -> None:
                 f"({limit['sense']} {limit['bound']:g})"
             )
         for what, why in stage["left_out"]:
-            console.print_line(f"left out: {what}: {why}")
+            console.print_line(f"omitted: {what}: {why}")
         console.print_line()
     console.rows(
         (
@@ -81,20 +81,21 @@ def print_tables(document: Mapping[str, Any], console: Console) -> None:
         ),
         [_line(name, stage) for name, stage in document["stages"].items()],
     )
-    if found := bands(document):
+    if found := list_band_rows(document):
         console.print_line()
         console.rows(BAND_COLUMNS, found)
     for name, why in document["left_out"]:
-        console.print_line(f"left out: {name}: {why}")
+        console.print_line(f"omitted: {name}: {why}")
     if document["not_judged"]:
         console.print_line(
-            "limits not judged, since measured at small size: "
-            f"{', '.join(document['not_judged'])}; `skinrig bench --stage NAME` judges them"
+            "limits not evaluated, measured at small size: "
+            f"{', '.join(document['not_judged'])}; run `skinrig bench --stage NAME` to evaluate "
+            "them"
         )
 
 
-def bands(document: Mapping[str, Any]) -> list[tuple[object, ...]]:
-    """Return the rows of :data:`BAND_COLUMNS`: errors of each stage from light skin to dark."""
+def list_band_rows(document: Mapping[str, Any]) -> list[tuple[object, ...]]:
+    """Return rows of :data:`BAND_COLUMNS`: errors of each stage, from light to dark skin."""
     rows: list[tuple[object, ...]] = []
     for name, stage in document["stages"].items():
         first = stage["by_band"][0]["error"] if stage["by_band"] else None
@@ -116,15 +117,15 @@ def bands(document: Mapping[str, Any]) -> list[tuple[object, ...]]:
     return rows
 
 
-def write(document: Mapping[str, Any], out: Path) -> None:
-    """Write one table of all points, ``bench.csv``, one by band, and a plot a stage.
+def write_tables(document: Mapping[str, Any], out: Path) -> None:
+    """Write the table of all points, the table by melanin band, and one plot per stage.
 
     Parameters
     ----------
     document
         ``skinrig.bench/2``.
     out
-        Folder; made if it is missing. It gets ``bench.csv``, ``bench-bands.csv``, ``NAME.svg``.
+        Folder for ``bench.csv``, ``bench-bands.csv`` and ``NAME.svg``; created if missing.
     """
     from skinrig.benchmarks import figures as bench_figures
 
@@ -145,10 +146,10 @@ def write(document: Mapping[str, Any], out: Path) -> None:
     ]
     head = ("stage", "size", "setting", "error is", *_POINT_COLUMNS, "low", "high", "front", "knee")
     write_atomically(out / "bench.csv", _csv(head, rows))
-    write_atomically(out / "bench-bands.csv", _csv(BAND_COLUMNS, bands(document)))
+    write_atomically(out / "bench-bands.csv", _csv(BAND_COLUMNS, list_band_rows(document)))
     for name, stage in document["stages"].items():
         if stage["points"]:
-            plot = bench_figures.error_against_seconds(name, stage)
+            plot = bench_figures.plot_error_against_time(name, stage)
             write_atomically(out / f"{name}.svg", plot + "\n")
 
 
@@ -161,7 +162,7 @@ def _csv(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
 
 
 def format_knobs(point: Mapping[str, Any]) -> str:
-    """Return what a point's knobs were set to, on one line.
+    """Format the settings of a point on one line.
 
     Examples
     --------
@@ -188,15 +189,15 @@ def _line(name: str, stage: Mapping[str, Any]) -> tuple[object, ...]:
     known = [point["efficiency"] for point in points if point["efficiency"] is not None]
     missed = sum(not limit["passed"] for limit in stage["limits"])
     verdict = f"{missed} MISSED" if missed else f"{len(stage['limits'])} kept"
-    many = f"{len(knees)}, one a condition" if len(knees) > 1 else ""
+    count = f"{len(knees)}, one per condition" if len(knees) > 1 else ""
     return (
         name,
         stage["size"],
         len(points),
         len(stage["fronts"]),
         min((float(point["error"]) for point in points), default=""),
-        format_knobs(bend) if bend else many,
+        format_knobs(bend) if bend else count,
         bend["seconds"] if bend else "",
         min(known) if known else "",
-        verdict if stage["size"] == "full" else "not judged",
+        verdict if stage["size"] == "full" else "not evaluated",
     )

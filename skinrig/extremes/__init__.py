@@ -1,1 +1,1 @@
-"""Stiff and extreme cases: what `skinrig bench --extremes` tries."""
+"""Stiff and extreme cases of `skinrig bench --extremes`."""

@@ -1,9 +1,8 @@
-"""Stiff and extreme cases: what is expected of each stage at the ends of its domain, and the check.
+"""Run each stage at the ends of its domain and check the result against a fixed expectation.
 
-A case hands a stage what is hardest for it, once in float32 and once in float64, and holds what
-comes back against an expectation that was written down before: a value, a bound, a mask or a named
-error. Nothing else counts as held: a NaN without a mask, a traceback of another kind or a silent
-clamp fails the case.
+A case runs a stage with extreme inputs in float32 and in float64. The expected result is fixed
+beforehand: a value, a bound, a mask or a named error. Any other result fails the case, such as a
+NaN without a mask, another exception or a silent clamp.
 """
 
 import csv
@@ -21,19 +20,19 @@ from skinrig.extremes.inputs import InputPrecision
 SCHEMA = "skinrig.extremes.cases/1"
 
 CASES_TABLE = resources.files("skinrig").joinpath("data/extremes.csv")
-"""Name, stage, extreme, danger and expectation of each case, with module and function of its trial;
-`one_precision` says why one run stands for both, where a trial has no precision to choose."""
+"""Stage, name, extreme, danger and expectation of each case, with module and function of its trial.
+`one_precision` is the reason why one run counts for both, where inputs have a fixed precision."""
 
 INPUT_PRECISIONS: Mapping[str, InputPrecision] = {
     "float32": InputPrecision(np.float32),
     "float64": InputPrecision(np.float64),
 }
-"""What the inputs of each case are given in."""
+"""Precisions of the inputs of each case."""
 
 
 @dataclass(frozen=True, slots=True)
 class CaseOutcome:
-    """What one precision of one case did."""
+    """Result of one case in one precision."""
 
     got: str
     passed: bool
@@ -49,12 +48,12 @@ class CaseResult:
 
     @property
     def passed(self) -> bool:
-        """Whether every precision held."""
+        """Whether the case passed in every precision."""
         return all(outcome.passed for outcome in self.outcomes.values())
 
 
 def read_cases() -> tuple[Case, ...]:
-    """Return every case, in the order of the light: transport, images, surface, motion."""
+    """Read every case from the table, in the table's order."""
     rows = csv.DictReader(CASES_TABLE.read_text(encoding="utf-8").splitlines())
     return tuple(_case(**row) for row in rows)
 
@@ -65,7 +64,7 @@ def _case(*, run: str, **words: str) -> Case:
 
 
 def try_case(case: Case) -> CaseResult:
-    """Run a case in every precision; whatever it raises becomes its outcome."""
+    """Run a case in every precision; an exception becomes its outcome."""
     outcomes: dict[str, CaseOutcome] = {}
     for name, real in INPUT_PRECISIONS.items():
         if case.one_precision and outcomes:
@@ -77,7 +76,9 @@ def try_case(case: Case) -> CaseResult:
                 got, passed = case.run(real), True
         except ExpectationError as error:
             got, passed = str(error), False
-        except Exception as error:  # any other error is what the table is to show
+        except (
+            Exception
+        ) as error:  # an unexpected exception fails the case and is listed in the table
             got, passed = f"{type(error).__name__}: {error}", False
         outcomes[name] = CaseOutcome(got, passed, time.perf_counter() - start)
     return CaseResult(case, outcomes)
@@ -86,14 +87,14 @@ def try_case(case: Case) -> CaseResult:
 def run_cases(
     stages: Sequence[str] = (), *, progress: Callable[[str], None] | None = None
 ) -> list[CaseResult]:
-    """Run all cases, or those of some stages.
+    """Run all cases, or those of selected stages.
 
     Parameters
     ----------
     stages
-        Names as in `Case.stage`; empty runs all.
+        Values of `Case.stage`; empty runs all.
     progress
-        Is told each case's name before it runs.
+        Called with each case's name before it runs.
 
     Raises
     ------
@@ -104,7 +105,9 @@ def run_cases(
     known = sorted({case.stage for case in cases})
     for stage in stages:
         if stage not in known:
-            raise ValueError(f"stage: got {stage!r}, expected one of {', '.join(known)}")
+            raise ValueError(
+                f"stage: got {stage!r}, expected one of {', '.join(known)}; correct the name"
+            )
     found = []
     for case in cases:
         if stages and case.stage not in stages:
@@ -116,7 +119,7 @@ def run_cases(
 
 
 def to_document(results: Iterable[CaseResult]) -> dict[str, Any]:
-    """Return the machine-readable table of a run."""
+    """Return the JSON document of a run."""
     rows = [
         {
             "name": result.case.name,

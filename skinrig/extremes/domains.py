@@ -1,4 +1,4 @@
-"""Extremes of what functions state of their arguments: ends of domains, and beyond them."""
+"""Extremes of documented domains of arguments: their ends, and values beyond."""
 
 import numpy as np
 
@@ -15,36 +15,37 @@ from skinrig.extremes.expectations import (
     expect_valid_fraction,
     expect_within,
 )
-from skinrig.extremes.inputs import InputPrecision, ring, sheet_faces, stretched_sheet
+from skinrig.extremes.inputs import InputPrecision, ring_directions, sheet_faces, stretched_sheet
 
 INVALID_COEFFICIENTS = (np.nan, np.inf, -1.0)
 
 
 def _far_lights(real: InputPrecision) -> str:
-    way = ring(8, np.pi / 6)
+    lights = ring_directions(8, np.pi / 6)
     normal = np.array([0.1, -0.2, np.sqrt(0.95)])
-    lit = real((way @ normal)[:, None, None])
-    infinite = stereo.estimate_normals(lit, way)
+    lit = real((lights @ normal)[:, None, None])
+    infinite = stereo.estimate_normals(lit, lights)
+    # lights at 1 km = 1e6 mm: irradiance falls by the square of the distance, 1e-12
     far = stereo.estimate_normals(
-        1e-12 * lit, way, light_positions_mm=1e6 * way, points_mm=np.zeros((1, 1, 3))
+        1e-12 * lit, lights, light_positions_mm=1e6 * lights, points_mm=np.zeros((1, 1, 3))
     )
     expect_valid_fraction(infinite.valid & far.valid, fraction_range=(1.0, 1.0))
     expect_near(far.normals, infinite.normals, absolute=1e-5)
     expect_error(
         lambda: stereo.estimate_normals(
-            lit, way, light_positions_mm=np.inf * np.sign(way), points_mm=np.zeros((1, 1, 3))
+            lit, lights, light_positions_mm=np.inf * np.sign(lights), points_mm=np.zeros((1, 1, 3))
         ),
         stereo.PhotometricStereoError,
         "light_positions_mm",
     )
-    return "at 1 km as without a distance; at infinity refused"
+    return "at 1 km equal to no distance; infinity rejected"
 
 
 def _one_photon(real: InputPrecision) -> str:
     rng = np.random.default_rng(9)
-    way = ring(24, np.arcsin(0.6))
+    lights = ring_directions(24, np.arcsin(0.6))
 
-    def seen(photons: float) -> stereo.NormalMaps:
+    def estimate(photons: float) -> stereo.NormalMaps:
         electrons = rng.poisson(photons, (24, 1, 1, 2000)) + rng.standard_normal((24, 1, 1, 2000))
         frames = np.rint(512.0 + electrons / 0.5).astype(np.uint16)
         merged = [
@@ -52,17 +53,18 @@ def _one_photon(real: InputPrecision) -> str:
             for frame in frames
         ]
         radiance, variance, valid = (np.stack(part) for part in zip(*merged, strict=True))
-        return stereo.estimate_normals(real(radiance), way, variance=real(variance), valid=valid)
+        return stereo.estimate_normals(real(radiance), lights, variance=real(variance), valid=valid)
 
-    dark, bright = seen(1.0), seen(100.0)
+    dark, bright = estimate(1.0), estimate(100.0)
     expect_valid_fraction(dark.valid, fraction_range=(0.0, 0.05))
     expect_finite(dark.normals, np.ones_like(dark.valid))
     expect_valid_fraction(bright.valid, fraction_range=(1.0, 1.0))
     off = np.arccos(np.clip(bright.normals[..., 2], -1.0, 1.0))
-    # of two alike Gaussian errors 68.27 % are within 1.0714 of the root mean square
-    held = float(np.mean(off <= 1.0714 * bright.stderr_rad))
-    return f"{dark.valid.sum()} of 2000 given a normal; of 100 photons " + expect_within(
-        held, 0.60, 0.76, label="share inside"
+    # The angle of two equal Gaussian components is Rayleigh distributed: 68.27 % of angles are
+    # below sqrt(-ln(1 - 0.6827)) = 1.0714 root mean squares.
+    inside = float(np.mean(off <= 1.0714 * bright.stderr_rad))
+    return f"{dark.valid.sum()} of 2000 with a normal; at 100 photons " + expect_within(
+        inside, 0.60, 0.76, label="coverage"
     )
 
 
@@ -80,25 +82,25 @@ def _profile_beyond_numbers(real: InputPrecision) -> str:
     slopes = photon_table.derivatives(ends, real(0.02), real(1.0))
     expect_finite(np.stack(slopes), np.ones((3, 2), bool), label="profile and slopes")
     expect_near(slopes.reflectance_per_mm2[1], 0.0, absolute=1e-30)
-    for place, name in enumerate(("radius_mm", "sigma_a_per_mm", "sigma_s_prime_per_mm")):
+    for index, name in enumerate(("radius_mm", "sigma_a_per_mm", "sigma_s_prime_per_mm")):
         for bad in INVALID_COEFFICIENTS:
             values = [real(1.0), real(0.1), real(1.0)]
-            values[place] = real(bad)
+            values[index] = real(bad)
             expect_error(lambda v=values: photon_table.reflectance(*v), ValueError, name)  # type: ignore[misc]
     expect_error(lambda: photon_table.reflectance(1e301, 0.1, 1.0), ValueError, "radius_mm")
-    return "finite from end to end; no medium is refused by name"
+    return "finite at both ends; the error names the invalid argument"
 
 
 def _layers_of_no_medium(real: InputPrecision) -> str:
-    told = 0
+    rejected = 0
     for solver in (adding_doubling, layered_diffusion):
-        for place, name in enumerate(("sigma_a_per_mm", "sigma_s_prime_per_mm", "thickness_mm")):
+        for index, name in enumerate(("sigma_a_per_mm", "sigma_s_prime_per_mm", "thickness_mm")):
             for bad in (np.nan, -1.0):
                 values = [real([[0.1, 0.1]]), real([[1.0, 1.0]]), real([[0.2, np.inf]])]
-                values[place][0, 0] = bad
+                values[index][0, 0] = bad
                 expect_error(lambda v=values, s=solver: s.reflectance(*v), ValueError, name)  # type: ignore[misc]
-                told += 1
-    return f"ValueError naming it, {told} times"
+                rejected += 1
+    return f"ValueError naming the argument, {rejected} times"
 
 
 def _nothing_to_continue(real: InputPrecision) -> str:

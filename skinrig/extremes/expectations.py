@@ -1,4 +1,4 @@
-"""Cases of the extremes and what is expected of them."""
+"""Extreme cases and checks of their results."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,33 +11,33 @@ from skinrig.extremes.inputs import InputPrecision
 
 
 class ExpectationError(AssertionError):
-    """A stage did something else than it should; the text says what."""
+    """Result of a stage that differs from the expectation; the message states both."""
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One extreme."""
+    """One extreme case of a stage."""
 
     name: str
     stage: str
-    """Module that is put to the test."""
+    """Stage under test."""
     extreme: str
-    """What is extreme."""
+    """Extreme input."""
     danger: str
-    """Why that can break."""
+    """Reason why the input can fail."""
     expected: str
-    """The behavior that holds."""
+    """Expected behavior."""
     run: Callable[[InputPrecision], str]
-    """Tries it with inputs of a precision; returns what happened, or raises `ExpectationError`."""
+    """Function that runs the case with inputs of a precision. It returns a description of the
+    result or raises `ExpectationError`."""
     one_precision: str = ""
-    """Why its inputs have no precision to choose, so that one run stands for both; empty: they
-    have."""
+    """Reason why the inputs have a fixed precision and one run counts for both; empty otherwise."""
 
 
 def expect_near(
     got: ArrayLike, expected: ArrayLike, *, relative: float = 0.0, absolute: float = 0.0
 ) -> str:
-    """Return the value where it is as near as said, else raise."""
+    """Return the value as text if it is within the tolerances, else raise `ExpectationError`."""
     value, target = np.asarray(got, np.float64), np.asarray(expected, np.float64)
     away = np.abs(value - target)
     if not np.all(away <= absolute + relative * np.abs(target)):
@@ -46,7 +46,7 @@ def expect_near(
 
 
 def expect_within(got: ArrayLike, low: float, high: float, *, label: str = "values") -> str:
-    """Return the range of the values where all are finite and within the bounds, else raise."""
+    """Return the range of the values if all are finite and within the bounds, else raise."""
     value = np.asarray(got, np.float64)
     if not np.all(np.isfinite(value)) or value.size == 0:
         raise ExpectationError(f"{label}: got {_short(value)}, expected finite values")
@@ -58,7 +58,7 @@ def expect_within(got: ArrayLike, low: float, high: float, *, label: str = "valu
 
 
 def expect_rising(got: ArrayLike, *, strictly: bool = True, label: str = "values") -> str:
-    """Return the ends of the values where they are finite and rise, else raise."""
+    """Return the first and last value if the values are finite and rise, else raise."""
     value = np.asarray(got, np.float64)
     steps = np.diff(value)
     if not np.all(np.isfinite(value)) or np.any(steps < 0) or (strictly and np.any(steps == 0)):
@@ -67,18 +67,18 @@ def expect_rising(got: ArrayLike, *, strictly: bool = True, label: str = "values
 
 
 def expect_error(call: Callable[[], object], error: type[BaseException], *words: str) -> str:
-    """Return the message where the call raises this error and says these words, else raise."""
+    """Return the message if the call raises this error and its text has these words, else raise."""
     try:
         got = call()
     except error as caught:
         text = str(caught)
         for word in words:
             if word not in text:
-                raise ExpectationError(f"the error does not say {word!r}: {text}") from caught
+                raise ExpectationError(f"got {text!r}, expected an error with {word!r}") from caught
         return f"{type(caught).__name__}: {text}"
     except Exception as caught:
         raise ExpectationError(
-            f"{type(caught).__name__} instead of {error.__name__}: {caught}"
+            f"got {type(caught).__name__}: {caught}, expected {error.__name__}"
         ) from None
     raise ExpectationError(f"got {type(got).__name__}, expected {error.__name__}")
 
@@ -86,21 +86,21 @@ def expect_error(call: Callable[[], object], error: type[BaseException], *words:
 def expect_valid_fraction(
     valid: ArrayLike, *, fraction_range: tuple[float, float] = (0.0, 0.0)
 ) -> str:
-    """Return how much is valid where that share lies in the range, else raise."""
+    """Return the valid fraction as text if it is in the range, else raise."""
     kept = float(np.mean(np.asarray(valid, np.float64)))
     if not fraction_range[0] <= kept <= fraction_range[1]:
         raise ExpectationError(
-            f"valid: got a share of {kept:.3g}, expected {fraction_range[0]:g} to"
+            f"valid: got a fraction of {kept:.3g}, expected {fraction_range[0]:g} to"
             f" {fraction_range[1]:g}"
         )
     return f"{100 * kept:.3g} % valid"
 
 
 def expect_finite(values: ArrayLike, valid: ArrayLike, *, label: str = "values") -> str:
-    """Return that every valid value is finite, else raise."""
-    shown = np.asarray(values)[np.asarray(valid, np.bool_)]
-    if not np.all(np.isfinite(shown)):
-        raise ExpectationError(f"{label}: got NaN or infinity at a valid place")
+    """Return a confirmation if every valid value is finite, else raise."""
+    kept = np.asarray(values)[np.asarray(valid, np.bool_)]
+    if not np.all(np.isfinite(kept)):
+        raise ExpectationError(f"{label}: got NaN or infinity in a valid entry, expected a number")
     return f"{label} finite where valid"
 
 

@@ -1,4 +1,4 @@
-"""Extremes of pictures: exposures, polarizers, chromophores, light stages."""
+"""Extremes of images: exposures, polarizers, chromophores."""
 
 from __future__ import annotations
 
@@ -28,7 +28,6 @@ EXPOSURES_S = (1.0, 0.25, 0.0625)
 
 
 def _merged(dn: NDArray[np.integer]) -> tuple[NDArray[Any], ...]:
-
     radiance, variance, valid = hdr.merge(dn, EXPOSURES_S, **_SENSOR_SETTINGS)
     expect_finite(radiance, valid, label="radiance")
     expect_finite(variance, valid, label="variance")
@@ -46,13 +45,13 @@ def _all_black(_: InputPrecision) -> str:
 
 
 def _below_black(_: InputPrecision) -> str:
-    # darks subtracted from noise: half of it is negative, and stays so, or the mean is biased
+    # noise minus the black level is negative in half of the pixels; a clamp would bias the mean
     rng = np.random.default_rng(3)
     dn = np.clip(np.round(512 + rng.normal(0, 6, (3, 128, 128))), 0, None).astype(np.uint16)
     radiance, variance, _valid = _merged(dn)
     z = float(radiance.mean() / np.sqrt(variance.mean() / radiance.size))
     if not np.any(radiance < 0):
-        raise ExpectationError("no radiance is negative: it was clamped")
+        raise ExpectationError("got no negative radiance, expected noise around 0: it was clamped")
     return f"mean {z:.2g} standard errors from 0: " + expect_within(z, -4.0, 4.0, label="z")
 
 
@@ -79,7 +78,7 @@ def _one_electron(_: InputPrecision) -> str:
     ]
     radiance, variance, valid = _merged(np.clip(np.array(frames), 0, None).astype(np.uint16))
     expect_valid_fraction(valid, fraction_range=(1.0, 1.0))
-    # an electron a second is two numbers a second
+    # one electron per second at a gain of 0.5 e-/DN is two DN per second
     z = float((radiance.mean() - 2.0) / np.sqrt(variance.mean() / radiance.size))
     return f"mean {z:.2g} standard errors from one electron: " + expect_within(
         z, -4.0, 4.0, label="z"
@@ -107,7 +106,6 @@ def _not_a_number(real: InputPrecision) -> str:
 
 
 def _table() -> ColorTable:
-
     return color_table.build("Nikon 5100 (NPL)", "D55", size=32)
 
 
@@ -118,8 +116,8 @@ def _black_pixels(real: InputPrecision) -> str:
 
 
 def _odd_colors(real: InputPrecision) -> str:
-    no_skin = [[0, 0, 1], [0, 1, 0], [-0.2, 0.1, 0.1], [np.nan, 0.3, 0.2], [np.inf, 1, 1]]
-    rgb = real(np.array(no_skin))
+    not_skin = [[0, 0, 1], [0, 1, 0], [-0.2, 0.1, 0.1], [np.nan, 0.3, 0.2], [np.inf, 1, 1]]
+    rgb = real(np.array(not_skin))
     variance = real(np.full((5, 3), 1e-6))
     found = chromophores.invert(rgb, _table(), shading="known", variance=variance)
     expect_finite(found.melanin, found.valid, label="melanin")
@@ -133,12 +131,12 @@ def _pigment_corners(real: InputPrecision) -> str:
     found = chromophores.invert(real(table.lookup(c_m, c_hd)), table, shading="known")
     expect_near(found.melanin, c_m, absolute=2e-3)
     expect_near(found.hemoglobin[:2], c_hd[:2], absolute=2e-3)
-    # through that much melanin hardly any light comes from the blood: the error must say so
+    # that much melanin hides the blood: the stated error of hemoglobin must be large
     off = np.abs(found.hemoglobin[2:] - c_hd[2:]) / found.stderr_hemoglobin[2:]
     expect_within(
         found.stderr_hemoglobin[2:], 0.03, 1.0, label="standard error of hidden hemoglobin"
     )
-    return "melanin and seen hemoglobin as made; the hidden off by " + expect_within(
+    return "melanin and visible hemoglobin exact; error of the hidden " + expect_within(
         off, 0.0, 3.0, label="standard errors"
     )
 

@@ -1,4 +1,4 @@
-"""What cases hand over: arrays of a precision, rings of lights, sheets of triangles."""
+"""Inputs of extreme cases: arrays of a precision, rings of lights, sheets of triangles."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,33 +11,33 @@ from skinrig.arrays import Float64Array, Int64Array
 
 @dataclass(frozen=True, slots=True)
 class InputPrecision:
-    """A precision of inputs; called, it returns values as numbers of it."""
+    """Floating-point precision of inputs; a call converts values to it."""
 
     dtype: type[np.float32] | type[np.float64]
 
     def __call__(self, values: ArrayLike) -> NDArray[Any]:
-        """Return values in the precision: an array, or of one number a number."""
+        """Return an array of the values in this precision; a scalar stays a scalar."""
         made: Any = self.dtype(values)  # type: ignore[arg-type]
         return made
 
     @property
     def single(self) -> bool:
-        """Whether it is that of 24 bits."""
+        """Whether the significand has 24 bits (float32)."""
         return self.dtype is np.float32
 
 
-def ring(count: int, tilt_rad: float) -> Float64Array:
-    """Return directions (count, 3) at a tilt from +z, evenly around it.
+def ring_directions(count: int, tilt_rad: float) -> Float64Array:
+    """Return unit directions (count, 3) at a tilt from +z, at equal azimuth steps.
 
     Examples
     --------
-    >>> ring(3, 0.5)[:, 2].round(3).tolist()
+    >>> ring_directions(3, 0.5)[:, 2].round(3).tolist()
     [0.878, 0.878, 0.878]
     """
-    turn = np.arange(count) * (2.0 * np.pi / count)
-    across = np.sin(tilt_rad)
+    azimuth = np.arange(count) * (2.0 * np.pi / count)
+    radius = np.sin(tilt_rad)
     return np.stack(
-        [across * np.cos(turn), across * np.sin(turn), np.full(count, np.cos(tilt_rad))], -1
+        [radius * np.cos(azimuth), radius * np.sin(azimuth), np.full(count, np.cos(tilt_rad))], -1
     )
 
 
@@ -56,7 +56,7 @@ def sheet_faces(side: int) -> Int64Array:
 
 
 def stretched_sheet(factors: tuple[float, float, float]) -> tuple[Float64Array, ...]:
-    """Return points (81, 3) of a flat sheet of 40 mm, the same times factors, and UV (81, 2)."""
+    """Return points (81, 3) of a flat sheet of 40 mm, those points scaled, and UV (81, 2)."""
     u, v = (part.ravel() for part in np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)))
     flat = np.stack([40 * u, 40 * v, 0 * u], -1)
     return flat, flat * factors, np.stack([u, v], -1)

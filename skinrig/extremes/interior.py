@@ -1,4 +1,4 @@
-"""Extremes of light inside the skin: coefficients of the model, and the gathered dipole."""
+"""Extremes of the gathered dipole: coefficients of the model, and lateral scattering."""
 
 import itertools
 
@@ -18,7 +18,7 @@ from skinrig.extremes.inputs import InputPrecision
 
 
 def _patch(real: InputPrecision, *, step_mm: float = 0.5, count: int = 20):  # type: ignore[no-untyped-def]
-    """Return places and areas of a curved patch."""
+    """Return positions and areas of a curved patch."""
     at = (np.arange(count) - 0.5 * (count - 1)) * step_mm
     x, y = np.meshgrid(at, at)
     place = np.stack([x, y, 0.05 * x * y], axis=-1).reshape(-1, 3)
@@ -28,13 +28,13 @@ def _patch(real: InputPrecision, *, step_mm: float = 0.5, count: int = 20):  # t
 def _even(real: InputPrecision) -> str:
     place, area = _patch(real)
     light = real(np.full((len(area), 3), 3.0))
-    told = []
+    count = 0
     ends = itertools.product((0.0, 1e-6, 0.5, 1.0 - 1e-9, 1.0), (0.01, 1.0, 100.0))
     for r_d, length in ends:
         got = exitance(place, area, light, place[::9], r_d, length)
         expect_near(got, np.full(got.shape, 3.0 * r_d), relative=1e-5)
-        told.append(r_d)
-    return f"R_d times what entered, for {len(told)} pairs"
+        count += 1
+    return f"R_d times the irradiance, for {count} pairs"
 
 
 def _coarse(real: InputPrecision) -> str:
@@ -55,7 +55,7 @@ def _above_one(real: InputPrecision) -> str:
     )
     return (
         expect_valid_fraction(found.valid, fraction_range=(0.3, 0.4))
-        + ", a named outlier; 1.2 times what entered"
+        + ", marked as an outlier; 1.2 times the irradiance"
     )
 
 
@@ -89,7 +89,7 @@ def _folded(real: InputPrecision) -> str:
     light = np.zeros((len(both), 3), real.dtype)
     light[: len(place)] = 1.0
     got = exitance(both, np.tile(area, 2), light, both, 1.0, (0.05, 1.0, 50.0))
-    return expect_within(got, -1e-3, 1.0 + 1e-3, label="exitance over the brightest")
+    return expect_within(got, -1e-3, 1.0 + 1e-3, label="exitance over the largest")
 
 
 def _opaque(real: InputPrecision) -> str:

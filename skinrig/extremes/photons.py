@@ -1,4 +1,4 @@
-"""Extremes of the photons' random walks: no absorption, nothing else, thin and stiff layers."""
+"""Extremes of photon random walks: no absorption, only absorption, thin and stiff layers."""
 
 import math
 
@@ -14,7 +14,7 @@ Matter = tuple[float, float, float, float]
 
 
 def _walked(real: InputPrecision, *layers: Matter, eta: float = 1.4, photons: int = 40_000):  # type: ignore[no-untyped-def]
-    """Return what becomes of photons in layers."""
+    """Trace photons through layers; check their energy balance and return the result."""
     made = []
     for one in layers:
         depth, absorption, scattering, g = (float(real(value)) for value in one)
@@ -26,32 +26,34 @@ def _walked(real: InputPrecision, *layers: Matter, eta: float = 1.4, photons: in
 
 
 def _z_of_layers(real: InputPrecision, *layers: Matter, eta: float = 1.4) -> str:
-    """Return how far the walks are from the doubled layers, in standard errors."""
+    """Compare walks with the adding-doubling reflectance, in standard errors."""
     depth, absorption, scattering, g = np.array(layers, np.float64).T
     if np.any(g != 0.0):
-        raise ValueError("g: expected 0, for which sigma_s' is sigma_s")
+        raise ValueError(
+            f"g: got {g.tolist()}, expected 0, for which sigma_s' is sigma_s; use isotropic layers"
+        )
     found = _walked(real, *layers, eta=eta)
-    told = float(
+    layered = float(
         tissue_optics.layer_stack_reflectance(
             real(absorption), real(scattering), real(depth), eta=float(real(eta)), directions=32
         )
     )
-    # the layers' own error: half a percent of what comes back
-    error = math.hypot(found.reflectance_stderr, 0.005 * told)
-    z = (found.reflectance - told) / error
-    return f"R {found.reflectance:.4g}, layers {told:.4g}: " + expect_within(
+    # adding-doubling itself has an error of about 0.5 % of the reflectance
+    error = math.hypot(found.reflectance_stderr, 0.005 * layered)
+    z = (found.reflectance - layered) / error
+    return f"R {found.reflectance:.4g}, layers {layered:.4g}: " + expect_within(
         z, -4.0, 4.0, label="z"
     )
 
 
 def _nothing_absorbed(real: InputPrecision) -> str:
-    said = []
+    returned = []
     for absorption in (0.0, 1e-30, 1e-12):
         found = _walked(real, (1.0, absorption, 10.0, 0.9), photons=4000)
         expect_within(found.absorbed, 0.0, 1e-9, label="absorbed")
         expect_near(found.specular + found.reflectance + found.transmittance, 1.0, absolute=1e-9)
-        said.append(found.reflectance + found.transmittance)
-    return expect_within(said, 0.9, 1.0, label="R + T")
+        returned.append(found.reflectance + found.transmittance)
+    return expect_within(returned, 0.9, 1.0, label="R + T")
 
 
 def _all_absorbed(real: InputPrecision) -> str:
@@ -71,7 +73,7 @@ def _thin(real: InputPrecision) -> str:
     covered = _walked(real, (1e-7, 50.0, 1.5, 0.0), (math.inf, 0.2, 1.5, 0.0))
     error = math.hypot(bare.reflectance_stderr, covered.reflectance_stderr)
     if error <= 0.0:
-        raise ExpectationError("got no standard error")
+        raise ExpectationError(f"got a standard error of {error:g}, expected a positive one")
     expect_within(covered.absorbed[0], 0.0, 1e-4, label="absorbed by the film")
     z = (covered.reflectance - bare.reflectance) / error
     return expect_within(z, -4.0, 4.0, label="z")

@@ -1,4 +1,4 @@
-"""Extremes of the skin's reflectance: lobes, factorizations, tables."""
+"""Extremes of surface reflectance: lobes, factorizations, tables."""
 
 import numpy as np
 
@@ -16,12 +16,12 @@ from skinrig.extremes.inputs import InputPrecision
 
 
 def _samples(value, real: InputPrecision, *, points: int = 3, count: int = 40):  # type: ignore[no-untyped-def]
-    """Return surface samples of `value`, called with light and view, at random directions."""
+    """Return surface samples at random directions of `value`, a function of light and view."""
     rng = np.random.default_rng(9)
-    ways = rng.normal(size=(2, points, count, 3))
-    ways[..., 2] = np.abs(ways[..., 2]) + 0.4
-    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
-    light, view = ways
+    directions = rng.normal(size=(2, points, count, 3))
+    directions[..., 2] = np.abs(directions[..., 2]) + 0.4
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    light, view = directions
     up = np.broadcast_to([0.0, 0.0, 1.0], (points, 3))
     brdf = np.broadcast_to(np.asarray(value(light, view))[..., None], (points, count, 3))
     return brdf_basis.surface_samples(
@@ -30,7 +30,7 @@ def _samples(value, real: InputPrecision, *, points: int = 3, count: int = 40): 
 
 
 def _fitted_to(value: float, real: InputPrecision) -> brdf_basis.BasisWeights:
-    """Return the weights of surface samples that are all of a value."""
+    """Return the weights fitted to surface samples of one constant value."""
     samples = _samples(lambda light, view: np.full(light.shape[:-1], value), real)
     return brdf_basis.fit_weights(samples, brdf_tables.default_basis())
 
@@ -71,7 +71,7 @@ def _ill_conditioned(real: InputPrecision) -> str:
     off = np.sum(np.abs(again - samples.value)[samples.valid]) / np.sum(
         np.abs(samples.value)[samples.valid]
     )
-    return "samples again within " + expect_within(off, 0.0, 0.02, label="share")
+    return "relative misfit of the samples " + expect_within(off, 0.0, 0.02, label="fraction")
 
 
 def _no_samples(real: InputPrecision) -> str:
@@ -88,8 +88,8 @@ def _rank_above_data(real: InputPrecision) -> str:
 def _zero_rows(real: InputPrecision) -> str:
     weights = np.random.default_rng(1).random((40, 12))
     weights[:20] = 0.0
-    shares, mix, error = brdf_basis.reduce(real(weights), 4)
-    expect_within(shares[:20] @ mix, 0.0, 1e-2, label="rows of zeros")
+    fractions, mix, error = brdf_basis.reduce(real(weights), 4)
+    expect_within(fractions[:20] @ mix, 0.0, 1e-2, label="rows of zeros")
     return expect_within(error, 0.0, 0.5, label="error")
 
 
@@ -111,7 +111,8 @@ def _merl_bins(real: InputPrecision) -> str:
 
 
 def _conditions(real: InputPrecision) -> str:
-    # sigma_t' = sigma_tr / sqrt(3 (1 - alpha')): sixteen decades of 1 - alpha'
+    # sigma_tr = sqrt(3 sigma_a sigma_t') gives sigma_t' = sigma_tr / sqrt(3 (1 - alpha')), here for
+    # sixteen decades of 1 - alpha'
     deficit = real(np.logspace(-15, 0, 16))
     sigma_a, sigma_s = dipole.coefficients(deficit, real(np.ones(16)))
     back = dipole.effective_transport(sigma_a, sigma_s)

@@ -1,4 +1,4 @@
-"""Extremes of the simulation: what a renderer or a sensor gets wrong without a word."""
+"""Extremes of the simulation: inputs with silent errors in a renderer or a sensor."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def _sheet(height_mm, offset_mm=(0.0, 0.0, 0.0), side: int = 33, pitch_mm: float = 1.0):  # type: ignore[no-untyped-def]
-    """Return a square sheet facing +z as a mesh of the rig frame."""
+    """Return the mesh of a square height field that faces +z, in the rig frame."""
     across = (np.arange(side) - (side - 1) / 2) * pitch_mm
     x, y = np.meshgrid(across, across)
     points = np.stack([x, y, height_mm(x, y)], -1).reshape(-1, 3) + np.asarray(offset_mm)
@@ -32,77 +32,76 @@ def _sheet(height_mm, offset_mm=(0.0, 0.0, 0.0), side: int = 33, pitch_mm: float
     return build_mesh(points, sheet_faces(side), uv)
 
 
-def _seen(mesh, light_mm) -> FloatArray:  # type: ignore[no-untyped-def]
-
+def _visible(mesh, light_mm) -> FloatArray:  # type: ignore[no-untyped-def]
     return visibility(
         Caster(mesh), mesh.vertices_mm, mesh.normals, np.asarray(light_mm, np.float64)
     )
 
 
 def _shadow_off_origin(_: InputPrecision) -> str:
-    # a wall 4 mm high throws the same shadow wherever the face is
+    # the shadow of a wall of 4 mm is the same at any distance from the origin
     def wall(x, y):  # type: ignore[no-untyped-def]
         return 4.0 * (np.abs(x) < 0.5)
 
     away = np.array([60.0, -40.0, 300.0])
     light = np.array([300.0, 0.0, 100.0])
-    here = _seen(_sheet(wall), light)
-    there = _seen(_sheet(wall, away), light + away)
-    share = float(np.mean(here != there))
+    here = _visible(_sheet(wall), light)
+    there = _visible(_sheet(wall, away), light + away)
+    changed = float(np.mean(here != there))
     if float(np.mean(here == 0)) < 0.05:
-        raise ExpectationError("no shadow at all")
-    return "places that differ: " + expect_within(share, 0.0, 0.01, label="share")
+        raise ExpectationError("got no shadow, expected the shadow of a wall")
+    return "points that differ: " + expect_within(changed, 0.0, 0.01, label="fraction")
 
 
 def _fine_shadow_off_origin(_: InputPrecision) -> str:
-    # furrows of 60 um under light at 80 degrees, where the renderer's own offsets are 90 um
-    def furrows(x, y):  # type: ignore[no-untyped-def]
+    # grooves of 60 um under light at 80 degrees, where the renderer's ray offsets are 90 um
+    def grooves(x, y):  # type: ignore[no-untyped-def]
         return 0.03 * np.cos(2.0 * np.pi * x / 0.2)
 
     away = np.array([100.0, 100.0, 1000.0])
     light = 500.0 * _tilted(80.0)
-    here = _seen(_sheet(furrows, side=101, pitch_mm=0.02), light)
-    there = _seen(_sheet(furrows, away, side=101, pitch_mm=0.02), light + away)
+    here = _visible(_sheet(grooves, side=101, pitch_mm=0.02), light)
+    there = _visible(_sheet(grooves, away, side=101, pitch_mm=0.02), light + away)
     shadowed = float(np.mean(here == 0))
     if not 0.2 < shadowed < 0.9:
         raise ExpectationError(
-            f"got {shadowed:.2g} in shadow, expected furrows that shade each other"
+            f"got {shadowed:.2g} in shadow, expected grooves that shade each other"
         )
-    share = float(np.mean(here != there))
-    return f"{shadowed:.2g} in shadow; places that differ: " + expect_within(
-        share, 0, 0.02, label="share"
+    changed = float(np.mean(here != there))
+    return f"{shadowed:.2g} in shadow; points that differ: " + expect_within(
+        changed, 0, 0.02, label="fraction"
     )
 
 
 def _no_self_shadow(_: InputPrecision) -> str:
-    lit = _seen(_sheet(lambda x, y: 0.0 * x), (5700.0, 0.0, 10.0))  # 0.1 degrees over the sheet
-    return "lit " + expect_within(lit, 1.0, 1.0, label="share")
+    lit = _visible(_sheet(lambda x, y: 0.0 * x), (5700.0, 0.0, 10.0))  # 0.1 degrees over the sheet
+    return "lit " + expect_within(lit, 1.0, 1.0, label="fraction")
 
 
 def _light_on_skin(_: InputPrecision) -> str:
-    lit = _seen(_sheet(lambda x, y: 0.0 * x), (0.3, 0.3, 1.0))
-    return expect_within(lit, 1.0, 1.0, label="share lit by a light at 1 mm")
+    lit = _visible(_sheet(lambda x, y: 0.0 * x), (0.3, 0.3, 1.0))
+    return expect_within(lit, 1.0, 1.0, label="fraction lit at 1 mm")
 
 
 def _light_near_far_skin(_: InputPrecision) -> str:
-    # where the renderer's own offsets, which grow with the distance, are as long as the ray
-    lit = _seen(_sheet(lambda x, y: 0.0 * x, (0.0, 0.0, 1000.0)), (0.3, 0.3, 1000.1))
-    return expect_within(lit, 1.0, 1.0, label="share lit by a light at 0.1 mm")
+    # the renderer's ray offsets grow with the distance from the origin: here to the ray's length
+    lit = _visible(_sheet(lambda x, y: 0.0 * x, (0.0, 0.0, 1000.0)), (0.3, 0.3, 1000.1))
+    return expect_within(lit, 1.0, 1.0, label="fraction lit at 0.1 mm")
 
 
 def _light_behind(_: InputPrecision) -> str:
     return expect_within(
-        _seen(_sheet(lambda x, y: 0.0 * x), (0.0, 0.0, -300.0)), 0.0, 0.0, label="share"
+        _visible(_sheet(lambda x, y: 0.0 * x), (0.0, 0.0, -300.0)), 0.0, 0.0, label="fraction"
     )
 
 
 def _zero_triangles(real: InputPrecision) -> str:
     points = real(np.array([[0, 0, 0], [40, 0, 0], [0, 40, 0], [80, 0, 0], [40, 40, 9]]))
-    faces = np.array([[0, 1, 2], [0, 1, 3], [1, 4, 2]])  # the second has no area
+    faces = np.array([[0, 1, 2], [0, 1, 3], [1, 4, 2]])  # the second is degenerate
     normals = vertex_normals(points, faces)
     expect_near(np.linalg.norm(normals, axis=-1)[[0, 1, 2]], np.ones(3), absolute=1e-5)
-    lit = _seen(build_mesh(points, faces, points[:, :2] / 80.0), (0, 0, 300))
-    return "corners of those with area: lit " + expect_within(lit[:3], 1.0, 1.0, label="share")
+    lit = _visible(build_mesh(points, faces, points[:, :2] / 80.0), (0, 0, 300))
+    return "vertices of the others: lit " + expect_within(lit[:3], 1.0, 1.0, label="fraction")
 
 
 def _wrong_unit(real: InputPrecision) -> str:
@@ -117,7 +116,6 @@ def _wrong_unit(real: InputPrecision) -> str:
 def _surface(
     direction: Float64Array, roughness: float, real: InputPrecision
 ) -> tuple[float, float]:
-
     packed = real([0.5, 0.4, 0.3, roughness, 0.5, 0.0015, 1.0])
     up = np.array([0.0, 0.0, 1.0])
     total, specular = surface_brdf.evaluate_brdf(packed, up, direction, direction * [-1, -1, 1])
@@ -140,10 +138,11 @@ def _grazing(real: InputPrecision) -> str:
         for a, b in ((up, low), (low, up))
     )
     expect_near(there, back, relative=1e-6)
-    # a mirror's whole light: the lobe's share of it rises to all at grazing
+    # integral of the lobe, peak value times its solid angle 4 pi a^2 cos: a fraction of a mirror's
+    # reflected light, which approaches 1 at grazing incidence
     flat = microfacet.brdf(low, low, up, low, roughness=0.3, eta=1.4, kind="ggx")
     lobe = float(flat) * cosine * 4 * math.pi * 0.3**2 * cosine
-    expect_within(lobe, 0.0, 1.0, label="share of a mirror's light")
+    expect_within(lobe, 0.0, 1.0, label="fraction of a mirror's light")
     return expect_within(values, 0.0, 1e6, label="f_r")
 
 
@@ -162,6 +161,7 @@ def _roughness_ends(real: InputPrecision) -> str:
 def _furnace(real: InputPrecision) -> str:
     rng = np.random.default_rng(7)
     count = 200_000
+    # cosine-weighted directions: the mean of pi f_r is the albedo
     u, v = rng.random(count), rng.random(count)
     light = np.stack(
         [np.sqrt(u) * np.cos(2 * np.pi * v), np.sqrt(u) * np.sin(2 * np.pi * v), np.sqrt(1 - u)], -1
@@ -171,11 +171,10 @@ def _furnace(real: InputPrecision) -> str:
     for degrees in (0.0, 45.0, 80.0):
         total, _ = surface_brdf.evaluate_brdf(packed, [0.0, 0.0, 1.0], light, _tilted(degrees))
         back.append(float(np.pi * np.mean(np.asarray(total, np.float64)[:, 0])))
-    return expect_within(back, 0.7, 1.01, label="share reflected")
+    return expect_within(back, 0.7, 1.01, label="fraction reflected")
 
 
 def _chip() -> Sensor:
-
     return make_sensor(load_rig("flash").views[0])
 
 

@@ -1,4 +1,4 @@
-"""Extremes of the surface: normals from light, heights, histograms, albedo, filled textures."""
+"""Extremes of surface estimates: photometric normals, heights, histograms, albedo, textures."""
 
 from functools import partial
 from typing import Any
@@ -19,7 +19,7 @@ from skinrig.extremes.expectations import (
     expect_valid_fraction,
     expect_within,
 )
-from skinrig.extremes.inputs import InputPrecision, ring
+from skinrig.extremes.inputs import InputPrecision, ring_directions
 
 UP_NORMAL = np.array([0.0, 0.0, 1.0])
 
@@ -29,7 +29,6 @@ def _upward(side: int) -> Float64Array:
 
 
 def _degrees_off(normals: FloatArray, truth: FloatArray) -> float:
-
     return float(np.degrees(np.max(angular_error_rad(normals, truth))))
 
 
@@ -37,33 +36,33 @@ def _lit(lights: Float64Array, normal: Float64Array, real: InputPrecision) -> ND
     return real(np.clip(lights @ normal, 0.0, None)[:, None, None])
 
 
-def _refused_under(lights: Float64Array, real: InputPrecision, *words: str) -> str:
+def _expect_rejected_lights(lights: Float64Array, real: InputPrecision, *words: str) -> str:
     estimate = partial(stereo.estimate_normals, _lit(lights, UP_NORMAL, real), lights)
     return expect_error(estimate, stereo.PhotometricStereoError, *words)
 
 
 def _coplanar(real: InputPrecision) -> str:
     lights = np.array([[np.sin(t), 0.0, np.cos(t)] for t in np.linspace(-0.6, 0.6, 9)])
-    return _refused_under(lights, real, "plane", "along (0.0, -1.0, 0.0);")
+    return _expect_rejected_lights(lights, real, "plane", "along (0.0, -1.0, 0.0);")
 
 
 def _collinear(real: InputPrecision) -> str:
     lights = np.repeat(UP_NORMAL[None], 5, axis=0)
-    return _refused_under(lights, real, "line", "(0.0, -1.0, 0.0) and (-1.0, 0.0, 0.0)")
+    return _expect_rejected_lights(lights, real, "line", "(0.0, -1.0, 0.0) and (-1.0, 0.0, 0.0)")
 
 
 def _all_shadowed(real: InputPrecision) -> str:
-    lights = ring(8, 0.6)
+    lights = ring_directions(8, 0.6)
     found = stereo.estimate_normals(real(np.zeros((8, 3, 3))), lights)
     expect_finite(found.normals, found.valid, label="normals")
     return expect_valid_fraction(found.valid)
 
 
 def _two_lights_left(real: InputPrecision) -> str:
-    lights = ring(8, 0.6)
-    seen = np.zeros((8, 1, 1), bool)
-    seen[:2] = True
-    found = stereo.estimate_normals(_lit(lights, UP_NORMAL, real), lights, valid=seen)
+    lights = ring_directions(8, 0.6)
+    visible = np.zeros((8, 1, 1), bool)
+    visible[:2] = True
+    found = stereo.estimate_normals(_lit(lights, UP_NORMAL, real), lights, valid=visible)
     return expect_valid_fraction(found.valid)
 
 
@@ -76,19 +75,21 @@ def _nearly_coplanar(real: InputPrecision) -> str:
     try:
         found = stereo.estimate_normals(noisy, lights, variance=real(np.full((9, 1, 1), 1e-6)))
     except stereo.PhotometricStereoError as error:
-        return f"refused: {error}"
+        return f"rejected: {error}"
     expect_finite(found.normals, found.valid, label="normals")
     if np.any(found.valid):
         off = _degrees_off(found.normals[found.valid], np.broadcast_to(UP_NORMAL, (1, 3)))
-        said = float(np.degrees(found.stderr_rad[found.valid].max()))
-        if off > 4 * said:
-            raise ExpectationError(f"{off:.2g} degrees off, but says {said:.2g}")
-        return f"{off:.2g} degrees off, says {said:.2g}"
+        stated = float(np.degrees(found.stderr_rad[found.valid].max()))
+        if off > 4 * stated:
+            raise ExpectationError(
+                f"got an error of {off:.2g} degrees, expected at most 4 x {stated:.2g}"
+            )
+        return f"error {off:.2g} degrees, stated {stated:.2g}"
     return expect_valid_fraction(found.valid)
 
 
 def _grazing(real: InputPrecision) -> str:
-    lights = ring(12, np.radians(89.9))
+    lights = ring_directions(12, np.radians(89.9))
     every = np.vstack([lights, UP_NORMAL])
     found = stereo.estimate_normals(_lit(every, UP_NORMAL, real), every)
     expect_finite(found.normals, found.valid, label="normals")
@@ -99,13 +100,13 @@ def _grazing(real: InputPrecision) -> str:
 
 
 def _near_light(real: InputPrecision) -> str:
-    places = 1.0 * ring(8, 0.6)  # a millimetre from the skin
-    away = np.linalg.norm(places, axis=-1)
-    lit = np.clip(places @ UP_NORMAL / away, 0, None) / away**2
+    positions = 1.0 * ring_directions(8, 0.6)  # 1 mm from the skin
+    distance = np.linalg.norm(positions, axis=-1)
+    lit = np.clip(positions @ UP_NORMAL / distance, 0, None) / distance**2
     found = stereo.estimate_normals(
         real(lit[:, None, None]),
-        places / away[:, None],
-        light_positions_mm=places,
+        positions / distance[:, None],
+        light_positions_mm=positions,
         points_mm=np.zeros((1, 1, 3)),
     )
     expect_valid_fraction(found.valid, fraction_range=(1.0, 1.0))
@@ -115,12 +116,12 @@ def _near_light(real: InputPrecision) -> str:
 
 
 def _far_light(real: InputPrecision) -> str:
-    places = 1e7 * ring(8, 0.6)
-    lit = np.clip(ring(8, 0.6) @ UP_NORMAL, 0, None) / 1e14
+    positions = 1e7 * ring_directions(8, 0.6)
+    lit = np.clip(ring_directions(8, 0.6) @ UP_NORMAL, 0, None) / 1e14
     found = stereo.estimate_normals(
         real(1e14 * lit[:, None, None]),
-        ring(8, 0.6),
-        light_positions_mm=places,
+        ring_directions(8, 0.6),
+        light_positions_mm=positions,
         points_mm=np.zeros((1, 1, 3)),
         light_intensity=np.full(8, 1e14),
     )
@@ -131,7 +132,7 @@ def _far_light(real: InputPrecision) -> str:
 
 
 def _scales(real: InputPrecision) -> str:
-    lights = ring(8, 0.6)
+    lights = ring_directions(8, 0.6)
     tilted = np.array([0.3, -0.2, np.sqrt(1 - 0.13)])
     off = []
     for scale in (1e-12, 1e12):
@@ -143,7 +144,7 @@ def _scales(real: InputPrecision) -> str:
 
 def _cliff(real: InputPrecision) -> str:
     slope = np.zeros((24, 24))
-    slope[:, 12] = 20.0  # a wall of 87 degrees
+    slope[:, 12] = 20.0  # a wall of arctan 20 = 87 degrees
     normals = np.stack([-slope, np.zeros_like(slope), np.ones_like(slope)], -1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     height = normal_integration.integrate(real(normals))
@@ -158,7 +159,7 @@ def _horizontal_normals(real: InputPrecision) -> str:
     try:
         height = normal_integration.integrate(real(normals))
     except normal_integration.IntegrationError as error:
-        return f"refused: {error}"
+        return f"rejected: {error}"
     return expect_within(height[np.isfinite(height)], -1e4, 1e4, label="height")
 
 
@@ -176,16 +177,16 @@ def _empty_mask(real: InputPrecision) -> str:
 
 
 def _flat_height(real: InputPrecision) -> str:
-    shares = normal_histogram.histogram(real(np.zeros((64, 64))), pixel=10.0)
-    expect_near(shares.sum(), 1.0, absolute=1e-9)
-    return expect_near(np.max(shares[31:33, 31:33]), np.max(shares), absolute=0.0)
+    fractions = normal_histogram.histogram(real(np.zeros((64, 64))), pixel=10.0)
+    expect_near(fractions.sum(), 1.0, absolute=1e-9)
+    return expect_near(np.max(fractions[31:33, 31:33]), np.max(fractions), absolute=0.0)
 
 
 def _steep_height(real: InputPrecision) -> str:
     rows = np.arange(64.0)[:, None] * np.ones((1, 64))
-    shares = normal_histogram.histogram(real(1e6 * rows), pixel=1.0)
-    expect_near(shares.sum(), 1.0, absolute=1e-9)
-    edge = shares[0].sum() + shares[-1].sum()
+    fractions = normal_histogram.histogram(real(1e6 * rows), pixel=1.0)
+    expect_near(fractions.sum(), 1.0, absolute=1e-9)
+    edge = fractions[0].sum() + fractions[-1].sum()
     return expect_near(edge, 1.0, absolute=1e-6)
 
 
@@ -201,12 +202,12 @@ def _relief_without_relief(real: InputPrecision) -> str:
     try:
         found = kernel_fit.fit_kernel(flat, target, stretch=1.1, axis="x", pixel_um=10.0)
     except ValueError as error:
-        return f"refused: {error}"
+        return f"rejected: {error}"
     return expect_valid_fraction(found.valid)
 
 
 def _no_diffuse(real: InputPrecision) -> str:
-    lights = np.vstack([ring(20, 0.5), ring(20, 0.9)])
+    lights = np.vstack([ring_directions(20, 0.5), ring_directions(20, 0.9)])
     views = np.broadcast_to(UP_NORMAL, lights.shape)
     samples = np.zeros((1, 40, 3))
     found = diffuse_albedo.estimate(

@@ -1,4 +1,4 @@
-"""Extremes of light inside the skin: dipole, diffusion, layers, Monte Carlo, profiles."""
+"""Extremes of subsurface scattering: dipole, diffusion, layers, Monte Carlo, profiles."""
 
 import math
 
@@ -27,7 +27,7 @@ def _layers(
     eta: float = 1.4,
     directions: int | None = None,
 ) -> Float64Array:
-    """Return the reflectance of layers by sigma_a and sigma_s', 1/mm, and thickness, mm."""
+    """Return the reflectance of layers of (sigma_a, sigma_s', thickness), in 1/mm and mm."""
     return tissue_optics.layer_stack_reflectance(
         *(real(part) for part in zip(*layers, strict=True)), eta=eta, directions=directions
     )
@@ -36,19 +36,22 @@ def _layers(
 def _albedo_near_one(real: InputPrecision) -> str:
     deficit = np.logspace(-15, -1, 57)
     lost = dipole.absorbed_fraction(real(deficit), 1.4)
-    said = expect_rising(lost, label="1 - R_d")
+    rise = expect_rising(lost, label="1 - R_d")
     back = dipole.invert_to_deficit(1.0 - np.asarray(lost[deficit > 1e-12]), 1.4)
-    # 1 - R_d carries the rounding of R_d itself, eps; the deficit goes with its square
+    # 1 - R_d has the absolute rounding eps of R_d, hence the relative error eps / (1 - R_d). The
+    # deficit 1 - alpha' is proportional to the square of 1 - R_d near 1.
     rounding = np.finfo(np.float64).eps / np.asarray(lost[deficit > 1e-12])
     single = float(np.finfo(real.dtype).eps) * 4
     away = np.abs(back / np.asarray(real(deficit), np.float64)[deficit > 1e-12] - 1)
     if np.any(away > single + 8 * rounding):
-        raise ExpectationError(f"the inverse is off by {float(np.max(away)):.2g}")
-    return f"{said}; inverse within {float(np.max(away)):.1g}"
+        raise ExpectationError(
+            f"inverse: got a relative error of {float(np.max(away)):.2g}, expected rounding"
+        )
+    return f"{rise}; inverse within {float(np.max(away)):.1g}"
 
 
 def _least_step(real: InputPrecision) -> float:
-    """Return the exponent of the smallest 1 - R_d that a precision tells from the next."""
+    """Return the decimal exponent of the least 1 - R_d that a precision resolves."""
     return -6.5 if real.single else -9.0
 
 
@@ -82,13 +85,13 @@ def _no_absorption(real: InputPrecision) -> str:
 
 def _black_medium(real: InputPrecision) -> str:
     inside = _layers(real, (1e3, 1.0, math.inf))
-    said = expect_within(inside, 0.0, 2e-3, label="R_d of layers")
+    layered = expect_within(inside, 0.0, 2e-3, label="R_d of layers")
     value = dipole.reflectance(real([0.0, 0.01, 0.1, 1.0, 10.0]), real(1e3), real(1.0), 1.4)
     expect_rising(-np.asarray(value, np.float64), strictly=False, label="-R(r)")
-    # of 1000 / 1001 that is absorbed at each event hardly anything comes back
+    # an albedo of 1/1001 per event leaves almost no reflected light
     total = dipole.total_reflectance(1.0 / 1001.0, 1.4)
     expect_within(total, 0.0, 2e-3, label="dipole's R_d")
-    return said + "; " + expect_within(value, 0.0, 1e3, label="R(r)")
+    return layered + "; " + expect_within(value, 0.0, 1e3, label="R(r)")
 
 
 def _radius_ends(real: InputPrecision) -> str:
@@ -132,7 +135,8 @@ def _thin_layer(real: InputPrecision) -> str:
 def _no_layer_at_all(real: InputPrecision) -> str:
     clear = _layers(real, (0.0, 0.0, 1.0))
     surface = ((1.4 - 1.0) / (1.4 + 1.0)) ** 2
-    # a pane of glass: what its back reflects, through its front, to and fro
+    # a clear pane: front transmittance squared times the back's reflectance, summed over all
+    # internal reflections, F (1 - F)^2 / (1 - F^2)
     return expect_near(clear, surface * (1.0 - surface) ** 2 / (1.0 - surface**2), relative=1e-6)
 
 
@@ -145,7 +149,7 @@ def _stiff_layers(real: InputPrecision) -> str:
 
 def _conserving_layers(real: InputPrecision) -> str:
     white = _layers(real, (0.0, 5.0, 0.25), (0.0, 1.0, math.inf))
-    entered = 1.0 - ((1.4 - 1.0) / (1.4 + 1.0)) ** 2  # what the surface does not reflect at once
+    entered = 1.0 - ((1.4 - 1.0) / (1.4 + 1.0)) ** 2  # all light but the specular reflection
     return expect_near(white, entered, absolute=2e-3)
 
 
@@ -154,7 +158,7 @@ def _pigment_ends(real: InputPrecision) -> str:
     c_m, c_hd = real([0.0, 0.5])[:, None, None], real([0.0, 0.32])[:, None]
     value = tissue_optics.two_layer_reflectance(wavelength, c_m, c_hd)
     if not (np.all(value[0] > value[1]) and np.all(value[:, 0] >= value[:, 1])):
-        raise ExpectationError("more pigment reflects more")
+        raise ExpectationError("got a reflectance that rises with pigment, expected a fall")
     return expect_within(value, 1e-5, 0.95, label="R")
 
 
@@ -171,7 +175,7 @@ def _table_far(real: InputPrecision) -> str:
     r = real([1e-4, 0.5, 20.0, 1e3])
     value = photon_table.reflectance(r, real(0.05), real(1.0))
     expect_rising(-value[:-1], label="-R(r)")
-    return "r = 0 refused; " + expect_within(value, 0.0, 1e6, label="R(r)")
+    return "r = 0 rejected; " + expect_within(value, 0.0, 1e6, label="R(r)")
 
 
 def _profile_flat(real: InputPrecision) -> str:
@@ -202,4 +206,4 @@ def _profile_broken(real: InputPrecision) -> str:
 def _one_photon(real: InputPrecision) -> str:
     stack = LayerStack((Layer(math.inf, 0.1, 10.0, 0.9, float(real(1.4))),))
     found = trace_photons(stack, photons=1, rng=np.random.default_rng(0))
-    return expect_within(found.reflectance, 0.0, 1.0, label="share reflected")
+    return expect_within(found.reflectance, 0.0, 1.0, label="fraction reflected")

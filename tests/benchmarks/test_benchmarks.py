@@ -1,4 +1,4 @@
-"""Each benchmark once at toy size; its document has the fields of docs/reference/benchmarks.md."""
+"""Each benchmark at toy size; its document has the fields of docs/reference/benchmarks.md."""
 
 import copy
 import itertools
@@ -28,31 +28,31 @@ HEAVY = {
     "sphere-lights",
     "traits",
 }
-LEAST_POINTS = 4
+MIN_POINTS = 4
 
 
 def problems(stage):
-    """Return what is wrong with a stage's part of a document, in words."""
+    """List the errors in a stage's part of a document."""
     points, fronts = stage["points"], stage["fronts"]
     found = []
 
-    def expect(kept, what):
-        if not kept:
-            found.append(what)
+    def expect(condition, problem):
+        if not condition:
+            found.append(problem)
 
-    # small sizes have the fewest: a run within any budget shows so many
-    expect(len(points) >= LEAST_POINTS, f"{len(points)} points")
+    # small sizes have the fewest points: a run within any budget has as many
+    expect(len(points) >= MIN_POINTS, f"{len(points)} points")
     expect(stage["error_name"] and stage["reference"], "no reference")
     expect(stage["reference_error"] >= 0.0, "no reference error")
-    expect(stage["reference_error_means"], "a reference error that means nothing")
-    expect(stage["interval_of"], "intervals of nothing")
+    expect(stage["reference_error_means"], "a reference error without a meaning")
+    expect(stage["interval_of"], "intervals without a population")
     for number, point in enumerate(points):
         low, high = point["error_interval"]
         expect(point["seconds"] > 0.0, f"{number}: no seconds")
         expect(point["cold_seconds"] > 0.0, f"{number}: no cold seconds")
         fast, slow = point["seconds_spread"]
-        expect(fast <= point["seconds"] <= slow, f"{number}: seconds outside their spread")
-        # the middle of a bootstrap is not always within it, but for rounding it is
+        expect(fast <= point["seconds"] <= slow, f"{number}: seconds outside their range")
+        # the estimate is inside the interval within rounding
         slack = 1e-9 * abs(point["error"])
         expect(low - slack <= point["error"] <= high + slack, f"{number}: error outside interval")
         expect(
@@ -66,13 +66,13 @@ def problems(stage):
             f"{number}: efficiency without bound, or the reverse",
         )
     expect(fronts, "no front")
-    seen = []
+    assigned = []
     for front in fronts:
         names = front["condition"]
         own = [
             n for n, p in enumerate(points) if all(p["knobs"].get(k) == v for k, v in names.items())
         ]
-        seen += own
+        assigned += own
         expect(set(front["points"]) <= set(own), f"{names}: a front of other conditions")
         along = [(points[n]["seconds"], points[n]["error"]) for n in front["points"]]
         expect(
@@ -83,9 +83,9 @@ def problems(stage):
             here = points[n]["seconds"], points[n]["error"]
             expect(
                 any(s <= here[0] and e <= here[1] for s, e in along),
-                f"{names}: point {n} is beaten by none of the front",
+                f"{names}: point {n} is not dominated by the front",
             )
-    expect(sorted(seen) == list(range(len(points))), "points of no condition, or of two")
+    expect(sorted(assigned) == list(range(len(points))), "points without one condition")
     marked = {n for front in fronts for n in front["points"]}
     expect(marked == {n for n, p in enumerate(points) if p["on_front"]}, "marks of other fronts")
     bands = [one["band"] for one in stage["by_band"]]
@@ -132,7 +132,7 @@ def slower_and_worse(stage):
         (lambda s: s.update(points=[], fronts=[]), "0 points"),
         (slower_and_worse, "error does not fall"),
         (lambda s: s.update(fronts=[]), "no front"),
-        (lambda s: s["fronts"].pop(), "points of no condition"),
+        (lambda s: s["fronts"].pop(), "points without one condition"),
         (lambda s: s.update(reference_error=-1.0), "no reference error"),
         (lambda s: s["points"][0].update(peak_memory_mb=None), "neither memory nor a reason"),
         (lambda s: s["points"][0].update(error_interval=[0.0, 0.0]), "outside interval"),

@@ -1,4 +1,4 @@
-"""Speed of the chromophore fit beside SciPy's least squares, pixel by pixel, in the same run."""
+"""Speed of the chromophore fit against SciPy's least squares, pixel by pixel, in the same run."""
 
 import time
 

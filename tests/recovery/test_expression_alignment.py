@@ -18,8 +18,8 @@ from skinrig.benchmarks.flash_rig.alignment import (
     displace_face,
     displace_map,
     face_mask,
+    load_color_table,
     smooth_displacement,
-    table,
 )
 
 SIDE = 256
@@ -113,7 +113,7 @@ def test_state_blood_is_mapped_onto_neutral_face(smiling, aligned):
 
 @pytest.mark.long
 def test_joint_inversion_of_aligned_states_improves_changes(smiling, aligned):
-    colors, prior = table(), shading_prior.face_prior()
+    colors, prior = load_color_table(), shading_prior.face_prior()
     rgb, seen = aligned.warp(smiling.moving, smiling.valid_moving)
     variance, _ = aligned.warp(smiling.variance_moving, smiling.valid_moving)
     both = np.stack([smiling.neutral, rgb])

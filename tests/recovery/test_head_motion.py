@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from reconstruction.registration import head_motion
-from skinrig.benchmarks.dome.motion import simulate
+from skinrig.benchmarks.dome.motion import simulate_drifting_capture
 
 
 @pytest.mark.long
 @pytest.mark.render
 @pytest.mark.timeout(600)
 def test_drift_is_tracked_and_twitch_is_discarded():
-    seen = simulate(
+    seen = simulate_drifting_capture(
         width_px=650, views=3, drift_mm=1.5, times_s=(0.0, 2.5, 5.0, 10.0, 12.5), twitch=True
     )
     found = head_motion.estimate(

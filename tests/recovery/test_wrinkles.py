@@ -32,7 +32,7 @@ def part_of_neutral_s_error(model, neutral, states, covered):
 def test_deepening_narrowing_grooves_follow_weighted_single_map():
     rng = np.random.default_rng(0)
     neutral, states = bench_wrinkles.synthesize_wrinkled_face(192, rng=rng)
-    masks = bench_wrinkles.zone_masks(32)
+    masks = bench_wrinkles.make_zone_masks(32)
     covered = np.ones((192, 192), bool)
     fit = wrinkle_fit.fit_wrinkle_map(neutral, states, masks, size=(96, 96), clamp="signed")
     left = part_of_neutral_s_error(fit.model(), neutral, states, covered)
@@ -52,7 +52,7 @@ def test_deepening_narrowing_grooves_follow_weighted_single_map():
 def test_unfitted_expression_is_represented_by_bounded_weights():
     neutral, states = bench_wrinkles.synthesize_wrinkled_face(192, rng=np.random.default_rng(1))
     fear = states.pop("fear")
-    masks = bench_wrinkles.zone_masks(32)
+    masks = bench_wrinkles.make_zone_masks(32)
     fit = wrinkle_fit.fit_wrinkle_map(neutral, states, masks, size=(96, 96), clamp="signed")
     weights = wrinkle_fit.fit_weights(fit.layer, neutral, fear)
     assert weights.explained > 0.8

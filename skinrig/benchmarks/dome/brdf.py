@@ -1,4 +1,4 @@
-"""Benchmarks of the dome's reflectance: diffuse albedo, surface BRDFs, and their space."""
+"""Benchmarks of the dome's reflectance: diffuse albedo, basis BRDFs, and their common space."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ BAND_ALBEDOS: dict[str, tuple[float, float, float]] = {
 of the others."""
 
 
-def albedo(stage: BenchmarkStage) -> None:
-    """Estimate R_d over noise and samples, by the fit and by the paper's minima."""
+def measure_diffuse_albedo(stage: BenchmarkStage) -> None:
+    """Measure errors of R_d over noise and samples, by the fit and by the paper's minima."""
     rng = np.random.default_rng(0)
     count = 12 if stage.toy else 150
     for skin, r_d in BAND_ALBEDOS.items():
         for noise in (0.02,) if stage.toy else (0.005, 0.02, 0.08):
             for samples in (60,) if stage.toy else (60, 240, 900):
-                p = brdf_truth.dome(count, r_d=r_d, noise=noise, samples=samples, rng=rng)
+                p = brdf_truth.sample_dome(count, r_d=r_d, noise=noise, samples=samples, rng=rng)
                 for method in DIFFUSE_METHODS:
                     estimate = partial(diffuse_albedo.estimate, *p.samples, eta=ETA, method=method)
                     timing, found = stage.time(
@@ -57,7 +57,7 @@ def albedo(stage: BenchmarkStage) -> None:
                     relative = 100.0 * (found.r_d / p.r_d - 1.0)
                     worst = np.median(np.abs(relative), axis=0)
                     channel = relative[:, int(np.argmax(worst))]
-                    # 68 % interval of a median of `count` errors of this spread
+                    # standard error of a Gaussian median: sqrt(pi / 2) = 1.2533 that of the mean
                     half = 1.2533 * float(np.std(np.abs(channel))) / np.sqrt(count)
                     outcome = ErrorEstimate.nonnegative(float(worst.max()), half)
                     knobs = {"skin": skin, "noise": noise, "samples": p.f.shape[1]}
@@ -71,8 +71,8 @@ def albedo(stage: BenchmarkStage) -> None:
                         stage.limits["error", skin] = outcome.error
 
 
-def surface(stage: BenchmarkStage) -> None:
-    """Fit surface BRDFs, and predict lights that were left out; beside GGX and SciPy."""
+def measure_basis_fit(stage: BenchmarkStage) -> None:
+    """Fit basis BRDFs and predict held-out lights; compare with GGX and SciPy."""
     rng = np.random.default_rng(0)
     basis = brdf_tables.default_basis()
     count = 12 if stage.toy else 120
@@ -112,46 +112,49 @@ def surface(stage: BenchmarkStage) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _KnownPoints:
-    """Points, and what is known of them by samples that leave a fifth of the lights out."""
+    """Points with their samples under four fifths of the lights; the others are held out."""
 
     truth: brdf_truth.TruePoints
-    left_out: BoolArray
+    held_out: BoolArray
     samples: brdf_basis.SurfaceSamples
     diffuse: Float64Array
-    """The diffuse part that is taken off, (P, M)."""
+    """Diffuse BRDF that is subtracted, (P, M)."""
     rng: np.random.Generator
 
     @classmethod
     def draw(
         cls, r_d: tuple[float, float, float], count: int, samples: int, rng: np.random.Generator
     ) -> _KnownPoints:
-        p = brdf_truth.dome(count, r_d=r_d, noise=0.02, samples=samples, rng=rng)
+        """Draw points and their samples; estimate R_d from samples that are not held out."""
+        p = brdf_truth.sample_dome(count, r_d=r_d, noise=0.02, samples=samples, rng=rng)
         out = _held_out_samples(p, rng)
-        known: dict[str, Any] = {"eta": ETA, "variance": p.variance, "valid": p.valid & ~out}
-        # R_d as it would be known: estimated, from the same samples
-        found = diffuse_albedo.estimate(*p.samples, **known)
-        given = brdf_basis.surface_samples(*p.samples, found.r_d, **known)
+        options: dict[str, Any] = {"eta": ETA, "variance": p.variance, "valid": p.valid & ~out}
+        # R_d is estimated from the same samples, as in a capture
+        found = diffuse_albedo.estimate(*p.samples, **options)
+        given = brdf_basis.surface_samples(*p.samples, found.r_d, **options)
         return cls(p, out, given, _diffuse(p, found.r_d), rng)
 
     def lobes(self, fit: brdf_basis.BasisWeights, basis: BrdfBasis) -> Float64Array:
+        """Return the fitted surface BRDF at every sample, (P, M)."""
         _, *where = self.truth.samples
         rows = zip(fit.weights, *where, strict=True)
         return np.stack([brdf_basis.evaluate(x, basis, *at) for x, *at in rows])
 
     def error(self, lobe: Float64Array) -> ErrorEstimate:
-        """Return the median error of all light under the lights left out, %."""
-        at = self.truth.valid & self.left_out
+        """Return the median error of the total reflection under held-out lights, %."""
+        at = self.truth.valid & self.held_out
         true = self.truth.surface + _diffuse(self.truth, self.truth.r_d) + 1e-12
         relative = 100.0 * np.abs((lobe + self.diffuse) / true - 1.0)
-        # The points are independent of each other, their samples are not.
+        # points are independent, samples of one point are not: the bootstrap draws points
         by_point = np.array([np.median(r[a]) for r, a in zip(relative, at, strict=True) if a.any()])
         return ErrorEstimate(float(np.median(by_point)), bootstrap_interval(by_point, rng=self.rng))
 
     def add(
         self, stage: BenchmarkStage, method: str, timing: Timing, lobe: Float64Array, **rank: int
     ) -> ErrorEstimate:
+        """Add a point for a method's surface BRDF `lobe`, (P, M), and return its error."""
         p = self.truth
-        at = p.valid & self.left_out
+        at = p.valid & self.held_out
         root = np.sqrt(np.mean((np.cbrt(lobe) - np.cbrt(p.surface))[at] ** 2))
         bright = at & (p.surface > 0.5 * _diffuse(p, p.r_d))
         highlight = np.median(np.abs(lobe[bright] / p.surface[bright] - 1.0))
@@ -164,13 +167,14 @@ class _KnownPoints:
 
 
 def _held_out_samples(p: brdf_truth.TruePoints, rng: np.random.Generator) -> BoolArray:
-    """Return the samples of a fifth of the lights."""
+    """Return the mask of the samples of a random fifth of the lights."""
     lights, which = np.unique(p.light.round(6).reshape(-1, 3), axis=0, return_inverse=True)
     return np.asarray((rng.random(len(lights)) < 0.2)[which].reshape(p.valid.shape))
 
 
 def _diffuse(p: brdf_truth.TruePoints, r_d: Float64Array) -> Float64Array:
-    """Return the green diffuse BRDF by the convention, (P, M)."""
+    """Return the green diffuse BRDF as `surface_samples` subtracts it, (P, M)."""
+    # samples of 0 give -(diffuse BRDF) times the light's cosine, the mean over channels
     zero = np.zeros_like(p.f)
     s = brdf_basis.surface_samples(zero, *p.samples[1:], r_d, eta=ETA, valid=p.valid)
     cos_l = np.einsum("pmc,pc->pm", p.light, p.normals)
@@ -186,7 +190,7 @@ def _cosines(p: brdf_truth.TruePoints, point: int) -> tuple[Float64Array, ...]:
 
 
 def _ggx(p: brdf_truth.TruePoints, s: brdf_basis.SurfaceSamples) -> Float64Array:
-    """Fit strength and roughness of one GGX lobe a point: the best of 60 roughnesses."""
+    """Fit strength and roughness of one GGX lobe per point, the best of 60 roughnesses."""
     lobes = np.zeros(p.surface.shape)
     for point in range(len(lobes)):
         cosines = _cosines(p, point)
@@ -207,7 +211,7 @@ def _ggx(p: brdf_truth.TruePoints, s: brdf_basis.SurfaceSamples) -> Float64Array
 def _fit_cube_roots(
     p: brdf_truth.TruePoints, s: brdf_basis.SurfaceSamples, basis: BrdfBasis
 ) -> Float64Array:
-    """Fit cube roots of the matrix' elements to cube roots of the samples, the paper's words."""
+    """Fit cube roots of the matrix elements to cube roots of the samples, the paper's wording."""
     lobes = np.zeros(p.surface.shape)
     for point in range(len(lobes)):
         material = np.cbrt(basis.evaluate(p.light[point], p.view[point], p.normals[point]))
@@ -221,10 +225,12 @@ def _fit_cube_roots(
 
 
 def _compare_with_scipy(basis: BrdfBasis, *, toy: bool) -> tuple[float, float]:
-    """Return how many times faster than SciPy, and the largest relative excess of the residual."""
+    """Return the speed-up over SciPy, and the largest relative excess of the residual."""
     rng = np.random.default_rng(1)
     different, copies, subset = (20, 1, 3) if toy else (500, 10, 200)
-    p = brdf_truth.dome(different, r_d=BAND_ALBEDOS["light"], noise=0.02, samples=900, rng=rng)
+    p = brdf_truth.sample_dome(
+        different, r_d=BAND_ALBEDOS["light"], noise=0.02, samples=900, rng=rng
+    )
     p = dataclasses.replace(p, valid=p.valid & (p.light @ p.normals[..., None] > 0.12)[..., 0])
     s = brdf_basis.surface_samples(*p.samples, p.r_d, eta=ETA, variance=p.variance, valid=p.valid)
     many = brdf_basis.SurfaceSamples(
@@ -242,7 +248,7 @@ def _compare_with_scipy(basis: BrdfBasis, *, toy: bool) -> tuple[float, float]:
         material = basis.evaluate(s.light_dir[point], s.view_dir[point], s.normals[point])
         matrix = (material * cos_l[:, None])[ok] * root[:, None]
         problems.append((matrix, s.value[point][ok] * root))
-    # Processor time, which does not see who else keeps the cores busy; SciPy uses one.
+    # processor time is independent of other programs; SciPy uses one core
     ours, theirs = [], []
     for _ in range(1 if toy else 5):
         ours_s, found = measure_processor_time(
@@ -261,13 +267,13 @@ def _compare_with_scipy(basis: BrdfBasis, *, toy: bool) -> tuple[float, float]:
 SPACE_METHODS: Final[tuple[Literal["shares", "brdf"], ...]] = ("shares", "brdf")
 SPACE_RANKS: Final = (1, 2, 3, 4, 6, 8, 12)
 NOISE_RANK: Final = 4
-"""Lobes of a model of one face, whose error is to stay below what noise leaves."""
+"""Lobes of a model of one face; the error at this rank is compared with that of noise."""
 HELD_OUT_POINT_FRACTION: Final = 0.3
-"""Part of the points that no mixture is made of."""
+"""Fraction of the points that no mixture is computed from."""
 
 
-def space(stage: BenchmarkStage) -> None:
-    """Factor the mixtures of three datasets into ever more common ones, in two ways."""
+def measure_brdf_space(stage: BenchmarkStage) -> None:
+    """Factor the mixtures of three datasets into common mixtures of rising rank, by two methods."""
     basis = brdf_tables.default_basis()
     ranks = (1, 2, 4) if stage.toy else SPACE_RANKS
     steepest, excess, beyond = -np.inf, 0.0, 0.0
@@ -275,15 +281,15 @@ def space(stage: BenchmarkStage) -> None:
         rng = np.random.default_rng([number, 72])
         order = rng.permutation(len(data.weights))
         kept = round(HELD_OUT_POINT_FRACTION * len(order))
-        tried, trained = data.weights[order[:kept]], data.weights[order[kept:]]
-        whose = data.label[order[:kept]] if data.name == "dataset B" else None
+        tested, trained = data.weights[order[:kept]], data.weights[order[kept:]]
+        persons = data.label[order[:kept]] if data.name == "dataset B" else None
         for method, rank in itertools.product(SPACE_METHODS, ranks):
-            # Each rank alone, as somebody who asks for it would have it.
+            # each rank is timed alone, as for a user who needs only this rank
             curve = partial(
                 brdf_space.compute_error_curve, trained, basis, ranks=(rank,), method=method
             )
             timing, found = stage.time(
-                lambda: curve(held_out=tried, groups=whose), repeats=1, memory=not stage.toy
+                lambda: curve(held_out=tested, groups=persons), repeats=1, memory=not stage.toy
             )
             inside, error = float(found.error[0]), 100.0 * float(found.held_out[0])
             outcome = ErrorEstimate.nonnegative(error, 100.0 * float(found.held_out_stderr[0]))
@@ -305,7 +311,6 @@ def space(stage: BenchmarkStage) -> None:
 
 
 def _datasets(*, toy: bool) -> tuple[Dataset, ...]:
-
     rng = np.random.default_rng(72)
     if toy:
         return (brdf_space_datasets.sample_one_person(60, rng=rng),)

@@ -1,4 +1,4 @@
-"""Synthetic points for the BRDF benchmarks, in code of their own: no estimator is used here."""
+"""Synthetic points for the BRDF benchmarks, from code that is independent of the estimators."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -19,13 +19,13 @@ class TrueSamples:
     Attributes
     ----------
     f, variance
-        (P, M, 3) BRDF samples with noise, 1/sr, and the variance of that.
+        (P, M, 3) BRDF samples with noise, 1/sr, and the variance of the noise, 1/sr^2.
     light, view
         (P, M, 3) unit.
     normals
         (P, 3).
     valid
-        (P, M) bool: light and view stand above the horizon.
+        (P, M) bool: light and view are above the horizon.
     surface
         (P, M) surface BRDF without noise, 1/sr.
     """
@@ -40,19 +40,19 @@ class TrueSamples:
 
     @property
     def samples(self) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
-        """Samples, their directions of light and view, and normals, as estimators take them."""
+        """Samples, directions of light and view, and normals, in the estimators' order."""
         return self.f, self.light, self.view, self.normals
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TruePoints(TrueSamples):
-    """The same with the diffuse reflectance that is true."""
+    """Samples with their true diffuse reflectance."""
 
     r_d: Float64Array
     """(P, 3)."""
 
 
-def dome(
+def sample_dome(
     points: int,
     *,
     r_d: tuple[float, float, float],
@@ -62,31 +62,31 @@ def dome(
     eta: float = 1.3,
     tail: Literal["light", "heavy"] = "light",
 ) -> TruePoints:
-    """Return points with normals over the front, seen by 16 views under 150 lights.
+    """Draw points with frontal normals and their samples by 16 views under 150 lights.
 
     Parameters
     ----------
     points
-        P.
+        Number of points, P.
     r_d
         Mean diffuse reflectance of the three channels; varies by 15 % over the points.
     noise
-        Standard deviation of a sample, as a fraction of the radiance plus 2 % of white's.
+        Standard deviation of a sample, relative to its radiance plus 2 % of white's.
     samples
-        Most samples a point; None: all that are lit and seen, some 900.
+        Maximum number of samples per point; None: all lit and visible ones, about 900.
     rng
-        Of everything random.
+        Generator of all random values.
     eta
         Refractive index of the diffuse part's Fresnel factors.
     tail
-        How the surface's slopes die away: "light" as exp(-(tan/m)^1.5), "heavy" as tan^-4.4.
+        Decay of the slope density: "light" as exp(-(tan/m)^1.5), "heavy" as tan^-4.4.
     """
-    # Lights on a spiral over the sphere, cameras on an arc in front.
+    # lights on a Fibonacci spiral over the sphere, cameras on an arc in front
     k = np.arange(N_LIGHTS) + 0.5
     y = 1.0 - 2.0 * k / N_LIGHTS
-    turn = np.pi * (1.0 + np.sqrt(5.0)) * k
+    azimuth = np.pi * (1.0 + np.sqrt(5.0)) * k
     ring = np.sqrt(1.0 - y**2)
-    lights = np.stack([ring * np.cos(turn), y, ring * np.sin(turn)], axis=-1)
+    lights = np.stack([ring * np.cos(azimuth), y, ring * np.sin(azimuth)], axis=-1)
     az, el = np.meshgrid(np.linspace(-1.1, 1.1, 8), [-0.3, 0.4])
     views = np.stack([np.cos(el) * np.sin(az), np.sin(el), np.cos(el) * np.cos(az)], axis=-1)
     normals = _unit(rng.normal(size=(points, 3)) * [0.5, 0.5, 0.2] + [0.0, 0.0, 1.0])
@@ -107,8 +107,9 @@ def dome(
     half = _unit(light + view)
     cos_h = np.clip(np.einsum("pmc,pc->pm", half, normals), 1e-3, 1.0)
     cos_d = np.clip(np.sum(half * light, axis=-1), 0.0, 1.0)
-    # A skin-like surface: slopes whose density falls between an exponential and a Gaussian, or as
-    # a power below GGX's 4, over a weaker wide lobe; none of them is in the built-in basis.
+    # Skin-like microfacets: the slope density falls between an exponential and a Gaussian, or as a
+    # power close to GGX's 4, plus a weaker lobe of twice the width. Neither is in the built-in
+    # basis. BRDF = D F G / (4 mu_l mu_v) with D(h) = p(slope) / cos^4 and a V-groove shadow term.
     m = rng.uniform(0.18, 0.34, (points, 1))
     strength = rng.uniform(0.5, 1.4, (points, 1))
     tan_h = np.sqrt(1.0 - cos_h**2) / cos_h
@@ -117,16 +118,16 @@ def dome(
     surface = (
         strength * (0.8 * density + 0.2 * wide) * _fresnel(cos_d, 1.38) * shadow / (4 * mu_l * mu_v)
     )
-    through = (1.0 - _fresnel(mu_l, eta)) * (1.0 - _fresnel(mu_v, eta))
-    clean = through[..., None] * albedo[:, None] / np.pi + surface[..., None]
-    # Noise of the radiance, hence of f times the light's cosine; white is 1/pi.
+    transmittance = (1.0 - _fresnel(mu_l, eta)) * (1.0 - _fresnel(mu_v, eta))
+    clean = transmittance[..., None] * albedo[:, None] / np.pi + surface[..., None]
+    # the noise is that of the radiance, f times the light's cosine; a white diffuser has f = 1/pi
     sigma = noise * (clean * mu_l[..., None] + 0.02 / np.pi) / mu_l[..., None]
     f = clean + sigma * rng.standard_normal(clean.shape)
     return TruePoints(f, sigma**2, light, view, normals, valid, surface, albedo)
 
 
 def _slopes(tan_h: Float64Array, m: Float64Array, tail: str) -> Float64Array:
-    """Return the density of slopes; its integral over the plane of slopes is 1."""
+    """Return the slope density, normalized to an integral of 1 over the plane of slopes."""
     q = tan_h / m
     if tail == "light":
         return np.asarray(np.exp(-(q**1.5)) / (1.1906 * np.pi * m**2))  # 1.1906 = Gamma(7/3)
@@ -138,7 +139,7 @@ def _unit(v: Float64Array) -> Float64Array:
 
 
 def _fresnel(c: Float64Array, eta: float) -> Float64Array:
-    """Return unpolarized reflectance by the angles of Snell's law."""
+    """Return the unpolarized Fresnel reflectance from the angles of Snell's law."""
     inside = np.arcsin(np.sqrt(1.0 - c**2) / eta)
     outside = np.arccos(c)
     small = outside < 1e-3

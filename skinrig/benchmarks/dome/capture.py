@@ -1,4 +1,4 @@
-"""Benchmarks of the dome's capture: order of lights, merging of brackets, calibration."""
+"""Benchmarks of the dome's capture: order of lights, HDR merging, geometric calibration."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 
 DWELL_S = 1.0 / 12.0
 DARK_TIME_FRACTION = 0.3
-"""Share of each light's time that is dark where lights do not overlap."""
+"""Fraction of each light's time that is dark, for orders with dark gaps."""
 
 
-def light_order(stage: BenchmarkStage) -> None:
-    """Time each order of the lights and take the flicker of one pass at open eyes."""
+def measure_light_order(stage: BenchmarkStage) -> None:
+    """Time each order of the lights and compute the flicker of one pass at open eyes."""
     rig = load_rig("dome")
     rig = rig.subset(lights=[light.name for light in rig.lights[::3]]) if stage.toy else rig
     limits = rig.leds or LedLimits()
@@ -83,8 +83,8 @@ EXPOSURE_RANGE_S = (1e-3, 1.0)
 Frames = list[UInt16Array]
 
 
-def merging(stage: BenchmarkStage) -> None:
-    """Merge brackets of 2 to 23 frames over three decades of exposure, four of radiance."""
+def measure_hdr_merging(stage: BenchmarkStage) -> None:
+    """Measure HDR merging of 2 to 23 frames over three decades of exposure, four of radiance."""
     side = 64 if stage.toy else FULL_SIDE_PX
     rng = np.random.default_rng(0)
     scene = np.geomspace(20.0, 2e5, side * side * 3)
@@ -97,20 +97,21 @@ def merging(stage: BenchmarkStage) -> None:
         frames = [_expose(scene, t, rng) for t in times]
         timing, (radiance, _, valid) = stage.time(lambda: _merge(frames, times))
         bound = _minimum_variance(scene, times)
-        # near a frame's saturation noise decides whether the frame counts
+        # near saturation, noise decides whether a frame counts: such pixels are excluded
         settled = valid & ~np.any(
             [np.abs(scene * t / (WHITE_DN - BLACK_DN) - 1) < 0.05 for t in times], axis=0
         )
         squares = ((radiance - scene) / scene)[settled] ** 2
         error = 100 * float(np.sqrt(squares.mean()))
-        spread = 50 * float(squares.std() / np.sqrt(squares.size) / np.sqrt(squares.mean()))
+        # standard error of a root mean square: d sqrt(m) = dm / (2 sqrt(m))
+        half = 50 * float(squares.std() / np.sqrt(squares.size) / np.sqrt(squares.mean()))
         least = 100 * float(np.sqrt(((bound / scene**2)[settled]).mean()))
         worst = max(worst, error / least)
-        outcome = ErrorEstimate.symmetric(error, spread, least)
+        outcome = ErrorEstimate.symmetric(error, half, least)
         stage.add({"frames": count}, timing, outcome)
     ours, theirs, ratio = _compare_with_opencv(frames, times, rounds=1 if stage.toy else 15)
     ours = replace(ours, peak_memory_mb=timing.peak_memory_mb)
-    stage.add({"frames": N_FRAMES, "way": "beside"}, ours, outcome)
+    stage.add({"frames": N_FRAMES, "way": "in turn with OpenCV"}, ours, outcome)
     stage.limits = {("speed_up", side, theirs): ratio, "over_bound": worst}
 
 
@@ -127,7 +128,8 @@ def _expose(scene: Float64Array, time_s: float, rng: np.random.Generator) -> UIn
 
 
 def _minimum_variance(scene: Float64Array, times: Sequence[float] | Float64Array) -> Float64Array:
-    """Return the least variance of an unbiased estimate, from the frames that are not saturated."""
+    """Return the Cramér-Rao bound of the radiance's variance, from unsaturated frames."""
+    # Fisher information of frame t: t^2 / variance, with shot, read and rounding noise (1/12 DN^2)
     information = np.zeros_like(scene)
     for t in times:
         variance = scene * t / GAIN_E_PER_DN + (READ_NOISE_E / GAIN_E_PER_DN) ** 2 + 1 / 12
@@ -138,7 +140,7 @@ def _minimum_variance(scene: Float64Array, times: Sequence[float] | Float64Array
 def _compare_with_opencv(
     frames: Frames, times: Float64Array, *, rounds: int
 ) -> tuple[Timing, float, float]:
-    """Time both in turn, so that both meet the same machine; return the ratio of the fastest."""
+    """Time both in turn, so that both meet the same load; return the ratio of the fastest calls."""
     import cv2
 
     eight_bits = [(frame >> 6).astype(np.uint8) for frame in frames]
@@ -154,7 +156,7 @@ def _compare_with_opencv(
         peer.process(eight_bits, seconds)
         ours.append(middle - start)
         theirs.append(time.perf_counter() - middle)
-    # the fastest of each: what neither the other nor the machine's other work slowed down
+    # the fastest call of each is the least disturbed by other programs
     ratio = min(theirs) / min(ours)
     timing = Timing(float(np.median(ours)), (min(ours), max(ours)), ours[0], None)
     return timing, min(theirs), ratio
@@ -165,8 +167,8 @@ SPHERE_RADIUS_MM = 50.0
 DOME_SEED = 5
 
 
-def geometry(stage: BenchmarkStage) -> None:
-    """Adjust cameras to 4 to 12 places of a simulated board."""
+def measure_geometry(stage: BenchmarkStage) -> None:
+    """Measure the calibration of cameras by 4 to 12 poses of a simulated board."""
     views = (
         ["C03", "C07", "C11", "C14"] if stage.toy else ["C03", "C05", "C07", "C10", "C11", "C14"]
     )
@@ -185,8 +187,8 @@ def geometry(stage: BenchmarkStage) -> None:
     start = nominal_cameras(rig)
     probes = np.random.default_rng(0).uniform(-70, 70, (300, 3))
     for count in counts:
-        seen = {key: s for key, s in sightings.items() if key[1] < count}
-        result = bundle.adjust(seen, CHARUCO_BOARD, start)
+        visible = {key: s for key, s in sightings.items() if key[1] < count}
+        result = bundle.adjust(visible, CHARUCO_BOARD, start)
         gaps, variances, projected = [], [], []
         for name, camera in result.cameras.items():
             view = dome.rig.view(name)
@@ -195,12 +197,12 @@ def geometry(stage: BenchmarkStage) -> None:
             truth = project_points(view, dome.distortion[name], probes)
             projected.append(np.linalg.norm(camera.project(probes) - truth, axis=1).mean())
         stage.limits["reprojection"] = float(max(projected))
-        timing, _ = stage.time(lambda: bundle.adjust(seen, CHARUCO_BOARD, start), repeats=3)
+        timing, _ = stage.time(lambda: bundle.adjust(visible, CHARUCO_BOARD, start), repeats=3)
         stage.add({"places": count}, timing, _rms(np.array(gaps), np.array(variances)))
 
 
-def lights(stage: BenchmarkStage) -> None:
-    """Place lights by one to four places of a simulated mirror sphere."""
+def measure_light_positions(stage: BenchmarkStage) -> None:
+    """Measure the positions of lights by one to four positions of a simulated mirror sphere."""
     views = ["C05", "C07", "C14"] if stage.toy else ["C01", "C05", "C07", "C10", "C11", "C14"]
     dome_rig = load_rig("dome")
     every = [light.name for light in dome_rig.lights][:: 30 if stage.toy else 10]
@@ -209,9 +211,9 @@ def lights(stage: BenchmarkStage) -> None:
     scene = make_target_scene("mirror", rig, seed=DOME_SEED, dome=dome)
     cameras = {view.name: CameraPose.nominal(view) for view in dome.rig.views}
     spheres: dict[int, mirror_sphere.SpherePosition] = {}
-    seen: list[mirror_lights.Highlights] = []
-    most = 4
-    for number in range(most):
+    highlights: list[mirror_lights.Highlights] = []
+    max_poses = 4
+    for number in range(max_poses):
         scene.set_pose(number)
         outlines, colors = {}, {}
         for name, camera in cameras.items():
@@ -226,19 +228,19 @@ def lights(stage: BenchmarkStage) -> None:
             window = mirror_lights.SphereWindow.of(camera, spheres[number])
             frame = _frame(scene, name, range(len(every)), 0.012, 0.002, number)
             spots = mirror_lights.find_highlights(neutral_mosaic(frame, colors[name]), window)
-            seen.append(mirror_lights.Highlights(name, number, tuple(every), spots))
+            highlights.append(mirror_lights.Highlights(name, number, tuple(every), spots))
     nominal = {light.name: np.array(light.position_mm) for light in rig.lights}
     truth = scene.truth()["position_mm"]
-    for count in range(1, most + 1):
-        rows = [row for row in seen if row.sphere < count]
+    for count in range(1, max_poses + 1):
+        rows = [row for row in highlights if row.sphere < count]
         some = {number: spheres[number] for number in range(count)}
 
         locate = partial(mirror_lights.locate_lights, rows, cameras, some, nominal)
         timing, result = stage.time(locate, repeats=3)
         ok = result.valid
         gaps = np.mean((result.position_mm - truth)[ok] ** 2, axis=1)
-        away = np.linalg.norm((result.position_mm - truth)[ok], axis=1)
-        stage.limits["distance"] = float(np.median(away))
+        distance = np.linalg.norm((result.position_mm - truth)[ok], axis=1)
+        stage.limits["distance"] = float(np.median(distance))
         variances = np.mean(result.stderr_mm[ok] ** 2, axis=1)
         stage.add({"spheres": count}, timing, _rms(gaps, variances))
 
@@ -246,7 +248,6 @@ def lights(stage: BenchmarkStage) -> None:
 def _frame(
     scene: TargetScene, name: str, lit: Sequence[int], exposure_s: float, level: float, seed: int
 ) -> RawFrame:
-
     view = scene.rig.view(name)
     pops = [LedPulse(k, level, 0.0, exposure_s) for k in lit]
     cfa = scene.exposure(name, pops=pops, exposure_s=exposure_s, seed=seed)
@@ -260,5 +261,5 @@ def _frame(
 
 
 def _rms(squares: Float64Array, variances: Float64Array) -> ErrorEstimate:
-    """Return the root of squares' mean beside that of the variances that errors state."""
+    """Return the root mean square with, as its bound, the root mean of the stated variances."""
     return bootstrap_rms(squares, float(np.sqrt(variances.mean())), draws=400)

@@ -1,4 +1,4 @@
-"""Benchmark of the head's motion: frames of the simulated dome, and what is found of its drift."""
+"""Benchmark of head motion: tracking frames of the simulated dome, and errors of the motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,17 +31,17 @@ class _Superpixels:
 
     @property
     def center_mm(self) -> Float64Array:
-        """Centre of projection, (3,)."""
+        """Center of projection, mm, (3,)."""
         return self.sensor.center_mm
 
     def project(self, points_mm: Float64Array) -> Float64Array:
-        """Return column and row (N, 2)."""
+        """Project points to column and row of the binned image, (N, 2)."""
         return (self.sensor.project(points_mm) - 0.5) / 2
 
 
 @dataclass(frozen=True, slots=True)
 class DriftingCapture:
-    """Tracking frames of one capture, with where the head was."""
+    """Tracking frames of one capture, with the true poses of the head."""
 
     frames: Sequence[Sequence[Float64Array]]
     cameras: Sequence[_Superpixels]
@@ -50,10 +50,10 @@ class DriftingCapture:
     times_s: Float64Array
     poses: Sequence[tuple[Float64Array, Float64Array]]
     twitch: Float64Array
-    """How far the twitch of the mouth has gone, 0 to 1."""
+    """Amount of the mouth's twitch by frame, 0 to 1."""
 
     def estimate(self, tracks: int) -> head_motion.HeadMotion:
-        """Estimate the motion with so many tracks per camera."""
+        """Estimate the motion with `tracks` tracks per camera."""
         return head_motion.estimate(
             self.frames,
             self.cameras,
@@ -73,18 +73,18 @@ class DriftingCapture:
         )
 
     def point_errors_mm(self, found: head_motion.HeadMotion) -> Float64Array:
-        """Return how far the estimate puts the points from where they were, RMS, (T - 1,)."""
-        turns = head_motion.rotation_matrix(found.rotation_rad)
-        moved = zip(self.poses[1:], turns[1:], found.translation_mm[1:], strict=True)
+        """Return the RMS distance between estimated and true points by frame, mm, (T - 1,)."""
+        rotations = head_motion.rotation_matrix(found.rotation_rad)
+        pairs = zip(self.poses[1:], rotations[1:], found.translation_mm[1:], strict=True)
         return np.array(
             [
-                _rms_mm(self.points_mm @ (turn - rotation).T + (move - shift))
-                for (rotation, shift), turn, move in moved
+                _rms_mm(self.points_mm @ (estimated - rotation).T + (translation - shift))
+                for (rotation, shift), estimated, translation in pairs
             ]
         )
 
     def true_motion_mm(self) -> Float64Array:
-        """Return how far the points moved in truth, RMS, (T - 1,)."""
+        """Return the RMS true displacement of the points by frame, mm, (T - 1,)."""
         return np.array(
             [
                 _rms_mm(self.points_mm @ (rotation - np.eye(3)).T + shift)
@@ -97,7 +97,7 @@ def _rms_mm(gap: Float64Array) -> float:
     return float(np.sqrt(np.mean(np.sum(gap**2, axis=1))))
 
 
-def simulate(
+def simulate_drifting_capture(
     *,
     width_px: int,
     views: int,
@@ -112,19 +112,19 @@ def simulate(
     Parameters
     ----------
     width_px
-        Of the sensors; the frames have half of it.
+        Width of the sensors; the frames have half of it.
     views
-        How many of the dome's frontal cameras.
+        Number of frontal cameras.
     drift_mm
-        Greatest shift within 25 s; it turns by a third as many degrees.
+        Largest translation within 25 s; the rotation is a third as many degrees.
     times_s
-        Of the frames; the first should be 0.
+        Times of the frames, s; the first should be 0.
     twitch
-        Whether the mouth twitches; one more frame then shows it in the middle of that.
+        Whether the mouth twitches; a further frame then shows the middle of the twitch.
     preset
-        Of the person's melanin.
+        Melanin preset of the subject.
     texels
-        Side of the person's maps.
+        Side of the subject's maps, texels.
     """
     rig = load_rig("dome")
     leds = [light.name for light in rig.lights if light.position_mm[2] > 350.0][::6]
@@ -162,25 +162,25 @@ def simulate(
     )
 
 
-def motion(stage: BenchmarkStage) -> None:
-    """Follow heads that drift little and much, with few and many tracks."""
+def measure_head_motion(stage: BenchmarkStage) -> None:
+    """Measure errors of the head's position over drift and number of tracks."""
     width, views, times = (
         (160, 2, (0.0, 8.0, 16.0)) if stage.toy else (484, 3, (0.0, 5.0, 12.5, 20.0))
     )
     texels = 128 if stage.toy else 512
-    drift = partial(simulate, width_px=width, views=views, texels=texels)
+    drift = partial(simulate_drifting_capture, width_px=width, views=views, texels=texels)
 
     for drift_mm in (1.0,) if stage.toy else (0.3, 1.0, 3.0):
-        seen = drift(drift_mm=drift_mm, times_s=times)
-        moved_mm = round(float(seen.true_motion_mm().mean()), 3)
+        captured = drift(drift_mm=drift_mm, times_s=times)
+        moved_mm = round(float(captured.true_motion_mm().mean()), 3)
         for tracks in (30, 60, 120, 200) if stage.toy else (30, 100, 300):
             knobs = {"drift mm": drift_mm, "tracks": tracks}
-            follow = partial(seen.estimate, tracks)
-            stage.measure(knobs, follow, seen.error, also={"moved_mm": moved_mm})
+            follow = partial(captured.estimate, tracks)
+            stage.measure(knobs, follow, captured.error, extra_values={"moved_mm": moved_mm})
 
     def on_skin(band: MelaninBand) -> ErrorEstimate:
-        seen = drift(drift_mm=1.0, times_s=times[:3], preset=band.preset)
-        return seen.error(seen.estimate(100))
+        captured = drift(drift_mm=1.0, times_s=times[:3], preset=band.preset)
+        return captured.error(captured.estimate(100))
 
     stage.measure_bands(on_skin)
-    stage.words = {"width": width // 2, "views": views}
+    stage.description_values = {"width": width // 2, "views": views}

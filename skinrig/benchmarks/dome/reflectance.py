@@ -1,4 +1,4 @@
-"""Benchmark of the reflectance model: how many lobes skin needs, and the statistics of albedo."""
+"""Benchmark of the reflectance model: error over the number of basis BRDFs, and textures."""
 
 from dataclasses import dataclass
 from typing import Any, Final
@@ -25,35 +25,37 @@ LOBE_RANKS: Final = (1, 2, 4, 8, 24)
 DEFAULT_RANK: Final = 4
 RELATIVE_NOISE: Final = 0.02
 HELD_OUT_LIGHT_FRACTION: Final = 0.2
-"""Share of the lights that no fit sees."""
+"""Fraction of the lights that are held out of fits."""
 MIN_COSINE: Final = 0.15
 ETA: Final = 1.4
 BAND_PRESETS: Final = tuple(band.preset for band in MELANIN_BANDS.values())
 EXTREME_PRESETS: Final = ("palest", "darkest")
-"""Beyond the typical people of the bands; of the full size alone."""
+"""Presets beyond the typical subjects of the bands; measured at full size only."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FacePoints(TrueSamples):
     """Points of a simulated face."""
 
-    left_out: BoolArray
-    """(P, M): samples of lights that no fit may see."""
+    held_out: BoolArray
+    """(P, M): samples of held-out lights."""
     total: Float64Array
     """(P, M, 3): true reflection, 1/sr."""
 
 
-def face_points(subject: str, *, points: int, samples: int, rng: np.random.Generator) -> FacePoints:
-    """Draw points of a simulated face, and samples of them by the dome's lights and cameras.
+def sample_face_points(
+    subject: str, *, points: int, samples: int, rng: np.random.Generator
+) -> FacePoints:
+    """Draw points of a simulated face and their samples by the dome's lights and cameras.
 
     Parameters
     ----------
     subject
-        Preset.
+        Melanin preset.
     points, samples
-        P and M.
+        Number of points, P, and of samples per point, M.
     rng
-        Of points, pairs of light and camera, and noise.
+        Generator of points, pairs of light and camera, and noise.
     """
     rig = load_rig("dome")
     face = make_subject(subject, seed=0, size=128)
@@ -64,14 +66,14 @@ def face_points(subject: str, *, points: int, samples: int, rng: np.random.Gener
     chosen = rng.permutation(np.flatnonzero(bare))[:points]
     packed = surface.packed().reshape(-1, 7)[chosen]
     normals = surface.normal.reshape(-1, 3)[chosen].astype(np.float64)
-    place = face.atlas.position_mm.reshape(-1, 3)[chosen].astype(np.float64)
+    position = face.atlas.position_mm.reshape(-1, 3)[chosen].astype(np.float64)
     ends = [np.array([one.position_mm for one in rows]) for rows in (rig.lights, rig.views)]
     every = rng.permuted(np.tile(np.arange(len(ends[0]) * len(ends[1])), (len(chosen), 1)), axis=1)
-    pair = _pairs_above_horizon(every, ends, place, normals)[:, :samples]
+    pair = _pairs_above_horizon(every, ends, position, normals)[:, :samples]
     which = np.divmod(pair, len(ends[1]))
-    to = [_unit(end[k] - place[:, None]) for end, k in zip(ends, which, strict=True)]
+    to = [_unit(end[k] - position[:, None]) for end, k in zip(ends, which, strict=True)]
     cosines = [np.einsum("pmk,pk->pm", way, normals) for way in to]
-    seen = (cosines[0] > MIN_COSINE) & (cosines[1] > MIN_COSINE)
+    visible = (cosines[0] > MIN_COSINE) & (cosines[1] > MIN_COSINE)
     count = pair.shape[1]
     total, specular = surface_brdf.evaluate_brdf(
         np.repeat(packed, count, axis=0),
@@ -88,25 +90,25 @@ def face_points(subject: str, *, points: int, samples: int, rng: np.random.Gener
         to[0],
         to[1],
         normals,
-        seen,
+        visible,
         np.asarray(specular, np.float64).reshape(len(chosen), count),
         held[which[0]],
         clean,
     )
 
 
-def model(stage: BenchmarkStage) -> None:
-    """Fit the surface term with few and many lobes, and predict lights that were left out."""
+def measure_reflectance_model(stage: BenchmarkStage) -> None:
+    """Fit the surface term with few and many lobes, and predict held-out lights."""
     rng = np.random.default_rng(0)
     materials = brdf_tables.default_basis()
     count, samples = (10, 120) if stage.toy else (150, 400)
     usual: list[float] = []
     for subject in BAND_PRESETS if stage.toy else (*BAND_PRESETS, *EXTREME_PRESETS):
-        p = face_points(subject, points=count, samples=samples, rng=rng)
-        use = p.valid & ~p.left_out
-        known: dict[str, Any] = {"eta": ETA, "variance": p.variance, "valid": use}
-        albedo = diffuse_albedo.estimate(*p.samples, **known)
-        given = brdf_basis.surface_samples(*p.samples, albedo.r_d, **known)
+        p = sample_face_points(subject, points=count, samples=samples, rng=rng)
+        use = p.valid & ~p.held_out
+        options: dict[str, Any] = {"eta": ETA, "variance": p.variance, "valid": use}
+        albedo = diffuse_albedo.estimate(*p.samples, **options)
+        given = brdf_basis.surface_samples(*p.samples, albedo.r_d, **options)
         full = brdf_basis.fit_weights(given, materials)
         for rank in LOBE_RANKS:
             if rank > min(count, materials.size):
@@ -136,20 +138,20 @@ def model(stage: BenchmarkStage) -> None:
 def _errors(
     p: FacePoints, lobes: BrdfBasis, weights: Float64Array, r_d: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Return of each point the surface term's error over its sum, and that of all light, %."""
-    known = np.asarray(np.isfinite(r_d).all(axis=1))
-    at = p.valid & p.left_out & known[:, None]
+    """Return relative errors of the surface term and of the total reflection by point, %."""
+    finite = np.asarray(np.isfinite(r_d).all(axis=1))
+    at = p.valid & p.held_out & finite[:, None]
     some = np.flatnonzero(at.any(axis=1))
     surface, everything = [], []
     for point in some:
         rows = at[point]
         to, view, n = p.light[point, rows], p.view[point, rows], p.normals[point]
-        share = np.broadcast_to(weights[point], (len(to), lobes.size))
-        lobe = skin_reflectance.lobe_brdf(lobes, share, to, view, n)
-        passed = np.prod(
-            [skin_reflectance.transmittance(way @ n, ETA) for way in (to, view)], axis=0
+        own = np.broadcast_to(weights[point], (len(to), lobes.size))
+        lobe = skin_reflectance.lobe_brdf(lobes, own, to, view, n)
+        transmitted = np.prod(
+            [skin_reflectance.transmittance(direction @ n, ETA) for direction in (to, view)], axis=0
         )
-        made = lobe[:, None] + passed[:, None] * r_d[point] / np.pi
+        made = lobe[:, None] + transmitted[:, None] * r_d[point] / np.pi
         true = p.surface[point, rows]
         surface.append(np.sum(np.abs(lobe - true)) / np.sum(true))
         light = luminance(p.total[point, rows])
@@ -160,7 +162,7 @@ def _errors(
 def _pairs_above_horizon(
     pairs: Int64Array, ends: list[Float64Array], position: Float64Array, normals: Float64Array
 ) -> Int64Array:
-    """Return the pairs of each point with those above its horizon first, in their order."""
+    """Sort the pairs of each point so that those above its horizon come first, in stable order."""
     up = [
         np.einsum("pmk,pk->pm", _unit(end[None] - position[:, None]), normals) > MIN_COSINE
         for end in ends

@@ -1,4 +1,4 @@
-"""Benchmark of rendering a fitted model: rays, texture, light that spreads."""
+"""Benchmark of rendering a fitted model: rays, texture size, lateral scattering."""
 
 from __future__ import annotations
 
@@ -31,51 +31,51 @@ VIEW_NAME: Final = "C07"
 LIGHT_INDEX: Final = 62
 REFERENCE_SUBPIXELS: Final = 6
 MEAN_SIGMA_TR_PER_MM: Final = (0.598, 1.069, 1.672)
-"""Of a mean face, 1/mm: Weyrich et al. 2005, table 2."""
+"""Effective transport coefficient of a mean face, 1/mm: Weyrich et al. 2005, table 2."""
 
 
-def model(stage: BenchmarkStage) -> None:
-    """Render a simulated face's true maps, and compare with the simulator's own pictures.
+def measure_model_rendering(stage: BenchmarkStage) -> None:
+    """Render the true maps of a simulated face and compare with the simulator's images.
 
-    Rays and textures are judged by the simulator at 36 rays a pixel, with every light from inside
-    leaving where it entered; the tolerance of light that spreads by our own finest one.
+    The reference for rays and textures is the simulator at 36 rays per pixel without lateral
+    scattering. The reference for tolerances of lateral scattering is our own finest tolerance.
     """
     width, size, fine = (48, 128, 3) if stage.toy else (325, 512, REFERENCE_SUBPIXELS)
     rays = (1, 2) if stage.toy else (1, 2, 3, 4)
     rig = load_rig("dome").resized(width + width % 2).subset(views=[VIEW_NAME])
-    seen = _SimulatedFace.of("III", rig, size=size, subpixels=fine)
+    face = _SimulatedFace.of("III", rig, size=size, subpixels=fine)
     binnings = (1, 2) if stage.toy else (1, 2, 4, 8)
-    laid = {k: seen.fitted_surface(binning=k) for k in binnings}
+    surfaces = {k: face.fitted_surface(binning=k) for k in binnings}
 
     def add(knobs: Knobs, call: Callable[[], FloatArray], true: FloatArray, repeats: int) -> None:
         stage.measure(knobs, call, partial(_relative, true=true), repeats=repeats, memory=None)
 
     for k in rays:
         knobs: Knobs = {"vary": "rays", "rays": k**2}
-        add(knobs, lambda: seen.render(laid[1], subpixels=k).radiance, seen.true, 2)
+        add(knobs, lambda: face.render(surfaces[1], subpixels=k).radiance, face.true, 2)
     for k in binnings[1:]:
         knobs = {"vary": "texture", "texels": size // k}
-        add(knobs, lambda: seen.render(laid[k]).radiance, seen.true, 2)
-    skin = laid[1].with_sigma_tr(MEAN_SIGMA_TR_PER_MM)
+        add(knobs, lambda: face.render(surfaces[k]).radiance, face.true, 2)
+    skin = surfaces[1].with_sigma_tr(MEAN_SIGMA_TR_PER_MM)
     inside = Interior.of(skin)
 
-    def spread(tolerance: float) -> FloatArray:
+    def render_scattered(tolerance: float) -> FloatArray:
         aimed = dataclasses.replace(inside, tolerance=tolerance)
-        return seen.render(skin, subsurface="dipole", interior=aimed, subpixels=1).diffuse
+        return face.render(skin, subsurface="dipole", interior=aimed, subpixels=1).diffuse
 
-    best = spread(0.001)
+    best = render_scattered(0.001)
     for tolerance in (0.1, 0.01) if stage.toy else (3.0, 1.0, 0.3, 0.1, 0.01):
         knobs = {"vary": "spreading", "tolerance": tolerance}
-        add(knobs, lambda: spread(tolerance), best, 1)
-    usual, true = seen.render(laid[1]), seen.true
+        add(knobs, lambda: render_scattered(tolerance), best, 1)
+    usual, true = face.render(surfaces[1]), face.true
     lit = usual.lit & usual.covered & (true.mean(axis=-1) > 0.0)
     gap = np.abs(usual.radiance - true).mean(axis=-1)[lit] / true.mean(axis=-1)[lit]
-    color = np.array(seen.light.intensity)
+    color = np.array(face.light.intensity)
     two = [
-        dataclasses.replace(seen.light, name=n, intensity=tuple((w * color).tolist()))
+        dataclasses.replace(face.light, name=n, intensity=tuple((w * color).tolist()))
         for n, w in (("a", 0.3), ("b", 0.7))
     ]
-    both = render_surface(laid[1], seen.camera, two, subpixels=2, caster=seen.caster).radiance
+    both = render_surface(surfaces[1], face.camera, two, subpixels=2, caster=face.caster).radiance
 
     def on_skin(band: MelaninBand) -> ErrorEstimate:
         other = _SimulatedFace.of(band.preset, rig, size=128 if stage.toy else 256, subpixels=fine)
@@ -85,12 +85,12 @@ def model(stage: BenchmarkStage) -> None:
     stage.limits["median"] = 100.0 * float(np.median(gap))
     stage.limits["sum"] = _relative(both, usual.radiance).error
     stage.reference_error = stage.points[len(rays) - 1].error * rays[-1] / fine
-    stage.words["rays"] = fine**2
+    stage.description_values["rays"] = fine**2
 
 
 @dataclass(frozen=True, slots=True)
 class _SimulatedFace:
-    """A face in the dome under one light, as the simulator and as the fitted model show it."""
+    """Face in the dome under one light, for the simulator and for the fitted model."""
 
     scene: DomeScene
     true: FloatArray
@@ -100,8 +100,9 @@ class _SimulatedFace:
 
     @classmethod
     def of(cls, preset: str, rig: Rig, *, size: int, subpixels: int) -> _SimulatedFace:
+        """Simulate a face of a melanin preset under one light, and render its reference image."""
         face = make_subject(preset, seed=5, size=size)
-        # as the model has it
+        # the fitted model has neither lateral scattering nor interreflection
         direct = partial(DomeScene, effects=SceneEffects(lateral=False, interreflections=False))
         scene = direct(rig, face)
         return cls(
@@ -113,20 +114,20 @@ class _SimulatedFace:
         )
 
     def fitted_surface(self, **binning: int) -> FittedSurface:
-        """Return the true maps, laid over the face."""
+        """Return the true maps on the face's mesh."""
         return FittedSurface.of(
             true_model(self.scene, VIEW_NAME, **binning), self.scene.subject.mesh
         )
 
     def render(self, surface: FittedSurface, **settings: Any) -> Rendering:
-        """Render with 4 rays a pixel where nothing else is set."""
+        """Render the surface, by default with 4 rays per pixel."""
         return render_surface(
             surface, self.camera, self.light, caster=self.caster, **{"subpixels": 2} | settings
         )
 
 
 def _relative(found: FloatArray, true: FloatArray) -> ErrorEstimate:
-    """Return the RMS error over the mean on skin, %, with its interval over 16 x 16 tiles."""
+    """Return the RMS error over the mean on skin, %, with its interval over 16 x 16 px tiles."""
     skin = true.mean(axis=-1) > 0.0
     to_percent = 100.0 / float(true[skin].mean())
     return bootstrap_tiled_rms((found.astype(np.float64) - true) * to_percent, skin)

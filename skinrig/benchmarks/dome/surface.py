@@ -1,4 +1,4 @@
-"""Benchmarks of what is done on the surface: gathering lumitexels, filling textures."""
+"""Benchmarks of work on the surface: gathering lumitexels, filling textures."""
 
 import itertools
 import tempfile
@@ -27,11 +27,11 @@ from skinrig.benchmarks.stage import BenchmarkStage
 SPHERE_RADIUS_MM, SPHERE_ALBEDO = 80.0, 0.4
 N_FULL_SAMPLES = 500_000 * 16 * 150
 N_ERROR_BLOCKS = 40
-"""Of samples, whose means scatter independently."""
+"""Blocks of samples whose means are independent."""
 
 
-def lumitexels(stage: BenchmarkStage) -> None:
-    """Gather a Lambertian sphere, with tables in memory and on disk, of both precisions."""
+def measure_lumitexels(stage: BenchmarkStage) -> None:
+    """Gather lumitexels of a Lambertian sphere with tables in memory and on disk."""
     width, step = (130, 30) if stage.toy else (1300, 10)
     names = [f"L{k:03d}" for k in range(0, 150, step)]
     views = ["C02", "C07"] if stage.toy else ["C02", "C07", "C13"]
@@ -40,10 +40,10 @@ def lumitexels(stage: BenchmarkStage) -> None:
     lights = LightTable.nominal(rig)
     sphere = trimesh.creation.icosphere(subdivisions=4 if stage.toy else 6, radius=SPHERE_RADIUS_MM)
     caster = RayCaster(sphere.vertices, sphere.faces)
-    seen = [_visible_points(camera) for camera in cameras]
+    visible = [_visible_points(camera) for camera in cameras]
 
     def gathered(count: int, **table: Any) -> tuple[Timing, list[FloatArray]]:
-        """Gather some points; return seconds and MB held, and relative errors of the samples."""
+        """Gather points; return time and memory, and relative errors of the samples."""
         where = sphere.vertices[:count]
         surface = SampledSurface(where, where / SPHERE_RADIUS_MM)
         tracemalloc.start()
@@ -51,7 +51,7 @@ def lumitexels(stage: BenchmarkStage) -> None:
         store = LumitexelStore(surface, cameras=cameras, lights=lights, caster=caster, **table)
         spent = time.perf_counter() - start
         for view, light in itertools.product(range(len(cameras)), range(len(names))):
-            image = _image(seen[view], lights, light)
+            image = _image(visible[view], lights, light)
             start = time.perf_counter()
             store.add(view, light, image, np.full_like(image, 1e-6))
             spent += time.perf_counter() - start
@@ -74,7 +74,7 @@ def lumitexels(stage: BenchmarkStage) -> None:
                 timing, errors = gathered(count, folder=Path(folder), dtype=np.float16)
         off = 100 * np.abs(np.concatenate(errors))
         samples = count * len(cameras) * len(names)
-        # samples of a point err alike: blocks of points are drawn
+        # errors of one point's samples are correlated: means of blocks of points are independent
         blocks = mean_error([part.mean() for part in np.array_split(off, N_ERROR_BLOCKS)])
         outcome = ErrorEstimate(float(off.mean()), blocks.error_interval)
         stage.add({"points": count, "tables": kind}, timing, outcome)
@@ -82,8 +82,8 @@ def lumitexels(stage: BenchmarkStage) -> None:
     stage.limits = {"memory": timing.peak_memory_mb or 0.0, "hours": hours}
 
 
-def filling(stage: BenchmarkStage) -> None:
-    """Fill a smooth texture of three channels of which a part of the texels is known."""
+def measure_texture_filling(stage: BenchmarkStage) -> None:
+    """Fill a smooth texture of three channels from a fraction of its texels."""
     side = 128 if stage.toy else 2048
     rng = np.random.default_rng(0)
     y, x = np.mgrid[0:side, 0:side] / side
@@ -96,12 +96,12 @@ def filling(stage: BenchmarkStage) -> None:
         off = 100 * (filled - truth) / truth.std()
         return bootstrap_tiled_rms(off, unknown, tile_px=max(side // 16, 8))
 
-    for share in (0.05, 0.15, 0.35, 0.75):
-        weight = (rng.random((side, side)) < share).astype(np.float32)
+    for fraction in (0.05, 0.15, 0.35, 0.75):
+        weight = (rng.random((side, side)) < fraction).astype(np.float32)
         weight[side // 3 : side // 3 + side // 16, side // 3 : side // 2] = 0.0
         for way, fill in (("push-pull", _push_pull), ("nearest texel", _nearest)):
             stage.measure(
-                {"known": share, "way": way, "side": side},
+                {"known": fraction, "way": way, "side": side},
                 partial(fill, truth, weight),
                 lambda filled: error(filled, weight == 0),
             )
@@ -118,22 +118,23 @@ def _nearest(values: Float32Array, weight: Float32Array) -> FloatArray:
 
 
 def _visible_points(camera: CameraPose) -> Float64Array:
-    """Return where the pixels of a camera meet the sphere, NaN elsewhere."""
+    """Return the points of the sphere in each pixel of a camera, NaN elsewhere."""
     width, height = camera.image_size
     row, column = np.mgrid[0:height, 0:width]
-    ways = camera.rays(np.stack([column, row], axis=-1))
-    along = ways @ camera.center_mm
+    # |c + t d|^2 = R^2 has the near root t = -c.d - sqrt((c.d)^2 - |c|^2 + R^2)
+    rays = camera.rays(np.stack([column, row], axis=-1))
+    along = rays @ camera.center_mm
     inside = along**2 - camera.center_mm @ camera.center_mm + SPHERE_RADIUS_MM**2
     root = np.sqrt(np.where(inside > 0, inside, np.nan))
-    return np.asarray(camera.center_mm + (-along - root)[..., None] * ways)
+    return np.asarray(camera.center_mm + (-along - root)[..., None] * rays)
 
 
 def _image(points: Float64Array, lights: LightTable, light: int) -> Float32Array:
-    """Return the sphere under one light, written out here."""
-    way = lights.position_mm[light] - points
-    distance = np.linalg.norm(way, axis=-1, keepdims=True)
-    way /= distance
-    cosine = np.clip((way * points).sum(axis=-1) / SPHERE_RADIUS_MM, 0.0, None)
-    lobe = np.clip(-(way @ lights.axis[light]), 0.0, None) ** lights.exponent[light]
+    """Return the closed-form image of the sphere under one light."""
+    direction = lights.position_mm[light] - points
+    distance = np.linalg.norm(direction, axis=-1, keepdims=True)
+    direction /= distance
+    cosine = np.clip((direction * points).sum(axis=-1) / SPHERE_RADIUS_MM, 0.0, None)
+    lobe = np.clip(-(direction @ lights.axis[light]), 0.0, None) ** lights.exponent[light]
     strength = (cosine * lobe)[..., None] / distance**2
     return np.asarray(SPHERE_ALBEDO * lights.intensity[light] * strength, np.float32)

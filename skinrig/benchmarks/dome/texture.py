@@ -1,4 +1,4 @@
-"""Benchmark of texture matching, beside pyrtools and scikit-image in the same run."""
+"""Benchmark of texture matching against pyrtools and scikit-image in the same run."""
 
 import time
 from collections.abc import Callable
@@ -24,17 +24,17 @@ _SKIN_COLOR = np.array([0.55, 0.38, 0.28])
 _DENSITY_COLORS = np.array([[0.5, 1.0, 1.4], [0.2, 1.0, 0.6], [1.0, 1.0, 1.0]])
 
 
-def skin_texture(side: int, *, spots: float, rng: np.random.Generator) -> Float32Array:
-    """Make a periodic texture: blotches, fine streaks and dark spots of their own colors.
+def synthesize_skin_texture(side: int, *, spots: float, rng: np.random.Generator) -> Float32Array:
+    """Synthesize a periodic texture of blotches, fine streaks and dark spots.
 
     Parameters
     ----------
-    side : int
-        Of the image, px.
-    spots : float
+    side
+        Side of the image, px.
+    spots
         Spots per 128 x 128 px.
     rng
-        Draws all of it.
+        Generator of all random values.
 
     Returns
     -------
@@ -60,12 +60,12 @@ def skin_texture(side: int, *, spots: float, rng: np.random.Generator) -> Float3
 
 
 def _error(images: list[Any], target: Float64Array, space: TextureSpace) -> ErrorEstimate:
-    """Return the mean distance of images from a vector, and its interval over the images."""
-    wanted = space.histograms(target)
+    """Return the mean histogram distance of images from a target, with its interval."""
+    target_histograms = space.histograms(target)
     off = [
         float(
             histogram_distance(
-                space.histograms(describe(i, space=space)), wanted, space.edges
+                space.histograms(describe(i, space=space)), target_histograms, space.edges
             ).mean()
         )
         for i in images
@@ -80,18 +80,21 @@ def _add(
     dtype: type = np.float32,
     **options: Any,
 ) -> None:
-    """Match plain skin to spotted skin; errors are at full depth, whatever depth is matched."""
+    """Match plain skin to spotted skin; errors are evaluated at full pyramid depth."""
     side, rng = int(knobs["side"]), np.random.default_rng(0)
-    target: Any = skin_texture(side, spots=10.0, rng=rng).astype(dtype)
-    sources = [0.9 * skin_texture(side, spots=0.0, rng=rng).astype(dtype) for _ in range(N_SOURCES)]
+    target: Any = synthesize_skin_texture(side, spots=10.0, rng=rng).astype(dtype)
+    sources = [
+        0.9 * synthesize_skin_texture(side, spots=0.0, rng=rng).astype(dtype)
+        for _ in range(N_SOURCES)
+    ]
     full = TextureSpace.fit([target, *sources])
     used = full if levels == full.levels else TextureSpace.fit([target, *sources], levels=levels)
     vector = describe(target, space=used)
 
     def run(source: Any) -> Any:
         rng = np.random.default_rng(1)
-        how = {"iterations": 5, "noise": 0.05} | options
-        return match(source, vector, space=used, rng=rng, **how).image
+        settings = {"iterations": 5, "noise": 0.05} | options
+        return match(source, vector, space=used, rng=rng, **settings).image
 
     timing, _ = stage.time(lambda: run(sources[0]))
     outcome = _error([run(s) for s in sources], describe(target, space=full), full)
@@ -99,7 +102,7 @@ def _add(
 
 
 def measure_efforts(stage: BenchmarkStage, knobs: Knobs) -> None:
-    """Measure pyramid depth and iterations (error: `matching`'s)."""
+    """Measure matching over pyramid depth and iterations."""
     at = knobs | {"side": _side(stage)}
     depths, counts = ((1, 7), (0, 2)) if stage.toy else ((1, 3, 5, 7), (0, 1, 2, 10, 20))
     for n in depths:
@@ -112,8 +115,8 @@ def _side(stage: BenchmarkStage) -> int:
     return 48 if stage.toy else 256
 
 
-def matching(stage: BenchmarkStage) -> None:
-    """Match textures: depth, iterations, precision, size, start; then one channel at full size."""
+def measure_texture_matching(stage: BenchmarkStage) -> None:
+    """Measure matching over depth, iterations, precision, size and start, then at full size."""
     measure_efforts(stage, {})
     usual: Knobs = {"side": _side(stage), "levels": 7, "iterations": 5}
     _add(stage, usual | {"precision": "float64"}, dtype=np.float64)
@@ -126,20 +129,20 @@ def matching(stage: BenchmarkStage) -> None:
 
 
 def _same_process_distance(side: int) -> float:
-    """Return how far apart two textures of one process are: what matching need not beat."""
+    """Return the distance between two textures of one random process, the error's lower limit."""
     rng = np.random.default_rng(2)
-    textures = [skin_texture(side, spots=10.0, rng=rng) for _ in range(1 + N_SOURCES)]
-    plain = 0.9 * skin_texture(side, spots=0.0, rng=rng)
+    textures = [synthesize_skin_texture(side, spots=10.0, rng=rng) for _ in range(1 + N_SOURCES)]
+    plain = 0.9 * synthesize_skin_texture(side, spots=0.0, rng=rng)
     space = TextureSpace.fit([*textures, plain])
     return _error(textures[1:], describe(textures[0], space=space), space).error
 
 
-def peer_iterations(
+def iterate_with_peer(
     image: ArrayLike, target: ArrayLike, iterations: int
 ) -> Callable[[], Float64Array]:
-    """Return Heeger and Bergen's matching of one channel out of pyrtools and scikit-image.
+    """Return a function that runs Heeger and Bergen's matching with pyrtools and scikit-image.
 
-    The pyramid of the target is made here and not timed, as ours is given its vector.
+    The target's pyramid is built here and is not timed, as ours is given the target's vector.
 
     Raises
     ------
@@ -149,28 +152,28 @@ def peer_iterations(
     from pyrtools.pyramids import SteerablePyramidFreq
     from skimage.exposure import match_histograms
 
-    start, wanted = np.asarray(image, np.float64), np.asarray(target, np.float64)
+    start, goal = np.asarray(image, np.float64), np.asarray(target, np.float64)
     pyramid = partial(
         SteerablePyramidFreq,
         height=steerable_pyramid.LEVELS,
         order=steerable_pyramid.ORIENTATIONS - 1,
     )
-    goals = pyramid(wanted).pyr_coeffs
+    goals = pyramid(goal).pyr_coeffs
 
     def run() -> Float64Array:
-        now = start
+        current = start
         for _ in range(iterations):
-            built = pyramid(now)
+            built = pyramid(current)
             for key, response in built.pyr_coeffs.items():
                 built.pyr_coeffs[key] = match_histograms(response, goals[key])
-            now = match_histograms(built.recon_pyr(), wanted)
-        return np.asarray(now)
+            current = match_histograms(built.recon_pyr(), goal)
+        return np.asarray(current)
 
     return run
 
 
-def peer_responses(image: ArrayLike) -> list[Float64Array]:
-    """Return pyrtools's responses in the order and unit of ours; its levels grow by 4 each."""
+def filter_with_peer(image: ArrayLike) -> list[Float64Array]:
+    """Return pyrtools' responses in our order and unit; pyrtools scales each level by 4."""
     from pyrtools.pyramids import SteerablePyramidFreq
 
     levels, orientations = steerable_pyramid.LEVELS, steerable_pyramid.ORIENTATIONS
@@ -182,19 +185,19 @@ def peer_responses(image: ArrayLike) -> list[Float64Array]:
 
 
 def compare_with_peer(stage: BenchmarkStage, side: int = FULL_SIDE_PX) -> None:
-    """Match one channel by turns with the peer; take down limits, or what is left out and why."""
+    """Match one channel in turn with the peer; add limits, or the omission and its reason."""
     try:
-        peer_responses(np.zeros((512, 512)))
+        filter_with_peer(np.zeros((512, 512)))
     except ImportError as error:
-        why = f"the peer is missing ({error}); to measure it: pip install 'skinrig[peers]'"
-        stage.left_out.append((f"{MIN_SPEEDUP_OVER_PYRTOOLS:g} x {PEER_NAME}", why))
+        why = f"a package is missing ({error}); run pip install 'skinrig[peers]'"
+        stage.omitted.append((f"{MIN_SPEEDUP_OVER_PYRTOOLS:g} x {PEER_NAME}", why))
         return
     rng = np.random.default_rng(0)
-    target = skin_texture(side, spots=10.0, rng=rng)[..., 1].copy()
-    source = 0.9 * skin_texture(side, spots=0.0, rng=rng)[..., 1]
+    target = synthesize_skin_texture(side, spots=10.0, rng=rng)[..., 1].copy()
+    source = 0.9 * synthesize_skin_texture(side, spots=0.0, rng=rng)[..., 1]
     space = TextureSpace.fit([target, source])
     vector = describe(target, space=space)
-    theirs = peer_iterations(source, target, 1)
+    theirs = iterate_with_peer(source, target, 1)
 
     def ours(iterations: int) -> Any:
         return match(source, vector, space=space, iterations=iterations).image
@@ -202,25 +205,25 @@ def compare_with_peer(stage: BenchmarkStage, side: int = FULL_SIDE_PX) -> None:
     own, peer = ours(1), theirs()
     ratios = []
     for _ in range(3):
-        # ours measures how far the result is off as well, which the peer's does not
+        # ours also evaluates the result's distance; the difference of two runs removes this time
         spent = [_measure_seconds(partial(ours, n)) for n in (0, FULL_ITERATIONS)]
         ratios.append(FULL_ITERATIONS * _measure_seconds(theirs) / (spent[1] - spent[0]))
-    wall, busy = np.median(ratios, axis=0)
+    wall, processor = np.median(ratios, axis=0)
     off = [_error([one.astype(np.float32)], vector, space).error for one in (own, peer)]
-    apart = [
+    differences = [
         float(np.abs(a - b).max() / source.max())
-        for a, b in zip(steerable_pyramid.analyze(source), peer_responses(source), strict=True)
+        for a, b in zip(steerable_pyramid.analyze(source), filter_with_peer(source), strict=True)
     ]
     stage.limits = {
         ("speed_up", side): float(wall),
-        ("processor", side): float(busy),
+        ("processor", side): float(processor),
         "distance": off[0] / off[1],
-        "responses": max(apart),
+        "responses": max(differences),
     }
 
 
 def _measure_seconds(call: Callable[[], Any]) -> Float64Array:
-    """Return seconds on the clock and of the processor."""
+    """Return elapsed time and processor time, s."""
     begin = time.perf_counter(), time.process_time()
     call()
     return np.array([time.perf_counter() - begin[0], time.process_time() - begin[1]])

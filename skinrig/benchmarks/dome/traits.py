@@ -1,4 +1,4 @@
-"""Benchmarks of trait vectors, and of albedo maps edited by one, against a simulated population."""
+"""Benchmarks of trait vectors and of albedo editing on a simulated population."""
 
 import dataclasses
 import time
@@ -30,20 +30,20 @@ from skinrig.traits.labels import TraitLabels
 from skinrig.traits.truth import CommonFaces
 
 TAN_MELANIN_FACTOR: Final = 1.5
-"""Factor of melanin."""
+"""Factor of melanin of the trait "tan"."""
 N_EDITED_FACES: Final = 4
-"""Faces that are edited; the traits are learned of others."""
+"""Number of edited faces; traits are learned from other faces."""
 
 
-def editing(stage: BenchmarkStage) -> None:
-    """Edit faces over iterations of matching, noise and kinds of vectors."""
+def measure_editing(stage: BenchmarkStage) -> None:
+    """Measure edited faces over matching iterations, noise and kinds of vectors."""
     count, size = (4, 64) if stage.toy else (28, 192)
-    # heads take long to build: one of them is enough to see that this runs
+    # heads take long to build; the toy size uses one
     everybody = [p for p in draw_population() if not stage.toy or p.head == 0]
     order = np.random.default_rng(0).permutation(len(everybody))[: count + N_EDITED_FACES]
-    people = [dataclasses.replace(everybody[k], applied=()) for k in order]
-    faces = CommonFaces.of(people, size=size, common=64 if stage.toy else 128)
-    learned, edited = people[:count], people[count:]
+    subjects = [dataclasses.replace(everybody[k], applied=()) for k in order]
+    faces = CommonFaces.of(subjects, size=size, common=64 if stage.toy else 128)
+    learned, edited = subjects[:count], subjects[count:]
     tanned = [p if k % 2 else _add_tan(p) for k, p in enumerate(learned)]
     rng = np.random.default_rng(1)
     samples = [faces.albedo(p, noise=0.01, rng=rng) for p in tanned]
@@ -76,7 +76,7 @@ def editing(stage: BenchmarkStage) -> None:
         first = partial(call, before[0].r_d, before[0].valid, 1.0)
         timing, _ = stage.time(first, memory=not stage.toy)
         if not stage.by_band:
-            stage.measure_bands(lambda band: _on_skin(call, faces, band.melanin, people[0]))
+            stage.measure_bands(lambda band: _on_skin(call, faces, band.melanin, subjects[0]))
         knobs: Knobs = {"vectors": kind, "iterations": iterations, "noise": noise}
         outcome = stage.add(knobs, timing, mean_error(errors))
         kept[kind, iterations, noise] = outcome.error, float(np.mean(back))
@@ -92,22 +92,23 @@ def editing(stage: BenchmarkStage) -> None:
 def _on_skin(
     edit: Callable[..., Float32Array], faces: CommonFaces, melanin: float, person: Member
 ) -> ErrorEstimate:
-    """Return the error of a tan put on one face of so much melanin, %."""
+    """Return the error of adding a tan to one face of the given melanin, %."""
     here = dataclasses.replace(person, melanin=melanin)
     rng = np.random.default_rng(2)
     one, truth = (faces.albedo(p, noise=0.0, rng=rng) for p in (here, _add_tan(here)))
     new = edit(one.r_d, one.valid, 1.0)
     good = one.valid & truth.valid
     sizes = 100 * np.abs(new / truth.r_d - 1)
-    # neighbors err alike: the face is cut into squares
-    places = [at for at in split_squares(len(good)) if good[at].any()]
-    medians = [float(np.median(sizes[at][good[at]])) for at in places]
+    # errors of neighboring texels are correlated: medians of squares are independent, and the
+    # standard error of a Gaussian median is sqrt(pi / 2) = 1.2533 that of the mean
+    squares = [at for at in split_squares(len(good)) if good[at].any()]
+    medians = [float(np.median(sizes[at][good[at]])) for at in squares]
     half = 1.2533 * float(np.std(medians)) / np.sqrt(len(medians))
     return ErrorEstimate.symmetric(float(np.median(sizes[good])), half)
 
 
 def _error_percent(r_d: FloatArray, sample: AlbedoSample, truth: AlbedoSample) -> float:
-    """Return the median error of an edited R_d where both faces are known, %."""
+    """Return the median relative error of an edited R_d where both faces are valid, %."""
     return 100 * float(np.median(np.abs(r_d / truth.r_d - 1)[sample.valid & truth.valid]))
 
 
@@ -123,11 +124,11 @@ def _edit(
     valid: BoolArray,
     amount: float,
 ) -> Float32Array:
-    """Edit a map that lies in the common map already."""
+    """Edit a map that is given in the common parameterization."""
     size = len(r_d)
-    place = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).astype(np.float64)
+    position = np.stack(np.meshgrid(np.arange(size), np.arange(size)), axis=-1).astype(np.float64)
     on = np.ones((size, size), np.bool_)
-    chart = TexelChart(size, place, on, on, np.zeros((size, size), np.float32))
+    chart = TexelChart(size, position, on, on, np.zeros((size, size), np.float32))
     found = editing_albedo.edit_albedo(
         r_d,
         valid,
@@ -144,31 +145,33 @@ def _edit(
 
 
 N_GROUP_DRAWS = 12
-"""Random choices of so many people, whose scatter is the error's."""
+"""Random groups of subjects; the error's interval is their variation."""
 N_LABEL_SHUFFLES = 200
 N_JACKKNIFE_GROUPS = 10
-"""Groups of people, each left out once, for the error of what all of them tell."""
+"""Groups of subjects, each omitted once, for the jackknife error of the fit to all."""
 MAX_LOBE_RANK = 8
 SPACE_KINDS: tuple[SpaceKind, ...] = ("pca", "nmf")
 VECTOR_KINDS: tuple[VectorKind, ...] = ("quantiles", "histograms")
 
 
-def traits(stage: BenchmarkStage) -> None:
-    """Learn lotion from fitted lobes and tan from albedo maps, over people, spaces and noise."""
-    people = draw_population()
+def measure_traits(stage: BenchmarkStage) -> None:
+    """Learn lotion from fitted lobes and tan from albedo maps over subjects, spaces and noise."""
+    subjects = draw_population()
     rng = np.random.default_rng(0)
-    some = [people[i] for i in np.sort(rng.permutation(len(people))[: 8 if stage.toy else 40])]
+    some = [subjects[i] for i in np.sort(rng.permutation(len(subjects))[: 8 if stage.toy else 40])]
     _surface(stage, some)
     _albedo(stage, some)
 
 
-def _surface(stage: BenchmarkStage, people: Sequence[Member]) -> None:
+def _surface(stage: BenchmarkStage, subjects: Sequence[Member]) -> None:
     basis = brdf_tables.default_basis()
     strength = basis.strength()
     metric = basis.cosine_similarity() * np.outer(strength, strength)
-    dressed = shift_trait(people, "lotion", products={"lotion": 0.9}, rng=np.random.default_rng(1))
+    dressed = shift_trait(
+        subjects, "lotion", products={"lotion": 0.9}, rng=np.random.default_rng(1)
+    )
     label = np.array(["lotion" in person.marks for person in dressed])
-    compared = [people[i] for i in range(0, len(people), 4 if stage.toy else 8)]
+    compared = [subjects[i] for i in range(0, len(subjects), 4 if stage.toy else 8)]
     worn = shift_trait(
         compared, "lotion", products={"lotion": 0.9}, fraction=1.0, rng=np.random.default_rng(1)
     )
@@ -179,28 +182,28 @@ def _surface(stage: BenchmarkStage, people: Sequence[Member]) -> None:
     changes = trait_truth.lobe_changes(bare, {"worn": worn}, points=points, pairs=pairs, rng=rng)
     truth = changes["worn"]
 
-    def judged(space: TraitSpace) -> float:
+    def trait_cosine(space: TraitSpace) -> float:
         return truth.cosine(space.trait("trait").vector, basis)
 
     rng = np.random.default_rng(3)
     most = 4 if stage.toy else 20
-    seen = [trait_truth.surface_points(p, most, rng=rng) for p in dressed]
-    for noise, places in ((0.02, 4),) if stage.toy else ((0.2, 20), (0.02, 5), (0.02, 20)):
+    sampled = [trait_truth.surface_points(p, most, rng=rng) for p in dressed]
+    for noise, count in ((0.02, 4),) if stage.toy else ((0.2, 20), (0.02, 5), (0.02, 20)):
         means = np.array(
             [
                 trait_truth.mean_mixture(
-                    p[:places], basis, pairs=60 if stage.toy else 160, noise=noise, rng=rng
+                    p[:count], basis, pairs=60 if stage.toy else 160, noise=noise, rng=rng
                 )
-                for p in seen
+                for p in sampled
             ]
         )
         for group in (2, 3) if stage.toy else (3, 8, int(label.sum())):
             for kind in SPACE_KINDS:
-                knobs: Knobs = {"trait": "lotion", "space": kind, "noise": noise, "points": places}
+                knobs: Knobs = {"trait": "lotion", "space": kind, "noise": noise, "points": count}
                 fit = partial(_fitted, means, label, kind, metric, basis)
-                _add(stage, knobs, fit, label, group, judged)
+                _add(stage, knobs, fit, label, group, trait_cosine)
     space = _fitted(means, label, "nmf", metric, basis, np.arange(len(means)))
-    stage.limits["lotion"] = judged(space)
+    stage.limits["lotion"] = trait_cosine(space)
     stage.limits["false_alarms", "lobes"] = _false_alarms(stage, means, metric)
     stage.limits |= _round_trip_error(means[~label], space, metric)
 
@@ -228,7 +231,7 @@ def _add(
     group: int,
     error_of: Callable[[TraitSpace], float],
 ) -> float:
-    """Learn from random groups of people; add and return the error, the median over them."""
+    """Learn from random groups of subjects; add and return the median error over the groups."""
     sides = [np.flatnonzero(label), np.flatnonzero(~label)]
     most = min(group, *(len(side) for side in sides))
     whole = most == min(len(side) for side in sides)
@@ -251,8 +254,8 @@ def _add(
     if whole:
         half = _jackknife(lambda rows: 1.0 - error_of(fit(rows)), groups[0])
         low, high = max(middle - half, 0.0), middle + half
-    spread = min(seconds), max(seconds)
-    timing = Timing(float(np.median(seconds)), spread, seconds[0], rise.mb, "resident")
+    range_s = min(seconds), max(seconds)
+    timing = Timing(float(np.median(seconds)), range_s, seconds[0], rise.mb, "resident")
     shown: Knobs = {**knobs, "people": 2 * most if not whole else len(label)}
     also = {
         "components": int(np.median(kept)),
@@ -262,9 +265,10 @@ def _add(
 
 
 def _jackknife(value: Callable[[NDArray[np.intp]], float], rows: NDArray[np.intp]) -> float:
-    """Return a value's standard error by leaving out each of `N_JACKKNIFE_GROUPS` groups."""
+    """Return a value's standard error by the jackknife over `N_JACKKNIFE_GROUPS` groups."""
     parts = np.array_split(np.random.default_rng(9).permutation(len(rows)), N_JACKKNIFE_GROUPS)
     values = [value(np.delete(rows, part)) for part in parts if part.size]
+    # delete-a-group jackknife: variance = (g - 1) / g times the sum of squared deviations
     count = len(values)
     return float(np.std(values) * np.sqrt(count - 1))
 
@@ -272,7 +276,7 @@ def _jackknife(value: Callable[[NDArray[np.intp]], float], rows: NDArray[np.intp
 def _false_alarms(
     stage: BenchmarkStage, samples: Float64Array, metric: Float64Array | None
 ) -> float:
-    """Return how often shuffled labels pass for a trait."""
+    """Return the fraction of shuffled labels that give a trait with p < 0.05."""
     rng = np.random.default_rng(6)
     passed = []
     for _ in range(10 if stage.toy else N_LABEL_SHUFFLES):
@@ -283,7 +287,7 @@ def _false_alarms(
 
 
 def _round_trip_error(faces: Float64Array, space: TraitSpace, metric: Float64Array) -> LimitValues:
-    """Edit the lobes of faces without the trait, and back again."""
+    """Return errors of adding a trait to lobes of faces without it, and of removing it again."""
     size = float(reduced_spaces.metric_lengths(space.trait("trait").vector, metric))
     rng = np.random.default_rng(7)
     worst_zero, back, off = 0.0, [], []
@@ -307,15 +311,15 @@ def _round_trip_error(faces: Float64Array, space: TraitSpace, metric: Float64Arr
     }
 
 
-def _albedo(stage: BenchmarkStage, people: Sequence[Member]) -> None:
-    tanned = shift_trait(people, "tan", melanin=TAN_MELANIN_FACTOR, rng=np.random.default_rng(1))
+def _albedo(stage: BenchmarkStage, subjects: Sequence[Member]) -> None:
+    tanned = shift_trait(subjects, "tan", melanin=TAN_MELANIN_FACTOR, rng=np.random.default_rng(1))
     label = np.array(["tan" in person.marks for person in tanned])
-    faces = CommonFaces.of(people, size=64 if stage.toy else 128, common=48 if stage.toy else 80)
+    faces = CommonFaces.of(subjects, size=64 if stage.toy else 128, common=48 if stage.toy else 80)
     inside = common_regions.region_mask("face", faces.frame)
-    compared = list(range(0, len(people), 4))
-    seen = list(range(2, len(people), 4))
+    compared = list(range(0, len(subjects), 4))
+    recaptured = list(range(2, len(subjects), 4))
     after = shift_trait(
-        people, "tan", melanin=TAN_MELANIN_FACTOR, fraction=1.0, rng=np.random.default_rng(1)
+        subjects, "tan", melanin=TAN_MELANIN_FACTOR, fraction=1.0, rng=np.random.default_rng(1)
     )
     for noise in (0.01,) if stage.toy else (0.01, 0.1):
         maps = [
@@ -324,16 +328,16 @@ def _albedo(stage: BenchmarkStage, people: Sequence[Member]) -> None:
         ]
         clean = [
             [faces.albedo(group[i], noise=0.0, rng=np.random.default_rng(0)) for i in compared]
-            for group in (people, after)
+            for group in (subjects, after)
         ]
-        # People who are seen without and with the trait; the truth is of others
+        # subjects that are captured without and with the trait; the ground truth is of others
         twice = [
             faces.albedo(group[i], noise=noise, rng=np.random.default_rng([9, i, k]))
-            for k, group in enumerate((people, after))
-            for i in seen
+            for k, group in enumerate((subjects, after))
+            for i in recaptured
         ]
         for kind in VECTOR_KINDS:
-            names = tuple(p.name for p in people)
+            names = tuple(p.name for p in subjects)
             spaces = fitting_traits.fit_albedo_spaces(
                 maps, TraitLabels(names, {"trait": label}, {}, ()), faces.frame, kind, left_out=[]
             )
@@ -342,7 +346,7 @@ def _albedo(stage: BenchmarkStage, people: Sequence[Member]) -> None:
             truth = (with_it - before).mean(axis=0)
             rows, pairs = vectors(maps), vectors(twice)
 
-            def judged(space: TraitSpace) -> float:
+            def trait_cosine(space: TraitSpace) -> float:
                 return cosine(space.trait("trait").vector, truth)
 
             knobs: Knobs = {"trait": "tan", "space": f"pca of {kind}", "noise": noise}
@@ -350,13 +354,13 @@ def _albedo(stage: BenchmarkStage, people: Sequence[Member]) -> None:
                 for components in (None, 1) if stage.toy else (None, 1, 4):
                     asked = knobs | {"asked": components or "chosen"}
                     fit = partial(_learned, rows, label, components)
-                    _add(stage, asked, fit, label, group, judged)
-            tan = np.arange(len(pairs)) >= len(seen)
+                    _add(stage, asked, fit, label, group, trait_cosine)
+            tan = np.arange(len(pairs)) >= len(recaptured)
             fit, asked = partial(_learned, pairs, tan, None), knobs | {"asked": "seen twice"}
-            error = _add(stage, asked, fit, tan, len(pairs), judged)
-            # Plain histograms are measured, and miss it: their points say by how much
+            error = _add(stage, asked, fit, tan, len(pairs), trait_cosine)
+            # plain histograms miss this limit; their points give the error
             if noise == 0.01 and kind == "quantiles":
-                stage.limits["tan", kind, len(seen)] = 1.0 - error
+                stage.limits["tan", kind, len(recaptured)] = 1.0 - error
                 stage.limits["false_alarms", "albedo"] = _false_alarms(stage, rows, None)
 
 

@@ -1,4 +1,4 @@
-"""Benchmark of expression images laid over neutral, and of what a misalignment does to blends."""
+"""Benchmark of aligning expression images to neutral, and of blends of misaligned maps."""
 
 from dataclasses import dataclass
 
@@ -19,25 +19,25 @@ from skinrig.benchmarks.stage import BenchmarkStage
 Points = dict[str, tuple[float, float]]
 
 LANDMARK_NOISE_PX = 1.0
-"""Standard deviation along each axis of where somebody places a landmark."""
+"""Standard deviation of a manually placed landmark along each axis, px."""
 TABLE_CAMERA, TABLE_ILLUMINANT = "Nikon 5100 (NPL)", "D65"
 
 
 def smooth_displacement(
     side: int, *, bend_px: float, rms_px: float, rng: np.random.Generator
 ) -> Float64Array:
-    """Return a smooth random displacement.
+    """Draw a smooth random displacement field.
 
     Parameters
     ----------
     side
-        Pixels a side.
+        Side of the image, px.
     bend_px
         Standard deviation of the Gaussian that smooths white noise, px.
     rms_px
         Root mean square length of the displacement, px.
     rng
-        Draws it.
+        Generator of the noise.
 
     Returns
     -------
@@ -52,24 +52,24 @@ def smooth_displacement(
 
 @dataclass(frozen=True, slots=True)
 class DisplacedFace:
-    """Two pictures of a simulated face's texture, with what is known of them.
+    """Two images of a simulated face's texture, with their ground truth.
 
     Attributes
     ----------
     neutral, moving : ndarray of float32, shape (N, N, 3)
-        White-balanced linear camera RGB of diffuse light, with noise; the second in a state of
-        blood, and moved.
+        White-balanced linear camera RGB of the diffuse reflection, with noise; the second with an
+        expression's blood, and displaced.
     variance_neutral, variance_moving : ndarray of float32, shape (N, N, 3)
     valid, valid_moving : ndarray of bool, shape (N, N)
-        Skin in each.
+        Masks of skin.
     source_px : ndarray of float64, shape (N, N, 2)
-        Where each pixel of the neutral picture is in the moving one.
+        Position in the moving image of each pixel of the neutral image.
     landmarks, landmarks_moving : dict
-        Points spread over the face, as somebody placed them.
+        Points distributed over the face, with placement errors.
     melanin, hemoglobin, hemoglobin_at_rest : ndarray of float32, shape (N, N)
-        Of the neutral picture, and the state's blood seen on it.
+        Maps of the neutral image, and the expression's blood at the neutral positions.
     hemoglobin_moving : ndarray of float32, shape (N, N)
-        The state's blood where the moving picture shows it.
+        The expression's blood at the positions of the moving image.
     """
 
     neutral: Float32Array
@@ -87,7 +87,7 @@ class DisplacedFace:
     hemoglobin_moving: Float32Array
 
     def align(self, landmarks: int, rounds: int) -> expression_alignment.Alignment:
-        """Lay the moving picture over the neutral one by so many landmarks and rounds of flow."""
+        """Align the moving image to the neutral one with `landmarks` and `rounds` of flow."""
         names = list(self.landmarks)[:landmarks]
         return expression_alignment.align(
             self.moving,
@@ -100,17 +100,17 @@ class DisplacedFace:
         )
 
     def errors_px(self, found: expression_alignment.Alignment) -> Float64Array:
-        """Return how far each aligned pixel is from its place, px, (n,)."""
+        """Return the distance of each aligned pixel from its true position, px, (n,)."""
         return np.asarray(np.linalg.norm(found.source_px - self.source_px, axis=-1)[found.valid])
 
 
-def table() -> ColorTable:
-    """Return the color table that pictures are made with."""
+def load_color_table() -> ColorTable:
+    """Build the color table from which the images are synthesized."""
     return color_table.build(TABLE_CAMERA, TABLE_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
 
 
 def face_mask(side: int) -> BoolArray:
-    """Return where a texture shows the face."""
+    """Return the mask of the face in a texture, an ellipse, (side, side)."""
     y, x = np.mgrid[:side, :side] / (side - 1.0) - 0.5
     return np.asarray((x / 0.34) ** 2 + (y / 0.40) ** 2 < 1.0)
 
@@ -118,7 +118,7 @@ def face_mask(side: int) -> BoolArray:
 def sample_displaced(
     image: Float64Array, displacement_px: Float64Array, order: int = 3
 ) -> Float64Array:
-    """Return an image (N, N) at places that are away from each pixel by columns and rows."""
+    """Sample an image (N, N) at each pixel plus its displacement (column, row), px."""
     rows, columns = np.indices(image.shape, np.float64)
     at = [rows + displacement_px[..., 1], columns + displacement_px[..., 0]]
     return np.asarray(map_coordinates(image, at, order=order, mode="nearest"))
@@ -133,39 +133,40 @@ def displace_face(
     landmarks: int = 24,
     rng: np.random.Generator,
 ) -> DisplacedFace:
-    """Picture a face in neutral, and moved in a state of its blood.
+    """Synthesize a neutral image of a face, and a displaced one with an expression's blood.
 
     Parameters
     ----------
     face
-        Its texture is the neutral picture.
+        Subject whose texture is the neutral image.
     displacement_px
-        (N, N, 2): where each pixel goes. It must not fold.
+        (N, N, 2): displacement of each pixel; it must not fold.
     state
-        Of `rigsim.subject.perfusion.STATE_NAMES`.
+        One of `rigsim.subject.perfusion.STATE_NAMES`.
     noise
         Relative standard deviation of each channel of each pixel.
     landmarks
-        How many somebody placed.
+        Number of landmarks.
     rng
-        Draws noise.
+        Generator of noise and placement errors.
     """
     side = face.size
     back = np.zeros_like(displacement_px)
+    # fixed-point iteration of the inverse displacement: b(x) = -d(x + b(x))
     for _ in range(60):
         back = -np.stack(
             [sample_displaced(displacement_px[..., k], back, 1) for k in range(2)], axis=-1
         )
-    colors = table()
+    colors = load_color_table()
     light = 0.75 * np.clip(face.normal[..., 2], 0.05, 1.0)
     rest = face.hemoglobin(state)
     mask = face_mask(side)
-    pictures, variances = [], []
+    images, variances = [], []
     for blood, moved in ((face.hemoglobin(), False), (rest, True)):
         clean = colors.lookup(face.melanin, blood) * light[..., None]
         if moved:
             clean = np.stack([sample_displaced(clean[..., k], back) for k in range(3)], axis=-1)
-        pictures.append((clean * (1.0 + noise * rng.standard_normal(clean.shape))).astype("f4"))
+        images.append((clean * (1.0 + noise * rng.standard_normal(clean.shape))).astype("f4"))
         variances.append(((noise * clean) ** 2).astype("f4"))
     points = farthest_point_sample(mask, landmarks)
     gone = points + displacement_px[points[:, 1], points[:, 0]]
@@ -177,8 +178,8 @@ def displace_face(
         for p in (points.astype(np.float64), gone)
     ]
     return DisplacedFace(
-        pictures[0],
-        pictures[1],
+        images[0],
+        images[1],
         variances[0],
         variances[1],
         mask,
@@ -194,24 +195,24 @@ def displace_face(
 
 
 def farthest_point_sample(mask: BoolArray, count: int) -> NDArray[np.intp]:
-    """Return points (count, 2), column and row, spread over a mask: each farthest from others."""
+    """Sample points of a mask, each farthest from those before it; column and row (count, 2)."""
     inner = distance_transform_edt(mask) > 0.02 * mask.shape[0]
-    places = np.argwhere(inner)[:, ::-1]
-    chosen = [int(np.argmin(places[:, 1]))]
-    away = np.linalg.norm(places - places[chosen[0]], axis=1)
+    candidates = np.argwhere(inner)[:, ::-1]
+    chosen = [int(np.argmin(candidates[:, 1]))]
+    distance = np.linalg.norm(candidates - candidates[chosen[0]], axis=1)
     while len(chosen) < count:
-        chosen.append(int(away.argmax()))
-        away = np.minimum(away, np.linalg.norm(places - places[chosen[-1]], axis=1))
-    return places[chosen]
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(candidates - candidates[chosen[-1]], axis=1))
+    return candidates[chosen]
 
 
 def measure_alignment(stage: BenchmarkStage) -> None:
-    """Align moved faces by landmarks few and many, by features, with and without dense flow."""
+    """Measure alignment by few and many landmarks, by features, with and without dense flow."""
     side = 128 if stage.toy else 512
     rng = np.random.default_rng(1)
     face = make_subject("III", seed=2, size=side)
     away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
-    seen = displace_face(face, away, state="exercise", noise=0.005, landmarks=48, rng=rng)
+    displaced = displace_face(face, away, state="exercise", noise=0.005, landmarks=48, rng=rng)
     still = displace_face(face, np.zeros_like(away), state="exercise", noise=0.005, rng=rng)
     effort = [(8, 0), (24, 0), (48, 0), (24, 2)]
     if not stage.toy:
@@ -219,17 +220,17 @@ def measure_alignment(stage: BenchmarkStage) -> None:
         effort = [(8, 0), (8, 2), *((24, n) for n in (0, 1, 2, 4)), *both]
     for count, rounds in effort:
         timing, found = stage.time(
-            lambda: seen.align(count, rounds), repeats=1, memory=(count, rounds) == (24, 2)
+            lambda: displaced.align(count, rounds), repeats=1, memory=(count, rounds) == (24, 2)
         )
-        error = seen.errors_px(found)
+        error = displaced.errors_px(found)
         if (count, rounds) == (24, 2):
             covered = float((error < 2.0 * found.error_px[found.valid]).mean())
         knobs = {"by": found.by, "landmarks": count, "rounds": rounds}
         stage.add(knobs, timing, _rms(error, side))
     stage.measure_bands(lambda band: _on_skin(band.preset, 128 if stage.toy else 256))
-    stage.words["moved_px"] = side / 50
+    stage.description_values["moved_px"] = side / 50
     if not stage.toy:
-        bare, dense = (stage.at(landmarks=24, rounds=n) for n in (0, 2))
+        bare, dense = (stage.find_point(landmarks=24, rounds=n) for n in (0, 2))
         stage.limits = {
             "false_motion": float(np.median(still.errors_px(still.align(24, 2)))),
             "covered": covered,
@@ -239,21 +240,23 @@ def measure_alignment(stage: BenchmarkStage) -> None:
 
 
 def _on_skin(preset: str, side: int) -> ErrorEstimate:
-    """Return the error on skin of a preset: 24 landmarks and dense flow, 1 % of noise."""
+    """Return the error on skin of a preset with 24 landmarks, dense flow and 1 % noise."""
     rng = np.random.default_rng(4)
     away = smooth_displacement(side, bend_px=side / 10, rms_px=side / 50, rng=rng)
-    seen = displace_face(make_subject(preset, seed=2, size=side), away, state="exercise", rng=rng)
-    return _rms(seen.errors_px(seen.align(24, 2)), side)
+    displaced = displace_face(
+        make_subject(preset, seed=2, size=side), away, state="exercise", rng=rng
+    )
+    return _rms(displaced.errors_px(displaced.align(24, 2)), side)
 
 
 MISALIGNMENTS_PX = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
 
 
 def measure_misalignment(stage: BenchmarkStage) -> None:
-    """Blend from maps that were put in a wrong place on purpose, beside interpolating them.
+    """Compare blending by local statistics with interpolation of misaligned maps.
 
-    The paper's claim (Jimenez et al. 2010, section 4.2) is that local statistics bear alignments
-    that are not perfect, and interpolated maps do not.
+    Jimenez et al. 2010, section 4.2, state that local statistics tolerate imperfect alignment and
+    interpolated maps do not.
     """
     side = 128 if stage.toy else 512
     face = make_subject("III", seed=2, size=side)
@@ -282,13 +285,13 @@ def measure_misalignment(stage: BenchmarkStage) -> None:
                 knobs |= {"radius_px": radius} if radius else {}
                 stage.add(knobs, timing, outcome)
         if not stage.toy:
-            kept = stage.at(state=state, off_px=2.0, way="interpolated")
-            blend = stage.at(state=state, off_px=2.0, radius_px=16.0)
+            kept = stage.find_point(state=state, off_px=2.0, way="interpolated")
+            blend = stage.find_point(state=state, off_px=2.0, radius_px=16.0)
             stage.limits["ratio", state] = kept.error / blend.error
 
 
 def displace_map(image: Float64Array, rms_px: float, *, rng: np.random.Generator) -> Float64Array:
-    """Return a map seen at places that are off by a smooth random displacement of so many px."""
+    """Displace a map by a smooth random field of the given RMS length, px."""
     if rms_px == 0.0:
         return image
     side = image.shape[0]
@@ -298,9 +301,10 @@ def displace_map(image: Float64Array, rms_px: float, *, rng: np.random.Generator
 
 
 def _rms(values: Float64Array, side: int) -> ErrorEstimate:
-    """Return a root mean square over pixels that go together in patches, with its interval."""
+    """Return a root mean square over pixels that are correlated within patches, with interval."""
     squares = np.square(values)
+    # pixels are correlated over side / 10: the number of independent values is that of patches
     patches = max(values.size / (side / 10.0) ** 2, 2.0)
-    mean, spread = float(squares.mean()), float(squares.std()) / np.sqrt(patches)
-    low, high = np.sqrt([max(mean - spread, 0.0), mean + spread]).tolist()
+    mean, stderr = float(squares.mean()), float(squares.std()) / np.sqrt(patches)
+    low, high = np.sqrt([max(mean - stderr, 0.0), mean + stderr]).tolist()
     return ErrorEstimate(float(np.sqrt(mean)), (low, high))

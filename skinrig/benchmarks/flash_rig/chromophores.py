@@ -1,4 +1,4 @@
-"""Benchmarks of the chromophore inversion: of one picture, and of states with one melanin."""
+"""Benchmarks of the chromophore inversion of one image and of expressions with shared melanin."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.facial_color import shared_melanin
 from rigsim.subject import make_subject
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.flash_rig.alignment import face_mask, table
-from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
+from skinrig.benchmarks.flash_rig.alignment import face_mask, load_color_table
+from skinrig.benchmarks.measurement import LIMIT_CORES, measure_processor_seconds
 from skinrig.benchmarks.resampling import median_error
 from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -31,11 +31,11 @@ from skinrig.evaluating.skin_bands import MelaninBand
 CHANNEL_NOISE = 0.01
 SHADING_MODES: dict[str, Literal["known"] | None] = {"known": "known", "free": None}
 MIN_MELANIN = 0.004
-"""Volume fraction of the palest skin that is drawn."""
+"""Melanosome volume fraction of the palest skin that is drawn."""
 
 
-def inversion(stage: BenchmarkStage) -> None:
-    """Invert a noisy picture with the shading known and free, through tables of several sizes."""
+def measure_inversion(stage: BenchmarkStage) -> None:
+    """Measure the inversion of a noisy image with known and free shading over table sizes."""
     side, pixels = (96, 8) if stage.toy else (2048, 40)
     rng = np.random.default_rng(0)
     table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
@@ -44,7 +44,7 @@ def inversion(stage: BenchmarkStage) -> None:
     c_hd = 0.05 + 0.03 * np.cos(8 * x + 3 * y)
     color = np.concatenate([table.lookup(m, h) for m, h in zip(c_m, c_hd, strict=True)])
     noisy = (color * (1 + CHANNEL_NOISE * rng.standard_normal(color.shape))).astype(np.float32)
-    picture = noisy.reshape(side, side, 3)
+    image = noisy.reshape(side, side, 3)
     variance = (CHANNEL_NOISE * color.reshape(side, side, 3)).astype(np.float32) ** 2
     for shading in SHADING_MODES:
         for size in (16, 128) if stage.toy else (16, 32, 64, 128):
@@ -53,13 +53,13 @@ def inversion(stage: BenchmarkStage) -> None:
             )
             timing, found = stage.time(
                 lambda: chromophores.invert(
-                    picture, coarse, shading=SHADING_MODES[shading], variance=variance
+                    image, coarse, shading=SHADING_MODES[shading], variance=variance
                 )
             )
             outcome = _error(found, c_m, rng)
             stage.add({"shading": shading, "table": size}, timing, outcome)
         if shading == "free":
-            peer_s = _time_scipy_fit(picture.reshape(-1, 3)[:: side * side // pixels], table)
+            peer_s = _time_scipy_fit(image.reshape(-1, 3)[:: side * side // pixels], table)
             ours_s = timing.seconds / side**2
             stage.limits = {("seconds", side): timing.seconds, "speed_up": peer_s / ours_s}
     count = 500 if stage.toy else 20_000
@@ -85,13 +85,13 @@ def _error(
 ) -> ErrorEstimate:
     """Return the median error of melanin, %."""
     off = 100 * np.abs(found.melanin / c_m - 1)[found.valid]
-    # the median of |error| of a normal error of the bound's size
+    # median of |error| of a normal error: 0.6745 standard deviations
     bound = 67.45 * float(np.median((found.stderr_melanin / c_m)[found.valid]))
     return median_error(off, bound, rng=rng)
 
 
 def _time_scipy_fit(rgb: FloatArray, table: color_table.ColorTable) -> float:
-    """Return seconds a pixel of a plain fit of cube roots and log shading."""
+    """Return the seconds per pixel of SciPy's least squares in cube roots and log shading."""
     start = time.perf_counter()
     for color in rgb:
 
@@ -107,51 +107,53 @@ STATE_NAMES = ("neutral", "smile", "anger", "fear", "happiness", "sadness", "sur
 SUPERPIXEL_NOISE = 0.003
 """Relative noise of a superpixel of the flash rig's camera on light skin."""
 LIGHT_CHANGE = 0.05
-"""How much the light of a state differs, smoothly over the face."""
+"""Amplitude of the smooth relative change of illumination between expressions."""
 FULL_SIDE_PX = 1024
 
 
 def measure_shared_melanin(stage: BenchmarkStage) -> None:
-    """Invert 1 to 7 states together, the light free or smooth, beside each state alone."""
+    """Measure joint inversion of 2 to 7 expressions against separate inversion of each."""
     side = 64 if stage.toy else 192
-    model = _ChromophoreModel(table(), shading_prior.face_prior(), model_error.load_covariance())
-    seen = _StateImages.of("II", side, STATE_NAMES, model)
+    model = _ChromophoreModel(
+        load_color_table(), shading_prior.face_prior(), model_error.load_covariance()
+    )
+    images = _StateImages.of("II", side, STATE_NAMES, model)
 
-    def alone() -> Float64Array:
+    def invert_separately() -> Float64Array:
         each = [
             chromophore_posterior.estimate(
-                seen.rgb[k],
+                images.rgb[k],
                 model.colors,
                 prior=model.prior,
-                variance=seen.variance[k],
+                variance=images.variance[k],
                 model_error=model.covariance,
-                valid=seen.mask,
+                valid=images.mask,
             )
             for k in (0, 1)
         ]
         return np.asarray(each[1].hemoglobin - each[0].hemoglobin, np.float64)
 
-    def together(count: int, window: float | None) -> shared_melanin.SharedMelanin:
-        return seen.invert_jointly(count, window, model)
+    def invert_jointly(count: int, window: float | None) -> shared_melanin.SharedMelanin:
+        return images.invert_jointly(count, window, model)
 
     def add(knobs: Knobs, call: Callable[[], Any], change: Callable[[Any], Float64Array]) -> None:
         timing, made = stage.time(call, repeats=1, memory=False)
-        stage.add(knobs, timing, _dense_error(seen.errors(change(made))))
+        stage.add(knobs, timing, _dense_error(images.errors(change(made))))
 
-    add({"way": "each alone", "states": 2}, alone, lambda made: made)
+    add({"way": "each alone", "states": 2}, invert_separately, lambda made: made)
     settings: list[tuple[int, float | None]] = [(2, None), (3, None), (2, 3.0)]
     if not stage.toy:
         settings = [(2, None), (4, None), (7, None), (7, 3.0), (7, 8.0)]
     for count, window in settings:
         knobs: Knobs = {"way": "together", "states": count, "light": window or "free"}
-        add(knobs, lambda: together(count, window), lambda made: made.change[1])
+        add(knobs, lambda: invert_jointly(count, window), lambda made: made.change[1])
     stage.measure_bands(lambda band: _on_skin(band.preset, side, model))
     if not stage.toy:
-        found = together(7, 3.0)
-        stated = found.stderr_change[1][seen.mask]
+        found = invert_jointly(7, 3.0)
+        stated = found.stderr_change[1][images.mask]
         stage.limits = {
             "over_alone": stage.points[0].error / stage.points[4].error,
-            "within": float(np.mean(seen.errors(found.change[1]) < 2.0 * stated)),
+            "within": float(np.mean(images.errors(found.change[1]) < 2.0 * stated)),
             **_melanin_limits(model),
             **_full_size(model),
         }
@@ -166,10 +168,10 @@ def simulate_colors(
     rng: np.random.Generator,
     noise: float = SUPERPIXEL_NOISE,
 ) -> tuple[Float32Array, Float32Array]:
-    """Return colors (S, H, W, 3) of one melanin and S bloods, and their variance.
+    """Simulate colors (S, H, W, 3) of one melanin map and S blood maps; return also their variance.
 
-    Each pixel has an error of the model that all its states share, and each state a light that
-    differs smoothly over the face.
+    Each pixel has one model error, common to all expressions. Each expression has an illumination
+    that varies smoothly over the face.
     """
     rows, columns = np.mgrid[: melanin.shape[0], : melanin.shape[1]] / melanin.shape[0]
     light = np.stack(
@@ -181,20 +183,20 @@ def simulate_colors(
     shared = rng.multivariate_normal(np.zeros(3), covariance, melanin.shape)
     clean = colors.lookup(np.broadcast_to(melanin, blood.shape), blood)
     clean = clean * np.exp(shared) * light[..., None]
-    seen = clean * (1.0 + noise * rng.standard_normal(clean.shape))
-    return seen.astype(np.float32), ((noise * clean) ** 2).astype(np.float32)
+    noisy = clean * (1.0 + noise * rng.standard_normal(clean.shape))
+    return noisy.astype(np.float32), ((noise * clean) ** 2).astype(np.float32)
 
 
 def _on_skin(preset: str, side: int, model: _ChromophoreModel) -> ErrorEstimate:
-    """Return the error of smile's change of blood on skin of a preset, three states together."""
-    seen = _StateImages.of(preset, side, STATE_NAMES[:3], model)
-    found = seen.invert_jointly(3, 3.0, model)
-    return median_error(seen.errors(found.change[1]))
+    """Return the error of a smile's change of blood on a preset's skin, three states jointly."""
+    images = _StateImages.of(preset, side, STATE_NAMES[:3], model)
+    found = images.invert_jointly(3, 3.0, model)
+    return median_error(images.errors(found.change[1]))
 
 
 @dataclass(frozen=True, slots=True)
 class _ChromophoreModel:
-    """What inversions know of all faces."""
+    """Color table, shading prior and model error that all inversions use."""
 
     colors: ColorTable
     prior: ShadingPrior
@@ -203,6 +205,7 @@ class _ChromophoreModel:
     def invert(
         self, rgb: Float32Array, variance: Float32Array, **options: Any
     ) -> shared_melanin.SharedMelanin:
+        """Estimate one melanin map and the blood of each state from colors (S, H, W, 3)."""
         return shared_melanin.estimate_shared_melanin(
             rgb,
             self.colors,
@@ -215,7 +218,7 @@ class _ChromophoreModel:
 
 @dataclass(frozen=True, slots=True)
 class _StateImages:
-    """Pictures of a face in states of its blood."""
+    """Images of a face with several expressions, and their ground truth."""
 
     rgb: Float32Array
     variance: Float32Array
@@ -226,53 +229,55 @@ class _StateImages:
     def of(
         cls, preset: str, side: int, names: Sequence[str], model: _ChromophoreModel
     ) -> _StateImages:
+        """Simulate the colors of a preset's face in the named states."""
         face = make_subject(preset, seed=3, size=side)
         blood = np.stack([face.hemoglobin(name) for name in names]).astype(np.float64)
         rng = np.random.default_rng(0)
-        seen = simulate_colors(model.colors, face.melanin, blood, model.covariance, rng=rng)
-        return cls(*seen, blood, face_mask(side))
+        noisy = simulate_colors(model.colors, face.melanin, blood, model.covariance, rng=rng)
+        return cls(*noisy, blood, face_mask(side))
 
     def invert_jointly(
         self, count: int, window: float | None, model: _ChromophoreModel
     ) -> shared_melanin.SharedMelanin:
-        """Invert the first states together, the light smooth in a window, px, or free."""
+        """Invert the first states jointly, with light smooth in a window, px, or free (None)."""
         valid = np.broadcast_to(self.mask, self.blood[:count].shape)
         return model.invert(
             self.rgb[:count], self.variance[:count], valid=valid, shading_window_px=window
         )
 
     def errors(self, change: Float64Array) -> Float64Array:
-        """Return how far the second state's change of blood is off, (n,)."""
+        """Return absolute errors of the second state's change of blood, (n,)."""
         return np.asarray(np.abs(change - (self.blood[1] - self.blood[0]))[self.mask])
 
 
 def _dense_error(errors: Float64Array) -> ErrorEstimate:
-    """Return the median; its interval is by the density about it."""
+    """Return the median of many errors with its 68 % interval."""
     errors = errors[np.isfinite(errors)]
+    # the rank of a sample median has the standard deviation sqrt(n) / 2, 0.5 / sqrt(n) in quantile
     low, high = np.quantile(errors, 0.5 + np.array([-0.5, 0.5]) / np.sqrt(errors.size))
     return ErrorEstimate(float(np.median(errors)), (float(low), float(high)))
 
 
 def _melanin_limits(model: _ChromophoreModel) -> LimitValues:
-    """Check how melanin's variance by noise goes with the number of states."""
+    """Return the ratio of melanin's noise variance between 1 and 7 expressions."""
     rng = np.random.default_rng(1)
     variances = {}
     for count in (1, 7):
         clean = 0.6 * np.broadcast_to(model.colors.lookup(0.02, 0.025), (count, 4000, 3))
-        seen = clean * (1.0 + 2e-3 * rng.standard_normal(clean.shape))
+        noisy = clean * (1.0 + 2e-3 * rng.standard_normal(clean.shape))
         found = shared_melanin.estimate_shared_melanin(
-            seen, model.colors, prior=model.prior, variance=(2e-3 * clean) ** 2
+            noisy, model.colors, prior=model.prior, variance=(2e-3 * clean) ** 2
         )
         variances[count] = float(found.melanin.var())
     return {"melanin": variances[1] / variances[7]}
 
 
 def _full_size(model: _ChromophoreModel) -> LimitValues:
-    """Time 7 states of a megapixel by a band of it."""
+    """Return processor seconds for 7 states of a megapixel, extrapolated from a band of rows."""
     rng = np.random.default_rng(2)
     band = 96
     melanin = np.full((band, FULL_SIDE_PX), 0.02)
     blood = 0.32 * rng.uniform(0.35, 0.5, (len(STATE_NAMES), band, FULL_SIDE_PX)) ** 3
-    seen = simulate_colors(model.colors, melanin, blood, model.covariance, rng=rng)
-    run = partial(model.invert, *seen, shading_window_px=shared_melanin.SHADING_WINDOW_PX)
-    return {"seconds": processor_seconds(run, 2) * FULL_SIDE_PX / band / LIMIT_CORES}
+    noisy = simulate_colors(model.colors, melanin, blood, model.covariance, rng=rng)
+    run = partial(model.invert, *noisy, shading_window_px=shared_melanin.SHADING_WINDOW_PX)
+    return {"seconds": measure_processor_seconds(run, 2) * FULL_SIDE_PX / band / LIMIT_CORES}

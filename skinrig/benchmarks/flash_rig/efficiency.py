@@ -1,9 +1,8 @@
-"""How near estimators come to the Cramér-Rao bound, over subjects from light to dark.
+"""Benchmark of estimators' efficiency against the Cramér-Rao bound, from light to dark skin.
 
-Each estimator is given data that its own model made, with noise of known variance: then nothing
-but its use of the data is measured, as the mean squared error over the least that any unbiased
-estimator can have. Bounds are taken from each forward equation by differences, not from the
-estimator's own standard errors.
+Each estimator receives data of its own model with noise of known variance, so that the result
+depends only on its use of the data. The error is the mean squared error over that bound. Bounds are
+computed from each forward equation by differences, not from the estimator's standard errors.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -25,21 +24,21 @@ from skinrig.evaluating.skin_bands import MELANIN_BANDS, classify_melanin
 
 @dataclass(frozen=True, slots=True)
 class EstimatorTrial:
-    """An estimator on draws of one subject."""
+    """Estimator with noise draws of one subject."""
 
     squared_errors: Callable[[], Float64Array]
-    """Makes the squared errors of the draws."""
+    """Function that computes the squared errors of the draws."""
     bound: float
     """Cramér-Rao bound on their mean."""
     noise: float
     """Relative noise of a reading."""
-    clear: float = np.inf
-    """Bounds between what is sought and 0, where it cannot be negative."""
+    sigmas_above_zero: float = np.inf
+    """True value over the bound's standard deviation, for quantities that cannot be negative."""
 
 
 @dataclass(frozen=True, slots=True)
 class TypicalSkin:
-    """Typical skin."""
+    """Parameters of typical skin of a preset."""
 
     melanin: float
     hemoglobin: float
@@ -57,20 +56,20 @@ TYPICAL_SKINS: Final = {
     "VI": TypicalSkin(0.17, 0.05, 0.1, 0.3, 1.0),
 }
 MIN_MEASURED_SIGMAS, MIN_EVALUATED_SIGMAS = 2.5, 10.0
-"""Standard errors between a fraction and 0. Below the first an estimate that cannot be negative is
-cut off, and a bound on unbiased ones says nothing of it. Below the second the color bends within
-the error, so that no estimator reaches the bound: it is measured there, but not judged."""
+"""Minimum distance of a fraction from 0, in standard errors. Below the first, nonnegative estimates
+are clipped, and the bound of unbiased estimators does not apply. Below the second, the color is
+nonlinear within the error and no estimator reaches the bound: it is measured, but not evaluated."""
 CHANNEL_NOISES: Final = (0.004, 0.002, 0.001, 0.0005)
-"""Relative noise of each channel: that of a usual picture; then the first at which all is linear,
-down to the mean of 64 such pixels."""
+"""Relative noise per channel: first that of a typical image; lower ones, down to the mean of 64
+pixels, are tried until the colors are linear within the noise."""
 ALBEDO_NOISE = 0.02
-"""Relative noise of a sample of the BRDF."""
+"""Relative noise of a BRDF sample."""
 FIBER_NOISE = 0.01
 """Relative noise of each fiber."""
 
 
-def efficiency(stage: BenchmarkStage) -> None:
-    """Measure mean squared errors over Cramér-Rao bounds."""
+def measure_efficiency(stage: BenchmarkStage) -> None:
+    """Measure mean squared errors over Cramér-Rao bounds of each estimator and subject."""
     draws = 500 if stage.toy else 20_000
     worst = stage.by_band
     for name, made in _ESTIMATOR_TRIALS.items():
@@ -78,39 +77,41 @@ def efficiency(stage: BenchmarkStage) -> None:
         for subject, trial in made(draws):
             timing, squared = stage.time(trial.squared_errors, repeats=1)
             ratio = float(squared.mean()) / trial.bound
-            spread = float(squared.std() / np.sqrt(len(squared))) / trial.bound
+            stderr = float(squared.std() / np.sqrt(len(squared))) / trial.bound
             knobs: Knobs = {"estimator": name, "subject": subject}
             knobs["noise_percent"] = round(100 * trial.noise, 2)
-            judged = trial.clear >= MIN_EVALUATED_SIGMAS
-            outcome = ErrorEstimate.symmetric(ratio, spread, 1.0)
-            stage.add(knobs, timing, outcome, {"judged": judged})
-            if judged:
+            evaluated = trial.sigmas_above_zero >= MIN_EVALUATED_SIGMAS
+            outcome = ErrorEstimate.symmetric(ratio, stderr, 1.0)
+            stage.add(knobs, timing, outcome, {"judged": evaluated})
+            if evaluated:
                 ratios[str(classify_melanin(TYPICAL_SKINS[subject].melanin))].append(
-                    (ratio, spread)
+                    (ratio, stderr)
                 )
-        stage.left_out += _excluded_subjects(name, stage.points)
+        stage.omitted += _excluded_subjects(name, stage.points)
         for band, pairs in ratios.items():
             if not pairs:
                 continue
-            each, spreads = np.array(pairs).T
+            each, stderrs = np.array(pairs).T
             ratio = float(np.mean(each))
-            spread = float(np.sqrt(np.sum(spreads**2))) / len(pairs)
-            # what so many draws leave open of the ratio counts for the estimator
-            stage.limits["ratio", name, band] = ratio - 2.0 * spread
+            stderr = float(np.sqrt(np.sum(stderrs**2))) / len(pairs)
+            # the limit applies to the lower end of the ratio's 95 % interval
+            stage.limits["ratio", name, band] = ratio - 2.0 * stderr
             if band not in worst or ratio > worst[band].error:
-                worst[band] = ErrorEstimate.symmetric(ratio, spread, 1.0)
+                worst[band] = ErrorEstimate.symmetric(ratio, stderr, 1.0)
 
 
 def _excluded_subjects(name: str, points: Sequence[Point]) -> list[tuple[str, str]]:
-    """Return the subjects of whom an estimator was not judged."""
-    judged = {
-        p.knobs["subject"] for p in points if p.knobs["estimator"] == name and p.also["judged"]
+    """Return the subjects for which an estimator was not evaluated, with the reason."""
+    evaluated = {
+        p.knobs["subject"]
+        for p in points
+        if p.knobs["estimator"] == name and p.extra_values["judged"]
     }
     why = (
-        f"a fraction is nearer to 0 than {MIN_EVALUATED_SIGMAS:g} bounds even at "
-        f"{100 * CHANNEL_NOISES[-1]:g} % of noise"
+        f"a fraction is below {MIN_EVALUATED_SIGMAS:g} standard deviations of the bound even at "
+        f"{100 * CHANNEL_NOISES[-1]:g} % noise"
     )
-    return [(f"{name}, {subject}", why) for subject in TYPICAL_SKINS if subject not in judged]
+    return [(f"{name}, {subject}", why) for subject in TYPICAL_SKINS if subject not in evaluated]
 
 
 def _chromophores(
@@ -136,19 +137,21 @@ def _chromophores(
         slopes = differentiate(lambda p: table.lookup(p[0], p[1]).reshape(3), np.array(truth))
         if shading == "free":
             slopes = np.column_stack([slopes, color])
+        # Fisher information for noise proportional to the color: (J / c)^T (J / c) / noise^2; free
+        # shading adds the column J = c of the derivative by log shading
         relative = slopes / color[:, None]
-        least = np.diag(np.linalg.inv(relative.T @ relative))[:2]  # at noise of 1
+        least = np.diag(np.linalg.inv(relative.T @ relative))[:2]  # variances at noise 1
         for noise in CHANNEL_NOISES:
-            clear = float(np.min(np.array(truth) / (noise * np.sqrt(least))))
+            sigmas = float(np.min(np.array(truth) / (noise * np.sqrt(least))))
             usual = noise == CHANNEL_NOISES[0]
-            if clear < (MIN_MEASURED_SIGMAS if usual else MIN_EVALUATED_SIGMAS):
+            if sigmas < (MIN_MEASURED_SIGMAS if usual else MIN_EVALUATED_SIGMAS):
                 continue
             sigma = noise * color
             rng = np.random.default_rng([1, number])
             noisy = color + sigma * rng.standard_normal((draws, 3))
             call = partial(squared, noisy, sigma, truth[index])
-            yield subject, EstimatorTrial(call, float(noise**2 * least[index]), noise, clear)
-            if clear >= MIN_EVALUATED_SIGMAS:
+            yield subject, EstimatorTrial(call, float(noise**2 * least[index]), noise, sigmas)
+            if sigmas >= MIN_EVALUATED_SIGMAS:
                 break
 
 
@@ -179,22 +182,25 @@ def _normals(draws: int) -> Iterator[tuple[str, EstimatorTrial]]:
             )
             return np.asarray(np.sum(np.cross(found.normals, normal) ** 2, axis=-1), np.float64)
 
+        # the squared angle is the sum of two tangential components of variance tilt^2 each
         noise = float(np.mean(sigma / (albedo * lit)))
         yield subject, EstimatorTrial(squared, 2.0 * float(tilt) ** 2, noise)
 
 
 def _albedo(draws: int) -> Iterator[tuple[str, EstimatorTrial]]:
     rng = np.random.default_rng(3)
-    ways = rng.normal(size=(2, 60, 3))
-    ways[..., 2] = np.abs(ways[..., 2]) + 0.4
-    light, view = ways / np.linalg.norm(ways, axis=-1, keepdims=True)
-    through = np.prod([1.0 - fresnel.reflectance(way[:, 2], 1.4) for way in (light, view)], axis=0)
+    directions = rng.normal(size=(2, 60, 3))
+    directions[..., 2] = np.abs(directions[..., 2]) + 0.4
+    light, view = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    transmittance = np.prod(
+        [1.0 - fresnel.reflectance(to[:, 2], 1.4) for to in (light, view)], axis=0
+    )
     up = np.array([0.0, 0.0, 1.0])
     for subject, skin in TYPICAL_SKINS.items():
         albedo = skin.r_d
-        value = albedo * through / np.pi
+        value = albedo * transmittance / np.pi
         sigma = ALBEDO_NOISE * value
-        bound = 1.0 / np.sum((through / np.pi / sigma) ** 2)
+        bound = 1.0 / np.sum((transmittance / np.pi / sigma) ** 2)
         count = draws // 4
         noisy = value[:, None] + sigma[:, None] * rng.standard_normal((count, 60, 1))
 
@@ -223,7 +229,8 @@ def _subsurface(draws: int) -> Iterator[tuple[str, EstimatorTrial]]:
         sigma = FIBER_NOISE * profile + 1e-3 * profile.max() * FIBER_NOISE
         slopes = differentiate(lambda p: photon_table.reflectance(radius, p[0], p[1]), truth)
         covariance = np.linalg.inv((slopes / sigma[:, None]).T @ (slopes / sigma[:, None]))
-        along = differentiate(lambda p: np.atleast_1d(_sigma_tr(p)), truth)[0]
+        # the bound of sigma_tr propagates the coefficients' covariance by its gradient
+        gradient = differentiate(lambda p: np.atleast_1d(_sigma_tr(p)), truth)[0]
         rng = np.random.default_rng([4, number])
         noisy = profile + sigma * rng.standard_normal((count, 28))
 
@@ -238,7 +245,7 @@ def _subsurface(draws: int) -> Iterator[tuple[str, EstimatorTrial]]:
             )
             return np.square(fit.sigma_tr_per_mm[fit.valid] - _sigma_tr(truth))
 
-        yield subject, EstimatorTrial(squared, float(along @ covariance @ along), FIBER_NOISE)
+        yield subject, EstimatorTrial(squared, float(gradient @ covariance @ gradient), FIBER_NOISE)
 
 
 def _sigma_tr(coefficients: Float64Array) -> float:
@@ -249,7 +256,7 @@ def _sigma_tr(coefficients: Float64Array) -> float:
 def differentiate(
     value: Callable[[Float64Array], Float64Array], point: Float64Array
 ) -> Float64Array:
-    """Return derivatives of a vector by each parameter, by central differences."""
+    """Return the Jacobian of a vector function by central differences, (values, parameters)."""
     columns = []
     for k in range(len(point)):
         step = np.zeros(len(point))

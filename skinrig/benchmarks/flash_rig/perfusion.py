@@ -1,4 +1,4 @@
-"""Benchmark of curves of blood in time: the time constant of five places, beside scipy's fit."""
+"""Benchmark of time curves of blood: the time constant of five regions, against SciPy's fit."""
 
 import warnings
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from reconstruction.facial_color.perfusion_fit import RelaxationFit, fit_cycle
 from rigsim.subject.perfusion_course import PromptedCourse
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.flash_rig.efficiency import differentiate
-from skinrig.benchmarks.measurement import processor_seconds
+from skinrig.benchmarks.measurement import measure_processor_seconds
 from skinrig.benchmarks.resampling import gaussian_rms
 from skinrig.benchmarks.results import ErrorEstimate
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -31,12 +31,12 @@ TIME_CONSTANT_S = 2.0
 REACTION_S = 0.16
 REST_BLOOD, BLOOD_NOISE = 0.03, 4e-4
 BLOOD_CHANGES = (0.0065, -0.002, 0.001, 0.004, 0.009)
-"""Change of blood of the five places; the noise is that of a disc of 12 px of a small picture."""
+"""Change of blood in the five regions; the noise is that of a disc of 12 px in a small image."""
 
 
 @dataclass(frozen=True, slots=True)
 class ShotSequence:
-    """Shots of a sequence."""
+    """Shots of a capture sequence at a constant period."""
 
     captures: int
     shot_period_s: float
@@ -47,7 +47,7 @@ class ShotSequence:
         return np.asarray((np.arange(self.captures) * self.shot_period_s) % CYCLE_S + 0.007)
 
     def levels(self, constant_s: float, reaction_s: float = REACTION_S) -> Float64Array:
-        """Return the simulated level of the blood at each shot, after cycles of prompts."""
+        """Return the simulated relative level of blood at each shot, in the steady cycle."""
         course = PromptedCourse(
             "smile",
             rise_s=constant_s,
@@ -63,12 +63,14 @@ class ShotSequence:
     def draw(
         self, constant_s: float, rng: np.random.Generator, noise: float = BLOOD_NOISE
     ) -> Float64Array:
-        """Return curves of the five places, (5, captures)."""
+        """Draw noisy curves of the five regions, (5, captures)."""
         clean = REST_BLOOD + np.outer(BLOOD_CHANGES, self.levels(constant_s))
         return np.asarray(clean + noise * rng.standard_normal(clean.shape))
 
     def time_constant_bound_s(self) -> float:
-        """Return the Cramér-Rao bound of the time constant, s; delay and levels unknown too."""
+        """Return the Cramér-Rao bound of the time constant, s, with unknown delay and levels."""
+        # Parameters: time constant, delay, then rest level and change of each region. The
+        # information matrix is scaled to a unit diagonal before the inversion.
         step = 1e-4
         slope = (self.levels(TIME_CONSTANT_S + step) - self.levels(TIME_CONSTANT_S - step)) / (
             2 * step
@@ -78,28 +80,30 @@ class ShotSequence:
         shift = (shift - self.levels(TIME_CONSTANT_S, REACTION_S - step)) / (2 * step)
         size = 2 + 2 * len(BLOOD_CHANGES)
         information = np.zeros((size, size))
-        for place, gap in enumerate(BLOOD_CHANGES):
+        for region, gap in enumerate(BLOOD_CHANGES):
             rows = np.zeros((size, self.captures))
             rows[0], rows[1] = gap * slope, gap * shift
-            rows[2 + 2 * place], rows[3 + 2 * place] = 1.0, level
+            rows[2 + 2 * region], rows[3 + 2 * region] = 1.0, level
             information += rows @ rows.T / BLOOD_NOISE**2
         scale = np.sqrt(np.diag(information))
         covariance = np.linalg.inv(information / np.outer(scale, scale))
         return float(np.sqrt(covariance[0, 0]) / scale[0])
 
 
-def scipy_fit(phase_s: Float64Array, value: Float64Array) -> tuple[float, float]:
-    """Return time constant and standard error of one curve by scipy's curve_fit, its usual way."""
+def fit_with_scipy(phase_s: Float64Array, value: Float64Array) -> tuple[float, float]:
+    """Return time constant and standard error of one curve, s, by SciPy's curve_fit."""
 
     def model(
         phase: Float64Array, low: float, gap: float, delay: float, constant: float
     ) -> Float64Array:
-        into = (phase - delay) % CYCLE_S
-        down = np.exp(-PROMPT_S / constant)
-        begin = down / (1.0 + down)
-        rising = 1.0 - (1.0 - begin) * np.exp(-into / constant)
-        falling = (1.0 - begin) * np.exp(-(into - PROMPT_S) / constant)
-        return np.asarray(low + gap * np.where(into < PROMPT_S, rising, falling))
+        # steady cycle: the level at the start, b, falls to itself over the other half cycle,
+        # b = (1 - b) q with q = exp(-T / tau), hence b = q / (1 + q)
+        elapsed = (phase - delay) % CYCLE_S
+        decay = np.exp(-PROMPT_S / constant)
+        begin = decay / (1.0 + decay)
+        rising = 1.0 - (1.0 - begin) * np.exp(-elapsed / constant)
+        falling = (1.0 - begin) * np.exp(-(elapsed - PROMPT_S) / constant)
+        return np.asarray(low + gap * np.where(elapsed < PROMPT_S, rising, falling))
 
     start = (float(value.min()), float(np.ptp(value)), 0.1, 1.0)
     bounds = ([-1.0, -1.0, 0.0, 1e-2], [1.0, 1.0, 2.5, 40.0])
@@ -109,27 +113,27 @@ def scipy_fit(phase_s: Float64Array, value: Float64Array) -> tuple[float, float]
     return float(found[3]), float(np.sqrt(covariance[3, 3]))
 
 
-def curves(stage: BenchmarkStage) -> None:
-    """Fit five places: number of shots, together or each alone, and scipy's fit beside it."""
+def measure_curve_fits(stage: BenchmarkStage) -> None:
+    """Measure fits over the number of shots, of five regions or the best one, and by SciPy."""
     trains = [ShotSequence(22, 5.5), ShotSequence(44, 10.25)]
     if not stage.toy:
         trains = [ShotSequence(11, 5.5), *trains, ShotSequence(88, 10.25)]
     runs = 3 if stage.toy else 30
     for train in trains:
         phase = train.phase_s
-        for way in ("five places", "best place", "best place, scipy"):
+        for way in ("five regions", "best region", "best region, scipy"):
             rng = np.random.default_rng(0)
             draws = [train.draw(TIME_CONSTANT_S, rng) for _ in range(runs)]
 
             def fitted_s(values: Float64Array) -> float:
-                if way == "best place, scipy":
-                    return scipy_fit(phase, values[-1])[0]
-                places = values if way == "five places" else values[-1]
-                return fit_cycle(phase, places, cycle_s=CYCLE_S).time_constant_s
+                if way == "best region, scipy":
+                    return fit_with_scipy(phase, values[-1])[0]
+                curves = values if way == "five regions" else values[-1]
+                return fit_cycle(phase, curves, cycle_s=CYCLE_S).time_constant_s
 
             off = np.array([fitted_s(values) for values in draws]) - TIME_CONSTANT_S
             outcome = gaussian_rms(
-                off, bound=train.time_constant_bound_s() if way == "five places" else None
+                off, bound=train.time_constant_bound_s() if way == "five regions" else None
             )
             timing, _ = stage.time(lambda: fitted_s(draws[0]))
             knobs = {"captures": train.captures, "every s": train.shot_period_s, "fit": way}
@@ -140,9 +144,9 @@ def curves(stage: BenchmarkStage) -> None:
 
 
 def noise_by_band() -> dict[str, float]:
-    """Return how much noisier than on light skin the blood of each band is, of equal pictures.
+    """Return the noise of blood by melanin band, relative to light skin, at equal exposure.
 
-    By the Cramér-Rao bound of hemoglobin at the same count of electrons in a white pixel.
+    From the Cramér-Rao bound of hemoglobin at equal electrons of a white pixel.
     """
     table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
     found = {}
@@ -150,7 +154,7 @@ def noise_by_band() -> dict[str, float]:
         at = np.array([band.melanin, band.hemoglobin])
         color = table.lookup(*at)
         slopes = differentiate(lambda p: table.lookup(*p).reshape(3), at)
-        # shot noise: the variance goes with the light
+        # shot noise: the variance is proportional to the signal, so that J^T diag(1 / c) J
         information = slopes.T @ (slopes / color.reshape(3, 1))
         found[name] = float(np.sqrt(np.linalg.inv(information)[1, 1]))
     least = found["light"]
@@ -158,7 +162,7 @@ def noise_by_band() -> dict[str, float]:
 
 
 def _on_skin(noise_factor: float, runs: int) -> ErrorEstimate:
-    """Return the error of five places in 44 captures, with so many times the noise."""
+    """Return the error of five regions in 44 captures, at a multiple of the noise."""
     train, rng = ShotSequence(44, 10.25), np.random.default_rng(0)
     found = []
     for _ in range(runs):
@@ -186,7 +190,7 @@ def _limits(stage: BenchmarkStage, runs: int) -> LimitValues:
         slow = fit_cycle(fine.phase_s, fine.draw(TIME_CONSTANT_S, rng), cycle_s=CYCLE_S)
         held += slow.interval_s[0] <= TIME_CONSTANT_S <= slow.interval_s[1]
     again = fine.draw(TIME_CONSTANT_S, rng)
-    spent_s = processor_seconds(lambda: fit_cycle(fine.phase_s, again, cycle_s=CYCLE_S))
+    spent_s = measure_processor_seconds(lambda: fit_cycle(fine.phase_s, again, cycle_s=CYCLE_S))
     five, _, by_scipy = (p.error for p in stage.points if p.knobs["captures"] == 44)
     # three binomial standard deviations beyond the stated rates
     beyond = 3 * float(

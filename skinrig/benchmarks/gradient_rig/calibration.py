@@ -21,8 +21,8 @@ from skinrig.benchmarks.stage import BenchmarkStage
 SPHERE_SEED = 7
 
 
-def sphere_lights(stage: BenchmarkStage) -> None:
-    """Survey a simulated sphere with two and four readings of the analyser, and large pixels."""
+def measure_sphere_lights(stage: BenchmarkStage) -> None:
+    """Measure the survey of a simulated sphere over analyzer readings and image size."""
     for width_px in (192,) if stage.toy else (512, 1024):
         rig = load_rig("gradient").resized(width_px)
         sphere = build_sphere(rig, seed=SPHERE_SEED)
@@ -32,26 +32,26 @@ def sphere_lights(stage: BenchmarkStage) -> None:
         for readings in (*fewer, (0, 90), (0, 80, 90, 100)):
             part = [one for one in shots if one.reading_deg in readings]
 
-            # nine tenths of a small survey's seconds are the LEDs': it is made once
+            # nine tenths of a small survey's time depend on the LEDs: the toy size runs once
             survey = partial(survey_sphere, part, rig)
             timing, result = measure_once(survey) if stage.toy else stage.time(survey)
-            lights, films = result.lights, result.polarizers
+            lights, polarizers = result.lights, result.polarizers
             good = lights.valid & ~lights.dead
-            place = sphere.position_mm
-            true = sphere.intensity / np.sum(place**2, axis=1)
+            position = sphere.position_mm
+            true = sphere.intensity / np.sum(position**2, axis=1)
             error = 100 * np.abs(lights.intensities * true[good].mean() / true - 1)[good]
             stated = 100 * (lights.intensities_stderr / lights.intensities)[good]
-            # the median of a normal distribution's size is 0.674 of its deviation
+            # median of |error| of a normal error: 0.6745 standard deviations
             bound = float(0.674 * np.median(stated))
             knobs: Knobs = {"pixels": width_px, "readings": " ".join(map(str, readings))}
             outcome = stage.add(knobs, timing, bootstrap_median(error, bound, draws=400))
-    aim = place / np.linalg.norm(place, axis=1, keepdims=True)
+    aim = position / np.linalg.norm(position, axis=1, keepdims=True)
     off = np.degrees(np.linalg.norm(lights.directions - aim, axis=1))
-    zero = np.degrees(films.misalignment_rad) - scene.films.analyser_zero_deg
+    zero = np.degrees(polarizers.misalignment_rad) - scene.films.analyser_zero_deg
     stage.limits = {
         "direction": float(np.median(off[lights.seen])),
         "intensity": outcome.error,
-        "misalignment": float(abs(zero) / np.degrees(films.misalignment_stderr_rad)),
+        "misalignment": float(abs(zero) / np.degrees(polarizers.misalignment_stderr_rad)),
     }
 
 

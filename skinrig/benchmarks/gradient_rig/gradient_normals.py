@@ -19,7 +19,7 @@ from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.subject.pigment import MELANIN_PRESETS
 from rigsim.world.taped_skin import GripState
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
+from skinrig.benchmarks.measurement import LIMIT_CORES, measure_processor_seconds
 from skinrig.benchmarks.resampling import bootstrap_interval
 from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -30,18 +30,18 @@ Images = Mapping[tuple[str, str], FloatArray]
 NEUTRAL = GripState(0.0, 0, 8.0, 1.0, True, False)
 PATTERN_EXPOSURE_S = 0.03
 MELANIN_PRESET = "III"
-"""Of the skin's melanin."""
+"""Melanin preset of the skin."""
 PATTERN_NAMES = ("full", "x", "y", "z", "-x", "-y", "-z", "dark")
 ANALYZER_DEG = {"parallel": 0.0, "crossed": 90.0}
 RELIEF_BLUR_PX = 8.0
-"""Of the relief's texels, by which skin is smoothed that stands for a smooth relief."""
+"""Standard deviation of the Gaussian that smooths the relief of the smooth patch, texels."""
 IGNORED_BORDER_PX = 6
-"""Border that is not judged: the lens brings in what is beyond it."""
+"""Border that is not evaluated: the lens blurs the surroundings into it."""
 
 
 @dataclass(frozen=True, slots=True)
 class SkinPatch:
-    """Skin in the gradient rig, without noise."""
+    """Noise-free images of skin in the gradient rig, with ground truth."""
 
     images: dict[tuple[str, str], Float32Array]
     """Fractions of full scale."""
@@ -50,19 +50,20 @@ class SkinPatch:
     sharp: Float64Array
     lights: SphereLights
     geometry: dict[str, Any]
-    """View and place of each pixel."""
+    """View direction and position of each pixel."""
     noise: SensorNoise
 
 
 def ideal_light_calibration(sphere: ActualSphere) -> SphereLights:
-    """Return a sphere's lights as a perfect calibration would."""
-    far = np.linalg.norm(sphere.position_mm, axis=1)
-    ways = sphere.position_mm / far[:, None]
-    fields = np.cross(sphere.absorbs, ways)
-    middle = float(np.median(far))
+    """Return the lights of a sphere as calibrated without error."""
+    distance = np.linalg.norm(sphere.position_mm, axis=1)
+    directions = sphere.position_mm / distance[:, None]
+    # a polarizer transmits the field across its absorbing axis and across the ray
+    fields = np.cross(sphere.absorbs, directions)
+    middle = float(np.median(distance))
     return SphereLights(
-        ways,
-        sphere.intensity * (middle / far) ** 2,
+        directions,
+        sphere.intensity * (middle / distance) ** 2,
         programmed=sphere.weights[:, 1:],
         polarizers=fields / np.linalg.norm(fields, axis=1)[:, None],
         distance_mm=middle,
@@ -70,19 +71,20 @@ def ideal_light_calibration(sphere: ActualSphere) -> SphereLights:
 
 
 def pixel_geometry(rig: Rig) -> dict[str, Any]:
-    """Return the view and the place of each pixel on the patch, as `from_patterns` takes them."""
+    """Return the view direction and the position of each pixel, as `from_patterns` takes them."""
     view = rig.views[0]
     distance = float(np.linalg.norm(view.position_mm))
     pixel = view.pixel_um * 1e-3 * distance / view.focal_mm
     x = (np.arange(view.width_px) - (view.width_px - 1) / 2) * pixel
     y = ((view.height_px - 1) / 2 - np.arange(view.height_px)) * pixel
     points = np.stack([*np.meshgrid(x, y), np.zeros((view.height_px, view.width_px))], axis=-1)
-    way = np.array([0.0, 0.0, distance]) - points
-    return {"points_mm": points, "view": way / np.linalg.norm(way, axis=-1, keepdims=True)}
+    view_dir = np.array([0.0, 0.0, distance]) - points
+    view_dir /= np.linalg.norm(view_dir, axis=-1, keepdims=True)
+    return {"points_mm": points, "view": view_dir}
 
 
-def skin_patch(side: int, *, smooth: bool) -> SkinPatch:
-    """Picture a patch of cheek, as it is or smoothed, by all sixteen conditions."""
+def render_skin_patch(side: int, *, smooth: bool) -> SkinPatch:
+    """Render a patch of cheek, as it is or smoothed, under all sixteen conditions."""
     rig = load_rig("gradient").cropped(side)
     size_mm = max(0.006 * side + 0.8, 1.2)
     skin = make_micro_skin("cheek", seed=5, size_mm=size_mm, preset=MELANIN_PRESET)
@@ -99,7 +101,7 @@ def skin_patch(side: int, *, smooth: bool) -> SkinPatch:
     }
     truth = ground_truth(scene, [NEUTRAL]).maps
     view = rig.views[0]
-    # as fractions of full scale; a full well is one
+    # in fractions of full scale, where a full well is 1: gain 1 / N and read variance (r / N)^2
     noise = SensorNoise(1.0 / view.full_well_e, (view.read_noise_e / view.full_well_e) ** 2)
     return SkinPatch(
         images,
@@ -114,7 +116,7 @@ def skin_patch(side: int, *, smooth: bool) -> SkinPatch:
 def add_sensor_noise(
     patch: SkinPatch, rng: np.random.Generator
 ) -> dict[tuple[str, str], Float32Array]:
-    """Return the pictures with the sensor's noise."""
+    """Return the images with shot and read noise of the sensor."""
     read, gain = patch.noise.read_variance, patch.noise.gain
     return {
         key: (
@@ -125,7 +127,9 @@ def add_sensor_noise(
 
 
 def normals_without_corrections(images: Images) -> Float64Array:
-    """Return normals by Ma et al.'s formula in plain NumPy, with complements, (H, W, 3)."""
+    """Compute normals by Ma et al.'s formula in plain NumPy, with complements, (H, W, 3)."""
+    # differences of complementary patterns give the mirror direction r; n is halfway between r and
+    # the view +z
     s = {
         name: images[name, "parallel"].astype(np.float64) - images[name, "crossed"]
         for name in PATTERN_NAMES[:7]
@@ -139,16 +143,16 @@ def _evaluate(normals: FloatArray, valid: BoolArray, truth: Float64Array) -> Err
     inner = (slice(IGNORED_BORDER_PX, -IGNORED_BORDER_PX),) * 2
     good = valid[inner]
     error = np.degrees(angular_error_rad(normals[inner][good], truth[inner][good]))
-    # neighbours share their error: blocks of lines are drawn, not pixels
+    # errors of neighboring pixels are correlated: blocks of rows are resampled, not pixels
     parts = [part.mean() for part in np.array_split(error, 64) if part.size]
     return ErrorEstimate(float(error.mean()), bootstrap_interval(parts, np.mean))
 
 
-def normals(stage: BenchmarkStage) -> None:
-    """Compute the normals of a patch of skin: patterns, corrections, filters; then all pixels."""
+def measure_normals(stage: BenchmarkStage) -> None:
+    """Measure normals of a skin patch over patterns, corrections and filters, then full size."""
     rng = np.random.default_rng(0)
     side = 40 if stage.toy else 192
-    patch = skin_patch(side, smooth=False)
+    patch = render_skin_patch(side, smooth=False)
     noisy = add_sensor_noise(patch, rng)
     corrections = {"lights": patch.lights, **patch.geometry}
 
@@ -157,7 +161,8 @@ def normals(stage: BenchmarkStage) -> None:
             outcome = _evaluate(found.normals, found.valid, patch.visible)
             if "variance" not in options or "smoothing" in options:
                 return outcome
-            # weighted least squares reaches it; the mean of a Rayleigh error over its RMS is 0.886
+            # weighted least squares attains the bound; a Rayleigh error has the mean
+            # sqrt(pi) / 2 = 0.886 of its root mean square
             rms = float(np.degrees(np.sqrt(np.pi) / 2 * found.stderr_rad[found.valid].mean()))
             return replace(outcome, cramer_rao_bound=rms)
 
@@ -193,16 +198,16 @@ def normals(stage: BenchmarkStage) -> None:
 
 
 def _on_skin(patch: SkinPatch, band: MelaninBand) -> ErrorEstimate:
-    """Return the error on the same relief with a band's pigment: 16 patterns, all corrections.
+    """Return the error on the same relief with a band's melanin, 16 patterns, all corrections.
 
-    Crossed pictures hold half of the diffuse light and no specular; parallel ones hold the other
-    half besides: with another albedo both change by so much of the crossed one.
+    Crossed images contain half of the diffuse reflection, parallel images the other half and the
+    specular reflection. A change of albedo thus changes both by a fraction of the crossed image.
     """
     usual = replace(band, melanin=MELANIN_PRESETS[MELANIN_PRESET]).reflectance()
-    share = float((band.reflectance() / usual)[1])
+    ratio = float((band.reflectance() / usual)[1])
     images = {
-        (name, way): image - np.float32(1.0 - share) * patch.images[name, "crossed"]
-        for (name, way), image in patch.images.items()
+        (name, polarizer): image - np.float32(1.0 - ratio) * patch.images[name, "crossed"]
+        for (name, polarizer), image in patch.images.items()
     }
     seen = replace(patch, images=images)
     found = from_patterns(
@@ -216,7 +221,7 @@ def _on_skin(patch: SkinPatch, band: MelaninBand) -> ErrorEstimate:
 
 
 def _limits(worst: float, rng: np.random.Generator) -> LimitValues:
-    smooth = skin_patch(128, smooth=True)
+    smooth = render_skin_patch(128, smooth=True)
     found = from_patterns(smooth.images, lights=smooth.lights, **smooth.geometry)
     against = {"lens' resolution": smooth.visible, "as it is": smooth.sharp}
     big = {
@@ -224,9 +229,9 @@ def _limits(worst: float, rng: np.random.Generator) -> LimitValues:
         for key, image in add_sensor_noise(smooth, rng).items()
     }
     options: dict[str, Any] = {"lights": smooth.lights, "alpha": 0.26, "variance": smooth.noise}
-    ours_s = processor_seconds(lambda: from_patterns(big, **options), 3) / LIMIT_CORES
+    ours_s = measure_processor_seconds(lambda: from_patterns(big, **options), 3) / LIMIT_CORES
     with threadpool_limits(1):
-        peer_s = processor_seconds(lambda: normals_without_corrections(big))
+        peer_s = measure_processor_seconds(lambda: normals_without_corrections(big))
     return {
         **{
             ("clean", name): _evaluate(found.normals, found.valid, true).error

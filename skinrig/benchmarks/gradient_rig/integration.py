@@ -1,4 +1,4 @@
-"""Benchmark of height from normals, beside Frankot-Chellappa, cosines and a sparse direct solve."""
+"""Benchmark of normal integration against Frankot-Chellappa, cosines and a sparse direct solve."""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,7 +18,11 @@ from reconstruction.normal_integration.discontinuities import integrate_with_dis
 from reconstruction.normal_integration.height_filters import high_pass
 from reconstruction.normal_integration.relief_errors import expected_height_rms
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import LIMIT_CORES, measure_processor_time, processor_seconds
+from skinrig.benchmarks.measurement import (
+    LIMIT_CORES,
+    measure_processor_seconds,
+    measure_processor_time,
+)
 from skinrig.benchmarks.resampling import bootstrap_rms, split_squares
 from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -30,10 +34,10 @@ NORMAL_NOISE_RAD = np.radians(1.5)
 RELIEF_RMS_UM = 12.0
 
 
-def relief(side: int, *, rng: np.random.Generator) -> tuple[Float64Array, Float64Array]:
-    """Make a relief of ridged cells on a bulge, and its normals (y up) without noise.
+def synthesize_relief(side: int, *, rng: np.random.Generator) -> tuple[Float64Array, Float64Array]:
+    """Synthesize a periodic relief of ridged cells on a bulge, and its exact normals (y up).
 
-    Periodic, of 90 um to 1 mm wavelength; slopes are exact derivatives of the height's waves.
+    Wavelengths are 90 um to 1 mm. Slopes are spectral derivatives of the height.
 
     Returns
     -------
@@ -51,7 +55,7 @@ def relief(side: int, *, rng: np.random.Generator) -> tuple[Float64Array, Float6
     waves[0, 0] = 0.0
     waves *= RELIEF_RMS_UM / fft.irfft2(waves, (side, side)).std()
     waves[1, 1] += 0.25 * side * side * 60.0  # the bulge
-    # no derivative of the highest wave of an even number
+    # the derivative of the Nyquist wave is undefined and set to 0
     odd_x = np.where(theta_x >= np.pi - 1e-9, 0.0, theta_x)
     odd_y = np.where(np.abs(theta_y) >= np.pi - 1e-9, 0.0, theta_y)
     height = fft.irfft2(waves, (side, side))
@@ -62,9 +66,9 @@ def relief(side: int, *, rng: np.random.Generator) -> tuple[Float64Array, Float6
 
 
 def frankot_chellappa(normals: Float64Array, *, pixel: float) -> Float64Array:
-    """Integrate slopes of a periodic picture by the Fourier transform.
+    """Integrate the slopes of a periodic image by the Fourier transform.
 
-    Frankot and Chellappa 1988, doi 10.1109/34.3909.
+    Frankot and Chellappa 1988, doi 10.1109/34.3909: Z = -i (u P + v Q) / (u^2 + v^2).
     """
     gx, gy = -normals[..., 0] / normals[..., 2], normals[..., 1] / normals[..., 2]
     v = 2.0 * np.pi * np.fft.fftfreq(gx.shape[0])[:, None]
@@ -76,7 +80,7 @@ def frankot_chellappa(normals: Float64Array, *, pixel: float) -> Float64Array:
 
 
 def sparse_direct(normals: Float64Array, valid: BoolArray, *, pixel: float) -> Float64Array:
-    """Solve the same normal equations with SciPy's SuperLU; one connected part."""
+    """Solve the same normal equations with SciPy's SuperLU, for one connected region."""
     ax, ay, dx, dy = slope_fields.edges(slope_fields.from_normals(normals, valid=valid), order=4)
     number = np.full(ax.shape, -1)
     inside = np.pad(valid, 1)
@@ -84,27 +88,27 @@ def sparse_direct(normals: Float64Array, valid: BoolArray, *, pixel: float) -> F
     h, v = ax > 0, ay > 0
     begin = np.concatenate([number[h], number[v]])
     end = np.concatenate([number[np.roll(h, 1, axis=1)], number[np.roll(v, 1, axis=0)]])
-    wanted = np.concatenate([dx[h], dy[v]])
+    differences = np.concatenate([dx[h], dy[v]])
     ones, rows = np.ones(begin.size), np.arange(begin.size)
     D = sparse.csc_matrix(
         (np.concatenate([-ones, ones]), (np.tile(rows, 2), np.concatenate([begin, end]))),
         shape=(begin.size, int(number.max()) + 1),
     )
     A = (D.T @ D).tolil()
-    A[0, 0] += 1.0
+    A[0, 0] += 1.0  # fixes the free constant: the equations alone are singular
     x = splu(A.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(
-        D.T @ wanted
+        D.T @ differences
     )
     height = np.zeros(valid.shape)
     height[valid] = pixel * (x - x.mean())
     return height
 
 
-def integration(stage: BenchmarkStage) -> None:
-    """Integrate a relief's normals: tolerance, order, mask, noise, peers; then at full size."""
+def measure_integration(stage: BenchmarkStage) -> None:
+    """Measure integration over tolerance, order, mask, noise and peers, then at full size."""
     rng = np.random.default_rng(0)
     side = 64 if stage.toy else 512
-    truth, clean = relief(side, rng=rng)
+    truth, clean = synthesize_relief(side, rng=rng)
     noisy = clean + NORMAL_NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(clean.shape)
     whole = np.ones((side, side), bool)
     disc = _disc(side)
@@ -123,8 +127,8 @@ def integration(stage: BenchmarkStage) -> None:
 
         def error(height: FloatArray) -> ErrorEstimate:
             off = _high_passed(height - truth, valid)
-            places = [at for at in split_squares(len(off)) if valid[at].any()]
-            tiles = [float(np.mean(off[at][valid[at]] ** 2)) for at in places]
+            squares = [at for at in split_squares(len(off)) if valid[at].any()]
+            tiles = [float(np.mean(off[at][valid[at]] ** 2)) for at in squares]
             low, high = bootstrap_rms(tiles, rng=rng).error_interval
             rms = float(np.sqrt(np.mean(off[valid] ** 2)))
             return ErrorEstimate(rms, (min(low, rms), max(high, rms)), bound)
@@ -171,8 +175,8 @@ def _disc(side: int) -> BoolArray:
 
 
 def _full_size(rng: np.random.Generator) -> LimitValues:
-    """Measure 2048 x 2048 with a mask, and 1024 x 1024 with jumps."""
-    _, normals = relief(2048, rng=rng)
+    """Measure 2048 x 2048 with a mask, and 1024 x 1024 with discontinuities."""
+    _, normals = synthesize_relief(2048, rng=rng)
     noisy = (normals + NORMAL_NOISE_RAD / np.sqrt(2.0) * rng.standard_normal(normals.shape)).astype(
         np.float32
     )
@@ -183,7 +187,9 @@ def _full_size(rng: np.random.Generator) -> LimitValues:
     )
     small = np.ascontiguousarray(noisy[:1024, :1024])
     integrate_with_discontinuities(small[:64, :64])
-    broken_s = processor_seconds(lambda: integrate_with_discontinuities(small, pixel=PIXEL_UM), 3)
+    broken_s = measure_processor_seconds(
+        lambda: integrate_with_discontinuities(small, pixel=PIXEL_UM), 3
+    )
     part = _disc(512)
     flat = np.asarray(noisy[:512, :512], float)
     ours_s, mine = measure_processor_time(lambda: integrate(flat, pixel=PIXEL_UM, valid=part), 3)

@@ -1,4 +1,4 @@
-"""Benchmarks of histograms of normals and of the search for kernels, beside plain NumPy."""
+"""Benchmarks of normal histograms and of the kernel search against plain NumPy."""
 
 from collections.abc import Callable
 from functools import partial
@@ -16,7 +16,7 @@ from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
 from reconstruction.normal_histogram import relief_slopes
 from reconstruction.normal_histogram import statistics as normal_statistics
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
+from skinrig.benchmarks.measurement import LIMIT_CORES, measure_processor_seconds
 from skinrig.benchmarks.resampling import mean_error
 from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -25,18 +25,18 @@ PIXEL_UM = 6.0
 STRETCH_RATIO = 0.88
 FULL_SIDE_PX = 2000
 N_PEER_CANDIDATES = 3
-"""Candidates of the straightforward search that are timed; it is extrapolated to the grid."""
+"""Candidates of the NumPy search that are timed, for an extrapolation to the grid."""
 
 
-def relief(side: int, *, rng: np.random.Generator) -> Float64Array:
-    """Return heights of a skin-like relief, um: grain, ridges, and a network of furrows.
+def synthesize_relief(side: int, *, rng: np.random.Generator) -> Float64Array:
+    """Synthesize heights of a skin-like relief, um: grain, ridges and a network of grooves.
 
     Parameters
     ----------
-    side : int
-        Pixels of 6 um a side.
+    side
+        Side in pixels of 6 um.
     rng
-        Draws the relief.
+        Generator of the relief.
     """
 
     def field(correlation_px: float) -> Float64Array:
@@ -44,30 +44,30 @@ def relief(side: int, *, rng: np.random.Generator) -> Float64Array:
         smooth = gaussian_filter(white, correlation_px, mode="wrap").astype(np.float64)
         return np.asarray(smooth / smooth.std())
 
-    furrows = np.exp(-((field(12.0) / 0.25) ** 2))
-    return np.asarray(field(2.0) + 5.0 * field(6.0) - 12.0 * furrows + 8.0 * field(25.0))
+    grooves = np.exp(-((field(12.0) / 0.25) ** 2))
+    return np.asarray(field(2.0) + 5.0 * field(6.0) - 12.0 * grooves + 8.0 * field(25.0))
 
 
 def strain_relief(height: Float64Array, *, rng: np.random.Generator) -> Float64Array:
-    """Return a relief that no kernel makes: furrows deepen more than ridges rise, with noise."""
+    """Return a strained relief outside the model: grooves deepen more than ridges rise; noise."""
     about = height - height.mean()
     deeper = 1.12 * height - 0.02 * about**2 * (about < 0)
     grain = gaussian_filter(rng.standard_normal(height.shape, np.float32), 1.0)
     return np.asarray(deeper + 0.5 * grain)
 
 
-def numpy_distance(
+def distance_with_numpy(
     height: Float64Array, target: Float64Array, alpha: float, sigma_um: float
 ) -> float:
-    """Return eq. (7)'s sum for one kernel, in vectorised NumPy and SciPy."""
+    """Return the distance of eq. (7) for one kernel with vectorized NumPy and SciPy."""
     blurred = gaussian_filter1d(height, sigma_um / PIXEL_UM, axis=1)
     dy, dx = np.gradient((1.0 - alpha) * height + alpha * blurred, PIXEL_UM)
     dx /= STRETCH_RATIO
-    return float(np.abs(numpy_histogram(dx, -dy) - target).sum())
+    return float(np.abs(histogram_with_numpy(dx, -dy) - target).sum())
 
 
-def numpy_histogram(dx: Float64Array, dy: Float64Array) -> Float64Array:
-    """Return the shares of normals in 64 x 64 buckets, in vectorised NumPy."""
+def histogram_with_numpy(dx: Float64Array, dy: Float64Array) -> Float64Array:
+    """Return the fractions of normals in 64 x 64 bins with vectorized NumPy."""
     w = 1.0 / np.sqrt(1.0 + dx * dx + dy * dy)
     edges = np.linspace(-1.0, 1.0, 65)
     counts = np.histogram2d((-dy * w).ravel(), (-dx * w).ravel(), bins=(edges, edges))[0]
@@ -75,7 +75,7 @@ def numpy_histogram(dx: Float64Array, dy: Float64Array) -> Float64Array:
 
 
 def _histogram(height: Float64Array) -> Float64Array:
-    """Return the histogram of normals of a relief that was stretched."""
+    """Return the normal histogram of a stretched relief."""
     return normal_histogram.histogram(height, pixel=(PIXEL_UM, PIXEL_UM * STRETCH_RATIO))
 
 
@@ -83,33 +83,33 @@ _fitted = partial(kernel_fit.fit_kernel, stretch=STRETCH_RATIO, axis="x", pixel_
 
 
 def _minimum_processor_s(call: Callable[[], object], repeats: int = 1) -> float:
-    """Return the least processor time of some calls on one thread, s.
+    """Return the least processor time of repeated calls on one thread, s.
 
-    Of two threads the one that is done first spins until the other is, which counts as its time:
-    where other programs keep the cores busy that is up to as much as the work.
+    Of two threads the first to finish spins until the other does, and the spinning counts as
+    processor time. With other programs on the cores it can equal the work.
     """
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
     try:
-        return processor_seconds(call, repeats)
+        return measure_processor_seconds(call, repeats)
     finally:
         numba.set_num_threads(threads)
 
 
-def search(stage: BenchmarkStage) -> None:
-    """Fit kernels: pixels used, search and its first sample; then 2000 x 2000 beside NumPy."""
+def measure_kernel_search(stage: BenchmarkStage) -> None:
+    """Measure kernel fits over pixels, search and first sample, then 2000 x 2000 against NumPy."""
     rng = np.random.default_rng(0)
     side = 64 if stage.toy else 256
-    height = relief(side, rng=rng)
+    height = synthesize_relief(side, rng=rng)
     target = _histogram(strain_relief(height, rng=rng))
     alphas, sigmas = (ALPHA_GRID[::50], SIGMAS_UM[::20]) if stage.toy else (ALPHA_GRID, SIGMAS_UM)
 
     def fit(
-        way: Literal["hierarchical", "exhaustive"], part: int, first: int, thin: int = 1
+        method: Literal["hierarchical", "exhaustive"], part: int, first: int, thin: int = 1
     ) -> kernel_outcome.KernelFit:
-        asked = kernel_fit.KernelSearch(way, first)
+        search = kernel_fit.KernelSearch(method, first)
         grid = alphas[::thin], sigmas[::thin]
-        return _fitted(height[:part, :part], target, search=asked, grid=grid)
+        return _fitted(height[:part, :part], target, search=search, grid=grid)
 
     best = fit("exhaustive", side, 2)
     whole = _grid_of(height, target)
@@ -146,19 +146,19 @@ def _grid_of(
 
 
 def _full_size(rng: np.random.Generator) -> LimitValues:
-    """Measure 2000 x 2000: the default search, and the exhaustive ones by some candidates."""
-    height = relief(FULL_SIDE_PX, rng=rng)
+    """Measure 2000 x 2000 with the default search, and exhaustive ones by some candidates."""
+    height = synthesize_relief(FULL_SIDE_PX, rng=rng)
     target = _histogram(strain_relief(height, rng=rng))
     few = SIGMAS_UM[[10, 60, 150]]
     whole = _grid_of(height, target, few)
     ours_s = _minimum_processor_s(lambda: kernel_search.search_exhaustively(whole))
     ours_s *= SIGMAS_UM.size / few.size
     tried = [(-1.5, 6.0), (-0.2, 31.0), (0.7, 76.0)][:N_PEER_CANDIDATES]
-    peer_s = _minimum_processor_s(lambda: [numpy_distance(height, target, *k) for k in tried])
+    peer_s = _minimum_processor_s(lambda: [distance_with_numpy(height, target, *k) for k in tried])
     peer_s *= ALPHA_GRID.size * SIGMAS_UM.size / len(tried)
     mismatch = max(
         abs(
-            numpy_distance(height, target, alpha, sigma)
+            distance_with_numpy(height, target, alpha, sigma)
             - float(whole.distances(sigma, np.array([alpha]))[0])
         )
         for alpha, sigma in tried
@@ -184,12 +184,12 @@ def _full_size(rng: np.random.Generator) -> LimitValues:
     }
 
 
-def histograms(stage: BenchmarkStage) -> None:
-    """Make histograms of normals: pixels and buckets; beside numpy.histogram2d."""
+def measure_histograms(stage: BenchmarkStage) -> None:
+    """Measure normal histograms over pixels and bins, against numpy.histogram2d."""
     rng = np.random.default_rng(0)
     side = 96 if stage.toy else 1024
     truth_side = 256 if stage.toy else 2048
-    truth_map = relief(truth_side, rng=rng)
+    truth_map = synthesize_relief(truth_side, rng=rng)
     for bins in (32, 64) if stage.toy else (16, 32, 64, 128):
         truth = normal_statistics.measure_normals(truth_map, pixel=PIXEL_UM, bins=bins)
         for part in (side // 2, side) if stage.toy else (128, 256, 512, 1024):
@@ -207,7 +207,7 @@ def histograms(stage: BenchmarkStage) -> None:
             stage.add({"side": part, "bins": bins}, timing, mean_error(off))
     height = truth_map[:side, :side]
     dx, dy, _ = relief_slopes.slopes(height, pixel=PIXEL_UM)
-    theirs = partial(numpy_histogram, dx, dy)
+    theirs = partial(histogram_with_numpy, dx, dy)
     ours = partial(normal_histogram.from_slopes, dx, dy)
     repeats = 1 if stage.toy else 3
     times = _minimum_processor_s(theirs, repeats) / max(_minimum_processor_s(ours, repeats), 1e-9)
@@ -215,4 +215,4 @@ def histograms(stage: BenchmarkStage) -> None:
     stage.reference_error = float(
         normal_histogram.noise_floor(truth.histogram, truth.effective_samples, 1e12)
     )
-    stage.words["truth_side"] = truth_side
+    stage.description_values["truth_side"] = truth_side

@@ -1,4 +1,4 @@
-"""Benchmarks of reliefs under strain: against skin that settled, and of the convolution itself."""
+"""Benchmarks of reliefs under strain: against skin in equilibrium, and of the convolution."""
 
 import math
 import tempfile
@@ -29,7 +29,7 @@ from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import StretchedSkin, stretch_skin
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import LIMIT_CORES, processor_seconds
+from skinrig.benchmarks.measurement import LIMIT_CORES, measure_processor_seconds
 from skinrig.benchmarks.resampling import mean_error
 from skinrig.benchmarks.results import Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -37,7 +37,7 @@ from skinrig.extremes.inputs import sheet_faces
 
 TEXEL_UM = 10.0
 FITTED_STRETCHES = (0.76, 0.82, 0.88, 0.94, 1.06, 1.12, 1.18, 1.25)
-"""Stretch ratios that the table is fitted to, on other patches than those it is judged on."""
+"""Stretch ratios to which the table is fitted, on other patches than the evaluated ones."""
 EVALUATED_STRETCHES = (0.8, 0.9, 1.1, 1.2)
 SEARCHED_ALPHAS = np.round(np.arange(-2.0, 1.001, 0.05), 2)
 SEARCHED_SIGMAS_UM = np.arange(4.0, 101.0, 4.0)
@@ -46,22 +46,23 @@ JAW_CONDITIONS: tuple[tuple[float, Literal["none", "volume"]], ...] = (
     (30.0, "none"),
     (30.0, "volume"),
 )
-"""Direction of the jaws, deg, and what the skin does across: kernels are fitted where it keeps its
-width, and where it does not, both passes act."""
+"""Direction of the jaws, deg, and strain across them. Kernels are fitted at constant width; with
+transverse strain both passes act."""
 FULL_SIDE_PX = 4096
 PEER_ROWS = 256
-"""Rows of the full map that the straightforward convolution is timed on."""
+"""Rows of the full map on which the NumPy convolution is timed."""
 TILED_SIDE_PX = 16_384
 GRADUAL_CHANGE_PER_SIGMA = 0.02
-"""Turn of axes, rad, and relative change of sigma, within one sigma, that are called gradual."""
+"""Rotation of axes, rad, and relative change of sigma, per sigma, that count as gradual."""
 N_WAVES = 60
 
 
 def strained_slopes(
     height: NDArray[Any], state: StretchedSkin
 ) -> tuple[Float64Array, Float64Array]:
-    """Return slopes along and across the jaws of a relief that goes along with the skin."""
+    """Return slopes along and across the jaws of a relief in texels that deform with the skin."""
     dx, dy, known = relief_slopes.slopes(height, pixel=TEXEL_UM)
+    # chain rule: a gradient in deformed coordinates is F^-T times that in texel coordinates
     inverse = np.linalg.inv(state.gradient)
     along_x = dx[known] * inverse[0, 0] + dy[known] * inverse[1, 0]
     along_y = dx[known] * inverse[0, 1] + dy[known] * inverse[1, 1]
@@ -71,14 +72,14 @@ def strained_slopes(
 def fit_kernel_table(
     skins: list[MicroSkin], states: tuple[float, ...], *, every: int = 1
 ) -> KernelTable:
-    """Fit a table as from caliper sessions: each state's kernel, then lines through them.
+    """Fit a kernel table as from caliper sessions: each state's kernel, then lines through them.
 
     Parameters
     ----------
     skins, states
-        Patches of `TEXEL_UM`, and the stretch ratios that each settles under.
+        Patches with texels of `TEXEL_UM`, and the stretch ratios of each.
     every
-        Steps of the grid of kernels that are searched.
+        Step of the searched grid of kernels.
     """
     found = []
     for skin in skins:
@@ -103,13 +104,13 @@ def fit_kernel_table(
 def strain_relief(
     skin: MicroSkin, state: StretchedSkin, table: KernelTable, sampling: Sampling
 ) -> Float32Array:
-    """Return the relief that a table's kernels make of a neutral one."""
+    """Return the neutral relief convolved with the kernels of a table for a state of strain."""
     angle = math.radians(state.angle_deg)
     alpha, sigma_um = kernel_parameters([state.stretch_s, state.stretch_t], table)
     return convolve(
         skin.height_um,
         (math.cos(angle), -math.sin(angle)),
-        (math.sin(angle), math.cos(angle)),  # rows go down
+        (math.sin(angle), math.cos(angle)),  # rows increase downwards
         alpha[0],
         sigma_um[0] / TEXEL_UM,
         alpha[1],
@@ -119,7 +120,7 @@ def strain_relief(
 
 
 def _slope_errors(made: Float32Array, state: StretchedSkin) -> tuple[float, float]:
-    """Return the distance of normals from settled skin's, and |log| of the ratio of variances."""
+    """Return the distance of normal histograms from the equilibrium's, and |log variance ratio|."""
     there, ours = strained_slopes(state.height_um, state), strained_slopes(made, state)
     distance = normal_histogram.distance(
         normal_histogram.from_slopes(*there), normal_histogram.from_slopes(*ours)
@@ -127,15 +128,15 @@ def _slope_errors(made: Float32Array, state: StretchedSkin) -> tuple[float, floa
     return distance, abs(math.log(ours[0].var() / there[0].var()))
 
 
-def truth(stage: BenchmarkStage) -> None:
-    """Judge convolved reliefs by skin whose stiff layer came to rest; then time the convolution."""
+def measure_kernel_maps(stage: BenchmarkStage) -> None:
+    """Measure convolved reliefs against the equilibrium of a stiff layer; time the convolution."""
     patch = partial(
         make_micro_skin, "forehead", size_mm=0.8 if stage.toy else 2.4, texel_um=TEXEL_UM
     )
     states = (0.82, 0.94, 1.06, 1.18) if stage.toy else FITTED_STRETCHES
     table = fit_kernel_table([patch(seed=1)], states, every=4 if stage.toy else 1)
     skins = [patch(seed=seed) for seed in ((7, 8) if stage.toy else (7, 8, 9))]
-    ways: list[tuple[str, KernelTable | None, Sampling]] = [
+    methods: list[tuple[str, KernelTable | None, Sampling]] = [
         ("none", None, "cubic"),
         ("the paper's forehead", FOREHEAD, "cubic"),
         ("fitted", table, "cubic"),
@@ -148,7 +149,7 @@ def truth(stage: BenchmarkStage) -> None:
             for skin in skins
             for r in (EVALUATED_STRETCHES[::3] if stage.toy else EVALUATED_STRETCHES)
         ]
-        for name, kernels, sampling in ways:
+        for name, kernels, sampling in methods:
             if sampling == "linear" and across == "none":
                 continue
             timing, made = stage.time(
@@ -184,12 +185,12 @@ def truth(stage: BenchmarkStage) -> None:
 def synthesize_kernel_fields(
     side: int, rows: int, *, first_row: int = 0
 ) -> tuple[Float32Array, ...]:
-    """Return axes, strengths and sigmas as a face has them: they turn, blur here, sharpen there.
+    """Synthesize face-like fields of axes, strengths and sigmas with blurred and sharpened parts.
 
     Parameters
     ----------
-    side, rows, first_row : int
-        Size of the whole map, and the rows that are returned.
+    side, rows, first_row
+        Side of the whole map, and number and first of the returned rows.
 
     Returns
     -------
@@ -215,8 +216,8 @@ def synthesize_kernel_fields(
     )
 
 
-def numpy_convolve(height: Float32Array, fields: tuple[Float32Array, ...]) -> Float32Array:
-    """Return eqs. (4)-(6) in vectorised NumPy and SciPy, with bilinear samples."""
+def convolve_with_numpy(height: Float32Array, fields: tuple[Float32Array, ...]) -> Float32Array:
+    """Convolve by eqs. (4)-(6) with vectorized NumPy and SciPy and bilinear samples."""
     axis_s, axis_t, alpha_s, sigma_s, alpha_t, sigma_t = fields
     y, x = np.mgrid[: height.shape[0], : height.shape[1]].astype(np.float32)
     for axis, alpha, sigma in ((axis_s, alpha_s, sigma_s), (axis_t, alpha_t, sigma_t)):
@@ -233,7 +234,7 @@ def numpy_convolve(height: Float32Array, fields: tuple[Float32Array, ...]) -> Fl
 
 
 def _full_size() -> LimitValues:
-    """Time 4096 x 4096 beside NumPy on a strip of it, a texture's fields, and tiles of 16K."""
+    """Time 4096 x 4096 against NumPy on a strip, the fields of a texture, and tiles of 16K."""
     rng = np.random.default_rng(0)
     height = rng.standard_normal((FULL_SIDE_PX, FULL_SIDE_PX), np.float32)
     fields = synthesize_kernel_fields(FULL_SIDE_PX, FULL_SIDE_PX)
@@ -242,15 +243,19 @@ def _full_size() -> LimitValues:
     for sampling in both:
         run = partial(convolve, height, *fields, sampling=sampling)
         run()
-        own[sampling] = processor_seconds(run, 2) / LIMIT_CORES
+        own[sampling] = measure_processor_seconds(run, 2) / LIMIT_CORES
     strip = height[:PEER_ROWS]
     own_strip = tuple(values[:PEER_ROWS] for values in fields)
-    peer_s = processor_seconds(lambda: numpy_convolve(strip, own_strip)) * FULL_SIDE_PX / PEER_ROWS
+    peer_s = (
+        measure_processor_seconds(lambda: convolve_with_numpy(strip, own_strip))
+        * FULL_SIDE_PX
+        / PEER_ROWS
+    )
     mismatch = np.abs(
-        numpy_convolve(strip, own_strip) - convolve(strip, *own_strip, sampling="linear")
+        convolve_with_numpy(strip, own_strip) - convolve(strip, *own_strip, sampling="linear")
     ).max()
     del fields, height
-    raster_s = processor_seconds(_rasterized(FULL_SIDE_PX), 2) / LIMIT_CORES
+    raster_s = measure_processor_seconds(_rasterized(FULL_SIDE_PX), 2) / LIMIT_CORES
     tile_s, peak_mb = _tiles_of_16k()
     return {
         "speed_up": peer_s / own["cubic"],
@@ -264,7 +269,7 @@ def _full_size() -> LimitValues:
 
 
 def _rasterized(side: int) -> Callable[[], object]:
-    """Return a call that fills a texture with the strain of a sheet of some 18,000 triangles."""
+    """Return a function that rasterizes the strain of a sheet of 18,432 triangles."""
     n = 97
     at = np.linspace(0.0, 1.0, n)
     u, v = np.meshgrid(at, at)
@@ -277,7 +282,7 @@ def _rasterized(side: int) -> Callable[[], object]:
 
 
 def _tiles_of_16k() -> tuple[float, float]:
-    """Return processor seconds a core for the whole of 16K, by two tiles, and MB held."""
+    """Return processor seconds per core for 16K, extrapolated from two tiles, and peak MB."""
     shape = (TILED_SIDE_PX, TILED_SIDE_PX)
     count = len(list_tiles(shape, 2048))
     chosen = (0, count // 2 + 3)
@@ -301,7 +306,7 @@ def _tiles_of_16k() -> tuple[float, float]:
             fields_at,
             finished=[number for number in range(count) if number not in chosen],
         )
-        spent = processor_seconds(run)
+        spent = measure_processor_seconds(run)
         tracemalloc.start()
         try:
             run()
@@ -312,12 +317,12 @@ def _tiles_of_16k() -> tuple[float, float]:
     return spent / LIMIT_CORES * count / len(chosen), peak / 1e6
 
 
-def waves(
+def synthesize_waves(
     side: int, sigma_px: float, *, rng: np.random.Generator
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return wave vectors (N, 2), rad per px, amplitudes and phases of a relief of many waves.
+    """Draw wave vectors (N, 2), rad per px, amplitudes and phases of a relief of N waves.
 
-    Wavelengths are 4 to 12 sigmas (no shorter than 5 px), where kernels do most.
+    Wavelengths are 4 to 12 sigmas, at least 5 px, where kernels have the largest effect.
     """
     length = sigma_px * rng.uniform(4.0, 12.0, N_WAVES)
     k = 2.0 * np.pi / np.maximum(length, 5.0)
@@ -335,27 +340,28 @@ def measure_two_pass_error(
     sampling: Sampling = "cubic",
     rng: np.random.Generator,
 ) -> tuple[float, Callable[[], FloatArray]]:
-    """Return how far two passes are from the true convolution whose kernel varies, and the call.
+    """Return the error of two passes against the exact convolution with a varying kernel.
 
-    The true one (eqs. 1 and 2, with the kernel of the pixel it is written to) is known exactly of
-    a relief of waves: each is scaled by the response of that pixel's kernel.
+    The exact result (eqs. 1 and 2, with the kernel of the output pixel) of a relief of waves has a
+    closed form: each wave is scaled by the frequency response of the pixel's kernel.
 
     Parameters
     ----------
-    rotation_rad, growth : float
-        Turn of the axes, rad, and largest relative change of sigma, over one sigma.
-    sigma_px : float
+    rotation_rad, growth
+        Rotation of the axes, rad, and largest relative change of sigma, per sigma.
+    sigma_px
         Sigma in the middle of the map, px.
-    side : int
-        Pixels a side.
-    sampling : {"cubic", "linear"}
-    rng : Generator
-        Draws the waves.
+    side
+        Side of the map, px.
+    sampling
+        Interpolation of samples.
+    rng
+        Generator of the waves.
 
     Returns
     -------
     error : float
-        RMS of the difference over that of the change by the true convolution.
+        RMS of the difference over that of the change by the exact convolution.
     call : callable
         The convolution, for timing.
     """
@@ -363,7 +369,7 @@ def measure_two_pass_error(
     margin = round(10.0 * sigma_px)
     whole = side + 2 * margin
     y, x = np.mgrid[:whole, :whole].astype(np.float64) - 0.5 * (whole - 1)
-    vectors, amplitudes, phases = waves(side, sigma_px, rng=rng)
+    vectors, amplitudes, phases = synthesize_waves(side, sigma_px, rng=rng)
     angle = 0.4 + rotation_rad / sigma_px * (x * np.cos(0.9) + y * np.sin(0.9))
     sigma = sigma_px * (1.0 + 0.5 * np.sin(2.0 * growth / sigma_px * (0.9 * x - 0.44 * y)))
     axis_s = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -373,6 +379,7 @@ def measure_two_pass_error(
         wave = amplitude * np.cos(vector[0] * x + vector[1] * y + phase)
         response = np.ones((whole, whole))
         for axis, strength in ((axis_s, alpha[0]), (axis_t, alpha[1])):
+            # response of (1 - alpha) delta + alpha G: 1 - alpha + alpha exp(-(sigma k)^2 / 2)
             along = axis @ vector
             response *= 1.0 - strength + strength * np.exp(-0.5 * (sigma * along) ** 2)
         height += wave
@@ -388,21 +395,21 @@ def measure_two_pass_error(
     return float(np.sqrt(np.mean(off**2) / np.mean(change**2))), call
 
 
-def passes(stage: BenchmarkStage) -> None:
-    """Compare two passes with the true convolution: turning axes, growing sigma, samples, sizes."""
+def measure_two_passes(stage: BenchmarkStage) -> None:
+    """Measure two passes against the exact convolution over rotation, growth, samples, sigma."""
     tried = [(0.0, 0.0), (0.1, 0.0), (0.0, 0.1)]
     if not stage.toy:
         values = (0.01, GRADUAL_CHANGE_PER_SIGMA, 0.05, 0.1, 0.2)
         tried = [(0.0, 0.0), *((v, 0.0) for v in values), *((0.0, v) for v in values)]
     efforts: dict[Sampling, list[tuple[float, float]]] = {"cubic": tried, "linear": tried[::5]}
     for sigma_px in (2.0,) if stage.toy else (1.5, 3.0):
-        for sampling, turn, growth in (
+        for sampling, rotation, growth in (
             (s, *pair) for s, pairs in efforts.items() for pair in pairs
         ):
             found = []
             for seed in range(2 if stage.toy else 3):
                 error, call = measure_two_pass_error(
-                    rotation_rad=turn,
+                    rotation_rad=rotation,
                     growth=growth,
                     sigma_px=sigma_px,
                     sampling=sampling,
@@ -410,15 +417,15 @@ def passes(stage: BenchmarkStage) -> None:
                     rng=np.random.default_rng(seed),
                 )
                 found.append(100.0 * error)
-            knobs: Knobs = {"turn_rad_per_sigma": turn, "growth_per_sigma": growth}
+            knobs: Knobs = {"turn_rad_per_sigma": rotation, "growth_per_sigma": growth}
             knobs |= {"sigma_px": sigma_px, "sampling": sampling}
             stage.add(knobs, stage.time(call, repeats=1, memory=False)[0], mean_error(found))
     if not stage.toy:
-        some = GRADUAL_CHANGE_PER_SIGMA
-        for name, (turn, growth) in {
+        gradual = GRADUAL_CHANGE_PER_SIGMA
+        for name, (rotation, growth) in {
             "constant": (0.0, 0.0),
-            "turn": (some, 0.0),
-            "growth": (0.0, some),
+            "turn": (gradual, 0.0),
+            "growth": (0.0, gradual),
         }.items():
-            varied = {"turn_rad_per_sigma": turn, "growth_per_sigma": growth}
-            stage.limits[name] = stage.at(sigma_px=3.0, sampling="cubic", **varied).error
+            varied = {"turn_rad_per_sigma": rotation, "growth_per_sigma": growth}
+            stage.limits[name] = stage.find_point(sigma_px=3.0, sampling="cubic", **varied).error

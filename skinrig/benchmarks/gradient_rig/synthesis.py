@@ -1,4 +1,4 @@
-"""Benchmark of maps grown from patches, beside histogram-preserving blending."""
+"""Benchmark of maps grown from patches against histogram-preserving blending."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -13,7 +13,11 @@ from reconstruction import normal_histogram
 from reconstruction.normal_histogram import relief_slopes
 from rigsim.skin_patch.microrelief import make_micro_skin
 from skinrig.arrays import Float32Array, Float64Array
-from skinrig.benchmarks.measurement import measure, measure_processor_time, processor_seconds
+from skinrig.benchmarks.measurement import (
+    measure,
+    measure_processor_seconds,
+    measure_processor_time,
+)
 from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 
@@ -25,22 +29,22 @@ N_THREADS = 2
 def blend_hexagonal_tiles(
     patches: Sequence[Float32Array], size_px: int, *, edge_px: int, rng: np.random.Generator
 ) -> Float32Array:
-    """Grow patches by blending hexagonal tiles, their histogram of heights preserved.
+    """Grow patches by blending hexagonal tiles with a preserved histogram of heights.
 
-    Heights become normally distributed by their rank, three tiles are blended at each pixel with
-    weights divided by the root of their sum of squares, and ranks are turned back (Heitz and
-    Neyret 2018, doi:10.1145/3233304). The method that was not taken; here as a peer.
+    Heights are mapped to a normal distribution by rank. Three tiles are blended at each pixel with
+    weights divided by the root of their sum of squares, which preserves the variance. The ranks are
+    then mapped back (Heitz and Neyret 2018, doi:10.1145/3233304). This is the peer of our method.
 
     Parameters
     ----------
     patches : sequence of (H, W) float32
-        Heights, of at least ``2 * edge_px + 2`` pixels a side.
-    size_px : int
+        Heights, with a side of at least ``2 * edge_px + 2`` pixels.
+    size_px
         Side of the map.
-    edge_px : int
-        Edge of the triangles whose corners are the middles of tiles.
+    edge_px
+        Edge of the triangles between tile centers.
     rng
-        Draws which part of which patch a tile shows.
+        Generator of the patch and the offset of each tile.
     """
     stack = np.stack(patches)
     ordered = np.sort(stack, axis=None)
@@ -60,7 +64,8 @@ def blend_hexagonal_tiles(
     reach = stack.shape[1] - 2 * edge_px - 2
     from_y, from_x = rng.integers(reach + 1, size=(2, *shape))
     total, square = np.zeros((size_px, size_px)), np.zeros((size_px, size_px))
-    for da, db, share in (
+    # barycentric weights of the three tile centers around each pixel
+    for da, db, weight in (
         (np.where(upper, 1, 0), np.where(upper, 1, 0), np.where(upper, fa + fb - 1, 1 - fa - fb)),
         (np.where(upper, 0, 1), np.where(upper, 1, 0), np.where(upper, 1 - fa, fa)),
         (np.where(upper, 1, 0), np.where(upper, 0, 1), np.where(upper, 1 - fb, fb)),
@@ -68,12 +73,12 @@ def blend_hexagonal_tiles(
         ca, cb = corner_a + da, corner_b + db
         local_y = np.rint(y - cb * high).astype(int) + edge_px
         local_x = np.rint(x - (ca + 0.5 * cb) * edge_px).astype(int) + edge_px
-        place = (cb, ca - lowest)
-        value = normal[which[place], from_y[place] + local_y, from_x[place] + local_x]
-        total += share * value
-        square += share**2
-    shares = (np.arange(4096) + 0.5) / 4096
-    quantile = np.interp(total / np.sqrt(square), ndtri(shares), np.quantile(ordered, shares))
+        index = (cb, ca - lowest)
+        value = normal[which[index], from_y[index] + local_y, from_x[index] + local_x]
+        total += weight * value
+        square += weight**2
+    levels = (np.arange(4096) + 0.5) / 4096
+    quantile = np.interp(total / np.sqrt(square), ndtri(levels), np.quantile(ordered, levels))
     return quantile.astype(np.float32)
 
 
@@ -85,9 +90,10 @@ def slope_histogram(heights: Sequence[Float32Array]) -> Float64Array:
 
 
 def autocorrelation(height: Float32Array, *, reach_px: int = 64) -> Float64Array:
-    """Return the autocorrelation of a map's slopes along y at distances up to a reach."""
+    """Return the autocorrelation of a map's slopes along y at offsets up to a reach."""
     slope = np.gradient(height.astype(np.float64), axis=0)
     rows, columns = (fft.next_fast_len(n + reach_px) for n in slope.shape)
+    # Wiener-Khinchin with zero padding; the transform of ones counts the pairs at each offset
     power = np.abs(fft.rfft2(slope - slope.mean(), s=(rows, columns))) ** 2
     ones = np.abs(fft.rfft2(np.ones(slope.shape), s=(rows, columns))) ** 2
     whole = fft.irfft2(power, s=(rows, columns)) / fft.irfft2(ones, s=(rows, columns))
@@ -96,14 +102,14 @@ def autocorrelation(height: Float32Array, *, reach_px: int = 64) -> Float64Array
 
 
 def skewness_of_curvature(height: Float32Array) -> float:
-    """Return the skewness of minus Laplace: furrows are sharp and ridges round, so it is not 0."""
+    """Return the skewness of the negative Laplacian, nonzero for sharp grooves and round ridges."""
     bend = -sum(np.roll(height, s, a) for s in (-1, 1) for a in (0, 1)) + 4.0 * height
     inner = bend[1:-1, 1:-1].astype(np.float64)
     return float(((inner - inner.mean()) ** 3).mean() / inner.std() ** 3)
 
 
-def growth(stage: BenchmarkStage) -> None:
-    """Grow a map: cells, what they share, windows tried; beside blending; then the largest map."""
+def measure_growth(stage: BenchmarkStage) -> None:
+    """Measure growth over cells, overlaps and candidates; compare with blending; extrapolate."""
     site = "forehead"
     count, size_mm, side = (2, 1.6, 200) if stage.toy else (4, 8.0, 2048)
     patches = [
@@ -135,13 +141,13 @@ def growth(stage: BenchmarkStage) -> None:
     )
     stage.add({"method": "blend", "cell": edge}, timing, _error(theirs, truth))
     stage.reference_error = normal_histogram.halved_distance(*halves)
-    stage.words = {"count": count, "size_mm": size_mm, "side": side}
+    stage.description_values = {"count": count, "size_mm": size_mm, "side": side}
     if not stage.toy:
         stage.limits = _evaluate_growth(patches, truth, theirs)
 
 
 def _error(height: Float32Array, truth: Float64Array) -> ErrorEstimate:
-    """Return the error of a map with the spread of its quarters as the interval."""
+    """Return the error of a map with a jackknife interval over its quarters."""
     error = normal_histogram.halved_distance(slope_histogram([height]), truth)
     half = height.shape[0] // 2
     halves = (slice(None, half), slice(half, None))
@@ -150,19 +156,20 @@ def _error(height: Float32Array, truth: Float64Array) -> ErrorEstimate:
         for rows in halves
         for columns in halves
     ]
-    left_out = [
+    # jackknife of four quarters: variance = 3/4 of the sum of squared deviations
+    omitted = [
         normal_histogram.halved_distance((sum(quarters) - each) / 3.0, truth) for each in quarters
     ]
-    spread = float(np.sqrt(0.75 * np.sum((np.array(left_out) - np.mean(left_out)) ** 2)))
-    return ErrorEstimate.nonnegative(error, spread)
+    stderr = float(np.sqrt(0.75 * np.sum((np.array(omitted) - np.mean(omitted)) ** 2)))
+    return ErrorEstimate.nonnegative(error, stderr)
 
 
 def _evaluate_growth(
     patches: Sequence[Float32Array], truth: Float64Array, reference_map: Float32Array
 ) -> LimitValues:
-    """Lay out the largest map, draw a band of its tiles, and judge them."""
+    """Build the layout of the largest map, draw some of its tiles and evaluate them."""
     rng = np.random.default_rng(0)
-    laid_s, layout = measure_processor_time(
+    layout_s, layout = measure_processor_time(
         lambda: displacement_synthesis.build_layout(
             patches, MAX_SIDE_PX, rng=rng, threads=N_THREADS
         )
@@ -170,7 +177,7 @@ def _evaluate_growth(
     tile = layout.tile(0, 0)
     rows, columns = tile.shape
     timing = measure(lambda: layout.tile(rows, columns), repeats=1)
-    tile_s = processor_seconds(lambda: layout.tile(rows, columns))
+    tile_s = measure_processor_seconds(lambda: layout.tile(rows, columns))
     tiles = sum(1 for _ in layout.tiles())
     site = layout.sites[0]
     held = site.sources.heights.nbytes * 2 + site.sources.filled.nbytes
@@ -184,18 +191,18 @@ def _evaluate_growth(
     square = slope_x**2 + slope_y**2
     ours = normal_histogram.halved_distance(slope_histogram([part]), truth)
     skew = [skewness_of_curvature(h) for h in (part, reference_map)]
-    ought = float(np.mean([skewness_of_curvature(patch) for patch in patches]))
-    alike = np.mean([autocorrelation(patch) for patch in patches], axis=0)
-    apart = [
-        float(np.sqrt(np.mean((autocorrelation(h) - alike) ** 2))) for h in (part, reference_map)
+    expected_skew = float(np.mean([skewness_of_curvature(patch) for patch in patches]))
+    expected = np.mean([autocorrelation(patch) for patch in patches], axis=0)
+    mismatch = [
+        float(np.sqrt(np.mean((autocorrelation(h) - expected) ** 2))) for h in (part, reference_map)
     ]
     blend = normal_histogram.halved_distance(slope_histogram([reference_map]), truth)
     return {
         "histogram": ours,
         "cuts": float(np.sqrt(square[cuts].mean() / square[~cuts].mean())),
         "memory": memory_gb,
-        "minutes": (laid_s + tiles * tile_s) / 60.0,
+        "minutes": (layout_s + tiles * tile_s) / 60.0,
         "slopes": blend / ours,
-        "furrows": abs(skew[1] - ought) / max(abs(skew[0] - ought), 1e-9),
-        "autocorrelation": apart[0] / apart[1],
+        "furrows": abs(skew[1] - expected_skew) / max(abs(skew[0] - expected_skew), 1e-9),
+        "autocorrelation": mismatch[0] / mismatch[1],
     }

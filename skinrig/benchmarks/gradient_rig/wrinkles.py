@@ -1,4 +1,4 @@
-"""Benchmarks of wrinkles: maps fitted to furrows, ways of storing them, weights under noise."""
+"""Benchmarks of wrinkles: maps fitted to grooves, storage formats, weights under noise."""
 
 import dataclasses
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from reconstruction.wrinkles import fit as wrinkle_fit
 from reconstruction.wrinkles import texels as wrinkle_texels
 from reconstruction.wrinkles import weights as wrinkle_weights
 from skinrig.arrays import Float32Array, Float64Array, FloatArray
-from skinrig.benchmarks.measurement import measure_once, processor_seconds
+from skinrig.benchmarks.measurement import measure_once, measure_processor_seconds
 from skinrig.benchmarks.resampling import gaussian_rms, split_squares
 from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage
@@ -28,7 +28,7 @@ ZONE_CENTERS_UV = (
 )
 ZONE_RADIUS_UV = 0.12
 GROOVES_PER_FACE = 16
-"""Furrows over the height of the face, if it had them everywhere."""
+"""Grooves over the height of the face, if it had them everywhere."""
 MAX_SLOPE = 0.6
 FULL_SIDE_PX = 2048
 NORMAL_NOISE_RAD = 0.02
@@ -39,11 +39,11 @@ STORED_TYPES: tuple[tuple[Any, Any], ...] = (
     ("bc5", "bc3"),
     ("bc5", "unit8"),
 )
-"""Of maps and of masks."""
+"""Encodings of maps and of masks."""
 
 
-def zone_masks(side: int) -> Float64Array:
-    """Return eight soft zones on a face's texture, (8, side, side), with sums of at most 1."""
+def make_zone_masks(side: int) -> Float64Array:
+    """Make masks of eight soft zones of a face's texture, (8, side, side), of sums at most 1."""
     y, x = (np.mgrid[:side, :side] + 0.5) / side
     masks = np.stack(
         [
@@ -57,38 +57,38 @@ def zone_masks(side: int) -> Float64Array:
 def synthesize_wrinkled_face(
     side: int, *, rng: np.random.Generator
 ) -> tuple[Float64Array, dict[str, Float64Array]]:
-    """Return normals of a face at rest and in the six expressions, made of heights.
+    """Synthesize normals of a face at rest and in six expressions from heights.
 
-    Furrows rise with an expression by a law that no weight times one map follows: they deepen
-    less than proportionally and grow narrower, and what an expression stretches loses the faint
-    furrows it has at rest.
+    The grooves follow a law outside the model of one map times a weight: they deepen less than
+    proportionally to the expression and become narrower, and stretched skin loses the faint grooves
+    it has at rest.
 
     Parameters
     ----------
-    side : int
-        Pixels a side.
+    side
+        Side of the maps, px.
     rng
-        Draws relief and lines.
+        Generator of relief and grooves.
 
     Returns
     -------
     neutral : ndarray, shape (side, side, 3)
-    expressions : mapping of str to the same
+    expressions : mapping of str to ndarray, shape (side, side, 3)
     """
     y = (np.mgrid[:side, :side][0] + 0.5) / side
     bend = gaussian_filter(rng.standard_normal((side, side)), side / 20, mode="wrap")
     phase = 2 * np.pi * GROOVES_PER_FACE * (y + 0.012 * bend / bend.std())
     grain = gaussian_filter(rng.standard_normal((side, side)), 1.5, mode="wrap")
-    masks = zone_masks(side)
+    masks = make_zone_masks(side)
     rest = 0.15 * masks.sum(axis=0)
 
-    def furrows(row: Float64Array) -> Float64Array:
+    def grooves(row: Float64Array) -> Float64Array:
         rise = np.maximum(rest + np.tensordot(row, masks, axes=1), 0.0)
         sharp = 1.0 + 3.0 * rise
         return np.asarray(-(rise**0.8) * np.exp(sharp * (np.cos(phase) - 1.0)))
 
     rows = {name: JIMENEZ2011_TABLE.row(name) for name in JIMENEZ2011_TABLE.rows}
-    deep = {name: furrows(row) for name, row in rows.items()}
+    deep = {name: grooves(row) for name, row in rows.items()}
     scale = MAX_SLOPE / max(float(np.abs(np.gradient(h)[0]).max()) for h in deep.values())
 
     def normals(height: Float64Array) -> Float64Array:
@@ -99,18 +99,18 @@ def synthesize_wrinkled_face(
             wrinkles.decode(np.stack([-dx - rough * relief_x, dy + rough * relief_y], axis=-1))
         )
 
-    return normals(furrows(np.zeros(8))), {name: normals(h) for name, h in deep.items()}
+    return normals(grooves(np.zeros(8))), {name: normals(h) for name, h in deep.items()}
 
 
 def _resized(texture: FloatArray, side: int) -> FloatArray:
-    """Return a texture (H, W, 2) at (side, side, 2)."""
+    """Resample a texture (H, W, 2) to (side, side, 2)."""
     return np.moveaxis(resampling.resample(np.moveaxis(texture, 2, 0), (side, side)), 0, 2)
 
 
-def numpy_combine(
+def combine_with_numpy(
     base: Float32Array, wrinkle: Float64Array, masks: Float64Array, sums: Float64Array
 ) -> Float64Array:
-    """Return listing 1.1's normals in vectorised NumPy and SciPy: each texture sampled, summed."""
+    """Combine normals by listing 1.1 with vectorized NumPy and SciPy."""
     height, width = base.shape[:2]
 
     def sampled(texture: Float64Array) -> Float64Array:
@@ -128,10 +128,10 @@ def numpy_combine(
     return np.asarray(n / np.linalg.norm(n, axis=-1, keepdims=True))
 
 
-def opencv_combine(
+def combine_with_opencv(
     base: Float32Array, wrinkle: Float64Array, masks: Float64Array, sums: Float64Array
 ) -> Float32Array:
-    """Return the same with OpenCV's resize for the sampler and NumPy for the sums, float32."""
+    """Combine normals by listing 1.1 with OpenCV's resize and NumPy's sums, in float32."""
     import cv2
 
     size = (base.shape[1], base.shape[0])
@@ -150,7 +150,7 @@ def opencv_combine(
 
 
 def _error(normals: FloatArray, truth: FloatArray) -> ErrorEstimate:
-    """Return the mean angle, degrees, and its interval over squares of the face."""
+    """Return the mean angular error, degrees, with its interval over squares of the face."""
     angle = np.degrees(metrics.angular_error_rad(normals, truth))
     parts = [float(angle[at].mean()) for at in split_squares(len(angle))]
     return ErrorEstimate.symmetric(float(angle.mean()), float(np.std(parts) / np.sqrt(len(parts))))
@@ -162,8 +162,8 @@ def _mean_error(model: Any, states: dict[str, Float64Array]) -> ErrorEstimate:
     return ErrorEstimate(float(np.mean([one.error for one in errors])), (low, high))
 
 
-def fitting(stage: BenchmarkStage) -> None:
-    """Fit a map and weights to six expressions: sizes of map and masks, known masks or not."""
+def measure_fitting(stage: BenchmarkStage) -> None:
+    """Measure fits of a map and weights to six expressions over sizes of map and masks."""
     side = 64 if stage.toy else 512
     neutral, states = synthesize_wrinkled_face(side, rng=np.random.default_rng(0))
     sizes = (
@@ -172,7 +172,7 @@ def fitting(stage: BenchmarkStage) -> None:
         else ((512, 64), (256, 64), (128, 64), (64, 64), (256, 256), (256, 16))
     )
     for map_side, mask_side in sizes:
-        masks = zone_masks(mask_side)
+        masks = make_zone_masks(mask_side)
 
         def fit() -> wrinkle_fit.WrinkleFit:
             return wrinkle_fit.fit_wrinkle_map(
@@ -189,17 +189,17 @@ def fitting(stage: BenchmarkStage) -> None:
     stage.limits["best"] = min(point.error for point in stage.points) / rest
 
 
-def summing(stage: BenchmarkStage) -> None:
-    """Add half of a wrinkle's relief to a base: derivatives, differences of normals, NumPy."""
+def measure_summing(stage: BenchmarkStage) -> None:
+    """Measure the sum of a base and half of a wrinkle's relief by each method and peer."""
     rng = np.random.default_rng(1)
     side, coarse, mask_side = (256, 32, 8) if stage.toy else (FULL_SIDE_PX, 256, 64)
     base = gaussian_filter(rng.standard_normal((side, side, 2)), (1, 1, 0)).astype(np.float32)
     base *= 0.1 / base.std()
     wrinkle = gaussian_filter(rng.standard_normal((coarse, coarse, 2)), (2, 2, 0))
     wrinkle *= MAX_SLOPE / np.abs(wrinkle).max()
-    masks = zone_masks(mask_side)
+    masks = make_zone_masks(mask_side)
     row = np.full(8, 0.5)
-    truth = numpy_combine(base, wrinkle, masks, row)
+    truth = combine_with_numpy(base, wrinkle, masks, row)
     neutral = wrinkles.decode(base)
     low = _resized(base, coarse)
     difference = wrinkle_differences.difference_map(
@@ -212,15 +212,15 @@ def summing(stage: BenchmarkStage) -> None:
     def by_differences(renormalize: bool = True) -> FloatArray:
         return wrinkle_differences.combine(neutral, difference, masks, row, renormalize=renormalize)
 
-    ways: dict[str, Callable[[], FloatArray]] = {
+    methods: dict[str, Callable[[], FloatArray]] = {
         "derivatives": by_derivatives,
         "differences": by_differences,
         "differences, not renormalized": lambda: by_differences(False),
-        "OpenCV and NumPy": lambda: opencv_combine(base, wrinkle, masks, row),
-        "NumPy": lambda: numpy_combine(base, wrinkle, masks, row),
+        "OpenCV and NumPy": lambda: combine_with_opencv(base, wrinkle, masks, row),
+        "NumPy": lambda: combine_with_numpy(base, wrinkle, masks, row),
     }
 
-    for way, call in ways.items():
+    for way, call in methods.items():
         stage.measure(
             {"way": way, "side": side},
             call,
@@ -230,23 +230,26 @@ def summing(stage: BenchmarkStage) -> None:
         )
     if stage.toy:
         return
-    peer_s, own_s = processor_seconds(ways["NumPy"], 1), processor_seconds(by_derivatives, 5)
+    peer_s, own_s = (
+        measure_processor_seconds(methods["NumPy"], 1),
+        measure_processor_seconds(by_derivatives, 5),
+    )
     stage.limits = {
         "over_numpy": peer_s / own_s,
-        "over_opencv": processor_seconds(ways["OpenCV and NumPy"], 5) / own_s,
+        "over_opencv": measure_processor_seconds(methods["OpenCV and NumPy"], 5) / own_s,
         "difference": float(np.abs(by_derivatives() - truth).max()),
         "differences": stage.points[0].error / stage.points[1].error,
         "storage": wrinkle_storage.paper_footprint().total_bytes / 1024,
     }
 
 
-def storing(stage: BenchmarkStage) -> None:
-    """Store a wrinkle map at sizes and encodings, and show it: angle, bytes, seconds."""
+def measure_storage(stage: BenchmarkStage) -> None:
+    """Measure stored wrinkle maps over sizes and encodings: angular error, bytes, seconds."""
     side = 64 if stage.toy else 512
     neutral, states = synthesize_wrinkled_face(side, rng=np.random.default_rng(0))
     base = wrinkles.encode(neutral).astype(np.float32)
     fitted = wrinkle_fit.fit_wrinkle_map(
-        neutral, states, zone_masks(16 if stage.toy else 64), size=(side, side), clamp="signed"
+        neutral, states, make_zone_masks(16 if stage.toy else 64), size=(side, side), clamp="signed"
     )
     wrinkle = np.clip(fitted.layer.wrinkle, -wrinkles.MAX_DERIVATIVE, wrinkles.MAX_DERIVATIVE)
     masks = fitted.layer.masks
@@ -273,8 +276,8 @@ def storing(stage: BenchmarkStage) -> None:
             )
 
 
-def weighing(stage: BenchmarkStage) -> None:
-    """Fit the weights of an expression that the model made, at several noises and sizes."""
+def measure_weights(stage: BenchmarkStage) -> None:
+    """Measure fitted weights of an expression of the model over noise and image size."""
     rng = np.random.default_rng(2)
     draws = 4 if stage.toy else 12
     true = np.array([0.3, 0.8, 0.4, 0.7, 0.25, 0.5, 0.6, 0.2])
@@ -282,7 +285,7 @@ def weighing(stage: BenchmarkStage) -> None:
     for side in (64, 96) if stage.toy else (128, 256):
         base = 0.1 * rng.standard_normal((side, side, 2))
         wrinkle = gaussian_filter(rng.standard_normal((64, 64, 2)), (1.5, 1.5, 0))
-        layer = WrinkleLayer(0.5 * wrinkle / np.abs(wrinkle).max(), zone_masks(32))
+        layer = WrinkleLayer(0.5 * wrinkle / np.abs(wrinkle).max(), make_zone_masks(32))
         neutral = wrinkle_texels.measure_derivatives(wrinkles.decode(base))
         clean = wrinkles.combine_layers(base, [layer], true)
         for noise in (0.005, NORMAL_NOISE_RAD) if stage.toy else (0.005, NORMAL_NOISE_RAD, 0.08):
@@ -299,14 +302,15 @@ def weighing(stage: BenchmarkStage) -> None:
             ratios.append(float(np.sqrt(np.mean((miss / bound) ** 2))))
             outcome = gaussian_rms(miss, bound=float(np.sqrt(np.mean(bound**2))))
             stage.add({"side": side, "noise, mrad": 1e3 * noise}, timing, outcome)
-    # the mean of six ratios of 96 weights each scatters by 3 %: 1.1 is missed by chance in 1e-3
+    # the mean of six ratios of 96 weights each has a standard deviation of 3 %: correct weights
+    # miss the limit of 1.1 with probability 1e-3
     stage.limits["over_bound"] = float(np.mean(ratios))
 
 
 def _add_normal_noise(
     normals: FloatArray, stderr_rad: Float64Array, rng: np.random.Generator
 ) -> Float64Array:
-    """Return normals turned by independent angles along two directions of the surface."""
+    """Rotate normals by independent angles about two tangential axes."""
     aside = np.where(np.abs(normals[..., :1]) < 0.5, [1.0, 0, 0], [0, 1.0, 0])
     u = np.cross(normals, aside)
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
@@ -316,10 +320,10 @@ def _add_normal_noise(
 
 
 def _bound(layer: WrinkleLayer, clean: FloatArray, stderr_rad: Float64Array) -> Float64Array:
-    """Return the least standard error of each weight: information of all normals at once.
+    """Return the Cramér-Rao bound of each weight's standard error, from all normals together.
 
-    In the normal's own two directions the errors are independent; derivatives of the normal by
-    the weights follow from n = (p, q, 1) / |(p, q, 1)|.
+    Errors in the two tangential directions are independent. The derivatives of the normal by the
+    weights follow from n = (p, q, 1) / |(p, q, 1)|: dn = n_z (dp, dq, 0), projected across n.
     """
     side = stderr_rad.shape[0]
     read = _resized(layer.wrinkle, side)

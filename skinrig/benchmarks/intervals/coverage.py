@@ -1,8 +1,8 @@
-"""How often stated intervals hold the truth, over subjects whose pixels share their errors.
+"""Coverage of stated intervals over subjects whose pixels have correlated errors.
 
-Pixels of one subject err together: a subject is one draw. The coverage is the mean of the
-subjects' shares, and its own interval is that of a mean of so many subjects (Student), however many
-pixels each has.
+Errors of one subject's pixels are correlated, so that a subject is one draw. The coverage is the
+mean of the subjects' fractions of ground truths inside. Its own interval is Student's for a mean of
+that many subjects, however many pixels each has.
 """
 
 import math
@@ -15,7 +15,7 @@ import numpy as np
 from skinrig.arrays import Float64Array
 
 COVERAGE_RANGES: Final = {68: (0.60, 0.76), 95: (0.92, 0.98)}
-"""Nominal coverage, %, and the range that a stage's coverage is to lie in."""
+"""Nominal coverage, %, and the accepted range of the measured coverage."""
 
 GAUSSIAN_95: Final = 1.959964
 """Half width of a 95 % interval of a Gaussian error over that of its 68.27 % interval."""
@@ -23,23 +23,23 @@ GAUSSIAN_95: Final = 1.959964
 
 @dataclass(frozen=True, slots=True)
 class IntervalTrial:
-    """What one simulated subject says about the intervals of one quantity."""
+    """Errors of one simulated subject in half widths of its stated intervals, for one quantity."""
 
     quantity: str
     subject: str
-    """Preset or medium, and its seed."""
+    """Preset or medium, and seed."""
     band: str
-    """Band of skin color (`skinrig.evaluating.skin_bands`); "any" where the quantity needs none."""
+    """Band of skin color (`skinrig.evaluating.skin_bands`); "any" for quantities without one."""
     deviation: Float64Array
     """|estimate - truth| over the half width of the stated 68 % interval, (n,)."""
     width: float
     """Median half width of the 68 % interval, in `unit`."""
     unit: str
     factor_95: float
-    """Half width of the 95 % interval over that of the 68 % one, as users are told to form it."""
+    """Half width of the 95 % interval over that of the 68 % one, as the manual defines it."""
 
-    def share(self, level: int) -> float:
-        """Return the share of truths in the intervals of a nominal level, %."""
+    def inside_fraction(self, level: int) -> float:
+        """Return the fraction of ground truths inside the intervals of a nominal level, %."""
         reach = {68: 1.0, 95: self.factor_95}[level]
         return float(np.mean(self.deviation <= reach))
 
@@ -52,19 +52,19 @@ class IntervalCoverage:
     band: str
     level: int
     """Nominal, %."""
-    share: float
-    """Mean of the subjects' shares."""
+    inside_fraction: float
+    """Mean of the subjects' fractions inside, i.e. the coverage."""
     interval: tuple[float, float]
-    """Of the share, at the confidence that it was asked for; (0, 1) of a single subject."""
+    """Confidence interval of the coverage at the requested confidence; (0, 1) for one subject."""
     subjects: int
     width: float
     unit: str
 
     @property
     def verdict(self) -> str:
-        """Whether the share is in its range: "kept", "open" (its interval is) or "missed"."""
+        """Verdict: "kept" (coverage in range), "open" (only its interval is) or "missed"."""
         low, high = COVERAGE_RANGES[self.level]
-        if low <= self.share <= high:
+        if low <= self.inside_fraction <= high:
             return "kept"
         return "open" if self.interval[1] >= low and self.interval[0] <= high else "missed"
 
@@ -77,39 +77,39 @@ def pool_trials(
     Parameters
     ----------
     trials
-        At least one; of one quantity, a subject each.
+        At least one trial; all of one quantity, one per subject.
     level
         68 or 95, %.
     confidence
-        Of the interval of the share, two-sided.
+        Two-sided confidence of the coverage's interval.
 
     Raises
     ------
     ValueError
-        Without trials, for trials of several quantities, or a subject without truths.
+        Without trials, for trials of several quantities, or a subject without ground truths.
 
     Examples
     --------
     >>> ones = [IntervalTrial("x", str(k), "any", np.array([0.5, 0.9, 2.5]), 1.0, "", 1.96)
     ...         for k in range(3)]
-    >>> round(pool_trials(ones, level=68).share, 3), pool_trials(ones, level=68).verdict
+    >>> round(pool_trials(ones, level=68).inside_fraction, 3), pool_trials(ones, level=68).verdict
     (0.667, 'kept')
     """
     quantities = {trial.quantity for trial in trials}
     if len(quantities) != 1 or not all(trial.deviation.size for trial in trials):
         raise ValueError(
             f"trials: got {len(trials)} of {sorted(quantities)}, expected at least one, all of one "
-            "quantity and each with truths"
+            "quantity and each with ground truths; omit trials without any"
         )
-    shares = np.array([trial.share(level) for trial in trials])
+    fractions = np.array([trial.inside_fraction(level) for trial in trials])
     bands = {trial.band for trial in trials}
     return IntervalCoverage(
         trials[0].quantity,
         bands.pop() if len(bands) == 1 else "all",
         level,
-        float(shares.mean()),
-        _interval(shares, np.array([trial.deviation.size for trial in trials]), confidence),
-        len(shares),
+        float(fractions.mean()),
+        _interval(fractions, np.array([trial.deviation.size for trial in trials]), confidence),
+        len(fractions),
         float(np.median([trial.width for trial in trials])),
         trials[0].unit,
     )
@@ -118,9 +118,10 @@ def pool_trials(
 def _interval(
     fractions: Float64Array, truths: Float64Array, confidence: float
 ) -> tuple[float, float]:
-    """Return the interval of the mean share, no narrower than if truths had nothing in common.
+    """Return the interval of the mean fraction, no narrower than that of independent truths.
 
-    Subjects with a truth or two each may agree by chance: their scatter alone tells nothing then.
+    Subjects with one or two truths each may agree by chance, and their standard deviation is then
+    too small. The binomial interval of all truths is the lower limit of the width.
     """
     from scipy.stats import beta, t
 
@@ -136,7 +137,7 @@ def _interval(
     return max(min(middle - error, float(low)), 0.0), min(max(middle + error, float(high)), 1.0)
 
 
-def by_band(
+def group_by_band(
     trials: Sequence[IntervalTrial], *, level: int, confidence: float
 ) -> list[IntervalCoverage]:
     """Return the coverage of every quantity: over all subjects, then band by band.
@@ -144,9 +145,9 @@ def by_band(
     Parameters
     ----------
     trials
-        Of any quantities and subjects; those without truths are left out.
+        Of any quantities and subjects; those without ground truths are omitted.
     level, confidence
-        As of `pool_trials`.
+        As in `pool_trials`.
     """
     rows: list[IntervalCoverage] = []
     counted = [trial for trial in trials if trial.deviation.size]

@@ -1,14 +1,14 @@
-"""Whether stated intervals hold the truth as often as they say, on subjects that set nothing.
+"""Benchmark of the coverage of stated intervals on held-out subjects.
 
-Terms of error models, and the factors from 68 to 95 %, were set on subjects of seeds 0 to 19
-(`reconstruction.chromophores.model_error`); subjects here have seeds from 400 on. Each goes the
-whole way, from calibration targets to maps, with a calibration of its rig's own
-(`skinrig.benchmarks.intervals.flash` and its like).
+Error models and the factors from 68 to 95 % were set on subjects of seeds 0 to 19
+(`reconstruction.chromophores.model_error`); subjects here have seeds from 400 on. Each passes the
+whole pipeline, from calibration targets to maps, with its rig's own calibration (see
+`skinrig.benchmarks.intervals.flash` and the other rigs' modules).
 
-A coverage is the mean of the subjects' shares, and its interval is that of the mean of so many
-subjects. A promise is missed where the interval lies wholly outside the promised range. The
-intervals' confidence is such that a run in which every coverage is in truth at the edge of its
-range misses one with a chance of 5 % at most (Bonferroni).
+A coverage is the mean of the subjects' fractions inside, with the interval of a mean of that many
+subjects. A limit is missed where the interval lies wholly outside the accepted range. The
+confidence of the intervals is corrected for the number of coverages (Bonferroni): a run in which
+every true coverage is at the edge of its range misses any limit with probability 5 % at most.
 """
 
 import itertools
@@ -23,7 +23,7 @@ from skinrig.benchmarks.intervals.coverage import (
     COVERAGE_RANGES,
     IntervalCoverage,
     IntervalTrial,
-    by_band,
+    group_by_band,
 )
 from skinrig.benchmarks.intervals.trials import ANY_BAND
 from skinrig.benchmarks.measurement import measure_once
@@ -32,7 +32,7 @@ from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 
 FIRST_SEED: Final = 400
 FALSE_ALARM_RATE: Final = 0.05
-"""Chance that a run of honest intervals misses a promise."""
+"""Largest probability that a run with correct intervals misses a limit."""
 
 FLASH_PRESETS: Final = ("palest", "I", "II", "III", "IV", "V", "VI", "darkest")
 GRADIENT_SITES: Final = ("forehead", "cheek", "chin")
@@ -46,24 +46,24 @@ PROBE_MEDIA: Final = (
     "homogeneous:0.5,1.8,0.82",
     "homogeneous:0.08,0.9,0.9",
 )
-"""Fractions in 1/mm of absorption and reduced scattering, and g."""
+"""Absorption and reduced scattering coefficient, 1/mm, and anisotropy g."""
 PROBE_PRESETS: Final = ("II", "IV", "VI", "I", "III", "V")
-"""Presets under the probe: a band of melanin each, twice."""
+"""Presets under the probe: two of each melanin band."""
 ANISOTROPIC_MEDIA: Final = ("anisotropic:0.25,2,-1,35", "anisotropic:0.25,2,1,110")
-"""Axes at which a turn the other way, or a quarter of a turn, shows: at 0 and 90 degrees the first
-cannot."""
+"""Media with axes at which a reversed sense of rotation and an exchange of axes are errors; at 0
+and 90 degrees a reversed sense has no effect."""
 DOME_PRESETS: Final = ("I", "III", "V", "II", "IV", "VI")
 
 Trials = Iterable[IntervalTrial]
 
 
-def intervals(stage: BenchmarkStage) -> Iterator[None]:
-    """Count how often 68 and 95 % intervals of every rig's maps hold the truth.
+def measure_coverage(stage: BenchmarkStage) -> Iterator[None]:
+    """Measure the coverage of the 68 and 95 % intervals of every rig's maps.
 
     Yields
     ------
     None
-        After each kind of trial, when the stage holds what is known of all so far.
+        After each kind of trial; the stage then contains the results of all trials so far.
     """
     trials: list[IntervalTrial] = []
     spent: dict[str, Timing] = {}
@@ -79,14 +79,14 @@ def intervals(stage: BenchmarkStage) -> Iterator[None]:
 def _evaluate_trials(
     stage: BenchmarkStage, trials: Sequence[IntervalTrial], spent: Mapping[str, Timing]
 ) -> None:
-    counted = len(by_band(trials, level=68, confidence=0.95))
-    # one-sided at each end of the range, of two levels
+    counted = len(group_by_band(trials, level=68, confidence=0.95))
+    # Bonferroni: `counted` coverages at two levels, each with two one-sided limits, share the rate
     confidence = 1.0 - 2.0 * FALSE_ALARM_RATE / (4 * counted)
-    tried = (by_band(trials, level=level, confidence=confidence) for level in COVERAGE_RANGES)
+    tried = (group_by_band(trials, level=level, confidence=confidence) for level in COVERAGE_RANGES)
     rows = list(itertools.chain(*tried))
     stage.points = [_point(row, spent[row.quantity]) for row in rows]
     stage.limits = {key: found for row in rows for key, found in _limits(row).items()}
-    stage.left_out = [
+    stage.omitted = [
         (f"{trial.quantity}, {trial.subject}", "every pixel is masked")
         for trial in trials
         if not trial.deviation.size
@@ -94,7 +94,7 @@ def _evaluate_trials(
 
 
 def _subjects(names: Sequence[str], count: int, first: int = 0) -> dict[int, str]:
-    """Return names in turn by seeds, the first of which are left to others."""
+    """Return names in cyclic order by seed; seeds below the offset `first` are used elsewhere."""
     return {FIRST_SEED + first + k: names[k % len(names)] for k in range(count)}
 
 
@@ -127,16 +127,16 @@ def _small() -> Mapping[str, Callable[[Path], Trials]]:
 
 
 def _point(row: IntervalCoverage, timing: Timing) -> Point:
-    off = abs(100.0 * row.share - row.level)
+    off = abs(100.0 * row.inside_fraction - row.level)
     low, high = (100.0 * end - row.level for end in row.interval)
-    # an interval of the coverage that holds the nominal one allows a distance of 0
+    # an interval of the coverage that contains the nominal one allows a distance of 0
     least = 0.0 if low <= 0.0 <= high else min(abs(low), abs(high))
     return Point(
         {
             "quantity": row.quantity,
             "skin": row.band,
             "nominal %": row.level,
-            "covered %": round(100.0 * row.share, 1),
+            "covered %": round(100.0 * row.inside_fraction, 1),
             "at least %": round(100.0 * row.interval[0], 1),
             "at most %": round(100.0 * row.interval[1], 1),
             "subjects": row.subjects,

@@ -20,8 +20,8 @@ from skinrig.planning.confirmation import calibrate_simulated
 
 FACTORS_95: Final[Mapping[str, float]] = {"normals": 2.1, "R_d": 2.2, "surface": 2.5}
 """Half width of a 95 % interval over that of the 68 % one, to 0.1, set on faces of seeds 0 to 5 and
-types I to V that are not judged (R_d: of seeds 1 to 3, types V, I and II): tails are heavier than a
-Gaussian's where one point in twenty is not like the others."""
+types I to V that are not evaluated (R_d: of seeds 1 to 3, types V, I and II). Tails are heavier
+than a Gaussian's where one point in twenty is an outlier."""
 NORMAL_MAP_NAMES: Final[Mapping[str, str]] = {
     "normals": "normals of the dome",
     "normals_refined": "refined normals of the dome",
@@ -34,8 +34,8 @@ def run_trials(
 ) -> Iterator[IntervalTrial]:
     """Yield trials of normals, diffuse albedo and lobes of faces.
 
-    Each seed has a dome of its own, built off the drawing, with its own calibration: errors of
-    calibration are drawn anew with each subject. Parameters as of `flash.flash`.
+    Each seed has its own dome with deviations from the nominal geometry and its own calibration, so
+    that calibration errors are independent between subjects. Parameters as in `flash.run_trials`.
     """
     shown = {key: {"width_px": width_px} for key in ("charuco", "mirror", "white")}
     kinds = (("geometry", ("charuco",)), ("lights", ("mirror", "white")))
@@ -54,9 +54,9 @@ def face_trials(found: SkinAppearance, truth: SkinAppearance, name: str) -> Iter
     Parameters
     ----------
     found
-        Its maps, of the dome.
+        Maps of the dome.
     truth
-        Of the same face.
+        Ground truth of the same face.
     name
         Preset and seed.
     """
@@ -82,8 +82,8 @@ def face_trials(found: SkinAppearance, truth: SkinAppearance, name: str) -> Iter
     covered = np.zeros(shape, bool)
     covered[pairs.rows, pairs.columns] = True
     for channel, color in enumerate(CHANNEL_NAMES):
-        how: dict[str, Any] = {"channel": channel, "factor_95": FACTORS_95["R_d"]}
-        yield subject.map_trial(f"R_d, {color}", albedo, true, covered, **how)
+        options: dict[str, Any] = {"channel": channel, "factor_95": FACTORS_95["R_d"]}
+        yield subject.map_trial(f"R_d, {color}", albedo, true, covered, **options)
     off, stderr = lobe_strength(found, truth)
     quantity, factor = "light from the surface, dome", FACTORS_95["surface"]
     yield subject.error_trial(quantity, np.abs(off), stderr, factor_95=factor)
@@ -92,37 +92,38 @@ def face_trials(found: SkinAppearance, truth: SkinAppearance, name: str) -> Iter
 def lobe_strength(
     found: SkinAppearance, truth: SkinAppearance
 ) -> tuple[Float64Array, Float64Array]:
-    """Return by how much fitted lobes are off in the light that a surface gives off, relative.
+    """Return the relative error of the surface term of fitted lobes, and its standard error.
 
-    Single weights are not determined where lobes resemble each other; how much light all of them
-    give off together is what their standard error speaks of.
+    Weights of similar lobes are not determined one by one. Their standard errors refer to the
+    light that all lobes reflect together.
 
     Parameters
     ----------
     found
-        With normals, albedo, weights and their basis.
+        Maps of normals, albedo and weights, with their basis.
     truth
-        With the file of directions that no light had.
+        Ground truth with the file of held-out directions.
 
     Returns
     -------
     off, stderr : ndarray of float64, shape (n,)
-        Of each point of the test that has weights: (true - fitted) / fitted of the mean over its
-        directions of f_r cos(light), and the stated standard error of it.
+        For each test point with weights: (true - fitted) / fitted, where both are means over the
+        point's directions of f_r cos(light), and its stated standard error.
     """
     test = reflection.surface_test(found, truth)
     if test is None:
         return np.zeros(0), np.zeros(0)
     weights = [found.maps[name] for name in WEIGHT_NAMES]
     valid = intersect_valid(weights[0]).reshape(-1)[test.texels]
-    shares, errors = (
+    weight_values, errors = (
         np.stack([part.reshape(-1)[test.texels].astype(np.float64) for part in parts])
         for parts in (
             [w.values for w in weights],
             [np.zeros(w.values.shape) if w.stderr is None else w.stderr for w in weights],
         )
     )
-    level, spread = shares.sum(axis=0), errors.sum(axis=0)
+    # errors of similar lobes are correlated: their sum is the largest error of the sum of weights
+    level, level_error = weight_values.sum(axis=0), errors.sum(axis=0)
     fitted, true = test.fitted.mean(axis=1), test.true.mean(axis=1)
-    good = valid & (level > 0) & (fitted > 0) & (spread > 0)
-    return true[good] / fitted[good] - 1.0, spread[good] / level[good]
+    good = valid & (level > 0) & (fitted > 0) & (level_error > 0)
+    return true[good] / fitted[good] - 1.0, level_error[good] / level[good]

@@ -1,8 +1,8 @@
-"""Trials of the flash rig's intervals: chromophores, and how blood changes with a state.
+"""Trials of the flash rig's intervals: chromophores, and the change of blood with an expression.
 
-Stated errors are of people who do not stand exactly where the white tile stood
-(`reconstruction.chromophores.shading_prior.LOG_SHADING_SOFTNESS`), and so each subject is drawn a
-place off it.
+Stated errors assume faces at a random distance from the position of the white reference
+(`reconstruction.chromophores.shading_prior.LOG_SHADING_SOFTNESS`), and each subject's distance is
+drawn accordingly.
 """
 
 from collections.abc import Iterator, Mapping
@@ -30,23 +30,24 @@ from skinrig.simulating.orders import SimulationResult, truth_folder
 
 BLOOD_STATES: Final = ("smile", "anger", "fear", "exercise")
 FACTOR_95: Final = 2.4
-"""Half width of a 95 % interval of a chromophore over that of the 68 % one, to 0.1, set on the
-subjects of seeds 0 to 15 at 384 and 768 px: tails are heavier than a Gaussian's."""
+"""Coverage factor from the 68 % to the 95 % half width of a chromophore, to 0.1, set on subjects of
+seeds 0 to 15 at 384 and 768 px: tails are heavier than a Gaussian's."""
 
 LOG_STANCE_STD: Final = 0.5 * shading_prior.LOG_SHADING_SOFTNESS
-"""Standard deviation of how far subjects stand off the tile's place, over the camera's distance:
-what the stated errors take it for. Light goes with the square of the distance."""
+"""Standard deviation of the distance between face and white reference over the camera's distance,
+as the stated errors assume. Irradiance falls with the square of the distance,
+d(ln E) = -2 d(ln r), hence the factor 0.5."""
 CALIBRATION_SEED: Final = 900
 _STANCE_STREAM: Final = 1
-"""Beside a subject's seed: of the draw of its place."""
+"""Second seed, after the subject's, of the generator that draws the subject's position."""
 
 
-def nearer_mm(seed: int) -> float:
-    """Return how much nearer to the camera than the tile's place the subject of a seed stands.
+def draw_stance_offset_mm(seed: int) -> float:
+    """Draw the distance of a subject from the white reference's position, positive to the camera.
 
     Examples
     --------
-    >>> round(nearer_mm(520), 1) == round(nearer_mm(520), 1) != round(nearer_mm(521), 1)
+    >>> draw_stance_offset_mm(520) == draw_stance_offset_mm(520) != draw_stance_offset_mm(521)
     True
     """
     drawn = np.random.default_rng([seed, _STANCE_STREAM]).standard_normal()
@@ -61,20 +62,20 @@ def run_trials(
     moving: bool = True,
     resolution: str = "",
 ) -> Iterator[IntervalTrial]:
-    """Yield trials of melanin and hemoglobin, and of the hemoglobin rig's blood and its change.
+    """Yield trials of melanin and hemoglobin, and of blood and its change by the hemoglobin rig.
 
     Parameters
     ----------
     folder
-        For sessions and maps; those of a subject are gone when the next begins.
+        For sessions and maps; those of a subject are deleted when the next begins.
     subjects
-        Seed of each and its preset.
+        Preset by seed.
     width_px
-        Pixels across the camera.
+        Width of the camera's image, pixels.
     moving
-        Whether each is captured in a second state, for the blood of a hemoglobin rig.
+        Whether each subject is captured with a second expression, for the hemoglobin rig.
     resolution
-        Said behind the quantities' names.
+        Suffix of the quantities' names.
     """
     targets = {"sensor": "flat", "white": "white", "polarization": "malus"}
     calibrate_flash(folder, targets, width_px)
@@ -87,7 +88,7 @@ def run_trials(
             seed=seed,
             width_px=width_px,
             states=("neutral", state) if moving else ("neutral",),
-            nearer_mm=nearer_mm(seed),
+            nearer_mm=draw_stance_offset_mm(seed),
         )
         found, truth = reconstruct_maps(folder, done, ["melanin", "hemoglobin"])
         skin = truth.maps["mask"].values > 0.5
@@ -99,29 +100,29 @@ def run_trials(
             quantity, estimate = f"{name}{resolution}", found.maps[name]
             yield subject.map_trial(quantity, estimate, true, skin, factor_95=FACTOR_95)
         if moving:
-            yield from _of_rig(done, folder, state, subject)
+            yield from _rig_trials(done, folder, state, subject)
 
 
 def calibrate_flash(folder: Path, targets: Mapping[str, str], width_px: int) -> None:
-    """Calibrate a simulated flash rig by these targets, each of the kind it is for."""
+    """Calibrate a simulated flash rig; `targets` maps kinds of calibration to their targets."""
     shown = {key: {"width_px": width_px} for key in targets.values()}
     kinds = ((kind, (target,)) for kind, target in targets.items())
     calibrate_simulated("flash", folder, shown, kinds, seed=CALIBRATION_SEED)
 
 
-def _of_rig(
+def _rig_trials(
     done: SimulationResult, folder: Path, state: str, subject: TrialSubject
 ) -> Iterator[IntervalTrial]:
     try:
         fit_facial_color([done.session], out=folder / "moving", calibration=folder / "calibration")
     except UnknownBloodError:
-        return  # of the darkest skin: it states no interval
+        return  # blood under the darkest skin is not determined, without an interval to test
     maps = store.read(folder / "moving").maps
     blood, found = maps.get(f"hemoglobin_{state}"), maps.get(f"change_{state}")
     neutral = truth_folder(done.session)
     truths = [neutral, neutral.with_name(f"{neutral.name}-{state}")]
     rest, moved = (
-        facial_color.true_blood(store.read(place)) if place.is_dir() else None for place in truths
+        facial_color.true_blood(store.read(path)) if path.is_dir() else None for path in truths
     )
     if blood is None or found is None or rest is None or moved is None:
         return

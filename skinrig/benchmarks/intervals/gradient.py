@@ -1,10 +1,10 @@
 """Trials of the gradient sphere's intervals: normals, heights, stretch and kernels of skin.
 
-Kernels are compared with those of more of the same skin, seven to ten times the patch: found by the
-same definition, eq. (7), from true heights and the true stretch. So the trial tells what another
-patch of the skin would change, which standard errors state, together with errors of pictures, lens
-and strain. Both reliefs of the truth are of one piece of skin, as the patch's are: histograms of
-other skin lead to narrower and stronger kernels.
+Kernels are compared with reference kernels of a larger area of the same skin, seven to ten times
+the patch. Those are fitted by the same definition, eq. (7), to true heights and the true stretch.
+The difference thus includes the variation between patches of the skin, as the standard errors do,
+and the errors of images, lens and strain. Both reliefs of the reference are of one piece of skin,
+as those of the patch are: histograms of other skin lead to narrower and stronger kernels.
 """
 
 import tempfile
@@ -34,24 +34,24 @@ from skinrig.planning.confirmation import calibrate_simulated
 
 FACTORS_95: Final[Mapping[str, float]] = {"normals": 1.9, "height": 2.1, "stretch": GAUSSIAN_95}
 """Half width of a 95 % interval over that of the 68 % one, to 0.1, set on 6 patches of seeds 0 to
-13 that are not judged: tails are heavier than a Gaussian's. Kernels state both half widths."""
+13 that are not evaluated: tails are heavier than a Gaussian's. Kernels have both half widths."""
 
 
 MAX_STRETCH_STEP: Final = 2
-"""Steps of the caliper to either side of neutral at which the skin's stretch is told."""
+"""Caliper steps to either side of neutral at which stretch is evaluated."""
 REFERENCE_SKIN_MM: Final = 2.4
-"""Side of the skin whose kernels are true."""
+"""Side of the skin of the reference kernels, mm."""
 SIMULATED_BORDER_MM: Final = 1.0
-"""What is simulated besides: skin at the border of the simulation is not looked at."""
+"""Additional side of the simulated skin, mm; boundary effects within it are cut off."""
 
 
 def run_trials(
     folder: Path, subjects: Mapping[int, str], *, width_px: int
 ) -> Iterator[IntervalTrial]:
-    """Yield trials of normals and heights at rest, and of stretch and kernels to either side.
+    """Yield trials of normals and heights at rest, and of stretch and kernels under strain.
 
-    Each seed has a sphere of its own, built off the drawing, with its own calibration. Parameters
-    as of `flash.flash`; a subject is a site of the face.
+    Each seed has its own sphere with deviations from the nominal geometry and its own calibration.
+    Parameters as in `flash.run_trials`; a subject is a site of the face.
     """
     kinds = [(kind, ("ball",)) for kind in ("lights", "polarization")]
     jaws = {"angles": (0.0,), "steps": (-MAX_STRETCH_STEP, MAX_STRETCH_STEP)}
@@ -59,8 +59,8 @@ def run_trials(
         with tempfile.TemporaryDirectory(dir=folder) as name:
             own = Path(name)
             calibrate_simulated("gradient", own, {"ball": {}}, kinds, seed=seed)
-            asked: dict[str, Any] = {"site": site, "seed": seed, "width_px": width_px, **jaws}
-            done = resimulate("gradient", own, **asked)
+            options: dict[str, Any] = {"site": site, "seed": seed, "width_px": width_px, **jaws}
+            done = resimulate("gradient", own, **options)
             found, truth = reconstruct_maps(own, done, ["normals", "height", "strain", "kernels"])
         subject = TrialSubject(f"{site} {seed}")
         state = next(
@@ -68,10 +68,10 @@ def run_trials(
             for key in found.maps
             if key.startswith("normals_a") and key.endswith("_n0")
         )
-        normals, seen = found.maps[f"normals_{state}"], truth.maps[f"normals_seen_{state}"]
-        good = intersect_valid(normals, seen)
+        normals, visible = found.maps[f"normals_{state}"], truth.maps[f"normals_seen_{state}"]
+        good = intersect_valid(normals, visible)
         if normals.stderr is not None:
-            angle = metrics.angular_error_rad(normals.values[good], seen.values[good])
+            angle = metrics.angular_error_rad(normals.values[good], visible.values[good])
             quantity, factor = "normals of the gradient sphere", FACTORS_95["normals"]
             yield subject.normal_trial(quantity, angle, normals.stderr[good], factor_95=factor)
         height = found.maps[f"height_{state}"]
@@ -82,18 +82,18 @@ def run_trials(
             off = np.abs(height.values.astype(np.float64)[good] - relief[good])
             factor = FACTORS_95["height"]
             yield subject.error_trial("height", off, stderr, unit="um", factor_95=factor)
-        # the neutral state is what stretch is told against: exact by definition
+        # stretch is relative to the neutral state, whose ratio is 1 by definition
         rows = [row for row in compare_stretch(found, truth) if row.state != state]
-        spread = np.array([row.stderr for row in rows])
+        stderr = np.array([row.stderr for row in rows])
         off = np.array([abs(row.error) for row in rows])
-        yield subject.error_trial("stretch ratio", off, spread, factor_95=FACTORS_95["stretch"])
+        yield subject.error_trial("stretch ratio", off, stderr, factor_95=FACTORS_95["stretch"])
         yield from _kernels(found, truth, subject, site=site, seed=seed)
 
 
 def _kernels(
     found: SkinAppearance, truth: SkinAppearance, subject: TrialSubject, *, site: str, seed: int
 ) -> Iterator[IntervalTrial]:
-    """Compare the kernels of strained states with those of more of the same skin."""
+    """Compare the kernels of strained states with reference kernels of the same skin."""
     document = read_document(found, KERNEL_FILE)
     fits = [fit for fit in document["fits"] if fit["valid"]] if document else []
     known = truth.parameters["states"]
@@ -119,9 +119,10 @@ def _kernels(
 
 
 def normalized_deviation(error: float, half: float, half_95: float) -> float:
-    """Return an error in half widths of a 68 % interval whose 95 % one is stated by itself.
+    """Return an error in 68 % half widths, scaled so that the 95 % half width maps to 1.96.
 
-    Up to the first as it is, beyond so that the second is at a Gaussian's 1.96.
+    Errors inside the 68 % interval are divided by its half width. Beyond it the scale is linear
+    from 1 at `half` to :data:`GAUSSIAN_95` at `half_95`.
 
     Examples
     --------
@@ -134,16 +135,16 @@ def normalized_deviation(error: float, half: float, half_95: float) -> float:
 
 
 def fit_reference_kernel(site: str, *, seed: int, stretch: float, pixel_um: float) -> KernelFit:
-    """Fit the kernel of `REFERENCE_SKIN_MM` of skin around the patch of a session.
+    """Fit the reference kernel to a square of `REFERENCE_SKIN_MM` around the patch of a session.
 
     Parameters
     ----------
     site, seed
-        Of the skin.
-    stretch : float
-        Its ratio r along x.
-    pixel_um : float
-        Distance of the heights, um.
+        Site of the face and seed of the skin.
+    stretch
+        Stretch ratio r along x.
+    pixel_um
+        Spacing of the heights, um.
     """
     skin = make_micro_skin(site, seed=seed, size_mm=REFERENCE_SKIN_MM + SIMULATED_BORDER_MM)
     strained = stretch_skin(skin, stretch=stretch, angle_deg=0.0)

@@ -1,4 +1,4 @@
-"""Trials of the fiber probe's intervals: media, skin of two layers, and directions."""
+"""Trials of the fiber probe's intervals: media, two-layer skin, and anisotropy."""
 
 import json
 import shutil
@@ -22,12 +22,13 @@ from skinrig.simulating.orders import SimulationResult
 from skinrig.simulating.simulation import simulate_session
 
 PHOTON_BUDGET: Final = "full"
-"""Of phantom and media, whose coefficients are known: with fewer the simulation's own noise,
-two percent, passes for errors of the probe. Skin's truth is of the very profile that is read."""
+"""Photon budget for phantom and media, whose coefficients are known. With fewer photons the noise
+of the simulation, 2 %, would count as error of the probe. The ground truth of skin comes from the
+simulated profile itself."""
 BLOCK_SEED_OFFSET: Final = 90_000
-"""Added to a subject's seed for that of its phantom."""
+"""Offset from a subject's seed to that of its phantom."""
 N_DIRECTIONS: Final = 8
-"""Of the head on tissue that scatters by direction."""
+"""Rotations of the probe head on anisotropic tissue."""
 COEFFICIENT_LABELS: Final[Mapping[str, str]] = {
     "sigma_a": "sigma_a of media",
     "sigma_s_prime": "sigma_s' of media",
@@ -41,19 +42,19 @@ def run_trials(
     skin: Mapping[int, str] | None = None,
     directed: Mapping[int, str] | None = None,
 ) -> Iterator[IntervalTrial]:
-    """Yield trials of what the fiber probe tells of media, of skin and of directions.
+    """Yield trials of the fiber probe's coefficients of media and skin, and of anisotropy.
 
     Parameters
     ----------
     folder
-        As of `flash.flash`.
+        As in `flash.run_trials`.
     media
-        Seed of each and "homogeneous:SIGMA_A,SIGMA_S_PRIME,G": sigma_tr, sigma_a and sigma_s'.
+        "homogeneous:SIGMA_A,SIGMA_S_PRIME,G" by seed, for sigma_tr, sigma_a and sigma_s'.
     skin
-        Seed of each and its preset: sigma_tr of layers, which is that of the nearest medium by
-        definition, on three sites.
+        Preset by seed, for sigma_tr of layered skin on three sites. By definition that is the
+        sigma_tr of the homogeneous medium with the nearest profile.
     directed
-        Seed of each and "anisotropic:SIGMA_A,SIGMA_S_PRIME,STRENGTH,AXIS_DEG": axis and ratio.
+        "anisotropic:SIGMA_A,SIGMA_S_PRIME,STRENGTH,AXIS_DEG" by seed, for axis and ratio.
     """
     for seed, medium in media.items():
         done = _subject(folder, medium, seed, sites=("cheek",), size=PHOTON_BUDGET)
@@ -75,9 +76,10 @@ def run_trials(
 
 
 def _subject(folder: Path, subject: str, seed: int, **options: Any) -> SimulationResult:
-    """Simulate a subject under a probe that was calibrated for it, with a block of its own.
+    """Simulate a subject under a probe that is calibrated with the subject's own phantom.
 
-    Subjects that share a calibration share its errors, and the block's: they are one draw.
+    Subjects with a common calibration would have its errors and the phantom's in common, and would
+    count as one draw.
     """
     phantom = folder / "session-phantom"
     shutil.rmtree(phantom, ignore_errors=True)
@@ -92,12 +94,12 @@ def _subject(folder: Path, subject: str, seed: int, **options: Any) -> Simulatio
 
 
 def draw_certificate(rng: np.random.Generator) -> dict[str, Any]:
-    """Return a certificate that is off the simulated block by errors as it states them.
+    """Draw a certificate of the simulated phantom with errors of its stated uncertainty.
 
     Parameters
     ----------
     rng
-        Of the two errors, of sigma_a and of sigma_s'.
+        Generator of the two errors, of sigma_a and of sigma_s'.
 
     Examples
     --------
@@ -105,16 +107,19 @@ def draw_certificate(rng: np.random.Generator) -> dict[str, Any]:
     >>> round(one[0] / two[0], 3) == round(one[-1] / two[-1], 3) != 1.0
     True
     """
-    paper = dict(phantom_certificate())
-    for name, made in zip(COEFFICIENT_LABELS, PHANTOM_DEVIATIONS, strict=True):
-        unsure = float(paper["uncertainty"][name])
-        factor = (1.0 + made * unsure) / (1.0 + unsure * float(rng.standard_normal()))
-        paper[f"{name}_per_mm"] = [factor * value for value in paper[f"{name}_per_mm"]]
-    return paper
+    certificate = dict(phantom_certificate())
+    for name, deviation in zip(COEFFICIENT_LABELS, PHANTOM_DEVIATIONS, strict=True):
+        # certified = true / (1 + u z), where true = nominal (1 + deviation u) and z is N(0, 1)
+        uncertainty = float(certificate["uncertainty"][name])
+        factor = (1.0 + deviation * uncertainty) / (
+            1.0 + uncertainty * float(rng.standard_normal())
+        )
+        certificate[f"{name}_per_mm"] = [factor * value for value in certificate[f"{name}_per_mm"]]
+    return certificate
 
 
 def preset_melanin_band(preset: str) -> str:
-    """Return the band of melanin of a preset of the simulated people.
+    """Return the melanin band of a preset of simulated subjects.
 
     Examples
     --------
@@ -127,14 +132,16 @@ def preset_melanin_band(preset: str) -> str:
 def decay_trial(
     quantity: str, found: SkinAppearance, truth: SkinAppearance, subject: TrialSubject
 ) -> IntervalTrial:
-    """Compare valid fits of sigma_tr; their interval is one of the logarithm, its halves alike.
+    """Compare valid fits of sigma_tr with the ground truth, on a logarithmic scale.
+
+    The interval of log(sigma_tr) is symmetric.
 
     Parameters
     ----------
     quantity, subject
-        Of the trial.
+        Name of the quantity, and subject of the trial.
     found, truth
-        With fits, and with true profiles.
+        Appearance with fits, and ground truth with profiles.
     """
     fits = [
         fit
@@ -150,16 +157,16 @@ def decay_trial(
 def coefficient_trial(
     name: str, found: SkinAppearance, truth: SkinAppearance, subject: TrialSubject
 ) -> IntervalTrial:
-    """Compare sigma_a or sigma_s' of a homogeneous medium, where the fit says that it is told.
+    """Compare sigma_a or sigma_s' of a homogeneous medium, for fits that identify it.
 
     Parameters
     ----------
     name
         "sigma_a" or "sigma_s_prime".
     found, truth
-        With fits, and with true profiles.
+        Appearance with fits, and ground truth with profiles.
     subject
-        Of the trial.
+        Subject of the trial.
     """
     known = evaluation.true_profiles(truth)
     fitted = evaluation.read_document(found, SUBSURFACE_FILE) or {"measurements": []}
@@ -179,20 +186,20 @@ def coefficient_trial(
 def direction_trials(
     found: SkinAppearance, truth: SkinAppearance, axis_deg: float, subject: TrialSubject
 ) -> Iterator[IntervalTrial]:
-    """Yield trials of axis and ratio of a medium that scatters by direction.
+    """Yield trials of the axis and the ratio of an anisotropic medium.
 
     Parameters
     ----------
     found, truth
-        With the anisotropy's document, and with true profiles in each direction.
+        Appearance with the anisotropy's document, and ground truth with profiles by direction.
     axis_deg
-        The medium's own direction in which least is scattered.
+        Direction of least scattering of the medium.
     subject
-        Of the trials.
+        Subject of the trials.
 
     Notes
     -----
-    A ratio has a truth by definition only: that of the ellipse through the true sigma_tr.
+    The true ratio is defined as that of the ellipse fitted to the true sigma_tr by direction.
     """
     rows = [row for row in json.loads(found.files[ANISOTROPY_FILE])["sites"] if row["valid"]]
     profiles: list[dict[str, Any]] = list(evaluation.true_profiles(truth).values())  # type: ignore[arg-type]
@@ -200,16 +207,17 @@ def direction_trials(
     true = anisotropy.estimate(
         angle, np.array([profile["sigma_tr_per_mm"] for profile in profiles]), outliers=False
     )
-    turn = np.array([abs((row["axis_deg"] - axis_deg + 90.0) % 180.0 - 90.0) for row in rows])
+    # an axis has no sign: differences are modulo 180 degrees, from -90 to 90
+    angle_deg = np.array([abs((row["axis_deg"] - axis_deg + 90.0) % 180.0 - 90.0) for row in rows])
     stderr = np.array([row["axis_stderr_deg"] for row in rows])
-    yield subject.error_trial("axis of anisotropy", turn, stderr, unit="degrees")
+    yield subject.error_trial("axis of anisotropy", angle_deg, stderr, unit="degrees")
     ratio = np.array([true.ratio[CHANNEL_NAMES.index(row["channel"])] for row in rows])
     off = np.abs(np.array([row["ratio"] for row in rows]) - ratio)
-    spread = np.array([row["ratio_stderr"] for row in rows])
-    yield subject.error_trial("ratio of anisotropy", off, spread, widths=spread / ratio)
+    stderr = np.array([row["ratio_stderr"] for row in rows])
+    yield subject.error_trial("ratio of anisotropy", off, stderr, widths=stderr / ratio)
 
 
 def _farthest_deg(medium: str) -> float:
-    """Return the direction in which light goes farthest: where it is scattered least."""
+    """Return the direction in which light propagates farthest, that of least scattering."""
     strength, axis_deg = (float(number) for number in medium.split(",")[2:4])
     return axis_deg if strength < 0.0 else axis_deg + 90.0

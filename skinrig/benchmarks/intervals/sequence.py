@@ -1,8 +1,7 @@
-"""Trials of intervals in time: time constants of blood after an event, and of its prompted change.
+"""Trials of time constants of blood after an event and under prompts, and of the prompts' delay.
 
-Of prompts the delay, too: the mean time from prompt to movement.
-
-A subject is a person with a time constant of their own; the places of the face are the truths.
+The delay is the mean time from prompt to movement. Each subject has its own time constant; the
+regions of the face are its ground truths.
 """
 
 import dataclasses
@@ -26,25 +25,25 @@ TIME_CONSTANTS_S: Final[Mapping[str, Sequence[float]]] = {
     "exercise": (15.0, 30.0, 60.0),
     "smile": (1.0, 2.0, 4.0),
 }
-"""Time constants that are simulated, s, of an event and of prompts."""
+"""Simulated time constants of an event and of prompts, s."""
 REACTION_RANGE_S: Final = (0.1, 0.4)
-"""Between which mean times from a prompt to the movement a person's own is drawn, s: from that of
-one who knows the rhythm to that of one who is slow."""
+"""Range of a subject's mean time from prompt to movement, s: from an anticipated rhythm to a slow
+reaction."""
 
 
 def run_trials(
     folder: Path, subjects: Mapping[int, str], *, width_px: int, state: str
 ) -> Iterator[IntervalTrial]:
-    """Yield trials of the time constant at each place of a face, and of the delay after prompts.
+    """Yield trials of the time constant in each region of a face, and of the delay after prompts.
 
     Parameters
     ----------
     folder
-        For sessions and curves; those of a subject are gone when the next begins.
+        For sessions and curves; those of a subject are deleted when the next begins.
     subjects
-        Seed of each and its preset.
+        Preset by seed.
     width_px
-        Pixels across the camera.
+        Width of the camera's image, pixels.
     state
         One of `TIME_CONSTANTS_S`.
     """
@@ -79,14 +78,14 @@ def run_trials(
 
 
 def build_request(state: str, seed: int) -> SequenceOrder:
-    """Return the sequence of a subject, of prompts with a reaction time of their own.
+    """Build the capture sequence of a subject, for prompts with the subject's reaction time.
 
     Parameters
     ----------
     state
         One of `TIME_CONSTANTS_S`.
     seed
-        Of the subject.
+        Seed of the subject.
     """
     order = SequenceOrder(state=state)
     if not order.is_prompted:
@@ -104,24 +103,23 @@ def fit_trial(
     *,
     delay: bool = False,
 ) -> IntervalTrial:
-    """Compare fits with the true time constant, or the true delay.
+    """Compare fits with the true time constant or the true delay.
 
-    A time constant counts by its own two intervals, which differ in length to both sides, and a
-    delay by its standard error and its 95 % interval. Bounds of a time constant are intervals that
-    are open to one side: to leave them out would leave out the large ones of those that are
-    estimated. Fits that tell nothing are left out; of delays as well those that tell a bound alone,
-    as delays mean little where blood hardly changes.
+    Time constants have an asymmetric 68 % and 95 % interval; delays have a standard error and a
+    95 % interval. Bounds of a time constant count as intervals with one open end: without them, the
+    sample would lack the largest values. Fits without information are omitted. Delays with a bound
+    only are omitted as well, as a delay is not defined without a change of blood.
 
     Parameters
     ----------
     quantity, subject, band
-        Of the trial.
+        Name of the quantity, subject and band of the trial.
     fits
-        As in the document of curves.
+        Entries of the document of curves.
     true_s
-        The true time, s.
+        True time, s.
     delay
-        Whether it is the delay.
+        Whether to compare the delay.
     """
     off, widths = [], []
     for fit in fits:
@@ -144,31 +142,32 @@ def fit_trial(
 def asymmetric_deviation(
     best: float, true: float, inner: tuple[float, float], outer: tuple[float, float]
 ) -> float:
-    """Return how far off an estimate is in half widths of its 68 % interval to that side.
+    """Return an error in half widths of the estimate's 68 % interval on the truth's side.
 
-    Up to 1 just where that holds the truth, and up to `GAUSSIAN_95` just where the 95 % one does.
+    The result is at most 1 exactly where the 68 % interval contains the truth, and at most
+    `GAUSSIAN_95` exactly where the 95 % interval does.
 
     Parameters
     ----------
     best
-        The estimate.
+        Estimate.
     true
-        The truth.
+        Ground truth.
     inner, outer
-        The 68 % and 95 % interval, the one within the other; infinite where an end is open.
+        The 68 % interval and the 95 % interval around it; an open end is infinite.
     """
     if inner[0] <= true <= inner[1]:
         end = inner[0] if true < best else inner[1]
         # a best beyond the tried constants may lie outside the interval
-        share = abs(true - best) / max(abs(end - best), 1e-300) if math.isfinite(end) else 0.0
-        return min(share, 1.0)
+        deviation = abs(true - best) / max(abs(end - best), 1e-300) if math.isfinite(end) else 0.0
+        return min(deviation, 1.0)
     if outer[0] <= true <= outer[1]:
         return GAUSSIAN_95
     return 2.0 * GAUSSIAN_95
 
 
 def _interval_ends(interval: Sequence[float | None]) -> tuple[float, float]:
-    """Return an interval as written, where null stands for an open upper end."""
+    """Return the ends of an interval from JSON; null is 0 below or an open end above."""
     low, high = interval
     return 0.0 if low is None else float(low), math.inf if high is None else float(high)
 

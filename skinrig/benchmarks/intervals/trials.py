@@ -1,8 +1,8 @@
-"""From a simulated subject's maps to trials of their intervals; what all rigs' trials share.
+"""Compare maps of simulated subjects with ground truth, as trials of the maps' stated intervals.
 
-Each trial goes the whole way of a user, from calibration targets to maps, at the sensor's noise:
-`flash` and its like of the other rigs. Nothing there knows the model: maps are
-compared with the truth that the simulator wrote.
+A trial runs the whole pipeline, from calibration targets to maps, at the sensor's noise (see
+`flash` and the other rigs' modules). The comparison uses only the maps and the ground truth that
+the simulator wrote.
 """
 
 import shutil
@@ -25,7 +25,7 @@ from skinrig.simulating.orders import SimulationResult
 from skinrig.simulating.simulation import simulate_session
 
 ANY_BAND: Final = "any"
-"""Band of quantities that do not depend on the color of the skin."""
+"""Band of quantities that do not depend on skin color."""
 
 
 def skin_color_band(truth: SkinAppearance, name: str, skin: BoolArray) -> str:
@@ -34,11 +34,11 @@ def skin_color_band(truth: SkinAppearance, name: str, skin: BoolArray) -> str:
     Parameters
     ----------
     truth
-        Of the subject.
+        Ground truth of the subject.
     name
-        Of its map of linear color.
+        Name of its map of linear color.
     skin
-        (H, W): pixels of skin.
+        (H, W): mask of skin.
     """
     color = truth.maps[name].values[skin]
     return str(skin_bands.classify_typology(np.median(skin_bands.typology_angle_deg(color))))
@@ -46,7 +46,7 @@ def skin_color_band(truth: SkinAppearance, name: str, skin: BoolArray) -> str:
 
 @dataclass(frozen=True, slots=True)
 class TrialSubject:
-    """Whose intervals are tried."""
+    """Subject of trials, which builds them from errors and stated half widths."""
 
     name: str
     """Preset, site or medium, and seed."""
@@ -67,11 +67,11 @@ class TrialSubject:
         Parameters
         ----------
         quantity, unit, factor_95
-            Of the trial; widths in "%" are taken for fractions.
-        off, half
-            (n,): sizes of errors, and half widths.
+            Fields of the trial; for the unit "%", widths are given as fractions.
+        errors, half
+            (n,): absolute errors, and half widths.
         widths
-            Half widths as the trial shows them; None: `half`.
+            Half widths for the trial's median width; None: `half`.
         """
         shown = half if widths is None else widths
         to_unit = 100.0 if unit == "%" else 1.0
@@ -90,23 +90,23 @@ class TrialSubject:
         over: FloatArray | None = None,
         factor_95: float = GAUSSIAN_95,
     ) -> IntervalTrial:
-        """Compare a map of numbers with the truth, where it is valid; widths are relative.
+        """Compare a scalar map with the ground truth in valid pixels; widths are relative.
 
         Parameters
         ----------
         quantity, factor_95
-            Of the trial.
+            Fields of the trial.
         estimate
-            With its standard error.
+            Map with its standard error.
         true
-            Of the map's shape.
+            Ground truth, in the map's shape.
         skin
-            (H, W): where there is a truth.
+            (H, W): pixels with ground truth.
         channel
-            Of a map of several.
+            Channel of a map with several.
         over
-            Of the map's shape: what widths are relative to, such as what a change is one of. None:
-            the truth.
+            Denominator of relative widths, in the map's shape, e.g. the value that changes. None:
+            the ground truth.
 
         Raises
         ------
@@ -114,14 +114,17 @@ class TrialSubject:
             When the map has no standard error.
         """
         if estimate.stderr is None:
-            raise ValueError(f"{quantity}: has no standard error, expected one")
+            raise ValueError(
+                f"{quantity}: got a map without a standard error, expected one with it; "
+                "reconstruct it again"
+            )
         good = skin & intersect_valid(estimate)
         part = (good,) if channel is None else (good, channel)
         value, stderr, truth, whole = (
             np.asarray(values, np.float64)[part]
             for values in (estimate.values, estimate.stderr, true, true if over is None else over)
         )
-        with np.errstate(divide="ignore"):  # what is nothing has a width of infinity
+        with np.errstate(divide="ignore"):  # a value of 0 has an infinite relative width
             relative = np.asarray(stderr / np.abs(whole))
         off = np.abs(value - truth)
         return self.error_trial(quantity, off, stderr, widths=relative, factor_95=factor_95)
@@ -129,46 +132,50 @@ class TrialSubject:
     def normal_trial(
         self, quantity: str, angle_rad: Float64Array, stderr_rad: FloatArray, *, factor_95: float
     ) -> IntervalTrial:
-        """Compare directions: the 68 % region is a cone about the estimate.
+        """Compare directions; the 68 % region is a cone about the estimate.
 
         Parameters
         ----------
         quantity, factor_95
-            Of the trial.
+            Fields of the trial.
         angle_rad
-            (n,): between estimates and truths.
+            (n,): angle between estimate and ground truth.
         stderr_rad
-            (n, 3): standard error of each of two directions across, the same in all channels.
+            (n, 3): standard error of each of two tangential components, repeated in all channels.
         """
+        # two equal Gaussian components make the angle Rayleigh distributed: its 68 % quantile is
+        # sqrt(-2 ln(1 - 0.6827)) standard errors
         reach = np.degrees(RAYLEIGH_68 * stderr_rad[:, 0].astype(np.float64))
         off = np.degrees(angle_rad)
         return self.error_trial(quantity, off, reach, unit="degrees", factor_95=factor_95)
 
 
 def resimulate(rig: str, folder: Path, **options: Any) -> SimulationResult:
-    """Simulate a subject into a folder, where the one before it and its maps are taken away."""
+    """Simulate a subject into a folder, after deleting the previous subject and its maps."""
     old = (folder / name for name in ("session-subject", "maps", "moving"))
-    for place in (*old, *folder.glob("truth-subject*")):
-        shutil.rmtree(place, ignore_errors=True)
+    for path in (*old, *folder.glob("truth-subject*")):
+        shutil.rmtree(path, ignore_errors=True)
     return simulate_session(rig, folder / "session-subject", **options)
 
 
 def truth_folder(done: SimulationResult) -> Path:
-    """Return the folder of a simulated session's truth.
+    """Return the folder of a simulated session's ground truth.
 
     Raises
     ------
     ValueError
-        When it has none.
+        When the session has none.
     """
     if done.truth is None:
-        raise ValueError("simulated session: has no truth, expected one")
+        raise ValueError(
+            "simulated session: got no ground truth, expected its folder; simulate a subject"
+        )
     return done.truth
 
 
 def reconstruct_maps(
     folder: Path, done: SimulationResult, want: Sequence[str]
 ) -> tuple[SkinAppearance, SkinAppearance]:
-    """Reconstruct a subject's maps into a folder's `maps`; return them and the truth."""
+    """Reconstruct a subject's maps into FOLDER/maps; return them and the ground truth."""
     reconstruct(done.session, want=want, out=folder / "maps", calibration=folder / "calibration")
     return read(folder / "maps"), read(truth_folder(done))

@@ -1,4 +1,4 @@
-"""Benchmark of reading a probe's fibers: errors over the number of exposures."""
+"""Benchmark of the readings of a probe's fibers: errors over the number of exposures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,17 +21,17 @@ PROBE_SEED = 5
 LIGHT_DECADES = 7.0
 EXPOSURE_COUNTS = (1, 2, 3, 5, 8, 12, 23)
 N_NOISE_DRAWS = 6
-"""Series of each number of exposures, of one probe with new noise."""
+"""Noise draws of the exposure series of one probe."""
 
 Frames = list[UInt16Array]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ProbeCamera:
-    """A probe's camera and light of known amount."""
+    """Frames of a probe's camera with known light at each fiber."""
 
     frames: list[Frames]
-    """Of each draw, all exposures."""
+    """All exposures of each draw."""
     times: Float64Array
     spots: FiberSpots
     darks: DarkModel
@@ -39,11 +39,11 @@ class _ProbeCamera:
     rate: Float64Array
     """Light of each pixel, full scales per second, (H, W)."""
     truth: Float64Array
-    """Of each fiber and color, summed over its aperture, (F, 3)."""
+    """Light of each fiber and color, summed over its aperture, (F, 3)."""
 
 
-def fiber_readings(stage: BenchmarkStage) -> None:
-    """Read 28 fibers whose light falls by seven decades with 1 to 23 exposures."""
+def measure_fiber_readings(stage: BenchmarkStage) -> None:
+    """Measure readings of 28 fibers over seven decades of light with 1 to 23 exposures."""
     bench = _bench(draws=2 if stage.toy else N_NOISE_DRAWS)
     for count in (1, 3, 8, 23) if stage.toy else EXPOSURE_COUNTS:
         chosen = _select_exposures(len(bench.times), count)
@@ -51,10 +51,10 @@ def fiber_readings(stage: BenchmarkStage) -> None:
         valid, signal, stderr = (
             np.array([getattr(r, name) for r in results]) for name in ("valid", "signal", "stderr")
         )
-        # what is saturated in every exposure is not known at all
+        # fibers that saturate in every exposure count with an error of 100 %
         miss = 100 * np.where(valid, np.abs(signal / bench.truth - 1), 1.0)
         bound = np.sqrt(_minimum_variance(bench, chosen)) / bench.truth
-        # the median of a normal distribution's size is 0.674 of its deviation
+        # median of |error| of a normal error: 0.6745 standard deviations
         least = 67.4 * float(np.median(np.where(np.isfinite(bound), bound, 1 / 0.674)))
         timing, _ = stage.time(lambda: _read(bench, chosen, 0))
         also = {
@@ -63,17 +63,16 @@ def fiber_readings(stage: BenchmarkStage) -> None:
         }
         outcome = bootstrap_columns_median(miss.reshape(len(miss), -1), least, draws=400)
         stage.add({"exposures": count}, timing, outcome, also)
-        away = ((signal - bench.truth) / np.where(valid, stderr, np.inf))[valid]
+        deviation = ((signal - bench.truth) / np.where(valid, stderr, np.inf))[valid]
         relative = (signal / bench.truth - 1).reshape(-1, bench.truth.size)
     near = bench.truth.ravel() > 1e-5 * bench.truth.max()
     worst = 100 * float(np.sqrt((relative[:, near] ** 2).mean(axis=0)).max())
     ratio = float(np.sqrt((relative**2 / bound.ravel() ** 2).mean()))
-    inside = 100 * float((np.abs(away) < 1).mean())
+    inside = 100 * float((np.abs(deviation) < 1).mean())
     stage.limits |= {"rms": worst, "over_bound": ratio, "inside": inside, "inside_most": inside}
 
 
 def _bench(*, draws: int) -> _ProbeCamera:
-
     rig = load_rig("probe")
     view = rig.views[0]
     build = build_probe(
@@ -83,7 +82,7 @@ def _bench(*, draws: int) -> _ProbeCamera:
     noise = CameraNoise.from_view(view)
     times = np.array(exposure_series_s())
     shape = (view.height_px, view.width_px)
-    # the brightest reaches half of full scale in the shortest exposure
+    # the brightest fiber reaches half of full scale in the shortest exposure
     light = 0.5 / times[0] * np.geomspace(1, 10.0**-LIGHT_DECADES, len(build.gain))[:, None]
     light = light * np.array([0.6, 1.0, 0.5])
     images = fiber_unit_images(build, view).astype(np.float64)
@@ -137,9 +136,9 @@ def _read(bench: _ProbeCamera, chosen: Sequence[int], draw: int) -> FiberReading
 
 
 def _minimum_variance(bench: _ProbeCamera, chosen: Sequence[int]) -> Float64Array:
-    """Return the least variance of each fiber's light, infinite where a pixel is saturated.
+    """Return the Cramér-Rao bound of each fiber's variance, infinite where a pixel saturates.
 
-    Of all pixels' light known from the frames that are not saturated, the dark signal known.
+    Each pixel's light is estimated from its unsaturated frames, with known dark signal.
     """
     noise = bench.noise
     span, gain = noise.span_dn, noise.gain_e_per_dn
@@ -161,7 +160,7 @@ def _minimum_variance(bench: _ProbeCamera, chosen: Sequence[int]) -> Float64Arra
 
 
 def _select_exposures(total: int, count: int) -> list[int]:
-    """Return which exposures to take: the longest, or evenly from the shortest to the longest."""
+    """Return indices of exposures: the longest, or evenly from the shortest to the longest."""
     if count == 1:
         return [total - 1]
     return [round(k) for k in np.linspace(0, total - 1, count)]

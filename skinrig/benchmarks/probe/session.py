@@ -1,4 +1,4 @@
-"""Benchmark of the fiber probe from end to end: sigma_tr of media through simulated sessions."""
+"""Benchmark of the fiber probe end to end: sigma_tr of media from simulated sessions."""
 
 import math
 import tempfile
@@ -24,11 +24,11 @@ SIGMA_TR_RANGE_PER_MM = (0.3, 3.0)
 SIGMA_S_PRIME_RANGE_PER_MM = (0.7, 3.0)
 G_RANGE = (0.7, 0.9)
 BAND_G = 0.8
-"""g of the media that stand for bands of skin."""
+"""Anisotropy g of the media that represent melanin bands."""
 
 
-def session(stage: BenchmarkStage) -> None:
-    """Capture, calibrate and invert media whose sigma_tr is known; seconds are of the inversion."""
+def measure_session(stage: BenchmarkStage) -> None:
+    """Measure sigma_tr of simulated, calibrated and inverted media; seconds are the inversion's."""
     with tempfile.TemporaryDirectory(prefix="skinrig-probe-") as name:
         folder = Path(name)
         simulate_session(
@@ -41,11 +41,11 @@ def session(stage: BenchmarkStage) -> None:
             )
             for seed, (name, band) in enumerate(MELANIN_BANDS.items())
         }
-        of_bands = {name: _invert(folder, place) for name, place in like_skin.items()}
+        of_bands = {name: _invert(folder, session) for name, session in like_skin.items()}
         rows = [row for some in of_bands.values() for row in some] if stage.toy else []
         last = like_skin["dark"]
         for seed in () if stage.toy else range(FIRST_MEDIUM_SEED, FIRST_MEDIUM_SEED + N_MEDIA):
-            last = _captured(folder, f"{seed}", medium(seed), seed)
+            last = _captured(folder, f"{seed}", draw_medium(seed), seed)
             rows += _invert(folder, last)
         stage.by_band |= {name: _default_method_error(some) for name, some in of_bands.items()}
         timing, _ = stage.time(lambda: _invert(folder, last, "again"), repeats=1, memory=False)
@@ -66,14 +66,14 @@ def session(stage: BenchmarkStage) -> None:
     }
 
 
-def medium(seed: int) -> tuple[float, float, float]:
-    """Return sigma_a and sigma_s' in 1/mm, and g, of a medium drawn by its seed.
+def draw_medium(seed: int) -> tuple[float, float, float]:
+    """Draw sigma_a and sigma_s', 1/mm, and g of a medium by its seed.
 
-    sigma_tr and sigma_s' are spread evenly in their logarithms, g evenly.
+    sigma_tr and sigma_s' are log-uniform, g is uniform.
 
     Examples
     --------
-    >>> sigma_a, sigma_s_prime, g = medium(3)
+    >>> sigma_a, sigma_s_prime, g = draw_medium(3)
     >>> 0.3 <= math.sqrt(3 * sigma_a * (sigma_a + sigma_s_prime)) <= 3.0
     True
     """
@@ -83,7 +83,7 @@ def medium(seed: int) -> tuple[float, float, float]:
         for span in (SIGMA_TR_RANGE_PER_MM, SIGMA_S_PRIME_RANGE_PER_MM)
     )
     g = rng.uniform(*G_RANGE)
-    # sigma_tr^2 = 3 a (a + s')
+    # the positive root of sigma_tr^2 = 3 sigma_a (sigma_a + sigma_s')
     sigma_a = 0.5 * (math.sqrt(sigma_s_prime**2 + 4.0 / 3.0 * sigma_tr**2) - sigma_s_prime)
     return sigma_a, sigma_s_prime, g
 
@@ -101,7 +101,7 @@ def _invert(folder: Path, session: Path, name: str = "") -> list[evaluation.FitA
 
 
 def _captured(folder: Path, name: str, coefficients: tuple[float, float, float], seed: int) -> Path:
-    """Return a session of a medium by its sigma_a, sigma_s' and g."""
+    """Simulate a session of a medium of sigma_a, sigma_s' and g; return its folder."""
     sigma_a, sigma_s_prime, g = coefficients
     simulate_session(
         "probe",
@@ -114,12 +114,12 @@ def _captured(folder: Path, name: str, coefficients: tuple[float, float, float],
 
 
 def _default_method_error(rows: list[evaluation.FitAccuracy]) -> ErrorEstimate:
-    """Return the error of the usual method over the channels of one medium, %."""
+    """Return the error of the default method over the channels of one medium, %."""
     sizes = [abs(row.relative) for row in rows if row.method == METHOD_NAMES[0] and row.valid]
     return _error(sizes)
 
 
 def _error(sizes: list[float]) -> ErrorEstimate:
-    """Return the median in percent, with its interval."""
+    """Return the median relative error in percent, with its interval."""
     percent = 100 * np.array(sizes)
     return bootstrap_median(percent, draws=400)

@@ -1,4 +1,4 @@
-"""Benchmarks of inverting radial profiles: model tier, fibers used, and batches beside SciPy."""
+"""Benchmarks of the inversion of radial profiles: model, fibers, and batches against SciPy."""
 
 from math import inf
 from typing import Any
@@ -12,7 +12,7 @@ from reconstruction.subsurface.models import Method
 from rigsim.fiber.profile import trace_fiber_profile
 from rigsim.tissue.tissue_mc import Layer, LayerStack
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.benchmarks.measurement import processor_seconds
+from skinrig.benchmarks.measurement import measure_processor_seconds
 from skinrig.benchmarks.resampling import bootstrap_columns_median, median_error
 from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -23,16 +23,17 @@ FIBER_CORE_MM = 0.2
 RELATIVE_FIBER_ERROR, RELATIVE_COMMON_ERROR = 0.012, 0.01
 """Relative errors of a calibration: of each fiber, and common to all."""
 DARK_NOISE_PER_MM2 = 1e-8
-"""Noise of a reading in the dark."""
+"""Dark noise of a reading, 1/mm^2."""
 N_BATCH_PROFILES = 30_000
 N_PEER_FITS = 60
-"""SciPy fits that are timed; their time is extrapolated to the batch."""
+"""Timed SciPy fits; their time is extrapolated to the batch."""
 
 
-def transport_profiles(*, toy: bool) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return true sigma_tr (N,), profiles in fibers and their errors (N, 28) by Monte Carlo.
+def simulate_profiles(*, toy: bool) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Simulate profiles and their errors (N, 28) by Monte Carlo; return also true sigma_tr (N,).
 
-    sigma_tr from 0.3 to 3.0 per mm, and sigma_s', and g in turn; then the three bands of skin.
+    Media have sigma_tr from 0.3 to 3.0 per mm, random sigma_s' and three values of g in turn. The
+    last three are the melanin bands.
     """
     rng = np.random.default_rng(0)
     media = []
@@ -56,11 +57,11 @@ def transport_profiles(*, toy: bool) -> tuple[Float64Array, Float64Array, Float6
     return sigma_tr, profiles, errors
 
 
-def tiers(stage: BenchmarkStage) -> None:
-    """Fit Monte Carlo profiles by the three models, with all fibers and with fewer."""
+def measure_tiers(stage: BenchmarkStage) -> None:
+    """Measure fits of Monte Carlo profiles by three models, with all fibers and with fewer."""
     rng = np.random.default_rng(1)
-    sigma_tr, profiles, errors = transport_profiles(toy=stage.toy)
-    spread = slice(0, len(sigma_tr) - len(MELANIN_BANDS))
+    sigma_tr, profiles, errors = simulate_profiles(toy=stage.toy)
+    media = slice(0, len(sigma_tr) - len(MELANIN_BANDS))
     draws = 4 if stage.toy else 40
     shape = (draws, *profiles.shape)
     noisy = profiles * np.exp(RELATIVE_COMMON_ERROR * rng.standard_normal((*shape[:2], 1)))
@@ -94,15 +95,15 @@ def tiers(stage: BenchmarkStage) -> None:
         if not stage.by_band:
             own = np.abs(relative[:, -len(MELANIN_BANDS) :].T)
             stage.by_band |= dict(zip(MELANIN_BANDS, map(median_error, own), strict=True))
-        error = np.abs(relative[:, spread])
+        error = np.abs(relative[:, media])
         radius = FIBER_RADII_MM[part]
         knobs: Knobs = {"model": method, "fibers": radius.size}
         knobs |= {"from mm": float(radius[0]), "to mm": float(radius[-1])}
         stage.add(knobs, timing, bootstrap_columns_median(error))
         if part == slice(None):
-            bias = np.median(relative[:, spread], axis=0)
+            bias = np.median(relative[:, media], axis=0)
             low, high = np.moveaxis(found.interval_per_mm, -1, 0)
-            inside = ((low <= sigma_tr) & (sigma_tr <= high))[:, spread]
+            inside = ((low <= sigma_tr) & (sigma_tr <= high))[:, media]
             best = bias if method == "photon_table" else best
             stage.limits |= _tier_limits(method, error, bias, inside, best)
     relative_error = float(np.median(errors / profiles))
@@ -112,7 +113,7 @@ def tiers(stage: BenchmarkStage) -> None:
 def _tier_limits(
     method: Method, error: Float64Array, bias: Float64Array, inside: BoolArray, best: Float64Array
 ) -> LimitValues:
-    """Return what is found of a model with all fibers; `best` is the photon table's bias."""
+    """Return the limits' values of a model with all fibers; `best` is the photon table's bias."""
     if method == "dipole":
         over_table = float(np.median(np.abs(bias))) / max(float(np.median(np.abs(best))), 1e-9)
         return {
@@ -122,13 +123,13 @@ def _tier_limits(
         }
     if method != "photon_table":
         return {}
-    # 60...76 %, and what the simulation's own error makes ten media's share scatter
-    share = float(inside.mean())
+    # the limits are 60 to 76 % plus the variation of ten media's coverage by simulation noise
+    coverage = float(inside.mean())
     return {
         "median": float(np.median(error)),
         "worst": float(np.median(error, axis=0).max()),
-        "inside": share,
-        "inside_most": share,
+        "inside": coverage,
+        "inside_most": coverage,
     }
 
 
@@ -143,23 +144,23 @@ def _minimum_error(
         )
         for up, along in ((1 + step, 1), (1 - step, 1), (1, 1 + step), (1, 1 - step))
     ]
-    # by the logarithms of both coefficients
+    # derivatives by the logarithms of both coefficients
     by_log = np.stack([slopes[0] - slopes[1], slopes[2] - slopes[3]], axis=-1) / (2.0 * step)
     information = np.einsum("nfi,nfj,nf->nij", by_log, by_log, 1.0 / variance)
     covariance = np.linalg.inv(information)
     # log sigma_tr = (log a + log (a + s')) / 2 + const
     total = sigma_a + sigma_s
-    along_tr = 0.5 * np.stack([1.0 + sigma_a / total, sigma_s / total], axis=-1)
-    return np.asarray(np.sqrt(np.einsum("ni,nij,nj->n", along_tr, covariance, along_tr)))
+    gradient = 0.5 * np.stack([1.0 + sigma_a / total, sigma_s / total], axis=-1)
+    return np.asarray(np.sqrt(np.einsum("ni,nij,nj->n", gradient, covariance, gradient)))
 
 
 def _absorbs_like(sigma_a: Float64Array, band: MelaninBand) -> BoolArray:
-    """Return which media absorb within a factor of two of a band's skin."""
+    """Return the mask of media whose sigma_a is within a factor of two of a band's skin."""
     return np.asarray(np.abs(np.log(sigma_a / band.sigma_a_per_mm)) < np.log(2.0))
 
 
-def batches(stage: BenchmarkStage) -> None:
-    """Fit batches of 28 fibers by diffusion; 30,000 beside a loop of SciPy's least_squares."""
+def measure_batches(stage: BenchmarkStage) -> None:
+    """Measure batches of diffusion fits, 30,000 of them against a loop of SciPy's least_squares."""
     rng = np.random.default_rng(2)
     count = 200 if stage.toy else N_BATCH_PROFILES
     k = np.exp(rng.uniform(np.log(0.3), np.log(3.0), count))
@@ -183,7 +184,7 @@ def batches(stage: BenchmarkStage) -> None:
         for n in (count // 10, count):
             timing, made = stage.time(lambda: ours(n, model_error))
             error = np.abs(made.sigma_tr_per_mm / k[:n] - 1.0)
-            # the bound is that of noise alone: an error that is allowed for is not in these data
+            # the bound includes noise only: these data have no model error
             bound = float(np.median(drawn[:n])) if model_error == 0.0 else None
             own = "none" if model_error == 0.0 else "diffusion's"
             outcome = median_error(error, bound=bound)
@@ -196,7 +197,7 @@ def batches(stage: BenchmarkStage) -> None:
 
                 stage.measure_bands(on_skin)
     if not stage.toy:
-        found, above, apart = ours(), [], []
+        found, above, differences = ours(), [], []
         start = np.log([0.1, 1.0])
 
         def peer(n: int) -> Any:
@@ -213,12 +214,12 @@ def batches(stage: BenchmarkStage) -> None:
             theirs = peer(n)
             above.append(float(found.chi2[n]) / (2.0 * theirs.cost) - 1.0)
             pair = np.array([found.sigma_a_per_mm[n], found.sigma_s_prime_per_mm[n]])
-            apart.append(float(np.abs(np.log(pair) - theirs.x).max()))
-        theirs_s = processor_seconds(lambda: [peer(n) for n in range(N_PEER_FITS)], 2)
+            differences.append(float(np.abs(np.log(pair) - theirs.x).max()))
+        theirs_s = measure_processor_seconds(lambda: [peer(n) for n in range(N_PEER_FITS)], 2)
         theirs_s *= count / N_PEER_FITS
-        ours_s = processor_seconds(ours, 3)
+        ours_s = measure_processor_seconds(ours, 3)
         stage.limits = {
             "speed_up": theirs_s / ours_s,
             "chi2": float(max(above)),
-            "apart": float(np.median(apart)),
+            "apart": float(np.median(differences)),
         }

@@ -1,4 +1,4 @@
-"""Benchmark of light gathered in skin, beside the direct sum in NumPy in the same run."""
+"""Benchmark of gathered subsurface light against the direct sum in NumPy in the same run."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +12,11 @@ from model.dipole.direct_sum import DipoleMedia, sum_exitance
 from model.dipole.gather import GATHER_TOL, SourceTree, gather
 from model.fresnel import ETA_SKIN
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import measure, measure_processor_time, processor_seconds
+from skinrig.benchmarks.measurement import (
+    measure,
+    measure_processor_seconds,
+    measure_processor_time,
+)
 from skinrig.benchmarks.resampling import bootstrap_rms
 from skinrig.benchmarks.results import ErrorEstimate, Knobs, Timing
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
@@ -20,18 +24,18 @@ from skinrig.evaluating.skin_bands import MelaninBand
 
 FULL_SIDE_PX = 512
 MIN_RELATIVE_EXITANCE = 0.01
-"""Of the brightest exitance: what is darker is left out where errors are over the local value."""
+"""Fraction of the largest exitance below which points are excluded from locally relative errors."""
 MEAN_R_D = np.array([0.55, 0.35, 0.25])
 MEAN_TRANSLUCENCY_MM = 1.0 / np.array([0.598, 1.069, 1.672])
-"""Of a mean face, table 2 of Weyrich et al. 2005."""
+"""Diffuse mean free path of a mean face, mm: table 2 of Weyrich et al. 2005."""
 BAND_STEP_MM = 0.8
-"""Of the sources where errors are told by skin."""
+"""Spacing of the sources for errors by melanin band, mm."""
 EDGE_POSITIONS_MM = np.linspace(-3.0, 3.0, 60)
 
 
 @dataclass(frozen=True, slots=True)
 class LitFace:
-    """A face as texels, lit from one side, with a cast shadow."""
+    """Texels of a face, lit from one side, with a cast shadow."""
 
     position_mm: Float64Array
     area: Float64Array
@@ -40,18 +44,18 @@ class LitFace:
     translucency_mm: Float64Array
 
 
-def face(side: int) -> LitFace:
-    """Make a face of 160 mm x 220 mm as side x side texels, albedo and translucency varying."""
+def build_lit_face(side: int) -> LitFace:
+    """Build a face of 160 mm x 220 mm in side x side texels of varying albedo and translucency."""
     u, v = np.meshgrid(np.linspace(-1, 1, side), np.linspace(1, -1, side))
     x, y = 80.0 * u, 110.0 * v
     z = 80.0 * np.sqrt(1.3 - 0.8 * u**2 - 0.4 * v**2) + 20.0 * np.exp(-(x**2 + y**2) / 300.0)
-    place = np.stack([x, y, z], axis=-1)
-    across = np.cross(np.gradient(place, axis=1), -np.gradient(place, axis=0))
+    position = np.stack([x, y, z], axis=-1)
+    across = np.cross(np.gradient(position, axis=1), -np.gradient(position, axis=0))
     area = np.linalg.norm(across, axis=-1)
     lit = np.clip(across @ np.array([0.8, 0.3, 0.52]) / area, 0.0, None)
     lit[(x - y > 20.0) & (x - y < 50.0)] = 0.0
     return LitFace(
-        place.reshape(-1, 3),
+        position.reshape(-1, 3),
         area.ravel(),
         lit.reshape(-1, 1) * np.array([1.0, 0.9, 0.8]),
         MEAN_R_D * (1.0 + 0.1 * np.sin(x / 5.0)).reshape(-1, 1),
@@ -60,18 +64,19 @@ def face(side: int) -> LitFace:
 
 
 def edge_profile(x_mm: Float64Array, media: DipoleMedia) -> Float64Array:
-    """Return the share of even light on x < 0 that comes out at x, by a 1-D integral."""
+    """Return the exitance at x of uniform light on x < 0, relative to R_d, by a 1-D integral."""
     widest = 40.0 / float(media.sigma_tr_per_mm)
     t = widest * np.linspace(0.0, 1.0, 20_001) ** 3
     away = np.abs(x_mm)[:, None]
-    # a ring of radius r lies beyond a line at a distance x by acos(x / r) / pi; r^2 = x^2 + t^2
+    # the fraction acos(x / r) / pi of a ring of radius r is beyond a line at a distance x; the
+    # substitution r^2 = x^2 + t^2 gives 2 pi r dr acos(x / r) / pi = 2 t atan2(t, x) dt
     ring = 2.0 * t * np.arctan2(t, away) * dipole_sum.profile(np.hypot(away, t), media)
     beyond = np.trapezoid(ring, t, axis=1)
     return np.asarray(np.where(x_mm >= 0.0, beyond, 1.0 - beyond))
 
 
-def gathering(stage: BenchmarkStage) -> None:
-    """Gather light over a face: tolerance of the tree; then a shadow's edge: number of sources."""
+def measure_gathering(stage: BenchmarkStage) -> None:
+    """Measure gathering over the tree's tolerance on a face and over sources at a shadow's edge."""
     rng = np.random.default_rng(0)
     _tolerances(stage, rng)
     _edges(stage, rng)
@@ -82,7 +87,7 @@ def gathering(stage: BenchmarkStage) -> None:
 
 def _tolerances(stage: BenchmarkStage, rng: np.random.Generator) -> None:
     side, steps = (48, 3) if stage.toy else (256, 6)
-    scene = face(side)
+    scene = build_lit_face(side)
     at = rng.choice(len(scene.area), 40 if stage.toy else 100, replace=False)
     truth = _sum_directly(scene, at)
     for tolerance in (10.0 ** (1.0 - k) for k in range(steps)):
@@ -94,7 +99,7 @@ def _tolerances(stage: BenchmarkStage, rng: np.random.Generator) -> None:
     direct = measure(lambda: _sum_directly(scene, at[:10]), repeats=1, memory=False)
     seconds = direct.seconds * side**2 / 10
     why = "its seconds are extrapolated from those of 10 points"
-    timing = Timing(seconds, (seconds, seconds), direct.cold_s, None, no_memory=why)
+    timing = Timing(seconds, (seconds, seconds), direct.cold_s, None, no_memory_reason=why)
     knobs = {"scene": "face", "texels": side**2, "sum": "direct, NumPy, extrapolated"}
     stage.add(knobs, timing, ErrorEstimate.symmetric(0.0, 0.0))
 
@@ -130,20 +135,20 @@ def _edge(
     *,
     skin: tuple[Float64Array, Float64Array] = (MEAN_R_D, MEAN_TRANSLUCENCY_MM),
 ) -> Float64Array:
-    """Return the profile of a shadow's edge from sources a step apart, (X, 3).
+    """Return the profile of a shadow's edge from sources at a spacing, (X, 3).
 
-    On skin of a diffuse albedo and a mean free path, mm.
+    `skin` is the diffuse albedo and the diffuse mean free path, mm.
     """
-    half = step_mm * round(10.0 / step_mm)  # so that no source lies on the edge
+    half = step_mm * round(10.0 / step_mm)  # a multiple of the step: no source is on the edge
     grid = np.arange(-half, half, step_mm) + 0.5 * step_mm
     x, y = np.meshgrid(grid, grid)
-    place = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
-    lit = np.repeat(place[:, :1] < 0.0, 3, axis=1).astype(np.float64)
+    position = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    lit = np.repeat(position[:, :1] < 0.0, 3, axis=1).astype(np.float64)
     at = np.stack(
         [EDGE_POSITIONS_MM, 0.3 * EDGE_POSITIONS_MM, np.zeros_like(EDGE_POSITIONS_MM)], axis=-1
     )
     own = np.repeat(EDGE_POSITIONS_MM[:, None] < 0.0, 3, axis=1).astype(np.float64)
-    tree = SourceTree.of(place, np.full(len(place), step_mm**2))
+    tree = SourceTree.of(position, np.full(len(position), step_mm**2))
     found = gather(tree, lit, at, *skin, entered_at=own if exact_coefficients else None)
     return np.asarray(found.exitance / skin[0])
 
@@ -179,17 +184,19 @@ def _rms(error: Float64Array, rng: np.random.Generator) -> ErrorEstimate:
 
 
 def _full_size(rng: np.random.Generator) -> LimitValues:
-    """Gather 512 x 512 texels at as many exit points, and some of them directly."""
-    scene = face(FULL_SIDE_PX)
+    """Measure 512 x 512 texels at as many exit points, and some of them by the direct sum."""
+    scene = build_lit_face(FULL_SIDE_PX)
     gathered = partial(_gathered, scene)
-    spent_s = processor_seconds(lambda: gathered(SourceTree.of(scene.position_mm, scene.area)), 2)
+    spent_s = measure_processor_seconds(
+        lambda: gathered(SourceTree.of(scene.position_mm, scene.area)), 2
+    )
     tree = SourceTree.of(scene.position_mm, scene.area)
     found = gathered(tree)
     at = rng.choice(len(scene.area), 80, replace=False)
     peer_s, truth = measure_processor_time(lambda: _sum_directly(scene, at))
     peer_s *= len(scene.area) / len(at)
-    seen = truth > MIN_RELATIVE_EXITANCE * (scene.r_d * scene.irradiance.max())[at]
-    relative = np.abs(found[at] / np.where(seen, truth, 1.0) - 1.0)[seen]
+    visible = truth > MIN_RELATIVE_EXITANCE * (scene.r_d * scene.irradiance.max())[at]
+    relative = np.abs(found[at] / np.where(visible, truth, 1.0) - 1.0)[visible]
     even = gather(
         tree,
         np.ones_like(scene.irradiance),
@@ -211,13 +218,15 @@ def _full_size(rng: np.random.Generator) -> LimitValues:
 
 
 def _plane_level() -> float:
-    """Return how far a plane's sum without normalization is from R_d at most, relative."""
+    """Return the largest relative error of a plane's sum without normalization from R_d."""
     step, half = 0.4, 30.0
     grid = np.arange(-half, half, step) + 0.5 * step
     x, y = np.meshgrid(grid, grid)
-    place = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
-    tree = SourceTree.of(place, np.full(len(place), step**2))
+    position = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    tree = SourceTree.of(position, np.full(len(position), step**2))
     offset = np.linspace(0.0, step, 9)
     at = np.stack(np.meshgrid(offset, offset, [0.0]), axis=-1).reshape(-1, 3)
-    found = gather(tree, np.ones_like(place), at, MEAN_R_D, MEAN_TRANSLUCENCY_MM, normalize=False)
+    found = gather(
+        tree, np.ones_like(position), at, MEAN_R_D, MEAN_TRANSLUCENCY_MM, normalize=False
+    )
     return float(np.max(np.abs(found.exitance / MEAN_R_D - 1.0)))

@@ -16,11 +16,11 @@ from skinrig.benchmarks.stage import BenchmarkStage
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, classify_melanin
 
 BAND_TABLE_SIZE = 64
-"""Of the table that errors by band are of."""
+"""Size of the table for errors by melanin band."""
 
 
-def layered_reflectance(stage: BenchmarkStage) -> None:
-    """Compare the tiers of the layered reflectance with the simulator's Monte Carlo table."""
+def measure_layered_reflectance(stage: BenchmarkStage) -> None:
+    """Measure the tiers of the layered reflectance against the simulator's Monte Carlo table."""
     rng = np.random.default_rng(0)
     truth = SkinTable.load()
     count = 24 if stage.toy else 200
@@ -36,10 +36,10 @@ def layered_reflectance(stage: BenchmarkStage) -> None:
             tiers.append({"tier": "adding_doubling", "g": g, "directions": directions})
 
     def evaluate(knobs: Knobs) -> Float64Array:
-        how: dict[str, Any] = {"tier": "diffusion"}
-        if knobs != how:
-            how = {"anisotropy": float(knobs["g"]), "directions": int(knobs["directions"])}
-        return tissue_optics.two_layer_reflectance(truth.wavelength_nm, c_m, c_hd, **how)
+        options: dict[str, Any] = {"tier": "diffusion"}
+        if knobs != options:
+            options = {"anisotropy": float(knobs["g"]), "directions": int(knobs["directions"])}
+        return tissue_optics.two_layer_reflectance(truth.wavelength_nm, c_m, c_hd, **options)
 
     def relative(found: Float64Array) -> Float64Array:
         return np.asarray(100 * np.abs(found / reference - 1))
@@ -52,7 +52,7 @@ def layered_reflectance(stage: BenchmarkStage) -> None:
     stage.by_band |= {band: median_error(off[bands == band]) for band in MELANIN_BANDS}
 
 
-def table(stage: BenchmarkStage) -> None:
+def measure_color_table(stage: BenchmarkStage) -> None:
     """Measure the color table's interpolation error in Delta E 2000 over its size."""
     rng = np.random.default_rng(0)
     count = 40 if stage.toy else 400
@@ -68,7 +68,7 @@ def table(stage: BenchmarkStage) -> None:
             repeats=1 if stage.toy or size > 512 else 3,
             memory=size <= 512,
         )
-        # as the paper's texture is read by graphics hardware, and as the table reads itself
+        # "bilinear" is the filter of graphics hardware, "spline" the table's own
         for between, color in (
             ("spline", made.lookup(c_m, c_hd)),
             ("bilinear", _bilinear(made, c_m, c_hd)),
@@ -84,17 +84,18 @@ def table(stage: BenchmarkStage) -> None:
 
 
 def _max_error(difference: Float64Array) -> ErrorEstimate:
-    """Return the largest error; its 68 % interval is by the two largest seen.
+    """Return the largest error with a 68 % interval from the two largest sampled ones.
 
     Robson and Whitlock 1964, Biometrika 51, 33, doi 10.1093/biomet/51.1-2.33.
     """
     second, worst = np.sort(difference)[-2:]
-    most = float(worst + 0.68 / 0.32 * (worst - second))
-    return ErrorEstimate(float(worst), (float(worst), most))
+    # the end point's upper bound at confidence c is y_n + c / (1 - c) (y_n - y_(n-1))
+    upper = float(worst + 0.68 / 0.32 * (worst - second))
+    return ErrorEstimate(float(worst), (float(worst), upper))
 
 
 def _bilinear(made: color_table.ColorTable, c_m: Float64Array, c_hd: Float64Array) -> Float64Array:
-    """Return colors of eq. (7)'s texture with bilinear filtering between texel centres."""
+    """Return colors of eq. (7)'s texture with bilinear filtering between texel centers."""
     i = (made.size - 1) * np.cbrt(c_m / made.c_m_max)
     j = (made.size - 1) * np.cbrt(c_hd / made.c_hd_max)
     row, column = (np.minimum(at.astype(np.intp), made.size - 2) for at in (i, j))
@@ -107,7 +108,7 @@ def _bilinear(made: color_table.ColorTable, c_m: Float64Array, c_hd: Float64Arra
 
 
 def _lab(linear_srgb: Float64Array) -> Float64Array:
-    """CIE Lab under D65 of linear sRGB, (..., 3)."""
+    """Convert linear sRGB to CIE Lab under D65, (..., 3)."""
     xyz = linear_srgb @ np.linalg.inv(spectra.XYZ_TO_LINEAR_SRGB).T
     ratio = xyz / np.linalg.inv(spectra.XYZ_TO_LINEAR_SRGB).sum(axis=1)
     bend = (6 / 29) ** 3

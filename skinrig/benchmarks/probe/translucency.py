@@ -1,4 +1,4 @@
-"""Benchmarks of anisotropy by directions and of translucency maps by sites, beside their bounds."""
+"""Benchmarks of anisotropy over directions and of translucency maps over sites, with bounds."""
 
 import math
 from typing import Literal
@@ -15,7 +15,7 @@ from reconstruction.subsurface import translucency
 from reconstruction.subsurface.probe_sites import SITE_UV
 from reconstruction.subsurface.translucency import TEXTURE_MM, TranslucencyPrior
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.measurement import processor_seconds
+from skinrig.benchmarks.measurement import measure_processor_seconds
 from skinrig.benchmarks.resampling import gaussian_rms
 from skinrig.benchmarks.results import ErrorEstimate
 from skinrig.benchmarks.stage import BenchmarkStage
@@ -31,12 +31,13 @@ Medium = tuple[float, float]
 MEDIUM_PER_MM: Medium = (0.04, 1.5)
 ETA = 1.4
 TRUE_RATIO, TRUE_AXIS_RAD = 1.1, 0.6
-"""Greatest over least 1/sigma_tr."""
+"""Largest over smallest 1/sigma_tr, and the axis of the largest."""
 COUPLING_ERROR, SINGLE_FIBER_ERROR, DARK_NOISE = 0.02, 0.01, 1e-7
-"""Relative deviations of a head set down anew and of each of its fibers; noise, 1/mm^2."""
+"""Relative standard deviations of the coupling of each placement and of each fiber; noise,
+1/mm^2."""
 FALSE_ALARM_RATE = 0.01
 LIMIT_FALSE_ALARM_PROBABILITY = 1e-6
-"""Chance that a count exceeds its limit though all is well."""
+"""Probability that a correct estimator exceeds the limit of false alarms."""
 SITE_ERROR = 0.03
 """Relative standard error of sigma_tr at a site."""
 
@@ -53,16 +54,16 @@ def _profiles(
     medium: Medium = MEDIUM_PER_MM,
     rng: np.random.Generator,
 ) -> Float64Array:
-    """Return readings (N, cases, F) of tissue that scatters less along an axis, heads set down."""
+    """Simulate readings (N, cases, F) of tissue that scatters less along an axis."""
     sigma_tr = np.hypot(np.cos(angle - TRUE_AXIS_RAD) / ratio, np.sin(angle - TRUE_AXIS_RAD))
-    # sigma_tr^2 = 3 sigma_a (sigma_a + sigma_s'), scaled about the middle of its extremes
+    # sigma_tr^2 = 3 sigma_a (sigma_a + sigma_s'), scaled about the geometric mean of its extremes
     sigma_a, sigma_s_prime = medium
     total = (sigma_a + sigma_s_prime) * ratio * sigma_tr**2
     truth = photon_table.reflectance(FIBER_RADII_MM, sigma_a, (total - sigma_a)[:, None], eta=ETA)
     shape = (angle.size, cases, FIBER_RADII_MM.size)
-    seen = truth[:, None] * np.exp(COUPLING_ERROR * rng.standard_normal((*shape[:2], 1)))
-    seen = seen * (1.0 + SINGLE_FIBER_ERROR * rng.standard_normal(shape))
-    return np.asarray(seen + DARK_NOISE * rng.standard_normal(shape))
+    readings = truth[:, None] * np.exp(COUPLING_ERROR * rng.standard_normal((*shape[:2], 1)))
+    readings = readings * (1.0 + SINGLE_FIBER_ERROR * rng.standard_normal(shape))
+    return np.asarray(readings + DARK_NOISE * rng.standard_normal(shape))
 
 
 def _estimate_anisotropy(
@@ -97,12 +98,12 @@ def _estimate_anisotropy(
 
 
 def _bound(count: int, medium: Medium = MEDIUM_PER_MM) -> float:
-    """Return the least standard deviation of the log ratio, absorption known, coupling not."""
+    """Return the Cramér-Rao bound of the log ratio with known absorption and unknown coupling."""
     sigma_a, sigma_s_prime = medium
     here = photon_table.derivatives(FIBER_RADII_MM, sigma_a, sigma_s_prime, eta=ETA)
     light = here.reflectance_per_mm2
     by_log = here.by_sigma_s_prime * sigma_s_prime
-    # deviations known, as those of readings with weights: coupling is free beside its prior
+    # parameters: log coupling, with its Gaussian prior, and log sigma_s'
     weight = 1.0 / ((SINGLE_FIBER_ERROR * light) ** 2 + DARK_NOISE**2)
     across = (weight * light * by_log).sum()
     fisher = np.array(
@@ -111,14 +112,16 @@ def _bound(count: int, medium: Medium = MEDIUM_PER_MM) -> float:
             [across, (weight * by_log * by_log).sum()],
         ]
     )
-    of_one = math.sqrt(np.linalg.inv(fisher)[1, 1])
-    of_one *= 0.5 * sigma_s_prime / (sigma_a + sigma_s_prime)
-    # sigma_tr is its mean times 1 - h / 2 cos 2 theta, h the log of the ratio
-    return 2.0 * of_one * math.sqrt(2.0 / count)
+    # d log sigma_tr = 0.5 sigma_s' / (sigma_a + sigma_s') d log sigma_s'
+    single = math.sqrt(np.linalg.inv(fisher)[1, 1])
+    single *= 0.5 * sigma_s_prime / (sigma_a + sigma_s_prime)
+    # log sigma_tr = const - h / 2 cos 2 theta, where h is the log ratio: the amplitude of a cosine
+    # over N directions has the standard deviation sqrt(2 / N)
+    return 2.0 * single * math.sqrt(2.0 / count)
 
 
-def directions(stage: BenchmarkStage) -> None:
-    """Tell ratios from 5 to 64 directions, by fits of each and by comparing profiles."""
+def measure_directions(stage: BenchmarkStage) -> None:
+    """Measure ratios from 5 to 64 directions, by fits of each and by comparison of profiles."""
     rng = np.random.default_rng(0)
     cases = 12 if stage.toy else 200
     for count in (5, 16) if stage.toy else (5, 8, 16, 32, 64):
@@ -144,7 +147,7 @@ def directions(stage: BenchmarkStage) -> None:
 
 
 def _ratio_error(found: anisotropy.Anisotropy, bound: float) -> ErrorEstimate:
-    """Return the error of the log of the ratio, of cases of which one is used up."""
+    """Return the RMS error of the log ratio, with cases - 1 degrees of freedom."""
     off = np.log(found.ratio) - math.log(TRUE_RATIO)
     return gaussian_rms(off, bound=bound, freedom=len(found.ratio) - 1)
 
@@ -153,17 +156,19 @@ def _evaluate_directions(stage: BenchmarkStage, rng: np.random.Generator) -> Non
     cases = 1000
     angle = _directions(16)
     null = _profiles(angle, 1.0, cases, rng=rng)
-    # an outlier left out by mistake may add its own rate
-    most = float(stats.binom.isf(LIMIT_FALSE_ALARM_PROBABILITY, cases, FALSE_ALARM_RATE + 0.001))
+    # a falsely omitted outlier may add its own rate
+    max_alarms = float(
+        stats.binom.isf(LIMIT_FALSE_ALARM_PROBABILITY, cases, FALSE_ALARM_RATE + 0.001)
+    )
     for way in ANISOTROPY_METHODS:
         alarms = float((_estimate_anisotropy(way, angle, null).p_value < FALSE_ALARM_RATE).sum())
-        stage.limits["alarms", str(cases), way] = (alarms, most)
-    fits, profiles = (stage.at(way=way, directions=16).error for way in ANISOTROPY_METHODS)
+        stage.limits["alarms", str(cases), way] = (alarms, max_alarms)
+    fits, profiles = (stage.find_point(way=way, directions=16).error for way in ANISOTROPY_METHODS)
     stage.limits |= {"over_bound": profiles / _bound(16), "over_profiles": fits / profiles}
 
 
 def _root(prior: TranslucencyPrior, uv: Float64Array) -> Float64Array:
-    """Return a square root of the prior covariance of log(1/sigma_tr) at places (P, 2)."""
+    """Return a square root of the prior covariance of log(1/sigma_tr) at positions (P, 2)."""
     at = uv * np.array(TEXTURE_MM)
     squared = ((at[:, None] - at[None]) ** 2).sum(axis=-1) / prior.length_mm**2
     covariance = prior.person_deviation[0] ** 2 + prior.place_deviation[0] ** 2 * np.exp(
@@ -173,8 +178,8 @@ def _root(prior: TranslucencyPrior, uv: Float64Array) -> Float64Array:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def sites(stage: BenchmarkStage) -> None:
-    """Map 1/sigma_tr from 1 to 16 sites, beside scikit-learn."""
+def measure_sites(stage: BenchmarkStage) -> None:
+    """Measure maps of 1/sigma_tr from 1 to 16 sites, and time against scikit-learn."""
     rng = np.random.default_rng(0)
     whole = translucency.population_prior()
     prior = TranslucencyPrior(
@@ -196,39 +201,43 @@ def sites(stage: BenchmarkStage) -> None:
         root = _root(prior, np.concatenate([uv, pixels]))
         for _ in range(faces):
             log = prior.log_mean[0] + root @ rng.standard_normal(len(root))
-            seen = np.exp(-log[:count] + SITE_ERROR * rng.standard_normal(count))[:, None]
-            found = translucency.interpolate(uv, seen, SITE_ERROR * seen, (side, side), prior=prior)
+            measured = np.exp(-log[:count] + SITE_ERROR * rng.standard_normal(count))[:, None]
+            found = translucency.interpolate(
+                uv, measured, SITE_ERROR * measured, (side, side), prior=prior
+            )
             off = np.log(found.values.reshape(-1)) - log[count:]
             deviation = found.log_stderr.reshape(-1)
             squares.append((off**2).mean())
             stated.append((deviation.astype(np.float64) ** 2).mean())
             inside.append((np.abs(off) < deviation).mean())
-        three = np.repeat(seen, 3, axis=1)
+        three = np.repeat(measured, 3, axis=1)
         timing, _ = stage.time(
             lambda: translucency.interpolate(uv, three, SITE_ERROR * three, (size, size)),
             memory=not stage.toy,
         )
         error, bound = (math.sqrt(float(np.mean(part))) for part in (squares, stated))
-        spread = float(np.std(squares)) / math.sqrt(faces) / (2 * error)
-        outcome = ErrorEstimate.symmetric(error, spread, bound)
+        half = float(np.std(squares)) / math.sqrt(faces) / (2 * error)
+        outcome = ErrorEstimate.symmetric(error, half, bound)
         stage.add({"sites": count, "side": size}, timing, outcome)
         if count == 3:
             within, three_sites = float(np.mean(inside)), error
     if not stage.toy:
         times, mismatch = _compare_with_scikit_learn(prior, named)
-        # of a patch without sites nothing is known but the population
-        alone = math.hypot(float(prior.person_deviation[0]), float(prior.place_deviation[0]))
+        # without sites, the error is the standard deviation of the population
+        population_std = math.hypot(
+            float(prior.person_deviation[0]), float(prior.place_deviation[0])
+        )
         stage.limits = {
             "within": within,
             "within_least": within,
-            "over_mean": three_sites / alone,
+            "over_mean": three_sites / population_std,
             "speed_up": times,
             "difference": mismatch,
         }
 
 
 def _compare_with_scikit_learn(prior: TranslucencyPrior, uv: Float64Array) -> tuple[float, float]:
-    """Return how many times faster than its Gaussian process, and the largest difference."""
+    """Return the speed-up over scikit-learn's Gaussian process, and the largest difference."""
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
@@ -239,12 +248,12 @@ def _compare_with_scikit_learn(prior: TranslucencyPrior, uv: Float64Array) -> tu
     ) * RBF(prior.length_mm, "fixed")
     center = (np.arange(side) + 0.5) / side
     u, v = np.meshgrid(center, 1.0 - center)
-    places = np.stack([u, v], axis=-1).reshape(-1, 2) * np.array(TEXTURE_MM)
+    positions = np.stack([u, v], axis=-1).reshape(-1, 2) * np.array(TEXTURE_MM)
 
     def theirs() -> tuple[Float64Array, Float64Array]:
         process = GaussianProcessRegressor(kernel, alpha=SITE_ERROR**2, optimizer=None)
         process.fit(uv * np.array(TEXTURE_MM), -np.log(sigma[:, 0]) - prior.log_mean[0])
-        mean, deviation = process.predict(places, return_std=True)
+        mean, deviation = process.predict(positions, return_std=True)
         return mean + prior.log_mean[0], deviation
 
     def ours() -> translucency.TranslucencyMap:
@@ -256,4 +265,6 @@ def _compare_with_scikit_learn(prior: TranslucencyPrior, uv: Float64Array) -> tu
         float(np.abs(found.log_stderr.reshape(-1) - deviation).max()),
     )
     with threadpool_limits(1, "blas"):
-        return processor_seconds(theirs, 2) / max(processor_seconds(ours, 5), 1e-6), mismatch
+        return measure_processor_seconds(theirs, 2) / max(
+            measure_processor_seconds(ours, 5), 1e-6
+        ), mismatch

@@ -1,4 +1,4 @@
-"""Benchmark of photon transport: what a fiber sees, and photons a second, beside their peers."""
+"""Benchmark of photon transport: light at each fiber, and photons per second, against peers."""
 
 from contextlib import suppress
 from functools import partial
@@ -18,23 +18,20 @@ from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 from skinrig.evaluating.skin_bands import MelaninBand
 
-RED_MEDIUM_PER_MM = (
-    0.04,
-    1.5,
-)  # sigma_a and sigma_s' in 1/mm, issue of the fiber probe and rigs.md section 4
+RED_MEDIUM_PER_MM = (0.04, 1.5)  # sigma_a and sigma_s', 1/mm; see rigs.md section 4
 MEDIUM_G = 0.8
 ETA = 1.4
 SPEED_MEDIUM = (0.05, 10.0, 0.9, 1.4)  # sigma_a, sigma_s (1/mm), g, eta
-MCML_R_D = 0.3592  # MCML's diffuse reflectance of that medium, specular left out
+MCML_R_D = 0.3592  # MCML's diffuse reflectance of that medium, without the specular reflection
 PEER_SAMPLES = 4096
 N_PEER_RUNS = 20
 
 
 @njit(cache=True, nogil=True)
 def trace_half_space(sigma_a, sigma_s, g, eta, photons, seed, sine, edges2, rings):  # type: ignore[no-untyped-def]
-    """Trace photons in a half-space as MCML does, one event after another; the sum that leaves.
+    """Trace photons in a half-space as MCML does, without optimization; return the exiting weight.
 
-    `rings` gets the weights that leave within a cone of that sine, by r^2; nothing is made clever.
+    `rings` receives the weights that exit within a cone of the sine `sine`, binned by r^2.
     """
     np.random.seed(seed)  # noqa: NPY002, numba's own generator
     sigma_t = sigma_a + sigma_s
@@ -72,8 +69,9 @@ def trace_half_space(sigma_a, sigma_s, g, eta, photons, seed, sine, edges2, ring
             y += step * uy
             z += step * uz
             weight *= sigma_s / sigma_t
-            if weight < 1e-4:
+            if weight < 1e-4:  # Russian roulette: survival 0.1, weight times 10
                 weight = weight * 10.0 if np.random.random() < 0.1 else 0.0  # noqa: NPY002
+            # Henyey-Greenstein: inverse of the cumulative distribution of the cosine
             u = np.random.random()  # noqa: NPY002
             cosine = 2.0 * u - 1.0
             if g != 0.0:
@@ -93,11 +91,11 @@ def trace_half_space(sigma_a, sigma_s, g, eta, photons, seed, sine, edges2, ring
     return total
 
 
-def photon_transport(stage: BenchmarkStage) -> None:
-    """Trace the probe's fibers by next event and by photons that leave in the cone; then peers."""
+def measure_photon_transport(stage: BenchmarkStage) -> None:
+    """Measure light at the fibers by next event and by photons in the cone, then against peers."""
     probe = load_rig("probe").probe
     if probe is None:
-        raise ValueError("rig: the probe's rig has no probe")
+        raise ValueError("probe rig: got no probe, expected its fibers; reinstall skinrig")
     radii = np.array(probe.radius_mm)
     stack = _half_space(*RED_MEDIUM_PER_MM)
     timed = partial(stage.time, repeats=1, memory=None)
@@ -111,7 +109,7 @@ def photon_transport(stage: BenchmarkStage) -> None:
         stage.add(knobs, timing, _max_relative_stderr(relative))
     medium = LayerStack((Layer(inf, SPEED_MEDIUM[0], *SPEED_MEDIUM[1:]),))
     for engine in ("numba", "drjit"):
-        with suppress(ValueError):  # no LLVM on this machine
+        with suppress(ValueError):  # drjit needs LLVM
             timing, total = timed(
                 lambda: trace_photons(
                     medium,
@@ -122,8 +120,9 @@ def photon_transport(stage: BenchmarkStage) -> None:
             )
             error = 100.0 * total.reflectance_stderr / total.reflectance
             knobs = {"quantity": "all that leaves", "engine": engine, "photons": total.photons}
-            spread = error / sqrt(2.0 * (total.batches - 1))
-            stage.add(knobs, timing, ErrorEstimate.symmetric(error, spread))
+            # a standard deviation of n batches has the relative error 1 / sqrt(2 (n - 1))
+            half = error / sqrt(2.0 * (total.batches - 1))
+            stage.add(knobs, timing, ErrorEstimate.symmetric(error, half))
     photons = 2000 if stage.toy else 20_000
     stage.measure_bands(lambda band: _on_skin(band, radii, photons))
     if not stage.toy:
@@ -133,7 +132,7 @@ def photon_transport(stage: BenchmarkStage) -> None:
 
 
 def _on_skin(band: MelaninBand, radii: Float64Array, photons: int) -> ErrorEstimate:
-    """Return the error of as many photons in skin that absorbs little or much."""
+    """Return the error of a number of photons in skin of a melanin band."""
     stack = _half_space(band.sigma_a_per_mm, band.sigma_s_prime_per_mm)
     run = _next_event(stack, radii, photons)
     return _max_relative_stderr(run.stderr / run.reflectance_per_mm2)
@@ -144,7 +143,7 @@ def _half_space(sigma_a: float, sigma_s_prime: float, eta: float = ETA) -> Layer
 
 
 def _next_event(stack: LayerStack, radii: Float64Array, photons: int) -> Any:
-    """Return what the fibers see by next event."""
+    """Trace the light at the fibers by next-event estimation."""
     rng = np.random.default_rng(1)
     return trace_fiber_profile(stack, radii_mm=radii, photons=photons, rng=rng, threads=LIMIT_CORES)
 
@@ -156,7 +155,7 @@ def _max_relative_stderr(relative: Float64Array) -> ErrorEstimate:
 
 
 def _cone_relative_stderr(radii: Float64Array, photons: int) -> Float64Array:
-    """Return relative standard errors of the plain walk in rings as wide as the fibers."""
+    """Return relative standard errors of the plain walk in rings of the fibers' width."""
     rings = np.zeros((20, 2 * len(radii)))
     edges = np.sort(np.concatenate([radii - 0.1, radii + 0.1]))
     for batch, row in enumerate(rings):
@@ -173,28 +172,28 @@ def _cone_relative_stderr(radii: Float64Array, photons: int) -> Float64Array:
             counted,
         )
         row[: counted.size] = counted
-    seen = rings[:, 0 : 2 * len(radii) : 2]
-    mean, error = seen.mean(axis=0), seen.std(axis=0, ddof=1) / sqrt(20.0)
+    counts = rings[:, 0 : 2 * len(radii) : 2]
+    mean, error = counts.mean(axis=0), counts.std(axis=0, ddof=1) / sqrt(20.0)
     return np.divide(error, mean, out=np.full(len(mean), np.nan), where=mean > 0)
 
 
 def _one_percent(radii: Float64Array, stack: Any) -> LimitValues:
-
     seconds, run = measure_processor_time(
         lambda: trace_fiber_profile(
             stack, radii_mm=radii, photons=200_000, rng=np.random.default_rng(3), batches=100
         )
     )
     worst = 100.0 * float((run.stderr / run.reflectance_per_mm2).max())
+    # the error falls with 1 / sqrt(seconds): time to 1 % is seconds * (error in %)^2
     return {"seconds": seconds * worst**2 / LIMIT_CORES}
 
 
 def _against_volpath(radii: Float64Array) -> LimitValues:
-    """Compare at n = 1: a disc of light on the surface, seen along the normal, square by fiber."""
-    scene = volpath_scene(radii)
+    """Compare with volpath at n = 1: a lit disc, viewed along the normal, one pixel per fiber."""
+    scene = build_volpath_scene(radii)
     try:
         radiance(scene, kind="mono", samples=16)
-    except (RenderError, RuntimeError):  # no variant with volumes here
+    except (RenderError, RuntimeError):  # no variant with volumes is installed
         return {}
     peer_s, runs = measure_processor_time(
         lambda: [
@@ -202,10 +201,9 @@ def _against_volpath(radii: Float64Array) -> LimitValues:
             for seed in range(N_PEER_RUNS)
         ]
     )
-    seen = np.array(runs, np.float64)
-    mean, error = seen.mean(axis=0), seen.std(axis=0, ddof=1) / sqrt(N_PEER_RUNS)
-    # Where light came in one run or none the error is not known: it is taken as that of one run,
-    # 100 %, which flatters the peer.
+    images = np.array(runs, np.float64)
+    mean, error = images.mean(axis=0), images.std(axis=0, ddof=1) / sqrt(N_PEER_RUNS)
+    # pixels with light in at most one run have an unknown error; 100 % is in the peer's favor
     relative = np.where(mean > 0.0, 100.0 * error / np.maximum(mean, 1e-30), 100.0)
     stack = _half_space(*RED_MEDIUM_PER_MM, eta=1.0)
     ours_s, run = measure_processor_time(
@@ -219,15 +217,15 @@ def _against_volpath(radii: Float64Array) -> LimitValues:
         )
     )
     ours = ours_s * float((100.0 * run.stderr / run.reflectance_per_mm2).max()) ** 2
-    # As if the peer's samples were shared out among the fibers in the best way.
+    # the peer's samples are counted as if they were distributed optimally over the fibers
     peers = peer_s * float((relative**2).mean())
     return {"over_volpath": peers / ours}
 
 
-def volpath_scene(radii: Float64Array) -> dict[str, Any]:
-    """Return Mitsuba's scene of a lit disc on a half-space and a row of square pixels, one a fiber.
+def build_volpath_scene(radii: Float64Array) -> dict[str, Any]:
+    """Build Mitsuba's scene of a lit disc on a half-space, with one square pixel per fiber.
 
-    The radiance times pi is the exitance per source power where the exit is Lambertian.
+    The radiance times pi is the exitance per source power for Lambertian exitance.
     """
     pitch = float(radii[1] - radii[0])
     middle, half = float(radii.mean()), 0.5 * pitch * len(radii)
@@ -280,7 +278,7 @@ def volpath_scene(radii: Float64Array) -> dict[str, Any]:
 
 
 def _compare_photon_rates(medium: Any) -> LimitValues:
-    """Compare photons a processor second with the plain walk's; R_d with MCML's."""
+    """Compare photons per processor second with the plain walk, and R_d with MCML."""
     edges2, rings = np.array([0.0, 1.0]), np.zeros(1)
     trace_half_space(*SPEED_MEDIUM, 10, 0, 1.0, edges2, rings)
     plain_s, _ = measure_processor_time(

@@ -1,4 +1,4 @@
-"""Small scenes of each rig, rendered with and without what their needs speak of."""
+"""Render small scenes of each rig with and without the effects that their rules evaluate."""
 
 import dataclasses
 import math
@@ -28,29 +28,29 @@ from skinrig.simulating.dome import small_dome
 from skinrig.simulating.gradient import make_scene
 
 FLOAT32_ROUNDING: Final = 4.0 * float(np.finfo(np.float32).eps)
-"""Relative error of a picture in single precision, after a few sums."""
+"""Relative error of an image in single precision, after a few sums."""
 
 FACE_TEXELS: Final = 256
 
-N_TIMED_PICTURES: Final = 3
-"""Pictures of which the quickest is timed."""
+N_TIMED_IMAGES: Final = 3
+"""Images per timing; the quickest counts."""
 
 
 @dataclass(frozen=True, slots=True)
 class EffectComparison:
-    """One effect of one scene, compared with and without."""
+    """Comparison of one scene with and without one effect."""
 
     rig: str
     subject: str
     effect: str
     verdict: str
-    """As the scene's rule has it, see `rigsim.needs.effects.Verdict`."""
+    """Verdict of the scene's rule, see `rigsim.needs.effects.Verdict`."""
     predicted_change: float | None
-    """Largest change over noise as the rule told it."""
+    """Largest change over noise as predicted by the rule."""
     found: float
     """Largest change of any pixel over its noise, as rendered."""
     change_stderr: float
-    """Standard error of ``found`` by photons, and its rounding, in the same unit."""
+    """Standard error of ``found`` by photon noise and rounding, in the same unit."""
     with_s: float
     """Processor seconds with the effect."""
     without_s: float
@@ -63,7 +63,7 @@ class EffectComparison:
 
 
 Images = Float32Array | Float64Array
-"""What a camera gets, in full scales."""
+"""Images of a camera, in fractions of full scale."""
 Render = Callable[..., Images]
 
 
@@ -74,11 +74,11 @@ class ComparedScene:
     rig: str
     subject: str
     scene: Any
-    """As its needs decide."""
+    """Scene with the effects that its rule selects."""
 
     @property
     def noise(self) -> PixelNoise:
-        """The sensor's."""
+        """Noise of the scene's sensor."""
         return PixelNoise.of(self.scene.sensor())
 
     def compare(
@@ -91,16 +91,16 @@ class ComparedScene:
         render
             Called with settings of the scene; returns images.
         switched
-            For each switch its settings with and without the effect.
+            Settings with and without the effect, by switch.
         """
         for effect in self.scene.needs:
             if effect.switch not in switched:
                 continue
-            # only of what is left out the seconds are a claim
-            times = N_TIMED_PICTURES if effect.verdict == "negligible" else 1
+            # the saved time matters for omitted effects only
+            times = N_TIMED_IMAGES if effect.verdict == "negligible" else 1
             (with_s, have), (without_s, lack) = (
-                measure_processor_time(lambda: render(**{effect.switch: how}), times)
-                for how in switched[effect.switch]
+                measure_processor_time(lambda: render(**{effect.switch: setting}), times)
+                for setting in switched[effect.switch]
             )
             yield self.compare_images(effect, have, lack, (with_s, without_s), full_scale=1.0)
 
@@ -113,7 +113,7 @@ class ComparedScene:
         *,
         full_scale: float = math.inf,
     ) -> EffectComparison:
-        """Compare two images that one effect tells apart, as a sensor shows them."""
+        """Compare images with and without one effect, relative to the sensor's noise."""
         sigma = self.noise.sigma(with_effect)
         shown, bare = (
             np.minimum(one.astype(np.float64), full_scale) for one in (with_effect, without_effect)
@@ -130,7 +130,7 @@ class ComparedScene:
         )
 
     def compare_simplified_face(self, render: Render) -> Iterator[EffectComparison]:
-        """Compare a face with one of even pigment, one without relief, and three bands with one.
+        """Compare a face with simplified ones: uniform pigment, no relief, one color band.
 
         Parameters
         ----------
@@ -150,24 +150,24 @@ class ComparedScene:
         white = spectra.camera_white(rig.views[0].spectral_sensitivity, rig.lights[0].illuminant)
         gray = np.asarray(white / white.mean(), np.float32)
         mean_s, one = measure_processor_time(lambda: have.mean(axis=-1, keepdims=True) * gray)
-        # a band alone would be a third of the sums over colors, which are not timed apart
+        # one band would take a third of the sums over colors, which are not timed separately
         yield self.compare_images(needs[BAND_EFFECT], have, one, (mean_s, mean_s))
 
 
 def compare_flash_face(
     preset: str, *, width_px: int, texels: int = FACE_TEXELS, light_deg: float | None = None
 ) -> Iterator[EffectComparison]:
-    """Compare pictures of a face before the flash rig, parallel and crossed, at full power.
+    """Compare images of a face in the flash rig, parallel and crossed, at full power.
 
     Parameters
     ----------
     preset
-        Of the face.
+        Melanin preset of the face.
     width_px, texels
-        Columns of the camera, and texels along one side of the face's texture.
+        Width of the image, and side of the face's texture.
     light_deg
-        One of the lights alone, so far off the camera's axis to the right, degrees; None: all
-        lights where they stand.
+        Angle of a single light to the right of the camera's axis, degrees; None: all lights at
+        their nominal positions.
     """
     rig = load_rig("flash").resized(width_px)
     name = preset
@@ -183,7 +183,7 @@ def compare_flash_face(
         made = FlashScene(rig, subject, effects=SceneEffects.from_switches(settings))
         return np.stack([made.radiance(name) for name in ("parallel", "crossed")])
 
-    scene.radiance()  # compiles, and traces what all scenes of this face share
+    scene.radiance()  # compiles, and traces rays that are common to all scenes of this face
     coarser = 2 if scene.needs.builds(WAVELENGTH_STEP_EFFECT) else None
     compared = ComparedScene("flash", name, scene)
     yield from compared.compare(
@@ -199,19 +199,19 @@ def compare_flash_face(
 
 
 def _set_light_angle(rig: Any, angle_deg: float) -> Any:
-    """Return a rig with the first of its lights alone, at an angle off +z towards +x."""
+    """Return a rig with its first light only, at an angle from +z towards +x."""
     light = rig.lights[0]
-    far, angle = math.hypot(*light.position_mm), math.radians(angle_deg)
-    place = (far * math.sin(angle), 0.0, far * math.cos(angle))
-    return dataclasses.replace(rig, lights=(dataclasses.replace(light, position_mm=place),))
+    distance, angle = math.hypot(*light.position_mm), math.radians(angle_deg)
+    position = (distance * math.sin(angle), 0.0, distance * math.cos(angle))
+    return dataclasses.replace(rig, lights=(dataclasses.replace(light, position_mm=position),))
 
 
 def compare_dome_face(
     preset: str, *, width_px: int, lights: int, state: str = "neutral"
 ) -> Iterator[EffectComparison]:
-    """Compare pictures of a face in the dome under some lights, each exposed to full scale.
+    """Compare images of a face in the dome under some lights, each exposed to full scale.
 
-    A face that has moved is compared with and without shadows of its wrinkles.
+    A face with an expression is compared with and without shadows of its wrinkles.
     """
     rig = small_dome(load_rig("dome"), lights=lights, views=1, width_px=width_px)
     face = make_subject(preset, seed=0, size=FACE_TEXELS)
@@ -219,7 +219,7 @@ def compare_dome_face(
     plain = {} if rest else {"interreflections": False, "subsurface": False}
 
     def made(subject: Any = face, **settings: Any) -> DomeScene:
-        # what light goes from skin to skin is traced once for all scenes of the face
+        # interreflection is traced once for all scenes of the face
         effects = SceneEffects.from_switches(plain | settings)
         return DomeScene(rig, subject, state=state, effects=effects)
 
@@ -242,7 +242,7 @@ def compare_dome_face(
 
 
 def compare_gradient_skin(site: str, *, width_px: int) -> Iterator[EffectComparison]:
-    """Compare pictures of a relaxed patch under all LEDs, parallel and crossed, at full scale."""
+    """Compare images of a relaxed patch under all LEDs, parallel and crossed, at full scale."""
     rig = load_rig("gradient").cropped(width_px)
     base = make_scene(rig, site=site)
     brightest = max(float(part[0].max()) for part in base.moments(NEUTRAL_GRIP).values())
@@ -259,7 +259,7 @@ def compare_gradient_skin(site: str, *, width_px: int) -> Iterator[EffectCompari
 
 
 def check_flat_targets() -> Iterator[EffectComparison]:
-    """Show that targets neither shade nor light themselves: rays between their own points."""
+    """Check with rays that targets have neither self-shadowing nor interreflection."""
     flash = load_rig("flash").resized(64)
     dome = small_dome(load_rig("dome"), lights=4, views=1, width_px=64)
     scenes: list[tuple[str, str, Any]] = [
@@ -269,15 +269,14 @@ def check_flat_targets() -> Iterator[EffectComparison]:
     for rig, name, scene in scenes:
         noise = PixelNoise.of(scene.sensor())
         caster = Caster(scene.subject.mesh)
-        told_s, flat = measure_processor_time(
-            lambda: is_flat(caster.mesh)
-        )  # all that leaving it out costs
+        # omission costs only the check for flatness
+        check_s, flat = measure_processor_time(lambda: is_flat(caster.mesh))
 
-        def exchanged() -> tuple[Interreflection, float]:
+        def trace_exchange() -> tuple[Interreflection, float]:
             bounce = Interreflection(caster, patches=24)
             return bounce, float(np.asarray(bounce.exchange.sum(axis=1)).max(initial=0.0))
 
-        seconds, (bounce, got) = measure_processor_time(exchanged)
+        seconds, (bounce, got) = measure_processor_time(trace_exchange)
         points, normals = (part[0] for part in bounce.surface())
         cast = partial(visibility, caster, points, normals, samples=4)
         shading_s, seen = measure_processor_time(
@@ -300,5 +299,5 @@ def check_flat_targets() -> Iterator[EffectComparison]:
                 noise.change_over_noise(lost),
                 noise.change_over_noise(FLOAT32_ROUNDING),
                 with_s,
-                max(told_s, 1e-6),
+                max(check_s, 1e-6),
             )

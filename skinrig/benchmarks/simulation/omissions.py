@@ -1,4 +1,4 @@
-"""Benchmark of what scenes leave out: how much pixels change by it, and the seconds it saves."""
+"""Benchmark of effects that scenes omit: change of pixels over noise, and saved time."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -20,26 +20,27 @@ from skinrig.benchmarks.simulation import omission_cases
 from skinrig.benchmarks.simulation.omission_cases import ComparedScene, EffectComparison
 from skinrig.benchmarks.stage import BenchmarkStage
 
-NO_MEMORY_REASON = "scenes share what they trace: a picture's memory is not its own"
+NO_MEMORY_REASON = "scenes share traced rays, so that memory has no single scene"
 FLASH_PX = 192
 GRAZING_LIGHT_PX = 96
 GRAZING_DEG = 88.0
-"""A plate that faces the camera gets 1/29 of what faces the light."""
+"""Light angle at which a plate that faces the camera has 1/29 of the irradiance at normal
+incidence (cos 88 degrees)."""
 DOME_PX = 100
 GRADIENT_PX = 128
 N_DOME_LIGHTS = 3
 
 
-def omissions(stage: BenchmarkStage) -> None:
-    """Render scenes of each rig with and without what their rules decide on.
+def measure_omissions(stage: BenchmarkStage) -> None:
+    """Measure scenes of each rig with and without the effects that their rules evaluate.
 
-    A point is one effect of one scene: its seconds are those of the picture without the effect, its
-    error the largest change of any pixel over that pixel's noise. All pictures but the probe's are
-    sums without chance, so that what is uncertain is rounding; the probe's are of equal photons.
+    A point is one effect of one scene. Its seconds are those of the image without the effect; its
+    error is the largest change of any pixel over that pixel's noise. All images but the probe's are
+    deterministic sums, whose error is rounding; the probe's images use the same photons.
     """
     found = list(_cases(stage.toy))
     for one in found:
-        timing = Timing.single(one.without_s, no_memory=NO_MEMORY_REASON)
+        timing = Timing.single(one.without_s, no_memory_reason=NO_MEMORY_REASON)
         knobs: Knobs = {"rig": one.rig, "subject": one.subject}
         knobs |= {"effect": one.effect, "verdict": one.verdict}
         also: Knobs = {"seconds saved": one.with_s - one.without_s}
@@ -49,20 +50,20 @@ def omissions(stage: BenchmarkStage) -> None:
         if one.verdict == "negligible":
             stage.limits["change", one.rig, one.subject, one.effect] = one.max_change
     built = [one for one in found if one.verdict == "built"]
-    told = [
+    predicted = [
         one
         for one in built
         if one.predicted_change is not None and not _changes_more_than_effect(one)
     ]
     stage.limits["over_rule"] = max(
-        ((one.found - one.change_stderr) / (one.predicted_change or 1e-30) for one in told),
+        ((one.found - one.change_stderr) / (one.predicted_change or 1e-30) for one in predicted),
         default=0.0,
     )
     stage.reference_error = max(one.change_stderr for one in found)
 
 
 def _changes_more_than_effect(comparison: EffectComparison) -> bool:
-    """Return whether switching an effect changes more than the effect."""
+    """Return whether the switch of an effect also changes other parts of the scene."""
     return comparison.rig == "dome" and comparison.effect == LATERAL_EFFECT
 
 
@@ -85,7 +86,7 @@ def _cases(toy: bool) -> Iterator[EffectComparison]:
 
 
 def compare_gray_tissue() -> Iterator[EffectComparison]:
-    """Take a gray medium as one color, and as 31 of which bands are made, of the same photons."""
+    """Compare a gray medium with one color and with 31 wavelengths, by the same photons."""
     rig = load_rig("probe")
     gray = HomogeneousTissue(0.05, 1.5)
     bands = tuple(float(nm) for nm in range(400, 701, 10))
@@ -101,18 +102,18 @@ def compare_gray_tissue() -> Iterator[EffectComparison]:
         spent_s, (made, profile) = measure_processor_time(partial(profiled, tissue))
         seconds.append(spent_s)
         if profile is None:
-            raise ValueError("gray tissue: the head touches nothing")
+            raise ValueError("gray tissue: got no profile, expected a head on skin; place the head")
         images.append(made.image(made.transmit_through_fibers(profile.reflectance_per_mm2)))
     brightest = np.float32(images[0].max())
     scene = ProbeScene(rig, gray)
     compared = ComparedScene("probe", "gray medium", scene)
-    have, lack = (part / brightest for part in images)  # of stored photons: the same for both
+    have, lack = (part / brightest for part in images)  # stored photons, the same for both
     yield compared.compare_images(scene.needs[COLOR_EFFECT], have, lack, (seconds[0], seconds[1]))
     yield from _compare_probe_build(compared, head)
 
 
 def _compare_probe_build(compared: ComparedScene, head: HeadState) -> Iterator[EffectComparison]:
-    """Compare the probe as built with one without cross-talk, wings, or dark current."""
+    """Compare the actual probe with one without cross-talk, wings or dark current."""
     scene = compared.scene
     profile, build = scene.profile(head), scene.build
 

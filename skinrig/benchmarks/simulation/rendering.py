@@ -1,4 +1,4 @@
-"""Benchmarks of the rigs' renderers, beside Mitsuba's own ways."""
+"""Benchmarks of the rigs' renderers against Mitsuba's own integrators and polarizers."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from skinrig.benchmarks.resampling import bootstrap_interval, bootstrap_tiled_rm
 from skinrig.benchmarks.results import ErrorEstimate, Knobs, Timing
 from skinrig.benchmarks.stage import BenchmarkStage
 
-NO_MEMORY_REASON = "three ways take turns in one process, each with its scene held"
+NO_MEMORY_REASON = "three methods run in turn in one process, which keeps all their scenes"
 
 
-def dome(stage: BenchmarkStage) -> None:
-    """Time one view of the dome, light after light, in three ways.
+def measure_dome(stage: BenchmarkStage) -> None:
+    """Measure one view of the dome, one light at a time (OLAT), by three methods.
 
-    The full size is that of the rig's cameras. Mitsuba's samples are stratified, which makes them
-    as even as our regular rays: with its default, independent ones it is twice as noisy.
+    The full size is that of the rig's cameras. Mitsuba uses stratified samples, which are as
+    uniform as our regular rays; with its default, independent samples it is twice as noisy.
     """
     width, lights = (64, 2) if stage.toy else (1300, 4)
     efforts = (1, 2) if stage.toy else (1, 3, 2)
@@ -46,18 +46,18 @@ def dome(stage: BenchmarkStage) -> None:
         )
         for name in ("ours", "path", "direct"):
             way = getattr(found, name)
-            timing = Timing.single(way.seconds, no_memory=NO_MEMORY_REASON)
+            timing = Timing.single(way.seconds, no_memory_reason=NO_MEMORY_REASON)
             stage.add({"way": name, "rays": subpixels**2}, timing, _method_error(way))
     stage.measure_bands(lambda band: _on_skin(band.preset, 64 if stage.toy else 650, fine))
     stage.limits["over_path"] = found.speed_up(found.path)
     stage.limits["over_direct"] = found.speed_up(found.direct)
-    finest = stage.at(way="ours", rays=max(efforts) ** 2)
+    finest = stage.find_point(way="ours", rays=max(efforts) ** 2)
     stage.reference_error = finest.error * max(efforts) / fine
-    stage.words["rays"] = fine**2
+    stage.description_values["rays"] = fine**2
 
 
 def _method_error(method: dome_scenes.RenderTiming) -> ErrorEstimate:
-    """Return a way's error in percent, with its interval over tiles."""
+    """Return the error of a method in percent, with its interval over tiles."""
     error, tiles = 100.0 * method.error, method.squared_by_tile
     low, high = error * np.array(
         bootstrap_interval(tiles, lambda again, axis: np.sqrt(again.mean(axis=axis) / tiles.mean()))
@@ -66,7 +66,7 @@ def _method_error(method: dome_scenes.RenderTiming) -> ErrorEstimate:
 
 
 def _on_skin(preset: str, width: int, fine: int) -> ErrorEstimate:
-    """Return our error with 4 rays a pixel on a face of a preset's melanin, one light, %."""
+    """Return our error with 4 rays per pixel on a face of a preset's melanin, one light, %."""
     rig = point_light_rig(load_rig("dome").resized(width).subset(views=["C02"]))
     face = dome_scenes.plain_face(preset, size=128 if width < 128 else 512)
     light = len(rig.lights) // 2
@@ -81,8 +81,8 @@ def _on_skin(preset: str, width: int, fine: int) -> ErrorEstimate:
 REFERENCE_RAYS = 144
 
 
-def flash(stage: BenchmarkStage) -> None:
-    """Time both polarization images by closed forms and by Mitsuba's own polarizers."""
+def measure_flash(stage: BenchmarkStage) -> None:
+    """Measure both polarization images by closed forms and by Mitsuba's own polarizers."""
     efforts = ((1, 2), (2, 4)) if stage.toy else ((1, 4), (2, 16), (3, 64))
     width = 48 if stage.toy else 256
     rig, view = flash_scenes.reference_rig(width)
@@ -119,7 +119,7 @@ def flash(stage: BenchmarkStage) -> None:
 
 
 def _larger_error(found: dict[str, Float32Array], truth: dict[str, Float32Array]) -> ErrorEstimate:
-    """Return the larger of both images' relative errors, %, where the sphere fills pixels."""
+    """Return the larger of both images' relative errors, %, in pixels inside the sphere."""
     errors = []
     for name, true in truth.items():
         whole = binary_erosion(true > 0.0, iterations=2)
@@ -129,17 +129,16 @@ def _larger_error(found: dict[str, Float32Array], truth: dict[str, Float32Array]
 
 
 N_LIT_CONDITIONS = 14
-"""Of the 16 conditions two are dark; Mitsuba is not asked to gradient those."""
+"""Conditions that Mitsuba renders; two of the 16 are dark."""
 
 BEST_KNOBS: Knobs = {"way": "moments", "subpixels": 2, "sectors": 32, "table": 65}
 
 
-def gradient(stage: BenchmarkStage) -> None:
-    """Picture one state of skin under all conditions, and gradient its conditions one by one.
+def measure_gradient(stage: BenchmarkStage) -> None:
+    """Measure renderings of one state of skin under all conditions, by moments and by Mitsuba.
 
-    Both sides are judged against sums over the LEDs with a shadow ray to each. Seconds are
-    processor time; ours are those of the table, which serves all states of a session, and of one
-    state.
+    The reference of both is the sum over all LEDs with a shadow ray to each. Seconds are processor
+    time. Ours include the table, which is common to all states of a session, and one state.
     """
     width = 48 if stage.toy else 192
     skin = gradient_scenes.plain_skin(width * 0.006 + 0.9)
@@ -155,16 +154,17 @@ def gradient(stage: BenchmarkStage) -> None:
                 image, seconds = gradient_scenes.render_pattern(
                     plain, pattern, samples=samples, seed=number
                 )
-            wanted = reference @ np.array(PATTERN_WEIGHTS[pattern])
+            expected = reference @ np.array(PATTERN_WEIGHTS[pattern])
             ways.append(
                 gradient_scenes.compare_with_reference(
-                    image.reshape(-1)[pixels].astype(np.float64), wanted, seconds
+                    image.reshape(-1)[pixels].astype(np.float64), expected, seconds
                 )
             )
         error = math.sqrt(sum(way.error**2 for way in ways) / 2.0)
         seconds = N_LIT_CONDITIONS * sum(way.seconds for way in ways) / 2.0
         knobs: Knobs = {"way": "Mitsuba", "samples": samples}
         _add(stage, knobs, seconds, error, rise.mb, len(pixels))
+    # the error of independent samples falls with 1 / sqrt(seconds)
     at_equal_error = seconds * (error / best.error) ** 2
     off = max(abs(way.mean_ratio - 1.0) / way.mean_ratio_stderr for way in ways)
     stage.limits = {
@@ -178,10 +178,10 @@ def gradient(stage: BenchmarkStage) -> None:
 def _by_moments(
     stage: BenchmarkStage, skin: MicroSkin, width: int, pixels: Int64Array, reference: Float64Array
 ) -> tuple[gradient_scenes.ReferenceComparison, gradient_scenes.ReferenceComparison]:
-    """Add our ways; return the best, and the usual one without shadows."""
+    """Add our settings; return the best one, and the default one without shadows."""
     gradient_scenes.scene_pixels(
         gradient_scenes.plain_scene(skin, width_px=width, table_size=17), pixels
-    )  # compiles
+    )  # compiles the kernels
     settings = [(1, 16, 33), (1, 32, 65), (2, 32, 65)]
     if not stage.toy:
         settings += [(1, 32, 129), (2, 16, 65), (2, 64, 65), (3, 32, 65)]
@@ -208,6 +208,6 @@ def _by_moments(
 def _add(
     stage: BenchmarkStage, knobs: Knobs, seconds: float, error: float, mb: float | None, pixels: int
 ) -> None:
-    timing = Timing.single(seconds, mb, memory_of="resident")
+    timing = Timing.single(seconds, mb, memory_kind="resident")
     outcome = ErrorEstimate.symmetric(100.0 * error, 100.0 * error / math.sqrt(2.0 * pixels))
     stage.add(knobs, timing, outcome)

@@ -1,4 +1,4 @@
-"""Benchmark of stretched skin: how far the equilibrium is from converged, against seconds."""
+"""Benchmark of stretched skin: convergence of the equilibrium against time."""
 
 from dataclasses import replace
 from functools import partial
@@ -8,27 +8,27 @@ import numpy as np
 from rigsim.skin_patch.microrelief import SITE_NAMES, MicroSkin, make_micro_skin
 from rigsim.skin_patch.stretch import FORCE_TOLERANCE, StretchedSkin, required_size_mm, stretch_skin
 from skinrig.arrays import Float32Array
-from skinrig.benchmarks.measurement import measure_processor_time, processor_seconds
+from skinrig.benchmarks.measurement import measure_processor_seconds, measure_processor_time
 from skinrig.benchmarks.resampling import mean_error
 from skinrig.benchmarks.stage import BenchmarkStage, LimitValues
 
 CALIPER_STRETCHES = (0.73, 0.8, 0.87, 0.94, 1.07, 1.14, 1.21, 1.28)
-"""Stretches of a series as the caliper gives them."""
+"""Stretch ratios of a caliper series."""
 
 
 def _variance(state: StretchedSkin, half_mm: float) -> float:
-    """Return the variance of slopes along the jaws over the same skin in every state."""
+    """Return the variance of slopes along the jaws over the same material points."""
     grid = np.arange(-half_mm, half_mm, 0.008)
     x, y = np.meshgrid(grid, -grid)
-    place = np.stack([x, y], -1) @ state.gradient.T
-    found = state.sample(place[..., 0], place[..., 1])
+    position = np.stack([x, y], -1) @ state.gradient.T
+    found = state.sample(position[..., 0], position[..., 1])
     angle = np.radians(state.angle_deg)
     along = np.cos(angle) * found.slope_x + np.sin(angle) * found.slope_y
     return float(np.var(along, dtype=np.float64))
 
 
 def measure_stretch(stage: BenchmarkStage) -> None:
-    """Stop the search for the equilibrium at forces of several sizes; then time whole series."""
+    """Measure the equilibrium at several force tolerances, then time whole series."""
     size = 0.3 if stage.toy else 1.6
     half = 0.4 * size
     seeds = range(2 if stage.toy else 3)
@@ -67,7 +67,9 @@ def _limits() -> LimitValues:
         strains = (abs(s.membrane_strain / (r - 1.0)) for r, s in states.items())
         limits["strain", site] = max(strains)
     field = make_micro_skin("forehead", seed=1, size_mm=required_size_mm(12.3, 1.0, angle_deg=0.0))
-    limits["field_s"] = processor_seconds(lambda: stretch_skin(field, stretch=1.2, angle_deg=90.0))
+    limits["field_s"] = measure_processor_seconds(
+        lambda: stretch_skin(field, stretch=1.2, angle_deg=90.0)
+    )
     flat = stretch_skin(_flat(field), stretch=0.8, angle_deg=0.0)
     limits["flat"] = float(np.abs(flat.height_um).max())
     return limits
@@ -80,6 +82,6 @@ def _flat(skin: MicroSkin) -> MicroSkin:
         for name in ("height_um", "albedo", "alpha", "layer_um")
     }
     maps["height_um"] = np.zeros_like(maps["height_um"])
-    # a layer of uneven thickness bends when it is compressed, however flat its top is
+    # a layer of varying thickness buckles under compression even if its surface is flat
     maps["layer_um"] = np.full_like(maps["layer_um"], maps["layer_um"].mean())
     return replace(skin, **maps)  # type: ignore[arg-type]

@@ -39,13 +39,13 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
             judged = got, limit["bound"], limit["sense"], limit["unit"]
             checks.append(page.Check(f"{name}: {limit['name']}", *judged, worst=_worst(stage)))
     plots = [
-        bench_figures.error_against_seconds(name, stage)
+        bench_figures.plot_error_against_time(name, stage)
         for name, stage in document["stages"].items()
         if stage["points"]
     ]
     yield page.Plots(plots)
     yield page.view("benchmark", stages=document["stages"])
-    bands = bench_table.bands(document)
+    bands = bench_table.list_band_rows(document)
     if bands:
         yield page.table(
             bench_table.BAND_COLUMNS, bands, caption="Error at the default setting by melanin band"

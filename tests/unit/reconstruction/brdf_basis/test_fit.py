@@ -20,7 +20,9 @@ def basis():
 @pytest.fixture(scope="module")
 def face():
     rng = np.random.default_rng(6)
-    return brdf_truth.dome(40, r_d=brdf_truth.LIGHT_SKIN_ALBEDO, noise=0.02, samples=900, rng=rng)
+    return brdf_truth.sample_dome(
+        40, r_d=brdf_truth.LIGHT_SKIN_ALBEDO, noise=0.02, samples=900, rng=rng
+    )
 
 
 def samples_of(p, **changes):
@@ -120,7 +122,9 @@ def test_held_out_light_errs_below_5_percent(face, basis):
 
 def test_the_scale_s_standard_error_covers_the_truth(basis):
     rng = np.random.default_rng(14)
-    p = brdf_truth.dome(150, r_d=brdf_truth.DARK_SKIN_ALBEDO, noise=0.0, samples=300, rng=rng)
+    p = brdf_truth.sample_dome(
+        150, r_d=brdf_truth.DARK_SKIN_ALBEDO, noise=0.0, samples=300, rng=rng
+    )
     lobe = brdf_basis.evaluate(
         np.eye(59)[20],
         basis,

@@ -11,7 +11,7 @@ SKINS = {"light": brdf_truth.LIGHT_SKIN_ALBEDO, "dark": brdf_truth.DARK_SKIN_ALB
 
 def scene(skin, *, noise=0.02, points=60, samples=None, tail="light"):
     rng = np.random.default_rng(5)
-    return brdf_truth.dome(
+    return brdf_truth.sample_dome(
         points, r_d=SKINS[skin], noise=noise, samples=samples, rng=rng, tail=tail
     )
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from skinrig.benchmarks import resident_memory
 from skinrig.benchmarks import table as bench_table
-from skinrig.benchmarks.document import knee, pareto_front, to_document
+from skinrig.benchmarks.document import find_knee, pareto_front, to_document
 from skinrig.benchmarks.measurement import measure
 from skinrig.benchmarks.results import ErrorEstimate, Limit, Point, StageBenchmark, Timing
 
@@ -23,18 +23,18 @@ def test_front_contains_all_undominated_points():
 
 def test_the_knee_is_where_the_front_bends_most():
     points = (point(1, 100), point(2, 2), point(100, 1))
-    assert knee(points) == 1
+    assert find_knee(points) == 1
 
 
 def test_two_points_have_no_knee():
-    assert knee((point(1, 2), point(2, 1))) is None
+    assert find_knee((point(1, 2), point(2, 1))) is None
 
 
 def test_first_call_is_timed_separately_from_warm_ones():
     calls = []
     timing = measure(lambda: calls.append(1), repeats=4)
     assert len(calls) == 1 + 4 + 1
-    assert timing.spread_s[0] <= timing.seconds <= timing.spread_s[1]
+    assert timing.range_s[0] <= timing.seconds <= timing.range_s[1]
 
 
 def test_measuring_nothing_is_refused():
@@ -104,13 +104,13 @@ def test_memory_of_slow_calls_is_process_growth(monkeypatch):
     if seen.mb is None:
         pytest.skip("this system does not count resident memory")
     timing = measure(lambda: np.ones(10_000_000).sum(), repeats=1, memory=False)
-    assert timing.memory_of == "resident"
+    assert timing.memory_kind == "resident"
     assert 60.0 < timing.peak_memory_mb < 160.0
 
 
 def test_memory_of_quick_calls_is_their_allocation():
     timing = measure(lambda: np.ones(100_000).sum(), repeats=1, memory=False)
-    assert timing.memory_of == "allocated"
+    assert timing.memory_kind == "allocated"
     assert 0.8 <= timing.peak_memory_mb < 0.9
 
 
@@ -122,12 +122,12 @@ def test_each_condition_has_own_front_and_knee():
         for s, error in zip(timing, errors, strict=True)
     ]
     alone = StageBenchmark("s", "rms", "r", 0.0, tuple(points), condition=("noise",))
-    told = to_document([alone])["stages"]["s"]
-    assert told["fronts"] == [
+    written = to_document([alone])["stages"]["s"]
+    assert written["fronts"] == [
         {"condition": {"noise": "low"}, "points": [0, 1, 2], "knee": 1},
         {"condition": {"noise": "high"}, "points": [3, 4], "knee": None},
     ]
-    assert [p["on_front"] for p in told["points"]] == [True] * 5 + [False]
+    assert [p["on_front"] for p in written["points"]] == [True] * 5 + [False]
     # in one front for all, what is measured with much noise would look like too little effort
     mixed = to_document([StageBenchmark("s", "rms", "r", 0.0, tuple(points))])["stages"]["s"]
     assert [p["on_front"] for p in mixed["points"]] == [True] * 3 + [False] * 3
@@ -145,17 +145,17 @@ def test_document_reports_error_ratio_on_dark_skin():
             "dark": ErrorEstimate(6.0, (4.0, 8.0), 3.0),
         },
     )
-    told = to_document([stage])["stages"]["s"]
-    assert [one["band"] for one in told["by_band"]] == ["light", "dark"]
-    assert told["darkest_over_lightest"] == {"ratio": 3.0, "interval": [1.0, 8.0]}
-    assert [row[1:7] for row in bench_table.bands({"stages": {"s": told}})] == [
+    written = to_document([stage])["stages"]["s"]
+    assert [one["band"] for one in written["by_band"]] == ["light", "dark"]
+    assert written["darkest_over_lightest"] == {"ratio": 3.0, "interval": [1.0, 8.0]}
+    assert [row[1:7] for row in bench_table.list_band_rows({"stages": {"s": written}})] == [
         ("light", 2.0, 1.0, 4.0, "", 1.0),
         ("dark", 6.0, 4.0, 8.0, 3.0, 3.0),
     ]
 
 
 def test_memory_that_was_not_measured_has_its_reason():
-    timing = Timing(1.0, (1.0, 1.0), 1.0, None, no_memory="extrapolated")
+    timing = Timing(1.0, (1.0, 1.0), 1.0, None, no_memory_reason="extrapolated")
     stage = StageBenchmark("s", "rms", "r", 0.0, (Point({}, timing, 1.0, (1.0, 1.0)),))
-    told = to_document([stage])["stages"]["s"]["points"][0]
-    assert (told["peak_memory_mb"], told["no_memory"]) == (None, "extrapolated")
+    written = to_document([stage])["stages"]["s"]["points"][0]
+    assert (written["peak_memory_mb"], written["no_memory"]) == (None, "extrapolated")

@@ -1,4 +1,4 @@
-"""The table of stages: every entry is measured by a function and promises one bound a limit."""
+"""The table of stages: every entry has a function, and every limit has one bound."""
 
 import ast
 from importlib.util import find_spec
@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from skinrig.benchmarks.stage import BenchmarkStage, descriptions
+from skinrig.benchmarks.stage import BenchmarkStage, read_descriptions
 
 
-@pytest.mark.parametrize("name", descriptions())
+@pytest.mark.parametrize("name", read_descriptions())
 def test_stage_has_function_and_limits_of_its_module(name):
-    entry = descriptions()[name]
+    entry = read_descriptions()[name]
     module, function = entry["run"].rsplit(".", 1)
     source = Path(find_spec(f"skinrig.benchmarks.{module}").origin).read_text(encoding="utf-8")
     tree = ast.parse(source)

@@ -1,4 +1,4 @@
-"""Budget of a run, on stages that take no time."""
+"""Budget of a run, on stages with a simulated clock."""
 
 import csv
 import json
@@ -49,7 +49,7 @@ def calls(monkeypatch):
     )
     limits = {"kept at full size": {"name": "kept", "at_most": 1.0}}
     entry = {"error_name": "rms, %", "reference": "truth", "interval_of": "", "limits": limits}
-    monkeypatch.setattr(bench_stage, "descriptions", lambda: dict.fromkeys(NAMES, entry))
+    monkeypatch.setattr(bench_stage, "read_descriptions", lambda: dict.fromkeys(NAMES, entry))
     monkeypatch.setattr(bench_plan, "FULL_S", costs)
     made.append(functions)
     return made
@@ -73,7 +73,7 @@ def test_stages_run_small_first_then_quickest_full_size(calls, capsys):
     assert document["not_judged"] == ["a"]
     assert document["stages"]["a"]["limits"] == []
     assert document["passed"]
-    assert "limits not judged, since measured at small size: a;" in capsys.readouterr().err
+    assert "limits not evaluated, measured at small size: a;" in capsys.readouterr().err
 
 
 def test_sufficient_budget_runs_all_full_size_recording_compilation(calls, capsys):
@@ -84,7 +84,7 @@ def test_sufficient_budget_runs_all_full_size_recording_compilation(calls, capsy
 
 def test_a_slow_machine_is_noticed(calls, monkeypatch, capsys):
     monkeypatch.setattr(bench_plan, "FULL_S", {"a": 40.0, "b": 1.0, "c": 12.0})
-    # c takes 50 s instead of 12: then a, told to take 40, would not end in time
+    # c takes 50 s instead of 12: then a, with 40 s expected, would not end in time
     assert run(150.0)["not_judged"] == ["a"]
 
 
@@ -162,7 +162,7 @@ def test_stage_named_twice_is_measured_once(calls, capsys):
 
 def test_table_of_points_and_stage_plots_are_written(calls, tmp_path, capsys):
     document = run(150.0, out=tmp_path)
-    bench_table.write(document, tmp_path)
+    bench_table.write_tables(document, tmp_path)
     with (tmp_path / "bench.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 4 * len(NAMES)

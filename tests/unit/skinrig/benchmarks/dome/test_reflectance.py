@@ -8,11 +8,11 @@ from skinrig.benchmarks.stage import BenchmarkStage
 
 
 def test_benchmark_points_are_above_horizon_with_separate_lights(rng):
-    p = reflectance.face_points("III", points=6, samples=40, rng=rng)
+    p = reflectance.sample_face_points("III", points=6, samples=40, rng=rng)
     assert p.valid.mean() > 0.9
-    assert 0.02 < p.left_out.mean() < 0.6
+    assert 0.02 < p.held_out.mean() < 0.6
     np.testing.assert_allclose(np.linalg.norm(p.light, axis=-1), 1.0, atol=1e-6)
-    # noise is what the variance says: 4 standard errors of the mean of squared deviates
+    # noise has the stated variance: 4 standard errors of the mean of squared deviates
     deviates = ((p.f - p.total) / np.sqrt(p.variance)) ** 2
     assert abs(deviates.mean() - 1.0) < 4 * np.sqrt(2.0 / deviates.size)
     assert (p.surface[p.valid] > 0).all()
@@ -22,7 +22,7 @@ def test_benchmark_points_are_above_horizon_with_separate_lights(rng):
 @pytest.mark.long
 def test_more_lobes_predict_held_out_lights_better():
     stage = BenchmarkStage("reflectance", toy=True)
-    reflectance.model(stage)
+    reflectance.measure_reflectance_model(stage)
     by_rank = {p.knobs["rank"]: p.error for p in stage.points if p.knobs["part"] == "lobes"}
     assert by_rank[1] > 1.5 * by_rank[4]
     assert stage.to_benchmark().limits[0].passed

@@ -1,4 +1,4 @@
-"""Coverage over subjects whose pixels share their errors."""
+"""Coverage over subjects whose pixels have correlated errors."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from skinrig.benchmarks.intervals.coverage import (
     COVERAGE_RANGES,
     GAUSSIAN_95,
     IntervalTrial,
-    by_band,
+    group_by_band,
     pool_trials,
 )
 from skinrig.evaluating.surface import RAYLEIGH_68
@@ -36,7 +36,7 @@ def test_intervals_half_as_wide_as_errors_miss_coverage(rng):
     # it can fail: 38 % are inside
     found = pool_trials(trials_of(rng, shared=0.0, scale=2.0), level=68)
     assert found.verdict == "missed"
-    assert found.share == pytest.approx(0.383, abs=0.02)
+    assert found.inside_fraction == pytest.approx(0.383, abs=0.02)
 
 
 def test_correlated_pixel_errors_widen_coverage_like_subjects(rng):
@@ -57,7 +57,7 @@ def test_single_subject_gives_no_interval(rng):
 def test_bands_are_reported_and_subjects_without_truth_omitted(rng):
     made = trials_of(rng, shared=0.0, band="light") + trials_of(rng, shared=0.0, band="dark")
     made.append(IntervalTrial("x", "masked", "dark", np.empty(0), float("nan"), "%", GAUSSIAN_95))
-    rows = by_band(made, level=95, confidence=0.95)
+    rows = group_by_band(made, level=95, confidence=0.95)
     assert [(row.band, row.subjects) for row in rows] == [("all", 24), ("light", 12), ("dark", 12)]
     with pytest.raises(ValueError, match="truths"):
         pool_trials(made, level=68)
@@ -65,12 +65,12 @@ def test_bands_are_reported_and_subjects_without_truth_omitted(rng):
 
 def test_angles_of_two_gaussian_components_reach_68_percent(rng):
     angle = np.hypot(*rng.standard_normal((2, 200_000)))
-    # 4 sigma of the share
+    # 4 sigma of the fraction
     assert np.mean(angle <= RAYLEIGH_68) == pytest.approx(0.6827, abs=0.0042)
 
 
 def test_few_truths_all_inside_leave_coverage_open():
-    """Two subjects with two truths each, all inside: that is no proof of 95 % or more."""
+    """Two subjects with two truths each, all inside, do not prove 95 % or more."""
     trials = [
         IntervalTrial("x", str(k), "any", np.array([0.1, 0.2]), 1.0, "s", 1.96) for k in range(2)
     ]

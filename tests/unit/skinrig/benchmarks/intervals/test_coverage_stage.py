@@ -12,8 +12,8 @@ from skinrig.benchmarks.results import Timing
 ONCE = Timing(1.0, (1.0, 1.0), 1.0, None)
 
 
-def point(share, interval):
-    return intervals._point(IntervalCoverage("x", "any", 68, share, interval, 6, 1.0, "%"), ONCE)
+def point(fraction, interval):
+    return intervals._point(IntervalCoverage("x", "any", 68, fraction, interval, 6, 1.0, "%"), ONCE)
 
 
 def test_interval_containing_nominal_coverage_allows_zero_distance():
@@ -22,18 +22,18 @@ def test_interval_containing_nominal_coverage_allows_zero_distance():
     assert found.error_interval == pytest.approx((0.0, 12.0))
 
 
-@pytest.mark.parametrize(("share", "interval"), [(0.5, (0.4, 0.6)), (0.86, (0.76, 0.96))])
-def test_interval_excluding_nominal_coverage_excludes_zero_distance(share, interval):
-    found = point(share, interval)
+@pytest.mark.parametrize(("fraction", "interval"), [(0.5, (0.4, 0.6)), (0.86, (0.76, 0.96))])
+def test_interval_excluding_nominal_coverage_excludes_zero_distance(fraction, interval):
+    found = point(fraction, interval)
     assert found.error == pytest.approx(18.0)
     assert found.error_interval == pytest.approx((8.0, 28.0))
 
 
 def test_media_distinguish_axis_mirrored_or_across():
-    """10 degrees tell them apart: the axis is known to a few.
+    """Wrong axes differ by 10 degrees at least; the axis is estimated to a few.
 
-    Rationale: at 0 and 90 degrees a direction and its mirror image are one; at 45 a direction
-    across is the mirror image.
+    At 0 and 90 degrees a direction is equal to its mirror image; at 45 degrees the direction across
+    is equal to the mirror image.
     """
     for medium in intervals.ANISOTROPIC_MEDIA:
         true_deg = interval_trials_probe._farthest_deg(medium)

@@ -1,4 +1,4 @@
-"""Trials of the flash rig: its subjects stand off the white tile's place as stated errors say."""
+"""Trials of the flash rig: subjects' distances from the white reference match the stated errors."""
 
 import numpy as np
 import pytest
@@ -9,9 +9,9 @@ from skinrig.benchmarks.intervals import flash as trials
 
 
 def test_subject_distance_from_tile_matches_stated_light_error():
-    """Light goes with the square of the distance; chi-square of 400 draws, 1 % false alarms."""
+    """Light falls with the square of the distance; chi-square of 400 draws, 1 % false alarms."""
     distance_mm = 1000.0
-    nearer = np.array([trials.nearer_mm(seed) for seed in range(400)])
+    nearer = np.array([trials.draw_stance_offset_mm(seed) for seed in range(400)])
     light = -2.0 * np.log1p(-nearer / distance_mm)
     low, high = stats.chi2.ppf([0.005, 0.995], nearer.size - 1) / (nearer.size - 1)
     assert (
@@ -32,5 +32,5 @@ def test_each_subject_is_simulated_at_its_drawn_position(tmp_path, monkeypatch):
     for seed in (520, 521):
         with pytest.raises(Asked) as asked:
             next(trials.run_trials(tmp_path, {seed: "III"}, width_px=64))
-        assert asked.value.args == (seed, trials.nearer_mm(seed))
-    assert trials.nearer_mm(520) != trials.nearer_mm(521)
+        assert asked.value.args == (seed, trials.draw_stance_offset_mm(seed))
+    assert trials.draw_stance_offset_mm(520) != trials.draw_stance_offset_mm(521)

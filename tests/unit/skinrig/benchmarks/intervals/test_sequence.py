@@ -1,4 +1,4 @@
-"""Trials of time constants count what the fits' own intervals say."""
+"""Trials of time constants use the fits' own intervals."""
 
 import numpy as np
 import pytest
@@ -34,10 +34,10 @@ def trials(rng, **more):
 
 
 def test_time_constants_in_noise_have_stated_coverage(rng):
-    """300 fits: 4 sigma of a share of 68 % is 11 points, of 95 % 5."""
+    """300 fits: 4 sigma of a coverage of 68 % is 11 points, of 95 % 5."""
     made = trials(rng, noise=4e-4)
-    assert abs(pool_trials(made, level=68).share - 0.683) < 0.11
-    assert abs(pool_trials(made, level=95).share - 0.95) < 0.05
+    assert abs(pool_trials(made, level=68).inside_fraction - 0.683) < 0.11
+    assert abs(pool_trials(made, level=95).inside_fraction - 0.95) < 0.05
 
 
 def test_intervals_half_as_wide_are_found_out(rng):
@@ -46,7 +46,7 @@ def test_intervals_half_as_wide_are_found_out(rng):
     assert pool_trials(made, level=95, confidence=0.999).verdict == "missed"
 
 
-def told(known, best, inner, outer):
+def fit_document(known, best, inner, outer):
     return {
         "known": known,
         "time_constant_s": best,
@@ -67,10 +67,10 @@ def told(known, best, inner, outer):
     ],
 )
 def test_each_interval_counts_as_stated(inner, outer, held_68, held_95):
-    fit = told("estimated", 35.0, inner, outer)
+    fit = fit_document("estimated", 35.0, inner, outer)
     one = fit_trial("x", [fit], CONSTANT_S, "a", "any")
-    assert one.share(68) == held_68
-    assert one.share(95) == held_95
+    assert one.inside_fraction(68) == held_68
+    assert one.inside_fraction(95) == held_95
 
 
 @pytest.mark.parametrize(
@@ -85,17 +85,17 @@ def test_each_interval_counts_as_stated(inner, outer, held_68, held_95):
 def test_bounds_are_one_sided_intervals(known, inner, outer, held):
     one = fit_trial(
         "x",
-        [told(known, 4.0 if known == "only below" else 90.0, inner, outer)],
+        [fit_document(known, 4.0 if known == "only below" else 90.0, inner, outer)],
         CONSTANT_S,
         subject="a",
         band="any",
     )
-    assert (one.share(68), one.share(95)) == held
+    assert (one.inside_fraction(68), one.inside_fraction(95)) == held
     assert np.isnan(one.width)
 
 
 def test_uninformative_fits_are_omitted():
-    fit = told("unknown", 0.1, [0.0, None], [0.0, None])
+    fit = fit_document("unknown", 0.1, [0.0, None], [0.0, None])
     assert fit_trial("x", [fit], CONSTANT_S, "a", "any").deviation.size == 0
 
 
@@ -121,5 +121,5 @@ def test_delays_count_by_their_own_interval(true_s, held_68, held_95):
         "delay_interval_s": [0.01, 0.51],
     }
     one = fit_trial("x", [fit], true_s, "a", "any", delay=True)
-    assert (one.share(68), one.share(95)) == (held_68, held_95)
+    assert (one.inside_fraction(68), one.inside_fraction(95)) == (held_68, held_95)
     assert one.width == pytest.approx(100 * 0.14 / true_s)

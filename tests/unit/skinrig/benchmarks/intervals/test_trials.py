@@ -20,8 +20,8 @@ def appearance(**given):
     return SkinAppearance({}, "simulated", **given)
 
 
-def medium(rng, *, stated=1.0, told=True):
-    """Fits that are off by 5 % and say so, or `stated` times it; and their truth."""
+def medium(rng, *, stated=1.0, identified=True):
+    """Fits with errors of 5 % and stated errors of `stated` times that; and their ground truth."""
     fits = []
     for channel in CHANNELS:
         error = 0.05 * rng.standard_normal()
@@ -31,7 +31,7 @@ def medium(rng, *, stated=1.0, told=True):
                 "channel": channel,
                 "method": "photon_table",
                 "valid": True,
-                "coefficients_identified": told,
+                "coefficients_identified": identified,
                 "sigma_tr_per_mm": value,
                 "sigma_tr_stderr": value * half,
                 "interval_per_mm": [value * np.exp(-half), value * np.exp(half)],
@@ -66,7 +66,7 @@ def absorptions(found, truth, subject):
 
 @pytest.mark.parametrize("trial", [decays, absorptions])
 def test_medium_intervals_keep_coverage_and_halved_ones_miss(trial):
-    """80 media of 3 colors: 240 draws; the share is off by 0.08 with a chance of 1 % at most."""
+    """80 media of 3 colors: 240 draws; the fraction is off by 0.08 in 1 % of runs at most."""
     rng = np.random.default_rng(8)
     honest = [trial(*medium(rng), f"{k}") for k in range(80)]
     assert pool_trials(honest, level=68).verdict == "kept"
@@ -76,7 +76,7 @@ def test_medium_intervals_keep_coverage_and_halved_ones_miss(trial):
 
 
 def test_indistinguishable_coefficients_are_not_evaluated():
-    found, truth = medium(np.random.default_rng(1), told=False)
+    found, truth = medium(np.random.default_rng(1), identified=False)
     assert absorptions(found, truth, "x").deviation.size == 0
     assert decays(found, truth, "x").deviation.size == 3
 
