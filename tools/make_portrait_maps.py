@@ -37,7 +37,7 @@ def main() -> None:
     for text in dict.fromkeys((*done.assumed, *outcome.assumed)):
         print(f"assumed: {text}", file=sys.stderr)
     picture = maps["picture"].values[FACE]
-    panels = [png.srgb8(picture / np.percentile(picture, 99))]
+    panels = [png.encode_srgb8(picture / np.percentile(picture, 99))]
     for name, high in SCALES.items():
         part = maps[name]
         mask = None if part.valid is None else part.valid[FACE]

@@ -36,12 +36,12 @@ def list_assumptions(appearance: SkinAppearance) -> list[str]:
     return [str(text) for text in texts] if isinstance(texts, list | tuple) else []
 
 
-def document_digest(folder: Path) -> str:
+def hash_document(folder: Path) -> str:
     """Return the SHA-256 of an APPEARANCE/ folder's document."""
-    return digest(folder / store.DOCUMENT_FILE)
+    return hash_file(folder / store.DOCUMENT_FILE)
 
 
-def digest(path: Path) -> str:
+def hash_file(path: Path) -> str:
     """Return the SHA-256 of a file."""
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -68,11 +68,11 @@ def derive_appearance(
         maps,
         "simulated" if any(one.source == "simulated" for one in sources) else "measured",
         {**parameters, **agreed},
-        versions=versions(),
+        versions=list_versions(),
         **{"seed": sources[0].seed, **more},
     )
 
 
-def versions() -> dict[str, str]:
+def list_versions() -> dict[str, str]:
     """Return the versions of what computes maps, by distribution."""
     return {name: metadata.version(name) for name in ("skinrig", "numpy", "scipy", "numba")}

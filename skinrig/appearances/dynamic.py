@@ -9,7 +9,7 @@ from typing import Any
 
 from model import store
 from model.skin import SkinAppearance
-from skinrig.appearances.contents import versions
+from skinrig.appearances.contents import list_versions
 
 DYNAMIC_KIND = "dynamic"
 FACIAL_COLOR, WRINKLES, MICROSTRUCTURE = "facial_color", "wrinkles", "microstructure"
@@ -74,7 +74,7 @@ def add(out: Path, name: str, part: SkinAppearance) -> SkinAppearance:
         source="simulated" if "simulated" in sources else "measured",
         parameters={"kind": DYNAMIC_KIND, "parts": parts},
         inputs={**inputs, **{f"{name}: {key}": value for key, value in part.inputs.items()}},
-        versions=versions(),
+        versions=list_versions(),
         left_out=(*left_out, *((f"{name}: {what}", why) for what, why in part.left_out)),
         files={**files, **part.files},
         seed=previous.seed if part.seed is None else part.seed,

@@ -65,7 +65,7 @@ class Face:
     @property
     def surface(self) -> BoolArray:
         """Texels that show the surface, (H, W)."""
-        return valid_texels(_map(self, "position"))
+        return find_valid_texels(_map(self, "position"))
 
     @property
     def r_d(self) -> SkinMap:
@@ -139,7 +139,7 @@ def read(path: Path, landmarks: Path | None = None) -> Face:
     return Face(name, path, found, points, "the simulation's own")
 
 
-def common_frame(faces: Sequence[Face], size: int | None = None) -> CommonFrame:
+def build_common_frame(faces: Sequence[Face], size: int | None = None) -> CommonFrame:
     """Return the common map of some faces with landmarks."""
     names, places = common_parameterization.average_landmarks([face.landmarks for face in faces])
     cylinders = [common_parameterization.Cylinder(face.landmarks["nose tip"]) for face in faces]
@@ -194,7 +194,7 @@ def read_landmarks(path: Path, face: Face) -> Landmarks:
     return out
 
 
-def valid_texels(skin_map: SkinMap) -> BoolArray:
+def find_valid_texels(skin_map: SkinMap) -> BoolArray:
     """Return the texels of a map that mean something, (H, W)."""
     finite = (
         np.isfinite(skin_map.values)

@@ -19,11 +19,11 @@ from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ROW_OF_STATE, Clamp
 from reconstruction.facial_color.rig_transfer import transfer_rig
 from skinrig.appearances import dynamic as dynamic_appearance
-from skinrig.appearances.contents import derive_appearance, document_digest, intersect_valid
+from skinrig.appearances.contents import derive_appearance, hash_document, intersect_valid
 from skinrig.appearances.dynamic import DYNAMIC_PARTS, FACIAL_COLOR, WRINKLES
 from skinrig.capturing.option_values import parse_amounts
 from skinrig.console import select_attributes
-from skinrig.errors import UsageError, one_of
+from skinrig.errors import UsageError, require_choice
 
 EXPRESSION_KIND = "expression"
 MIN_WEIGHT_SUM = 1e-6
@@ -167,7 +167,7 @@ def apply_expression(
         For weights that a part cannot take, or a folder that holds none of the parts.
     """
     for name in parts:
-        one_of("parts", name, DYNAMIC_PARTS, ApplyError)
+        require_choice("parts", name, DYNAMIC_PARTS, ApplyError)
     appearance, found = dynamic_appearance.read(path, parts=parts)
     _check_target(out, path)
     expression = normalize_weights(expression)
@@ -209,7 +209,7 @@ def apply_expression(
             **select_attributes(expression, "clamp", "emotional", "gain"),
         },
         inputs={
-            "appearance": document_digest(path),
+            "appearance": hash_document(path),
             **({} if other is None else other.hashes),
             **done.inputs,
         },
@@ -243,7 +243,7 @@ def normalize_weights(expression: ExpressionRequest) -> ExpressionRequest:
     return replace(expression, weights=weights, normalize=False)
 
 
-def hemoglobin_rig(appearance: SkinAppearance) -> HemoglobinRig:
+def read_hemoglobin_rig(appearance: SkinAppearance) -> HemoglobinRig:
     """Return the hemoglobin rig that an appearance holds."""
     return from_maps_and_document(appearance.maps, appearance.files[RIG_DOCUMENT])
 
@@ -251,7 +251,7 @@ def hemoglobin_rig(appearance: SkinAppearance) -> HemoglobinRig:
 def _facial_color(
     appearance: SkinAppearance, expression: ExpressionRequest, done: AppliedExpression
 ) -> None:
-    rig = hemoglobin_rig(appearance)
+    rig = read_hemoglobin_rig(appearance)
     maps = appearance.maps
     if expression.onto is not None:
         rig = _transfer_rig(rig, expression.onto, done)
@@ -342,7 +342,7 @@ def wrinkle_weights(model: WrinkleModel, weights: Mapping[str, float]) -> dict[s
     found: dict[str, float] = {}
     for state, weight in weights.items():
         if state not in rows and state not in ROW_OF_STATE:
-            one_of("weights", state, sorted(rows), ApplyError)
+            require_choice("weights", state, sorted(rows), ApplyError)
         row = state if state in rows else ROW_OF_STATE[state]
         if row is not None and row not in rows:
             raise ApplyError(

@@ -28,7 +28,7 @@ from model.displacement_synthesis.volume_noise import VolumeNoise
 from model.microstructure import FOREHEAD, KernelTable, strain_fields
 from skinrig.applying.microstructure import convolve_by_strain
 from skinrig.arrays import Float32Array, Float64Array, Int64Array
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 
 CHART_HALF_SIDE: Final = 1.1
 """Half the chart's side, in units of the projection: 1 is the rim that is seen from +z."""
@@ -146,7 +146,7 @@ class DeformedSphere:
         within_rad : float
             Angle around it on the neutral sphere, rad, 0.02 to 0.5.
         """
-        one_of("site", site, ROUGHNESS_POINTS, SphereError)
+        require_choice("site", site, ROUGHNESS_POINTS, SphereError)
         if not 0.02 <= within_rad <= 0.5:
             raise SphereError(f"within_rad: got {within_rad}, expected 0.02...0.5")
         near = self.sphere.points_mm() @ np.asarray(ROUGHNESS_POINTS[site]) > (

@@ -160,7 +160,7 @@ class PushedPatch:
         return convolve_by_strain(height, self.strain(), self.surface, self.uv, table)
 
 
-def push(block: SkinBlock, probe: Push, *, steps: int = 2) -> PushedPatch:
+def push_block(block: SkinBlock, probe: Push, *, steps: int = 2) -> PushedPatch:
     """Push a block of skin and return its equilibrium.
 
     Parameters
@@ -202,24 +202,24 @@ def push(block: SkinBlock, probe: Push, *, steps: int = 2) -> PushedPatch:
     given[touched, 2] = (
         probe.tip_mm - np.sqrt(probe.tip_mm**2 - distance[touched] ** 2) - probe.depth_mm
     )
-    return solve(block, given, steps=steps)
+    return solve_equilibrium(block, given, steps=steps)
 
 
-def solve(block: SkinBlock, given_mm: ArrayLike, *, steps: int = 2) -> PushedPatch:
+def solve_equilibrium(block: SkinBlock, given_mm: ArrayLike, *, steps: int = 2) -> PushedPatch:
     """Return the equilibrium of a block some of whose nodes' displacements are given.
 
     Parameters
     ----------
     block : SkinBlock
     given_mm : array_like, shape (V, 3)
-        Displacements of the nodes (those of ``solve(...).rest_mm``), mm; NaN: free.
+        Displacements of the nodes (those of ``solve_equilibrium(...).rest_mm``), mm; NaN: free.
     steps : int
         Parts in which they are brought about, >= 1.
 
     Raises
     ------
     PushError, PushDiverged, skinrig.errors.MissingExtra
-        As of :func:`push`.
+        As of :func:`push_block`.
     """
     tissue = _Tissue(block)
     given = np.asarray(given_mm, np.float64)

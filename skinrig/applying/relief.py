@@ -23,7 +23,7 @@ from rigsim.geometry.mesh import build_mesh
 from rigsim.subject.expressions import displacement_mm, is_moving_state
 from rigsim.subject.face_regions import region_masks, to_mean_head
 from rigsim.subject.perfusion import STATE_NAMES
-from skinrig.appearances.contents import digest
+from skinrig.appearances.contents import hash_file
 from skinrig.appearances.dynamic import MICROSTRUCTURE
 from skinrig.applying.expression import AppliedExpression, ApplyError
 from skinrig.applying.microstructure import apply_microstructure
@@ -31,7 +31,7 @@ from skinrig.arrays import Float32Array, Float64Array
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.blend_shapes.meshes import BlendShapeMesh
 from skinrig.console import select_attributes
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 
 REGION_ATLAS_PX: Final = 256
 """Width of the maps of relief site and pixel size, texels."""
@@ -75,8 +75,8 @@ class ReliefRequest:
     """Of the growth."""
 
     def __post_init__(self) -> None:
-        one_of("synthesize", self.source, RELIEF_SOURCES, ApplyError)
-        one_of("extrapolate", self.extrapolate, EXTRAPOLATION_MODES, ApplyError)
+        require_choice("synthesize", self.source, RELIEF_SOURCES, ApplyError)
+        require_choice("extrapolate", self.extrapolate, EXTRAPOLATION_MODES, ApplyError)
 
     @property
     def exceeds_exr(self) -> bool:
@@ -146,7 +146,7 @@ class ReliefEvaluator:
         """Grow the neutral relief, move it, and put the maps into ``done``."""
         sites, asked = dict(part["sites"]), self.request
         if asked.site is not None:
-            one_of("site", asked.site, sites, ApplyError)
+            require_choice("site", asked.site, sites, ApplyError)
         names = [asked.site] if asked.site is not None else list(sites)
         regions = _regions(self.mesh, names)
         neutral = self._neutral(appearance, {name: sites[name] for name in names}, regions)
@@ -240,7 +240,7 @@ def _sha256(path: Path) -> str:
         for each in sorted(path.iterdir()):
             total.update(each.name.encode() + bytes.fromhex(_sha256(each)))
         return total.hexdigest()
-    return digest(path)
+    return hash_file(path)
 
 
 def _with_states(

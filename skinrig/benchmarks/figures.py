@@ -27,7 +27,7 @@ def error_against_seconds(stage: str, document: Mapping[str, Any]) -> str:
         its own, and its points are labelled with their effort where there is room for it; others
         are hollow. Knees have a ring, and the Cramer-Rao bound a dash where it is known.
     """
-    figure, axes = figures.canvas(5.2, 3.4)
+    figure, axes = figures.create_canvas(5.2, 3.4)
     points, fronts = document["points"], document["fronts"]
     seconds, error, bars, exact = _measured(points)
     labels: list[tuple[str, float, float]] = []
@@ -161,7 +161,7 @@ def plot_compared_fronts(
     str
         An image with a name, as SVG. Settings that both measured are joined by thin lines.
     """
-    figure, axes = figures.canvas(5.2, 3.4)
+    figure, axes = figures.create_canvas(5.2, 3.4)
     places: list[dict[str, tuple[float, float]]] = []
     summaries = []
     for number, (label, document) in enumerate((a, b)):

@@ -15,7 +15,7 @@ from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.results import StageBenchmark
 from skinrig.benchmarks.stage import BenchmarkStage, descriptions
 from skinrig.console import Console, to_json_value
-from skinrig.errors import EXTRA_MISSING, exit_code, sentence
+from skinrig.errors import EXIT_EXTRA_MISSING, exit_code, format_error
 
 STAGES: dict[str, str] = {name: entry["run"] for name, entry in descriptions().items()}
 """Module and function of each; a module is imported, and its kernels compiled, when it is run."""
@@ -135,9 +135,9 @@ class _Run:
                     self._take(name, made, size)
                     self.save()
         except ImportError as error:
-            if self.asked or exit_code(error) != EXTRA_MISSING:
+            if self.asked or exit_code(error) != EXIT_EXTRA_MISSING:
                 raise
-            self.left_out.append((name, sentence(error)))
+            self.left_out.append((name, format_error(error)))
             return
         self._take(name, made, size)
 

@@ -196,7 +196,7 @@ def _capture(
     console = Console(common.json)
     rig = load_rig(str(context.info_name))
     plan = choose_plan(rig, common.plan, target, **chosen)
-    console.document("skinrig.capture/1", capture_session(rig, plan, order, console))
+    console.print_document("skinrig.capture/1", capture_session(rig, plan, order, console))
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,13 +295,13 @@ def verify(session: Path, /, json: options.Json = False) -> None:
 
     console = Console(json)
     found = check(session)
-    console.each("warning", found.warnings)
-    console.each("damaged", found.problems)
+    console.print_each("warning", found.warnings)
+    console.print_each("damaged", found.problems)
     console.print_line(
         f"{session}: {'sound' if found.ok else 'DAMAGED'}, {format_count(found.frames, 'frame')}, "
         f"{found.bytes / 1e6:.1f} MB"
     )
     figures = select_attributes(found, "ok", "problems", "warnings", "frames", "bytes")
-    console.document("skinrig.verify/1", figures)
+    console.print_document("skinrig.verify/1", figures)
     if not found.ok:
-        raise typer.Exit(errors.BAD_INPUT)
+        raise typer.Exit(errors.EXIT_BAD_INPUT)

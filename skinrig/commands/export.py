@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final
 
 from skinrig.commands.options import Json, Out, choice, command
 from skinrig.console import Console, format_count, select_attributes
-from skinrig.errors import UnusableError, one_of
+from skinrig.errors import UnusableError, require_choice
 from skinrig.exporting.options import ExportSettings, SkinPosition
 
 NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
@@ -100,7 +100,7 @@ class PlaceOptions:
     radius: float = 0.0
     without_diffuse: bool = False
 
-    def named(self) -> SkinPosition | None:
+    def position(self) -> SkinPosition | None:
         """Return the position; None without --at."""
         if self.at is None:
             return None
@@ -146,25 +146,25 @@ def export(
     console = Console(json)
     _check_format(to, source, exporting.APPEARANCE_FORMATS, exporting.SESSION_FORMATS)
     of_session = {"camera": camera, "calibration": calibration}
-    delivery = how.delivery(place=place.named() if to in ("merl", "rgl") else None, **of_session)
+    delivery = how.delivery(place=place.position() if to in ("merl", "rgl") else None, **of_session)
     done = exporting.export(source, out, to, delivery, use=use)
     after = NEXT_STEP_BY_FORMAT.get(
         to, "pass the folder on; `ascmhl verify` checks that it is complete and unchanged"
     )
-    console.left_out(done.left_out)
+    console.print_omissions(done.left_out)
     console.print_line(
         f"{done.path}: {format_count(done.files, 'file')}, listed in {done.manifest}"
     )
     console.print_line(f"next: {after}")
     document = select_attributes(done, "path", "files", "manifest") | {"to": to, "next": after}
-    console.document("skinrig.export/1", document | select_attributes(done, "left_out"))
+    console.print_document("skinrig.export/1", document | select_attributes(done, "left_out"))
 
 
 def _check_format(
     to: str, source: Path, of_maps: Iterable[str], of_sessions: Iterable[str]
 ) -> None:
     """Raise for an unknown format, or one that the source's kind of folder does not have."""
-    one_of("--to", to, (*of_maps, *of_sessions))
+    require_choice("--to", to, (*of_maps, *of_sessions))
     for file, kind, fitting in (
         ("session.json", "a session", of_sessions),
         ("appearance.json", "maps", of_maps),

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type
 import typer
 
 from skinrig.commands import completion
-from skinrig.errors import UnusableError, UsageError, one_of
+from skinrig.errors import UnusableError, UsageError, require_choice
 
 if TYPE_CHECKING:
     from skinrig.capturing.sequences import SequenceOrder
@@ -36,7 +36,7 @@ def choice(*values: str, metavar: str | None = None) -> Any:
     """
 
     def check(parameter: typer.CallbackParam, value: str | None) -> str | None:
-        return None if value is None else one_of(parameter.opts[0], value, values)
+        return None if value is None else require_choice(parameter.opts[0], value, values)
 
     return typer.Option(
         metavar=metavar or f"[{'|'.join(values)}]",
@@ -88,7 +88,7 @@ Subject = Annotated[
     str,
     option(
         "Simulated subject: preset I to VI, palest or darkest, or a file NAME.toml.",
-        autocompletion=completion.subjects,
+        autocompletion=completion.complete_subjects,
     ),
 ]
 Scale = Annotated[str, choice("small", "full")]
@@ -132,7 +132,7 @@ ConsentExpires = Annotated[
 
 def target_option(rig: str) -> Any:
     """Return the option --target of a rig, with its closed set of targets."""
-    names = completion.target_completer(rig)
+    names = completion.list_targets(rig)
     return option(
         f"Capture a calibration target instead of a subject: {', '.join(names)}.",
         autocompletion=lambda incomplete: completion.filter_by_prefix(names, incomplete),

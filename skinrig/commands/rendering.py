@@ -158,7 +158,7 @@ def _compare(
     )
     photographs_errors.print_comparison(console, found)
     if not found["passed"]:
-        raise typer.Exit(errors.LIMIT_MISSED)
+        raise typer.Exit(errors.EXIT_LIMIT_MISSED)
 
 
 def _draw(
@@ -215,7 +215,7 @@ def _parse_sigma_tr(row: dict[str, Any]) -> str:
 
 
 def _report(console: Console, done: dict[str, Any]) -> None:
-    console.each("assumed", done["assumed"])
+    console.print_each("assumed", done["assumed"])
     if "bases" in done:
         for row in done["bases"]:
             gap = next(v for k, v in row.items() if k.startswith("surface_difference"))
@@ -225,9 +225,9 @@ def _report(console: Console, done: dict[str, Any]) -> None:
                 f"{row['lobes']} basis BRDFs, {how}: specular reflection differs by {words}"
             )
     if "boundaries" in done:
-        console.rows(
+        console.print_table(
             ("skin", "sigma_tr, 1/mm", "90 to 10 % red, mm", "green", "blue"),
             ((row["skin"], _parse_sigma_tr(row), *row["rise_mm"]) for row in done["boundaries"]),
         )
     console.print_line(f"{done['out']}: {', '.join(done['files'])}, {done['seconds']:.1f} s")
-    console.document(done["schema"], {k: v for k, v in done.items() if k != "schema"})
+    console.print_document(done["schema"], {k: v for k, v in done.items() if k != "schema"})

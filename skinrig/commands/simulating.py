@@ -28,14 +28,14 @@ States = Annotated[
     option(
         "Expression or condition of the face, such as smile or exercise; repeatable; "
         "default: neutral.",
-        autocompletion=completion.states,
+        autocompletion=completion.complete_states,
     ),
 ]
 OneState = Annotated[
     list[str] | None,
     option(
         "Expression or condition of the face, such as smile or exercise; default: neutral.",
-        autocompletion=completion.states,
+        autocompletion=completion.complete_states,
     ),
 ]
 
@@ -153,7 +153,7 @@ def simulate_flash(
 def simulate_dome(
     common: SimulateOptions,
     face: SimulatedFaceOptions,
-    subject: Annotated[str, typer.Option(autocompletion=completion.subjects)] = "III",
+    subject: Annotated[str, typer.Option(autocompletion=completion.complete_subjects)] = "III",
     target: Annotated[str | None, target_option("dome")] = None,
     lights: int | None = None,
     views: int | None = None,
@@ -164,7 +164,7 @@ def simulate_dome(
     interreflections: bool = False,
     condition: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME[=AMOUNT]", autocompletion=completion.conditions),
+        typer.Option(metavar="NAME[=AMOUNT]", autocompletion=completion.complete_conditions),
     ] = None,
 ) -> None:
     """Simulate the dome: a face with one expression and its scan, or a target.
@@ -256,7 +256,7 @@ def simulate_gradient(
 @command
 def simulate_probe(
     common: SimulateOptions,
-    subject: Annotated[str, typer.Option(autocompletion=completion.subjects)] = "III",
+    subject: Annotated[str, typer.Option(autocompletion=completion.complete_subjects)] = "III",
     target: Annotated[str | None, target_option("probe")] = None,
     sites: options.Sites = None,
     repeats: options.Placements = 1,
@@ -297,4 +297,4 @@ def _simulate(order: SimulationOrder, console: Console, target: str | None) -> N
     truth = f", ground truth in {done.truth}" if done.truth else ""
     console.print_line(f"{done.session}: {format_count(done.frames, 'frame')}{truth}")
     console.print_line(f"next: {suggest_after_session(order.rig, order.out, target)}")
-    console.document("skinrig.simulate/1", done.document())
+    console.print_document("skinrig.simulate/1", done.document())

@@ -13,7 +13,7 @@ from skinrig.drawing import svg
 SERIES_COLORS = ("#2a78b8", "#d1602c", "#3f8f4f", "#8458a8")
 
 
-def canvas(width_in: float, height_in: float) -> tuple[Any, Any]:
+def create_canvas(width_in: float, height_in: float) -> tuple[Any, Any]:
     """Return a figure without a background, and its axes; sizes in inches."""
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -60,7 +60,7 @@ def format_range(values: FloatArray) -> str:
     return f"{finite.min():.3g} to {finite.max():.3g}" if finite.size else "none"
 
 
-def bars(
+def draw_bars(
     title: str,
     labels: Sequence[str],
     series: Mapping[str, FloatArray | Sequence[float]],
@@ -72,7 +72,7 @@ def bars(
 
     A series in ``limits`` has its limit drawn as a dashed line of its color.
     """
-    figure, axes = canvas(6.2, 3.0)
+    figure, axes = create_canvas(6.2, 3.0)
     position = np.arange(len(labels))
     width = 0.8 / max(len(series), 1)
     words = []
@@ -114,14 +114,14 @@ class PlotSeries:
     """As matplotlib knows it; None: by the order of the series."""
 
 
-def curves(
+def draw_curves(
     title: str, x_name: str, y_name: str, series: Sequence[PlotSeries], *, log_y: bool = False
 ) -> str:
     """Draw series over a common axis, with bars of one standard error; NaN leaves a gap.
 
     On a logarithmic axis what is not above zero leaves a gap too.
     """
-    figure, axes = canvas(5.2, 3.4)
+    figure, axes = create_canvas(5.2, 3.4)
     for number, curve in enumerate(series):
         color = curve.color or SERIES_COLORS[number % len(SERIES_COLORS)]
         style = ("o" if curve.marks else "") + ("-" if curve.line else "")
@@ -147,7 +147,7 @@ def curves(
     return to_svg(figure, f"{title}: {y_name} against {x_name}; {spans}")
 
 
-def sensitivity(title: str, c_m: FloatArray, c_hd: FloatArray, percent: FloatArray) -> str:
+def draw_sensitivity(title: str, c_m: FloatArray, c_hd: FloatArray, percent: FloatArray) -> str:
     """Draw the Cramér-Rao bound over melanin and blood volume fractions, in percent.
 
     Parameters
@@ -160,7 +160,7 @@ def sensitivity(title: str, c_m: FloatArray, c_hd: FloatArray, percent: FloatArr
         (N, M) Cramer-Rao bound on the relative standard error; contours at 1, 3, 10, 30
         and 100 %.
     """
-    figure, axes = canvas(4.2, 3.2)
+    figure, axes = create_canvas(4.2, 3.2)
     shown = np.clip(np.nan_to_num(percent, nan=1e4, posinf=1e4), 0.1, 1e3).T
     mesh = axes.pcolormesh(
         np.cbrt(c_m),

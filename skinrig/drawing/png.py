@@ -65,7 +65,7 @@ def to_data_url(file: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(file).decode("ascii")
 
 
-def jpeg_address(image: UInt8Array, *, quality: int = 88) -> str:
+def encode_jpeg_url(image: UInt8Array, *, quality: int = 88) -> str:
     """Return an image, (H, W, 3), as a JPEG file in a ``data:`` address, for small previews."""
     import cv2
 
@@ -74,7 +74,7 @@ def jpeg_address(image: UInt8Array, *, quality: int = 88) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(file).decode("ascii")
 
 
-def srgb8(linear: FloatArray) -> UInt8Array:
+def encode_srgb8(linear: FloatArray) -> UInt8Array:
     """Apply the sRGB curve (IEC 61966-2-1) and round to 8 bits.
 
     Parameters
@@ -124,7 +124,7 @@ class Scale:
     def colors(self, values: FloatArray, valid: BoolArray | None = None) -> UInt8Array:
         """Return the colors of values, (H, W, 3); of what is NaN or not valid mid gray."""
         position, shown = self._position(values, valid)
-        image = palette(self.name, 256)[np.round(255 * position).astype(np.intp)]
+        image = sample_palette(self.name, 256)[np.round(255 * position).astype(np.intp)]
         image[~shown] = INVALID_GRAY
         return image
 
@@ -148,7 +148,7 @@ class Scale:
         index[~shown] = levels
         gray = np.full((1, 3), INVALID_GRAY, np.uint8)
         image = Image.frombytes("P", index.shape[::-1], index.tobytes())
-        image.putpalette(np.concatenate([palette(self.name, levels), gray]).tobytes())
+        image.putpalette(np.concatenate([sample_palette(self.name, levels), gray]).tobytes())
         file = io.BytesIO()
         image.save(file, "PNG", optimize=True)
         return file.getvalue()
@@ -165,7 +165,7 @@ class Scale:
         return position, finite if valid is None else finite & np.asarray(valid, bool)
 
 
-def palette(scale: str, colors: int) -> UInt8Array:
+def sample_palette(scale: str, colors: int) -> UInt8Array:
     """Return colors spread evenly over a matplotlib color map, (colors, 3), uint8."""
     from matplotlib import colormaps
 

@@ -17,7 +17,7 @@ from model.traits.vectors import MAX_P_VALUE, TraitVector
 from reconstruction.correspondence import common_regions
 from skinrig import consent
 from skinrig.appearances import face_textures
-from skinrig.appearances.contents import digest, document_digest
+from skinrig.appearances.contents import hash_document, hash_file
 from skinrig.appearances.face_textures import Face
 from skinrig.arrays import BoolArray, Float32Array
 from skinrig.console import select_attributes
@@ -26,9 +26,9 @@ from skinrig.editing import masks, pigment_spots, surface_mixtures
 from skinrig.editing import spots as editing_spots
 from skinrig.editing import surface as editing_surface
 from skinrig.editing.albedo import AlbedoEdit
-from skinrig.editing.spots import SpotOrder
+from skinrig.editing.spots import SpotRequest
 from skinrig.editing.surface_mixtures import SurfaceMixtures
-from skinrig.errors import UsageError, one_of
+from skinrig.errors import UsageError, require_choice
 from skinrig.traits import regions
 from skinrig.traits.regions import LibraryParts
 
@@ -76,7 +76,7 @@ class EditRequest:
     region: str = "face"
     parts: tuple[str, ...] | None = None
     mask: Path | None = None
-    spots: tuple[SpotOrder, ...] = ()
+    spots: tuple[SpotRequest, ...] = ()
     landmarks: Path | None = None
     basis: Path | None = None
     iterations: int = 5
@@ -94,7 +94,7 @@ class EditRequest:
                     "no face of the training data lies beyond; give a smaller amount"
                 )
         for part in self.parts or ():
-            one_of("parts", part, EDITABLE_PARTS, EditError)
+            require_choice("parts", part, EDITABLE_PARTS, EditError)
         if self.iterations < 1:
             raise EditError(
                 f"iterations: got {self.iterations}, expected at least 1: none changes nothing"
@@ -175,11 +175,11 @@ def edit_folder(
     face = face_textures.read(path, request.landmarks)
     inputs = {
         **{f"source {name}": value for name, value in face.appearance.inputs.items()},
-        "appearance": document_digest(path),
+        "appearance": hash_document(path),
     }
     for name, file in (("mask", request.mask), ("landmarks", request.landmarks)):
         if file is not None:
-            inputs[name] = digest(file)
+            inputs[name] = hash_file(file)
     if library is not None and library_hash:
         inputs["traits"] = library_hash
     done = edit_face(face, request, library, progress=progress)
@@ -261,7 +261,7 @@ def _open_library(request: EditRequest, library: TraitLibrary | None) -> Library
                 "`skinrig fit traits` learns others"
             )
     if request.region != "face":
-        one_of("region", request.region, dict.fromkeys(("face", *parts.albedo)), EditError)
+        require_choice("region", request.region, dict.fromkeys(("face", *parts.albedo)), EditError)
     return parts
 
 
@@ -325,7 +325,7 @@ def _edit_albedo(work: _EditState, parts: LibraryParts, amounts: Mapping[str, fl
     def one(values: Float32Array, given: Mapping[str, float], stream: int) -> AlbedoEdit:
         how: dict[str, Any] = {"region": region, "weight": share, "iterations": order.iterations}
         rng = np.random.default_rng([order.seed, stream])
-        known = face_textures.valid_texels(source)
+        known = face_textures.find_valid_texels(source)
         return editing_albedo.edit_albedo(values, known, chart, space, given, **how, rng=rng)
 
     found = one(source.values, amounts, 0)
@@ -333,7 +333,7 @@ def _edit_albedo(work: _EditState, parts: LibraryParts, amounts: Mapping[str, fl
     back = one(values, {name: -amount for name, amount in amounts.items()}, 1)
     again, _ = back.apply(values, mask)
     work.maps["r_d"] = editing_spots.replace_values(source, values)
-    good = face_textures.valid_texels(source) & (values != source.values).any(axis=-1)
+    good = face_textures.find_valid_texels(source) & (values != source.values).any(axis=-1)
     if found.after > MAX_RESIDUAL_DISTANCE * found.before and any(
         abs(a) > 1 for a in amounts.values()
     ):
@@ -389,12 +389,12 @@ def _edit_surface(work: _EditState, parts: LibraryParts, amounts: Mapping[str, f
 
 
 def _edit_spots(
-    work: _EditState, spots: Sequence[SpotOrder], progress: Callable[[str], None]
+    work: _EditState, spots: Sequence[SpotRequest], progress: Callable[[str], None]
 ) -> None:
     face, order, mask = work.face, work.order, work.mask
     if "r_d" not in work.maps:
         raise EditError(f"{face.path}: has no map r_d, which spots are drawn into")
-    frame = editing_spots.spot_frame(face)
+    frame = editing_spots.build_spot_frame(face)
     chart = face.chart(frame)
     skin = masks.region_weights("skin" if order.region == "face" else order.region, frame, chart)
     # a mask image limits spots itself; without one they avoid eyes, brows and lips
@@ -409,7 +409,7 @@ def _edit_spots(
             work.maps["r_d"] = editing_spots.replace_values(source, values)
         else:
             values, one = editing_spots.remove_spots(source, spot, share, chart, frame)
-            good = face_textures.valid_texels(source) if source.valid is not None else None
+            good = face_textures.find_valid_texels(source) if source.valid is not None else None
             moved = editing_spots.replace_values(source, values)
             if moved.stderr is not None:  # what is filled in is known no better than it changed
                 off = np.abs(values - source.values)

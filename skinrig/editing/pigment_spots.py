@@ -20,7 +20,7 @@ from model import color_table
 from model.color_table import ColorTable
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 
 DOME_CAMERA, DOME_ILLUMINANT = "Nikon 5100 (NPL)", "LED-B3"
 """Of the dome's camera RGB."""
@@ -96,7 +96,7 @@ class DrawnSpots:
     transmitted: Float64Array
 
 
-def draw(
+def draw_spots(
     kind: str,
     r_d: ArrayLike,
     position_mm: ArrayLike,
@@ -136,7 +136,7 @@ def draw(
     SpotError
         For another kind, negative amounts, an empty mask, or more than `MAX_SPOTS` spots.
     """
-    what = SPOT_KINDS[one_of("spots", kind, SPOT_KINDS, SpotError)]
+    what = SPOT_KINDS[require_choice("spots", kind, SPOT_KINDS, SpotError)]
     density = what.density_per_cm2 if density_per_cm2 is None else float(density_per_cm2)
     for name, value in (("amount", amount), ("density_per_cm2", density)):
         if not (np.isfinite(value) and value >= 0):

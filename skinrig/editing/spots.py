@@ -16,16 +16,16 @@ from skinrig.appearances import face_textures
 from skinrig.appearances.face_textures import Face
 from skinrig.arrays import BoolArray, Float32Array
 from skinrig.editing import pigment_spots, spot_removal
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 from skinrig.traits import albedo_vectors
 
 
-class SpotOrderError(ValueError):
+class SpotRequestError(ValueError):
     """Spots that nobody can add or remove."""
 
 
 @dataclass(frozen=True, slots=True)
-class SpotOrder:
+class SpotRequest:
     """Spots to add or to remove.
 
     Attributes
@@ -44,15 +44,15 @@ class SpotOrder:
 
     def __post_init__(self) -> None:
         """Refuse another kind, and more than all spots removed."""
-        one_of("spots", self.kind, pigment_spots.SPOT_KINDS, SpotOrderError)
+        require_choice("spots", self.kind, pigment_spots.SPOT_KINDS, SpotRequestError)
         if not np.isfinite(self.amount) or self.amount < -1.0:
-            raise SpotOrderError(f"spots: got {self.kind}={self.amount}, expected at least -1")
+            raise SpotRequestError(f"spots: got {self.kind}={self.amount}, expected at least -1")
 
 
-def spot_frame(face: Face) -> CommonFrame:
+def build_spot_frame(face: Face) -> CommonFrame:
     """Return a map of the whole face without seams, about as fine as its texture."""
     if face.landmarks:
-        return face_textures.common_frame([face])
+        return face_textures.build_common_frame([face])
     cylinder = common_parameterization.find_cylinder(face.position, face.surface)
     places = cylinder.unroll(face.position[face.surface])
     around = common_parameterization.fit_common_frame((), np.empty((0, 2)), [places], size=64)
@@ -61,11 +61,11 @@ def spot_frame(face: Face) -> CommonFrame:
 
 
 def add_spots(
-    face: Face, source: SkinMap, spot: SpotOrder, weight: Float32Array, rng: np.random.Generator
+    face: Face, source: SkinMap, spot: SpotRequest, weight: Float32Array, rng: np.random.Generator
 ) -> tuple[Float32Array, dict[str, Any]]:
     """Return R_d with spots drawn in, and what was done, as JSON values."""
     place, density = (face.position, face.surface), spot.density_per_cm2
-    drawn = pigment_spots.draw(
+    drawn = pigment_spots.draw_spots(
         spot.kind,
         source.values,
         *place,
@@ -85,10 +85,13 @@ def add_spots(
 
 
 def remove_spots(
-    source: SkinMap, spot: SpotOrder, weight: Float32Array, chart: TexelChart, frame: CommonFrame
+    source: SkinMap, spot: SpotRequest, weight: Float32Array, chart: TexelChart, frame: CommonFrame
 ) -> tuple[Float32Array, dict[str, Any]]:
     """Return R_d with spots filled from around, and what was done, as JSON values."""
-    valid, sizes = face_textures.valid_texels(source), pigment_spots.SPOT_KINDS[spot.kind].range_mm
+    valid, sizes = (
+        face_textures.find_valid_texels(source),
+        pigment_spots.SPOT_KINDS[spot.kind].range_mm,
+    )
     found = spot_removal.fill_spots(
         source.values, valid, chart, pixel_mm=frame.pixel_mm, range_mm=sizes
     )

@@ -76,7 +76,7 @@ def write(appearance: SkinAppearance, folder: Path, place: SkinPosition | None, 
     write_json(folder / DOCUMENT_FILE, document)
 
 
-def merl_table(brdf: Brdf) -> merl.MerlTable:
+def tabulate_merl(brdf: Brdf) -> merl.MerlTable:
     """Tabulate a BRDF at the middles of MERL's bins; -1 where light or view are below the horizon.
 
     Parameters
@@ -153,7 +153,7 @@ def _nearest_valid(valid: BoolArray, place: SkinPosition) -> tuple[int, int]:
 
 def _write(to: str, path: Path, brdf: Brdf, description: str, light_radius_rad: float) -> None:
     if to == "merl":  # the format has no place for words
-        merl.write(path, merl_table(brdf))
+        merl.write(path, tabulate_merl(brdf))
     else:
         description = f"{description}; measured with a light of radius {light_radius_rad:.6g} rad"
         rgl.write(path, rgl.tabulate_brdf(brdf, description=description))

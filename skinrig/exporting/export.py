@@ -10,7 +10,7 @@ from capture.session import Session, verify
 from model import store
 from model.skin import SkinAppearance
 from skinrig import consent
-from skinrig.errors import UsageError, one_of
+from skinrig.errors import UsageError, require_choice
 from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.sealing import ExportResult, export_sealed
 
@@ -98,7 +98,7 @@ def export(
     ValueError
         Of the format, for a source that it cannot be made of.
     """
-    one_of("to", to, (*APPEARANCE_FORMATS, *SESSION_FORMATS), ExportError)
+    require_choice("to", to, (*APPEARANCE_FORMATS, *SESSION_FORMATS), ExportError)
     if Path(out).exists():
         raise ExportError(f"{out}: exists; choose a new folder")
     order = delivery or ExportSettings()

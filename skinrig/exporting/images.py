@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.skin import SkinAppearance
-from skinrig.appearances.contents import digest
+from skinrig.appearances.contents import hash_file
 from skinrig.arrays import BoolArray, FloatArray
 from skinrig.drawing import png
 from skinrig.exporting.options import FIRST_TILE, ExportSettings
@@ -182,7 +182,7 @@ class ImageFolder:
                 "shape": list(one.values.shape),
                 "valid_share": 1.0 if one.valid is None else float(one.valid.mean()),
                 **put(self.root / names[-1], one),
-                "sha256": digest(self.root / names[-1]),
+                "sha256": hash_file(self.root / names[-1]),
             }
         return names[0]
 

@@ -87,7 +87,7 @@ def write(
         normal, why = _tangent_normals(appearance, names, out)
         if why:
             out.record_omission("normal", why)
-    text = materialx.images_document(shown, delivery, tangent_normal=normal)
+    text = materialx.format_image_nodes(shown, delivery, tangent_normal=normal)
     (folder / "maps.mtlx").write_text(text, encoding="utf-8")
     for name, data in sorted(appearance.files.items()):
         (folder / "files").mkdir(exist_ok=True)

@@ -11,10 +11,10 @@ from typing import Final
 
 from skinrig.errors import UnusableError, UsageError
 
-UNITS_M: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+METERS_PER_UNIT: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of a scene unit, m."""
-M_PER_MM: Final = UNITS_M["mm"]
-NORMAL_Y: Final[Mapping[str, float]] = {"gl": 1.0, "dx": -1.0}
+M_PER_MM: Final = METERS_PER_UNIT["mm"]
+GREEN_SIGN_BY_NORMAL_Y: Final[Mapping[str, float]] = {"gl": 1.0, "dx": -1.0}
 """Sign of a normal map's green: +Y up (OpenGL, glTF, Blender, Maya) or down (DirectX, Unreal)."""
 FIRST_TILE: Final = 1001
 """UDIM tile of texture coordinates 0 to 1, which maps are of."""
@@ -78,9 +78,9 @@ class ExportSettings:
     Attributes
     ----------
     unit
-        Scene unit, of `UNITS_M`; None: the format's own.
+        Scene unit, of `METERS_PER_UNIT`; None: the format's own.
     normal_y
-        Of `NORMAL_Y`.
+        Of `GREEN_SIGN_BY_NORMAL_Y`.
     udim
         Of `TILE_SEPARATORS`. Maps are those of tile 1001; a mesh may reach over more.
     with_errors
@@ -118,8 +118,8 @@ class ExportSettings:
     def __post_init__(self) -> None:
         """Refuse words that mean nothing."""
         for option, value, known in (
-            ("--unit", self.unit, UNITS_M),
-            ("--normal-y", self.normal_y, NORMAL_Y),
+            ("--unit", self.unit, METERS_PER_UNIT),
+            ("--normal-y", self.normal_y, GREEN_SIGN_BY_NORMAL_Y),
             ("--udim", self.udim, TILE_SEPARATORS),
         ):
             if value is not None and value not in known:
@@ -131,7 +131,7 @@ class ExportSettings:
     @property
     def y(self) -> float:
         """Sign of the green of normal maps: 1 for +Y up."""
-        return NORMAL_Y[self.normal_y]
+        return GREEN_SIGN_BY_NORMAL_Y[self.normal_y]
 
     @property
     def green_direction(self) -> str:
@@ -146,7 +146,7 @@ class ExportSettings:
     @property
     def units_per_mm(self) -> float:
         """Scene units in a millimeter."""
-        return M_PER_MM / UNITS_M[self.scene_unit]
+        return M_PER_MM / METERS_PER_UNIT[self.scene_unit]
 
     def format_tile_name(self, name: str, suffix: str, tile: int | str = FIRST_TILE) -> str:
         """Return the file name of a texture's tile.

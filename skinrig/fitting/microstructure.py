@@ -15,7 +15,7 @@ from model.skin import SkinAppearance, SkinMap
 from reconstruction.kernel_fit.table import KernelTableFitError, fit_table
 from reconstruction.pipeline.gradient.stages import KERNEL_FILE
 from skinrig.appearances import dynamic as dynamic_appearance
-from skinrig.appearances.contents import derive_appearance, document_digest
+from skinrig.appearances.contents import derive_appearance, hash_document
 from skinrig.appearances.dynamic import MICROSTRUCTURE
 
 SITE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}")
@@ -104,7 +104,7 @@ def fit_microstructure(
         files={f"kernel_table_{site}.json": f.table.to_json().encode() for site, f in fits.items()},
         parameters={"sites": {site: fit.document() for site, fit in fits.items()}},
         inputs={
-            f"{site} {number}": document_digest(path)
+            f"{site} {number}": hash_document(path)
             for site, group in by_site.items()
             for number, (path, _) in enumerate(group)
         },

@@ -12,8 +12,8 @@ from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from reconstruction.subsurface.translucency import population_prior
 from skinrig.appearances.contents import (
     derive_appearance,
-    digest,
-    document_digest,
+    hash_document,
+    hash_file,
     list_assumptions,
 )
 from skinrig.errors import UsageError
@@ -76,7 +76,7 @@ def fit_reflectance(
         if given is not None and given.resolve() == out.resolve():
             raise ReflectanceInputError(f"{out}: is one of the inputs; name another --out")
     surface = store.read(dome)
-    inputs = {"dome": document_digest(dome)}
+    inputs = {"dome": hash_document(dome)}
     placed = None
     assumed = list_assumptions(surface)
     left_out = list(surface.left_out)
@@ -84,7 +84,7 @@ def fit_reflectance(
     sources = [surface]
     if probe is not None:
         measured = store.read(probe)
-        inputs["probe"] = document_digest(probe)
+        inputs["probe"] = hash_document(probe)
         sources.append(measured)
         try:
             placed = probe_sites.map_translucency(measured, _position(surface), landmarks=landmarks)
@@ -92,7 +92,7 @@ def fit_reflectance(
             raise ReflectanceInputError(f"{probe}: {error}") from error
         depth = placed.map
         if landmarks is not None:
-            inputs["landmarks"] = digest(landmarks)
+            inputs["landmarks"] = hash_file(landmarks)
         assumed += [f"probe: {text}" for text in list_assumptions(measured)] + list(placed.assumed)
         left_out += [(f"translucency of {what}", why) for what, why in placed.left_out]
         files[SUBSURFACE_FILE] = measured.files[SUBSURFACE_FILE]

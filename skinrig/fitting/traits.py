@@ -16,7 +16,7 @@ from reconstruction.correspondence import common_regions
 from reconstruction.correspondence.common_parameterization import CommonFrame
 from skinrig import consent
 from skinrig.appearances import face_textures
-from skinrig.appearances.contents import digest, document_digest
+from skinrig.appearances.contents import hash_document, hash_file
 from skinrig.appearances.face_textures import Face
 from skinrig.atomic_file import write_atomically
 from skinrig.editing import surface_mixtures
@@ -109,11 +109,11 @@ def fit_traits(
     report = progress or (lambda text: None)
     faces = read_faces(appearances, landmarks)
     table = trait_labels.read(labels, [face.name for face in faces])
-    frame = face_textures.common_frame(faces, size)
+    frame = face_textures.build_common_frame(faces, size)
     report(f"common map: {frame.size} pixels of {frame.pixel_mm:.2f} mm, {len(frame.names)} marks")
     samples = []
     for face in faces:
-        samples.append(albedo_sample(face, frame))
+        samples.append(sample_albedo(face, frame))
         report(f"{face.name}: {100 * samples[-1].valid.mean():.0f} % of the common map")
     left_out: list[tuple[str, str]] = []
     spaces = fit_albedo_spaces(
@@ -136,7 +136,7 @@ def fit_traits(
                 n: v.astype(float).tolist() for n, v in {**table.binary, **table.continuous}.items()
             },
             landmarks=sorted({face.marked_by for face in faces}),
-            inputs={"labels": digest(labels)} | {f.name: document_digest(f.path) for f in faces},
+            inputs={"labels": hash_file(labels)} | {f.name: hash_document(f.path) for f in faces},
             left_out=[list(row) for row in left_out],
             consent=consent.merge_consent(*(face.appearance for face in faces)),
         ),
@@ -151,10 +151,10 @@ def fit_traits(
     )
 
 
-def albedo_sample(face: Face, frame: CommonFrame) -> AlbedoSample:
+def sample_albedo(face: Face, frame: CommonFrame) -> AlbedoSample:
     """Return a face's albedo in the common map."""
     r_d = face.r_d
-    image, valid = face.chart(frame).gather(r_d.values, face_textures.valid_texels(r_d))
+    image, valid = face.chart(frame).gather(r_d.values, face_textures.find_valid_texels(r_d))
     return AlbedoSample(image, valid)
 
 

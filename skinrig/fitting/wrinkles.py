@@ -17,7 +17,7 @@ from reconstruction.surface.tangent_space import SMOOTHING_MM, tangent_normals
 from reconstruction.wrinkles.fit import WrinkleFit, fit_wrinkle_map
 from reconstruction.wrinkles.zones import ZoneFit, estimate_amplitudes, fit_zones
 from skinrig.appearances import dynamic as dynamic_appearance
-from skinrig.appearances.contents import derive_appearance, document_digest, intersect_valid
+from skinrig.appearances.contents import derive_appearance, hash_document, intersect_valid
 from skinrig.appearances.dynamic import WRINKLES
 from skinrig.arrays import BoolArray, Float32Array
 from skinrig.console import select_attributes
@@ -118,7 +118,7 @@ def fit_wrinkles(
             "smoothing_mm": SMOOTHING_MM,
             "truth": {state: one.parameters.get("truth", "") for state, (_, one) in read.items()},
         },
-        inputs={state: document_digest(folder) for state, (folder, _) in read.items()},
+        inputs={state: hash_document(folder) for state, (folder, _) in read.items()},
         left_out=tuple((state, why) for state in unchecked),
         seed=read["neutral"][1].seed,
     )
@@ -239,6 +239,6 @@ def summarize_expressions(found: FittedWrinkles) -> list[tuple[str, ...]]:
     ]
 
 
-def zone_names(found: FittedWrinkles) -> Mapping[int, str]:
+def list_zone_names(found: FittedWrinkles) -> Mapping[int, str]:
     """Return the names of the zones by their number."""
     return dict(enumerate(found.fit.layer.table.zones))  # type: ignore[union-attr]

@@ -28,7 +28,7 @@ def confirm_choice(
         Called with a line per step.
     """
     rig = load_planner(choice.rig.name)
-    steps = rig.rehearsal(choice)
+    steps = rig.describe_rehearsal(choice)
     calibrate_simulated(
         choice.rig.name, out, steps.targets, steps.calibrations, seed=seed, progress=progress
     )

@@ -56,15 +56,15 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
     every_view, every_light = list(range(len(rig.views))), list(range(len(rig.lights)))
     information = observation.information(every_view)
     best = light_selection.predict_errors(information, every_light, min_lights=least)
-    if not request.wants:
+    if not request.goals:
         return _choice(rig, observation, (every_light, every_view), best, request)
-    share = request.valid_share * best.valid_fraction
+    share = request.min_valid_fraction * best.valid_fraction
     selected = light_selection.select_lights(
         information,
         median_rad=_target_rad(request),
         valid_fraction=share,
         min_lights=least,
-        max_lights=request.most_lights,
+        max_lights=request.max_lights,
     )
     lights, prediction = list(selected.lights), selected.prediction
     while not _is_r_d_reached(prediction, observation, request) and len(lights) < len(rig.lights):
@@ -77,7 +77,7 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
             fixed=tuple(lights),
         )
         lights, prediction = list(selected.lights), selected.prediction
-        if request.most_lights is not None and len(lights) >= request.most_lights:
+        if request.max_lights is not None and len(lights) >= request.max_lights:
             break
     views, prediction = _remove_views(observation, lights, prediction, request, share)
     reasons = _explain_shortfall(best, observation, request)
@@ -109,7 +109,7 @@ def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
     return _choice(rig, observation, (lights, views), prediction, request, plan=plan)
 
 
-def rehearsal(choice: PlanChoice) -> plans.Rehearsal:
+def describe_rehearsal(choice: PlanChoice) -> plans.Rehearsal:
     """Return the dome's targets, under the lights and cameras of a choice."""
     width = {"width_px": choice.rig.views[0].width_px}
     return plans.Rehearsal(
@@ -170,7 +170,7 @@ def _choice(
 
 
 def _target_rad(request: PlanRequest) -> float:
-    return math.radians(request.wants.get("normals", 90.0))
+    return math.radians(request.goals.get("normals", 90.0))
 
 
 def _r_d_error(prediction: ErrorPrediction, observation: DomeObservation) -> float:
@@ -203,7 +203,7 @@ def _median_magnitude(offset: Float64Array, sigma: Float64Array) -> float:
 def _is_r_d_reached(
     prediction: ErrorPrediction, observation: DomeObservation, request: PlanRequest
 ) -> bool:
-    most = request.wants.get("r_d")
+    most = request.goals.get("r_d")
     return most is None or 100.0 * _r_d_error(prediction, observation) <= most
 
 
@@ -244,7 +244,7 @@ def _explain_shortfall(
     best: ErrorPrediction, observation: DomeObservation, request: PlanRequest
 ) -> tuple[str, ...]:
     """Return the reasons why no number of lights reaches the goals; empty if one does."""
-    out, wants = [], request.wants
+    out, wants = [], request.goals
     normals = math.degrees(best.median_rad)
     if normals > wants.get("normals", math.inf):
         floor = math.degrees(light_selection.rayleigh_mixture_median(observation.systematic_rad))

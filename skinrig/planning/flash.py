@@ -116,7 +116,7 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
     """
     observation = simulate_observation(rig, request.subject, seed=request.seed)
     best = predict(observation, repeats=REPEAT_CHOICES[-1], power=1.0, darks=DARK_CHOICES[-1])
-    if not request.wants:
+    if not request.goals:
         whole = {"repeats": 1, "power": 1.0, "darks": 4, "parallel": True}
         return _choice(rig, observation, flash_plan(rig), whole, request)
     path = []
@@ -128,18 +128,18 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
                 | {f"{name}_percent": 100.0 * found.median(name) for name in CHROMOPHORE_NAMES}
             )
         if _is_reached(found, best, request):
-            plan = crossed_plan(rig, **settings)
+            plan = build_crossed_plan(rig, **settings)
             return _choice(rig, observation, plan, settings, request, path=tuple(path))
     least = next(one for one in _candidates(rig) if one["power"] == 1.0)
     reasons = _explain_shortfall(best, observation, request)
     # an unreachable goal does not justify sixteen frames: keep the fewest within 5 % of the best
-    estimable = [name for name in request.wants if np.isfinite(best.median(name))]
+    estimable = [name for name in request.goals if np.isfinite(best.median(name))]
     for settings in _candidates(rig) if estimable else ():  # else fewer frames are as good
         now = predict(observation, **settings)
         if all(now.median(name) <= 1.05 * best.median(name) for name in estimable):
             least = settings
             break
-    plan = crossed_plan(rig, **least)
+    plan = build_crossed_plan(rig, **least)
     return _choice(rig, observation, plan, least, request, path=tuple(path), reasons=reasons)
 
 
@@ -161,7 +161,7 @@ def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
     return _choice(rig, observation, plan, settings, request)
 
 
-def rehearsal(choice: PlanChoice) -> plans.Rehearsal:
+def describe_rehearsal(choice: PlanChoice) -> plans.Rehearsal:
     """Return the flash rig's targets, at the forecast's pixels."""
     width = {"width_px": min(choice.rig.views[0].width_px, CONFIRM_PX)}
     target_of = {"sensor": "flat", "white": "white", "polarization": "malus"}
@@ -182,7 +182,7 @@ def measure_errors(
     }
 
 
-def crossed_plan(rig: Rig, *, repeats: int, power: float, darks: int) -> Plan:
+def build_crossed_plan(rig: Rig, *, repeats: int, power: float, darks: int) -> Plan:
     """Return a plan of crossed frames alone.
 
     Examples
@@ -209,7 +209,7 @@ def _candidates(rig: Rig) -> Iterator[dict[str, Any]]:
     yield from sorted(
         every,
         key=lambda one: (
-            crossed_plan(rig, **one | {"power": 1.0}).estimate_duration_s(rig),
+            build_crossed_plan(rig, **one | {"power": 1.0}).estimate_duration_s(rig),
             one["power"],
         ),
     )
@@ -218,8 +218,8 @@ def _candidates(rig: Rig) -> Iterator[dict[str, Any]]:
 def _is_reached(found: FlashPrediction, best: FlashPrediction, request: PlanRequest) -> bool:
     return all(
         100.0 * found.median(name) <= value
-        and found.valid_share(name) >= request.valid_share * best.valid_share(name)
-        for name, value in request.wants.items()
+        and found.valid_share(name) >= request.min_valid_fraction * best.valid_share(name)
+        for name, value in request.goals.items()
     )
 
 
@@ -274,7 +274,7 @@ def _explain_shortfall(
 ) -> tuple[str, ...]:
     """Return the reasons why no number of frames reaches the goals."""
     out = []
-    for name, value in request.wants.items():
+    for name, value in request.goals.items():
         now = 100.0 * best.median(name)
         if now <= value:
             continue

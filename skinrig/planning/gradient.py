@@ -121,15 +121,15 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
         the forecast of the rig's own plan. The share is of the patch.
     """
     observation = simulate_observation(rig, request.subject, seed=request.seed)
-    if not request.wants:
+    if not request.goals:
         plan = gradient_plan(rig)
         return _choice(rig, observation, plan, read_settings(plan), request)
     tried: list[tuple[GradientScanSettings, Plan, GradientPrediction]] = []
-    target = math.radians(request.wants.get("normals", 90.0))
-    for setting, plan in candidates(rig, observation):
+    target = math.radians(request.goals.get("normals", 90.0))
+    for setting, plan in generate_candidates(rig, observation):
         found = predict(observation, setting)
         tried.append((setting, plan, found))
-        if found.median_rad <= target and found.valid_share >= request.valid_share:
+        if found.median_rad <= target and found.valid_share >= request.min_valid_fraction:
             break
     if not tried:
         raise plans.PlanningError("rig: got limits that no pattern keeps to")
@@ -164,7 +164,7 @@ def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
     return _choice(rig, observation, plan, read_settings(plan), request)
 
 
-def rehearsal(choice: PlanChoice) -> plans.Rehearsal:
+def describe_rehearsal(choice: PlanChoice) -> plans.Rehearsal:
     """Return the gradient sphere's targets, skin and flat field on few pixels."""
     width = {"width_px": min(choice.rig.views[0].width_px, 128)}
     of_ball = tuple((kind, ("ball",)) for kind in ("lights", "polarization"))
@@ -185,7 +185,7 @@ def measure_errors(
     return {"normals": (float(np.median(error[good])), float(good.mean()))}
 
 
-def candidates(
+def generate_candidates(
     rig: Rig, observation: GradientObservation | None = None
 ) -> Iterator[tuple[GradientScanSettings, Plan]]:
     """Yield scans of the neutral skin that the rig's limits allow, the quickest first.

@@ -24,12 +24,12 @@ from capture.rig import Rig, load_rig
 from skinrig.capturing.light_safety import light_figures
 from skinrig.capturing.plan_choice import read_plan
 from skinrig.console import select_attributes
-from skinrig.errors import UsageError, one_of
+from skinrig.errors import UsageError, require_choice
 from skinrig.unit_format import format_quantity
 
 SCHEMA = "skinrig.plan-choice/1"
 
-WANTED_UNITS: Mapping[str, Mapping[str, str]] = {
+GOAL_UNITS: Mapping[str, Mapping[str, str]] = {
     "dome": {"normals": "deg", "r_d": "%"},
     "flash": {"melanin": "%", "hemoglobin": "%"},
     "gradient": {"normals": "deg"},
@@ -42,7 +42,7 @@ PERCENT_BY_SITE = "percent_by_site"
 
 OMISSIONS_TABLE = resources.files("skinrig").joinpath("data/left_out.toml")
 
-_WANTED_LIMIT = re.compile(r"\s*([a-z_]+)\s*<=\s*([0-9.eE+-]+)\s*(deg|%)?\s*")
+_GOAL_PATTERN = re.compile(r"\s*([a-z_]+)\s*<=\s*([0-9.eE+-]+)\s*(deg|%)?\s*")
 
 
 class PlanningError(ValueError):
@@ -81,15 +81,15 @@ class Forecast:
 class PlanRequest:
     """What a plan is chosen, or forecast, for."""
 
-    wants: Mapping[str, float] = field(default_factory=dict)
-    """Medians to reach, in the units of :data:`WANTED_UNITS`; empty: the rig's own plan."""
+    goals: Mapping[str, float] = field(default_factory=dict)
+    """Medians to reach, in the units of :data:`GOAL_UNITS`; empty: the rig's own plan."""
     subject: str = "III"
     """Preset of the simulated face that is forecast."""
     seed: int = 0
     """Of that face."""
-    valid_share: float = 0.9
+    min_valid_fraction: float = 0.9
     """Of what the whole rig gives an estimate, so much must keep one."""
-    most_lights: int | None = None
+    max_lights: int | None = None
     """Largest number of lights, of a dome."""
 
 
@@ -156,7 +156,7 @@ class PlanChoice:
         }
 
 
-def parse_wants(text: str, rig: str) -> dict[str, float]:
+def parse_goals(text: str, rig: str) -> dict[str, float]:
     """Read what is wanted of a rig.
 
     Parameters
@@ -169,7 +169,7 @@ def parse_wants(text: str, rig: str) -> dict[str, float]:
     Returns
     -------
     dict
-        Error by name, in the unit of :data:`WANTED_UNITS`.
+        Error by name, in the unit of :data:`GOAL_UNITS`.
 
     Raises
     ------
@@ -183,18 +183,18 @@ def parse_wants(text: str, rig: str) -> dict[str, float]:
     >>> parse_wants("normals<=1deg, r_d <= 3%", "dome")
     {'normals': 1.0, 'r_d': 3.0}
     """
-    units = WANTED_UNITS[one_of("rig", rig, WANTED_UNITS, PlanningError)]
+    units = GOAL_UNITS[require_choice("rig", rig, GOAL_UNITS, PlanningError)]
     known = ", ".join(f"{name}<=NUMBER{unit}" for name, unit in units.items())
     wants: dict[str, float] = {}
     for part in filter(str.strip, text.split(",")):
-        match = _WANTED_LIMIT.fullmatch(part)
+        match = _GOAL_PATTERN.fullmatch(part)
         if match is None:
             raise PlanOptionsError(f"--goals: got {part.strip()!r}, expected {known}")
         name, number, unit = match.groups()
         if name not in units:
             close = difflib.get_close_matches(name, units, 1)
             hint = f"; did you mean {close[0]}?" if close else ""
-            others = [other for other, gives in WANTED_UNITS.items() if name in gives]
+            others = [other for other, gives in GOAL_UNITS.items() if name in gives]
             if others:
                 hint = f"; {name} is planned for {', '.join(others)}"
             raise PlanningError(f"--goals: got {name!r} of rig {rig!r}, expected {known}{hint}")
@@ -221,10 +221,10 @@ def build_forecasts(
     return tuple(
         Forecast(
             name,
-            WANTED_UNITS[rig][name],
+            GOAL_UNITS[rig][name],
             value,
             forecast_interval(value, relative_sd[name]),
-            request.wants.get(name),
+            request.goals.get(name),
         )
         for name, value in medians.items()
     )
@@ -265,9 +265,9 @@ def choose(
     Parameters
     ----------
     rig_name
-        Out of :data:`WANTED_UNITS`.
+        Out of :data:`GOAL_UNITS`.
     want
-        See `parse_wants`.
+        See `parse_goals`.
     width_px
         Pixels across the cameras; None: the rig's own.
     forecast
@@ -280,8 +280,8 @@ def choose(
     PlanningError
         For what cannot be read or planned.
     """
-    asked = PlanRequest(parse_wants(want, rig_name), **request)
-    most_lights = asked.most_lights
+    asked = PlanRequest(parse_goals(want, rig_name), **request)
+    most_lights = asked.max_lights
     own = load_planner(rig_name)
     rig = load_rig(rig_name)
     if width_px is not None:
@@ -308,7 +308,7 @@ def choose(
 def load_planner(rig_name: str) -> Any:
     """Return the module that plans for a rig.
 
-    It has `choose`, `forecast`, and for a confirmation `rehearsal` and `measured`.
+    It has `choose`, `forecast`, and for a confirmation `describe_rehearsal` and `measure_errors`.
     """
     return importlib.import_module(f"skinrig.planning.{rig_name}")
 

@@ -45,7 +45,7 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
         makes valid.
     """
     observation = simulate_observation(rig, request.subject, seed=request.seed)
-    own, wants, valid_share = probe_plan(rig), request.wants, request.valid_share
+    own, wants, valid_share = probe_plan(rig), request.goals, request.min_valid_fraction
     if not wants:
         setting = read_settings(own)
         return _choice(rig, observation, own, setting, predict(observation, setting), wants)
@@ -63,7 +63,7 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
         )
 
     tried: list[tuple[ProbeSettings, Plan, ProbePrediction]] = []
-    for setting, plan in candidates(rig, observation):
+    for setting, plan in generate_candidates(rig, observation):
         tried.append((setting, plan, predict(observation, setting, memory=memory)))
         if good(tried[-1][2]):
             break
@@ -98,10 +98,10 @@ def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
     """Return what a plan of the probe will give at its sites."""
     setting = read_settings(plan)
     observation = simulate_observation(rig, request.subject, seed=request.seed, sites=setting.sites)
-    return _choice(rig, observation, plan, setting, predict(observation, setting), request.wants)
+    return _choice(rig, observation, plan, setting, predict(observation, setting), request.goals)
 
 
-def rehearsal(_: PlanChoice) -> plans.Rehearsal:
+def describe_rehearsal(_: PlanChoice) -> plans.Rehearsal:
     """Return the probe's phantom."""
     return plans.Rehearsal({"phantom": {}}, (("fibre", ("phantom",)),), ("subsurface",))
 
@@ -117,7 +117,9 @@ def measure_errors(
     return {"sigma_tr": (median, len(good) / max(len(rows), 1))}
 
 
-def candidates(rig: Rig, observation: ProbeObservation) -> Iterator[tuple[ProbeSettings, Plan]]:
+def generate_candidates(
+    rig: Rig, observation: ProbeObservation
+) -> Iterator[tuple[ProbeSettings, Plan]]:
     """Yield plans of all sites in one direction that the rig allows, the quickest first."""
     found: list[tuple[float, Plan]] = []
     for brackets, longest_s, repeats, darks in itertools.product(

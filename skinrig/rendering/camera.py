@@ -116,7 +116,7 @@ def bin_pixels(camera: Camera, factor: float) -> Camera:
     return dataclasses.replace(camera, matrix=matrix, image_size=(columns, rows))
 
 
-def rays(
+def generate_rays(
     camera: Camera, *, subpixels: int, rows: tuple[int, int] | None = None
 ) -> tuple[Float32Array, Float32Array]:
     """Return rays through a regular grid inside the pixels.

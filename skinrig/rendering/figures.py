@@ -185,7 +185,7 @@ def draw_rendering(
         name: png.encode(apply_tone_curve(image, exposure)) for name, image in shown.items()
     }
     if components:
-        pictures["components"] = encode_sheet([component_panels(seen, exposure)])
+        pictures["components"] = encode_sheet([build_component_panels(seen, exposure)])
     record = request.record([subject], seen)
     return drawing.write(images, pictures, record, kind="picture", exposure=exposure)
 
@@ -243,13 +243,13 @@ def draw_photograph(
         "surface": seen.surface,
         "coverage": seen.coverage,
     }
-    pictures = {"components": encode_sheet([component_panels(seen, exposure, photo)])}
+    pictures = {"components": encode_sheet([build_component_panels(seen, exposure, photo)])}
     facts = {"kind": "components", "exposure": exposure, "held_out": shot.held_out}
     record = asked.record([subject], seen)
     return drawing.write(images, pictures, record, session=session, **facts)
 
 
-def component_panels(
+def build_component_panels(
     rendering: Rendering, exposure: float, photograph: FloatArray | None = None
 ) -> list[Panel]:
     """Return the panels of the paper's figure 12, those that need a photograph where there is one.
@@ -374,7 +374,7 @@ def draw_shadow_boundary(
                 Panel(f"{boundary.name}, {words}", apply_tone_curve(seen.radiance, exposure))
             )
             images[f"{boundary.name.replace(' ', '_')}_{name}"] = seen.radiance
-            rise = shadow.rise_mm(*shadow.profile(seen))
+            rise = shadow.measure_rise_mm(*shadow.measure_profile(seen))
             skin = {"skin": boundary.name, "name": name}
             widths.append({**skin, "sigma_tr_per_mm": sigma, "rise_mm": rise})
         rows.append(row)

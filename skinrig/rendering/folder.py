@@ -65,7 +65,7 @@ def apply_tone_curve(radiance: ArrayLike, exposure: float) -> UInt8Array:
     value = np.asarray(radiance, np.float64) * exposure
     room = 1.0 - TONE_KNEE
     above = TONE_KNEE + room * -np.expm1(-np.maximum(value - TONE_KNEE, 0.0) / room)
-    return png.srgb8(np.where(value > TONE_KNEE, above, value))
+    return png.encode_srgb8(np.where(value > TONE_KNEE, above, value))
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from capture.calibration.lights import LightTable
 from model import store
 from skinrig.arrays import Float32Array, Float64Array
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 
 Vector = tuple[float, float, float]
 
@@ -109,7 +109,7 @@ class Light:
         LightError
             The light is unknown, or its calibration is invalid.
         """
-        row = table.names.index(one_of("light", name, table.names, LightError))
+        row = table.names.index(require_choice("light", name, table.names, LightError))
         if not table.valid[row]:
             raise LightError(f"light {name!r}: is dead, or its calibration is not valid")
         place = _check_triple(name, "position_mm", table.position_mm[row])
@@ -222,7 +222,7 @@ MAX_LIGHT_RADIUS_RAD: Final = 0.35
 MAX_LIGHTS: Final = 65_536
 
 
-def directions(height: int, width: int) -> tuple[Float64Array, Float64Array]:
+def compute_pixel_directions(height: int, width: int) -> tuple[Float64Array, Float64Array]:
     """Return unit vectors to the middles of the map's pixels, (H, W, 3), and solid angles, (H, W).
 
     Examples
@@ -244,7 +244,7 @@ def directions(height: int, width: int) -> tuple[Float64Array, Float64Array]:
     return towards, solid
 
 
-def environment_lights(
+def sample_environment_lights(
     radiance: ArrayLike, count: int, *, rng: np.random.Generator
 ) -> tuple[Light, ...]:
     """Sample distant lights from an environment map with probability proportional to power.
@@ -286,7 +286,7 @@ def environment_lights(
         raise LightError("environment: got negative or non-finite values, expected radiances")
     if not 1 <= count <= MAX_LIGHTS:
         raise LightError(f"environment lights: got {count}, expected 1 to {MAX_LIGHTS}")
-    towards, solid = directions(*image.shape[:2])
+    towards, solid = compute_pixel_directions(*image.shape[:2])
     power = image.mean(axis=-1) * solid
     if not power.sum() > 0.0:
         raise LightError("environment: got a map without light")

@@ -24,7 +24,7 @@ from model.skin_reflectance import lobe_brdf, transmittance
 from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.render import Caster, GBuffer, trace
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.camera import Camera, RenderingError
 from skinrig.rendering.geometry import FittedSurface, SurfacePointSamples
@@ -131,7 +131,7 @@ def render_surface(
     if not given:
         raise RenderingError("lights: got none, expected at least one")
     lamps = [part for light in given for part in light.parts()]
-    one_of("subsurface", subsurface, get_args(Subsurface), RenderingError)
+    require_choice("subsurface", subsurface, get_args(Subsurface), RenderingError)
     if shadow_samples < 1:
         raise RenderingError(f"shadow samples: got {shadow_samples}, expected at least 1")
     rays = Caster(surface.mesh) if caster is None else caster
@@ -148,7 +148,9 @@ def render_surface(
     band = max(1, BAND_RAYS // (columns * subpixels**2))
     for top in range(0, height, band):
         part = (top, min(top + band, height))
-        buffers = trace(rays, *rendering_camera.rays(camera, subpixels=subpixels, rows=part))
+        buffers = trace(
+            rays, *rendering_camera.generate_rays(camera, subpixels=subpixels, rows=part)
+        )
         facing = np.einsum("hwk,hwk->hw", buffers.face_normal, buffers.to_camera) > 0.0
         index = np.flatnonzero(buffers.mask & facing)
         out, met = out + len(index), met + int(np.count_nonzero(buffers.mask))

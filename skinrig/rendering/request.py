@@ -19,7 +19,13 @@ from model.skin_reflectance import SkinReflectance, assemble
 from skinrig.errors import UnusableError, UsageError
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.camera import Camera
-from skinrig.rendering.lights import Light, LightError, Vector, environment_lights, read_environment
+from skinrig.rendering.lights import (
+    Light,
+    LightError,
+    Vector,
+    read_environment,
+    sample_environment_lights,
+)
 
 POSITION_PREFIX: Final = "at:"
 LED_RADIUS_MM: Final = 10.0
@@ -170,7 +176,9 @@ def parse_lights(
     if environment is not None:
         rng = np.random.default_rng(seed)
         try:
-            found += environment_lights(read_environment(environment), environment_count, rng=rng)
+            found += sample_environment_lights(
+                read_environment(environment), environment_count, rng=rng
+            )
         except LightError as error:
             raise LightError(f"{environment}: {error}") from error
     if not found:

@@ -157,7 +157,7 @@ def _boundary(
     return ShadowBoundary(name, surface, camera, light, card, caster, below)
 
 
-def profile(rendering: Rendering) -> tuple[Float64Array, Float64Array]:
+def measure_profile(rendering: Rendering) -> tuple[Float64Array, Float64Array]:
     """Return places across the boundary in mm, (W,), and light from inside there, (W, 3).
 
     The mean over the middle half of the rows; the lit side is at negative places.
@@ -168,7 +168,7 @@ def profile(rendering: Rendering) -> tuple[Float64Array, Float64Array]:
     return place, rows.mean(axis=0)
 
 
-def rise_mm(position_mm: Float64Array, level: Float64Array) -> Float64Array:
+def measure_rise_mm(position_mm: Float64Array, level: Float64Array) -> Float64Array:
     """Return how far apart 90 % and 10 % of the fall from light to shadow lie, mm, (3,).
 
     Parameters

@@ -28,7 +28,7 @@ HAIR_OPTICAL_DEPTH: Final = 1e-3
 
 
 @lru_cache(maxsize=1)
-def true_lobes() -> BrdfBasis:
+def tabulate_true_lobes() -> BrdfBasis:
     """Return tables of facets at each roughness, without and with oil, and of vellus hair."""
     materials = {}
     for roughness in TRUE_ROUGHNESS_NODES:
@@ -37,7 +37,7 @@ def true_lobes() -> BrdfBasis:
     return brdf_tables.tabulate({**materials, "hair": _hair})
 
 
-def true_model(scene: DomeScene, view: str, *, binning: int = 1) -> SkinReflectance:
+def build_true_model(scene: DomeScene, view: str, *, binning: int = 1) -> SkinReflectance:
     """Return the truth as a fitted model would hold it.
 
     Parameters
@@ -76,7 +76,7 @@ def true_model(scene: DomeScene, view: str, *, binning: int = 1) -> SkinReflecta
     return SkinReflectance(
         r_d=wide[..., :3],
         weights=np.maximum(wide[..., 9:], 0.0),
-        lobes=true_lobes(),
+        lobes=tabulate_true_lobes(),
         translucency_mm=np.ones((size, size, 3), np.float32),
         normals=wide[..., 3:6] / np.maximum(length, 1e-6),
         position_mm=wide[..., 6:9],
@@ -84,7 +84,7 @@ def true_model(scene: DomeScene, view: str, *, binning: int = 1) -> SkinReflecta
     )
 
 
-def true_light(scene: DomeScene, index: int, view: str) -> Light:
+def build_true_light(scene: DomeScene, index: int, view: str) -> Light:
     """Return one of a dome's lights, in the unit of the simulator's pictures."""
     led = scene.rig.lights[index]
     x, y, z = led.position_mm

@@ -73,7 +73,7 @@ def map_heading(name: str) -> str:
     return label if label == name else f"{label} ({name})"
 
 
-def uncertainty(name: str) -> str:
+def uncertainty_title(name: str) -> str:
     """Return the label of a map's uncertainty: chromophores have a posterior.
 
     Examples

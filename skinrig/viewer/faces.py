@@ -50,7 +50,7 @@ ACTION_UNITS: Final[Mapping[str, Mapping[str, float]]] = tomllib.loads(
 """Shapes of ARKit, without left and right, and their weights."""
 
 
-def presets(names: Iterable[str]) -> dict[str, dict[str, float]]:
+def build_presets(names: Iterable[str]) -> dict[str, dict[str, float]]:
     """Return weights by preset, in the order in which people look for them.
 
     Parameters
@@ -100,12 +100,12 @@ def _add_weights(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
 
 
 ASSET_BUILDERS: Final[tuple[Callable[[SceneSource], Assets], ...]] = (
-    facial_color_assets.assets,
-    reflectance_assets.default_scattering,
-    wrinkle_assets.surface_assets,
-    fitted_assets.assets,
-    wrinkle_assets.assets,
-    microstructure_assets.assets,
+    facial_color_assets.build_assets,
+    reflectance_assets.build_default_scattering,
+    wrinkle_assets.build_surface_assets,
+    fitted_assets.build_assets,
+    wrinkle_assets.build_assets,
+    microstructure_assets.build_assets,
 )
 """In the order in which their parts are listed; they do not see each other's."""
 
@@ -116,7 +116,9 @@ def assemble_scene(source: SceneSource, provenance: Mapping[str, Any]) -> Viewer
     for build in ASSET_BUILDERS:
         scene = scene.with_assets(build(source))
     names = (*scene.mesh.shapes, *scene.params.get("weights", {}))
-    return scene.with_assets({"presets": {n: {"weights": w} for n, w in presets(names).items()}})
+    return scene.with_assets(
+        {"presets": {n: {"weights": w} for n, w in build_presets(names).items()}}
+    )
 
 
 DEFAULT_PRESET = "III"
@@ -130,7 +132,7 @@ POSITION_STEPS_PER_MM = np.float32(1024.0)
 """Steps of a millimetre that positions are rounded to; strain is of the rounded mesh throughout."""
 
 
-def scene(
+def build_scene(
     paths: Sequence[Path] = (),
     *,
     mesh: Path | None = None,
@@ -191,7 +193,7 @@ def scene(
     surface = None if whole is None else whole.mesh
     subject = make_subject(preset, seed=seed, size=min(size, PERSON_PX), mesh=surface)
     skin = FineSkin(subject, size)
-    of = viewer_mesh(subject), size, seed, subject, skin, appearances, folders
+    of = build_viewer_mesh(subject), size, seed, subject, skin, appearances, folders
     source = SceneSource(kind, *of, landmarks, calibration)
     if not paths:
         provenance = {"source": "simulated", "kind": kind, "preset": preset, "seed": seed}
@@ -255,7 +257,7 @@ def load_mesh(path: Path) -> Mesh:
     )
 
 
-def viewer_mesh(subject: SimulatedSubject) -> Mesh:
+def build_viewer_mesh(subject: SimulatedSubject) -> Mesh:
     """Return a person's mesh; its own blend shapes come behind those of the expressions."""
     rounded = np.round(subject.mesh.vertices_mm * POSITION_STEPS_PER_MM) / POSITION_STEPS_PER_MM
     own = {n: d for n, d in subject.mesh.shapes.items() if np.any(d)}

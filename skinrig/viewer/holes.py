@@ -65,7 +65,7 @@ class HolePatch:
         return np.concatenate([values, splu(inner).solve(-(weights[n:, :n] @ values))])
 
 
-def patches(vertices_mm: FloatArray, faces: NDArray[np.integer]) -> list[HolePatch]:
+def find_patches(vertices_mm: FloatArray, faces: NDArray[np.integer]) -> list[HolePatch]:
     """Return what closes the holes of a mesh that are small, the longest loop first.
 
     Parameters
@@ -312,7 +312,7 @@ def close_holes(mesh: Mesh) -> ClosedMesh:
     mesh
         Without blend shapes.
     """
-    found = patches(mesh.vertices_mm, mesh.faces)
+    found = find_patches(mesh.vertices_mm, mesh.faces)
     if not found or mesh.shapes:
         return ClosedMesh(mesh, (), ())
     taken = unwrap(mesh, GRID_CELLS).covered

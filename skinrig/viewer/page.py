@@ -25,7 +25,7 @@ SCRIPT_NAMES: Final = (
 _CHUNK_LINE = re.compile(r"^//@chunk (\w+)[ \t]*$", re.MULTILINE)
 
 
-def chunks() -> dict[str, str]:
+def read_chunks() -> dict[str, str]:
     """Return the pieces of GLSL by name.
 
     Raises
@@ -43,13 +43,13 @@ def chunks() -> dict[str, str]:
     return found
 
 
-def script() -> str:
+def build_script() -> str:
     """Return all scripts as one strict function that shares an object ``V``."""
     here = resources.files("skinrig.viewer").joinpath("js")
     body = "\n".join(
         _bare(here.joinpath(f"{name}.js").read_text(encoding="utf-8")) for name in SCRIPT_NAMES
     )
-    glsl = json.dumps(chunks(), sort_keys=True)
+    glsl = json.dumps(read_chunks(), sort_keys=True)
     return f'(() => {{\n"use strict";\nconst V = {{glsl: {glsl}}};\n{body}\n}})();\n'
 
 
@@ -75,7 +75,7 @@ def render(packed: PackedScene, *, connect: bool = False) -> str:
     """Return the page of a packed scene."""
     here = resources.files("skinrig.viewer")
     style = here.joinpath("page.css").read_text(encoding="utf-8")
-    code = script().replace("</", "<\\/")
+    code = build_script().replace("</", "<\\/")
     source = "'self'" if connect else "'none'"
     policy = (
         f"default-src 'none'; script-src '{_hash(code)}'; style-src '{_hash(style)}'; "

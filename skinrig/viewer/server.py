@@ -145,7 +145,7 @@ def serve_scene(
             console.print_line(
                 f"{served.url}: open it in a browser on this machine; Ctrl-C ends it"
             )
-            console.document("skinrig.view-served/1", document)
+            console.print_document("skinrig.view-served/1", document)
             try:
                 served.wait()
             except KeyboardInterrupt:

@@ -106,7 +106,7 @@ def write(
             f"--mesh: reaches over tiles {', '.join(map(str, material.tiles))}, but glTF knows one "
             "alone; take mtlx or usd, or a mesh of tile 1001"
         )
-    (folder / GLB_FILE).write_bytes(content(material))
+    (folder / GLB_FILE).write_bytes(encode_glb(material))
     script = blender.Import.from_channels(GLB_FILE, material.median_radius_mm()).script()
     (folder / blender.SCRIPT_FILE).write_text(script, encoding="utf-8")
     out = ImageFolder(folder, delivery)
@@ -134,7 +134,7 @@ def write(
     return left_out
 
 
-def content(material: Material) -> bytes:
+def encode_glb(material: Material) -> bytes:
     """Return a .glb file.
 
     Parameters

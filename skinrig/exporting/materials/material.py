@@ -12,7 +12,7 @@ from model import dipole, fresnel, skin_reflectance
 from model.skin import SkinAppearance
 from skinrig.appearances.contents import list_assumptions
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from skinrig.errors import UsageError, one_of
+from skinrig.errors import UsageError, require_choice
 from skinrig.exporting.images import CAMERA_SPACE, DATA_SPACE, SRGB_SPACE, ExportImage
 from skinrig.exporting.materials import subsurface_radius, surface_fit, tangents, udim
 from skinrig.exporting.materials.tangents import FramedMesh
@@ -247,7 +247,7 @@ class Material:
             "translucency": (self.translucency_mm, "mm", DATA_SPACE, 16.0),
             "mask": (self.valid.astype(np.float32), "1", DATA_SPACE, 1.0),
         }
-        values, unit, space, high = simple[one_of("texture", name, simple, ExportError)]
+        values, unit, space, high = simple[require_choice("texture", name, simple, ExportError)]
         what = MAP_NOTES.get(name, "1 where all was measured")
         if name == "base_color":
             what = f"{what}; {COLOR_NOTE}"

@@ -51,12 +51,14 @@ def write(
     (folder / "skin.obj").write_text(
         material.mesh.to_obj(delivery.units_per_mm, delivery.scene_unit), encoding="utf-8"
     )
-    out.document(DOCUMENT_FILE, appearance, facts(material, appearance, delivery, SCHEMA, scale))
+    out.document(
+        DOCUMENT_FILE, appearance, describe_material(material, appearance, delivery, SCHEMA, scale)
+    )
     return left_out
 
 
 def write_textures(material: Material, out: ImageFolder) -> float:
-    """Write the textures that `openpbr_document` names; return the largest radius, mm."""
+    """Write the textures that `format_openpbr` names; return the largest radius, mm."""
     for name in ("base_color", "specular_roughness", "specular_weight", "translucency"):
         out.write_exr(material.image(name, out.delivery), TEXTURE_FOLDER)
     out.write_png(material.image("base_color", out.delivery), TEXTURE_FOLDER)
@@ -71,12 +73,12 @@ def write_textures(material: Material, out: ImageFolder) -> float:
         TEXTURE_FOLDER,
     )
     out.errors(material.error_images(), TEXTURE_FOLDER)
-    text = openpbr_document(material, scale, out.delivery)
+    text = format_openpbr(material, scale, out.delivery)
     (out.root / MATERIALX_FILE).write_text(text, encoding="utf-8")
     return scale
 
 
-def facts(
+def describe_material(
     material: Material,
     appearance: SkinAppearance,
     delivery: ExportSettings,
@@ -112,7 +114,7 @@ def facts(
     }
 
 
-def openpbr_document(material: Material, radius_mm: float, delivery: ExportSettings) -> str:
+def format_openpbr(material: Material, radius_mm: float, delivery: ExportSettings) -> str:
     """Return a material whose textures lie in `TEXTURE_FOLDER`.
 
     Parameters
@@ -134,7 +136,7 @@ def openpbr_document(material: Material, radius_mm: float, delivery: ExportSetti
     )
 
 
-def images_document(
+def format_image_nodes(
     files: Mapping[str, tuple[str, str]], delivery: ExportSettings, *, tangent_normal: str | None
 ) -> str:
     """Return a node graph with an image node a map, so that a reader knows its color space.

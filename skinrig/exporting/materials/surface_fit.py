@@ -114,7 +114,7 @@ def _fit(
     return (np.where(dark, 1.0, roughness), np.where(dark, 0.0, scale), np.where(dark, 0.0, misfit))
 
 
-def lobe_values(roughness: float, eta: float) -> Float64Array:
+def evaluate_ggx(roughness: float, eta: float) -> Float64Array:
     """Return GGX of a roughness at the directions of the sums, 1/sr, shape (N,)."""
     return microfacet.brdf(*_directions()[0], roughness=roughness**2, eta=eta, kind="ggx")
 
@@ -126,7 +126,7 @@ def _products(lobes: BrdfBasis, eta: float) -> tuple[Float64Array, Float64Array,
     values = table.reshape(-1, lobes.size)[keep].astype(np.float64)
     mean = values.mean(axis=1)
     weight = solid / (mean + LOBE_FLOOR_FRACTION * mean.max(initial=1e-12))
-    model = np.stack([lobe_values(float(r), eta) for r in ROUGHNESS_NODES], axis=1)
+    model = np.stack([evaluate_ggx(float(r), eta) for r in ROUGHNESS_NODES], axis=1)
     scaled = values * weight[:, None]
     return values.T @ scaled, scaled.T @ model, np.sum(weight[:, None] * model**2, axis=0)
 

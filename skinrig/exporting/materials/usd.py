@@ -21,7 +21,7 @@ from skinrig.errors import MissingExtra
 from skinrig.exporting.images import ImageFolder
 from skinrig.exporting.materials import blender, materialx
 from skinrig.exporting.materials.material import Material
-from skinrig.exporting.options import UNITS_M, ExportSettings
+from skinrig.exporting.options import METERS_PER_UNIT, ExportSettings
 
 USD_FILE, DOCUMENT_FILE = "skin.usdc", "usd.json"
 SCHEMA: Final = "skinrig.export.usd/1"
@@ -73,7 +73,7 @@ def write(
     )
     script = blender.Import(USD_FILE, scale, None, textures).script()
     (folder / blender.SCRIPT_FILE).write_text(script, encoding="utf-8")
-    facts = materialx.facts(material, appearance, delivery, SCHEMA, scale)
+    facts = materialx.describe_material(material, appearance, delivery, SCHEMA, scale)
     out.document(DOCUMENT_FILE, appearance, {**facts, "blend_shapes": names})
     what = "subsurface light and specular weight of UsdPreviewSurface"
     in_blender = f"the mtlx network holds both; {blender.SCRIPT_FILE} sets them"
@@ -97,7 +97,7 @@ def _write_stage(
     points = mesh.vertices_mm * per_mm
     text = templates.render(
         "exporting/templates/skin.usda",
-        unit_m=UNITS_M[delivery.scene_unit],
+        unit_m=METERS_PER_UNIT[delivery.scene_unit],
         shapes=list(names.values()),
         sigma_tr=material.sigma_tr(),
         materialx=materialx.MATERIALX_FILE,

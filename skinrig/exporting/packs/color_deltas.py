@@ -65,7 +65,7 @@ def write(appearance: SkinAppearance, out: ImageFolder) -> tuple[dict[str, Any],
     states : list of str
         All that the rig has.
     """
-    rig = expression.hemoglobin_rig(appearance)
+    rig = expression.read_hemoglobin_rig(appearance)
     have = sorted(rig.states)
     states = select_states(have, "color", out)
     colors = _colors(appearance, rig, states, out)

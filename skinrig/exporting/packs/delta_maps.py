@@ -87,7 +87,7 @@ def write(
         document["wrinkles"], rows = _write_wrinkles(appearance, parts, out)
         known |= set(rows)
     if MICROSTRUCTURE in parts:
-        document |= detail_maps.micro_normals(appearance, parts[MICROSTRUCTURE], out)
+        document |= detail_maps.write_micro_normals(appearance, parts[MICROSTRUCTURE], out)
     for part, what in PART_MAPS.items():
         if part not in parts:
             fit = f"skinrig fit {part.replace('_', '-')}"

@@ -62,7 +62,7 @@ def make_periodic(image: ArrayLike) -> Float64Array:
     return found
 
 
-def periodic_normals(height_um: Float64Array, pixel_um: float) -> Float64Array:
+def compute_periodic_normals(height_um: Float64Array, pixel_um: float) -> Float64Array:
     """Return unit normals of relief that repeats, (H, W, 3), +Y up, row 0 at the top.
 
     Examples
@@ -234,7 +234,7 @@ def write_scatter(out: ImageFolder) -> dict[str, Any]:
     }
 
 
-def micro_normals(
+def write_micro_normals(
     appearance: SkinAppearance, part: Mapping[str, Any], out: ImageFolder
 ) -> dict[str, Any]:
     """Write the neutral relief of each site as a normal map that repeats without a seam.
@@ -265,7 +265,7 @@ def micro_normals(
         height = np.asarray(filled, np.float64).reshape(relief.values.shape)
         pixel_um = float(entry["pixel_um"])
         tile = make_periodic(height - height.mean())
-        normals = periodic_normals(tile, pixel_um)
+        normals = compute_periodic_normals(tile, pixel_um)
         name = f"micro_normal_{site}"
         what = f"relief of {site} at rest, tangent space, {green}, repeats without a seam"
         out.write_exr_and_png(ExportImage.from_normals(name, normals, out.delivery, what))

@@ -55,7 +55,7 @@ def write_events(session: Session, out: Path, delivery: ExportSettings) -> None:
     """Copy the frames, and write documents.jsonl as Bluesky's event model describes a run."""
     write_frames(session, out, delivery)
     with (out / DOCUMENTS_FILE).open("w", encoding="utf-8") as stream:
-        for name, document in documents(session):
+        for name, document in generate_documents(session):
             stream.write(json.dumps([name, document], allow_nan=False) + "\n")
 
 
@@ -66,7 +66,7 @@ _UNIT_SUFFIXES = {"_s": "s", "_deg": "deg", "_w": "W", "_mm": "mm", "_us": "us"}
 Document = tuple[str, dict[str, Any]]
 
 
-def documents(session: Session) -> Iterator[Document]:
+def generate_documents(session: Session) -> Iterator[Document]:
     """Yield name and content of every document of a session, in the order of a run.
 
     Notes

@@ -15,7 +15,7 @@ from reconstruction.pipeline.dome.calibrated import load_dome
 from reconstruction.pipeline.dome.images import DomeImages
 from reconstruction.pipeline.inputs import Inputs
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray, UInt16Array
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.sessions.copies import write_session_document
 
@@ -73,7 +73,7 @@ def write(session: Session, folder: Path, delivery: ExportSettings) -> list[tupl
     ]
     if len(good) < 3:
         raise ExportError(f"{session.path}: has {len(good)} usable lights, expected at least 3")
-    places = in_camera_frame(dome.table.position_mm[good], pose.rotation)
+    places = transform_to_camera_frame(dome.table.position_mm[good], pose.rotation)
     toward = places / np.linalg.norm(places, axis=1, keepdims=True)
     names = [f"{images.lights[k]}.tif" for k in good]
 
@@ -112,7 +112,7 @@ def write(session: Session, folder: Path, delivery: ExportSettings) -> list[tupl
     return left_out
 
 
-def in_camera_frame(position_mm: FloatArray, rotation: FloatArray) -> Float64Array:
+def transform_to_camera_frame(position_mm: FloatArray, rotation: FloatArray) -> Float64Array:
     """Return places as light lists have them: x right, y up, z towards the camera.
 
     Parameters
@@ -134,7 +134,7 @@ def in_camera_frame(position_mm: FloatArray, rotation: FloatArray) -> Float64Arr
 def _view(names: tuple[str, ...], cameras: Any, requested: str | None) -> int:
     if requested is None:
         return int(np.argmin([camera.rotation[2, 2] for camera in cameras]))
-    return names.index(one_of("--camera", requested, names, ExportError))
+    return names.index(require_choice("--camera", requested, names, ExportError))
 
 
 def _imported(session: Session, view: str, light: str) -> tuple[Float32Array, BoolArray]:

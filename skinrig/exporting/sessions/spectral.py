@@ -28,7 +28,7 @@ from reconstruction.pipeline.gradient.stages import WAVELENGTH_UM
 from reconstruction.pipeline.inputs import Inputs
 from reconstruction.pipeline.sensor_noise import ElectronNoise
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 from skinrig.exporting.images import write_channels
 from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.sealing import IMAGE_ORIENTATION, describe_provenance, write_json
@@ -113,7 +113,7 @@ def format_channel_name(kind: str, wavelength_nm: float) -> str:
     return f"{kind}.{f'{wavelength_nm:.6g}'.replace('.', ',')}nm"
 
 
-def band_means_nm(camera: str, illuminant: str) -> Float64Array:
+def compute_band_means_nm(camera: str, illuminant: str) -> Float64Array:
     """Return the mean wavelength of a camera's bands under a light, nm, (3,).
 
     Examples
@@ -159,7 +159,7 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
             "stokes: the maps have no camera and illuminant, so bands have no "
             "wavelength; make them with `skinrig reconstruct --maps diffuse,specular,melanin`"
         )
-    means = band_means_nm(str(recorded["camera"]), str(recorded["illuminant"]))
+    means = compute_band_means_nm(str(recorded["camera"]), str(recorded["illuminant"]))
     valid = diffuse.mask & specular.mask
     s0 = np.where(valid[..., None], diffuse.values + specular.values, 0.0)
     s1 = np.where(valid[..., None], specular.values, 0.0)
@@ -173,7 +173,7 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
         "Bands of the camera at their mean wavelengths, not narrow lines; a white tile in the "
         "same place = 1"
     )
-    write_channels(folder / STOKES_FILE, channels, stokes_header(what))
+    write_channels(folder / STOKES_FILE, channels, build_stokes_header(what))
     return {
         "what": what,
         "origin": "measured",
@@ -185,7 +185,7 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
     }
 
 
-def stokes_header(description: str) -> dict[str, str]:
+def build_stokes_header(description: str) -> dict[str, str]:
     """Return the attributes of a Stokes image in the published layout."""
     return {
         "spectralLayoutVersion": LAYOUT_VERSION,
@@ -236,7 +236,7 @@ def write_stokes(session: Session, folder: Path, delivery: ExportSettings) -> li
     images = GradientImages(session, noise=_noise(inputs, camera))
     names = [state.name for state in images.states]
     for name in only:
-        one_of("--only", name, names, ExportError)
+        require_choice("--only", name, names, ExportError)
     axis = session.rig.view(camera).analyser_axis_deg
     if axis is None:
         raise ExportError(
@@ -287,11 +287,11 @@ def _write_state(
         if not {along, across} <= set(patterns.values):
             left_out.append((f"{state} {pattern}", "was taken with one polarization only"))
             continue
-        stem = file_stem(state, pattern)
+        stem = format_file_stem(state, pattern)
         one, other = patterns.values[along], patterns.values[across]
         found = one + other, one - other
         channels = dict(zip(STOKES_CHANNELS, found, strict=True))
-        write_channels(folder / f"{stem}.exr", channels, stokes_header(description))
+        write_channels(folder / f"{stem}.exr", channels, build_stokes_header(description))
         stderr = np.sqrt(patterns.variance[along] + patterns.variance[across])
         figures = _figures(*found, stderr, patterns.valid)
         files[f"{stem}.exr"] = {"state": state, "pattern": pattern, **figures}
@@ -314,7 +314,7 @@ def _noise(inputs: Any, camera: str) -> Any:
     return ElectronNoise(float(known.gain_e_per_dn.value[0]), float(known.read_noise_e.value[0]))
 
 
-def file_stem(state: str, pattern: str) -> str:
+def format_file_stem(state: str, pattern: str) -> str:
     """Return a Stokes image's name without suffix.
 
     Examples

@@ -163,7 +163,7 @@ def compare_pair(
     noise = (_sigma(photograph)[chosen] / real[chosen]) * 0.6745  # median of a normal deviate
     middle = float(np.median(noise)) if chosen.any() else float("nan")
     total = float(np.sum(np.abs(made - real)[skin]) / max(float(np.sum(real[skin])), 1e-30))
-    alike = similarity(photograph.rgb, image, skin)
+    alike = structural_similarity(photograph.rgb, image, skin)
     return PairErrors(np.abs(signed), signed, chosen, middle, total, alike)
 
 
@@ -178,7 +178,7 @@ def tone_map(rgb: ArrayLike, white: float) -> Float64Array:
     return png.srgb_curve(np.clip(np.asarray(rgb, np.float64) / white, 0.0, 1.0))
 
 
-def similarity(photograph: ArrayLike, rendering: ArrayLike, skin: BoolArray) -> float:
+def structural_similarity(photograph: ArrayLike, rendering: ArrayLike, skin: BoolArray) -> float:
     """Return the mean structural similarity over the skin of a tone-mapped pair.
 
     Both are exposed so that `WHITE_PERCENTILE` of the photograph's skin is white, and black
@@ -230,7 +230,7 @@ class Summary:
     ssim: float
 
 
-def summarize(pairs: Sequence[PairErrors], *, rng: np.random.Generator) -> Summary:
+def summarize_pairs(pairs: Sequence[PairErrors], *, rng: np.random.Generator) -> Summary:
     """Put pairs together.
 
     Raises
@@ -266,7 +266,7 @@ def summarize(pairs: Sequence[PairErrors], *, rng: np.random.Generator) -> Summa
     )
 
 
-def by_band(
+def group_errors_by_band(
     pairs: Sequence[PairErrors], bands: Sequence[NDArray[np.str_]]
 ) -> Mapping[str, tuple[int, float]]:
     """Return lit pixels and their median relative error by the band that each pixel lies in.
@@ -371,7 +371,7 @@ def print_comparison(console: Console, record: Mapping[str, Any]) -> None:
     held_out = {f"{name} held out": row for name, row in record["by_kind"].items()}
     rows = {FULL_MODEL: full, **held_out, **record["ablation"]}
     shares = ("median", "p68", "p95", "bias", "total_error")
-    console.rows(
+    console.print_table(
         ("model", "photographs", "median error, %", "68 %", "95 %", "bias", "all skin, %", "SSIM"),
         [
             (name, row["pairs"], *(round(100 * row[k], 2) for k in shares), round(row["ssim"], 4))
@@ -387,4 +387,4 @@ def print_comparison(console: Console, record: Mapping[str, Any]) -> None:
         f"{100 * full['noise']:.2f} %"
     )
     console.print_line(f"{record['out']}: {', '.join(record['files'])}, {record['seconds']:.1f} s")
-    console.document(record["schema"], {k: v for k, v in record.items() if k != "schema"})
+    console.print_document(record["schema"], {k: v for k, v in record.items() if k != "schema"})

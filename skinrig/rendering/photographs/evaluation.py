@@ -29,15 +29,15 @@ from skinrig.rendering.photographs.errors import (
     Comparison,
     PairErrors,
     Photograph,
-    by_band,
     compare_pair,
-    summarize,
+    group_errors_by_band,
+    summarize_pairs,
 )
 from skinrig.rendering.photographs.held_out import HeldOutPhotographs, HeldOutShot
 from skinrig.rendering.render import Rendering, Subsurface, render_surface
 from skinrig.rendering.request import read_model
 
-N_PICTURES: Final = 6
+N_DRAWN_IMAGES: Final = 6
 """Number of photographs drawn with their renderings, evenly spread over all."""
 MAX_SHOWN_ERROR: Final = 0.2
 """Relative error at the end of the pictures' scale."""
@@ -139,7 +139,9 @@ def evaluate_photographs(
         for name, less in (build_ablations(whole, mesh) if settings.ablation else {}).items()
     }
     chosen = photographs.select_shots(settings.count)
-    drawn = {chosen[int(k)] for k in np.linspace(0, len(chosen) - 1, min(N_PICTURES, len(chosen)))}
+    drawn = {
+        chosen[int(k)] for k in np.linspace(0, len(chosen) - 1, min(N_DRAWN_IMAGES, len(chosen)))
+    }
     pairs: list[PairErrors] = []
     bands: list[NDArray[np.str_]] = []
     parts: dict[str, list[PairErrors]] = {}
@@ -165,10 +167,10 @@ def evaluate_photographs(
     angle, of = _typology_angle_deg(whole, truth)
     comparison = Comparison(
         subject=photographs.subject,
-        full=summarize(pairs, rng=rng),
-        by_kind={kind: summarize(some, rng=rng) for kind, some in kinds.items()},
-        ablation={name: summarize(some, rng=rng) for name, some in parts.items()},
-        by_band=by_band(pairs, bands),
+        full=summarize_pairs(pairs, rng=rng),
+        by_kind={kind: summarize_pairs(some, rng=rng) for kind, some in kinds.items()},
+        ablation={name: summarize_pairs(some, rng=rng) for name, some in parts.items()},
+        by_band=group_errors_by_band(pairs, bands),
         typology_angle_deg=angle,
         typology_of=of,
         shots=tuple(rows),

@@ -69,7 +69,7 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
         for case in cases
     ]
     yield page.Heading("Extreme cases", level=2)
-    yield page.table(
+    yield page.build_table(
         ("stage", "case", "extreme", "risk", "expected", *INPUT_PRECISIONS),
         rows,
         caption=f"{len(cases)} cases in both precisions, {failed or 'none'} failed",

@@ -18,7 +18,7 @@ from model.skin import SkinAppearance
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.perfusion import STATE_NAMES
-from skinrig.appearances.contents import digest as sha256_of
+from skinrig.appearances.contents import hash_file as sha256_of
 from skinrig.appearances.dynamic import FACIAL_COLOR, describe_parts
 from skinrig.arrays import Float64Array
 from skinrig.viewer.assets.placed_color import RIG_PX, FaceColor, place_facial_color
@@ -142,7 +142,7 @@ FINEST_STEP_WORDS: Final = 8
 ALBEDO_MAP: Final = "r_d"
 
 
-def assets(source: SceneSource) -> Assets:
+def build_assets(source: SceneSource) -> Assets:
     """Return chromophores, color table, hemoglobin rig and, where it was measured, the albedo."""
     albedo = _albedo(source)
     found = _face(source, measured=albedo is not None)

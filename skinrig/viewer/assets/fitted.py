@@ -109,7 +109,7 @@ def select_significant_traits(traits: Mapping[str, TraitVector]) -> tuple[str, .
     )
 
 
-def surface_traits(found: PageLobes) -> LobeTraits | None:
+def build_surface_traits(found: PageLobes) -> LobeTraits | None:
     """Return the surface traits of a page's lobes; None where the lobes are of other materials.
 
     Parameters
@@ -159,7 +159,7 @@ def surface_traits(found: PageLobes) -> LobeTraits | None:
     return dataclasses.replace(made, held_error=errors)
 
 
-def surface_facts(traits: LobeTraits) -> dict[str, Any]:
+def describe_surface_traits(traits: LobeTraits) -> dict[str, Any]:
     """Return what the page needs to know of surface traits; lobes and shares go with the lobes'."""
     found = {}
     for name, pull in traits.pull.items():
@@ -248,7 +248,7 @@ class AlbedoTraitLayers:
         }
 
 
-def albedo_traits(source: SceneSource) -> AlbedoTraitLayers | str:
+def build_albedo_traits(source: SceneSource) -> AlbedoTraitLayers | str:
     """Return the albedo traits of a fitted face, or why there are none.
 
     Parameters
@@ -312,7 +312,7 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values.astype(np.float64)))))
 
 
-def assets(source: SceneSource) -> Assets:
+def build_assets(source: SceneSource) -> Assets:
     """Return lobes with their shares, a diffusion profile, and trait sliders.
 
     Parameters
@@ -331,16 +331,16 @@ def assets(source: SceneSource) -> Assets:
     textures: dict[str, Texture] = {}
     facts: dict[str, Any] = {}
     names: list[str] = []
-    surface = surface_traits(found)
+    surface = build_surface_traits(found)
     if surface is None:
         left_out["traits of the surface"] = (
             "the basis BRDFs of this fit differ from those of the traits"
         )
     else:
         found = surface.lobes
-        facts["surface_traits"] = surface_facts(surface)
+        facts["surface_traits"] = describe_surface_traits(surface)
         names += surface.pull
-    albedo = albedo_traits(source)
+    albedo = build_albedo_traits(source)
     if isinstance(albedo, str):
         left_out["traits of the albedo"] = albedo
     else:

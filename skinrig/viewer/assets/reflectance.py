@@ -44,7 +44,7 @@ class CompactBrdf:
     table : ndarray of float64, shape (32, 12, 90, K)
         1/sr, what a page reads back at the nodes of `model.brdf.tables`.
     rms_error, strong_error : float
-        See `table_errors`.
+        See `compute_table_errors`.
     """
 
     slabs: int
@@ -71,7 +71,7 @@ def choose_table(lobes: BrdfBasis) -> CompactBrdf:
     table = lobes.table[..., : lobes.size].astype(np.float64)
     for slabs in TRIED_SLABS:
         back = average_slabs(table, slabs)
-        found = CompactBrdf(slabs, back, *table_errors(back, table))
+        found = CompactBrdf(slabs, back, *compute_table_errors(back, table))
         if max(found.rms_error, found.strong_error) <= MAX_SHAPE_ERROR:
             break
     return found
@@ -90,7 +90,7 @@ def average_slabs(table: Float64Array, slabs: int) -> Float64Array:
     return np.broadcast_to(held, parts.shape).reshape(table.shape)
 
 
-def atlas(found: CompactBrdf) -> Float32Array:
+def build_atlas(found: CompactBrdf) -> Float32Array:
     """Return a table as an image for one bilinear look-up, (G * slabs * 32, 90, 4).
 
     Group g of four lobes, slab s, node i of theta_d is row (g * slabs + s) * 32 + i, theta_h goes
@@ -112,7 +112,7 @@ def pack_fours(values: Float32Array) -> Float32Array:
     return np.ascontiguousarray(np.moveaxis(split, -2, 0))
 
 
-def table_errors(decoded: Float64Array, table: Float64Array) -> tuple[float, float]:
+def compute_table_errors(decoded: Float64Array, table: Float64Array) -> tuple[float, float]:
     """Return how far (32, 12, 90, K) values are from a table's, both of the worst lobe.
 
     Returns
@@ -123,7 +123,7 @@ def table_errors(decoded: Float64Array, table: Float64Array) -> tuple[float, flo
         95th percentile of the relative difference where a lobe exceeds `MIN_STRONG_FRACTION` of
         its peak.
     """
-    weight = (solid_angle_weights() * _cosines())[..., None]
+    weight = (compute_solid_angle_weights() * _cosines())[..., None]
     off = np.sum(weight * (decoded - table) ** 2, axis=(0, 1, 2))
     own = np.sum(weight * table**2, axis=(0, 1, 2))
     rms = float(np.sqrt(np.max(np.where(own > 0.0, off / np.maximum(own, 1e-300), 0.0))))
@@ -137,7 +137,7 @@ def table_errors(decoded: Float64Array, table: Float64Array) -> tuple[float, flo
     return rms, worst
 
 
-def solid_angle_weights() -> Float64Array:
+def compute_solid_angle_weights() -> Float64Array:
     """Return the solid angle of each node up to a factor, (32, 12, 90)."""
     d, _, h = brdf_tables.grid_nodes()
     solid = np.sin(2.0 * d)[:, None, None] * (np.sin(h) * np.gradient(h))
@@ -152,9 +152,9 @@ def _cosines() -> Float64Array:
     return np.asarray(np.where((mu_l > 0.0) & (mu_v > 0.0), mu_l * mu_v, 0.0))
 
 
-SHARES_PX: Final = 256
+WEIGHT_MAP_PX: Final = 256
 """Most texels a side of the maps of shares; finer ones are averaged."""
-SHARE_BITS: Final = 7
+WEIGHT_BITS: Final = 7
 """Binary digits of a share in the page: within 0.8 %, a sixth of a fit's own errors."""
 TRANSLUCENCY_PX: Final = 128
 """Texels a side of the map of widths: a probe measures few places, between them it is smooth."""
@@ -199,7 +199,7 @@ def build_lobe_assets(source: SceneSource, found: PageLobes) -> Assets:
     compact = choose_table(found.lobes)
     profile, widths, told = _diffusion_of(source)
     # the packer turns pictures over; this one's rows stand as the shader counts them
-    rows = np.ascontiguousarray(atlas(compact)[::-1])
+    rows = np.ascontiguousarray(build_atlas(compact)[::-1])
     textures = {
         "lobe_atlas": Texture(rows, "f16"),
         "lobe_shares": Texture(round_weights(pack_fours(found.shares)), "f16"),
@@ -213,7 +213,7 @@ def build_lobe_assets(source: SceneSource, found: PageLobes) -> Assets:
     }
 
 
-def default_scattering(source: SceneSource) -> Assets:
+def build_default_scattering(source: SceneSource) -> Assets:
     """Return the profile of the population's mean dipole, for skin of which nothing was measured.
 
     The page switches between it and that of the fitted reflectance.
@@ -229,7 +229,9 @@ def read_lobes(source: SceneSource) -> PageLobes:
         if skin_reflectance.BASIS_FILE in appearance.files:
             lobes = skin_reflectance.load_basis(appearance)
             mixtures = surface_mixtures.read(appearance)
-            shares = fill_texels(mixtures.weights().astype(np.float32), mixtures.valid, SHARES_PX)
+            shares = fill_texels(
+                mixtures.weights().astype(np.float32), mixtures.valid, WEIGHT_MAP_PX
+            )
             shares = np.maximum(shares, np.float32(0.0))  # filling can undershoot
             return PageLobes(lobes, shares, mixtures.mix, mixtures.materials, "fitted")
     space = trait_storage.load_packaged_traits().spaces[POPULATION_SPACE]
@@ -244,7 +246,7 @@ def read_lobes(source: SceneSource) -> PageLobes:
 
 
 def round_weights(values: Float32Array) -> Float32Array:
-    """Return numbers with `SHARE_BITS` binary digits, the nearest: a fit knows shares to percents.
+    """Return numbers with `WEIGHT_BITS` binary digits, the nearest: a fit knows shares to percents.
 
     Examples
     --------
@@ -252,7 +254,7 @@ def round_weights(values: Float32Array) -> Float32Array:
     [0.0, 1.0, 1.015625, -0.30078125]
     """
     mantissa, exponent = np.frexp(values)
-    steps = np.float32(2**SHARE_BITS)
+    steps = np.float32(2**WEIGHT_BITS)
     return np.asarray(np.ldexp(np.rint(mantissa * steps) / steps, exponent), np.float32)
 
 

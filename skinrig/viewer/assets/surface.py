@@ -32,19 +32,19 @@ MAX_LAYERS: Final = 4
 """Wrinkle maps that the shader has room for."""
 
 
-def assets(source: SceneSource) -> Assets:
+def build_assets(source: SceneSource) -> Assets:
     """Return the wrinkles of a scene, fitted ones before those of the simulated person."""
     dynamic = source.appearances.get("dynamic")
     if dynamic is not None and WRINKLE_FILE in dynamic.files:
         found = WrinkleModel.from_maps(dynamic.maps, bytes(dynamic.files[WRINKLE_FILE]))
         return build_model_assets(found, source, origin="fitted")
-    found = simulated_model(source.subject, size=min(source.size, MAP_PX))
+    found = fit_simulated_wrinkles(source.subject, size=min(source.size, MAP_PX))
     return build_model_assets(
         found, source, origin="simulated: fitted to the person's own expressions"
     )
 
 
-def simulated_model(subject: SimulatedSubject, *, size: int) -> WrinkleModel:
+def fit_simulated_wrinkles(subject: SimulatedSubject, *, size: int) -> WrinkleModel:
     """Return wrinkles fitted to the expressions of a simulated person.
 
     Parameters
@@ -111,11 +111,15 @@ def build_model_assets(model: WrinkleModel, source: SceneSource, *, origin: str)
         for table in tables
     ]
     facts: dict[str, Any] = {"expressions": driven, "layers": layers}
-    facts |= {"clamp": model.clamp, "origin": origin, "slope_rms": retained_rms(model, shape)}
+    facts |= {
+        "clamp": model.clamp,
+        "origin": origin,
+        "slope_rms": compute_retained_rms(model, shape),
+    }
     return Assets(textures=textures, facts={"wrinkles": facts})
 
 
-def retained_rms(model: WrinkleModel, shape: tuple[int, int]) -> list[list[float]]:
+def compute_retained_rms(model: WrinkleModel, shape: tuple[int, int]) -> list[list[float]]:
     """Return the rms of slopes that pixels of 2^level texels still show, by zone and level.
 
     Of each zone's part of its wrinkle map at a weight of 1, over the texels where the map has
@@ -188,7 +192,7 @@ RELIEF_STEP_WORDS: Final = 20
 """Words of the finest octave's steps, of reliefs of 2048 texels a side and more: 5 um at most."""
 
 
-def surface_assets(source: SceneSource) -> Assets:
+def build_surface_assets(source: SceneSource) -> Assets:
     """Return the relief at rest, um, and roughness (Beckmann m) and intensity by region."""
     subject = source.subject
     covered = subject.atlas.covered

@@ -24,8 +24,8 @@ from skinrig.viewer.microstructure import relief_growth
 from skinrig.viewer.microstructure.relief_growth import (
     STRETCH_RANGE,
     GrownRelief,
-    slope_rms,
-    strained_variance,
+    compute_slope_rms,
+    compute_strained_variance,
 )
 from skinrig.viewer.microstructure.tiles import TILE_PX, Pyramid
 from skinrig.viewer.scene import Assets, SceneError, SceneSource, Texture, ViewerScene
@@ -106,7 +106,7 @@ MAX_REACH_PX: Final = 64
 """Kernels that reach farther than this leave nothing of the window."""
 
 
-def assets(source: SceneSource) -> Assets:
+def build_assets(source: SceneSource) -> Assets:
     """Return the microstructure of a scene, or why there is none.
 
     A fitted relief comes before a simulated one; what is simulated on a captured face is said.
@@ -132,7 +132,7 @@ def grow_relief(relief: MicroRelief, *, seed: int = 0) -> GrownRelief:
         For a relief too small to choose places from.
     """
     side = min(*relief.height_um.shape, PATCH_PX) // relief_growth.STEP_PX * relief_growth.STEP_PX
-    cell = min(CELL_PX, relief_growth.max_cell_px(side))
+    cell = min(CELL_PX, relief_growth.compute_max_cell_px(side))
     if cell < 2 * relief_growth.STEP_PX:
         raise SceneError(
             f"relief: got {relief.height_um.shape}, expected at least 96 pixels a side"
@@ -168,11 +168,11 @@ def build_relief_assets(relief: MicroRelief, mesh: Mesh, *, seed: int = 0) -> As
         raise SceneError(
             f"table: got {len(table.alpha_breaks)} breaks, expected at most {MAX_BREAKS}"
         )
-    scale = px_per_mm(mesh)
+    scale = compute_px_per_mm(mesh)
     virtual = round(1e3 / (relief.pixel_um * float(np.median(scale))))
     virtual = max(relief_growth.STEP_PX, virtual // relief_growth.STEP_PX * relief_growth.STEP_PX)
     virtual = min(virtual, relief_growth.MAX_LATTICE_PX // 2)
-    reach = reach_px(table, scale, virtual)
+    reach = compute_kernel_reach_px(table, scale, virtual)
     facts = {
         **{name: getattr(growth, name) for name in ("pixel_um", "cell_px", "choices", "seed")},
         "patch_px": growth.patch.shape[0],
@@ -182,7 +182,7 @@ def build_relief_assets(relief: MicroRelief, mesh: Mesh, *, seed: int = 0) -> As
         "stretch_range": list(table.stretch_range),
         "alpha_limits": list(ALPHA_LIMITS),
         "variance_stretch_range": list(STRETCH_RANGE),
-        "slope_rms": slope_rms(growth),
+        "slope_rms": compute_slope_rms(growth),
         "source": relief.source,
         "table": table.source,
     }
@@ -190,20 +190,20 @@ def build_relief_assets(relief: MicroRelief, mesh: Mesh, *, seed: int = 0) -> As
         "kernel_alpha_breaks": np.asarray([table.alpha_breaks], np.float32),
         "kernel_alpha_lines": np.asarray(table.alpha_lines, np.float32),
         "kernel_sigma_lines_mm": 1e-3 * np.asarray(table.sigma_lines_um(), np.float32),
-        "strained_variance": strained_variance(growth, table).astype(np.float32),
+        "strained_variance": compute_strained_variance(growth, table).astype(np.float32),
     }
     patch = Texture(growth.patch[..., None], "u16", "nearest")
     return Assets(textures={"relief_patch": patch}, tables=tables, facts={"microstructure": facts})
 
 
-def reach_px(table: KernelTable, scale: Float64Array, virtual_px: int) -> int:
+def compute_kernel_reach_px(table: KernelTable, scale: Float64Array, virtual_px: int) -> int:
     """Return how many pixels of the displacement a kernel reaches, and two for its samples.
 
     Parameters
     ----------
     table : KernelTable
     scale : ndarray
-        Texture units per mm of skin, see `px_per_mm`.
+        Texture units per mm of skin, see `compute_px_per_mm`.
     virtual_px : int
         Side of the displacement.
 
@@ -240,7 +240,7 @@ def add_displacement_tiles(scene: ViewerScene, pyramid: Pyramid) -> ViewerScene:
     SceneError
         As of `build_relief_assets`.
     """
-    scale = px_per_mm(scene.mesh)
+    scale = compute_px_per_mm(scene.mesh)
     pixel_um = 1e3 / (pyramid.size * float(np.median(scale)))
     source = pyramid.levels[0]
     first = (pyramid.size - SAMPLE_PX) // 2
@@ -252,7 +252,7 @@ def add_displacement_tiles(scene: ViewerScene, pyramid: Pyramid) -> ViewerScene:
     facts |= {
         "virtual_px": pyramid.size,
         "levels": len(pyramid.levels),
-        "reach_px": reach_px(FOREHEAD, scale, pyramid.size),
+        "reach_px": compute_kernel_reach_px(FOREHEAD, scale, pyramid.size),
         "tiles": {"tile_px": TILE_PX, "low": pyramid.low, "high": pyramid.high},
     }
     bare = replace(
@@ -265,7 +265,7 @@ def add_displacement_tiles(scene: ViewerScene, pyramid: Pyramid) -> ViewerScene:
     return bare.with_assets(Assets(tables=made["tables"], facts={"microstructure": facts}))
 
 
-def px_per_mm(mesh: Mesh) -> Float64Array:
+def compute_px_per_mm(mesh: Mesh) -> Float64Array:
     """Return texture units per mm of skin at the vertices of a mesh, by the root of areas."""
     rest = mesh.vertices_mm.astype(np.float64)
     found = strain(rest, rest, mesh.faces, mesh.uv)

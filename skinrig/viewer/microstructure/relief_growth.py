@@ -81,7 +81,7 @@ class GrownRelief:
         if self.cell_px < 2 * STEP_PX or self.choices < MIN_MOVES:
             raise SceneError(
                 f"cell_px: got {self.cell_px} for a patch of {shape[0]} px, expected at least "
-                f"{2 * STEP_PX} and at most {max_cell_px(shape[0])}"
+                f"{2 * STEP_PX} and at most {compute_max_cell_px(shape[0])}"
             )
 
     @property
@@ -90,7 +90,7 @@ class GrownRelief:
         return _choices(self.patch.shape[0], self.cell_px)
 
 
-def reach_px(cell_px: int) -> int:
+def compute_reach_px(cell_px: int) -> int:
     """Return how many pixels from its corner a place may be shown, a multiple of `STEP_PX`.
 
     The hexagon's radius is one cell; a pixel of the coarsest level reaches half a step farther,
@@ -100,10 +100,10 @@ def reach_px(cell_px: int) -> int:
 
 
 def _choices(side_px: int, cell_px: int) -> int:
-    return (side_px - 2 * reach_px(cell_px)) // STEP_PX
+    return (side_px - 2 * compute_reach_px(cell_px)) // STEP_PX
 
 
-def max_cell_px(side_px: int) -> int:
+def compute_max_cell_px(side_px: int) -> int:
     """Return the largest cell that leaves `MIN_MOVES` moves in a patch of so many pixels."""
     fits = [c for c in range(1, side_px) if _choices(side_px, c) >= MIN_MOVES]
     return max(fits, default=0)
@@ -116,7 +116,7 @@ MIN_LEVEL_PX: Final = 6
 """Pixels a side of the coarsest level whose slopes are counted."""
 
 
-def slope_rms(growth: GrownRelief) -> list[float]:
+def compute_slope_rms(growth: GrownRelief) -> list[float]:
     """Return the rms of slopes that pixels of 2^level px still show, by level of a relief.
 
     A slope is the gradient by central differences over two pixels of the level, as the page's
@@ -135,7 +135,7 @@ def slope_rms(growth: GrownRelief) -> list[float]:
     return found
 
 
-def strained_variance(growth: GrownRelief, table: KernelTable) -> Float64Array:
+def compute_strained_variance(growth: GrownRelief, table: KernelTable) -> Float64Array:
     """Return how the variance of slopes changes under strain, relative to neutral skin.
 
     The kernels' transfer functions on the patch's power spectrum, averaged with that of the

@@ -15,7 +15,7 @@ from skinrig.cli import main
 from skinrig.drawing import png
 from skinrig.editing import edit as editing
 from skinrig.editing.edit import EditError, EditRequest
-from skinrig.editing.spots import SpotOrder
+from skinrig.editing.spots import SpotRequest
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,9 @@ def test_an_edit_of_amount_zero_changes_no_bit(lab, capsys):
     assert store.read(out).files == store.read(paths[0]).files
     record = store.read(out).parameters["edit"]
     assert record["traits"] == {"tan": 0.0, "oily": 0.0}
-    assert store.read(out).inputs["appearance"] == contents.digest(paths[0] / store.DOCUMENT_FILE)
+    assert store.read(out).inputs["appearance"] == contents.hash_file(
+        paths[0] / store.DOCUMENT_FILE
+    )
 
 
 def test_tan_edit_darkens_only_albedo_as_in_population(source, library):
@@ -127,7 +129,7 @@ def test_mask_keeps_every_bit_where_black(traits, source, library, tmp_path):
     mask[10:40, 8:24] = 255
     (tmp_path / "mask.png").write_bytes(png.encode(mask))
     order = EditRequest(
-        traits=traits, mask=tmp_path / "mask.png", spots=(SpotOrder("freckles", 1.0, 3.0),)
+        traits=traits, mask=tmp_path / "mask.png", spots=(SpotRequest("freckles", 1.0, 3.0),)
     )
     done = editing.edit_face(source, order, library)
     most = 0.0
@@ -170,7 +172,7 @@ def test_single_colors_darkest_and_whitest_faces_survive(kind, dome_faces, libra
         new = editing.edit_face(face, EditRequest(traits={"tan": amount}), library)
         spotted = dataclasses.replace(face, appearance=new.appearance)
         moles = editing.edit_face(
-            spotted, EditRequest(traits={}, spots=(SpotOrder("moles", 1.0, 1.0),))
+            spotted, EditRequest(traits={}, spots=(SpotRequest("moles", 1.0, 1.0),))
         )
         for one in (new, moles):
             values = one.appearance.maps["r_d"].values[good]
@@ -205,7 +207,7 @@ def test_face_without_lobes_is_edited_in_albedo(source, library):
 
 
 def test_the_same_seed_makes_the_same_face(source, library):
-    order = EditRequest(traits={"tan": 1.0}, spots=(SpotOrder("freckles", 1.0),), seed=5)
+    order = EditRequest(traits={"tan": 1.0}, spots=(SpotRequest("freckles", 1.0),), seed=5)
     one, two = (editing.edit_face(source, order, library).appearance.maps["r_d"] for _ in range(2))
     np.testing.assert_array_equal(one.values, two.values)
     other = editing.edit_face(source, dataclasses.replace(order, seed=6), library)

@@ -72,8 +72,8 @@ def test_unreachable_error_reports_reason(small, capsys, monkeypatch):
 
 def test_saturating_or_overloading_exposures_are_not_candidates(rig, look):
     bright = replace(look, rates={key: 1000.0 * rate for key, rate in look.rates.items()})
-    assert not list(gradient.candidates(rig, bright))
-    seconds = [plan.estimate_duration_s(rig) for _, plan in gradient.candidates(rig, look)]
+    assert not list(gradient.generate_candidates(rig, bright))
+    seconds = [plan.estimate_duration_s(rig) for _, plan in gradient.generate_candidates(rig, look)]
     assert seconds == sorted(seconds)
     assert len(seconds) > 10
 

@@ -87,7 +87,7 @@ def test_base_color_plus_delta_gives_expression_color(moving, tmp_path):
     left_out = dict(delta_maps.write(moving, tmp_path, ExportSettings(only=("fear", "smile"))))
     told = json.loads((tmp_path / "delta_maps.json").read_text())["color"]
     assert told["maps"] == {"cm1": "fear", "cm2": "smile"}
-    rig = expression.hemoglobin_rig(moving)
+    rig = expression.read_hemoglobin_rig(moving)
     melanin = moving.maps["melanin"].values
     for name, state in told["maps"].items():
         blend = rig.evaluate({state: 1.0})
@@ -172,7 +172,7 @@ def test_colors_are_carried_onto_a_texture_by_landmarks(moving, tmp_path, rng):
     )
     delta_maps.write(moving, out, order)
     base, delta = read(out / "exr/base_color.exr"), read(out / "exr/cm1_delta.exr")
-    rig, melanin = expression.hemoglobin_rig(moving), moving.maps["melanin"].values
+    rig, melanin = expression.read_hemoglobin_rig(moving), moving.maps["melanin"].values
     shown = {}
     for state in ("neutral", "fear"):
         blend = rig.evaluate({state: 1.0})

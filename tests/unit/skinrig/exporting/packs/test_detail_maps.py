@@ -13,7 +13,11 @@ from model.skin import SkinAppearance, SkinMap
 from skinrig.exporting.images import ImageFolder
 from skinrig.exporting.options import ExportSettings
 from skinrig.exporting.packs import color_deltas, delta_maps, detail_maps
-from skinrig.exporting.packs.detail_maps import ambient_visibility, make_periodic, periodic_normals
+from skinrig.exporting.packs.detail_maps import (
+    ambient_visibility,
+    compute_periodic_normals,
+    make_periodic,
+)
 
 SIDE = 48
 
@@ -116,7 +120,7 @@ def test_tiled_relief_has_no_seam_and_keeps_variance(rng):
 def test_micro_normals_match_relief_slopes_in_own_unit():
     x = np.arange(128)
     relief = 5.0 * np.sin(2 * np.pi * 3 * x / 128)[:, None] * np.ones((1, 128))  # um, rows
-    normals = periodic_normals(relief, 6.0)
+    normals = compute_periodic_normals(relief, 6.0)
     slope = 5.0 * 2 * np.pi * 3 / (128 * 6.0)
     found = normals[..., 1] / normals[..., 2]
     assert found.max() == pytest.approx(slope, rel=5e-3)
