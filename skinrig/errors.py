@@ -76,7 +76,7 @@ def require_choice(
 
     Examples
     --------
-    >>> one_of("--clamp", "unit", ("unit", "signed"))
+    >>> require_choice("--clamp", "unit", ("unit", "signed"))
     'unit'
     """
     known = tuple(choices)
@@ -140,9 +140,9 @@ def format_interruption(given: Sequence[str]) -> str:
 
     Examples
     --------
-    >>> interruption(["simulate", "flash"])
+    >>> format_interruption(["simulate", "flash"])
     'interrupted; run the same command with --resume to continue'
-    >>> interruption(["bench", "--out", "bench"])
+    >>> format_interruption(["bench", "--out", "bench"])
     'interrupted; bench.json in --out keeps what was measured'
     """
     command = next((word for word in given if not word.startswith("-")), "")

@@ -22,7 +22,7 @@ def find_user_cache(environment: Mapping[str, str]) -> Path:
 
     Examples
     --------
-    >>> user_cache({"XDG_CACHE_HOME": "/scratch", "HOME": "/home/me"}).as_posix()
+    >>> find_user_cache({"XDG_CACHE_HOME": "/scratch", "HOME": "/home/me"}).as_posix()
     '/scratch'
     """
     if cache := environment.get("XDG_CACHE_HOME"):

@@ -1,4 +1,4 @@
-"""Shared readers of an appearance: valid texels, assumptions, digest and versions."""
+"""Derive valid texels, assumptions, digests and versions of an appearance."""
 
 import hashlib
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from skinrig.arrays import BoolArray
 
 
 def intersect_valid(*maps: SkinMap) -> BoolArray:
-    """Return the texels that are valid in all of some maps of one size, (H, W).
+    """Return the texels that are valid in all given maps of one size, (H, W).
 
     Examples
     --------
@@ -31,7 +31,7 @@ def intersect_valid(*maps: SkinMap) -> BoolArray:
 
 
 def list_assumptions(appearance: SkinAppearance) -> list[str]:
-    """Return what an appearance takes for granted, a text each."""
+    """Return the assumptions of an appearance, one text each."""
     texts = appearance.parameters.get("assumed", ())
     return [str(text) for text in texts] if isinstance(texts, list | tuple) else []
 
@@ -53,13 +53,13 @@ def derive_appearance(
     parameters: Mapping[str, object],
     **more: Any,
 ) -> SkinAppearance:
-    """Return an appearance with the provenance of those that it is made of.
+    """Create an appearance with the provenance of its sources.
 
     Parameters
     ----------
     sources
-        One or more. The result is simulated where one of them is, records what all their subjects
-        agreed to, and has the seed of the first.
+        One or more sources. The result is simulated if one of them is. It records the consent of
+        all subjects, and the seed of the first source.
     maps, parameters, more
         Fields of the appearance.
     """
@@ -74,5 +74,5 @@ def derive_appearance(
 
 
 def list_versions() -> dict[str, str]:
-    """Return the versions of what computes maps, by distribution."""
+    """Return the versions of the distributions that compute maps."""
     return {name: metadata.version(name) for name in ("skinrig", "numpy", "scipy", "numba")}

@@ -25,7 +25,7 @@ def list_targets(rig: str) -> tuple[str, ...]:
 
     Examples
     --------
-    >>> target_completer("probe")
+    >>> list_targets("probe")
     ('phantom', 'dark')
     """
     return tuple(dict.fromkeys((*CALIBRATION_BY_TARGET[rig], "dark")))

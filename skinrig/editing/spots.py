@@ -1,4 +1,4 @@
-"""Spots added to an appearance's R_d, and those that are there taken away."""
+"""Add spots to an appearance's R_d, and remove existing ones."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from skinrig.traits import albedo_vectors
 
 
 class SpotRequestError(ValueError):
-    """Spots that nobody can add or remove."""
+    """Invalid request to add or remove spots."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +33,9 @@ class SpotRequest:
     kind
         One of `pigment_spots.SPOT_KINDS`.
     amount
-        Above 0 adds spots with so much pigment, below 0 removes that share of those there are.
+        Above 0: pigment of added spots; below 0: fraction by which existing spots are removed.
     density_per_cm2
-        Of added ones; None: as usual.
+        Density of added spots, 1/cm^2; None: that of `pigment_spots.SPOT_KINDS`.
     """
 
     kind: str
@@ -43,14 +43,16 @@ class SpotRequest:
     density_per_cm2: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse another kind, and more than all spots removed."""
+        """Raise for an unknown kind and for amounts below -1."""
         require_choice("spots", self.kind, pigment_spots.SPOT_KINDS, SpotRequestError)
         if not np.isfinite(self.amount) or self.amount < -1.0:
-            raise SpotRequestError(f"spots: got {self.kind}={self.amount}, expected at least -1")
+            raise SpotRequestError(
+                f"--spots: got {self.kind}={self.amount}, expected at least -1; enter another"
+            )
 
 
 def build_spot_frame(face: Face) -> CommonFrame:
-    """Return a map of the whole face without seams, about as fine as its texture."""
+    """Return a seamless common map of the face, with about the resolution of its texture."""
     if face.landmarks:
         return face_textures.build_common_frame([face])
     cylinder = common_parameterization.find_cylinder(face.position, face.surface)
@@ -63,7 +65,7 @@ def build_spot_frame(face: Face) -> CommonFrame:
 def add_spots(
     face: Face, source: SkinMap, spot: SpotRequest, weight: Float32Array, rng: np.random.Generator
 ) -> tuple[Float32Array, dict[str, Any]]:
-    """Return R_d with spots drawn in, and what was done, as JSON values."""
+    """Return R_d with added spots, and a record as JSON values."""
     place, density = (face.position, face.surface), spot.density_per_cm2
     drawn = pigment_spots.draw_spots(
         spot.kind,
@@ -87,7 +89,7 @@ def add_spots(
 def remove_spots(
     source: SkinMap, spot: SpotRequest, weight: Float32Array, chart: TexelChart, frame: CommonFrame
 ) -> tuple[Float32Array, dict[str, Any]]:
-    """Return R_d with spots filled from around, and what was done, as JSON values."""
+    """Return R_d with spots removed, and a record as JSON values."""
     valid, sizes = (
         face_textures.find_valid_texels(source),
         pigment_spots.SPOT_KINDS[spot.kind].range_mm,
@@ -107,7 +109,7 @@ def remove_spots(
 
 
 def _dilate_factors(gain: Float32Array, surface: BoolArray, weight: Float32Array) -> Float32Array:
-    """Carry factors two texels beyond the rims of a texture's islands, where lookups reach."""
+    """Extend factors by two texels beyond the rims of a texture's islands, for lookups there."""
     rim = ndimage.binary_dilation(surface, iterations=2) & ~surface & (weight > 0)
     if not rim.any():
         return gain
@@ -116,7 +118,7 @@ def _dilate_factors(gain: Float32Array, surface: BoolArray, weight: Float32Array
 
 
 def replace_values(source: SkinMap, values: Float32Array) -> SkinMap:
-    """Return a map with other values, its standard error scaled as they are."""
+    """Replace a map's values and scale its standard uncertainties by the same factor."""
     error = source.stderr
     if error is not None:
         ratio = np.abs(values) / np.maximum(np.abs(source.values), np.float32(1e-12))

@@ -227,7 +227,7 @@ def compute_pixel_directions(height: int, width: int) -> tuple[Float64Array, Flo
 
     Examples
     --------
-    >>> towards, solid = directions(90, 180)
+    >>> towards, solid = compute_pixel_directions(90, 180)
     >>> towards[44, 90].round(1).tolist(), bool(abs(solid.sum() - 4 * math.pi) < 1e-9)
     ([-0.0, 0.0, 1.0], True)
     """
@@ -274,7 +274,7 @@ def sample_environment_lights(
 
     Examples
     --------
-    >>> lights = environment_lights(np.ones((8, 16, 3)), 32, rng=np.random.default_rng(0))
+    >>> lights = sample_environment_lights(np.ones((8, 16, 3)), 32, rng=np.random.default_rng(0))
     >>> white = sum(light.intensity[0] for light in lights)
     >>> len(lights), round(white, 6)  # over all directions, four times what comes from the front
     (32, 4.0)

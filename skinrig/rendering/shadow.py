@@ -182,7 +182,7 @@ def measure_rise_mm(position_mm: Float64Array, level: Float64Array) -> Float64Ar
     --------
     >>> place = np.linspace(-10.0, 10.0, 201)
     >>> ramp = np.clip(0.5 - place / 4.0, 0.0, 1.0)[:, None] * [1.0, 2.0, 3.0]
-    >>> rise_mm(place, ramp).round(6).tolist()
+    >>> measure_rise_mm(place, ramp).round(6).tolist()
     [3.2, 3.2, 3.2]
     """
     top, bottom = level[:3].mean(axis=0), level[-3:].mean(axis=0)

@@ -78,7 +78,7 @@ def uncertainty_title(name: str) -> str:
 
     Examples
     --------
-    >>> uncertainty("melanin"), uncertainty("normals")
+    >>> uncertainty_title("melanin"), uncertainty_title("normals")
     ('68 % credible half-width', 'standard uncertainty')
     """
     posterior = name.startswith(("melanin", "hemoglobin"))

@@ -239,8 +239,8 @@ def format_short_unit(unit: str) -> str:
 
     Examples
     --------
-    >>> short_unit("volume fraction of the epidermis"), short_unit("1"), short_unit("mm")
-    ('volume fraction', '', 'mm')
+    >>> format_short_unit("volume fraction of the epidermis"), format_short_unit("1"),
+    format_short_unit("mm") ('volume fraction', '', 'mm')
     """
     return "" if unit == "1" else unit.split(" of ")[0]
 
@@ -308,7 +308,7 @@ def build_single_subject_note(parameters: Mapping[str, object]) -> Paragraph:
 
     Examples
     --------
-    >>> single_subject_note({"preset": "III"}).text
+    >>> build_single_subject_note({"preset": "III"}).text
     'All errors are for one subject, III; the session has no melanin bands.'
     """
     subject = next((f", {parameters[k]}" for k in ("subject", "preset") if parameters.get(k)), "")

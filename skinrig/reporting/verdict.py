@@ -25,13 +25,13 @@ def format_headline(checks: Sequence[page.Check]) -> str:
 
     Examples
     --------
-    >>> headline([])
+    >>> format_headline([])
     'No limit was checked: none applies to these results.'
-    >>> headline([page.Check("error", 2.0, 1.0, "<=")])
+    >>> format_headline([page.Check("error", 2.0, 1.0, "<=")])
     '1 of 1 checks missed its limit.'
-    >>> headline([page.Check("error", 0.5, 1.0, "<=")])
+    >>> format_headline([page.Check("error", 0.5, 1.0, "<=")])
     'The only check kept its limit.'
-    >>> headline([page.Check("red", 0.5, 1.0, "<="), page.Check("blue", 2.0, 1.0, "<=")])
+    >>> format_headline([page.Check("red", 0.5, 1.0, "<="), page.Check("blue", 2.0, 1.0, "<=")])
     '1 of 2 checks missed its limit; the worst is blue, at 200 % of its limit.'
     """
     missed = sum(not check.passed for check in checks)
@@ -111,7 +111,7 @@ def list_weaknesses(checks: Sequence[page.Check]) -> list[tuple[str, str, str, s
     Examples
     --------
     >>> one = page.Check("melanin", 9.0, 10.0, "<=", "%", coverage=0.4, worst="dark: 40 %")
-    >>> for row in weaknesses([one]): print(row)
+    >>> for row in list_weaknesses([one]): print(row)
     ('close to its limit', 'melanin', '9 %', '≤ 10 %', 'dark: 40 %')
     ('68 % intervals too narrow', 'melanin', 'coverage 40 %', '', '')
     """

@@ -60,9 +60,9 @@ def build_presets(names: Iterable[str]) -> dict[str, dict[str, float]]:
 
     Examples
     --------
-    >>> presets(["anger", "surprise"])["anger and surprise"]
+    >>> build_presets(["anger", "surprise"])["anger and surprise"]
     {'anger': 1.0, 'surprise': 1.0}
-    >>> presets(["mouthSmile_L", "mouthSmile_R"])["smile"]
+    >>> build_presets(["mouthSmile_L", "mouthSmile_R"])["smile"]
     {'mouthSmile_L': 1.0, 'mouthSmile_R': 1.0}
     """
     known = tuple(dict.fromkeys(names))

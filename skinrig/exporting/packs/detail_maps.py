@@ -69,7 +69,7 @@ def compute_periodic_normals(height_um: Float64Array, pixel_um: float) -> Float6
     --------
     >>> x = np.arange(64)
     >>> relief = np.sin(2 * np.pi * x / 64) * np.ones((4, 1))
-    >>> normals = periodic_normals(relief, 1.0)
+    >>> normals = compute_periodic_normals(relief, 1.0)
     >>> round(float(-normals[0, 0, 0] / normals[0, 0, 2]), 3), float(normals[0, 16, 0].round(6))
     (0.098, -0.0)
     """

@@ -125,7 +125,7 @@ def transform_to_camera_frame(position_mm: FloatArray, rotation: FloatArray) -> 
     Examples
     --------
     >>> ahead = np.array([[0.0, -10.0, 700.0]])
-    >>> in_camera_frame(ahead, np.diag([1.0, -1.0, -1.0])).tolist()
+    >>> transform_to_camera_frame(ahead, np.diag([1.0, -1.0, -1.0])).tolist()
     [[0.0, -10.0, 700.0]]
     """
     return np.asarray((position_mm @ np.asarray(rotation).T) * _CAMERA_TO_LIST_SIGNS)

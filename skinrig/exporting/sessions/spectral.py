@@ -118,7 +118,7 @@ def compute_band_means_nm(camera: str, illuminant: str) -> Float64Array:
 
     Examples
     --------
-    >>> band_means_nm("Nikon 5100 (NPL)", "D55").round(0).tolist()
+    >>> compute_band_means_nm("Nikon 5100 (NPL)", "D55").round(0).tolist()
     [596.0, 529.0, 473.0]
     """
     weights = spectra.camera_sensitivity(camera) * spectra.illuminant(illuminant)[:, None]
@@ -319,7 +319,7 @@ def format_file_stem(state: str, pattern: str) -> str:
 
     Examples
     --------
-    >>> file_stem("a000_n0", "-x")
+    >>> format_file_stem("a000_n0", "-x")
     'stokes_a000_n0_minus_x'
     """
     return f"stokes_{state}_{pattern.replace('-', 'minus_')}"

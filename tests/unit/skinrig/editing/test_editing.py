@@ -105,7 +105,10 @@ def test_oil_edit_changes_only_lobes_as_in_population(source, library):
     done = editing.edit_face(source, EditRequest(traits={"oily": 1.0}), library)
     assert "r_d" not in done.changed
     assert "lobe_residual" not in done.appearance.maps
-    assert ("lobe_residual", "is of the lobes before the edit") in done.appearance.left_out
+    assert (
+        "lobe_residual",
+        "residual of the basis BRDFs before the edit",
+    ) in done.appearance.left_out
     good = source.r_d.valid
     change = [
         float(
@@ -230,8 +233,8 @@ def test_the_same_seed_makes_the_same_face(source, library):
         (["--trait", "tan=1", "--landmarks", "none.csv"], 3, "none.csv"),
         (["--trait", "tan=1000"], 3, "trait tan: got 1000, expected -10 to 10"),
         (["--trait", "tan=nan"], 3, "trait tan: got nan, expected -10 to 10"),
-        (["--trait", "tan=1", "--iterations", "0"], 3, "iterations: got 0, expected at least 1"),
-        (["--trait", "tan=1", "--seed", "-1"], 3, "seed: got -1, expected at least 0"),
+        (["--trait", "tan=1", "--iterations", "0"], 3, "--iterations: got 0, expected 1 or more"),
+        (["--trait", "tan=1", "--seed", "-1"], 3, "--seed: got -1, expected 0 or more"),
     ],
 )
 def test_invalid_edit_gives_clear_error_and_writes_nothing(argv, code, says, lab, capsys):
@@ -339,7 +342,7 @@ def test_landmark_table_in_texels_matches_mesh_landmarks(source, tmp_path):
     for name, (x, y) in picked.items():
         np.testing.assert_allclose(found[name], source.position[y, x])
     table.write_text("name,x,y\nchin,0,0\n")
-    with pytest.raises(face_textures.FaceError, match="shows no surface"):
+    with pytest.raises(face_textures.FaceError, match="not on the surface"):
         face_textures.read_landmarks(table, source)
     table.write_text("name,x,y,z\nchin,0,-60.5,nan\n")
     with pytest.raises(ValueError, match="finite"):

@@ -107,7 +107,7 @@ def test_plan_without_crossed_frames_or_foreign_is_refused(rig, small, tmp_path,
     bare = replace(
         whole, steps=tuple(s for s in whole.steps if s.index.get("polarizer") != "crossed")
     )
-    with pytest.raises(plans.PlanningError, match="no crossed frame"):
+    with pytest.raises(plans.PlanningError, match="no crossed-polarized frame"):
         flash.forecast(rig, bare, plans.PlanRequest())
     file = tmp_path / "plan.json"
     file.write_text(json.dumps(whole.to_json()))

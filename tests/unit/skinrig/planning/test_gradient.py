@@ -67,7 +67,7 @@ def test_unreachable_error_reports_reason(small, capsys, monkeypatch):
     assert main(["plan", "gradient", "--goals", "normals<=0.1deg"]) == 1
     said = capsys.readouterr().out
     assert "the best scan leaves" in said
-    assert "the lens shows" in said
+    assert "imaged by the lens" in said
 
 
 def test_saturating_or_overloading_exposures_are_not_candidates(rig, look):
