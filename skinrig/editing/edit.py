@@ -34,7 +34,7 @@ from skinrig.traits.regions import LibraryParts
 
 EDITABLE_PARTS: Final = ("albedo", "surface")
 MAX_TRAIT_AMOUNT: Final = 10.0
-"""Maximum amount of a trait, absolute; at 10, strong traits reach the limits of an edit's factor."""
+"""Maximum amount of a trait, absolute; at 10, strong traits reach the limits of an edit."""
 MAX_RESIDUAL_DISTANCE: Final = 0.5
 """Fraction of the distance to the target histograms above which the residual is reported."""
 STALE_MAPS: Final = {"lobe_residual": "residual of the basis BRDFs before the edit"}

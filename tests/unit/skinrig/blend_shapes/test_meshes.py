@@ -244,7 +244,7 @@ def arrays():
 @pytest.mark.parametrize(
     ("change", "word"),
     [
-        ({"uv": None}, "lacks uv"),
+        ({"uv": None}, "uv missing"),
         ({"shape_names": np.array(["up", "up"])}, "twice"),
         ({"shape_names": np.array([1])}, "text"),
         ({"shape_names": np.array(["up"], object)}, "npz"),

@@ -57,7 +57,7 @@ def test_each_tile_has_textures_and_first_has_maps(simulated_face, head, tmp_pat
     assert told["udim"] == {"tiles": [1001, 1002], "measured": [1001]}
     entry = told["files"]["textures/base_color.1002.exr"]
     assert entry["valid_share"] == 0.0
-    assert entry["what"].startswith("nothing was measured on this tile")
+    assert entry["what"].startswith("tile without measurements")
     text = (tmp_path / "skin.mtlx").read_text()
     assert "base_color.&lt;UDIM&gt;.exr" in text
     assert "1001" not in text

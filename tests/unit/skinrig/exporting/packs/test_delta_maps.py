@@ -148,7 +148,7 @@ def test_folder_without_wrinkles_or_color_reports_missing_part(moving, tmp_path)
     )
     left_out = dict(delta_maps.write(alone, tmp_path, ExportSettings()))
     assert "skinrig fit wrinkles" in left_out["normal, wm1 to wm3, masks, cavity"]
-    with pytest.raises(ExportError, match="nothing was fitted to"):
+    with pytest.raises(ExportError, match="without fitted parts"):
         delta_maps.write(SkinAppearance({}, "simulated"), tmp_path, ExportSettings())
 
 

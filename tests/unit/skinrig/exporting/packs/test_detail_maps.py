@@ -82,7 +82,7 @@ def test_cavity_map_is_dark_only_in_wrinkle_creases(tmp_path):
 def test_cavity_without_valid_normals_is_not_made(tmp_path):
     out = ImageFolder(tmp_path, ExportSettings())
     told = detail_maps.write_cavity(np.zeros((8, 8, 2)), np.zeros((8, 8), bool), 8, out)
-    assert (told, out.left_out) == ({}, [("cavity", "no wrinkle normal is valid")])
+    assert (told, out.left_out) == ({}, [("cavity", "wrinkle normals have no valid texel")])
     assert list(tmp_path.iterdir()) == []
 
 

@@ -115,7 +115,7 @@ def test_document_separates_measured_from_unmeasured(flash, tmp_path):
 
 def test_bands_without_a_camera_have_no_wavelength(flash, tmp_path):
     nameless = SkinAppearance(dict(flash.maps), "simulated")
-    with pytest.raises(ExportError, match="no camera and illuminant"):
+    with pytest.raises(ExportError, match="camera and illuminant"):
         stokes.write_spectra(nameless, tmp_path, ExportSettings())
     with pytest.raises(ExportError, match="expected melanin and hemoglobin"):
         stokes.write_spectra(SkinAppearance({}, "simulated"), tmp_path, ExportSettings())
