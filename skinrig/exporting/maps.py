@@ -59,7 +59,7 @@ def write(
     missing = [name for name in names if name not in appearance.maps]
     if missing or not names:
         raise ExportError(
-            f"--only: got {missing[0] if missing else 'an appearance without maps'}, expected "
+            f"--only: got {missing[0] if missing else 'no maps'}, expected some of "
             f"{', '.join(sorted(appearance.maps)) or 'a reconstruction that has some'}"
         )
     out = ImageFolder(folder, delivery)

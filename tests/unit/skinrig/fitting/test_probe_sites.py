@@ -98,7 +98,7 @@ def test_unknown_or_unscanned_sites_are_omitted_with_reason():
     assert "the scan ends" in why["chin"]
     assert [site.name for site in found.sites] == ["forehead", "cheek"]
     np.testing.assert_array_equal(found.map.valid, upper.valid)
-    with pytest.raises(ProbeSiteError, match="elbow: its place"):
+    with pytest.raises(ProbeSiteError, match="elbow: unknown position"):
         probe_sites.map_translucency(probe({"elbow": (0.6, 1.0, 1.5)}), position)
 
 

@@ -57,7 +57,7 @@ def test_reflectance_matches_two_layer_model_per_wavelength(flash, tmp_path):
     named = wavelengths(found, "T")
     assert sorted(named.values()) == spectra.WAVELENGTH_NM.tolist()
     assert header["spectralLayoutVersion"] == "1.0"
-    assert header["comments"].startswith("modelled")
+    assert header["comments"].startswith("modeled")
     picked = [400.0, 540.0, 700.0]
     for row, column in ((1, 2), (2, 3)):
         direct = two_layer_reflectance(
