@@ -166,7 +166,7 @@ def test_fewer_lobes_and_a_shadow_boundary_are_drawn(folder, monkeypatch, capsys
     words = ("face", "--shadow-boundary", "--samples", "1", "--out", "shadow", "--json")
     assert run(folder, monkeypatch, *words) == 0
     document = json.loads(capsys.readouterr().out)
-    assert "labels are sigma_tr" in document["labels"]
+    assert "all labels are sigma_tr" in document["labels"]
     assert [row["sigma_tr_per_mm"] for row in document["boundaries"][:2]] == [
         [0.3558, 0.7932, 1.5173],
         [0.9171, 1.5682, 1.6569],

@@ -118,7 +118,7 @@ V.registerScattering = () => {
       show: v => `× ${v.toFixed(2)}`, off: p => !p.scattering, help: "Factor on all widths."},
     {group: "scattering", kind: "toggle", path: ["measured_translucency"], label: "Diffuse mean free path of this face",
       when: () => Boolean(profile), off: p => !p.scattering,
-      help: profile ? `Widths from 1/σtr: ${profile.told}. The edge response of the Gaussians is within ` +
+      help: profile ? `Widths from 1/σtr: ${profile.origin}. The edge response of the Gaussians is within ` +
         `${edge} % of the dipole.` : ""},
     {group: "scattering", kind: "choice", path: ["texturing"], label: "Texturing", off: p => !p.scattering,
       help: "A measured color map already contains scattering. Post-scatter texturing does not blur it twice.",

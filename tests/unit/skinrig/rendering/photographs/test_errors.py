@@ -110,7 +110,7 @@ def test_images_that_cannot_be_compared_are_refused(rng):
     rgb, photo, covered, lit = scene(rng)
     with pytest.raises(RenderingError, match="expected"):
         errors.compare_pair(photo, rgb[:5], covered=covered, lit=lit)
-    with pytest.raises(RenderingError, match="no pixel"):
+    with pytest.raises(RenderingError, match="no unsaturated pixel"):
         errors.compare_pair(photo, rgb, covered=covered & False, lit=lit)
     dark = errors.compare_pair(photo, rgb, covered=covered, lit=lit & False)
     assert np.isnan(dark.median)
