@@ -278,7 +278,7 @@ def _probe(run: RigDemo) -> None:
                 lost = np.mean([not fit.valid for fit in fits if fit.method == row.method])
                 what, error = f"sigma_tr, {row.method}", 100 * row.median
                 run.found.add(name, what, error, "%", row.coverage, float(lost))
-    run.found.add_omissions("fibre probe", captures[-1])
+    run.found.add_omissions("fiber probe", captures[-1])
 
 
 RIGS: Mapping[str, Callable[[RigDemo], None]] = {

@@ -37,7 +37,7 @@ def name_points(
     points
         x and y of all points that labels must not cover.
     lines
-        Lines, (N, 2) each, x and y; a label crosses them only if there is no free space.
+        Lines, (N, 2) each, x and y; a label crosses them only without free space.
     legend
         Legend of the axes, which labels must not cover.
 

@@ -91,7 +91,7 @@ def encode_sheet(rows: Sequence[Sequence[Panel]], *, title: str = "") -> bytes:
     Raises
     ------
     ValueError
-        If there are no panels, or sizes differ.
+        If panels are missing, or sizes differ.
     """
     sizes = {panel.image.shape for row in rows for panel in row}
     if len(sizes) != 1:

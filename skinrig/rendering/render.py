@@ -124,7 +124,7 @@ def render_surface(
     Raises
     ------
     RenderingError
-        If there is no light, the mesh is not visible, or only its back is.
+        If lights are missing, the mesh is not visible, or only its back is.
     """
     given = [lights] if isinstance(lights, Light) else lights
     if not given:

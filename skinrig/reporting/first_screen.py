@@ -169,7 +169,7 @@ def _panel(title: str, chosen: Candidate) -> Panel:
 def _drawn(
     title: str, shown: list[tuple[str, Float64Array, BoolArray]], unit: str, *, normals: bool
 ) -> tuple[list[page.Image], str]:
-    """Return the images of a quantity to one scale, and a legend where that is no color bar."""
+    """Return the images of a quantity on one scale, and a legend if it is not a color bar."""
     if normals:
         draw = [
             map_images.MapDrawing(title, "", mask, WIDTH_PX, lossy=True).normals(label, image)

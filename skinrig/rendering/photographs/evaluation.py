@@ -121,7 +121,7 @@ def evaluate_photographs(
     Raises
     ------
     RenderingError, GeometryError, SkinReflectanceError
-        If there is no photograph to compare, or the model lacks a part.
+        If photographs or a part of the model are missing.
     """
     begun = time.perf_counter()
     rng = np.random.default_rng(settings.seed)

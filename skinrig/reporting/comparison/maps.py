@@ -220,7 +220,7 @@ def list_truth_errors(appearance: SkinAppearance, truth: SkinAppearance) -> list
     Parameters
     ----------
     appearance
-        Of a flash camera, a dome, a gradient sphere or a fibre probe.
+        Maps of a flash camera, a dome, a gradient sphere or a fiber probe.
     truth
         Of the same session.
     """

@@ -121,9 +121,9 @@ def split_sides(
     )
     if not fits:
         if require_comparison:
-            told = ", ".join(f"{path} ({kinds[path]})" for path in paths)
+            given = ", ".join(f"{path} ({kinds[path]})" for path in paths)
             raise ReportError(
-                f"--compare: got {told}, expected two of one kind: two folders of maps, two "
+                f"--compare: got {given}, expected two of one kind: two folders of maps, two "
                 "benchmarks, two folders of images or two folders of runs; ground truths of "
                 "either may be added"
             )
@@ -133,7 +133,7 @@ def split_sides(
 
 
 def _labels(a: Path, b: Path) -> tuple[str, str]:
-    """Return names that tell two runs apart: their folders', or A and B before equal ones.
+    """Return distinct labels of two runs: A and B with their folders' names.
 
     Examples
     --------
@@ -197,7 +197,7 @@ def compare_maps_of_runs(a: ComparedRun, b: ComparedRun) -> list[MapsPair]:
 
 
 def _apart_mm(a: SkinAppearance, b: SkinAppearance) -> float:
-    """Return the median distance of texels of the same index; 0 where there is no mesh."""
+    """Return the median distance of texels of the same index, mm; 0 without a mesh."""
     places = [one.maps.get("position") for one in (a, b)]
     if places[0] is None or places[1] is None:
         return 0.0

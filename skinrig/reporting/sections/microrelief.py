@@ -50,7 +50,7 @@ def _images(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterato
     states = evaluation.find_states(appearance)
     order = sorted(states, key=_by_step)
     first = "a000_n0" if "a000_n0" in states else order[0]
-    yield from _beside_truth(first, appearance, truth)
+    yield from _compare_with_truth(first, appearance, truth)
     one = [state for state in order if state[:4] == first[:4]]
     chosen = _select_states(one)
     series = []
@@ -68,7 +68,7 @@ def _images(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterato
         yield from series
 
 
-def _beside_truth(
+def _compare_with_truth(
     state: str, appearance: SkinAppearance, truth: SkinAppearance | None
 ) -> Iterator[page.Block]:
     """Yield ground truth | estimate | error | uncertainty of normals and height of one step."""

@@ -224,7 +224,7 @@ def place_facial_color(source: SceneSource) -> FaceColor:
     neutral, known = where.sample(rig.neutral, rig.valid)
     aside = float((atlas.covered & ~known).mean() / atlas.covered.mean())
     left_out = {
-        "color outside the image": f"{100 * aside:.0f} % of the skin was not visible to the camera; "
+        "color outside the image": f"{100 * aside:.0f} % of the skin was not visible; "
         "its color is extrapolated"
     }
     if MELANIN_MAP in appearance.maps:

@@ -159,30 +159,30 @@ WEIGHT_BITS: Final = 7
 TRANSLUCENCY_PX: Final = 128
 """Side of the map of scattering widths; it is smooth, as it is interpolated from a few sites."""
 POPULATION_SPACE: Final = "surface"
-"""Space of the trait library whose centre is the mean surface of a population."""
+"""Space of the trait library whose center is the mean surface of a population."""
 FACIAL_R_D: Final = (0.46, 0.31, 0.23)
 """R_d of facial skin, Weyrich et al. 2006, figure 11, linear sRGB; it shapes the profile's core."""
 TYPICAL_CHROMOPHORES: Final = (0.03, 0.03)
-"""Volume fractions of melanin and hemoglobin, whose color stands in for R_d where there is none:
-the shape of a profile depends little on it."""
+"""Volume fractions of melanosomes and blood whose color replaces an unmeasured R_d; the shape of a
+profile depends little on it."""
 
 Origin = Literal["fitted", "population"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PageLobes:
-    """Lobes and shares before they are packed.
+    """Basis BRDFs and weights before packing.
 
     Attributes
     ----------
     lobes
-        K lobes, 1/sr.
+        K basis BRDFs, 1/sr.
     shares : ndarray of float32, shape (H, W, K)
-        Row 0 at the top.
+        Weights; row 0 at the top.
     mix : ndarray of float64, shape (K, M)
-        Each lobe as a mixture of `materials`.
+        Each basis BRDF as a mixture of `materials`.
     materials
-        M names.
+        Names of the M materials.
     origin
         "fitted" to a face, or "population": the mean of simulated people.
     """

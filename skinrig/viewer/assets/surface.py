@@ -189,7 +189,7 @@ def _masks(layers: tuple[WrinkleLayer, ...]) -> Float32Array:
 MAPS_PX: Final = 256
 """Maximum side of the maps of roughness and intensity, which vary by region."""
 RELIEF_STEP_WORDS: Final = 20
-"""Quantization step of the finest octave for reliefs of 2048 texels per side and more: up to 5 um."""
+"""Quantization step of the finest octave for reliefs of 2048 texels per side and more; <= 5 um."""
 
 
 def build_surface_assets(source: SceneSource) -> Assets:

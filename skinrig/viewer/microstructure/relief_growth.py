@@ -92,7 +92,7 @@ class GrownRelief:
 def compute_reach_px(cell_px: int) -> int:
     """Return the radius in which a corner's offset is used, a multiple of `STEP_PX`, px.
 
-    The hexagon's radius is one cell. A pixel of the coarsest level extends half a step farther, and
+    The hexagon's radius is one cell. Pixels of the coarsest level extend half a step farther, and
     corners are rounded to whole steps, up to half a step from the lattice.
     """
     return STEP_PX * math.ceil((cell_px + STEP_PX + 1) / STEP_PX)

@@ -104,7 +104,7 @@ def test_size_too_large_for_page_is_refused(size):
 
 
 def test_landmarks_without_image_are_refused(tmp_path):
-    with pytest.raises(SceneError, match="name the folder"):
+    with pytest.raises(SceneError, match="give the folder, too"):
         faces.build_scene(landmarks=tmp_path / "landmarks.csv")
 
 

@@ -73,7 +73,7 @@ def test_expressions_missing_in_mesh_omit_wrinkles():
     made = wrinkle_assets.build_model_assets(model, source("jawOpen"), origin="simulated")
     assert "textures" not in made
     assert made["left_out"] == (
-        ("wrinkles", "none of their expressions (anger, joy) is a blend shape of the mesh"),
+        ("wrinkles", "the mesh has no blend shape of their expressions (anger, joy)"),
     )
 
 
