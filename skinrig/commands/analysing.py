@@ -49,10 +49,10 @@ def analyse_brdf(
     merl_basis
         Folder of the MERL tables used in the reconstruction; default: built-in materials.
     points
-        Texels per measured face, default 2000; simulated: points of the single subject and of the
-        seven conditions, default 5000, and 0.4 times as many of each of the 87 subjects.
+        Texels per measured face, default 2000. Simulated faces: points per condition of the single
+        subject, default 5000, and 0.4 times as many for each of the 87 subjects.
     method
-        Space in which basis BRDFs are compared: shares (material weights) or brdf.
+        Space in which basis BRDFs are compared: shares (material weights) or brdf (reflectance).
     seed
         Random seed.
     """

@@ -120,7 +120,8 @@ def capture_dome(
     Parameters
     ----------
     eyes
-        State of the subject's eyes under LEDs.
+        Subject's eyes, as confirmed by the operator; flicker above its limit requires closed or
+        shielded.
     """
     from skinrig.capturing.option_values import parse_eye_state
 
@@ -145,7 +146,8 @@ def capture_gradient(
     Parameters
     ----------
     eyes
-        State of the subject's eyes under LEDs.
+        Subject's eyes, as confirmed by the operator; flicker above its limit requires closed or
+        shielded.
     force_limit
         Maximum force of the caliper on this skin, N; required with a caliper.
     """
@@ -210,12 +212,12 @@ class ServeOptions:
     tcp
         Address of cameras and, without --pty, of controllers; port 0: any free port.
     scale
-        Scale of the simulation: small (quick) or full (all of the rig); gradient: small only.
+        Scale of the simulation: small (fast) or full (the complete rig); gradient: small only.
     allow_remote
         Accept connections from other machines.
     resume
-        Interrupted session captured from an earlier server with this rig and seed; continues its
-        noise sequence, so that shots differ from those on disk.
+        Interrupted session captured from an earlier server with this rig and seed; new shots
+        continue its noise sequence and differ from those on disk.
     """
 
     pty: bool = False

@@ -186,7 +186,7 @@ class ReliefOptions:
     size_px
         Width and height of the displacement map, pixels.
     relief_site
-        Site whose microrelief is used; default: the first one fitted.
+        Site whose microrelief covers the whole mesh; default: each fitted site its own region.
     synthesize
         Neutral relief: patches (measured texture, synthesized) or noise (procedural, 3D).
     extrapolate
@@ -230,7 +230,7 @@ class ExpressionOptions:
     clamp
         Range of the summed weights of a wrinkle zone: unit (0 to 1) or signed (-1 to 1).
     emotional
-        Redden the whole face for anger, pale it for fear.
+        Scale the blood volume fraction of the whole face: up for anger, down for fear.
     gain
         Factor of the blood volume fraction.
     target_face

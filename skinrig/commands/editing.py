@@ -41,9 +41,10 @@ class EditOptions:
     space
         Trait library written by `skinrig fit traits`; default: the built-in library.
     region
-        Edited region: face, beard or no-beard; for --spots also skin.
+        Edited region; skin (face without eyes, brows and lips) for --spots only.
     mask
-        Weight of the edit per texel, 0 to 1: .png or .exr the size of the texture.
+        Weight of the edit per texel, 0 to 1: .png or .exr with the texture's aspect ratio; default:
+        1 in the region.
     spots
         Spots to add as KIND=PIGMENT[:NUMBER PER CM2], or to remove as KIND=-1; KIND is freckles,
         moles or follicles: freckles=1:3,moles=-1.
@@ -52,12 +53,12 @@ class EditOptions:
     landmarks
         CSV table name,x,y (texels) or name,x,y,z (mm) of the face's landmarks.
     iterations
-        Iterations of the match of albedo statistics.
+        Iterations of the albedo histogram matching.
     """
 
     trait: str | None = None
     space: Path | None = None
-    region: str = "face"
+    region: Annotated[str, choice("face", "beard", "no-beard", "skin")] = "face"
     mask: Path | None = None
     spots: str | None = None
     parts: str | None = None

@@ -45,7 +45,8 @@ class DeliveryOptions:
     with_errors
         Also write standard uncertainties and masks.
     only
-        Names to export: maps (maps), up to three states (metahuman), states (stokes).
+        Names to export, separated by commas: maps (maps), up to three expressions (metahuman) or
+        strain steps (stokes); default: all, for metahuman the first three.
     mesh
         Mesh with the maps' texture coordinates and blend shapes, mm.
     target_face
@@ -89,7 +90,8 @@ class PlaceOptions:
     Attributes
     ----------
     at
-        Also export the BRDF at the texture coordinate U,V, each 0 to 1 (merl, rgl).
+        Also export the BRDF at the texture coordinates U,V, each 0 to 1 (merl, rgl); default: only
+        basis BRDFs.
     radius
         Radius around U,V over which the BRDF is averaged, mm (merl, rgl).
     without_diffuse
@@ -135,7 +137,8 @@ def export(
         Format. Appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. Session: mhl,
         frames, lp, stokes, event-model.
     use
-        Purpose of the copy, such as research; the subjects' consent must include it.
+        Purpose of the copy, such as research, which the subjects' consent must include; required
+        for measured data.
     camera
         Camera whose images are exported (lp); default: the frontal one.
     calibration

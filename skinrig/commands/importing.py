@@ -137,7 +137,7 @@ def import_lp(
         Light list: .lp file, list of directions, or folder of a chrome ball's images; default:
         found in the folder.
     mask
-        Image that is bright at the object; default: the folder's *mask* file, else the whole image.
+        Image whose bright pixels are the object; default: the folder's *mask* file, else all.
     encoding
         Transfer function of 8-bit and PNG values: auto, sRGB or linear.
     mm_per_px

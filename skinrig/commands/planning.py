@@ -42,7 +42,7 @@ class PlanOptions:
     Attributes
     ----------
     min_valid_fraction
-        Minimum fraction of the complete rig's valid pixels that stay valid, above 0 to 1.
+        Minimum fraction of the complete rig's valid pixels that stay valid, above 0, at most 1.
     forecast
         Forecast the errors of this plan file, JSON, instead of choosing a plan.
     confirm

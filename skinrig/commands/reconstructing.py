@@ -33,11 +33,11 @@ def calibrate(
     sessions
         SESSION/ folders of the target.
     square_mm
-        Side of the calibration board's squares, mm (dome, geometry).
+        Side of the calibration board's squares, mm (dome: geometry).
     sphere_mm
-        Radius of the mirror sphere, mm (dome, lights).
+        Radius of the mirror sphere, mm (dome: lights).
     phantom
-        Certificate (JSON) of the phantom (probe, fibre).
+        Certificate of the phantom, JSON (probe: fibre).
     kind
         Calibration: sensor, color, polarization or white (flash); geometry or lights (dome);
         sensor, lights or polarization (gradient); fibre (probe).

@@ -43,7 +43,7 @@ class RenderOptions:
     fov
         Horizontal field of view of a camera given by its position, degrees.
     look_at
-        Point that a camera given by its position looks at, mm.
+        Target point of a camera given by its position, mm.
     samples
         Rays per pixel, a square number: 1, 4, 9, 16 ...
     shadow_samples
@@ -63,10 +63,10 @@ class RenderOptions:
     exposure
         Exposure factor of the PNGs; default: set from the brightness of skin.
     against
-        Session to compare with, of photographs not used in any fit (reconstruct --hold-out); with
-        --components, split the photograph of --view and --light.
+        SESSION/ folder whose held-out photographs (reconstruct --hold-out) are compared with
+        renderings; with --components, the photograph of --view and --light is decomposed instead.
     photographs
-        Maximum number of photographs, spread evenly over the held-out ones (with --against).
+        Maximum number of compared photographs, at equal steps over the held-out ones (--against).
     seed
         Random seed of the environment's lights and of --bases.
     shadow_boundary

@@ -47,7 +47,7 @@ class SimulateOptions:
     Attributes
     ----------
     scale
-        Scale of the simulation: small (quick) or full (all of the rig).
+        Scale of the simulation: small (fewer pixels and lights, fast) or full (the complete rig).
     plan
         Plan file of `skinrig plan`, JSON; default: the rig's own plan.
     """
@@ -89,7 +89,7 @@ class SimulatedFaceOptions:
     mesh
         Face mesh, .npz or .obj; default: the built-in head.
     omit
-        Effects not to simulate although they change pixels, separated by commas: lateral (or
+        Visible effects to omit from the simulation, separated by commas: lateral (or
         subsurface), interreflections, spectral, optics, relief_shadows.
     movement
         Deform the face with its expressions, or change its blood volume only.
@@ -182,11 +182,11 @@ def simulate_dome(
     move
         Simulate head motion during the capture.
     wrapped
-        Scan with a template mesh, so that all expressions share one texture.
+        Scan with a wrapped template mesh, so that all expressions share one texture layout.
     subsurface
-        Simulate subsurface scattering even if it changes no pixel visibly.
+        Simulate subsurface scattering even if its effect is not visible.
     interreflections
-        Simulate interreflection of skin even if it changes no pixel visibly.
+        Simulate interreflection of skin even if its effect is not visible.
     subject
         Simulated subject: preset I to VI, palest or darkest, a file NAME.toml, or P01 to P87 of
         the simulated population.
@@ -233,7 +233,7 @@ def simulate_gradient(
     Parameters
     ----------
     omit
-        Effects not to simulate although they change pixels, separated by commas: shadows, lateral,
+        Visible effects to omit from the simulation, separated by commas: shadows, lateral,
         interreflections, optics.
     """
     from skinrig.capturing.option_values import parse_floats, parse_names, parse_range

@@ -239,8 +239,8 @@ def format_short_unit(unit: str) -> str:
 
     Examples
     --------
-    >>> format_short_unit("volume fraction of the epidermis"), format_short_unit("1"),
-    format_short_unit("mm") ('volume fraction', '', 'mm')
+    >>> [format_short_unit(unit) for unit in ("volume fraction of the epidermis", "1", "mm")]
+    ['volume fraction', '', 'mm']
     """
     return "" if unit == "1" else unit.split(" of ")[0]
 

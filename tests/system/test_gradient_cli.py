@@ -57,7 +57,7 @@ def test_missing_address_is_reported_target_needs_no_caliper(capsys, tmp_path):
         (["--angles", "30"], errors.EXIT_BAD_INPUT, "angles: got 30"),
         (["--steps", "1-2"], errors.EXIT_USAGE, "FIRST..LAST"),
         (["--steps", "-9..0"], errors.EXIT_BAD_INPUT, "steps"),
-        (["--target", "chart"], errors.EXIT_BAD_INPUT, "expected one of ball, dark, flat"),
+        (["--target", "chart"], errors.EXIT_BAD_INPUT, "expected one of ball, flat, dark"),
         (["--target", "ball", "--angles", "0"], errors.EXIT_USAGE, "default plan of skin"),
     ],
 )
