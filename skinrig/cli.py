@@ -29,7 +29,7 @@ from skinrig.commands import (
 from skinrig.commands.help import Command, Commands
 from skinrig.commands.options import Json, Out, Seed, option
 from skinrig.console import Console
-from skinrig.next_steps import welcome
+from skinrig.next_steps import format_welcome
 
 app = typer.Typer(
     name="skinrig",
@@ -65,7 +65,7 @@ def _root(
     if context.invoked_subcommand is None:
         from importlib.metadata import version as version_of
 
-        typer.echo(welcome(Path(), version_of("skinrig")))
+        typer.echo(format_welcome(Path(), version_of("skinrig")))
 
 
 @app.command(cls=Command)
@@ -90,7 +90,9 @@ def demo(
     from skinrig.demo import run_demo
 
     console = Console(json)
-    console.document("skinrig.demo/1", run_demo(out, rigs.split(","), seed=seed, console=console))
+    console.print_document(
+        "skinrig.demo/1", run_demo(out, rigs.split(","), seed=seed, console=console)
+    )
 
 
 for command in (
@@ -147,17 +149,17 @@ def _report_failure(
     """Report why a command ended, on stderr and with --json as a document; return its code."""
     format_message = getattr(error, "format_message", None)
     if isinstance(error, KeyboardInterrupt):
-        message = errors.interruption(arguments)
+        message = errors.format_interruption(arguments)
     else:
         message = (
-            errors.sentence(error)
+            errors.format_error(error)
             if print_message or format_message is None
             else str(format_message())
         )
     if print_message:
         print(f"skinrig: {message}", file=sys.stderr)
     # still one document only: a command prints its own last, after all that can fail
-    Console("--json" in arguments).document(
+    Console("--json" in arguments).print_document(
         "skinrig.error/1", {"error": message, "exit_code": code}
     )
     return code

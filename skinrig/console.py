@@ -64,7 +64,7 @@ def _cell(value: object) -> str:
 class Console:
     """Output streams of a command.
 
-    With ``as_json``, only the document of :meth:`document` goes to stdout; text goes to stderr.
+    With ``as_json``, stdout gets only the document of :meth:`print_document`; text goes to stderr.
     """
 
     as_json: bool = False
@@ -79,7 +79,7 @@ class Console:
         seconds = time.perf_counter() - self.started_s
         print(f"[{seconds:6.1f} s] {text}", file=sys.stderr, flush=True)
 
-    def rows(self, head: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+    def print_table(self, head: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
         """Print a table with aligned columns; NaN is printed as a dash."""
         cells = [[str(h) for h in head]] + [[_cell(value) for value in row] for row in rows]
         widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
@@ -87,7 +87,7 @@ class Console:
             line = "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True))
             self.print_line(line.rstrip())
 
-    def figures(
+    def print_figures(
         self, parts: Mapping[str, Mapping[str, object]], *kinds: type[int | float | str]
     ) -> None:
         """Print the figures of each part whose values have one of the given types."""
@@ -98,18 +98,18 @@ class Console:
             if isinstance(value, kinds)
         ]
         if rows:
-            self.rows(("part", "figure", "value"), rows)
+            self.print_table(("part", "figure", "value"), rows)
 
-    def each(self, label: str, texts: Iterable[object]) -> None:
+    def print_each(self, label: str, texts: Iterable[object]) -> None:
         """Print each text on a line of its own, after a label."""
         for text in texts:
             self.print_line(f"{label}: {text}")
 
-    def left_out(self, rows: Iterable[tuple[object, object]]) -> None:
+    def print_omissions(self, rows: Iterable[tuple[object, object]]) -> None:
         """Print what was omitted, with reasons."""
-        self.each("left out", (f"{what}: {why}" for what, why in rows))
+        self.print_each("left out", (f"{what}: {why}" for what, why in rows))
 
-    def document(self, schema: str, content: Mapping[str, Any]) -> None:
+    def print_document(self, schema: str, content: Mapping[str, Any]) -> None:
         """Print the command's JSON document if --json was given."""
         if self.as_json:
             print(

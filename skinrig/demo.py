@@ -110,7 +110,7 @@ def run_demo(
 
         (out / "report.html").write_text(build([out], title="skinrig demo"), encoding="utf-8")
     console.print_line("")
-    console.rows(
+    console.print_table(
         ("subject", "map", "error", "unit", "68 % interval covers, %", "masked, %"),
         [[*row[:3], format_unit(row[3]), *row[4:]] for row in found.errors],
     )
@@ -119,7 +119,7 @@ def run_demo(
         (f"{rig}: total", sum(s for name, s in shares.items() if name.startswith(f"{rig}: ")))
         for rig in asked
     ]
-    console.rows(("step", "seconds"), [*shares.items(), *by_rig])
+    console.print_table(("step", "seconds"), [*shares.items(), *by_rig])
     parallel = f", {at_once} rigs in parallel" if at_once > 1 else ""
     total_s = time.perf_counter() - began
     console.print_line(f"\ntotal: {total_s:.1f} s{parallel}")

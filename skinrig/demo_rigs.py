@@ -17,7 +17,7 @@ from model.skin import SkinAppearance
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.inputs import DomeOptions
 from skinrig.appearances.dynamic import FACIAL_COLOR, describe_parts
-from skinrig.applying.expression import hemoglobin_rig
+from skinrig.applying.expression import read_hemoglobin_rig
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.capturing.light_safety import light_rows
 from skinrig.evaluating import facial_color, flash, microrelief, subsurface
@@ -173,7 +173,7 @@ def _evaluate_states(appearance: Path, found: DemoResults) -> None:
     named = describe_parts(maps)[FACIAL_COLOR]["truth"]
     truths = {state: store.read(appearance.parent / folder) for state, folder in named.items()}
     rng = np.random.default_rng(0)
-    states, _ = facial_color.compare(maps, hemoglobin_rig(maps), truths, rng=rng)
+    states, _ = facial_color.compare(maps, read_hemoglobin_rig(maps), truths, rng=rng)
     name = appearance.name.removeprefix("appearance-")
     for row in states:
         if row.method in (facial_color.PREDICTION_METHODS[1], facial_color.PREDICTION_METHODS[3]):

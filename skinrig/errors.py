@@ -23,18 +23,19 @@ from typing import TypeVar
 Choice = TypeVar("Choice", bound=str)
 
 EXIT_DONE = 0
-LIMIT_MISSED = 1
+EXIT_LIMIT_MISSED = 1
 EXIT_USAGE = 2
-BAD_INPUT = 3
-DEVICE_FAILED = 4
-EXTRA_MISSING = 5
+EXIT_BAD_INPUT = 3
+EXIT_DEVICE_FAILED = 4
+EXIT_EXTRA_MISSING = 5
 EXIT_BUG = 70
 EXIT_INTERRUPTED = 130
 EXIT_CODE_HELP = (
-    f"{EXIT_DONE} done; {LIMIT_MISSED} a limit was missed; {EXIT_USAGE} invalid command line (an "
-    f"argument is missing, malformed or excluded by another); {BAD_INPUT} invalid input (unknown, "
-    f"out of range, damaged or unusable); {DEVICE_FAILED} a device or a capture failed; "
-    f"{EXTRA_MISSING} an optional part is missing; {EXIT_BUG} a defect of skinrig; "
+    f"{EXIT_DONE} done; {EXIT_LIMIT_MISSED} a limit was missed; {EXIT_USAGE} invalid command line "
+    "(an argument is missing, malformed or excluded by another); "
+    f"{EXIT_BAD_INPUT} invalid input (unknown, out of range, damaged or unusable); "
+    f"{EXIT_DEVICE_FAILED} a device or a capture failed; "
+    f"{EXIT_EXTRA_MISSING} an optional part is missing; {EXIT_BUG} a defect of skinrig; "
     f"{EXIT_INTERRUPTED} interrupted."
 )
 """Exit codes as listed by ``skinrig --help``; the module's docstring has more detail."""
@@ -57,7 +58,7 @@ class UnusableError(ValueError):
     """A well-formed argument whose value is unknown, out of range or unusable."""
 
 
-def one_of(
+def require_choice(
     name: str, value: str, choices: Iterable[Choice], error: type[Exception] = UnusableError
 ) -> Choice:
     """Return the value if it is one of the choices, else raise an error that lists them.
@@ -75,7 +76,7 @@ def one_of(
 
     Examples
     --------
-    >>> one_of("--clamp", "unit", ("unit", "signed"))
+    >>> require_choice("--clamp", "unit", ("unit", "signed"))
     'unit'
     """
     known = tuple(choices)
@@ -96,7 +97,7 @@ def exit_code(error: BaseException) -> int:
     if isinstance(error, ImportError) and (error.name or "").split(".")[0] in _OWN_PACKAGES:
         return EXIT_BUG
     if isinstance(error, ImportError):
-        return EXTRA_MISSING
+        return EXIT_EXTRA_MISSING
     if isinstance(error, UsageError):
         return EXIT_USAGE
     own = [kind for kind in type(error).__mro__ if kind.__module__.split(".")[0] in _OWN_PACKAGES]
@@ -104,9 +105,9 @@ def exit_code(error: BaseException) -> int:
     if any(kind.__module__.startswith("capture.devices") for kind in own) or (
         names & {"DeviceError", "AcquisitionError"}
     ):
-        return DEVICE_FAILED
+        return EXIT_DEVICE_FAILED
     if own or isinstance(error, (ValueError, OSError)):
-        return BAD_INPUT
+        return EXIT_BAD_INPUT
     return EXIT_BUG
 
 
@@ -129,7 +130,7 @@ RESUMABLE_COMMANDS = ("capture", "serve", "simulate")
 """Commands that have --resume."""
 
 
-def interruption(given: Sequence[str]) -> str:
+def format_interruption(given: Sequence[str]) -> str:
     """Return the message of an interrupted command.
 
     Parameters
@@ -139,9 +140,9 @@ def interruption(given: Sequence[str]) -> str:
 
     Examples
     --------
-    >>> interruption(["simulate", "flash"])
+    >>> format_interruption(["simulate", "flash"])
     'interrupted; run the same command with --resume to continue'
-    >>> interruption(["bench", "--out", "bench"])
+    >>> format_interruption(["bench", "--out", "bench"])
     'interrupted; bench.json in --out keeps what was measured'
     """
     command = next((word for word in given if not word.startswith("-")), "")
@@ -155,7 +156,7 @@ def interruption(given: Sequence[str]) -> str:
     return "interrupted; run the same command again"
 
 
-def sentence(error: BaseException) -> str:
+def format_error(error: BaseException) -> str:
     """Return the message of an exception, one sentence without a traceback."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"

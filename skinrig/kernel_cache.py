@@ -12,7 +12,7 @@ PASSIVE_WAIT_SETTINGS = {"OMP_WAIT_POLICY": "PASSIVE"}
 reads the variable when it is loaded, before the first parallel loop."""
 
 
-def user_cache(environment: Mapping[str, str]) -> Path:
+def find_user_cache(environment: Mapping[str, str]) -> Path:
     """Return the user's cache folder, by Numba's rule.
 
     Parameters
@@ -22,7 +22,7 @@ def user_cache(environment: Mapping[str, str]) -> Path:
 
     Examples
     --------
-    >>> user_cache({"XDG_CACHE_HOME": "/scratch", "HOME": "/home/me"}).as_posix()
+    >>> find_user_cache({"XDG_CACHE_HOME": "/scratch", "HOME": "/home/me"}).as_posix()
     '/scratch'
     """
     if cache := environment.get("XDG_CACHE_HOME"):
@@ -70,7 +70,7 @@ def provide_kernel_cache(
     if sys.platform == "win32" or environment.get("NUMBA_CACHE_DIR"):
         return None
     source_cache = packages / "model" / "__pycache__"
-    if is_writable(source_cache) or is_writable(user_cache(environment) / "numba"):
+    if is_writable(source_cache) or is_writable(find_user_cache(environment) / "numba"):
         return None
     import atexit  # imported here to keep the start of other commands fast
     import shutil

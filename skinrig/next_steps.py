@@ -151,7 +151,7 @@ def suggest(found: Workspace, folder: Path) -> tuple[Step, ...]:
     return tuple(steps[:MAX_STEPS])
 
 
-def welcome(folder: Path, version: str) -> str:
+def format_welcome(folder: Path, version: str) -> str:
     """Return the output of ``skinrig`` without arguments.
 
     Parameters

@@ -29,7 +29,7 @@ from skinrig.reporting.sections import (
 from skinrig.reporting.sections import images as image_section
 from skinrig.reporting.sections import surface as surface_section
 
-__all__ = ["Report", "ReportError", "build", "make"]
+__all__ = ["Report", "ReportError", "build", "build_any"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class Report:
     @property
     def verdict(self) -> str:
         """Number of checks that kept their limits, in a sentence."""
-        return verdict_section.headline(self.checks)
+        return verdict_section.format_headline(self.checks)
 
 
 def build(paths: Sequence[str | Path], *, title: str = "skinrig report") -> str:
@@ -63,10 +63,10 @@ def build(paths: Sequence[str | Path], *, title: str = "skinrig report") -> str:
     ReportError
         If a path does not exist, or nothing is found.
     """
-    return make(paths, title=title, compare=False).html
+    return build_any(paths, title=title, compare=False).html
 
 
-def make(
+def build_any(
     paths: Sequence[str | Path], *, title: str = "skinrig report", compare: bool | None = None
 ) -> Report:
     """Return the report on a collection, or the comparison of two runs.
@@ -92,18 +92,18 @@ def make(
         for run in both:
             evaluate_checks(run.found, run.checks)
         pairs = run_comparison.compare_maps_of_runs(*both)
-        html = page.document(
-            title, comparison.lead(*both, pairs), comparison.sections(*both, pairs)
+        html = page.render_page(
+            title, comparison.build_lead(*both, pairs), comparison.build_sections(*both, pairs)
         )
         checks = tuple(both[0].checks + both[1].checks)
         return Report(html, checks, (both[0].label, both[1].label))
     checks_of_all: list[page.Check] = []
     found = discover(places)
-    body = sections(found, checks_of_all)
+    body = build_sections(found, checks_of_all)
     lead = verdict_section.section(
         checks_of_all, found.summary(), _list_least_certain(found), _first_screen(found)
     )
-    html = page.document(title, lead, body)
+    html = page.render_page(title, lead, body)
     return Report(html, tuple(checks_of_all), None)
 
 
@@ -111,7 +111,7 @@ def _first_screen(found: ReportInputs) -> Iterator[page.Block]:
     """Yield the images of the first screen."""
     appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
     truths = {name: found.find_truth(appearance) for name, appearance in appearances.items()}
-    yield from first_screen.strip(appearances, truths)
+    yield from first_screen.draw_first_screen(appearances, truths)
 
 
 def _list_least_certain(found: ReportInputs) -> list[str]:
@@ -145,7 +145,7 @@ def evaluate_checks(found: ReportInputs, checks: list[page.Check]) -> None:
         deque(blocks, maxlen=0)  # each section adds its checks while its blocks are made
 
 
-def sections(found: ReportInputs, checks: list[page.Check]) -> list[page.Block]:
+def build_sections(found: ReportInputs, checks: list[page.Check]) -> list[page.Block]:
     """Return the sections of a report, and add its checks.
 
     Parameters
@@ -159,11 +159,11 @@ def sections(found: ReportInputs, checks: list[page.Check]) -> list[page.Block]:
     sessions = session.read_session_facts(found.sessions)
     return [
         *_maps(found, appearances, checks),
-        *chromophore.identifiability(appearances.values()),
-        *subsurface.over_people(appearances, found.truths),
+        *chromophore.draw_identifiability(appearances.values()),
+        *subsurface.compare_people(appearances, found.truths),
         *_documents(found, checks),
         *calibration.section(found.calibrations, appearances, sessions, checks),
-        *session.omissions(found.sessions),
+        *session.list_omissions(found.sessions),
         *provenance.consent_section([found]),
         *session.section(sessions),
     ]
@@ -199,8 +199,8 @@ def _appearance_section(subject: page.ReportedAppearance) -> Iterator[page.Block
     appearance, truth = subject.appearance, subject.truth
     yield page.Heading(f"Maps: {subject.name}", level=2)
     images = [
-        map_images.color_image(f"{map_title(key)}, linear RGB", appearance.maps[key].values)
-        for key in ("image", "specular_image")
+        map_images.draw_color_image(f"{map_title(key)}, linear RGB", appearance.maps[key].values)
+        for key in ("picture", "specular_picture")
         if key in appearance.maps
     ]
     if images:
@@ -215,10 +215,10 @@ def _appearance_section(subject: page.ReportedAppearance) -> Iterator[page.Block
         elif sequence.is_sequence(appearance):
             yield from sequence.section(appearance)
         if truth is not None and "melanin" in truth.maps:
-            yield from chromophore.errors(subject, truth)
-        yield from chromophore.panels(appearance, truth)
+            yield from chromophore.list_errors(subject, truth)
+        yield from chromophore.draw_panels(appearance, truth)
     if truth is None:
-        yield from verdict_section.uncertainty_blocks(appearance)
+        yield from verdict_section.build_uncertainty_blocks(appearance)
     yield from provenance.section(appearance)
 
 
@@ -233,7 +233,7 @@ def _dynamic_section(subject: page.ReportedAppearance, found: ReportInputs) -> I
     yield page.Heading(f"Moving face: {subject.name}", level=2)
     yield from dynamic.section(subject, truths)
     if not truths:
-        yield from verdict_section.uncertainty_blocks(appearance)
+        yield from verdict_section.build_uncertainty_blocks(appearance)
     yield from provenance.section(appearance)
 
 
@@ -241,4 +241,4 @@ def _document_section(document: Mapping[str, Any]) -> Iterator[page.Block]:
     heading = document.get("title", document["schema"])
     yield page.Heading(heading, level=2)
     for entry in document.get("tables", ()):
-        yield page.table(entry["head"], entry["rows"], caption=entry["title"])
+        yield page.build_table(entry["head"], entry["rows"], caption=entry["title"])

@@ -34,7 +34,7 @@ def panels(
         image, seen = view.rasterize(shown.values[there], valid=valid)
         picture = 0.5 + 0.5 * image if name == "normals" else image / 0.8
         codes = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
-        codes = codes if name == "normals" else png.srgb8(picture)
+        codes = codes if name == "normals" else png.encode_srgb8(picture)
         codes[~seen] = round(255 * GRAY)
         found.append(codes)
     return found

@@ -36,8 +36,8 @@ def main() -> None:
         maps = store.read(folder / "maps").maps
     for text in dict.fromkeys((*done.assumed, *outcome.assumed)):
         print(f"assumed: {text}", file=sys.stderr)
-    picture = maps["image"].values[FACE]
-    panels = [png.srgb8(picture / np.percentile(picture, 99))]
+    picture = maps["picture"].values[FACE]
+    panels = [png.encode_srgb8(picture / np.percentile(picture, 99))]
     for name, high in SCALES.items():
         part = maps[name]
         mask = None if part.valid is None else part.valid[FACE]

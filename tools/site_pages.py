@@ -156,13 +156,13 @@ def command_pages() -> dict[str, str]:
 
 
 def _command_index(root: Any) -> str:
-    from skinrig.commands.help import HELP_SECTIONS, OTHER_SECTION, summary
+    from skinrig.commands.help import HELP_SECTIONS, OTHER_SECTION, summarize_command
 
     lines = ["# Command line", "", root.help, ""]
     left = dict(root.commands)
     sections = [*HELP_SECTIONS, (OTHER_SECTION, tuple(left))]
     for title, names in sections:
-        rows = [(name, summary(left.pop(name))) for name in names if name in left]
+        rows = [(name, summarize_command(left.pop(name))) for name in names if name in left]
         if rows:
             lines += [f"## {title}", "", "| command | effect |", "| --- | --- |"]
             lines += [f"| [`skinrig {name}`]({name}.md) | {_cell(text)} |" for name, text in rows]

@@ -127,7 +127,7 @@ def analyze_measured(
     """
     report = progress or (lambda text: None)
     faces = traits.read_faces(appearances, landmarks)
-    frame = face_textures.common_frame(faces, size)
+    frame = face_textures.build_common_frame(faces, size)
     names = tuple(face.name for face in faces)
     groups = {ALL_GROUPS: np.ones(len(names), np.bool_)}
     if labels is not None:
@@ -136,7 +136,7 @@ def analyze_measured(
     samples = []
     for face in faces:
         report(face.name)
-        samples.append(traits.albedo_sample(face, frame))
+        samples.append(traits.sample_albedo(face, frame))
     seen = [face.appearance for face in faces]
     found = dataclasses.replace(
         analyze(samples, names, groups, frame),

@@ -18,7 +18,7 @@ from reconstruction.brdf_basis.space import SpaceCurve
 from skinrig import consent
 from skinrig.analysing import brdf_space_datasets, brdf_space_figures
 from skinrig.analysing.brdf_space_datasets import Dataset
-from skinrig.appearances.face_textures import valid_texels
+from skinrig.appearances.face_textures import find_valid_texels
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.editing import surface_mixtures
 from skinrig.editing.surface_mixtures import SurfaceMixtureError
@@ -298,7 +298,7 @@ def _read_weights(
             f"({lobes.materials[0]}, ...), expected {materials.size} ({materials.names[0]}, ...); "
             "name the files of the fit with --merl-basis DIR"
         )
-    known = np.logical_and.reduce([valid_texels(one) for one in lobes.maps])
+    known = np.logical_and.reduce([find_valid_texels(one) for one in lobes.maps])
     at = rng.permutation(np.flatnonzero(known))[:count]
     if not len(at):
         raise AnalysisError(

@@ -1,1 +1,1 @@
-"""Views of appearances: dynamic maps, face textures and ground truth of expressions."""
+"""Access parts of appearances: dynamic parts, face textures and ground truth of expressions."""

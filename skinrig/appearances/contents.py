@@ -1,4 +1,4 @@
-"""Shared readers of an appearance: valid texels, assumptions, digest and versions."""
+"""Derive valid texels, assumptions, digests and versions of an appearance."""
 
 import hashlib
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from skinrig.arrays import BoolArray
 
 
 def intersect_valid(*maps: SkinMap) -> BoolArray:
-    """Return the texels that are valid in all of some maps of one size, (H, W).
+    """Return the texels that are valid in all given maps of one size, (H, W).
 
     Examples
     --------
@@ -31,17 +31,17 @@ def intersect_valid(*maps: SkinMap) -> BoolArray:
 
 
 def list_assumptions(appearance: SkinAppearance) -> list[str]:
-    """Return what an appearance takes for granted, a text each."""
+    """Return the assumptions of an appearance, one text each."""
     texts = appearance.parameters.get("assumed", ())
     return [str(text) for text in texts] if isinstance(texts, list | tuple) else []
 
 
-def document_digest(folder: Path) -> str:
+def hash_document(folder: Path) -> str:
     """Return the SHA-256 of an APPEARANCE/ folder's document."""
-    return digest(folder / store.DOCUMENT_FILE)
+    return hash_file(folder / store.DOCUMENT_FILE)
 
 
-def digest(path: Path) -> str:
+def hash_file(path: Path) -> str:
     """Return the SHA-256 of a file."""
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -53,13 +53,13 @@ def derive_appearance(
     parameters: Mapping[str, object],
     **more: Any,
 ) -> SkinAppearance:
-    """Return an appearance with the provenance of those that it is made of.
+    """Create an appearance with the provenance of its sources.
 
     Parameters
     ----------
     sources
-        One or more. The result is simulated where one of them is, records what all their subjects
-        agreed to, and has the seed of the first.
+        One or more sources. The result is simulated if one of them is. It records the consent of
+        all subjects, and the seed of the first source.
     maps, parameters, more
         Fields of the appearance.
     """
@@ -68,11 +68,11 @@ def derive_appearance(
         maps,
         "simulated" if any(one.source == "simulated" for one in sources) else "measured",
         {**parameters, **agreed},
-        versions=versions(),
+        versions=list_versions(),
         **{"seed": sources[0].seed, **more},
     )
 
 
-def versions() -> dict[str, str]:
-    """Return the versions of what computes maps, by distribution."""
+def list_versions() -> dict[str, str]:
+    """Return the versions of the distributions that compute maps."""
     return {name: metadata.version(name) for name in ("skinrig", "numpy", "scipy", "numba")}

@@ -1,6 +1,6 @@
-"""An APPEARANCE/ folder that moves: facial color, wrinkles and microstructure, fitted one by one.
+"""Read and write dynamic appearances: facial color, wrinkles and microstructure in one folder.
 
-Each fit adds its part to the folder and replaces an older one of its kind; the other parts stay.
+Each fit adds its part to the folder and replaces an older part of the same kind; others are kept.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,7 @@ from typing import Any
 
 from model import store
 from model.skin import SkinAppearance
-from skinrig.appearances.contents import versions
+from skinrig.appearances.contents import list_versions
 
 DYNAMIC_KIND = "dynamic"
 FACIAL_COLOR, WRINKLES, MICROSTRUCTURE = "facial_color", "wrinkles", "microstructure"
@@ -22,36 +22,36 @@ FIT_COMMANDS: Mapping[str, str] = {
 
 
 class DynamicAppearanceError(ValueError):
-    """A folder that holds no part that can be evaluated, or another kind of maps."""
+    """A folder without dynamic parts, or with maps of another kind."""
 
 
 def check_target(out: Path) -> None:
-    """Raise where a fit could not be written, before it is computed.
+    """Raise if the output folder of a fit is not usable, before the fit is computed.
 
     Raises
     ------
-    DynamicAppearanceError
-        ``out`` holds maps of another kind.
+        DynamicAppearanceError
+    *        If ``out`` has maps of another kind.
     """
     _previous(out)
 
 
 def add(out: Path, name: str, part: SkinAppearance) -> SkinAppearance:
-    """Add a part to those in the folder.
+    """Add a fitted part to a dynamic appearance.
 
     Parameters
     ----------
-    out
-        The folder; made where there is none.
-    name
-        Of `DYNAMIC_PARTS`.
-    part
-        What was fitted: one model with its maps, files, settings and figures.
+        out
+            The folder; created if missing.
+        name
+            Name of the part, of `DYNAMIC_PARTS`.
+        part
+            The fitted model with its maps, files, settings and figures.
 
     Raises
     ------
-    DynamicAppearanceError
-        ``out`` holds maps of another kind, or another part has a map of the same name.
+        DynamicAppearanceError
+    *        If ``out`` has maps of another kind, or another part has a map of the same name.
     """
     previous = _previous(out) or SkinAppearance({}, part.source)
     parts = {other: entry for other, entry in describe_parts(previous).items() if other != name}
@@ -62,7 +62,9 @@ def add(out: Path, name: str, part: SkinAppearance) -> SkinAppearance:
     left_out = [row for row in previous.left_out if row[0].partition(": ")[0] in parts]
     double = sorted({*maps, *files} & {*part.maps, *part.files})
     if double:
-        raise DynamicAppearanceError(f"{double[0]}: another part of {out} has a map of that name")
+        raise DynamicAppearanceError(
+            f"{double[0]}: another part of {out} has a map of that name; name another --out"
+        )
     parts[name] = {
         "maps": sorted(part.maps),
         "files": sorted(part.files),
@@ -74,7 +76,7 @@ def add(out: Path, name: str, part: SkinAppearance) -> SkinAppearance:
         source="simulated" if "simulated" in sources else "measured",
         parameters={"kind": DYNAMIC_KIND, "parts": parts},
         inputs={**inputs, **{f"{name}: {key}": value for key, value in part.inputs.items()}},
-        versions=versions(),
+        versions=list_versions(),
         left_out=(*left_out, *((f"{name}: {what}", why) for what, why in part.left_out)),
         files={**files, **part.files},
         seed=previous.seed if part.seed is None else part.seed,
@@ -86,27 +88,27 @@ def add(out: Path, name: str, part: SkinAppearance) -> SkinAppearance:
 def read(
     path: Path, *, parts: Sequence[str] = DYNAMIC_PARTS
 ) -> tuple[SkinAppearance, dict[str, Any]]:
-    """Return a dynamic appearance and the documents of its parts.
+    """Read a dynamic appearance and the documents of its parts.
 
     Parameters
     ----------
     path
         The folder.
     parts
-        Those of which at least one is needed.
+        Parts of which at least one is required.
 
     Raises
     ------
     DynamicAppearanceError
-        It holds none of them.
+        If it has none of them.
     """
     appearance = store.read(path)
     found = describe_parts(appearance) if appearance.parameters.get("kind") == DYNAMIC_KIND else {}
     if not set(parts) & set(found):
         commands = " or ".join(f"`{FIT_COMMANDS[name]}`" for name in parts)
         raise DynamicAppearanceError(
-            f"{path}: got {', '.join(found) or 'maps that nothing was fitted to'}, expected "
-            f"{' or '.join(parts)}; {commands} makes it"
+            f"{path}: got {', '.join(found) or 'maps without fitted parts'}, expected "
+            f"{' or '.join(parts)}; run {commands}"
         )
     return appearance, found
 
@@ -118,7 +120,7 @@ def _previous(out: Path) -> SkinAppearance | None:
     if kind != DYNAMIC_KIND:
         raise DynamicAppearanceError(
             f"{out}: holds maps of kind {kind!r}, expected a new folder or one that a fit wrote; "
-            "nothing was touched: name another with --out"
+            "it was not changed; name another with --out"
         )
     return store.read(out)
 

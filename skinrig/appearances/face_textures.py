@@ -1,4 +1,4 @@
-"""A reconstructed face laid out in a common map: its landmarks, positions and albedo."""
+"""Read a reconstructed face with its landmarks and relate its texture to a common map."""
 
 import json
 import math
@@ -24,31 +24,31 @@ Point = tuple[float, float, float]
 Landmarks = dict[str, Point]
 
 TRUE_LANDMARKS_KEY: Final = "landmarks_mm"
-"""Parameter of a TRUTH/ folder: name to x, y, z, mm, rig frame."""
+"""Parameter of a TRUTH/ folder: x, y, z by landmark, mm, rig frame."""
 LANDMARK_STDERR_MM: Final = 1.0
-"""Standard error of a landmark that a person places, along each axis."""
+"""Standard uncertainty of a manually placed landmark, per axis."""
 
 
 class FaceError(ValueError):
-    """An appearance that lacks what the common map needs, or landmarks that do not fit it."""
+    """An appearance without the maps of a common map, or inconsistent landmarks."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Face:
-    """One appearance and where its landmarks are.
+    """An appearance with its landmarks.
 
     Attributes
     ----------
     name
-        Of its folder, without "appearance-".
+        Name of its folder, without "appearance-".
     path
         The folder.
     appearance
         Its maps.
     landmarks
-        Name to x, y, z, mm, rig frame; empty where there are none.
+        x, y, z by name, mm, rig frame; empty if there are none.
     marked_by
-        Where they come from, for people.
+        Source of the landmarks, in words.
     """
 
     name: str
@@ -64,8 +64,8 @@ class Face:
 
     @property
     def surface(self) -> BoolArray:
-        """Texels that show the surface, (H, W)."""
-        return valid_texels(_map(self, "position"))
+        """Texels of the surface, (H, W)."""
+        return find_valid_texels(_map(self, "position"))
 
     @property
     def r_d(self) -> SkinMap:
@@ -78,18 +78,18 @@ class Face:
         return found
 
     def texel_mm(self) -> float:
-        """Return the usual distance of two texels."""
+        """Return the median distance of adjacent texels, mm."""
         position, on = self.position, self.surface
         step = np.linalg.norm(np.diff(position, axis=1), axis=-1)[on[:, 1:] & on[:, :-1]]
         return float(np.median(step)) if step.size else 1.0
 
     def correspondence(self, frame: CommonFrame) -> Correspondence:
-        """Return how the face lies in a common map; without landmarks it is unrolled and no more.
+        """Return the correspondence to a common map; without landmarks, only a cylindrical unwrap.
 
         Raises
         ------
         FaceError
-            Naming the folder, where its landmarks do not fit.
+            If the landmarks are inconsistent; the message names the folder.
         """
         if not self.landmarks:
             cylinder = common_parameterization.find_cylinder(self.position, self.surface)
@@ -102,12 +102,12 @@ class Face:
             raise FaceError(f"{self.path}: {error}") from error
 
     def chart(self, frame: CommonFrame) -> TexelChart:
-        """Return where each texel lies in a common map."""
+        """Return the position of each texel in a common map."""
         return charts.chart_texels(self.position, self.surface, self.correspondence(frame), frame)
 
 
 def read(path: Path, landmarks: Path | None = None) -> Face:
-    """Read an appearance with its landmarks: of a table, else of its ground truth.
+    """Read an appearance with landmarks from a table, else from its ground truth.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def read(path: Path, landmarks: Path | None = None) -> Face:
     Raises
     ------
     FaceError, LandmarkError, StoreError
-        Naming the file.
+        If a file is invalid; the message names it.
     """
     found = store.read(path)
     name = path.resolve().name.removeprefix("appearance-")
@@ -139,8 +139,8 @@ def read(path: Path, landmarks: Path | None = None) -> Face:
     return Face(name, path, found, points, "the simulation's own")
 
 
-def common_frame(faces: Sequence[Face], size: int | None = None) -> CommonFrame:
-    """Return the common map of some faces with landmarks."""
+def build_common_frame(faces: Sequence[Face], size: int | None = None) -> CommonFrame:
+    """Build the common map of faces with landmarks."""
     names, places = common_parameterization.average_landmarks([face.landmarks for face in faces])
     cylinders = [common_parameterization.Cylinder(face.landmarks["nose tip"]) for face in faces]
     unrolled = [
@@ -159,9 +159,9 @@ def read_landmarks(path: Path, face: Face) -> Landmarks:
     Raises
     ------
     landmark_table.LandmarkError
-        For a file that is not a table.
+        If the file is not a table.
     FaceError
-        For a landmark outside the texture, or where it shows no surface.
+        If a landmark is outside the texture or not on the surface.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -174,7 +174,7 @@ def read_landmarks(path: Path, face: Face) -> Landmarks:
             cells = [c.strip() for c in line.split(",")]
             try:
                 if len(cells) != 4 or not cells[0] or cells[0] in found:
-                    raise ValueError("expected a name of its own and three numbers")
+                    raise ValueError("expected a unique name and three numbers")
                 found[cells[0]] = _point([float(c) for c in cells[1:]])
             except ValueError as error:
                 raise landmark_table.LandmarkError(f"{path}, row {number}: {error}") from error
@@ -186,16 +186,16 @@ def read_landmarks(path: Path, face: Face) -> Landmarks:
         inside = 0 <= row < on.shape[0] and 0 <= column < on.shape[1]
         if not inside or not on[row, column]:
             raise FaceError(
-                f"{path}: {name!r} at ({x:g}, {y:g}) lies "
-                + ("where the texture shows no surface" if inside else "outside the texture")
+                f"{path}: {name!r} at ({x:g}, {y:g}) is "
+                + ("not on the surface" if inside else "outside the texture")
                 + f" of {face.path} ({on.shape[1]} x {on.shape[0]} texels)"
             )
         out[name] = _point(position[row, column].tolist())
     return out
 
 
-def valid_texels(skin_map: SkinMap) -> BoolArray:
-    """Return the texels of a map that mean something, (H, W)."""
+def find_valid_texels(skin_map: SkinMap) -> BoolArray:
+    """Return the valid texels with finite values, (H, W)."""
     finite = (
         np.isfinite(skin_map.values)
         if skin_map.values.ndim == 2
@@ -205,7 +205,7 @@ def valid_texels(skin_map: SkinMap) -> BoolArray:
 
 
 def choose_size(side_mm: float, texel_mm: float) -> int:
-    """Return the width in pixels, a power of two, of a map with texels of a given size.
+    """Return the width, a power of two in pixels, of a map with texels of about a given size.
 
     Examples
     --------
@@ -233,7 +233,8 @@ def _map(face: Face, name: str) -> SkinMap:
     if name not in face.appearance.maps:
         have: Mapping[str, SkinMap] = face.appearance.maps
         raise FaceError(
-            f"{face.path}: has no map {name!r} (it has {', '.join(sorted(have)) or 'none'}); "
-            f"`skinrig reconstruct SESSION --maps {name}` of a dome session makes it"
+            f"{face.path}: got maps {', '.join(sorted(have)) or 'none'}, expected {name!r};"
+            f" create it "
+            f"by `skinrig reconstruct SESSION --maps {name}` from a dome session"
         )
     return face.appearance.maps[name]

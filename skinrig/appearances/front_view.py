@@ -1,4 +1,4 @@
-"""A surface seen from the front: its points as a picture."""
+"""Project surface points to an image from the front."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from scipy import ndimage
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 
 FRONT_VIEW_WIDTH_PX = 220
-"""Pixels across."""
+"""Image width."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrontView:
-    """Points of a surface as they lie in a picture from the front, without perspective.
+    """Orthographic projection of surface points to an image from the front.
 
     Attributes
     ----------
     shape
-        Rows and columns of the picture.
+        Rows and columns of the image.
     rows, columns
-        Where each point falls, shape (N,); -1 outside the picture.
+        Pixel of each point, shape (N,); -1 outside the image.
     order
-        Points from the back to the front, shape (N,).
+        Indices of the points from back to front, shape (N,).
     """
 
     shape: tuple[int, int]
@@ -35,7 +35,7 @@ class FrontView:
 
     @staticmethod
     def of(position_mm: FloatArray, box: tuple[FloatArray, FloatArray]) -> FrontView:
-        """Look along -z at points, shape (N, 3), inside a box given by its two corners."""
+        """Project points, shape (N, 3), along -z; a box given by two corners is the image."""
         low, high = box
         pixel = max(float(high[0] - low[0]) / FRONT_VIEW_WIDTH_PX, 1e-9)
         height = max(int(np.ceil(float(high[1] - low[1]) / pixel)), 1)
@@ -52,10 +52,10 @@ class FrontView:
     def rasterize(
         self, values: FloatArray, *, valid: BoolArray | None = None
     ) -> tuple[Float64Array, BoolArray]:
-        """Return the picture of a value at each point, (N,) or (N, 3), and where there is one.
+        """Return the image of a value per point, (N,) or (N, 3), and its valid pixels.
 
-        The frontmost point of a pixel is shown; gaps of up to two pixels between points take the
-        nearest one's value.
+        The frontmost point of a pixel is visible; gaps of up to two pixels between points get the
+        value of the nearest.
         """
         chosen = self.order[(self.rows[self.order] >= 0)]
         image = np.zeros((*self.shape, *values.shape[1:]))

@@ -1,4 +1,4 @@
-"""Find the ground truth of a simulated session's state."""
+"""Find the ground truth of an expression or strain step of a simulated session."""
 
 from pathlib import Path
 from typing import Final
@@ -7,14 +7,14 @@ from model import store
 from skinrig.simulating.orders import truth_folder
 
 DEFAULT_STATE: Final = "neutral"
-"""State used if none is given."""
+"""Expression used if none is given."""
 
 
 def find_state_truth(session: Path, state: str) -> Path | None:
-    """Return the folder with a simulated session's truth of a state, where there is one.
+    """Return the ground truth folder of a simulated session's expression, if it exists.
 
-    A session's first state has no name in its folder's: ``truth-face`` of `session-face`, and
-    ``truth-face-smile`` of a state that comes later.
+    The first expression of `session-face` is in ``truth-face``, a later one such as smile in
+    ``truth-face-smile``.
     """
     first = truth_folder(session)
     for named in (first, first.with_name(f"{first.name}-{state}")):
@@ -25,9 +25,9 @@ def find_state_truth(session: Path, state: str) -> Path | None:
 
 
 def find_comparison_truth(session: Path, state: str = DEFAULT_STATE) -> Path | None:
-    """Return the folder with what maps of a session's state are to be compared with, or None.
+    """Return the ground truth folder with which maps of a session are compared, or None.
 
-    Where no state is asked for, as of rigs before which faces hold still, it is the session's own.
+    For the default expression, as of rigs with one expression only, it is the session's own.
     """
     found = find_state_truth(session, state)
     if found is not None or state != DEFAULT_STATE:

@@ -1,1 +1,1 @@
-"""Fitted models of a moving face, evaluated."""
+"""Evaluate fitted models of a moving face: `skinrig apply`."""

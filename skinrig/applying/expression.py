@@ -1,4 +1,4 @@
-"""A dynamic appearance evaluated: blood, color, normals and displacement of an expression."""
+"""Evaluate a dynamic appearance: blood, color, normals and displacement of an expression."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,40 +19,40 @@ from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ROW_OF_STATE, Clamp
 from reconstruction.facial_color.rig_transfer import transfer_rig
 from skinrig.appearances import dynamic as dynamic_appearance
-from skinrig.appearances.contents import derive_appearance, document_digest, intersect_valid
+from skinrig.appearances.contents import derive_appearance, hash_document, intersect_valid
 from skinrig.appearances.dynamic import DYNAMIC_PARTS, FACIAL_COLOR, WRINKLES
 from skinrig.capturing.option_values import parse_amounts
 from skinrig.console import select_attributes
-from skinrig.errors import UsageError, one_of
+from skinrig.errors import UsageError, require_choice
 
 EXPRESSION_KIND = "expression"
 MIN_WEIGHT_SUM = 1e-6
 COLOR_OBSERVER, COLOR_ILLUMINANT = "linear sRGB", "D65"
-"""What colors are given for: screens and textures, not the camera that measured."""
+"""Observer and illuminant of output colors: those of screens and textures, not of the camera."""
 
 
 class ApplyError(ValueError):
-    """Weights that cannot be applied."""
+    """Weights or outputs that are not applicable to the fitted parts."""
 
 
 class WeightsError(ApplyError, UsageError):
-    """Weights that cannot be read."""
+    """Malformed weights."""
 
 
 @dataclass(slots=True)
 class AppliedExpression:
-    """What came out of an evaluation.
+    """Result of an evaluation.
 
     Attributes
     ----------
     maps
-        By name.
+        Maps by name.
     figures
         JSON values of each part: clipped fractions, clamped zones, seconds.
     left_out
-        Parts that were not evaluated, and why.
+        Omitted parts with reasons.
     inputs
-        SHA-256 of what was read besides the folder.
+        SHA-256 of inputs other than the folder.
     """
 
     maps: dict[str, SkinMap] = field(default_factory=dict)
@@ -63,18 +63,18 @@ class AppliedExpression:
 
 @dataclass(frozen=True, slots=True)
 class TargetFace:
-    """A face that a rig was not fitted to.
+    """A face to which a rig of another face is transferred.
 
     Attributes
     ----------
     appearance
-        With a map ``hemoglobin`` and, for its color, ``melanin``: measured, of imported
-        photographs, or painted.
+        Appearance with a map ``hemoglobin`` and, for color, ``melanin``: measured, from
+        imported photographs, or painted.
     landmarks, landmarks_rig
-        Named points of it and of the rig's face, px of their maps; None: both are framed or
-        unwrapped alike.
+        Landmarks of this face and of the rig's face, px of their maps; None: both have the same
+        framing or texture layout.
     hashes
-        SHA-256 of the files they were read from, by what they are.
+        SHA-256 of the source files, by role.
     """
 
     appearance: SkinAppearance
@@ -85,22 +85,22 @@ class TargetFace:
 
 @dataclass(frozen=True, slots=True)
 class ExpressionRequest:
-    """What is asked for.
+    """Weights and options of an evaluation.
 
     Attributes
     ----------
     weights
-        By state; of facial color they sum to one, "neutral" among them.
+        Weight by expression; those of facial color sum to 1, including "neutral".
     normalize
         Divide the weights by their sum.
     clamp
-        Range of a wrinkle zone's sum over blend shapes.
+        Range of a wrinkle zone's summed weight over blend shapes.
     onto
-        Another face's blood and melanin that the rig is applied to; None: the rig's own.
+        Target face to which the rig is transferred; None: the rig's own face.
     emotional
-        Let anger redden and fear pale the whole face by the paper's factors.
+        Scale the blood of the whole face by the paper's factors for anger and fear.
     gain
-        One more factor of all blood.
+        Additional factor of the blood volume fraction.
     """
 
     weights: Mapping[str, float]
@@ -112,12 +112,12 @@ class ExpressionRequest:
 
 
 def parse_weights(text: str) -> dict[str, float]:
-    """Return weights given as ``smile=0.7,anger=0.3``.
+    """Parse weights from ``smile=0.7,anger=0.3``.
 
     Raises
     ------
     WeightsError
-        If a part is not ``NAME=NUMBER``, or a name given twice.
+        If a part is not ``NAME=NUMBER``, or a name occurs twice.
 
     Examples
     --------
@@ -127,7 +127,9 @@ def parse_weights(text: str) -> dict[str, float]:
     found = parse_amounts(text.split(","), "weights", error=WeightsError)
     for name, weight in found.items():
         if not np.isfinite(weight):
-            raise WeightsError(f"weights: got {name}={weight}, expected a finite number")
+            raise WeightsError(
+                f"--weights: got {name}={weight}, expected a finite number; correct it"
+            )
     return found
 
 
@@ -145,36 +147,36 @@ def apply_expression(
     Parameters
     ----------
     path
-        Folder that `skinrig fit` made.
+        Dynamic appearance written by `skinrig fit`.
     expression
-        What is asked for.
+        Weights and options.
     out
         APPEARANCE/ folder of the result.
     parts
-        Which parts to evaluate, of those that there are.
+        Parts to evaluate, if the folder has them.
     relief
-        Evaluates the microstructure, which needs a mesh; None leaves it out.
+        Evaluates the microstructure, which needs a mesh; None: it is omitted.
     progress
-        Called with one line a part.
+        Called with one line per part.
 
     Returns
     -------
-    Applied
+    AppliedExpression
 
     Raises
     ------
     ApplyError, FacialColorError, WrinkleError, DynamicAppearanceError, StoreError
-        For weights that a part cannot take, or a folder that holds none of the parts.
+        If a part does not have a weight's expression, or the folder has none of the parts.
     """
     for name in parts:
-        one_of("parts", name, DYNAMIC_PARTS, ApplyError)
+        require_choice("parts", name, DYNAMIC_PARTS, ApplyError)
     appearance, found = dynamic_appearance.read(path, parts=parts)
     _check_target(out, path)
     expression = normalize_weights(expression)
     done = AppliedExpression()
     for name in DYNAMIC_PARTS:
         if name not in found or name not in parts:
-            why = "not asked for" if name in found else "the folder does not hold it"
+            why = "omitted by option" if name in found else "not in the folder"
             done.left_out.append((name, why))
             continue
         if progress is not None:
@@ -187,13 +189,13 @@ def apply_expression(
         elif relief is not None:
             relief(appearance, found[name], done)
         else:
-            done.left_out.append((name, "needs the moving mesh: give --mesh"))
+            done.left_out.append((name, "requires the moving mesh; add --mesh"))
             continue
         done.figures.setdefault(name, {})["seconds"] = round(time.perf_counter() - start, 3)
     if not done.maps:
         reasons = "; ".join(f"{what}: {why}" for what, why in done.left_out)
-        raise ApplyError(f"{path}: nothing was left to evaluate ({reasons})")
-    # seconds differ from run to run: the same input gives the same bytes
+        raise ApplyError(f"{path}: no part can be evaluated ({reasons})")
+    # run times are not written, so that the same input gives the same bytes
     figures = {
         name: {key: value for key, value in part.items() if "seconds" not in key}
         for name, part in done.figures.items()
@@ -209,7 +211,7 @@ def apply_expression(
             **select_attributes(expression, "clamp", "emotional", "gain"),
         },
         inputs={
-            "appearance": document_digest(path),
+            "appearance": hash_document(path),
             **({} if other is None else other.hashes),
             **done.inputs,
         },
@@ -220,7 +222,7 @@ def apply_expression(
 
 
 def _check_target(out: Path, path: Path) -> None:
-    """Raise where the result would replace what it is made of, or anything but a result."""
+    """Raise if the result would replace its input, or a folder that is not a result."""
     if out.resolve() == path.resolve():
         raise ApplyError(f"{out}: is the fitted folder itself; name another with --out")
     if (out / store.DOCUMENT_FILE).is_file():
@@ -228,30 +230,32 @@ def _check_target(out: Path, path: Path) -> None:
         if kind != EXPRESSION_KIND:
             raise ApplyError(
                 f"{out}: holds maps of kind {kind!r}, expected a new folder or an older result; "
-                "nothing was touched: name another with --out"
+                "it was not changed; name another with --out"
             )
 
 
 def normalize_weights(expression: ExpressionRequest) -> ExpressionRequest:
-    """Return the expression with the weights that all parts are evaluated with."""
+    """Normalize the weights if requested, as all parts use them."""
     if not expression.normalize:
         return expression
     total = sum(expression.weights.values())
     if abs(total) < MIN_WEIGHT_SUM:
-        raise ApplyError(f"weights: their sum is {total:g}: it cannot be made 1")
+        raise ApplyError(
+            f"--weights: got a sum of {total:g}, expected another than 0; remove --normalize"
+        )
     weights = {name: weight / total for name, weight in expression.weights.items()}
     return replace(expression, weights=weights, normalize=False)
 
 
-def hemoglobin_rig(appearance: SkinAppearance) -> HemoglobinRig:
-    """Return the hemoglobin rig that an appearance holds."""
+def read_hemoglobin_rig(appearance: SkinAppearance) -> HemoglobinRig:
+    """Read the hemoglobin rig of an appearance."""
     return from_maps_and_document(appearance.maps, appearance.files[RIG_DOCUMENT])
 
 
 def _facial_color(
     appearance: SkinAppearance, expression: ExpressionRequest, done: AppliedExpression
 ) -> None:
-    rig = hemoglobin_rig(appearance)
+    rig = read_hemoglobin_rig(appearance)
     maps = appearance.maps
     if expression.onto is not None:
         rig = _transfer_rig(rig, expression.onto, done)
@@ -271,7 +275,7 @@ def _facial_color(
         "mean_hemoglobin": float(held[good].mean()) if good.any() else None,
     }
     if "melanin" not in maps:
-        done.left_out.append(("color", "it needs a melanin map"))
+        done.left_out.append(("color", "requires a melanin map"))
         return
     melanin = maps["melanin"]
     seen = good & intersect_valid(melanin)
@@ -283,15 +287,16 @@ def _facial_color(
 
 
 def _transfer_rig(rig: HemoglobinRig, target: TargetFace, done: AppliedExpression) -> HemoglobinRig:
-    """Return the rig for another face's blood."""
+    """Transfer a rig to the blood volume fraction of another face."""
     if "hemoglobin" not in target.appearance.maps:
         names = ", ".join(target.appearance.maps) or "none"
-        raise ApplyError(f"onto: got maps {names}, expected hemoglobin among them")
+        raise ApplyError(f"--target-face: got maps {names}, expected hemoglobin; reconstruct it")
     blood = target.appearance.maps["hemoglobin"]
     melanin = target.appearance.maps.get("melanin")
     if melanin is not None and melanin.values.shape != blood.values.shape:
         raise ApplyError(
-            f"onto: melanin is {melanin.values.shape}, hemoglobin {blood.values.shape}, expected "
+            f"--target-face: got melanin of {melanin.values.shape} and hemoglobin of "
+            f"{blood.values.shape} px, expected "
             "one size"
         )
     shape = (blood.values.shape[0], blood.values.shape[1])
@@ -300,7 +305,9 @@ def _transfer_rig(rig: HemoglobinRig, target: TargetFace, done: AppliedExpressio
             rig, shape, landmarks_rig=target.landmarks_rig, landmarks_onto=target.landmarks
         )
     else:
-        done.left_out.append(("landmarks", "none: both faces are taken to be framed alike"))
+        done.left_out.append(
+            ("landmarks", "none given; both faces are assumed to have the same framing")
+        )
     return rig.transfer_to(blood.values, valid=blood.valid, stderr=blood.stderr)
 
 
@@ -328,26 +335,26 @@ def _wrinkles(
 
 
 def wrinkle_weights(model: WrinkleModel, weights: Mapping[str, float]) -> dict[str, float]:
-    """Return the weights of a wrinkle model's own rows for weights of states.
+    """Map weights of expressions to weights of a wrinkle model's rows.
 
-    A state selects the row of its name, or the equivalent row of the paper. Conditions of the
-    whole body deform nothing.
+    An expression selects the row of its name, or the equivalent row of the paper. Conditions of the
+    whole body have no wrinkles.
 
     Raises
     ------
     ApplyError
-        For a state that has no row.
+        If an expression has no row.
     """
     rows = {name for layer in model.layers for name in layer.table.rows}  # type: ignore[union-attr]
     found: dict[str, float] = {}
     for state, weight in weights.items():
         if state not in rows and state not in ROW_OF_STATE:
-            one_of("weights", state, sorted(rows), ApplyError)
+            require_choice("weights", state, sorted(rows), ApplyError)
         row = state if state in rows else ROW_OF_STATE[state]
         if row is not None and row not in rows:
             raise ApplyError(
-                f"weights: wrinkles were not fitted to {state!r}, expected out of "
-                f"{', '.join(sorted(rows))}; leave them out with --parts "
+                f"--weights: got {state!r}, expected an expression with fitted wrinkles, one of "
+                f"{', '.join(sorted(rows))}; or omit wrinkles with --parts "
                 "facial_color,microstructure"
             )
         if row is not None:

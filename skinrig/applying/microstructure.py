@@ -1,4 +1,4 @@
-"""The relief of a face whose skin is stretched: strain of a mesh, kernels, convolution."""
+"""Deform relief by the strain of a mesh: kernels per texel and tiled convolution."""
 
 from __future__ import annotations
 
@@ -38,54 +38,55 @@ from skinrig.console import select_attributes
 TILE_PX: Final = 2048
 JOURNAL_SCHEMA: Final = "skinrig.microstructure-tiles/1"
 STATISTICS_SIDE_PX: Final = 1024
-"""Shares of pixels are counted on a texture of so many a side."""
+"""Side of the texture on which pixel fractions are evaluated."""
 MIN_SIGMA_PX: Final = 0.3
-"""The discrete Gaussian of a narrower kernel leaves 99 % and more to the pixel itself."""
+"""Minimum effective kernel width; a narrower discrete Gaussian has 99 % of its weight at one
+pixel."""
 ROWS_PER_DIGEST: Final = 256
-"""Rows of a map that are hashed at a time to identify it."""
+"""Rows of a map per hash update."""
 
 
 class ApplyMicrostructureError(ValueError):
-    """A relief and a mesh that do not go together, or a file of another job."""
+    """Inconsistent relief and mesh, or an output file of another job."""
 
 
 @dataclass(frozen=True, slots=True)
 class MicrostructureReport:
-    """What a pose did to the relief; shares are of 1.
+    """Effect of a pose on the relief; shares are fractions of 1.
 
     Attributes
     ----------
     size_px : (int, int)
         Height and width of the map.
     stretch_s, stretch_t : (float, float)
-        Least and largest ratio over vertices.
+        Minimum and maximum stretch ratio over vertices.
     fitted_range : (float, float)
-        Ratios that the table, the first one of several, was fitted to.
+        Stretch ratios to which the table, or the first of several, was fitted.
     outside_share : float
-        Of the vertices: r_s or r_t beyond the range of the table that counts most there.
+        Fraction of vertices with r_s or r_t outside the range of the locally dominant table.
     below_share, above_share : float
-        Of the vertices: a ratio below it, a ratio above it.
+        Fraction of vertices with a ratio below, or above, that range.
     extrapolate : str
-        What was done there.
+        Extrapolation mode outside the range.
     clipped_share : float
-        Of the vertices: an alpha that the table's lines have beyond [-2, 1].
+        Fraction of vertices whose alpha was clipped to [-2, 1].
     invalid_share, degenerate_share, uv_degenerate_share, uv_turned_share : float
-        Of the vertices: without strain. Of the triangles: as in
+        Fraction of vertices without strain; the others are fractions of triangles, see
         `model.microstructure.mesh_strain.MeshStrain`.
     covered_share : float
-        Of the pixels: within a triangle of the texture. Others keep the neutral relief.
+        Fraction of pixels within a triangle of the texture; others keep the neutral relief.
     changed_share : float
-        Of the covered pixels: a kernel does something.
+        Fraction of covered pixels whose kernel is not the identity.
     unresolved_share : float
-        Of the covered pixels: kernels are asked for that are all too narrow for the map's pixels
-        (`MIN_SIGMA_PX`), so that next to nothing is done. Near 1 for maps of a whole face below
-        8K or so: microstructure needs pixels of 10 to 20 um.
+        Fraction of covered pixels whose kernels are narrower than `MIN_SIGMA_PX` and thus have
+        almost no effect. It is near 1 for maps of a whole face below about 8K, as microstructure
+        requires pixels of 10 to 20 um.
     pixel_um : float
-        Median over vertices of the length of skin that a pixel has along the axes.
+        Median pixel size on the skin over vertices.
     strain_s, convolution_s : float
-        Seconds for the strain of the mesh, and for fields and convolution of all tiles done now.
+        Run time of the strain, and of fields and convolution of the tiles of this run.
     tiles, tiles_before : int
-        Tiles in all, and those that an interrupted run had done.
+        Total number of tiles, and those finished by an interrupted run.
     """
 
     size_px: tuple[int, int]
@@ -113,12 +114,12 @@ class MicrostructureReport:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AppliedMicrostructure:
-    """A relief under strain.
+    """Relief under strain, with a report.
 
     Attributes
     ----------
     height : ndarray of float32, shape (H, W)
-        In the neutral relief's unit; a memory map where a file was asked for.
+        Relief in the unit of the neutral relief; a memory map if `out` was given.
     report : MicrostructureReport
     """
 
@@ -139,31 +140,31 @@ def apply_microstructure(
     out: Path | str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> AppliedMicrostructure:
-    """Return the relief of a mesh under weights of its blend shapes.
+    """Deform relief by the strain of a mesh under blend-shape weights.
 
     Parameters
     ----------
     mesh : BlendShapeMesh
-        Mesh, mm: its texture's scale determines the width of kernels in pixels.
+        Mesh, mm; the scale of its texture determines the kernels' widths in pixels.
     weights : mapping of str to float
-        Of its shapes.
+        Weight by blend shape.
     neutral_height : array or memory map, shape (H, W)
         Displacement in the mesh's texture, any unit; row 0 is the top (v = 1).
     table : KernelTable or KernelRegions
-        Kernels of the skin by its stretch ratios; several kinds of skin and where they are.
+        Kernels over stretch ratios; or several tables with their regions.
     valid : array or memory map of bool, shape (H, W), optional
-        Heights that may be sampled; heights that are not finite never are.
+        Heights that may be sampled; non-finite heights are always excluded.
     extrapolate : {"hold", "formula"}
-        Beyond the table's range: see `model.microstructure.kernel_parameters`.
+        Extrapolation outside the table's range, see `model.microstructure.kernel_parameters`.
     sampling : {"cubic", "linear"}
-        As of `model.microstructure.convolution.convolve`.
+        Interpolation, see `model.microstructure.convolution.convolve`.
     tile : int
         Width and height of tiles, pixels; the result does not depend on it.
     out : path, optional
-        A .npy file for the result, written as a memory map. Until all tiles are
-        done, ``<out>.tiles.json`` lists them, so that the same call resumes an interrupted one.
+        A .npy file for the result, written as a memory map. Until all tiles are finished,
+        ``<out>.tiles.json`` lists those that are, so that the same call resumes an interrupted one.
     progress : callable, optional
-        Called with the numbers of tiles done and in all.
+        Called with the number of finished tiles and their total.
 
     Returns
     -------
@@ -172,9 +173,9 @@ def apply_microstructure(
     Raises
     ------
     ApplyMicrostructureError
-        If heights are not a map, or for an `out` that belongs to another job.
+        If heights are not a map, or `out` belongs to another job.
     rigsim.geometry.mesh.MeshError
-        For shapes that the mesh lacks.
+        If the mesh lacks a blend shape.
     """
     shape = tuple(int(side) for side in np.shape(neutral_height))
     if len(shape) != 2 or min(shape) < 1:
@@ -239,7 +240,7 @@ def apply_microstructure(
 def convolve_by_strain(
     height: Float32Array, found: MeshStrain, faces: Int64Array, uv: Float64Array, table: KernelTable
 ) -> tuple[Float32Array, TextureStrain]:
-    """Return a map in memory convolved by the strain of its mesh, and the strain at its pixels."""
+    """Convolve a map in memory by the strain of its mesh; also return the strain per pixel."""
     field = rasterize(found, faces, uv, (height.shape[0], height.shape[1]))
     s, t = line_kernels(field, table)
     return convolve(height, s.axis, t.axis, s.alpha, s.sigma_px, t.alpha, t.sigma_px), field
@@ -263,7 +264,7 @@ class _Pose:
         return regional_kernels(shown, self.regions, self.size, **how)
 
     def shares(self) -> dict[str, Any]:
-        """Return shares of pixels: covered; of these, changed, and asked for but unresolved."""
+        """Return fractions of covered pixels and, of these, of changed and unresolved ones."""
         coarser = math.ceil(max(self.size) / STATISTICS_SIDE_PX)
         few = (math.ceil(self.size[0] / coarser), math.ceil(self.size[1] / coarser))
         shown = rasterize(self.strain, self.mesh.faces, self.mesh.uv, few, pad_px=0)
@@ -282,11 +283,12 @@ class _Pose:
         }
 
     def stretches(self) -> dict[str, Any]:
-        """Return what of a report is of the vertices: stretch, range, pixels."""
+        """Return the report's entries over vertices: stretch, range, pixel size."""
         found, good = self.strain, self.strain.valid
         if not good.any():
             raise ApplyMicrostructureError(
-                "mesh: no vertex has a triangle with an area and a texture"
+                "mesh: got no triangle with an area and a texture area, expected some; check its "
+                "texture coordinates"
             )
         both = np.stack([found.r_s[good], found.r_t[good]])
         own = self.regions.table_at(self.mesh.uv[good])
@@ -338,7 +340,7 @@ def _hash_job(
 
 @dataclass(slots=True, eq=False)
 class _Tiles:
-    """A map, and which tiles of it are done."""
+    """A map with its finished tiles."""
 
     target: Any
     finished: list[int]
@@ -347,7 +349,7 @@ class _Tiles:
         self.finished.append(number)
 
     def close(self) -> None:
-        """Nothing is left to be done with a map in memory."""
+        """Do nothing, as a map in memory needs no clean-up."""
 
 
 @dataclass(slots=True, eq=False)
@@ -361,7 +363,9 @@ class _Journal(_Tiles):
     def open(cls, out: Path, job: str, size: tuple[int, int]) -> _Journal:
         path = out.with_name(out.name + ".tiles.json")
         if out.suffix != ".npy":
-            raise ApplyMicrostructureError(f"out: got {out.name!r}, expected a name in .npy")
+            raise ApplyMicrostructureError(
+                f"out: got {out.name!r}, expected a name that ends in .npy; rename it"
+            )
         if path.exists() and out.exists():
             try:
                 document = json.loads(path.read_text("utf-8"))
@@ -371,7 +375,9 @@ class _Journal(_Tiles):
                     [int(number) for number in document["finished"]],
                 )
             except (ValueError, KeyError, TypeError) as error:
-                raise ApplyMicrostructureError(f"{path}: not a list of tiles: {error}") from error
+                raise ApplyMicrostructureError(
+                    f"{path}: not a list of tiles ({error}); remove it"
+                ) from error
             if not (known and same):
                 raise ApplyMicrostructureError(
                     f"{path}: belongs to another relief, mesh, pose or setting; "

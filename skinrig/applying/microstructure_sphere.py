@@ -1,10 +1,9 @@
-"""The sphere of Nagano et al. 2015, fig. 5: shrunk, grown, squashed, and its relief with it.
+"""Deform the sphere of Nagano et al. 2015, fig. 5, with its relief: shrunk, grown, squashed.
 
-The half that faces +z and a margin are one chart, by stereographic projection from -z, which keeps
-angles: x of the texture is x in space, and its rows go down with y. Relief is a map on that chart,
-from noise in space (top row of the figure) or grown from patches (bottom row), and follows the
-strain of the sphere's mesh like any other (`model.microstructure.mesh_strain`,
-`model.microstructure`).
+The half that faces +z and a margin are one chart, by stereographic projection from -z, which is
+conformal. x of the texture is x in space, and its rows go down with y. Relief is a map on that
+chart, from noise in space (top row of the figure) or grown from patches (bottom row). It follows
+the strain of the sphere's mesh (`model.microstructure.mesh_strain`, `model.microstructure`).
 
 References
 ----------
@@ -28,10 +27,10 @@ from model.displacement_synthesis.volume_noise import VolumeNoise
 from model.microstructure import FOREHEAD, KernelTable, strain_fields
 from skinrig.applying.microstructure import convolve_by_strain
 from skinrig.arrays import Float32Array, Float64Array, Int64Array
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 
 CHART_HALF_SIDE: Final = 1.1
-"""Half the chart's side, in units of the projection: 1 is the rim that is seen from +z."""
+"""Half the chart's side, in units of the projection; 1 is the silhouette from +z."""
 SPHERE_DIVISIONS: Final = 96
 DEFORMATION_RATIOS: Final[Mapping[str, tuple[float, float, float]]] = {
     "neutral": (1.0, 1.0, 1.0),
@@ -39,7 +38,8 @@ DEFORMATION_RATIOS: Final[Mapping[str, tuple[float, float, float]]] = {
     "grown": (1.25, 1.25, 1.25),
     "squashed": (1.25, 0.8, 1.0),
 }
-"""Ratios along x, y, z of what the figure shows; it gives no numbers, these are ours."""
+"""Stretch ratios along x, y, z for the figure's shapes; the paper gives none, these are
+estimates."""
 ROUGHNESS_POINTS: Final[Mapping[str, tuple[float, float, float]]] = {
     "front": (0.0, 0.0, 1.0),
     "right": (math.sqrt(0.5), 0.0, math.sqrt(0.5)),
@@ -49,7 +49,7 @@ ROUGHNESS_POINTS: Final[Mapping[str, tuple[float, float, float]]] = {
 
 
 class SphereError(ValueError):
-    """A sphere, a deformation, a map or a place that makes no sense."""
+    """Invalid sphere, deformation, map or site."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class Sphere:
             raise SphereError(f"texels: got {self.texels}, expected 32...16384")
 
     def points_mm(self) -> Float64Array:
-        """Return where the chart's pixels are, (N, N, 3) mm; row 0 is +y."""
+        """Return the positions of the chart's pixels, (N, N, 3) mm; row 0 is +y."""
         return self._points(*self._chart())
 
     def pixel_um(self) -> Float64Array:
@@ -78,13 +78,13 @@ class Sphere:
         return np.asarray(2e3 * self.radius_mm * step / (1.0 + x * x + y * y))
 
     def sample_noise_relief(self, noise: VolumeNoise) -> Float32Array:
-        """Return noise in space as a map of the chart, (N, N) um."""
+        """Sample noise in space at the chart's pixels, (N, N) um."""
         return noise.at(self.points_mm()).astype(np.float32)
 
     def grow_relief(
         self, patches: Sequence[ArrayLike], *, patch_pixel_um: float, rng: np.random.Generator
     ) -> Float32Array:
-        """Return patches grown over the chart at their own size on the skin, (N, N) um."""
+        """Grow patches over the chart at their original scale on the skin, (N, N) um."""
         return displacement_synthesis.grow(
             patches, self.texels, rng=rng, pixel_um=self.pixel_um(), patch_pixel_um=patch_pixel_um
         )
@@ -115,21 +115,20 @@ class Sphere:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeformedSphere:
-    """A sphere after its deformation, and its relief."""
+    """A deformed sphere with its relief."""
 
     sphere: Sphere
     ratios: tuple[float, float, float]
-    """Of lengths along x, y, z."""
+    """Stretch ratios along x, y, z."""
     height_um: Float32Array
-    """(N, N) relief of the chart."""
+    """(N, N) relief on the chart, um."""
     strain: strain_fields.TextureStrain
     """Ratios and axes at the chart's pixels."""
 
     def slopes(self) -> Float64Array:
         """Return slopes of the relief on the deformed surface along s and t, (N, N, 2).
 
-        Mesh and relief follow the skin: a pixel is as long as on the neutral sphere times the
-        stretch ratio.
+        The length of a pixel is that on the neutral sphere times the stretch ratio.
         """
         down, right = (np.asarray(part) for part in np.gradient(self.height_um))
         along = self.strain.axes[..., 0] * right[..., None]
@@ -137,16 +136,16 @@ class DeformedSphere:
         return np.asarray(1e-3 * along * self.strain.px_per_mm / self.strain.stretch)
 
     def roughness(self, site: str, *, within_rad: float = 0.2) -> tuple[float, float]:
-        """Return the variances of slopes along s and t around a place.
+        """Return the variances of slopes along s and t around a site.
 
         Parameters
         ----------
         site : str
             One of :data:`ROUGHNESS_POINTS`.
         within_rad : float
-            Angle around it on the neutral sphere, rad, 0.02 to 0.5.
+            Angular radius around the site on the neutral sphere, rad, 0.02 to 0.5.
         """
-        one_of("site", site, ROUGHNESS_POINTS, SphereError)
+        require_choice("site", site, ROUGHNESS_POINTS, SphereError)
         if not 0.02 <= within_rad <= 0.5:
             raise SphereError(f"within_rad: got {within_rad}, expected 0.02...0.5")
         near = self.sphere.points_mm() @ np.asarray(ROUGHNESS_POINTS[site]) > (
@@ -163,16 +162,16 @@ class DeformedSphere:
         light: tuple[float, float, float] = (-0.35, 0.45, 0.82),
         samples: int = 3,
     ) -> Float64Array:
-        """Return what is reflected to +z at the surface, lit from far away.
+        """Render the specular reflection towards +z under a distant light.
 
         Parameters
         ----------
         size_px : int
-            Side of the picture; it shows 2.6 neutral radii.
+            Side of the image, px; it spans 2.6 neutral radii.
         alpha : float
             GGX roughness below the relief's pixels, 0.02 to 1 (Walter et al. 2007).
         light : tuple of float
-            Direction to the light.
+            Direction towards the light.
         samples : int
             Rays per pixel and axis.
 
@@ -198,7 +197,8 @@ class DeformedSphere:
             map_coordinates(part * scale, [rows, columns], order=1, mode="nearest")
             for part in (right, -down)
         )
-        # tangents of the chart on the neutral sphere, then on the deformed one
+        # tangents of the chart on the neutral sphere; the deformation diag(r) maps them to the
+        # deformed sphere, where their cross product is the normal
         q = 1.0 + pz
         along_x = np.stack([q - px * px, -px * py, -px * q], axis=-1) / q[..., None]
         along_y = np.stack([-px * py, q - py * py, -py * q], axis=-1) / q[..., None]
@@ -229,7 +229,7 @@ def deform(
     table: KernelTable = FOREHEAD,
     dynamic: bool = True,
 ) -> DeformedSphere:
-    """Deform a sphere, and its relief by the strain.
+    """Deform a sphere and convolve its relief by the strain.
 
     Parameters
     ----------
@@ -237,11 +237,11 @@ def deform(
     height_um : array_like, shape (N, N)
         Neutral relief on its chart, um.
     ratios : sequence of 3 floats
-        Of lengths along x, y, z, > 0; :data:`DEFORMATION_RATIOS` has those of the figure.
+        Stretch ratios along x, y, z, > 0; :data:`DEFORMATION_RATIOS` has those of the figure.
     table : KernelTable
-        Kernels by stretch; the paper's forehead by default, held at the ends of its range.
+        Kernels over stretch, clamped at the ends of its range; default: the paper's forehead.
     dynamic : bool
-        False keeps the neutral relief, for comparison.
+        False: keep the neutral relief, for comparison.
 
     Returns
     -------

@@ -1,14 +1,15 @@
-"""A block of skin pushed by a probe: finite elements whose surface strain drives microstructure.
+"""Simulate a block of skin pushed by a probe; its surface strain drives microstructure.
 
-The patch of Nagano et al. 2015, fig. 14 (doi:10.1145/2766894): a coarse volume mesh gives the shape
-and the strain of the surface, the displacement map's convolution the relief at ten micrometres.
+The patch of Nagano et al. 2015, fig. 14 (doi:10.1145/2766894): a coarse finite-element mesh yields
+shape and strain of the surface; convolution of the displacement map yields relief of 10 um pixels.
 
 The tissue is a compressible neo-Hookean solid with the energy
 ``mu / 2 (|F|^2 - 3 - 2 ln J) + lambda / 2 (ln J)^2`` per neutral volume, for large deformations;
 for small ones it is linear elasticity. Pressure ``p = lambda ln J`` is a field of its own on MINI
 elements (Arnold, Brezzi and Fortin 1984, doi:10.1007/BF02576171), which do not lock as Poisson's
-number goes to 1/2. Forces are not asked for, so only Poisson's number matters. Newton's method, in
-steps of the push; scikit-fem assembles (the optional part ``fem``).
+ratio approaches 1/2. Only displacements are evaluated, so the shear modulus cancels and Poisson's
+ratio is the only material constant. Newton's method solves the push in steps; scikit-fem (optional
+part ``fem``) supplies the elements.
 
 Axes: x to the right and y up on the skin, z out of it; mm; the block's surface is z = 0.
 """
@@ -31,34 +32,34 @@ from skinrig.arrays import Float32Array, Float64Array, Int64Array
 from skinrig.errors import MissingExtra
 
 BLOCK_DIVISIONS = (23, 23, 8)
-"""Boxes of six tetrahedra each: 25,392 in all, as many as the paper's mesh has, about."""
+"""Cells along x, y, z, six tetrahedra each: 25,392, about the number of the paper's mesh."""
 MAX_NEWTON_ITERATIONS = 30
 MIN_PUSH_STEP = 1.0 / 64.0
-"""Of the push, below which a step that does not converge ends the search."""
+"""Minimum step, fraction of the push; if it does not converge, the search ends."""
 RELATIVE_MOVE_TOL = 1e-7
-"""Of the displacement's last correction, of the block's width."""
+"""Convergence limit of the last correction of the displacement, fraction of the block's width."""
 
 
 class PushError(ValueError):
-    """A block or a push that makes no sense."""
+    """Invalid block or push."""
 
 
 class PushDiverged(PushError, ArithmeticError):
-    """Newton's method found no equilibrium: the push is too strong for the mesh."""
+    """Newton's method did not converge: the push is too large for the mesh."""
 
 
 @dataclass(frozen=True, slots=True)
 class SkinBlock:
-    """A block of tissue, held below and at its sides."""
+    """A block of tissue, fixed at its bottom and its sides."""
 
     width_mm: float = 10.0
     """Side of its square surface, mm, > 0."""
     depth_mm: float = 4.0
     """Thickness, mm, > 0."""
     poisson: float = 0.49
-    """Poisson's number, 0.01 to 0.5; 0.5 keeps every volume."""
+    """Poisson's ratio, 0.01 to 0.5; 0.5 is incompressible."""
     divisions: tuple[int, int, int] = BLOCK_DIVISIONS
-    """Boxes along x, y and z, each of six tetrahedra."""
+    """Cells along x, y and z, six tetrahedra each."""
 
     def __post_init__(self) -> None:
         for name in ("width_mm", "depth_mm"):
@@ -71,24 +72,24 @@ class SkinBlock:
 
     @property
     def inverse_lame_lambda(self) -> float:
-        """Lame's first parameter inverted, for a shear modulus of 1."""
+        """Inverse of Lamé's first parameter for a shear modulus of 1."""
         return (1.0 - 2.0 * self.poisson) / (2.0 * self.poisson)
 
 
 @dataclass(frozen=True, slots=True)
 class Push:
-    """A probe with a round tip that is stuck to the skin and moves it."""
+    """A probe with a spherical tip that adheres to the skin and moves it."""
 
     contact_mm: float = 1.2
-    """Radius of the skin that is stuck to the tip, mm, > 0."""
+    """Radius of the contact area, mm, > 0."""
     tip_mm: float = 4.0
-    """Radius of the tip's sphere, mm, >= ``contact_mm``."""
+    """Radius of the tip, mm, >= ``contact_mm``."""
     depth_mm: float = 0.8
-    """How far the tip's lowest point goes in, mm; below 0 it pulls."""
+    """Indentation of the tip's lowest point, mm; negative: pull."""
     shift_mm: tuple[float, float] = (0.8, 0.0)
-    """How far it goes along x and y, mm."""
+    """Displacement of the tip along x and y, mm."""
     center_mm: tuple[float, float] = (0.0, 0.0)
-    """Where it touches, mm from the middle of the block."""
+    """Center of the contact along x and y, mm from the center of the block."""
 
     def __post_init__(self) -> None:
         if not 0 < self.contact_mm <= self.tip_mm < math.inf:
@@ -97,25 +98,27 @@ class Push:
                 "expected 0 < contact <= tip"
             )
         if not np.isfinite([self.depth_mm, *self.shift_mm, *self.center_mm]).all():
-            raise PushError("depth_mm, shift_mm, centre_mm: got NaN or infinity")
+            raise PushError(
+                "depth_mm, shift_mm, center_mm: got NaN or infinity, expected finite numbers"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PushedPatch:
-    """The block's equilibrium."""
+    """Equilibrium of a pushed block."""
 
     rest_mm: Float64Array
-    """(V, 3) nodes before."""
+    """(V, 3) node positions before the push."""
     deformed_mm: Float64Array
-    """(V, 3) nodes after."""
+    """(V, 3) node positions after the push."""
     tetrahedra: Int64Array
-    """(T, 4) nodes."""
+    """(T, 4) node indices."""
     surface: Int64Array
-    """(F, 3) nodes of the triangles at z = 0, counterclockwise from outside."""
+    """(F, 3) node indices of the triangles at z = 0, counterclockwise from outside."""
     width_mm: float
     """Side of the surface, mm."""
     iterations: int
-    """Newton's corrections in all."""
+    """Total number of Newton iterations."""
 
     @property
     def uv(self) -> Float64Array:
@@ -124,7 +127,7 @@ class PushedPatch:
 
     @property
     def volume_ratio(self) -> float:
-        """Volume of all tetrahedra after the push, over that before."""
+        """Ratio of the total volume after the push to that before."""
         after, before = (self._volumes(nodes) for nodes in (self.deformed_mm, self.rest_mm))
         return float(after.sum() / before.sum())
 
@@ -144,15 +147,15 @@ class PushedPatch:
         Parameters
         ----------
         height_um : array_like, shape (N, N)
-            Neutral map of the whole surface, um; row 0 is its +y side.
+            Neutral displacement of the whole surface, um; row 0 is the +y side.
         table : KernelTable
-            Kernels by stretch; the paper's forehead by default.
+            Kernels over stretch; default: the paper's forehead.
 
         Returns
         -------
         height_um : ndarray of float32, shape (N, N)
         strain : model.microstructure.strain_fields.TextureStrain
-            Ratios and axes at its pixels.
+            Stretch ratios and axes per pixel.
         """
         height = np.asarray(height_um, np.float32)
         if height.ndim != 2 or height.shape[0] != height.shape[1]:
@@ -160,15 +163,15 @@ class PushedPatch:
         return convolve_by_strain(height, self.strain(), self.surface, self.uv, table)
 
 
-def push(block: SkinBlock, probe: Push, *, steps: int = 2) -> PushedPatch:
-    """Push a block of skin and return its equilibrium.
+def push_block(block: SkinBlock, probe: Push, *, steps: int = 2) -> PushedPatch:
+    """Compute the equilibrium of a pushed block of skin.
 
     Parameters
     ----------
     block : SkinBlock
     probe : Push
     steps : int
-        Parts of the push that are solved one after the other; halved where one does not converge.
+        Number of increments of the push; an increment that does not converge is halved.
 
     Returns
     -------
@@ -177,11 +180,11 @@ def push(block: SkinBlock, probe: Push, *, steps: int = 2) -> PushedPatch:
     Raises
     ------
     PushError
-        For a probe that does not touch the block's surface within its edges.
+        If the contact area is not within the block's edges.
     PushDiverged
-        When no equilibrium is found.
+        If no equilibrium is found.
     skinrig.errors.MissingExtra
-        Without scikit-fem: the optional part ``fem``.
+        If scikit-fem, the optional part ``fem``, is not installed.
     """
     mesh = _mesh(block)
     nodes = mesh.p.T
@@ -193,8 +196,8 @@ def push(block: SkinBlock, probe: Push, *, steps: int = 2) -> PushedPatch:
     held = (nodes[:, 2] < 1e-9 - block.depth_mm) | edge
     if not touched.any() or (touched & held).any():
         raise PushError(
-            "center_mm, contact_mm: expected a contact within the block's edges that has at least "
-            "one node of its surface"
+            "center_mm, contact_mm: expected a contact within the block's edges with at least one "
+            "surface node; enlarge it or move it inwards"
         )
     given = np.full(nodes.shape, np.nan)
     given[held] = 0.0
@@ -202,24 +205,24 @@ def push(block: SkinBlock, probe: Push, *, steps: int = 2) -> PushedPatch:
     given[touched, 2] = (
         probe.tip_mm - np.sqrt(probe.tip_mm**2 - distance[touched] ** 2) - probe.depth_mm
     )
-    return solve(block, given, steps=steps)
+    return solve_equilibrium(block, given, steps=steps)
 
 
-def solve(block: SkinBlock, given_mm: ArrayLike, *, steps: int = 2) -> PushedPatch:
-    """Return the equilibrium of a block some of whose nodes' displacements are given.
+def solve_equilibrium(block: SkinBlock, given_mm: ArrayLike, *, steps: int = 2) -> PushedPatch:
+    """Compute the equilibrium of a block with prescribed displacements of some nodes.
 
     Parameters
     ----------
     block : SkinBlock
     given_mm : array_like, shape (V, 3)
-        Displacements of the nodes (those of ``solve(...).rest_mm``), mm; NaN: free.
+        Displacements of the nodes (those of ``solve_equilibrium(...).rest_mm``), mm; NaN: free.
     steps : int
-        Parts in which they are brought about, >= 1.
+        Number of increments of the displacements, >= 1.
 
     Raises
     ------
     PushError, PushDiverged, skinrig.errors.MissingExtra
-        As of :func:`push`.
+        See :func:`push_block`.
     """
     tissue = _Tissue(block)
     given = np.asarray(given_mm, np.float64)
@@ -239,8 +242,8 @@ def solve(block: SkinBlock, given_mm: ArrayLike, *, steps: int = 2) -> PushedPat
             step *= 0.5
             if step < MIN_PUSH_STEP / steps:
                 raise PushDiverged(
-                    f"push: found no equilibrium beyond {100 * reached:.0f} % of it, expected a "
-                    "weaker push, a finer mesh or a wider contact"
+                    f"push: found no equilibrium beyond {100 * reached:.0f} % of it, expected "
+                    "convergence; use a smaller push, a finer mesh or a wider contact"
                 )
         else:
             state, reached = found, target
@@ -283,10 +286,10 @@ def _surface(mesh: Any) -> Int64Array:
 
 
 class _Tissue:
-    """Forces and stiffness of one block; the bubbles of MINI elements are solved for in each.
+    """Forces and stiffness of one block; bubbles of MINI elements are eliminated per element.
 
-    Within an element the unknowns are the displacements of its 4 corners and its bubble, (5, 3),
-    and the pressure at its corners, (4,), for a shear modulus of 1.
+    The unknowns of an element are the displacements of its 4 corners and its bubble, (5, 3), and
+    the pressure at its corners, (4,), for a shear modulus of 1.
     """
 
     def __init__(self, block: SkinBlock) -> None:
@@ -320,7 +323,7 @@ class _Tissue:
     def find_equilibrium(
         self, start: _State, displacement_mm: Float64Array
     ) -> tuple[_State | None, int]:
-        """Return the equilibrium with given displacements, or None, and corrections made."""
+        """Return the equilibrium with given displacements, or None; and the iterations."""
         known = np.isfinite(displacement_mm)
         free = np.concatenate([~known.reshape(-1), np.ones(len(self.nodes), bool)])
         first = np.zeros(free.size)
@@ -359,10 +362,12 @@ class _Tissue:
     def _system(
         self, state: _State
     ) -> tuple[Any, Float64Array, tuple[Float64Array, Float64Array]] | None:
-        """Return stiffness, forces, and how bubbles follow; None where an element is turned over.
+        """Return stiffness, forces and bubble elimination; None if an element is inverted.
 
-        Of each element, with H the gradients on the deformed block: force
-        ``F G - (1 - p) H``, stiffness ``G.G + (1 - p) H H`` with both indices exchanged.
+        The energy is mu / 2 (|F|^2 - 2 ln J) + p ln J - p^2 / (2 lambda) with mu = 1. With
+        G the gradients on the neutral block and H = G F^-1 those on the deformed block, its first
+        derivative is the force ``F G - (1 - p) H``. As dH = -H dF F^-1, its second derivative is
+        the stiffness ``G.G + (1 - p) H H`` with both indices exchanged.
         """
         moves = np.concatenate([state.nodes_mm[self.corners], state.bubbles_mm[:, None]], axis=1)
         deformation = moves.transpose(0, 2, 1)[:, None] @ self.gradients + np.eye(3)
@@ -390,7 +395,7 @@ class _Tissue:
         mass = tested.transpose(0, 2, 1) @ self.values
         excess = np.log(ratio) - self.inverse_lambda * pressure
         force_p = (excess[:, None] @ tested)[:, 0]
-        # whole element: 12 of corners, 3 of the bubble, 4 of the pressure
+        # rows of an element: 12 displacements of corners, 3 of the bubble, 4 pressures
         matrix = np.zeros((elements, 19, 19))
         matrix[:, :15, :15] = stiff.reshape(elements, 15, 15)
         matrix[:, 15:, :15] = coupling
@@ -413,7 +418,7 @@ class _Tissue:
 
 
 def _invert_matrices(matrices: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Return determinants and inverses of (..., 3, 3) matrices, by the cross products of rows."""
+    """Return determinants and inverses of (..., 3, 3) matrices from cross products of rows."""
     a, b, c = (matrices[..., row, :] for row in range(3))
     columns = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
     ratio = np.einsum("...i,...i->...", a, columns[..., 0])

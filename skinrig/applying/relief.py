@@ -1,4 +1,4 @@
-"""The measured relief of sites grown over a mesh, and moved with it."""
+"""Grow the measured relief of sites over a mesh and deform it by the mesh's strain."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from rigsim.geometry.mesh import build_mesh
 from rigsim.subject.expressions import displacement_mm, is_moving_state
 from rigsim.subject.face_regions import region_masks, to_mean_head
 from rigsim.subject.perfusion import STATE_NAMES
-from skinrig.appearances.contents import digest
+from skinrig.appearances.contents import hash_file
 from skinrig.appearances.dynamic import MICROSTRUCTURE
 from skinrig.applying.expression import AppliedExpression, ApplyError
 from skinrig.applying.microstructure import apply_microstructure
@@ -31,23 +31,23 @@ from skinrig.arrays import Float32Array, Float64Array
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.blend_shapes.meshes import BlendShapeMesh
 from skinrig.console import select_attributes
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 
 REGION_ATLAS_PX: Final = 256
-"""Width of the maps of relief site and pixel size, texels."""
+"""Side of the maps of site weights and of pixel size, texels."""
 SITE_REGIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "forehead": ("forehead", "brows", "temples"),
     "cheek": ("cheeks", "nose sides", "lids", "nose"),
     "chin": ("chin", "lips", "mouth corners", "neck"),
 }
-"""Regions of a face covered by the relief of a site."""
+"""Regions of a face that each site's relief covers."""
 MIN_PATCH_PX: Final = 64
 MIN_WAVES_PER_MM: Final = 1.0
-"""The relief's longest waves: longer ones are the face's own shape (Nagano2015, section 4)."""
+"""Minimum spatial frequency of relief; lower ones belong to the mesh (Nagano2015, section 4)."""
 MAX_WAVES_PER_MM: Final = 25.0
 NYQUIST_FRACTION: Final = 0.8
 PIXEL_SIZE_TOL: Final = 0.01
-"""Sizes of pixels that count as one: calibrations of one rig differ by less."""
+"""Relative tolerance of equal pixel sizes; calibrations of one rig differ by less."""
 POSITION_ATLAS_PX: Final = 1024
 ROWS_PER_NOISE_BAND: Final = 256
 SECONDS_KEYS: Final = ("strain_s", "convolution_s")
@@ -55,32 +55,32 @@ RELIEF_SOURCES: Final = ("patches", "noise")
 Extrapolation = Literal["hold", "formula"]
 EXTRAPOLATION_MODES: Final[tuple[Extrapolation, ...]] = get_args(Extrapolation)
 MAX_EXR_SIDE_PX: Final = 8192
-"""Larger maps are written tile by tile as .npy files next to the folder, not as EXR."""
+"""Maximum side of EXR maps; larger maps are written as .npy files next to the folder."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReliefRequest:
-    """What relief is asked for."""
+    """Settings of the relief of a mesh."""
 
     size_px: int
     """Width and height of the map."""
     site: str | None = None
-    """Whose relief covers the whole mesh; None: of several each site its own region."""
+    """Site whose relief covers the whole mesh; None: each site covers its own region."""
     source: str = "patches"
-    """"patches": the measured ones, grown; "noise": noise in space as high as they are, which has
-    no seams between islands of the texture."""
+    """"patches": grown from measured patches; "noise": noise in space of the same RMS height, which
+    is seamless across islands of the texture."""
     extrapolate: Extrapolation = "hold"
-    """Beyond the table's range: "hold" or "formula"."""
+    """Extrapolation beyond the table's range: "hold" or "formula"."""
     seed: int = 0
-    """Of the growth."""
+    """Random seed of the growth."""
 
     def __post_init__(self) -> None:
-        one_of("synthesize", self.source, RELIEF_SOURCES, ApplyError)
-        one_of("extrapolate", self.extrapolate, EXTRAPOLATION_MODES, ApplyError)
+        require_choice("synthesize", self.source, RELIEF_SOURCES, ApplyError)
+        require_choice("extrapolate", self.extrapolate, EXTRAPOLATION_MODES, ApplyError)
 
     @property
     def exceeds_exr(self) -> bool:
-        """Whether the maps are too large for EXR."""
+        """Whether the maps exceed `MAX_EXR_SIDE_PX`."""
         return self.size_px > MAX_EXR_SIDE_PX
 
 
@@ -91,19 +91,19 @@ class ReliefEvaluator:
     Attributes
     ----------
     request
-        Which relief.
+        Settings of the relief.
     mesh
-        With a shape for each name in ``weights``.
+        Mesh with a blend shape for each name in ``weights``.
     weights
-        Of the mesh's shapes.
+        Weight by blend shape.
     own_shapes
-        Which of the names the mesh file has itself; the others are moved as the simulated head.
-    aside
+        Shapes of the mesh file itself; the others are transferred from the simulated head.
+    temporary_folder
         Folder for maps that are too large for EXR.
     mesh_sha256
-        Of the mesh's file.
+        Digest of the mesh's file.
     progress
-        Called with one line now and then.
+        Called with one line per step.
     """
 
     request: ReliefRequest
@@ -123,17 +123,19 @@ class ReliefEvaluator:
         out: Path,
         progress: Callable[[str], None],
     ) -> ReliefEvaluator:
-        """Load the mesh and give it the shapes that states need.
+        """Load the mesh and add the blend shapes that the weights need.
 
         Maps of more than `MAX_EXR_SIDE_PX` go to a folder next to ``out``, as .npy files.
 
         Raises
         ------
         ApplyError, MeshError
-            For a size, a weight's name or a mesh that cannot be used.
+                If a size, the name of a weight or the mesh is invalid.
         """
         if not MIN_PATCH_PX <= request.size_px <= 65_536:
-            raise ApplyError(f"size: got {request.size_px}, expected {MIN_PATCH_PX} to 65536 px")
+            raise ApplyError(
+                f"--size-px: got {request.size_px}, expected {MIN_PATCH_PX} to 65536; enter another"
+            )
         used = {name: weight for name, weight in weights.items() if name != "neutral"}
         mesh, own = _with_states(blend_shapes.load(path), list(used))
         kept = {name: weight for name, weight in used.items() if name in mesh.shapes}
@@ -143,10 +145,10 @@ class ReliefEvaluator:
     def __call__(
         self, appearance: SkinAppearance, part: dict[str, Any], done: AppliedExpression
     ) -> None:
-        """Grow the neutral relief, move it, and put the maps into ``done``."""
+        """Grow the neutral relief, deform it, and add the maps to ``done``."""
         sites, asked = dict(part["sites"]), self.request
         if asked.site is not None:
-            one_of("site", asked.site, sites, ApplyError)
+            require_choice("site", asked.site, sites, ApplyError)
         names = [asked.site] if asked.site is not None else list(sites)
         regions = _regions(self.mesh, names)
         neutral = self._neutral(appearance, {name: sites[name] for name in names}, regions)
@@ -163,13 +165,13 @@ class ReliefEvaluator:
             out=self.temporary_folder / "displacement.npy" if asked.exceeds_exr else None,
             progress=lambda at, of: self.progress(f"tile {at} of {of}"),
         )
-        made = "noise as high as" if asked.source == "noise" else "grown from"
+        made = "noise with the RMS of" if asked.source == "noise" else "grown from"
         note = f"um, {made} measured patches; texture of the mesh"
         step = -(-asked.size_px // MAX_EXR_SIDE_PX) if asked.exceeds_exr else 1
         if asked.exceeds_exr:
             why = f"EXR of {asked.size_px} px: written to {self.temporary_folder.name} as .npy"
             done.left_out.append((MICROSTRUCTURE, why))
-            note += f"; every {step}. pixel"
+            note += f"; one of {step} pixels per axis"
         for name, height, more in (
             ("displacement_neutral", neutral, ""),
             ("displacement", moved.height, ", under strain"),
@@ -196,13 +198,13 @@ class ReliefEvaluator:
     def _neutral(
         self, appearance: SkinAppearance, sites: Mapping[str, Any], regions: Float64Array | None
     ) -> Any:
-        """Return the neutral relief on the mesh's texture, um: grown patches, or noise."""
+        """Return the neutral relief on the mesh's texture, um: grown patches or noise."""
         asked = self.request
         patches = {name: [_patch(name, appearance, entry)] for name, entry in sites.items()}
         pixels_um = [float(entry["pixel_um"]) for entry in sites.values()]
         if max(pixels_um) > (1.0 + PIXEL_SIZE_TOL) * min(pixels_um):
             raise ApplyError(
-                f"sites: reliefs with pixels of {sorted(pixels_um)} um, expected one size; "
+                f"sites: got reliefs with pixels of {sorted(pixels_um)} um, expected one size; "
                 "choose one with --relief-site"
             )
         rng, scale = np.random.default_rng(asked.seed), _scale(self.mesh)
@@ -213,7 +215,7 @@ class ReliefEvaluator:
             growing = self.temporary_folder / "displacement_neutral.npy.part"
             neutral = np.lib.format.open_memmap(growing, "w+", np.float32, (asked.size_px,) * 2)
         if asked.source == "noise":
-            self.progress(f"draw noise on {shape} pixels")
+            self.progress(f"sample noise at {shape} pixels")
             rms_um = float(np.sqrt(np.mean([np.nanvar(one) for (one,) in patches.values()])))
             neutral = _noise(self.mesh, asked.size_px, rms_um, scale, rng=rng, out=neutral)
         else:
@@ -240,13 +242,13 @@ def _sha256(path: Path) -> str:
         for each in sorted(path.iterdir()):
             total.update(each.name.encode() + bytes.fromhex(_sha256(each)))
         return total.hexdigest()
-    return digest(path)
+    return hash_file(path)
 
 
 def _with_states(
     mesh: BlendShapeMesh, names: Sequence[str]
 ) -> tuple[BlendShapeMesh, tuple[str, ...]]:
-    """Return the mesh with shapes for states that it lacks, and the names that it has itself."""
+    """Add blend shapes for missing expressions; also return the names of the mesh's own shapes."""
     own = tuple(name for name in names if name in mesh.shapes)
     unknown = [name for name in names if name not in mesh.shapes and name not in STATE_NAMES]
     if unknown:
@@ -281,15 +283,13 @@ def _noise(
     rng: np.random.Generator,
     out: Float32Array | None,
 ) -> Float32Array:
-    """Return noise in space on the mesh's texture, up to half a wave in a pixel."""
+    """Sample noise in space on the mesh's texture, below the pixels' Nyquist frequency."""
     finest = NYQUIST_FRACTION * 0.5e3 * size_px / float(np.median(scale_um))
     if finest <= MIN_WAVES_PER_MM:
-        raise ApplyError(
-            f"size: {size_px} px show no wave shorter than a millimetre, expected larger maps"
-        )
+        raise ApplyError(f"--size-px: got {size_px}, which does not resolve 1 mm; enter more")
     band = (MIN_WAVES_PER_MM, min(finest, MAX_WAVES_PER_MM))
     noise = VolumeNoise.draw(rms_um=rms_um, band_per_mm=band, rng=rng)
-    # places lie smoothly between the texels of a smaller atlas: microns off at most
+    # positions are smooth: interpolation from a smaller atlas deviates by microns at most
     atlas = unwrap(_face(mesh), POSITION_ATLAS_PX)
     places = dilate_texture(atlas.position_mm, atlas.covered, steps=8).astype(np.float64)
     target = np.empty((size_px, size_px), np.float32) if out is None else out
@@ -305,12 +305,12 @@ def _noise(
 
 
 def _scale(mesh: BlendShapeMesh) -> Float64Array:
-    """Return how long the texture's side is on the skin, um, by place, (h, w)."""
+    """Return the length of the texture's side on the skin, um, per texel, (h, w)."""
     atlas = _atlas(mesh)
     area = np.linalg.norm(np.cross(atlas.dp_du_mm, atlas.dp_dv_mm), axis=-1)
     seen = atlas.covered & (area > 0)
     if not seen.any():
-        raise ApplyError("mesh: its texture covers nothing")
+        raise ApplyError("mesh: its texture coordinates enclose no area; check the mesh")
     side = np.sqrt(np.where(seen, area, np.median(area[seen])))
     return np.asarray(1e3 * np.clip(side, *np.percentile(side[seen], [2, 98])), np.float64)
 
@@ -322,14 +322,14 @@ def _regions(mesh: BlendShapeMesh, names: Sequence[str]) -> Float64Array | None:
     unknown = [name for name in names if name not in SITE_REGIONS]
     if unknown:
         raise ApplyError(
-            f"sites: no region is known for {unknown[0]!r}, expected {', '.join(SITE_REGIONS)}; "
+            f"sites: got {unknown[0]!r}, expected one of {', '.join(SITE_REGIONS)}; "
             "choose one with --relief-site"
         )
     atlas = _atlas(mesh)
     masks = region_masks(to_mean_head(atlas.position_mm, _face(mesh)))
     weights = np.stack([sum(masks[r] for r in SITE_REGIONS[name]) for name in names])
     weights = weights.astype(np.float64) * atlas.covered
-    # where no region speaks all sites mix evenly
+    # the constant gives all sites equal weight outside of their regions
     return np.asarray(weights + 1e-3)
 
 

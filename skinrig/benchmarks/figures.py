@@ -27,7 +27,7 @@ def plot_error_against_time(stage: str, document: Mapping[str, Any]) -> str:
         joined and, where there is room, labeled with their settings; other points are hollow.
         Knees have a ring; a dash marks the Cramér-Rao bound where it is known.
     """
-    figure, axes = figures.canvas(5.2, 3.4)
+    figure, axes = figures.create_canvas(5.2, 3.4)
     points, fronts = document["points"], document["fronts"]
     seconds, error, bars, exact = _measured(points)
     labels: list[tuple[str, float, float]] = []
@@ -166,8 +166,8 @@ def plot_compared_fronts(
     str
         SVG with an alternative text. Thin lines join settings that both benchmarks measured.
     """
-    figure, axes = figures.canvas(5.2, 3.4)
-    positions: list[dict[str, tuple[float, float]]] = []
+    figure, axes = figures.create_canvas(5.2, 3.4)
+    places: list[dict[str, tuple[float, float]]] = []
     summaries = []
     for number, (label, document) in enumerate((a, b)):
         points = [p for p in document["points"] if p["error"] > 0.0]

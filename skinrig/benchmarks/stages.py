@@ -15,7 +15,7 @@ from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.results import StageBenchmark
 from skinrig.benchmarks.stage import BenchmarkStage, read_descriptions
 from skinrig.console import Console, to_json_value
-from skinrig.errors import EXTRA_MISSING, exit_code, sentence
+from skinrig.errors import EXIT_EXTRA_MISSING, exit_code, format_error
 
 STAGES: dict[str, str] = {name: entry["run"] for name, entry in read_descriptions().items()}
 """Module and function by stage. A module is imported, and its kernels are compiled, when the stage
@@ -138,9 +138,9 @@ class _Run:
                     self._take(name, made, size)
                     self.save()
         except ImportError as error:
-            if self.requested or exit_code(error) != EXTRA_MISSING:
+            if self.asked or exit_code(error) != EXIT_EXTRA_MISSING:
                 raise
-            self.omitted.append((name, sentence(error)))
+            self.left_out.append((name, format_error(error)))
             return
         self._take(name, made, size)
 

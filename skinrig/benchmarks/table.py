@@ -42,7 +42,7 @@ def print_tables(document: Mapping[str, Any], console: Console) -> None:
         Receives the tables.
     """
     for name, stage in document["stages"].items():
-        console.rows(
+        console.print_table(
             (
                 f"{name} ({stage['size']} size)",
                 "seconds",
@@ -67,7 +67,7 @@ def print_tables(document: Mapping[str, Any], console: Console) -> None:
         for what, why in stage["left_out"]:
             console.print_line(f"omitted: {what}: {why}")
         console.print_line()
-    console.rows(
+    console.print_table(
         (
             "stage",
             "size",
@@ -83,7 +83,7 @@ def print_tables(document: Mapping[str, Any], console: Console) -> None:
     )
     if found := list_band_rows(document):
         console.print_line()
-        console.rows(BAND_COLUMNS, found)
+        console.print_table(BAND_COLUMNS, found)
     for name, why in document["left_out"]:
         console.print_line(f"omitted: {name}: {why}")
     if document["not_judged"]:

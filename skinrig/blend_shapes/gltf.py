@@ -1,11 +1,11 @@
-"""Blend shapes from glTF 2.0: the morph targets of one mesh of a .gltf or .glb file.
+"""Read blend shapes from glTF 2.0: the morph targets of one mesh of a .gltf or .glb file.
 
-The file's JSON and buffers are read here: of what the libraries for glTF know, a mesh with targets
-needs accessors only (also sparse and quantized ones), and those they leave to the caller.
+JSON and buffers are decoded here: a mesh with targets needs only accessors (also sparse and
+quantized ones), which glTF libraries leave to the caller.
 
-Positions are taken through the transforms of the node that shows the mesh; a skinned mesh is taken
-as it is bound, as the standard has it. Texture coordinates are turned to v up. Compressed geometry
-is refused by its extension's name.
+Positions are transformed by the node that instantiates the mesh. A skinned mesh is read in its bind
+pose, as the standard requires. Texture coordinates are flipped to v up. Compressed geometry is
+refused with the name of its extension.
 
 References
 ----------
@@ -36,7 +36,7 @@ COMPONENT_DTYPES: Final[dict[int, np.dtype[Any]]] = {
     5125: np.dtype("<u4"),
     5126: np.dtype("<f4"),
 }
-"""Types of numbers in buffers, by the standard's codes."""
+"""Component types of buffers by the standard's codes."""
 ACCESSOR_WIDTHS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 COMPRESSION_EXTENSIONS: Final = (
     "KHR_draco_mesh_compression",
@@ -45,11 +45,11 @@ COMPRESSION_EXTENSIONS: Final = (
 )
 TRIANGLES_MODE: Final = 4
 MAX_NODE_DEPTH: Final = 1000
-"""Nodes above a mesh beyond which a file is taken to go in circles."""
+"""Maximum depth of a mesh in the scene graph; a deeper one is assumed to be cyclic."""
 
 
 class _Gltf:
-    """One file: its document, and accessors as arrays."""
+    """A glTF file: its document, and its accessors as arrays."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -70,7 +70,7 @@ class _Gltf:
             raise self.build_error(f"got glTF version {version}, expected 2")
         for name in document.get("extensionsRequired", []):
             if name in COMPRESSION_EXTENSIONS:
-                raise self.build_error(f"geometry is compressed by {name}; export it without")
+                raise self.build_error(f"geometry is compressed by {name}; export it uncompressed")
         self.document: dict[str, Any] = document
         self.buffers: dict[int, bytes] = {}
 
@@ -82,20 +82,20 @@ class _Gltf:
             raise self.build_error("not a GLB file")
         length = struct.unpack_from("<I", data, 8)[0]
         if length != len(data):
-            raise self.build_error(f"got {len(data)} bytes, expected {length}: it was cut short")
+            raise self.build_error(f"got {len(data)} bytes, expected {length}; copy it again")
         at, text = 12, None
         while at + 8 <= len(data):
             size, kind = struct.unpack_from("<II", data, at)
             chunk = data[at + 8 : at + 8 + size]
             if len(chunk) != size:
-                raise self.build_error("a chunk is cut short")
+                raise self.build_error("a chunk is truncated; copy the file again")
             if kind == GLB_JSON and text is None:
                 text = chunk
             elif kind == GLB_BIN and self.binary is None:
                 self.binary = chunk
             at += 8 + size
         if text is None:
-            raise self.build_error("has no JSON chunk")
+            raise self.build_error("JSON chunk is missing; export it again")
         return text
 
     def buffer(self, number: int) -> bytes:
@@ -120,14 +120,16 @@ class _Gltf:
                 try:
                     data = file.read_bytes()
                 except OSError as error:
-                    raise self.build_error(f"buffer {number}: {uri!r} cannot be read") from error
+                    raise self.build_error(
+                        f"buffer {number}: {uri!r} is not readable; check the file"
+                    ) from error
             if len(data) < int(entry["byteLength"]):
-                raise self.build_error(f"buffer {number} is cut short")
+                raise self.build_error(f"buffer {number} is truncated; copy the file again")
             self.buffers[number] = data
         return self.buffers[number]
 
     def _rows(self, entry: dict[str, Any], count: int, component: int, width: int) -> NDArray[Any]:
-        """Return (count, width) numbers of an entry's view of a buffer."""
+        """Return the numbers of an entry's buffer view, (count, width)."""
         view_number, offset = int(entry["bufferView"]), int(entry.get("byteOffset", 0))
         kind = COMPONENT_DTYPES[component]
         view = self.document["bufferViews"][view_number]
@@ -143,7 +145,7 @@ class _Gltf:
         return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize)).copy()
 
     def accessor(self, number: int, kind: str) -> NDArray[Any]:
-        """Return an accessor's numbers, normalised ones as floats, shape (N, width)."""
+        """Return an accessor's numbers, shape (N, width); normalized integers as floats."""
         entry = self.document["accessors"][number]
         if entry["type"] != kind:
             raise self.build_error(f"accessor {number}: got {entry['type']}, expected {kind}")
@@ -179,12 +181,12 @@ def read(path: Path) -> MeshArrays:
     Returns
     -------
     vertices, uv, faces, deltas
-        Shapes (V, 3), (V, 2), (F, 3), and (V, 3) each; metres, v up.
+        Shapes (V, 3), (V, 2), (F, 3), and (V, 3) each; meters, v up.
 
     Raises
     ------
     MeshFileError
-        For a file that is damaged, compressed, or has no such mesh.
+        If the file is damaged, compressed, or without such a mesh.
     """
     gltf = _Gltf(path)
     try:
@@ -192,7 +194,9 @@ def read(path: Path) -> MeshArrays:
     except MeshFileError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-        raise gltf.build_error(f"a part is missing or of a wrong kind: {error!r}") from error
+        raise gltf.build_error(
+            f"an entry is missing or of a wrong type ({error!r}); export it again"
+        ) from error
 
 
 def _read(gltf: _Gltf) -> MeshArrays:
@@ -217,7 +221,7 @@ def _read(gltf: _Gltf) -> MeshArrays:
             corners = np.arange(len(points), dtype=np.int64)
         if corners.size % 3 or (corners.size and corners.max() >= len(points)):
             raise gltf.build_error(
-                f"{where}: its indices make no triangles of {len(points)} vertices"
+                f"{where}: indices are not those of triangles of {len(points)} vertices"
             )
         targets = []
         for target in primitive.get("targets", []):
@@ -226,7 +230,9 @@ def _read(gltf: _Gltf) -> MeshArrays:
                 deltas = gltf.accessor(target["POSITION"], "VEC3").astype(np.float64)
             targets.append(deltas @ matrix[:3, :3].T)
         if any(len(values) != len(points) for values in (uv, *targets)):
-            raise gltf.build_error(f"{where}: its attributes and targets differ in length")
+            raise gltf.build_error(
+                f"{where}: attributes and targets differ in length; export it again"
+            )
         vertices.append(points @ matrix[:3, :3].T + matrix[:3, 3])
         texture.append(np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1))
         faces.append(corners.reshape(-1, 3) + count)
@@ -256,13 +262,13 @@ def _select_mesh(gltf: _Gltf) -> int:
     if len(able) != 1:
         listed = ", ".join(able.values()) or "none"
         raise gltf.build_error(
-            f"got {len(able)} meshes with morph targets ({listed}), expected one"
+            f"got {len(able)} meshes with morph targets ({listed}), expected one; export one mesh"
         )
     return next(iter(able))
 
 
 def _transform(gltf: _Gltf, mesh: int) -> Float64Array:
-    """Return the 4 x 4 matrix from the mesh to the scene; the identity for a mesh no node shows."""
+    """Return the 4 x 4 matrix from mesh to scene; identity if no node instantiates the mesh."""
     nodes = gltf.document.get("nodes", [])
     shown = [number for number, node in enumerate(nodes) if node.get("mesh") == mesh]
     if not shown or "skin" in nodes[shown[0]]:
@@ -276,7 +282,7 @@ def _transform(gltf: _Gltf, mesh: int) -> Float64Array:
             return matrix
         here = parent[here]
         matrix = _local(nodes[here]) @ matrix
-    raise gltf.build_error("its nodes go in circles")
+    raise gltf.build_error("its nodes are cyclic; export it again")
 
 
 def _local(node: dict[str, Any]) -> Float64Array:

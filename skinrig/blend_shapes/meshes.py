@@ -1,4 +1,4 @@
-"""Meshes whose vertices move by blend shapes: checked, loaded from .npz, OBJ and glTF files."""
+"""Load and check meshes with blend shapes: .npz, OBJ and glTF files."""
 
 import difflib
 import zipfile
@@ -16,12 +16,12 @@ from skinrig.blend_shapes import obj as blend_shape_obj
 
 NPZ_KEYS: Final = ("vertices_mm", "uv", "faces", "shape_names", "shape_deltas_mm")
 MM_PER_M: Final = 1000.0
-"""glTF files are in metres."""
+"""Millimeters per meter, the unit of glTF files."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlendShapeMesh:
-    """A triangle mesh with a texture, and how far each shape moves its vertices.
+    """A triangle mesh with texture coordinates and displacements of its vertices by blend shape.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class BlendShapeMesh:
         (0, 0) is bottom left of the texture.
     faces : ndarray of int32, shape (F, 3)
     shapes : mapping of str to ndarray of float32, shape (V, 3)
-        Movement by a weight of 1, mm.
+        Displacement at weight 1, mm.
     """
 
     vertices_mm: Float32Array
@@ -44,17 +44,17 @@ class BlendShapeMesh:
         check_triangles(self.vertices_mm, self.faces, self.uv, self.shapes)
 
     def deform(self, weights: Mapping[str, float]) -> Float64Array:
-        """Return the vertices under weights of shapes, mm, shape (V, 3).
+        """Return the vertices displaced by weighted blend shapes, mm, shape (V, 3).
 
         Parameters
         ----------
         weights
-            By shape; any finite number, 0 is neutral. Shapes that are not named stay at 0.
+            Weight by shape, any finite number; missing shapes have weight 0.
 
         Raises
         ------
         MeshError
-            For a shape that the mesh lacks, or a weight that is not finite.
+            If the mesh lacks a shape, or a weight is not finite.
         """
         moved = self.vertices_mm.astype(np.float64)
         for name, weight in weights.items():
@@ -66,7 +66,9 @@ class BlendShapeMesh:
                     f"{', '.join(self.shapes) or 'none: the mesh has no shapes'}{hint}"
                 )
             if not np.isfinite(weight):
-                raise MeshError(f"weights: got {weight} for {name!r}, expected a number")
+                raise MeshError(
+                    f"weights: got {weight} for {name!r}, expected a finite number; correct it"
+                )
             moved += float(weight) * self.shapes[name].astype(np.float64)
         return moved
 
@@ -83,14 +85,14 @@ def load(path: Path | str) -> BlendShapeMesh:
     Raises
     ------
     MeshFileError
-        For a file that cannot be read, with what and where.
+        If a file is not readable; the message names place and reason.
     MeshError
-        For a mesh that contradicts itself.
+        If the mesh is inconsistent.
     """
     source = Path(path)
     kind, scale = source.suffix.lower(), 1.0
     if not source.exists():
-        raise MeshFileError(f"{source}: no such file or folder")
+        raise MeshFileError(f"{source}: no such file or folder; check the name")
     if source.is_dir() or kind == ".obj":
         vertices, uv, faces, deltas = blend_shape_obj.read(source)
     elif kind in (".gltf", ".glb"):
@@ -115,7 +117,7 @@ def _read_npz(path: Path) -> blend_shape_obj.MeshArrays:
         with np.load(path, allow_pickle=False) as archive:
             missing = [key for key in NPZ_KEYS if key not in archive]
             if missing:
-                raise MeshFileError(f"{path}: lacks {', '.join(missing)}")
+                raise MeshFileError(f"{path}: {', '.join(missing)} missing; export it again")
             arrays = {key: archive[key] for key in NPZ_KEYS}
     except MeshFileError:
         raise
@@ -127,7 +129,7 @@ def _read_npz(path: Path) -> blend_shape_obj.MeshArrays:
             f"{path}: shape_names: got {names.dtype} {names.shape}, expected one row of text"
         )
     if len(set(names.tolist())) != names.size:
-        raise MeshFileError(f"{path}: shape_names: got a name twice")
+        raise MeshFileError(f"{path}: shape_names: got a name twice; rename one")
     for key in ("vertices_mm", "uv", "shape_deltas_mm"):
         if arrays[key].dtype.kind != "f":
             raise MeshFileError(f"{path}: {key}: got {arrays[key].dtype}, expected floats")

@@ -1,7 +1,7 @@
-"""Blend shapes from OBJ files: one neutral mesh, and one file of the same topology per shape.
+"""Read blend shapes from OBJ files: a neutral mesh, and one file of the same topology per shape.
 
-Polygons are cut into fans, and vertices split where a seam of the texture gives them several
-texture coordinates. Normals, materials, groups, points, lines and smoothing are passed over.
+Polygons are triangulated as fans. Vertices are split where a texture seam gives them several
+texture coordinates. Normals, materials, groups, points, lines and smoothing are ignored.
 """
 
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from skinrig.arrays import Float64Array, Int64Array
 MeshArrays = tuple[Float64Array, Float64Array, Int64Array, dict[str, Float64Array]]
 """Vertices (V, 3), texture coordinates (V, 2), triangles (F, 3), and shapes by name (V, 3)."""
 NEUTRAL = "neutral"
-"""Stem of the neutral file of a folder, in any case."""
+"""Stem of the neutral file of a folder, case-insensitive."""
 
 
 @dataclass(frozen=True, slots=True)
 class ObjMesh:
-    """What an OBJ file holds, as it is indexed there."""
+    """Contents of an OBJ file with its own indices."""
 
     positions: Float64Array
     texture: Float64Array
@@ -29,7 +29,7 @@ class ObjMesh:
 
 
 def read(path: Path) -> MeshArrays:
-    """Read a neutral OBJ and its shapes.
+    """Read a neutral OBJ file and its blend shapes.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def read(path: Path) -> MeshArrays:
     Raises
     ------
     MeshFileError
-        For a folder without a neutral file, a line that cannot be read, or another topology.
+        If the neutral file is missing, a line is invalid, or topologies differ.
     """
     neutral_path = path if path.is_file() else _neutral_of(path)
     neutral = parse(neutral_path)
@@ -61,15 +61,20 @@ def read(path: Path) -> MeshArrays:
                 f"{file}: got {len(shape.positions)} vertices, expected {len(neutral.positions)} "
                 f"as in {neutral_path.name}"
             )
-        # exporters may leave out or renumber texture coordinates of shapes: they are not used
+        # texture coordinates of shapes are ignored, as exporters may omit or renumber them
         if not np.array_equal(shape.corners[..., 0], neutral.corners[..., 0]):
-            raise MeshFileError(f"{file}: its faces are not those of {neutral_path.name}")
+            raise MeshFileError(
+                f"{file}: faces differ from those of {neutral_path.name}; export"
+                f" with the same topology"
+            )
         deltas[file.stem] = (shape.positions - neutral.positions)[pairs[:, 0]]
     if len(pairs) == 0:
-        raise MeshFileError(f"{neutral_path}: got no faces, expected triangles or polygons")
+        raise MeshFileError(
+            f"{neutral_path}: got no faces, expected triangles or polygons; check the file"
+        )
     if pairs[:, 1].min() < 0:
         raise MeshFileError(
-            f"{neutral_path}: got faces without texture coordinates (f v/vt), expected a texture"
+            f"{neutral_path}: got faces without texture coordinates, expected f v/vt; export them"
         )
     return neutral.positions[pairs[:, 0]], neutral.texture[pairs[:, 1]], faces, deltas
 
@@ -91,7 +96,7 @@ def parse(path: Path) -> ObjMesh:
     Parameters
     ----------
     path
-        Text; lines that end with a backslash go on.
+        Text file; a backslash at the end of a line continues it.
 
     Returns
     -------
@@ -101,7 +106,7 @@ def parse(path: Path) -> ObjMesh:
     Raises
     ------
     MeshFileError
-        With the number of the line that is wrong.
+        If a line is invalid; the message has its number.
     """
     positions: list[tuple[float, ...]] = []
     texture: list[tuple[float, ...]] = []
@@ -109,7 +114,7 @@ def parse(path: Path) -> ObjMesh:
     try:
         lines = path.read_text("utf-8", errors="replace").replace("\\\n", " ").splitlines()
     except OSError as error:
-        raise MeshFileError(f"{path}: cannot be read: {error.strerror}") from error
+        raise MeshFileError(f"{path}: not readable: {error.strerror}") from error
     for number, line in enumerate(lines, 1):
         words = line.split("#", 1)[0].split()
         if not words:

@@ -22,7 +22,7 @@ from skinrig.calibrating.outcome import (
     photon_transfer,
 )
 from skinrig.console import select_attributes
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 
 CALIBRATION_KINDS = (
     "sensor",
@@ -78,7 +78,7 @@ def calibrate(
     NoWhiteReferenceError
         When the frames for "white" do not show a white reference.
     """
-    one_of("kind", kind, CALIBRATION_KINDS, CalibratingError)
+    require_choice("kind", kind, CALIBRATION_KINDS, CalibratingError)
     opened = [Session.open(path) for path in sessions]
     if not opened:
         raise CalibratingError("sessions: got none, expected at least one folder; name it")

@@ -101,7 +101,7 @@ def capture_session(
         steps = plan.steps
         settings = [" ".join(f"{k}={v}" for k, v in step.settings.items()) for step in steps]
         rows = [(s.id, s.kind, text) for s, text in zip(steps, settings, strict=True)]
-        console.rows(("step", "kind", "settings"), rows)
+        console.print_table(("step", "kind", "settings"), rows)
         figures = {"steps": len(steps), "estimated_s": seconds, "captured": 0, "light": light}
         return figures | {"plan": plan.to_json()}
     return _run(rig, plan, order.out, order, console)
@@ -154,7 +154,7 @@ def _run(
         omitted = dict(session.omitted_steps())
     if done.dead_lights:
         console.print_line(f"dead lights: {', '.join(done.dead_lights)}; their frames are dark")
-    console.each("omitted", dict.fromkeys(omitted.values()))
+    console.print_each("omitted", dict.fromkeys(omitted.values()))
     console.print_line(f"{out}: {done.frames} frames in {done.steps} steps, {done.retakes} retaken")
     console.print_line(f"next: skinrig verify {shell_quote(out)}")
     figures = {"session": out, "captured": done.frames, "retakes": done.retakes}

@@ -6,7 +6,7 @@ from typing import get_args
 
 from capture.devices.led_box import Eyes
 from skinrig.capturing.sequences import SequenceOrder
-from skinrig.errors import UsageError, one_of
+from skinrig.errors import UsageError, require_choice
 
 
 def parse_eye_state(text: str) -> Eyes:
@@ -17,7 +17,7 @@ def parse_eye_state(text: str) -> Eyes:
     UnusableError
         For any other text.
     """
-    return one_of("--eyes", text, get_args(Eyes))
+    return require_choice("--eyes", text, get_args(Eyes))
 
 
 def parse_floats(text: str | None, option: str) -> tuple[float, ...] | None:

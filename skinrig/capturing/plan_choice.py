@@ -17,7 +17,7 @@ from capture.plan.gradient import (
 from capture.plan.probe import PROBE_SITES, ProbeTarget, probe_calibration_plan, probe_plan
 from capture.rig import Rig
 from skinrig.capturing.sequences import SequenceOrder, sequence_plan
-from skinrig.errors import UsageError, one_of
+from skinrig.errors import UsageError, require_choice
 
 FLASH_CALIBRATION_TARGETS = ("dark", "flat", "chart", "malus")
 
@@ -80,7 +80,7 @@ class DefaultPlan:
         return flash_calibration_plan(rig, target)
 
     def _check_target(self, targets: Sequence[str]) -> Any:
-        return one_of("target", str(self.target), targets, CaptureError)
+        return require_choice("target", str(self.target), targets, CaptureError)
 
 
 def choose_plan(

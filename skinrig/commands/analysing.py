@@ -8,7 +8,7 @@ import typer
 from skinrig.commands.help import Command, Subcommands
 from skinrig.commands.options import Json, Out, choice, command, option
 from skinrig.console import Console
-from skinrig.errors import UnusableError, UsageError, one_of
+from skinrig.errors import UnusableError, UsageError, require_choice
 
 Labels = Annotated[Path | None, option("CSV table name,TRAIT,... of 0 and 1, one row per face.")]
 
@@ -49,17 +49,17 @@ def analyse_brdf(
     merl_basis
         Folder of the MERL tables used in the reconstruction; default: built-in materials.
     points
-        Texels per measured face, default 2000; simulated: points of the single subject and of the
-        seven conditions, default 5000, and 0.4 times as many of each of the 87 subjects.
+        Texels per measured face, default 2000. Simulated faces: points per condition of the single
+        subject, default 5000, and 0.4 times as many for each of the 87 subjects.
     method
-        Space in which basis BRDFs are compared: shares (material weights) or brdf.
+        Space in which basis BRDFs are compared: shares (material weights) or brdf (reflectance).
     seed
         Random seed.
     """
     from reconstruction.brdf_basis.space import Method
     from skinrig.analysing import brdf as analysing_brdf
 
-    how = one_of("--method", method, get_args(Method))
+    how = require_choice("--method", method, get_args(Method))
     if points is not None and points < 20:
         raise UnusableError(f"--points: got {points}, expected 20 or more; raise it")
     console = Console(json)
@@ -78,20 +78,20 @@ def analyse_brdf(
             out, points=some, points_each=each, method=how, seed=seed, progress=console.progress
         )
     documents = [one.document() for one in found]
-    console.rows(
+    console.print_table(
         ("data set", "needed", "by 2 %", "by 10 %", "to noise", "error", "held out", "noise"),
         ((d["name"], *_plateaus(d), *_at_plateau(d)) for d in documents),
     )
     for document in documents:
         left_out = document["left_out"]
-        console.left_out(
+        console.print_omissions(
             (f"{document['name']}, {r} basis BRDFs and more", why) for r, why in left_out
         )
         if document["points_lost"]:
             lost = document["points_lost"]
             console.print_line(f"{document['name']}: {lost} points without specular reflection")
     console.print_line(f"{out}: figure-14.png, figure-15.png, curves.csv, analysis.json")
-    console.document("skinrig.analyse-brdf/1", {"out": out, "datasets": documents})
+    console.print_document("skinrig.analyse-brdf/1", {"out": out, "datasets": documents})
 
 
 def _plateaus(document: dict[str, Any]) -> list[object]:

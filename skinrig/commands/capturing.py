@@ -120,7 +120,8 @@ def capture_dome(
     Parameters
     ----------
     eyes
-        State of the subject's eyes under LEDs.
+        Subject's eyes, as confirmed by the operator; flicker above its limit requires closed or
+        shielded.
     """
     from skinrig.capturing.option_values import parse_eye_state
 
@@ -145,7 +146,8 @@ def capture_gradient(
     Parameters
     ----------
     eyes
-        State of the subject's eyes under LEDs.
+        Subject's eyes, as confirmed by the operator; flicker above its limit requires closed or
+        shielded.
     force_limit
         Maximum force of the caliper on this skin, N; required with a caliper.
     """
@@ -196,7 +198,7 @@ def _capture(
     console = Console(common.json)
     rig = load_rig(str(context.info_name))
     plan = choose_plan(rig, common.plan, target, **chosen)
-    console.document("skinrig.capture/1", capture_session(rig, plan, order, console))
+    console.print_document("skinrig.capture/1", capture_session(rig, plan, order, console))
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,12 +212,12 @@ class ServeOptions:
     tcp
         Address of cameras and, without --pty, of controllers; port 0: any free port.
     scale
-        Scale of the simulation: small (quick) or full (all of the rig); gradient: small only.
+        Scale of the simulation: small (fast) or full (the complete rig); gradient: small only.
     allow_remote
         Accept connections from other machines.
     resume
-        Interrupted session captured from an earlier server with this rig and seed; continues its
-        noise sequence, so that shots differ from those on disk.
+        Interrupted session captured from an earlier server with this rig and seed; new shots
+        continue its noise sequence and differ from those on disk.
     """
 
     pty: bool = False
@@ -295,13 +297,13 @@ def verify(session: Path, /, json: options.Json = False) -> None:
 
     console = Console(json)
     found = check(session)
-    console.each("warning", found.warnings)
-    console.each("damaged", found.problems)
+    console.print_each("warning", found.warnings)
+    console.print_each("damaged", found.problems)
     console.print_line(
         f"{session}: {'sound' if found.ok else 'DAMAGED'}, {format_count(found.frames, 'frame')}, "
         f"{found.bytes / 1e6:.1f} MB"
     )
     figures = select_attributes(found, "ok", "problems", "warnings", "frames", "bytes")
-    console.document("skinrig.verify/1", figures)
+    console.print_document("skinrig.verify/1", figures)
     if not found.ok:
-        raise typer.Exit(errors.BAD_INPUT)
+        raise typer.Exit(errors.EXIT_BAD_INPUT)

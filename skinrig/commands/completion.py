@@ -20,18 +20,18 @@ def complete_rig_list(incomplete: str) -> list[str]:
     return complete_list(CALIBRATION_BY_TARGET, incomplete)
 
 
-def target_completer(rig: str) -> tuple[str, ...]:
+def list_targets(rig: str) -> tuple[str, ...]:
     """Return the calibration targets of a rig.
 
     Examples
     --------
-    >>> target_completer("probe")
+    >>> list_targets("probe")
     ('phantom', 'dark')
     """
     return tuple(dict.fromkeys((*CALIBRATION_BY_TARGET[rig], "dark")))
 
 
-def calibrations(incomplete: str) -> list[str]:
+def complete_calibrations(incomplete: str) -> list[str]:
     """Complete a kind of calibration."""
     kinds = {kind for kinds in CALIBRATION_BY_TARGET.values() for kind in kinds.values()}
     return filter_by_prefix(kinds, incomplete)
@@ -49,35 +49,35 @@ def complete_wants(incomplete: str) -> list[str]:
     return complete_list(names, incomplete)
 
 
-def subjects(incomplete: str) -> list[str]:
+def complete_subjects(incomplete: str) -> list[str]:
     """Complete a skin preset."""
     from rigsim.subject import PRESET_NAMES
 
     return filter_by_prefix(PRESET_NAMES, incomplete)
 
 
-def states(incomplete: str) -> list[str]:
+def complete_states(incomplete: str) -> list[str]:
     """Complete an expression or condition of a simulated face (flash and dome rigs)."""
     from rigsim.subject import STATE_NAMES
 
     return filter_by_prefix(STATE_NAMES, incomplete)
 
 
-def conditions(incomplete: str) -> list[str]:
+def complete_conditions(incomplete: str) -> list[str]:
     """Complete a surface condition of a simulated face (dome)."""
     from rigsim.population.conditions import CONDITION_NAMES
 
     return filter_by_prefix(CONDITION_NAMES, incomplete)
 
 
-def stages(incomplete: str) -> list[str]:
+def complete_stages(incomplete: str) -> list[str]:
     """Complete a benchmark stage."""
     from skinrig.benchmarks.stages import STAGES
 
     return filter_by_prefix(STAGES, incomplete)
 
 
-def sizes(incomplete: str) -> list[str]:
+def complete_scales(incomplete: str) -> list[str]:
     """Complete a scale of a simulation."""
     return filter_by_prefix(("small", "full"), incomplete)
 

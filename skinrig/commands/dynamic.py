@@ -14,7 +14,7 @@ from reconstruction.correspondence import landmark_table
 from skinrig.commands.help import Command, Subcommands
 from skinrig.commands.options import Json, NewMaps, choice, command
 from skinrig.console import Console, select_attributes
-from skinrig.errors import UsageError, one_of
+from skinrig.errors import UsageError, require_choice
 from skinrig.next_steps import shell_quote
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def fit_facial_color(
         progress=console.progress,
     )
     rows = summarize_states(found)
-    console.rows(
+    console.print_table(
         (
             "state",
             "blood volume change, points",
@@ -82,7 +82,7 @@ def fit_facial_color(
         ),
         rows,
     )
-    console.left_out(found.omitted)
+    console.print_omissions(found.omitted)
     states = ",".join(found.hemoglobin)
     console.print_line(f"{out}: hemoglobin rig with states {states}")
     last = list(found.changes)[-1]
@@ -125,11 +125,13 @@ def fit_wrinkles(
         Random seed of the zone estimation.
     """
     from skinrig.fitting.wrinkles import fit_wrinkles as fit
-    from skinrig.fitting.wrinkles import summarize_expressions, zone_names
+    from skinrig.fitting.wrinkles import list_zone_names, summarize_expressions
 
     console = Console(json)
     found = fit(appearances, out=out, masks=mask, size=size_px, mask_size=mask_size, seed=seed)
-    console.rows(("expression", *zone_names(found).values()), summarize_expressions(found))
+    console.print_table(
+        ("expression", *list_zone_names(found).values()), summarize_expressions(found)
+    )
     console.print_line(
         f"{out}: wrinkles explain {100 * found.fit.explained:.0f} % of normal differences"
     )
@@ -184,7 +186,7 @@ class ReliefOptions:
     size_px
         Width and height of the displacement map, pixels.
     relief_site
-        Site whose microrelief is used; default: the first one fitted.
+        Site whose microrelief covers the whole mesh; default: each fitted site its own region.
     synthesize
         Neutral relief: patches (measured texture, synthesized) or noise (procedural, 3D).
     extrapolate
@@ -228,7 +230,7 @@ class ExpressionOptions:
     clamp
         Range of the summed weights of a wrinkle zone: unit (0 to 1) or signed (-1 to 1).
     emotional
-        Redden the whole face for anger, pale it for fear.
+        Scale the blood volume fraction of the whole face: up for anger, down for fear.
     gain
         Factor of the blood volume fraction.
     target_face
@@ -252,7 +254,7 @@ class ExpressionOptions:
         return ExpressionRequest(
             weights,
             normalize=self.normalize,
-            clamp=one_of("--clamp", self.clamp, ("unit", "signed")),
+            clamp=require_choice("--clamp", self.clamp, ("unit", "signed")),
             emotional=self.emotional,
             gain=self.gain,
             onto=_read_target_face(self.target_face, self.landmarks or []),
@@ -364,20 +366,20 @@ def _read_target_face(onto: Path | None, landmarks: list[Path]) -> TargetFace | 
 
 def _report(console: Console, out: Path, done: AppliedExpression) -> None:
     """Print the figures and maps of an evaluation."""
-    console.figures(done.figures, int, float, str)
-    console.left_out(done.left_out)
+    console.print_figures(done.figures, int, float, str)
+    console.print_omissions(done.left_out)
     console.print_line(f"{out}: {', '.join(done.maps)}")
     document = {
         "out": out,
         "maps": list(done.maps),
         **select_attributes(done, "figures", "left_out"),
     }
-    console.document("skinrig.apply/1", document)
+    console.print_document("skinrig.apply/1", document)
 
 
 def print_fit(console: Console, model: str, out: Path, found: Mapping[str, Any]) -> None:
     """Print the JSON document of a fit."""
-    console.document("skinrig.fit/1", {"model": model, "out": out, **found})
+    console.print_document("skinrig.fit/1", {"model": model, "out": out, **found})
 
 
 @fit_app.command("reflectance", cls=Command)
@@ -410,11 +412,11 @@ def fit_reflectance(
     console = Console(json)
     found = fit(dome, probe, out=out, landmarks=landmarks)
     rows = summarize_medians(found)
-    console.rows(("median over valid texels", "red", "green", "blue"), rows)
+    console.print_table(("median over valid texels", "red", "green", "blue"), rows)
     for site in found.placed.sites if found.placed is not None else ():
         console.print_line(f"{site.name}: texel row {site.texel[0]}, column {site.texel[1]}")
-    console.each("assumed", found.assumed)
-    console.left_out(found.left_out)
+    console.print_each("assumed", found.assumed)
+    console.print_omissions(found.left_out)
     valid = float(found.model.valid.mean())
     console.print_line(f"{out}: reflectance model, {100 * valid:.0f} % of its texels valid")
     console.print_line(f"next: skinrig render {shell_quote(out)} --light 1,1,2 --out picture")

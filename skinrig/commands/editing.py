@@ -10,7 +10,7 @@ from skinrig.commands.analysing import Labels
 from skinrig.commands.dynamic import print_fit
 from skinrig.commands.options import Json, NewMaps, Out, Seed, choice, command, option
 from skinrig.console import Console, select_attributes
-from skinrig.errors import UsageError, one_of
+from skinrig.errors import UsageError, require_choice
 from skinrig.next_steps import shell_quote
 
 if TYPE_CHECKING:
@@ -41,9 +41,10 @@ class EditOptions:
     space
         Trait library written by `skinrig fit traits`; default: the built-in library.
     region
-        Edited region: face, beard or no-beard; for --spots also skin.
+        Edited region; skin (face without eyes, brows and lips) for --spots only.
     mask
-        Weight of the edit per texel, 0 to 1: .png or .exr the size of the texture.
+        Weight of the edit per texel, 0 to 1: .png or .exr with the texture's aspect ratio; default:
+        1 in the region.
     spots
         Spots to add as KIND=PIGMENT[:NUMBER PER CM2], or to remove as KIND=-1; KIND is freckles,
         moles or follicles: freckles=1:3,moles=-1.
@@ -52,12 +53,12 @@ class EditOptions:
     landmarks
         CSV table name,x,y (texels) or name,x,y,z (mm) of the face's landmarks.
     iterations
-        Iterations of the match of albedo statistics.
+        Iterations of the albedo histogram matching.
     """
 
     trait: str | None = None
     space: Path | None = None
-    region: str = "face"
+    region: Annotated[str, choice("face", "beard", "no-beard", "skin")] = "face"
     mask: Path | None = None
     spots: str | None = None
     parts: str | None = None
@@ -101,14 +102,14 @@ def edit(appearance: Path, /, out: NewMaps, chosen: EditOptions, json: Json = Fa
         appearance, order, out=out, library=library, library_hash=digest, progress=console.progress
     )
     parts = {part: done.record.get(part, {}) for part in editing.EDITABLE_PARTS}
-    console.figures(parts, int, float)
+    console.print_figures(parts, int, float)
     for one in done.record.get("spots_done", []):
         what = f"{one['drawn']} drawn" if "drawn" in one else f"{one['found']} found"
         console.print_line(f"{one['kind']}: {what}")
-    console.each("warning", done.warnings)
+    console.print_each("warning", done.warnings)
     console.print_line(f"{out}: {', '.join(done.changed) or 'nothing'} changed")
     console.print_line(f"next: skinrig render {shell_quote(out)} --out pictures")
-    console.document("skinrig.edit/1", {"out": out, **done.record})
+    console.print_document("skinrig.edit/1", {"out": out, **done.record})
 
 
 @command
@@ -152,18 +153,20 @@ def fit_traits(
         labels,
         out=out,
         landmarks=landmarks,
-        vectors=one_of("--vectors", vectors, get_args(VectorKind)),
-        contrast=one_of("--contrast", contrast, get_args(Contrast)),
+        vectors=require_choice("--vectors", vectors, get_args(VectorKind)),
+        contrast=require_choice("--contrast", contrast, get_args(Contrast)),
         size=size_px,
         basis=merl_basis,
         seed=seed,
         progress=console.progress,
     )
     head = ("part", "trait", "with", "without", "p value", "cosine to the true one")
-    console.rows(head, found.rows)
-    console.each("warning", found.warnings)
-    console.each("ignored", (f"{name} has labels but is not an input" for name in found.ignored))
-    console.left_out(found.left_out)
+    console.print_table(head, found.rows)
+    console.print_each("warning", found.warnings)
+    console.print_each(
+        "ignored", (f"{name} has labels but is not an input" for name in found.ignored)
+    )
+    console.print_omissions(found.left_out)
     names = found.library.names
     console.print_line(f"{out}: {len(names)} traits of {len(found.faces)} faces")
     after = f"--space {shell_quote(out)} --trait {names[0]}=1 --out edited"
@@ -222,7 +225,7 @@ def analyse_albedo(
             out, people=people, seed=seed, progress=console.progress
         )
     document = found.document()
-    console.rows(
+    console.print_table(
         ("group", "faces", "R_d red", "green", "blue"),
         [
             (group, document["groups"][group], *mean)
@@ -235,9 +238,9 @@ def analyse_albedo(
             f"{region}: components explain {first} of the variance; "
             f"{document['components_for_90_percent'][region]} explain 90 %"
         )
-    console.left_out(found.left_out)
+    console.print_omissions(found.left_out)
     console.print_line(f"{out}: {', '.join(analysing_albedo.OUTPUT_FILES)}")
-    console.document("skinrig.analyse-albedo/1", {"out": out, **document})
+    console.print_document("skinrig.analyse-albedo/1", {"out": out, **document})
 
 
 def _split_names(text: str | None) -> list[str]:
@@ -253,14 +256,14 @@ def parse_spots(text: str | None) -> tuple[Any, ...]:
     >>> [(s.kind, s.amount, s.density_per_cm2) for s in parse_spots("freckles=1:3,moles=-1")]
     [('freckles', 1.0, 3.0), ('moles', -1.0, None)]
     """
-    from skinrig.editing.spots import SpotOrder
+    from skinrig.editing.spots import SpotRequest
 
     out = []
     for word in _split_names(text):
         kind, _, rest = word.partition("=")
         amount, colon, density = rest.partition(":")
         try:
-            wanted = SpotOrder(kind.strip(), float(amount), float(density) if colon else None)
+            wanted = SpotRequest(kind.strip(), float(amount), float(density) if colon else None)
         except ValueError as error:
             if isinstance(error, UsageError) or type(error) is not ValueError:
                 raise

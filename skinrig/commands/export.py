@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final
 
 from skinrig.commands.options import Json, Out, choice, command
 from skinrig.console import Console, format_count, select_attributes
-from skinrig.errors import UnusableError, one_of
+from skinrig.errors import UnusableError, require_choice
 from skinrig.exporting.options import ExportSettings, SkinPosition
 
 NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
@@ -45,7 +45,8 @@ class DeliveryOptions:
     with_errors
         Also write standard uncertainties and masks.
     only
-        Names to export: maps (maps), up to three states (metahuman), states (stokes).
+        Names to export, separated by commas: maps (maps), up to three expressions (metahuman) or
+        strain steps (stokes); default: all, for metahuman the first three.
     mesh
         Mesh with the maps' texture coordinates and blend shapes, mm.
     target_face
@@ -89,7 +90,8 @@ class PlaceOptions:
     Attributes
     ----------
     at
-        Also export the BRDF at the texture coordinate U,V, each 0 to 1 (merl, rgl).
+        Also export the BRDF at the texture coordinates U,V, each 0 to 1 (merl, rgl); default: only
+        basis BRDFs.
     radius
         Radius around U,V over which the BRDF is averaged, mm (merl, rgl).
     without_diffuse
@@ -100,7 +102,7 @@ class PlaceOptions:
     radius: float = 0.0
     without_diffuse: bool = False
 
-    def named(self) -> SkinPosition | None:
+    def position(self) -> SkinPosition | None:
         """Return the position; None without --at."""
         if self.at is None:
             return None
@@ -135,7 +137,8 @@ def export(
         Format. Appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. Session: mhl,
         frames, lp, stokes, event-model.
     use
-        Purpose of the copy, such as research; the subjects' consent must include it.
+        Purpose of the copy, such as research, which the subjects' consent must include; required
+        for measured data.
     camera
         Camera whose images are exported (lp); default: the frontal one.
     calibration
@@ -146,25 +149,25 @@ def export(
     console = Console(json)
     _check_format(to, source, exporting.APPEARANCE_FORMATS, exporting.SESSION_FORMATS)
     of_session = {"camera": camera, "calibration": calibration}
-    delivery = how.delivery(place=place.named() if to in ("merl", "rgl") else None, **of_session)
+    delivery = how.delivery(place=place.position() if to in ("merl", "rgl") else None, **of_session)
     done = exporting.export(source, out, to, delivery, use=use)
     after = NEXT_STEP_BY_FORMAT.get(
         to, "pass the folder on; `ascmhl verify` checks that it is complete and unchanged"
     )
-    console.left_out(done.left_out)
+    console.print_omissions(done.left_out)
     console.print_line(
         f"{done.path}: {format_count(done.files, 'file')}, listed in {done.manifest}"
     )
     console.print_line(f"next: {after}")
     document = select_attributes(done, "path", "files", "manifest") | {"to": to, "next": after}
-    console.document("skinrig.export/1", document | select_attributes(done, "left_out"))
+    console.print_document("skinrig.export/1", document | select_attributes(done, "left_out"))
 
 
 def _check_format(
     to: str, source: Path, of_maps: Iterable[str], of_sessions: Iterable[str]
 ) -> None:
     """Raise for an unknown format, or one that the source's kind of folder does not have."""
-    one_of("--to", to, (*of_maps, *of_sessions))
+    require_choice("--to", to, (*of_maps, *of_sessions))
     for file, kind, fitting in (
         ("session.json", "a session", of_sessions),
         ("appearance.json", "maps", of_maps),

@@ -107,11 +107,14 @@ class Commands(TyperGroup):
             if (command := self.get_command(ctx, name)) is not None and not command.hidden
         }
         for title, names in HELP_SECTIONS:
-            rows = [(name, summary(left.pop(name))) for name in names if name in left]
+            rows = [(name, summarize_command(left.pop(name))) for name in names if name in left]
             if rows:
                 yield title, rows
         if left:
-            yield OTHER_SECTION, [(name, summary(command)) for name, command in left.items()]
+            yield (
+                OTHER_SECTION,
+                [(name, summarize_command(command)) for name, command in left.items()],
+            )
 
 
 class Subcommands(TyperGroup):
@@ -121,7 +124,9 @@ class Subcommands(TyperGroup):
         """Write the commands with their full summaries."""
         found = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
         with formatter.section("Commands"):
-            formatter.write_dl([(name, summary(one)) for name, one in found if one is not None])
+            formatter.write_dl(
+                [(name, summarize_command(one)) for name, one in found if one is not None]
+            )
 
 
 class RigCommand(Command):
@@ -218,7 +223,7 @@ def _with_names(param: Any, further: Mapping[str, Iterable[str]]) -> Any:
     return named
 
 
-def summary(command: Any) -> str:
+def summarize_command(command: Any) -> str:
     """Return the first paragraph of a command's help on one line, without its period."""
     text = (command.short_help or command.help or "").split("\n\n")[0]
     return " ".join(text.split()).rstrip(".")

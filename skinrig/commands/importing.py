@@ -47,8 +47,8 @@ def import_photos(
     console = Console(json)
     person = parse_subject(subject, consent, consent_expires)
     done = bring_in(directory, out=out, rig=None if rig is None else load_rig(rig), subject=person)
-    console.each("assumed", done.assumed)
-    console.each("ignored", done.ignored)
+    console.print_each("assumed", done.assumed)
+    console.print_each("ignored", done.ignored)
     console.print_line(
         f"{done.path}: {format_count(done.frames, 'photograph')}, states {', '.join(done.states)}"
     )
@@ -63,7 +63,7 @@ def import_photos(
         )
         after = f"verify {place}"
     console.print_line(f"next: skinrig {after}")
-    console.document(
+    console.print_document(
         "skinrig.import/1",
         select_attributes(done, "path", "frames", "assumed", "states", "ignored"),
     )
@@ -107,7 +107,7 @@ def import_mesh(
     console.print_line(
         f"next: skinrig {after if done.reopened else f'verify {shell_quote(done.path)}'}"
     )
-    console.document(
+    console.print_document(
         "skinrig.import/1",
         select_attributes(done, "path", "vertices", "faces", "has_uv", "extent_mm", "reopened"),
     )
@@ -137,7 +137,7 @@ def import_lp(
         Light list: .lp file, list of directions, or folder of a chrome ball's images; default:
         found in the folder.
     mask
-        Image that is bright at the object; default: the folder's *mask* file, else the whole image.
+        Image whose bright pixels are the object; default: the folder's *mask* file, else all.
     encoding
         Transfer function of 8-bit and PNG values: auto, sRGB or linear.
     mm_per_px
@@ -154,14 +154,14 @@ def import_lp(
         encoding=encoding,  # type: ignore[arg-type]
         mm_per_px=mm_per_px,
     )
-    console.each("assumed", done.assumed)
+    console.print_each("assumed", done.assumed)
     console.print_line(
         f"{done.path}: {format_count(done.frames, 'picture')}, lights of {done.lights}"
     )
     console.print_line(
         f"next: skinrig reconstruct {shell_quote(out)} --maps normals,albedo --out appearance"
     )
-    console.document(
+    console.print_document(
         "skinrig.import/1",
         select_attributes(done, "path", "frames", "lights", "encoding", "mask", "assumed"),
     )

@@ -23,10 +23,14 @@ BUDGET_S = 600.0
 def bench(
     more: Annotated[
         list[str] | None,
-        typer.Argument(metavar="NAME", show_default=False, autocompletion=completion.stages),
+        typer.Argument(
+            metavar="NAME", show_default=False, autocompletion=completion.complete_stages
+        ),
     ] = None,
     /,
-    stage: Annotated[list[str] | None, typer.Option(autocompletion=completion.stages)] = None,
+    stage: Annotated[
+        list[str] | None, typer.Option(autocompletion=completion.complete_stages)
+    ] = None,
     budget: Annotated[float | None, typer.Option(show_default=False)] = None,
     smoke: bool = False,
     extremes: bool = False,
@@ -84,10 +88,10 @@ def bench(
 
         document = run_stages(stages, budget_s=budget, toy=smoke, out=out, console=console)
         if out is not None:
-            bench_table.write_tables(document, out)
-    console.document(document.pop("schema"), document)
+            bench_table.write(document, out)
+    console.print_document(document.pop("schema"), document)
     if not document["passed"]:
-        raise typer.Exit(errors.LIMIT_MISSED)
+        raise typer.Exit(errors.EXIT_LIMIT_MISSED)
 
 
 def doctor(json: Json = False) -> None:
@@ -97,11 +101,11 @@ def doctor(json: Json = False) -> None:
     """
     console = Console(json)
     findings = check_installation()
-    console.rows(
+    console.print_table(
         ("", "what", "state", "fix"),
         [("ok" if f.fine else "!!", f.what, f.state, f.fix) for f in findings],
     )
     rows = [{**select_attributes(f, "what", "state", "fine"), FIX_KEY: f.fix} for f in findings]
-    console.document("skinrig.doctor/1", {"findings": rows})
+    console.print_document("skinrig.doctor/1", {"findings": rows})
     if not all(f.fine for f in findings):
-        raise typer.Exit(errors.EXTRA_MISSING)
+        raise typer.Exit(errors.EXIT_EXTRA_MISSING)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type
 import typer
 
 from skinrig.commands import completion
-from skinrig.errors import UnusableError, UsageError, one_of
+from skinrig.errors import UnusableError, UsageError, require_choice
 
 if TYPE_CHECKING:
     from skinrig.capturing.sequences import SequenceOrder
@@ -24,22 +24,25 @@ def option(text: str, *names: str, **settings: Any) -> Any:
     return typer.Option(*names, help=text, **settings)
 
 
-def choice(*values: str, metavar: str | None = None) -> Any:
-    """Return an option with a closed set of values: shown in help, completed and checked.
+def choice(*values: str, text: str | None = None, metavar: str | None = None) -> Any:
+    """Return an option with a closed set of values: listed in help, completed and checked.
 
     Parameters
     ----------
     values
         Valid values; any other raises `UnusableError`, which lists them.
+    text
+        Help of the option; None: that of the command's docstring.
     metavar
         Label of the value in help; None: the values.
     """
 
     def check(parameter: typer.CallbackParam, value: str | None) -> str | None:
-        return None if value is None else one_of(parameter.opts[0], value, values)
+        return None if value is None else require_choice(parameter.opts[0], value, values)
 
     return typer.Option(
         metavar=metavar or f"[{'|'.join(values)}]",
+        help=text,
         callback=check,
         autocompletion=lambda incomplete: completion.filter_by_prefix(values, incomplete),
     )
@@ -88,14 +91,15 @@ Subject = Annotated[
     str,
     option(
         "Simulated subject: preset I to VI, palest or darkest, or a file NAME.toml.",
-        autocompletion=completion.subjects,
+        autocompletion=completion.complete_subjects,
     ),
 ]
 Scale = Annotated[str, choice("small", "full")]
 Width = Annotated[int | None, option("Image width, pixels; default: that of the scale.")]
 Resume = Annotated[bool, option("Continue an interrupted session.", "--resume")]
 Site = Annotated[
-    str | None, option("Skin site in the caliper: forehead (default), cheek or chin (gradient).")
+    str | None,
+    choice("forehead", "cheek", "chin", text="Skin site in the caliper; default: forehead."),
 ]
 Sites = Annotated[
     str | None,
@@ -118,7 +122,11 @@ Steps = Annotated[
 ]
 Consent = Annotated[
     list[str] | None,
-    option("Use the subject agreed to; repeatable, or separated by commas.", "--consent"),
+    option(
+        "Permitted use of the subject's data, such as research; repeatable, or separated by "
+        "commas; default: none.",
+        "--consent",
+    ),
 ]
 ConsentExpires = Annotated[
     datetime | None,
@@ -132,11 +140,8 @@ ConsentExpires = Annotated[
 
 def target_option(rig: str) -> Any:
     """Return the option --target of a rig, with its closed set of targets."""
-    names = completion.target_completer(rig)
-    return option(
-        f"Capture a calibration target instead of a subject: {', '.join(names)}.",
-        autocompletion=lambda incomplete: completion.filter_by_prefix(names, incomplete),
-    )
+    text = "Calibration target to capture; default: a subject."
+    return choice(*completion.list_targets(rig), text=text)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +158,7 @@ class SequenceOptions:
     shot_period
         Time between shots of a sequence, s; default 5.5, for alcohol 300.
     captures
-        Number of shots of a prompted sequence; default: each phase once, a tenth of them twice.
+        Number of shots of a prompted sequence; default: one per phase, plus 10 % repeats.
     duration
         Time after exercise or alcohol, s; default 60 for exercise, 3600 for alcohol.
     """

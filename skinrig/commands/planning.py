@@ -42,7 +42,7 @@ class PlanOptions:
     Attributes
     ----------
     min_valid_fraction
-        Minimum fraction of the complete rig's valid pixels that stay valid, above 0 to 1.
+        Minimum fraction of the complete rig's valid pixels that stay valid, above 0, at most 1.
     forecast
         Forecast the errors of this plan file, JSON, instead of choosing a plan.
     confirm
@@ -148,8 +148,8 @@ def _plan(
         rig,
         goals,
         width_px=width,
-        most_lights=max_lights,
-        valid_share=common.min_valid_fraction,
+        max_lights=max_lights,
+        min_valid_fraction=common.min_valid_fraction,
         **asked,
     )
     for line in format_choice(choice):
@@ -174,6 +174,6 @@ def _plan(
     if (out := common.out) is not None:
         write_atomically(out, json_text.dumps(choice.plan.to_json(), indent=1) + "\n")
         console.print_line(f"next: skinrig capture {rig} --plan {shell_quote(out)} --out session")
-    console.document(document.pop("schema"), document)
+    console.print_document(document.pop("schema"), document)
     if not reached:
-        raise typer.Exit(errors.LIMIT_MISSED)
+        raise typer.Exit(errors.EXIT_LIMIT_MISSED)

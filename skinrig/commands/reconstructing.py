@@ -16,7 +16,7 @@ from skinrig.next_steps import shell_quote
 
 @command
 def calibrate(
-    kind: Annotated[str, typer.Argument(autocompletion=completion.calibrations)],
+    kind: Annotated[str, typer.Argument(autocompletion=completion.complete_calibrations)],
     sessions: list[Path],
     /,
     out: Out = Path("calibration"),
@@ -34,11 +34,11 @@ def calibrate(
     sessions
         SESSION/ folders of the target.
     square_mm
-        Side of the calibration board's squares, mm (dome, geometry).
+        Side of the calibration board's squares, mm (dome: geometry).
     sphere_mm
-        Radius of the mirror sphere, mm (dome, lights).
+        Radius of the mirror sphere, mm (dome: lights).
     phantom
-        Certificate (JSON) of the phantom (probe, fiber).
+        Certificate of the phantom, JSON (probe: fibre).
     kind
         Calibration: sensor, color, polarization or white (flash); geometry or lights (dome);
         sensor, lights or polarization (gradient); fiber (probe).
@@ -50,14 +50,14 @@ def calibrate(
     console = Console(json)
     (kind,) = replace_former_values([kind], FORMER_NAMES)
     done = make(kind, sessions, out, targets=dome_targets(square_mm, sphere_mm), phantom=phantom)
-    console.rows(("quantity", "value"), done.summary)
-    console.each("found", done.findings)
+    console.print_table(("quantity", "value"), done.summary)
+    console.print_each("found", done.findings)
     for change in done.drift:
         if change.change and (change.sigmas is None or abs(change.sigmas) > 2):
             console.print_line(f"drift: {change}")
     console.print_line(f"{done.path}: valid until {done.calibration.valid_until}")
     values = {"path": done.path, "values": dict(done.summary), "findings": done.findings}
-    console.document("skinrig.calibrate/1", values | {"drift": [str(d) for d in done.drift]})
+    console.print_document("skinrig.calibrate/1", values | {"drift": [str(d) for d in done.drift]})
 
 
 def check_rank(rank: int | None, basis: Path | None) -> None:
@@ -160,14 +160,14 @@ def reconstruct(
             truth=truth.name if truth else "",
             dome=DomeOptions(scan, merl_basis, hold_out, rank),
         )
-        console.each("assumed", done.assumed)
+        console.print_each("assumed", done.assumed)
         console.print_line(f"run: {', '.join(done.ran) or 'nothing'}")
         console.print_line(f"reused: {', '.join(done.reused) or 'nothing'}")
-        console.each("left out", (f"{what} ({why})" for what, why in done.omitted))
+        console.print_each("left out", (f"{what} ({why})" for what, why in done.omitted))
         written = select_attributes(done, "ran", "reused", "assumed", "work")
         made.append({"path": folder, **written, "left_out": done.omitted})
     console.print_line(f"next: skinrig report {shell_quote(out)}")
-    console.document(
+    console.print_document(
         "skinrig.reconstruct/1", made[0] if len(made) == 1 else {"path": out, "appearances": made}
     )
 

@@ -43,7 +43,7 @@ class RenderOptions:
     fov
         Horizontal field of view of a camera given by its position, degrees.
     look_at
-        Point that a camera given by its position looks at, mm.
+        Target point of a camera given by its position, mm.
     samples
         Rays per pixel, a square number: 1, 4, 9, 16 ...
     shadow_samples
@@ -63,10 +63,10 @@ class RenderOptions:
     exposure
         Exposure factor of the PNGs; default: set from the brightness of skin.
     against
-        Session to compare with, of photographs not used in any fit (reconstruct --hold-out); with
-        --components, split the photograph of --view and --light.
+        SESSION/ folder whose held-out photographs (reconstruct --hold-out) are compared with
+        renderings; with --components, the photograph of --view and --light is decomposed instead.
     photographs
-        Maximum number of photographs, spread evenly over the held-out ones (with --against).
+        Maximum number of compared photographs, at equal steps over the held-out ones (--against).
     seed
         Random seed of the environment's lights and of --bases.
     shadow_boundary
@@ -158,7 +158,7 @@ def _compare(
     )
     photographs_errors.print_comparison(console, found)
     if not found["passed"]:
-        raise typer.Exit(errors.LIMIT_MISSED)
+        raise typer.Exit(errors.EXIT_LIMIT_MISSED)
 
 
 def _draw(
@@ -215,7 +215,7 @@ def _parse_sigma_tr(row: dict[str, Any]) -> str:
 
 
 def _report(console: Console, done: dict[str, Any]) -> None:
-    console.each("assumed", done["assumed"])
+    console.print_each("assumed", done["assumed"])
     if "bases" in done:
         for row in done["bases"]:
             gap = next(v for k, v in row.items() if k.startswith("surface_difference"))
@@ -225,9 +225,9 @@ def _report(console: Console, done: dict[str, Any]) -> None:
                 f"{row['lobes']} basis BRDFs, {how}: specular reflection differs by {words}"
             )
     if "boundaries" in done:
-        console.rows(
+        console.print_table(
             ("skin", "sigma_tr, 1/mm", "90 to 10 % red, mm", "green", "blue"),
             ((row["skin"], _parse_sigma_tr(row), *row["rise_mm"]) for row in done["boundaries"]),
         )
     console.print_line(f"{done['out']}: {', '.join(done['files'])}, {done['seconds']:.1f} s")
-    console.document(done["schema"], {k: v for k, v in done.items() if k != "schema"})
+    console.print_document(done["schema"], {k: v for k, v in done.items() if k != "schema"})

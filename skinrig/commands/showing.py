@@ -45,14 +45,14 @@ def report(
         Compare two runs side by side; default: if PATHS are exactly two of one kind.
     """
     from skinrig.atomic_file import write_atomically
-    from skinrig.report import make
+    from skinrig.report import build_any
 
     piped = str(out) == STDOUT_MARK
     if piped and json:
         raise UsageError("--out: got '-' with --json, whose document goes there; name a file")
     console = Console(json)
     talk = Console(json or piped)  # messages go to stderr if the page goes to stdout
-    done = make(paths, compare=compare)
+    done = build_any(paths, compare=compare)
     if piped:
         typer.echo(done.html, nl=False)
     else:
@@ -68,7 +68,7 @@ def report(
         talk.print_line(f"{out}: {size / 1e6:.2f} MB; open it in a browser")
     missed = sum(not check.passed for check in done.checks)
     figures = {"path": out, "bytes": size, "checks": len(done.checks), "missed": missed}
-    console.document("skinrig.report/1", {**figures, "compared": done.compared})
+    console.print_document("skinrig.report/1", {**figures, "compared": done.compared})
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +107,7 @@ class HeadOptions:
         Width and height of textures, texels, 64 to 4096.
     """
 
-    preset: Annotated[str, typer.Option(autocompletion=completion.subjects)] = "III"
+    preset: Annotated[str, typer.Option(autocompletion=completion.complete_subjects)] = "III"
     seed: int = 0
     size_px: int = 2048
 
@@ -152,7 +152,7 @@ def view(
     given = select_attributes(face, "mesh", "landmarks", "calibration")
     given |= select_attributes(head, "preset", "seed") | {"size": head.size_px}
     console.progress("making textures and tables")
-    scene = faces.scene(appearance or [], **given)
+    scene = faces.build_scene(appearance or [], **given)
     document: dict[str, Any]
     if port is None:
         document = page.write(scene, out)
@@ -160,9 +160,9 @@ def view(
             f"{out}: {document['bytes'] / 1e6:.2f} MB, {document['textures']} textures, "
             f"{document['blend_shapes']} blend shapes; open it in a browser"
         )
-    console.left_out(scene.left_out)
+    console.print_omissions(scene.left_out)
     if port is None:
-        console.document("skinrig.view/1", document)
+        console.print_document("skinrig.view/1", document)
     else:
         server.serve_scene(
             scene, port, appearance or [], console=console, displacement=displacement

@@ -28,14 +28,14 @@ States = Annotated[
     option(
         "Expression or condition of the face, such as smile or exercise; repeatable; "
         "default: neutral.",
-        autocompletion=completion.states,
+        autocompletion=completion.complete_states,
     ),
 ]
 OneState = Annotated[
     list[str] | None,
     option(
         "Expression or condition of the face, such as smile or exercise; default: neutral.",
-        autocompletion=completion.states,
+        autocompletion=completion.complete_states,
     ),
 ]
 
@@ -47,7 +47,7 @@ class SimulateOptions:
     Attributes
     ----------
     scale
-        Scale of the simulation: small (quick) or full (all of the rig).
+        Scale of the simulation: small (fewer pixels and lights, fast) or full (the complete rig).
     plan
         Plan file of `skinrig plan`, JSON; default: the rig's own plan.
     """
@@ -89,7 +89,7 @@ class SimulatedFaceOptions:
     mesh
         Face mesh, .npz or .obj; default: the built-in head.
     omit
-        Effects not to simulate although they change pixels, separated by commas: lateral (or
+        Visible effects to omit from the simulation, separated by commas: lateral (or
         subsurface), interreflections, spectral, optics, relief_shadows.
     movement
         Deform the face with its expressions, or change its blood volume only.
@@ -153,7 +153,7 @@ def simulate_flash(
 def simulate_dome(
     common: SimulateOptions,
     face: SimulatedFaceOptions,
-    subject: Annotated[str, typer.Option(autocompletion=completion.subjects)] = "III",
+    subject: Annotated[str, typer.Option(autocompletion=completion.complete_subjects)] = "III",
     target: Annotated[str | None, target_option("dome")] = None,
     lights: int | None = None,
     views: int | None = None,
@@ -164,7 +164,7 @@ def simulate_dome(
     interreflections: bool = False,
     condition: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME[=AMOUNT]", autocompletion=completion.conditions),
+        typer.Option(metavar="NAME[=AMOUNT]", autocompletion=completion.complete_conditions),
     ] = None,
 ) -> None:
     """Simulate the dome: a face with one expression and its scan, or a target.
@@ -182,11 +182,11 @@ def simulate_dome(
     move
         Simulate head motion during the capture.
     wrapped
-        Scan with a template mesh, so that all expressions share one texture.
+        Scan with a wrapped template mesh, so that all expressions share one texture layout.
     subsurface
-        Simulate subsurface scattering even if it changes no pixel visibly.
+        Simulate subsurface scattering even if its effect is not visible.
     interreflections
-        Simulate interreflection of skin even if it changes no pixel visibly.
+        Simulate interreflection of skin even if its effect is not visible.
     subject
         Simulated subject: preset I to VI, palest or darkest, a file NAME.toml, or P01 to P87 of
         the simulated population.
@@ -233,7 +233,7 @@ def simulate_gradient(
     Parameters
     ----------
     omit
-        Effects not to simulate although they change pixels, separated by commas: shadows, lateral,
+        Visible effects to omit from the simulation, separated by commas: shadows, lateral,
         interreflections, optics.
     """
     from skinrig.capturing.option_values import parse_floats, parse_names, parse_range
@@ -256,7 +256,7 @@ def simulate_gradient(
 @command
 def simulate_probe(
     common: SimulateOptions,
-    subject: Annotated[str, typer.Option(autocompletion=completion.subjects)] = "III",
+    subject: Annotated[str, typer.Option(autocompletion=completion.complete_subjects)] = "III",
     target: Annotated[str | None, target_option("probe")] = None,
     sites: options.Sites = None,
     repeats: options.Placements = 1,
@@ -297,4 +297,4 @@ def _simulate(order: SimulationOrder, console: Console, target: str | None) -> N
     truth = f", ground truth in {done.truth}" if done.truth else ""
     console.print_line(f"{done.session}: {format_count(done.frames, 'frame')}{truth}")
     console.print_line(f"next: {suggest_after_session(order.rig, order.out, target)}")
-    console.document("skinrig.simulate/1", done.document())
+    console.print_document("skinrig.simulate/1", done.document())

@@ -1,1 +1,1 @@
-"""Drawing: PNG images, SVG figures and labels."""
+"""Draw PNG images, SVG figures and labels."""

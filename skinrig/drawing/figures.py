@@ -1,4 +1,4 @@
-"""Plots of the report as SVG text, equal bytes for equal input."""
+"""Draw the plots of the report as deterministic SVG text."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -13,8 +13,8 @@ from skinrig.drawing import svg
 SERIES_COLORS = ("#2a78b8", "#d1602c", "#3f8f4f", "#8458a8")
 
 
-def canvas(width_in: float, height_in: float) -> tuple[Any, Any]:
-    """Return a figure without a background, and its axes; sizes in inches."""
+def create_canvas(width_in: float, height_in: float) -> tuple[Any, Any]:
+    """Create a figure without background, and its axes; sizes in inches."""
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -31,17 +31,17 @@ def canvas(width_in: float, height_in: float) -> tuple[Any, Any]:
 
 
 def to_svg(figure: Any, alt: str) -> str:
-    """Return a figure as SVG text, with ``alt`` as its alternative text."""
+    """Convert a figure to SVG text with the alternative text ``alt``."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     buffer = io.StringIO()
-    # savefig would draw twice, the first time for the layout, which the one drawing finds as well
+    # savefig draws twice, first for the layout; print_svg computes the layout in its single pass
     FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
     return svg.simplify_svg(buffer.getvalue(), alt=alt)
 
 
 def format_log_axes(*log_axes: Any) -> None:
-    """Label decades by plain numbers, and ticks between them where decades are few."""
+    """Label decades of logarithmic axes by plain numbers, and ticks between a few decades."""
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
     for axis in log_axes:
@@ -55,12 +55,12 @@ def format_log_axes(*log_axes: Any) -> None:
 
 
 def format_range(values: FloatArray) -> str:
-    """Return the ends of what is finite, as words."""
+    """Format the range of the finite values."""
     finite = values[np.isfinite(values)]
     return f"{finite.min():.3g} to {finite.max():.3g}" if finite.size else "none"
 
 
-def bars(
+def draw_bars(
     title: str,
     labels: Sequence[str],
     series: Mapping[str, FloatArray | Sequence[float]],
@@ -68,11 +68,11 @@ def bars(
     unit: str,
     limits: Mapping[str, float] | None = None,
 ) -> str:
-    """Draw groups of bars, one group a label, one bar a series; NaN leaves a gap.
+    """Draw groups of bars, one group per label, one bar per series; NaN leaves a gap.
 
-    A series in ``limits`` has its limit drawn as a dashed line of its color.
+    The limit of a series in ``limits`` is a dashed line of its color.
     """
-    figure, axes = canvas(6.2, 3.0)
+    figure, axes = create_canvas(6.2, 3.0)
     position = np.arange(len(labels))
     width = 0.8 / max(len(series), 1)
     words = []
@@ -100,7 +100,7 @@ def _title(axes: Any, title: str, y_name: str, x_name: str = "") -> None:
 
 @dataclass(frozen=True, slots=True)
 class PlotSeries:
-    """One series of a plot: points with standard errors, a line, or both."""
+    """One series of a plot: points with standard uncertainties, a line, or both."""
 
     name: str
     x: Sequence[float] | FloatArray
@@ -109,19 +109,19 @@ class PlotSeries:
     marks: bool = True
     """Whether points are marked."""
     line: bool = True
-    """Whether they are joined."""
+    """Whether points are connected."""
     color: str | None = None
-    """As matplotlib knows it; None: by the order of the series."""
+    """A color of matplotlib; None: by the order of the series."""
 
 
-def curves(
+def draw_curves(
     title: str, x_name: str, y_name: str, series: Sequence[PlotSeries], *, log_y: bool = False
 ) -> str:
-    """Draw series over a common axis, with bars of one standard error; NaN leaves a gap.
+    """Draw series over a common axis with bars of one standard uncertainty; NaN leaves a gap.
 
-    On a logarithmic axis what is not above zero leaves a gap too.
+    On a logarithmic axis, values at or below zero leave a gap, too.
     """
-    figure, axes = canvas(5.2, 3.4)
+    figure, axes = create_canvas(5.2, 3.4)
     for number, curve in enumerate(series):
         color = curve.color or SERIES_COLORS[number % len(SERIES_COLORS)]
         style = ("o" if curve.marks else "") + ("-" if curve.line else "")
@@ -132,7 +132,7 @@ def curves(
             axes.plot(x, y, style or "o", color=color, ms=4, lw=1.2, label=curve.name)
             continue
         bars = np.where(np.isfinite(curve.stderr), np.asarray(curve.stderr, float), 0.0)
-        down = np.fmin(bars, 0.999 * y) if log_y else bars  # a log axis has no room for zero
+        down = np.fmin(bars, 0.999 * y) if log_y else bars  # a log axis cannot show zero
         look = {"fmt": style or "o", "color": color, "ms": 4, "lw": 1.2, "elinewidth": 1}
         axes.errorbar(x, y, yerr=np.stack([down, bars]), label=curve.name, **look)
     if log_y:
@@ -147,20 +147,20 @@ def curves(
     return to_svg(figure, f"{title}: {y_name} against {x_name}; {spans}")
 
 
-def sensitivity(title: str, c_m: FloatArray, c_hd: FloatArray, percent: FloatArray) -> str:
+def draw_sensitivity(title: str, c_m: FloatArray, c_hd: FloatArray, percent: FloatArray) -> str:
     """Draw the Cramér-Rao bound over melanin and blood volume fractions, in percent.
 
     Parameters
     ----------
     title
-        Which chromophore.
+        Title with the chromophore.
     c_m, c_hd
         (N,) and (M,) volume fractions.
     percent
-        (N, M) Cramer-Rao bound on the relative standard error; contours at 1, 3, 10, 30
+        (N, M) Cramér-Rao bound of the relative standard deviation; contours at 1, 3, 10, 30
         and 100 %.
     """
-    figure, axes = canvas(4.2, 3.2)
+    figure, axes = create_canvas(4.2, 3.2)
     shown = np.clip(np.nan_to_num(percent, nan=1e4, posinf=1e4), 0.1, 1e3).T
     mesh = axes.pcolormesh(
         np.cbrt(c_m),

@@ -1,4 +1,4 @@
-"""PNG and JPEG images, and color scales."""
+"""Encode PNG and JPEG images, and apply color scales."""
 
 import base64
 import io
@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from skinrig.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 
 SCALE_CLASSES = {"viridis": "viridis", "magma": "magma", "RdBu_r": "diverging", "gray": "grays"}
-"""matplotlib's color maps that maps are shown by, and what a style sheet calls them."""
+"""Color maps of matplotlib in use, with their names in style sheets."""
 INVALID_GRAY = 128
-"""Of pixels without a value."""
+"""Gray level of pixels without a value."""
 MIN_SPAN = 1e-200
-"""Span of a color scale below which all values have its first color: division would overflow."""
+"""Minimum span of a color scale; below it division overflows, and all values get the first
+color."""
 
 
 def encode(image: NDArray[np.generic], *, quick: bool = False) -> bytes:
@@ -25,7 +26,7 @@ def encode(image: NDArray[np.generic], *, quick: bool = False) -> bytes:
     image
         (H, W) gray, (H, W, 3) RGB or (H, W, 4) RGB and opacity, uint8 or uint16, row 0 at the top.
     quick
-        Compress less: for large textures, in a third of the time.
+        Compress less, in a third of the time, for large textures.
 
     Returns
     -------
@@ -35,7 +36,7 @@ def encode(image: NDArray[np.generic], *, quick: bool = False) -> bytes:
     Raises
     ------
     ValueError
-        When shape or dtype is another.
+        If shape or dtype is another.
 
     Examples
     --------
@@ -61,12 +62,12 @@ def encode(image: NDArray[np.generic], *, quick: bool = False) -> bytes:
 
 
 def to_data_url(file: bytes) -> str:
-    """Return a PNG file's bytes as a ``data:`` address."""
+    """Encode a PNG file as a ``data:`` URL."""
     return "data:image/png;base64," + base64.b64encode(file).decode("ascii")
 
 
-def jpeg_address(image: UInt8Array, *, quality: int = 88) -> str:
-    """Return an image, (H, W, 3), as a JPEG file in a ``data:`` address, for small previews."""
+def encode_jpeg_url(image: UInt8Array, *, quality: int = 88) -> str:
+    """Encode an image, (H, W, 3), as a JPEG file in a ``data:`` URL, for small previews."""
     import cv2
 
     stored = np.ascontiguousarray(image[..., ::-1])  # OpenCV has blue first
@@ -74,14 +75,13 @@ def jpeg_address(image: UInt8Array, *, quality: int = 88) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(file).decode("ascii")
 
 
-def srgb8(linear: FloatArray) -> UInt8Array:
+def encode_srgb8(linear: FloatArray) -> UInt8Array:
     """Apply the sRGB curve (IEC 61966-2-1) and round to 8 bits.
 
     Parameters
     ----------
     linear
-        Linear values of any shape; outside [0, 1] and NaN are shown at the nearest end,
-        for display only.
+        Linear values of any shape, clipped to [0, 1], for display only.
 
     Returns
     -------
@@ -93,7 +93,7 @@ def srgb8(linear: FloatArray) -> UInt8Array:
 
 
 def srgb_curve(linear: FloatArray) -> Float64Array:
-    """Return sRGB's curve of values in [0, 1], IEC 61966-2-1.
+    """Apply the sRGB transfer curve (IEC 61966-2-1) to values in [0, 1].
 
     Examples
     --------
@@ -112,7 +112,7 @@ class Scale:
     Attributes
     ----------
     low, high
-        Its ends, in the unit of the values; beyond them the end's color shows.
+        Ends of the scale in the unit of the values; values beyond them are clipped.
     name
         A matplotlib color map, such as "viridis" or the diverging "RdBu_r".
     """
@@ -122,24 +122,24 @@ class Scale:
     name: str = "viridis"
 
     def colors(self, values: FloatArray, valid: BoolArray | None = None) -> UInt8Array:
-        """Return the colors of values, (H, W, 3); of what is NaN or not valid mid gray."""
+        """Return the colors of values, (H, W, 3); NaN and invalid pixels are mid gray."""
         position, shown = self._position(values, valid)
-        image = palette(self.name, 256)[np.round(255 * position).astype(np.intp)]
+        image = sample_palette(self.name, 256)[np.round(255 * position).astype(np.intp)]
         image[~shown] = INVALID_GRAY
         return image
 
     def encode(
         self, values: FloatArray, valid: BoolArray | None = None, *, levels: int = 128
     ) -> bytes:
-        """Return a map by few colors as a PNG file with a palette.
+        """Encode a map as a PNG file with a palette.
 
         Parameters
         ----------
         values, valid
-            (H, W); as for `colors`.
+            (H, W); see `colors`.
         levels
-            Colors of the scale, 2 to 255, which quantize the values; pixels without a value have a
-            color of their own.
+            Number of colors, 2 to 255, to which values are quantized; pixels without a value have
+            an extra color.
         """
         from PIL import Image
 
@@ -148,7 +148,7 @@ class Scale:
         index[~shown] = levels
         gray = np.full((1, 3), INVALID_GRAY, np.uint8)
         image = Image.frombytes("P", index.shape[::-1], index.tobytes())
-        image.putpalette(np.concatenate([palette(self.name, levels), gray]).tobytes())
+        image.putpalette(np.concatenate([sample_palette(self.name, levels), gray]).tobytes())
         file = io.BytesIO()
         image.save(file, "PNG", optimize=True)
         return file.getvalue()
@@ -156,7 +156,7 @@ class Scale:
     def _position(
         self, values: FloatArray, valid: BoolArray | None
     ) -> tuple[Float64Array, BoolArray]:
-        """Return where values lie on the scale, in [0, 1], and which are shown."""
+        """Return the positions of values on the scale, in [0, 1], and the valid ones."""
         values = np.asarray(values, np.float64)
         span = self.high - self.low
         span = span if span > MIN_SPAN else 1.0
@@ -165,8 +165,8 @@ class Scale:
         return position, finite if valid is None else finite & np.asarray(valid, bool)
 
 
-def palette(scale: str, colors: int) -> UInt8Array:
-    """Return colors spread evenly over a matplotlib color map, (colors, 3), uint8."""
+def sample_palette(scale: str, colors: int) -> UInt8Array:
+    """Sample a matplotlib color map at equal steps, (colors, 3), uint8."""
     from matplotlib import colormaps
 
     return np.round(255 * colormaps[scale](np.linspace(0.0, 1.0, colors))[:, :3]).astype(np.uint8)

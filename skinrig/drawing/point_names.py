@@ -1,4 +1,4 @@
-"""Labels of the points of a plot, placed without overlap."""
+"""Label the points of a plot without overlap."""
 
 import itertools
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ _LABEL_OFFSETS = tuple(
     for far in (5, 12, 20)
     for x, y in ((1, 1), (-1, 1), (1, -1), (-1, -1), (0, 1), (0, -1))
 )
-"""Where a name is tried: offsets from its point, points, and which of its corners lies there."""
+"""Candidate offsets of a label from its point, points, with the label's aligned corner."""
 
 
 def name_points(
@@ -31,24 +31,24 @@ def name_points(
     Parameters
     ----------
     figure, axes
-        Finished but for the names: limits and scales are final.
+        Figure and axes with final limits and scales.
     labels
-        Name, x and y of each point that has one, the most important first.
+        Name, x and y of each labeled point, the most important first.
     points
-        x and y of all points that names must leave free.
+        x and y of all points that labels must not cover.
     lines
-        (N, 2) each, x and y: they are crossed only where there is no other room.
+        Lines, (N, 2) each, x and y; a label crosses them only without free space.
     legend
-        Of the axes, left free too.
+        Legend of the axes, which labels must not cover.
 
     Notes
     -----
-    Of equal names, the first one is written where the others have no free space. A name that is
+    Of equal names, the first one is written if the others have no free space. A label that is
     wider than the axes is omitted; tables and alt texts list all of them.
     """
     from matplotlib.transforms import Bbox
 
-    figure.draw_without_rendering()  # what the constrained layout makes of the axes
+    figure.draw_without_rendering()  # computes the constrained layout of the axes
     inside = axes.get_window_extent()
     dot = figure.dpi / 72.0
     taken = [
@@ -64,7 +64,7 @@ def name_points(
         if not label:
             continue
         words = axes.annotate(label, (x, y), xytext=(0, 0), textcoords="offset points", fontsize=6)
-        words.set_in_layout(False)  # a long name must not squeeze the axes away
+        words.set_in_layout(False)  # a long label must not shrink the axes
         found = None
         for place in _LABEL_OFFSETS:
             box = _place_label(words, place)
@@ -84,7 +84,7 @@ def name_points(
 
 
 def _place_label(words: Any, offset: tuple[int, int, str, str]) -> Any:
-    """Put a name at a place of `_LABEL_OFFSETS`, and return the box that it then fills, pixels."""
+    """Move a label to an offset of `_LABEL_OFFSETS` and return its bounding box, pixels."""
     dx, dy, across, up = offset
     words.set_position((dx, dy))
     words.set_ha(across)
@@ -93,7 +93,7 @@ def _place_label(words: Any, offset: tuple[int, int, str, str]) -> Any:
 
 
 def _along(line: FloatArray) -> Float64Array:
-    """Return points along a line of (N, 2) pixels, closer than a name is high."""
+    """Return points along a line of (N, 2) pixels, denser than the height of a label."""
     parts = np.linspace(0.0, 1.0, 200)[:, None]
     pairs = itertools.pairwise(line)
     return np.concatenate([start + parts * (end - start) for start, end in pairs])

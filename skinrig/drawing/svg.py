@@ -1,11 +1,11 @@
-"""Plots as short SVG text that needs no style sheet and can be read aloud."""
+"""Shorten SVG plots of matplotlib, without style sheet and with alternative text."""
 
 import hashlib
 import html
 import re
 
 COORDINATE_DECIMALS = 2
-"""Of coordinates, in points: a hundredth of a point is finer than a screen or a printer shows."""
+"""Decimals of coordinates; 0.01 points is below the resolution of screens and printers."""
 
 _TAG_PATTERN = re.compile(r"<[^>]+>")
 _LONG_NUMBER = re.compile(r"-?\d+\.\d+(?:e-?\d+)?")
@@ -14,21 +14,21 @@ _FONT_FAMILY = "DejaVu Sans, Verdana, Arial, sans-serif"
 
 
 def simplify_svg(svg: str, *, alt: str) -> str:
-    r"""Return a plot of matplotlib's SVG writer in a fifth to half of its length.
+    r"""Shorten a plot of matplotlib's SVG writer to a fifth to half of its length.
 
     Parameters
     ----------
-    drawn
-        Output of the writer, with text as text.
+    svg
+        Output of the writer, with text as text elements.
     alt
         Alternative text of the plot.
 
     Returns
     -------
     str
-        The element ``<svg>`` alone, an image with a name. It has no style attributes, which a
-        strict content security policy refuses; black is the color of the text around it, so
-        that it is legible on dark pages; its ids are its own among other plots of a page.
+        The element ``<svg>`` as a labeled image. It has no style attributes, which a strict
+        content security policy refuses. Black becomes the color of the surrounding text, so that
+        it is legible on dark pages. Its ids are unique on a page.
 
     Examples
     --------
@@ -58,7 +58,7 @@ def simplify_svg(svg: str, *, alt: str) -> str:
 
 
 def _attributes(tag: str) -> str:
-    """Return a tag with attributes in place of styles, short numbers, and no empty rotation."""
+    """Replace styles of a tag by attributes, shorten its numbers, and drop empty rotations."""
     if tag.startswith("</") or "base64," in tag:
         return re.sub(r"\s+", " ", tag)
 
@@ -75,7 +75,7 @@ def _attributes(tag: str) -> str:
     tag = re.sub(r' transform="rotate\(-?0 [^"]*\)"', "", tag)
     tag = _LONG_NUMBER.sub(lambda found: f"{round(float(found[0]), COORDINATE_DECIMALS):g}", tag)
     tag = re.sub(r"\s+", " ", tag)
-    # letters of a path's commands stand for themselves
+    # the letters of path commands are separators themselves
     return re.sub(r' d="([^"]*)"', lambda found: f' d="{_path(found[1])}"', tag)
 
 

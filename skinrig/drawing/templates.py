@@ -1,4 +1,4 @@
-"""Templates of HTML pages, with all markup except drawings."""
+"""Render templates of HTML pages."""
 
 import functools
 
@@ -13,7 +13,7 @@ def render(name: str, **data: object) -> str:
     name
         Path inside the package, such as "viewer/page.html".
     data
-        Values of the names in the template; a missing name is an error.
+        Values of the names in the template; a missing name raises.
     """
     return _environment().get_template(name).render(data)
 

@@ -1,1 +1,1 @@
-"""Traits and spots given to a face or taken from it."""
+"""Edit traits and spots of a face: `skinrig edit`."""

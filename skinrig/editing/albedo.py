@@ -1,9 +1,9 @@
-"""R_d with other statistics: the albedo map matched to the histograms that a trait asks for.
+"""Edit R_d by traits: match the albedo map to the histograms of the edited statistics.
 
-The map is laid out without seams, its statistics are changed, and it is matched to them after the
-method of Heeger and Bergen, starting from itself with a little noise added. By what factor the
-matching changed each place, each texel is changed: nothing becomes negative, and finer detail than
-the common map shows is kept.
+The albedo is resampled to the seamless common map. Its statistics are edited, and the map is
+matched to them by the method of Heeger and Bergen, starting from the map itself with slight noise.
+The result is applied to the texels as a factor. Thus no value becomes negative, and detail finer
+than the common map is kept.
 """
 
 from collections.abc import Mapping
@@ -21,25 +21,25 @@ from skinrig.traits import albedo_vectors
 from skinrig.traits.albedo_vectors import AlbedoTraits, VectorKind
 
 MATCHING_NOISE: Final = 0.05
-"""Standard deviation of the noise added before matching, in each channel's own."""
+"""Noise added before matching, as a fraction of each channel's standard deviation."""
 MIN_ALBEDO_FACTOR: Final = 0.02
-"""Least factor by which an edit darkens, and the inverse of the most by which it lightens."""
+"""Minimum factor of an edit; its inverse is the maximum."""
 
 
 class AlbedoEditError(ValueError):
-    """An albedo map that cannot be edited as asked."""
+    """An albedo map without the texels that the edit needs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AlbedoEdit:
-    """What an edit does to R_d at each texel.
+    """Factor of R_d per texel, with the residual of the matching.
 
     Attributes
     ----------
     factor
-        (H, W, 3), `MIN_ALBEDO_FACTOR` to its inverse; 1 where nothing changes.
+        (H, W, 3), `MIN_ALBEDO_FACTOR` to its inverse; 1: unchanged.
     clipped
-        Share of the change of statistics that was not possible.
+        Fraction of the change of statistics that was clipped.
     before, after
         Mean distance of the informative histograms from the target ones, before and after
         matching.
@@ -53,19 +53,19 @@ class AlbedoEdit:
     def apply(
         self, r_d: ArrayLike, mask: ArrayLike | None = None
     ) -> tuple[Float32Array, BoolArray]:
-        """Return R_d edited, and which texels had to be held at a perfect white's.
+        """Return the edited R_d, and the texels that were clipped at 1.
 
         Parameters
         ----------
         r_d
             (H, W, 3).
         mask
-            (H, W), 0 to 1; where it is 0 every bit stays.
+            (H, W), 0 to 1; texels of 0 stay bit-identical.
 
         Returns
         -------
         r_d : ndarray of float32, shape (H, W, 3)
-            No lighter than 1, or than it was where it was lighter already.
+            At most 1, or the original value where that exceeds 1.
         held : ndarray of bool, shape (H, W)
         """
         given = np.asarray(r_d, np.float32)
@@ -90,27 +90,27 @@ def edit_albedo(
     noise: float = MATCHING_NOISE,
     rng: np.random.Generator,
 ) -> AlbedoEdit:
-    """Find what some traits do to an albedo map.
+    """Compute the factor by which traits change an albedo map.
 
     Parameters
     ----------
     r_d
         (H, W, 3).
     valid
-        (H, W): texels that were measured; the others take part in no statistic.
+        (H, W): measured texels; others are excluded from the statistics.
     chart
-        Where texels lie in the common map.
+        Positions of the texels in the common map.
     space
         Traits of this region.
     amounts
-        Trait to amount.
+        Amount by trait.
     region
         (N, N), pixels of the common map whose statistics change.
-    share
-        (N, N), 0 to 1: how much of the change each place of the map gets; the change goes on
-        smoothly beyond the region.
+    weight
+        (N, N), 0 to 1: weight of the change per pixel of the common map; it may extend smoothly
+        beyond the region.
     iterations
-        Of matching.
+        Number of iterations of the matching.
     noise
         See `MATCHING_NOISE`.
     rng
@@ -119,9 +119,12 @@ def edit_albedo(
     image, known = chart.gather(albedo_vectors.encode_albedo(r_d, space.kind), valid)
     used = region & known
     if not used.any():
-        raise AlbedoEditError("r_d: no valid texel lies in the region that is edited")
+        raise AlbedoEditError(
+            "r_d: got no valid texel in the edited region, expected some; choose another --region"
+        )
     if space.kind == "quantiles":
-        # the same factor for any skin: bring one darker or lighter than all to where the bins are
+        # shift the mean to that of the training data, where the histogram bins are; the log factor
+        # of the edit is the same for skin that is darker or lighter than all training data
         image = image - (image[used].mean(axis=0) - space.texture.mean)
     start = _noisy(image, used, space, noise, rng)
     vector = texture_statistics.describe(start, space=space.texture, valid=known, region=used)
@@ -148,7 +151,7 @@ def edit_albedo(
 def _log_ratio(
     new: Float64Array, old: Float64Array, kind: VectorKind, used: BoolArray
 ) -> Float64Array:
-    """Return the logarithm of the factor from one encoded map to another."""
+    """Return the log ratio of two encoded maps."""
     if kind == "quantiles":
         return new - old
     least = max(MIN_ALBEDO_FACTOR * float(np.median(old[used])), albedo_vectors.MIN_REFLECTANCE)
@@ -162,7 +165,7 @@ def _noisy(
     noise: float,
     rng: np.random.Generator,
 ) -> Float64Array:
-    """Return a map with noise in its decorrelated channels."""
+    """Add noise to the decorrelated channels of a map."""
     channels = space.texture.to_channels(np.asarray(image, np.float64))
     for channel in channels:
         channel += noise * float(channel[used].std()) * rng.standard_normal(channel.shape)

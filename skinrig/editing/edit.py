@@ -1,4 +1,4 @@
-"""An appearance with other traits and other spots, in the same layout: `skinrig edit`."""
+"""Edit traits and spots of an appearance; its texture layout is kept: `skinrig edit`."""
 
 import dataclasses
 import difflib
@@ -17,7 +17,7 @@ from model.traits.vectors import MAX_P_VALUE, TraitVector
 from reconstruction.correspondence import common_regions
 from skinrig import consent
 from skinrig.appearances import face_textures
-from skinrig.appearances.contents import digest, document_digest
+from skinrig.appearances.contents import hash_document, hash_file
 from skinrig.appearances.face_textures import Face
 from skinrig.arrays import BoolArray, Float32Array
 from skinrig.console import select_attributes
@@ -26,97 +26,95 @@ from skinrig.editing import masks, pigment_spots, surface_mixtures
 from skinrig.editing import spots as editing_spots
 from skinrig.editing import surface as editing_surface
 from skinrig.editing.albedo import AlbedoEdit
-from skinrig.editing.spots import SpotOrder
+from skinrig.editing.spots import SpotRequest
 from skinrig.editing.surface_mixtures import SurfaceMixtures
-from skinrig.errors import UsageError, one_of
+from skinrig.errors import UsageError, require_choice
 from skinrig.traits import regions
 from skinrig.traits.regions import LibraryParts
 
 EDITABLE_PARTS: Final = ("albedo", "surface")
 MAX_TRAIT_AMOUNT: Final = 10.0
-"""Of a trait. The strongest of the package's change R_d by a factor of 1.3 (tan) to 1.9 (powder)
-per amount: at 10 they reach the smallest or largest factor of an edit."""
+"""Maximum amount of a trait, absolute; at 10, strong traits reach the limits of an edit."""
 MAX_RESIDUAL_DISTANCE: Final = 0.5
 """Fraction of the distance to the target histograms above which the residual is reported."""
-STALE_MAPS: Final = {"lobe_residual": "is of the lobes before the edit"}
-"""Maps that an edit of the lobes leaves without meaning."""
+STALE_MAPS: Final = {"lobe_residual": "residual of the basis BRDFs before the edit"}
+"""Maps that an edit of the basis BRDFs invalidates, with the reason."""
 
 
 class EditError(ValueError):
-    """An edit that cannot be made as asked."""
+    """An edit that is invalid for the appearance."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EditRequest:
-    """What to do to an appearance.
+    """Traits and spots of an edit, with its region and parts.
 
     Attributes
     ----------
     traits
-        Name to amount.
+        Amount by trait.
     region
-        One of `common_regions.REGION_NAMES` that the library has: "face", "beard" or "no-beard".
+        Region of the library: "face", "beard" or "no-beard", see `common_regions.REGION_NAMES`.
     parts
-        Of `EDITABLE_PARTS`; None: those with a significant effect of the trait.
+        Edited parts, of `EDITABLE_PARTS`; None: those with a significant effect of the trait.
     mask
-        Picture of the texture, see `edit_masks.read`.
+        Mask image of the texture, see `skinrig.editing.masks.read`.
     spots
-        Added and removed after the traits.
+        Spots that are added or removed after the traits.
     landmarks
-        Table, see `face_textures.read`.
+        Table of landmarks, see `face_textures.read`.
     basis
         Folder of MERL files that the lobes were fitted with.
     iterations
-        Of matching the albedo.
+        Number of iterations of the albedo matching.
     seed
-        Of noise and spots.
+        Random seed.
     """
 
     traits: Mapping[str, float]
     region: str = "face"
     parts: tuple[str, ...] | None = None
     mask: Path | None = None
-    spots: tuple[SpotOrder, ...] = ()
+    spots: tuple[SpotRequest, ...] = ()
     landmarks: Path | None = None
     basis: Path | None = None
     iterations: int = 5
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse an empty order and values out of range."""
+        """Raise for an empty request and values out of range."""
         if not self.traits and not self.spots:
             raise UsageError("edit: got neither traits nor spots, expected --trait or --spots")
         for name, amount in self.traits.items():
             if not abs(amount) <= MAX_TRAIT_AMOUNT:
                 raise EditError(
-                    f"trait {name}: got {amount:g}, expected -{MAX_TRAIT_AMOUNT:g} to "
-                    f"{MAX_TRAIT_AMOUNT:g}; faces with and without the trait differ by 1, and "
-                    "no face of the training data lies beyond; give a smaller amount"
+                    f"--trait {name}: got {amount:g}, expected -{MAX_TRAIT_AMOUNT:g} to "
+                    f"{MAX_TRAIT_AMOUNT:g}; enter a smaller one (1: faces with and without it)"
                 )
         for part in self.parts or ():
-            one_of("parts", part, EDITABLE_PARTS, EditError)
+            require_choice("parts", part, EDITABLE_PARTS, EditError)
         if self.iterations < 1:
             raise EditError(
-                f"iterations: got {self.iterations}, expected at least 1: none changes nothing"
+                f"--iterations: got {self.iterations}, expected 1 or more; enter another"
             )
         if self.seed < 0:
-            raise EditError(f"seed: got {self.seed}, expected at least 0")
+            raise EditError(f"--seed: got {self.seed}, expected 0 or more; enter another")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EditResult:
-    """What an edit made.
+    """Result of an edit.
 
     Attributes
     ----------
     appearance
-        All maps, edited and not.
+        All maps, edited and unchanged.
     changed
         Names of maps and files that differ from the source's.
     record
-        What was done, as JSON values; in the appearance's parameters as "edit".
+        Record of the edit as JSON values; the appearance's parameter "edit".
     warnings
-        A sentence each.
+        Sentences.
     """
 
     appearance: SkinAppearance
@@ -130,7 +128,7 @@ class _EditState:
     """State of an edit under way."""
 
     face: Face
-    order: EditRequest
+    request: EditRequest
     mask: Float32Array | None
     maps: dict[str, SkinMap]  # as edited so far
     files: dict[str, bytes]  # as edited so far
@@ -148,38 +146,38 @@ def edit_folder(
     library_hash: str = "",
     progress: Callable[[str], None] | None = None,
 ) -> EditResult:
-    """Write an edited appearance.
+    """Edit an appearance and write the result.
 
     Parameters
     ----------
     path
         APPEARANCE/ folder.
-    order
-        What to do.
+    request
+        Traits and spots.
     out
         APPEARANCE/ folder to write; not the source.
     library
-        Traits; needed where the order has any.
+        Trait library; required if the request has traits.
     library_hash
-        Of its file, for the record.
+        Digest of the library's file, for the record.
     progress
-        Called with a line a step.
+        Called with one line per step.
 
     Raises
     ------
     EditError, FaceError, MaskError, SpotError, StoreError, UnusableError
-        Naming what is missing or does not fit; nothing is written.
+        If an input is missing or inconsistent; nothing is written.
     """
     if out.resolve() == path.resolve():
-        raise EditError(f"out: {out} is the source; name another folder")
+        raise EditError(f"--out: {out} is the source; name another folder")
     face = face_textures.read(path, request.landmarks)
     inputs = {
         **{f"source {name}": value for name, value in face.appearance.inputs.items()},
-        "appearance": document_digest(path),
+        "appearance": hash_document(path),
     }
     for name, file in (("mask", request.mask), ("landmarks", request.landmarks)):
         if file is not None:
-            inputs[name] = digest(file)
+            inputs[name] = hash_file(file)
     if library is not None and library_hash:
         inputs["traits"] = library_hash
     done = edit_face(face, request, library, progress=progress)
@@ -234,7 +232,7 @@ def edit_face(
     if before is not None:
         record["before"] = before
     parameters = {**source.parameters, "edit": record}
-    # the people whose traits were used are in the result, too
+    # the result contains data of the people whose traits were used: it inherits their consent
     used = () if library is None or not asked else (library,)
     if agreed := consent.merge_consent(source, *used):
         parameters[consent.CONSENT_KEY] = agreed
@@ -246,22 +244,22 @@ def edit_face(
 
 
 def _open_library(request: EditRequest, library: TraitLibrary | None) -> LibraryParts | None:
-    """Return the library's parts, after a check that it has what is asked for."""
+    """Return the library's parts; raise if a requested trait is missing."""
     if not request.traits:
         return None
     if library is None:
-        raise EditError("traits: got no library to take them from, expected --space FILE")
+        raise EditError("--trait: got no trait library, expected one; add --space FILE")
     parts = regions.open_library(library)
     for name in request.traits:
         if name not in parts.traits:
             near = difflib.get_close_matches(name, parts.traits, n=1, cutoff=0.5)
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise EditError(
-                f"trait {name!r}: is not one of {', '.join(parts.traits)}{hint} "
+                f"--trait: got {name!r}, expected one of {', '.join(parts.traits)}{hint}; "
                 "`skinrig fit traits` learns others"
             )
     if request.region != "face":
-        one_of("region", request.region, dict.fromkeys(("face", *parts.albedo)), EditError)
+        require_choice("region", request.region, dict.fromkeys(("face", *parts.albedo)), EditError)
     return parts
 
 
@@ -271,40 +269,40 @@ def _texture_shape(source: SkinAppearance, face: Face) -> tuple[int, int]:
             height, width = source.maps[name].values.shape[:2]
             return int(height), int(width)
     raise EditError(
-        f"{face.path}: has neither r_d nor basis_weight_0, there is nothing to edit; it has "
-        f"{', '.join(sorted(source.maps)) or 'no map'}"
+        f"{face.path}: got {', '.join(sorted(source.maps)) or 'no map'}, expected r_d or "
+        "basis_weight_0; reconstruct them first"
     )
 
 
 def _select_traits(
     requested: Mapping[str, float], parts: LibraryParts, work: _EditState
 ) -> dict[str, dict[str, float]]:
-    """Return which traits to use in which part."""
-    order = work.order
+    """Select the traits to edit in each part."""
+    where = work.request.region
     have: dict[str, Mapping[str, TraitVector]] = {
-        "albedo": parts.albedo[order.region].traits.traits if order.region in parts.albedo else {},
+        "albedo": parts.albedo[where].traits.traits if where in parts.albedo else {},
         "surface": {} if parts.surface is None else parts.surface.traits,
     }
     missing = {"albedo": "r_d", "surface": "basis_weight_0"}
     out: dict[str, dict[str, float]] = {part: {} for part in EDITABLE_PARTS}
     for name, amount in requested.items():
         possible = [p for p in EDITABLE_PARTS if name in have[p] and missing[p] in work.maps]
-        if order.parts is not None:
-            use = [p for p in possible if p in order.parts]
+        if work.request.parts is not None:
+            use = [p for p in possible if p in work.request.parts]
         else:
             use = [p for p in possible if have[p][name].confidence.p_value <= MAX_P_VALUE]
             for p in possible if use else []:
                 if p not in use:
                     chance = have[p][name].confidence.p_value
-                    why = f"the effect of the trait is not significant (p = {chance:.2g})"
+                    why = f"effect of the trait is not significant (p = {chance:.2g})"
                     work.left_out.append((f"{name} in {p}", f"{why}; --parts {p} edits it"))
             use = use or possible
         if not use:
             known = ", ".join(p for p in EDITABLE_PARTS if name in have[p]) or "no part"
             shown = ", ".join(p for p in EDITABLE_PARTS if missing[p] in work.maps)
             raise EditError(
-                f"trait {name!r}: none of the parts asked for can be edited by it; the traits have "
-                f"it in {known}, the appearance has {shown}"
+                f"--trait {name}: applies to {known}, the appearance has {shown}; choose another "
+                "trait or --parts"
             )
         for p in use:
             out[p][name] = amount
@@ -313,19 +311,19 @@ def _select_traits(
 
 
 def _edit_albedo(work: _EditState, parts: LibraryParts, amounts: Mapping[str, float]) -> None:
-    order, mask = work.order, work.mask
-    space = parts.albedo[order.region]
+    request, mask = work.request, work.mask
+    space = parts.albedo[request.region]
     chart = work.face.chart(parts.frame)
     source = work.maps["r_d"]
     _warn_without_landmarks(work)
 
-    region = common_regions.region_mask(order.region, parts.frame)
-    share = masks.feather_region(order.region, parts.frame)
+    region = common_regions.region_mask(request.region, parts.frame)
+    share = masks.feather_region(request.region, parts.frame)
 
     def one(values: Float32Array, given: Mapping[str, float], stream: int) -> AlbedoEdit:
-        how: dict[str, Any] = {"region": region, "weight": share, "iterations": order.iterations}
-        rng = np.random.default_rng([order.seed, stream])
-        known = face_textures.valid_texels(source)
+        how: dict[str, Any] = {"region": region, "weight": share, "iterations": request.iterations}
+        rng = np.random.default_rng([request.seed, stream])
+        known = face_textures.find_valid_texels(source)
         return editing_albedo.edit_albedo(values, known, chart, space, given, **how, rng=rng)
 
     found = one(source.values, amounts, 0)
@@ -333,13 +331,13 @@ def _edit_albedo(work: _EditState, parts: LibraryParts, amounts: Mapping[str, fl
     back = one(values, {name: -amount for name, amount in amounts.items()}, 1)
     again, _ = back.apply(values, mask)
     work.maps["r_d"] = editing_spots.replace_values(source, values)
-    good = face_textures.valid_texels(source) & (values != source.values).any(axis=-1)
+    good = face_textures.find_valid_texels(source) & (values != source.values).any(axis=-1)
     if found.after > MAX_RESIDUAL_DISTANCE * found.before and any(
         abs(a) > 1 for a in amounts.values()
     ):
         work.warnings.append(
-            f"albedo: matching came {100 * (1 - found.after / found.before):.0f} % of the way to "
-            "the histograms asked for; smaller amounts can be reached"
+            f"albedo: matching reached {100 * (1 - found.after / found.before):.0f} % of the "
+            "distance to the target histograms; use a smaller amount to reach them"
         )
     work.record["albedo"] = {
         "traits": dict(amounts),
@@ -350,23 +348,24 @@ def _edit_albedo(work: _EditState, parts: LibraryParts, amounts: Mapping[str, fl
         "held_at_white": int(held.sum()),
         "change_rms": _relative(values, source.values, good),
         "return_error_rms": _relative(again, source.values, good),
-        "stderr": "carried: multiplied by the factor of the edit, which has no error of its own",
+        "stderr": "multiplied by the factor of the edit, which is taken as exact",
     }
 
 
 def _edit_surface(work: _EditState, parts: LibraryParts, amounts: Mapping[str, float]) -> None:
-    order, mask = work.order, work.mask
+    request, mask = work.request, work.mask
     if parts.surface is None:
         return
     share = mask
-    if order.region != "face":
+    if request.region != "face":
         _warn_without_landmarks(work)
-        over = masks.region_weights(order.region, parts.frame, work.face.chart(parts.frame))
+        over = masks.region_weights(request.region, parts.frame, work.face.chart(parts.frame))
         share = over if mask is None else mask * over
     current = dataclasses.replace(work.face.appearance, maps=work.maps, files=work.files)
     source = surface_mixtures.read(current)
     found = editing_surface.edit_surface(source, parts.surface, amounts, weight=share)
-    tables = surface_mixtures.load_materials(source.materials, source.light_radius_rad, order.basis)
+    names, radius_rad = source.materials, source.light_radius_rad
+    tables = surface_mixtures.load_materials(names, radius_rad, request.basis)
     back = editing_surface.edit_surface(
         found.mixtures, parts.surface, {n: -a for n, a in amounts.items()}, weight=share
     )
@@ -384,34 +383,35 @@ def _edit_surface(work: _EditState, parts: LibraryParts, amounts: Mapping[str, f
         "lobes": len(found.mixtures.mix),
         "change_rms": _strength_difference(found.mixtures, source, strength),
         "return_error_rms": _strength_difference(back.mixtures, source, strength),
-        "stderr": "carried; of a lobe that a trait brought the relative error of its vector",
+        "stderr": "unchanged; of a basis BRDF added by a trait, the relative error of its vector",
     }
 
 
 def _edit_spots(
-    work: _EditState, spots: Sequence[SpotOrder], progress: Callable[[str], None]
+    work: _EditState, spots: Sequence[SpotRequest], progress: Callable[[str], None]
 ) -> None:
-    face, order, mask = work.face, work.order, work.mask
+    face, request, mask = work.face, work.request, work.mask
     if "r_d" not in work.maps:
-        raise EditError(f"{face.path}: has no map r_d, which spots are drawn into")
-    frame = editing_spots.spot_frame(face)
+        raise EditError(f"{face.path}: map r_d is missing, expected it for spots; reconstruct it")
+    frame = editing_spots.build_spot_frame(face)
     chart = face.chart(frame)
-    skin = masks.region_weights("skin" if order.region == "face" else order.region, frame, chart)
-    # a mask image limits spots itself; without one they avoid eyes, brows and lips
-    share = skin if mask is None else (mask if order.region == "face" else mask * skin)
+    region = "skin" if request.region == "face" else request.region
+    skin = masks.region_weights(region, frame, chart)
+    # a mask image limits the spots; without it, they avoid eyes, brows and lips
+    share = skin if mask is None else (mask if request.region == "face" else mask * skin)
     reports = []
     for number, spot in enumerate(spots):
         progress(f"{spot.kind}: {spot.amount:+g}")
         source = work.maps["r_d"]
-        rng = np.random.default_rng([order.seed, 2, number])
+        rng = np.random.default_rng([request.seed, 2, number])
         if spot.amount > 0:
             values, one = editing_spots.add_spots(face, source, spot, share, rng)
             work.maps["r_d"] = editing_spots.replace_values(source, values)
         else:
             values, one = editing_spots.remove_spots(source, spot, share, chart, frame)
-            good = face_textures.valid_texels(source) if source.valid is not None else None
+            good = face_textures.find_valid_texels(source) if source.valid is not None else None
             moved = editing_spots.replace_values(source, values)
-            if moved.stderr is not None:  # what is filled in is known no better than it changed
+            if moved.stderr is not None:  # the size of the change is added as uncertainty
                 off = np.abs(values - source.values)
                 moved = dataclasses.replace(moved, stderr=np.hypot(moved.stderr, off))
             work.maps["r_d"] = dataclasses.replace(moved, valid=good)
@@ -419,16 +419,16 @@ def _edit_spots(
         least = pigment_spots.SPOT_KINDS[spot.kind].diameter_mm
         if face.texel_mm() > least:
             work.warnings.append(
-                f"{spot.kind}: are smaller ({least} mm) than a texel ({face.texel_mm():.2f} mm) "
-                "and only darken it by their share"
+                f"{spot.kind}: {least} mm is smaller than a texel ({face.texel_mm():.2f} mm), "
+                "which is darkened by the spot's fraction of its area"
             )
     _warn_without_landmarks(work)
     work.record["spots_done"] = reports
 
 
 def _warn_without_landmarks(work: _EditState) -> None:
-    text = "the face has no landmarks: it was unrolled from its foremost point, regions are typical"
-    regional = work.order.region != "face" or work.order.spots
+    text = "the face has no landmarks; regions are those of a mean face at its foremost point"
+    regional = work.request.region != "face" or work.request.spots
     if not work.face.landmarks and regional and text not in work.warnings:
         work.warnings.append(text)
 
@@ -438,13 +438,13 @@ def _relative(a: Float32Array, b: Float32Array, valid: BoolArray) -> float:
 
 
 def _strength_difference(a: SurfaceMixtures, b: SurfaceMixtures, strength: NDArray[Any]) -> float:
-    """Return how far two faces' mixtures differ over the texels, RMS, relative to the second's."""
+    """Return the RMS difference of two faces' mixtures over texels, relative to the second."""
     good = b.valid
     x, y = (one.weights()[good] @ (one.mix * strength) for one in (a, b))
     return _relative_rms_difference(x, y)
 
 
 def _relative_rms_difference(a: NDArray[Any], b: NDArray[Any]) -> float:
-    """Return how far some values are from others, RMS, relative to the others; 0 without any."""
+    """Return the RMS difference of values relative to the RMS of the second ones; 0 if empty."""
     size = float(np.sqrt(np.mean(b**2))) if b.size else 0.0
     return float(np.sqrt(np.mean((a - b) ** 2))) / size if size > 0 else 0.0

@@ -1,4 +1,4 @@
-"""Masks of edits: images over a texture, and regions of the face."""
+"""Read masks of edits from images, and build them from regions of the face."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ FEATHER_MM = 6.0
 
 
 class MaskError(ValueError):
-    """An image that is not a mask of a texture."""
+    """An image that is not a valid mask of the texture."""
 
 
 def read(path: Path, shape: tuple[int, int]) -> Float32Array:
@@ -25,8 +25,8 @@ def read(path: Path, shape: tuple[int, int]) -> Float32Array:
     Parameters
     ----------
     path
-        PNG (its gray, over its largest value) or EXR (values 0 to 1); row 0 at the top, over
-        the whole texture. Another size is interpolated.
+        PNG (gray level over its maximum code) or EXR (values 0 to 1) of the whole texture; row 0
+        is the top. Another size is interpolated.
     shape
         Rows and columns of the texture.
 
@@ -38,8 +38,8 @@ def read(path: Path, shape: tuple[int, int]) -> Float32Array:
     Raises
     ------
     MaskError
-        For a file that is not an image, values outside 0 to 1, another aspect, and one that is
-        0 everywhere.
+        If the file is not an image, has values outside 0 to 1 or another aspect ratio, or is 0
+        everywhere.
     """
     kind = path.suffix.lower()
     if kind == ".exr":
@@ -47,14 +47,14 @@ def read(path: Path, shape: tuple[int, int]) -> Float32Array:
     elif kind == ".png":
         image = _png(path)
     else:
-        raise MaskError(f"mask: got {path.name}, expected a .png or .exr file")
+        raise MaskError(f"--mask: got {path.name}, expected a .png or .exr file; convert it")
     gray = np.asarray(image.mean(axis=-1) if image.ndim == 3 else image, np.float32)
     if not np.isfinite(gray).all() or gray.min() < 0 or gray.max() > 1:
-        raise MaskError(f"mask: {path} holds values outside 0 to 1")
+        raise MaskError(f"--mask: {path} has values outside 0 to 1; rescale it")
     if gray.shape[0] * shape[1] != gray.shape[1] * shape[0]:
         raise MaskError(
-            f"mask: {path} has {gray.shape[1]} x {gray.shape[0]} pixels, expected the shape of the "
-            f"texture, {shape[1]} x {shape[0]}"
+            f"--mask: {path} has {gray.shape[1]} x {gray.shape[0]} pixels, expected the aspect "
+            f"ratio of the texture, {shape[1]} x {shape[0]}; resize it"
         )
     if gray.shape != shape:
         rows = (np.arange(shape[0]) + 0.5) * gray.shape[0] / shape[0] - 0.5
@@ -62,12 +62,14 @@ def read(path: Path, shape: tuple[int, int]) -> Float32Array:
         at = np.meshgrid(rows, columns, indexing="ij")
         gray = map_coordinates(gray, at, order=1, mode="nearest").astype(np.float32)
     if not gray.any():
-        raise MaskError(f"mask: {path} is black everywhere, nothing would be edited")
+        raise MaskError(
+            f"--mask: {path} is black everywhere, expected a region above 0; correct it"
+        )
     return gray
 
 
 def feather_region(name: str, frame: CommonFrame) -> Float64Array:
-    """Return a region of the common map whose rim fades over `FEATHER_MM`, (N, N), 0 to 1."""
+    """Return a region's weight in the common map, (N, N), 0 to 1, faded over `FEATHER_MM`."""
     inside = common_regions.region_mask(name, frame).astype(np.float64)
     if name == "face":
         return inside
@@ -77,7 +79,7 @@ def feather_region(name: str, frame: CommonFrame) -> Float64Array:
 
 
 def region_weights(name: str, frame: CommonFrame, chart: TexelChart) -> Float32Array:
-    """Return a region's share at the texels of a face, (H, W); off the face it is 0."""
+    """Return a region's weight at the texels of a face, (H, W); 0 off the face."""
     if name == "face":
         return np.ones(chart.on_surface.shape, np.float32)
     share, inside = chart.read(feather_region(name, frame))
@@ -90,10 +92,10 @@ def _png(path: Path) -> Float32Array:
     try:
         raw = np.frombuffer(path.read_bytes(), np.uint8)
     except OSError as error:
-        raise MaskError(f"mask: {path}: {error.strerror}") from error
+        raise MaskError(f"--mask: {path}: {error.strerror}") from error
     image = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if len(raw) else None
     if image is None or image.dtype not in (np.uint8, np.uint16):
-        raise MaskError(f"mask: {path} cannot be read as PNG")
+        raise MaskError(f"--mask: {path} is not readable as PNG; check the file")
     if image.ndim == 3 and image.shape[2] in (2, 4):
         image = image[..., :-1]
     return (image / np.iinfo(image.dtype).max).astype(np.float32)

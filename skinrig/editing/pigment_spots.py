@@ -1,9 +1,9 @@
-"""Freckles, moles and hair follicles: small spots with more pigment than the skin around them.
+"""Draw freckles, moles and hair follicles: small spots with additional pigment.
 
-A spot multiplies R_d by what more melanin leaves of each channel, read from the table of skin
-colors at the face's own melanin and blood, so that a freckle on light skin is brown and one on
-dark skin is faint. Spots are balls around points of the surface, in mm: what they do is continuous
-over the islands of a texture.
+A spot multiplies R_d by the transmittance of additional melanin per channel. The factor is read
+from the table of skin colors at the face's own melanin and blood, so that a freckle is brown on
+light skin and faint on dark skin. Spots are balls around points of the surface, in mm, so that
+they are continuous over the islands of a texture.
 """
 
 from collections.abc import Mapping
@@ -20,39 +20,39 @@ from model import color_table
 from model.color_table import ColorTable
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 
 DOME_CAMERA, DOME_ILLUMINANT = "Nikon 5100 (NPL)", "LED-B3"
-"""Of the dome's camera RGB."""
+"""Camera and illuminant of the dome's RGB."""
 MAX_SPOT_MELANIN: Final = 0.45
-"""Volume fraction, just inside the table."""
+"""Maximum melanosome volume fraction, just inside the table."""
 MAX_SPOTS: Final = 50_000
 _MIN_SPACING_RATIO: Final = 0.6
-"""Least distance of spots over that at which they would stand on a square grid."""
+"""Minimum distance of spots, relative to their spacing on a square grid of the same density."""
 
 
 class SpotError(ValueError):
-    """Spots that cannot be drawn as asked."""
+    """Invalid settings of spots."""
 
 
 @dataclass(frozen=True, slots=True)
 class SpotKind:
-    """What spots of one kind look like.
+    """Size, pigment and density of one kind of spots.
 
     Attributes
     ----------
     diameter_mm
-        Median.
+        Median diameter, mm.
     log_diameter_std
         Standard deviation of the diameter's logarithm.
     melanin
-        Volume fraction of the epidermis that it holds more than the skin around.
+        Additional melanosome volume fraction of the epidermis.
     edge
-        Share of the radius over which a spot ends, in (0, 1].
+        Width of the soft edge as a fraction of the radius, in (0, 1].
     density_per_cm2
-        Usual number.
+        Default density, 1/cm^2.
     range_mm
-        Diameters that are looked for where spots are removed.
+        Range of diameters that are detected when spots are removed, mm.
     """
 
     diameter_mm: float
@@ -70,24 +70,24 @@ SPOT_KINDS: Final[Mapping[str, SpotKind]] = MappingProxyType(
         "follicles": SpotKind(0.45, 0.2, 0.06, 0.6, 40.0, (0.2, 1.5)),
     }
 )
-"""Chosen sizes and numbers, in round figures: ephelides of 1 to 3 mm, common nevi of 2 to 6 mm,
-some tens of beard hairs a cm^2."""
+"""Rounded, assumed values: ephelides of 1 to 3 mm, common nevi of 2 to 6 mm, some tens of beard
+hairs per cm^2."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnSpots:
-    """Spots that were drawn.
+    """Drawn spots with their factor of R_d.
 
     Attributes
     ----------
     gain
         (H, W, 3) factor of R_d, in (0, 1]; exactly 1 outside the spots and the mask.
     center_mm
-        (n, 3), rig frame.
+        (n, 3) centers, mm, rig frame.
     diameter_mm
-        (n,).
+        (n,) diameters, mm.
     transmitted
-        (3,): what the middle of a spot leaves of each channel.
+        (3,) factor of R_d at the center of a spot, per channel.
     """
 
     gain: Float32Array
@@ -96,7 +96,7 @@ class DrawnSpots:
     transmitted: Float64Array
 
 
-def draw(
+def draw_spots(
     kind: str,
     r_d: ArrayLike,
     position_mm: ArrayLike,
@@ -108,43 +108,45 @@ def draw(
     rng: np.random.Generator,
     table: ColorTable | None = None,
 ) -> DrawnSpots:
-    """Draw spots into a mask.
+    """Draw spots at random positions in a mask.
 
     Parameters
     ----------
     kind
         One of `SPOT_KINDS`.
     r_d
-        (H, W, 3), whose median color in the mask determines the chromophores of the skin.
+        (H, W, 3); its median color in the mask determines the chromophores of the skin.
     position_mm
         (H, W, 3), rig frame.
     surface
-        (H, W) bool: texels that show the surface.
+        (H, W) bool: texels of the surface.
     mask
-        (H, W), 0 to 1: where, and how strongly.
+        (H, W), 0 to 1: strength of the spots.
     amount
-        Of pigment, at least 0: 1 as `SPOT_KINDS` has it, 0 none.
+        Amount of pigment, at least 0; 1: that of `SPOT_KINDS`.
     density_per_cm2
-        At least 0; as `SPOT_KINDS` has it by default.
+        Density, at least 0; None: that of `SPOT_KINDS`.
     rng
-        Generator of their positions.
+        Generator of positions and diameters.
     table
-        Colors of skin; by default of the dome's camera and light.
+        Table of skin colors; None: that of the dome's camera and light.
 
     Raises
     ------
     SpotError
-        For another kind, negative amounts, an empty mask, or more than `MAX_SPOTS` spots.
+        For an unknown kind, negative amounts, an empty mask, or more than `MAX_SPOTS` spots.
     """
-    what = SPOT_KINDS[one_of("spots", kind, SPOT_KINDS, SpotError)]
+    what = SPOT_KINDS[require_choice("spots", kind, SPOT_KINDS, SpotError)]
     density = what.density_per_cm2 if density_per_cm2 is None else float(density_per_cm2)
     for name, value in (("amount", amount), ("density_per_cm2", density)):
         if not (np.isfinite(value) and value >= 0):
-            raise SpotError(f"{name} of {kind}: got {value}, expected at least 0")
+            raise SpotError(f"{name} of {kind}: got {value}, expected at least 0; enter another")
     place = np.asarray(position_mm, np.float64)
     share = np.where(np.asarray(surface, np.bool_), np.asarray(mask, np.float64), 0.0)
     if not share.any():
-        raise SpotError(f"mask of {kind}: no texel of the surface lies in it")
+        raise SpotError(
+            f"mask of {kind}: got no texel of the surface, expected some; choose another mask"
+        )
     if table is None:
         table = color_table.build(DOME_CAMERA, DOME_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
     colors = np.asarray(r_d, np.float64)[share > 0]
@@ -152,7 +154,9 @@ def draw(
     area = texel_area_mm2(place, np.asarray(surface, np.bool_))
     wanted = float((area * share).sum()) / 100.0 * density
     if wanted > MAX_SPOTS:
-        raise SpotError(f"density of {kind}: asks for {wanted:.0f} spots, at most {MAX_SPOTS}")
+        raise SpotError(
+            f"density of {kind}: got {wanted:.0f} spots, expected at most {MAX_SPOTS}; lower it"
+        )
     number = int(np.floor(wanted + rng.random())) if amount > 0 else 0
     centers = _scatter(place[share > 0], (area * share)[share > 0], number, density, rng)
     diameter = what.diameter_mm * np.exp(what.log_diameter_std * rng.standard_normal(len(centers)))
@@ -162,9 +166,9 @@ def draw(
 
 
 def texel_area_mm2(position_mm: Float64Array, surface: BoolArray) -> Float64Array:
-    """Return the area that each texel shows, (H, W), mm^2; 0 off the surface.
+    """Return the surface area per texel, (H, W), mm^2; 0 off the surface.
 
-    Rims of islands, where a neighbor is missing, take the median.
+    Texels at the rims of islands, which lack a neighbor, get the median.
     """
     both = [np.gradient(position_mm, axis=axis) for axis in (0, 1)]
     cross = ndimage.generate_binary_structure(2, 1)
@@ -177,7 +181,7 @@ def texel_area_mm2(position_mm: Float64Array, surface: BoolArray) -> Float64Arra
 def _transmitted(
     colors: Float64Array, added: float, amount: float, table: ColorTable
 ) -> Float64Array:
-    """Return what `added` melanin leaves of each channel of the median color, (3,)."""
+    """Return the factor of each channel of the median color by `added` melanin, (3,)."""
     usable = colors[(colors > 0).all(axis=1)]
     if not len(usable):
         raise SpotError("r_d: got 0 all over the mask, expected skin; choose another mask")
@@ -199,9 +203,9 @@ def _scatter(
     density: float,
     rng: np.random.Generator,
 ) -> Float64Array:
-    """Return points no two of which are closer than a part of their mean distance (Poisson disc).
+    """Sample points with a minimum distance (Poisson disc).
 
-    Points are drawn by area; one that is too near to an earlier one is passed over.
+    Points are drawn in proportion to area; a point too near to an earlier one is rejected.
     """
     if number == 0:
         return np.empty((0, 3))
@@ -239,9 +243,9 @@ def _profile(
     edge: float,
     rng: np.random.Generator,
 ) -> Float64Array:
-    """Return how deep each texel lies in a spot, (H, W), 0 to 1.
+    """Return the strength of the spots per texel, (H, W), 0 to 1.
 
-    A spot smaller than a texel darkens it by its share of the area.
+    A spot smaller than a texel darkens it by its fraction of the texel's area.
     """
     depth = np.zeros(mask.shape)
     if not len(centers):
@@ -257,7 +261,7 @@ def _profile(
         wide = np.hypot(radius, half_texel)
         near = np.asarray(tree.query_ball_point(center, 1.35 * wide), np.intp)
         away = points[near] - center
-        # an outline that is not quite round: three waves in space, shallow relative to the radius
+        # irregular outline: the radius is modulated by three plane waves of small amplitude
         waves = np.sin(away @ way.T * (2.0 / wide) + start).mean(axis=1)
         reach = np.linalg.norm(away, axis=1) / (wide * (1.0 + 0.25 * waves))
         soft = max(edge, half_texel / wide)

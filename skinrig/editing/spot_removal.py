@@ -1,8 +1,8 @@
-"""Small dark spots of skin found in the common map and filled from around.
+"""Detect small dark spots in the common map and fill them from the surrounding skin.
 
-Spots are what a closing by a disc brightens: darker than all around within their size. Lines, such
-as brows and folds, are not taken for spots. What is filled in is a membrane through the skin
-around, with no grain of its own.
+A spot is brightened by a morphological closing with a disc, as it is darker than its surroundings
+at the disc's scale. Elongated regions, such as brows and folds, are not spots. The fill is a
+membrane (harmonic) interpolation from the surrounding skin, without texture of its own.
 """
 
 from dataclasses import dataclass
@@ -17,25 +17,25 @@ from reconstruction.surface import texture_fill
 from skinrig.arrays import BoolArray, Float32Array
 
 DEPTH_SIGMAS: Final = 5.0
-"""Times the usual depth of the skin's grain from which on a spot is one."""
+"""Minimum depth of a spot in units of the skin texture's typical depth."""
 MIN_SPOT_DEPTH: Final = 0.03
-"""Natural logarithm of brightness; less is not seen."""
+"""Minimum depth of a spot, natural logarithm of brightness; less is not visible."""
 MAX_ELONGATION: Final = 3.0
-"""Length over width of what is still a spot."""
+"""Maximum ratio of length to width of a spot."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpotRemoval:
-    """Spots found, and what the skin would be without them.
+    """Detected spots and R_d without them.
 
     Attributes
     ----------
     fill
-        (H, W, 3): R_d as filled from around, at the texels.
+        (H, W, 3) R_d, filled from the surrounding skin.
     share
-        (H, W), 0 to 1: how far a texel belongs to a spot.
+        (H, W), 0 to 1: weight of the fill per texel.
     spots
-        How many were found.
+        Number of detected spots.
     """
 
     fill: Float32Array
@@ -51,20 +51,20 @@ def fill_spots(
     pixel_mm: float,
     range_mm: tuple[float, float],
 ) -> SpotRemoval:
-    """Find spots of a face and fill them.
+    """Detect the spots of a face and fill them.
 
     Parameters
     ----------
     r_d
         (H, W, 3).
     valid
-        (H, W): texels that were measured.
+        (H, W): measured texels.
     chart
-        Where the texels lie in a map without seams.
+        Positions of the texels in the seamless common map.
     pixel_mm
-        Side of its pixels.
+        Pixel size of the common map.
     range_mm
-        Smallest and largest diameter.
+        Minimum and maximum diameter.
     """
     image, known = chart.gather(r_d, valid)
     spots, count = detect_dark_spots(image, known, pixel_mm=pixel_mm, range_mm=range_mm)
@@ -79,18 +79,18 @@ def fill_spots(
 def detect_dark_spots(
     image: ArrayLike, valid: ArrayLike, *, pixel_mm: float, range_mm: tuple[float, float]
 ) -> tuple[BoolArray, int]:
-    """Return the pixels of small dark spots, (N, N), with their rims, and how many spots there are.
+    """Return the pixels of small dark spots with their rims, (N, N), and the number of spots.
 
     Parameters
     ----------
     image
-        (N, N, 3), above 0 where known.
-    known
-        (N, N).
+        (N, N, 3), above 0 where valid.
+    valid
+        (N, N) mask.
     pixel_mm
         Side of a pixel.
     range_mm
-        Smallest and largest diameter.
+        Minimum and maximum diameter.
     """
     good = np.asarray(valid, np.bool_)
     color = np.asarray(image, np.float64)
@@ -104,7 +104,7 @@ def detect_dark_spots(
     least = max(DEPTH_SIGMAS * grain, MIN_SPOT_DEPTH)
     seeds = np.zeros(good.shape, np.bool_)
     found = 0
-    # deep thresholds part spots that touch, shallow ones find the faint
+    # high thresholds separate spots that touch; low ones detect faint spots
     for threshold in least * np.array([8.0, 4.0, 2.0, 1.0]):
         label = ndimage.label(depth > threshold)[0]
         for number, window in enumerate(ndimage.find_objects(label), start=1):
@@ -125,7 +125,7 @@ def detect_dark_spots(
 
 
 def _longest(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> float:
-    """Return half the length of a set of pixels along its longest axis, as of an ellipse."""
+    """Return the major semi-axis of the ellipse with the same second moments as some pixels."""
     if len(rows) < 3:
         return 1.0
     spread = np.cov(np.stack([rows, columns]).astype(np.float64))

@@ -1,4 +1,4 @@
-"""Spots added to an appearance's R_d, and those that are there taken away."""
+"""Add spots to an appearance's R_d, and remove existing ones."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -16,16 +16,16 @@ from skinrig.appearances import face_textures
 from skinrig.appearances.face_textures import Face
 from skinrig.arrays import BoolArray, Float32Array
 from skinrig.editing import pigment_spots, spot_removal
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 from skinrig.traits import albedo_vectors
 
 
-class SpotOrderError(ValueError):
-    """Spots that nobody can add or remove."""
+class SpotRequestError(ValueError):
+    """Invalid request to add or remove spots."""
 
 
 @dataclass(frozen=True, slots=True)
-class SpotOrder:
+class SpotRequest:
     """Spots to add or to remove.
 
     Attributes
@@ -33,9 +33,9 @@ class SpotOrder:
     kind
         One of `pigment_spots.SPOT_KINDS`.
     amount
-        Above 0 adds spots with so much pigment, below 0 removes that share of those there are.
+        Above 0: pigment of added spots; below 0: fraction by which existing spots are removed.
     density_per_cm2
-        Of added ones; None: as usual.
+        Density of added spots, 1/cm^2; None: that of `pigment_spots.SPOT_KINDS`.
     """
 
     kind: str
@@ -43,16 +43,18 @@ class SpotOrder:
     density_per_cm2: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse another kind, and more than all spots removed."""
-        one_of("spots", self.kind, pigment_spots.SPOT_KINDS, SpotOrderError)
+        """Raise for an unknown kind and for amounts below -1."""
+        require_choice("spots", self.kind, pigment_spots.SPOT_KINDS, SpotRequestError)
         if not np.isfinite(self.amount) or self.amount < -1.0:
-            raise SpotOrderError(f"spots: got {self.kind}={self.amount}, expected at least -1")
+            raise SpotRequestError(
+                f"--spots: got {self.kind}={self.amount}, expected at least -1; enter another"
+            )
 
 
-def spot_frame(face: Face) -> CommonFrame:
-    """Return a map of the whole face without seams, about as fine as its texture."""
+def build_spot_frame(face: Face) -> CommonFrame:
+    """Return a seamless common map of the face, with about the resolution of its texture."""
     if face.landmarks:
-        return face_textures.common_frame([face])
+        return face_textures.build_common_frame([face])
     cylinder = common_parameterization.find_cylinder(face.position, face.surface)
     places = cylinder.unroll(face.position[face.surface])
     around = common_parameterization.fit_common_frame((), np.empty((0, 2)), [places], size=64)
@@ -61,11 +63,11 @@ def spot_frame(face: Face) -> CommonFrame:
 
 
 def add_spots(
-    face: Face, source: SkinMap, spot: SpotOrder, weight: Float32Array, rng: np.random.Generator
+    face: Face, source: SkinMap, spot: SpotRequest, weight: Float32Array, rng: np.random.Generator
 ) -> tuple[Float32Array, dict[str, Any]]:
-    """Return R_d with spots drawn in, and what was done, as JSON values."""
+    """Return R_d with added spots, and a record as JSON values."""
     place, density = (face.position, face.surface), spot.density_per_cm2
-    drawn = pigment_spots.draw(
+    drawn = pigment_spots.draw_spots(
         spot.kind,
         source.values,
         *place,
@@ -85,10 +87,13 @@ def add_spots(
 
 
 def remove_spots(
-    source: SkinMap, spot: SpotOrder, weight: Float32Array, chart: TexelChart, frame: CommonFrame
+    source: SkinMap, spot: SpotRequest, weight: Float32Array, chart: TexelChart, frame: CommonFrame
 ) -> tuple[Float32Array, dict[str, Any]]:
-    """Return R_d with spots filled from around, and what was done, as JSON values."""
-    valid, sizes = face_textures.valid_texels(source), pigment_spots.SPOT_KINDS[spot.kind].range_mm
+    """Return R_d with spots removed, and a record as JSON values."""
+    valid, sizes = (
+        face_textures.find_valid_texels(source),
+        pigment_spots.SPOT_KINDS[spot.kind].range_mm,
+    )
     found = spot_removal.fill_spots(
         source.values, valid, chart, pixel_mm=frame.pixel_mm, range_mm=sizes
     )
@@ -104,7 +109,7 @@ def remove_spots(
 
 
 def _dilate_factors(gain: Float32Array, surface: BoolArray, weight: Float32Array) -> Float32Array:
-    """Carry factors two texels beyond the rims of a texture's islands, where lookups reach."""
+    """Extend factors by two texels beyond the rims of a texture's islands, for lookups there."""
     rim = ndimage.binary_dilation(surface, iterations=2) & ~surface & (weight > 0)
     if not rim.any():
         return gain
@@ -113,7 +118,7 @@ def _dilate_factors(gain: Float32Array, surface: BoolArray, weight: Float32Array
 
 
 def replace_values(source: SkinMap, values: Float32Array) -> SkinMap:
-    """Return a map with other values, its standard error scaled as they are."""
+    """Replace a map's values and scale its standard uncertainties by the same factor."""
     error = source.stderr
     if error is not None:
         ratio = np.abs(values) / np.maximum(np.abs(source.values), np.float32(1e-12))

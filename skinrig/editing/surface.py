@@ -1,4 +1,4 @@
-"""Lobes with more or less of some traits: `model.traits.lobe_edits` on an appearance's maps."""
+"""Edit basis BRDFs and weights by traits: `model.traits.lobe_edits` on an appearance's maps."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -14,16 +14,16 @@ from skinrig.editing.surface_mixtures import SurfaceMixtures
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceEditResult:
-    """Edited lobes, and what of the edit was possible.
+    """Edited basis BRDFs and weights, with the residual of the edit.
 
     Attributes
     ----------
     mixtures
-        Shares and lobes: the source's first, then those that traits brought.
+        Weights and basis BRDFs: those of the source first, then those added by traits.
     clipped
-        Share of the change that could not be taken off, RMS over the texels.
+        Fraction of the change clipped by non-negativity, RMS over the texels.
     misfit
-        Of each trait: share of its vector that the lobes cannot show.
+        Fraction of each trait's vector that the basis BRDFs do not represent.
     """
 
     mixtures: SurfaceMixtures
@@ -38,23 +38,23 @@ def edit_surface(
     *,
     weight: FloatArray | None = None,
 ) -> SurfaceEditResult:
-    """Change the lobes of a face.
+    """Edit the basis BRDFs and weights of a face by traits.
 
     Parameters
     ----------
     source
-        Its lobes.
+        Basis BRDFs and weights of the face.
     space
         Traits of mean mixtures of the same materials.
     amounts
-        Trait to amount.
-    share
-        (H, W), 0 to 1: how much of the amounts each texel gets; every bit stays where it is 0.
+        Amount by trait.
+    weight
+        (H, W), 0 to 1: weight of the amounts per texel; texels of 0 stay bit-identical.
 
     Raises
     ------
     model.traits.vectors.TraitError
-        For other materials, and more than 15 lobes.
+        For other materials, or more than 15 basis BRDFs.
     """
     weights = source.weights()
     shape = weights.shape[:2]
@@ -73,7 +73,7 @@ def edit_surface(
     valid = source.valid if source.maps[0].valid is not None else None
     for share_k in np.moveaxis(new, -1, 0)[len(maps) :]:
         error = (noise * share_k).astype(np.float32)
-        maps.append(SkinMap(share_k, "1", error, valid, "share of a lobe of a trait"))
+        maps.append(SkinMap(share_k, "1", error, valid, "weight of a basis BRDF added by a trait"))
     edited = dataclasses.replace(source, maps=tuple(maps), mix=found.mix)
     counted = source.valid.reshape(-1) & (part.reshape(-1) > 0)
     moved, clipped = found.moved[counted], found.clipped[counted]
@@ -83,7 +83,7 @@ def edit_surface(
 
 
 def _noise(space: TraitSpace, amounts: Mapping[str, float]) -> float:
-    """Return the relative error of a trait's vector, 1 where it is not known."""
+    """Return the relative error of the traits' vectors; 1 if unknown."""
     worst = max(
         (space.trait(n).confidence.relative_noise for n, a in amounts.items() if a), default=0.0
     )

@@ -1,4 +1,4 @@
-"""The lobes of an appearance as mixtures of named materials, and a face's mean mixture."""
+"""Read and write basis BRDFs of an appearance as mixtures of named materials."""
 
 import dataclasses
 import io
@@ -17,27 +17,28 @@ from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import BoolArray, Float64Array
 
 OUTLIER_STRENGTH_RATIO: Final = 6.0
-"""Times the usual strength from which on a texel does not count: no sample held its lobes down."""
+"""Strength relative to the median above which a texel is an outlier, as no sample constrained
+it."""
 
 
 class SurfaceMixtureError(ValueError):
-    """Lobes that cannot be read as mixtures of materials."""
+    """Basis BRDFs that are not mixtures of the expected materials."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceMixtures:
-    """Shares of common lobes over a texture, and what each lobe is made of.
+    """Weights of basis BRDFs over a texture, and the materials of each basis BRDF.
 
     Attributes
     ----------
     maps
-        K maps of shares, each (H, W).
+        K maps of weights, each (H, W).
     mix
-        (K, M): materials in each lobe, at least 0.
+        (K, M): weight of each material in each basis BRDF, at least 0.
     materials
-        Their M names.
+        Names of the M materials.
     stored
-        All arrays of the file, which an edit keeps but for `mix` and `table`.
+        All arrays of the file; an edit changes only `mix` and `table`.
     """
 
     maps: tuple[SkinMap, ...]
@@ -47,29 +48,31 @@ class SurfaceMixtures:
 
     @property
     def light_radius_rad(self) -> float:
-        """Angular radius of the light that the lobes are convolved with."""
+        """Angular radius of the light with which the basis BRDFs are convolved."""
         return float(self.stored["light_radius_rad"])
 
     @property
     def valid(self) -> BoolArray:
-        """Texels where all shares are known, (H, W)."""
+        """Texels with valid weights of all basis BRDFs, (H, W)."""
         return intersect_valid(*self.maps)
 
     def weights(self) -> Float64Array:
-        """Return the shares at least 0, (H, W, K)."""
+        """Return the weights, clipped below at 0, (H, W, K)."""
         return np.maximum(np.stack([m.values for m in self.maps], axis=-1).astype(np.float64), 0.0)
 
     def mean(self, strength: Float64Array) -> Float64Array:
-        """Return the mean mixture of materials over texels of no unusual strength, (M,).
+        """Return the mean mixture of materials over texels without outliers, (M,).
 
         Parameters
         ----------
         strength
-            (M,): how much each material reflects.
+            (M,): reflected fraction of each material.
         """
         rows = self.weights()[self.valid]
         if not len(rows):
-            raise SurfaceMixtureError("basis_weight: no texel is valid")
+            raise SurfaceMixtureError(
+                "basis_weight: got no valid texel, expected some; reconstruct the session again"
+            )
         total = rows @ (self.mix @ strength)
         some = total[total > 0]
         if not len(some):
@@ -79,16 +82,17 @@ class SurfaceMixtures:
 
 
 def read(appearance: SkinAppearance) -> SurfaceMixtures:
-    """Return the lobes of an appearance.
+    """Read the basis BRDFs and weights of an appearance.
 
     Raises
     ------
     SurfaceMixtureError
-        Where there are none, or maps and file do not fit each other.
+        If they are missing, or maps and file are inconsistent.
     """
     if BASIS_FILE not in appearance.files:
         raise SurfaceMixtureError(
-            f"files: got no {BASIS_FILE}; `skinrig reconstruct --maps {WEIGHT_PREFIX}0` makes it"
+            f"files: {BASIS_FILE} is missing; create it by `skinrig reconstruct --maps"
+            f" {WEIGHT_PREFIX}0`"
         )
     try:
         with np.load(io.BytesIO(appearance.files[BASIS_FILE]), allow_pickle=False) as file:
@@ -97,7 +101,9 @@ def read(appearance: SkinAppearance) -> SurfaceMixtures:
         names = tuple(str(name) for name in stored["materials"])
         stored["light_radius_rad"], stored["table"]
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise SurfaceMixtureError(f"{BASIS_FILE}: cannot be read: {error}") from error
+        raise SurfaceMixtureError(
+            f"{BASIS_FILE}: not readable ({error}); reconstruct the session again"
+        ) from error
     if mix.ndim != 2 or mix.shape[1] != len(names) or not np.all(mix >= 0):
         raise SurfaceMixtureError(
             f"{BASIS_FILE}: mix has shape {mix.shape}, expected (K, {len(names)}) of at least 0"
@@ -106,8 +112,8 @@ def read(appearance: SkinAppearance) -> SurfaceMixtures:
     for k in range(len(mix)):
         if f"{WEIGHT_PREFIX}{k}" not in appearance.maps:
             raise SurfaceMixtureError(
-                f"{WEIGHT_PREFIX}{k}: is missing, {BASIS_FILE} has {len(mix)} lobes; reconstruct "
-                "all of them"
+                f"{WEIGHT_PREFIX}{k}: is missing, {BASIS_FILE} has {len(mix)} basis BRDFs; "
+                "reconstruct all of them"
             )
         maps.append(appearance.maps[f"{WEIGHT_PREFIX}{k}"])
     return SurfaceMixtures(tuple(maps), mix, names, stored)
@@ -116,21 +122,21 @@ def read(appearance: SkinAppearance) -> SurfaceMixtures:
 def load_materials(
     names: tuple[str, ...], light_radius_rad: float, folder: Any = None
 ) -> BrdfBasis:
-    """Return the tables that lobes are mixtures of.
+    """Load the material tables of which basis BRDFs are mixtures.
 
     Parameters
     ----------
     names
-        Of the materials.
+        Names of the materials.
     light_radius_rad
-        Of the light that they are convolved with.
+        Angular radius of the light with which they are convolved.
     folder
-        MERL files that the lobes were fitted with; None: the materials of this package.
+        Folder of the MERL files of the fit; None: the materials of this package.
 
     Raises
     ------
     SurfaceMixtureError
-        When they are others.
+        If the folder has other materials.
     """
     if folder is None:
         found = brdf_tables.default_basis(light_radius_rad)
@@ -139,14 +145,15 @@ def load_materials(
     if found.names != names:
         where = "this package" if folder is None else str(folder)
         raise SurfaceMixtureError(
-            f"materials: the lobes are mixtures of {len(names)} materials ({names[0]}, ...) that "
-            f"are not those of {where}; name the fitted materials with --merl-basis"
+            f"materials: got basis BRDFs of {len(names)} materials ({names[0]}, ...), expected"
+            f" those "
+            f"of {where}; name the fitted materials with --merl-basis"
         )
     return found
 
 
 def serialize_mixtures(edited: SurfaceMixtures, materials: BrdfBasis) -> bytes:
-    """Return the file that goes with edited lobes, tables and all."""
+    """Serialize edited basis BRDFs with their tables as an .npz file."""
     stream = io.BytesIO()
     arrays = dict(edited.stored)
     arrays["mix"] = edited.mix
@@ -158,7 +165,7 @@ def serialize_mixtures(edited: SurfaceMixtures, materials: BrdfBasis) -> bytes:
 def replace_mixtures(
     appearance: SkinAppearance, edited: SurfaceMixtures, file: bytes
 ) -> SkinAppearance:
-    """Return an appearance with other lobes."""
+    """Replace the basis BRDFs and weights of an appearance."""
     maps = {n: m for n, m in appearance.maps.items() if not n.startswith(WEIGHT_PREFIX)}
     maps |= {f"{WEIGHT_PREFIX}{k}": one for k, one in enumerate(edited.maps)}
     return dataclasses.replace(appearance, maps=maps, files={**appearance.files, BASIS_FILE: file})

@@ -1,1 +1,1 @@
-"""Exports to other programs: sessions, maps, materials, meshes and reflectance tables."""
+"""Export sessions, maps, materials, meshes and reflectance tables to other programs."""

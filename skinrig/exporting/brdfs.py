@@ -1,4 +1,4 @@
-"""Fitted lobes, and the BRDF of a place on the skin, as files of other programs."""
+"""Write fitted basis BRDFs, and the BRDF of a position on the skin, in formats of renderers."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -14,7 +14,7 @@ from skinrig.exporting.options import ExportError, ExportSettings, SkinPosition
 from skinrig.exporting.sealing import write_json
 
 Brdf = Callable[[Float64Array, Float64Array], Float64Array]
-"""Takes light and view, unit vectors (n, 3) where +z is the normal; gives 1/sr, (n,) or (n, 3)."""
+"""BRDF of unit vectors to light and view, (n, 3), +z is the normal; 1/sr, (n,) or (n, 3)."""
 
 DOCUMENT_FILE = "brdfs.json"
 BRDF_SUFFIXES: Mapping[str, str] = {"merl": ".binary", "rgl": ".bsdf"}
@@ -22,7 +22,7 @@ _SURFACE_NORMAL = np.array([0.0, 0.0, 1.0])
 
 
 def write_merl(appearance: SkinAppearance, folder: Path, delivery: ExportSettings) -> None:
-    """Write tables of MERL, .binary of 35 MB each; see `write`."""
+    """Write MERL tables, .binary files of 35 MB each; see `write`."""
     write(appearance, folder, delivery.place, "merl")
 
 
@@ -32,31 +32,31 @@ def write_rgl(appearance: SkinAppearance, folder: Path, delivery: ExportSettings
 
 
 def write(appearance: SkinAppearance, folder: Path, place: SkinPosition | None, to: str) -> None:
-    """Write each lobe as lobe_K, the BRDF of a position as place, and a document of all files.
+    """Write each basis BRDF as lobe_K, the BRDF of a position as place, and a document.
 
     Parameters
     ----------
     appearance
-        Of a dome, or a fitted model.
+        Appearance of a dome, or a fitted model.
     folder
         Existing folder.
     place
-        Where on the skin; None: lobes alone.
+        Position on the skin; None: only basis BRDFs.
     to
         "merl" or "rgl".
 
     Raises
     ------
     ExportError
-        Where the place has no valid texel, or a negative albedo.
+        If the position has no valid texel, or a negative albedo.
     model.skin_reflectance.SkinReflectanceError
-        Where the appearance has no lobes.
+        If the appearance has no basis BRDFs.
     """
     lobes = skin_reflectance.load_basis(appearance)
     suffix, light = BRDF_SUFFIXES[to], lobes.light_radius_rad
     files: dict[str, object] = {}
     for k in range(lobes.size):
-        description = f"lobe {k}, equal in all channels: highlights have the light's color"
+        description = f"basis BRDF {k}, equal in all channels: highlights have the light's color"
         _write(to, folder / f"lobe_{k}{suffix}", _lobe(lobes, k), description, light)
         files[f"lobe_{k}{suffix}"] = {"what": description, "light_from_inside": False}
     if place is not None:
@@ -68,16 +68,16 @@ def write(appearance: SkinAppearance, folder: Path, place: SkinPosition | None, 
         "format": to,
         "source": appearance.source,
         "light_radius_rad": lobes.light_radius_rad,
-        "light": "angular radius of the round light that the BRDFs were measured with and hold: a "
-        "renderer's lights of this size should be points, a wider light is nearly right",
-        "unit": "1/sr, without the cosine, Fresnel's reflection included",
+        "light": "angular radius of the round light with which the BRDFs are convolved: replace "
+        "a renderer's light of this size by a point; larger lights are nearly unaffected",
+        "unit": "1/sr, without the cosine, Fresnel reflection included",
         "files": files,
     }
     write_json(folder / DOCUMENT_FILE, document)
 
 
-def merl_table(brdf: Brdf) -> merl.MerlTable:
-    """Tabulate a BRDF at the middles of MERL's bins; -1 where light or view are below the horizon.
+def tabulate_merl(brdf: Brdf) -> merl.MerlTable:
+    """Tabulate a BRDF at the centers of MERL's bins; -1 if light or view are below the horizon.
 
     Parameters
     ----------
@@ -114,8 +114,8 @@ def _place(
     r_d = model.r_d[near].astype(np.float64).mean(axis=0)
     if place.diffuse and not np.all(r_d >= 0.0):
         raise ExportError(
-            f"place: r_d is {r_d.tolist()} there, below 0; take another place, a wider radius, or "
-            "--without-diffuse"
+            f"--at: r_d is {r_d.tolist()} there, expected 0 or more; choose another position, a "
+            "larger --radius, or --without-diffuse"
         )
     surface = lobes.mix_materials(model.weights[near].astype(np.float64).mean(axis=0)[None])
 
@@ -127,7 +127,7 @@ def _place(
             found = found + through[:, None] * r_d / np.pi
         return np.asarray(found)
 
-    inside = "with light from inside" if place.diffuse else "the surface alone"
+    inside = "with subsurface scattering" if place.diffuse else "specular reflection only"
     entry: dict[str, object] = {
         "what": f"mean of {int(near.sum())} texels, {inside}; camera RGB over a perfect white",
         "light_from_inside": place.diffuse,
@@ -145,15 +145,15 @@ def _nearest_valid(valid: BoolArray, place: SkinPosition) -> tuple[int, int]:
     column = min(int(place.u * width), width - 1)
     if not valid[row, column]:
         raise ExportError(
-            f"place: u {place.u}, v {place.v} is texel row {row}, column {column}, where the "
-            f"reflectance is not known ({np.count_nonzero(valid)} of {valid.size} texels are)"
+            f"--at: u {place.u}, v {place.v} is texel row {row}, column {column}, which is not "
+            f"valid ({np.count_nonzero(valid)} of {valid.size} texels are); choose another position"
         )
     return row, column
 
 
 def _write(to: str, path: Path, brdf: Brdf, description: str, light_radius_rad: float) -> None:
-    if to == "merl":  # the format has no place for words
-        merl.write(path, merl_table(brdf))
+    if to == "merl":  # the format has no description
+        merl.write(path, tabulate_merl(brdf))
     else:
         description = f"{description}; measured with a light of radius {light_radius_rad:.6g} rad"
         rgl.write(path, rgl.tabulate_brdf(brdf, description=description))

@@ -1,4 +1,4 @@
-"""Export: formats, consent of the subjects and the sealed folder."""
+"""Export sessions and appearances: choice of format, consent check and sealed folder."""
 
 from collections.abc import Mapping
 from datetime import date, datetime
@@ -10,7 +10,7 @@ from capture.session import Session, verify
 from model import store
 from model.skin import SkinAppearance
 from skinrig import consent
-from skinrig.errors import UsageError, one_of
+from skinrig.errors import UsageError, require_choice
 from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.sealing import ExportResult, export_sealed
 
@@ -24,7 +24,7 @@ APPEARANCE_FORMATS: Final[Mapping[str, str]] = {
     "merl": "brdfs.write_merl",
     "rgl": "brdfs.write_rgl",
 }
-"""Format to the function of this package that writes it: each module imports its own libraries."""
+"""Writer of each format of an appearance; imported on use, with its libraries."""
 SESSION_FORMATS: Final[Mapping[str, str]] = {
     "mhl": "sessions.copies.write_session",
     "frames": "sessions.copies.write_frames",
@@ -32,15 +32,15 @@ SESSION_FORMATS: Final[Mapping[str, str]] = {
     "lp": "sessions.light_lists.write",
     "stokes": "sessions.spectral.write_stokes",
 }
-"""The same of a session: all of it, the DNG files alone, or other descriptions of them."""
+"""Writer of each format of a session: all files, the DNG files alone, or other descriptions."""
 SURFACE_FORMATS: Final = ("mtlx", "gltf", "usd", "merl", "rgl")
-"""Formats of a surface in space, which a dome's maps hold and a photograph's do not."""
+"""Formats of a surface in space, which require maps of a dome."""
 _DOME_MAPS: Final = ("position", "normals", "normals_refined", "r_d")
-"""Maps of which a dome's reconstruction holds one at least."""
+"""Maps of which a dome's reconstruction has at least one."""
 
 
 def load_writer(to: str) -> Any:
-    """Return the function that writes a format: of appearance or session, folder, `ExportSettings`.
+    """Return the writer of a format; it takes appearance or session, folder, `ExportSettings`.
 
     Examples
     --------
@@ -63,7 +63,7 @@ def export(
 ) -> ExportResult:
     """Write an appearance or a session for another program, sealed by an ASC MHL manifest.
 
-    The folder is there as a whole, or not at all.
+    The folder is written atomically.
 
     Parameters
     ----------
@@ -74,31 +74,31 @@ def export(
     to
         One of `APPEARANCE_FORMATS`, or of `SESSION_FORMATS` for a session.
     delivery
-        Scene unit, tiles, green of normals, errors, mesh; None: as `ExportSettings()`.
+        Scene unit, tiles, green of normals, errors, mesh; None: `ExportSettings()`.
     use
-        What the copy is for. Must lie within the consent of every measured subject, on a day
-        before it ends; may be None where an appearance was simulated.
+        Purpose of the copy, which the unexpired consent of every measured subject must include;
+        may be None for simulated appearances.
     today, now
-        Day on which consent is judged, and time in the manifest; None: the present.
+        Day of the consent check, and time in the manifest; None: the present.
 
     Returns
     -------
-    Exported
-        With what the format asks for and the source does not hold as left out.
+    ExportResult
+        Omissions are parts of the format that the source lacks.
 
     Raises
     ------
     capture.session.ConsentError
-        Where a subject has not agreed to the use, or not any more.
+        If a subject has not agreed to the use, or the consent has expired.
     ExportError
-        For an unknown format, one of surfaces for maps of none, a damaged session, or a folder
-        that exists.
+        If the format is unknown or requires a surface that the maps lack, the session is damaged,
+        or the folder exists.
     model.store.StoreError
-        For a folder that is none of maps, or damaged.
+        If the folder is not an appearance, or damaged.
     ValueError
-        Of the format, for a source that it cannot be made of.
+        If the source lacks what the format requires.
     """
-    one_of("to", to, (*APPEARANCE_FORMATS, *SESSION_FORMATS), ExportError)
+    require_choice("to", to, (*APPEARANCE_FORMATS, *SESSION_FORMATS), ExportError)
     if Path(out).exists():
         raise ExportError(f"{out}: exists; choose a new folder")
     order = delivery or ExportSettings()
@@ -110,29 +110,31 @@ def export(
         if to in SURFACE_FORMATS and not any(name in held.maps for name in _DOME_MAPS):
             others = ", ".join(name for name in APPEARANCE_FORMATS if name not in SURFACE_FORMATS)
             raise ExportError(
-                f"to: got {to!r}, which is of a dome's maps (position, normals, r_d, lobes), but "
-                f"{source} holds {', '.join(held.maps) or 'none'}; expected {others}"
+                f"--to: got {to!r}, which requires a dome's maps (position, normals, r_d, basis "
+                f"BRDFs), but {source} has {', '.join(held.maps) or 'none'}; choose {others}"
             )
         if order.onto is not None:
-            _appearance(order.onto, use, today)  # its maps are handed on, too
+            _appearance(order.onto, use, today)  # its maps are exported, too
     write = load_writer(to)
     return export_sealed(Path(out), lambda part: write(held, part, order), now)
 
 
 def _appearance(path: str | Path, use: str | None, today: date | None) -> SkinAppearance:
-    """Read an appearance whose subjects agreed to a use."""
+    """Read an appearance after a check of its subjects' consent to a use."""
     appearance = store.read(path)
     consent.require_consent(appearance, use, folder=str(path), today=today)
     return appearance
 
 
 def _session(path: str | Path, use: str | None, today: date | None) -> Session:
-    """Open an undamaged session whose subject agreed to a use."""
+    """Open a session after a check of its digests and of its subject's consent to a use."""
     if use is None:
         raise UsageError("--use: got none; name the purpose of the copy, e.g. research")
     session = Session.open(path)
     session.require_consent(use, today=today)
     found = verify(path)
     if not found.ok:
-        raise ExportError(f"{path}: is damaged, nothing was copied: {found.problems[0]}")
+        raise ExportError(
+            f"{path}: damaged, nothing was copied ({found.problems[0]}); restore the file"
+        )
     return session

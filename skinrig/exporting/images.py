@@ -1,4 +1,4 @@
-"""Images as other programs read them: float EXR and 16-bit PNG, each described in one record.
+"""Write images as float EXR and 16-bit PNG, each with a record of its encoding.
 
 The header of an EXR has its unit and color space. A PNG cannot store numbers below 0 or above 1:
 its record has the decoding of codes to values, and the fraction of clipped pixels.
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.skin import SkinAppearance
-from skinrig.appearances.contents import digest
+from skinrig.appearances.contents import hash_file
 from skinrig.arrays import BoolArray, FloatArray
 from skinrig.drawing import png
 from skinrig.exporting.options import FIRST_TILE, ExportSettings
@@ -35,7 +35,7 @@ PNG_RANGES: Final[Mapping[str, tuple[float, float]]] = {
     "translucency": (0.0, 16.0),
     "basis_weight": (0.0, 2.0),
 }
-"""Ranges of PNG codes of maps whose names begin so, equal for all subjects."""
+"""Ranges of PNG codes by prefix of the map's name, equal for all subjects."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,21 +45,21 @@ class ExportImage:
     Attributes
     ----------
     name
-        Of the files, without suffix.
+        Name of the files, without suffix.
     values
         (H, W) or (H, W, 3), row 0 at the top (v = 1).
     unit
-        "1" for numbers without dimension.
+        Unit; "1": dimensionless.
     space
         `SRGB_SPACE`, `CAMERA_SPACE` or `DATA_SPACE`.
     what
-        One line for people.
+        Description, one line.
     low, high
-        Values of PNG codes 0 and 65535; None: the least and largest valid value.
+        Values of PNG codes 0 and 65535; None: minimum and maximum valid value.
     valid
-        (H, W); values elsewhere mean nothing. None: all mean something.
+        (H, W) valid pixels; None: all.
     filler
-        Value on tiles where nothing was measured; None: the median of what is valid.
+        Value on tiles without measurements; None: median of the valid pixels.
     """
 
     name: str
@@ -76,12 +76,12 @@ class ExportImage:
     def from_normals(
         name: str, normals: FloatArray, delivery: ExportSettings, description: str, **more: Any
     ) -> ExportImage:
-        """Return a map of normals, +Y up, with the green that is asked for."""
+        """Create an image of normals, given +Y up, with the requested green."""
         turned = normals * np.array([1.0, delivery.y, 1.0], np.float32)
         return ExportImage(name, turned, "1", DATA_SPACE, description, -1.0, 1.0, **more)
 
     def fill_empty_tile(self) -> ExportImage:
-        """Return the image of a tile where nothing was measured, of one value."""
+        """Return a constant image for tiles without measurements."""
         layers = self.values if self.values.ndim == 3 else self.values[..., None]
         rows = layers[self.valid] if self.valid is not None else layers.reshape(-1, layers.shape[2])
         known = rows[np.isfinite(rows).all(axis=-1)]
@@ -89,7 +89,7 @@ class ExportImage:
         value = usual if self.filler is None else np.array(self.filler)
         values = np.empty((EMPTY_TILE_PX, EMPTY_TILE_PX, *self.values.shape[2:]), np.float32)
         values[...] = value if self.values.ndim == 3 else value[0]
-        what = f"nothing was measured on this tile: one value; {self.what}"
+        what = f"tile without measurements, constant; {self.what}"
         return replace(self, values=values, valid=np.zeros(values.shape[:2], np.bool_), what=what)
 
 
@@ -104,11 +104,11 @@ class ImageFolder:
     delivery
         Names of tiles.
     records
-        File name to what the file holds, JSON values.
+        Record of each file by name, JSON values.
     tiles
-        UDIM tiles of the mesh; images are of the first.
+        UDIM tiles of the mesh; images cover the first.
     left_out
-        What is not written, and why.
+        Omissions with reasons.
     """
 
     root: Path
@@ -118,11 +118,11 @@ class ImageFolder:
     left_out: list[tuple[str, str]] = field(default_factory=list)
 
     def record_omission(self, item: str, why: str) -> None:
-        """Record what is not written, and why."""
+        """Record an omission with its reason."""
         self.left_out.append((item, why))
 
     def write_exr(self, image: ExportImage, folder: str = "exr") -> str:
-        """Write a float32 EXR a tile; return the first's name below the root."""
+        """Write a float32 EXR per tile; return the first one's name below the root."""
 
         def put(path: Path, one: ExportImage) -> dict[str, Any]:
             channels = {"Y" if one.values.ndim == 2 else "RGB": one.values}
@@ -133,9 +133,9 @@ class ImageFolder:
         return self._tiled(image, folder, "exr", put)
 
     def write_png(self, image: ExportImage, folder: str = "png") -> str:
-        """Write a PNG of 16 bits a tile; return the first's name below the root.
+        """Write a 16-bit PNG per tile; return the first one's name below the root.
 
-        Colors in `SRGB_SPACE` are coded by sRGB's curve, all else in proportion.
+        Colors in `SRGB_SPACE` are encoded by the sRGB curve, others linearly.
         """
 
         def put(path: Path, one: ExportImage) -> dict[str, Any]:
@@ -147,18 +147,18 @@ class ImageFolder:
         return self._tiled(replace(image, low=low, high=high), folder, "png", put)
 
     def write_exr_and_png(self, image: ExportImage) -> str:
-        """Write a float EXR and a 16-bit PNG a tile; return the first PNG's name."""
+        """Write a float EXR and a 16-bit PNG per tile; return the first PNG's name."""
         self.write_exr(image)
         return self.write_png(image)
 
     def errors(self, images: Iterable[ExportImage], folder: str = "exr") -> None:
-        """Write images of errors, where they are asked for."""
+        """Write images of uncertainties if they were requested."""
         if self.delivery.with_errors:
             for image in images:
                 self.write_exr(image, folder)
 
     def document(self, file: str, appearance: SkinAppearance, content: Mapping[str, Any]) -> None:
-        """Write the document of an export: provenance, and the content of each file."""
+        """Write the document of an export: provenance and the record of each file."""
         files = dict(sorted(self.records.items()))
         write_json(self.root / file, {**describe_provenance(appearance), **content, "files": files})
 
@@ -169,7 +169,7 @@ class ImageFolder:
         suffix: str,
         put: Callable[[Path, ExportImage], dict[str, Any]],
     ) -> str:
-        """Write an image of each tile and keep its record; return the first's name."""
+        """Write one image per tile with its record; return the first one's name."""
         (self.root / folder).mkdir(exist_ok=True)
         names = []
         for tile in self.tiles:
@@ -182,18 +182,18 @@ class ImageFolder:
                 "shape": list(one.values.shape),
                 "valid_share": 1.0 if one.valid is None else float(one.valid.mean()),
                 **put(self.root / names[-1], one),
-                "sha256": digest(self.root / names[-1]),
+                "sha256": hash_file(self.root / names[-1]),
             }
         return names[0]
 
 
 def encode_png_codes(image: ExportImage, *, depth: int = 16) -> tuple[NDArray[Any], dict[str, Any]]:
-    """Return PNG codes and how they become values again.
+    """Encode an image as PNG codes; also return the record that decodes them.
 
     Parameters
     ----------
     image
-        What to code.
+        The image.
     depth
         8 or 16 bits.
 
@@ -201,7 +201,7 @@ def encode_png_codes(image: ExportImage, *, depth: int = 16) -> tuple[NDArray[An
     -------
     codes : ndarray of uint8 or uint16, shape of the values
     record : dict
-        JSON values: encoding, range, share of valid values that were clipped.
+        JSON values: encoding, range, fraction of valid values that were clipped.
 
     Examples
     --------
@@ -235,7 +235,7 @@ def encode_png_codes(image: ExportImage, *, depth: int = 16) -> tuple[NDArray[An
 
 
 def png_code_range(image: ExportImage) -> tuple[float, float]:
-    """Return the values of an image's least and largest PNG code, see `encode_png_codes`.
+    """Return the values of the minimum and maximum PNG code, see `encode_png_codes`.
 
     Examples
     --------
@@ -249,12 +249,12 @@ def png_code_range(image: ExportImage) -> tuple[float, float]:
     low = float(shown.min(initial=np.inf)) if image.low is None else image.low
     high = float(shown.max(initial=-np.inf)) if image.high is None else image.high
     if not np.isfinite(low) or not np.isfinite(high):
-        low, high = 0.0, 1.0  # nothing is valid
+        low, high = 0.0, 1.0  # without valid pixels
     return low, high if high > low else low + 1.0
 
 
 def png_range(name: str) -> tuple[float | None, float | None]:
-    """Return the fixed range of a map's PNG, None and None where it follows the values."""
+    """Return the fixed range of a map's PNG; None and None: that of the values."""
     for start, (low, high) in PNG_RANGES.items():
         if name.startswith(start):
             return low, high
@@ -268,7 +268,7 @@ def write_channels(
     *,
     rec709: bool = False,
 ) -> None:
-    """Write named channels of one size as float32 EXR, compressed without loss.
+    """Write named channels of one size as losslessly compressed float32 EXR.
 
     Parameters
     ----------
@@ -277,7 +277,7 @@ def write_channels(
     channels
         (H, W) by name; or (H, W, 3) as ``"RGB"``.
     attributes
-        Texts of the header; empty ones are left out.
+        Texts of the header; empty ones are omitted.
     rec709
         Whether R, G, B are linear sRGB.
     """

@@ -26,8 +26,8 @@ from skinrig.rendering.geometry import MESH_FILES, GeometryError, read_own_mesh
 DOCUMENT_FILE: Final = "maps.json"
 SCHEMA: Final = "skinrig.export.maps/1"
 CHROMOPHORE_PACK: Final = "chromophores"
-"""Melanin in R, hemoglobin in G, as texture suppliers deliver them."""
-SRGB_MAPS: Final = ("image", "specular_image", "color")
+"""Name of the packed map: melanin in R, hemoglobin in G, as in texture libraries."""
+SRGB_MAPS: Final = ("picture", "specular_picture", "color")
 CAMERA_RGB_MAPS: Final = ("diffuse", "specular", "r_d", "reflectance", "albedo", "crossed")
 
 
@@ -39,32 +39,32 @@ def write(
     Parameters
     ----------
     appearance
-        Any.
+        Any appearance.
     folder
-        Existing, empty.
+        Existing, empty folder.
     delivery
-        Which maps, names of tiles, green of normals, whether errors are written.
+        Selected maps, names of tiles, green of normals, with or without errors.
 
     Returns
     -------
     list of (str, str)
-        What was left out, and why.
+        Omissions with reasons.
 
     Raises
     ------
     ExportError
-        For a map that there is not, or an appearance without any.
+        If a selected map is missing, or the appearance has none.
     """
     names = list(delivery.only) or sorted(appearance.maps)
     missing = [name for name in names if name not in appearance.maps]
     if missing or not names:
         raise ExportError(
-            f"maps: got {missing[0] if missing else 'an appearance without maps'}, expected of "
+            f"--only: got {missing[0] if missing else 'no maps'}, expected some of "
             f"{', '.join(sorted(appearance.maps)) or 'a reconstruction that has some'}"
         )
     out = ImageFolder(folder, delivery)
     on_mesh = any(name in appearance.files for name in MESH_FILES)
-    shown: dict[str, tuple[str, str]] = {}  # what a material file names: file and its type
+    shown: dict[str, tuple[str, str]] = {}  # file and type by name in the material file
     for name in names:
         image = _image(name, appearance.maps[name], delivery, on_mesh)
         exr = out.write_exr(image)
@@ -75,10 +75,10 @@ def write(
     if {"melanin", "hemoglobin"} <= set(names):
         packed = _pack_chromophores(appearance)
         if packed is None:
-            out.record_omission(CHROMOPHORE_PACK, "melanin and hemoglobin are of different sizes")
+            out.record_omission(CHROMOPHORE_PACK, "melanin and hemoglobin differ in size")
         else:
             out.write_exr(packed)
-            # with the ranges of its channels: values times 2 and 4, blue 0
+            # values times 2 and 4 map the channels' ranges 0 to 0.5 and 0 to 0.25 to 0 to 1
             scaled = packed.values * np.array([2.0, 4.0, 1.0], np.float32)
             what = f"{packed.what}; R is 2 times melanin, G is 4 times hemoglobin"
             out.write_png(replace(packed, values=scaled, what=what, low=0.0, high=1.0))
@@ -87,7 +87,7 @@ def write(
         normal, why = _tangent_normals(appearance, names, out)
         if why:
             out.record_omission("normal", why)
-    text = materialx.images_document(shown, delivery, tangent_normal=normal)
+    text = materialx.format_image_nodes(shown, delivery, tangent_normal=normal)
     (folder / "maps.mtlx").write_text(text, encoding="utf-8")
     for name, data in sorted(appearance.files.items()):
         (folder / "files").mkdir(exist_ok=True)
@@ -108,14 +108,14 @@ def write(
 
 
 def _image(name: str, skin_map: SkinMap, delivery: ExportSettings, on_mesh: bool) -> ExportImage:
-    """Return a map as an image: normals seen by a camera get the green that is asked for."""
+    """Convert a map to an image; normals in a camera's frame get the requested green."""
     values, what = skin_map.values, skin_map.description
     low, high = png_range(name)
     if _is_normals(name, skin_map):
         low, high = -1.0, 1.0
         if not on_mesh:
             values = values * np.array([1.0, delivery.y, 1.0], np.float32)
-        frame = f"picture's frame: x right, y {'up' if delivery.y > 0 else 'down'}"
+        frame = f"image frame: x right, y {'up' if delivery.y > 0 else 'down'}"
         frame = "rig frame, green is not flipped" if on_mesh else frame
         what = f"{what}; {frame}".strip("; ")
     space = DATA_SPACE
@@ -134,9 +134,9 @@ def _is_normals(name: str, skin_map: SkinMap) -> bool:
 def _errors(name: str, skin_map: SkinMap) -> Iterator[ExportImage]:
     if skin_map.stderr is not None:
         unit = "rad" if _is_normals(name, skin_map) else skin_map.unit
-        what = f"standard error of {name}, 68 %"
+        what = f"standard uncertainty of {name}, 68 %"
         yield ExportImage(f"{name}.stderr", skin_map.stderr, unit, what=what, valid=skin_map.valid)
-    what = f"1 where {name} means something, else 0"
+    what = f"1 where {name} is valid, else 0"
     yield ExportImage(f"{name}.valid", intersect_valid(skin_map).astype(np.float32), what=what)
 
 
@@ -153,10 +153,10 @@ def _pack_chromophores(appearance: SkinAppearance) -> ExportImage | None:
 def _tangent_normals(
     appearance: SkinAppearance, names: list[str], out: ImageFolder
 ) -> tuple[str | None, str]:
-    """Write normals in the mesh's frames; return the PNG's name, and why there is none."""
+    """Write tangent-space normals; return the PNG's name, or None and the reason."""
     found = next((n for n in ("normals_refined", "normals") if n in names), None)
     if found is None:
-        return None, "neither normals_refined nor normals is among the maps"
+        return None, "the maps have neither normals_refined nor normals"
     one = appearance.maps[found]
     height, width = one.values.shape[:2]
     if height != width:

@@ -1,4 +1,4 @@
-"""Settings of an export: scene unit, green of normal maps, tiles, position on the skin."""
+"""Define the settings of an export: scene unit, green of normals, tiles, position on the skin."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ from typing import Final
 
 from skinrig.errors import UnusableError, UsageError
 
-UNITS_M: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+METERS_PER_UNIT: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of a scene unit, m."""
-M_PER_MM: Final = UNITS_M["mm"]
-NORMAL_Y: Final[Mapping[str, float]] = {"gl": 1.0, "dx": -1.0}
+M_PER_MM: Final = METERS_PER_UNIT["mm"]
+GREEN_SIGN_BY_NORMAL_Y: Final[Mapping[str, float]] = {"gl": 1.0, "dx": -1.0}
 """Sign of a normal map's green: +Y up (OpenGL, glTF, Blender, Maya) or down (DirectX, Unreal)."""
 FIRST_TILE: Final = 1001
-"""UDIM tile of texture coordinates 0 to 1, which maps are of."""
+"""UDIM tile of texture coordinates 0 to 1, covered by the maps."""
 TILE_SEPARATORS: Final[Mapping[str, str]] = {"none": "", "dot": ".", "underscore": "_"}
-"""Separator of a texture's name and the number of its tile."""
+"""Separator between a texture's name and its tile number."""
 
 _NAME_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 
 class ExportError(ValueError):
-    """An export that cannot be made as asked."""
+    """Invalid settings or source of an export."""
 
 
 @dataclass(frozen=True, slots=True)
 class SkinPosition:
-    """Where on the texture the skin is looked at.
+    """Position on the texture whose BRDF is exported.
 
     Attributes
     ----------
     u, v
         Texture coordinates, 0 to 1; v = 1 at the top.
     radius_mm
-        The BRDFs of all valid texels as near as this are averaged; 0: the nearest alone.
+        Radius of the averaged valid texels; 0: the nearest texel only.
     diffuse
-        Whether light from inside the skin is included.
+        Whether subsurface scattering is included.
     """
 
     u: float
@@ -48,21 +48,21 @@ class SkinPosition:
     diffuse: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse a place off the texture."""
+        """Raise for a position off the texture."""
         if not (0.0 <= self.u <= 1.0 and 0.0 <= self.v <= 1.0 and 0.0 <= self.radius_mm < math.inf):
             raise ExportError(
-                f"place: got u {self.u}, v {self.v}, radius {self.radius_mm} mm, expected u and v "
-                "in 0 to 1 and a radius of at least 0"
+                f"--at: got u {self.u}, v {self.v}, radius {self.radius_mm} mm, expected u and v "
+                "in 0 to 1 and a radius of at least 0; correct them"
             )
 
     @staticmethod
     def parse(text: str, *, radius_mm: float, diffuse: bool) -> SkinPosition:
-        """Return the place that a command line names as U,V.
+        """Parse a position from U,V.
 
         Raises
         ------
         skinrig.errors.UsageError
-            When it is not two numbers.
+            If the text is not two numbers.
         """
         try:
             u, v = (float(part) for part in text.split(","))
@@ -73,31 +73,31 @@ class SkinPosition:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExportSettings:
-    """How an appearance or a session is to be delivered.
+    """Settings of an export.
 
     Attributes
     ----------
     unit
-        Scene unit, of `UNITS_M`; None: the format's own.
+        Scene unit, of `METERS_PER_UNIT`; None: the format's own.
     normal_y
-        Of `NORMAL_Y`.
+        Direction of a normal map's green, a key of `GREEN_SIGN_BY_NORMAL_Y`.
     udim
-        Of `TILE_SEPARATORS`. Maps are those of tile 1001; a mesh may reach over more.
+        Naming of tiles, a key of `TILE_SEPARATORS`. Maps cover tile 1001; a mesh may have more.
     with_errors
         Whether standard uncertainties and masks are written, too.
     only
-        Names of the maps, or of the states, to write; empty: all that there are.
+        Names of the maps or expressions to write; empty: all.
     mesh
-        A mesh with the maps' texture coordinates, perhaps with blend shapes, instead of the
+        Mesh with the maps' texture coordinates, optionally with blend shapes; None: the
         appearance's own.
     onto
-        APPEARANCE/ of a dome whose texture facial color is put on.
+        APPEARANCE/ of a dome to whose texture facial color is mapped.
     landmarks
-        Tables ``name,x,y`` of the flash picture and of that texture, px.
+        Tables ``name,x,y`` of the flash image and of that texture, px.
     place
-        Where on the skin its BRDF is exported, too; None: lobes alone.
+        Position whose BRDF is exported; None: only basis BRDFs.
     camera
-        Name of the view whose images are exported; None: the one that looks most along -z.
+        View whose images are exported; None: the one whose axis is nearest to -z.
     calibration
         CALIBRATION/ of a session's lights, cameras and sensor; None: the nominal
         rig, with the noise recorded by the frames.
@@ -116,37 +116,37 @@ class ExportSettings:
     calibration: Path | None = None
 
     def __post_init__(self) -> None:
-        """Refuse words that mean nothing."""
+        """Raise for unknown values and malformed names."""
         for option, value, known in (
-            ("--unit", self.unit, UNITS_M),
-            ("--normal-y", self.normal_y, NORMAL_Y),
+            ("--unit", self.unit, METERS_PER_UNIT),
+            ("--normal-y", self.normal_y, GREEN_SIGN_BY_NORMAL_Y),
             ("--udim", self.udim, TILE_SEPARATORS),
         ):
             if value is not None and value not in known:
                 raise UnusableError(f"{option}: got {value!r}, expected one of {', '.join(known)}")
         for name in self.only:
             if not _NAME_PATTERN.fullmatch(name):
-                raise UsageError(f"--only: got {name!r}, expected names joined by commas")
+                raise UsageError(f"--only: got {name!r}, expected names separated by commas")
 
     @property
     def y(self) -> float:
         """Sign of the green of normal maps: 1 for +Y up."""
-        return NORMAL_Y[self.normal_y]
+        return GREEN_SIGN_BY_NORMAL_Y[self.normal_y]
 
     @property
     def green_direction(self) -> str:
-        """What growing green of a normal map means, for people."""
+        """Direction of increasing green of a normal map, in words."""
         return "+Y (OpenGL)" if self.y > 0 else "-Y (DirectX)"
 
     @property
     def scene_unit(self) -> str:
-        """Scene unit; meters where none is asked for."""
+        """Scene unit; meters by default."""
         return self.unit or "m"
 
     @property
     def units_per_mm(self) -> float:
         """Scene units in a millimeter."""
-        return M_PER_MM / UNITS_M[self.scene_unit]
+        return M_PER_MM / METERS_PER_UNIT[self.scene_unit]
 
     def format_tile_name(self, name: str, suffix: str, tile: int | str = FIRST_TILE) -> str:
         """Return the file name of a texture's tile.
@@ -160,5 +160,5 @@ class ExportSettings:
         return f"{name}{TILE_SEPARATORS[self.udim]}{number}.{suffix}"
 
     def format_reference(self, name: str, suffix: str) -> str:
-        """Return a texture's name as a material file refers to all its tiles."""
+        """Return a texture's name with the token of all its tiles, for material files."""
         return self.format_tile_name(name, suffix, "<UDIM>")

@@ -1,4 +1,4 @@
-"""A new folder that appears whole or not at all, listed file by file in an ASC MHL manifest."""
+"""Write an export folder atomically, sealed by an ASC MHL manifest of all files."""
 
 import json
 import os
@@ -17,7 +17,7 @@ from skinrig.atomic_file import replace_folder_atomically
 
 @dataclass(frozen=True, slots=True)
 class ExportResult:
-    """What an export made.
+    """Files of an export with its omissions.
 
     Attributes
     ----------
@@ -26,9 +26,9 @@ class ExportResult:
     manifest
         The ASC MHL manifest that lists every file.
     files
-        How many, without the manifest.
+        Number of files, without the manifest.
     left_out
-        What the format asks for and the source does not hold, with the reason.
+        Parts of the format that the source lacks, with reasons.
     """
 
     path: Path
@@ -42,7 +42,7 @@ def export_sealed(
     write: Callable[[Path], Sequence[tuple[str, str]] | None],
     now: datetime | None = None,
 ) -> ExportResult:
-    """Let ``write`` fill a hidden folder, seal it, and rename it once it is complete.
+    """Fill a hidden folder by ``write``, seal it, and rename it when it is complete.
 
     Parameters
     ----------
@@ -51,25 +51,25 @@ def export_sealed(
     write
         Called with an empty folder.
     now
-        Time that the manifest bears; None: the present.
+        Date of the manifest; None: the present.
 
     Returns
     -------
-    Exported
-        With what ``write`` returned as left out, where it returned anything.
+    ExportResult
+        Omissions are those that ``write`` returned.
     """
     moment = now or datetime.now(UTC)
-    with replace_folder_atomically(target) as part:  # of the final name, which the manifest bears
+    with replace_folder_atomically(target) as part:  # has the final name, which is in the manifest
         left_out = tuple(write(part) or ())
         written = [path for path in part.rglob("*") if path.is_file()]
-        for path in written:  # the manifest bears dates: one moment, one manifest
+        for path in written:  # the manifest has dates: equal times give equal manifests
             os.utime(path, (moment.timestamp(), moment.timestamp()))
         manifest = write_first_generation(part, now=moment, version=version("skinrig"))
     return ExportResult(target, target / manifest.relative_to(part), len(written), left_out)
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a document as people read it; the same bytes for the same content."""
+    """Write a document as indented JSON; equal content gives equal bytes."""
     text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
     path.write_text(text + "\n", encoding="utf-8")
 
@@ -80,12 +80,12 @@ IMAGE_ORIENTATION: Final = (
 
 
 def describe_provenance(appearance: SkinAppearance) -> dict[str, Any]:
-    """Return where an appearance is from, as JSON values.
+    """Return the provenance of an appearance as JSON values.
 
     Parameters
     ----------
     appearance
-        Any appearance; of a moving one, its parts are listed.
+        Any appearance; of a dynamic one, the parts are listed.
 
     Examples
     --------

@@ -1,1 +1,1 @@
-"""Models fitted to maps of sessions."""
+"""Fit models to the maps of sessions: `skinrig fit`."""

@@ -1,4 +1,4 @@
-"""From flash sessions to a hemoglobin rig that can be blended: `skinrig fit facial-color`."""
+"""Fit a hemoglobin rig to flash sessions: `skinrig fit facial-color`."""
 
 import json
 import math
@@ -25,7 +25,7 @@ from skinrig.console import select_attributes
 
 
 class FacialColorInputError(ValueError):
-    """Landmarks or sessions that cannot be used."""
+    """Unusable landmarks or sessions."""
 
 
 def fit_facial_color(
@@ -38,35 +38,39 @@ def fit_facial_color(
     stored_size: int | None = 256,
     progress: Callable[[str], None] | None = None,
 ) -> FacialColorFit:
-    """Fit the facial-color part of a dynamic appearance.
+    """Fit the facial-color part of a dynamic appearance and write it to `out`.
 
     Parameters
     ----------
     sessions
-        SESSION/ folders of the flash rig, one subject, with a neutral state.
+        SESSION/ folders of the flash rig, one subject, with a neutral expression.
     out
-        Folder of the dynamic appearance; other parts in it stay.
+        Folder of the dynamic appearance; its other parts are kept.
     calibration
         CALIBRATION/ folder.
     landmarks
-        Folder with a table ``STATE.csv`` (name, x, y) for each state; None: a simulation's own,
-        otherwise features are matched.
+        Folder with a table ``STATE.csv`` (name, x, y) per expression; None: those of a simulation,
+        else features are matched.
     radius_px
-        Radius of the disc of the local statistics, px of the maps.
+        Radius of the disc of local statistics, px of the maps; None: the fit's default.
     stored_size
-        Cells a side of the stored scale and bias maps.
+        Side of the stored scale and bias maps, cells; None: that of the images.
     progress
-        Called with one line a step.
+        Called with one line per step.
 
     Raises
     ------
     FacialColorFitError, InputsError, LandmarkError, DynamicAppearanceError
-        Naming what is missing or does not fit.
+        If an input is missing or inconsistent; the message names it.
     """
     if radius_px is not None and not 0.0 < radius_px < math.inf:
-        raise FacialColorInputError(f"radius: got {radius_px:g} px, expected more than 0")
+        raise FacialColorInputError(
+            f"--radius: got {radius_px:g} px, expected above 0; enter another"
+        )
     if stored_size is not None and stored_size < 1:
-        raise FacialColorInputError(f"stored size: got {stored_size} cells, expected 1 or more")
+        raise FacialColorInputError(
+            f"--stored-size: got {stored_size} cells, expected 1 or more; enter another"
+        )
     dynamic_appearance.check_target(out)
     subject = state_images.reconstruct_states(sessions, calibration=calibration, progress=progress)
     marks, marked_by, unmarked = _landmarks(subject, sessions, landmarks)
@@ -115,7 +119,7 @@ def fit_facial_color(
 
 
 def summarize_states(found: FacialColorFit) -> list[tuple[str, str, str, str, str]]:
-    """Return state, mean change in percent, its share of the neutral's, scale, and alignment."""
+    """Return rows of expression, mean change (%), relative change, scale, alignment error."""
     rows = []
     neutral = found.hemoglobin["neutral"]
     errors = {one.image.state: one.alignment for one in found.aligned if one.alignment is not None}
@@ -134,12 +138,13 @@ def summarize_states(found: FacialColorFit) -> list[tuple[str, str, str, str, st
 def _landmarks(
     subject: SubjectImages, sessions: Sequence[Path], folder: Path | None
 ) -> tuple[Mapping[str, Landmarks] | None, str, list[tuple[str, str]]]:
-    """Return the landmarks of each state, where they come from, and which states have none."""
+    """Return the landmarks by expression, their source, and the expressions without landmarks."""
     found: dict[str, Landmarks] = {}
     if folder is not None:
         if not folder.is_dir():
             raise FacialColorInputError(
-                f"landmarks: got {folder}, expected a folder with STATE.csv per state"
+                f"--landmarks: got {folder}, expected a folder with a table STATE.csv per"
+                f" expression"
             )
         found = {
             state: landmark_table.read_landmark_table(folder / f"{state}.csv")
@@ -147,7 +152,7 @@ def _landmarks(
             if (folder / f"{state}.csv").is_file()
         }
         if "neutral" not in found:
-            raise FacialColorInputError(f"landmarks: {folder / 'neutral.csv'} is missing")
+            raise FacialColorInputError(f"--landmarks: {folder / 'neutral.csv'} is missing; add it")
         words = "tables"
     elif subject.source == "simulated":
         for state, place in _truths(subject, sessions).items():
@@ -162,7 +167,7 @@ def _landmarks(
 
 
 def _truths(subject: SubjectImages, sessions: Sequence[Path]) -> dict[str, Path | None]:
-    """Return the folder of each state's ground truth, next to the first session of the state."""
+    """Return the ground truth folder by expression, next to the expression's first session."""
     return {
         state: find_state_truth(sessions[subject.images_of_state(state)[0].session], state)
         for state in subject.states
@@ -175,5 +180,6 @@ def _point(table: Path, name: str, value: Any) -> tuple[float, float]:
         return float(x), float(y)
     except (TypeError, ValueError) as error:
         raise FacialColorInputError(
-            f"{table}: landmark {name!r} is {json.dumps(value)}, expected two numbers"
+            f"{table}: landmark {name!r} is {json.dumps(value)}, expected two numbers; correct"
+            f" the table"
         ) from error

@@ -1,4 +1,4 @@
-"""From caliper sessions to microstructure that moves: neutral relief and its table of kernels."""
+"""Fit microstructure to caliper sessions: neutral relief and a table of stretch kernels."""
 
 import json
 import re
@@ -15,34 +15,34 @@ from model.skin import SkinAppearance, SkinMap
 from reconstruction.kernel_fit.table import KernelTableFitError, fit_table
 from reconstruction.pipeline.gradient.stages import KERNEL_FILE
 from skinrig.appearances import dynamic as dynamic_appearance
-from skinrig.appearances.contents import derive_appearance, document_digest
+from skinrig.appearances.contents import derive_appearance, hash_document
 from skinrig.appearances.dynamic import MICROSTRUCTURE
 
 SITE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}")
 
 
 class MicrostructureFitError(ValueError):
-    """Maps of caliper sessions that give no neutral relief or no table of kernels."""
+    """Maps of caliper sessions without a neutral relief or enough kernels for a table."""
 
 
 @dataclass(frozen=True, slots=True)
 class SiteFit:
-    """One site's share.
+    """Fitted microstructure of one site.
 
     Attributes
     ----------
     site
-        Name; files and maps carry it.
+        Name of the site, part of file and map names.
     height
         Neutral relief, um.
     pixel_um
-        Of the relief, on the skin.
+        Pixel size of the relief on the skin, um.
     table
-        Kernels over the stretch ratio.
+        Kernel parameters over the stretch ratio.
     kernels
-        How many fitted kernels stand behind the table; 0: it is the paper's forehead.
+        Number of fitted kernels of the table; 0: the paper's forehead table.
     alpha_rms, sigma_rms_um
-        Residuals of the table's lines; None for the paper's.
+        RMS residuals of the table's lines; None for the paper's table.
     """
 
     site: str
@@ -71,23 +71,22 @@ class SiteFit:
 def fit_microstructure(
     appearances: Sequence[Path], *, out: Path, paper_table: bool = False
 ) -> dict[str, SiteFit]:
-    """Fit the microstructure part of a dynamic appearance.
+    """Fit the microstructure part of a dynamic appearance and write it to `out`.
 
     Parameters
     ----------
     appearances
-        APPEARANCE/ folders of caliper sessions with heights and kernels; ``SITE=FOLDER`` names
-        the site, otherwise the folder's name does. Several of one site share one table.
+        APPEARANCE/ folders of caliper sessions with heights and kernels. ``SITE=FOLDER`` names the
+        site, by default the folder's name. Folders of the same site share one table.
     out
-        Folder of the dynamic appearance; other parts in it stay.
+        Folder of the dynamic appearance; its other parts are kept.
     paper_table
-        Take the paper's forehead table where fewer kernels were fitted than a table needs,
-        instead of refusing.
+        Use the paper's forehead table where too few kernels were fitted; False: raise.
 
     Raises
     ------
     MicrostructureFitError
-        Naming the folder and what it lacks.
+        If a folder lacks a map or enough kernels; the message names both.
     """
     dynamic_appearance.check_target(out)
     if not appearances:
@@ -97,14 +96,14 @@ def fit_microstructure(
         site, path = _parse_site(given)
         by_site.setdefault(site, []).append((path, store.read(path)))
     fits = {site: _fit_site(site, group, paper_table) for site, group in by_site.items()}
-    why = "its table of kernels is the paper's forehead: too few kernels were fitted"
+    why = "too few kernels were fitted; its kernel table is the paper's, of a forehead"
     part = derive_appearance(
         *(one for group in by_site.values() for _, one in group),
         maps={f"microrelief_{site}": fit.height for site, fit in fits.items()},
         files={f"kernel_table_{site}.json": f.table.to_json().encode() for site, f in fits.items()},
         parameters={"sites": {site: fit.document() for site, fit in fits.items()}},
         inputs={
-            f"{site} {number}": document_digest(path)
+            f"{site} {number}": hash_document(path)
             for site, group in by_site.items()
             for number, (path, _) in enumerate(group)
         },
@@ -136,7 +135,7 @@ def _fit_site(
     for path, appearance in group:
         if KERNEL_FILE not in appearance.files:
             raise MicrostructureFitError(
-                f"{path}: holds no {KERNEL_FILE}, expected a caliper session reconstructed with "
+                f"{path}: {KERNEL_FILE} is missing, expected a caliper session reconstructed with "
                 "`skinrig reconstruct SESSION --maps height,kernels`"
             )
         document = json.loads(appearance.files[KERNEL_FILE])
@@ -153,8 +152,8 @@ def _fit_site(
     except (KernelTableFitError, KernelTableError) as error:
         if not paper_table:
             raise MicrostructureFitError(
-                f"{site}: {len(points)} fitted kernels give no table ({error}); capture more "
-                "states (`--steps`), or take the paper's forehead with --paper-table"
+                f"{site}: {len(points)} fitted kernels are too few for a table ({error}); capture "
+                "more strain steps (`--steps`), or use the paper's forehead with --paper-table"
             ) from error
         return SiteFit(site, height, pixel_um, FOREHEAD, 0, None, None)
     return SiteFit(
@@ -170,7 +169,7 @@ def _neutral(path: Path, appearance: SkinAppearance) -> tuple[SkinMap, float]:
     pixel_um = appearance.parameters.get("pixel_um")
     if name not in appearance.maps or not isinstance(pixel_um, int | float):
         raise MicrostructureFitError(
-            f"{path}: has no height of the neutral state, expected a caliper session reconstructed "
+            f"{path}: neutral height is missing, expected a caliper session reconstructed "
             "with `--maps height,kernels`"
         )
     return appearance.maps[name], float(pixel_um)

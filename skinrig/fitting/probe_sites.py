@@ -25,33 +25,35 @@ SITE_OFFSETS_FROM_NOSE_MM: Final[Mapping[str, tuple[float, float]]] = {
     "cheek right": (48.0, 0.0),
     "chin": (0.0, -72.0),
 }
-"""Places of the simulator's mean head, mm to the right and up of the tip of the nose as seen from
-the front; chin is below it. Left and right as seen in the picture."""
+"""Sites of the simulator's mean head: mm to the right of and above the tip of the nose.
+
+In front view; left and right are those of the image.
+"""
 GRID_SIDE: Final = 256
-"""Places a side that translucency is interpolated at before it is laid on the texture."""
+"""Side of the grid on which translucency is interpolated before it is resampled to the texture."""
 MAX_SITE_DISTANCE_MM: Final = 15.0
-"""Farther than this from every measured texel a place is not on the scan."""
+"""Maximum distance of a site from the nearest texel of the scan."""
 HEAD_RADIUS_RANGE_MM: Final = (40.0, 200.0)
-"""Radii of what counts as a head; other shapes are measured along x and y."""
+"""Range of fitted girth radii that count as a head; other shapes are measured along x and y."""
 
 
 class ProbeSiteError(ValueError):
-    """Measurements of a probe that cannot be placed on a face."""
+    """Probe measurements without a position on the face."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProbeSite:
-    """One place of the probe.
+    """One measured site of the probe.
 
     Attributes
     ----------
     name
     sigma_tr_per_mm, stderr_per_mm
-        Of each channel; NaN and infinity without a valid fit.
+        Value and standard uncertainty per channel; NaN and infinity without a valid fit.
     texel
-        Row and column on the face's texture.
+        Row and column in the face's texture.
     position_mm
-        In the rig frame.
+        Position in the rig frame, mm.
     """
 
     name: str
@@ -63,22 +65,22 @@ class ProbeSite:
 
 @dataclass(frozen=True, slots=True)
 class PlacedTranslucency:
-    """A probe's translucency on a face's texture.
+    """A probe's diffuse mean free path, interpolated over a face's texture.
 
     Attributes
     ----------
     map
-        1/sigma_tr, mm, with standard errors.
+        Diffuse mean free path 1/sigma_tr, mm, with standard uncertainties.
     sites
-        Those it rests on.
+        Sites that were used.
     left_out
-        Site, with or without its channel, and why it is not used.
+        Omitted sites, or channels of sites, with reasons.
     conflicts
-        Site and channel whose repeats contradict each other, and how.
+        Sites and channels with inconsistent repeats, with their deviation.
     assumed
-        What was taken for granted in placing them.
+        Assumptions about the positions of sites.
     p_value
-        By channel: chance that people hold a face so unlike their mean.
+        Per channel: p value of the face's deviation from the population mean.
     """
 
     map: SkinMap
@@ -94,31 +96,33 @@ def map_translucency(
 ) -> PlacedTranslucency:
     """Interpolate a probe's measurements over the texture of a face.
 
-    Distances over the face are those along its girth and its height, from where texels are, so
-    that a texture may be laid out in any charts.
+    Distances are measured along the face's girth and height from the positions of texels, so that
+    they are independent of the texture's layout.
 
     Parameters
     ----------
     probe
-        With the file `subsurface.json`.
+        Maps of the probe with the file `subsurface.json`.
     position
-        Map `position` of the face, mm, rig frame.
+        Map `position` of the face, mm, in the rig frame.
     landmarks
-        Table ``name,x,y`` in texels of that map; sites it lacks, and all without it, are found by
-        a mean face's distances from the tip of the nose.
+        Table ``name,x,y`` in texels of that map. Other sites are located by a mean face's distances
+        from the tip of the nose.
 
     Raises
     ------
     ProbeSiteError
-        Where nothing was measured at a place that is known and on the scan.
+        If no measured site has a known position on the scan.
     reconstruction.subsurface.translucency.TranslucencyError
-        Where no measurement is usable, or the table is faulty.
+        If no measurement is usable, or the table is invalid.
     """
     measured = _measured(probe)
     height, width = position.values.shape[:2]
     known = intersect_valid(position)
     if not known.any():
-        raise ProbeSiteError("position: got no valid texel, expected those of a face")
+        raise ProbeSiteError(
+            "position: got no valid texel, expected those of a face; give another appearance"
+        )
     given: dict[str, tuple[float, float]] = {}
     if landmarks is not None:
         given = probe_sites.read_landmarks(landmarks, texture_px=(height, width))
@@ -133,16 +137,18 @@ def map_translucency(
         elif name in SITE_OFFSETS_FROM_NOSE_MM:
             wanted, off_mm = _mean_site_position(name, at_mm[known])
             if off_mm > MAX_SITE_DISTANCE_MM:
-                left_out.append((name, f"the scan ends {off_mm:.0f} mm before it"))
+                left_out.append((name, f"the scan ends {off_mm:.0f} mm short of the site"))
                 continue
             guessed.append(name)
         else:
-            left_out.append((name, "its place on a face is not known; a table may name it"))
+            left_out.append(
+                (name, "unknown position on the face; list it in the table of --landmarks")
+            )
             continue
         away = np.where(known, np.linalg.norm(at_mm - wanted, axis=-1), np.inf)
         texel = np.unravel_index(np.argmin(away), away.shape)
         if away[texel] > MAX_SITE_DISTANCE_MM:
-            left_out.append((name, f"the scan ends {away[texel]:.0f} mm before it"))
+            left_out.append((name, f"the scan ends {away[texel]:.0f} mm short of the site"))
             continue
         found = at_mm[texel]
         sites.append(
@@ -150,8 +156,8 @@ def map_translucency(
         )
     if not sites:
         why = "; ".join(f"{name}: {reason}" for name, reason in left_out)
-        raise ProbeSiteError(f"sites: got none on the face: {why}")
-    how = "of the probe lie where a mean face has them, measured from the tip of the nose"
+        raise ProbeSiteError(f"sites: got none on the face, expected one or more: {why}")
+    how = "of the probe are placed as on a mean face, relative to the tip of the nose"
     assumed = (f"{', '.join(guessed)} {how}",) if guessed else ()
     chart = _Chart.of(at_mm[known], sites)
     found_map = _interpolated(chart, sites)
@@ -163,7 +169,7 @@ def map_translucency(
             "mm",
             spread[..., 3:],
             valid,
-            "1/sigma_tr of red, green and blue light, between measured sites by kriging",
+            "1/sigma_tr of red, green and blue light, kriging between measured sites",
         ),
         sites=tuple(sites),
         left_out=(*left_out, *found_map.omitted),
@@ -174,11 +180,11 @@ def map_translucency(
 
 
 def _measured(probe: SkinAppearance) -> dict[str, tuple[tuple[float, ...], tuple[float, ...]]]:
-    """Return sigma_tr and its standard error of each site by channel."""
+    """Return sigma_tr and its standard uncertainty per channel, keyed by site."""
     if SUBSURFACE_FILE not in probe.files:
         raise ProbeSiteError(
-            f"probe: has no {SUBSURFACE_FILE}; `skinrig reconstruct --maps subsurface` makes it of "
-            "a session of the fiber probe"
+            f"probe: {SUBSURFACE_FILE} is missing; reconstruct a session of the fiber probe with "
+            "`skinrig reconstruct --maps subsurface`"
         )
     try:
         rows = json.loads(probe.files[SUBSURFACE_FILE])["sites"]
@@ -191,7 +197,9 @@ def _measured(probe: SkinAppearance) -> dict[str, tuple[tuple[float, ...], tuple
                 math.inf if stderr is None else float(stderr),
             )
     except (ValueError, KeyError, TypeError) as error:
-        raise ProbeSiteError(f"{SUBSURFACE_FILE}: cannot be read: {error!r}") from error
+        raise ProbeSiteError(
+            f"{SUBSURFACE_FILE}: not readable: {error!r}; reconstruct the session again"
+        ) from error
     none = (math.nan, math.inf)
     return {
         name: (
@@ -203,9 +211,10 @@ def _measured(probe: SkinAppearance) -> dict[str, tuple[tuple[float, ...], tuple
 
 
 def _mean_site_position(name: str, points_mm: Float64Array) -> tuple[Float64Array, float]:
-    """Return the point at a mean face's distance from the foremost one, the nose, and how far off.
+    """Return the point at a mean face's offset from the tip of the nose, and its distance, mm.
 
-    Distances are as seen from the front; of what lies behind each other the foremost counts.
+    The tip of the nose is the foremost point. Offsets are in front view; of several points on one
+    line of sight, the foremost counts.
     """
     nose = points_mm[np.argmax(points_mm[:, 2])]
     across, up = SITE_OFFSETS_FROM_NOSE_MM[name]
@@ -216,22 +225,23 @@ def _mean_site_position(name: str, points_mm: Float64Array) -> tuple[Float64Arra
 
 @dataclass(frozen=True, slots=True)
 class _Chart:
-    """Coordinates over a face: along its girth and its height, mm, above a corner."""
+    """Coordinates over a face along its girth and its height, mm, from a corner."""
 
     axis_mm: tuple[float, float] | None
-    """x and z of the vertical axis; None: the surface is not round, x counts."""
+    """x and z of the vertical axis; None: the surface is not round and x replaces the girth."""
     radius_mm: float
     corner_mm: Float64Array
     size_mm: Float64Array
 
     @staticmethod
     def of(points_mm: Float64Array, sites: Sequence[ProbeSite]) -> _Chart:
-        """Find the axis of a face: the centre of the circle nearest to its girth."""
+        """Fit the axis of a face: the center of the circle nearest to its girth."""
         middle = np.median([site.position_mm[1] for site in sites])
         girth = points_mm[np.abs(points_mm[:, 1] - middle) < 60.0]
         axis, radius = None, 1.0
         if len(girth) >= 3:
-            # x^2 + z^2 = 2 a x + 2 b z + c (Kasa 1976)
+            # a circle about (a, b) is linear in a, b, c: x^2 + z^2 = 2 a x + 2 b z + c with
+            # c = r^2 - a^2 - b^2, so that least squares need no start value (Kasa 1976)
             columns = np.column_stack([2.0 * girth[:, 0], 2.0 * girth[:, 2], np.ones(len(girth))])
             (a, b, c), _, rank, _ = np.linalg.lstsq(
                 columns, (girth[:, [0, 2]] ** 2).sum(axis=1), rcond=None
@@ -245,7 +255,7 @@ class _Chart:
         return _Chart(axis, radius, low, np.maximum(high - low, 1.0))
 
     def coordinates(self, points_mm: Float64Array) -> Float64Array:
-        """Return (..., 2): along the girth and up, mm, from the corner."""
+        """Return coordinates along the girth and upwards, (..., 2), mm from the corner."""
         along = points_mm[..., 0]
         if self.axis_mm is not None:
             a, b = self.axis_mm
@@ -253,7 +263,7 @@ class _Chart:
         return np.asarray(np.stack([along, points_mm[..., 1]], axis=-1) - self.corner_mm)
 
     def interpolate(self, found: TranslucencyMap, points_mm: Float64Array) -> Float32Array:
-        """Return values and standard errors, (H, W, 6), at the places of texels, linear."""
+        """Interpolate values and standard uncertainties linearly at texel positions, (H, W, 6)."""
         both = np.concatenate([found.values, found.stderr], axis=-1)
         share = self.coordinates(points_mm) / self.size_mm
         x = np.clip(share[..., 0] * GRID_SIDE - 0.5, 0.0, GRID_SIDE - 1.0)

@@ -1,4 +1,4 @@
-"""From a dome's maps and a probe's measurements to one model: `skinrig fit reflectance`."""
+"""Combine a dome's maps and a probe's measurements in one model: `skinrig fit reflectance`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +12,8 @@ from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from reconstruction.subsurface.translucency import population_prior
 from skinrig.appearances.contents import (
     derive_appearance,
-    digest,
-    document_digest,
+    hash_document,
+    hash_file,
     list_assumptions,
 )
 from skinrig.errors import UsageError
@@ -21,24 +21,24 @@ from skinrig.fitting import probe_sites
 from skinrig.fitting.probe_sites import PlacedTranslucency
 
 REFLECTANCE_KEY = "reflectance_model"
-"""Of `parameters`: how the translucency of a model came about."""
+"""Key in `parameters` of the source of a model's translucency."""
 
 
 class ReflectanceInputError(ValueError):
-    """Folders that no reflectance model can be made of."""
+    """Folders that are not the inputs of a reflectance model."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedReflectance:
-    """An assembled model, and what it was made of.
+    """An assembled model with its assumptions and omissions.
 
     Attributes
     ----------
     model
     placed
-        None where no probe was given.
+        Translucency on the texture; None without a probe.
     assumed
-        By the dome's and the probe's maps, and here.
+        Assumptions of the dome's maps, of the probe's maps, and of their combination.
     left_out
     """
 
@@ -51,7 +51,7 @@ class FittedReflectance:
 def fit_reflectance(
     dome: Path, probe: Path | None = None, *, out: Path, landmarks: Path | None = None
 ) -> FittedReflectance:
-    """Write the model of one subject: the dome's maps with translucency on their texture.
+    """Write the reflectance model of a subject: the dome's maps with translucency on their texture.
 
     Parameters
     ----------
@@ -68,15 +68,17 @@ def fit_reflectance(
     Raises
     ------
     model.skin_reflectance.SkinReflectanceError, ReflectanceInputError, ProbeSiteError
-        Naming the folder or map that is missing or does not fit.
+        If a folder or map is missing or inconsistent; the message names it.
     """
     if landmarks is not None and probe is None:
-        raise UsageError("--landmarks: places a probe's sites, but no probe's maps are given")
+        raise UsageError(
+            "--landmarks: positions the sites of --probe, which is missing; add or remove an option"
+        )
     for given in (dome, probe):
         if given is not None and given.resolve() == out.resolve():
             raise ReflectanceInputError(f"{out}: is one of the inputs; name another --out")
     surface = store.read(dome)
-    inputs = {"dome": document_digest(dome)}
+    inputs = {"dome": hash_document(dome)}
     placed = None
     assumed = list_assumptions(surface)
     left_out = list(surface.left_out)
@@ -84,7 +86,7 @@ def fit_reflectance(
     sources = [surface]
     if probe is not None:
         measured = store.read(probe)
-        inputs["probe"] = document_digest(probe)
+        inputs["probe"] = hash_document(probe)
         sources.append(measured)
         try:
             placed = probe_sites.map_translucency(measured, _position(surface), landmarks=landmarks)
@@ -92,7 +94,7 @@ def fit_reflectance(
             raise ReflectanceInputError(f"{probe}: {error}") from error
         depth = placed.map
         if landmarks is not None:
-            inputs["landmarks"] = digest(landmarks)
+            inputs["landmarks"] = hash_file(landmarks)
         assumed += [f"probe: {text}" for text in list_assumptions(measured)] + list(placed.assumed)
         left_out += [(f"translucency of {what}", why) for what, why in placed.left_out]
         files[SUBSURFACE_FILE] = measured.files[SUBSURFACE_FILE]
@@ -118,7 +120,7 @@ def fit_reflectance(
 
 
 def summarize_medians(found: FittedReflectance) -> list[tuple[str, float, float, float]]:
-    """Return rows for people: what, and its median in red, green and blue over valid texels."""
+    """Return a row per quantity: label and medians over valid texels, red, green and blue."""
     model, coefficients = found.model, found.model.dipole()
 
     def medians(values: np.ndarray) -> tuple[float, float, float]:
@@ -135,7 +137,7 @@ def summarize_medians(found: FittedReflectance) -> list[tuple[str, float, float,
         ("1 - alpha'", *medians(coefficients.deficit)),
         ("sigma_a, 1/mm", *medians(coefficients.sigma_a_per_mm)),
         ("sigma_s', 1/mm", *medians(coefficients.sigma_s_prime_per_mm)),
-        ("share with R_d above 1 or below 0", *_valid_fraction(model, coefficients.outlier)),
+        ("fraction with R_d above 1 or below 0", *_valid_fraction(model, coefficients.outlier)),
     ]
 
 
@@ -146,7 +148,7 @@ def _valid_fraction(model: SkinReflectance, mask: np.ndarray) -> tuple[float, fl
 
 
 def _population_translucency(position: SkinMap) -> tuple[SkinMap, str]:
-    """Return the mean translucency of people as a map, their spread as its standard error."""
+    """Return the population's mean translucency; its standard deviation is the uncertainty."""
     mean_mm, what = skin_reflectance.population_mean_mm()
     prior = population_prior()
     deviation = np.hypot(prior.person_deviation, prior.place_deviation)
@@ -157,7 +159,7 @@ def _population_translucency(position: SkinMap) -> tuple[SkinMap, str]:
             "mm",
             np.broadcast_to(mean_mm * np.sinh(deviation), shape).astype(np.float32),
             position.valid,
-            "1/sigma_tr of red, green and blue light: the mean of people, not measured",
+            "1/sigma_tr of red, green and blue light: population mean, not measured",
         ),
         what,
     )

@@ -1,4 +1,4 @@
-"""From labelled appearances to trait spaces: `skinrig fit traits`."""
+"""Fit trait spaces to labeled appearances: `skinrig fit traits`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from reconstruction.correspondence import common_regions
 from reconstruction.correspondence.common_parameterization import CommonFrame
 from skinrig import consent
 from skinrig.appearances import face_textures
-from skinrig.appearances.contents import digest, document_digest
+from skinrig.appearances.contents import hash_document, hash_file
 from skinrig.appearances.face_textures import Face
 from skinrig.atomic_file import write_atomically
 from skinrig.editing import surface_mixtures
@@ -28,31 +28,32 @@ from skinrig.traits.albedo_vectors import AlbedoSample, VectorKind
 from skinrig.traits.labels import TraitLabels
 
 MAX_SURFACE_RANK: Final = 8
-"""Lobes of a population's surface (Weyrich et al. 2005, figure 15)."""
+"""Maximum number of basis BRDFs of a population (Weyrich et al. 2005, figure 15)."""
 MIN_REGION_PIXELS: Final = 200
-"""Valid pixels of the common map required of a region."""
+"""Minimum number of valid pixels of a region in the common map."""
 
 
 class TraitFitError(ValueError):
-    """Appearances that no traits can be learned from."""
+    """Appearances from which no trait can be learned."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TraitFit:
-    """What was learned.
+    """Fitted trait spaces with their faces and warnings.
 
     Attributes
     ----------
     library
-        The spaces.
+        Trait spaces by part.
     faces, ignored
-        Names of the faces, and of those in the table that were not given.
+        Names of the faces, and labels without a face.
     rows
-        Part, trait, faces with and without, p value, expected cosine; one a trait and part.
+        Part, trait, faces with and without it, p value, expected cosine; one row per trait and
+        part.
     warnings
-        A sentence each.
+        One sentence each.
     left_out
-        What was not learned, and why.
+        Omitted parts with reasons.
     """
 
     library: TraitLibrary
@@ -76,44 +77,46 @@ def fit_traits(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> TraitFit:
-    """Learn traits of labelled faces.
+    """Learn traits from labeled faces and write them to `out`.
 
     Parameters
     ----------
     appearances
         APPEARANCE/ folders of dome sessions.
     labels
-        Table, see `trait_labels.read`.
+        Table of labels, see `trait_labels.read`.
     out
-        File to write; an older one is replaced when the new is complete.
+        File to write; an existing file is replaced atomically.
     landmarks
-        Folder with a table ``NAME.csv`` for each face; None: those of simulations.
+        Folder with a table ``NAME.csv`` per face; None: those of simulations.
     vectors
-        Feature vector of an albedo, see `albedo_vectors`.
+        Albedo feature vector, see `albedo_vectors`.
     contrast
-        "means" of those with and without, or "regression" on all traits together.
+        "means": difference of the means with and without a trait; "regression" on all traits.
     size
         Width and height of the common map, pixels; None: those of the coarsest texture.
     basis
         Folder of MERL files that the lobes were fitted with.
     seed
-        Of the tests of confidence.
+        Random seed of the permutation tests.
     progress
-        Called with a line a step.
+        Called with one line per step.
 
     Raises
     ------
     TraitFitError, FaceError, UnusableError, TraitError, ParameterizationError
-        Naming what is missing or does not fit.
+        If an input is missing or inconsistent; the message names it.
     """
     report = progress or (lambda text: None)
     faces = read_faces(appearances, landmarks)
     table = trait_labels.read(labels, [face.name for face in faces])
-    frame = face_textures.common_frame(faces, size)
-    report(f"common map: {frame.size} pixels of {frame.pixel_mm:.2f} mm, {len(frame.names)} marks")
+    frame = face_textures.build_common_frame(faces, size)
+    report(
+        f"common map: {frame.size} pixels of {frame.pixel_mm:.2f} mm, {len(frame.names)} landmarks"
+    )
     samples = []
     for face in faces:
-        samples.append(albedo_sample(face, frame))
+        samples.append(sample_albedo(face, frame))
         report(f"{face.name}: {100 * samples[-1].valid.mean():.0f} % of the common map")
     left_out: list[tuple[str, str]] = []
     spaces = fit_albedo_spaces(
@@ -136,14 +139,16 @@ def fit_traits(
                 n: v.astype(float).tolist() for n, v in {**table.binary, **table.continuous}.items()
             },
             landmarks=sorted({face.marked_by for face in faces}),
-            inputs={"labels": digest(labels)} | {f.name: document_digest(f.path) for f in faces},
+            inputs={"labels": hash_file(labels)} | {f.name: hash_document(f.path) for f in faces},
             left_out=[list(row) for row in left_out],
             consent=consent.merge_consent(*(face.appearance for face in faces)),
         ),
         {regions.TEXTURE_SPACE_FILE: regions.texture_bytes(texture)},
     )
     if out.is_dir():
-        raise TraitFitError(f"{out}: is a folder, expected the name of a file such as traits.npz")
+        raise TraitFitError(
+            f"--out: {out} is a folder, expected a file such as traits.npz; name a file"
+        )
     write_atomically(out, library.to_bytes())
     rows, warnings = summarize_traits(library)
     return TraitFit(
@@ -151,10 +156,10 @@ def fit_traits(
     )
 
 
-def albedo_sample(face: Face, frame: CommonFrame) -> AlbedoSample:
-    """Return a face's albedo in the common map."""
+def sample_albedo(face: Face, frame: CommonFrame) -> AlbedoSample:
+    """Resample a face's albedo to the common map."""
     r_d = face.r_d
-    image, valid = face.chart(frame).gather(r_d.values, face_textures.valid_texels(r_d))
+    image, valid = face.chart(frame).gather(r_d.values, face_textures.find_valid_texels(r_d))
     return AlbedoSample(image, valid)
 
 
@@ -173,7 +178,7 @@ def fit_albedo_spaces(
     Returns
     -------
     dict
-        Name of each space to a `TraitSpace`, and "texture" to the `TextureSpace` common to all.
+        A `TraitSpace` by name, and "texture": the `TextureSpace` that all of them share.
     """
     encoded = [albedo_vectors.encode_albedo(one.r_d, vectors) for one in samples]
     texture = TextureSpace.fit(encoded, valid=[one.valid for one in samples])
@@ -182,7 +187,7 @@ def fit_albedo_spaces(
         inside = common_regions.region_mask(region, frame)
         fewest = min(int((inside & one.valid).sum()) for one in samples)
         if fewest < MIN_REGION_PIXELS:
-            left_out.append((f"albedo of {region}", f"a face shows {fewest} pixels of it"))
+            left_out.append((f"albedo of {region}", f"a face has only {fewest} valid pixels of it"))
             continue
         rows = [
             albedo_vectors.vector(
@@ -194,14 +199,16 @@ def fit_albedo_spaces(
             rows, labels.binary, labels.continuous, texture, vectors, contrast=contrast, seed=seed
         ).traits
     if len(found) == 1:
-        raise TraitFitError("r_d: no region of the face is valid in all appearances")
+        raise TraitFitError(
+            "r_d: no region of the face is valid in all appearances; omit incomplete faces"
+        )
     return found
 
 
 def summarize_traits(
     library: TraitLibrary,
 ) -> tuple[tuple[tuple[str, str, int, int, float, float], ...], tuple[str, ...]]:
-    """Return a row for each trait and part, and all warnings, each once."""
+    """Return a row per trait and part, and all warnings without duplicates."""
     rows = tuple(
         (
             part,
@@ -224,20 +231,22 @@ def read_faces(appearances: Sequence[Path], landmarks: Path | None) -> list[Face
     Raises
     ------
     skinrig.errors.UsageError
-        For fewer than two.
+        If fewer than two appearances are given.
     TraitFitError
-        For names that are the same, or faces without landmarks, with a remedy.
+        If names are equal, or faces lack landmarks.
     """
     if len(appearances) < 2:
         raise UsageError(f"appearances: got {len(appearances)}, expected two or more faces")
     if landmarks is not None and not landmarks.is_dir():
-        raise TraitFitError(f"landmarks: got {landmarks}, expected a folder with NAME.csv per face")
+        raise TraitFitError(
+            f"--landmarks: got {landmarks}, expected a folder with NAME.csv per face"
+        )
     faces: list[Face] = []
     for path in appearances:
         name = path.resolve().name.removeprefix("appearance-")
         table = None if landmarks is None else landmarks / f"{name}.csv"
         if table is not None and not table.is_file():
-            raise TraitFitError(f"landmarks: {table} is missing")
+            raise TraitFitError(f"--landmarks: {table} is missing; add it")
         faces.append(face_textures.read(path, table))
     names = [face.name for face in faces]
     if len(set(names)) < len(names):
@@ -277,14 +286,17 @@ def _surface(
     first = found[0]
     for face, one in zip(faces, found, strict=True):
         if (one.materials, one.light_radius_rad) != (first.materials, first.light_radius_rad):
-            left_out.append(("surface", f"{face.name}: its lobes are of other materials"))
+            left_out.append(
+                ("surface", f"{face.name}: its basis BRDFs are mixtures of other materials")
+            )
             return None
     tables = surface_mixtures.load_materials(first.materials, first.light_radius_rad, folder)
     strength = tables.strength()
     means = np.array([one.mean(strength) for one in found])
     products = tables.cosine_similarity() * np.outer(strength, strength)
     rank = min(MAX_SURFACE_RANK, len(means) - 1)
-    # the paper's: traits in the space of few non-negative lobes of the population
+    # as in the paper, traits are directions in the space of a few non-negative basis BRDFs of the
+    # population; the mean mixtures of faces are factorized for it
     mix = brdf_basis.reduce(means, rank, basis=tables, seed=seed)[1]
     return TraitSpace.fit(
         means,

@@ -1,4 +1,4 @@
-"""From normals of a neutral face and its expressions to wrinkle maps: `skinrig fit wrinkles`."""
+"""Fit wrinkle maps to normals of a neutral face and its expressions: `skinrig fit wrinkles`."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -17,29 +17,29 @@ from reconstruction.surface.tangent_space import SMOOTHING_MM, tangent_normals
 from reconstruction.wrinkles.fit import WrinkleFit, fit_wrinkle_map
 from reconstruction.wrinkles.zones import ZoneFit, estimate_amplitudes, fit_zones
 from skinrig.appearances import dynamic as dynamic_appearance
-from skinrig.appearances.contents import derive_appearance, document_digest, intersect_valid
+from skinrig.appearances.contents import derive_appearance, hash_document, intersect_valid
 from skinrig.appearances.dynamic import WRINKLES
 from skinrig.arrays import BoolArray, Float32Array
 from skinrig.console import select_attributes
 
 STATE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}")
 NORMAL_MAPS = ("normals_refined", "normals")
-"""Maps that are taken, the better first."""
+"""Maps of normals in order of preference."""
 N_ZONES = 8
-"""As many as Jimenez2011 stores in two RGBA masks."""
+"""Number of wrinkle zones: the channels of two RGBA masks (Jimenez2011)."""
 
 
 class WrinkleInputError(ValueError):
-    """Folders whose normals cannot be compared."""
+    """Folders whose normals are not comparable."""
 
 
 @dataclass(frozen=True, slots=True)
 class FittedWrinkles:
-    """What a fit of wrinkles found."""
+    """Result of a wrinkle fit."""
 
     fit: WrinkleFit
     zones: ZoneFit | None
-    """None: the masks were given."""
+    """Fit of the zones; None if masks were given."""
 
 
 def fit_wrinkles(
@@ -51,38 +51,41 @@ def fit_wrinkles(
     mask_size: int = 64,
     seed: int = 0,
 ) -> FittedWrinkles:
-    """Fit the wrinkle part of a dynamic appearance.
+    """Fit the wrinkle part of a dynamic appearance and write it to `out`.
 
     Parameters
     ----------
     appearances
         APPEARANCE/ folders of dome sessions of one subject, with normals and positions on one
-        texture: the neutral and at least one expression. ``STATE=FOLDER`` names the state,
-        otherwise its document does.
+        texture: the neutral and at least one expression. ``STATE=FOLDER`` names the expression, by
+        default the folder's document.
     out
-        Folder of the dynamic appearance; other parts in it stay.
+        Folder of the dynamic appearance; its other parts are kept.
     masks
-        Two RGBA pictures of the zones; None: zones are found in the data.
+        Two RGBA images of the zones; None: zones are estimated from the normals.
     size, mask_size
         Width and height of wrinkle map and masks, texels.
     seed
-        Of the search for zones.
+        Random seed of the zone search.
 
     Raises
     ------
     WrinkleInputError, WrinkleError, DynamicAppearanceError
-        Naming the folder and what it lacks.
+        If a folder lacks a map; the message names both.
     """
     dynamic_appearance.check_target(out)
     read: dict[str, tuple[Path, SkinAppearance]] = {}
     for given in appearances:
         state, folder = _parse_state(given)
         if state in read:
-            raise WrinkleInputError(f"{folder}: {state!r} is there twice: {read[state][0]}")
+            raise WrinkleInputError(
+                f"{folder}: got expression {state!r} twice, also {read[state][0]}; give one of them"
+            )
         read[state] = (folder, store.read(folder))
     if "neutral" not in read or len(read) < 2:
         raise WrinkleInputError(
-            f"appearances: got {', '.join(read) or 'none'}, expected neutral and an expression"
+            f"appearances: got {', '.join(read) or 'none'}, expected neutral and at least one"
+            f" expression"
         )
     unchecked = _check_textures({state: one for state, (_, one) in read.items()})
     measured = {state: _normals(folder, one) for state, (folder, one) in read.items()}
@@ -103,7 +106,7 @@ def fit_wrinkles(
         stack = _read_masks(masks)
     found = fit_wrinkle_map(neutral, measured, stack, size=(min(size, side), min(size, side)))
     maps, document = found.model().to_maps()
-    why = "match of its texture with the others not checked: it has no mesh"
+    why = "texture layout not compared with the others, since the mesh is missing"
     part = derive_appearance(
         *(one for _, one in read.values()),
         maps=maps,
@@ -118,7 +121,7 @@ def fit_wrinkles(
             "smoothing_mm": SMOOTHING_MM,
             "truth": {state: one.parameters.get("truth", "") for state, (_, one) in read.items()},
         },
-        inputs={state: document_digest(folder) for state, (folder, _) in read.items()},
+        inputs={state: hash_document(folder) for state, (folder, _) in read.items()},
         left_out=tuple((state, why) for state in unchecked),
         seed=read["neutral"][1].seed,
     )
@@ -132,15 +135,17 @@ def _parse_state(appearance: Path) -> tuple[str, Path]:
         return state, Path(path)
     recorded = store.read_document(appearance).parameters.get("state")
     if not isinstance(recorded, str) or not recorded:
-        raise WrinkleInputError(f"{appearance}: has no state; name it as STATE={appearance}")
+        raise WrinkleInputError(
+            f"{appearance}: expression is not recorded; name it as STATE={appearance}"
+        )
     return recorded, appearance
 
 
 def _check_textures(appearances: Mapping[str, SkinAppearance]) -> list[str]:
-    """Refuse faces that are unwrapped differently; return those without a mesh.
+    """Raise if faces have different texture layouts; return the faces without a mesh.
 
-    A texel would be other skin in each. Faces on one texture need not have all triangles in
-    common: each scan is cropped for itself.
+    With different layouts, one texel is different skin in each face. Faces of one layout need not
+    share all triangles, as each scan is cropped individually.
     """
     places = {
         state: _texture_triangles(appearance.files[MESH_FILE])
@@ -150,7 +155,7 @@ def _check_textures(appearances: Mapping[str, SkinAppearance]) -> list[str]:
     first = next(iter(places.values()), set())
     if any(len(first & one) < 0.5 * min(len(first), len(one)) for one in places.values()):
         raise WrinkleInputError(
-            f"appearances: {', '.join(places)} have textures of their own, expected one for all; "
+            f"appearances: {', '.join(places)} have different texture layouts, expected one; "
             "give each session the same template wrapped onto its scan (`skinrig simulate dome "
             "--wrapped`, or `skinrig reconstruct --scan`)"
         )
@@ -158,7 +163,7 @@ def _check_textures(appearances: Mapping[str, SkinAppearance]) -> list[str]:
 
 
 def _texture_triangles(mesh: bytes) -> set[tuple[float, float]]:
-    """Return where the triangles of a Wavefront mesh lie in its texture, by their middles."""
+    """Return the centers of a Wavefront mesh's triangles in texture coordinates."""
     corners: list[tuple[float, float]] = []
     found = set()
     for line in mesh.split(b"\n"):
@@ -172,7 +177,7 @@ def _texture_triangles(mesh: bytes) -> set[tuple[float, float]]:
 
 
 def _normals(folder: Path, appearance: SkinAppearance) -> NormalMaps:
-    """Return normals in the texture's frame."""
+    """Return normals in the tangent space of the texture."""
     maps = appearance.maps
     if "normals_tangent" in maps:
         tangent = maps["normals_tangent"]
@@ -180,7 +185,7 @@ def _normals(folder: Path, appearance: SkinAppearance) -> NormalMaps:
     name = next((name for name in NORMAL_MAPS if name in maps), None)
     if name is None or "position" not in maps:
         raise WrinkleInputError(
-            f"{folder}: holds no normals with positions, expected a dome session reconstructed "
+            f"{folder}: normals with positions are missing, expected a dome session reconstructed "
             "with `skinrig reconstruct SESSION --maps normals_refined`"
         )
     normals, position = maps[name], maps["position"]
@@ -192,7 +197,7 @@ def _normals(folder: Path, appearance: SkinAppearance) -> NormalMaps:
 def _build_normal_maps(
     normals: Float32Array, stderr: Float32Array | None, valid: BoolArray
 ) -> NormalMaps:
-    """Return normals with the angle that their components' errors make."""
+    """Return normals with angular standard uncertainties from those of their components."""
     shape = valid.shape
     error = np.zeros(shape) if stderr is None else np.sqrt((stderr.astype(float) ** 2).sum(axis=2))
     return NormalMaps(
@@ -205,28 +210,31 @@ def _build_normal_maps(
 
 
 def _read_masks(paths: Sequence[Path]) -> Float32Array:
-    """Return zones from RGBA pictures, (Z, h, w)."""
+    """Read zones from RGBA images, (Z, h, w)."""
     import cv2
 
     planes: list[Float32Array] = []
     for path in paths:
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if picture is None:
-            raise WrinkleInputError(f"{path}: cannot be read as a picture")
+            raise WrinkleInputError(f"{path}: not readable as an image; check the file")
         if picture.ndim != 3 or picture.shape[2] != 4:
             raise WrinkleInputError(
-                f"{path}: got shape {picture.shape}, expected four channels: a zone in each of RGBA"
+                f"{path}: got shape {picture.shape}, expected four channels, one zone per channel"
+                f" of RGBA"
             )
         scale = float(np.iinfo(picture.dtype).max) if picture.dtype.kind == "u" else 1.0
         rgba = picture[..., [2, 1, 0, 3]].astype(np.float32) / scale
         planes += [rgba[..., k] for k in range(4)]
     if len({plane.shape for plane in planes}) > 1:
-        raise WrinkleInputError("masks: pictures of different sizes, expected one size")
+        raise WrinkleInputError(
+            "--mask: got images of different sizes, expected one size; resize them"
+        )
     return np.stack(planes)
 
 
 def summarize_expressions(found: FittedWrinkles) -> list[tuple[str, ...]]:
-    """Return expression and its zones' weights with standard errors, for people."""
+    """Return a row per expression: its weights by zone with standard uncertainties, as text."""
     return [
         (
             name,
@@ -239,6 +247,6 @@ def summarize_expressions(found: FittedWrinkles) -> list[tuple[str, ...]]:
     ]
 
 
-def zone_names(found: FittedWrinkles) -> Mapping[int, str]:
-    """Return the names of the zones by their number."""
+def list_zone_names(found: FittedWrinkles) -> Mapping[int, str]:
+    """Return the names of the zones, keyed by index."""
     return dict(enumerate(found.fit.layer.table.zones))  # type: ignore[union-attr]

@@ -1,1 +1,1 @@
-"""The least capture that reaches an error, and the error that a capture gives."""
+"""Minimal acquisition: the smallest capture plan per error goal, and error forecasts of plans."""

@@ -1,4 +1,4 @@
-"""A choice simulated, reconstructed and compared with its forecast."""
+"""Confirm a plan choice: simulate it, reconstruct it and compare the errors with the forecast."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -14,21 +14,21 @@ from skinrig.simulating.simulation import simulate_session
 def confirm_choice(
     choice: PlanChoice, out: Path, *, subject: str, seed: int, progress: Callable[[str], None]
 ) -> list[dict[str, Any]]:
-    """Simulate a choice, reconstruct it, and compare what came out with the forecast.
+    """Simulate and reconstruct a chosen plan; return measured errors next to the forecast.
 
     Parameters
     ----------
     choice
-        Of `skinrig.planning.plans.choose`.
+        Result of `skinrig.planning.plans.choose`.
     out
-        Folder for sessions, calibration, maps.
+        Folder of sessions, calibration and maps.
     subject, seed
-        The simulated face.
+        Preset and seed of the simulated subject.
     progress
-        Called with a line per step.
+        Called with one line per step.
     """
     rig = load_planner(choice.rig.name)
-    steps = rig.rehearsal(choice)
+    steps = rig.describe_rehearsal(choice)
     calibrate_simulated(
         choice.rig.name, out, steps.targets, steps.calibrations, seed=seed, progress=progress
     )
@@ -70,22 +70,22 @@ def calibrate_simulated(
     seed: int,
     progress: Callable[[str], None] | None = None,
 ) -> None:
-    """Simulate targets and calibrate a rig by them into a folder's `calibration`.
+    """Simulate calibration targets and calibrate a rig from them into `folder/calibration`.
 
     Parameters
     ----------
     rig
-        Its name.
+        Name of the rig.
     folder
-        For sessions and the calibration.
+        Folder of the sessions and the calibration.
     targets
         Options of each target's session.
     kinds
-        Of calibration, each with the targets that it is made from.
+        Kinds of calibration, each with the targets that it is made from.
     seed
-        Of the sessions.
+        Random seed of the sessions.
     progress
-        Called with a line per target.
+        Called with one line per target.
     """
     for target, options in targets.items():
         if progress is not None:

@@ -1,8 +1,8 @@
 """Plan the light dome: choose the lights and cameras that a subject needs.
 
-The forecast simulates a face: visibility of its points for each light and camera, reflected light
-and sensor noise. Errors that no sample removes are those that the reconstruction states: samples
-misplaced by part of a pixel, and relief too fine for it.
+The forecast simulates a face: visibility of its points from each light and camera, reflected light
+and sensor noise. Two errors do not decrease with more samples: registration errors below a pixel,
+and surface topography finer than a pixel.
 """
 
 import math
@@ -28,23 +28,29 @@ from skinrig.planning.plans import PlanChoice, PlanRequest
 FORECAST_RELATIVE_SD = {"normals": 0.2, "r_d": 0.2}
 """Relative deviation of measured from predicted medians, see docs/validation/forecasts.md."""
 SHARED_R_D_ERROR = 0.0095
-"""Relative error of R_d that a face's points share or that follows nothing known, whatever the
-lights. With `SPECULAR_R_D_ERROR` set on faces of seeds 1 to 3, types V, I and IV."""
+"""Relative error of R_d that is independent of the number of lights.
+
+Fitted together with `SPECULAR_R_D_ERROR` to simulated faces of seeds 1 to 3, types V, I and IV.
+"""
 SPECULAR_R_D_ERROR = 0.0022
-"""What gloss outside the part that is left out adds to R_d by one light: the same on all skin, so
-much on dark skin. Lights' errors of R_d by it are as far from each other as their `LIGHT_ERROR`."""
+"""Absolute standard deviation of R_d per light by specular reflection outside the omitted lobe.
+
+It is the same for all skin, thus relatively larger on dark skin. It averages over lights as
+`LIGHT_ERROR` does.
+"""
 
 
 def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
-    """Choose the fewest lights, then the fewest cameras, that reach what is wanted.
+    """Choose the fewest lights, then the fewest cameras, that reach the goals.
 
     Parameters
     ----------
     rig
         A dome.
-    asked
-        Wants by name: "normals" in degrees, "r_d" in percent, both medians over the face; empty:
-        the forecast of the whole dome. The share is of the points that the whole dome estimates.
+    request
+        Goals by name: "normals" in degrees, "r_d" in percent, both medians over the face; empty:
+        forecast of the whole dome. The valid fraction refers to the points that the whole dome
+        estimates.
     """
     least = surface_estimates.MIN_LIGHTS
     if len(rig.lights) < least or len(rig.views) < surface_estimates.MIN_VIEWS:
@@ -56,15 +62,15 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
     every_view, every_light = list(range(len(rig.views))), list(range(len(rig.lights)))
     information = observation.information(every_view)
     best = light_selection.predict_errors(information, every_light, min_lights=least)
-    if not request.wants:
+    if not request.goals:
         return _choice(rig, observation, (every_light, every_view), best, request)
-    share = request.valid_share * best.valid_fraction
+    share = request.min_valid_fraction * best.valid_fraction
     selected = light_selection.select_lights(
         information,
         median_rad=_target_rad(request),
         valid_fraction=share,
         min_lights=least,
-        max_lights=request.most_lights,
+        max_lights=request.max_lights,
     )
     lights, prediction = list(selected.lights), selected.prediction
     while not _is_r_d_reached(prediction, observation, request) and len(lights) < len(rig.lights):
@@ -77,7 +83,7 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
             fixed=tuple(lights),
         )
         lights, prediction = list(selected.lights), selected.prediction
-        if request.most_lights is not None and len(lights) >= request.most_lights:
+        if request.max_lights is not None and len(lights) >= request.max_lights:
             break
     views, prediction = _remove_views(observation, lights, prediction, request, share)
     reasons = _explain_shortfall(best, observation, request)
@@ -90,7 +96,7 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
 
 
 def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
-    """Return what a plan of the dome will give by its lights and cameras."""
+    """Forecast the errors of a plan from its lights and cameras."""
     olat = [step for step in plan.steps if step.kind == "olat"]
     lit = {name for step in olat for name in step_lights(step)}
     seen = {name for step in olat for name in step.cameras}
@@ -109,8 +115,8 @@ def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
     return _choice(rig, observation, (lights, views), prediction, request, plan=plan)
 
 
-def rehearsal(choice: PlanChoice) -> plans.Rehearsal:
-    """Return the dome's targets, under the lights and cameras of a choice."""
+def describe_rehearsal(choice: PlanChoice) -> plans.Rehearsal:
+    """Return the targets and calibrations that confirm a choice, with its lights and cameras."""
     width = {"width_px": choice.rig.views[0].width_px}
     return plans.Rehearsal(
         dict.fromkeys(("charuco", "mirror", "white"), width | {"plan": choice.plan}),
@@ -123,7 +129,7 @@ def rehearsal(choice: PlanChoice) -> plans.Rehearsal:
 def measure_errors(
     choice: PlanChoice, appearance: SkinAppearance, truth: SkinAppearance, _: int
 ) -> dict[str, tuple[float, float]]:
-    """Return median error and valid share of normals and R_d over the face."""
+    """Return median error and valid fraction of normals (deg) and R_d (%) over the face."""
     pairs = surface_evaluation.match_texels(appearance, truth)
     found = {}
     for one in choice.forecasts:
@@ -141,7 +147,7 @@ def _choice(
     *,
     plan: Plan | None = None,
 ) -> PlanChoice:
-    """Return the choice of some lights and cameras, by their numbers."""
+    """Build the choice of a subset of lights and cameras, given by index."""
     lights, views = selection
     small = rig.subset(
         lights=[rig.lights[k].name for k in lights], views=[rig.views[k].name for k in views]
@@ -170,7 +176,7 @@ def _choice(
 
 
 def _target_rad(request: PlanRequest) -> float:
-    return math.radians(request.wants.get("normals", 90.0))
+    return math.radians(request.goals.get("normals", 90.0))
 
 
 def _r_d_error(prediction: ErrorPrediction, observation: DomeObservation) -> float:
@@ -189,7 +195,7 @@ def _r_d_error(prediction: ErrorPrediction, observation: DomeObservation) -> flo
 
 
 def _median_magnitude(offset: Float64Array, sigma: Float64Array) -> float:
-    """Return the median of |error| of a mixture of Gaussian errors about offsets."""
+    """Return the median of |error| for a mixture of normal errors with the given means."""
     from scipy.special import ndtr
 
     low, high = 0.0, float(np.max(np.abs(offset) + 2.0 * sigma))
@@ -203,7 +209,7 @@ def _median_magnitude(offset: Float64Array, sigma: Float64Array) -> float:
 def _is_r_d_reached(
     prediction: ErrorPrediction, observation: DomeObservation, request: PlanRequest
 ) -> bool:
-    most = request.wants.get("r_d")
+    most = request.goals.get("r_d")
     return most is None or 100.0 * _r_d_error(prediction, observation) <= most
 
 
@@ -214,7 +220,7 @@ def _remove_views(
     request: PlanRequest,
     valid_share: float,
 ) -> tuple[list[int], ErrorPrediction]:
-    """Take off cameras, the one that is missed least first, while what is wanted is reached."""
+    """Remove cameras greedily, the least informative first, while the goals are reached."""
     views = list(range(observation.variance.shape[2]))
     least = surface_estimates.MIN_LIGHTS
     target = _target_rad(request)
@@ -244,19 +250,20 @@ def _explain_shortfall(
     best: ErrorPrediction, observation: DomeObservation, request: PlanRequest
 ) -> tuple[str, ...]:
     """Return the reasons why no number of lights reaches the goals; empty if one does."""
-    out, wants = [], request.wants
+    out, wants = [], request.goals
     normals = math.degrees(best.median_rad)
     if normals > wants.get("normals", math.inf):
         floor = math.degrees(light_selection.rayleigh_mixture_median(observation.systematic_rad))
         out.append(
             f"normals: all lights and cameras leave {normals:.2f}°, {floor:.2f}° of it by "
-            f"misplaced samples and fine relief at {observation.pixel_mm:.2g} mm per pixel; "
+            f"registration errors and fine topography at {observation.pixel_mm:.2g} mm per pixel; "
             "use more pixels, not more lights"
         )
     r_d = 100.0 * _r_d_error(best, observation)
     if r_d > wants.get("r_d", math.inf):
         out.append(
-            f"r_d: all lights and cameras leave {r_d:.2g} %, in part by albedo finer than a "
+            f"r_d: all lights and cameras leave {r_d:.2g} %, in part because albedo varies within"
+            f" a "
             f"pixel of {observation.pixel_mm:.2g} mm; use more pixels"
         )
     return tuple(out)

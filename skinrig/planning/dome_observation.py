@@ -24,40 +24,42 @@ from rigsim.sensor import make_sensor
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 
 FACE_POINTS = 1500
-"""Points of the face that are looked at."""
+"""Number of sampled points of the face."""
 LIGHT_ERROR = 0.015
-"""Relative error that all cameras share of what one light shows: gloss outside the part that is
-left out, a light's intensity, a shadow's edge."""
+"""Relative error per light that all cameras share: residual specular reflection, intensity of the
+light, penumbra."""
 BLUR_PX = 1.0
-"""Standard deviation, in each direction, of what an estimate of the albedo averages over, px:
-pixels and their interpolation, obliqueness, misplaced samples. R_d of simulated faces of
-seeds 1 to 3 (types V, I and IV) came nearest to the truth blurred by 0.9 to 1.05 of it."""
+"""Standard deviation of the Gaussian blur of an albedo estimate, px, per direction.
+
+It models pixel size, interpolation, oblique view and registration errors. R_d of simulated faces of
+seeds 1 to 3 (types V, I and IV) was nearest to ground truth blurred by 0.9 to 1.05 of it.
+"""
 TEXTURE_TEXELS = 512
-"""Along one side of the face's maps: albedo finer than pixels must be in them."""
+"""Side of the face's maps, texels; they must resolve albedo finer than the camera's pixels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DomeObservation:
-    """What the dome's lights and cameras reach of a face."""
+    """Visibility and noise of P face points for L lights and V cameras."""
 
     normals: Float64Array
-    """(P, 3)."""
+    """(P, 3) unit normals."""
     to_light: Float64Array
-    """(P, L, 3)."""
+    """(P, L, 3) unit vectors to the lights."""
     variance: Float64Array
-    """(P, L, V): variance of a sample over its square; infinite where it has no information."""
+    """(P, L, V) relative variance of a sample; infinite where it has no information."""
     lit: BoolArray
     """(P, L): the point is visible from the light."""
     seen: BoolArray
     """(P, V): the point is visible from the camera."""
     area_mm2: Float64Array
-    """(P,)."""
+    """(P,) surface area that a point represents."""
     systematic_rad: Float64Array
-    """(P,)."""
+    """(P,) error of the normal that does not decrease with more samples."""
     unresolved: Float64Array
-    """(P, 3): what the albedo of camera RGB is off where it is averaged over pixels, relative."""
+    """(P, 3) relative error of the albedo, camera RGB, by averaging over pixels."""
     r_d: Float64Array
-    """(P, 3): that albedo."""
+    """(P, 3) albedo, camera RGB."""
     pixel_mm: float
 
     def information(self, views: Sequence[int]) -> FisherInformation:
@@ -80,18 +82,18 @@ class DomeObservation:
 def simulate_observation(
     rig: Rig, subject: str, *, seed: int = 0, points: int | None = None
 ) -> DomeObservation:
-    """Look at a simulated face from the dome.
+    """Simulate which points of a face the dome observes, and with which noise.
 
     Parameters
     ----------
     rig
-        The dome as drawn.
+        The dome with nominal geometry.
     subject
         Preset of the face, see `rigsim.subject.PRESET_NAMES`.
     seed
-        Of the face and of the points.
+        Random seed of the face and of the points.
     points
-        How many to look at; `FACE_POINTS` by default.
+        Number of points; None: `FACE_POINTS`.
     """
     points = FACE_POINTS if points is None else points
     face = subject_file.load_subject(subject).face(seed=seed, size=TEXTURE_TEXELS)
@@ -154,7 +156,7 @@ def simulate_observation(
 def _trace_to_positions(
     caster: Any, start: Float64Array, normal: Float64Array, positions_mm: Float64Array
 ) -> tuple[Float64Array, Float64Array, BoolArray]:
-    """Return unit vectors, distances and free sight from points to places."""
+    """Return unit vectors, distances (mm) and unobstructed visibility from points to positions."""
     away = positions_mm[None] - start[:, None]
     length = np.linalg.norm(away, axis=-1)
     way = away / length[..., None]
@@ -168,7 +170,7 @@ def _trace_to_positions(
 
 
 def _relative_variance(rate: Float64Array, full_well_e: float, read_noise_e: float) -> Float64Array:
-    """Return the variance of merged brackets over the square of the light."""
+    """Return the relative variance of a merged exposure series."""
     information = np.zeros(rate.shape)
     # brackets are merged by inverse variance, so that the information of the unsaturated ones adds:
     # (N / sigma)^2 with N electrons and sigma^2 = N (shot noise) + read noise^2
@@ -181,7 +183,7 @@ def _relative_variance(rate: Float64Array, full_well_e: float, read_noise_e: flo
 
 
 def _gaussian_mean(r_d: FloatArray, atlas: Any, sigma_mm: float) -> Float64Array:
-    """Return the mean of an albedo about each texel, Gaussian over the surface, (N * N, 3)."""
+    """Blur an albedo map by a Gaussian over the surface; (N * N, 3)."""
     covered = atlas.covered[..., None]
     field = np.where(covered, r_d, 0.0).astype(np.float32)
     spread = scatter_laterally(field, atlas, [sigma_mm], np.ones((field.shape[-1], 1)))
@@ -189,7 +191,7 @@ def _gaussian_mean(r_d: FloatArray, atlas: Any, sigma_mm: float) -> Float64Array
 
 
 def _normal_bend_rate(face: Any, texels: NDArray[np.intp], pixel_mm: float) -> Float64Array:
-    """Return how fast the face's normals turn at texels, rad/mm, over edges as in the scan."""
+    """Return the curvature of the face at texels, rad/mm, over edges of the scan's length."""
     mesh = face.mesh
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])
     turn = np.linalg.norm(mesh.normals[edges[:, 0]] - mesh.normals[edges[:, 1]], axis=1)

@@ -1,8 +1,8 @@
 """Plan the flash rig: choose the frames, flash power and dark frames that a face needs.
 
-The forecast is the Cramer-Rao bound of both chromophores at every pixel of a simulated face: the
-sensor's noise at the light that comes back, the model error and the prior of the light, as in the
-report. The settings change only the part of the error that is noise.
+The forecast is the Cramér-Rao bound of both chromophores at every pixel of a simulated face. It
+contains the sensor noise at the reflected light, the model error and the prior of illumination, as
+in the report. The settings change only the noise.
 """
 
 from collections.abc import Iterator, Mapping
@@ -29,27 +29,29 @@ from skinrig.planning.flash_observation import (
 from skinrig.planning.plans import PlanChoice, PlanRequest
 
 REPEAT_CHOICES = (1, 2, 4, 8, 16)
-"""Crossed frames of a state that are averaged: 16 of them take a minute and a half."""
+"""Numbers of averaged crossed-polarized frames per expression; 16 take about 90 s."""
 DARK_CHOICES = (0, 1, 4)
 POWER_CHOICES = (0.03125, 0.0625, 0.125, 0.25, 0.5, 1.0)
-"""Of the flashes' full energy; less is kinder to eyes and costs no time."""
+"""Fractions of the flashes' full energy; less reduces glare and takes the same time."""
 FORECAST_RELATIVE_SD: Mapping[str, float] = {"melanin": 0.2, "hemoglobin": 0.15}
 """Relative deviation of measured from predicted medians, see docs/validation/forecasts.md."""
 ERROR_OVER_BOUND: Mapping[str, float] = {"melanin": 1.1, "hemoglobin": 1.0}
-"""Errors over their bounds, medians of sessions. Melanin's exceed it for three
-reasons: the light's prior has less information for most pixels than its mean (2 to 10 %), the model
-error of a face differs from that of faces in general (up to 10 %), and color is nonlinear over
-errors of its size."""
+"""Ratio of measured error to its bound, median of sessions.
+
+Melanin exceeds its bound for three reasons. The prior of illumination is less informative for most
+pixels than its mean (2 to 10 %). The model error of one face differs from the population's (up to
+10 %). Color is nonlinear over errors of this size.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlashPrediction:
-    """Relative errors of the face's pixels, standard deviations, by chromophore."""
+    """Predicted relative standard deviations per pixel, keyed by chromophore."""
 
     sigma: Mapping[str, Float64Array]
     """(H, W)."""
     valid: Mapping[str, BoolArray]
-    """(H, W) where the estimate would not be masked."""
+    """(H, W) pixels whose estimate would not be masked."""
     skin: BoolArray
 
     def median(self, name: str) -> float:
@@ -57,25 +59,25 @@ class FlashPrediction:
         return plans.median_magnitude(self.sigma[name][self.valid[name]])
 
     def valid_share(self, name: str) -> float:
-        """Return the share of the skin that keeps an estimate."""
+        """Return the fraction of the skin with an unmasked estimate."""
         return float(self.valid[name].sum() / max(self.skin.sum(), 1))
 
 
 def predict(
     observation: FlashObservation, *, repeats: int, power: float, darks: int
 ) -> FlashPrediction:
-    """Return the errors that crossed frames of a face leave.
+    """Predict the errors of chromophores from crossed-polarized frames.
 
     Parameters
     ----------
     observation
         See `simulate_observation`.
     repeats
-        Crossed frames that are averaged.
+        Number of averaged crossed-polarized frames.
     power
-        Of the flashes, 0 to 1.
+        Flash energy, fraction of full, 0 to 1.
     darks
-        Frames without light; 0: the black level of the camera is taken at its word.
+        Number of dark frames; 0: the camera's nominal black level is used.
     """
     frame = observation.gain * power * np.maximum(observation.light, 0.0) + observation.floor
     dark = observation.floor / darks if darks else 0.0
@@ -103,20 +105,20 @@ def predict(
 
 
 def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
-    """Choose the quickest plan, and of those the one with the least light, for a face.
+    """Choose the shortest plan that reaches the goals; of equal ones, that with the least light.
 
     Parameters
     ----------
     rig
         The flash rig.
-    asked
-        Wants by name: "melanin" and "hemoglobin", medians of the relative error over the face,
-        percent; empty: the forecast of the rig's own plan. The share is of the skin that most light
-        and most frames give an estimate.
+    request
+        Goals by name: "melanin" and "hemoglobin", medians of the relative error over the face,
+        percent; empty: forecast of the rig's own plan. The valid fraction refers to the skin that
+        full power and the most frames estimate.
     """
     observation = simulate_observation(rig, request.subject, seed=request.seed)
     best = predict(observation, repeats=REPEAT_CHOICES[-1], power=1.0, darks=DARK_CHOICES[-1])
-    if not request.wants:
+    if not request.goals:
         whole = {"repeats": 1, "power": 1.0, "darks": 4, "parallel": True}
         return _choice(rig, observation, flash_plan(rig), whole, request)
     path = []
@@ -128,27 +130,29 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
                 | {f"{name}_percent": 100.0 * found.median(name) for name in CHROMOPHORE_NAMES}
             )
         if _is_reached(found, best, request):
-            plan = crossed_plan(rig, **settings)
+            plan = build_crossed_plan(rig, **settings)
             return _choice(rig, observation, plan, settings, request, path=tuple(path))
     least = next(one for one in _candidates(rig) if one["power"] == 1.0)
     reasons = _explain_shortfall(best, observation, request)
     # an unreachable goal does not justify sixteen frames: keep the fewest within 5 % of the best
-    estimable = [name for name in request.wants if np.isfinite(best.median(name))]
+    estimable = [name for name in request.goals if np.isfinite(best.median(name))]
     for settings in _candidates(rig) if estimable else ():  # else fewer frames are as good
         now = predict(observation, **settings)
         if all(now.median(name) <= 1.05 * best.median(name) for name in estimable):
             least = settings
             break
-    plan = crossed_plan(rig, **least)
+    plan = build_crossed_plan(rig, **least)
     return _choice(rig, observation, plan, least, request, path=tuple(path), reasons=reasons)
 
 
 def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
-    """Return what a plan of the flash rig with crossed frames will give, in its first state."""
+    """Forecast the errors of a plan with crossed-polarized frames, for its first expression."""
     shots = [step for step in plan.steps if step.kind == "subject"]
     crossed = [step for step in shots if step.index.get("polarizer") == "crossed"]
     if not crossed:
-        raise plans.PlanningError("plan: got no crossed frame of a subject, expected at least one")
+        raise plans.PlanningError(
+            "plan: got no crossed-polarized frame of a subject, expected at least one; add one"
+        )
     own = [step for step in crossed if step.index.get("state") == crossed[0].index.get("state")]
     powers = [float(step.settings.get("power", 1.0)) for step in own]
     settings = {
@@ -161,8 +165,8 @@ def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
     return _choice(rig, observation, plan, settings, request)
 
 
-def rehearsal(choice: PlanChoice) -> plans.Rehearsal:
-    """Return the flash rig's targets, at the forecast's pixels."""
+def describe_rehearsal(choice: PlanChoice) -> plans.Rehearsal:
+    """Return the targets and calibrations that confirm a choice, at the forecast's image width."""
     width = {"width_px": min(choice.rig.views[0].width_px, CONFIRM_PX)}
     target_of = {"sensor": "flat", "white": "white", "polarization": "malus"}
     calibrations = tuple((kind, (target,)) for kind, target in target_of.items())
@@ -173,7 +177,7 @@ def rehearsal(choice: PlanChoice) -> plans.Rehearsal:
 def measure_errors(
     _: PlanChoice, appearance: SkinAppearance, truth: SkinAppearance, seed: int
 ) -> dict[str, tuple[float, float]]:
-    """Return median error, percent, and valid share of the chromophores over the face."""
+    """Return median error, percent, and valid fraction of the chromophores over the face."""
     rows = flash.compare(appearance, truth, rng=np.random.default_rng(seed))
     return {
         row.name: (100.0 * row.median_relative, 1.0 - row.masked)
@@ -182,14 +186,14 @@ def measure_errors(
     }
 
 
-def crossed_plan(rig: Rig, *, repeats: int, power: float, darks: int) -> Plan:
-    """Return a plan of crossed frames alone.
+def build_crossed_plan(rig: Rig, *, repeats: int, power: float, darks: int) -> Plan:
+    """Return a plan of crossed-polarized frames and dark frames only.
 
     Examples
     --------
     >>> from capture.rig import load_rig
     >>> rig = load_rig("flash")
-    >>> plan = crossed_plan(rig, repeats=2, power=0.5, darks=0)
+    >>> plan = build_crossed_plan(rig, repeats=2, power=0.5, darks=0)
     >>> [step.index["polarizer"] for step in plan.steps], round(plan.estimate_duration_s(rig), 1)
     (['crossed', 'crossed'], 11.4)
     """
@@ -199,7 +203,7 @@ def crossed_plan(rig: Rig, *, repeats: int, power: float, darks: int) -> Plan:
 
 
 def _candidates(rig: Rig) -> Iterator[dict[str, Any]]:
-    """Yield settings, the quickest first, of those the darkest."""
+    """Yield settings by increasing duration, then by increasing power."""
     every: list[dict[str, Any]] = [
         {"repeats": repeats, "power": power, "darks": darks}
         for repeats in REPEAT_CHOICES
@@ -209,7 +213,7 @@ def _candidates(rig: Rig) -> Iterator[dict[str, Any]]:
     yield from sorted(
         every,
         key=lambda one: (
-            crossed_plan(rig, **one | {"power": 1.0}).estimate_duration_s(rig),
+            build_crossed_plan(rig, **one | {"power": 1.0}).estimate_duration_s(rig),
             one["power"],
         ),
     )
@@ -218,8 +222,8 @@ def _candidates(rig: Rig) -> Iterator[dict[str, Any]]:
 def _is_reached(found: FlashPrediction, best: FlashPrediction, request: PlanRequest) -> bool:
     return all(
         100.0 * found.median(name) <= value
-        and found.valid_share(name) >= request.valid_share * best.valid_share(name)
-        for name, value in request.wants.items()
+        and found.valid_share(name) >= request.min_valid_fraction * best.valid_share(name)
+        for name, value in request.goals.items()
     )
 
 
@@ -274,7 +278,7 @@ def _explain_shortfall(
 ) -> tuple[str, ...]:
     """Return the reasons why no number of frames reaches the goals."""
     out = []
-    for name, value in request.wants.items():
+    for name, value in request.goals.items():
         now = 100.0 * best.median(name)
         if now <= value:
             continue
@@ -287,7 +291,7 @@ def _explain_shortfall(
         )
         out.append(
             f"{name}: {REPEAT_CHOICES[-1]} frames at full power leave {now:.3g} %, of which the "
-            f"model error alone, without any noise, leaves {model:.3g} %; {why}"
+            f"model error alone, without noise, leaves {model:.3g} %; {why}"
         )
     if not out and not _is_reached(best, best, request):
         out.append("valid_share: too few valid skin pixels; lower --min-valid-fraction")

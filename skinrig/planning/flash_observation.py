@@ -18,56 +18,58 @@ from skinrig.simulating.flash_truth import to_superpixels
 
 CHROMOPHORE_NAMES = ("melanin", "hemoglobin")
 TEXTURE_TEXELS = 512
-"""Side of the face's texture: finer than what the forecast's pixels show."""
+"""Side of the face's texture, texels; finer than the forecast's pixels."""
 WIDTH_PX = 256
 """Pixels across the face that the forecast looks at, each as noisy as one of the whole camera."""
 CONFIRM_PX = 640
 """Pixels across that are simulated: coarser ones mix the colors of different skin."""
 MIXING_POWER = 2.4
-"""The model error's variance grows so with the size of pixels wider than these, which mix the
-colors of different skin: at 320 across its share of the errors of three faces was 2 to 2.8 times
-that at 640."""
+"""Exponent of the model error's variance over pixel size, for pixels wider than `CONFIRM_PX` gives.
+
+Large pixels mix different skin colors: at 320 px width, the model error of three faces contributed
+2 to 2.8 times as much as at 640 px.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlashObservation:
-    """What the crossed camera sees of a face at full power, by superpixels."""
+    """A face under full flash power as the cross-polarized camera records it, per superpixel."""
 
     melanin: Float64Array
-    """(H, W) volume fraction, as the light's spreading leaves it to be seen."""
+    """(H, W) melanosome volume fraction, blurred by lateral scattering."""
     hemoglobin: Float64Array
-    """(H, W)."""
+    """(H, W) blood volume fraction, blurred by lateral scattering."""
     light: Float64Array
-    """(H, W, 3) fraction of full scale."""
+    """(H, W, 3) signal, fraction of full scale."""
     skin: BoolArray
     """(H, W)."""
     gain: float
-    """Variance of a pixel of full scale by its photons."""
+    """Shot noise variance of a pixel at full scale."""
     floor: float
     """Variance of a pixel without light."""
     shares: Float64Array
-    """(3,) variance of a superpixel's channels over that of a sensor's pixel."""
+    """(3,) ratio of a superpixel's variance to a sensor pixel's, per channel."""
     table: Any
     """Color table of the camera and the light."""
     light_spread: float
-    """Standard error of log light that the prior of faces alone would leave."""
+    """Standard deviation of log illumination under the prior alone."""
     mixing: float = 1.0
-    """Variance of the model error over that of pictures `CONFIRM_PX` across."""
+    """Ratio of the model error's variance to that at `CONFIRM_PX` image width."""
 
 
 def simulate_observation(
     rig: Rig, subject: str, *, seed: int = 0, width_px: int = WIDTH_PX
 ) -> FlashObservation:
-    """Look at a simulated face through the crossed polarizers.
+    """Simulate the signal and the noise of a face through crossed polarizers.
 
     Parameters
     ----------
     rig
         The flash rig.
     subject, seed
-        The face, see `rigsim.subject.PRESETS`.
+        Preset and seed of the face, see `rigsim.subject.PRESETS`.
     width_px
-        Pixels across; fewer see the same face with the same noise a pixel.
+        Image width, px; fewer pixels show the same face with the same noise per pixel.
     """
     small = rig.resized(width_px) if width_px < rig.views[0].width_px else rig
     view = small.views[0]
@@ -107,10 +109,10 @@ def simulate_observation(
 
 
 def log_light_information() -> float:
-    """Return the standard deviation of the log of a pixel's light by the prior's information.
+    """Return the standard deviation of log illumination from the prior's Fisher information.
 
-    It is below that of the prior itself: the prior has a steep edge, as hardly any skin gets more
-    light than a white reference in its place.
+    It is below that of the prior itself. The prior has a steep edge, as hardly any skin receives
+    more light than a white reference at the same position.
     """
     prior = shading_prior.face_prior()
     # Fisher information of a shift of the density p(x): I = integral of p'(x)^2 / p(x) dx
@@ -119,7 +121,7 @@ def log_light_information() -> float:
 
 
 def _superpixel_variance_ratio(pattern: str) -> Float64Array:
-    """Return the variance of superpixels over that of the sensor's pixels, by channel, (3,)."""
+    """Return the ratio of a superpixel's variance to a sensor pixel's, by channel, (3,)."""
     frame = raw.RawFrame(
         cfa=np.full((8, 8), 500, np.uint16), pattern=pattern, black=(0.0,) * 4, white=1000
     )

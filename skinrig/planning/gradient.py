@@ -1,8 +1,8 @@
 """Plan the gradient sphere: choose the patterns and exposures that skin normals need.
 
-The forecast propagates the sensor's noise through the reconstruction itself, on the pictures of a
-small patch of simulated skin: moments, Wiener filter and lookup state a standard error for each
-pixel. The excess error of measured patches is added. The relief lost by the lens is reported
+The forecast propagates the sensor's noise through the reconstruction itself, on images of a small
+patch of simulated skin: moments, Wiener filter and lookup yield a standard uncertainty per pixel.
+The excess error of measured patches is added. The topography lost by the lens is reported
 separately.
 """
 
@@ -38,51 +38,53 @@ PATTERN_SETS: tuple[tuple[str, ...], ...] = (
     ("full", "x", "y", "z", "-x", "-y", "-z"),
     tuple(LIGHT_PATTERNS),
 )
-"""Patterns that determine total light and three gradients: one complement instead of full, which
-lowers the noise more; all complements; and dark."""
+"""Sets of patterns that determine total light and three gradients, from four to all.
+
+In the first set, one complement replaces the full pattern, which reduces the noise more.
+"""
 EXPOSURE_CHOICES = (0.125, 0.25, 0.5, 1.0, 1.5, 2.0)
-"""Of the rig's own exposure."""
+"""Multiples of the rig's nominal exposure time."""
 MAX_SIGNAL_FRACTION = 0.98
-"""Of full scale, in the brightest thousandth of the pixels."""
+"""Upper limit of the 99.9th percentile of pixels, fraction of full scale."""
 UNMODELED_TILT_RAD = math.radians(0.2)
-"""Error of each tilt that is in no standard error: shadows in furrows, a lobe unlike the one that
-is assumed; see docs/validation/forecasts.md."""
+"""Error of each tilt that the standard uncertainties omit: shadows in grooves and deviations from
+the assumed lobe; see docs/validation/forecasts.md."""
 FORECAST_RELATIVE_SD = {"normals": 0.2}
 """Relative deviation of measured from predicted medians, see docs/validation/forecasts.md."""
 WHOLE_READOUT_S = PATTERN_DWELL_S - PATTERN_EXPOSURE_S
-"""Between two exposures of patterns: read-out and settling of the LEDs."""
+"""Time between two exposures: read-out and settling of the LEDs."""
 
 
 @dataclass(frozen=True, slots=True)
 class GradientScanSettings:
-    """Settings of a plan that determine the normals of one strain step."""
+    """Settings of a plan that determine the errors of the normals of one strain step."""
 
     patterns: tuple[str, ...]
     exposure_s: float
     darks: int
-    """Frames without light, all in all."""
+    """Total number of dark frames."""
     level: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class GradientPrediction:
-    """Errors of a patch's normals."""
+    """Predicted errors of a patch's normals."""
 
     median_rad: float
     noise_rad: float
-    """Median of the errors that noise and lost detail make."""
+    """Median error by noise and unresolved detail."""
     valid_share: float
 
 
 def predict(observation: GradientObservation, setting: GradientScanSettings) -> GradientPrediction:
-    """Return the errors that a scan of one state leaves.
+    """Predict the errors of the normals of one strain step.
 
     Parameters
     ----------
     observation
         See `simulate_observation`.
     setting
-        Patterns, exposure and darks.
+        Patterns, exposure time, dark frames and LED level.
     """
     rng = np.random.default_rng([observation.seed, 23])
     gain, floor = observation.chip.noise_profile(setting.exposure_s)
@@ -110,29 +112,31 @@ def predict(observation: GradientObservation, setting: GradientScanSettings) -> 
 
 
 def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
-    """Choose the quickest scan of the neutral skin that reaches what is wanted.
+    """Choose the shortest scan of neutral skin that reaches the goal.
 
     Parameters
     ----------
     rig
         The gradient sphere.
-    asked
-        Wants by name: "normals" in degrees, the median over the patch as the lens shows it; empty:
-        the forecast of the rig's own plan. The share is of the patch.
+    request
+        Goal by name: "normals" in degrees, the median over the patch as imaged by the lens; empty:
+        forecast of the rig's own plan. The valid fraction refers to the patch.
     """
     observation = simulate_observation(rig, request.subject, seed=request.seed)
-    if not request.wants:
+    if not request.goals:
         plan = gradient_plan(rig)
         return _choice(rig, observation, plan, read_settings(plan), request)
     tried: list[tuple[GradientScanSettings, Plan, GradientPrediction]] = []
-    target = math.radians(request.wants.get("normals", 90.0))
-    for setting, plan in candidates(rig, observation):
+    target = math.radians(request.goals.get("normals", 90.0))
+    for setting, plan in generate_candidates(rig, observation):
         found = predict(observation, setting)
         tried.append((setting, plan, found))
-        if found.median_rad <= target and found.valid_share >= request.valid_share:
+        if found.median_rad <= target and found.valid_share >= request.min_valid_fraction:
             break
     if not tried:
-        raise plans.PlanningError("rig: got limits that no pattern keeps to")
+        raise plans.PlanningError(
+            "rig: got LED limits below those of every pattern; raise the limits in the rig's file"
+        )
     best = min((found for _, _, found in tried), key=lambda found: found.median_rad)
     path = tuple(
         {
@@ -149,7 +153,7 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
     reasons: tuple[str, ...] = ()
     if found.median_rad > target:
         reasons = (_explain_shortfall(best, observation),)
-        # the quickest of those that are nearly as good as it gets
+        # the shortest of those within 5 % of the smallest error
         setting, plan, found = next(
             one for one in tried if one[2].median_rad <= 1.05 * best.median_rad
         )
@@ -159,13 +163,13 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
 
 
 def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
-    """Return what a plan of the gradient sphere will give, in its neutral state."""
+    """Forecast the errors of a plan of the gradient sphere, for its neutral strain step."""
     observation = simulate_observation(rig, request.subject, seed=request.seed)
     return _choice(rig, observation, plan, read_settings(plan), request)
 
 
-def rehearsal(choice: PlanChoice) -> plans.Rehearsal:
-    """Return the gradient sphere's targets, skin and flat field on few pixels."""
+def describe_rehearsal(choice: PlanChoice) -> plans.Rehearsal:
+    """Return the targets and calibrations that confirm a choice, of cropped images."""
     width = {"width_px": min(choice.rig.views[0].width_px, 128)}
     of_ball = tuple((kind, ("ball",)) for kind in ("lights", "polarization"))
     calibrations = (("sensor", ("flat",)), *of_ball)
@@ -175,7 +179,7 @@ def rehearsal(choice: PlanChoice) -> plans.Rehearsal:
 def measure_errors(
     choice: PlanChoice, appearance: SkinAppearance, truth: SkinAppearance, _: int
 ) -> dict[str, tuple[float, float]]:
-    """Return median error, degrees, and valid share of the neutral skin's normals."""
+    """Return median error, degrees, and valid fraction of the neutral skin's normals."""
     state = next(name for name in map(strain_state, choice.plan.steps) if name is not None)
     made = appearance.maps[f"normals_{state}"]
     known = np.asarray(truth.maps[f"normals_seen_{state}"].values, np.float64)
@@ -185,17 +189,17 @@ def measure_errors(
     return {"normals": (float(np.median(error[good])), float(good.mean()))}
 
 
-def candidates(
+def generate_candidates(
     rig: Rig, observation: GradientObservation | None = None
 ) -> Iterator[tuple[GradientScanSettings, Plan]]:
-    """Yield scans of the neutral skin that the rig's limits allow, the quickest first.
+    """Yield scans of neutral skin within the rig's limits, by increasing duration.
 
     Parameters
     ----------
     rig
         The gradient sphere.
     observation
-        Skin that must not be saturated; None: any.
+        Skin that must not saturate the sensor; None: exposures are not checked.
     """
     angle = _angles(rig)[0]
     rates = {} if observation is None else observation.rates
@@ -218,7 +222,7 @@ def candidates(
                         dwell_s=exposure_s + WHOLE_READOUT_S,
                     )
                 except PlanError:
-                    continue  # beyond what an LED may do
+                    continue  # beyond the LEDs' limits
                 setting = read_settings(plan)
                 found.append((plan.estimate_duration_s(rig), len(patterns), setting, plan))
     for _, _, setting, plan in sorted(found, key=lambda one: one[:2]):
@@ -236,7 +240,9 @@ def read_settings(plan: Plan) -> GradientScanSettings:
     shots = [step for step in plan.steps if step.kind == "gradient" and strain_state(step)]
     neutral = [step for step in shots if int(step.index.get("caliper", 1)) == 0]
     if not neutral:
-        raise plans.PlanningError("plan: got no neutral state of skin, expected one")
+        raise plans.PlanningError(
+            "plan: got no neutral strain step of skin, expected one; add caliper step 0"
+        )
     state = strain_state(neutral[0])
     own = [step for step in neutral if strain_state(step) == state]
     sets = [
@@ -263,7 +269,8 @@ def read_settings(plan: Plan) -> GradientScanSettings:
 def _angles(rig: Rig) -> Sequence[float]:
     if rig.caliper is None:
         raise plans.PlanningError(
-            f"rig: got {rig.name!r} without a caliper, expected one that holds skin"
+            f"rig: got {rig.name!r} without a caliper, expected one with a caliper; choose"
+            f" another rig file"
         )
     return rig.caliper.angles_deg
 
@@ -294,8 +301,8 @@ def _choice(
         (not setting.darks, "darks"),
     )
     reasons += (
-        "normals are those that the lens shows; the relief's own are "
-        f"{math.degrees(observation.lost_rad):.2g}° off them, which no pattern brings back",
+        "normals are evaluated as imaged by the lens; those of the topography differ by "
+        f"{math.degrees(observation.lost_rad):.2g}°, which no pattern recovers",
     )
     dwell_s = next(float(s.settings["dwell_s"]) for s in plan.steps if strain_state(s))
     knobs = {
@@ -317,11 +324,12 @@ def _explain_shortfall(best: GradientPrediction, observation: GradientObservatio
     floor = math.degrees(UNMODELED_TILT_RAD * math.sqrt(2.0 * math.log(2.0)))
     return (
         f"normals: the best scan leaves {math.degrees(best.median_rad):.2f}°; noise and "
-        f"lost detail {math.degrees(best.noise_rad):.2f}°, shadows and lobes unlike the assumed "
-        f"one {floor:.2f}°; "
+        f"unresolved detail {math.degrees(best.noise_rad):.2f}°, shadows and deviations from the"
+        f" lobe "
+        f"{floor:.2f}°; "
         + (
             "more patterns or light will not help"
             if best.noise_rad < math.radians(floor)
-            else "a longer exposure would saturate or ask too much of the LEDs"
+            else "a longer exposure would saturate or exceed the limits of the LEDs"
         )
     )

@@ -23,41 +23,41 @@ from skinrig.benchmarks.gradient_rig.gradient_normals import (
 Key = tuple[str, str]
 
 PATCH_PX = 96
-"""Side of the patch that the forecast looks at; a pixel is the rig's, 6 um."""
+"""Side of the simulated patch, pixels of the rig, 6 um each."""
 BORDER_PX = 6
-"""That is not judged: the lens brings in what is beyond it."""
+"""Margin that is not evaluated: the lens blurs light from outside the patch into it, px."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GradientObservation:
-    """What the sphere's camera sees of a patch of skin, and what the reconstruction must know."""
+    """A patch of skin as the sphere's camera records it, with the inputs of the reconstruction."""
 
     rates: Mapping[Key, Float32Array]
-    """By pattern and polarizer, (H, W), full scales per second at full level."""
+    """Signal rate by pattern and polarizer, (H, W), full scales per second at full level."""
     known: Mapping[str, Any]
-    """Lights, views and places, as `reconstruction.gradient_normals.from_patterns` takes them."""
+    """Lights, views and positions: arguments of `reconstruction.gradient_normals.from_patterns`."""
     chip: Any
     """The sensor, see `rigsim.sensor.Sensor`."""
     seen: Float64Array
-    """(H, W, 3) normals as the lens shows them."""
+    """(H, W, 3) normals as imaged by the lens."""
     lost_rad: float
-    """Median angle between the relief's normals before and behind the lens."""
+    """Median angle between the topography's normals before and after the lens's blur."""
     seed: int
 
 
 def simulate_observation(
     rig: Rig, subject: str, *, seed: int = 0, side_px: int = PATCH_PX
 ) -> GradientObservation:
-    """Look at a patch of simulated skin, neutral, under all patterns.
+    """Simulate images of a neutral patch of skin under all patterns.
 
     Parameters
     ----------
     rig
         The gradient sphere.
     subject, seed
-        Pigment and relief of the forehead.
+        Preset and seed of the forehead's pigment and topography.
     side_px
-        Pixels across.
+        Side of the patch, px.
     """
     small = rig.cropped(side_px) if side_px < rig.views[0].width_px else rig
     size_mm = max(1.2, 0.8 + max(small.views[0].field_mm))

@@ -24,123 +24,123 @@ from capture.rig import Rig, load_rig
 from skinrig.capturing.light_safety import light_figures
 from skinrig.capturing.plan_choice import read_plan
 from skinrig.console import select_attributes
-from skinrig.errors import UsageError, one_of
+from skinrig.errors import UsageError, require_choice
 from skinrig.unit_format import format_quantity
 
 SCHEMA = "skinrig.plan-choice/1"
 
-WANTED_UNITS: Mapping[str, Mapping[str, str]] = {
+GOAL_UNITS: Mapping[str, Mapping[str, str]] = {
     "dome": {"normals": "deg", "r_d": "%"},
     "flash": {"melanin": "%", "hemoglobin": "%"},
     "gradient": {"normals": "deg"},
     "probe": {"sigma_tr": "%"},
 }
-"""What can be wanted of each rig, and in which unit."""
+"""Quantities with error goals by rig, with their unit."""
 
 PERCENT_BY_SITE = "percent_by_site"
-"""Knob of the probe's choices: error of sigma_tr by site, red, green and blue, %."""
+"""Key of the probe's error of sigma_tr by site, red, green and blue, %."""
 
 OMISSIONS_TABLE = resources.files("skinrig").joinpath("data/left_out.toml")
 
-_WANTED_LIMIT = re.compile(r"\s*([a-z_]+)\s*<=\s*([0-9.eE+-]+)\s*(deg|%)?\s*")
+_GOAL_PATTERN = re.compile(r"\s*([a-z_]+)\s*<=\s*([0-9.eE+-]+)\s*(deg|%)?\s*")
 
 
 class PlanningError(ValueError):
-    """What is wanted is not known, or no plan can be made for it."""
+    """Unknown goals, or goals that no plan can be made for."""
 
 
 class PlanOptionsError(PlanningError, UsageError):
-    """What is wanted cannot be read, or options do not go together, or with the rig."""
+    """Malformed goals, or options that exclude each other or do not apply to the rig."""
 
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """The predicted error of one quantity."""
+    """Predicted median error of one quantity."""
 
     name: str
     unit: str
     value: float
-    """Predicted median error, in the unit; infinite where no estimate would be kept."""
+    """Predicted median error, in `unit`; infinite where every estimate would be masked."""
     interval: tuple[float, float]
-    """68 % interval of what a capture will show, from how far forecasts were off."""
+    """68 % interval of the measured error, from the deviations of earlier forecasts."""
     wanted: float | None
-    """What was asked for; None: nothing."""
+    """Goal, in `unit`; None: no goal."""
 
     @property
     def reached(self) -> bool:
-        """Whether the forecast keeps to what was asked for."""
+        """Whether the predicted error is within the goal."""
         return self.wanted is None or self.value <= self.wanted
 
     def document(self) -> dict[str, Any]:
-        """Return this as JSON values."""
+        """Return the forecast as JSON values."""
         named = {"name": self.name, "unit": self.unit, "median": self.value}
         return {**named, **select_attributes(self, "interval", "wanted", "reached")}
 
 
 @dataclass(frozen=True, slots=True)
 class PlanRequest:
-    """What a plan is chosen, or forecast, for."""
+    """Goals and subject of a plan."""
 
-    wants: Mapping[str, float] = field(default_factory=dict)
-    """Medians to reach, in the units of :data:`WANTED_UNITS`; empty: the rig's own plan."""
+    goals: Mapping[str, float] = field(default_factory=dict)
+    """Medians to reach, in the units of :data:`GOAL_UNITS`; empty: the rig's own plan."""
     subject: str = "III"
-    """Preset of the simulated face that is forecast."""
+    """Preset of the simulated subject of the forecast."""
     seed: int = 0
-    """Of that face."""
-    valid_share: float = 0.9
-    """Of what the whole rig gives an estimate, so much must keep one."""
-    most_lights: int | None = None
-    """Largest number of lights, of a dome."""
+    """Random seed of that subject."""
+    min_valid_fraction: float = 0.9
+    """Minimum fraction of the whole rig's valid estimates that stays valid."""
+    max_lights: int | None = None
+    """Maximum number of lights (dome)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """What is simulated, and how it is calibrated, to confirm a choice."""
+    """Simulated sessions and calibrations that confirm a choice."""
 
     targets: Mapping[str, Mapping[str, Any]]
     """Options of each calibration target's session."""
     calibrations: tuple[tuple[str, tuple[str, ...]], ...]
-    """Kind, and the targets that it is made from."""
+    """Kinds of calibration, each with the targets that it is made from."""
     want: tuple[str, ...]
     options: Mapping[str, Any] = field(default_factory=dict)
-    """Of the subject's session, besides the plan."""
+    """Options of the subject's session, in addition to the plan."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanChoice:
-    """A plan, why it is as it is, and what it will give."""
+    """A chosen plan with its forecast, omissions and reasons."""
 
     rig: Rig
-    """With the lights and views of the plan only."""
+    """The rig, reduced to the lights and views of the plan."""
     plan: Plan
     forecasts: tuple[Forecast, ...]
     full_seconds: float
-    """Of the rig's whole plan."""
+    """Duration of the whole rig's plan, s."""
     knobs: Mapping[str, Any]
-    """What was chosen: lights, views, repeats, ..."""
+    """Chosen settings by name: lights, views, repeats, ..."""
     left_out: tuple[tuple[str, str], ...]
-    """What the plan leaves out of the rig's whole plan, and why."""
+    """Parts of the whole rig's plan that are omitted, with reasons."""
     path: tuple[Mapping[str, float], ...] = ()
-    """What each step of the choice bought."""
+    """Settings and predicted errors of each step of the search."""
     reasons: tuple[str, ...] = ()
-    """Why what is wanted is not reached, or what the forecast rests on."""
+    """Why a goal is not reached, or assumptions of the forecast."""
     flashes: Mapping[str, Any] = field(default_factory=dict)
-    """Figures of flashes, where the rig has no LEDs."""
+    """Light figures of flashes, for rigs without LEDs."""
 
     @property
     def seconds(self) -> float:
-        """Time of the capture, as the box's times add up."""
+        """Duration of the capture, s, from the controller's times."""
         return self.plan.estimate_duration_s(self.rig)
 
     @property
     def light(self) -> Mapping[str, Any]:
-        """Flicker and dose, see `skinrig.capturing.light_safety.light_figures`, or flashes."""
+        """Flicker and dose, see `skinrig.capturing.light_safety.light_figures`, or `flashes`."""
         leds = self.rig.leds is not None or self.rig.probe is not None
         return light_figures(self.plan, self.rig) if leds else self.flashes
 
     @property
     def reached(self) -> bool:
-        """Whether every forecast keeps to what was asked for."""
+        """Whether every forecast is within its goal."""
         return all(one.reached for one in self.forecasts)
 
     def to_document(self) -> dict[str, Any]:
@@ -156,45 +156,45 @@ class PlanChoice:
         }
 
 
-def parse_wants(text: str, rig: str) -> dict[str, float]:
-    """Read what is wanted of a rig.
+def parse_goals(text: str, rig: str) -> dict[str, float]:
+    """Parse error goals of a rig.
 
     Parameters
     ----------
     text
-        Such as ``"normals<=1deg,r_d<=3%"``; empty: nothing, the forecast of the plan is asked for.
+        Goals such as ``"normals<=1deg,r_d<=3%"``; empty: no goal, only a forecast.
     rig
         Name of the rig.
 
     Returns
     -------
     dict
-        Error by name, in the unit of :data:`WANTED_UNITS`.
+        Maximum error by name, in the unit of :data:`GOAL_UNITS`.
 
     Raises
     ------
-    OptionsError
-        Naming the part that cannot be read, and what can be wanted.
+    PlanOptionsError
+        If a part is malformed; the message lists the goals of the rig.
     PlanningError
-        Naming what the rig does not give, or a number out of range.
+        If the rig does not estimate a quantity, or a number is out of range.
 
     Examples
     --------
-    >>> parse_wants("normals<=1deg, r_d <= 3%", "dome")
+    >>> parse_goals("normals<=1deg, r_d <= 3%", "dome")
     {'normals': 1.0, 'r_d': 3.0}
     """
-    units = WANTED_UNITS[one_of("rig", rig, WANTED_UNITS, PlanningError)]
+    units = GOAL_UNITS[require_choice("rig", rig, GOAL_UNITS, PlanningError)]
     known = ", ".join(f"{name}<=NUMBER{unit}" for name, unit in units.items())
     wants: dict[str, float] = {}
     for part in filter(str.strip, text.split(",")):
-        match = _WANTED_LIMIT.fullmatch(part)
+        match = _GOAL_PATTERN.fullmatch(part)
         if match is None:
             raise PlanOptionsError(f"--goals: got {part.strip()!r}, expected {known}")
         name, number, unit = match.groups()
         if name not in units:
             close = difflib.get_close_matches(name, units, 1)
             hint = f"; did you mean {close[0]}?" if close else ""
-            others = [other for other, gives in WANTED_UNITS.items() if name in gives]
+            others = [other for other, gives in GOAL_UNITS.items() if name in gives]
             if others:
                 hint = f"; {name} is planned for {', '.join(others)}"
             raise PlanningError(f"--goals: got {name!r} of rig {rig!r}, expected {known}{hint}")
@@ -217,28 +217,29 @@ def parse_wants(text: str, rig: str) -> dict[str, float]:
 def build_forecasts(
     medians: Mapping[str, float], relative_sd: Mapping[str, float], request: PlanRequest, rig: str
 ) -> tuple[Forecast, ...]:
-    """Return the forecasts of medians by name, each off by a relative spread."""
+    """Return forecasts of median errors, with intervals from their relative standard deviations."""
     return tuple(
         Forecast(
             name,
-            WANTED_UNITS[rig][name],
+            GOAL_UNITS[rig][name],
             value,
             forecast_interval(value, relative_sd[name]),
-            request.wants.get(name),
+            request.goals.get(name),
         )
         for name, value in medians.items()
     )
 
 
 def list_omissions(rig: str, *rows: tuple[Any, ...]) -> tuple[tuple[str, str], ...]:
-    """Return what a plan leaves out and why.
+    """List the parts that a plan omits, with reasons.
 
     Parameters
     ----------
     rig
-        Its name.
+        Name of the rig.
     rows
-        Whether it is left out, its name in `data/left_out.toml`, and what fills its braces.
+        Per part: whether it is omitted, its key in `data/left_out.toml`, and the values of that
+        text's placeholders.
     """
     table = tomllib.loads(OMISSIONS_TABLE.read_text(encoding="utf-8"))[rig]
     named = [(table[name], words) for left, name, *words in rows if left]
@@ -246,10 +247,10 @@ def list_omissions(rig: str, *rows: tuple[Any, ...]) -> tuple[tuple[str, str], .
 
 
 def explain_less_light(reasons: Sequence[str]) -> str:
-    """Return why less light will do, where there are reasons why the wish is out of reach."""
+    """Return why less light suffices; `reasons` are not empty if the goals are out of reach."""
     if reasons:
-        return "what is left errs by at most a twentieth more"
-    return "what is left reaches what is wanted"
+        return "the error increases by at most 5 %"
+    return "the goals are reached without it"
 
 
 def choose(
@@ -260,41 +261,43 @@ def choose(
     forecast: Path | None = None,
     **request: Any,
 ) -> PlanChoice:
-    """Choose the smallest plan of a rig that reaches what is wanted.
+    """Choose the smallest plan of a rig that reaches the goals, or forecast a given plan.
 
     Parameters
     ----------
     rig_name
-        Out of :data:`WANTED_UNITS`.
+        Name of a rig, a key of :data:`GOAL_UNITS`.
     want
-        See `parse_wants`.
+        Goals as text, see `parse_goals`.
     width_px
-        Pixels across the cameras; None: the rig's own.
+        Image width of the cameras, px; None: the rig's own.
     forecast
-        A plan, JSON, of which only the forecast is asked for.
+        Plan file (JSON) to forecast instead of choosing one.
     request
         Fields of `PlanRequest`.
 
     Raises
     ------
     PlanningError
-        For what cannot be read or planned.
+        If goals, options or the plan are invalid.
     """
-    asked = PlanRequest(parse_wants(want, rig_name), **request)
-    most_lights = asked.most_lights
+    asked = PlanRequest(parse_goals(want, rig_name), **request)
+    most_lights = asked.max_lights
     own = load_planner(rig_name)
     rig = load_rig(rig_name)
     if width_px is not None:
         if rig_name == "probe":
             raise PlanOptionsError(
-                "--width: the probe's spots lie on its camera as it is; leave it"
+                "--width: not an option of the probe, whose spots have fixed pixels; remove it"
             )
-        # the gradient sphere keeps its pixels' size and gives up field, as its simulation does
+        # the gradient sphere keeps its pixel size and loses field of view, as in its simulation
         rig = rig.cropped(width_px) if rig_name == "gradient" else rig.resized(width_px)
     if most_lights is not None and most_lights < 1:
         raise PlanningError(f"--max-lights: got {most_lights}, expected 1 or more")
     if most_lights is not None and rig_name != "dome":
-        raise PlanOptionsError(f"--max-lights: is for the dome, not the {rig_name} rig")
+        raise PlanOptionsError(
+            f"--max-lights: is an option of the dome, not of the {rig_name} rig; remove it"
+        )
     if forecast is not None:
         plan = read_plan(forecast)
         if plan.rig != rig.name:
@@ -306,15 +309,16 @@ def choose(
 
 
 def load_planner(rig_name: str) -> Any:
-    """Return the module that plans for a rig.
+    """Return the planning module of a rig.
 
-    It has `choose`, `forecast`, and for a confirmation `rehearsal` and `measured`.
+    It has `choose` and `forecast`, and for a confirmation `describe_rehearsal` and
+    `measure_errors`.
     """
     return importlib.import_module(f"skinrig.planning.{rig_name}")
 
 
 def forecast_interval(value: float, relative_sd: float) -> tuple[float, float]:
-    """Return the interval of a forecast that is off by a relative spread.
+    """Return the 68 % interval of a forecast from its relative standard deviation.
 
     Examples
     --------
@@ -325,12 +329,12 @@ def forecast_interval(value: float, relative_sd: float) -> tuple[float, float]:
 
 
 def median_magnitude(scale: ArrayLike) -> float:
-    """Return the median magnitude of a mixture of normal errors; infinite for none.
+    """Return the median magnitude of a mixture of zero-mean normal errors; infinite if empty.
 
     Parameters
     ----------
     scale : array_like
-        Their standard deviations, each as often as another.
+        Standard deviations of the components, which have equal weights.
 
     Examples
     --------
@@ -351,7 +355,7 @@ def median_magnitude(scale: ArrayLike) -> float:
 
 
 def format_choice(choice: PlanChoice) -> list[str]:
-    """Return a choice as lines for people."""
+    """Format a choice as lines of text."""
     out = []
     for one in choice.forecasts:
         asked = (
@@ -359,7 +363,7 @@ def format_choice(choice: PlanChoice) -> list[str]:
         )
         if not math.isfinite(one.value):
             out.append(
-                f"forecast: {one.name} keeps no estimate anywhere on this subject{asked}"
+                f"forecast: {one.name} has no valid estimate on this subject{asked}"
                 f"{'' if one.reached else ': NOT REACHED'}"
             )
             continue
@@ -387,12 +391,12 @@ def format_choice(choice: PlanChoice) -> list[str]:
 
 
 def _format_site_errors(errors: Mapping[str, Sequence[float]]) -> str:
-    """Return the errors of sites as people read them, each of its color.
+    """Format the errors of sites, each with its color.
 
     Parameters
     ----------
     errors
-        Percent by site, red, green and blue; infinite where it is unknown.
+        Errors by site, percent, red, green and blue; infinite: unknown.
 
     Examples
     --------
@@ -410,7 +414,7 @@ def _format_site_errors(errors: Mapping[str, Sequence[float]]) -> str:
 
 
 def _format_knob(value: Any) -> str:
-    """Return a figure as people read it: four digits, names with their values.
+    """Format a figure with four digits; mappings as names with values.
 
     Examples
     --------

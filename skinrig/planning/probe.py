@@ -1,6 +1,6 @@
 """Plan the fiber probe: choose the exposures, placements and sites that sigma_tr needs.
 
-The information of a plan's readings is forecast in `skinrig.planning.probe_forecast`.
+`skinrig.planning.probe_forecast` predicts the errors of a plan.
 """
 
 import itertools
@@ -23,29 +23,29 @@ from skinrig.planning.probe_forecast import Memory, ProbePrediction, ProbeSettin
 from skinrig.planning.probe_observation import ProbeObservation, simulate_observation
 
 MIN_EXPOSURE_S = exposure_series_s()[0]
-"""Of the rig's own series: the nearest fiber must not saturate in it."""
+"""Shortest exposure of the rig's own series, s; the nearest fiber must not saturate in it."""
 BRACKET_CHOICES = (3, 4, 6, 8, 12, N_BRACKETS)
-"""How many exposures a series may have."""
+"""Numbers of exposures per series."""
 LONGEST_EXPOSURE_CHOICES_S = (0.5, 1.0, 2.0, 4.0, 8.0, 15.0, MAX_EXPOSURE_S)
-"""Its longest one, s."""
+"""Longest exposures of a series, s."""
 REPEAT_CHOICES = (1, 2, 4)
 DARK_CHOICES = (1, 2)
 
 
 def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
-    """Choose the quickest plan that reaches what is wanted.
+    """Choose the shortest plan that reaches the goal.
 
     Parameters
     ----------
     rig
-        The probe's.
-    asked
-        Wants by name: "sigma_tr" in percent, the median of the relative error over sites and
-        colors; empty: the forecast of the rig's own plan. The share is of the fits that this plan
-        makes valid.
+        The probe.
+    request
+        Goal by name: "sigma_tr" in percent, the median of the relative error over sites and
+        colors; empty: forecast of the rig's own plan. The valid fraction refers to the valid fits
+        of that plan.
     """
     observation = simulate_observation(rig, request.subject, seed=request.seed)
-    own, wants, valid_share = probe_plan(rig), request.wants, request.valid_share
+    own, wants, valid_share = probe_plan(rig), request.goals, request.min_valid_fraction
     if not wants:
         setting = read_settings(own)
         return _choice(rig, observation, own, setting, predict(observation, setting), wants)
@@ -63,7 +63,7 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
         )
 
     tried: list[tuple[ProbeSettings, Plan, ProbePrediction]] = []
-    for setting, plan in candidates(rig, observation):
+    for setting, plan in generate_candidates(rig, observation):
         tried.append((setting, plan, predict(observation, setting, memory=memory)))
         if good(tried[-1][2]):
             break
@@ -95,21 +95,21 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
 
 
 def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
-    """Return what a plan of the probe will give at its sites."""
+    """Forecast the errors of a plan of the probe at its sites."""
     setting = read_settings(plan)
     observation = simulate_observation(rig, request.subject, seed=request.seed, sites=setting.sites)
-    return _choice(rig, observation, plan, setting, predict(observation, setting), request.wants)
+    return _choice(rig, observation, plan, setting, predict(observation, setting), request.goals)
 
 
-def rehearsal(_: PlanChoice) -> plans.Rehearsal:
-    """Return the probe's phantom."""
-    return plans.Rehearsal({"phantom": {}}, (("fiber", ("phantom",)),), ("subsurface",))
+def describe_rehearsal(_: PlanChoice) -> plans.Rehearsal:
+    """Return the probe's phantom and its calibration."""
+    return plans.Rehearsal({"phantom": {}}, (("fibre", ("phantom",)),), ("subsurface",))
 
 
 def measure_errors(
     _choice: PlanChoice, appearance: SkinAppearance, truth: SkinAppearance, _: int
 ) -> dict[str, tuple[float, float]]:
-    """Return median error, percent, and valid share of sigma_tr over sites and colors."""
+    """Return median error, percent, and valid fraction of sigma_tr over sites and colors."""
     fits = subsurface.compare_fits(appearance, truth)
     rows = [row for row in fits if row.method == METHOD_NAMES[0]]
     good = [abs(row.relative) for row in rows if row.valid]
@@ -117,8 +117,10 @@ def measure_errors(
     return {"sigma_tr": (median, len(good) / max(len(rows), 1))}
 
 
-def candidates(rig: Rig, observation: ProbeObservation) -> Iterator[tuple[ProbeSettings, Plan]]:
-    """Yield plans of all sites in one direction that the rig allows, the quickest first."""
+def generate_candidates(
+    rig: Rig, observation: ProbeObservation
+) -> Iterator[tuple[ProbeSettings, Plan]]:
+    """Yield plans of all sites in one direction within the rig's limits, by increasing duration."""
     found: list[tuple[float, Plan]] = []
     for brackets, longest_s, repeats, darks in itertools.product(
         BRACKET_CHOICES, LONGEST_EXPOSURE_CHOICES_S, REPEAT_CHOICES, DARK_CHOICES
@@ -135,7 +137,7 @@ def candidates(rig: Rig, observation: ProbeObservation) -> Iterator[tuple[ProbeS
                 darks=darks,
             )
         except PlanError:
-            continue  # beyond what the head may do
+            continue  # beyond the limits of the probe's head
         found.append((plan.estimate_duration_s(rig), plan))
     for _, plan in sorted(found, key=lambda one: one[0]):
         yield read_settings(plan), plan
@@ -156,9 +158,9 @@ def remove_sites(
     observation
         See `simulate_observation`.
     setting, plan
-        That reach what is wanted.
-    good
-        Whether errors keep to what is wanted.
+        Settings and plan that reach the goal.
+    is_sufficient
+        Returns whether predicted errors are within the goal.
     memory
         See `predict`.
     """
@@ -180,15 +182,15 @@ def read_settings(plan: Plan) -> ProbeSettings:
     Raises
     ------
     plans.PlanningError
-        Where nothing is measured on skin, or no dark frame is there.
+        If the plan has no series on skin or no dark frame.
     """
     shots = [step for step in plan.steps if step.kind == "fibers"]
     darks = [step for step in plan.steps if step.kind == "dark"]
     if not shots:
-        raise plans.PlanningError("plan: got no series on skin, expected at least one")
+        raise plans.PlanningError("plan: got no series on skin, expected at least one; add a site")
     if not darks:
         raise plans.PlanningError(
-            "plan: got no frame without light, expected some: the dark current"
+            "plan: got no dark frame, expected at least one per exposure time; add dark frames"
         )
     placements = list(dict.fromkeys(step_placement(step) for step in shots))
     sites = tuple(dict.fromkeys(str(step.index["site"]) for step in shots))
@@ -249,8 +251,8 @@ def _explain_shortfall(observation: ProbeObservation, whole: ProbePrediction, ta
     stays = 100.0 * plans.median_magnitude(whole.misfit)
     calibration = 100.0 * plans.median_magnitude(whole.common)
     return (
-        f"sigma_tr: the rig's own series leave {100.0 * whole.median:.2g} %; without any noise "
-        f"layers unlike any homogeneous medium and the calibration (the phantom's certificate, far "
+        f"sigma_tr: the rig's own series leave {100.0 * whole.median:.2g} %; without noise, "
+        f"layers unlike a homogeneous medium and the calibration (phantom certificate, far "
         f"cross-talk) leave {stays:.2g} %, the calibration alone {calibration:.2g} %; "
         + (
             "more exposures or placements will not help"

@@ -1,7 +1,8 @@
 """Forecast of sigma_tr from a series of exposures of the fiber probe.
 
-The forecast uses the inversion itself: Fisher information by the derivatives of the photon table,
-the misfit of layers, and the certificate of the phantom, which no exposure removes.
+The forecast uses the inversion itself: Fisher information from the derivatives of the photon table,
+the misfit of layered skin to a homogeneous medium, and the phantom's certificate. The last two do
+not decrease with exposure.
 """
 
 import math
@@ -24,13 +25,18 @@ from skinrig.planning.plans import median_magnitude
 from skinrig.planning.probe_observation import ProbeObservation, reading_variance
 
 CROSSTALK_ERROR = (0.0, 8.5e-6, 6.3e-6, 9.3e-7, 2.5e-7)
-"""Standard error of the share of a fiber's light in a spot so many places away, the last of all
-farther ones: medians of twenty simulated calibrations of the shipped rig, seeds 0 to 19."""
+"""Standard uncertainty of cross-talk by distance in spots, the last for all larger distances.
+
+Cross-talk is the fraction of a fiber's light in another spot. Medians of twenty simulated
+calibrations of the shipped rig, seeds 0 to 19.
+"""
 FORECAST_RELATIVE_SD = 0.2
-"""Relative deviation of standard errors that sessions state from those that were forecast: those
-of three sessions were 0.7 to 1.5 times as large, about two of it either way."""
+"""Relative standard deviation of a session's reported from its forecast uncertainties.
+
+Those of three sessions were 0.7 to 1.5 times as large, about two standard deviations either way.
+"""
 INTERVAL_DRAWS = 40_000
-"""Of calibrations and readings, for the interval of a median."""
+"""Random draws of calibrations and readings for the interval of a median."""
 MAP_PX = 32
 
 
@@ -42,32 +48,35 @@ class ProbeSettings:
     exposures_s: tuple[float, ...]
     repeats: int
     darks: int
-    """Frames without light of each exposure time that has some."""
+    """Dark frames per exposure time that has any."""
     level: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProbePrediction:
-    """Relative errors of sigma_tr by site and color."""
+    """Predicted relative errors of sigma_tr for S sites and 3 colors."""
 
     sites: tuple[str, ...]
     sigma: Float64Array
-    """(S, 3) standard error: readings, misfit, certificate; of sites that are not measured what
-    the others and people in general leave open. What a fit without noise is off on this skin is
-    one sample of the misfit that this states, and not counted again."""
+    """(S, 3) standard uncertainty by readings, misfit and certificate.
+
+    At sites without a measurement: that of the prediction from the other sites and the population.
+    The error of a noise-free fit on this skin is one sample of the misfit, and not added again.
+    """
     shared: Float64Array
-    """(T, S, 3) the calibration's part, certificate and far cross-talk: what each of its errors
-    does to all sites and colors together, which no median averages out."""
+    """(T, S, 3) errors by the calibration: effect of each of T error sources (certificate, far
+    cross-talk) on all sites and colors. They are correlated, so that a median does not average
+    them out."""
     misfit: Float64Array
-    """(S, 3) what stays without any noise."""
+    """(S, 3) relative error without noise."""
     valid: BoolArray
-    """(S, 3)."""
+    """(S, 3) valid fits."""
     measured: BoolArray
-    """(S,)."""
+    """(S,) sites that the plan measures."""
 
     @property
     def total(self) -> Float64Array:
-        """Standard deviation of the error of what is measured and valid."""
+        """Standard deviation of the errors of measured, valid fits."""
         return np.asarray(self.sigma[self.valid & self.measured[:, None]])
 
     @property
@@ -77,14 +86,14 @@ class ProbePrediction:
 
     @property
     def common(self) -> Float64Array:
-        """Standard error of the calibration's part, (S, 3)."""
+        """Standard uncertainty by the calibration, (S, 3)."""
         return np.asarray(np.sqrt(np.square(self.shared).sum(axis=0)))
 
     def interval(self) -> tuple[float, float]:
-        """Return the interval that holds 68 % of the medians of a session's errors.
+        """Return the 68 % interval of the median error of a session.
 
-        Errors that all fits share move the median as a whole: nine fits of one calibration are
-        hardly more than one.
+        Errors by the calibration are common to all fits and shift the median as a whole: nine fits
+        of one calibration have hardly more information than one.
         """
         good = self.valid & self.measured[:, None]
         if not good.any():
@@ -95,37 +104,39 @@ class ProbePrediction:
         off = rng.standard_normal((INTERVAL_DRAWS, len(shared))) @ shared
         off += own * rng.standard_normal((INTERVAL_DRAWS, own.size))
         ends = np.quantile(np.median(np.abs(off), axis=1), (0.16, 0.84))
-        # that, and how well a session's standard errors are known beforehand, as logarithms
+        # combined in logarithms with the relative deviation of a session's stated uncertainties
         low, high = np.hypot(np.log(ends / self.median), math.log(1.0 + FORECAST_RELATIVE_SD))
         return self.median * math.exp(-low), self.median * math.exp(high)
 
     @property
     def valid_share(self) -> float:
-        """Share of the fits at measured sites that will be valid."""
+        """Fraction of the fits at measured sites that are valid."""
         return float(self.valid[self.measured].mean()) if self.measured.any() else 0.0
 
 
 Memory = dict[tuple[Any, ...], Sequence[Any]]
-"""Cache of fits of one `ProbeObservation`, keyed by all that they depend on: plans that differ in
-placements only share them, and without noise nearly all plans do."""
+"""Cache of fits of one `ProbeObservation`, keyed by everything that they depend on.
+
+Plans that differ only in placements share fits; without noise, nearly all plans do.
+"""
 
 
 def predict(
     observation: ProbeObservation, setting: ProbeSettings, *, memory: Memory | None = None
 ) -> ProbePrediction:
-    """Return the errors that a plan leaves.
+    """Predict the errors of sigma_tr of a plan.
 
-    Placements lower what the readings' noise leaves, and neither the misfit of layers nor what the
-    calibration leaves open.
+    Repeated placements reduce the noise of the readings, but neither the misfit of layers nor the
+    errors by the calibration.
 
     Parameters
     ----------
     observation
         See `simulate_observation`.
     setting
-        Sites, exposures, placements and darks.
+        Sites, exposures, placements and dark frames.
     memory
-        Fits of earlier plans of the same sight, which is added to; None: none are kept.
+        Cache of fits of earlier plans of the same observation, extended in place; None: no cache.
     """
     memory = {} if memory is None else memory
     shape = (len(observation.sites), 3)
@@ -163,7 +174,7 @@ def _fits(
     noise: bool,
     memory: Memory,
 ) -> Sequence[Any]:
-    """Return the fits of each site's profile as a plan would read it, or without its noise."""
+    """Fit the profile of each site, with the weights of the plan's noise or without noise."""
     how = (setting.exposures_s, setting.darks, setting.level)
     read = [reading_variance(observation, observation.reflectance[k], *how) for k in sites]
     # a noise-free fit depends on the readings' noise only by which fibers are read at all
@@ -183,10 +194,10 @@ def _fit_noisy_profiles(
     *,
     noise: bool,
 ) -> Sequence[Any]:
-    """Return the fits of profiles with these variances of their readings."""
-    names = tuple(fiber.name for fiber in observation.probe.fibers)
+    """Fit profiles whose readings have the given variances."""
+    names = tuple(fibre.name for fibre in observation.probe.fibres)
     radius = np.array(observation.probe.radius_mm)
-    # gains are known from a series of all exposures on the phantom, as far as its light is known
+    # gains come from a full exposure series on the phantom, up to the error of its reflectance
     gain = (
         reading_variance(observation, observation.phantom, exposure_series_s(), 4, 1.0)
         / observation.phantom**2
@@ -211,11 +222,11 @@ def _fit_noisy_profiles(
 
 
 def _crosstalk(count: int) -> Any:
-    """Return cross-talk of none, known as well as a calibration leaves it.
+    """Return zero cross-talk with the standard uncertainty of a calibration.
 
-    The nearest fibers are brighter than the farthest by a million times on skin and by a thousand
-    on the phantom; what a calibration has wrong of their light in far spots cancels only as far as
-    the two are alike.
+    The nearest fibers are a million times brighter than the farthest on skin, and a thousand times
+    on the phantom. A calibration's error of their light in far spots thus cancels only in part
+    between skin and phantom.
     """
     place = np.arange(count)
     apart = np.minimum(np.abs(place[:, None] - place), len(CROSSTALK_ERROR) - 1)
@@ -227,7 +238,7 @@ def _crosstalk(count: int) -> Any:
 def _interpolation_error(
     observation: ProbeObservation, found: Float64Array, sigma: Float64Array, valid: BoolArray
 ) -> Float64Array:
-    """Return the relative error of sigma_tr at each site by the map between the others, (S, 3)."""
+    """Return the relative error of sigma_tr at each site, interpolated from the others, (S, 3)."""
     known = [k for k, site in enumerate(observation.sites) if site in SITE_UV]
     measured = [k for k in known if valid[k].any()]
     out = np.full(found.shape, np.inf)

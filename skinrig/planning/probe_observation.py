@@ -21,27 +21,27 @@ from skinrig.planning.plans import PlanningError
 from skinrig.simulating.probe import TRUTH_PHOTONS
 
 MAX_READ_FRACTION = 0.95
-"""Of the full scale: what is above it is not read."""
+"""Saturation limit, fraction of full scale; brighter readings are discarded."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProbeObservation:
-    """What the fibers take from simulated skin, and what the camera makes of it."""
+    """Light of F fibers on S simulated skin sites, with the camera's gain and noise."""
 
     sites: tuple[str, ...]
     reflectance: Float64Array
-    """(S, F, 3) in 1/mm^2."""
+    """(S, F, 3) radial reflectance of the skin, 1/mm^2."""
     phantom: Float64Array
-    """(F, 3) of the block that the probe is calibrated with."""
+    """(F, 3) radial reflectance of the calibration phantom, 1/mm^2."""
     phantom_error: Float64Array
-    """(F, 3) relative error of what the block is expected to give, each fiber's own: the photon
-    table's."""
+    """(F, 3) relative error of the phantom's expected reflectance by the photon table, independent
+    per fiber."""
     common: Float64Array
-    """(T, F, 3) relative errors of all gains together, by the certificate."""
+    """(T, F, 3) relative errors of the gains by the phantom's certificate, common to all fibers."""
     unit: Float64Array
-    """(3,) full scales per second in the middle of a spot, for 1/mm^2."""
+    """(3,) signal rate at the center of a spot for 1/mm^2, full scales per second."""
     pixels: Float64Array
-    """(3,) of each color in a spot."""
+    """(3,) pixels per spot and color."""
     chip: Any
     """The sensor, see `rigsim.sensor.Sensor`."""
     probe: Any
@@ -50,19 +50,22 @@ class ProbeObservation:
 def simulate_observation(
     rig: Rig, subject: str, *, seed: int = 0, sites: Sequence[str] = PROBE_SITES
 ) -> ProbeObservation:
-    """Look at simulated skin through the fibers.
+    """Simulate the light of the fibers on skin and phantom.
 
     Parameters
     ----------
     rig
-        The probe's.
+        The probe.
     subject, seed
-        The tissue, see `rigsim.fiber.probe_tissue.parse_tissue`.
+        Tissue and its seed, see `rigsim.fiber.probe_tissue.parse_tissue`.
     sites
-        Where the head may be placed.
+        Sites of the probe's head.
     """
     if rig.probe is None:
-        raise PlanningError(f"rig: got {rig.name!r} without a probe, expected one with fibers")
+        raise PlanningError(
+            f"rig: got {rig.name!r} without a probe, expected one with fibers;"
+            f" choose a probe's rig file"
+        )
     tissue = subject_file.load_tissue(subject, seed=seed)
     profiles = ProfileCache(rig, tissue, photons=TRUTH_PHOTONS["small"], seed=seed)
     made = [profiles.profile(site, 0.0, rig.probe.suction_mbar) for site in sites]
@@ -97,19 +100,19 @@ def reading_variance(
     Parameters
     ----------
     observation
-        The skin's or the phantom's, see `simulate_observation`.
+        Observation with gain and noise, see `simulate_observation`.
     value
-        Reflectance in the fibers, 1/mm^2, (F, 3).
+        Reflectance at the fibers, 1/mm^2, (F, 3).
     exposures_s
-        Of a series, s.
+        Exposure times of a series, s.
     darks
-        Frames without light of each exposure time.
+        Dark frames per exposure time.
     level
-        Of the light source, 0 to 1.
+        Level of the light source, 0 to 1.
     """
     rate = level * observation.unit * value  # full scales per second
-    # each unsaturated exposure is a reading of the rate, light / t, with variance spread / t^2, so
-    # that its information is t^2 / spread; a dark frame adds its share 1 / darks of the floor
+    # an unsaturated exposure t measures the rate as signal / t with variance var(signal) / t^2, so
+    # that its information is t^2 / var(signal); averaging the dark frames adds floor / darks
     information = np.zeros(rate.shape)
     for seconds in exposures_s:
         gain, floor = observation.chip.noise_profile(seconds)

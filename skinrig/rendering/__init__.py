@@ -1,1 +1,1 @@
-"""Pictures of fitted skin models, and how they stand against photographs."""
+"""Render fitted skin models and compare renderings with photographs: `skinrig render`."""

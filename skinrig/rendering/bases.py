@@ -1,4 +1,4 @@
-"""The same face with fewer lobes: a model reduced to common mixtures of its own lobes."""
+"""Reduce a model to fewer basis BRDFs, which are mixtures of its own."""
 
 import dataclasses
 from typing import Final
@@ -12,35 +12,35 @@ from skinrig.arrays import Float64Array
 from skinrig.rendering.camera import RenderingError
 
 FACTORIZED_TEXELS: Final = 5_000
-"""Texels, drawn at random, that the mixtures are found on."""
+"""Number of random texels that are factorized."""
 DESCENT_SWEEPS: Final = 60
-"""Passes over the shares of all texels; each sets one share to its best while others stand."""
+"""Sweeps of coordinate descent over the weights; each step optimizes one weight, others fixed."""
 
 
 def reduce_lobes(model: SkinReflectance, rank: int, *, rng: np.random.Generator) -> SkinReflectance:
-    """Return the model with `rank` lobes that are mixtures of its own.
+    """Return the model with `rank` basis BRDFs that are mixtures of its own.
 
-    The mixtures are found by non-negative factorization at some texels; then every texel gets the
-    shares whose BRDF is nearest to its old one, over the tables' nodes by solid angle. A fit to
-    the samples would be better still: `skinrig reconstruct --rank`.
+    The mixtures result from non-negative factorization of a subset of texels. Then every texel gets
+    the weights whose BRDF is nearest to its original one, over the tables' nodes by solid angle. A
+    fit to the samples would be more accurate: `skinrig reconstruct --rank`.
 
     Parameters
     ----------
     model
         The model.
     rank
-        Lobes, 1 to those it has.
+        Number of basis BRDFs, from 1 to those of the model.
     rng
-        Draws the texels, and seeds the factorization.
+        Generator that draws the texels and seeds the factorization.
 
     Raises
     ------
     RenderingError
-        The model has fewer lobes.
+        If the model has fewer basis BRDFs.
     """
     if not 1 <= rank <= model.lobes.size:
         raise RenderingError(
-            f"bases: got {rank}, but the model has {model.lobes.size} lobes; fit more with "
+            f"--bases: got {rank}, expected at most {model.lobes.size} of the model; fit more with "
             f"`skinrig reconstruct SESSION --rank {rank} --maps basis_weight_0,r_d,normals`"
         )
     if rank == model.lobes.size:
@@ -56,21 +56,21 @@ def reduce_lobes(model: SkinReflectance, rank: int, *, rng: np.random.Generator)
 
 
 def fit_nearest_weights(weights: Float64Array, mix: Float64Array, lobes: BrdfBasis) -> Float64Array:
-    """Return non-negative shares of mixtures whose BRDFs are nearest to given ones.
+    """Fit non-negative weights of mixtures whose BRDFs are nearest to given ones.
 
     Parameters
     ----------
-    shares
-        Of the lobes, shape (n, K).
+    weights
+        Weights of the basis BRDFs, shape (n, K).
     mix
-        Mixtures of the lobes, shape (R, K).
+        Mixtures of the basis BRDFs, shape (R, K).
     lobes
-        The K lobes.
+        The K basis BRDFs.
 
     Returns
     -------
     ndarray of float64
-        Shape (n, R), by cyclic coordinate descent, whose error never grows.
+        Shape (n, R), by cyclic coordinate descent, whose error never increases.
     """
     strength = lobes.strength()
     gram = lobes.cosine_similarity() * np.outer(strength, strength)

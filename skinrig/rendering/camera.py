@@ -1,4 +1,4 @@
-"""Cameras to render by: a calibrated view of a rig, or one that looks at a point."""
+"""Define the cameras of renderings: a calibrated view of a rig, or a camera aimed at a point."""
 
 import dataclasses
 import math
@@ -11,14 +11,14 @@ from capture.calibration.geometry import CameraPose
 from skinrig.arrays import Float32Array, Float64Array
 
 Camera = CameraPose
-"""Pinhole with distortion, in the rig frame; x right, y down, pixel (0, 0)'s centre is (0, 0)."""
+"""Pinhole with distortion, in the rig frame; x right, y down, pixel (0, 0)'s center is (0, 0)."""
 
 MAX_SIDE_PX: Final = 16_384
 """Longest side of a rendering."""
 
 
 class RenderingError(ValueError):
-    """What is asked for gives no picture, or cannot be compared."""
+    """Settings that give no image, or images that are not comparable."""
 
 
 def look_at(
@@ -30,27 +30,27 @@ def look_at(
     size_px: tuple[int, int] = (512, 512),
     name: str = "look-at",
 ) -> Camera:
-    """Return a camera without distortion that looks at a point.
+    """Create a camera without distortion that is aimed at a point.
 
     Parameters
     ----------
-    place_mm
-        Centre of projection, shape (3,), mm, rig frame.
+    position_mm
+        Center of projection, shape (3,), mm, rig frame.
     target_mm
-        What it looks at.
+        Point on the optical axis, mm.
     up
-        Direction that is up in the image.
+        Direction of the image's upward axis.
     fov_deg
-        Angle that the longer side of the image spans, degrees, above 0 and below 170.
+        Field of view along the longer side, degrees, above 0 and below 170.
     size_px
         Columns and rows.
     name
-        What records call it.
+        Name of the camera in records.
 
     Raises
     ------
     RenderingError
-        For a place at the target, a view along `up`, or numbers that make no image.
+        If the position is at the target, the view is along `up`, or a number is out of range.
 
     Examples
     --------
@@ -65,7 +65,9 @@ def look_at(
                 f"view: got {field} {given.tolist()}, expected three finite numbers"
             )
     if not 0.0 < fov_deg < 170.0:
-        raise RenderingError(f"fov: got {fov_deg} degrees, expected above 0 and below 170")
+        raise RenderingError(
+            f"--fov: got {fov_deg} degrees, expected above 0 and below 170; enter another"
+        )
     columns, rows = size_px
     if not (2 <= columns <= MAX_SIDE_PX and 2 <= rows <= MAX_SIDE_PX):
         raise RenderingError(
@@ -87,14 +89,14 @@ def look_at(
 
 
 def bin_pixels(camera: Camera, factor: float) -> Camera:
-    """Return a camera whose pixels are larger: `factor` = 2 is the grid of 2 x 2 cells.
+    """Return a camera with larger pixels; `factor` = 2 joins cells of 2 x 2 pixels.
 
     Parameters
     ----------
     camera
         The camera.
     factor
-        Old pixels along the side of a new one, above 0; below 1 pixels become smaller.
+        Side of a new pixel in old pixels, above 0; below 1: smaller pixels.
 
     Examples
     --------
@@ -104,10 +106,10 @@ def bin_pixels(camera: Camera, factor: float) -> Camera:
     ((100, 50), [[49.5, 24.5]])
     """
     if not 0.0 < factor < math.inf:
-        raise RenderingError(f"size: got {factor} old pixels in a new one, expected above 0")
+        raise RenderingError(f"factor: got {factor} old pixels per new one, expected above 0")
     matrix = np.array(camera.matrix)
     matrix[:2] /= factor
-    matrix[:2, 2] += 0.5 / factor - 0.5  # a pixel's centre is at a whole number
+    matrix[:2, 2] += 0.5 / factor - 0.5  # centers of pixels are at integers
     columns, rows = (int(side / factor + 1e-6) for side in camera.image_size)
     if not (1 <= columns <= MAX_SIDE_PX and 1 <= rows <= MAX_SIDE_PX):
         raise RenderingError(
@@ -116,10 +118,10 @@ def bin_pixels(camera: Camera, factor: float) -> Camera:
     return dataclasses.replace(camera, matrix=matrix, image_size=(columns, rows))
 
 
-def rays(
+def generate_rays(
     camera: Camera, *, subpixels: int, rows: tuple[int, int] | None = None
 ) -> tuple[Float32Array, Float32Array]:
-    """Return rays through a regular grid inside the pixels.
+    """Generate rays through a regular grid of points in each pixel.
 
     Parameters
     ----------
@@ -128,7 +130,7 @@ def rays(
     subpixels
         Rays along each side of a pixel, k.
     rows
-        First row of pixels and the one after the last; None takes all.
+        First row of pixels and the one after the last; None: all.
 
     Returns
     -------
@@ -136,7 +138,9 @@ def rays(
         Shape (H k, W k, 3) each, rig frame in mm, directions of unit length.
     """
     if subpixels < 1:
-        raise RenderingError(f"samples: got {subpixels} along a pixel's side, expected at least 1")
+        raise RenderingError(
+            f"samples: got {subpixels} per pixel side, expected 1 or more; enter another"
+        )
     columns, height = camera.image_size
     first, last = (0, height) if rows is None else rows
     x = (np.arange(columns * subpixels) + 0.5) / subpixels - 0.5

@@ -1,4 +1,4 @@
-"""Figures of `skinrig render`: image, components, fewer basis BRDFs, shadow boundary."""
+"""Draw the figures of `skinrig render`: image, components, fewer basis BRDFs, shadow boundary."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ RADIANCE_UNIT = (
 
 @dataclass(frozen=True, slots=True)
 class RenderSettings:
-    """How a picture is rendered."""
+    """Settings of a rendering."""
 
     subsurface: Subsurface = "dipole"
     subpixels: int = 2
     """Rays along each side of a pixel."""
     shadow_samples: int = 4
     exposure: float | None = None
-    """Factor of the PNGs; None: that of well shown skin, the same for all pictures of a sheet."""
+    """Factor of the PNGs; None: automatic by skin brightness, equal for all images of a sheet."""
     seed: int = 0
     progress: Callable[[str], None] = field(default=lambda _: None)
 
@@ -56,7 +56,7 @@ class RenderModel:
     appearance: SkinAppearance
     surface: FittedSurface
     mesh: str
-    """Which mesh, for the record."""
+    """Description of the mesh, for the record."""
 
     @property
     def model(self) -> SkinReflectance:
@@ -65,7 +65,7 @@ class RenderModel:
 
     @staticmethod
     def of(path: Path, *, mesh: Path | None = None, translucency: str | None = None) -> RenderModel:
-        """Read an appearance and lay its maps on its own mesh, or on another of the same layout."""
+        """Read an appearance and put its maps on its own mesh, or on another of the same layout."""
         appearance, model = read_model(path, translucency=translucency)
         own = read_own_mesh(appearance)
         if mesh is None:
@@ -74,7 +74,7 @@ class RenderModel:
         return RenderModel(path, appearance, laid, str(mesh))
 
     def record(self) -> dict[str, Any]:
-        """Return the model's part of a rendering's record."""
+        """Return the model's entries of a rendering's record."""
         valid = self.model.valid & self.surface.atlas.covered
         return {
             "appearance": self.path,
@@ -90,17 +90,17 @@ class RenderModel:
 
 @dataclass(frozen=True, slots=True)
 class RenderRequest:
-    """What a picture is to be of, where it is written, and how it is rendered."""
+    """Camera, lights, output folder and settings of a rendering."""
 
     camera: Camera
     lights: Sequence[Light]
     out: Path
     effort: RenderSettings
     assumed: Sequence[str] = ()
-    """What else was taken for granted."""
+    """Additional assumptions."""
 
     def render(self, surface: FittedSurface, interior: Interior | None = None) -> Rendering:
-        """Render a model, with the light inside it where that is known already."""
+        """Render a model, optionally with its precomputed interior."""
         return render_surface(
             surface,
             self.camera,
@@ -142,7 +142,7 @@ class RenderRequest:
 
 
 class _Drawing:
-    """What is written to a folder, with the time that it took."""
+    """Output folder of a figure, with the elapsed time."""
 
     def __init__(self, out: Path) -> None:
         folder.check(out)
@@ -164,14 +164,14 @@ class _Drawing:
 def draw_rendering(
     subject: RenderModel, request: RenderRequest, *, components: bool = False
 ) -> dict[str, Any]:
-    """Render one picture into a folder; see `skinrig.rendering.folder.write`.
+    """Render one image into a folder; see `skinrig.rendering.folder.write`.
 
     Parameters
     ----------
-    subject, asked
-        What is seen, and how.
+    subject, request
+        Model, and camera, lights and settings.
     components
-        Write light from inside and from the surface, too, and a sheet of the paper's figure 12.
+        Also write diffuse and specular components, and a sheet of the paper's figure 12.
     """
     drawing = _Drawing(request.out)
     seen = request.render(subject.surface)
@@ -185,7 +185,7 @@ def draw_rendering(
         name: png.encode(apply_tone_curve(image, exposure)) for name, image in shown.items()
     }
     if components:
-        pictures["components"] = encode_sheet([component_panels(seen, exposure)])
+        pictures["components"] = encode_sheet([build_component_panels(seen, exposure)])
     record = request.record([subject], seen)
     return drawing.write(images, pictures, record, kind="picture", exposure=exposure)
 
@@ -200,25 +200,25 @@ def draw_photograph(
     *,
     calibration: Path | None = None,
 ) -> dict[str, Any]:
-    """Take a photograph that the model has not seen apart: the paper's figure 12, (a) to (e).
+    """Decompose a photograph that was held out of the fit: the paper's figure 12, (a) to (e).
 
     Parameters
     ----------
     subject
         The fitted model on its own mesh.
     session
-        SESSION/ that holds the photograph.
+        SESSION/ with the photograph.
     view, light
         Names of its camera and light.
     out, effort
-        As of `RenderRequest`.
+        As in `RenderRequest`.
     calibration
         CALIBRATION/ folder.
 
     Raises
     ------
     UnusableError
-        The session holds no such photograph that the model has not seen.
+        If the session has no such held-out photograph.
     """
     drawing = _Drawing(out)
     photographs = HeldOutPhotographs.of(session, subject.appearance, calibration=calibration)
@@ -226,8 +226,8 @@ def draw_photograph(
     if shot is None:
         some = ", ".join(f"{s.view} {s.light}" for s in photographs.shots[:8])
         raise UnusableError(
-            f"--view {view} --light {light}: the session holds no such photograph that the model "
-            f"has not seen; there are {some}{' ...' if len(photographs.shots) > 8 else ''}"
+            f"--view {view} --light {light}: not a held-out photograph of the session, expected "
+            f"one of {some}{' ...' if len(photographs.shots) > 8 else ''}; choose one"
         )
     camera, lamp = photographs.camera(shot), photographs.light(shot)
     asked = RenderRequest(camera, [lamp], out, effort, photographs.assumed)
@@ -243,67 +243,67 @@ def draw_photograph(
         "surface": seen.surface,
         "coverage": seen.coverage,
     }
-    pictures = {"components": encode_sheet([component_panels(seen, exposure, photo)])}
+    pictures = {"components": encode_sheet([build_component_panels(seen, exposure, photo)])}
     facts = {"kind": "components", "exposure": exposure, "held_out": shot.held_out}
     record = asked.record([subject], seen)
     return drawing.write(images, pictures, record, session=session, **facts)
 
 
-def component_panels(
+def build_component_panels(
     rendering: Rendering, exposure: float, photograph: FloatArray | None = None
 ) -> list[Panel]:
-    """Return the panels of the paper's figure 12, those that need a photograph where there is one.
+    """Build the panels of the paper's figure 12; (a) and (c) only with a photograph.
 
     Parameters
     ----------
-    seen
+    rendering
         The rendering.
     exposure
-        Of all panels.
+        Factor of all panels.
     photograph
-        In the unit of the rendering, (H, W, 3).
+        Photograph in the unit of the rendering, (H, W, 3).
     """
 
     def panel(label: str, image: FloatArray) -> Panel:
         return Panel(label, apply_tone_curve(image, exposure))
 
     out = [] if photograph is None else [panel("(a) photograph", photograph)]
-    out.append(panel("(b) light from inside", rendering.diffuse))
+    out.append(panel("(b) diffuse component", rendering.diffuse))
     if photograph is not None:
         skin = rendering.coverage[..., None] > 0.5
         out.append(
-            panel("(c) photograph less (b)", np.where(skin, photograph - rendering.diffuse, 0.0))
+            panel("(c) photograph minus (b)", np.where(skin, photograph - rendering.diffuse, 0.0))
         )
     out.append(panel("(d) model", rendering.radiance))
-    out.append(panel("(e) surface reflection", rendering.surface))
+    out.append(panel("(e) specular component", rendering.surface))
     return out
 
 
 def draw_bases(
     subjects: Sequence[RenderModel], ranks: Sequence[int], request: RenderRequest
 ) -> dict[str, Any]:
-    """Render one view with models of several ranks, complete and the surface alone: figure 7.
+    """Render one view with models of several ranks, complete and specular only: figure 7.
 
     Parameters
     ----------
     subjects
-        Fits; those of a wanted rank are used as they are, others are reduced from the one that
-        has the fewest lobes above it.
+        Fitted models. A requested rank is taken from them if available, else reduced from the
+        model with the next larger rank.
     ranks
-        Numbers of lobes.
-    asked
-        What is seen, and how.
+        Numbers of basis BRDFs.
+    request
+        Camera, lights and settings.
 
     Raises
     ------
     RenderingError
-        No model has as many lobes as a rank.
+        If every model has fewer basis BRDFs than a rank.
     """
     drawing = _Drawing(request.out)
     effort = request.effort
     models = {rank: _reduce_subjects(subjects, rank, effort) for rank in ranks}
     if not models:
-        raise UsageError("--bases: got none, expected numbers of lobes, as 1,2,4")
+        raise UsageError("--bases: got none, expected numbers of basis BRDFs, such as 1,2,4")
     interiors: dict[int, Interior] = {}
     rows: tuple[list[Panel], list[Panel]] = ([], [])
     images: dict[str, Float32Array] = {}
@@ -311,14 +311,16 @@ def draw_bases(
     exposure = 0.0
     pictures: dict[int, Rendering] = {}
     for rank, (subject, laid) in models.items():
-        effort.progress(f"render with {rank} lobes")
+        effort.progress(f"render with {rank} basis BRDFs")
         if effort.subsurface == "dipole" and id(subject) not in interiors:
             interiors[id(subject)] = Interior.of(laid)
         seen = pictures[rank] = request.render(laid, interiors.get(id(subject)))
         exposure = exposure or request.exposure(seen)
         how = "fitted" if laid is subject.surface else f"reduced from {subject.model.lobes.size}"
-        rows[0].append(Panel(f"{rank} lobes, {how}", apply_tone_curve(seen.radiance, exposure)))
-        rows[1].append(Panel("surface reflection", apply_tone_curve(seen.surface, exposure)))
+        rows[0].append(
+            Panel(f"{rank} basis BRDFs, {how}", apply_tone_curve(seen.radiance, exposure))
+        )
+        rows[1].append(Panel("specular component", apply_tone_curve(seen.surface, exposure)))
         images |= {f"radiance_{rank}": seen.radiance, f"surface_{rank}": seen.surface}
     best = pictures[against].surface
     bases = [
@@ -340,7 +342,7 @@ def draw_bases(
 def draw_shadow_boundary(
     subject: RenderModel, out: Path, effort: RenderSettings, *, size_px: int
 ) -> dict[str, Any]:
-    """Render a shadow's edge by the paper's two extremes of sigma_tr, on face and flat patch.
+    """Render a shadow boundary for the paper's two extremes of sigma_tr, on face and flat patch.
 
     Parameters
     ----------
@@ -349,9 +351,9 @@ def draw_shadow_boundary(
     out
         Folder to write.
     effort
-        How; light spreads by the dipole, and leaves where it entered for comparison.
+        Settings; rendered with the dipole and, for comparison, without lateral scattering.
     size_px
-        Columns of each picture.
+        Width of each image, px.
     """
     drawing = _Drawing(out)
     media = {"most_translucent": MIN_SIGMA_TR_PER_MM, "least_translucent": MAX_SIGMA_TR_PER_MM}
@@ -367,20 +369,20 @@ def draw_shadow_boundary(
             effort.progress(f"render {boundary.name}, {name.replace('_', ' ')}")
             seen = boundary.render(sigma, subpixels=effort.subpixels)
             exposure = exposure or choose_exposure(seen.radiance, seen.coverage)
-            words = "without spreading"
+            words = "without lateral scattering"
             if sigma is not None:
                 words = "sigma_tr " + ", ".join(f"{value:.4g}" for value in sigma)
             row.append(
                 Panel(f"{boundary.name}, {words}", apply_tone_curve(seen.radiance, exposure))
             )
             images[f"{boundary.name.replace(' ', '_')}_{name}"] = seen.radiance
-            rise = shadow.rise_mm(*shadow.profile(seen))
+            rise = shadow.measure_rise_mm(*shadow.measure_profile(seen))
             skin = {"skin": boundary.name, "name": name}
             widths.append({**skin, "sigma_tr_per_mm": sigma, "rise_mm": rise})
         rows.append(row)
     title = (
-        "Shadow boundary by sigma_tr of red, green, blue in 1/mm; the least sigma_tr is the most "
-        f"translucent skin; {shadow.BOUNDARY_WIDTH_MM:g} mm across"
+        "Shadow boundary by sigma_tr of red, green, blue in 1/mm; smallest sigma_tr: most "
+        f"translucent skin; width {shadow.BOUNDARY_WIDTH_MM:g} mm"
     )
     facts = {
         "kind": "shadow boundary",
@@ -400,7 +402,9 @@ def _reduce_subjects(
     enough = [s for s in subjects if s.model.lobes.size >= rank]
     if not enough:
         reduce_lobes(subjects[0].model, rank, rng=np.random.default_rng(effort.seed))
-        raise RenderingError(f"bases: got {rank}, which no given model has")
+        raise RenderingError(
+            f"--bases: got {rank}, expected at most the basis BRDFs of a given model; lower it"
+        )
     subject = min(enough, key=lambda s: s.model.lobes.size)
     if subject.model.lobes.size == rank:
         return subject, subject.surface

@@ -1,4 +1,4 @@
-"""The folder that a rendering is written to: whole or not at all."""
+"""Write the folder of a rendering atomically: images, sheets and record."""
 
 import io
 import json
@@ -18,24 +18,24 @@ from skinrig.drawing import png
 from skinrig.rendering.camera import RenderingError
 
 BRIGHT_SKIN_LEVEL: Final = 0.75
-"""Linear value at which the brightest skin is shown."""
+"""Linear display value of the brightest skin."""
 BRIGHT_SKIN_PERCENTILE: Final = 99.0
-"""Share of skin, %, that stays below it: highlights are few."""
+"""Percentile of skin radiance that defines the brightest skin, without highlights."""
 TONE_KNEE: Final = 0.8
-"""Linear value up to which tones are shown as they are; above they are pressed below 1."""
+"""Linear value up to which the tone curve is the identity; higher values are compressed below 1."""
 MARGIN_PX: Final = 8
 LABEL_PX: Final = 26
 
 
 def choose_exposure(radiance: ArrayLike, coverage: ArrayLike) -> float:
-    """Return the factor that puts the brightest skin at `BRIGHT_SKIN_LEVEL`; 1 if it is dark.
+    """Return the factor that maps the brightest skin to `BRIGHT_SKIN_LEVEL`; 1 for black images.
 
     Parameters
     ----------
     radiance
         Shape (H, W, 3).
     coverage
-        Share of skin in each pixel, shape (H, W).
+        Fraction of skin in each pixel, shape (H, W).
 
     Examples
     --------
@@ -48,50 +48,50 @@ def choose_exposure(radiance: ArrayLike, coverage: ArrayLike) -> float:
 
 
 def apply_tone_curve(radiance: ArrayLike, exposure: float) -> UInt8Array:
-    """Return a picture for a screen: linear up to `TONE_KNEE`, highlights pressed together above.
+    """Convert radiance to a display image: linear up to `TONE_KNEE`, compressed above.
 
     Parameters
     ----------
     radiance
         Linear values of any shape.
     exposure
-        What they are multiplied by first.
+        Factor of the values.
 
     Returns
     -------
     ndarray of uint8
-        By the sRGB curve; channels are shown as if they were linear sRGB.
+        sRGB-encoded image; camera channels are taken as linear sRGB.
     """
     value = np.asarray(radiance, np.float64) * exposure
     room = 1.0 - TONE_KNEE
     above = TONE_KNEE + room * -np.expm1(-np.maximum(value - TONE_KNEE, 0.0) / room)
-    return png.srgb8(np.where(value > TONE_KNEE, above, value))
+    return png.encode_srgb8(np.where(value > TONE_KNEE, above, value))
 
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One picture of a sheet."""
+    """One labeled image of a sheet."""
 
     label: str
-    """Below it, one line."""
+    """Text below the image, one line."""
     image: UInt8Array
     """(H, W, 3)."""
 
 
 def encode_sheet(rows: Sequence[Sequence[Panel]], *, title: str = "") -> bytes:
-    """Return a PNG of labeled images side by side, not resampled.
+    """Encode labeled images side by side as PNG, without resampling.
 
     Parameters
     ----------
     rows
-        Panels, all of one size.
+        Panels of equal size.
     title
-        Above them.
+        Title above the panels.
 
     Raises
     ------
     ValueError
-        Without panels, or of several sizes.
+        If panels are missing, or sizes differ.
     """
     sizes = {panel.image.shape for row in rows for panel in row}
     if len(sizes) != 1:
@@ -135,12 +135,12 @@ SCHEMA: Final = "skinrig.render/1"
 
 
 def check(out: Path) -> None:
-    """Refuse a folder that holds something else, before anything is rendered.
+    """Raise if a folder has other files, before anything is rendered.
 
     Raises
     ------
     RenderingError
-        ``out`` exists and is neither empty nor an older rendering.
+        If ``out`` exists and is neither empty nor an older rendering.
     """
     if out.is_file() or (
         out.is_dir() and not (out / DOCUMENT_FILE).is_file() and any(out.iterdir())
@@ -157,16 +157,16 @@ def write(
     pictures: Mapping[str, bytes],
     document: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Write images as OpenEXR, pictures as PNG and the record; an older rendering is replaced.
+    """Write OpenEXR and PNG images and the record; an older rendering is replaced.
 
     Parameters
     ----------
     out
         The folder.
     images
-        By name without extension, (H, W) or (H, W, 3).
+        Images by name without suffix, (H, W) or (H, W, 3).
     pictures
-        PNG files by name without extension.
+        PNG files by name without suffix.
     document
         Content of the record.
 

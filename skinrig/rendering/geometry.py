@@ -1,4 +1,4 @@
-"""A fitted model's maps on a mesh: meshes read, normals carried along, values looked up."""
+"""Put a fitted model's maps on a mesh: read meshes, transfer normals, sample values."""
 
 from __future__ import annotations
 
@@ -20,40 +20,40 @@ from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.rendering.lookup_kernels import look_up
 
 MESH_FILES: Final = ("mesh.obj", "mesh.ply")
-"""Names under which an appearance holds the mesh that its maps lie on."""
+"""File names of the mesh of an appearance's maps."""
 MAX_SAME_MESH_MM: Final = 1.0
-"""Median distance from the maps' places up to which a mesh is the one they were made on."""
+"""Maximum median distance from the maps' positions for a mesh to be the original one."""
 MAX_LAYOUT_DISTANCE_MM: Final = 40.0
-"""Median distance from which on texture coordinates cannot be of the same layout."""
+"""Maximum median distance from the maps' positions for texture coordinates of the same layout."""
 MIN_COVERED_FRACTION: Final = 0.2
-"""Least share of a mesh's texels that the maps must hold values for."""
+"""Minimum fraction of a mesh's texels with values in the maps."""
 FRAME_DILATION_STEPS: Final = 4
 N_NEAREST_TEXELS: Final = 8
-"""Nearest texels that stand in where a point has none of its own."""
+"""Number of nearest texels that replace missing values at a point."""
 N_SPARSE_TEXELS: Final = 8_000
-"""Texels, drawn at random, that stand in farther away: their mean is smooth."""
+"""Number of random texels that replace missing values far from valid texels."""
 MIN_BLEND_WEIGHT: Final = 0.01
-"""Least share of the four texels around a point that must be of its place."""
+"""Minimum bilinear weight of the texels around a point that belong to its part of the surface."""
 
 
 class GeometryError(ValueError):
-    """A mesh that the maps cannot be laid on."""
+    """A mesh that is inconsistent with the maps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfacePointSamples:
-    """What the maps hold at n points."""
+    """Values of the maps at n points."""
 
     r_d: Float32Array
-    """Shape (n, 3)."""
+    """Albedo, shape (n, 3)."""
     weights: Float32Array
-    """Shares of the lobes, shape (n, K)."""
+    """Weights of the basis BRDFs, shape (n, K)."""
     normals: Float32Array
-    """Unit, frame of the mesh, shape (n, 3)."""
+    """Unit normals in the frame of the mesh, shape (n, 3)."""
     translucency_mm: Float32Array
-    """1/sigma_tr, shape (n, 3)."""
+    """Diffuse mean free path 1/sigma_tr, shape (n, 3)."""
     measured: BoolArray
-    """Whether a valid texel lies within a texel's width; others hold the nearest valid one's."""
+    """Whether a valid texel is within a texel's width; other points have values of the nearest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,15 +63,15 @@ class FittedSurface:
     Attributes
     ----------
     model
-        Tables and maps.
+        Model with tables and maps.
     mesh
-        Its texture coordinates are those of the maps.
+        Mesh with the texture coordinates of the maps.
     atlas
-        The mesh laid out in the texture.
+        Texture atlas of the mesh.
     normals
         Unit normals of the maps in the frame of the mesh, shape (H, W, 3).
-    carried
-        Whether the mesh has moved against the maps, so that the normals were turned with it.
+    is_transferred
+        Whether the mesh has moved relative to the maps, so that the normals were rotated with it.
     """
 
     model: SkinReflectance
@@ -84,27 +84,27 @@ class FittedSurface:
     """Texels with a surface and valid maps."""
     _width_mm: Float32Array
     _trees: list[tuple[cKDTree, NDArray[np.intp]]] = field(default_factory=list)
-    """Places of the known texels, and of some of them, once they are asked for."""
+    """Search trees of all valid texels, and of a random subset, built on demand."""
 
     @staticmethod
     def of(model: SkinReflectance, mesh: Mesh, *, rest: Mesh | None = None) -> FittedSurface:
-        """Lay maps on a mesh.
+        """Put maps on a mesh.
 
         Parameters
         ----------
         model
-            Maps; all of one square size.
+            Model whose maps have one square size.
         mesh
-            A mesh with the maps' texture coordinates, at rest or moved.
+            Mesh with the maps' texture coordinates, original or moved.
         rest
-            The mesh that the maps were made on, needed where `mesh` has moved: object-space
-            normals only fit the mesh that they were measured on.
+            Original mesh of the maps, required if `mesh` has moved, since normals in object space
+            are valid only on the mesh on which they were measured.
 
         Raises
         ------
         GeometryError
-            The texture coordinates are of another layout, or the mesh has moved and `rest` is not
-            given.
+            If the texture coordinates have another layout, or the mesh has moved and `rest` is
+            missing.
         """
         height, width = model.valid.shape
         if height != width:
@@ -114,7 +114,7 @@ class FittedSurface:
         share = float(np.sum(both)) / max(float(np.sum(atlas.covered)), 1.0)
         if share < MIN_COVERED_FRACTION:
             raise GeometryError(
-                f"mesh: the maps hold values for {100 * share:.0f} % of it, expected at least "
+                f"mesh: the maps have values for {100 * share:.0f} % of it, expected at least "
                 f"{100 * MIN_COVERED_FRACTION:.0f} %; its texture coordinates are not those of "
                 "the maps: export it with the layout of the appearance's own mesh"
             )
@@ -122,7 +122,7 @@ class FittedSurface:
         median = float(np.median(apart))
         if median > MAX_LAYOUT_DISTANCE_MM:
             raise GeometryError(
-                f"mesh: its points lie {median:.0f} mm (median) from where the maps have them, "
+                f"mesh: its points are {median:.0f} mm (median) from their positions in the maps, "
                 f"expected less than {MAX_LAYOUT_DISTANCE_MM:.0f} mm; its texture coordinates are "
                 "not those of the maps, or it is in another frame"
             )
@@ -132,14 +132,14 @@ class FittedSurface:
         )
         if rest is None and median > MAX_SAME_MESH_MM:
             raise GeometryError(
-                f"mesh: lies {median:.1f} mm (median) from the maps' own places; normals in the "
-                "rig's frame fit only the mesh that they were measured on: give that one, too"
+                f"mesh: its points are {median:.1f} mm (median) from their positions in the maps, "
+                "expected the original mesh for normals in the rig frame; give that one, too"
             )
         normals = np.asarray(model.normals, np.float32)
         if moved and rest is not None:
             normals = transfer_normals(normals, unwrap(rest, width), atlas)
         depth = np.asarray(model.translucency_mm, np.float32)
-        # where nothing is known light must spread, too
+        # unknown texels get the median, as subsurface scattering needs a value everywhere
         usual = np.median(depth[model.valid], axis=0)
         layers = [model.r_d, model.weights, normals, np.where(depth > 0.0, depth, usual)]
         values = np.concatenate([np.asarray(layer, np.float32) for layer in layers], axis=-1)
@@ -147,7 +147,7 @@ class FittedSurface:
         return FittedSurface(model, mesh, atlas, normals, moved, np.nan_to_num(values), both, width)
 
     def with_sigma_tr(self, sigma_tr_per_mm: ArrayLike) -> FittedSurface:
-        """Return the same surface above a medium of one sigma_tr, three channels, 1/mm."""
+        """Return the same surface with a uniform sigma_tr, three channels, 1/mm."""
         depth = (1.0 / np.asarray(sigma_tr_per_mm, np.float64)).astype(np.float32)
         spread_out = np.broadcast_to(depth, self.model.translucency_mm.shape).copy()
         values = self._values.copy()
@@ -158,7 +158,7 @@ class FittedSurface:
         return dataclasses.replace(self, model=model, _values=values)
 
     def with_lobes(self, model: SkinReflectance) -> FittedSurface:
-        """Return the same surface with the lobes and shares of another model of the same maps."""
+        """Return the same surface with basis BRDFs and weights of another model of these maps."""
         layers = [self._values[..., :3], model.weights, self._values[..., -6:]]
         values = np.concatenate(layers, axis=-1)
         own = dataclasses.replace(self.model, lobes=model.lobes, weights=model.weights)
@@ -167,20 +167,20 @@ class FittedSurface:
     def at(
         self, uv: Float32Array, position_mm: Float32Array, normal: Float32Array
     ) -> SurfacePointSamples:
-        """Look the maps up at points of the mesh.
+        """Sample the maps at points of the mesh.
 
-        Bilinearly among valid texels of the same place. Without any, valid surroundings
-        on the mesh are used, with its normal: neighbors in the texture would add other parts of
-        the face where charts are small.
+        Interpolation is bilinear over valid texels of the same part of the surface. Without any,
+        nearby valid texels on the mesh are used, with the mesh's normal. Neighbors in the texture
+        could belong to other parts of the face where charts are small.
 
         Parameters
         ----------
         uv
             Texture coordinates, shape (n, 2), (0, 0) is bottom left.
         position_mm
-            The points, shape (n, 3), frame of the mesh.
+            Points, shape (n, 3), in the frame of the mesh.
         normal
-            The mesh's shading normals there, shape (n, 3).
+            Shading normals of the mesh at the points, shape (n, 3).
         """
         point, place = (np.ascontiguousarray(one, np.float32) for one in (position_mm, uv))
         rows = np.zeros((len(uv), self._values.shape[-1]), np.float32)
@@ -199,7 +199,7 @@ class FittedSurface:
         return SurfacePointSamples(r_d, weights, normalize_vectors(normals), translucency, measured)
 
     def _sample_neighbors(self, point: Float32Array) -> tuple[Float32Array, BoolArray]:
-        """Return means of known texels around points, and where one is within its own width."""
+        """Return means of valid texels near points, and whether one is within its own width."""
         if not self._trees:
             every = np.flatnonzero(self._known)
             some = np.sort(np.random.default_rng(0).permutation(every)[:N_SPARSE_TEXELS])
@@ -214,7 +214,7 @@ class FittedSurface:
     def _mean(
         self, tree: cKDTree, texels: NDArray[np.intp], point: Float32Array
     ) -> tuple[Float32Array, BoolArray]:
-        """Return means of the nearest texels by inverse squares, and where one is near."""
+        """Return inverse-square means of nearest texels, and whether one is within its width."""
         count = min(N_NEAREST_TEXELS, len(texels))
         distance, index = tree.query(point.astype(np.float64), k=range(1, count + 1))
         found = texels[index]
@@ -226,22 +226,22 @@ class FittedSurface:
 
 
 def transfer_normals(normals: Float32Array, rest: Atlas, moved: Atlas) -> Float32Array:
-    """Return normals of relief on a surface after the surface has moved below it.
+    """Transfer normals of relief to a deformed surface.
 
-    Relief keeps its height: a normal turns by the inverse transpose of the change of the frame of
-    the two tangents and the smooth normal, so that stretched skin becomes flatter.
+    Relief keeps its height. A normal is transformed by the inverse transpose of the change of the
+    frame of two tangents and the smooth normal, so that stretched skin becomes flatter.
 
     Parameters
     ----------
     normals
-        Unit normals in the frame of the resting surface, shape (N, N, 3).
+        Unit normals on the undeformed surface, shape (N, N, 3).
     rest, moved
-        The same texture before and after, see `rigsim.geometry.atlas.unwrap`.
+        Atlas before and after the deformation, see `rigsim.geometry.atlas.unwrap`.
 
     Returns
     -------
     ndarray of float32
-        Unit, shape (N, N, 3); as they were where either has no surface.
+        Unit normals, shape (N, N, 3); unchanged where either atlas has no surface.
 
     Examples
     --------
@@ -255,32 +255,33 @@ def transfer_normals(normals: Float32Array, rest: Atlas, moved: Atlas) -> Float3
     [0.800000011920929, 0.0, -0.6000000238418579]
     """
     before, after = _frames(rest), _frames(moved)
-    # a height in both frames, as long as a side of the texture is, so that none is ill-conditioned
+    # the normal axis is scaled to the length of the tangents, for well-conditioned frames
     height = np.sqrt(np.linalg.norm(np.cross(before[..., 0, :], before[..., 1, :]), axis=-1))
     for frame in (before, after):
         frame[..., 2, :] *= height[..., None]
     good = (np.abs(np.linalg.det(before)) > 1e-9) & (np.abs(np.linalg.det(after)) > 1e-9)
     whole = good[..., None, None]
-    # frames have their vectors as rows: inverse transpose of the change is after^-1 before
+    # with frames as rows, x = c B before and x' = c A after: the change is B^-1 A, whose inverse
+    # transpose acts on normals (columns) as A^-1 B
     slopes = np.einsum("hwij,hwj->hwi", before, normals.astype(np.float64))
     turned = np.linalg.solve(np.where(whole, after, np.eye(3)), slopes[..., None])[..., 0]
     return np.where(good[..., None], normalize_vectors(turned), normals).astype(np.float32)
 
 
 def read_own_mesh(appearance: SkinAppearance) -> Mesh:
-    """Return the mesh that an appearance's maps lie on.
+    """Read the mesh of an appearance's maps.
 
     Raises
     ------
     GeometryError
-        It holds none with texture coordinates.
+        If it has no mesh with texture coordinates.
     """
     for name in MESH_FILES:
         if name in appearance.files:
             return parse_mesh(appearance.files[name], name)
     raise GeometryError(
-        f"appearance: holds no {MESH_FILES[0]}; make it with `skinrig reconstruct SESSION --maps "
-        "normals,r_d,basis_weight_0`, or name a mesh with --mesh"
+        f"appearance: {MESH_FILES[0]} is missing; create it by `skinrig reconstruct SESSION --maps "
+        "normals,r_d,basis_weight_0`, or give a mesh with --mesh"
     )
 
 
@@ -290,7 +291,7 @@ def read_mesh(path: str | Path) -> Mesh:
     Raises
     ------
     MeshFileError
-        The file is missing, damaged, of another kind, or has no texture coordinates.
+        If the file is missing, damaged, of another type, or without texture coordinates.
     """
     path = Path(path)
     if path.suffix == ".npz":
@@ -305,7 +306,7 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def parse_mesh(data: bytes, name: str) -> Mesh:
-    """Return the mesh in the bytes of an .obj or .ply file; see `read_mesh`."""
+    """Parse the bytes of an .obj or .ply file; see `read_mesh`."""
     import trimesh
 
     kind = Path(name).suffix[1:]
@@ -313,12 +314,14 @@ def parse_mesh(data: bytes, name: str) -> Mesh:
         loaded = trimesh.load(io.BytesIO(data), file_type=kind, process=False, force="mesh")
         vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
         uv = getattr(loaded.visual, "uv", None)
-    except Exception as error:  # the reader raises whatever its parser meets
-        raise MeshFileError(f"{name}: cannot be read as .{kind}: {error}") from error
+    except Exception as error:  # the reader raises exceptions of its parsers
+        raise MeshFileError(
+            f"{name}: not readable as .{kind} ({error}); export it again"
+        ) from error
     if uv is None or len(uv) != len(vertices):
         raise MeshFileError(
-            f"{name}: has no texture coordinates, so no map can be laid on it; export it with "
-            "those of the appearance's own mesh"
+            f"{name}: got no texture coordinates, expected those of the appearance's own mesh; "
+            "export them, too"
         )
     try:
         return build_mesh(vertices, faces, np.clip(uv, *_rounding_margin(np.asarray(uv))))
@@ -329,7 +332,7 @@ def parse_mesh(data: bytes, name: str) -> Mesh:
 
 
 def normalize_vectors(vectors: ArrayLike) -> Float32Array:
-    """Return vectors at length 1, shape (..., 3), in float32; (0, 0, 1) for those of none."""
+    """Normalize vectors, shape (..., 3), to float32; (0, 0, 1) for zero vectors."""
     given = np.asarray(vectors)
     length = np.linalg.norm(given, axis=-1, keepdims=True)
     up = np.array([0.0, 0.0, 1.0])
@@ -344,6 +347,6 @@ def _frames(atlas: Atlas) -> Float64Array:
 
 
 def _rounding_margin(uv: FloatArray) -> tuple[float, float]:
-    """Return the range that rounded coordinates are put into; what is farther out stays wrong."""
+    """Return the range within which rounded coordinates are clipped; others remain errors."""
     low, high = float(uv.min()), float(uv.max())
     return (0.0 if low > -1e-5 else low), (1.0 if high < 1.0 + 1e-5 else high)

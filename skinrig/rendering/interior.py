@@ -1,4 +1,4 @@
-"""Light inside a rendered face: what enters everywhere by all lights, and where it comes out."""
+"""Compute subsurface light of a rendered face: entering flux by all lights, and exiting flux."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from skinrig.rendering.geometry import FittedSurface, SurfacePointSamples
 from skinrig.rendering.lights import Light
 
 POINTS_PER_SIDE: Final = 2
-"""Points along each side of a piece that light is looked for at."""
+"""Sample points along each side of a surface element."""
 MIN_LIGHTS_FOR_ONE_POINT: Final = 8
-"""With so many lights one point is enough: their shadows' steps lie in different places."""
+"""Number of lights from which one sample point suffices, since their shadow edges differ."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lighting:
-    """Lights, and what casts shadows in them."""
+    """Lights with their shadow caster."""
 
     lamps: Sequence[Light]
     shadows: Caster
     samples: int
-    """Points on the disc of a light that has a radius."""
+    """Shadow rays per light with a radius."""
 
     def entering_radiance(
         self,
@@ -41,7 +41,7 @@ class Lighting:
         normals: Float32Array,
         eta: float,
     ) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
-        """Return what a light brings to points.
+        """Compute the irradiance and visibility of a light at points.
 
         Parameters
         ----------
@@ -55,11 +55,11 @@ class Lighting:
         Returns
         -------
         entered, arriving : ndarray of float64, shape (n, 3)
-            Through the boundary, and before it: over what a white patch that faces the light shows.
+            Transmitted and incident light, relative to a white patch that faces the light.
         towards : ndarray of float64, shape (n, 3)
             Unit vectors to the light.
         seen : ndarray of float64, shape (n,)
-            Share of the light that is seen; 0 where the point does not face it.
+            Visible fraction of the light; 0 if the point does not face it.
         """
         towards, white = lamp.directions_and_irradiance(position_mm)
         cosine = np.einsum("nk,nk->n", normals.astype(np.float64), towards)
@@ -77,20 +77,20 @@ class Lighting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Interior:
-    """The skin below a surface, ready for any light: S pieces of it that light enters by.
+    """Skin below a surface, discretized to S surface elements, independent of the lights.
 
     Attributes
     ----------
-    laid
+    surface
         Surface and maps.
     position_mm, across_mm, along_mm, normals
-        Middle of each piece, its two sides, and the maps' normal, shape (S, 3).
+        Center of each element, its two sides, and the maps' normal, shape (S, 3).
     prim
-        Its triangle, shape (S,).
+        Triangle of each element, shape (S,).
     tree
-        Places and areas of the pieces.
+        Search tree of positions and areas of the elements.
     tolerance
-        Aimed-at error of what leaves, over the brightest light that entered.
+        Target error of the exiting flux, relative to the largest entering flux.
     """
 
     laid: FittedSurface
@@ -109,16 +109,16 @@ class Interior:
         subdivisions: int = 1,
         region: tuple[ArrayLike, float] | None = None,
     ) -> Interior:
-        """Divide the skin into texels.
+        """Discretize the skin by texels.
 
         Parameters
         ----------
-        laid
+        surface
             Surface and maps.
-        finer
-            Pieces along each side of a texel.
-        near
-            A place, mm, and a distance, mm, within which the skin is taken; None: all of it.
+        subdivisions
+            Elements along each side of a texel.
+        region
+            Center, mm, and radius, mm, of the discretized skin; None: all.
         """
         atlas = (
             surface.atlas
@@ -141,14 +141,14 @@ class Interior:
         return Interior(surface, position, across, along, held.normals, atlas.prim[chosen], tree)
 
     def with_surface(self, surface: FittedSurface) -> Interior:
-        """Return the same pieces below other maps on the same mesh with the same normals."""
+        """Return the same elements with other maps on the same mesh with the same normals."""
         return replace(self, laid=surface)
 
     def compute_entered_flux(self, lighting: Lighting) -> Float64Array:
-        """Return what passes the surface by the pieces, over what a white patch shows, (S, 3)."""
+        """Return the flux entering each element, relative to a white patch, (S, 3)."""
         faces = lighting.shadows.face_normals[self.prim]
         total = np.zeros((len(self.prim), 3))
-        # several points of each piece, or shadows would end in steps
+        # several points per element anti-alias the shadow edges
         points = POINTS_PER_SIDE if len(lighting.lamps) < MIN_LIGHTS_FOR_ONE_POINT else 1
         offsets = (np.arange(points, dtype=np.float32) + np.float32(0.5)) / points - 0.5
         eta = self.laid.model.eta
@@ -167,16 +167,16 @@ class Interior:
         rows: SurfacePointSamples,
         entered_at: Float64Array,
     ) -> Float64Array:
-        """Return what comes back to the surface from inside at points, before it leaves, (n, 3).
+        """Return the subsurface flux arriving at points from inside, before transmission, (n, 3).
 
         Parameters
         ----------
         entered
-            By the pieces, see `compute_entered_flux`.
+            Entering flux of the elements, see `compute_entered_flux`.
         position_mm, rows
-            Points, shape (n, 3), and what the maps hold there.
+            Points, shape (n, 3), and values of the maps there.
         entered_at
-            What enters at the points themselves, shape (n, 3).
+            Entering flux at the points themselves, shape (n, 3).
         """
         return dipole_gather.gather(
             self.tree,

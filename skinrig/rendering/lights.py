@@ -1,6 +1,6 @@
-"""Lights to render by: at a place, far away, or the LEDs of a calibrated rig.
+"""Define the lights of renderings: near, distant, or the LEDs of a calibrated rig.
 
-Strengths are in one unit: what a perfect white Lambertian patch that faces the light would show.
+The unit of intensity is the value of a perfect white Lambertian patch that faces the light.
 """
 
 from __future__ import annotations
@@ -17,52 +17,54 @@ from numpy.typing import ArrayLike
 from capture.calibration.lights import LightTable
 from model import store
 from skinrig.arrays import Float32Array, Float64Array
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 
 Vector = tuple[float, float, float]
 
 FAR_LIGHT_MM: Final = 1e5
-"""Distance of the disc of a distant light, at which shadow rays end, mm."""
+"""Distance of a distant light's disc, at which shadow rays end."""
 MAX_UNDIVIDED_RAD: Final = 0.04
-"""Seen larger than this (half its width) a light is shaded in parts: lobes change across it."""
+"""Maximum angular radius of a light that is shaded as one; BRDFs vary over larger ones."""
 LIGHT_PARTS: Final = 16
-"""Into how many parts a broad light is divided."""
+"""Number of parts of a divided light."""
 GOLDEN_ANGLE_RAD: Final = math.pi * (3.0 - math.sqrt(5.0))
 
 
 class LightError(ValueError):
-    """A light that cannot be rendered by."""
+    """Invalid light."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Light:
-    """A round light, at a place or far away; one of `position_mm` and `direction` is given."""
+    """A circular light, near or distant; either `position_mm` or `direction` is given."""
 
     name: str
-    """What messages and records call it."""
+    """Name in messages and records."""
     intensity: Vector = (1.0, 1.0, 1.0)
-    """What a white Lambertian patch that faces the light shows, at least 0, in the channels of the
-    model; of a light at a place at `reference_mm` from it, on its axis."""
+    """Value of a white Lambertian patch that faces the light, at least 0, in the channels of the
+    model; for a near light at `reference_mm` on its axis."""
     position_mm: Vector | None = None
-    """Centre of its disc, mm, rig frame."""
+    """Center of its disc, mm, rig frame."""
     direction: Vector | None = None
-    """Towards a light that is far away, rig frame, any length; kept as a unit vector."""
+    """Direction towards a distant light, rig frame, any length; stored as a unit vector."""
     radius: float = 0.0
-    """Of its disc: mm at a place, rad far away; 0 is a point, which casts hard shadows."""
+    """Radius of its disc: mm if near, rad if distant; 0: a point, with hard shadows."""
     reference_mm: float | None = None
-    """Distance at which `intensity` holds, mm; None: that of the rig's origin."""
+    """Distance at which `intensity` is stated, mm; None: that of the rig's origin."""
     axis: Vector | None = None
-    """In which it shines, any length; None: towards the rig's origin."""
+    """Direction of its axis, any length; None: towards the rig's origin."""
     divisible: bool = True
-    """Whether it is shaded in parts where it is broad; not where it is one of many itself."""
+    """Whether a broad light is shaded in parts; False for parts of a larger source."""
     exponent: float = 0.0
-    """Of the cosine off its axis that it falls off by; 0: the same in all directions."""
+    """Exponent of the cosine of the angle from its axis; 0: isotropic."""
     _reference: float = field(default=1.0, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check the numbers, and make directions unit vectors."""
+        """Check the numbers and normalize directions."""
         if (self.position_mm is None) == (self.direction is None):
-            raise LightError(f"light {self.name!r}: got both or none of place and direction")
+            raise LightError(
+                f"light {self.name!r}: got both or neither of position and direction, expected one"
+            )
         for name in ("intensity", "position_mm", "direction", "axis"):
             given = getattr(self, name)
             if given is not None:
@@ -93,7 +95,7 @@ class Light:
 
     @staticmethod
     def from_table(table: LightTable, name: str, *, radius_mm: float) -> Light:
-        """Return a calibrated light; renderings then have the unit of the images.
+        """Create a calibrated light; renderings then have the unit of the images.
 
         Parameters
         ----------
@@ -102,16 +104,18 @@ class Light:
         name
             One of ``table.names``.
         radius_mm
-            Of its disc, mm.
+            Radius of its disc, mm.
 
         Raises
         ------
         LightError
-            The light is unknown, or its calibration is invalid.
+            If the light is unknown, or its calibration is invalid.
         """
-        row = table.names.index(one_of("light", name, table.names, LightError))
+        row = table.names.index(require_choice("light", name, table.names, LightError))
         if not table.valid[row]:
-            raise LightError(f"light {name!r}: is dead, or its calibration is not valid")
+            raise LightError(
+                f"light {name!r}: defective, or its calibration is invalid; choose another light"
+            )
         place = _check_triple(name, "position_mm", table.position_mm[row])
         away = math.hypot(*place)
         return Light(
@@ -125,7 +129,7 @@ class Light:
         )
 
     def directions_and_irradiance(self, points_mm: ArrayLike) -> tuple[Float64Array, Float64Array]:
-        """Return the directions to the light and what a white that faces it would show.
+        """Return the directions to the light and the values of a white patch that faces it.
 
         Parameters
         ----------
@@ -135,7 +139,7 @@ class Light:
         Returns
         -------
         direction, white : ndarray of float64
-            Unit vectors towards the light, shape (n, 3), and strengths, shape (n, 3).
+            Unit vectors towards the light, shape (n, 3), and values, shape (n, 3).
 
         Examples
         --------
@@ -160,7 +164,7 @@ class Light:
         return direction, strength * np.asarray(self.intensity)
 
     def disc(self) -> tuple[Float64Array, float]:
-        """Return the centre of the disc, mm, shape (3,), and its radius, mm: shadow rays end there.
+        """Return center, mm, shape (3,), and radius, mm, of the disc at which shadow rays end.
 
         The disc of a distant light is at `FAR_LIGHT_MM`.
         """
@@ -169,7 +173,7 @@ class Light:
         return np.asarray(self.position_mm, np.float64), self.radius
 
     def parts(self, count: int = LIGHT_PARTS) -> tuple[Light, ...]:
-        """Return a broad light as smaller ones that together give the same; others as they are."""
+        """Divide a broad light into smaller ones of the same total; return others unchanged."""
         center, radius = self.disc()
         away = float(np.linalg.norm(center))
         if not self.divisible or count < 2 or away == 0.0 or radius <= MAX_UNDIVIDED_RAD * away:
@@ -184,7 +188,8 @@ class Light:
             np.cos(k * GOLDEN_ANGLE_RAD)[:, None] * side
             + np.sin(k * GOLDEN_ANGLE_RAD)[:, None] * other
         )
-        # a white that faces the middle sees the others aslant, and at a place farther away
+        # a white patch that faces the center receives the parts at an angle and, for a near light,
+        # from a larger distance; intensities are scaled so that the total is kept
         cosine = away / np.linalg.norm(places, axis=-1)
         whole = float(np.sum(cosine if self.direction is not None else cosine**3))
         share = tuple(value / whole for value in self.intensity)
@@ -222,12 +227,12 @@ MAX_LIGHT_RADIUS_RAD: Final = 0.35
 MAX_LIGHTS: Final = 65_536
 
 
-def directions(height: int, width: int) -> tuple[Float64Array, Float64Array]:
-    """Return unit vectors to the middles of the map's pixels, (H, W, 3), and solid angles, (H, W).
+def compute_pixel_directions(height: int, width: int) -> tuple[Float64Array, Float64Array]:
+    """Return unit vectors to the centers of a map's pixels, (H, W, 3), and solid angles, (H, W).
 
     Examples
     --------
-    >>> towards, solid = directions(90, 180)
+    >>> towards, solid = compute_pixel_directions(90, 180)
     >>> towards[44, 90].round(1).tolist(), bool(abs(solid.sum() - 4 * math.pi) < 1e-9)
     ([-0.0, 0.0, 1.0], True)
     """
@@ -244,7 +249,7 @@ def directions(height: int, width: int) -> tuple[Float64Array, Float64Array]:
     return towards, solid
 
 
-def environment_lights(
+def sample_environment_lights(
     radiance: ArrayLike, count: int, *, rng: np.random.Generator
 ) -> tuple[Light, ...]:
     """Sample distant lights from an environment map with probability proportional to power.
@@ -255,26 +260,26 @@ def environment_lights(
     Parameters
     ----------
     radiance
-        Shape (H, W, 3), at least 0, finite; see this module for its frame and unit.
+        Shape (H, W, 3), at least 0, finite; see this module for frame and unit.
     count
-        Lights, at least 1.
+        Number of lights, at least 1.
     rng
         Generator of the positions in the strata.
 
     Returns
     -------
     tuple of Light
-        Their angular radius is that of the solid angle that each represents, at most
+        Lights whose angular radius is that of the represented solid angle, at most
         `MAX_LIGHT_RADIUS_RAD`.
 
     Raises
     ------
     LightError
-        The map is not such an image, or it is dark.
+        If the map is not such an image, or is black.
 
     Examples
     --------
-    >>> lights = environment_lights(np.ones((8, 16, 3)), 32, rng=np.random.default_rng(0))
+    >>> lights = sample_environment_lights(np.ones((8, 16, 3)), 32, rng=np.random.default_rng(0))
     >>> white = sum(light.intensity[0] for light in lights)
     >>> len(lights), round(white, 6)  # over all directions, four times what comes from the front
     (32, 4.0)
@@ -286,11 +291,12 @@ def environment_lights(
         raise LightError("environment: got negative or non-finite values, expected radiances")
     if not 1 <= count <= MAX_LIGHTS:
         raise LightError(f"environment lights: got {count}, expected 1 to {MAX_LIGHTS}")
-    towards, solid = directions(*image.shape[:2])
+    towards, solid = compute_pixel_directions(*image.shape[:2])
     power = image.mean(axis=-1) * solid
     if not power.sum() > 0.0:
         raise LightError("environment: got a map without light")
-    # every second row runs backwards, so that neighbors on the way are neighbors in the map
+    # every second row is reversed (boustrophedon), so that neighbors in the order are neighbors in
+    # the map
     order = np.arange(power.size).reshape(power.shape)
     order[1::2] = order[1::2, ::-1]
     order = order.reshape(-1)
@@ -322,7 +328,7 @@ def read_environment(path: str | Path) -> Float32Array:
     Raises
     ------
     model.store.StoreError
-        The file is missing or no such image.
+        If the file is missing or not such an image.
     """
     image = store.read_exr(path)
     return np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image

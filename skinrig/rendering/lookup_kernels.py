@@ -1,4 +1,4 @@
-"""Look textures up among the texels that show the same place of a surface."""
+"""Sample textures from texels of the same part of a surface."""
 
 from typing import Final
 
@@ -6,23 +6,23 @@ import numpy as np
 from numba import njit, prange
 
 MAX_TEXEL_DISTANCE: Final = 2.0
-"""A texel counts for a point up to so many of its own widths away on the surface."""
+"""Maximum distance of a used texel from a point on the surface, in widths of the texel."""
 POINTS_PER_THREAD_BLOCK: Final = 1 << 12
 
 
 @njit(parallel=True, cache=True)
 def look_up(values, valid, position, width, uv, point, out, total_weight):  # type: ignore[no-untyped-def]
-    """Blend the four texels around texture coordinates, without those of other places.
+    """Blend the four texels around texture coordinates, without those of other parts.
 
-    Charts lie close together in a texture: the texels around a point near a chart's rim, or in a
-    chart smaller than a texel, may show another part of the surface.
+    Charts are adjacent in a texture. Texels around a point near a chart's border, or in a chart
+    smaller than a texel, may thus belong to another part of the surface.
 
     Parameters
     ----------
     values : float32 (H, W, C)
         Row 0 is at v = 1.
     valid : bool (H, W)
-        Texels that hold something.
+        Texels with values.
     position : float32 (H, W, 3)
         Surface point of each texel, mm.
     width : float32 (H, W)
@@ -32,9 +32,9 @@ def look_up(values, valid, position, width, uv, point, out, total_weight):  # ty
     point : float32 (n, 3)
         Surface points, mm, in the frame of `position`.
     out : float32 (n, C)
-        Blends; 0 where no texel counts.
+        Blended values; 0 without a used texel.
     total_weight : float32 (n,)
-        Sum of the weights of those that count, 0 to 1.
+        Sum of the weights of used texels, 0 to 1.
     """
     rows, columns, channels = values.shape
     for chunk in prange((uv.shape[0] + POINTS_PER_THREAD_BLOCK - 1) // POINTS_PER_THREAD_BLOCK):

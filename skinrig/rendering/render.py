@@ -1,4 +1,4 @@
-"""Render a fitted model of skin: rays by the renderer, then the fitted maps at what they meet.
+"""Render a fitted skin model: ray tracing, then shading by the fitted maps at the hit points.
 
 Geometry, texture coordinates and shadows come from `rigsim.render`; what a point reflects comes
 from `model.skin_reflectance`, direct light only. Radiance is relative to that of a perfect
@@ -7,8 +7,8 @@ light's intensity is stated (see `skinrig.rendering.lights`)::
 
     L = sum over lights of  w V cos(theta) (pi f_surface + F_t(light) F_t(view) R_d)
 
-with w the white patch's value, V the share of the light that the point sees, and R_d F_t(light)
-replaced by the dipole's sum over the skin where light spreads in it.
+with w the white patch's value and V the visible fraction of the light. With subsurface scattering,
+R_d F_t(light) is replaced by the dipole's sum over the skin.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from model.skin_reflectance import lobe_brdf, transmittance
 from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.render import Caster, GBuffer, trace
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.camera import Camera, RenderingError
 from skinrig.rendering.geometry import FittedSurface, SurfacePointSamples
@@ -32,41 +32,41 @@ from skinrig.rendering.interior import Interior, Lighting
 from skinrig.rendering.lights import Light
 
 Subsurface = Literal["local", "dipole", "none"]
-"""Light from inside leaves where it entered, spreads by the dipole, or is left out."""
+"""Subsurface light leaves at its point of entry, is scattered by the dipole, or is omitted."""
 
 BAND_RAYS: Final = 1 << 18
-"""Camera rays worked on at a time; bounds memory."""
+"""Camera rays per batch; limits memory."""
 SUBPIXELS_PER_SIDE: Final = 2
 SHADOW_SAMPLES: Final = 4
-"""Rays to different points of a light's disc, from each ray of a pixel."""
+"""Shadow rays to points of a light's disc, per camera ray."""
 MIN_LIT_FRACTION: Final = 0.999
-"""Share of a light that counts as all of it."""
+"""Minimum visible fraction of a light that counts as fully visible."""
 MIN_OUTSIDE_FRACTION: Final = 0.5
-"""Least share of what a camera sees of the mesh that must be its outside."""
+"""Minimum fraction of camera rays on the mesh that must hit its outside."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rendering:
-    """A picture and what it is made of, averaged over whole pixels; row 0 is the top.
+    """A rendered image with its components, averaged over pixels; row 0 is the top.
 
     Attributes
     ----------
     radiance
         Sum of the two below, (H, W, 3); see this module for its unit.
     diffuse
-        What left the inside of the skin.
+        Radiance of subsurface light, (H, W, 3).
     surface
-        What its surface reflected.
+        Radiance of specular reflection, (H, W, 3).
     coverage
-        Share of each pixel that is skin, (H, W), 0 to 1.
+        Fraction of each pixel that is skin, (H, W), 0 to 1.
     covered
-        Pixels wholly on skin that was measured.
+        Pixels entirely on measured skin, (H, W).
     lit
-        Covered pixels of which every ray sees the whole of a light that it faces.
+        Covered pixels all of whose rays have full visibility of each light that they face.
     uv
         Mean texture coordinates, (H, W, 2); (0, 0) outside the skin.
     subsurface
-        How light from inside was treated.
+        Treatment of subsurface light.
     """
 
     radiance: Float32Array
@@ -92,31 +92,30 @@ def render_surface(
     interior: Interior | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Rendering:
-    """Render a fitted model.
+    """Render a fitted model under lights.
 
     Parameters
     ----------
-    laid
-        The model laid on a mesh, mm, rig frame.
+    surface
+        The model on a mesh, mm, rig frame.
     camera
         See `skinrig.rendering.camera`.
     lights
-        At least one; their light adds up.
+        At least one light; their radiance is summed.
     subsurface
-        "local": R_d F_t F_t / pi; "dipole": light spreads; "none": the surface alone.
+        "local": R_d F_t F_t / pi; "dipole": subsurface scattering; "none": specular only.
     subpixels
-        Rays along each side of a pixel.
+        Camera rays along each side of a pixel.
     shadow_samples
-        Points on the disc of each light that a ray's end is tested against; lights without a
-        radius need one.
+        Shadow rays per camera ray to the disc of each light; 1 for lights without radius.
     blockers
-        What else casts shadows but is not seen.
+        Mesh that casts shadows but is invisible.
     caster
-        Of the mesh, where there is one already.
+        Precomputed shadow caster of the mesh.
     interior
-        Of the model on the mesh, where there is one already; for "dipole".
+        Precomputed interior of the model on the mesh, for "dipole".
     progress
-        Called with a line of text now and then.
+        Called with one line per step.
 
     Returns
     -------
@@ -125,15 +124,17 @@ def render_surface(
     Raises
     ------
     RenderingError
-        No light, the camera sees nothing of the mesh, or its back.
+        If lights are missing, the mesh is not visible, or only its back is.
     """
     given = [lights] if isinstance(lights, Light) else lights
     if not given:
         raise RenderingError("lights: got none, expected at least one")
     lamps = [part for light in given for part in light.parts()]
-    one_of("subsurface", subsurface, get_args(Subsurface), RenderingError)
+    require_choice("subsurface", subsurface, get_args(Subsurface), RenderingError)
     if shadow_samples < 1:
-        raise RenderingError(f"shadow samples: got {shadow_samples}, expected at least 1")
+        raise RenderingError(
+            f"shadow samples: got {shadow_samples}, expected 1 or more; enter another"
+        )
     rays = Caster(surface.mesh) if caster is None else caster
     shadows = (
         rays
@@ -148,7 +149,9 @@ def render_surface(
     band = max(1, BAND_RAYS // (columns * subpixels**2))
     for top in range(0, height, band):
         part = (top, min(top + band, height))
-        buffers = trace(rays, *rendering_camera.rays(camera, subpixels=subpixels, rows=part))
+        buffers = trace(
+            rays, *rendering_camera.generate_rays(camera, subpixels=subpixels, rows=part)
+        )
         facing = np.einsum("hwk,hwk->hw", buffers.face_normal, buffers.to_camera) > 0.0
         index = np.flatnonzero(buffers.mask & facing)
         out, met = out + len(index), met + int(np.count_nonzero(buffers.mask))
@@ -165,7 +168,7 @@ def render_surface(
 
 
 def join_meshes(*meshes: Mesh) -> Mesh:
-    """Return meshes as one, for shadows."""
+    """Join meshes for shadow rays."""
     starts = np.cumsum([0, *(len(mesh.vertices_mm) for mesh in meshes[:-1])])
     return build_mesh(
         np.concatenate([mesh.vertices_mm for mesh in meshes]),
@@ -177,7 +180,7 @@ def join_meshes(*meshes: Mesh) -> Mesh:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Points:
-    """What rays met: n points of the outside."""
+    """Hit points of camera rays on the outside, n points."""
 
     position_mm: Float32Array
     face_normal: Float32Array
@@ -187,7 +190,7 @@ class _Points:
 
     @staticmethod
     def of(surface: FittedSurface, buffers: GBuffer, index: NDArray[np.intp]) -> _Points:
-        """Gather the rows of a G-buffer that count, and look the maps up there."""
+        """Gather the selected rows of a G-buffer and sample the maps there."""
 
         def flat(image: Float32Array) -> Float32Array:
             return image.reshape(-1, image.shape[-1])[index]
@@ -199,7 +202,7 @@ class _Points:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Shaded:
-    """What n points send to the camera."""
+    """Radiance of n points towards the camera."""
 
     diffuse: Float64Array
     surface: Float64Array
@@ -207,7 +210,7 @@ class _Shaded:
 
 
 def _require_outside(out: int, inside: int, camera: Camera) -> None:
-    """Refuse a camera that misses the mesh or looks at its back, by rays that met its sides."""
+    """Raise if the camera's rays miss the mesh, or mostly hit its inside."""
     place = ", ".join(f"{x:.0f}" for x in camera.center_mm)
     if out + inside == 0:
         raise RenderingError(
@@ -222,7 +225,7 @@ def _require_outside(out: int, inside: int, camera: Camera) -> None:
 
 
 class _PixelAccumulator:
-    """Pixels that rays are averaged into."""
+    """Image buffers into which rays are averaged."""
 
     def __init__(self, height: int, width: int) -> None:
         self.diffuse, self.surface = (np.zeros((height, width, 3), np.float32) for _ in range(2))
@@ -238,7 +241,7 @@ class _PixelAccumulator:
         points: _Points,
         shaded: _Shaded,
     ) -> None:
-        """Average the rays of some rows of pixels."""
+        """Average the rays of a band of pixel rows."""
         width, tall = self.coverage.shape[1], part[1] - part[0]
         wide = width * subpixels
         pixel = index // wide // subpixels * width + index % wide // subpixels
@@ -265,7 +268,7 @@ class _PixelAccumulator:
 def _subsurface_radiance(
     surface: FittedSurface, subsurface: Subsurface, lighting: Lighting, interior: Interior | None
 ) -> Callable[[_Points, Float64Array], Float64Array]:
-    """Return what gives the light that comes from inside at points, of what enters there."""
+    """Return the function from entering to exiting subsurface flux at points."""
     if subsurface == "none":
         return lambda points, entered: np.zeros_like(entered)
     if subsurface == "local":
@@ -283,7 +286,7 @@ def _shade(
     fitted_surface: FittedSurface,
     inside: Callable[[_Points, Float64Array], Float64Array],
 ) -> _Shaded:
-    """Return what points send to the camera by all lights."""
+    """Compute the radiance of points towards the camera, summed over lights."""
     count = len(points.uv)
     entered, surface = np.zeros((count, 3)), np.zeros((count, 3))
     lit = np.zeros(count, np.bool_)

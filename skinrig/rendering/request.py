@@ -19,22 +19,28 @@ from model.skin_reflectance import SkinReflectance, assemble
 from skinrig.errors import UnusableError, UsageError
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.camera import Camera
-from skinrig.rendering.lights import Light, LightError, Vector, environment_lights, read_environment
+from skinrig.rendering.lights import (
+    Light,
+    LightError,
+    Vector,
+    read_environment,
+    sample_environment_lights,
+)
 
 POSITION_PREFIX: Final = "at:"
 LED_RADIUS_MM: Final = 10.0
-"""Radius of a light's disc, mm at `LED_DISTANCE_MM`, where none is asked for: the dome's LEDs."""
+"""Radius of a light's disc, mm at `LED_DISTANCE_MM`, by default that of the dome's LEDs."""
 LED_DISTANCE_MM: Final = 700.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class RenderRig:
-    """A rig, drawn or calibrated, whose views and lights can be named."""
+    """A nominal or calibrated rig, whose views and lights are selected by name."""
 
     rig: Rig
     calibration: Path | None
     assumed: list[str]
-    """What was taken for granted for want of a calibration; grows."""
+    """Assumptions in place of missing calibrations; appended."""
 
     @staticmethod
     def of(rig: str, calibration: Path | None) -> RenderRig:
@@ -43,7 +49,7 @@ class RenderRig:
         Raises
         ------
         UnusableError
-            `calibration` is not a folder.
+            If `calibration` is not a folder.
         """
         if calibration is not None and not calibration.is_dir():
             raise UnusableError(f"--calibration: got {calibration}, expected a folder")
@@ -52,23 +58,23 @@ class RenderRig:
     def camera(
         self, text: str, *, size_px: int, target_mm: str = "0,0,0", fov_deg: float = 25.0
     ) -> Camera:
-        """Return a camera: ``C03``, a view of the rig, or ``0,0,700``, a place in mm.
+        """Parse a camera: ``C03``, a view of the rig, or ``0,0,700``, a position in mm.
 
         Parameters
         ----------
         text
-            Name or place, mm.
+            Name or position, mm.
         size_px
-            Columns of the picture; a place gives as many rows.
+            Image width, px; for a position also the height.
         target_mm, fov_deg
-            Where a place looks, and the angle that its picture spans.
+            Target of the optical axis and field of view, for a position.
 
         Raises
         ------
         UsageError
-            Numbers are not as many as they must be, or none.
+            If numbers are missing or malformed.
         UnusableError
-            The rig has no view of that name.
+            If the rig has no view of that name.
         """
         place = parse_triple(text)
         if place is not None:
@@ -82,7 +88,7 @@ class RenderRig:
             view = self.rig.view(text)
         except RigError as error:
             raise _unreadable_error(text)(
-                f"--view: {error}; or give a place in mm, as 0,0,700"
+                f"--view: {error}; or give a position in mm, such as 0,0,700"
             ) from error
         camera = Camera.nominal(view)
         found = self._calibration("geometry", f"camera {text} is at its nominal pose")
@@ -92,24 +98,24 @@ class RenderRig:
         return rendering_camera.bin_pixels(camera, camera.image_size[0] / size_px)
 
     def light(self, text: str, *, radius_mm: float | None = None) -> Light:
-        """Return a light: ``L017``, ``1,1,2`` (towards it) or ``at:300,200,600`` (mm).
+        """Parse a light: ``L017``, ``1,1,2`` (direction) or ``at:300,200,600`` (position, mm).
 
-        A factor after ``*`` is its intensity, one number or red, green, blue: ``L017*0.5``. All
-        show 1 on a white patch that faces them, those at a place at the rig's origin.
+        A factor after ``*`` is its intensity, one number or red, green, blue: ``L017*0.5``. The
+        default is 1 on a white patch that faces the light, for near lights at the rig's origin.
 
         Parameters
         ----------
         text
-            What is asked for.
+            Text of the option.
         radius_mm
-            Of its disc, mm; of a light that is far away at `LED_DISTANCE_MM`. None: the rig's own.
+            Radius of its disc, mm; for a distant light at `LED_DISTANCE_MM`. None: the rig's own.
 
         Raises
         ------
         UsageError
-            Numbers are not as many as they must be, or none.
+            If numbers are missing or malformed.
         UnusableError
-            The rig has no light of that name.
+            If the rig has no light of that name.
         """
         what, _, factor = text.partition("*")
         strength = (1.0, 1.0, 1.0) if not factor else _color(text, factor)
@@ -126,8 +132,8 @@ class RenderRig:
             drawn = self.rig.light(what)
         except RigError as error:
             raise _unreadable_error(what)(
-                f"--light: {error}; or give a direction, as 1,1,2, or a place in mm, as "
-                "at:300,200,600"
+                f"--light: {error}; or give a direction, such as 1,1,2, or a position in mm, such "
+                "as at:300,200,600"
             ) from error
         rig = self.rig.subset(lights=[what])
         table = LightTable.nominal(rig)
@@ -159,24 +165,26 @@ def parse_lights(
     environment_count: int,
     seed: int,
 ) -> tuple[Light, ...]:
-    """Return all lights that were asked for.
+    """Parse all requested lights.
 
     Raises
     ------
     UsageError
-        There is none.
+        If there is none.
     """
     found = [rig.light(text, radius_mm=radius_mm) for text in lights]
     if environment is not None:
         rng = np.random.default_rng(seed)
         try:
-            found += environment_lights(read_environment(environment), environment_count, rng=rng)
+            found += sample_environment_lights(
+                read_environment(environment), environment_count, rng=rng
+            )
         except LightError as error:
             raise LightError(f"{environment}: {error}") from error
     if not found:
         raise UsageError(
-            "--light: got none; name a light of the rig (L017), a direction (1,1,2) or a place "
-            "(at:300,200,600), or give --environment MAP.exr"
+            "--light: got none, expected a light of the rig (L017), a direction (1,1,2) or a "
+            "position (at:300,200,600); give one, or --environment MAP.exr"
         )
     return tuple(found)
 
@@ -184,21 +192,21 @@ def parse_lights(
 def read_model(
     path: Path, *, translucency: str | None = None
 ) -> tuple[SkinAppearance, SkinReflectance]:
-    """Read a fitted appearance and put its model together.
+    """Read a fitted appearance and its model.
 
     Parameters
     ----------
     path
-        An APPEARANCE/ folder of the dome, with lobes and R_d.
+        APPEARANCE/ folder of the dome, with basis BRDFs and R_d.
     translucency
-        sigma_tr of red, green and blue in 1/mm, to be used everywhere, as 0.36,0.79,1.52.
+        Uniform sigma_tr of red, green and blue in 1/mm, such as 0.36,0.79,1.52; None: the model's.
 
     Raises
     ------
     UsageError
-        `translucency` is not three numbers above 0.
+        If `translucency` is not three numbers above 0.
     model.skin_reflectance.SkinReflectanceError
-        It lacks what the model is made of; the message names it.
+        If a part of the model is missing; the message names it.
     """
     appearance = store.read(path)
     if translucency is None:
@@ -209,12 +217,12 @@ def read_model(
 
 
 def parse_sigma_tr(text: str) -> Vector:
-    """Return sigma_tr of three channels, 1/mm.
+    """Parse sigma_tr of three channels, 1/mm.
 
     Raises
     ------
     UsageError
-        It is not three numbers above 0.
+        If the text is not three numbers above 0.
 
     Examples
     --------
@@ -225,18 +233,18 @@ def parse_sigma_tr(text: str) -> Vector:
     if found is None or min(found) <= 0.0:
         raise UsageError(
             f"--translucency: got {text!r}, expected sigma_tr of red, green and blue in 1/mm, "
-            "above 0, as 0.3558,0.7932,1.5173"
+            "above 0, such as 0.3558,0.7932,1.5173"
         )
     return found
 
 
 def parse_subpixels(samples: int) -> int:
-    """Return rays along a pixel's side, of rays in a pixel.
+    """Return the rays along a pixel's side from those per pixel.
 
     Raises
     ------
     UnusableError
-        No square has so many.
+        If the number is not a square.
 
     Examples
     --------
@@ -250,7 +258,7 @@ def parse_subpixels(samples: int) -> int:
 
 
 def parse_triple(text: str) -> Vector | None:
-    """Return three finite numbers joined by commas, or None where the text is something else."""
+    """Parse three finite numbers separated by commas; None for other texts."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:

@@ -1,8 +1,8 @@
-"""A shadow boundary close up, by two media: what translucency does to a face.
+"""Render a shadow boundary close up for two media, to show the effect of translucency.
 
-The paper's figures 17 and 18 show the subjects of least and greatest *translucency*, and give for
-them the least and greatest *sigma_tr*. Translucency is 1/sigma_tr: so the subject of least sigma_tr
-is the most translucent one. Everything here is labelled by sigma_tr.
+The paper's figures 17 and 18 are labeled least and greatest *translucency*, with the least and
+greatest *sigma_tr*. Translucency is 1/sigma_tr, thus the subject of least sigma_tr is the most
+translucent one. All labels here are sigma_tr.
 
 References
 ----------
@@ -30,47 +30,47 @@ from skinrig.rendering.render import Rendering, render_surface
 
 MIN_SIGMA_TR_PER_MM: Final = (0.3558, 0.7932, 1.5173)
 MAX_SIGMA_TR_PER_MM: Final = (0.9171, 1.5682, 1.6569)
-"""sigma_tr of red, green and blue, 1/mm: least and greatest of the paper's dataset B."""
+"""sigma_tr of red, green and blue, 1/mm: minimum and maximum of the paper's dataset B."""
 BOUNDARY_WIDTH_MM: Final = 24.0
-"""What the picture spans on the skin."""
+"""Width of the image on the skin."""
 CAMERA_DISTANCE_MM: Final = 250.0
 CARD_HEIGHT_MM: Final = 30.0
-"""How far off the skin the card's edge is."""
+"""Distance of the card's edge from the skin."""
 LIGHT_SLANT_RAD: Final = 0.6
 """Angle of the light to the skin's normal."""
 SHADOW_LIGHT_RADIUS_RAD: Final = 0.002
-"""Angular radius of the light: a half shadow of 0.1 mm."""
+"""Angular radius of the light, which gives a penumbra of 0.1 mm."""
 MAX_ENTRY_DISTANCE_MM: Final = 25.0
-"""Light that enters farther away does not reach the picture's middle."""
+"""Radius of the discretized skin; light that enters farther away does not reach the center."""
 FACE_TEXELS: Final = 2048
-"""Pieces that a face is divided into along a side of its texture: 0.15 mm."""
+"""Elements along a side of the face's texture: 0.15 mm each."""
 PATCH_MM: Final = 60.0
 PATCH_TEXELS: Final = 256
 FOREHEAD_SITE: Final = (0.12, 0.72)
-"""Where on the face: parts of the mesh's width from its middle, and of its height; the forehead."""
+"""Position on the forehead: offset from the center per width, and fraction of the mesh's height."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShadowBoundary:
-    """A piece of skin half in the shadow of a card; the lit side is on the left."""
+    """A region of skin half in the shadow of a card; the lit side is on the left."""
 
     name: str
     surface: FittedSurface
     camera: Camera
     light: Light
     card: Mesh
-    """Casts the shadow; the camera does not see it."""
+    """Mesh that casts the shadow; invisible to the camera."""
     caster: Caster
     interior: Interior
 
     @staticmethod
     def on_face(surface: FittedSurface, *, size_px: int) -> ShadowBoundary:
-        """Put the shadow on the forehead of a face.
+        """Create the shadow on the forehead of a face.
 
         Raises
         ------
         RenderingError
-            Nothing of the mesh is there.
+            If the mesh has no surface there.
         """
         caster = Caster(surface.mesh)
         low, high = surface.mesh.vertices_mm.min(axis=0), surface.mesh.vertices_mm.max(axis=0)
@@ -80,7 +80,10 @@ class ShadowBoundary:
         origin = np.array([[x, y, high[2] + 10.0]])
         prim, share = caster.first_hit(origin, [[0.0, 0.0, -1.0]])
         if prim[0] < 0:
-            raise RenderingError(f"mesh: nothing at x {x:.0f}, y {y:.0f} mm to cast a shadow on")
+            raise RenderingError(
+                f"mesh: got no surface at x {x:.0f}, y {y:.0f} mm, expected the forehead; check "
+                "its frame"
+            )
         corners = surface.mesh.vertices_mm[surface.mesh.faces[prim[0]]].astype(np.float64)
         one, two = (float(w) for w in share[0])
         target = np.array([1.0 - one - two, one, two]) @ corners
@@ -90,7 +93,7 @@ class ShadowBoundary:
 
     @staticmethod
     def on_plane(model: SkinReflectance, *, size_px: int) -> ShadowBoundary:
-        """Put the shadow on a flat patch of a model's median skin."""
+        """Create the shadow on a flat patch with a model's median maps."""
         corners = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
         mesh = build_mesh(PATCH_MM * corners, [[0, 1, 2], [0, 2, 3]], corners[:, :2] + 0.5)
         shape = (PATCH_TEXELS, PATCH_TEXELS)
@@ -110,7 +113,7 @@ class ShadowBoundary:
         return _boundary("flat patch", laid, Caster(mesh), np.zeros(3), up, size_px)
 
     def render(self, sigma_tr_per_mm: Vector | None, *, subpixels: int = 2) -> Rendering:
-        """Render it above a medium; None: light leaves where it entered."""
+        """Render with a uniform sigma_tr; None: without lateral scattering."""
         laid = (
             self.surface if sigma_tr_per_mm is None else self.surface.with_sigma_tr(sigma_tr_per_mm)
         )
@@ -136,7 +139,7 @@ def _boundary(
     *,
     subdivisions: int = 1,
 ) -> ShadowBoundary:
-    """Put camera, light and card around a point of the skin."""
+    """Place camera, light and card around a point of the skin."""
     up = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
     up /= np.linalg.norm(up)
     right = np.cross(up, normal)
@@ -157,10 +160,11 @@ def _boundary(
     return ShadowBoundary(name, surface, camera, light, card, caster, below)
 
 
-def profile(rendering: Rendering) -> tuple[Float64Array, Float64Array]:
-    """Return places across the boundary in mm, (W,), and light from inside there, (W, 3).
+def measure_profile(rendering: Rendering) -> tuple[Float64Array, Float64Array]:
+    """Return positions across the boundary, mm, (W,), and their subsurface radiance, (W, 3).
 
-    The mean over the middle half of the rows; the lit side is at negative places.
+    The radiance is the mean over the middle half of the rows; the lit side is at negative
+    positions.
     """
     height, width = rendering.coverage.shape
     rows = rendering.diffuse[height // 4 : height - height // 4].astype(np.float64)
@@ -168,21 +172,21 @@ def profile(rendering: Rendering) -> tuple[Float64Array, Float64Array]:
     return place, rows.mean(axis=0)
 
 
-def rise_mm(position_mm: Float64Array, level: Float64Array) -> Float64Array:
-    """Return how far apart 90 % and 10 % of the fall from light to shadow lie, mm, (3,).
+def measure_rise_mm(position_mm: Float64Array, level: Float64Array) -> Float64Array:
+    """Return the distance between the 90 % and 10 % levels of a shadow boundary, mm, (3,).
 
     Parameters
     ----------
-    place_mm
-        Growing, shape (W,).
+    position_mm
+        Increasing positions, shape (W,).
     level
-        Falling from light to shadow, shape (W, 3); its ends count as 1 and 0.
+        Decreasing radiance from light to shadow, shape (W, 3); its ends are the levels 1 and 0.
 
     Examples
     --------
     >>> place = np.linspace(-10.0, 10.0, 201)
     >>> ramp = np.clip(0.5 - place / 4.0, 0.0, 1.0)[:, None] * [1.0, 2.0, 3.0]
-    >>> rise_mm(place, ramp).round(6).tolist()
+    >>> measure_rise_mm(place, ramp).round(6).tolist()
     [3.2, 3.2, 3.2]
     """
     top, bottom = level[:3].mean(axis=0), level[-3:].mean(axis=0)

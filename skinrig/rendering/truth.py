@@ -1,7 +1,7 @@
-"""Ground truth of a simulated face as a fitted model, for tests and benchmarks.
+"""Build a model of a simulated face from its ground truth, for tests and benchmarks.
 
-The simulator's surface is put on tables at some roughnesses, with and without oil; shares between
-them are linear. Nothing is fitted: what a rendering of it misses is the renderer's own error.
+The simulator's surface is tabulated at several roughnesses, with and without oil; weights between
+them are linear. Nothing is fitted, so that errors of its renderings are those of the renderer.
 """
 
 from functools import lru_cache, partial
@@ -20,16 +20,16 @@ from skinrig.arrays import Float32Array, Float64Array
 from skinrig.rendering.lights import Light
 
 TRUE_ROUGHNESS_NODES: Final = np.linspace(0.12, 0.6, 9)
-"""Nodes of the roughness."""
+"""Roughness values of the tables."""
 MIN_TABLE_COSINE: Final = 0.02
-"""Tables hold what the surface does at 89 degrees for directions closer to the horizon, too."""
+"""Minimum cosine of tabulated directions; lower ones get the value at 89 degrees."""
 HAIR_OPTICAL_DEPTH: Final = 1e-3
 """Optical depth of the table of vellus hair."""
 
 
 @lru_cache(maxsize=1)
-def true_lobes() -> BrdfBasis:
-    """Return tables of facets at each roughness, without and with oil, and of vellus hair."""
+def tabulate_true_lobes() -> BrdfBasis:
+    """Tabulate facets at each roughness, without and with oil, and vellus hair."""
     materials = {}
     for roughness in TRUE_ROUGHNESS_NODES:
         for oil in (0.0, 1.0):
@@ -37,22 +37,22 @@ def true_lobes() -> BrdfBasis:
     return brdf_tables.tabulate({**materials, "hair": _hair})
 
 
-def true_model(scene: DomeScene, view: str, *, binning: int = 1) -> SkinReflectance:
-    """Return the truth as a fitted model would hold it.
+def build_true_model(scene: DomeScene, view: str, *, binning: int = 1) -> SkinReflectance:
+    """Build a model from the ground truth of a scene.
 
     Parameters
     ----------
     scene
-        A dome with a face, still, without light that spreads.
+        A dome with a static face, without subsurface scattering.
     view
-        A camera, for its spectral sensitivity.
+        Camera, for its spectral sensitivity.
     binning
-        Texels of the truth along a side of a texel of the model.
+        Ground truth texels along a side of a model texel.
 
     Returns
     -------
     SkinReflectance
-        With brows and lashes; its translucency is 1 mm and means nothing.
+        Model with brows and lashes; its translucency of 1 mm is a placeholder.
     """
     if not isinstance(scene.subject, SimulatedSubject):
         raise TypeError(f"scene: got the target {scene.subject.name!r}, expected a face")
@@ -76,7 +76,7 @@ def true_model(scene: DomeScene, view: str, *, binning: int = 1) -> SkinReflecta
     return SkinReflectance(
         r_d=wide[..., :3],
         weights=np.maximum(wide[..., 9:], 0.0),
-        lobes=true_lobes(),
+        lobes=tabulate_true_lobes(),
         translucency_mm=np.ones((size, size, 3), np.float32),
         normals=wide[..., 3:6] / np.maximum(length, 1e-6),
         position_mm=wide[..., 6:9],
@@ -84,8 +84,8 @@ def true_model(scene: DomeScene, view: str, *, binning: int = 1) -> SkinReflecta
     )
 
 
-def true_light(scene: DomeScene, index: int, view: str) -> Light:
-    """Return one of a dome's lights, in the unit of the simulator's pictures."""
+def build_true_light(scene: DomeScene, index: int, view: str) -> Light:
+    """Build one of a dome's lights, in the unit of the simulator's images."""
     led = scene.rig.lights[index]
     x, y, z = led.position_mm
     away = float(np.linalg.norm(led.position_mm))
@@ -112,7 +112,7 @@ def _lobe(
 
 
 def _above_horizon(directions: Float64Array) -> Float32Array:
-    """Return directions above the horizon, where hair would glow without end."""
+    """Clip directions above the horizon, where the hair's radiance would diverge."""
     up = np.maximum(directions[:, 2:], MIN_TABLE_COSINE)
     across = np.linalg.norm(directions[:, :2], axis=-1, keepdims=True)
     scale = np.sqrt(1.0 - up**2) / np.maximum(across, 1e-9)

@@ -82,7 +82,7 @@ class Candidate:
         return Candidate(name, key, estimate, places[0], other, places[1], (labels, "ground truth"))
 
 
-def strip(
+def draw_first_screen(
     appearances: Mapping[str, SkinAppearance], truths: Mapping[str, SkinAppearance | None]
 ) -> Iterator[page.Block]:
     """Yield the images of the first screen; nothing where no map can be drawn.
@@ -106,7 +106,7 @@ def strip(
         if best is not None and len(panels) < MAX_PANELS:
             panels.append(_panel(title, best))
     for name, appearance in appearances.items():
-        if len(panels) < MAX_PANELS and (plot := subsurface.first_profile(appearance)):
+        if len(panels) < MAX_PANELS and (plot := subsurface.draw_first_profile(appearance)):
             panels.append(Panel("radial profile", name, plot=plot))
             break
     yield from _view(panels)
@@ -132,7 +132,7 @@ def compare_first_screens(
 def _view(panels: Sequence[Panel]) -> Iterator[page.Block]:
     if panels:
         masked = any("masked" in image.alt for one in panels for image in one.images)
-        yield page.view("first_screen", panels=panels, note_text=GRAY_MEANS if masked else "")
+        yield page.build_view("first_screen", panels=panels, note_text=GRAY_MEANS if masked else "")
 
 
 def _keys(appearance: SkinAppearance, pattern: str) -> list[str]:
@@ -155,7 +155,7 @@ def _panel(title: str, chosen: Candidate) -> Panel:
             shown.append((chosen.labels[1], other_values, other_valid))
     crop = _crop(valid)
     shown = [(label, image[crop], mask[crop]) for label, image, mask in shown]
-    unit = page.short_unit(estimate.unit)
+    unit = page.format_short_unit(estimate.unit)
     images, legend = _drawn(title, shown, unit, normals="normals" in chosen.key)
     if len(images) == 1 and estimate.stderr is not None:
         images.append(_uncertainty(title, chosen, box, crop))
@@ -169,7 +169,7 @@ def _panel(title: str, chosen: Candidate) -> Panel:
 def _drawn(
     title: str, shown: list[tuple[str, Float64Array, BoolArray]], unit: str, *, normals: bool
 ) -> tuple[list[page.Image], str]:
-    """Return the images of a quantity to one scale, and a legend where that is no color bar."""
+    """Return the images of a quantity on one scale, and a legend if it is not a color bar."""
     if normals:
         draw = [
             map_images.MapDrawing(title, "", mask, WIDTH_PX, lossy=True).normals(label, image)
@@ -181,7 +181,7 @@ def _drawn(
     if shown[0][1].ndim == 3:
         bright = max(float(np.percentile(shown[0][1][shown[0][2]], 99.5)), 1e-9)
         draw = [
-            map_images.color_image(
+            map_images.draw_color_image(
                 label,
                 np.where(mask[..., None], image / bright, map_images.GRAY_LINEAR),
                 width=WIDTH_PX,
@@ -191,7 +191,7 @@ def _drawn(
             for label, image, mask in shown
         ]
         return draw, f"linear RGB, white: {bright:.2g}"
-    ends = map_images.shared_range([image[mask] for _, image, mask in shown])
+    ends = map_images.compute_shared_range([image[mask] for _, image, mask in shown])
     low, high = (float(f"{end:.2g}") for end in ends)
     colors = "gray" if title == CAPTURED_IMAGE else "viridis"
     draw = [
@@ -208,16 +208,16 @@ def _uncertainty(
 ) -> page.Image:
     """Return the image of an estimate's uncertainty, in the unit of the estimate."""
     stderr = np.asarray(chosen.estimate.stderr, np.float64)
-    unit = page.short_unit(chosen.estimate.unit)
+    unit = page.format_short_unit(chosen.estimate.unit)
     if stderr.ndim == 3:
         stderr = stderr[..., 1] if title.endswith("green") else stderr.mean(axis=-1)
     if "normals" in chosen.key:
         stderr, unit = np.degrees(stderr), "°"
     image, valid = _image(stderr, chosen.estimate.mask, chosen.place, box)
     image, valid = image[crop], valid[crop]
-    reach = float(f"{map_images.percentile_reach(image, valid, 98):.2g}")
+    reach = float(f"{map_images.compute_percentile_reach(image, valid, 98):.2g}")
     drawing = map_images.MapDrawing(title, unit, valid, WIDTH_PX)
-    return drawing.size(map_names.uncertainty(chosen.key), image, reach)
+    return drawing.size(map_names.uncertainty_title(chosen.key), image, reach)
 
 
 def _box(place: SkinMap | None) -> Box | None:

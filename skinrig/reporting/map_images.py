@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from skinrig.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from skinrig.drawing import png
 from skinrig.reporting import map_names, page
-from skinrig.reporting.page import number
+from skinrig.reporting.page import format_number
 from skinrig.unit_format import format_quantity
 
 GRAY_LINEAR = float(png.INVALID_GRAY / 255.0) ** 2.2
@@ -62,9 +62,13 @@ class MapDrawing:
         mask = None if self.valid is None else shrink(self.valid, self.width).astype(bool)
         data = png.Scale(low, high, scale).encode(small, mask, levels=SCALE_COLORS)
         named = f"{self.of}, {title}" if self.of else title
-        scale_words = f"color scale {number(low)} to {format_quantity(number(high), self.unit)}"
+        scale_words = (
+            f"color scale {format_number(low)} to {format_quantity(format_number(high), self.unit)}"
+        )
         alt = f"{named}: {_summary(small, mask, self.unit)}; {scale_words}"
-        bar = page.ColorScale(png.SCALE_CLASSES[scale], number(low), number(high), self.unit)
+        bar = page.ColorScale(
+            png.SCALE_CLASSES[scale], format_number(low), format_number(high), self.unit
+        )
         return _build_image(title, png.to_data_url(data), alt, small.shape, bar)
 
     def size(self, title: str, values: FloatArray, reach: float) -> page.Image:
@@ -87,7 +91,7 @@ class MapDrawing:
         if mask.any():
             length = np.linalg.norm(small[mask], axis=-1)
             tilt = np.degrees(np.arccos(np.clip(small[mask][:, 2] / np.fmax(length, 1e-9), -1, 1)))
-            alt += f"; median tilt from the view {number(float(np.median(tilt)))}°"
+            alt += f"; median tilt from the view {format_number(float(np.median(tilt)))}°"
         return _build_image(
             title, _address(image, self.lossy), alt + _describe_missing(mask), image.shape[:2]
         )
@@ -105,11 +109,13 @@ def _summary(values: Float64Array, mask: BoolArray | None, unit: str) -> str:
     if not shown.any():
         return "all pixels are masked"
     low, median, high = np.percentile(values[shown], [5, 50, 95])
-    within = f"90 % of pixels within {number(low)} to {number(high)}"
-    return f"median {format_quantity(number(median), unit)}, {within}{_describe_missing(shown)}"
+    within = f"90 % of pixels within {format_number(low)} to {format_number(high)}"
+    return (
+        f"median {format_quantity(format_number(median), unit)}, {within}{_describe_missing(shown)}"
+    )
 
 
-def color_image(
+def draw_color_image(
     title: str, linear: FloatArray, *, width: int = 320, of: str = "", lossy: bool = False
 ) -> page.Image:
     """Return a linear sRGB image, (H, W, 3), for the page; ``lossy``: as JPEG."""
@@ -118,18 +124,20 @@ def color_image(
     level = ""
     if finite.any():
         middle = np.median(small[finite], axis=0)
-        level = f": median linear red, green, blue {', '.join(number(float(v)) for v in middle)}"
+        level = (
+            f": median linear red, green, blue {', '.join(format_number(float(v)) for v in middle)}"
+        )
     alt = (f"{of}, {title}" if of else title) + level
-    return _build_image(title, _address(png.srgb8(small), lossy), alt, small.shape[:2])
+    return _build_image(title, _address(png.encode_srgb8(small), lossy), alt, small.shape[:2])
 
 
-def plain_image(title: str, image: UInt8Array, *, alt: str = "") -> page.Image:
+def draw_plain_image(title: str, image: UInt8Array, *, alt: str = "") -> page.Image:
     """Return an 8-bit image, (H, W) or (H, W, 3), for the page as it is."""
     return _build_image(title, _address(image), alt or title, image.shape[:2])
 
 
 def _address(image: UInt8Array, lossy: bool = False) -> str:
-    return png.jpeg_address(image) if lossy else png.to_data_url(png.encode(image))
+    return png.encode_jpeg_url(image) if lossy else png.to_data_url(png.encode(image))
 
 
 def _build_image(
@@ -138,20 +146,20 @@ def _build_image(
     return page.Image(title, address, alt, (shape[1], shape[0]), scale)
 
 
-def percentile_reach(values: FloatArray, mask: BoolArray, percentile: float) -> float:
+def compute_percentile_reach(values: FloatArray, mask: BoolArray, percentile: float) -> float:
     """Return that percentile of the shown |values|, as the end of a color scale."""
     inside = np.abs(values[mask & np.isfinite(values)])
     return float(np.percentile(inside, percentile)) if inside.size else 1.0
 
 
-def shared_range(maps: Sequence[FloatArray]) -> tuple[float, float]:
+def compute_shared_range(maps: Sequence[FloatArray]) -> tuple[float, float]:
     """Return the 1st and 99th percentile of all finite values of several maps."""
     joined = np.concatenate([one[np.isfinite(one)] for one in maps])
     low, high = np.percentile(joined, [1, 99]).tolist() if joined.size else (0.0, 1.0)
     return low, high
 
 
-def map_panel(
+def draw_map_panel(
     name: str,
     unit: str,
     *,
@@ -175,17 +183,19 @@ def map_panel(
         Label of the standard error.
     """
     mask = np.isfinite(estimate) if valid is None else np.asarray(valid, bool)
-    low, high = shared_range([one[mask] for one in (estimate, truth) if one is not None])
+    low, high = compute_shared_range([one[mask] for one in (estimate, truth) if one is not None])
     shown = MapDrawing(name, unit, mask)
     parts = [shown.draw_scalar("estimate", estimate, low, high)]
     if truth is not None:
         error = estimate - truth
         parts.insert(0, shown.draw_scalar("ground truth", truth, low, high))
         parts.append(
-            shown.draw_signed("estimate − ground truth", error, percentile_reach(error, mask, 98))
+            shown.draw_signed(
+                "estimate − ground truth", error, compute_percentile_reach(error, mask, 98)
+            )
         )
     if standard_error is not None:
-        reach = percentile_reach(standard_error, mask, 98)
+        reach = compute_percentile_reach(standard_error, mask, 98)
         parts.append(shown.size(uncertainty, standard_error, reach))
     yield page.Heading(name)
     yield page.Images(parts)

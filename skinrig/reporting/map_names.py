@@ -73,12 +73,12 @@ def map_heading(name: str) -> str:
     return label if label == name else f"{label} ({name})"
 
 
-def uncertainty(name: str) -> str:
+def uncertainty_title(name: str) -> str:
     """Return the label of a map's uncertainty: chromophores have a posterior.
 
     Examples
     --------
-    >>> uncertainty("melanin"), uncertainty("normals")
+    >>> uncertainty_title("melanin"), uncertainty_title("normals")
     ('68 % credible half-width', 'standard uncertainty')
     """
     posterior = name.startswith(("melanin", "hemoglobin"))

@@ -199,13 +199,13 @@ class View(Block):
 
     @property
     def html(self) -> Markup:
-        """The filled template; it writes tables by `table` and labels by `map_names`."""
+        """The filled template; it writes tables by `build_table` and labels by `map_names`."""
         helpers: dict[str, Any] = {
-            "as_table": table,
+            "as_table": build_table,
             "cell": Cell,
             # numbers keep their percent signs when a narrow cell breaks a text
             "unbroken": lambda text: text.replace(" %", "\N{NO-BREAK SPACE}%"),
-            "number": number,
+            "number": format_number,
             "abs": np.abs,
             "median": np.median,
             "finite": lambda values: bool(np.isfinite(values).all()),
@@ -229,28 +229,28 @@ class Part:
     blocks: list[Block]
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """Return a number with four significant digits, or a dash where there is none."""
     return "–" if value is None or not np.isfinite(value) else f"{value:.4g}"
 
 
-def short_unit(unit: str) -> str:
+def format_short_unit(unit: str) -> str:
     """Return a short unit for tables and scales; empty for a plain number.
 
     Examples
     --------
-    >>> short_unit("volume fraction of the epidermis"), short_unit("1"), short_unit("mm")
-    ('volume fraction', '', 'mm')
+    >>> [format_short_unit(unit) for unit in ("volume fraction of the epidermis", "1", "mm")]
+    ['volume fraction', '', 'mm']
     """
     return "" if unit == "1" else unit.split(" of ")[0]
 
 
-def checks_table(checks: Sequence[Check]) -> View:
+def build_checks_table(checks: Sequence[Check]) -> View:
     """Return the table of checks, the missed ones first."""
-    return view("checks", checks=sorted(checks, key=lambda check: check.passed))
+    return build_view("checks", checks=sorted(checks, key=lambda check: check.passed))
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str) -> Table:
+def build_table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str) -> Table:
     """Return a table; numbers are set right-aligned with four digits.
 
     Parameters
@@ -265,7 +265,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str
 
     def cell(value: object, first: bool) -> Cell:
         if isinstance(value, (float, np.floating)):
-            return Cell(number(float(value)), "n", first)
+            return Cell(format_number(float(value)), "n", first)
         if isinstance(value, (int, np.integer)) and not isinstance(value, bool):
             return Cell(str(value), "n", first)
         text = str(value)
@@ -282,45 +282,45 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], *, caption: str
     )
 
 
-def facts(values: Mapping[str, object], *, caption: str) -> Table:
+def build_facts_table(values: Mapping[str, object], *, caption: str) -> Table:
     """Return a two-column table of names and values."""
-    return table(("quantity", "value"), list(values.items()), caption=caption)
+    return build_table(("quantity", "value"), list(values.items()), caption=caption)
 
 
-def assumptions(texts: Iterable[str]) -> Table:
+def build_assumptions_table(texts: Iterable[str]) -> Table:
     """Return the table of assumptions."""
     rows = [[text] for text in texts]
-    return table(("assumption",), rows, caption="Assumed, not measured")
+    return build_table(("assumption",), rows, caption="Assumed, not measured")
 
 
-def view(template: str, **data: Any) -> View:
+def build_view(template: str, **data: Any) -> View:
     """Return the results of a section, to be laid out by a template."""
     return View(template, data)
 
 
-def note(text: str) -> Paragraph:
+def build_note(text: str) -> Paragraph:
     """Return a remark of plain text."""
     return Paragraph(text, "note")
 
 
-def single_subject_note(parameters: Mapping[str, object]) -> Paragraph:
+def build_single_subject_note(parameters: Mapping[str, object]) -> Paragraph:
     """Return a remark on the subject, where a session holds one and has no bands.
 
     Examples
     --------
-    >>> single_subject_note({"preset": "III"}).text
+    >>> build_single_subject_note({"preset": "III"}).text
     'All errors are for one subject, III; the session has no melanin bands.'
     """
     subject = next((f", {parameters[k]}" for k in ("subject", "preset") if parameters.get(k)), "")
-    return note(f"All errors are for one subject{subject}; the session has no melanin bands.")
+    return build_note(f"All errors are for one subject{subject}; the session has no melanin bands.")
 
 
-def fragment(blocks: Iterable[Block]) -> str:
+def render_fragment(blocks: Iterable[Block]) -> str:
     """Return blocks as HTML, without a page around them."""
     return templates.render("reporting/templates/fragment.html", blocks=list(blocks))
 
 
-def document(title: str, lead: Iterable[Block], sections: Iterable[Block]) -> str:
+def render_page(title: str, lead: Iterable[Block], sections: Iterable[Block]) -> str:
     """Return the whole page; it makes no request and runs no script.
 
     Parameters
@@ -380,6 +380,6 @@ def _bars() -> str:
     """Return the style of the color bars, with the colors of the images."""
     rules = []
     for scale, name in png.SCALE_CLASSES.items():
-        stops = ",".join("#" + bytes(rgb).hex() for rgb in png.palette(scale, BAR_STOPS))
+        stops = ",".join("#" + bytes(rgb).hex() for rgb in png.sample_palette(scale, BAR_STOPS))
         rules.append(f".bar.{name}{{background:linear-gradient(90deg,{stops})}}")
     return "\n".join(rules)

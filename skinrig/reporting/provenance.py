@@ -41,13 +41,13 @@ def section(appearance: SkinAppearance) -> Iterator[page.Block]:
     assumed = appearance.parameters.get("assumed")
     if isinstance(assumed, (list, tuple)) and assumed:
         yield page.Heading("Assumptions")
-        yield page.assumptions(assumed)
+        yield page.build_assumptions_table(assumed)
     if appearance.left_out:
         yield page.Heading("Omitted stages")
-        yield page.table(
+        yield page.build_table(
             ("stage", "reason"), appearance.left_out, caption="Stages that were not run"
         )
-    origin = page.facts(
+    origin = page.build_facts_table(
         {"source": appearance.source, "seed": str(appearance.seed)}
         | {f"input {k}": shorten_digest(v) for k, v in sorted(appearance.inputs.items())}
         | {f"version of {k}": v for k, v in sorted(appearance.versions.items())},
@@ -58,7 +58,7 @@ def section(appearance: SkinAppearance) -> Iterator[page.Block]:
         for name, value in flatten_settings(appearance.parameters).items()
         if not name.startswith(("stages.", "assumed"))
     }
-    listed = page.facts(settings, caption="Parameters recorded in the folder")
+    listed = page.build_facts_table(settings, caption="Parameters recorded in the folder")
     title = f"Provenance: inputs, versions and {len(settings)} parameters"
     yield page.Collapsible(title, [origin, listed])
 
@@ -114,7 +114,7 @@ def consent_section(sides: Sequence[ReportInputs]) -> Iterator[page.Block]:
         for line, names in sorted(rows.items())
     ]
     yield page.Heading("Consent", level=2)
-    yield page.table(
+    yield page.build_table(
         ("subject", "consent", "folders shown"),
         table,
         caption="This report shows these people; use it within their consent only",

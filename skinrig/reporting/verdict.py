@@ -6,7 +6,7 @@ import numpy as np
 
 from model.skin import SkinAppearance, SkinMap
 from skinrig.reporting import page
-from skinrig.reporting.map_names import map_title, split_melanin_bands, uncertainty
+from skinrig.reporting.map_names import map_title, split_melanin_bands, uncertainty_title
 from skinrig.unit_format import format_quantity
 
 MAX_NAME_WORDS = 9
@@ -20,18 +20,18 @@ MAX_UNREMARKED_MASK = 0.2
 """Masked fraction of pixels above which a sentence names the map."""
 
 
-def headline(checks: Sequence[page.Check]) -> str:
+def format_headline(checks: Sequence[page.Check]) -> str:
     """Return the verdict as one sentence, with the check that is closest to its limit.
 
     Examples
     --------
-    >>> headline([])
+    >>> format_headline([])
     'No limit was checked: none applies to these results.'
-    >>> headline([page.Check("error", 2.0, 1.0, "<=")])
+    >>> format_headline([page.Check("error", 2.0, 1.0, "<=")])
     '1 of 1 checks missed its limit.'
-    >>> headline([page.Check("error", 0.5, 1.0, "<=")])
+    >>> format_headline([page.Check("error", 0.5, 1.0, "<=")])
     'The only check kept its limit.'
-    >>> headline([page.Check("red", 0.5, 1.0, "<="), page.Check("blue", 2.0, 1.0, "<=")])
+    >>> format_headline([page.Check("red", 0.5, 1.0, "<="), page.Check("blue", 2.0, 1.0, "<=")])
     '1 of 2 checks missed its limit; the worst is blue, at 200 % of its limit.'
     """
     missed = sum(not check.passed for check in checks)
@@ -80,28 +80,28 @@ def section(
         Blocks between the verdict and the rest.
     """
     kind = "bad" if any(not check.passed for check in checks) else "good"
-    yield page.Paragraph(headline(checks), f"verdict {kind if checks else ''}")
+    yield page.Paragraph(format_headline(checks), f"verdict {kind if checks else ''}")
     yield from images
     if subject:
         yield page.Paragraph(subject)
-    weak = weaknesses(checks)
+    weak = list_weaknesses(checks)
     if weak:
         yield page.Heading("Where errors are largest", level=2)
-        yield page.table(
+        yield page.build_table(
             ("finding", "check", "measured", "limit", "largest for"),
             [[cell.replace(" %", "\N{NO-BREAK SPACE}%") for cell in row] for row in weak],
             caption="Missed limits, checks close to their limit, and unusual coverage or masks",
         )
     if unjudged:
         yield page.Heading("Largest uncertainties of maps without ground truth", level=2)
-        yield page.note("Uncertainties are the estimates' own; their errors are unknown.")
+        yield page.build_note("Uncertainties are the estimates' own; their errors are unknown.")
         yield page.Bullets(unjudged)
     if checks:
         yield page.Heading("Checks", level=2)
-        yield page.checks_table(checks)
+        yield page.build_checks_table(checks)
 
 
-def weaknesses(checks: Sequence[page.Check]) -> list[tuple[str, str, str, str, str]]:
+def list_weaknesses(checks: Sequence[page.Check]) -> list[tuple[str, str, str, str, str]]:
     """Return the weakest results: finding, check, measured value, limit, group of largest error.
 
     Missed limits; checks with one skin band or strain step above the limit of the whole; the
@@ -111,7 +111,7 @@ def weaknesses(checks: Sequence[page.Check]) -> list[tuple[str, str, str, str, s
     Examples
     --------
     >>> one = page.Check("melanin", 9.0, 10.0, "<=", "%", coverage=0.4, worst="dark: 40 %")
-    >>> for row in weaknesses([one]): print(row)
+    >>> for row in list_weaknesses([one]): print(row)
     ('close to its limit', 'melanin', '9 %', '≤ 10 %', 'dark: 40 %')
     ('68 % intervals too narrow', 'melanin', 'coverage 40 %', '', '')
     """
@@ -152,7 +152,7 @@ def _compared(check: page.Check) -> tuple[str, str, str, str]:
     """Return name, measured value, limit, and the group with the largest error."""
     sign = "≤" if check.sense == "<=" else "≥"
     measured, bound = (
-        format_quantity(page.number(one), check.unit) for one in (check.got, check.bound)
+        format_quantity(page.format_number(one), check.unit) for one in (check.got, check.bound)
     )
     return check.name, measured, f"{sign} {bound}", check.worst
 
@@ -189,20 +189,20 @@ def list_least_certain(name: str, appearance: SkinAppearance) -> list[str]:
         if row is None:
             continue
         share = float(str(row[2]))
-        of = f"{name}: {map_title(key)}, median {uncertainty(key)}"
+        of = f"{name}: {map_title(key)}, median {uncertainty_title(key)}"
         missing = f", {100 - share:.0f} % of pixels masked" if share < 99.5 else ""
         if row[1] == "°":
             angle = float(str(row[4]))
-            text = f"{of} {page.number(angle)}°"
+            text = f"{of} {page.format_number(angle)}°"
             angles.append((angle, text + missing))
         elif np.isfinite(percent := float(str(row[5]))):
-            text = f"{of} {page.number(percent)} % of its value"
+            text = f"{of} {page.format_number(percent)} % of its value"
             relative.append((percent, text + missing))
     first = sorted(relative, reverse=True)[:MAX_NAMED_MAPS] + sorted(angles, reverse=True)[:1]
     return [text for _, text in first]
 
 
-def uncertainty_blocks(appearance: SkinAppearance) -> Iterator[page.Block]:
+def build_uncertainty_blocks(appearance: SkinAppearance) -> Iterator[page.Block]:
     """Yield uncertainties and residuals of maps, by melanin band where melanin is estimated.
 
     Parameters
@@ -222,7 +222,7 @@ def uncertainty_blocks(appearance: SkinAppearance) -> Iterator[page.Block]:
         and (row := _median_residual(name, one)) is not None
     ]
     bands = list(_by_band(appearance))
-    yield page.view("unjudged", spreads=spreads, residuals=residuals, bands=bands)
+    yield page.build_view("unjudged", spreads=spreads, residuals=residuals, bands=bands)
 
 
 def _relative_stderr(name: str, skin_map: SkinMap) -> tuple[object, ...] | None:
@@ -241,7 +241,15 @@ def _relative_stderr(name: str, skin_map: SkinMap) -> tuple[object, ...] | None:
     percent = 100.0 * float(np.median(relative)) if relative.size else float("nan")
     middle, high = np.percentile(stderr, [50, 95]).tolist()
     median = float(np.median(values))
-    return map_title(name), page.short_unit(skin_map.unit), share, median, middle, percent, high
+    return (
+        map_title(name),
+        page.format_short_unit(skin_map.unit),
+        share,
+        median,
+        middle,
+        percent,
+        high,
+    )
 
 
 def _median_residual(name: str, skin_map: SkinMap) -> tuple[object, ...] | None:
@@ -249,7 +257,13 @@ def _median_residual(name: str, skin_map: SkinMap) -> tuple[object, ...] | None:
         return None
     values = np.abs(skin_map.values[skin_map.mask].astype(np.float64))
     low, middle, high = np.percentile(values, [50, 68.27, 95])
-    return (map_title(name), page.short_unit(skin_map.unit), float(low), float(middle), float(high))
+    return (
+        map_title(name),
+        page.format_short_unit(skin_map.unit),
+        float(low),
+        float(middle),
+        float(high),
+    )
 
 
 def _by_band(appearance: SkinAppearance) -> Iterator[tuple[object, ...]]:

@@ -28,7 +28,7 @@ from rigsim.subject.head_motion import draw_head_motion
 from rigsim.subject.perfusion import STATE_NAMES
 from rigsim.targets import make_target
 from skinrig.console import select_attributes
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 from skinrig.evaluating.reflection_truth import TEST_FILE, make_test
 from skinrig.simulating import driving
 from skinrig.simulating.orders import (
@@ -62,7 +62,7 @@ TRACKING_EVERY = 24
 
 def simulate_dome(order: DomeOrder) -> SimulationResult:
     """Simulate a capture with the dome; see `simulation.simulate`."""
-    one_of("state", order.state, STATE_NAMES, SimulationError)
+    require_choice("state", order.state, STATE_NAMES, SimulationError)
     conditions = _conditions(order)
     rig = _rig(order)
     planned = order.plan if order.target is None else None

@@ -12,7 +12,7 @@ from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject.perfusion import STATE_NAMES
 from skinrig.capturing.plan_choice import DefaultPlan
 from skinrig.console import select_attributes
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 from skinrig.simulating import subject_records
 from skinrig.simulating.driving import build_result, drive_plan, manifest_settings, open_session
 from skinrig.simulating.flash_truth import WIDTHS_PX, _stance_offset_mm, build_truth
@@ -26,7 +26,7 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
         return simulate_sequence(order, order.sequence)
     target, states = order.target, order.states
     for state in states if target is None else ():
-        one_of("state", state, STATE_NAMES, SimulationError)
+        require_choice("state", state, STATE_NAMES, SimulationError)
     width = order.width_px or WIDTHS_PX[order.size]
     rig = load_rig("flash")
     rig = rig.resized(width) if width != rig.views[0].width_px else rig

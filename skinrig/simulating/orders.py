@@ -13,7 +13,7 @@ from capture.plan.gradient import GradientTarget
 from capture.plan.probe import ProbeTarget
 from capture.session import SubjectRecord
 from skinrig.capturing.sequences import SequenceOrder
-from skinrig.errors import UsageError, one_of
+from skinrig.errors import UsageError, require_choice
 from skinrig.simulating.effect_omission import omission_arguments
 
 PICTURE_SIZES = ("small", "full")
@@ -62,7 +62,7 @@ class SimulationResult:
 
 def require_size(size: str) -> None:
     """Raise unless a size is "small" or "full"."""
-    one_of("size", size, PICTURE_SIZES, SimulationError)
+    require_choice("size", size, PICTURE_SIZES, SimulationError)
 
 
 def truth_folder(session: Path) -> Path:
@@ -127,7 +127,7 @@ class SimulationOrder:
         if width_px is not None and width_px < MIN_WIDTH_PX:
             raise SimulationError(f"width: got {width_px}, expected {MIN_WIDTH_PX} pixels or more")
         if self.target is not None:
-            one_of("target", self.target, self.targets, SimulationError)
+            require_choice("target", self.target, self.targets, SimulationError)
         self.check()
         self.scene_switches()
 
@@ -378,7 +378,7 @@ def order_for(rig: str, **options: Any) -> SimulationOrder:
     >>> order_for("dome", out=Path("session"), lights=12).rig
     'dome'
     """
-    one_of("rig", rig, ORDER_BY_RIG, SimulationError)
+    require_choice("rig", rig, ORDER_BY_RIG, SimulationError)
     own = {one.name for one in fields(ORDER_BY_RIG[rig])}
     foreign = {one.name: one for kind in ORDER_BY_RIG.values() for one in fields(kind)}
     for name in sorted(options.keys() & foreign.keys() - own):

@@ -91,7 +91,7 @@ def serve_rig(rig_name: str, order: ServeOrder, console: Console) -> None:
         command = _next_step(rig_name, rig, served.addresses, order.resume)
         if console.as_json:
             addresses = {"addresses": dict(served.addresses), "next": command}
-            console.document("skinrig.serve/1", addresses)
+            console.print_document("skinrig.serve/1", addresses)
         else:
             for name, url in served.addresses.items():
                 print(f"{name} {url}", flush=True)

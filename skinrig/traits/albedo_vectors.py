@@ -20,7 +20,7 @@ from model.traits import TraitSpace, histogram_transport
 from model.traits.feasible_sets import HistogramSet, UnconstrainedSet
 from model.traits.vectors import Contrast
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.errors import UnusableError, one_of
+from skinrig.errors import UnusableError, require_choice
 
 VectorKind = Literal["quantiles", "histograms"]
 
@@ -51,7 +51,7 @@ class AlbedoTraits:
 
     def __post_init__(self) -> None:
         """Raise for an unknown kind, or vectors of another length."""
-        one_of("vectors", self.kind, VECTOR_KINDS)
+        require_choice("vectors", self.kind, VECTOR_KINDS)
         if len(self.traits.center) != self.texture.size:
             raise UnusableError(
                 f"vectors: got {len(self.traits.center)} numbers, expected {self.texture.size}"
@@ -108,7 +108,7 @@ class AlbedoTraits:
 def encode_albedo(r_d: ArrayLike, kind: VectorKind) -> Float64Array:
     """Return the values whose statistics are taken: R_d for histograms, ln R_d for quantiles."""
     given = np.asarray(r_d, np.float64)
-    if one_of("vectors", kind, VECTOR_KINDS) == "histograms":
+    if require_choice("vectors", kind, VECTOR_KINDS) == "histograms":
         return given
     return np.asarray(np.log(np.maximum(given, MIN_REFLECTANCE)))
 

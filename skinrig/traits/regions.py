@@ -16,8 +16,8 @@ from model.traits import storage as trait_storage
 from model.traits.storage import TraitLibrary
 from reconstruction.correspondence import common_regions
 from reconstruction.correspondence.common_parameterization import CommonFrame
-from skinrig.appearances.contents import digest
-from skinrig.errors import UnusableError, one_of
+from skinrig.appearances.contents import hash_file
+from skinrig.errors import UnusableError, require_choice
 from skinrig.traits.albedo_vectors import AlbedoTraits, VectorKind
 
 SURFACE_SPACE: Final = "surface"
@@ -92,7 +92,7 @@ def open_library(library: TraitLibrary) -> LibraryParts:
     """
     parameters = library.parameters
     stated = parameters.get("vectors", "histograms")
-    kind = one_of("vectors", stated, get_args(VectorKind))
+    kind = require_choice("vectors", stated, get_args(VectorKind))
     frame = (
         CommonFrame.from_document(parameters["frame"])
         if isinstance(parameters.get("frame"), dict)
@@ -136,7 +136,7 @@ def load(path: Path | None) -> tuple[TraitLibrary, str]:
         For None, if this package has no library.
     """
     if path is not None:
-        return trait_storage.load(path), digest(path)
+        return trait_storage.load(path), hash_file(path)
     packaged = resources.files("model").joinpath("data", trait_storage.PACKAGED_FILE)
     if not packaged.is_file():
         raise UnusableError(

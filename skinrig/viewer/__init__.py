@@ -1,1 +1,1 @@
-"""The live viewer: one self-contained WebGL2 page with the real-time systems of the papers."""
+"""Build the live viewer: one self-contained WebGL2 page with the papers' real-time systems."""

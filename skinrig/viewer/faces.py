@@ -1,4 +1,4 @@
-"""Faces to show: captured ones, the procedural head, or another mesh grown a skin."""
+"""Build the scene of a face: captured, the procedural head, or another mesh with simulated skin."""
 
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -30,7 +30,7 @@ from skinrig.viewer.scene import MAX_TEXTURE_PX, Assets, Kind, SceneError, Scene
 Weights = Mapping[str, float]
 
 EMOTION_STATES: Final = ("happiness", "sadness", "surprise", "fear", "anger", "disgust")
-"""Ekman's six."""
+"""The six basic emotions of Ekman."""
 
 COMBINED_STATES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
@@ -39,35 +39,35 @@ COMBINED_STATES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "after exercise": ("anger", "surprise", "exercise"),
     }
 )
-"""Of Jimenez et al.: figure 1's sad smile, and the row of figure 11, each at full weight."""
+"""Combinations of Jimenez et al., each part at weight 1: figure 1 (sad smile) and figure 11."""
 
 GLOBAL_STATES: Final = ("exercise", "alcohol")
-"""States of the whole face that no muscle makes."""
+"""Conditions of the whole face without muscle action."""
 
 ACTION_UNITS: Final[Mapping[str, Mapping[str, float]]] = tomllib.loads(
     resources.files("skinrig").joinpath("data/action_units.toml").read_text(encoding="utf-8")
 )
-"""Shapes of ARKit, without left and right, and their weights."""
+"""Weights of ARKit shapes, without side, by expression."""
 
 
-def presets(names: Iterable[str]) -> dict[str, dict[str, float]]:
-    """Return weights by preset, in the order in which people look for them.
+def build_presets(names: Iterable[str]) -> dict[str, dict[str, float]]:
+    """Build blend-shape weights by preset, in display order.
 
     Parameters
     ----------
     names
-        Of blend shapes and states.
+        Names of blend shapes and expressions.
 
     Examples
     --------
-    >>> presets(["anger", "surprise"])["anger and surprise"]
+    >>> build_presets(["anger", "surprise"])["anger and surprise"]
     {'anger': 1.0, 'surprise': 1.0}
-    >>> presets(["mouthSmile_L", "mouthSmile_R"])["smile"]
+    >>> build_presets(["mouthSmile_L", "mouthSmile_R"])["smile"]
     {'mouthSmile_L': 1.0, 'mouthSmile_R': 1.0}
     """
     known = tuple(dict.fromkeys(names))
     basic = {name: _weights(name, known) for name in (*EMOTION_STATES, "smile", *GLOBAL_STATES)}
-    # a combination of which a part is missing would be another one's
+    # combinations with a missing part are omitted, as they would be another expression
     combined = {
         name: _add_weights(basic[part] for part in parts)
         for name, parts in COMBINED_STATES.items()
@@ -79,7 +79,7 @@ def presets(names: Iterable[str]) -> dict[str, dict[str, float]]:
 
 
 def _weights(name: str, shape_names: tuple[str, ...]) -> dict[str, float]:
-    """Return the state of that name and, where there is no such shape, its action units."""
+    """Return the weights of an expression: the shape of that name, else its action units."""
     found = {name: 1.0} if name in shape_names else {}
     units = {
         shape: weight
@@ -91,7 +91,7 @@ def _weights(name: str, shape_names: tuple[str, ...]) -> dict[str, float]:
 
 
 def _add_weights(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    """Return weights added, no muscle beyond its full movement."""
+    """Add weights, each clipped at 1."""
     total: dict[str, float] = {}
     for part in parts:
         for name, weight in part.items():
@@ -100,37 +100,39 @@ def _add_weights(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
 
 
 ASSET_BUILDERS: Final[tuple[Callable[[SceneSource], Assets], ...]] = (
-    facial_color_assets.assets,
-    reflectance_assets.default_scattering,
-    wrinkle_assets.surface_assets,
-    fitted_assets.assets,
-    wrinkle_assets.assets,
-    microstructure_assets.assets,
+    facial_color_assets.build_assets,
+    reflectance_assets.build_default_scattering,
+    wrinkle_assets.build_surface_assets,
+    fitted_assets.build_assets,
+    wrinkle_assets.build_assets,
+    microstructure_assets.build_assets,
 )
-"""In the order in which their parts are listed; they do not see each other's."""
+"""Builders of the page's assets, in the order of its parts; they are independent."""
 
 
 def assemble_scene(source: SceneSource, provenance: Mapping[str, Any]) -> ViewerScene:
-    """Return the scene of a source."""
+    """Assemble the scene of a source from all asset builders."""
     scene = ViewerScene(mesh=source.mesh, provenance=provenance)
     for build in ASSET_BUILDERS:
         scene = scene.with_assets(build(source))
     names = (*scene.mesh.shapes, *scene.params.get("weights", {}))
-    return scene.with_assets({"presets": {n: {"weights": w} for n, w in presets(names).items()}})
+    return scene.with_assets(
+        {"presets": {n: {"weights": w} for n, w in build_presets(names).items()}}
+    )
 
 
 DEFAULT_PRESET = "III"
-"""Skin type of faces of whom nothing else is known."""
+"""Skin type of faces without measured skin."""
 MESH_FILE: Final = "mesh.obj"
 ALBEDO_MAP: Final = "r_d"
 CAPTURED_KINDS: Final[tuple[Kind, ...]] = ("model", "dome", "dynamic")
-"""What is shown of several folders: the first."""
+"""Kinds of folders in order of preference for the geometry."""
 MIN_TEXTURE_PX = 64
 POSITION_STEPS_PER_MM = np.float32(1024.0)
-"""Steps of a millimetre that positions are rounded to; strain is of the rounded mesh throughout."""
+"""Quantization of positions; strain is computed from the rounded mesh."""
 
 
-def scene(
+def build_scene(
     paths: Sequence[Path] = (),
     *,
     mesh: Path | None = None,
@@ -140,49 +142,52 @@ def scene(
     seed: int = 0,
     size: int = 2048,
 ) -> ViewerScene:
-    """Return the scene of fitted folders, or of a simulated person without any.
+    """Build the scene of fitted folders, or of a simulated person without any.
 
     Parameters
     ----------
     paths
-        Folders of `skinrig reconstruct` (dome) or `skinrig fit`, one of a kind.
+        Folders of `skinrig reconstruct` (dome) or `skinrig fit`, one per kind.
     mesh
-        The face they belong to, or to grow the skin on, see `load_mesh`; None: the mesh that a
-        folder holds, else the procedural head.
+        Mesh of the face, or to be covered with simulated skin, see `load_mesh`; None: the mesh of
+        a folder, else the procedural head.
     landmarks
-        Table ``name,x,y`` of the neutral picture that the flash rig's maps are drawn on; None: a
-        simulation's own, from its TRUTH/ folder beside.
+        Table ``name,x,y`` of the neutral image of the flash rig's maps; None: that of a
+        simulation, from its TRUTH/ folder next to the maps.
     calibration
-        Folder with the color calibration of the dome's cameras; None: the one that the maps were
-        made with, where it lies beside and has color, else what is known of the sensor.
+        Folder with the color calibration of the dome's cameras; None: the one of the maps, if it
+        is next to them and has color, else the tabulated sensor.
     preset, seed
-        Of a simulated person, one of `rigsim.subject.PRESET_NAMES`; folders have their own seed.
+        Simulated person, one of `rigsim.subject.PRESET_NAMES`, and its seed; folders have their
+        own seed.
     size
-        Texels a side of the large textures, 64 to 4096.
+        Side of the large textures, 64 to 4096 texels.
 
     Raises
     ------
     SceneError
-        A size out of range, a folder of a kind that cannot be shown, two of one kind, no
-        landmarks, or landmarks or a calibration of nothing.
+        If the size is out of range, a folder cannot be displayed, two are of one kind, landmarks
+        are missing, or landmarks or a calibration are not applicable.
     model.store.StoreError
-        A folder that cannot be read.
+        If a folder is not readable.
     rigsim.subject.SubjectError, rigsim.geometry.mesh.MeshError,
     rigsim.geometry.mesh.MeshError
-        For a preset, seed or mesh that cannot be used.
+        If preset, seed or mesh are invalid.
     """
     if not MIN_TEXTURE_PX <= size <= MAX_TEXTURE_PX:
-        raise SceneError(f"size: got {size}, expected {MIN_TEXTURE_PX} to {MAX_TEXTURE_PX} texels")
+        raise SceneError(
+            f"--size-px: got {size}, expected {MIN_TEXTURE_PX} to {MAX_TEXTURE_PX}; enter another"
+        )
     if landmarks is not None and not paths:
         raise SceneError(
-            "landmarks: got a table but no appearance whose picture it belongs to; name the folder"
+            "--landmarks: got a table without the appearance of its image; give the folder, too"
         )
     if calibration is not None and not paths:
         raise SceneError(
-            "calibration: got a folder but no dome's appearance whose colors it is of; name one"
+            "--calibration: got a folder without a dome's appearance; give the appearance, too"
         )
     folders, appearances = _read(paths)
-    whole, told = _mesh(appearances, mesh)
+    whole, mesh_origin = _mesh(appearances, mesh)
     kind: Kind = "procedural" if mesh is None else "mesh"
     if paths:
         first = next(iter(appearances.values())).seed
@@ -191,23 +196,25 @@ def scene(
     surface = None if whole is None else whole.mesh
     subject = make_subject(preset, seed=seed, size=min(size, PERSON_PX), mesh=surface)
     skin = FineSkin(subject, size)
-    of = viewer_mesh(subject), size, seed, subject, skin, appearances, folders
+    of = build_viewer_mesh(subject), size, seed, subject, skin, appearances, folders
     source = SceneSource(kind, *of, landmarks, calibration)
     if not paths:
         provenance = {"source": "simulated", "kind": kind, "preset": preset, "seed": seed}
         return assemble_scene(source, provenance | ({} if mesh is None else {"mesh": mesh.name}))
-    found = assemble_scene(source, _provenance(source, paths, whole, told))
-    movement = "the movement was not captured; blend shapes are from the file or simulated"
+    found = assemble_scene(source, _provenance(source, paths, whole, mesh_origin))
+    movement = "movement was not captured; blend shapes are from the file or simulated"
     holes = () if whole is None else whole.summary()
     left_out = [*holes, ("expressions of this face", movement)]
     if whole is None:
-        left_out.insert(0, ("geometry of this face", f"{told}; --mesh FILE shows another"))
+        left_out.insert(
+            0, ("geometry of this face", f"{mesh_origin}; display another with --mesh FILE")
+        )
     found = found.with_assets({"left_out": tuple(left_out)})
     return found if whole is None else whole.paint_scene(found)
 
 
 def _read(paths: Sequence[Path]) -> tuple[dict[str, Path], dict[str, SkinAppearance]]:
-    """Return folders and what they hold by kind."""
+    """Read the folders; return paths and appearances by kind."""
     folders: dict[str, Path] = {}
     appearances: dict[str, SkinAppearance] = {}
     for path in paths:
@@ -222,7 +229,7 @@ def _read(paths: Sequence[Path]) -> tuple[dict[str, Path], dict[str, SkinAppeara
 def _provenance(
     source: SceneSource, paths: Sequence[Path], whole: ClosedMesh | None, mesh: str
 ) -> dict[str, Any]:
-    """Return where a captured scene is from, and what its people agreed to."""
+    """Return the provenance of a captured scene, with the consent of its subjects."""
     found: dict[str, Any] = {
         "source": " and ".join(sorted({one.source for one in source.appearances.values()})),
         "kind": source.kind,
@@ -236,27 +243,27 @@ def _provenance(
 
 
 def load_mesh(path: Path) -> Mesh:
-    """Return a face mesh of a file with or without blend shapes, in place of the procedural head.
+    """Load a face mesh with or without blend shapes, in place of the procedural head.
 
     Parameters
     ----------
     path
         .npz, .obj (or a folder of them), .gltf or .glb, see `skinrig.blend_shapes.meshes.load`. The
-        face looks towards +z, and its foremost vertex is the tip of the nose.
+        face is oriented towards +z, and its foremost vertex is the tip of the nose.
     """
     loaded = blend_shapes.load(path)
     if loaded.uv.min() < 0.0 or loaded.uv.max() > 1.0:
         raise SceneError(
-            f"{path}: texture coordinates reach from {loaded.uv.min():g} to {loaded.uv.max():g}, "
-            "expected 0 to 1; export the tile of the face alone"
+            f"{path}: got texture coordinates {loaded.uv.min():g} to {loaded.uv.max():g}, "
+            "expected 0 to 1; export only the tile of the face"
         )
     return center_face(
         build_mesh(loaded.vertices_mm, loaded.faces, loaded.uv, shapes=loaded.shapes)
     )
 
 
-def viewer_mesh(subject: SimulatedSubject) -> Mesh:
-    """Return a person's mesh; its own blend shapes come behind those of the expressions."""
+def build_viewer_mesh(subject: SimulatedSubject) -> Mesh:
+    """Build a person's mesh with blend shapes: those of the expressions, then its own."""
     rounded = np.round(subject.mesh.vertices_mm * POSITION_STEPS_PER_MM) / POSITION_STEPS_PER_MM
     own = {n: d for n, d in subject.mesh.shapes.items() if np.any(d)}
     shapes = {**subject.blend_shapes(), **own}
@@ -269,7 +276,7 @@ def detect_kind(path: Path, appearance: SkinAppearance) -> str:
     Raises
     ------
     SceneError
-        Nothing of it can be drawn on a face.
+        If it has nothing to display on a face.
     """
     if dynamic_appearance.describe_parts(appearance):
         return "dynamic"
@@ -280,7 +287,7 @@ def detect_kind(path: Path, appearance: SkinAppearance) -> str:
     if MESH_FILE in appearance.files and ALBEDO_MAP in appearance.maps:
         return "dome"
     raise SceneError(
-        f"{path}: holds {', '.join(sorted(appearance.maps)) or 'no maps'}, expected a moving face "
+        f"{path}: got {', '.join(sorted(appearance.maps)) or 'no maps'}, expected a moving face "
         "(`skinrig fit facial-color`, `wrinkles` or `microstructure`), or a dome's maps with "
         f"{ALBEDO_MAP} and {MESH_FILE}"
     )
@@ -289,9 +296,9 @@ def detect_kind(path: Path, appearance: SkinAppearance) -> str:
 def _mesh(
     appearances: dict[str, SkinAppearance], path: Path | None
 ) -> tuple[ClosedMesh | None, str]:
-    """Return the mesh to show, None for the procedural head, and words for it.
+    """Return the displayed mesh, None for the procedural head, and its description.
 
-    Holes of a scan are closed; another mesh may have them for a reason.
+    Holes of a scan are closed; those of another mesh may be intended.
     """
     if path is not None:
         return ClosedMesh(load_mesh(path), (), ()), path.name

@@ -1,7 +1,7 @@
-"""The few maps of a simulated person that the page shows at its full size, and nothing else.
+"""Simulate only those maps of a person that the page displays at full resolution.
 
-A whole person of 2048 texels takes several times as long: normals, gloss, hair and blood of every
-state are drawn from a coarser one.
+A complete person of 2048 texels takes several times as long. Normals, specular reflection, hair and
+blood of expressions are those of a coarser person.
 """
 
 from typing import Final
@@ -15,29 +15,29 @@ from skinrig.arrays import Float32Array, Float64Array
 from skinrig.viewer.map_filling import fill_holes
 
 PERSON_PX: Final = 512
-"""Most texels a side of the person that everything else comes from: half a millimeter of a face."""
+"""Maximum side of the person of all other maps: texels of 0.5 mm on a face."""
 
 
 class FineSkin:
-    """Skin of a simulated person in a texture of another size, the same as the person's own.
+    """Skin of a simulated person in a texture of another size, consistent with the person's own.
 
-    Texels without skin hold what surrounds them.
+    Texels without skin are filled from their surroundings.
 
     Parameters
     ----------
     person : rigsim.subject.SimulatedSubject
-        At rest.
+        Neutral person.
     size : int
-        Texels a side, at least the person's.
+        Side of the texture, texels, at least the person's.
     """
 
     def __init__(self, person: SimulatedSubject, size: int) -> None:
-        """Lay out the surface."""
+        """Compute the texture atlas."""
         self._person = person
         self._atlas = person.atlas if size == person.size else unwrap(person.mesh, size)
         self.covered = self._atlas.covered
         """Texels with skin, (N, N)."""
-        # noise is drawn point by point: those beside the face are left out
+        # noise is evaluated per point, only on the face
         surface = self._atlas.position_mm[self.covered]
         self._points = np.asarray(face_regions.to_mean_head(surface, person.mesh), np.float32)
         self._regions = face_regions.region_masks(self._points)

@@ -1,8 +1,8 @@
-"""Places in the texture for what closes a mesh's holes, and values there for maps that have none.
+"""Close small holes of a mesh by patches, and fill measured maps there.
 
-The charts of a scan meet the rim of a hole from several sides, so that a patch cannot continue
-them: it gets a disc of its own where the texture is empty. Maps that are drawn by the point of the
-surface cover it by themselves; those that were measured are painted on.
+Several charts of a scan meet at the rim of a hole, so that a patch cannot extend them. It gets its
+own disc in an empty part of the texture. Maps that are functions of the surface point cover it
+automatically; measured maps are interpolated from the rim.
 """
 
 import dataclasses
@@ -21,13 +21,13 @@ from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray, In
 from skinrig.viewer.scene import Texture, ViewerScene
 
 MAX_LOOP_MM: Final = 200.0
-"""Length of a loop that is closed, at most: an eye, a nostril, the underside of a chin."""
+"""Maximum length of a closed loop: an eye, a nostril, the underside of a chin."""
 MAX_HOLE_RIM_RATIO: Final = 0.5
-"""A loop of more than this part of the longest is another rim."""
+"""Maximum length of a hole relative to the longest loop; longer loops are outer rims."""
 WEIGHT_ROUNDS: Final = 3
-"""Of the energy's weights, which depend on the shape that it gives."""
+"""Iterations of the energy's weights, which depend on the resulting shape."""
 MIN_EDGE_WEIGHT: Final = 1e-3
-"""Of an edge, in cotangents: less would let triangles turn over."""
+"""Minimum cotangent weight of an edge; with less, triangles may be inverted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,15 +37,15 @@ class HolePatch:
     Attributes
     ----------
     rim : ndarray of int, shape (n,)
-        Vertices of the mesh along the loop, as the patch's triangles turn.
+        Vertices of the mesh along the loop, in the orientation of the patch's triangles.
     disc : ndarray of float64, shape (n + m, 2)
-        Places of the rim's and the new vertices in the unit disc.
+        Positions of rim and new vertices in the unit disc.
     faces : ndarray of int, shape (f, 3)
-        Of rim and new vertices in that order, counter-clockwise from outside.
+        Indices into rim and new vertices, in that order; counterclockwise from outside.
     inner_mm : ndarray of float64, shape (m, 3)
-        The new vertices.
+        Positions of the new vertices.
     length_mm : float
-        Of the loop.
+        Length of the loop.
     """
 
     rim: Int64Array
@@ -55,9 +55,9 @@ class HolePatch:
     length_mm: float
 
     def interpolate_from_rim(self, values: Float64Array) -> Float64Array:
-        """Return values of the rim, (n, C), at rim and new vertices, (n + m, C): harmonic in it.
+        """Interpolate values of the rim, (n, C), harmonically to all vertices, (n + m, C).
 
-        None lies beyond those of the rim.
+        The results are within the range of the rim's values.
         """
         n = len(self.rim)
         weights = _uniform(self.faces, len(self.disc))
@@ -65,21 +65,21 @@ class HolePatch:
         return np.concatenate([values, splu(inner).solve(-(weights[n:, :n] @ values))])
 
 
-def patches(vertices_mm: FloatArray, faces: NDArray[np.integer]) -> list[HolePatch]:
-    """Return what closes the holes of a mesh that are small, the longest loop first.
+def find_patches(vertices_mm: FloatArray, faces: NDArray[np.integer]) -> list[HolePatch]:
+    """Find patches that close the small holes of a mesh, the longest loop first.
 
     Parameters
     ----------
     vertices_mm
-        Shape (V, 3); vertices at one place count as one.
+        Shape (V, 3); coincident vertices count as one.
     faces
         Shape (F, 3).
 
     Returns
     -------
-    list of Patch
-        None for the longest loop, which is the rim of a scan, for loops above `MAX_LOOP_MM`, and
-        for those that meet themselves.
+    list of HolePatch
+        Patches of all loops except the longest, which is the rim of a scan, those above
+        `MAX_LOOP_MM`, and self-intersecting ones.
     """
     points = np.asarray(vertices_mm, np.float64)
     _, first, place = np.unique(points, axis=0, return_index=True, return_inverse=True)
@@ -98,13 +98,13 @@ def _edges(loop_mm: Float64Array) -> Float64Array:
 
 
 def _loops(faces: Int64Array) -> list[Int64Array]:
-    """Return loops of vertices around holes, in the direction in which a filling triangle turns."""
+    """Return loops of vertices around holes, in the orientation of filling triangles."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = edges[edges[:, 0] != edges[:, 1]]
     number = int(faces.max()) + 1
     alone = ~np.isin(edges[:, 0] * number + edges[:, 1], edges[:, 1] * number + edges[:, 0])
     open_edges = edges[alone]
-    # the other way round: the patch lies on the other side of the edge
+    # reversed orientation, as the patch is on the other side of the edge
     starts, counts = np.unique(open_edges[:, 1], return_counts=True)
     twice = {int(v) for v in starts[counts > 1]}
     ahead = {int(b): int(a) for a, b in open_edges}
@@ -122,7 +122,7 @@ def _loops(faces: Int64Array) -> list[Int64Array]:
 
 
 def _neighbors(faces: Int64Array, count: int) -> sparse.csr_matrix:
-    """Return the (V, V) pattern of edges."""
+    """Return the adjacency matrix of vertices, (V, V)."""
     i, j = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).T
     whole = sparse.coo_matrix((np.ones(2 * len(i)), (np.r_[i, j], np.r_[j, i])), (count, count))
     return whole.tocsr()
@@ -137,12 +137,16 @@ def _patch(
         return HolePatch(loop, disc, faces, np.zeros((0, 3)), length)
     patch = HolePatch(loop, disc, faces, np.zeros((m, 3)), length)
     flat = patch.interpolate_from_rim(points[loop])
-    # held besides the loop: vertices around it, each joined to those of the loop as the mesh has it
-    beside = neighbors[loop].tocoo()
-    outer = np.setdiff1d(beside.col, loop)
+    # also fixed: vertices adjacent to the loop, with the mesh's edges to the loop
+    adjacent = neighbors[loop].tocoo()
+    outer = np.setdiff1d(adjacent.col, loop)
     index = {int(v): n + m + k for k, v in enumerate(outer)}
     around = np.array(
-        [(i, index[int(v)]) for i, v in zip(beside.row, beside.col, strict=True) if int(v) in index]
+        [
+            (i, index[int(v)])
+            for i, v in zip(adjacent.row, adjacent.col, strict=True)
+            if int(v) in index
+        ]
     ).reshape(-1, 2)
     whole = np.concatenate([flat, points[outer]])
     for _ in range(WEIGHT_ROUNDS):
@@ -151,9 +155,9 @@ def _patch(
 
 
 def _disc(count: int, angles: Float64Array) -> tuple[Float64Array, Int64Array]:
-    """Return points of the unit disc, the rim's first, and their triangles.
+    """Return points of the unit disc, the rim first, and their triangles.
 
-    Rings have as many points as their radius has of the rim's.
+    The number of points per ring is proportional to its radius.
     """
     from scipy.spatial import Delaunay
 
@@ -168,7 +172,7 @@ def _disc(count: int, angles: Float64Array) -> tuple[Float64Array, Int64Array]:
     if count > 3:
         points.append(np.zeros((1, 2)))
     disc = np.concatenate(points)
-    # a little farther out, the rim stays the hull whatever is rounded
+    # slightly enlarged, the rim is the convex hull in spite of rounding
     lifted = np.concatenate([1.001 * points[0], *points[1:]])
     faces = Delaunay(lifted).simplices.astype(np.int64) if len(disc) > 3 else np.array([[0, 1, 2]])
     a, b, c = (disc[faces[:, k]] for k in range(3))
@@ -178,7 +182,7 @@ def _disc(count: int, angles: Float64Array) -> tuple[Float64Array, Int64Array]:
 
 
 def _uniform(faces: Int64Array, count: int) -> sparse.csr_matrix:
-    """Return the graph's Laplacian, (count, count)."""
+    """Return the graph Laplacian, (count, count)."""
     pattern = _neighbors(faces, count)
     pattern.data[:] = 1.0
     degree = np.asarray(pattern.sum(axis=1)).ravel()
@@ -188,7 +192,7 @@ def _uniform(faces: Int64Array, count: int) -> sparse.csr_matrix:
 def _smoothed(
     points: Float64Array, faces: Int64Array, rim: Int64Array, n: int, m: int
 ) -> Float64Array:
-    """Return the m inner points of the least bending energy; the others are held."""
+    """Return the m inner points with minimum bending energy; other points are fixed."""
     total = len(points)
     rows, columns, values = [], [], []
     for k in range(3):
@@ -200,7 +204,7 @@ def _smoothed(
         rows += [faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]]
         columns += [faces[:, (k + 2) % 3], faces[:, (k + 1) % 3]]
         values += [weight, weight]
-    # beyond the loop lengths alone are known: weights fall with them
+    # outside of the loop, only edge lengths are known; weights decrease with them
     size = np.linalg.norm(points[rim[:, 0]] - points[rim[:, 1]], axis=1)
     own = np.linalg.norm(points[np.roll(np.arange(n), -1)] - points[:n], axis=1).mean()
     rows.append(rim[:, 0])
@@ -220,28 +224,28 @@ def _smoothed(
 
 
 GRID_CELLS: Final = 512
-"""Side of the grid on which empty places are sought."""
+"""Side of the grid for the search of empty texture space."""
 PATCH_MARGIN: Final = 4.0 / 256.0
-"""Between a disc and anything else: four texels of a map of 256, so that filters stay clean."""
+"""Minimum distance of a disc from charts: four texels of a map of 256, for texture filters."""
 MIN_RELATIVE_SCALE: Final = 0.25
-"""Of the scale of the texture around: coarser than this a patch finds no place."""
+"""Minimum texture scale of a patch relative to its surroundings; below it, the hole stays open."""
 MEASURED_TEXTURES: Final = ("albedo_map", "lobe_shares", "translucency", "albedo_traits")
-"""Textures that are not drawn by the point of the surface."""
+"""Textures that are not functions of the surface point."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchChart:
-    """A disc of the texture that holds a patch.
+    """A disc of the texture for a patch.
 
     Attributes
     ----------
     patch
-        What it holds.
+        The patch.
     center : ndarray of float64, shape (2,)
         Texture coordinates.
     radius : float
     rim_uv : ndarray of float64, shape (n, 2)
-        Where the patch's rim lies in the charts around.
+        Texture coordinates of the patch's rim in the surrounding charts.
     """
 
     patch: HolePatch
@@ -257,11 +261,11 @@ class ClosedMesh:
     Attributes
     ----------
     mesh
-        With the patches; vertices of the mesh before come first.
+        Mesh with patches; vertices of the original mesh come first.
     charts
-        Of the patches.
+        Charts of the patches.
     left_open_mm
-        Lengths of loops that found no place in the texture.
+        Lengths of loops without space in the texture.
     """
 
     mesh: Mesh
@@ -269,7 +273,7 @@ class ClosedMesh:
     left_open_mm: tuple[float, ...]
 
     def paint_scene(self, scene: ViewerScene) -> ViewerScene:
-        """Return a scene whose measured textures continue into the patches."""
+        """Fill the patches in all measured textures of a scene."""
         if not self.charts:
             return scene
         textures: Mapping[str, Texture] = {
@@ -279,7 +283,7 @@ class ClosedMesh:
         return dataclasses.replace(scene, textures=textures)
 
     def paint_texture(self, texture: Texture) -> Texture:
-        """Return a texture with the values of the rims continued into the patches."""
+        """Fill the patches of a texture by interpolation from their rims."""
         values = texture.values.reshape(-1, *texture.values.shape[-3:]).copy()
         for layer in values:
             for chart in self.charts:
@@ -287,38 +291,40 @@ class ClosedMesh:
         return dataclasses.replace(texture, values=values.reshape(texture.values.shape))
 
     def summary(self) -> tuple[tuple[str, str], ...]:
-        """Return what the page says of it."""
+        """Return the page's omissions about holes, with reasons."""
         rows = {}
         if self.charts:
             lengths = [chart.patch.length_mm for chart in self.charts]
             rows["surface in holes of the scan"] = (
                 f"{len(lengths)} {'hole' if len(lengths) == 1 else 'holes'} of "
-                f"{min(lengths):.0f} to {max(lengths):.0f} mm around "
-                "were not measured; smooth patches close them, with colors from their rims"
+                f"{min(lengths):.0f} to {max(lengths):.0f} mm circumference "
+                "not measured; closed by smooth patches with colors of their rims"
             )
         if self.left_open_mm:
             rows["open holes"] = (
-                f"the texture has no room for {len(self.left_open_mm)} of up to "
-                f"{max(self.left_open_mm):.0f} mm around"
+                f"the texture has no space for {len(self.left_open_mm)} of up to "
+                f"{max(self.left_open_mm):.0f} mm circumference"
             )
         return tuple(rows.items())
 
 
 def close_holes(mesh: Mesh) -> ClosedMesh:
-    """Return a scanned mesh with its small holes closed.
+    """Close the small holes of a scanned mesh.
 
     Parameters
     ----------
     mesh
-        Without blend shapes.
+        Mesh without blend shapes.
     """
-    found = patches(mesh.vertices_mm, mesh.faces)
+    found = find_patches(mesh.vertices_mm, mesh.faces)
     if not found or mesh.shapes:
         return ClosedMesh(mesh, (), ())
     taken = unwrap(mesh, GRID_CELLS).covered
     flat = np.pad(mesh.uv.astype(np.float64), ((0, 0), (0, 1)))
     surface = max(_area(mesh.vertices_mm, mesh.faces), 1e-9)
-    scale = float(np.sqrt(_area(flat, mesh.faces) / surface))  # texture over mm, by whole areas
+    scale = float(
+        np.sqrt(_area(flat, mesh.faces) / surface)
+    )  # texture units per mm, from total areas
     vertices, faces, uv = [mesh.vertices_mm], [mesh.faces], [mesh.uv]
     count = len(mesh.vertices_mm)
     charts: list[PatchChart] = []
@@ -346,7 +352,7 @@ def _area(points: FloatArray, faces: NDArray[np.integer]) -> float:
 
 
 def _placed(taken: BoolArray, radius: float) -> tuple[Float64Array, float] | None:
-    """Return middle and radius of the emptiest place, smaller where it must be; None: no room."""
+    """Return center and radius of the largest empty disc, reduced if necessary; None: no space."""
     far = ndimage.distance_transform_edt(np.pad(~taken, 1))[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(far)), far.shape)
     most = (float(far[row, column]) - 1.0) / GRID_CELLS - PATCH_MARGIN
@@ -385,7 +391,7 @@ def _paint(layer: Float32Array, chart: PatchChart) -> None:
     disc = np.stack([x, y], axis=-1)
     far = np.linalg.norm(disc, axis=-1) / chart.radius
     inside = far * chart.radius <= reach
-    # beside the disc what its edge has, for filters
+    # outside of the disc, values of its edge, for texture filters
     within = disc / chart.radius / np.maximum(far, 1.0)[..., None]
     # the rim is a polygon within the circle
     polygon = np.concatenate([chart.patch.disc, 1.5 * chart.patch.disc[: len(chart.patch.rim)]])

@@ -1,4 +1,4 @@
-"""Maps without holes, and maps of fewer texels."""
+"""Fill holes of maps, and downsample maps."""
 
 import numpy as np
 
@@ -7,16 +7,16 @@ from skinrig.arrays import BoolArray, Float64Array, FloatArray
 
 
 def fill_holes(values: FloatArray, valid: BoolArray) -> Float64Array:
-    """Return a map whose missing texels hold what surrounds them, so that filters stay clean.
+    """Fill invalid texels from their surroundings, so that texture filters are unaffected.
 
-    Means over ever larger cells are interpolated back until nothing is missing.
+    Means over increasingly large cells are interpolated back until all texels are filled.
 
     Parameters
     ----------
     values
-        (H, W) or (H, W, C); what is not valid may be anything.
+        (H, W) or (H, W, C); invalid values are ignored.
     valid
-        (H, W); where nothing is, the result is 0.
+        (H, W); if no texel is valid, the result is 0.
 
     Examples
     --------
@@ -41,7 +41,7 @@ def fill_holes(values: FloatArray, valid: BoolArray) -> Float64Array:
 
 
 def downsample(values: Float64Array, size: int) -> Float64Array:
-    """Return means over cells, (size, size[, C]), of a larger map; a smaller one as it is."""
+    """Return means over cells, (size, size[, C]); smaller maps are unchanged."""
     if values.shape[0] <= size:
         return values
     cells = coarse_grid((values.shape[0], values.shape[1]), size)

@@ -1,9 +1,8 @@
-"""Arrays made small for a page: quantized with a stated error, predicted, compressed.
+"""Compress arrays for a page: quantize with a stated error, predict, deflate.
 
-Everything goes into one gzip stream with a JSON header that says where each array lies. The words
-of an array are first replaced by their differences from neighbors (modulo the word), which a
-cumulative sum undoes, and their bytes are sorted by rank; which neighbors is chosen by what
-compresses best.
+All arrays are in one gzip stream with a JSON header of their offsets. The words of an array are
+replaced by differences from a prediction by neighbors (modulo the word), which a cumulative sum
+inverts. Low and high bytes are separated. The predictor is the one that compresses best.
 """
 
 import json
@@ -24,13 +23,13 @@ Words = NDArray[Any]
 """uint8, uint16, int16, float16 or float32."""
 
 PREDICTOR_NAMES: Final = ("none", "left", "up", "plane")
-"""Which neighbors a word is predicted from; "plane" is left + up - upper left."""
+"""Predictors of a word from its neighbors; "plane" is left + up - upper left."""
 NORMAL_STEPS: Final = 8191.0
 """Steps of a normal's component from 0 to 1: 0.005 degrees."""
 SHAPE_BITS: Final = 32767
-"""Steps of a blend shape's largest movement, at most."""
+"""Maximum number of steps of a blend shape's largest displacement."""
 SHAPE_STEP_MM: Final = 2.5e-4
-"""Steps of blend shapes are no finer than this: over an edge of 1 mm a strain of 2e-4."""
+"""Minimum step of blend shapes: a strain of 2e-4 over an edge of 1 mm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +39,11 @@ class PackedScene:
     Attributes
     ----------
     header
-        JSON values: everything but the arrays, and where they lie in the payload.
+        JSON values: all data except the arrays, and the arrays' offsets in the payload.
     payload
         gzip of the arrays.
     errors
-        Largest quantization error by array, in its own unit.
+        Maximum quantization error by array, in its own unit.
     """
 
     header: Mapping[str, Any]
@@ -59,14 +58,14 @@ class PackedScene:
 
 
 def _quantize(values: Float32Array, storage: Storage) -> tuple[Words, Float32Array, Float32Array]:
-    """Return the words of a texture, and the range of each layer and channel.
+    """Quantize a texture; return its words, and the range of each layer and channel.
 
     Parameters
     ----------
     values
         Shape (H, W, C) or (L, H, W, C).
     storage
-        "u8", "u16", "f16" or "f32"; the range of floats is 0 to 1: they are not scaled.
+        "u8", "u16", "f16" or "f32"; floats are not scaled, their range is 0 to 1.
 
     Returns
     -------
@@ -85,7 +84,7 @@ def _quantize(values: Float32Array, storage: Storage) -> tuple[Words, Float32Arr
 
 
 def dequantize(words: Words, low: Float32Array, high: Float32Array) -> Float32Array:
-    """Return what the page makes of words."""
+    """Return the values that the page decodes from words."""
     if words.dtype.kind == "f":
         return words.astype(np.float32)
     top = np.float32(np.iinfo(words.dtype).max)
@@ -94,7 +93,7 @@ def dequantize(words: Words, low: Float32Array, high: Float32Array) -> Float32Ar
 
 
 def encode_texture(texture: Texture) -> tuple[Words, Float32Array, Float32Array]:
-    """Return the words that the page holds of a texture, and their range."""
+    """Encode a texture as words with their range."""
     if texture.fine == 1:
         return _quantize(texture.values, texture.storage)
     _, low, high = _quantize(texture.values, "u8")
@@ -103,19 +102,19 @@ def encode_texture(texture: Texture) -> tuple[Words, Float32Array, Float32Array]
 
 
 def _unrounded(values: Float32Array, low: Float32Array, high: Float32Array) -> Float64Array:
-    """Return words of 0 to 255 before rounding, (L, H, W, C)."""
+    """Return values scaled to 0 to 255, before rounding, (L, H, W, C)."""
     return _shares(values, low, high).reshape(-1, *values.shape[-3:]) * 255.0
 
 
 def _shares(values: Float32Array, low: Float32Array, high: Float32Array) -> Float64Array:
-    """Return values as shares of the range of each layer and channel."""
+    """Normalize values by the range of each layer and channel."""
     spread = np.where(high > low, high - low, np.float32(1.0)).astype(np.float64)
     shares = (values.astype(np.float64) - low[..., None, None, :]) / spread[..., None, None, :]
     return np.asarray(shares)
 
 
 def pack(scene: ViewerScene) -> PackedScene:
-    """Return a scene as a header and one compressed payload."""
+    """Pack a scene into a header and one compressed payload."""
     chunks: list[bytes] = []
     errors: dict[str, float] = {}
     offset = 0
@@ -125,7 +124,7 @@ def pack(scene: ViewerScene) -> PackedScene:
         predictor, data = _choose_predictor(words)
         kind = words.dtype.str[1:]
         entry = {"offset": offset, "shape": list(words.shape), "type": kind, "predictor": predictor}
-        # typed arrays want offsets in whole words of any size
+        # typed arrays require offsets that are multiples of their word size
         padded = data + b"\0" * (-len(data) % 4)
         chunks.append(padded)
         offset += len(padded)
@@ -191,13 +190,13 @@ def pack(scene: ViewerScene) -> PackedScene:
 
 
 def weld_vertices(positions: Float32Array) -> NDArray[np.intp]:
-    """Return for each vertex the first that lies at the same place, shape (V,)."""
+    """Return the first vertex at the position of each vertex, shape (V,)."""
     _, first, inverse = np.unique(positions, axis=0, return_index=True, return_inverse=True)
     return np.asarray(first[inverse.reshape(-1)])
 
 
 def encode_shape(mesh: Mesh) -> dict[str, tuple[NDArray[np.int16], np.float32]]:
-    """Return the words of each blend shape's movement, (V, 3), and the step of one, mm."""
+    """Quantize the displacements of blend shapes, (V, 3); return words and step, mm, by shape."""
     out = {}
     for name, deltas in mesh.shapes.items():
         step = np.float32(max(float(np.abs(deltas).max()) / SHAPE_BITS, SHAPE_STEP_MM))
@@ -206,11 +205,11 @@ def encode_shape(mesh: Mesh) -> dict[str, tuple[NDArray[np.int16], np.float32]]:
 
 
 def _choose_predictor(words: Words) -> tuple[str, bytes]:
-    """Return the predictor under which words compress best, and their bytes."""
+    """Choose the predictor with the smallest compressed size; also return the bytes."""
     little = words.astype(words.dtype.newbyteorder("<"), copy=False)
     if words.ndim < 2:
         return "raw", little.tobytes()
-    # floats as words: those beside each other share sign, exponent and first digits
+    # floats as words: neighbors share sign, exponent and leading digits
     little = np.ascontiguousarray(little).view(np.dtype(f"<u{words.dtype.itemsize}"))
     flat = little.reshape(-1, *words.shape[-3:]) if words.ndim >= 3 else little[None, :, None, :]
     tried = {name: _bytes_of(_differences(flat, name)) for name in PREDICTOR_NAMES}
@@ -218,7 +217,7 @@ def _choose_predictor(words: Words) -> tuple[str, bytes]:
 
 
 def _differences(words: NDArray[Any], predictor: str) -> NDArray[Any]:
-    """Return words less their prediction, modulo the word; shape (L, H, W, C)."""
+    """Return words minus their prediction, modulo the word; shape (L, H, W, C)."""
     out = words.copy()
     if predictor in ("left", "plane"):
         out[:, :, 1:] -= out[:, :, :-1].copy()
@@ -228,29 +227,29 @@ def _differences(words: NDArray[Any], predictor: str) -> NDArray[Any]:
 
 
 def _bytes_of(words: NDArray[Any]) -> bytes:
-    """Return all low bytes, then all high ones: each compresses better by itself."""
+    """Return all low bytes, then all high bytes, as they compress better separately."""
     size = words.dtype.itemsize
     return words.reshape(-1).view(np.uint8).reshape(-1, size).T.tobytes()
 
 
 _GZIP_HEADER: Final = b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x02\xff"
-"""gzip, deflate, no name, no time, slowest, unknown system (RFC 1952): the same everywhere."""
+"""Header of gzip without name, time and system (RFC 1952), equal on all platforms."""
 _EMPTY_LAST_BLOCK: Final = b"\x03\x00"
 """An empty last block of deflate."""
 _MEMORY_LEVEL: Final = 9
 MAX_QUICK_RATIO: Final = 0.9
-"""Repetitions are searched for thoroughly where a quick search makes this much of the size."""
+"""Maximum size ratio of a quick search from which a thorough search is made."""
 MAX_MEASURED_BYTES: Final = 1 << 20
-"""Bytes above which a size is guessed from codes and runs alone."""
+"""Maximum size of data that is compressed to measure its size; larger data are estimated."""
 
 
 def gzip_parts(parts: Iterable[bytes]) -> bytes:
-    """Return parts behind each other as one gzip member, the same bytes for the same parts.
+    """Compress concatenated parts as one gzip member, deterministically.
 
     Parameters
     ----------
     parts
-        Each is compressed without a look at the others.
+        Parts, compressed independently.
 
     Examples
     --------
@@ -269,7 +268,7 @@ def gzip_parts(parts: Iterable[bytes]) -> bytes:
 
 
 def estimate_gzip_size(data: bytes) -> int:
-    """Return about how many bytes `gzip_parts` makes of data, quickly: to compare orders of it."""
+    """Estimate the size of `gzip_parts` quickly, to compare orderings of data."""
     if len(data) < MAX_MEASURED_BYTES:
         return len(zlib.compress(data, 1))
     return min(len(_deflated(data, 1, strategy)) for strategy in _WITHOUT_SEARCH)
@@ -287,25 +286,25 @@ def _smallest(part: bytes) -> bytes:
 
 
 def _deflated(part: bytes, level: int, strategy: int) -> bytes:
-    """Return blocks of deflate that end at a whole byte, none of them the last (RFC 1951)."""
+    """Return non-final deflate blocks that end at a byte boundary (RFC 1951)."""
     packer = zlib.compressobj(level, zlib.DEFLATED, -zlib.MAX_WBITS, _MEMORY_LEVEL, strategy)
     return packer.compress(part) + packer.flush(zlib.Z_SYNC_FLUSH)
 
 
 def split_octave(values: Float64Array, step_words: int) -> tuple[UInt8Array, UInt8Array]:
-    """Return words of half as many texels a side, and the steps that the finest octave adds.
+    """Split values into words of half the resolution and quantized steps of the finest octave.
 
     Parameters
     ----------
     values
         Words before they are rounded, 0 to 255, shape (L, H, W, C), H and W even.
-    fine
-        Words a step.
+    step_words
+        Size of a step in words.
 
     Returns
     -------
     coarse, steps : ndarray of uint8
-        (L, H/2, W/2, C), and (L, H, W, C) modulo 256; `join_octave` makes words of them.
+        (L, H/2, W/2, C), and (L, H, W, C) modulo 256; inverted by `join_octave`.
     """
     L, H, W, C = values.shape
     means = values.reshape(L, H // 2, 2, W // 2, 2, C).mean(axis=(2, 4))
@@ -315,15 +314,15 @@ def split_octave(values: Float64Array, step_words: int) -> tuple[UInt8Array, UIn
 
 
 def join_octave(coarse: UInt8Array, steps: UInt8Array, step_words: int) -> UInt8Array:
-    """Return the words of `split_octave`, (L, H, W, C)."""
+    """Join the two outputs of `split_octave` to words, (L, H, W, C)."""
     words = _upsample(coarse) + step_words * steps.view(np.int8).astype(np.int64)
     return np.clip(words, 0, 255).astype(np.uint8)
 
 
 def _upsample(coarse: UInt8Array) -> Int64Array:
-    """Return twice as many texels a side, interpolated linearly and rounded half up, (L, H, W, C).
+    """Upsample twofold by linear interpolation, rounded half up, (L, H, W, C).
 
-    Whole numbers throughout, so that the page comes to the same words.
+    Arithmetic is in integers, so that the page computes identical words.
     """
     c = coarse.astype(np.int64)
     for axis in (1, 2):

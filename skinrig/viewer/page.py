@@ -1,4 +1,4 @@
-"""Pack a scene, our shaders and our script into ONE HTML page that asks the network for nothing."""
+"""Pack scene, shaders and scripts into one HTML page without network requests."""
 
 import base64
 import hashlib
@@ -25,57 +25,57 @@ SCRIPT_NAMES: Final = (
 _CHUNK_LINE = re.compile(r"^//@chunk (\w+)[ \t]*$", re.MULTILINE)
 
 
-def chunks() -> dict[str, str]:
-    """Return the pieces of GLSL by name.
+def read_chunks() -> dict[str, str]:
+    """Read the chunks of GLSL, keyed by name.
 
     Raises
     ------
     SceneError
-        Two pieces have one name.
+        If two chunks have one name.
     """
     found: dict[str, str] = {}
     for entry in sorted(_files("glsl", ".glsl"), key=lambda one: one.name):
         parts = _CHUNK_LINE.split(entry.read_text(encoding="utf-8"))
         for name, text in zip(parts[1::2], parts[2::2], strict=True):
             if name in found:
-                raise SceneError(f"glsl/{entry.name}: chunk {name!r} is there twice")
+                raise SceneError(f"glsl/{entry.name}: chunk {name!r} occurs twice; rename one")
             found[name] = _bare(text.strip("\n") + "\n")
     return found
 
 
-def script() -> str:
-    """Return all scripts as one strict function that shares an object ``V``."""
+def build_script() -> str:
+    """Join all scripts to one strict function with a shared object ``V``."""
     here = resources.files("skinrig.viewer").joinpath("js")
     body = "\n".join(
         _bare(here.joinpath(f"{name}.js").read_text(encoding="utf-8")) for name in SCRIPT_NAMES
     )
-    glsl = json.dumps(chunks(), sort_keys=True)
+    glsl = json.dumps(read_chunks(), sort_keys=True)
     return f'(() => {{\n"use strict";\nconst V = {{glsl: {glsl}}};\n{body}\n}})();\n'
 
 
 def build(scene: ViewerScene, *, connect: bool = False) -> str:
-    """Return the page of a scene.
+    """Build the page of a scene.
 
     Parameters
     ----------
     scene
-        What it shows.
+        The displayed scene.
     connect
-        Whether it may ask the server it came from for more (tiles); a page in a file may not.
+        Whether the page may fetch tiles from its own server; False for a page in a file.
 
     Returns
     -------
     str
-        HTML, the same for the same scene.
+        HTML; equal scenes give equal text.
     """
     return render(pack(scene), connect=connect)
 
 
 def render(packed: PackedScene, *, connect: bool = False) -> str:
-    """Return the page of a packed scene."""
+    """Render the page of a packed scene."""
     here = resources.files("skinrig.viewer")
     style = here.joinpath("page.css").read_text(encoding="utf-8")
-    code = script().replace("</", "<\\/")
+    code = build_script().replace("</", "<\\/")
     source = "'self'" if connect else "'none'"
     policy = (
         f"default-src 'none'; script-src '{_hash(code)}'; style-src '{_hash(style)}'; "
@@ -92,19 +92,19 @@ def render(packed: PackedScene, *, connect: bool = False) -> str:
 
 
 def write(scene: ViewerScene, out: Path) -> dict[str, Any]:
-    """Write the page of a scene, whole or not at all, and return what it holds.
+    """Write the page of a scene atomically and return its record.
 
     Parameters
     ----------
     scene
-        What it shows.
+        The displayed scene.
     out
         File to write or replace.
 
     Returns
     -------
     dict
-        JSON values: path, bytes, textures, blend shapes, quantization errors, what is left out.
+        JSON values: path, bytes, textures, blend shapes, quantization errors, omissions.
     """
     packed = pack(scene)
     text = render(packed)
@@ -123,7 +123,7 @@ def write(scene: ViewerScene, out: Path) -> dict[str, Any]:
 
 
 def _bare(text: str) -> str:
-    """Return a script without lines that are comments, and without indentation."""
+    """Strip comment lines and indentation from a script."""
     return re.sub(r"^[ \t]+", "", re.sub(r"^[ \t]*//.*\n", "", text, flags=re.M), flags=re.M)
 
 
@@ -137,15 +137,15 @@ def _files(folder: str, ending: str) -> list[Traversable]:
 
 
 UNSAFE_CODES: Final = (0, 8, 9, 10, 11, 12, 13, 26, 27, 34, 38, 60, 127)
-"""Codes of characters that HTML, editors or transports may change: controls, line ends, and those
-with which markup begins."""
+"""Codes of characters that HTML, editors or transports may change: control characters, line ends
+and the beginning of markup."""
 
 
 def encode_as_text(data: bytes) -> str:
-    """Return bytes as text of which UTF-8 holds seven bits a byte (base64: six).
+    """Encode bytes as text with seven bits per byte of UTF-8 (base64: six).
 
-    A character below 128 is seven bits, the first the highest. Those that a page or an editor may
-    change (`UNSAFE_CODES`) become, with the seven bits behind them, one of two bytes:
+    A character below 128 has seven bits, the highest first. An unsafe code (`UNSAFE_CODES`) and the
+    seven bits that follow it become one character of two bytes:
     ``(index in UNSAFE_CODES + 1) * 128 + next``.
 
     Parameters
@@ -164,9 +164,9 @@ def encode_as_text(data: bytes) -> str:
     unsafe = np.full(128, -1, np.int64)
     unsafe[list(UNSAFE_CODES)] = np.arange(len(UNSAFE_CODES))
     if len(codes) and unsafe[codes[-1]] >= 0:
-        codes = np.append(codes, np.uint16(32))  # something for the last to be joined with
+        codes = np.append(codes, np.uint16(32))  # padding, as an unsafe last code needs a successor
     found = np.flatnonzero(unsafe[codes] >= 0)
-    # of several behind each other every other one is joined to the one before it
+    # in a run of unsafe codes, every second one is the successor of the code before it
     begins = np.diff(found, prepend=-2) > 1
     first = found[begins][np.cumsum(begins) - 1] if len(found) else found
     joining = found[(found - first) % 2 == 0]

@@ -1,8 +1,7 @@
-"""What the viewer shows: a mesh that moves, textures, tables, parameters and what is left out.
+"""Define the viewer's scene: deformable mesh, textures, tables, parameters and omissions.
 
-A scene is plain data. Its sources (`skinrig.viewer.faces`, `skinrig.viewer.faces`)
-say what is known of a face; asset builders turn that into textures, tables and parameters; the
-packer (`skinrig.viewer.packing`) makes it small.
+A scene is plain data. `skinrig.viewer.faces` collects the known data of a face. Asset builders
+derive textures, tables and parameters from it, and `skinrig.viewer.packing` compresses them.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ Filter = Literal["linear", "mipmap", "nearest"]
 Kind = Literal["procedural", "mesh", "dynamic", "dome", "model"]
 
 MAX_TEXTURE_PX: Final = 4096
-"""Texels a side that any WebGL2 device of the last ten years takes."""
+"""Maximum side of a texture on any WebGL2 device of the last ten years."""
 
 
 class SceneError(ValueError):
-    """A scene that contradicts itself, or nothing that could be shown."""
+    """An inconsistent scene, or data that cannot be displayed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,13 +41,13 @@ class Texture:
     values : ndarray of float32
         Shape (H, W, C), C from 1 to 4, row 0 at the top (v = 1); or (L, H, W, C) for layers.
     storage
-        How the page holds it: "u8" and "u16" are spread linearly over the range of each layer and
-        channel; "f16" and "f32" as they are.
+        Storage in the page: "u8" and "u16" are scaled linearly to the range of each layer and
+        channel; "f16" and "f32" are unscaled.
     filter
-        Between texels.
+        Interpolation between texels.
     fine
-        Of "u8" alone: the finest octave (what a texel differs by from its neighborhood) is rounded
-        to so many words; 1 keeps all. Noise costs the most bytes and shows the least there.
+        Quantization step of the finest octave (difference of a texel from its neighborhood) in
+        words, only for "u8"; 1: lossless. Noise there costs most bytes and is least visible.
     """
 
     values: Float32Array
@@ -57,7 +56,7 @@ class Texture:
     fine: int = 1
 
     def __post_init__(self) -> None:
-        """Check shape, numbers and names."""
+        """Raise for invalid shapes, values and names."""
         shape = self.values.shape
         if self.values.ndim not in (3, 4) or not 1 <= shape[-1] <= 4 or 0 in shape:
             raise SceneError(
@@ -65,24 +64,26 @@ class Texture:
             )
         if max(shape[-3:-1]) > MAX_TEXTURE_PX:
             raise SceneError(
-                f"texture: got {shape}, expected at most {MAX_TEXTURE_PX} texels a side; "
+                f"texture: got {shape}, expected at most {MAX_TEXTURE_PX} texels per side; "
                 "choose a smaller --size-px"
             )
         if self.values.dtype != np.float32 or not np.isfinite(self.values).all():
             raise SceneError(f"texture: got {self.values.dtype} or NaN, expected finite float32")
         if self.storage not in get_args(Storage) or self.filter not in get_args(Filter):
-            raise SceneError(f"texture: got {self.storage!r}, {self.filter!r}: unknown")
+            raise SceneError(
+                f"texture: got {self.storage!r}, {self.filter!r}, expected a storage and a filter"
+            )
         if self.fine != 1 and (
             self.storage != "u8" or not 1 < self.fine < 128 or any(n % 2 for n in shape[-3:-1])
         ):
             raise SceneError(
                 f"texture: got fine = {self.fine} of {self.storage} {shape}, expected 1, or up to "
-                "127 of u8 with an even number of texels a side"
+                "127 of u8 with an even number of texels per side"
             )
 
 
 class Assets(TypedDict, total=False):
-    """What an asset builder adds to a scene; every key may be missing."""
+    """Additions of an asset builder to a scene; every key is optional."""
 
     textures: Mapping[str, Texture]
     tables: Mapping[str, Float32Array]
@@ -94,28 +95,28 @@ class Assets(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneSource:
-    """What is known of a face before assets are built from it.
+    """Data of a face from which assets are built.
 
     Attributes
     ----------
     kind
-        Where it comes from.
+        Kind of source.
     mesh
-        Its geometry.
+        Geometry.
     size
-        Texels a side of the large textures.
+        Side of the large textures, texels.
     seed
-        Of everything that is drawn, where something is.
+        Random seed of simulated parts.
     subject
-        The simulated person who stands for what was not measured.
+        Simulated person that replaces what was not measured.
     skin
-        Its finest maps at `size`.
+        Finest maps of that person, of side `size`.
     appearances
         Fitted folders by kind: "dynamic" (facial color, wrinkles, microstructure), "dome", "model".
     paths
-        Those folders.
+        Paths of these folders.
     landmarks
-        Table of named points of the picture that the flash rig's maps are drawn on.
+        Table of landmarks of the flash rig's neutral image.
     calibration
         Folder with the color calibration of the dome's cameras.
     """
@@ -133,31 +134,31 @@ class SceneSource:
 
     @property
     def fitted(self) -> tuple[SkinAppearance, ...]:
-        """Folders of a dome's maps, the better one first: a model with lobes, or the maps alone."""
+        """Appearances of a dome, the fitted model before plain maps."""
         return tuple(self.appearances[k] for k in ("model", "dome") if k in self.appearances)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewerScene:
-    """All that goes into a page.
+    """Contents of a page.
 
     Attributes
     ----------
     mesh
         Geometry and blend shapes.
     textures, tables
-        By name; a table is a float32 array of any shape, (rows, columns, channels) where the page
-        samples it: row 0 first, not flipped.
+        Textures and tables by name. A table is a float32 array of any shape, or (rows, columns,
+        channels) if the page samples it; row 0 first, not flipped.
     params
-        Parameters the page starts with; JSON values.
+        Initial parameters of the page, JSON values.
     presets
-        Parameters that a preset sets, by name.
+        Parameters by preset.
     facts
-        Stated errors and figures that the page shows; JSON values.
+        Errors and figures that the page displays, JSON values.
     provenance
-        Where the scene comes from.
+        Provenance of the scene.
     left_out
-        (what, why) of each feature that the page lacks.
+        Omitted features with reasons.
     """
 
     mesh: Mesh
@@ -170,12 +171,12 @@ class ViewerScene:
     left_out: tuple[tuple[str, str], ...] = ()
 
     def with_assets(self, assets: Assets) -> ViewerScene:
-        """Return the scene with more in it.
+        """Return the scene with added assets.
 
         Raises
         ------
         SceneError
-            Two builders name a texture, table, parameter, preset or fact alike.
+            If two builders use the same name.
         """
         merged: dict[str, Any] = {}
         for key in ("textures", "tables", "params", "presets", "facts"):

@@ -1,9 +1,8 @@
-"""The page and its tiles on a port of this machine, for nobody else.
+"""Serve the page and its tiles on a local port, for this machine only.
 
-Bound to the loopback address. A page of another origin cannot ask through this browser either: a
-request whose Host is not this server's is refused (a name that was rebound to 127.0.0.1), answers
-are not readable across origins, and nothing but two kinds of paths is answered. No path names a
-file.
+The server is bound to the loopback address. Pages of other origins cannot access it through the
+browser: a request with another Host is refused (DNS rebinding), and responses are not readable
+across origins. Only two kinds of paths are answered, none of which is a file name.
 """
 
 import re
@@ -26,7 +25,7 @@ from skinrig.viewer.scene import SceneError, ViewerScene
 LOOPBACK_HOST: Final = "127.0.0.1"
 TILE_PATH: Final = re.compile(r"/tiles/([0-9]{1,2})/([0-9]{1,4})/([0-9]{1,4})")
 CONNECTION_TIMEOUT_S: Final = 30.0
-"""A connection that says nothing for so long is closed."""
+"""Time after which an idle connection is closed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,9 +35,9 @@ class PageServer:
     Attributes
     ----------
     url
-        Of the page.
+        Address of the page.
     port
-        It was given, or found free.
+        Given or free port.
     requests
         Paths answered so far, in order.
     """
@@ -62,17 +61,17 @@ def serve(html: bytes, *, pyramid: Pyramid | None = None, port: int = 0) -> Iter
     html : bytes
         The page.
     pyramid : Pyramid, optional
-        Answered at ``/tiles/LEVEL/ROW/COLUMN``.
+        Tiles, served at ``/tiles/LEVEL/ROW/COLUMN``.
     port : int
-        0 chooses a free one.
+        Port; 0: a free one.
 
     Raises
     ------
     SceneError
-        The port is no number of one, or taken.
+        If the port is out of range or in use.
     """
     if not 0 <= port <= 65535:
-        raise SceneError(f"port: got {port}, expected 0 to 65535")
+        raise SceneError(f"--port: got {port}, expected 0 to 65535; enter another")
     requests: list[str] = []
     of_page = {"html": html, "pyramid": pyramid, "requests": requests}
     handler: Any = type("Handler", (_Handler,), of_page)
@@ -80,7 +79,7 @@ def serve(html: bytes, *, pyramid: Pyramid | None = None, port: int = 0) -> Iter
         server = ThreadingHTTPServer((LOOPBACK_HOST, port), handler)
     except OSError as error:
         raise SceneError(
-            f"port: {port} cannot be used ({error.strerror}); choose another, or 0 for a free one"
+            f"--port: {port} is not usable ({error.strerror}); choose another, or 0 for a free one"
         ) from error
     server.daemon_threads = True
     number = int(server.server_address[1])
@@ -110,26 +109,26 @@ def serve_scene(
     Parameters
     ----------
     scene
-        What it shows.
+        The displayed scene.
     port
-        0: any free one.
+        Port; 0: a free one.
     appearances
-        Folders that it was made of.
+        Source folders of the scene.
     console
-        Is told the address.
+        Output of the address.
     displacement
-        A .npy file of heights, um, in the texture of the mesh: fetched as tiles, in place of relief
-        that is grown in the page.
+        A .npy file of heights, um, in the texture of the mesh; the page fetches it as tiles instead
+        of growing relief.
 
     Raises
     ------
     SceneError, TileError
-        A port that is taken; a file that is no displacement.
+        If the port is in use, or the file is not a displacement.
     """
     with tempfile.TemporaryDirectory(prefix="skinrig-view-") as name:
         pyramid = None
         if displacement is not None:
-            console.progress(f"cutting {displacement.name} into tiles")
+            console.progress(f"cut {displacement.name} into tiles")
             pyramid = open_displacement(displacement, Path(name) / "levels")
             scene = add_displacement_tiles(scene, pyramid)
         text = page.build(scene, connect=pyramid is not None).encode("utf-8")
@@ -145,15 +144,15 @@ def serve_scene(
             console.print_line(
                 f"{served.url}: open it in a browser on this machine; Ctrl-C ends it"
             )
-            console.document("skinrig.view-served/1", document)
+            console.print_document("skinrig.view-served/1", document)
             try:
                 served.wait()
             except KeyboardInterrupt:
-                console.progress("no longer served")
+                console.progress("server closed")
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answer for the page and its tiles alone."""
+    """Request handler of the page and its tiles."""
 
     html: bytes
     pyramid: Pyramid | None
@@ -165,11 +164,11 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = CONNECTION_TIMEOUT_S
 
     def do_GET(self) -> None:
-        """Answer with the body."""
+        """Send headers and body."""
         self._answer(body=True)
 
     def do_HEAD(self) -> None:
-        """Answer without the body."""
+        """Send headers only."""
         self._answer(body=False)
 
     def _answer(self, *, body: bool) -> None:
@@ -205,4 +204,4 @@ class _Handler(BaseHTTPRequestHandler):
         return HTTPStatus.NOT_FOUND, text, b"there is nothing at this path\n"
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing: the page's own address was told already."""
+        """Omit the log line per request."""

@@ -155,7 +155,7 @@ def procedural_scene() -> Any:
     """The procedural head with textures of 256 texels."""
     from skinrig.viewer import faces as procedural
 
-    return procedural.scene(size=256)
+    return procedural.build_scene(size=256)
 
 
 @pytest.fixture(scope="session")

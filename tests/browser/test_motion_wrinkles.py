@@ -209,9 +209,9 @@ def test_hybrid_normals_softest_in_red_sharpest_in_highlight(viewer, procedural_
     covered = source[..., 3] > 0.5
     assert covered.mean() > 0.5
     side = source.shape[0]
-    from skinrig.viewer.microstructure.assets import px_per_mm
+    from skinrig.viewer.microstructure.assets import compute_px_per_mm
 
-    per_mm = side * float(np.median(px_per_mm(as_packed(procedural_scene).mesh)))
+    per_mm = side * float(np.median(compute_px_per_mm(as_packed(procedural_scene).mesh)))
     sigma = np.array(viewer.page.evaluate("() => window.viewer.params.hybrid_sigma_mm")) * per_mm
     radius = int(np.ceil(3.0 * sigma.max()))
     weight = covered.astype(np.float64)

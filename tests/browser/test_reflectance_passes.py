@@ -70,7 +70,7 @@ def fitted_page(procedural_scene, open_page) -> FittedPage:
     mix /= mix.sum(axis=1, keepdims=True)
     shares = np.maximum(0.3 + 0.4 * smooth((16, 16, 3), rng), 0.0).astype(np.float32)
     face = PageLobes(materials.mix_materials(mix), shares, mix, materials.names, "fitted")
-    traits = trait_assets.surface_traits(face)
+    traits = trait_assets.build_surface_traits(face)
     assert traits is not None
     base = reflectance_assets.build_lobe_assets(
         SceneSource("dome", procedural_scene.mesh, 64, 0, None, None), traits.lobes
@@ -94,7 +94,7 @@ def fitted_page(procedural_scene, open_page) -> FittedPage:
         facts={
             **procedural_scene.facts,
             **base["facts"],
-            "surface_traits": trait_assets.surface_facts(traits),
+            "surface_traits": trait_assets.describe_surface_traits(traits),
             "albedo_traits": albedo.facts(),
         },
         params={

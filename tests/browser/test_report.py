@@ -49,7 +49,7 @@ def pages(tmp_path_factory):
     found = []
     for name, paths in (("one", [folder / "one"]), ("both", [folder / "one", folder / "two"])):
         path = folder / f"{name}.html"
-        path.write_text(report.make(paths).html, encoding="utf-8")
+        path.write_text(report.build_any(paths).html, encoding="utf-8")
         found.append(path)
     return found
 

@@ -20,7 +20,7 @@ counted beside it is what holds the frame small."""
 
 def test_page_of_2048_texels_stays_below_5_mb():
     # the largest texture work of the suite: 45 s of a quiet core
-    text = page.build(procedural.scene(size=2048))
+    text = page.build(procedural.build_scene(size=2048))
     assert len(text.encode("utf-8")) < LARGEST_PAGE
     assert '"width":2048' in text
 
@@ -39,7 +39,7 @@ def test_light_rotation_redraws_only_required_passes(viewer):
 
 
 def test_mesh_file_accepts_any_number_of_blend_shapes(open_page, tmp_path):
-    mesh = procedural.viewer_mesh(make_subject("III", size=64))
+    mesh = procedural.build_viewer_mesh(make_subject("III", size=64))
     names = [f"own {k}" for k in range(20)]
     shapes = np.zeros((20, *mesh.vertices_mm.shape), np.float32)
     shapes[:, :, 2] = np.linspace(0.1, 2.0, 20)[:, None]
@@ -51,7 +51,7 @@ def test_mesh_file_accepts_any_number_of_blend_shapes(open_page, tmp_path):
         shape_names=np.array(names),
         shape_deltas_mm=shapes,
     )
-    grown = procedural.scene(size=64, mesh=tmp_path / "face.npz")
+    grown = procedural.build_scene(size=64, mesh=tmp_path / "face.npz")
     assert set(names) < set(grown.mesh.shapes)
     viewer = open_page(page.build(grown))
     rest, _ = viewer.mesh()

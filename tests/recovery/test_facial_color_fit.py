@@ -11,7 +11,7 @@ from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores import shading_prior
 from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.flash.facial_color import UnknownBloodError
-from skinrig.applying.expression import hemoglobin_rig
+from skinrig.applying.expression import read_hemoglobin_rig
 from skinrig.benchmarks.intervals import flash as interval_trials_flash
 from skinrig.benchmarks.intervals.trials import TrialSubject
 from skinrig.calibrating.calibrate import calibrate
@@ -53,7 +53,9 @@ def truths(folder):
 
 def errors(folder, truths):
     appearance = store.read(folder / "moving")
-    return compare(appearance, hemoglobin_rig(appearance), truths, rng=np.random.default_rng(0))
+    return compare(
+        appearance, read_hemoglobin_rig(appearance), truths, rng=np.random.default_rng(0)
+    )
 
 
 def test_rig_estimates_state_blood_closer_than_neutral_map(fitted, folder, truths):

@@ -145,7 +145,7 @@ def test_head_repositioned_in_other_session_is_found(fitted):
         out / "session-face", elsewhere, calibration=out / "calibration"
     )
     assert len(photographs.shots) == DOME["lights"] * DOME["views"]
-    assert "the head sits" in photographs.assumed[0]
+    assert "the head is moved" in photographs.assumed[0]
     found, _ = evaluation.evaluate_photographs(
         elsewhere, photographs, evaluation.EvaluationSettings("local", count=4, ablation=False)
     )

@@ -12,7 +12,7 @@ from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import make_subject
 from skinrig.rendering.geometry import FittedSurface
 from skinrig.rendering.render import render_surface
-from skinrig.rendering.truth import true_light, true_model
+from skinrig.rendering.truth import build_true_light, build_true_model
 
 LIGHTS = (20, 62)
 
@@ -26,14 +26,14 @@ def scene():
 
 @pytest.fixture(scope="module")
 def model(scene):
-    return true_model(scene, "C03")
+    return build_true_model(scene, "C03")
 
 
 def error(scene, model, view, light, *, shown=None, **options):
     """Return the median relative error of luminance on lit pixels, and how many there are."""
     laid = FittedSurface.of(model, scene.subject.mesh)
     camera = CameraPose.nominal(scene.rig.view(view))
-    seen = render_surface(laid, camera, true_light(scene, light, view), **options)
+    seen = render_surface(laid, camera, build_true_light(scene, light, view), **options)
     true = scene.radiance(view, [light if shown is None else shown])[0]
     good = seen.lit & seen.covered & (true.mean(axis=-1) > 0)
     gap = np.abs(seen.radiance - true).mean(axis=-1) / np.maximum(true.mean(axis=-1), 1e-9)
@@ -83,7 +83,7 @@ def test_smiling_face_renders_with_carried_neutral_normals(scene, model):
     left = FittedSurface.of(dataclasses.replace(model, position_mm=place), smiling.mesh)
     far = []
     for laid in (carried, left):
-        seen = render_surface(laid, camera, true_light(scene, light, view))
+        seen = render_surface(laid, camera, build_true_light(scene, light, view))
         good = seen.lit & seen.covered & (true.mean(axis=-1) > 0)
         assert good.sum() > 1000
         gap = np.abs(seen.radiance - true).mean(axis=-1)[good] / true.mean(axis=-1)[good]

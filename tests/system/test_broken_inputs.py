@@ -172,9 +172,12 @@ def test_reconstruct_refuses_damage_or_is_unaffected(session, damage, capsys, tm
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["fit", "facial-color", "SESSION", "--radius", "-3"], "radius: got -3 px, expected more"),
+        (
+            ["fit", "facial-color", "SESSION", "--radius", "-3"],
+            "radius: got -3 px, expected above 0",
+        ),
         (["fit", "facial-color", "SESSION", "--radius", "nan"], "radius: got nan px"),
-        (["fit", "facial-color", "SESSION", "--stored-size", "0"], "stored size: got 0 cells"),
+        (["fit", "facial-color", "SESSION", "--stored-size", "0"], "--stored-size: got 0 cells"),
         (["reconstruct", "SESSION", "--maps", "melanin", "--scan", "x.ply"], "scan: "),
         (
             ["reconstruct", "SESSION", "--maps", "melanin", "--rank", "3"],

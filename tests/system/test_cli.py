@@ -272,7 +272,7 @@ def test_interrupted_command_suggests_resuming_where_possible():
         if any("--resume" in option.opts for option in one.params)
     }
     assert resumable == set(errors.RESUMABLE_COMMANDS)
-    told = {name: errors.interruption([name, "--json"]) for name in commands}
+    told = {name: errors.format_interruption([name, "--json"]) for name in commands}
     assert {name for name, text in told.items() if "--resume" in text} == resumable
 
 

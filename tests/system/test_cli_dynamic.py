@@ -92,7 +92,7 @@ def test_fits_refuse_folders_without_required_inputs(moving, tmp_path, capsys):
         assert not (tmp_path / "new").exists()
     # a folder of other maps is not overwritten
     assert main(["fit", "microstructure", str(plain), "--out", str(plain)]) == 3
-    assert "nothing was touched" in capsys.readouterr().err
+    assert "it was not changed" in capsys.readouterr().err
 
 
 def test_state_repeats_are_captured_in_alternation(tmp_path, capsys):

@@ -90,7 +90,7 @@ def test_missing_probe_uses_population_and_reports_substitution(folders, capsys)
         (["probe"], 3, "position"),
         (["dome", "dome"], 3, "subsurface.json"),
         (["dome", "probe", "--landmarks", "none.csv"], 3, "none.csv"),
-        (["dome", "--landmarks", "none.csv"], 2, "no probe"),
+        (["dome", "--landmarks", "none.csv"], 2, "--probe, which is missing"),
     ],
 )
 def test_reflectance_fit_failure_gives_single_sentence(

@@ -60,7 +60,7 @@ def test_of_several_photographs_the_states_there_are_named(photos, tmp_path, cap
     said = capsys.readouterr().err
     assert "has no photograph of state 'neutral'; it has those of a, b" in said
     assert "--state a" in said
-    assert "crossed frame" not in said
+    assert "crossed-polarized frame" not in said
 
 
 def test_full_disk_during_import_suggests_reimport(photos, tmp_path, capsys, monkeypatch):

@@ -221,8 +221,8 @@ def test_uncorrectable_words_exit_with_2(argv, here, capsys):
 
 @pytest.mark.parametrize("argv", cases(UNUSABLE))
 def test_invalid_names_numbers_and_files_exit_with_3(argv, here, capsys):
-    assert main([*argv, "--json"]) == errors.BAD_INPUT
-    assert told(capsys) == errors.BAD_INPUT
+    assert main([*argv, "--json"]) == errors.EXIT_BAD_INPUT
+    assert told(capsys) == errors.EXIT_BAD_INPUT
     assert sorted(path.name for path in here.iterdir()) == ["file.txt", "folder"]
 
 

@@ -54,10 +54,10 @@ def test_missing_address_is_reported_target_needs_no_caliper(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "code", "match"),
     [
-        (["--angles", "30"], errors.BAD_INPUT, "angles: got 30"),
+        (["--angles", "30"], errors.EXIT_BAD_INPUT, "angles: got 30"),
         (["--steps", "1-2"], errors.EXIT_USAGE, "FIRST..LAST"),
-        (["--steps", "-9..0"], errors.BAD_INPUT, "steps"),
-        (["--target", "chart"], errors.BAD_INPUT, "expected one of ball, dark, flat"),
+        (["--steps", "-9..0"], errors.EXIT_BAD_INPUT, "steps"),
+        (["--target", "chart"], errors.EXIT_BAD_INPUT, "expected one of ball, flat, dark"),
         (["--target", "ball", "--angles", "0"], errors.EXIT_USAGE, "default plan of skin"),
     ],
 )
@@ -75,7 +75,7 @@ def test_target_is_simulated_and_next_step_printed(capsys, tmp_path):
 
 
 def test_a_large_rig_is_not_served(capsys):
-    assert main(["serve", "gradient", "--scale", "full"]) == errors.BAD_INPUT
+    assert main(["serve", "gradient", "--scale", "full"]) == errors.EXIT_BAD_INPUT
     assert "expected small" in capsys.readouterr().err
 
 

@@ -55,9 +55,9 @@ def test_dry_run_prints_plan_time_light_without_address(capsys):
     [
         (["--angles", "0,90"], errors.EXIT_USAGE, "number of directions"),
         (["--steps", "-1..1"], errors.EXIT_USAGE, "--steps"),
-        (["--sites", "cheek,cheek"], errors.BAD_INPUT, "none twice"),
-        (["--repeats", "0"], errors.BAD_INPUT, "repeats"),
-        (["--target", "ball"], errors.BAD_INPUT, "expected one of phantom, dark"),
+        (["--sites", "cheek,cheek"], errors.EXIT_BAD_INPUT, "none twice"),
+        (["--repeats", "0"], errors.EXIT_BAD_INPUT, "repeats"),
+        (["--target", "ball"], errors.EXIT_BAD_INPUT, "expected one of phantom, dark"),
         (["--target", "phantom", "--sites", "cheek"], errors.EXIT_USAGE, "default plan of skin"),
     ],
 )

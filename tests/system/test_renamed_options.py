@@ -20,7 +20,7 @@ from skinrig.cli import app, main
 from skinrig.commands.export import FORMATS
 from skinrig.commands.renamed_options import RENAMED_OPTIONS, format_notice
 from skinrig.exporting.export import APPEARANCE_FORMATS, SESSION_FORMATS
-from skinrig.exporting.options import UNITS_M
+from skinrig.exporting.options import METERS_PER_UNIT
 from skinrig.rendering.render import Subsurface
 from skinrig.simulating.orders import PICTURE_SIZES
 from skinrig.traits.albedo_vectors import VectorKind
@@ -148,7 +148,7 @@ def test_former_names_are_hidden_from_help(path, former, capsys):
         ("fit traits", "--vectors", get_args(VectorKind)),
         ("fit traits", "--contrast", get_args(Contrast)),
         ("analyse brdf", "--method", get_args(Method)),
-        ("export", "--unit", UNITS_M),
+        ("export", "--unit", METERS_PER_UNIT),
         ("import mesh", "--unit", MM_PER_UNIT),
         ("import lp", "--encoding", get_args(Encoding)),
     ],

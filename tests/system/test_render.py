@@ -166,7 +166,7 @@ def test_fewer_lobes_and_a_shadow_boundary_are_drawn(folder, monkeypatch, capsys
     words = ("face", "--shadow-boundary", "--samples", "1", "--out", "shadow", "--json")
     assert run(folder, monkeypatch, *words) == 0
     document = json.loads(capsys.readouterr().out)
-    assert "labels are sigma_tr" in document["labels"]
+    assert "all labels are sigma_tr" in document["labels"]
     assert [row["sigma_tr_per_mm"] for row in document["boundaries"][:2]] == [
         [0.3558, 0.7932, 1.5173],
         [0.9171, 1.5682, 1.6569],
@@ -237,7 +237,7 @@ def test_a_folder_of_something_else_is_not_replaced(folder, monkeypatch, capsys)
 class OnePhotograph:
     """A session with one photograph that no fit has seen."""
 
-    assumed = ("the head held still",)
+    assumed = ("the head was static",)
     shots = (HeldOutShot("C03", "L017", "light"),)
 
     def camera(self, shot):
@@ -257,7 +257,7 @@ def test_photograph_is_decomposed_alongside_its_rendering(folder, monkeypatch, c
     assert run(folder, monkeypatch, *words, *lit) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["held_out"] == "light"
-    assert "the head held still" in document["assumed"]
+    assert "the head was static" in document["assumed"]
     left, diffuse, coverage = (
         store.read_exr(folder / "apart" / f"{name}.exr")
         for name in ("photograph_less_diffuse", "diffuse", "coverage")

@@ -10,7 +10,7 @@ from skinrig.viewer.microstructure.relief_growth import (
     MAX_LATTICE_PX,
     STEP_PX,
     GrownRelief,
-    reach_px,
+    compute_reach_px,
 )
 
 WEIGHT_POWER = 4
@@ -69,7 +69,7 @@ def _moves(growth: GrownRelief, i: Int64Array, j: Int64Array) -> tuple[Int64Arra
     # the hexagon's first pixel becomes one of the first pixels that keep its last inside
     free_x = STEP_PX * ((drawn & np.uint32(0xFFFF)) % np.uint32(growth.choices)).astype(np.int64)
     free_y = STEP_PX * ((drawn >> np.uint32(16)) % np.uint32(growth.choices)).astype(np.int64)
-    reach = reach_px(growth.cell_px)
+    reach = compute_reach_px(growth.cell_px)
     return free_x + reach - at_x, free_y + reach - at_y
 
 

@@ -25,7 +25,7 @@ from skinrig.rendering.geometry import FittedSurface
 from skinrig.rendering.interior import Interior
 from skinrig.rendering.lights import Light
 from skinrig.rendering.render import Rendering, render_surface
-from skinrig.rendering.truth import true_light, true_model
+from skinrig.rendering.truth import build_true_light, build_true_model
 
 VIEW_NAME: Final = "C07"
 LIGHT_INDEX: Final = 62
@@ -109,14 +109,14 @@ class _SimulatedFace:
             scene,
             direct(rig, face, subpixels=subpixels).radiance(VIEW_NAME, [LIGHT_INDEX])[0],
             CameraPose.nominal(rig.views[0]),
-            true_light(scene, LIGHT_INDEX, VIEW_NAME),
+            build_true_light(scene, LIGHT_INDEX, VIEW_NAME),
             Caster(face.mesh),
         )
 
     def fitted_surface(self, **binning: int) -> FittedSurface:
         """Return the true maps on the face's mesh."""
         return FittedSurface.of(
-            true_model(self.scene, VIEW_NAME, **binning), self.scene.subject.mesh
+            build_true_model(self.scene, VIEW_NAME, **binning), self.scene.subject.mesh
         )
 
     def render(self, surface: FittedSurface, **settings: Any) -> Rendering:

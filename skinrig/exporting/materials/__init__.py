@@ -1,1 +1,1 @@
-"""Exports of materials and meshes."""
+"""Export materials and meshes."""

@@ -1,9 +1,9 @@
-"""A script that brings an export into Blender together with what its importers leave out.
+"""Write a script that imports an export into Blender with subsurface scattering.
 
-Blender's importers of glTF and USD read no subsurface light, and USD's preview has no weight of
-reflection. Blender's Principled BSDF takes both. Its "Random Walk" divides radii by 4 pi before it
-takes them for mean free paths, and finds the albedo of single scattering from the color much as
-OpenPBR does: the radius that OpenPBR takes, times 4 pi, is the one for Blender.
+Blender's importers of glTF and USD ignore subsurface scattering, and USD's preview surface has no
+specular weight. Blender's Principled BSDF has both. Its "Random Walk" divides radii by 4 pi to get
+mean free paths, and derives the single-scattering albedo from the color much as OpenPBR does. Thus
+Blender's radius is that of OpenPBR times 4 pi.
 
 References
 ----------
@@ -22,12 +22,12 @@ from skinrig.exporting.options import M_PER_MM
 
 SCRIPT_FILE: Final = "skin_in_blender.py"
 RADIUS_FACTOR: Final = 4.0 * math.pi
-"""Blender's radius over the mean free path, for the method Random Walk."""
+"""Ratio of Blender's radius to the mean free path, for the method Random Walk."""
 
 
 @dataclass(frozen=True, slots=True)
 class Import:
-    """How a file comes into Blender.
+    """Settings of the import of a file into Blender.
 
     Attributes
     ----------
@@ -36,9 +36,9 @@ class Import:
     radius_mm
         Mean free path at a texture of 1, or the longest of `channels`, mm.
     channels
-        Fraction of it in red, green and blue; None: a texture has it.
+        Fraction of it in red, green and blue; None: given by a texture.
     textures
-        Input of the Principled BSDF to the texture's name below the folder, and the factor of its
+        Input of the Principled BSDF, name of the texture below the folder, and factor of its
         values.
     """
 
@@ -49,7 +49,7 @@ class Import:
 
     @staticmethod
     def from_channels(file: str, radius_mm: Sequence[float]) -> Import:
-        """Return an import whose radius is the same all over, (3,), mm.
+        """Create an import with a spatially constant radius, (3,), mm.
 
         Examples
         --------
@@ -61,7 +61,7 @@ class Import:
         return Import(file, float(longest), (red, green, blue))
 
     def script(self) -> str:
-        """Return the script that Blender runs."""
+        """Return the text of the script."""
         operator = "import_scene.gltf" if self.file.endswith(".glb") else "wm.usd_import"
         channels = None if self.channels is None else tuple(round(c, 9) for c in self.channels)
         script = resources.files("skinrig.exporting").joinpath("templates/skin_in_blender.py.txt")

@@ -1,7 +1,7 @@
-"""A mesh with its material and blend shapes as one binary glTF 2.0 file.
+"""Write a mesh with its material and blend shapes as a binary glTF 2.0 file.
 
-Lengths are metres and texture coordinates grow downwards, as the standard has it. glTF has no place
-for subsurface light: sigma_tr goes into ``extras``.
+As the standard requires, lengths are in meters and v increases downwards. glTF has no subsurface
+scattering; sigma_tr is written to ``extras``.
 
 References
 ----------
@@ -32,7 +32,7 @@ SCHEMA: Final = "skinrig.export.glb/1"
 
 @dataclass(slots=True)
 class _Binary:
-    """The binary chunk of a file while it grows."""
+    """The binary chunk of a file under construction."""
 
     file: pygltflib.GLTF2
     data: bytearray = field(default_factory=bytearray)
@@ -48,7 +48,7 @@ class _Binary:
         return len(self.file.bufferViews) - 1
 
     def accessor(self, values: NDArray[Any], *, bounds: bool = False) -> int:
-        """Add rows of vectors as floats, or a row of integers as indices; return the number."""
+        """Add vectors as floats, or integers as indices; return the accessor's index."""
         vectors = values.ndim == 2
         rows = np.ascontiguousarray(values, "<f4" if vectors else "<u4")
         self.file.accessors.append(
@@ -70,26 +70,26 @@ class _Binary:
 def write(
     appearance: SkinAppearance, folder: Path, delivery: ExportSettings
 ) -> list[tuple[str, str]]:
-    """Write skin.glb and a document of what it holds.
+    """Write skin.glb and a document of its contents.
 
     Parameters
     ----------
     appearance
-        Of a dome, or a fitted model.
+        Appearance of a dome, or a fitted model.
     folder
-        Existing, empty.
+        Existing, empty folder.
     delivery
-        Another mesh; blend shapes come from it. glTF is in metres and +Y, and has no tiles.
+        Another mesh, with optional blend shapes. glTF is in meters and +Y, and has no tiles.
 
     Returns
     -------
     list of (str, str)
-        What was left out, and why.
+        Omissions with reasons.
 
     Raises
     ------
     skinrig.errors.UsageError
-        For another unit or direction of green than glTF's.
+        If unit or direction of green are not those of glTF.
     ValueError
         See :meth:`skinrig.exporting.materials.material.Material.of`.
     """
@@ -99,14 +99,16 @@ def write(
         ("--udim", delivery.udim, "none"),
     ):
         if value != only:
-            raise UsageError(f"{option}: got {value}, but glTF knows {only} alone; leave it out")
+            raise UsageError(
+                f"{option}: got {value}, expected {only}, the only one of glTF; remove it"
+            )
     material = Material.of(appearance, delivery.mesh)
     if material.tiles[1:]:
         raise UnusableError(
-            f"--mesh: reaches over tiles {', '.join(map(str, material.tiles))}, but glTF knows one "
-            "alone; take mtlx or usd, or a mesh of tile 1001"
+            f"--mesh: got tiles {', '.join(map(str, material.tiles))}, expected tile 1001, as glTF "
+            "has one; export to mtlx or usd, or give another mesh"
         )
-    (folder / GLB_FILE).write_bytes(content(material))
+    (folder / GLB_FILE).write_bytes(encode_glb(material))
     script = blender.Import.from_channels(GLB_FILE, material.median_radius_mm()).script()
     (folder / blender.SCRIPT_FILE).write_text(script, encoding="utf-8")
     out = ImageFolder(folder, delivery)
@@ -122,25 +124,27 @@ def write(
             "frame": "+x right, +y up, +z towards the main camera (the front of glTF)",
             "base_color": f"{facts['base_color']}; 8 bits, sRGB curve",
             "normal": "tangent space of the TANGENT attribute, +Y, 8 bits; the maps and mtlx "
-            "exports hold 16",
+            "exports have 16",
             "morph_targets": list(material.shapes),
         },
     )
     in_blender = f"see extras; {blender.SCRIPT_FILE} sets it in Blender"
     left_out = material.list_mesh_omissions(delivery)
-    left_out.append(("subsurface light", f"glTF has no place for it: {in_blender}"))
+    left_out.append(("subsurface light", f"not part of glTF: {in_blender}"))
     if not material.shapes:
-        left_out.append(("morph targets", "the mesh has no blend shapes; name one with --mesh"))
+        left_out.append(
+            ("morph targets", "the mesh has no blend shapes; give one that has with --mesh")
+        )
     return left_out
 
 
-def content(material: Material) -> bytes:
-    """Return a .glb file.
+def encode_glb(material: Material) -> bytes:
+    """Encode a material with its mesh as the bytes of a .glb file.
 
     Parameters
     ----------
     material
-        In mm.
+        Material with lengths in mm.
     """
     mesh = material.mesh
     skeleton = resources.files("skinrig.exporting").joinpath("templates/skin.gltf")
@@ -154,7 +158,7 @@ def content(material: Material) -> bytes:
     attributes = pygltflib.Attributes(
         POSITION=binary.accessor(mesh.vertices_mm * M_PER_MM, bounds=True),
         NORMAL=binary.accessor(mesh.normals),
-        # v grows downwards here: the third axis keeps its meaning, along falling v
+        # v increases downwards in glTF; the bitangent remains along decreasing v, as required
         TANGENT=binary.accessor(mesh.tangents),
         TEXCOORD_0=binary.accessor(np.column_stack([mesh.uv[:, 0], 1.0 - mesh.uv[:, 1]])),
     )
@@ -181,7 +185,7 @@ def content(material: Material) -> bytes:
 
 
 def _pictures(material: Material) -> list[tuple[str, bytes]]:
-    """Return the textures' names and PNG files of 8 bits, in the order of their indices."""
+    """Return names and 8-bit PNG files of the textures, in the order of their indices."""
 
     def codes(name: str) -> NDArray[Any]:
         return encode_png_codes(material.image(name, ExportSettings()), depth=8)[0]

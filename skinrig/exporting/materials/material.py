@@ -1,4 +1,4 @@
-"""An appearance on its mesh, in the quantities that material formats have in common."""
+"""Convert an appearance on its mesh to the quantities that material formats share."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from model import dipole, fresnel, skin_reflectance
 from model.skin import SkinAppearance
 from skinrig.appearances.contents import list_assumptions
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from skinrig.errors import UsageError, one_of
+from skinrig.errors import UsageError, require_choice
 from skinrig.exporting.images import CAMERA_SPACE, DATA_SPACE, SRGB_SPACE, ExportImage
 from skinrig.exporting.materials import subsurface_radius, surface_fit, tangents, udim
 from skinrig.exporting.materials.tangents import FramedMesh
@@ -21,55 +21,55 @@ from skinrig.exporting.options import FIRST_TILE, ExportError, ExportSettings
 from skinrig.rendering.geometry import FittedSurface, read_own_mesh
 
 COLOR_NOTE: Final = (
-    "camera RGB, linear, over that of a perfect white: taken as linear sRGB where a format knows "
-    "nothing else; no color calibration is in it"
+    "camera RGB, linear, relative to a perfect white; used as linear sRGB in formats that have no "
+    "other space, without color calibration"
 )
 MAP_NOTES: Final[dict[str, str]] = {
-    "base_color": "R_d (1 - F_diffuse): what light from inside adds below a dielectric whose "
-    "reflection formats take off by themselves; equal to the measured model for even light",
+    "base_color": "R_d (1 - F_diffuse): diffuse reflection below a dielectric whose reflection "
+    "renderers subtract themselves; equal to the measured model under uniform illumination",
     "specular_roughness": "square root of GGX's alpha, the lobe nearest to the measured mixture",
     "specular_weight": "factor of the reflection of a smooth dielectric of specular_ior",
-    "specular_misfit": "what the single lobe leaves of the measured mixture, relative RMS",
-    "subsurface_radius": "mean free path at which light in the medium that OpenPBR finds for "
-    "the color decays as it does in the measured one, by exact transport",
+    "specular_misfit": "residual of the single lobe from the measured mixture, relative RMS",
+    "subsurface_radius": "mean free path for which OpenPBR's medium of this color has the decay "
+    "of the measured medium, by exact transport",
     "translucency": "1/sigma_tr as measured or assumed",
 }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Material:
-    """What formats are written from.
+    """Material quantities of an appearance on its mesh.
 
     Attributes
     ----------
     mesh
-        In mm, rig frame, with tangents.
+        Mesh in mm, rig frame, with tangents.
     shapes
-        Blend shapes: movement of `mesh`'s vertices by weight 1, mm, (V, 3) by name.
+        Displacement of `mesh`'s vertices at weight 1 by blend shape, mm, (V, 3).
     base_color, base_color_stderr
-        (H, W, 3), linear; see `COLOR_NOTE`. Not clipped. None: no standard error is known.
+        (H, W, 3), linear; see `COLOR_NOTE`. Not clipped. None: unknown uncertainty.
     normals, normals_rig
         (H, W, 3), unit: in the mesh's tangent frames, +Y up; and in the rig frame.
     axes
-        (H, W, 3, 3), tangent, bitangent and normal under each texel.
+        (H, W, 3, 3), tangent, bitangent and normal of each texel.
     covered
         (H, W), texels of the mesh.
     valid
-        (H, W), texels where all was measured; others are filled from around.
+        (H, W), texels with all quantities measured; others are filled from their surroundings.
     surface
-        Roughness, weight, misfit.
+        Roughness, weight and misfit of the specular lobe.
     translucency_mm, translucency_stderr_mm
         1/sigma_tr, (H, W, 3), mm.
     deficit
-        1 - alpha' of the measured medium, (H, W, 3); that of R_d 0.001 to 0.999 beyond.
+        1 - alpha' of the measured medium, (H, W, 3), of R_d clipped to 0.001 to 0.999.
     eta
         Refractive index.
     assumed
-        What was not measured.
+        Assumptions about unmeasured quantities.
     source
         "measured" or "simulated".
     tiles
-        UDIM tiles of the mesh; the maps are of the first.
+        UDIM tiles of the mesh; maps cover the first.
     """
 
     mesh: FramedMesh
@@ -92,29 +92,29 @@ class Material:
 
     @staticmethod
     def of(appearance: SkinAppearance, mesh_file: Path | None = None) -> Material:
-        """Return the material of a dome's or a fitted appearance.
+        """Create the material of a dome's or a fitted appearance.
 
         Parameters
         ----------
         appearance
-            With position, normals, r_d, lobes and mesh.
+            Appearance with position, normals, r_d, basis BRDFs and mesh.
         mesh_file
-            Another mesh with the same texture coordinates on tile 1001, perhaps with more on other
-            tiles; .npz, .obj, .ply, .gltf or .glb.
+            Another mesh with the same texture coordinates on tile 1001, and optionally others on
+            other tiles; .npz, .obj, .ply, .gltf or .glb.
 
         Raises
         ------
         model.skin_reflectance.SkinReflectanceError, skinrig.rendering.geometry.GeometryError,
         rigsim.geometry.mesh.MeshError, ExportError
-            Naming the map or file that is missing or does not fit.
+            If a map or file is missing or inconsistent; the message names it.
         """
         model = skin_reflectance.assemble(appearance)
         own = read_own_mesh(appearance)
         mesh = TiledMesh.of(own) if mesh_file is None else udim.read(mesh_file)
         surface = FittedSurface.of(model, mesh.first(), rest=own)
         framed = FramedMesh.of(mesh)
-        # frames of the whole mesh: at a border of tiles a renderer has no others
-        on_maps = framed.only(mesh.tile == FIRST_TILE)
+        # frames are those of the whole mesh, as in a renderer, also at borders of tiles
+        on_maps = framed.select_faces(mesh.tile == FIRST_TILE)
         axes, covered = on_maps.texel_frames(surface.atlas.size)
         turned = tangents.rotate_to_tangent(surface.normals, axes, covered)
         inside = 1.0 - fresnel.diffuse_external(model.eta)
@@ -152,25 +152,28 @@ class Material:
         return found.astype(np.float32)
 
     def list_mesh_omissions(self, delivery: ExportSettings) -> list[tuple[str, str]]:
-        """Return what the mesh leaves out, and why: holes of a scan, maps of other tiles.
+        """Return the mesh's omissions with reasons: holes of a scan, maps of other tiles.
 
         Raises
         ------
         skinrig.errors.UsageError
-            For several tiles where files have no numbers.
+            If the mesh has several tiles and file names have no tile numbers.
         """
         if self.tiles[1:] and delivery.udim == "none":
             numbers = ", ".join(map(str, self.tiles))
             raise UsageError(
-                f"--udim: got none, but the mesh reaches over tiles {numbers}, expected dot or "
-                "underscore"
+                f"--udim: got none for a mesh on tiles {numbers}, expected dot or underscore; "
+                "choose one"
             )
         holes = self.mesh.count_holes()
         omissions = [
-            (f"the surface at {holes} holes", "the scan has none there; --mesh takes a whole one")
+            (f"the surface at {holes} holes", "not in the scan; give a complete mesh with --mesh")
         ]
         return (omissions if holes else []) + [
-            (f"maps of tile {tile}", f"maps are of tile {FIRST_TILE}: medians and flat normals")
+            (
+                f"maps of tile {tile}",
+                f"maps cover tile {FIRST_TILE}; filled by medians and flat normals",
+            )
             for tile in self.tiles[1:]
         ]
 
@@ -181,11 +184,11 @@ class Material:
 
     @property
     def specular_weight(self) -> Float32Array:
-        """The surface's weight, held in [0, 1] as formats demand, (H, W)."""
+        """The specular weight, clipped to [0, 1] as formats require, (H, W)."""
         return np.clip(self.surface.weight, 0.0, 1.0)
 
     def sigma_tr(self) -> dict[str, Any]:
-        """Return medians over valid texels, as JSON values for formats without subsurface light."""
+        """Return medians over valid texels as JSON values, for formats without subsurface light."""
         shown = self.translucency_mm[self.valid] if self.valid.any() else self.translucency_mm
         depth = np.median(shown.reshape(-1, 3), axis=0)
         return {
@@ -197,7 +200,7 @@ class Material:
         }
 
     def facts(self, appearance: SkinAppearance) -> dict[str, Any]:
-        """Return the part that documents of all exported materials share, as JSON values."""
+        """Return the entries that documents of all exported materials share, as JSON values."""
         subsurface = {**self.sigma_tr(), "mapping": MAP_NOTES["subsurface_radius"]}
         return {
             "base_color": f"{MAP_NOTES['base_color']}; {COLOR_NOTE}",
@@ -208,7 +211,7 @@ class Material:
         }
 
     def figures(self) -> dict[str, Any]:
-        """Return the errors of the material as an approximation of the model, as JSON values."""
+        """Return the approximation errors of the material relative to the model, as JSON values."""
         on = self.valid if self.valid.any() else np.ones_like(self.valid)
         weight, color = self.surface.weight[on], self.base_color[on]
         return {
@@ -247,22 +250,22 @@ class Material:
             "translucency": (self.translucency_mm, "mm", DATA_SPACE, 16.0),
             "mask": (self.valid.astype(np.float32), "1", DATA_SPACE, 1.0),
         }
-        values, unit, space, high = simple[one_of("texture", name, simple, ExportError)]
-        what = MAP_NOTES.get(name, "1 where all was measured")
+        values, unit, space, high = simple[require_choice("texture", name, simple, ExportError)]
+        what = MAP_NOTES.get(name, "1 where all quantities were measured")
         if name == "base_color":
             what = f"{what}; {COLOR_NOTE}"
         valid, filler = (None, (0.0,)) if name == "mask" else (self.valid, None)
         return ExportImage(name, values, unit, space, what, 0.0, high, valid, filler)
 
     def error_images(self) -> list[ExportImage]:
-        """Return standard errors of what has them, and the mask."""
+        """Return images of the available standard uncertainties, and of the mask."""
         out = [self.image("mask", ExportSettings())]
         for name, values, unit in (
             ("base_color", self.base_color_stderr, "1"),
             ("translucency", self.translucency_stderr_mm, "mm"),
         ):
             if values is not None:
-                what = f"standard error of {name}, 68 %"
+                what = f"standard uncertainty of {name}, 68 %"
                 space = CAMERA_SPACE if name == "base_color" else DATA_SPACE
                 known = np.nan_to_num(values)
                 out.append(
@@ -272,12 +275,12 @@ class Material:
 
 
 def similarity_albedo_deficit(r_d: FloatArray, eta: float) -> Float64Array:
-    """Return 1 - alpha' of the medium of an albedo, looked up between 1 000 exact values.
+    """Return 1 - alpha' of the medium of an albedo, interpolated between 1 000 exact values.
 
     Parameters
     ----------
     r_d
-        Any shape; held within 0.001 to 0.999.
+        Any shape; clipped to 0.001 to 0.999.
     eta
         Refractive index over that of air.
 
@@ -287,5 +290,7 @@ def similarity_albedo_deficit(r_d: FloatArray, eta: float) -> Float64Array:
     [0.041, 0.0]
     """
     nodes = np.linspace(0.001, 0.999, 999)
-    root = np.sqrt(dipole.invert_to_deficit(nodes, eta))  # smooth at an albedo of 1, too
+    root = np.sqrt(
+        dipole.invert_to_deficit(nodes, eta)
+    )  # the root is smooth also at an albedo of 1
     return np.asarray(np.interp(r_d, nodes, root) ** 2, np.float64)

@@ -1,4 +1,4 @@
-"""Materials as MaterialX text: an OpenPBR surface, and image nodes that state color spaces."""
+"""Write MaterialX materials: an OpenPBR surface, and image nodes with color spaces."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +17,7 @@ MATERIALX_FILE, DOCUMENT_FILE = "skin.mtlx", "material.json"
 SCHEMA: Final = "skinrig.export.material/1"
 TEXTURE_FOLDER: Final = "textures"
 LINEAR_SRGB_NAME: Final = "lin_rec709"
-"""MaterialX's name of linear sRGB; data get no color space."""
+"""MaterialX's name of linear sRGB; data have no color space."""
 
 
 def write(
@@ -28,16 +28,16 @@ def write(
     Parameters
     ----------
     appearance
-        Of a dome, or a fitted model.
+        Appearance of a dome, or a fitted model.
     folder
-        Existing, empty.
+        Existing, empty folder.
     delivery
         Scene unit (m by default), names of tiles, green of the normal map, another mesh.
 
     Returns
     -------
     list of (str, str)
-        What was left out, and why: maps of other tiles than the first.
+        Omissions with reasons: maps of tiles other than the first.
 
     Raises
     ------
@@ -51,12 +51,14 @@ def write(
     (folder / "skin.obj").write_text(
         material.mesh.to_obj(delivery.units_per_mm, delivery.scene_unit), encoding="utf-8"
     )
-    out.document(DOCUMENT_FILE, appearance, facts(material, appearance, delivery, SCHEMA, scale))
+    out.document(
+        DOCUMENT_FILE, appearance, describe_material(material, appearance, delivery, SCHEMA, scale)
+    )
     return left_out
 
 
 def write_textures(material: Material, out: ImageFolder) -> float:
-    """Write the textures that `openpbr_document` names; return the largest radius, mm."""
+    """Write the textures of `format_openpbr`; return the largest radius, mm."""
     for name in ("base_color", "specular_roughness", "specular_weight", "translucency"):
         out.write_exr(material.image(name, out.delivery), TEXTURE_FOLDER)
     out.write_png(material.image("base_color", out.delivery), TEXTURE_FOLDER)
@@ -71,12 +73,12 @@ def write_textures(material: Material, out: ImageFolder) -> float:
         TEXTURE_FOLDER,
     )
     out.errors(material.error_images(), TEXTURE_FOLDER)
-    text = openpbr_document(material, scale, out.delivery)
+    text = format_openpbr(material, scale, out.delivery)
     (out.root / MATERIALX_FILE).write_text(text, encoding="utf-8")
     return scale
 
 
-def facts(
+def describe_material(
     material: Material,
     appearance: SkinAppearance,
     delivery: ExportSettings,
@@ -88,11 +90,11 @@ def facts(
     Parameters
     ----------
     material, appearance
-        What is exported, and what it was made of.
+        The exported material and its source.
     delivery
         The scene's unit.
     schema
-        Of the document.
+        Schema of the document.
     scale
         Radius of subsurface scattering, mm.
     """
@@ -112,15 +114,15 @@ def facts(
     }
 
 
-def openpbr_document(material: Material, radius_mm: float, delivery: ExportSettings) -> str:
-    """Return a material whose textures lie in `TEXTURE_FOLDER`.
+def format_openpbr(material: Material, radius_mm: float, delivery: ExportSettings) -> str:
+    """Format a material whose textures are in `TEXTURE_FOLDER`.
 
     Parameters
     ----------
     material
-        What it is of.
+        The material.
     radius_mm
-        Subsurface radius that the texture of radius scales is a share of.
+        Subsurface radius; the texture of radius scales is relative to it.
     delivery
         Scene unit, names of tiles, green of the normal map.
     """
@@ -134,19 +136,19 @@ def openpbr_document(material: Material, radius_mm: float, delivery: ExportSetti
     )
 
 
-def images_document(
+def format_image_nodes(
     files: Mapping[str, tuple[str, str]], delivery: ExportSettings, *, tangent_normal: str | None
 ) -> str:
-    """Return a node graph with an image node a map, so that a reader knows its color space.
+    """Format a node graph with one image node per map, which records its color space.
 
     Parameters
     ----------
     files
-        Map to file and MaterialX type; "color3" is linear sRGB, all else is data.
+        File and MaterialX type by map; "color3" is linear sRGB, other types are data.
     delivery
         Names of tiles, green of the normal map.
     tangent_normal
-        Name of a 16-bit normal map in tangent space, where there is one.
+        Name of a 16-bit normal map in tangent space; None: no such map.
     """
     shown = {name: (_all_tiles(file, delivery), kind) for name, (file, kind) in files.items()}
     normal = None if tangent_normal is None else _all_tiles(tangent_normal, delivery)
@@ -156,7 +158,7 @@ def images_document(
 
 
 def _all_tiles(file: str, delivery: ExportSettings) -> str:
-    """Return a file's name with the token of all tiles in place of the tile's number."""
+    """Replace the tile number of a file's name by the token of all tiles."""
     stem, dot, suffix = file.rpartition(".")
     tile = "" if delivery.udim == "none" else f"{TILE_SEPARATORS[delivery.udim]}{FIRST_TILE}"
     return delivery.format_reference(stem.removesuffix(tile), suffix) if dot and tile else file

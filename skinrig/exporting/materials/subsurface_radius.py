@@ -1,18 +1,18 @@
-"""From R_d and 1/sigma_tr to the radius that OpenPBR takes, and back.
+"""Convert R_d and 1/sigma_tr to the radius of OpenPBR, and back.
 
-OpenPBR, and what follows it, takes the color that a medium shows and its mean free path r, and
-finds the albedo of single scattering itself: by Kulla and Conty's fit, which its specification
-names, 1 - alpha = s(color)^2 for isotropic scattering. Far from where it entered, light in that
-medium decays by k(alpha) / r with the exact k of transport, alpha = k / artanh(k).
+OpenPBR takes the reflected color of a medium and its mean free path r. It derives the
+single-scattering albedo by Kulla and Conty's fit, which its specification names:
+1 - alpha = s(color)^2 for isotropic scattering. Far from its point of entry, light in that medium
+decays by k(alpha) / r with the exact k of transport, alpha = k / artanh(k).
 
 The measured medium of alpha' and sigma_tr = sqrt(3 (1 - alpha')) sigma_t' decays by k(alpha')
 sigma_t'. The radius is the one with the same decay:
 
     r = k(alpha) / (k(alpha') sigma_t') = k(alpha) sqrt(3 (1 - alpha')) / (k(alpha') sigma_tr).
 
-Both media show the same color. They differ in what is between: the renderer's has no reflection
-from inside at its surface, and so a lower albedo and a longer path for the same color. Renderers
-that invert the color otherwise get another decay.
+Both media have the same color. They differ at the boundary: the renderer's medium has no internal
+reflection, thus a lower albedo and a longer path for the same color. Renderers that invert the
+color by another fit get another decay.
 
 References
 ----------
@@ -28,11 +28,11 @@ from numpy.typing import ArrayLike
 from skinrig.arrays import Float64Array
 
 MIN_COLOR, MAX_COLOR = 0.001, 0.999
-"""Colors are held in this range: at 1 no light is absorbed, and no radius has a sigma_tr."""
+"""Range to which colors are clipped: at 1, nothing is absorbed and sigma_tr is 0 for any radius."""
 
 
 def deficit_root(color: ArrayLike) -> Float64Array:
-    """Return sqrt(1 - alpha) of the medium that shows a color, isotropic scattering.
+    """Return sqrt(1 - alpha) of the isotropic medium that reflects a color.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def decay(deficit: ArrayLike) -> Float64Array:
     Parameters
     ----------
     deficit
-        1 - alpha, 1e-9 to 0.999; beyond it is held there.
+        1 - alpha, clipped to 1e-9 to 0.999.
 
     Examples
     --------
@@ -75,14 +75,14 @@ def radius_mm(translucency_mm: ArrayLike, color: ArrayLike, deficit: ArrayLike) 
     translucency_mm
         1/sigma_tr of the measured medium, mm.
     color
-        What it shows, 0 to 1.
+        Reflected color, 0 to 1.
     deficit
-        1 - alpha' of the measured medium; NaN: not known, sigma_tr is taken for its decay.
+        1 - alpha' of the measured medium; NaN: unknown, the decay is taken as sigma_tr.
 
     Returns
     -------
     ndarray
-        mm, of the shape of all.
+        Radius, mm, of the broadcast shape.
     """
     return np.asarray(_per_translucency(color, deficit) * np.asarray(translucency_mm, np.float64))
 

@@ -1,8 +1,9 @@
-"""The nearest single GGX lobe to a mixture of tabulated lobes: what materials have a place for.
+"""Fit a single GGX lobe to mixtures of basis BRDFs, as material formats have one lobe.
 
-Least squares over the directions of the lobes' grid up to 60 degrees of half angle between light
-and view, each counting by its solid angle and both cosines over the mean lobe there: neither the
-peak nor the tail decides alone. All sums are those of K lobes: a texel costs K (K + 69) products.
+Least squares over the directions of the basis grid up to 60 degrees of half angle between light and
+view. Weights are solid angle times both cosines, over the mean lobe, so that neither the peak nor
+the tail dominates. The squared error of a mixture w is w' G w - 2 s w' c + s^2 g with products G,
+c, g that are computed once; a texel costs K (K + 69) products.
 """
 
 from dataclasses import dataclass
@@ -19,31 +20,34 @@ from model.brdf.tables import BrdfBasis
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 
 ROUGHNESS_NODES: Final = np.linspace(0.15, 1.0, 69)
-"""Of materials: the square root of the slope width alpha."""
+"""Candidates of roughness, the square root of the slope width alpha."""
 TEXELS_PER_FIT: Final = 1 << 15
-"""Texels at a time: 69 sums of each are held."""
+"""Texels per batch; 69 sums per texel are in memory."""
 MIN_FIT_COSINE: Final = 0.2
 MAX_THETA_D: Final = np.deg2rad(60.0)
-"""Grazing light is left out: there one lobe of a smooth dielectric's index cannot follow a mixture,
-and would pay for it head-on, where skin is looked at."""
+"""Maximum half angle between light and view.
+
+At grazing angles, one lobe of a smooth dielectric's index cannot follow a mixture; fitting them
+would increase the errors at normal incidence.
+"""
 LOBE_FLOOR_FRACTION: Final = 0.03
-"""Of the greatest mean lobe, added to it: the far tail of a sharp lobe decides nothing."""
+"""Offset of the mean lobe in the weights, fraction of its maximum; it limits far tails."""
 STRIDE_D, STRIDE_PHI, STRIDE_H = 2, 3, 2
-"""Nodes of the grid are passed over: the lobes are smooth, and sums are of 3 000 directions."""
+"""Strides over the nodes of the grid: the lobes are smooth, and 3 000 directions suffice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceFit:
-    """One lobe a texel.
+    """One fitted GGX lobe per texel.
 
     Attributes
     ----------
     roughness : ndarray of float32, shape (H, W)
-        Square root of GGX's alpha, as OpenPBR and glTF have it.
+        Square root of GGX's alpha, as in OpenPBR and glTF.
     weight : ndarray of float32, shape (H, W)
         Factor of the reflection of a smooth dielectric of the given index; not clipped.
     misfit : ndarray of float32, shape (H, W)
-        RMS of what is left over the RMS of the mixture, by the sum's own weights.
+        Weighted RMS of the residual over that of the mixture.
     """
 
     roughness: Float32Array
@@ -52,21 +56,21 @@ class SurfaceFit:
 
 
 def fit_ggx_lobe(lobes: BrdfBasis, weights: ArrayLike, *, eta: float) -> SurfaceFit:
-    """Fit roughness and weight to mixtures of lobes.
+    """Fit roughness and weight of a GGX lobe to mixtures of basis BRDFs.
 
     Parameters
     ----------
     lobes
-        K tables, 1/sr, Fresnel's reflection inside.
+        K tables, 1/sr, with Fresnel reflection included.
     weights
-        Shares, (H, W, K), at least 0.
+        Weights, (H, W, K), at least 0.
     eta
         Refractive index over that of air.
 
     Returns
     -------
     SurfaceFit
-        Texels without any surface reflection have weight 0 and roughness 1.
+        Texels without surface reflection have weight 0 and roughness 1.
     """
     share = np.asarray(weights)
     products = _products(lobes, eta)
@@ -82,7 +86,7 @@ def fit_ggx_lobe(lobes: BrdfBasis, weights: ArrayLike, *, eta: float) -> Surface
 def _fit(
     weights: Float64Array, gram: Float64Array, cross: Float64Array, ggx_norm: Float64Array
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return roughness, weight and misfit of N mixtures, by the products of `_products`."""
+    """Return roughness, weight and misfit of N mixtures from the products of `_products`."""
     energy = np.einsum("...k,kl,...l->...", weights, gram, weights)
     along = weights @ cross  # (N, R)
     explained = np.maximum(along, 0.0) ** 2 / ggx_norm
@@ -114,28 +118,28 @@ def _fit(
     return (np.where(dark, 1.0, roughness), np.where(dark, 0.0, scale), np.where(dark, 0.0, misfit))
 
 
-def lobe_values(roughness: float, eta: float) -> Float64Array:
-    """Return GGX of a roughness at the directions of the sums, 1/sr, shape (N,)."""
+def evaluate_ggx(roughness: float, eta: float) -> Float64Array:
+    """Evaluate GGX of a roughness at the directions of the sums, 1/sr, shape (N,)."""
     return microfacet.brdf(*_directions()[0], roughness=roughness**2, eta=eta, kind="ggx")
 
 
 def _products(lobes: BrdfBasis, eta: float) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Return weighted products: lobes with lobes (K, K), with GGX (K, R), of GGX itself (R,)."""
+    """Return weighted products: lobe-lobe (K, K), lobe-GGX (K, R), GGX-GGX (R,)."""
     _, solid, keep = _directions()
     table = lobes.table[::STRIDE_D, ::STRIDE_PHI, ::STRIDE_H, : lobes.size]
     values = table.reshape(-1, lobes.size)[keep].astype(np.float64)
     mean = values.mean(axis=1)
     weight = solid / (mean + LOBE_FLOOR_FRACTION * mean.max(initial=1e-12))
-    model = np.stack([lobe_values(float(r), eta) for r in ROUGHNESS_NODES], axis=1)
+    model = np.stack([evaluate_ggx(float(r), eta) for r in ROUGHNESS_NODES], axis=1)
     scaled = values * weight[:, None]
     return values.T @ scaled, scaled.T @ model, np.sum(weight[:, None] * model**2, axis=0)
 
 
 @lru_cache(maxsize=1)
 def _directions() -> tuple[tuple[Float64Array, ...], Float64Array, BoolArray]:
-    """Return cosines of light, view, half vector and difference angle where nodes count.
+    """Return cosines of light, view, half vector and difference angle at the used nodes.
 
-    Also return the solid angle of each node times both cosines, up to a factor, and which count.
+    Also return the solid angle times both cosines per node, up to a factor, and the used nodes.
     """
     d, phi, h = brdf_tables.grid_nodes()
     picked = np.meshgrid(d[::STRIDE_D], phi[::STRIDE_PHI], h[::STRIDE_H], indexing="ij")
@@ -143,7 +147,7 @@ def _directions() -> tuple[tuple[Float64Array, ...], Float64Array, BoolArray]:
     light, view = (w[:, 2] for w in merl.to_directions(theta_h, theta_d, phi_d))
     keep = (light > MIN_FIT_COSINE) & (view > MIN_FIT_COSINE) & (theta_d <= MAX_THETA_D)
     light, view, theta_d, theta_h = light[keep], view[keep], theta_d[keep], theta_h[keep]
-    # d theta_h grows with theta_h's square root, whose nodes are even
+    # nodes are uniform in sqrt(theta_h), so that d theta_h is proportional to sqrt(theta_h)
     solid = np.sin(2.0 * theta_d) * np.sin(theta_h) * np.sqrt(np.maximum(theta_h, 0.0))
     solid = solid * np.clip(light, 0.0, 1.0) * np.clip(view, 0.0, 1.0)
     return (light, view, np.cos(theta_h), np.cos(theta_d)), solid, keep

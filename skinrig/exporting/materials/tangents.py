@@ -1,9 +1,10 @@
-"""Frames of a mesh that normal maps are given in, as renderers rebuild them.
+"""Compute tangent frames of a mesh for normal maps, as renderers rebuild them.
 
-A tangent-space normal means something only in the frame it was baked in. Frames here follow the
-rules most programs share: at each vertex the direction of growing u, averaged over the triangles
-by their angle and laid into the plane across the vertex normal; the third axis is the cross product
-times the chart's handedness; frames are interpolated over triangles and not made orthogonal again.
+A tangent-space normal is defined only in the frame in which it was baked. Frames here follow the
+rules that most programs share. The tangent of a vertex is the direction of increasing u, averaged
+over its triangles by angle and projected to the plane perpendicular to the vertex normal. The
+bitangent is the cross product times the chart's handedness. Frames are interpolated over triangles
+and not orthogonalized again.
 
 References
 ----------
@@ -24,7 +25,7 @@ from skinrig.exporting.materials.udim import TiledMesh
 
 MIN_VECTOR_LENGTH = 1e-12
 MIN_FRAME_VOLUME = 1e-6
-"""Of a frame: below it the texture is folded and the normal is undefined."""
+"""Minimum volume of a frame; below it the texture is folded and the normal is undefined."""
 MIN_TANGENT_Z = 1e-3
 
 
@@ -37,13 +38,13 @@ class FramedMesh:
     vertices_mm : ndarray of float32, shape (V, 3)
     normals : ndarray of float32, shape (V, 3)
     uv : ndarray of float32, shape (V, 2)
-        (0, 0) is bottom left.
+        Texture coordinates; (0, 0) is bottom left.
     tangents : ndarray of float32, shape (V, 4)
-        Unit vector along growing u, and the sign of the third axis: bitangent, along growing v, is
+        Unit vector along increasing u, and a sign; the bitangent, along increasing v, is
         sign * cross(normal, tangent).
     faces : ndarray of int32, shape (F, 3)
     source : ndarray of int64, shape (V,)
-        The vertex of the mesh it was made of: mirrored charts have vertices of their own.
+        Index of the original vertex; vertices shared by mirrored charts are duplicated.
     """
 
     vertices_mm: Float32Array
@@ -55,7 +56,7 @@ class FramedMesh:
 
     @staticmethod
     def of(mesh: Mesh | TiledMesh) -> FramedMesh:
-        """Return a mesh with its tangents.
+        """Compute the tangents of a mesh.
 
         Examples
         --------
@@ -69,7 +70,7 @@ class FramedMesh:
         uv = mesh.uv.astype(np.float64)
         along_u, turn = _face_tangents(points[mesh.faces], uv[mesh.faces])
         sign = np.where(turn >= 0.0, 1, -1)
-        # a vertex shared by mirrored and plain charts becomes two vertices
+        # a vertex of both mirrored and unmirrored charts is duplicated
         corner_keys = 2 * mesh.faces.astype(np.int64) + (sign < 0)[:, None]
         keys, faces = np.unique(corner_keys.reshape(-1), return_inverse=True)
         source, signs = keys // 2, np.where(keys % 2 == 1, -1.0, 1.0)
@@ -88,13 +89,13 @@ class FramedMesh:
         tangent = _unit(total)
         lost = np.linalg.norm(tangent, axis=1) < 0.5
         axis = np.eye(3)[np.argmin(np.abs(normals[lost]), axis=1)]
-        tangent[lost] = _project_across(axis, normals[lost])  # some direction
+        tangent[lost] = _project_across(axis, normals[lost])  # any direction in the plane
         frames = np.column_stack([tangent, signs]).astype(np.float32)
         own = mesh.vertices_mm[source], normals.astype(np.float32), mesh.uv[source]
         return FramedMesh(*own, frames, faces.astype(np.int32), source)
 
-    def only(self, faces: BoolArray) -> FramedMesh:
-        """Return the mesh with some of its faces, (F,), all vertices and their frames."""
+    def select_faces(self, faces: BoolArray) -> FramedMesh:
+        """Return the mesh with the selected faces, (F,), and all vertices and frames."""
         return replace(self, faces=self.faces[faces])
 
     def to_obj(self, per_mm: float, unit: str) -> str:
@@ -103,7 +104,7 @@ class FramedMesh:
         Parameters
         ----------
         per_mm
-            Scene units in one mm.
+            Scene units per mm.
         unit
             Name of the scene unit, for the comment.
         """
@@ -116,7 +117,7 @@ class FramedMesh:
         return "\n".join(lines) + "\n"
 
     def count_holes(self) -> int:
-        """Return the number of rims in excess of one per connected surface, seams of charts apart.
+        """Return the number of boundary loops beyond one per connected surface, ignoring seams.
 
         Examples
         --------
@@ -144,7 +145,7 @@ class FramedMesh:
         return parts(rim) - parts(found)
 
     def texel_frames(self, size: int) -> tuple[Float64Array, BoolArray]:
-        """Return the interpolated axes under each texel.
+        """Return the interpolated frame of each texel.
 
         Parameters
         ----------
@@ -154,7 +155,7 @@ class FramedMesh:
         Returns
         -------
         axes : ndarray, shape (size, size, 3, 3)
-            Rows are tangent, bitangent and normal, in the mesh's frame; row 0 is v = 1.
+            Rows are tangent, bitangent and normal in the mesh's frame; image row 0 is v = 1.
         covered : ndarray of bool, shape (size, size)
         """
         texels = rasterize(self.uv[self.faces].astype(np.float64), size)
@@ -173,7 +174,7 @@ class FramedMesh:
 
 
 def rotate_to_tangent(normals: ArrayLike, axes: Float64Array, covered: BoolArray) -> Float32Array:
-    """Return normals in their texels' frames.
+    """Rotate normals to the tangent frames of their texels.
 
     Parameters
     ----------
@@ -185,9 +186,9 @@ def rotate_to_tangent(normals: ArrayLike, axes: Float64Array, covered: BoolArray
     Returns
     -------
     ndarray of float32, shape (H, W, 3)
-        Unit vectors whose decoding is :func:`rotate_from_tangent`; (0, 0, 1) where nothing is
-        covered. The third component is above 0 as a map must have it: normals that face away from
-        the surface are laid onto its horizon.
+        Unit vectors, decoded by :func:`rotate_from_tangent`; (0, 0, 1) on uncovered texels. The
+        third component is above 0, as maps require: normals that face away from the surface are
+        projected to its horizon.
     """
     given = np.asarray(normals)
     good = covered & np.isfinite(given).all(axis=-1)
@@ -195,7 +196,8 @@ def rotate_to_tangent(normals: ArrayLike, axes: Float64Array, covered: BoolArray
     out[..., 2] = 1.0
     world = given[good].astype(np.float64)
     tangent, bitangent, normal = (axes[..., row, :][good] for row in range(3))
-    # n is along n' A with the axes as rows of A: the adjugate, as renderers interpolate A
+    # a renderer decodes n = n' A with the interpolated, non-orthogonal axes as rows of A; hence
+    # n' = n A^-1, where A^-1 is the adjugate (cross products of axes) over the frame's volume
     volume = np.sum(np.cross(tangent, bitangent) * normal, axis=-1)
     found = np.empty_like(world)
     found[:, 0] = np.sum(np.cross(bitangent, normal) * world, axis=-1)
@@ -209,17 +211,17 @@ def rotate_to_tangent(normals: ArrayLike, axes: Float64Array, covered: BoolArray
 
 
 def fill_tangent_normals(tangent_normals: ArrayLike, valid: BoolArray) -> Float32Array:
-    """Return tangent-space normals with what was not measured filled from around, (H, W, 3).
+    """Fill invalid tangent-space normals from their surroundings, (H, W, 3).
 
-    In its texel's frame relief goes on beyond an edge. Filled in the frame of the rig instead, the
-    normal of one part of a face would be laid onto the horizon of another.
+    In tangent space, relief continues plausibly beyond an edge. In the rig frame, the normal of one
+    part of a face could be projected to the horizon of another part.
 
     Parameters
     ----------
     tangent_normals
         Unit vectors, (H, W, 3).
     valid
-        Texels that keep theirs, (H, W).
+        Valid texels, which are unchanged, (H, W).
 
     Examples
     --------
@@ -236,12 +238,12 @@ def fill_tangent_normals(tangent_normals: ArrayLike, valid: BoolArray) -> Float3
 
 
 def rotate_from_tangent(tangent_normals: ArrayLike, axes: Float64Array) -> Float64Array:
-    """Return unit normals in the frame of the axes, as a renderer decodes a map, (H, W, 3)."""
+    """Decode a tangent-space map as a renderer does: unit normals in the axes' frame, (H, W, 3)."""
     return _unit(np.einsum("hwk,hwkc->hwc", np.asarray(tangent_normals, np.float64), axes))
 
 
 def _face_tangents(points: Float64Array, uv: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Return each triangle's unit direction of growing u, and twice its signed area in uv."""
+    """Return each triangle's unit direction of increasing u, and twice its signed area in uv."""
     a, b = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
     (au, av), (bu, bv) = (uv[:, 1] - uv[:, 0]).T, (uv[:, 2] - uv[:, 0]).T
     area = au * bv - av * bu
@@ -251,7 +253,7 @@ def _face_tangents(points: Float64Array, uv: Float64Array) -> tuple[Float64Array
 
 
 def _project_across(vectors: Float64Array, normals: Float64Array) -> Float64Array:
-    """Return unit vectors laid into the plane across normals; 0 for those along them."""
+    """Project vectors perpendicular to normals and normalize them; 0 for parallel ones."""
     return _unit(vectors - np.sum(vectors * normals, axis=1, keepdims=True) * normals)
 
 

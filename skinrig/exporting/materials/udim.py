@@ -1,7 +1,7 @@
-"""Meshes whose texture coordinates reach over several UDIM tiles.
+"""Read meshes whose texture coordinates span several UDIM tiles.
 
-Maps are of one tile, 1001: u and v from 0 to 1. A head may have its back, or its teeth, on others.
-Its faces keep their coordinates; what lies on the first tile gets the maps.
+Maps cover tile 1001: u and v from 0 to 1. Parts of a head, such as its back or teeth, may be on
+other tiles. Their faces keep their coordinates; only faces on the first tile get maps.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from skinrig.exporting.options import FIRST_TILE, ExportError
 from skinrig.rendering.geometry import read_mesh
 
 TILES_PER_ROW: Final = 10
-"""Tiles side by side before the next row begins."""
+"""Number of tiles per row."""
 UV_ROUNDING: Final = 1e-5
-"""Of coordinates on a tile's border."""
+"""Tolerance of texture coordinates on a tile's border."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TiledMesh:
-    """A mesh over any tiles.
+    """A mesh with texture coordinates on any UDIM tiles.
 
     Attributes
     ----------
     vertices_mm, faces, uv, normals, shapes
-        As of :class:`rigsim.geometry.mesh.Mesh`, texture coordinates of any tile.
+        As in :class:`rigsim.geometry.mesh.Mesh`; texture coordinates of any tile.
     tile
         UDIM tile of each face, (F,).
     """
@@ -47,7 +47,7 @@ class TiledMesh:
 
     @staticmethod
     def of(mesh: Mesh) -> TiledMesh:
-        """Return a mesh of the first tile."""
+        """Wrap a mesh whose texture is on the first tile."""
         tile = np.full(len(mesh.faces), FIRST_TILE, np.intp)
         return TiledMesh(
             mesh.vertices_mm, mesh.faces, mesh.uv, mesh.normals, tile, dict(mesh.shapes)
@@ -55,7 +55,7 @@ class TiledMesh:
 
     @property
     def tiles(self) -> tuple[int, ...]:
-        """Tiles that the mesh reaches over, the first one first, and there in any case."""
+        """Tiles of the mesh; the first tile is always included, and first."""
         return (FIRST_TILE, *sorted(set(self.tile.tolist()) - {FIRST_TILE}))
 
     def first(self) -> Mesh:
@@ -64,13 +64,13 @@ class TiledMesh:
         Raises
         ------
         ExportError
-            When it has none there.
+            If the mesh has no face there.
         """
         faces = self.faces[self.tile == FIRST_TILE]
         if not len(faces):
             raise ExportError(
-                f"--mesh: lies on tiles {', '.join(map(str, self.tiles[1:]))}, expected faces on "
-                f"{FIRST_TILE}, which the maps are of"
+                f"--mesh: got faces on tiles {', '.join(map(str, self.tiles[1:]))}, expected some "
+                f"on {FIRST_TILE}, the tile of the maps; move its texture coordinates"
             )
         used, flat = np.unique(faces, return_inverse=True)
         return build_mesh(
@@ -95,7 +95,7 @@ def find_tiles(uv: FloatArray, faces: NDArray[np.integer]) -> NDArray[np.intp]:
     Raises
     ------
     ExportError
-        For a face across a border of tiles, or coordinates that no tile has.
+        If a face crosses a border of tiles, or coordinates are outside of all tiles.
 
     Examples
     --------
@@ -112,7 +112,7 @@ def find_tiles(uv: FloatArray, faces: NDArray[np.integer]) -> NDArray[np.intp]:
     if len(across):
         low, high = corners[across[0]].min(axis=0), corners[across[0]].max(axis=0)
         raise ExportError(
-            f"--mesh: face {across[0]} reaches from {low.round(3).tolist()} to "
+            f"--mesh: face {across[0]} extends from {low.round(3).tolist()} to "
             f"{high.round(3).tolist()} of the texture, expected each face on one UDIM tile; cut "
             "its texture along the tiles' borders"
         )
@@ -130,7 +130,7 @@ def read(path: Path) -> TiledMesh:
     Raises
     ------
     rigsim.geometry.mesh.MeshError, rigsim.geometry.mesh.MeshError
-        The file is missing, damaged, or no mesh that maps can be laid on.
+        If the file is missing or damaged, or lacks texture coordinates.
     ExportError
         See `find_tiles`.
     """
@@ -138,7 +138,7 @@ def read(path: Path) -> TiledMesh:
     if uv.min() >= -UV_ROUNDING and uv.max() <= 1.0 + UV_ROUNDING:
         inside = np.clip(uv, 0.0, 1.0)
         return TiledMesh.of(build_mesh(vertices, faces, inside, shapes=shapes))
-    # of a scaled copy of the texture: all else is checked as of any mesh
+    # the checks of a mesh require coordinates in 0 to 1: they run on a scaled copy
     lowest, span = float(uv.min()), max(float(np.ptp(uv)), 1.0)
     checked = build_mesh(vertices, faces, (uv - lowest) / (2.0 * span), shapes=shapes)
     points, corners = checked.vertices_mm, checked.faces
@@ -151,14 +151,14 @@ Contents = tuple[FloatArray, NDArray[np.integer], FloatArray, dict[str, FloatArr
 
 
 def _contents(path: Path) -> Contents:
-    """Return vertices, faces, texture coordinates and blend shapes as a file has them."""
+    """Return vertices, faces, texture coordinates and blend shapes of a file, in its unit."""
     if path.is_dir() or path.suffix.lower() in (".gltf", ".glb"):
         read = blend_shapes.load(path)
         return read.vertices_mm, read.faces, read.uv, dict(read.shapes)
     try:
         mesh = read_mesh(path)
     except ValueError as error:
-        # texture coordinates over more than one tile are the one thing that is allowed here
+        # only texture coordinates over several tiles are accepted here
         if "uv: got" not in str(error):
             raise
         return _read_tiles(path)

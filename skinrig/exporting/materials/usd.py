@@ -1,8 +1,8 @@
-"""A mesh with its material and blend shapes as OpenUSD.
+"""Write a mesh with its material and blend shapes as OpenUSD.
 
-Two materials in one: UsdPreviewSurface, which every reader knows and which has no subsurface light,
-and the OpenPBR surface of the MaterialX export as a network of render context ``mtlx``. sigma_tr is
-also in the customData of the material.
+The material has two networks: UsdPreviewSurface, which every reader supports but which lacks
+subsurface scattering, and the OpenPBR surface of the MaterialX export in the render context
+``mtlx``. sigma_tr is also in the customData of the material.
 
 References
 ----------
@@ -21,7 +21,7 @@ from skinrig.errors import MissingExtra
 from skinrig.exporting.images import ImageFolder
 from skinrig.exporting.materials import blender, materialx
 from skinrig.exporting.materials.material import Material
-from skinrig.exporting.options import UNITS_M, ExportSettings
+from skinrig.exporting.options import METERS_PER_UNIT, ExportSettings
 
 USD_FILE, DOCUMENT_FILE = "skin.usdc", "usd.json"
 SCHEMA: Final = "skinrig.export.usd/1"
@@ -36,9 +36,9 @@ def write(
     Parameters
     ----------
     appearance
-        Of a dome, or a fitted model.
+        Appearance of a dome, or a fitted model.
     folder
-        Existing, empty.
+        Existing, empty folder.
     delivery
         Scene unit (m by default), names of tiles, green of the normal map, another mesh; blend
         shapes come from it.
@@ -46,12 +46,12 @@ def write(
     Returns
     -------
     list of (str, str)
-        What was left out, and why.
+        Omissions with reasons.
 
     Raises
     ------
     skinrig.errors.MissingExtra
-        Without usd-core.
+        If usd-core is not installed.
     ValueError
         See :meth:`skinrig.exporting.materials.material.Material.of`.
     """
@@ -73,13 +73,13 @@ def write(
     )
     script = blender.Import(USD_FILE, scale, None, textures).script()
     (folder / blender.SCRIPT_FILE).write_text(script, encoding="utf-8")
-    facts = materialx.facts(material, appearance, delivery, SCHEMA, scale)
+    facts = materialx.describe_material(material, appearance, delivery, SCHEMA, scale)
     out.document(DOCUMENT_FILE, appearance, {**facts, "blend_shapes": names})
-    what = "subsurface light and specular weight of UsdPreviewSurface"
-    in_blender = f"the mtlx network holds both; {blender.SCRIPT_FILE} sets them"
-    left_out = [*tiles, (what, f"it has no place for them: {in_blender}")]
+    what = "subsurface scattering and specular weight of UsdPreviewSurface"
+    in_blender = f"the mtlx network has both; {blender.SCRIPT_FILE} sets them"
+    left_out = [*tiles, (what, f"not part of it: {in_blender}")]
     if not material.shapes:
-        left_out.append(("blend shapes", "the mesh has none; name one with --mesh"))
+        left_out.append(("blend shapes", "the mesh has none; give one that has with --mesh"))
     return left_out
 
 
@@ -90,14 +90,14 @@ def _write_stage(
     radius: float,
     delivery: ExportSettings,
 ) -> None:
-    """Write the file; blend shapes bear their own names in it."""
+    """Write the stage; blend shapes keep their names."""
     from pxr import Sdf, Vt
 
     mesh, per_mm = material.mesh, delivery.units_per_mm
     points = mesh.vertices_mm * per_mm
     text = templates.render(
         "exporting/templates/skin.usda",
-        unit_m=UNITS_M[delivery.scene_unit],
+        unit_m=METERS_PER_UNIT[delivery.scene_unit],
         shapes=list(names.values()),
         sigma_tr=material.sigma_tr(),
         materialx=materialx.MATERIALX_FILE,

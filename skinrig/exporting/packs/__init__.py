@@ -1,1 +1,1 @@
-"""Exports of map packs."""
+"""Export map packs."""

@@ -1,4 +1,4 @@
-"""Base color on a pack's layout, and how expressions change it, from the hemoglobin rig."""
+"""Write base color and color deltas of expressions, from the hemoglobin rig."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,25 +20,25 @@ COLOR_SIZE, MAX_STATES = 512, 3
 NEUTRAL: Final = "neutral"
 LANDMARK_STDERR_PX: Final = 1.0
 MIN_KNOWN_FRACTION: Final = 0.5
-"""Share of a pixel that must be known for it to count."""
+"""Minimum valid fraction of a pixel's area."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Colors:
-    """Base colors on one layout.
+    """Base color and deltas on one layout.
 
     Attributes
     ----------
     base
         (N, N, 3), linear.
     deltas
-        State to its color less the neutral one, (N, N, 3).
+        Color minus the neutral color by expression, (N, N, 3).
     valid
-        (N, N).
+        (N, N) valid pixels.
     layout
-        What the pixels lie on, for people.
+        Layout of the pixels, in words.
     space
-        Of `base`, see :mod:`skinrig.exporting.images`.
+        Color space of `base`, see :mod:`skinrig.exporting.images`.
     """
 
     base: Float64Array
@@ -54,18 +54,18 @@ def write(appearance: SkinAppearance, out: ImageFolder) -> tuple[dict[str, Any],
     Parameters
     ----------
     appearance
-        With the part facial_color.
+        Appearance with the part facial_color.
     out
-        Where to.
+        Destination folder.
 
     Returns
     -------
     document : dict
-        JSON values: layout, states by map, largest deltas.
+        JSON values: layout, expressions by map, largest deltas.
     states : list of str
-        All that the rig has.
+        All expressions of the rig.
     """
-    rig = expression.hemoglobin_rig(appearance)
+    rig = expression.read_hemoglobin_rig(appearance)
     have = sorted(rig.states)
     states = select_states(have, "color", out)
     colors = _colors(appearance, rig, states, out)
@@ -78,7 +78,7 @@ def write(appearance: SkinAppearance, out: ImageFolder) -> tuple[dict[str, Any],
     largest = {}
     for name, state in names.items():
         delta = colors.deltas[state]
-        what = f"color of {state} at full strength less neutral, linear, on {colors.layout}"
+        what = f"color of {state} at weight 1 minus neutral, linear, on {colors.layout}"
         out.write_exr_and_png(
             ExportImage(f"{name}_delta", delta, "1", DATA_SPACE, what, -1.0, 1.0, colors.valid)
         )
@@ -110,14 +110,14 @@ def _colors(appearance: SkinAppearance, rig: Any, states: list[str], out: ImageF
     neutral = shown[NEUTRAL]
     if out.delivery.onto is None:
         why = (
-            "they lie on the flash camera's picture; name the "
-            "dome's maps with --target-face, and two tables of landmarks"
+            "they are on the flash camera's image; give the dome's "
+            "maps with --target-face, and two tables of landmarks"
         )
         out.record_omission("colors on the face's texture", why)
         base, valid = resize_map(neutral, seen, COLOR_SIZE)
         deltas = {s: resize_map(shown[s] - neutral, seen, COLOR_SIZE)[0] for s in states}
         height, width = seen.shape
-        layout = f"the flash camera's picture, {width} x {height}, stretched to a square"
+        layout = f"the flash camera's image, {width} x {height}, stretched to a square"
         return Colors(base, deltas, valid, layout, SRGB_SPACE)
     return _on_texture(out.delivery, shown, seen, states)
 
@@ -128,7 +128,7 @@ def _on_texture(
     visible: BoolArray,
     states: list[str],
 ) -> Colors:
-    """Return colors on another appearance's texture: its albedo, and changes carried over."""
+    """Map colors to another appearance's texture: its albedo with the changes of the rig."""
     if delivery.onto is None or len(delivery.landmarks) != 2:
         raise ExportError(
             f"--landmarks: got {len(delivery.landmarks)} tables, expected two with --target-face: "
@@ -138,8 +138,8 @@ def _on_texture(
     albedo = other.maps.get("r_d")
     if albedo is None:
         raise ExportError(
-            f"{delivery.onto}: got maps {', '.join(sorted(other.maps)) or 'none'}, expected r_d "
-            "among them"
+            f"{delivery.onto}: got maps {', '.join(sorted(other.maps)) or 'none'}, expected r_d; "
+            "reconstruct it"
         )
     inside = 1.0 - fresnel.diffuse_external(fresnel.ETA_SKIN)
     base, valid = resize_map(inside * albedo.values.astype(np.float64), albedo.mask, COLOR_SIZE)
@@ -147,7 +147,7 @@ def _on_texture(
     neutral = colors[NEUTRAL]
     deltas: dict[str, Float64Array] = {}
     for state in states:
-        # a ratio of colors is the skin's own; a difference would be that of another exposure
+        # changes are transferred as ratios, which are independent of exposure and illumination
         ratio = np.divide(colors[state], neutral, out=np.ones_like(neutral), where=neutral > 1e-3)
         carried, known = _sample_map(ratio - 1.0, visible, source)
         deltas[state] = base * carried
@@ -158,7 +158,7 @@ def _on_texture(
 
 
 def _source_pixels(delivery: ExportSettings, shape: tuple[int, int]) -> Float64Array:
-    """Return the flash picture's pixel under each pixel of the pack, column and row, (N, N, 2)."""
+    """Return the flash image's column and row for each pixel of the pack, (N, N, 2)."""
     own, onto = (landmark_table.read_landmark_table(path) for path in delivery.landmarks)
     names = sorted(set(own) & set(onto))
     try:
@@ -170,7 +170,7 @@ def _source_pixels(delivery: ExportSettings, shape: tuple[int, int]) -> Float64A
     rows, columns = np.mgrid[0:COLOR_SIZE, 0:COLOR_SIZE] + 0.5
     pixel = [columns * shape[1] / COLOR_SIZE - 0.5, rows * shape[0] / COLOR_SIZE - 0.5]
     texel = np.stack(pixel, axis=-1)
-    # the field is smooth: every eighth pixel, and linearly between
+    # the correspondence is smooth: every eighth pixel is mapped, others are interpolated
     step = texel[::8, ::8].reshape(-1, 2)
     moved = field.evaluate(step)[0].reshape(*texel[::8, ::8].shape)
     fine = np.moveaxis(_refined(np.moveaxis(moved, -1, 0)), 0, -1)
@@ -178,7 +178,7 @@ def _source_pixels(delivery: ExportSettings, shape: tuple[int, int]) -> Float64A
 
 
 def _refined(coarse: Float64Array) -> Float64Array:
-    """Return every eighth sample, (C, n, n), at each, linearly; extrapolated past the last."""
+    """Upsample (C, n, n) eightfold, linearly; extrapolate beyond the last sample."""
     for axis in (1, 2):
         n = coarse.shape[axis]
         at = np.arange(COLOR_SIZE) / 8.0
@@ -191,7 +191,7 @@ def _refined(coarse: Float64Array) -> Float64Array:
 def _sample_map(
     values: Float64Array, visible: BoolArray, source: Float64Array
 ) -> tuple[Float64Array, BoolArray]:
-    """Return values at places of a picture, bilinearly among what is known."""
+    """Sample an image bilinearly among its valid pixels."""
     from scipy.ndimage import map_coordinates
 
     at = [source[..., 1], source[..., 0]]
@@ -205,16 +205,18 @@ def _sample_map(
 
 
 def select_states(available: list[str], quantity: str, out: ImageFolder) -> list[str]:
-    """Return up to three states, those asked for first of all."""
+    """Select up to three expressions, the requested ones first."""
     only = out.delivery.only
     names = [name for name in only if name in available] if only else available
     for name in names[MAX_STATES:]:
-        out.record_omission(f"{quantity} of {name}", f"a face has {MAX_STATES}; choose with --only")
+        out.record_omission(
+            f"{quantity} of {name}", f"a pack has at most {MAX_STATES}; choose with --only"
+        )
     return names[:MAX_STATES]
 
 
 def resize_map(values: Float64Array, valid: BoolArray, size: int) -> tuple[Float64Array, BoolArray]:
-    """Return values at another size, means among what is known; 0 where nothing is."""
+    """Resize a map by means over valid pixels; 0 without any."""
     layers = np.moveaxis(np.where(valid[..., None], values, 0.0), -1, 0)
     share = resample(valid.astype(np.float64), (size, size))
     found = np.moveaxis(resample(layers, (size, size)), 0, -1)

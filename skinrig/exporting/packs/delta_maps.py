@@ -1,9 +1,9 @@
-"""The pack of maps that digital humans are driven by: neutral maps, and what expressions change.
+"""Write the map pack of a digital human: neutral maps, and deltas of expressions.
 
-Laid out as engines' face materials want it: a base color with up to three animated color maps
+The pack follows the face materials of engines: a base color with up to three animated color maps
 (cm1 to cm3), a normal map with up to three animated wrinkle maps (wm1 to wm3), masks of their
 zones, and cavity, scatter and micro normal maps. Animated maps are deltas: colors of 512 x 512,
-normals of 1024 x 1024. The encoding of deltas is ours, since no engine publishes one;
+normals of 1024 x 1024. The encoding of deltas is our own, since engines do not publish one;
 ``delta_maps.json`` has it, and the EXR files have unencoded numbers.
 
 Colors come from the hemoglobin rig, whose maps are registered to the flash camera's image. They are
@@ -37,7 +37,7 @@ PART_MAPS: Final = {
     WRINKLES: "normal, wm1 to wm3, masks, cavity",
     MICROSTRUCTURE: "micro normals",
 }
-"""Maps of the pack by the part that they are made of."""
+"""Maps of the pack by their source part."""
 COLOR_CODING: Final = "linear: shown = base + weight * delta; PNG: delta = 2 code / 65535 - 1"
 NORMAL_CODING: Final = (
     "slopes n_x/n_z and n_y/n_z, green with the sign of normal_y: shown = slopes of normal + "
@@ -53,29 +53,29 @@ def write(
     Parameters
     ----------
     appearance
-        That `skinrig fit facial-color` or `skinrig fit wrinkles`, or both, made.
+        Result of `skinrig fit facial-color` or `skinrig fit wrinkles`, or both.
     folder
-        Existing, empty.
+        Existing, empty folder.
     delivery
-        States by `only` (the first three otherwise), green of normals, names of tiles; `onto` and
-        `landmarks` put colors on a texture.
+        Expressions by `only` (default: the first three), green of normals, names of tiles; `onto`
+        and `landmarks` map colors to a texture.
 
     Returns
     -------
     list of (str, str)
-        What was left out, and why.
+        Omissions with reasons.
 
     Raises
     ------
     ExportError
-        For a folder that holds neither part, or states that it lacks.
+        If the folder has neither part, or lacks an expression.
     """
     parts = dynamic_appearance.describe_parts(appearance)
     if not {FACIAL_COLOR, WRINKLES, MICROSTRUCTURE} & set(parts):
         raise ExportError(
-            f"metahuman: got {', '.join(parts) or 'maps that nothing was fitted to'}, expected "
-            "facial_color, wrinkles or microstructure; `skinrig fit facial-color`, `skinrig fit "
-            "wrinkles` and `skinrig fit microstructure` make them"
+            f"metahuman: got {', '.join(parts) or 'maps without fitted parts'}, expected "
+            "facial_color, wrinkles or microstructure; run `skinrig fit facial-color`, `skinrig "
+            "fit wrinkles` or `skinrig fit microstructure`"
         )
     out = ImageFolder(folder, delivery)
     document: dict[str, Any] = {}
@@ -87,16 +87,16 @@ def write(
         document["wrinkles"], rows = _write_wrinkles(appearance, parts, out)
         known |= set(rows)
     if MICROSTRUCTURE in parts:
-        document |= detail_maps.micro_normals(appearance, parts[MICROSTRUCTURE], out)
+        document |= detail_maps.write_micro_normals(appearance, parts[MICROSTRUCTURE], out)
     for part, what in PART_MAPS.items():
         if part not in parts:
             fit = f"skinrig fit {part.replace('_', '-')}"
-            out.record_omission(what, f"the folder holds no {part}: run `{fit}`")
+            out.record_omission(what, f"{part} is missing in the folder; run `{fit}`")
     document |= detail_maps.write_scatter(out)
     unknown = [name for name in delivery.only if name not in known]
     if unknown:
         raise ExportError(
-            f"--only: got {unknown[0]!r}, expected of {', '.join(sorted(known)) or 'no state'}"
+            f"--only: got {unknown[0]!r}, expected some of {', '.join(sorted(known)) or 'no state'}"
         )
     out.document(
         DOCUMENT_FILE,
@@ -133,7 +133,7 @@ def _write_wrinkles(
         moved = wrinkles.encode(shown.normals.astype(np.float64), limit=None) - model.base
         delta, _ = color_deltas.resize_map(moved, shown.valid, NORMAL_SIZE)
         layers = np.concatenate([delta * sign, np.zeros((*delta.shape[:2], 1))], axis=-1)
-        what = f"slopes that {row} adds at full strength: R n_x/n_z, G n_y/n_z, B 0"
+        what = f"slopes added by {row} at weight 1: R n_x/n_z, G n_y/n_z, B 0"
         out.write_exr_and_png(
             ExportImage(f"{name}_delta", layers, "1", DATA_SPACE, what, -1.0, 1.0, valid)
         )

@@ -1,11 +1,11 @@
-"""Cavity, scatter and micro normal maps of a pack, next to color and normal deltas.
+"""Write cavity, scatter and micro normal maps of a pack.
 
-Each is made of something that was measured, or left out: cavity of the neutral wrinkle normals,
-scatter of the translucency of a fitted model, micro normals of relief from the gradient sphere.
+Each is derived from measurements, or omitted: cavity from neutral wrinkle normals, scatter from the
+translucency of a fitted model, micro normals from relief of the gradient sphere.
 
 References
 ----------
-Max 1988, Horizon Mapping, doi 10.1007/BF01905562 (light that relief leaves).
+Max 1988, Horizon Mapping, doi 10.1007/BF01905562 (shadowing by relief).
 """
 
 from collections.abc import Mapping
@@ -24,23 +24,23 @@ from skinrig.exporting.images import DATA_SPACE, ExportImage, ImageFolder
 from skinrig.exporting.packs import color_deltas
 
 FADE_DIVISOR: Final = 8
-"""One part of so many of a tile is faded into what lies beyond its other end."""
+"""A tile's side over the width of the cross-faded border."""
 
 
 def make_periodic(image: ArrayLike) -> Float64Array:
-    """Return an image that repeats without a seam: what is beyond its end fades into its beginning.
+    """Return a seamlessly repeating image by cross-fading its end into its beginning.
 
-    By weights whose squares sum to 1, so that relief of independent places keeps its variance.
+    The squares of the weights sum to 1, so that the variance of independent relief is kept.
 
     Parameters
     ----------
     image
-        (H, W), finite, mean 0; 8 pixels and more a side.
+        (H, W), finite, mean 0, at least 8 pixels per side.
 
     Returns
     -------
     ndarray
-        Smaller by an eighth along each axis; beyond the faded eighth its values are the image's.
+        Image that is smaller by an eighth per axis; outside of the faded eighth it is unchanged.
 
     Examples
     --------
@@ -62,14 +62,14 @@ def make_periodic(image: ArrayLike) -> Float64Array:
     return found
 
 
-def periodic_normals(height_um: Float64Array, pixel_um: float) -> Float64Array:
-    """Return unit normals of relief that repeats, (H, W, 3), +Y up, row 0 at the top.
+def compute_periodic_normals(height_um: Float64Array, pixel_um: float) -> Float64Array:
+    """Compute unit normals of periodic relief, (H, W, 3), +Y up, row 0 at the top.
 
     Examples
     --------
     >>> x = np.arange(64)
     >>> relief = np.sin(2 * np.pi * x / 64) * np.ones((4, 1))
-    >>> normals = periodic_normals(relief, 1.0)
+    >>> normals = compute_periodic_normals(relief, 1.0)
     >>> round(float(-normals[0, 0, 0] / normals[0, 0, 2]), 3), float(normals[0, 16, 0].round(6))
     (0.098, -0.0)
     """
@@ -81,36 +81,36 @@ def periodic_normals(height_um: Float64Array, pixel_um: float) -> Float64Array:
 
 HORIZON_DIRECTIONS: Final = 16
 HORIZON_REACH_PX: Final = 16
-"""How far relief shades, texels of the measured map."""
+"""Maximum distance of shadowing relief, texels of the measured map."""
 SCATTER_SIZE: Final = 512
 MAX_SCATTER_MM: Final = 16.0
-"""Translucency of the PNG code 65535."""
+"""Diffuse mean free path of the PNG code 65535."""
 MM_PER_UM: Final = 0.001
 
 
 def write_cavity(
     slopes: Float64Array, valid: BoolArray, size: int, out: ImageFolder
 ) -> dict[str, Any]:
-    """Write the share of light from all around that relief leaves to its own hollows.
+    """Write the fraction of uniform illumination that relief does not shadow.
 
     Parameters
     ----------
     slopes
         n_x/n_z and n_y/n_z of the neutral relief, (H, W, 2), +Y up.
     valid
-        (H, W), where they mean something.
+        (H, W) valid slopes.
     size
         Width and height to write, texels.
     out
-        Where to.
+        Destination folder.
 
     Returns
     -------
     dict
-        JSON values; empty where it is left out.
+        JSON values; empty if omitted.
     """
     if not valid.any():
-        out.record_omission("cavity", "no wrinkle normal is valid")
+        out.record_omission("cavity", "wrinkle normals have no valid texel")
         return {}
     found = integrate_map(wrinkles.decode(slopes), valid=valid)
     if not found.convergence.converged:
@@ -120,9 +120,9 @@ def write_cavity(
     shown, known = color_deltas.resize_map(seen[..., None], found.valid, size)
     values = np.where(known, shown[..., 0], 1.0)
     what = (
-        "share of light from all around that relief leaves at a place: 1 on ridges and flat "
-        f"skin; horizons of {HORIZON_REACH_PX} measured texels in {HORIZON_DIRECTIONS} "
-        "directions; 1 where nothing was measured"
+        "fraction of uniform illumination that relief does not shadow: 1 on ridges and flat "
+        f"skin; horizons within {HORIZON_REACH_PX} measured texels in {HORIZON_DIRECTIONS} "
+        "directions; 1 without measurement"
     )
     out.write_exr_and_png(ExportImage("cavity", values, "1", DATA_SPACE, what, 0.0, 1.0, known))
     return {
@@ -137,14 +137,14 @@ def write_cavity(
 
 
 def ambient_visibility(height: ArrayLike, part: ArrayLike) -> Float64Array:
-    """Return the share of cosine-weighted light from all around that reaches each texel.
+    """Return the fraction of cosine-weighted uniform illumination that reaches each texel.
 
     Parameters
     ----------
     height
         (H, W), texels.
     part
-        (H, W), number of the connected part, -1 outside. Heights of different parts are unrelated.
+        (H, W), index of the connected part, -1 outside. Heights of different parts are unrelated.
 
     Returns
     -------
@@ -153,7 +153,7 @@ def ambient_visibility(height: ArrayLike, part: ArrayLike) -> Float64Array:
 
     Examples
     --------
-    In an infinite groove of slopes of 1 the light that is left is 1 / sqrt(2):
+    At the bottom of an infinite groove of slope 1 the fraction is 1 / sqrt(2):
 
     >>> walls = np.abs(np.arange(41) - 20.0)
     >>> groove = np.broadcast_to(walls, (41, 41))
@@ -178,7 +178,7 @@ def ambient_visibility(height: ArrayLike, part: ArrayLike) -> Float64Array:
 
 
 def _has_own_part(number: NDArray[Any], positions: Float64Array) -> BoolArray:
-    """Return whether all four texels around places, (2, H, W), are of the part of their own."""
+    """Return whether the four texels around positions, (2, H, W), are of the same part."""
     last = np.array(number.shape)[:, None, None] - 1
     low = np.clip(np.floor(positions).astype(int), 0, last)
     high = np.clip(low + 1, 0, last)
@@ -190,36 +190,36 @@ def _has_own_part(number: NDArray[Any], positions: Float64Array) -> BoolArray:
 
 
 def write_scatter(out: ImageFolder) -> dict[str, Any]:
-    """Write how far light spreads below the surface, of the model that colors are put on.
+    """Write the diffuse mean free path of the target face's model.
 
     Parameters
     ----------
     out
-        Where to.
+        Destination folder.
 
     Returns
     -------
     dict
-        JSON values; empty where it is left out.
+        JSON values; empty if omitted.
     """
     onto = out.delivery.onto
     if onto is None:
-        why = "it is of a model: name one of `skinrig fit reflectance` by --target-face"
+        why = "requires a model of `skinrig fit reflectance`; name it by --target-face"
         out.record_omission("scatter", why)
         return {}
     other = store.read(onto)
     depth = other.maps.get("translucency")
     if depth is None:
-        makes = "`skinrig fit reflectance` makes it"
-        out.record_omission("scatter", f"{onto.name} holds no translucency: {makes}")
+        makes = "create it by `skinrig fit reflectance`"
+        out.record_omission("scatter", f"translucency is missing in {onto.name}; {makes}")
         return {}
     values = np.asarray(depth.values, np.float64)
     if not depth.mask.any():
-        out.record_omission("scatter", f"no translucency of {onto.name} is known")
+        out.record_omission("scatter", f"translucency of {onto.name} has no valid texel")
         return {}
     shown, valid = color_deltas.resize_map(values, depth.mask, SCATTER_SIZE)
     usual = np.median(values[depth.mask], axis=0)
-    what = "1/sigma_tr in red, green and blue; the median where it is not known"
+    what = "1/sigma_tr in red, green and blue; the median where it is unknown"
     shown = np.where(valid[..., None], shown, usual)
     out.write_exr_and_png(
         ExportImage("scatter", shown, "mm", DATA_SPACE, what, 0.0, MAX_SCATTER_MM, valid)
@@ -234,24 +234,24 @@ def write_scatter(out: ImageFolder) -> dict[str, Any]:
     }
 
 
-def micro_normals(
+def write_micro_normals(
     appearance: SkinAppearance, part: Mapping[str, Any], out: ImageFolder
 ) -> dict[str, Any]:
-    """Write the neutral relief of each site as a normal map that repeats without a seam.
+    """Write the neutral relief of each site as a seamlessly repeating normal map.
 
     Parameters
     ----------
     appearance
-        With the part microstructure.
+        Appearance with the part microstructure.
     part
-        Its document of sites.
+        Document of its sites.
     out
-        Where to.
+        Destination folder.
 
     Returns
     -------
     dict
-        JSON values; sites whose relief is not known are left out.
+        JSON values; sites without valid relief are omitted.
     """
     entries: dict[str, Any] = {}
     green = out.delivery.green_direction
@@ -259,15 +259,15 @@ def micro_normals(
         relief = appearance.maps[entry["map"]]
         valid = relief.mask
         if not valid.any():
-            out.record_omission(f"micro normals of {site}", "no height is valid")
+            out.record_omission(f"micro normals of {site}", "the height has no valid texel")
             continue
         filled = push_pull(np.nan_to_num(relief.values), valid.astype(np.float32)).values
         height = np.asarray(filled, np.float64).reshape(relief.values.shape)
         pixel_um = float(entry["pixel_um"])
         tile = make_periodic(height - height.mean())
-        normals = periodic_normals(tile, pixel_um)
+        normals = compute_periodic_normals(tile, pixel_um)
         name = f"micro_normal_{site}"
-        what = f"relief of {site} at rest, tangent space, {green}, repeats without a seam"
+        what = f"neutral relief of {site}, tangent space, {green}, repeats seamlessly"
         out.write_exr_and_png(ExportImage.from_normals(name, normals, out.delivery, what))
         slope = normals[..., :2] / normals[..., 2:]
         entries[name] = {

@@ -1,1 +1,1 @@
-"""Exports of sessions."""
+"""Export sessions."""

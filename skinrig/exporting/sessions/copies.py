@@ -1,4 +1,4 @@
-"""Sessions copied, their frames alone, or these in the words of Bluesky's event model."""
+"""Copy sessions or their frames, or describe the frames by Bluesky's event model."""
 
 import json
 import shutil
@@ -33,13 +33,13 @@ def write_session_document(
 
 
 def write_session(session: Session, out: Path, delivery: ExportSettings) -> None:
-    """Copy all of a session."""
+    """Copy all files of a session."""
     for name in ("session.json", "journal.jsonl"):
         shutil.copyfile(session.path / name, out / name)
     for folder in ("frames", "attachments"):
         if (session.path / folder).is_dir():
             (out / folder).mkdir()
-    # all attempts, not the last alone: the journal names them
+    # all attempts of frames, not only the last, since the journal lists them
     for line in read_undamaged_contents(session.path).file_lines:
         (out / line.file).write_bytes(check_file(session.path / line.file, line))
 
@@ -52,10 +52,10 @@ def write_frames(session: Session, out: Path, delivery: ExportSettings) -> None:
 
 
 def write_events(session: Session, out: Path, delivery: ExportSettings) -> None:
-    """Copy the frames, and write documents.jsonl as Bluesky's event model describes a run."""
+    """Copy the frames, and write documents.jsonl, a run in Bluesky's event model."""
     write_frames(session, out, delivery)
     with (out / DOCUMENTS_FILE).open("w", encoding="utf-8") as stream:
-        for name, document in documents(session):
+        for name, document in generate_documents(session):
             stream.write(json.dumps([name, document], allow_nan=False) + "\n")
 
 
@@ -66,12 +66,12 @@ _UNIT_SUFFIXES = {"_s": "s", "_deg": "deg", "_w": "W", "_mm": "mm", "_us": "us"}
 Document = tuple[str, dict[str, Any]]
 
 
-def documents(session: Session) -> Iterator[Document]:
-    """Yield name and content of every document of a session, in the order of a run.
+def generate_documents(session: Session) -> Iterator[Document]:
+    """Yield name and content of the event-model documents of a session, in the order of a run.
 
     Notes
     -----
-    Uids follow from the session's id, so that a second export gives the same documents.
+    Uids are derived from the session's id, so that repeated exports give the same documents.
     """
     space = uuid.uuid5(uuid.NAMESPACE_OID, session.id)
 

@@ -1,7 +1,7 @@
-"""Pictures of one light each with their light list, as programs for photometric stereo read.
+"""Write images under one light at a time with their light list, for photometric stereo programs.
 
-One camera's pictures as linear 16-bit TIFF on one common scale, and ``lights.lp``: a count, then
-a file name and a unit vector towards the light in each line; x right, y up, z to the camera.
+Images of one camera are linear 16-bit TIFF on a common scale. ``lights.lp`` has a count, then a
+file name and a unit vector towards the light per line; x right, y up, z towards the camera.
 """
 
 from pathlib import Path
@@ -15,7 +15,7 @@ from reconstruction.pipeline.dome.calibrated import load_dome
 from reconstruction.pipeline.dome.images import DomeImages
 from reconstruction.pipeline.inputs import Inputs
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray, UInt16Array
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.sessions.copies import write_session_document
 
@@ -24,7 +24,7 @@ SCHEMA: Final = "skinrig.export.lights/1"
 SATURATED_CODE: Final = 65535
 """Code of saturated pixels; unsaturated ones stay below."""
 MAX_BRIGHT_FRACTION: Final = 1e-4
-"""Share of a picture's values that may lie above the scale: single sparkles do not set it."""
+"""Fraction of an image's values above the scale, so that single highlights do not determine it."""
 _CAMERA_TO_LIST_SIGNS = np.array([1.0, -1.0, -1.0])  # from camera axes, x right, y down, z forward
 
 
@@ -34,31 +34,31 @@ def write(session: Session, folder: Path, delivery: ExportSettings) -> list[tupl
     Parameters
     ----------
     session
-        Of a dome, or of images that were imported with a list.
+        Session of a dome, or of images imported with a light list.
     folder
         Existing folder.
     delivery
-        Its camera and calibration count.
+        Camera and calibration.
 
     Returns
     -------
     list of (str, str)
-        Lights that are dead, or whose place is not known.
+        Omitted lights: defective ones, and those of unknown position.
 
     Raises
     ------
     ExportError
-        For a session without single lights, or a camera that it lacks.
+        If the session has no images of single lights, or lacks the camera.
     ValueError
-        Where the calibration is not of its rig.
+        If the calibration is of another rig.
     """
     import tifffile
 
     if not any(step.kind == "olat" for step in session.plan.steps):
         kinds = ", ".join(sorted({step.kind for step in session.plan.steps}))
         raise ExportError(
-            f"{session.path}: shows {kinds}, expected one light a picture: a session of the dome, "
-            "or of `skinrig import lp`"
+            f"{session.path}: got {kinds}, expected images of one light each; give a session of "
+            "the dome or of `skinrig import lp`"
         )
     inputs = Inputs.of(session, delivery.calibration, state="neutral", on_date=None)
     images = DomeImages(session)
@@ -67,13 +67,16 @@ def write(session: Session, folder: Path, delivery: ExportSettings) -> list[tupl
     pose = dome.cameras[view]
     good = [k for k in range(len(images.lights)) if dome.table.valid[k]]
     left_out = [
-        (name, "the light is dead, or its place is not known")
+        (name, "the light is defective, or its position is unknown")
         for k, name in enumerate(images.lights)
         if k not in good
     ]
     if len(good) < 3:
-        raise ExportError(f"{session.path}: has {len(good)} usable lights, expected at least 3")
-    places = in_camera_frame(dome.table.position_mm[good], pose.rotation)
+        raise ExportError(
+            f"{session.path}: has {len(good)} usable lights, expected at least 3; capture more "
+            "lights"
+        )
+    places = transform_to_camera_frame(dome.table.position_mm[good], pose.rotation)
     toward = places / np.linalg.norm(places, axis=1, keepdims=True)
     names = [f"{images.lights[k]}.tif" for k in good]
 
@@ -83,7 +86,7 @@ def write(session: Session, folder: Path, delivery: ExportSettings) -> list[tupl
         found = dome.image(view, images.captures.index((images.lights[light], -1)))
         return found.rgb, found.valid
 
-    # twice through the pictures instead of all of them in memory
+    # the images are read twice, for scale and output, instead of keeping them in memory
     top = max(_full_scale(*picture(k)) for k in good)
     scale = (SATURATED_CODE - 1) / top if top > 0.0 else 1.0
     clipped: dict[str, float] = {}
@@ -99,8 +102,8 @@ def write(session: Session, folder: Path, delivery: ExportSettings) -> list[tupl
     document = {
         "schema": SCHEMA,
         "frame": "x right, y up, z towards the camera; directions from the rig's origin",
-        "encoding": f"linear camera values: fraction of full scale, per second of light where "
-        f"the exposure is known, = code / {scale:.9g}; {SATURATED_CODE} is saturated",
+        "encoding": f"linear camera values: fraction of full scale, per second of exposure if "
+        f"known, = code / {scale:.9g}; {SATURATED_CODE} is saturated",
         "code_per_rate": scale,
         "clipped_share": clipped,
         "camera": images.views[view],
@@ -112,8 +115,8 @@ def write(session: Session, folder: Path, delivery: ExportSettings) -> list[tupl
     return left_out
 
 
-def in_camera_frame(position_mm: FloatArray, rotation: FloatArray) -> Float64Array:
-    """Return places as light lists have them: x right, y up, z towards the camera.
+def transform_to_camera_frame(position_mm: FloatArray, rotation: FloatArray) -> Float64Array:
+    """Transform positions to the frame of light lists: x right, y up, z towards the camera.
 
     Parameters
     ----------
@@ -125,7 +128,7 @@ def in_camera_frame(position_mm: FloatArray, rotation: FloatArray) -> Float64Arr
     Examples
     --------
     >>> ahead = np.array([[0.0, -10.0, 700.0]])
-    >>> in_camera_frame(ahead, np.diag([1.0, -1.0, -1.0])).tolist()
+    >>> transform_to_camera_frame(ahead, np.diag([1.0, -1.0, -1.0])).tolist()
     [[0.0, -10.0, 700.0]]
     """
     return np.asarray((position_mm @ np.asarray(rotation).T) * _CAMERA_TO_LIST_SIGNS)
@@ -134,11 +137,11 @@ def in_camera_frame(position_mm: FloatArray, rotation: FloatArray) -> Float64Arr
 def _view(names: tuple[str, ...], cameras: Any, requested: str | None) -> int:
     if requested is None:
         return int(np.argmin([camera.rotation[2, 2] for camera in cameras]))
-    return names.index(one_of("--camera", requested, names, ExportError))
+    return names.index(require_choice("--camera", requested, names, ExportError))
 
 
 def _imported(session: Session, view: str, light: str) -> tuple[Float32Array, BoolArray]:
-    """Return a picture that came with a light list, which need not have an exposure."""
+    """Return an image imported with a light list, whose exposure may be unknown."""
     record = next(one for one in session.frames("olat", light=light) if one.camera == view)
     frame = session.read(record)
     time = float(record.settings.get("exposure_s", 0.0)) * float(record.settings.get("iso", 100.0))

@@ -1,10 +1,10 @@
-"""Spectral and polarized images in the layout of Fichet et al.: of maps, and as they were taken.
+"""Write spectral and polarized images of maps and sessions in the layout of Fichet et al.
 
-Of the gradient sphere each state and pattern is a Stokes image: it is shown with the analyser along
-the light's polarization, and across it. Their sum is all light, S0; their difference is S1, along
-the analyser's axis: light that the surface reflected. S2 and S3 need an analyser at 45 degrees and
-a retarder, which the rig does not have. The sensor is monochrome: its one band bears the mean
-wavelength of the LEDs' light behind it.
+Each strain step and pattern of the gradient sphere is a Stokes image. It is captured with the
+analyzer parallel and perpendicular to the light's polarization. Their sum is S0, the total light.
+Their difference is S1 along the analyzer's axis, the specular reflection. S2 and S3 require an
+analyzer at 45 degrees and a retarder, which the rig lacks. The sensor is monochrome; its band is
+labeled by the mean wavelength of the LEDs' light weighted by its response.
 
 References
 ----------
@@ -28,7 +28,7 @@ from reconstruction.pipeline.gradient.stages import WAVELENGTH_UM
 from reconstruction.pipeline.inputs import Inputs
 from reconstruction.pipeline.sensor_noise import ElectronNoise
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 from skinrig.exporting.images import write_channels
 from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.sealing import IMAGE_ORIENTATION, describe_provenance, write_json
@@ -43,26 +43,26 @@ LAYOUT_VERSION: Final = "1.0"
 def write_spectra(
     appearance: SkinAppearance, folder: Path, delivery: ExportSettings
 ) -> list[tuple[str, str]]:
-    """Write what an appearance of the flash rig holds of spectra and polarization.
+    """Write the spectral reflectance and Stokes images of a flash appearance.
 
     Parameters
     ----------
     appearance
-        With melanin and hemoglobin, or diffuse and specular, or all of them.
+        Appearance with melanin and hemoglobin, or diffuse and specular, or all of them.
     folder
-        Existing, empty.
+        Existing, empty folder.
     delivery
-        Whether masks are written.
+        With or without masks.
 
     Returns
     -------
     list of (str, str)
-        What was left out, and why.
+        Omissions with reasons.
 
     Raises
     ------
     ExportError
-        For an appearance that holds neither.
+        If the appearance has neither.
     """
     left_out: list[tuple[str, str]] = []
     files: dict[str, Any] = {}
@@ -96,14 +96,14 @@ def write_spectra(
 
 
 def format_channel_name(kind: str, wavelength_nm: float) -> str:
-    """Return a channel's name: a comma parts decimals, for dots part layers.
+    """Format a channel's name; the decimal separator is a comma, as dots separate layers.
 
     Parameters
     ----------
     kind
         "T" for reflectance, "S0" to "S3" for a Stokes component.
     wavelength_nm
-        Above 0.
+        Wavelength, nm, above 0.
 
     Examples
     --------
@@ -113,12 +113,12 @@ def format_channel_name(kind: str, wavelength_nm: float) -> str:
     return f"{kind}.{f'{wavelength_nm:.6g}'.replace('.', ',')}nm"
 
 
-def band_means_nm(camera: str, illuminant: str) -> Float64Array:
-    """Return the mean wavelength of a camera's bands under a light, nm, (3,).
+def compute_band_means_nm(camera: str, illuminant: str) -> Float64Array:
+    """Compute the mean wavelength of a camera's bands under an illuminant, nm, (3,).
 
     Examples
     --------
-    >>> band_means_nm("Nikon 5100 (NPL)", "D55").round(0).tolist()
+    >>> compute_band_means_nm("Nikon 5100 (NPL)", "D55").round(0).tolist()
     [596.0, 529.0, 473.0]
     """
     weights = spectra.camera_sensitivity(camera) * spectra.illuminant(illuminant)[:, None]
@@ -129,10 +129,11 @@ def _reflectance(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
     melanin, blood = appearance.maps["melanin"], appearance.maps["hemoglobin"]
     if melanin.values.shape != blood.values.shape:
         raise ExportError(
-            f"hemoglobin: got shape {blood.values.shape}, expected {melanin.values.shape}"
+            f"hemoglobin: got shape {blood.values.shape}, expected {melanin.values.shape} as of "
+            "melanin; reconstruct both together"
         )
     valid = melanin.mask & blood.mask
-    # estimates lie in the table by construction; rounding to float32 can leave it
+    # estimates are within the table by construction, but rounding to float32 can exceed it
     c_m = np.clip(melanin.values[valid].astype(np.float64), 0.0, C_M_MAX)
     c_hd = np.clip(blood.values[valid].astype(np.float64), 0.0, C_HD_MAX)
     found = color_table.spectral_reflectance(c_m, c_hd, anisotropy=ANISOTROPY_SKIN)
@@ -142,8 +143,9 @@ def _reflectance(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
         layer[valid] = found[:, band]
         channels[format_channel_name("T", float(wavelength))] = layer
     what = (
-        "modelled, not measured: diffuse reflectance at normal incidence without the surface's, of "
-        "the two-layer skin with the estimated melanin and hemoglobin; 0 where they are not known"
+        "modeled, not measured: diffuse reflectance at normal incidence, without specular "
+        "reflection, of two-layer skin with the estimated melanin and hemoglobin; 0 where these "
+        "are unknown"
     )
     header = {"spectralLayoutVersion": LAYOUT_VERSION, "comments": what}
     write_channels(folder / REFLECTANCE_FILE, channels, header)
@@ -156,10 +158,10 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
     recorded = appearance.parameters.get("color_table")
     if not isinstance(recorded, dict) or not {"camera", "illuminant"} <= set(recorded):
         raise ExportError(
-            "stokes: the maps have no camera and illuminant, so bands have no "
-            "wavelength; make them with `skinrig reconstruct --maps diffuse,specular,melanin`"
+            "stokes: camera and illuminant of the maps are unknown, expected them for the bands' "
+            "wavelengths; reconstruct with `--maps diffuse,specular,melanin`"
         )
-    means = band_means_nm(str(recorded["camera"]), str(recorded["illuminant"]))
+    means = compute_band_means_nm(str(recorded["camera"]), str(recorded["illuminant"]))
     valid = diffuse.mask & specular.mask
     s0 = np.where(valid[..., None], diffuse.values + specular.values, 0.0)
     s1 = np.where(valid[..., None], specular.values, 0.0)
@@ -168,16 +170,16 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
         channels[format_channel_name("S0", float(wavelength))] = s0[..., band]
         channels[format_channel_name("S1", float(wavelength))] = s1[..., band]
     what = (
-        "measured, by a parallel and a crossed picture: S0 all light, S1 what passes the analyser "
-        "along the flash's polarizer less what passes across it; S2 and S3 were not measured. "
-        "Bands of the camera at their mean wavelengths, not narrow lines; a white tile in the "
-        "same place = 1"
+        "measured, from a parallel and a cross-polarized image: S0 total light, S1 light through "
+        "the analyzer parallel minus perpendicular to the flash's polarizer; S2 and S3 were not "
+        "measured. Bands of the camera at their mean wavelengths, not narrow lines; a white "
+        "reference in the same position = 1"
     )
-    write_channels(folder / STOKES_FILE, channels, stokes_header(what))
+    write_channels(folder / STOKES_FILE, channels, build_stokes_header(what))
     return {
         "what": what,
         "origin": "measured",
-        "unit": "white tile = 1",
+        "unit": "white reference = 1",
         "channels": list(channels),
         "camera": recorded["camera"],
         "illuminant": recorded["illuminant"],
@@ -185,8 +187,8 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
     }
 
 
-def stokes_header(description: str) -> dict[str, str]:
-    """Return the attributes of a Stokes image in the published layout."""
+def build_stokes_header(description: str) -> dict[str, str]:
+    """Build the header attributes of a Stokes image in the published layout."""
     return {
         "spectralLayoutVersion": LAYOUT_VERSION,
         "emissiveUnits": "1",
@@ -207,28 +209,28 @@ def write_stokes(session: Session, folder: Path, delivery: ExportSettings) -> li
     Parameters
     ----------
     session
-        Of the gradient sphere.
+        Session of the gradient sphere.
     folder
         Existing folder.
     delivery
-        Its ``only`` names states such as "a000_n0"; with errors, standard uncertainties
-        of each image are written, and the mask of each state; its calibration is of the sensor.
+        ``only`` selects strain steps such as "a000_n0". With errors, the standard uncertainties of
+        each image and the mask of each strain step are written. The calibration is of the sensor.
 
     Returns
     -------
     list of (str, str)
-        Patterns that were not taken with both polarizations.
+        Omitted patterns: those without both polarizations.
 
     Raises
     ------
     ExportError
-        For a session of another rig, or a state that it lacks.
+        If the session is of another rig, or lacks a strain step.
     """
     if not session.frames("gradient"):
         kinds = ", ".join(sorted({step.kind for step in session.plan.steps}))
         raise ExportError(
-            f"{session.path}: shows {kinds}, expected patterns of the gradient sphere; of the "
-            "flash rig take `skinrig export APPEARANCE --to spectral`"
+            f"{session.path}: got {kinds}, expected patterns of the gradient sphere; for the flash "
+            "rig use `skinrig export APPEARANCE --to spectral`"
         )
     only, with_errors = delivery.only, delivery.with_errors
     inputs = Inputs.of(session, delivery.calibration, state="neutral", on_date=None)
@@ -236,17 +238,17 @@ def write_stokes(session: Session, folder: Path, delivery: ExportSettings) -> li
     images = GradientImages(session, noise=_noise(inputs, camera))
     names = [state.name for state in images.states]
     for name in only:
-        one_of("--only", name, names, ExportError)
+        require_choice("--only", name, names, ExportError)
     axis = session.rig.view(camera).analyser_axis_deg
     if axis is None:
         raise ExportError(
-            f"{session.path}: the rig has no axis of its analyzer; add analyser_axis_deg "
+            f"{session.path}: axis of the rig's analyzer is missing; add analyser_axis_deg "
             "to the view"
         )
     what = (
-        "measured, by a picture along the analyser's axis and one across: S0 all light, S1 along "
-        f"the axis minus across it; the axis lies {axis:g} degrees from x right towards y up; S2 "
-        "and S3 were not measured. Wavelengths are the means of the sensor's broad bands"
+        "measured, from images parallel and perpendicular to the analyzer's axis: S0 total light, "
+        f"S1 parallel minus perpendicular; the axis is {axis:g} degrees from x right towards y "
+        "up; S2 and S3 were not measured. Wavelengths are the means of the sensor's broad bands"
     )
     files: dict[str, Any] = {}
     left_out: list[tuple[str, str]] = []
@@ -257,19 +259,19 @@ def write_stokes(session: Session, folder: Path, delivery: ExportSettings) -> li
             left_out += missing
     if not files:
         raise ExportError(
-            f"{session.path}: no pattern was taken both along and across the analyser's axis, "
-            "expected `skinrig plan gradient` with both polarizations"
+            f"{session.path}: got no pattern with both polarizations, expected at least one; "
+            "capture with a plan of `skinrig plan gradient`"
         )
     document = {
         "schema": SCHEMA,
         "what": what,
-        "unit": "fraction of the sensor's full scale, darks subtracted, exposure as taken",
+        "unit": "fraction of the sensor's full scale, dark frames subtracted, exposure as captured",
         "channels": STOKES_CHANNELS,
         "reference_axis_deg": axis,
-        "image_frame": "against the picture's x axis S1 is "
-        f"{math.cos(math.radians(2 * axis)):.9g} of what was measured along the analyser",
-        "orientation": "as the camera sees it, row 0 is the top",
-        "leakage": "not taken off: what crossed films let through is in S0 and lowers S1",
+        "image_frame": "relative to the image's x axis, S1 is "
+        f"{math.cos(math.radians(2 * axis)):.9g} of that along the analyzer",
+        "orientation": "camera image, row 0 is the top",
+        "leakage": "not subtracted: leakage of crossed polarizers is in S0 and reduces S1",
         "files": files,
     }
     write_session_document(folder / DOCUMENT_FILE, inputs, document, left_out)
@@ -279,24 +281,24 @@ def write_stokes(session: Session, folder: Path, delivery: ExportSettings) -> li
 def _write_state(
     state: str, patterns: StatePatterns, folder: Path, description: str, with_errors: bool
 ) -> tuple[dict[str, Any], list[tuple[str, str]]]:
-    """Write the images of one state; return what is in each file, and patterns left out."""
+    """Write the images of one strain step; return a record per file, and omitted patterns."""
     files: dict[str, Any] = {}
     left_out = []
     for pattern in sorted({pattern for pattern, _ in patterns.values}):
         along, across = (pattern, PARALLEL), (pattern, CROSSED)
         if not {along, across} <= set(patterns.values):
-            left_out.append((f"{state} {pattern}", "was taken with one polarization only"))
+            left_out.append((f"{state} {pattern}", "captured with one polarization only"))
             continue
-        stem = file_stem(state, pattern)
+        stem = format_file_stem(state, pattern)
         one, other = patterns.values[along], patterns.values[across]
         found = one + other, one - other
         channels = dict(zip(STOKES_CHANNELS, found, strict=True))
-        write_channels(folder / f"{stem}.exr", channels, stokes_header(description))
+        write_channels(folder / f"{stem}.exr", channels, build_stokes_header(description))
         stderr = np.sqrt(patterns.variance[along] + patterns.variance[across])
         figures = _figures(*found, stderr, patterns.valid)
         files[f"{stem}.exr"] = {"state": state, "pattern": pattern, **figures}
         if with_errors:
-            header = {"unit": "1", "comments": "standard error of S0 and of S1, 68 %"}
+            header = {"unit": "1", "comments": "standard uncertainty of S0 and of S1, 68 %"}
             write_channels(folder / f"{stem}.stderr.exr", {"Y": stderr}, header)
     if with_errors:
         mask = patterns.valid.astype(np.float32)
@@ -314,12 +316,12 @@ def _noise(inputs: Any, camera: str) -> Any:
     return ElectronNoise(float(known.gain_e_per_dn.value[0]), float(known.read_noise_e.value[0]))
 
 
-def file_stem(state: str, pattern: str) -> str:
-    """Return a Stokes image's name without suffix.
+def format_file_stem(state: str, pattern: str) -> str:
+    """Format a Stokes image's name without suffix.
 
     Examples
     --------
-    >>> file_stem("a000_n0", "-x")
+    >>> format_file_stem("a000_n0", "-x")
     'stokes_a000_n0_minus_x'
     """
     return f"stokes_{state}_{pattern.replace('-', 'minus_')}"
@@ -328,13 +330,13 @@ def file_stem(state: str, pattern: str) -> str:
 def _figures(
     s0: Float32Array, s1: Float32Array, stderr: Float32Array, valid: BoolArray
 ) -> dict[str, float]:
-    """Return what is worth knowing of an image before it is opened, as JSON values."""
+    """Return summary figures of an image as JSON values."""
     if not valid.any():
         return {"valid_share": 0.0}
     total, along = s0[valid].astype(np.float64), s1[valid].astype(np.float64)
     return {
         "valid_share": float(valid.mean()),
         "degree_of_polarization": float(along.sum() / total.sum()) if total.sum() > 0.0 else 0.0,
-        # noise alone makes a difference exceed its sum, or fall below 0
+        # by noise alone, a difference may exceed its sum, and a sum may be below 0
         "beyond_s0_by_3_stderr_share": float(np.mean(np.abs(along) - total > 3.0 * stderr[valid])),
     }

@@ -1,1 +1,1 @@
-"""Renderings compared with held-out photographs."""
+"""Compare renderings with held-out photographs."""

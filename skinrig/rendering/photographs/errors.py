@@ -1,14 +1,13 @@
-"""Errors of renderings against photographs with the same camera and light.
+"""Compute errors of renderings against photographs with the same camera and light.
 
-Both are white-balanced linear camera RGB over what a perfect white Lambertian patch at the rig's
-origin shows that faces the light. The luminance is that of ITU-R BT.709 with the camera's channels
-in place of its primaries.
+Both are white-balanced linear camera RGB, relative to a perfect white Lambertian patch at the rig's
+origin that faces the light. The luminance is that of ITU-R BT.709 with the camera's channels in
+place of its primaries.
 
-A pixel counts as **lit** where it and its eight neighbors lie wholly on skin that was measured and
-every ray of them sees the whole light, by the geometry that is rendered; and where the photograph
-is not saturated and at least `MIN_SIGNAL_SIGMAS` times its own noise. How well the
-two agree has no part in it. Everything else on the skin, shadows and their borders, counts in
-`total_error` only.
+A pixel is **lit** if it and its eight neighbors are entirely on measured skin with full visibility
+of the light for every ray, by the rendered geometry, and if the photograph is not saturated and at
+least `MIN_SIGNAL_SIGMAS` times its own noise. The agreement of the two is not a criterion. Other
+skin, such as shadows and their borders, contributes only to `total_error`.
 """
 
 import dataclasses
@@ -29,12 +28,12 @@ from skinrig.rendering.render import Subsurface
 
 LUMINANCE_WEIGHTS: Final = (0.2126, 0.7152, 0.0722)
 MIN_SIGNAL_SIGMAS: Final = 10.0
-"""Times its standard deviation that a photograph's luminance must be."""
+"""Minimum ratio of a photograph's luminance to its standard deviation."""
 MAX_MEDIAN_ERROR: Final = 0.05
-"""Median relative error of the luminance on lit pixels that a model has to stay below."""
+"""Limit of a model's median relative error of the luminance on lit pixels."""
 ERROR_PERCENTILES: Final = (50.0, 68.0, 90.0, 95.0)
 WHITE_PERCENTILE: Final = 99.0
-"""Luminance of a photograph's skin that is shown as white before structures are compared."""
+"""Percentile of a photograph's skin luminance that is mapped to white before SSIM."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +45,7 @@ class Photograph:
     rgb, variance
         (H, W, 3), see this module.
     valid
-        (H, W) bool; False where it is saturated.
+        (H, W) bool; False: saturated.
     """
 
     rgb: Float64Array
@@ -66,7 +65,7 @@ class Photograph:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairErrors:
-    """A rendering compared with a photograph.
+    """Errors of a rendering relative to a photograph.
 
     Attributes
     ----------
@@ -77,9 +76,9 @@ class PairErrors:
     lit
         (H, W) bool, see this module.
     noise
-        Median of what the photograph's noise alone does to `relative`; NaN without lit pixels.
+        Median of `relative` by the photograph's noise alone; NaN without lit pixels.
     total_error
-        Sum over the skin of |rendering - photograph| over that of the photograph, lit or not.
+        Sum of |rendering - photograph| over all skin, relative to that of the photograph.
     ssim
         Mean structural similarity of the tone-mapped pair over the skin, -1 to 1.
     """
@@ -109,14 +108,14 @@ def luminance(rgb: ArrayLike) -> Float64Array:
 
 
 def find_lit_pixels(photograph: Photograph, *, covered: ArrayLike, lit: ArrayLike) -> BoolArray:
-    """Return which pixels count as lit, see this module.
+    """Return the lit pixels, see this module.
 
     Parameters
     ----------
     photograph
         The photograph.
     covered, lit
-        (H, W) bool of the rendering: wholly on measured skin; wholly in the light.
+        (H, W) bool of the rendering: entirely on measured skin; full visibility of the light.
     """
     light = luminance(photograph.rgb)
     sigma = _sigma(photograph)
@@ -138,15 +137,15 @@ def compare_pair(
     photograph
         The photograph.
     rendering
-        (H, W, 3), in its unit.
+        (H, W, 3), in the photograph's unit.
     covered, lit
-        (H, W) bool of the rendering: pixels wholly on measured skin, and those of them wholly in
-        the light. One mask for all renderings that are to be compared with each other.
+        (H, W) bool of the rendering: pixels entirely on measured skin, and those with full
+        visibility of the light. Renderings that are compared with each other share one mask.
 
     Raises
     ------
     RenderingError
-        When shapes differ or no pixel is covered.
+        If shapes differ or no pixel is covered.
     """
     image = np.asarray(rendering, np.float64)
     skin = np.asarray(covered, bool) & photograph.valid
@@ -155,20 +154,25 @@ def compare_pair(
             f"rendering: got {image.shape}, covered {skin.shape}, expected {photograph.rgb.shape}"
         )
     if not skin.any():
-        raise RenderingError("covered: got no pixel of measured skin that is not saturated")
+        raise RenderingError(
+            "covered: got no unsaturated pixel of measured skin, expected some; check view and "
+            "exposure"
+        )
     chosen = find_lit_pixels(photograph, covered=covered, lit=lit)
     real, made = luminance(photograph.rgb), luminance(image)
     signed = np.full(real.shape, np.nan)
     signed[chosen] = made[chosen] / real[chosen] - 1.0
-    noise = (_sigma(photograph)[chosen] / real[chosen]) * 0.6745  # median of a normal deviate
+    noise = (
+        _sigma(photograph)[chosen] / real[chosen]
+    ) * 0.6745  # median magnitude of a standard normal variable
     middle = float(np.median(noise)) if chosen.any() else float("nan")
     total = float(np.sum(np.abs(made - real)[skin]) / max(float(np.sum(real[skin])), 1e-30))
-    alike = similarity(photograph.rgb, image, skin)
+    alike = structural_similarity(photograph.rgb, image, skin)
     return PairErrors(np.abs(signed), signed, chosen, middle, total, alike)
 
 
 def tone_map(rgb: ArrayLike, white: float) -> Float64Array:
-    """Return linear light by the sRGB curve, 0 to 1, with `white` as 1; brighter is 1.
+    """Apply the sRGB curve to linear light over `white`, clipped to 0 to 1.
 
     Examples
     --------
@@ -178,10 +182,10 @@ def tone_map(rgb: ArrayLike, white: float) -> Float64Array:
     return png.srgb_curve(np.clip(np.asarray(rgb, np.float64) / white, 0.0, 1.0))
 
 
-def similarity(photograph: ArrayLike, rendering: ArrayLike, skin: BoolArray) -> float:
+def structural_similarity(photograph: ArrayLike, rendering: ArrayLike, skin: BoolArray) -> float:
     """Return the mean structural similarity over the skin of a tone-mapped pair.
 
-    Both are exposed so that `WHITE_PERCENTILE` of the photograph's skin is white, and black
+    Both are scaled so that `WHITE_PERCENTILE` of the photograph's skin is white, and are black
     outside the skin. Windows are Gaussian, 1.5 pixels (Wang et al. 2004,
     doi:10.1109/TIP.2003.819861).
     """
@@ -204,15 +208,15 @@ class Summary:
     Attributes
     ----------
     pairs, pixels
-        Photographs, and their lit pixels.
+        Number of photographs, and of their lit pixels.
     median, p68, p90, p95
         Percentiles of the relative error of the luminance over all lit pixels.
     interval
-        68 % interval of the median, photographs drawn again 200 times.
+        68 % bootstrap interval of the median, 200 resamples of the photographs.
     bias
         Median of the signed error.
     noise
-        Median of what noise alone does, mean over the photographs.
+        Median relative error by noise alone, mean over the photographs.
     total_error, ssim
         Means over the photographs, see `PairErrors`.
     """
@@ -230,17 +234,17 @@ class Summary:
     ssim: float
 
 
-def summarize(pairs: Sequence[PairErrors], *, rng: np.random.Generator) -> Summary:
-    """Put pairs together.
+def summarize_pairs(pairs: Sequence[PairErrors], *, rng: np.random.Generator) -> Summary:
+    """Summarize the errors of pairs.
 
     Raises
     ------
     RenderingError
-        When they have no lit pixel.
+        If they have no lit pixel.
     """
     values = [pair.relative[pair.lit] for pair in pairs]
     if not sum(len(v) for v in values):
-        raise RenderingError("photographs: got no lit pixel; are they underexposed?")
+        raise RenderingError("photographs: got no lit pixel, expected some; check their exposure")
     every = np.concatenate(values)
     again = [
         float(np.median(np.concatenate(drawn)))
@@ -266,17 +270,17 @@ def summarize(pairs: Sequence[PairErrors], *, rng: np.random.Generator) -> Summa
     )
 
 
-def by_band(
+def group_errors_by_band(
     pairs: Sequence[PairErrors], bands: Sequence[NDArray[np.str_]]
 ) -> Mapping[str, tuple[int, float]]:
-    """Return lit pixels and their median relative error by the band that each pixel lies in.
+    """Return the number of lit pixels and their median relative error by band.
 
     Parameters
     ----------
     pairs
         See `compare_pair`.
     bands
-        Of each pair the names of bands, (H, W); "" is none.
+        Band of each pixel per pair, (H, W); "": none.
     """
     names = np.concatenate([band[p.lit] for p, band in zip(pairs, bands, strict=True)])
     errors = np.concatenate([p.relative[p.lit] for p in pairs])
@@ -298,32 +302,32 @@ FULL_MODEL: Final = "full model"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """Errors of a model over all photographs.
+    """Errors of a model over all held-out photographs.
 
     Attributes
     ----------
     subject
         Pseudonym of the face.
     full
-        Errors of the whole model.
+        Errors of the full model.
     by_kind
-        The same by why the photographs were not in the fit: "light", "view", ...
+        Errors by the reason for which photographs were held out: "light", "view", ...
     ablation
-        The same without parts; the key names the replacement.
+        Errors of ablated models; the key names the replacement.
     by_band
         Lit pixels and median error by band of skin color, see `skinrig.evaluating.skin_bands`.
     typology_angle_deg
-        Median over the face, of the truth where there is one, else of R_d.
+        Median over the face, of the ground truth if given, else of R_d.
     typology_of
         "truth" or "r_d".
     shots
         Result of each photograph: view, light, held_out, median, lit pixels, noise, ssim.
     assumed
-        What was taken for granted.
+        Assumptions.
     subsurface
-        How the whole model treats light from inside.
+        Treatment of subsurface light in the full model.
     seconds
-        Of rendering and comparing.
+        Run time.
     """
 
     subject: str
@@ -340,11 +344,11 @@ class Comparison:
 
     @property
     def passed(self) -> bool:
-        """Whether the median relative error keeps to the limit."""
+        """Whether the median relative error is within the limit."""
         return self.full.median < MAX_MEDIAN_ERROR
 
     def document(self) -> dict[str, Any]:
-        """Return this as JSON values."""
+        """Return the comparison as JSON values."""
         document = dataclasses.asdict(self)
         document[FULL_MODEL], document["photographs"] = document.pop("full"), document.pop("shots")
         document["by_band"] = {
@@ -355,8 +359,8 @@ class Comparison:
             **document,
             "band": str(classify_typology(self.typology_angle_deg)),
             "lit_pixels": (
-                "pixel and neighbors wholly on measured skin, every ray sees the whole light, not "
-                f"saturated, at least {MIN_SIGNAL_SIGMAS:g} times its noise"
+                "pixel and neighbors entirely on measured skin with full visibility of the light, "
+                f"not saturated, at least {MIN_SIGNAL_SIGMAS:g} times its noise"
             ),
             "limit": MAX_MEDIAN_ERROR,
             "passed": self.passed,
@@ -371,7 +375,7 @@ def print_comparison(console: Console, record: Mapping[str, Any]) -> None:
     held_out = {f"{name} held out": row for name, row in record["by_kind"].items()}
     rows = {FULL_MODEL: full, **held_out, **record["ablation"]}
     shares = ("median", "p68", "p95", "bias", "total_error")
-    console.rows(
+    console.print_table(
         ("model", "photographs", "median error, %", "68 %", "95 %", "bias", "all skin, %", "SSIM"),
         [
             (name, row["pairs"], *(round(100 * row[k], 2) for k in shares), round(row["ssim"], 4))
@@ -383,8 +387,8 @@ def print_comparison(console: Console, record: Mapping[str, Any]) -> None:
     word = "kept" if record["passed"] else "MISSED"
     console.print_line(
         f"{word}: median relative error of the luminance on lit pixels: "
-        f"{100 * full['median']:.2f} % (< {100 * record['limit']:g}); noise alone makes "
+        f"{100 * full['median']:.2f} % (< {100 * record['limit']:g}); by noise alone "
         f"{100 * full['noise']:.2f} %"
     )
     console.print_line(f"{record['out']}: {', '.join(record['files'])}, {record['seconds']:.1f} s")
-    console.document(record["schema"], {k: v for k, v in record.items() if k != "schema"})
+    console.print_document(record["schema"], {k: v for k, v in record.items() if k != "schema"})

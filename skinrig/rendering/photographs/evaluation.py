@@ -1,4 +1,4 @@
-"""Renderings of a fitted model against photographs under lights and views that it has not seen."""
+"""Evaluate a fitted model against photographs under held-out lights and views."""
 
 from __future__ import annotations
 
@@ -29,38 +29,38 @@ from skinrig.rendering.photographs.errors import (
     Comparison,
     PairErrors,
     Photograph,
-    by_band,
     compare_pair,
-    summarize,
+    group_errors_by_band,
+    summarize_pairs,
 )
 from skinrig.rendering.photographs.held_out import HeldOutPhotographs, HeldOutShot
 from skinrig.rendering.render import Rendering, Subsurface, render_surface
 from skinrig.rendering.request import read_model
 
-N_PICTURES: Final = 6
-"""Number of photographs drawn with their renderings, evenly spread over all."""
+N_DRAWN_IMAGES: Final = 6
+"""Number of photographs drawn with their renderings, at equal steps."""
 MAX_SHOWN_ERROR: Final = 0.2
-"""Relative error at the end of the pictures' scale."""
+"""Relative error at the end of the images' color scale."""
 
 
 @dataclass(frozen=True, slots=True)
 class EvaluationSettings:
-    """How photographs are compared with renderings."""
+    """Settings of the comparison."""
 
     subsurface: Subsurface = "dipole"
-    """How the whole model treats light from inside."""
+    """Treatment of subsurface light in the full model."""
     count: int | None = None
-    """So many of the photographs, even over them; None: all."""
+    """Number of photographs, selected at equal steps; None: all."""
     ablation: bool = True
-    """Whether the model is rendered without each of its parts, too."""
+    """Whether the model is also rendered without each of its parts."""
     seed: int = 0
-    """Of intervals."""
+    """Random seed of the bootstrap intervals."""
     progress: Callable[[str], None] = field(default=lambda _: None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Surface:
-    """A model laid on its mesh, with what is the same for all of its pictures."""
+    """A model on its mesh, with precomputed data of all its images."""
 
     laid: FittedSurface
     caster: Caster
@@ -83,7 +83,7 @@ class _Surface:
         if made.subsurface == "dipole":
             yield "light that does not spread", self.render(shot, "local").radiance
         for name, less in fewer.items():
-            if name == "one lobe":  # nothing changes inside
+            if name == "one lobe":  # the diffuse component is unchanged
                 yield name, made.diffuse + less.render(shot, "none").surface
             else:
                 yield name, less.render(shot, made.subsurface).radiance
@@ -97,20 +97,20 @@ def evaluate_photographs(
     truth: SkinAppearance | None = None,
     model: SkinReflectance | None = None,
 ) -> tuple[Comparison, dict[str, bytes]]:
-    """Render what the photographs show, and compare.
+    """Render the views and lights of photographs, and compare.
 
     Parameters
     ----------
     appearance
-        Fitted, with its mesh.
+        Fitted appearance with its mesh.
     photographs
-        Those it was not fitted to.
-    how
-        Light from inside, number of photographs, whether parts are left out.
+        Photographs that were held out of the fit.
+    settings
+        Subsurface light, number of photographs, ablation.
     truth
-        Of the face, if it is simulated; used for bands of skin color only.
+        Ground truth of a simulated face; used only for bands of skin color.
     model
-        The appearance's model, where something of it is to be another; None: as it is.
+        Model to render in place of the appearance's own; None: its own.
 
     Returns
     -------
@@ -121,7 +121,7 @@ def evaluate_photographs(
     Raises
     ------
     RenderingError, GeometryError, SkinReflectanceError
-        Where there is nothing to compare, or the model lacks a part.
+        If photographs or a part of the model are missing.
     """
     begun = time.perf_counter()
     rng = np.random.default_rng(settings.seed)
@@ -139,7 +139,9 @@ def evaluate_photographs(
         for name, less in (build_ablations(whole, mesh) if settings.ablation else {}).items()
     }
     chosen = photographs.select_shots(settings.count)
-    drawn = {chosen[int(k)] for k in np.linspace(0, len(chosen) - 1, min(N_PICTURES, len(chosen)))}
+    drawn = {
+        chosen[int(k)] for k in np.linspace(0, len(chosen) - 1, min(N_DRAWN_IMAGES, len(chosen)))
+    }
     pairs: list[PairErrors] = []
     bands: list[NDArray[np.str_]] = []
     parts: dict[str, list[PairErrors]] = {}
@@ -165,10 +167,10 @@ def evaluate_photographs(
     angle, of = _typology_angle_deg(whole, truth)
     comparison = Comparison(
         subject=photographs.subject,
-        full=summarize(pairs, rng=rng),
-        by_kind={kind: summarize(some, rng=rng) for kind, some in kinds.items()},
-        ablation={name: summarize(some, rng=rng) for name, some in parts.items()},
-        by_band=by_band(pairs, bands),
+        full=summarize_pairs(pairs, rng=rng),
+        by_kind={kind: summarize_pairs(some, rng=rng) for kind, some in kinds.items()},
+        ablation={name: summarize_pairs(some, rng=rng) for name, some in parts.items()},
+        by_band=group_errors_by_band(pairs, bands),
         typology_angle_deg=angle,
         typology_of=of,
         shots=tuple(rows),
@@ -188,9 +190,9 @@ def evaluate_folders(
     calibration: Path | None = None,
     translucency: str | None = None,
 ) -> dict[str, Any]:
-    """Compare an APPEARANCE/ with a SESSION/ and write pictures and record to ``out``.
+    """Compare an APPEARANCE/ with a SESSION/ and write images and record to ``out``.
 
-    The ground truth is the folder next to the appearance that it names, if any.
+    The ground truth is the folder that the appearance names, if it is next to it.
 
     Returns
     -------
@@ -269,20 +271,20 @@ def _sheet(photo: Photograph, made: Rendering, pair: PairErrors, shot: HeldOutSh
 
 
 def build_ablations(model: SkinReflectance, mesh: Mesh) -> Mapping[str, SkinReflectance]:
-    """Return the models that have less, by what they have instead.
+    """Build the ablated models, keyed by the replacement of a part.
 
     Parameters
     ----------
     model
-        The whole.
+        The full model.
     mesh
-        That it lies on; its own normals are those of the scan.
+        Its mesh, with normals of the scan.
 
     Returns
     -------
     mapping
-        "one lobe": the mixture of lobes that the face has on average, of each texel's own strength;
-        "scanned normals": those of the mesh; "even albedo": the face's mean R_d everywhere.
+        "one lobe": the face's mean mixture of basis BRDFs, scaled per texel; "scanned normals":
+        those of the mesh; "even albedo": the face's mean R_d.
     """
     flat = unwrap(mesh, model.valid.shape[0]).normal
     length = np.linalg.norm(flat, axis=-1, keepdims=True)
@@ -298,12 +300,12 @@ def build_ablations(model: SkinReflectance, mesh: Mesh) -> Mapping[str, SkinRefl
 
 
 def fit_one_lobe(model: SkinReflectance) -> Float32Array:
-    """Return weights of one common mixture, scaled at each texel to reflect most like its own.
+    """Fit one common mixture of basis BRDFs, scaled per texel.
 
     Returns
     -------
     ndarray of float32, shape (H, W, K)
-        The least squares over the lobes' grid, directions counting by solid angle.
+        Weights of least squares over the grid of the BRDFs, weighted by solid angle.
     """
     strength = model.lobes.strength()
     gram = model.lobes.cosine_similarity() * np.outer(strength, strength)

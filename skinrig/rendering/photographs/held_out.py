@@ -1,4 +1,4 @@
-"""Photographs of a dome session that no fit has seen, each with its camera and light."""
+"""Read the photographs of a dome session that were held out of a fit, with camera and light."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from skinrig.rendering.photographs.errors import Photograph
 
 @dataclass(frozen=True, slots=True)
 class HeldOutShot:
-    """One photograph's names and why it is not in the fit."""
+    """Names of a photograph, with the reason for which it was held out."""
 
     view: str
     light: str
@@ -36,23 +36,23 @@ class HeldOutShot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOutPhotographs:
-    """The photographs that a fitted model can be judged by.
+    """Held-out photographs with which a fitted model is evaluated.
 
     Attributes
     ----------
     shots
-        All of them, the lights of a view together.
+        All photographs, sorted by view.
     assumed
-        What was taken for granted, one line each.
+        Assumptions, one line each.
     """
 
     shots: tuple[HeldOutShot, ...]
     assumed: tuple[str, ...]
     _dome: CalibratedDome
-    """In the frame of the maps."""
+    """The dome in the frame of the maps."""
     _session: Session
     _white_mm: tuple[float, ...]
-    """Distance of each light of the dome at which white is taken."""
+    """Reference distance of white for each light of the dome."""
 
     @staticmethod
     def of(
@@ -63,25 +63,25 @@ class HeldOutPhotographs:
         Parameters
         ----------
         session
-            SESSION/ folder of the dome: the one that was fitted, of which lights or views were
-            held out, or another one of the same face.
+            SESSION/ folder of the dome: the fitted session with held-out lights or views, or
+            another session of the same face.
         appearance
-            What was fitted.
+            The fitted appearance.
         calibration
-            CALIBRATION/ folder; None: cameras and lights stand as drawn.
+            CALIBRATION/ folder; None: nominal poses of cameras and lights.
 
         Raises
         ------
         RenderingError
-            The session was fitted to whole, or is none of the dome.
+            If all photographs were used in the fit, or the session is not of the dome.
         InputsError, CalibrationError
-            It lacks frames, or a calibration is damaged or of another rig.
+            If frames are missing, or a calibration is damaged or of another rig.
         """
         opened = Session.open(session)
         if not any(step.kind == "olat" for step in opened.plan.steps):
             raise RenderingError(
-                f"{opened.path}: has no photographs under one light each; give one of the "
-                "dome with a face"
+                f"{opened.path}: got no photographs of one light each; give a dome session of a "
+                "face"
             )
         inputs = Inputs.of(opened, calibration, state="neutral", on_date=None)
         dome = load_dome(inputs, DomeImages(opened))
@@ -89,9 +89,9 @@ class HeldOutPhotographs:
         held = _held_out(appearance) if same else HoldOut()
         if same and not held:
             raise RenderingError(
-                f"{opened.path}: the model was fitted to all of its photographs; fit again "
-                "with `skinrig reconstruct --hold-out lights=NAMES,views=NAMES`, or compare with "
-                "another session of the same face"
+                f"{opened.path}: all photographs were used in the fit, expected held-out ones; fit "
+                "again with `skinrig reconstruct --hold-out lights=NAMES,views=NAMES`, or compare "
+                "with another session of the same face"
             )
         good = {n for n, v in zip(dome.lights.names, dome.lights.valid, strict=True) if v}
         shots = [
@@ -101,7 +101,9 @@ class HeldOutPhotographs:
             if light in good and (not same or held.is_held_out(light, view))
         ]
         if not shots:
-            raise RenderingError(f"{opened.path}: none of its lights is calibrated")
+            raise RenderingError(
+                f"{opened.path}: got no calibrated light, expected some; calibrate the lights"
+            )
         assumed = list(inputs.assumed)
         away = tuple(float(r) for r in np.linalg.norm(dome.table.position_mm, axis=1))
         if not same:
@@ -110,7 +112,7 @@ class HeldOutPhotographs:
         motion = appearance.parameters.get("motion", {})
         if isinstance(motion, dict) and motion.get("still") is False:
             moved = float(motion.get("displacement_mm_max", 0.0))
-            assumed.append(f"the head held still; it moved by up to {moved:.1f} mm")
+            assumed.append(f"the head was static; it moved by up to {moved:.1f} mm")
         return HeldOutPhotographs(tuple(shots), tuple(assumed), dome, opened, away)
 
     @property
@@ -145,11 +147,11 @@ class HeldOutPhotographs:
         )
 
     def select_shots(self, count: int | None) -> tuple[HeldOutShot, ...]:
-        """Return so many of the shots, even over views and lights; None: all."""
+        """Select a number of shots at equal steps over views and lights; None: all."""
         return _select_evenly(self.shots, count)
 
     def _white(self, light: str) -> np.ndarray:
-        """Return what white at the rig's origin shows in the images' unit, shape (3,)."""
+        """Return the value of white at the rig's origin in the images' unit, shape (3,)."""
         row = self._dome.table.names.index(light)
         return np.asarray(self._dome.table.intensity[row] / self._white_mm[row] ** 2, np.float64)
 
@@ -157,17 +159,17 @@ class HeldOutPhotographs:
 def _fitted_head_frame(
     dome: CalibratedDome, appearance: SkinAppearance
 ) -> tuple[CalibratedDome, str]:
-    """Return the dome about the head as it sat when it was fitted, and words for it.
+    """Return the dome in the frame of the fitted head, and the assumption in words.
 
-    Only where the head is comes from the photographs, from their shading, and nothing of its skin.
+    Only the head's pose is estimated from the photographs, from their shading; not its skin.
     """
     mesh = read_own_mesh(appearance)
     welded, index = np.unique(mesh.vertices_mm.round(4), axis=0, return_inverse=True)
     lights = int(np.count_nonzero(dome.lights.valid))
     if lights < MIN_LIGHTS:
         return dome, (
-            "the head sits where it sat in the session that was fitted: "
-            f"{lights} lights are too few to find it, {MIN_LIGHTS} would do"
+            "the head has the pose of the fitted session: "
+            f"{lights} lights are too few to estimate it, {MIN_LIGHTS} would suffice"
         )
     fit = register_mesh(
         dome, TriangleMesh(welded.astype(np.float64), index.reshape(-1)[mesh.faces])
@@ -177,8 +179,8 @@ def _fitted_head_frame(
     moved_mm = np.linalg.norm(fit.center_mm - before)
     off_mm, off_deg = np.linalg.norm(fit.stderr[3:]), np.degrees(np.linalg.norm(fit.stderr[:3]))
     return transform_dome(dome, fit.rotation, fit.translation_mm), (
-        f"the head sits {moved_mm:.2f} +- {off_mm:.2f} mm and {turn_deg:.2f} +- {off_deg:.2f} "
-        "degrees from where it sat in the session that was fitted, by the shading of these "
+        f"the head is moved by {moved_mm:.2f} +- {off_mm:.2f} mm and rotated by {turn_deg:.2f} +- "
+        f"{off_deg:.2f} degrees from the fitted session, estimated from the shading of these "
         "photographs"
     )
 
@@ -203,6 +205,6 @@ def _select_evenly(shots: Sequence[HeldOutShot], count: int | None) -> tuple[Hel
     if count is None or count >= len(shots):
         return tuple(shots)
     if count < 1:
-        raise RenderingError(f"photographs: got {count}, expected at least 1")
+        raise RenderingError(f"--photographs: got {count}, expected 1 or more; enter another")
     places = np.floor((np.arange(count) + 0.5) * len(shots) / count).astype(int)
     return tuple(shots[k] for k in places)

@@ -131,16 +131,16 @@ def section(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
         yield page.Heading(f"Images: {name}", level=2)
         if found:
             order = sorted(found, key=lambda one: (-np.nan_to_num(one.relative_rms), one.name))
-            yield page.view("compared_images", pictures=order)
+            yield page.build_view("compared_images", pictures=order)
             drawn = [one for one in order if not one.equal]
             for one in drawn[:MAX_DRAWN_IMAGES]:
                 yield page.Heading(one.name)
                 yield page.Images(list(_draw_difference(a, b, one)))
             if drawn[MAX_DRAWN_IMAGES:]:
                 rest = ", ".join(one.name for one in drawn[MAX_DRAWN_IMAGES:])
-                yield page.note(f"Images with smaller differences are not drawn: {rest}.")
+                yield page.build_note(f"Images with smaller differences are not drawn: {rest}.")
         if refused:
-            yield page.table(
+            yield page.build_table(
                 ("image", "reason"), refused, caption="Images that were not subtracted"
             )
         yield _records(a, b, path_a, path_b)
@@ -157,15 +157,15 @@ def _draw_difference(
         shown = np.broadcast_to(values, (*values.shape[:2], 3))
         if difference.kind == "linear":
             shown = np.clip(shown / bright, 0.0, 1.0)
-            yield map_images.color_image(label, shown, width=200, of=difference.name)
+            yield map_images.draw_color_image(label, shown, width=200, of=difference.name)
         else:
             small = map_images.shrink(np.rint(MAX_CODE * shown).astype(np.uint8), 200)
-            yield map_images.plain_image(
+            yield map_images.draw_plain_image(
                 label, np.ascontiguousarray(small), alt=f"{difference.name}, {label}"
             )
     every = np.ones(difference.difference.shape, bool)
     reach = (
-        map_images.percentile_reach(difference.difference, every, SCALE_PERCENTILE)
+        map_images.compute_percentile_reach(difference.difference, every, SCALE_PERCENTILE)
         or difference.largest
         or 1.0
     )
@@ -175,10 +175,10 @@ def _draw_difference(
 
 def _records(a: ComparedRun, b: ComparedRun, path_a: Path, path_b: Path) -> page.Block:
     sides = [provenance.flatten_settings(_document(path)) for path in (path_a, path_b)]
-    rows = runs.differing_entries(*sides)
+    rows = runs.find_differing_entries(*sides)
     if not rows:
-        return page.note("Settings and records are equal.")
-    return page.table(
+        return page.build_note("Settings and records are equal.")
+    return page.build_table(
         ("entry", a.label, b.label),
         rows,
         caption="Differing entries of the records, without run times",

@@ -12,7 +12,7 @@ from skinrig.evaluating import flash, microrelief, subsurface
 from skinrig.evaluating import surface as surface_evaluation
 from skinrig.evaluating.surface import errors_by_band
 from skinrig.reporting.map_names import map_title
-from skinrig.reporting.page import short_unit
+from skinrig.reporting.page import format_short_unit
 from skinrig.unit_format import format_unit
 
 SIGMA_LEVELS = (1.0, 2.0, 3.0)
@@ -130,7 +130,7 @@ def compare_maps(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
     flat = difference if difference.ndim == 2 else difference.mean(axis=2)
     return MapDifference(
         name,
-        "°" if normals else short_unit(a.unit),
+        "°" if normals else format_short_unit(a.unit),
         int(both.sum()),
         int((a.mask & ~b.mask).sum()),
         int((b.mask & ~a.mask).sum()),
@@ -214,13 +214,13 @@ class QuantityAccuracy:
     coverage: float = float("nan")
 
 
-def truth_errors(appearance: SkinAppearance, truth: SkinAppearance) -> list[QuantityAccuracy]:
+def list_truth_errors(appearance: SkinAppearance, truth: SkinAppearance) -> list[QuantityAccuracy]:
     """Return the errors of an appearance by quantity and skin.
 
     Parameters
     ----------
     appearance
-        Of a flash camera, a dome, a gradient sphere or a fiber probe.
+        Maps of a flash camera, a dome, a gradient sphere or a fiber probe.
     truth
         Of the same session.
     """

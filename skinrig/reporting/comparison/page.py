@@ -26,7 +26,7 @@ MAX_SHOWN_SIGMAS = 5.0
 """End of the scale of differences in combined standard uncertainties."""
 
 
-def lead(a: ComparedRun, b: ComparedRun, found: Sequence[MapsPair]) -> Iterator[page.Block]:
+def build_lead(a: ComparedRun, b: ComparedRun, found: Sequence[MapsPair]) -> Iterator[page.Block]:
     """Yield the verdict on the differences, and the checks of both runs."""
     rows = match_checks(a, b)
     changed = [row for row in rows if row.verdict_change]
@@ -62,18 +62,18 @@ def lead(a: ComparedRun, b: ComparedRun, found: Sequence[MapsPair]) -> Iterator[
     worst = sorted(disagree, key=lambda item: -item[1].beyond[-1])
     if worst:
         yield page.Heading("Largest differences", level=2)
-        yield page.note(
+        yield page.build_note(
             "Fraction of pixels with a difference above three combined standard uncertainties; "
             f"0.27 % is expected by chance. {min(len(worst), MAX_NAMED_MAPS)} of {len(worst)} maps."
         )
         yield page.Bullets(
             [f"{name}: {_describe_difference(one)}" for name, one in worst[:MAX_NAMED_MAPS]]
         )
-    yield from check_table(a, b, rows)
+    yield from build_check_table(a, b, rows)
 
 
 def _describe_difference(difference: MapDifference) -> str:
-    by = page.number(difference.median if difference.unit == "°" else difference.bias)
+    by = page.format_number(difference.median if difference.unit == "°" else difference.bias)
     return (
         f"{map_title(difference.name)}, median difference {format_quantity(by, difference.unit)}, "
         f"{100 * difference.beyond[-1]:.3g} % of pixels"
@@ -85,17 +85,19 @@ def _format_run_path(run: ComparedRun) -> str:
     return "/".join(run.path.resolve().parts[-2:])
 
 
-def sections(a: ComparedRun, b: ComparedRun, found: Sequence[MapsPair]) -> Iterator[page.Block]:
+def build_sections(
+    a: ComparedRun, b: ComparedRun, found: Sequence[MapsPair]
+) -> Iterator[page.Block]:
     """Yield maps, errors against ground truth, settings and times of both runs."""
     for pair in found:
         yield from _pair(a, b, pair)
-    yield from runs.benchmarks(a, b)
-    yield from runs.seconds(a, b)
-    yield from runs.moved_calibrations(a, b)
+    yield from runs.compare_benchmarks(a, b)
+    yield from runs.compare_seconds(a, b)
+    yield from runs.compare_calibrations(a, b)
     yield from image_comparison.section(a, b)
     if missing := list_unpaired(a, b):
         yield page.Heading("Only in one run", level=2)
-        yield page.table(
+        yield page.build_table(
             ("folder", "run"),
             missing,
             caption="Folders of maps or images without a partner of the same name",
@@ -107,18 +109,20 @@ def _pair(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Block
     yield page.Heading(f"Maps: {pair.name}", level=2)
     common = pair.a.inputs.get("session") == pair.b.inputs.get("session")
     if common and "session" in pair.a.inputs:
-        yield page.note(
+        yield page.build_note(
             "Both estimates are from the same frames. Differences are due to processing, and the "
             "combined standard uncertainties are too large because both share the noise."
         )
-    yield page.view("compared_maps", maps=sorted(pair.differences, key=_sort_key))
+    yield page.build_view("compared_maps", maps=sorted(pair.differences, key=_sort_key))
     if pair.refused:
-        table = page.table(("map", "reason"), pair.refused, caption="Maps that were not subtracted")
+        table = page.build_table(
+            ("map", "reason"), pair.refused, caption="Maps that were not subtracted"
+        )
         yield page.Collapsible(f"{len(pair.refused)} maps not subtracted", [table])
     yield from _images(a, b, pair)
     yield from _by_band(pair)
     yield from _errors(a, b, pair)
-    yield from runs.settings(a, b, pair)
+    yield from runs.compare_settings(a, b, pair)
 
 
 def _sort_key(difference: MapDifference) -> tuple[float, str]:
@@ -134,7 +138,7 @@ def _images(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Blo
         yield page.Images(list(_difference_images(a, b, pair, one)))
     if len(order) > MAX_DRAWN_MAPS:
         names = "; ".join(map_title(one.name) for one in order[MAX_DRAWN_MAPS:])
-        yield page.note(f"Maps with smaller differences are not drawn: {names}.")
+        yield page.build_note(f"Maps with smaller differences are not drawn: {names}.")
 
 
 def _difference_images(
@@ -165,7 +169,7 @@ def _difference_images(
         if difference.unit == "°":
             yield shown.normals(label, image)
         elif image.ndim == 3:
-            yield map_images.color_image(
+            yield map_images.draw_color_image(
                 label,
                 np.where(mask[..., None], image, 0.2),
                 width=IMAGE_WIDTH_PX,
@@ -174,7 +178,7 @@ def _difference_images(
         else:
             yield shown.draw_scalar(label, image, low, high)
     image, mask = laid(difference.difference)
-    reach = map_images.percentile_reach(image, mask, 98) or 1.0
+    reach = map_images.compute_percentile_reach(image, mask, 98) or 1.0
     drawing = map_images.MapDrawing(
         map_title(difference.name), difference.unit, mask, IMAGE_WIDTH_PX
     )
@@ -208,7 +212,7 @@ def _by_band(pair: MapsPair) -> Iterator[page.Block]:
             off, sigmas = one.difference[inside], np.abs(one.sigmas[inside])
             rows.append((map_title(one.name), band, one.unit, off, sigmas))
     if rows:
-        yield page.view("compared_bands", bands=rows)
+        yield page.build_view("compared_bands", bands=rows)
 
 
 def _errors(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Block]:
@@ -218,10 +222,10 @@ def _errors(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Blo
         lacking = " and ".join(
             run.label for run, truth in zip((a, b), truths, strict=True) if truth is None
         )
-        yield page.note(f"No ground truth is given for {lacking}; errors are unknown.")
+        yield page.build_note(f"No ground truth is given for {lacking}; errors are unknown.")
         return
     found_a, found_b = (
-        {(row.quantity, row.skin): row for row in comparison_maps.truth_errors(side, truth)}
+        {(row.quantity, row.skin): row for row in comparison_maps.list_truth_errors(side, truth)}
         for side, truth in ((pair.a, truths[0]), (pair.b, truths[1]))
     )
     rows = [(one, found_b[key]) for key, one in found_a.items() if key in found_b]
@@ -232,7 +236,7 @@ def _errors(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Blo
         for key, one in truths[0].maps.items()
         if key in truths[1].maps
     )
-    yield page.view("compared_errors", errors=rows, truths_differ=differ)
+    yield page.build_view("compared_errors", errors=rows, truths_differ=differ)
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,7 +285,9 @@ def _common_name(check: page.Check, run: ComparedRun, other_run: ComparedRun) ->
     return name
 
 
-def check_table(a: ComparedRun, b: ComparedRun, rows: Sequence[CheckRow]) -> Iterator[page.Block]:
+def build_check_table(
+    a: ComparedRun, b: ComparedRun, rows: Sequence[CheckRow]
+) -> Iterator[page.Block]:
     """Yield the section on checks of both; empty without any."""
     if not rows:
         return
@@ -289,20 +295,21 @@ def check_table(a: ComparedRun, b: ComparedRun, rows: Sequence[CheckRow]) -> Ite
     def measured(check: page.Check | None) -> str:
         if check is None:
             return "not checked"
-        return format_quantity(page.number(check.got), check.unit) + (
+        return format_quantity(page.format_number(check.got), check.unit) + (
             ", kept" if check.passed else ", missed"
         )
 
     def limit(row: CheckRow) -> str:
         bounds = [
-            f"{'≤' if c.sense == '<=' else '≥'} {format_quantity(page.number(c.bound), c.unit)}"
-            for c in (row.a, row.b)
-            if c is not None
+            f"{'≤' if check.sense == '<=' else '≥'} "
+            f"{format_quantity(page.format_number(check.bound), check.unit)}"
+            for check in (row.a, row.b)
+            if check is not None
         ]
         return " and ".join(dict.fromkeys(bounds))
 
     yield page.Heading("Checks of both runs", level=2)
-    yield page.table(
+    yield page.build_table(
         ("check", a.label, b.label, "difference", "limit", "changed"),
         [
             (

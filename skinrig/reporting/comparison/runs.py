@@ -121,9 +121,9 @@ def split_sides(
     )
     if not fits:
         if require_comparison:
-            told = ", ".join(f"{path} ({kinds[path]})" for path in paths)
+            given = ", ".join(f"{path} ({kinds[path]})" for path in paths)
             raise ReportError(
-                f"--compare: got {told}, expected two of one kind: two folders of maps, two "
+                f"--compare: got {given}, expected two of one kind: two folders of maps, two "
                 "benchmarks, two folders of images or two folders of runs; ground truths of "
                 "either may be added"
             )
@@ -133,7 +133,7 @@ def split_sides(
 
 
 def _labels(a: Path, b: Path) -> tuple[str, str]:
-    """Return names that tell two runs apart: their folders', or A and B before equal ones.
+    """Return distinct labels of two runs: A and B with their folders' names.
 
     Examples
     --------
@@ -197,7 +197,7 @@ def compare_maps_of_runs(a: ComparedRun, b: ComparedRun) -> list[MapsPair]:
 
 
 def _apart_mm(a: SkinAppearance, b: SkinAppearance) -> float:
-    """Return the median distance of texels of the same index; 0 where there is no mesh."""
+    """Return the median distance of texels of the same index, mm; 0 without a mesh."""
     places = [one.maps.get("position") for one in (a, b)]
     if places[0] is None or places[1] is None:
         return 0.0
@@ -214,7 +214,7 @@ MAX_LISTED_DRIFTS = 3
 """Quantities listed for each kind of calibration."""
 
 
-def settings(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Block]:
+def compare_settings(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Block]:
     """Yield the settings that differ."""
     sides = []
     for side in (pair.a, pair.b):
@@ -226,21 +226,23 @@ def settings(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Bl
         listed |= {"source": side.source, "seed": str(side.seed)}
         listed |= {f"omitted: {what}": why for what, why in side.left_out}
         sides.append(listed)
-    rows = differing_entries(*sides)
+    rows = find_differing_entries(*sides)
     stages = [row for row in rows if row[0].startswith("parameter stages.")]
     rest = [row for row in rows if not row[0].startswith("parameter stages.")]
     yield page.Heading("Differing settings")
     if not rows:
-        yield page.note("Parameters, inputs, versions and seeds are equal.")
+        yield page.build_note("Parameters, inputs, versions and seeds are equal.")
         return
     if rest:
-        yield page.table(("setting", a.label, b.label), rest, caption="Settings that differ")
+        yield page.build_table(("setting", a.label, b.label), rest, caption="Settings that differ")
     if stages:
         names = ", ".join(row[0].removeprefix("parameter stages.") for row in stages)
-        yield page.note(f"Stages with different code, settings or inputs: {names}.")
+        yield page.build_note(f"Stages with different code, settings or inputs: {names}.")
 
 
-def differing_entries(a: Mapping[str, str], b: Mapping[str, str]) -> list[tuple[str, str, str]]:
+def find_differing_entries(
+    a: Mapping[str, str], b: Mapping[str, str]
+) -> list[tuple[str, str, str]]:
     """Return the entries that differ, with a dash where one lacks them."""
     return [
         (key, a.get(key, "–"), b.get(key, "–"))
@@ -249,7 +251,7 @@ def differing_entries(a: Mapping[str, str], b: Mapping[str, str]) -> list[tuple[
     ]
 
 
-def benchmarks(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
+def compare_benchmarks(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
     """Yield seconds and errors of common settings, and one plot per stage."""
     documents = [_bench_of(run) for run in (a, b)]
     if documents[0] is None or documents[1] is None:
@@ -266,7 +268,7 @@ def benchmarks(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
             )
     if not rows:
         return
-    machines = differing_entries(
+    machines = find_differing_entries(
         *(
             provenance.flatten_settings(document.get("machine", {}))
             for document in documents
@@ -276,12 +278,12 @@ def benchmarks(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
     yield page.Heading("Error against run time", level=2)
     yield page.Plots(plots)
     if machines:
-        yield page.table(
+        yield page.build_table(
             ("machine", a.label, b.label),
             machines,
             caption="The machines differ: their speed is part of the seconds",
         )
-    yield page.view("compared_benchmarks", settings=rows)
+    yield page.build_view("compared_benchmarks", settings=rows)
 
 
 def _bench_of(run: ComparedRun) -> dict[str, Any] | None:
@@ -305,7 +307,7 @@ def _settings_of_stage(
     return rows
 
 
-def seconds(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
+def compare_seconds(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
     """Yield the seconds of steps that the documents of both record."""
     sides = [dict(_steps(run)) for run in (a, b)]
     common = [step for step in sides[0] if step in sides[1]]
@@ -317,7 +319,7 @@ def seconds(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
     total = [sum(side[step] for step in common) for side in sides]
     rows.append(("sum", total[0], total[1], total[1] - total[0]))
     yield page.Heading("Seconds", level=2)
-    yield page.table(
+    yield page.build_table(
         ("step", a.label, b.label, "difference"),
         rows,
         caption="Wall-clock seconds of common steps; other load on the machine adds to them",
@@ -331,7 +333,7 @@ def _steps(run: ComparedRun) -> Iterator[tuple[str, float]]:
                 yield from ((str(step), float(seconds)) for step, seconds in entry["rows"])
 
 
-def moved_calibrations(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
+def compare_calibrations(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
     """Yield the largest changes between calibrations of the same folder and kind."""
     folders: dict[str, Path] = {path.name: path for path in b.found.calibrations}
     rows: list[tuple[object, ...]] = []
@@ -353,7 +355,7 @@ def moved_calibrations(a: ComparedRun, b: ComparedRun) -> Iterator[page.Block]:
     if not rows:
         return
     yield page.Heading("Changed calibrations", level=2)
-    yield page.table(
+    yield page.build_table(
         (
             "calibration",
             "device",

@@ -28,7 +28,7 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
     """
     yield page.Heading("Error against run time", level=2)
     if document["schema"] != SCHEMA:
-        yield page.note(
+        yield page.build_note(
             f"The file has schema {document['schema']}, expected {SCHEMA}; "
             "run `skinrig bench` again."
         )
@@ -44,10 +44,10 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
         if stage["points"]
     ]
     yield page.Plots(plots)
-    yield page.view("benchmark", stages=document["stages"])
-    bands = bench_table.list_band_rows(document)
+    yield page.build_view("benchmark", stages=document["stages"])
+    bands = bench_table.bands(document)
     if bands:
-        yield page.table(
+        yield page.build_table(
             bench_table.BAND_COLUMNS, bands, caption="Error at the default setting by melanin band"
         )
     yield from _left_out(document)
@@ -69,10 +69,12 @@ def _left_out(document: Mapping[str, Any]) -> Iterator[page.Block]:
         for what, why in stage.get("left_out", ())
     ]
     if rows:
-        table = page.table(("setting", "reason"), rows, caption="Settings that were not measured")
+        table = page.build_table(
+            ("setting", "reason"), rows, caption="Settings that were not measured"
+        )
         yield page.Collapsible(f"{len(rows)} settings not measured", [table])
     if document.get("not_judged"):
-        yield page.note(
+        yield page.build_note(
             "Measured at small size; their limits are not checked: "
             f"{', '.join(document['not_judged'])}."
         )

@@ -12,7 +12,7 @@ import numpy as np
 from capture.calibration import store
 from capture.calibration.record import Calibration, CalibrationError
 from model.skin import SkinAppearance
-from skinrig.appearances.contents import digest
+from skinrig.appearances.contents import hash_file
 from skinrig.arrays import Float64Array
 from skinrig.reporting import page
 from skinrig.reporting.sections.session import SessionFacts
@@ -104,7 +104,7 @@ def section(
             name = f"{folder.name}: days of validity left at capture"
             checks.append(page.Check(name, float(np.min(left)), 0.0, ">=", "d"))
     yield page.Heading("Calibrations", level=2)
-    yield page.view("calibrations", ages=ages, figures=figures)
+    yield page.build_view("calibrations", ages=ages, figures=figures)
     yield from values
 
 
@@ -116,7 +116,7 @@ def _age(
     sessions: Mapping[str, SessionFacts],
 ) -> tuple[list[float], tuple[object, ...]]:
     """Return the days left at each capture, and the row of the table."""
-    made_of = digest(path)
+    made_of = hash_file(path)
     users = sorted(
         name
         for name, one in appearances.items()
@@ -201,14 +201,16 @@ def _values(folder: str, found: Calibration) -> page.Collapsible:
     ]
     listed: page.Block
     if len(rows) > MAX_LISTED_QUANTITIES:
-        listed = page.note(f"{found.kind}.json lists {len(rows)} quantities of its devices.")
+        listed = page.build_note(f"{found.kind}.json lists {len(rows)} quantities of its devices.")
     else:
-        listed = page.table(
+        listed = page.build_table(
             ("device", "quantity", "value", "standard uncertainty"),
             rows,
             caption=f"Values of {folder}, {found.kind}, {found.created}",
         )
-    noted = page.facts(dict(sorted(found.notes.items())), caption="Notes of the calibration")
+    noted = page.build_facts_table(
+        dict(sorted(found.notes.items())), caption="Notes of the calibration"
+    )
     return page.Collapsible(f"{folder}, {found.kind}: notes and values", [noted, listed])
 
 

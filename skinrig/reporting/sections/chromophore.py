@@ -26,7 +26,7 @@ VECTOR_MAPS = ("normals", "albedo")
 """Maps of three channels that are drawn."""
 
 
-def panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[page.Block]:
+def draw_panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[page.Block]:
     """Yield each map of one channel with its ground truth, to one color scale; normals, albedo."""
     alone = []
     for key, skin_map in sorted(appearance.maps.items()):
@@ -38,14 +38,14 @@ def panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator
         if true_map is None and skin_map.stderr is None:
             alone.append(_single_image(key, skin_map))
             continue
-        yield from map_images.map_panel(
+        yield from map_images.draw_map_panel(
             map_names.map_heading(key),
-            page.short_unit(skin_map.unit),
+            page.format_short_unit(skin_map.unit),
             estimate=skin_map.values,
             standard_error=skin_map.stderr,
             truth=None if true_map is None else true_map.values,
             valid=_shown(skin_map, true_map),
-            uncertainty=map_names.uncertainty(key),
+            uncertainty=map_names.uncertainty_title(key),
         )
     if alone:
         yield page.Heading("Maps without uncertainties")
@@ -54,7 +54,7 @@ def panels(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator
 
 def _vectors(key: str, skin_map: SkinMap) -> Iterator[page.Block]:
     """Yield the colors of a map of three channels, and its uncertainty."""
-    normals, unit = key == "normals", page.short_unit(skin_map.unit)
+    normals, unit = key == "normals", page.format_short_unit(skin_map.unit)
     drawing = map_images.MapDrawing(
         map_names.map_title(key), "°" if normals else unit, skin_map.mask
     )
@@ -62,15 +62,16 @@ def _vectors(key: str, skin_map: SkinMap) -> Iterator[page.Block]:
         images = [drawing.normals("estimate", skin_map.values)]
     else:
         bright = (
-            map_images.percentile_reach(skin_map.values.max(axis=-1), skin_map.mask, 99.5) or 1.0
+            map_images.compute_percentile_reach(skin_map.values.max(axis=-1), skin_map.mask, 99.5)
+            or 1.0
         )
         shown = np.where(skin_map.mask[..., None], skin_map.values / bright, map_images.GRAY_LINEAR)
-        images = [map_images.color_image("estimate", shown, of=map_names.map_title(key))]
+        images = [map_images.draw_color_image("estimate", shown, of=map_names.map_title(key))]
     if skin_map.stderr is not None:
         stderr = skin_map.stderr.reshape(*skin_map.mask.shape, -1).mean(axis=-1)
         stderr = np.degrees(stderr) if normals else stderr
-        reach = map_images.percentile_reach(stderr, skin_map.mask, 98)
-        images.append(drawing.size(map_names.uncertainty(key), stderr, reach))
+        reach = map_images.compute_percentile_reach(stderr, skin_map.mask, 98)
+        images.append(drawing.size(map_names.uncertainty_title(key), stderr, reach))
     yield page.Heading(map_names.map_heading(key))
     yield page.Images(images)
 
@@ -82,7 +83,7 @@ def _single_image(key: str, skin_map: SkinMap) -> page.Image:
     low, high = np.percentile(inside, [1, 99]) if inside.size else (0.0, 1.0)
     if max(abs(low), abs(high)) < MAX_ROUNDING_ERROR:
         low, high = 0.0, 1.0  # rounding errors would look like structure
-    drawing = map_images.MapDrawing("", page.short_unit(skin_map.unit), mask, SMALL_WIDTH_PX)
+    drawing = map_images.MapDrawing("", page.format_short_unit(skin_map.unit), mask, SMALL_WIDTH_PX)
     return drawing.draw_scalar(map_names.map_heading(key), skin_map.values, low, high)
 
 
@@ -91,7 +92,7 @@ def _shown(estimate: SkinMap, truth: SkinMap | None) -> BoolArray | None:
     return np.logical_and.reduce(masks) if masks else None
 
 
-def errors(subject: page.ReportedAppearance, truth: SkinAppearance) -> Iterator[page.Block]:
+def list_errors(subject: page.ReportedAppearance, truth: SkinAppearance) -> Iterator[page.Block]:
     """Yield the errors of melanin and blood against their ground truth, by melanin band.
 
     Parameters
@@ -114,7 +115,7 @@ def errors(subject: page.ReportedAppearance, truth: SkinAppearance) -> Iterator[
                 worst=worst,
                 worst_got=worst_got,
             )
-    yield page.view("chromophore_errors", errors=rows)
+    yield page.build_view("chromophore_errors", errors=rows)
     limits = {
         map_names.map_title(row.name): 100 * flash.limit(row) for row in blurred if row.band is None
     }
@@ -141,10 +142,10 @@ def _bars(banded: list[flash.MapAccuracy], limits: Mapping[str, float]) -> Itera
         for key in dict.fromkeys(row.name for row in banded)
     }
     title = "median error by melanin band; dashed: limit over all bands"
-    yield page.Plots([figures.bars(title, labels, series, unit="%", limits=limits)])
+    yield page.Plots([figures.draw_bars(title, labels, series, unit="%", limits=limits)])
 
 
-def identifiability(appearances: Iterable[SkinAppearance]) -> Iterator[page.Block]:
+def draw_identifiability(appearances: Iterable[SkinAppearance]) -> Iterator[page.Block]:
     """Draw the Cramér-Rao bound of each chromophore.
 
     Parameters
@@ -161,7 +162,7 @@ def identifiability(appearances: Iterable[SkinAppearance]) -> Iterator[page.Bloc
     if not tables:
         return
     yield page.Heading("Identifiability of chromophores", level=2)
-    yield page.note(
+    yield page.build_note(
         "Cramér-Rao bound on the relative standard uncertainty of an unbiased estimator, for "
         f"{100 * IDENTIFIABILITY_NOISE:g} % noise per channel and the model error."
     )
@@ -187,7 +188,7 @@ def _plots_of_table(camera: str, illuminant: str) -> list[str]:
         )
         errors = {"melanin": found.stderr_melanin, "blood": found.stderr_hemoglobin}
         plots += [
-            figures.sensitivity(f"{name}, {words}", found.c_m, found.c_hd, 100 * relative)
+            figures.draw_sensitivity(f"{name}, {words}", found.c_m, found.c_hd, 100 * relative)
             for name, relative in errors.items()
         ]
     return plots

@@ -18,7 +18,7 @@ from skinrig.appearances.dynamic import (
     WRINKLES,
     describe_parts,
 )
-from skinrig.applying.expression import hemoglobin_rig, skin_reflectance
+from skinrig.applying.expression import read_hemoglobin_rig, skin_reflectance
 from skinrig.arrays import Float64Array, FloatArray
 from skinrig.drawing import figures
 from skinrig.evaluating import facial_color as evaluation
@@ -63,7 +63,7 @@ def section(
     appearance = subject.appearance
     parts = describe_parts(appearance)
     if FACIAL_COLOR in parts:
-        yield from facial_color(subject, parts[FACIAL_COLOR], truths)
+        yield from draw_facial_color(subject, parts[FACIAL_COLOR], truths)
     if WRINKLES in parts:
         yield from _wrinkles(appearance, parts[WRINKLES])
     if MICROSTRUCTURE in parts:
@@ -75,7 +75,7 @@ def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iterator[p
     layer = model.layers[0]
     masks = np.moveaxis(np.asarray(layer.masks, float), 0, 2)
     tints = ZONE_COLORS[np.arange(masks.shape[2]) % len(ZONE_COLORS)]
-    images = [map_images.color_image("zones", masks @ tints, width=WIDTH_PX)]
+    images = [map_images.draw_color_image("zones", masks @ tints, width=WIDTH_PX)]
     shown: dict[str, FloatArray] = {"wrinkle map": _normals(layer.wrinkle)}
     for name in list(part["expressions"])[:MAX_SHOWN_EXPRESSIONS]:
         shown[f"normals, {name}"] = model.evaluate({name: 1.0}).normals
@@ -88,7 +88,7 @@ def _wrinkles(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iterator[p
     yield page.Heading("Wrinkles")
     yield page.Images(images)
     stderr = model.weight_stderr
-    yield page.view(
+    yield page.build_view(
         "wrinkles", table=table, stderr=stderr, part=part, together=together, clamps=clamps
     )
 
@@ -119,11 +119,11 @@ def _microstructure(appearance: SkinAppearance, part: Mapping[str, Any]) -> Iter
     yield page.Images(images)
     yield page.Plots(
         [
-            figures.curves("strength", "stretch ratio", "alpha", alphas),
-            figures.curves("width", "stretch ratio", "sigma, um", sigmas),
+            figures.draw_curves("strength", "stretch ratio", "alpha", alphas),
+            figures.draw_curves("width", "stretch ratio", "sigma, um", sigmas),
         ]
     )
-    yield page.table(
+    yield page.build_table(
         ("site", "pixel, um", "kernels fitted", "stretch ratio", "source of the table"),
         rows,
         caption="Sites with microstructure",
@@ -134,7 +134,7 @@ MAX_SHOWN_STATES = 4
 """Expressions drawn; the tables list all."""
 
 
-def facial_color(
+def draw_facial_color(
     subject: page.ReportedAppearance, part: Mapping[str, Any], truths: Mapping[str, SkinAppearance]
 ) -> Iterator[page.Block]:
     """Yield the blood volume fraction of each expression, its repeatability and its errors.
@@ -149,18 +149,20 @@ def facial_color(
         True blood volume fraction by expression, where given.
     """
     appearance = subject.appearance
-    rig = hemoglobin_rig(appearance)
+    rig = read_hemoglobin_rig(appearance)
     yield page.Heading("Hemoglobin rig")
-    yield page.note(
+    yield page.build_note(
         "Each expression scales and offsets the neutral map over discs of "
         f"{rig.radius_px:.1f} px. Blends are affine combinations."
     )
     yield from _blends(appearance, rig)
     mean = {state: _mean_change(appearance.maps.get(f"change_{state}")) for state in rig.states}
     scales = {state: float(np.median(m.scale[m.valid])) for state, m in rig.states.items()}
-    yield page.view("facial_states", states=rig.states, part=part, changes=mean, scales=scales)
+    yield page.build_view(
+        "facial_states", states=rig.states, part=part, changes=mean, scales=scales
+    )
     if repeats := part.get("repeatability"):
-        yield page.view("facial_repeats", repeats=repeats)
+        yield page.build_view("facial_repeats", repeats=repeats)
     if truths:
         yield from _color_errors(subject, rig, truths)
     for state in list(rig.states)[:MAX_SHOWN_STATES]:
@@ -170,7 +172,7 @@ def facial_color(
             continue
         blend = rig.evaluate({state: 1.0})
         seen = blend.valid if true is None else blend.valid & true.mask
-        yield from map_images.map_panel(
+        yield from map_images.draw_map_panel(
             f"blood volume fraction of {state}, by the rig",
             "volume fraction",
             estimate=np.where(blend.valid, blend.hemoglobin, 0.0),
@@ -195,9 +197,9 @@ def _blends(appearance: SkinAppearance, rig: HemoglobinRig) -> Iterator[page.Blo
         blend = rig.evaluate(weights)
         seen = blend.valid & melanin.mask
         color = skin_reflectance(melanin.values, np.where(seen, blend.hemoglobin, 0.0), seen)
-        images.append(map_images.color_image(title, color, width=WIDTH_PX))
+        images.append(map_images.draw_color_image(title, color, width=WIDTH_PX))
     yield page.Images(images)
-    yield page.note("Diffuse reflectance without shading, linear sRGB under D65.")
+    yield page.build_note("Diffuse reflectance without shading, linear sRGB under D65.")
 
 
 def _color_errors(
@@ -207,14 +209,14 @@ def _color_errors(
     states, changes = evaluation.compare(subject.appearance, rig, truths, rng=rng)
     if not states:
         return
-    banded = errors_by_band(rig, truths)
+    banded = compute_errors_by_band(rig, truths)
     for row in states:
         if row.method == evaluation.PREDICTION_METHODS[1]:
             text = f"blood volume fraction of {row.state}, median error"
             got, worst = row.median_relative, _worst_band(row.state, banded)
             limit = evaluation.MAX_LEVEL_ERROR
             subject.check_fraction(text, got, limit, coverage=row.coverage, worst=worst)
-    yield page.view("facial_errors", states=states, changes=changes, banded=banded)
+    yield page.build_view("facial_errors", states=states, changes=changes, banded=banded)
     labels = list(dict.fromkeys(row.state for row in states))
     found = {(row.state, row.method): 100 * row.median_relative for row in reversed(states)}
     series = {
@@ -222,11 +224,11 @@ def _color_errors(
         for way in evaluation.PREDICTION_METHODS
     }
     yield page.Plots(
-        [figures.bars("median error of the blood volume fraction", labels, series, unit="%")]
+        [figures.draw_bars("median error of the blood volume fraction", labels, series, unit="%")]
     )
 
 
-def errors_by_band(
+def compute_errors_by_band(
     rig: HemoglobinRig, truths: Mapping[str, SkinAppearance]
 ) -> list[tuple[object, ...]]:
     """Return the errors of the rig by expression and band of true melanin.

@@ -25,15 +25,15 @@ def run_extremes(
     out
         Folder for ``extremes.json``; None writes nothing.
     console
-        Where results and progress go.
+        Output of results and progress.
 
     Raises
     ------
     ValueError
-        For a stage without cases.
+        If a stage has no cases.
     """
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)  # a folder that cannot be is told before the work
+        out.mkdir(parents=True, exist_ok=True)  # fails before the computation if not possible
     document = to_document(
         run_cases(stages, progress=lambda name: console.progress(f"extreme: {name}"))
     )
@@ -69,7 +69,7 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
         for case in cases
     ]
     yield page.Heading("Extreme cases", level=2)
-    yield page.table(
+    yield page.build_table(
         ("stage", "case", "extreme", "risk", "expected", *INPUT_PRECISIONS),
         rows,
         caption=f"{len(cases)} cases in both precisions, {failed or 'none'} failed",

@@ -45,7 +45,7 @@ def section(folder: Path, checks: list[page.Check]) -> Iterator[page.Block]:
     if FULL_MODEL in document:
         yield from _comparison(folder.name, document, checks)
     elif "view" in document:
-        yield page.facts(
+        yield page.build_facts_table(
             {
                 "view": document["view"].get("name", ""),
                 "lights": ", ".join(document.get("lights", {})),
@@ -60,7 +60,7 @@ def section(folder: Path, checks: list[page.Check]) -> Iterator[page.Block]:
     yield from _images(folder)
     if document.get("assumed"):
         yield page.Heading("Assumptions")
-        yield page.assumptions(document["assumed"])
+        yield page.build_assumptions_table(document["assumed"])
 
 
 def _heading(document: Mapping[str, Any]) -> str:
@@ -79,7 +79,7 @@ def _comparison(
     checks.append(page.Check(what, *judged, "<=", "%", note))
     kinds = {f"{kind} held out": row for kind, row in document["by_kind"].items()}
     models = {FULL_MODEL: full, **kinds, **document["ablation"]}
-    yield page.view("photographs", models=models, bands=document["by_band"])
+    yield page.build_view("photographs", models=models, bands=document["by_band"])
 
 
 def _data_set(one: Mapping[str, Any]) -> Iterator[page.Block]:
@@ -92,7 +92,9 @@ def _data_set(one: Mapping[str, Any]) -> Iterator[page.Block]:
         for k, rank in enumerate(ranks)
     ]
     caption = f"Errors by number of basis BRDFs: {one.get('name', '')}"
-    yield page.table(("basis BRDFs", *(n.replace("_", " ") for n in head)), rows, caption=caption)
+    yield page.build_table(
+        ("basis BRDFs", *(n.replace("_", " ") for n in head)), rows, caption=caption
+    )
 
 
 def _images(folder: Path) -> Iterator[page.Block]:
@@ -107,4 +109,4 @@ def _images(folder: Path) -> Iterator[page.Block]:
         figures.append(page.Image(title, png.to_data_url(data), title))
     yield page.Images(figures)
     if kept:
-        yield page.note(f"Too large for this report: {', '.join(kept)}.")
+        yield page.build_note(f"Too large for this report: {', '.join(kept)}.")

@@ -43,14 +43,14 @@ def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     yield from _strain(subject)
     yield from _histograms(subject.appearance)
     yield from _variances(subject.appearance)
-    yield from kernels(subject)
+    yield from draw_kernels(subject)
 
 
 def _images(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[page.Block]:
     states = evaluation.find_states(appearance)
     order = sorted(states, key=_by_step)
     first = "a000_n0" if "a000_n0" in states else order[0]
-    yield from _beside_truth(first, appearance, truth)
+    yield from _compare_with_truth(first, appearance, truth)
     one = [state for state in order if state[:4] == first[:4]]
     chosen = _select_states(one)
     series = []
@@ -68,7 +68,7 @@ def _images(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterato
         yield from series
 
 
-def _beside_truth(
+def _compare_with_truth(
     state: str, appearance: SkinAppearance, truth: SkinAppearance | None
 ) -> Iterator[page.Block]:
     """Yield ground truth | estimate | error | uncertainty of normals and height of one step."""
@@ -89,7 +89,7 @@ def _beside_truth(
         yield page.Images(parts)
     height = appearance.maps.get(f"height_{state}")
     if height is not None:
-        yield from map_images.map_panel(
+        yield from map_images.draw_map_panel(
             f"height, {state_title(state)}",
             "um",
             estimate=height.values,
@@ -114,7 +114,7 @@ def _scalar_image(words: str, skin_map: SkinMap, width: int = 280) -> map_images
 
 def _angle_image(title: str, degrees: FloatArray, valid: BoolArray, words: str) -> page.Image:
     drawing = map_images.MapDrawing(words, "°", valid)
-    return drawing.size(title, degrees, map_images.percentile_reach(degrees, valid, 98))
+    return drawing.size(title, degrees, map_images.compute_percentile_reach(degrees, valid, 98))
 
 
 def _relief_errors(subject: page.ReportedAppearance) -> Iterator[page.Block]:
@@ -140,8 +140,11 @@ def _relief_errors(subject: page.ReportedAppearance) -> Iterator[page.Block]:
             worst=where,
             worst_got=worst_got,
         )
-    limit, skin = 100 * evaluation.MAX_HEIGHT_ERROR, page.single_subject_note(truth.parameters)
-    yield page.view("relief_errors", states=rows, limit=limit, skin=skin)
+    limit, skin = (
+        100 * evaluation.MAX_HEIGHT_ERROR,
+        page.build_single_subject_note(truth.parameters),
+    )
+    yield page.build_view("relief_errors", states=rows, limit=limit, skin=skin)
 
 
 def _strain(subject: page.ReportedAppearance) -> Iterator[page.Block]:
@@ -156,7 +159,7 @@ def _strain(subject: page.ReportedAppearance) -> Iterator[page.Block]:
         got, where = abs(worst.error), state_title(worst.state)
         text = "stretch ratio, largest error"
         subject.check(text, got, evaluation.MAX_STRAIN_ERROR, worst=where)
-    yield page.view("strain", states=document["states"], truths=true, degrees=math.degrees)
+    yield page.build_view("strain", states=document["states"], truths=true, degrees=math.degrees)
 
 
 def _histograms(appearance: SkinAppearance) -> Iterator[page.Block]:
@@ -177,10 +180,10 @@ def _histograms(appearance: SkinAppearance) -> Iterator[page.Block]:
         panels.append(drawing.size(state_title(state["name"]), shown, top))
     aliased = [state_title(state["name"]) for state in states if state["aliased"]]
     yield page.Heading("Histograms of normals, square root of frequency")
-    yield page.note("Horizontal: along the jaws. Vertical: across the jaws.")
+    yield page.build_note("Horizontal: along the jaws. Vertical: across the jaws.")
     yield page.Images(panels, small=True)
     if aliased:
-        yield page.note(
+        yield page.build_note(
             f"Too few samples per bin in {'; '.join(aliased)}. Distances between these "
             "histograms are sampling noise."
         )
@@ -199,7 +202,7 @@ def _variances(appearance: SkinAppearance) -> Iterator[page.Block]:
         )
         for angle, rows in by_angle.items()
     ]
-    plot = figures.curves(
+    plot = figures.draw_curves(
         "roughness along the jaws", "stretch ratio r of the skin", "variance of n", series
     )
     yield page.Plots([plot])
@@ -216,7 +219,7 @@ def _by_step(state: str) -> tuple[str, int]:
     return angle, int(step[1:]) * (-1 if step[0] == "m" else 1)
 
 
-def kernels(subject: page.ReportedAppearance) -> Iterator[page.Block]:
+def draw_kernels(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     """Yield kernels by strain step and direction, and check their residual distances.
 
     Parameters
@@ -236,10 +239,10 @@ def kernels(subject: page.ReportedAppearance) -> Iterator[page.Block]:
         text = "ratio of histogram distances after and before the kernel, largest"
         subject.check(text, got, evaluation.MAX_HISTOGRAM_DISTANCE, worst=where)
     untold = [state_title(fit["name"]) for fit in fits if fit["valid"] and not _is_significant(fit)]
-    yield page.view("kernels", fits=fits, untold=untold)
+    yield page.build_view("kernels", fits=fits, untold=untold)
     yield page.Plots(_kernel_plots(fits, document.get("tables", [])))
     if direction := document.get("direction"):
-        yield page.view("kernel_directions", found=direction)
+        yield page.build_view("kernel_directions", found=direction)
 
 
 def _kernel_plots(
@@ -269,7 +272,7 @@ def _kernel_plots(
                 figures.PlotSeries(f"fit, {table['name']}", line["stretch"], drawn, marks=False)
             )
         if series:
-            plots.append(figures.curves(title, "stretch ratio r of the skin", title, series))
+            plots.append(figures.draw_curves(title, "stretch ratio r of the skin", title, series))
     return plots
 
 

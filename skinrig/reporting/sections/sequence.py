@@ -22,18 +22,18 @@ def is_sequence(appearance: SkinAppearance) -> bool:
 
 def section(appearance: SkinAppearance) -> Iterator[page.Block]:
     """Yield the curves of all regions, their levels, time constants and phase coverage."""
-    told = json.loads(appearance.files[CURVES_FILE])
-    cycle_s = told.get("cycle_s")
-    yield page.Heading(f"Blood volume fraction in time: {told['state']}")
+    document = json.loads(appearance.files[CURVES_FILE])
+    cycle_s = document.get("cycle_s")
+    yield page.Heading(f"Blood volume fraction in time: {document['state']}")
     if cycle_s is not None:
-        phases = told["phases"]
-        yield page.note(
-            f"{phases['captures']} images, one every {told['shot_period_s']:g} s, sample "
+        phases = document["phases"]
+        yield page.build_note(
+            f"{phases['captures']} images, one every {document['shot_period_s']:g} s, sample "
             f"{phases['distinct']} phases of a cycle of {cycle_s:g} s. The phases are "
             f"{phases['interval_s']:g} s apart. Images are ordered by flash time."
         )
-    yield _curves(told, cycle_s)
-    yield page.view("sequence", told=told, seen=_words)
+    yield _curves(document, cycle_s)
+    yield page.build_view("sequence", document=document, seen=_words)
 
 
 def _curves(document: Mapping[str, Any], cycle_s: float | None) -> page.Plots:
@@ -49,7 +49,7 @@ def _curves(document: Mapping[str, Any], cycle_s: float | None) -> page.Plots:
         curves.append(figures.PlotSeries(place, *points, line=line, color=color))
     title = f"blood volume fraction, {document['state']}"
     return page.Plots(
-        [figures.curves(title, axis, "blood volume fraction, % of the dermis", curves)]
+        [figures.draw_curves(title, axis, "blood volume fraction, % of the dermis", curves)]
     )
 
 

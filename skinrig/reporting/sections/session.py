@@ -51,7 +51,7 @@ def section(sessions: Mapping[str, SessionFacts]) -> Iterator[page.Block]:
     if not sessions:
         return
     yield page.Heading("Sessions", level=2)
-    yield page.table(
+    yield page.build_table(
         ("session", "rig", "captured", "source", "seed", "frames", "MB"),
         [(name, *one.cells) for name, one in sessions.items()],
         caption="Frames on disk; `skinrig verify` checks each of them",
@@ -86,7 +86,7 @@ def read_effects(session: Path) -> list[Mapping[str, Any]]:
     return [entry for entry in found if isinstance(entry, dict)]
 
 
-def omissions(sessions: Sequence[Path]) -> Iterator[page.Block]:
+def list_omissions(sessions: Sequence[Path]) -> Iterator[page.Block]:
     """Yield the effects of simulated scenes; empty where no session records them.
 
     Parameters
@@ -107,7 +107,7 @@ def omissions(sessions: Sequence[Path]) -> Iterator[page.Block]:
     if not alike:
         return
     yield page.Heading("Effects in simulated scenes", level=2)
-    yield page.view("omissions")
+    yield page.build_view("omissions")
     order = list(VERDICT_WORDS.values())
     for text, names in alike.items():
         effects = json.loads(text)
@@ -116,7 +116,7 @@ def omissions(sessions: Sequence[Path]) -> Iterator[page.Block]:
         out = sum(not effect["verdict"] == "built" for effect in effects)
         title = f"{', '.join(names)}: {len(effects) - out} of {len(effects)} effects simulated"
         head = ("effect", "treatment", "reason", "change over noise", "option name")
-        table = page.table(head, rows, caption="Optical effects of the scene")
+        table = page.build_table(head, rows, caption="Optical effects of the scene")
         yield page.Collapsible(title, [table])
 
 

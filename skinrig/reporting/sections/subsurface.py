@@ -56,10 +56,10 @@ def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     yield from _errors(subject)
     anisotropy = evaluation.read_document(appearance, ANISOTROPY_FILE)
     if anisotropy is not None and anisotropy["sites"]:
-        yield page.view("anisotropy", sites=anisotropy["sites"])
+        yield page.build_view("anisotropy", sites=anisotropy["sites"])
     fitted = evaluation.read_document(appearance, SUBSURFACE_FILE)
     if fitted is not None and fitted.get("sites"):
-        yield page.view("sites", sites=fitted["sites"])
+        yield page.build_view("sites", sites=fitted["sites"])
     yield from _map(appearance)
 
 
@@ -79,7 +79,7 @@ def _plots(appearance: SkinAppearance) -> Iterator[page.Block]:
     yield page.Plots(plots)
 
 
-def first_profile(appearance: SkinAppearance) -> str:
+def draw_first_profile(appearance: SkinAppearance) -> str:
     """Return the plot of a probe's first radial profile as SVG; empty where there is none."""
     measured = evaluation.read_document(appearance, PROFILE_FILE)
     if measured is None or not measured["measurements"]:
@@ -110,7 +110,7 @@ def _profile(
                 predicted, name = parse_numbers(fit["predicted_per_mm2"]), f"{channel}, fit"
                 series.append(figures.PlotSeries(name, radius, predicted, marks=False, color=color))
     axes = "distance from the source, mm", "reflectance, 1/mm²"
-    return figures.curves(title, *axes, series, log_y=True)
+    return figures.draw_curves(title, *axes, series, log_y=True)
 
 
 def _residuals(
@@ -132,7 +132,7 @@ def _residuals(
     if not series:
         return []
     title = f"{_words(entry)}, {channel}: measured minus fitted"
-    return [figures.curves(title, "distance from the source, mm", "% of the fit", series)]
+    return [figures.draw_curves(title, "distance from the source, mm", "% of the fit", series)]
 
 
 def _fits(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[page.Block]:
@@ -149,7 +149,7 @@ def _fits(appearance: SkinAppearance, truth: SkinAppearance | None) -> Iterator[
         for entry in fitted["measurements"]
         for fit in entry["fits"]
     ]
-    yield page.view("fits", fits=fits, truths=true, methods=METHOD_NAMES)
+    yield page.build_view("fits", fits=fits, truths=true, methods=METHOD_NAMES)
 
 
 def _errors(subject: page.ReportedAppearance) -> Iterator[page.Block]:
@@ -157,11 +157,11 @@ def _errors(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     if truth is None:
         return
     rows = evaluation.compare_fits(appearance, truth)
-    yield page.single_subject_note(truth.parameters)
+    yield page.build_single_subject_note(truth.parameters)
     for kind in dict.fromkeys(row.kind for row in rows):
         found = evaluation.summarize_methods([row for row in rows if row.kind == kind])
         yield page.Heading(f"Error of sigma_tr against the ground truth, {kind} tissue")
-        yield page.view("methods", errors=found, methods=METHOD_NAMES, kind=kind)
+        yield page.build_view("methods", errors=found, methods=METHOD_NAMES, kind=kind)
         yield from _by_channel([row for row in rows if row.kind == kind])
         best = next((row for row in found if row.method == evaluation.RECOMMENDED_METHOD), None)
         if kind == "homogeneous" and best is not None:
@@ -171,7 +171,7 @@ def _errors(subject: page.ReportedAppearance) -> Iterator[page.Block]:
             ):
                 subject.check_fraction(f"sigma_tr, {word} error", got, bound)
     if profiles := evaluation.compare_profiles(appearance, truth):
-        yield page.view("profiles", errors=profiles, measurement=_words_of_name)
+        yield page.build_view("profiles", errors=profiles, measurement=_words_of_name)
 
 
 def _by_channel(rows: Sequence[evaluation.FitAccuracy]) -> Iterator[page.Block]:
@@ -184,7 +184,7 @@ def _by_channel(rows: Sequence[evaluation.FitAccuracy]) -> Iterator[page.Block]:
         series[words] = [100.0 * errors.get(label, float("nan")) for label in labels]
     parts = [label.rpartition(", ") for label in labels]
     short = [f"{_words_of_name(name)}\n{channel}" for name, _, channel in parts]
-    yield page.Plots([figures.bars("error of sigma_tr", short, series, unit="%")])
+    yield page.Plots([figures.draw_bars("error of sigma_tr", short, series, unit="%")])
 
 
 def _map(appearance: SkinAppearance) -> Iterator[page.Block]:
@@ -205,7 +205,7 @@ def _map(appearance: SkinAppearance) -> Iterator[page.Block]:
             spread = found.stderr[..., c]
             images.append(drawing.size("standard uncertainty", spread, float(spread.max())))
     yield page.Heading("Map of the diffuse mean free path")
-    yield page.note(
+    yield page.build_note(
         "1/sigma_tr over the face texture, interpolated between the measured sites by kriging. "
         "Far from the sites, the uncertainty is the variation between people."
     )
@@ -258,7 +258,7 @@ MEDIUM_PREFIXES = ("homogeneous:", "anisotropic:")
 """Prefixes of the names of simulated media."""
 
 
-def over_people(
+def compare_people(
     appearances: Mapping[str, SkinAppearance], truths: Mapping[str, Path] | None = None
 ) -> Iterator[page.Block]:
     """Yield the tables of sigma_tr over people; empty where nobody's skin was probed.
@@ -284,7 +284,7 @@ def over_people(
         published.sample(POPULATION_SIZE, rng=np.random.default_rng(0)), sites=published.sites
     )
     yield page.Heading("sigma_tr by person, 1/mm", level=2)
-    yield page.note(
+    yield page.build_note(
         "Standard deviations are over people. The second column of the published table has the "
         "heading “Var.”. Variances would contradict the published extremes, so these values are "
         "used as standard deviations."
@@ -306,7 +306,7 @@ def over_people(
         rows += _people_rows(f"this report, {len(people)} {many}", found, published.sites)
     columns = [f"{site}, {word}" for site in published.sites for word in ("mean", "deviation")]
     head = ("population", "channel", *columns)
-    yield page.table(
+    yield page.build_table(
         head, rows, caption="Mean and standard deviation over people, red, green and blue light"
     )
 

@@ -40,7 +40,7 @@ def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     rows, columns = np.nonzero(place.mask)
     points = place.values[rows, columns].astype(np.float64)
     if not len(points):
-        yield page.note("No texel of these maps is valid.")
+        yield page.build_note("No texel of these maps is valid.")
         return
     box = points.min(axis=0), points.max(axis=0)
     view = FrontView.of(points, box)
@@ -105,7 +105,7 @@ def _shown(
         return drawing.draw_scalar(_title(title, key), image, low, high)
     if "normals" in key:
         return drawing.normals(title, image)
-    return map_images.color_image(
+    return map_images.draw_color_image(
         title,
         np.where(valid[..., None], image, BACKGROUND_CODE**2.2),
         of=f"{map_title(key)}, linear sRGB",
@@ -128,7 +128,7 @@ def _error(
     points = both[0].maps["position"].values[pairs.rows, pairs.columns].astype(np.float64)
     good = np.isfinite(error)
     image, valid = FrontView.of(points, box).rasterize(np.nan_to_num(error), valid=good)
-    reach = map_images.percentile_reach(error, good, 95)
+    reach = map_images.compute_percentile_reach(error, good, 95)
     if key in evaluation.NORMAL_MAPS:
         return map_images.MapDrawing(map_title(key), "°", valid, width).size("error", image, reach)
     return map_images.MapDrawing(map_title(key), "%", valid, width).draw_signed(
@@ -144,7 +144,7 @@ def _stderr_image(
     texels: tuple[Index, Index],
     width: int,
 ) -> page.Image:
-    unit = page.short_unit(skin_map.unit)
+    unit = page.format_short_unit(skin_map.unit)
     good = skin_map.mask[texels]
     if key in RELATIVE_ERROR_MAPS:  # as its errors
         size = np.abs(skin_map.values[texels].astype(np.float64))
@@ -155,7 +155,7 @@ def _stderr_image(
     if key in evaluation.NORMAL_MAPS:
         stderr, unit = np.degrees(stderr), "°"
     image, valid = view.rasterize(stderr, valid=good)
-    reach = map_images.percentile_reach(image, valid, 98)
+    reach = map_images.compute_percentile_reach(image, valid, 98)
     drawing = map_images.MapDrawing(map_title(key), unit, valid, width)
     return drawing.size(_title("standard uncertainty", key), image, reach)
 
@@ -184,7 +184,9 @@ def _errors(subject: page.ReportedAppearance, truth: SkinAppearance) -> Iterator
         subject.check(name, got, bound, unit, worst_got=worst_got, **more)
     bounds = evaluation.MAX_NORMAL_ERROR_DEG, evaluation.MAX_EVALUATED_PIXEL_MM
     pixel = pixel_mm if coarse else None
-    yield page.view("surface_errors", errors=found, banded=banded, pixel_mm=pixel, bounds=bounds)
+    yield page.build_view(
+        "surface_errors", errors=found, banded=banded, pixel_mm=pixel, bounds=bounds
+    )
 
 
 def _worst(name: str, banded: list[Banded]) -> tuple[str, float]:
@@ -207,13 +209,13 @@ def _reflection(subject: page.ReportedAppearance, truth: SkinAppearance) -> Iter
         reflection.MAX_HELD_OUT_ERROR,
         f"{held_out.points} points × {held_out.directions} directions",
     )
-    yield page.view("reflection", found=held_out)
+    yield page.build_view("reflection", found=held_out)
     figures = []
     for site, true_image, image in reflection.render_spheres(subject.appearance, truth):
         bright = float(np.percentile(true_image.max(axis=-1), 99.5)) or 1.0
-        figures.append(map_images.color_image(f"{site}: ground truth", true_image / bright))
+        figures.append(map_images.draw_color_image(f"{site}: ground truth", true_image / bright))
         if image is not None:
-            figures.append(map_images.color_image(f"{site}: estimate", image / bright))
+            figures.append(map_images.draw_color_image(f"{site}: estimate", image / bright))
     if figures:
         yield page.Heading("Reflectance on spheres")
         yield page.Images(figures)

@@ -1,1 +1,1 @@
-"""Assets of the viewer's page."""
+"""Build the assets of the viewer's page."""

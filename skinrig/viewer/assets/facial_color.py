@@ -1,4 +1,4 @@
-"""Textures and tables of Jimenez 2010: chromophores, the hemoglobin rig, the color of skin."""
+"""Build the assets of Jimenez 2010: chromophores, hemoglobin rig, skin color table, albedo."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from model.skin import SkinAppearance
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.perfusion import STATE_NAMES
-from skinrig.appearances.contents import digest as sha256_of
+from skinrig.appearances.contents import hash_file as sha256_of
 from skinrig.appearances.dynamic import FACIAL_COLOR, describe_parts
 from skinrig.arrays import Float64Array
 from skinrig.viewer.assets.placed_color import RIG_PX, FaceColor, place_facial_color
@@ -28,23 +28,23 @@ from skinrig.viewer.scene import Assets, SceneSource, Texture
 
 COLOR_KIND: Final = "color"
 CALIBRATION_INPUT_PREFIX: Final = "calibration "
-"""Inputs of an appearance that are files of a calibration begin like this."""
+"""Prefix of an appearance's inputs that are files of a calibration."""
 MATRIX_NODES: Final = 24
-"""Nodes a side of the table of skin colors that a matrix is fitted to."""
+"""Nodes per axis of the skin color table to which a matrix is fitted."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraColor:
-    """How camera RGB over that of a white becomes linear sRGB.
+    """Conversion of camera RGB, relative to white, to linear sRGB.
 
     Attributes
     ----------
     convert
-        From (..., 3) to (..., 3).
+        Function from (..., 3) to (..., 3).
     provenance
-        Where it comes from, for people.
+        Source of the conversion, in words.
     known
-        False: nothing is known, and camera RGB is taken for linear sRGB.
+        False: unknown, and camera RGB is taken as linear sRGB.
     """
 
     convert: Callable[[Float64Array], Float64Array]
@@ -53,12 +53,12 @@ class CameraColor:
 
 
 def find_camera_color(source: SceneSource) -> CameraColor:
-    """Return the color of the camera that measured a scene's albedo.
+    """Find the color conversion of the camera that measured a scene's albedo.
 
     Raises
     ------
     capture.calibration.record.CalibrationError
-        A color calibration that is damaged, or missing in a folder that was named.
+        If a color calibration is damaged, or missing in the given folder.
     """
     kind = next(name for name in ("model", "dome") if name in source.appearances)
     appearance, path = source.appearances[kind], source.paths.get(kind)
@@ -71,7 +71,7 @@ def find_camera_color(source: SceneSource) -> CameraColor:
 
 
 def _find_calibration(appearance: SkinAppearance, path: Path) -> Path | None:
-    """Return the calibration that an appearance was made with, if it lies beside and has color."""
+    """Return the calibration of an appearance, if it is next to it and has color."""
     digests = {
         name.removeprefix(CALIBRATION_INPUT_PREFIX): digest
         for name, digest in appearance.inputs.items()
@@ -97,7 +97,7 @@ def _calibrated_color(folder: Path) -> CameraColor:
     error = float(np.mean([one.mean_delta_e for one, _ in cameras]))
 
     def convert(rgb: Float64Array) -> Float64Array:
-        # maps merge all cameras: so are their colors
+        # maps are merged over all cameras, thus their conversions are averaged
         seen = [one.to_linear_srgb(rgb * white) for one, white in cameras]
         return np.asarray(np.mean(seen, axis=0))
 
@@ -107,7 +107,7 @@ def _calibrated_color(folder: Path) -> CameraColor:
 
 
 def _tabulated_color(appearance: SkinAppearance, path: Path) -> CameraColor | None:
-    """Return a matrix between colors of skin, where a session beside names sensor and light."""
+    """Fit a matrix for skin colors, if a session next to the maps records sensor and light."""
     name: Any = appearance.parameters.get("session")
     if not isinstance(name, str):
         return None
@@ -127,7 +127,7 @@ def _tabulated_color(appearance: SkinAppearance, path: Path) -> CameraColor | No
     error = float(np.sqrt(np.mean((measured @ matrix - shown) ** 2)))
     return CameraColor(
         lambda rgb: np.asarray(rgb @ matrix),
-        f"no color calibration was found; matrix for skin colors from the tabulated sensor "
+        f"without color calibration; matrix for skin colors from the tabulated sensor "
         f"{camera} under {light} to linear sRGB, {error:.4f} RMS",
     )
 
@@ -135,15 +135,15 @@ def _tabulated_color(appearance: SkinAppearance, path: Path) -> CameraColor | No
 TABLE_NODES: Final = 128
 """Nodes along each axis of the color table."""
 RADIUS_PER_SIZE: Final = 24.0 / 512.0
-"""Radius of the local statistics' disc, as a part of the map's side."""
+"""Radius of the disc of local statistics, fraction of the map's side."""
 FINEST_STEP_WORDS: Final = 8
-"""Words of the finest octave's steps, of chromophores of 2048 texels a side and more: texels below
-0.2 mm hold noise."""
+"""Quantization step of the finest octave for chromophores of 2048 texels per side and more; detail
+below 0.2 mm is noise."""
 ALBEDO_MAP: Final = "r_d"
 
 
-def assets(source: SceneSource) -> Assets:
-    """Return chromophores, color table, hemoglobin rig and, where it was measured, the albedo."""
+def build_assets(source: SceneSource) -> Assets:
+    """Build chromophores, color table, hemoglobin rig and the albedo, if measured."""
     albedo = _albedo(source)
     found = _face(source, measured=albedo is not None)
     table = color_table.build(
@@ -186,7 +186,7 @@ def assets(source: SceneSource) -> Assets:
 
 
 def _face(source: SceneSource, *, measured: bool) -> FaceColor:
-    """Return the chromophores; beside a measured albedo, coarse: only their changes show."""
+    """Return the chromophores, coarse if albedo is measured, as then only changes are visible."""
     subject, dynamic = source.subject, source.appearances.get("dynamic")
     if dynamic is not None and FACIAL_COLOR in describe_parts(dynamic):
         return place_facial_color(source)
@@ -196,7 +196,7 @@ def _face(source: SceneSource, *, measured: bool) -> FaceColor:
 
 
 def simulate_chromophores(person: SimulatedSubject, skin: FineSkin) -> FaceColor:
-    """Return the chromophores of a simulated person, with a rig of all of its states."""
+    """Simulate the chromophores of a person, with a rig of all expressions."""
     rig = HemoglobinRig.from_maps(
         person.hemoglobin(),
         {name: person.hemoglobin(name) for name in STATE_NAMES if name != NEUTRAL},
@@ -214,7 +214,7 @@ def simulate_chromophores(person: SimulatedSubject, skin: FineSkin) -> FaceColor
 
 
 def _stored_states(rig: HemoglobinRig) -> dict[str, Float64Array]:
-    """Return a rig's scale and bias maps by state, (h, w, 2), filled where they are not valid."""
+    """Return a rig's scale and bias by expression, (h, w, 2), with invalid cells filled."""
     valid = {NEUTRAL: rig.neutral_mean_valid, **{name: m.valid for name, m in rig.states.items()}}
     return {
         name: fill_holes(np.stack([rig.scale[name], rig.bias[name]], axis=-1), valid[name])

@@ -1,8 +1,8 @@
-"""Trait sliders for the page: changes of lobe shares, and factors of the albedo.
+"""Build the page's trait sliders: edits of BRDF weights, and factors of the albedo.
 
-Surface traits move shares of few lobes to the nearest ones of at least 0, which the page finds
-itself. What its way leaves out is measured against `model.traits.lobe_edits` and told:
-`LobeTraits.held_error`. Traits of the albedo are in `albedo_trait_assets`.
+Surface traits change the weights of the basis BRDFs; the page solves for the nearest non-negative
+weights. `LobeTraits.held_error` reports its error relative to `model.traits.lobe_edits`. Albedo
+traits are layers of factors, see `AlbedoTraitLayers`.
 
 References
 ----------
@@ -31,34 +31,34 @@ from skinrig.viewer.assets.reflectance import LOBES_PER_LOOKUP, PageLobes, fill_
 from skinrig.viewer.scene import Assets, SceneSource, Texture
 
 DESCENT_SWEEPS: Final = 96
-"""Of coordinate descent: after as many, errors stay within a few percent of a trait."""
+"""Sweeps of coordinate descent, after which errors are within a few percent of a trait."""
 MAX_ADDED_LOBES: Final = 4
-"""Lobes that traits may bring: one more look-up for all of them."""
+"""Maximum number of basis BRDFs added by traits; they need one more look-up."""
 SAMPLED_TEXELS: Final = 400
-"""Texels on which lobes are chosen and errors measured."""
+"""Number of texels for the choice of added basis BRDFs and for error estimates."""
 OPPOSITE_TRAITS: Final = {"caucasian": "asian", "male": "female"}
-"""Traits that are others the other way round."""
+"""Traits that are the opposite of another trait."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LobeTraits:
-    """Traits of the surface on the lobes of a page.
+    """Surface traits in terms of a page's basis BRDFs.
 
     Attributes
     ----------
     lobes
-        The face's lobes and those that traits brought.
+        Basis BRDFs of the face, and those added by traits.
     gram : ndarray of float32, shape (K, K)
-        Cosines between the lobes under the library's metric.
+        Cosines between the basis BRDFs under the library's metric.
     scale : ndarray of float32, shape (K,)
-        Their lengths; 1 where there is none.
+        Norms of the basis BRDFs; 1 for unused entries.
     pull : mapping of str to ndarray of float32, shape (K,)
-        Products of each trait's vector with the lobes of length 1.
+        Products of each trait's vector with the normalized basis BRDFs.
     misfit : mapping of str to float
-        Share of each trait's vector that the lobes cannot show.
+        Fraction of each trait's vector that the basis BRDFs do not represent.
     held_error : mapping of str to (float, float)
-        RMS length by which `apply_traits` misses `lobe_edits.edit_weights` at amounts -1 and 1,
-        over the trait's length. It stops before it is there, and may bring no further lobe.
+        RMS difference of `apply_traits` from `lobe_edits.edit_weights` at amounts -1 and 1,
+        relative to the trait's norm. The descent is truncated, and cannot add further basis BRDFs.
     """
 
     lobes: PageLobes
@@ -69,17 +69,17 @@ class LobeTraits:
     held_error: Mapping[str, tuple[float, float]]
 
     def apply_traits(self, weights: Float64Array, amounts: Mapping[str, float]) -> Float32Array:
-        """Return the shares under some traits as the page computes them.
+        """Return the edited weights as the page computes them.
 
-        Least squares over shares of at least 0 by `DESCENT_SWEEPS` sweeps of coordinate descent, in
-        float32: the shares nearest to what is asked, from those given.
+        Non-negative least squares for the target weights by `DESCENT_SWEEPS` sweeps of coordinate
+        descent in float32, starting from the given weights.
 
         Parameters
         ----------
-        shares
+        weights
             (T, K), at least 0.
         amounts
-            Trait to amount.
+            Amount by trait.
         """
         given = np.asarray(weights, np.float32) * self.scale
         asked = np.zeros(len(self.scale), np.float32)
@@ -97,10 +97,10 @@ class LobeTraits:
 
 
 def select_significant_traits(traits: Mapping[str, TraitVector]) -> tuple[str, ...]:
-    """Return the traits that are worth a slider, in the library's order.
+    """Select the traits with a slider, in the library's order.
 
-    Those that a permutation of the labels brings about as easily are left out, and of two opposite
-    ones the second.
+    Traits that are not significant in the permutation test are omitted, and the second of two
+    opposite ones.
     """
     return tuple(
         name
@@ -109,13 +109,13 @@ def select_significant_traits(traits: Mapping[str, TraitVector]) -> tuple[str, .
     )
 
 
-def surface_traits(found: PageLobes) -> LobeTraits | None:
-    """Return the surface traits of a page's lobes; None where the lobes are of other materials.
+def build_surface_traits(found: PageLobes) -> LobeTraits | None:
+    """Build the surface traits of a page; None if its basis BRDFs are of other materials.
 
     Parameters
     ----------
     found
-        Lobes with what they are mixtures of.
+        Basis BRDFs with their mixtures of materials.
     """
     traits = trait_storage.load_packaged_traits().spaces["surface"]
     materials = brdf_tables.default_basis()
@@ -140,7 +140,7 @@ def surface_traits(found: PageLobes) -> LobeTraits | None:
     shares[..., :count] = found.shares
     mixed = materials.mix_materials(mix)
     table = np.array(mixed.table)
-    table[..., :count] = found.lobes.table[..., :count]  # the face's own, bit for bit
+    table[..., :count] = found.lobes.table[..., :count]  # the face's own, bit-identical
     basis = BrdfBasis(table, mixed.names, found.lobes.light_radius_rad)
     lobes = dataclasses.replace(found, lobes=basis, shares=shares, mix=mix)
     pulls = {name: times @ traits.trait(name).vector / scale for name in names}
@@ -159,8 +159,8 @@ def surface_traits(found: PageLobes) -> LobeTraits | None:
     return dataclasses.replace(made, held_error=errors)
 
 
-def surface_facts(traits: LobeTraits) -> dict[str, Any]:
-    """Return what the page needs to know of surface traits; lobes and shares go with the lobes'."""
+def describe_surface_traits(traits: LobeTraits) -> dict[str, Any]:
+    """Return the page's data of surface traits; basis BRDFs and weights are separate assets."""
     found = {}
     for name, pull in traits.pull.items():
         errors = {"misfit": traits.misfit[name], "held_error": list(traits.held_error[name])}
@@ -170,7 +170,7 @@ def surface_facts(traits: LobeTraits) -> dict[str, Any]:
 
 
 def _sample_texels(weights: Float32Array) -> Float64Array:
-    """Return at most `SAMPLED_TEXELS` texels with any share, evenly taken, (n, K)."""
+    """Sample at most `SAMPLED_TEXELS` texels with positive weights at equal steps, (n, K)."""
     rows = weights.reshape(-1, weights.shape[-1]).astype(np.float64)
     rows = rows[rows.sum(axis=1) > 0.0]
     if not len(rows):
@@ -203,29 +203,28 @@ def _held_out_error(
 
 
 MAX_FACTOR_PX: Final = 128
-"""Most texels a side of a factor's map; the common map that edits are made on has no more detail
-over a face than this."""
+"""Maximum side of a factor map; the common map of edits does not have more detail on a face."""
 END_AMOUNTS: Final = (-1, 1)
 CHECKED_AMOUNT: Final = 0.5
 MATCHING_ITERATIONS: Final = 1
-"""Of matching. `skinrig edit` makes five: one is off those by 0.2 % of R_d for an edit by 24 %
-(tan, the demo's dome), and takes a third of the time."""
+"""Iterations of matching. `skinrig edit` uses five: one deviates from these by 0.2 % of R_d for an
+edit of 24 % (tan, dome of the demo) in a third of the time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AlbedoTraitLayers:
-    """End points of traits over a texture.
+    """Albedo factors of traits at amounts -1 and 1 over a texture.
 
     Attributes
     ----------
     names
-        Of the traits; layer 2 i is less of trait i, layer 2 i + 1 more.
+        Names of the traits; layer 2 i is amount -1 of trait i, layer 2 i + 1 is amount 1.
     log_factor : ndarray of float32, shape (L, H, W, 3)
         Logarithm of the factor of R_d at amounts -1 and 1.
     change : mapping of str to float
-        RMS of the factor at 1 less 1, over the valid texels.
+        RMS of the factor at amount 1, minus 1, over the valid texels.
     between_error : mapping of str to float
-        RMS by which the blend at half the trait misses the edit by half, in shares of R_d.
+        RMS difference of the blended factor at amount 0.5 from the edit, fraction of R_d.
     """
 
     names: tuple[str, ...]
@@ -238,7 +237,7 @@ class AlbedoTraitLayers:
         return Texture(self.log_factor, "u8")
 
     def facts(self) -> dict[str, Any]:
-        """Return what the page says of them."""
+        """Return the errors and figures that the page displays."""
         return {
             "layers": [{"name": name, "end": end} for name in self.names for end in END_AMOUNTS],
             "traits": {
@@ -248,17 +247,17 @@ class AlbedoTraitLayers:
         }
 
 
-def albedo_traits(source: SceneSource) -> AlbedoTraitLayers | str:
-    """Return the albedo traits of a fitted face, or why there are none.
+def build_albedo_traits(source: SceneSource) -> AlbedoTraitLayers | str:
+    """Build the albedo traits of a fitted face; return the reason as text if there are none.
 
     Parameters
     ----------
     source
-        With the folder of an appearance "model" or "dome" that holds `position` and `r_d`.
+        Source with an appearance "model" or "dome" that has `position` and `r_d`.
     """
     path = next((source.paths[kind] for kind in ("model", "dome") if kind in source.paths), None)
     if path is None:
-        return "albedo edits need a measured albedo: the map R_d of a dome session"
+        return "albedo edits require a measured albedo: the map R_d of a dome session"
     face = face_textures.read(path)
     if not {"position", "r_d"} <= set(face.appearance.maps):
         return f"{path.name} has no maps position and r_d"
@@ -297,7 +296,7 @@ def albedo_traits(source: SceneSource) -> AlbedoTraitLayers | str:
 
 
 def _upsample(values: Float32Array, shape: tuple[int, ...]) -> Float32Array:
-    """Return a map at more texels, linear between the centres, as the page samples it."""
+    """Upsample a map linearly between texel centers, as the page samples it."""
     for axis, size in enumerate(shape[:2]):
         old = values.shape[axis]
         place = np.clip((np.arange(size) + 0.5) * old / size - 0.5, 0.0, old - 1.0)
@@ -312,35 +311,35 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values.astype(np.float64)))))
 
 
-def assets(source: SceneSource) -> Assets:
-    """Return lobes with their shares, a diffusion profile, and trait sliders.
+def build_assets(source: SceneSource) -> Assets:
+    """Build basis BRDFs with weights, the diffusion profile and trait sliders.
 
     Parameters
     ----------
     source
-        A fitted appearance "model" or "dome" gives the face's own; others show the mean surface of
-        the population that the packaged traits were learned from.
+        With a fitted appearance "model" or "dome", the assets are those of the face; otherwise the
+        mean surface of the population of the packaged traits.
 
     Raises
     ------
     SkinReflectanceError, SurfaceMixtureError
-        For a fitted folder that is damaged.
+        If a fitted folder is damaged.
     """
     found = reflectance_assets.read_lobes(source)
     left_out: dict[str, str] = {}
     textures: dict[str, Texture] = {}
     facts: dict[str, Any] = {}
     names: list[str] = []
-    surface = surface_traits(found)
+    surface = build_surface_traits(found)
     if surface is None:
         left_out["traits of the surface"] = (
             "the basis BRDFs of this fit differ from those of the traits"
         )
     else:
         found = surface.lobes
-        facts["surface_traits"] = surface_facts(surface)
+        facts["surface_traits"] = describe_surface_traits(surface)
         names += surface.pull
-    albedo = albedo_traits(source)
+    albedo = build_albedo_traits(source)
     if isinstance(albedo, str):
         left_out["traits of the albedo"] = albedo
     else:

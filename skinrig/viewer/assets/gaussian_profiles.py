@@ -1,8 +1,8 @@
-"""Diffusion profiles as sums of Gaussians, which a page blurs with.
+"""Fit diffusion profiles by sums of Gaussians, for blurs in the page.
 
-A dipole's reflectance around a beam, normalized to 1, becomes a few Gaussians whose variances are
-the same for red, green and blue, so that one blur serves all three, with weights for each that add
-up to 1: light that is even over the skin stays as it is.
+A dipole's radial reflectance, normalized to 1, is fitted by a few Gaussians. Their variances are
+common to red, green and blue, so that one blur serves all three. The weights of each channel sum to
+1, so that uniform light is preserved.
 
 References
 ----------
@@ -23,9 +23,9 @@ from skinrig.arrays import Float64Array
 from skinrig.viewer.scene import SceneError
 
 N_GAUSSIANS: Final = 4
-"""Spread an edge of light within 0.1 % (three: 0.4 %; six: 0.01 %) and are two passes each."""
+"""Number of Gaussians, two passes each; edge error 0.1 % (three: 0.4 %; six: 0.01 %)."""
 _RADIUS_NODES: Final = 240
-_MAX_RELATIVE_RADIUS: Final = 12.0  # radii reach so many times 1/sigma_tr, where e^-12 is left
+_MAX_RELATIVE_RADIUS: Final = 12.0  # largest radius times sigma_tr, where e^-12 remains
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,14 +35,13 @@ class GaussianProfile:
     Attributes
     ----------
     variances_mm2 : ndarray of float64, shape (G,)
-        Along one axis, growing.
+        Variance along one axis, increasing.
     weights : ndarray of float64, shape (G, 3)
-        At least 0; each channel adds up to 1.
+        Weights, at least 0; those of a channel sum to 1.
     edge_error : ndarray of float64, shape (3,)
-        Largest difference between how the profile and the sum spread a straight edge of light, in
-        shares of the light.
+        Maximum difference of the edge responses of profile and sum, fraction of the light.
     radial_error : ndarray of float64, shape (3,)
-        RMS difference of the profiles over the plane's rings, over the profile's own.
+        Relative RMS difference of the radial profiles, weighted by ring.
     """
 
     variances_mm2: Float64Array
@@ -51,9 +50,9 @@ class GaussianProfile:
     radial_error: Float64Array
 
     def facts(self, origin: str) -> dict[str, Any]:
-        """Return what the page says of it, and where it comes from, as JSON values."""
+        """Return variances, weights, errors and source for the page, as JSON values."""
         names = ("variances_mm2", "weights", "edge_error", "radial_error")
-        return {**{name: getattr(self, name).tolist() for name in names}, "told": origin}
+        return {**{name: getattr(self, name).tolist() for name in names}, "origin": origin}
 
 
 def fit_gaussians(
@@ -68,18 +67,17 @@ def fit_gaussians(
     sigma_tr_per_mm
         Effective transport coefficient, (3,), 1/mm, above 0.
     count
-        Gaussians, at least 1.
+        Number of Gaussians, at least 1.
 
     Returns
     -------
     GaussianProfile
-        Variances and weights are those that spread an edge of light most nearly as the dipoles do,
-        least squares over distances.
+        Variances and weights that minimize the squared error of the dipoles' edge response.
 
     Raises
     ------
     SceneError
-        For values out of range.
+        If values are out of range.
 
     Examples
     --------
@@ -138,15 +136,14 @@ def _dipoles(albedo: Float64Array, transport: Float64Array) -> tuple[Float64Arra
 
 
 def _edge_of(radii: Float64Array, profile: Float64Array, positions: Float64Array) -> Float64Array:
-    """Return how a radial profile spreads an edge: the share of it within half-planes.
+    """Return the edge response of a radial profile: its fraction beyond lines at distances.
 
-    Of a ring of radius r, the share on the dark side of a line at distance x < r is
-    arccos(x / r) / pi.
+    The fraction of a ring of radius r beyond a line at distance x < r is arccos(x / r) / pi.
     """
     fine = np.geomspace(radii[0], radii[-1], 8 * len(radii))
     values = np.exp(np.interp(np.log(fine), np.log(radii), np.log(np.maximum(profile, 1e-300))))
     mass = 2.0 * np.pi * fine**2 * values * np.gradient(np.log(fine))
-    mass /= mass.sum()  # what the last radii leave out
+    mass /= mass.sum()  # compensates the truncation at the last radius
     dark = np.arccos(np.minimum(positions[:, None] / fine, 1.0)) / np.pi
     return np.asarray(1.0 - dark @ mass)
 
@@ -156,8 +153,8 @@ def _edges(variances: Float64Array, positions: Float64Array) -> Float64Array:
 
 
 def _weights(bases: Float64Array, target: Float64Array) -> Float64Array:
-    """Return weights of at least 0 that add up to 1, (G, 3)."""
-    firm = 1e3  # a row that holds the sum at 1
+    """Fit non-negative weights that sum to 1, (G, 3)."""
+    firm = 1e3  # weight of the additional equation: sum = 1
     rows = np.vstack([bases, np.full((1, bases.shape[1]), firm)])
     found = np.stack([nnls(rows, np.append(one, firm))[0] for one in target.T], axis=-1)
     return np.asarray(found / found.sum(axis=0))

@@ -1,4 +1,4 @@
-"""The flash rig's facial color, drawn on a picture, brought to the texture of a mesh."""
+"""Map the flash rig's facial color from its image to the texture of a mesh."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,27 +24,27 @@ Points2 = Mapping[str, tuple[float, float]]
 Points3 = Mapping[str, tuple[float, float, float]]
 
 MIN_LANDMARKS: Final = 7
-"""Landmarks; a projective camera has 11 unknowns, and each landmark tells two."""
+"""Minimum number of landmarks: a projective camera has 11 unknowns, a landmark two equations."""
 MIN_VIEW_COSINE: Final = 0.3
-"""Between surface and view: texels more aslant are not taken from the picture."""
+"""Minimum cosine of normal and view; more oblique texels are not sampled from the image."""
 LANDMARK_STDERR_PX: Final = 1.0
-"""Of a landmark along each axis."""
+"""Standard uncertainty of a landmark per axis."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TexelPlacement:
-    """Where each texel of a mesh lies in a picture.
+    """Positions of a mesh's texels in an image.
 
     Attributes
     ----------
     pixel : ndarray of float64, shape (N, N, 2)
         Column and row.
     visible : ndarray of bool, shape (N, N)
-        Texels that the camera faced.
+        Texels visible from the camera.
     leave_one_out_px : float
-        Median distance of a landmark from where the others put it.
+        Median distance of a landmark from its prediction by the others.
     landmarks : int
-        How many were used.
+        Number of landmarks used.
     """
 
     pixel: Float64Array
@@ -53,7 +53,7 @@ class TexelPlacement:
     landmarks: int
 
     def sample(self, values: FloatArray, valid: BoolArray) -> tuple[Float64Array, BoolArray]:
-        """Return a map of the picture in the texture, (N, N), and where it is known.
+        """Resample a map of the image to the texture, (N, N), with its valid texels.
 
         Parameters
         ----------
@@ -78,26 +78,26 @@ def place_texels(
     landmarks_mm: Points3,
     landmarks_px: Points2,
 ) -> TexelPlacement:
-    """Find where the texels of a mesh lie in a picture.
+    """Find the positions of a mesh's texels in an image.
 
     Parameters
     ----------
     position_mm, normal
         Surface point and unit normal of each texel, (N, N, 3).
     covered
-        Texels that have a surface, (N, N).
+        Texels of the surface, (N, N).
     landmarks_mm, landmarks_px
-        Named points of the mesh and of the picture; those of the same name are used.
+        Named points of the mesh and of the image; those of equal names are used.
 
     Raises
     ------
     SceneError
-        Fewer than `MIN_LANDMARKS` names in both, or points that lie too flat or on a line.
+        If fewer than `MIN_LANDMARKS` names are in both, or points are coplanar or collinear.
     """
     names = sorted(set(landmarks_mm) & set(landmarks_px))
     if len(names) < MIN_LANDMARKS:
         raise SceneError(
-            f"landmarks: {len(names)} names are in both the picture's table and the mesh, "
+            f"--landmarks: got {len(names)} names of both the image's table and the mesh, "
             f"expected at least {MIN_LANDMARKS}; the mesh has {', '.join(sorted(landmarks_mm))}"
         )
     solid = np.array([landmarks_mm[name] for name in names], np.float64)
@@ -112,7 +112,7 @@ def place_texels(
     pixel = np.zeros((*covered.shape, 2))
     direct = _project(camera, position_mm[covered].astype(np.float64))
     low = np.floor(direct.min(axis=0))
-    # the field is smooth: nodes some pixels apart are enough
+    # the deformation is smooth: it is evaluated at nodes some pixels apart
     shape = np.ceil(direct.max(axis=0) - low).astype(int) + 1
     nodes = landmark_field.fit_landmark_field(
         field.points_px - low, field.moved_px - low, stderr_px=field.stderr_px
@@ -121,7 +121,7 @@ def place_texels(
     at = (direct - low).T[::-1]
     shift = np.stack([ndimage.map_coordinates(moved[..., k], at, order=1) for k in range(2)], -1)
     pixel[covered] = direct + shift
-    far = np.linalg.svd(camera)[2][-1]  # where the camera stands is what it maps to nothing
+    far = np.linalg.svd(camera)[2][-1]  # the projection center is the null space of the camera
     eye = far[:3] / far[3]
     way = eye - position_mm
     way /= np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-12)
@@ -135,18 +135,20 @@ def place_texels(
 
 
 def _camera(solid: Float64Array, flat: Float64Array) -> Float64Array:
-    """Return the projective camera (3, 4) through points, by the normalized linear method."""
+    """Fit a projective camera, (3, 4), to points by the normalized direct linear transform."""
     middle, size = solid.mean(axis=0), float(np.sqrt(solid.var(axis=0).sum()))
     center, spread = flat.mean(axis=0), float(np.sqrt(flat.var(axis=0).sum()))
     if size == 0.0 or spread == 0.0:
-        raise SceneError("landmarks: all lie at one place, expected points all over the face")
+        raise SceneError(
+            "--landmarks: got coincident points, expected points all over the face; correct them"
+        )
     X = np.column_stack([(solid - middle) / size, np.ones(len(solid))])
     x = (flat - center) / spread
     zero = np.zeros_like(X)
     rows = np.vstack([np.hstack([X, zero, -x[:, :1] * X]), np.hstack([zero, X, -x[:, 1:] * X])])
     _, values, vectors = np.linalg.svd(rows)
     if values[-2] < 1e-4 * values[0]:
-        raise SceneError("landmarks: lie in one plane, expected nose and ears among them")
+        raise SceneError("--landmarks: got coplanar points, expected also nose and ears; add them")
     P = vectors[-1].reshape(3, 4)
     from_solid = np.eye(4)
     from_solid[:3, :3] /= size
@@ -164,25 +166,25 @@ def _project(camera: Float64Array, points: Float64Array) -> Float64Array:
 
 MELANIN_MAP = "melanin"
 RIG_PX: Final = 256
-"""Cells a side of the scale and bias maps (Jimenez 2010, section 6)."""
+"""Side of the scale and bias maps, cells (Jimenez 2010, section 6)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceColor:
-    """Chromophores of a face on its texture, and its hemoglobin rig.
+    """Chromophores and hemoglobin rig of a face on its texture.
 
     Attributes
     ----------
     melanin, hemoglobin : ndarray of float64, shape (N, N)
-        Volume fractions in the neutral state, known everywhere.
+        Volume fractions of the neutral expression, without gaps.
     states : mapping of str to ndarray of float64, shape (h, w, 2)
-        Scale and bias by state, "neutral" first.
+        Scale and bias by expression, "neutral" first.
     global_states
-        Those of the whole body.
+        Conditions of the whole body.
     facts
-        How they came to lie on the texture; JSON values.
+        Record of the mapping, JSON values.
     left_out
-        What could not be placed.
+        Omissions with reasons.
     """
 
     melanin: Float64Array
@@ -194,17 +196,17 @@ class FaceColor:
 
 
 def place_facial_color(source: SceneSource) -> FaceColor:
-    """Return the measured chromophores and rig on the texture of the scene's mesh.
+    """Map the measured chromophores and rig to the texture of the scene's mesh.
 
     Parameters
     ----------
     source
-        With a dynamic appearance that holds facial color.
+        Source with a dynamic appearance that has facial color.
 
     Raises
     ------
     SceneError
-        Nothing says where the picture lies on the mesh, or the landmarks do not.
+        If landmarks of the image are missing or unusable.
     """
     appearance, subject = source.appearances["dynamic"], source.subject
     rig = from_maps_and_document(appearance.maps, appearance.files[RIG_DOCUMENT])
@@ -222,7 +224,7 @@ def place_facial_color(source: SceneSource) -> FaceColor:
     neutral, known = where.sample(rig.neutral, rig.valid)
     aside = float((atlas.covered & ~known).mean() / atlas.covered.mean())
     left_out = {
-        "color outside the image": f"{100 * aside:.0f} % of the skin did not face the camera; "
+        "color outside the image": f"{100 * aside:.0f} % of the skin was not visible; "
         "its color is extrapolated"
     }
     if MELANIN_MAP in appearance.maps:
@@ -262,12 +264,12 @@ def place_facial_color(source: SceneSource) -> FaceColor:
 def read_image_landmarks(
     source: SceneSource, part: dict[str, Any]
 ) -> dict[str, tuple[float, float]]:
-    """Return named points of the neutral picture that the flash rig's maps are drawn on, px.
+    """Read the landmarks of the flash rig's neutral image, px.
 
     Raises
     ------
     SceneError
-        There is no table, and no simulation's truth beside the folder.
+        If there is neither a table nor a simulation's ground truth next to the folder.
     """
     if source.landmarks is not None:
         return landmark_table.read_landmark_table(source.landmarks)
@@ -279,6 +281,6 @@ def read_image_landmarks(
             if isinstance(points, dict):
                 return {key: (float(x), float(y)) for key, (x, y) in points.items()}
     raise SceneError(
-        f"{source.paths['dynamic']}: its maps are drawn on a picture, and nothing says where that "
-        "lies on the mesh; give --landmarks FILE, a table name,x,y of the neutral picture"
+        f"{source.paths['dynamic']}: got maps of an image without landmarks, expected some to map "
+        "them to the mesh; give --landmarks FILE, a table name,x,y of the neutral image"
     )

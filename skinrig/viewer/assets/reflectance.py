@@ -1,7 +1,7 @@
-"""Fitted reflectance for the page: lobes as one table, their shares, a profile of scattering.
+"""Build the page's fitted reflectance: basis BRDFs as one table, weights, diffusion profile.
 
-Names in the page: textures `lobe_atlas` (see `compact_brdf.atlas`), `lobe_shares` (layers of four
-lobes) and `translucency` (how much wider than the profile light spreads at a texel); facts
+Names in the page: textures `lobe_atlas` (see `build_atlas`), `lobe_shares` (weights, layers of four
+basis BRDFs) and `translucency` (local width of scattering relative to the profile); facts
 `reflectance` and `profile` (variances and weights of the Gaussians, stated errors).
 """
 
@@ -26,25 +26,25 @@ from skinrig.viewer.scene import Assets, SceneSource, Texture
 
 TRIED_SLABS: Final = (1, 2, 3, 4, 6, 12)
 MIN_STRONG_FRACTION: Final = 0.01
-"""Values above this share of a lobe's peak count for the error of single values."""
+"""Minimum value, fraction of a BRDF's peak, for the error of single values."""
 MAX_SHAPE_ERROR: Final = 0.01
-"""Bound on both errors of a table that is chosen, relative."""
+"""Limit of both relative errors of a chosen table."""
 LOBES_PER_LOOKUP: Final = 4
-"""Lobes that one look-up reads."""
+"""Basis BRDFs per look-up."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompactBrdf:
-    """Lobes in a table, and what that costs.
+    """Basis BRDFs in a compact table, with errors and cost.
 
     Attributes
     ----------
     slabs : int
-        Of phi_d.
+        Number of slabs of phi_d.
     table : ndarray of float64, shape (32, 12, 90, K)
-        1/sr, what a page reads back at the nodes of `model.brdf.tables`.
+        1/sr, values as decoded by the page at the nodes of `model.brdf.tables`.
     rms_error, strong_error : float
-        See `table_errors`.
+        See `compute_table_errors`.
     """
 
     slabs: int
@@ -54,31 +54,31 @@ class CompactBrdf:
 
     @property
     def lookups(self) -> int:
-        """Filtered look-ups for one light, all lobes together."""
+        """Filtered look-ups per light for all basis BRDFs."""
         return -(-self.table.shape[-1] // LOBES_PER_LOOKUP)
 
     @property
     def size_bytes(self) -> int:
-        """Bytes before compression: values of 16 bits."""
+        """Size before compression, 16 bits per value."""
         return 2 * self.slabs * NODES_D * NODES_H * self.lookups * LOBES_PER_LOOKUP
 
 
 def choose_table(lobes: BrdfBasis) -> CompactBrdf:
-    """Return the table with the fewest slabs whose errors are within `MAX_SHAPE_ERROR`.
+    """Choose the table with the fewest slabs whose errors are within `MAX_SHAPE_ERROR`.
 
-    The finest table is off by its 16 bits only, so that one always fits.
+    The finest table has only rounding errors of 16 bits, so that one always suffices.
     """
     table = lobes.table[..., : lobes.size].astype(np.float64)
     for slabs in TRIED_SLABS:
         back = average_slabs(table, slabs)
-        found = CompactBrdf(slabs, back, *table_errors(back, table))
+        found = CompactBrdf(slabs, back, *compute_table_errors(back, table))
         if max(found.rms_error, found.strong_error) <= MAX_SHAPE_ERROR:
             break
     return found
 
 
 def average_slabs(table: Float64Array, slabs: int) -> Float64Array:
-    """Return (32, 12, 90, K) with runs of phi_d nodes at their mean over the visible half-space."""
+    """Average runs of phi_d nodes over the visible half-space, (32, 12, 90, K)."""
     if slabs not in TRIED_SLABS:
         raise ValueError(f"slabs: got {slabs}, expected one of {', '.join(map(str, TRIED_SLABS))}")
     weight = _cosines()[..., None] + 1e-9
@@ -90,11 +90,11 @@ def average_slabs(table: Float64Array, slabs: int) -> Float64Array:
     return np.broadcast_to(held, parts.shape).reshape(table.shape)
 
 
-def atlas(found: CompactBrdf) -> Float32Array:
-    """Return a table as an image for one bilinear look-up, (G * slabs * 32, 90, 4).
+def build_atlas(found: CompactBrdf) -> Float32Array:
+    """Arrange a table as an image for bilinear look-ups, (G * slabs * 32, 90, 4).
 
-    Group g of four lobes, slab s, node i of theta_d is row (g * slabs + s) * 32 + i, theta_h goes
-    along columns, lobe 4 g + c is channel c. Lobes that fill a group up are 0.
+    Group g of four basis BRDFs, slab s and node i of theta_d are row (g * slabs + s) * 32 + i;
+    columns are theta_h; basis BRDF 4 g + c is channel c. Unused channels are 0.
     """
     kept = found.table[:, :: NODES_PHI // found.slabs].astype(np.float32)
     layers = pack_fours(kept)
@@ -104,7 +104,7 @@ def atlas(found: CompactBrdf) -> Float32Array:
 
 
 def pack_fours(values: Float32Array) -> Float32Array:
-    """Return values (..., K) of lobes as layers of four, (L, ..., 4); what fills them up is 0."""
+    """Arrange values of basis BRDFs, (..., K), in layers of four, (L, ..., 4), padded with 0."""
     groups = -(-values.shape[-1] // LOBES_PER_LOOKUP)
     missing = groups * LOBES_PER_LOOKUP - values.shape[-1]
     padded = np.pad(values, (*[(0, 0)] * (values.ndim - 1), (0, missing)))
@@ -112,18 +112,18 @@ def pack_fours(values: Float32Array) -> Float32Array:
     return np.ascontiguousarray(np.moveaxis(split, -2, 0))
 
 
-def table_errors(decoded: Float64Array, table: Float64Array) -> tuple[float, float]:
-    """Return how far (32, 12, 90, K) values are from a table's, both of the worst lobe.
+def compute_table_errors(decoded: Float64Array, table: Float64Array) -> tuple[float, float]:
+    """Return two errors of decoded values, (32, 12, 90, K), each of the worst basis BRDF.
 
     Returns
     -------
     rms : float
-        RMS difference over that of the lobe, nodes counting by solid angle and both cosines.
+        RMS difference relative to the BRDF's RMS, weighted by solid angle and both cosines.
     strong : float
-        95th percentile of the relative difference where a lobe exceeds `MIN_STRONG_FRACTION` of
-        its peak.
+        95th percentile of the relative difference of values above `MIN_STRONG_FRACTION` of the
+        peak.
     """
-    weight = (solid_angle_weights() * _cosines())[..., None]
+    weight = (compute_solid_angle_weights() * _cosines())[..., None]
     off = np.sum(weight * (decoded - table) ** 2, axis=(0, 1, 2))
     own = np.sum(weight * table**2, axis=(0, 1, 2))
     rms = float(np.sqrt(np.max(np.where(own > 0.0, off / np.maximum(own, 1e-300), 0.0))))
@@ -137,7 +137,7 @@ def table_errors(decoded: Float64Array, table: Float64Array) -> tuple[float, flo
     return rms, worst
 
 
-def solid_angle_weights() -> Float64Array:
+def compute_solid_angle_weights() -> Float64Array:
     """Return the solid angle of each node up to a factor, (32, 12, 90)."""
     d, _, h = brdf_tables.grid_nodes()
     solid = np.sin(2.0 * d)[:, None, None] * (np.sin(h) * np.gradient(h))
@@ -152,37 +152,37 @@ def _cosines() -> Float64Array:
     return np.asarray(np.where((mu_l > 0.0) & (mu_v > 0.0), mu_l * mu_v, 0.0))
 
 
-SHARES_PX: Final = 256
-"""Most texels a side of the maps of shares; finer ones are averaged."""
-SHARE_BITS: Final = 7
-"""Binary digits of a share in the page: within 0.8 %, a sixth of a fit's own errors."""
+WEIGHT_MAP_PX: Final = 256
+"""Maximum side of weight maps; finer ones are averaged."""
+WEIGHT_BITS: Final = 7
+"""Binary digits of a weight in the page: within 0.8 %, a sixth of a fit's errors."""
 TRANSLUCENCY_PX: Final = 128
-"""Texels a side of the map of widths: a probe measures few places, between them it is smooth."""
+"""Side of the map of scattering widths; it is smooth, as it is interpolated from a few sites."""
 POPULATION_SPACE: Final = "surface"
-"""Space of the trait library whose centre is the mean surface of a population."""
+"""Space of the trait library whose center is the mean surface of a population."""
 FACIAL_R_D: Final = (0.46, 0.31, 0.23)
 """R_d of facial skin, Weyrich et al. 2006, figure 11, linear sRGB; it shapes the profile's core."""
 TYPICAL_CHROMOPHORES: Final = (0.03, 0.03)
-"""Volume fractions of melanin and hemoglobin, whose color stands in for R_d where there is none:
-the shape of a profile depends little on it."""
+"""Volume fractions of melanosomes and blood whose color replaces an unmeasured R_d; the shape of a
+profile depends little on it."""
 
 Origin = Literal["fitted", "population"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PageLobes:
-    """Lobes and shares before they are packed.
+    """Basis BRDFs and weights before packing.
 
     Attributes
     ----------
     lobes
-        K lobes, 1/sr.
+        K basis BRDFs, 1/sr.
     shares : ndarray of float32, shape (H, W, K)
-        Row 0 at the top.
+        Weights; row 0 at the top.
     mix : ndarray of float64, shape (K, M)
-        Each lobe as a mixture of `materials`.
+        Each basis BRDF as a mixture of `materials`.
     materials
-        M names.
+        Names of the M materials.
     origin
         "fitted" to a face, or "population": the mean of simulated people.
     """
@@ -197,9 +197,9 @@ class PageLobes:
 def build_lobe_assets(source: SceneSource, found: PageLobes) -> Assets:
     """Return the assets of some lobes, which may hold those of traits too."""
     compact = choose_table(found.lobes)
-    profile, widths, told = _diffusion_of(source)
+    profile, widths, origin = _diffusion_of(source)
     # the packer turns pictures over; this one's rows stand as the shader counts them
-    rows = np.ascontiguousarray(atlas(compact)[::-1])
+    rows = np.ascontiguousarray(build_atlas(compact)[::-1])
     textures = {
         "lobe_atlas": Texture(rows, "f16"),
         "lobe_shares": Texture(round_weights(pack_fours(found.shares)), "f16"),
@@ -208,28 +208,30 @@ def build_lobe_assets(source: SceneSource, found: PageLobes) -> Assets:
         textures["translucency"] = Texture(widths[..., None], "u8")
     return {
         "textures": textures,
-        "facts": {"reflectance": _facts(found, compact), "profile": profile.facts(told)},
-        "left_out": _list_omissions(found, told),
+        "facts": {"reflectance": _facts(found, compact), "profile": profile.facts(origin)},
+        "left_out": _list_omissions(found, origin),
     }
 
 
-def default_scattering(source: SceneSource) -> Assets:
-    """Return the profile of the population's mean dipole, for skin of which nothing was measured.
+def build_default_scattering(source: SceneSource) -> Assets:
+    """Build the diffusion profile of the population's mean dipole, for unmeasured skin.
 
-    The page switches between it and that of the fitted reflectance.
+    The page can switch between it and the profile of the fitted reflectance.
     """
-    depth_mm, told = skin_reflectance.population_mean_mm()
+    depth_mm, origin = skin_reflectance.population_mean_mm()
     profile = gaussian_profiles.fit_gaussians(FACIAL_R_D, 1.0 / depth_mm)
-    return {"facts": {"scattering": profile.facts(told)}}
+    return {"facts": {"scattering": profile.facts(origin)}}
 
 
 def read_lobes(source: SceneSource) -> PageLobes:
-    """Return the lobes of a face, or of the mean of a population."""
+    """Read the basis BRDFs and weights of a face, or of a population's mean."""
     for appearance in source.fitted:
         if skin_reflectance.BASIS_FILE in appearance.files:
             lobes = skin_reflectance.load_basis(appearance)
             mixtures = surface_mixtures.read(appearance)
-            shares = fill_texels(mixtures.weights().astype(np.float32), mixtures.valid, SHARES_PX)
+            shares = fill_texels(
+                mixtures.weights().astype(np.float32), mixtures.valid, WEIGHT_MAP_PX
+            )
             shares = np.maximum(shares, np.float32(0.0))  # filling can undershoot
             return PageLobes(lobes, shares, mixtures.mix, mixtures.materials, "fitted")
     space = trait_storage.load_packaged_traits().spaces[POPULATION_SPACE]
@@ -244,7 +246,7 @@ def read_lobes(source: SceneSource) -> PageLobes:
 
 
 def round_weights(values: Float32Array) -> Float32Array:
-    """Return numbers with `SHARE_BITS` binary digits, the nearest: a fit knows shares to percents.
+    """Round weights to `WEIGHT_BITS` binary digits, since fits are accurate to percents.
 
     Examples
     --------
@@ -252,12 +254,12 @@ def round_weights(values: Float32Array) -> Float32Array:
     [0.0, 1.0, 1.015625, -0.30078125]
     """
     mantissa, exponent = np.frexp(values)
-    steps = np.float32(2**SHARE_BITS)
+    steps = np.float32(2**WEIGHT_BITS)
     return np.asarray(np.ldexp(np.rint(mantissa * steps) / steps, exponent), np.float32)
 
 
 def fill_texels(values: Float32Array, valid: BoolArray, max_px: int) -> Float32Array:
-    """Return (h, w, C) with values in texels that have none, no more than `max_px` a side.
+    """Fill invalid texels from their surroundings and reduce to at most `max_px` per side.
 
     Parameters
     ----------
@@ -265,8 +267,8 @@ def fill_texels(values: Float32Array, valid: BoolArray, max_px: int) -> Float32A
         (H, W, C).
     valid
         (H, W).
-    most
-        Texels a side; larger maps are averaged over whole blocks.
+    max_px
+        Maximum side of the result, (h, w, C); larger maps are averaged over whole blocks.
     """
     step = -(-max(values.shape[:2]) // max_px)
     kept = valid.astype(np.float32)
@@ -280,34 +282,34 @@ def fill_texels(values: Float32Array, valid: BoolArray, max_px: int) -> Float32A
 
 
 def _diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32Array | None, str]:
-    """Return the profile at a face's mean, how much wider it is at each texel, and where from.
+    """Return the profile of a face's mean, its relative width per texel, and its source.
 
     Returns
     -------
     profile
-        Of the mean translucency and albedo.
+        Profile of the mean translucency and albedo.
     widths : ndarray of float32, shape (H, W), or None
-        Geometric mean over the channels of 1/sigma_tr over that of the profile; None: everywhere 1.
-    told
-        Where the translucency comes from, for people.
+        Geometric mean over channels of 1/sigma_tr relative to the profile; None: 1 everywhere.
+    origin
+        Source of the translucency, in words.
     """
-    mean_mm, told = skin_reflectance.population_mean_mm()
+    mean_mm, origin = skin_reflectance.population_mean_mm()
     if not source.fitted:
-        return gaussian_profiles.fit_gaussians(_typical_r_d(), 1.0 / mean_mm), None, told
+        return gaussian_profiles.fit_gaussians(_typical_r_d(), 1.0 / mean_mm), None, origin
     appearance = source.fitted[0]
     r_d = _mean_albedo(appearance)
     depth = appearance.maps.get(TRANSLUCENCY_MAP)
     if depth is None or not (known := depth.mask & (depth.values > 0).all(-1)).any():
-        return gaussian_profiles.fit_gaussians(r_d, 1.0 / mean_mm), None, told
+        return gaussian_profiles.fit_gaussians(r_d, 1.0 / mean_mm), None, origin
     logs = np.log(np.where(known[..., None], depth.values, 1.0)).astype(np.float32)
     mean = logs[known].astype(np.float64).mean(axis=0)
     off = (logs - mean.astype(np.float32)).mean(axis=-1, keepdims=True)
     widths = np.exp(fill_texels(off, known, TRANSLUCENCY_PX)[..., 0])
     record: Any = appearance.parameters.get("reflectance_model")
     if isinstance(record, dict) and record.get("translucency") == "measured":
-        told = "a fiber probe on this face"
+        origin = "a fiber probe on this face"
     even = float(np.ptp(widths)) < 1e-3
-    return gaussian_profiles.fit_gaussians(r_d, np.exp(-mean)), None if even else widths, told
+    return gaussian_profiles.fit_gaussians(r_d, np.exp(-mean)), None if even else widths, origin
 
 
 def _mean_albedo(appearance: SkinAppearance) -> Float64Array:
@@ -324,7 +326,7 @@ def _typical_r_d() -> Float64Array:
 
 
 def _blocks(values: Float32Array, step: int) -> Float32Array:
-    """Return means over blocks of `step` texels; what is beyond whole blocks is left out."""
+    """Return means over blocks of `step` texels, without incomplete blocks."""
     height, width = (size // step * step for size in values.shape[:2])
     cut = values[:height, :width]
     parts = cut.reshape(height // step, step, width // step, step, -1)
@@ -346,8 +348,8 @@ def _list_omissions(found: PageLobes, origin: str) -> tuple[tuple[str, str], ...
     rows = {}
     if found.origin == "population":
         rows["basis BRDFs of this face"] = (
-            "not fitted; the mean of simulated people is shown. `skinrig view MODEL` with the maps "
-            "of a dome shows those of a face"
+            "not fitted; the mean of simulated people is displayed. Use `skinrig view MODEL` with "
+            "the maps of a dome for those of a face"
         )
     if "probe" not in origin:
         rows["diffuse mean free path of this face"] = f"not measured by a probe: {origin}"

@@ -1,7 +1,7 @@
-"""What the page needs to wrinkle: base derivatives, wrinkle maps, zones, and who moves them.
+"""Build the page's wrinkle and relief assets: base derivatives, wrinkle maps, zones and weights.
 
-Maps are those of `model.wrinkles.evaluation`: fitted (`skinrig fit wrinkles`) where a folder has
-them, otherwise fitted to the simulated person's own expressions. The page adds them as
+Maps are those of `model.wrinkles.evaluation`: from `skinrig fit wrinkles` if a folder has them,
+else fitted to the simulated person's own expressions. The page combines them as
 `model.wrinkles.combine_layers` does.
 """
 
@@ -22,37 +22,37 @@ from skinrig.viewer.map_filling import downsample, fill_holes
 from skinrig.viewer.scene import Assets, SceneError, SceneSource, Texture
 
 MAP_PX: Final = 512
-"""Side of wrinkle maps, at most: half a millimeter of a face; the paper has 256."""
+"""Maximum side of wrinkle maps: texels of 0.5 mm on a face; the paper has 256."""
 MASK_PX: Final = 64
 WEIGHTS_PX: Final = 128
-"""Side of the normals that the zones' weights are found on."""
+"""Side of the normals to which the zones' weights are fitted."""
 ZONES_PER_LAYER: Final = 8
-"""Of each wrinkle map, in two RGBA textures."""
+"""Zones per wrinkle map, in two RGBA textures."""
 MAX_LAYERS: Final = 4
-"""Wrinkle maps that the shader has room for."""
+"""Maximum number of wrinkle maps of the shader."""
 
 
-def assets(source: SceneSource) -> Assets:
-    """Return the wrinkles of a scene, fitted ones before those of the simulated person."""
+def build_assets(source: SceneSource) -> Assets:
+    """Build the wrinkles of a scene: fitted ones, else those of the simulated person."""
     dynamic = source.appearances.get("dynamic")
     if dynamic is not None and WRINKLE_FILE in dynamic.files:
         found = WrinkleModel.from_maps(dynamic.maps, bytes(dynamic.files[WRINKLE_FILE]))
         return build_model_assets(found, source, origin="fitted")
-    found = simulated_model(source.subject, size=min(source.size, MAP_PX))
+    found = fit_simulated_wrinkles(source.subject, size=min(source.size, MAP_PX))
     return build_model_assets(
         found, source, origin="simulated: fitted to the person's own expressions"
     )
 
 
-def simulated_model(subject: SimulatedSubject, *, size: int) -> WrinkleModel:
-    """Return wrinkles fitted to the expressions of a simulated person.
+def fit_simulated_wrinkles(subject: SimulatedSubject, *, size: int) -> WrinkleModel:
+    """Fit wrinkles to the expressions of a simulated person.
 
     Parameters
     ----------
     subject : Subject
-        At rest or posed; its mesh, seed and preset count.
+        Neutral or posed person; its mesh, seed and preset are used.
     size : int
-        Texels a side of the normals that are fitted and of the wrinkle map.
+        Side of the fitted normals and of the wrinkle map, texels.
     """
     rest = subject if subject.rest is None else subject.rest
     if rest.size != size:
@@ -63,7 +63,7 @@ def simulated_model(subject: SimulatedSubject, *, size: int) -> WrinkleModel:
     moved = estimate_amplitudes(neutral, posed, size=(few, few))
     rng = np.random.default_rng(subject.seed)
     zones = fit_zones(moved, zones=ZONES_PER_LAYER, rng=rng)
-    # weights hardly depend on detail: found on coarse normals, then one map is fitted to them
+    # weights hardly depend on detail: they are fitted to coarse normals, then the map to fine ones
     coarse = (min(WEIGHTS_PX, size),) * 2
     small = {name: _downsample_normals(normals, coarse) for name, normals in posed.items()}
     rough = fit_wrinkle_map(_downsample_normals(neutral, coarse), small, zones.masks, size=coarse)
@@ -77,25 +77,25 @@ def _downsample_normals(normals: Float32Array, shape: tuple[int, int]) -> Float3
 
 
 def build_model_assets(model: WrinkleModel, source: SceneSource, *, origin: str) -> Assets:
-    """Return textures and facts of a wrinkle model on a scene's mesh.
+    """Build textures and facts of a wrinkle model on a scene's mesh.
 
-    A simulated face at rest keeps the relief that the surface's own assets bring: its base is left
-    to them. A fitted base replaces them.
+    The neutral base of a simulated face is in `build_surface_assets`; a fitted base replaces it.
 
     Raises
     ------
     SceneError
-        For more maps than the shader has room for.
+        If there are more maps than `MAX_LAYERS`.
     """
     if len(model.layers) > MAX_LAYERS:
         raise SceneError(
-            f"layers: got {len(model.layers)} wrinkle maps, expected at most {MAX_LAYERS}"
+            f"layers: got {len(model.layers)} wrinkle maps, expected at most {MAX_LAYERS}; fit "
+            "fewer"
         )
     tables = [as_table(layer.table) for layer in model.layers]
     driven = sorted({name for table in tables for name in table.rows} & set(source.mesh.shapes))
     if not driven:
         rows = ", ".join(tables[0].rows) if tables else "none"
-        why = f"none of their expressions ({rows}) is a blend shape of the mesh"
+        why = f"the mesh has no blend shape of their expressions ({rows})"
         return Assets(left_out=(("wrinkles", why),))
     shape = _map_shape(model)
     maps = np.stack([_plane(layer.wrinkle, shape) for layer in model.layers])
@@ -111,27 +111,31 @@ def build_model_assets(model: WrinkleModel, source: SceneSource, *, origin: str)
         for table in tables
     ]
     facts: dict[str, Any] = {"expressions": driven, "layers": layers}
-    facts |= {"clamp": model.clamp, "origin": origin, "slope_rms": retained_rms(model, shape)}
+    facts |= {
+        "clamp": model.clamp,
+        "origin": origin,
+        "slope_rms": compute_retained_rms(model, shape),
+    }
     return Assets(textures=textures, facts={"wrinkles": facts})
 
 
-def retained_rms(model: WrinkleModel, shape: tuple[int, int]) -> list[list[float]]:
-    """Return the rms of slopes that pixels of 2^level texels still show, by zone and level.
+def compute_retained_rms(model: WrinkleModel, shape: tuple[int, int]) -> list[list[float]]:
+    """Return the RMS of slopes resolved by pixels of 2^level texels, by zone and level.
 
-    Of each zone's part of its wrinkle map at a weight of 1, over the texels where the map has
-    anything: what a view loses by leaving wrinkles out is at most the zones' strengths times these
-    times the largest change of the reflection by a slope.
+    It is that of each zone's part of its wrinkle map at weight 1, over texels with wrinkles. The
+    error of omitting wrinkles in a view is at most this times the zone's weight times the largest
+    derivative of the reflection by a slope.
 
     Parameters
     ----------
     model : WrinkleModel
     shape : (int, int)
-        Of the page's maps: level 0.
+        Shape of the page's maps, level 0.
 
     Returns
     -------
     list of list of float
-        Eight zones a layer, layer by layer; levels down to one texel.
+        Eight zones per layer; levels down to one texel.
     """
     found = []
     for layer in model.layers:
@@ -144,7 +148,7 @@ def retained_rms(model: WrinkleModel, shape: tuple[int, int]) -> list[list[float
 
 
 def _level_rms(derivatives: Float64Array, count: int) -> list[float]:
-    """Return the rms at each level over so many texels of the finest; others are 0."""
+    """Return the RMS per level over a number of texels of the finest; other texels are 0."""
     share = count / derivatives[..., 0].size
     found = []
     planes: FloatArray = np.moveaxis(derivatives, 2, 0)
@@ -166,7 +170,7 @@ def _plane(wrinkle: Any, shape: tuple[int, int]) -> Float32Array:
 
 
 def _masks(layers: tuple[WrinkleLayer, ...]) -> Float32Array:
-    """Return two RGBA textures a layer, of one size."""
+    """Return two RGBA textures per layer, of one size."""
     side = max(max(layer.masks.shape[1:]) for layer in layers)
     out = []
     for layer in layers:
@@ -183,19 +187,19 @@ def _masks(layers: tuple[WrinkleLayer, ...]) -> Float32Array:
 
 
 MAPS_PX: Final = 256
-"""Most texels a side of roughness and intensity, which vary by region."""
+"""Maximum side of the maps of roughness and intensity, which vary by region."""
 RELIEF_STEP_WORDS: Final = 20
-"""Words of the finest octave's steps, of reliefs of 2048 texels a side and more: 5 um at most."""
+"""Quantization step of the finest octave for reliefs of 2048 texels per side and more; <= 5 um."""
 
 
-def surface_assets(source: SceneSource) -> Assets:
-    """Return the relief at rest, um, and roughness (Beckmann m) and intensity by region."""
+def build_surface_assets(source: SceneSource) -> Assets:
+    """Build neutral relief, um, roughness (Beckmann m) and specular intensity by region."""
     subject = source.subject
     covered = subject.atlas.covered
     height = source.skin.height_um()[..., None]
-    # Beckmann's m and GGX's alpha give a peak of the same height, 1 / (pi m^2)
+    # Beckmann's m and GGX's alpha have the same peak 1 / (pi m^2) of the normal distribution
     roughness = downsample(fill_holes(subject.roughness, covered), MAPS_PX)
-    # hair hides the skin's gloss, as the subject's own renderings have it
+    # hair hides the skin's specular reflection, as in the subject's own renderings
     intensity = 1.0 - downsample(fill_holes(subject.hair, covered), MAPS_PX)
     maps = np.stack([roughness, intensity], axis=-1)
     why = "simulated; used by the analytic specular model"

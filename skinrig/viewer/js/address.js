@@ -1,4 +1,4 @@
-// Settings in the address: what differs from the start, as name=value behind the #.
+// Settings in the URL: differences from the initial state, as name=value after the #.
 V.flat = (value, before = "") => Object.entries(value).flatMap(([name, one]) => {
   const path = before + name;
   const deep = one && typeof one === "object" && !Array.isArray(one) && path !== "compare";
@@ -14,7 +14,7 @@ V.differences = p => {
 V.addressOf = p => V.differences(p).map(([name, value]) =>
   `${name}=${encodeURIComponent(JSON.stringify(value))}`).join("&");
 
-// Only parameters that exist, of the kind they are, are taken from an address.
+// Only existing parameters of the right type are read from a URL.
 V.stateOfAddress = () => {
   const found = {};
   for (const part of location.hash.slice(1).split("&").filter(Boolean)) {

@@ -1,4 +1,4 @@
-// The camera turns about a point in front of the face; lights are directions from the same place.
+// The camera orbits a point in front of the face; lights are directions from that point.
 Object.assign(V.defaults, {
   camera_yaw_deg: 0, camera_pitch_deg: 0, camera_distance_mm: 620, camera_fov_deg: 28,
   camera_target_mm: [0, -22, -30], light_azimuth_deg: 35, light_elevation_deg: 30,
@@ -14,7 +14,7 @@ V.direction = (azimuth, elevation) => [
 V.cameraKey = p => [p.camera_yaw_deg, p.camera_pitch_deg, p.camera_distance_mm, p.camera_fov_deg,
   ...p.camera_target_mm].join();
 
-// Matrices, column by column as GL has them; near and far hug the head for depth's sake.
+// Matrices in column order as in GL; near and far planes enclose the head for depth precision.
 V.camera = (p, [width, height], shift = [0, 0, 0]) => {
   const back = V.direction(p.camera_yaw_deg, p.camera_pitch_deg);
   const right = V.direction(p.camera_yaw_deg + 90, 0);

@@ -1,7 +1,7 @@
 // Jimenez 2010: hemoglobin blended from small scale and bias maps, color from the table.
 Object.assign(V.defaults, {melanin_gain: 1, hemoglobin_gain: 1});
 
-// Weights of the rig's states in the order of the layers; the neutral takes what is left of 1.
+// Weights of the rig's states in the order of the layers; the neutral has the rest to 1.
 V.stateWeights = p => {
   const names = V.scene.facts.facial_color.states;
   const weights = names.map(name => p.weights[name] ?? 0);

@@ -1,4 +1,4 @@
-// The controls: what can be changed, said once and drawn from that.
+// The controls: one declaration per parameter, from which the panel is built.
 //
 //   V.groups    [id, title, sentence, open]
 //   V.controls  {group, kind, path, label, help, when, ...}: a control of the parameter at `path`
@@ -6,7 +6,7 @@
 //     kind "toggle"
 //     kind "choice"  options() => [[value, label], ...]
 //     kind "own"     build(box) => update(p) or nothing
-//   V.say(text) speaks through the live region; V.afterStart.push(fn) runs behind the first frame.
+//   V.announce(text) writes to the live region; V.afterStart.push(fn) runs after the first frame.
 V.groups = [
   ["view", "View", "The final image, or a buffer of one render pass.", true],
   ["expression", "Expression", "Weights of the blend shapes; blood, wrinkles and strain follow.", true],
@@ -43,12 +43,12 @@ V.element = (tag, properties = {}, ...children) => {
   return made;
 };
 
-V.say = text => {
-  clearTimeout(V.saying);
-  V.saying = setTimeout(() => { document.getElementById("live").textContent = text; }, 350);
+V.announce = text => {
+  clearTimeout(V.announceTimer);
+  V.announceTimer = setTimeout(() => { document.getElementById("live").textContent = text; }, 350);
 };
 
-// One control as elements, and how it follows the parameters.
+// Build the elements of a control, and its update from the parameters.
 V.buildControl = (control, number) => {
   const id = `c${number}`;
   const help = control.help ? V.element("p", {className: "help", id: `${id}h`}, control.help) : null;
@@ -60,7 +60,7 @@ V.buildControl = (control, number) => {
     const input = V.element("input", {type: "checkbox", id, ...described});
     const label = V.element("label", {className: "toggle", for: id}, input, control.label);
     const kept = on => typeof V.at(V.initial, control.path) === "number" ? Number(on) : on;
-    input.onchange = () => { change(kept(input.checked)); V.say(`${control.label}: ${input.checked ? "on" : "off"}`); };
+    input.onchange = () => { change(kept(input.checked)); V.announce(`${control.label}: ${input.checked ? "on" : "off"}`); };
     return {box: V.element("div", {className: "control"}, label, ...(help ? [help] : [])), input,
       update: p => { input.checked = Boolean(value(p)); }};
   }
@@ -73,7 +73,7 @@ V.buildControl = (control, number) => {
     input.onfocus = () => { const kept = input.value; options(); input.value = kept; };
     input.onchange = () => {
       change(JSON.parse(input.value));
-      V.say(`${control.label}: ${input.selectedOptions[0].textContent}`);
+      V.announce(`${control.label}: ${input.selectedOptions[0].textContent}`);
     };
     return {box: V.element("div", {className: "control"}, label, input, ...(help ? [help] : [])),
       input, options, update: p => { input.value = JSON.stringify(value(p)); }};
@@ -97,7 +97,7 @@ V.buildControl = (control, number) => {
     update: p => { input.value = value(p) ?? 0; paint(); }};
 };
 
-// The groups and their controls into the panel; those without what they need are not there.
+// Add groups and controls to the panel; those whose assets are missing are omitted.
 V.buildPanel = () => {
   const panel = document.getElementById("panel");
   V.updates = [];
@@ -139,19 +139,19 @@ V.buildPanel = () => {
 
 V.updateControls = p => V.updates?.forEach(update => update(p));
 
-// Parameters that belong to how one looks, not to the face: both sides of a comparison share them.
+// Parameters of the view, not of the face: both sides of a comparison share them.
 V.SHARED = ["camera_yaw_deg", "camera_pitch_deg", "camera_distance_mm", "camera_fov_deg",
   "camera_target_mm", "light_azimuth_deg", "light_elevation_deg", "light_intensity", "ambient",
   "exposure", "background", "view", "view_low", "view_high", "split", "compare", "heads", "crowd",
   "shadows", "shadow_px", "shadow_softness_mm"];
 
-// Parameters that passes keep for themselves.
+// Internal parameters of passes.
 V.transient = name => /^(microstructure_(place|side_px|virtual_px|margin_px|variance|split_px)|detail_wrinkles)$/.test(name);
 
 V.faceOf = p => JSON.parse(JSON.stringify(Object.fromEntries(
   Object.entries(p).filter(([name]) => !V.SHARED.includes(name) && !V.transient(name)))));
 
-// All as it was at first; weights and traits that came later go to 0.
+// Reset to the initial parameters; weights and traits added later are set to 0.
 V.reset = () => {
   const back = JSON.parse(JSON.stringify(V.initial));
   for (const name of ["weights", "traits"]) {
@@ -159,7 +159,7 @@ V.reset = () => {
   }
   for (const name of Object.keys(back)) if (V.transient(name)) delete back[name];
   V.set(back);
-  V.say("All controls are reset.");
+  V.announce("All controls are reset.");
 };
 
 V.start.push(() => {
@@ -171,7 +171,7 @@ V.start.push(() => {
   V.buildPanel();
   V.updateControls(V.params);
   V.changed.push(p => { V.updateControls(p); V.rememberState(p); });
-  // some buffers are known only when all passes are
+  // some buffers exist only after all passes are registered
   window.viewer.ready.then(() => {
     V.controls.forEach(control => control.made?.options?.());
     V.updateControls(V.params);
@@ -182,9 +182,9 @@ V.start.push(() => {
     V.rememberNow(V.params);
     try {
       await navigator.clipboard.writeText(location.href);
-      V.say("Link with all settings copied.");
+      V.announce("Link with all settings copied.");
     } catch {
-      V.say("Copy the link with all settings from the address bar.");
+      V.announce("Copy the link with all settings from the address bar.");
     }
   };
 });

@@ -1,7 +1,7 @@
-// What a frame costs: passes, texture reads, bytes written, milliseconds.
+// Costs of a frame: passes, texture reads, bytes written, milliseconds.
 //
-// On a graphics processor time is that of timer queries; where the processor draws (software GL),
-// each pass is waited for, and shares mean more than milliseconds.
+// On a GPU, times are from timer queries. With software rendering, each pass is waited for, and
+// fractions are more meaningful than milliseconds.
 V.software = () => {
   if (V.softwareKnown === undefined) {
     const info = V.gl.getExtension("WEBGL_debug_renderer_info");
@@ -41,7 +41,7 @@ V.passTimer = () => {
   };
 };
 
-// Results of timer queries come frames later.
+// Results of timer queries arrive some frames later.
 V.collect = async timer => {
   for (const [name, handle] of timer.open) {
     for (let wait = 0; wait < 200 && !V.gl.getQueryParameter(handle, V.gl.QUERY_RESULT_AVAILABLE); wait++) {
@@ -57,13 +57,13 @@ V.collect = async timer => {
   }
 };
 
-// Forget what was drawn, so that the next frame draws all of it.
+// Invalidate all passes, so that the next frame draws them.
 V.forgetDrawn = side => {
   side.keys.clear();
   side.crowd?.forEach(one => one.keys.clear());
 };
 
-// Texture reads and bytes of a pass, for all heads that have it for themselves.
+// Texture reads and bytes of a pass, summed over the heads that draw it.
 V.costOf = (pass, p) => {
   const {taps, bytes} = pass.cost ? pass.cost(p) : {taps: 0, bytes: 0};
   if (!V.ownPasses().has(pass.name)) return {taps, bytes};
@@ -75,7 +75,7 @@ V.costOf = (pass, p) => {
   }, {taps, bytes});
 };
 
-// Costs of n frames with every pass drawn anew, and of a frame in which only the light moved.
+// Costs of n frames with all passes drawn, and of a frame in which only the light moved.
 V.measure = async (n = 3) => {
   V.drawFrame();
   V.finish();
@@ -154,11 +154,11 @@ V.showCosts = (found, result, note) => {
   note.textContent = `${found.software ? "Software rendering: fractions are meaningful, milliseconds are not. " : ""}` +
     `A full frame takes ${found.frame_ms.toFixed(1)} ms. After a change of light, ${found.light_passes} passes ` +
     `are redrawn in ${found.light_ms.toFixed(1)} ms. ${V.renderer}.`;
-  V.say(`${found.passes} passes, ${V.thousands(found.taps)} texture reads, ${(found.bytes / 1e6).toFixed(1)} megabytes, ` +
+  V.announce(`${found.passes} passes, ${V.thousands(found.taps)} texture reads, ${(found.bytes / 1e6).toFixed(1)} megabytes, ` +
     `${found.frame_ms.toFixed(0)} milliseconds`);
 };
 
-// Time of each frame that is drawn, in the corner of the picture.
+// Time of each frame, in the corner of the canvas.
 V.start.push(() => {
   const draw = V.drawFrame;
   V.drawFrame = () => {

@@ -1,16 +1,16 @@
-// Several heads, each with an expression of its own: blood, wrinkles, strain, shadow and mesh are
-// every head's own, drawn again only where its weights changed; screen passes are shared.
+// Several heads, each with its own expression: blood, wrinkles, strain, shadow and mesh are drawn
+// per head, and again only if its weights changed; screen passes are shared.
 //
-// The head in the middle is the one that the controls move. The others add what the table says to
-// its weights: emotions and global states of the presets. Microstructure follows the middle of the
-// picture; on the other heads all of its slopes are in the roughness.
+// The controls change the middle head. The others add the table's emotions and global conditions to
+// its weights. Microstructure is drawn at the center of the canvas; on the other heads all of its
+// slopes are in the roughness.
 Object.assign(V.defaults, {crowd: 1});
 V.CROWD = ["happiness", "anger and surprise", "sad smile", "exercise", "surprise", "alcohol"];
 
 V.crowdOf = p => p.heads > 1 && p.crowd > 0.5;
 V.middleHead = p => Math.floor(0.5 * (p.heads - 1));
 
-// Weights that head i adds to the controls', and what they are called.
+// Weights that head i adds to those of the controls, with their label.
 V.crowdOffset = (p, i) => {
   const middle = V.middleHead(p);
   if (!V.crowdOf(p) || i === middle) return {name: "", weights: {}};
@@ -22,7 +22,7 @@ V.crowdOffset = (p, i) => {
   return {name, weights: presets[name].weights ?? {}};
 };
 
-// Parameters of head i: the middle one has those of all.
+// Parameters of head i; the middle head has the common ones.
 V.headParams = (p, i) => {
   if (!V.crowdOf(p) || i === V.middleHead(p)) return p;
   const weights = {...p.weights};
@@ -37,7 +37,7 @@ V.headParams = (p, i) => {
 V.headSide = (side, p, i) => !V.crowdOf(p) || i === V.middleHead(p) ? side
   : ((side.crowd ??= [])[i] ??= V.newSide());
 
-// Passes that each head has for itself: those the surface reads, in the texture or from the light.
+// Passes per head: those that the surface reads, in texture space or from the light.
 V.ownPasses = () => {
   const byName = new Map(V.passes.map(pass => [pass.name, pass]));
   const own = new Set();
@@ -50,7 +50,7 @@ V.ownPasses = () => {
   return own;
 };
 
-// Heads that are drawn besides the middle one.
+// Heads other than the middle one.
 V.otherHeads = p => V.crowdOf(p)
   ? Array.from({length: p.heads}, (_, i) => i).filter(i => i !== V.middleHead(p)) : [];
 

@@ -1,17 +1,17 @@
-// Level of detail: wrinkles and microstructure are left out where what a pixel would still show of
-// them is proved small; the variance of their slopes stays, in the roughness.
+// Level of detail: wrinkles and microstructure are omitted where a bound proves their visible effect
+// small; the variance of their slopes remains in the roughness.
 //
-// A pixel shows the mean slope over its footprint. Its root mean square over the face is known for
-// each size of footprint, for each zone of each wrinkle map and for the microstructure (facts:
-// slope_rms by level). The reflection's change by a slope is found below for all normals that face
-// the camera under this light; the largest one times the slopes' root mean square bounds, to first
-// order, the root mean square error of leaving them out, in radiance where 1 is a white surface.
-// V.detail.state holds it; below the tolerance they are left out.
+// A pixel shows the mean slope over its footprint. The RMS of this mean over the face is tabulated by
+// size of footprint, for each zone of each wrinkle map and for the microstructure (facts: slope_rms by
+// level). The derivative of the reflection by a slope is maximized below over all normals that face the
+// camera under this light. This maximum times the slopes' RMS bounds, to first order, the RMS error of
+// omitting them, in radiance where 1 is a white surface. V.detail.state has this error; if it is below
+// the tolerance, they are omitted.
 Object.assign(V.defaults, {detail: 1, detail_tolerance: 2 / 255});
 V.detail = {ALBEDO: 0.8, NORMALS: 400, state: {}};
 V.statistics.detail = V.detail.state;
 
-// The largest change of diffuse and specular radiance by a slope, over normals and directions.
+// Maximum derivative of diffuse and specular radiance by a slope, over normals and directions.
 V.detail.sensitivity = p => {
   const key = [p.light_azimuth_deg, p.light_elevation_deg, p.light_intensity, p.roughness,
     p.specular_intensity, p.f0, p.camera_yaw_deg, p.camera_pitch_deg].join();
@@ -45,12 +45,12 @@ V.detail.sensitivity = p => {
       - specular(unit(n.map((c, j) => c - step * axis[j])))) / (2 * step);
     largest = Math.max(largest, Math.hypot(change(t), change(b)));
   }
-  // no cosine changes faster than by 1
+  // the derivative of a cosine is at most 1
   V.detail.found = {key, diffuse: p.light_intensity * V.detail.ALBEDO, specular: largest};
   return V.detail.found;
 };
 
-// Value of a list by level between its entries, which halve or so: linear in the logarithm.
+// Interpolate a list by level, linearly in the logarithm, as its entries decrease geometrically.
 V.detail.between = (list, level) => {
   const at = Math.min(Math.max(level, 0), list.length - 1);
   const first = Math.floor(at);
@@ -60,7 +60,7 @@ V.detail.between = (list, level) => {
   return level > list.length - 1 ? inside * 0.5 ** (level - list.length + 1) : inside;
 };
 
-// Millimeters that a pixel of the canvas has at the nearest point of the heads.
+// Size of a canvas pixel at the nearest point of the heads, mm.
 V.detail.footprint = p => {
   const key = [V.meshKey(p), V.screen()].join();
   if (V.detail.near?.key === key) return V.detail.near.mm;
@@ -80,15 +80,15 @@ V.detail.footprint = p => {
   return V.detail.near.mm;
 };
 
-// Radiance that leaving out the microstructure changes, root mean square, by the pixel's size. Its
-// slopes have no direction of their own: along one, they are half of the sum of squares.
+// RMS change of radiance by omitting the microstructure, by pixel size. Its slopes are isotropic: the
+// variance along one direction is half of the sum of both.
 V.detail.microstructureError = (p, mm) => {
   const {slope_rms, pixel_um} = V.scene.facts.microstructure;
   const level = Math.log2(1e3 * mm / pixel_um);
   return Math.SQRT1_2 * V.detail.sensitivity(p).specular * V.detail.between(slope_rms, level);
 };
 
-// Zones may add up where they overlap: the sum over zones bounds what they show together.
+// Zones may overlap: the sum over zones bounds their joint effect.
 V.detail.wrinkleError = (p, mm) => {
   const side = V.scene.textures.wrinkle_maps.width;
   const texel = V.wrinkles.HYBRID_PX / V.wrinkles.texelsPerMm() / side;

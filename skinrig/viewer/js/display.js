@@ -1,4 +1,4 @@
-// Tone mapping, and what of all buffers the canvas shows.
+// Tone mapping, and choice of the displayed buffer.
 Object.assign(V.defaults, {
   exposure: 0.8, filmic: false, background: [0.09, 0.1, 0.11], view: "display", view_low: 0,
   view_high: 1, split: 0.5, compare: null,

@@ -1,4 +1,4 @@
-// Hands on the picture: pointers and keys turn the camera, move the light or read a place.
+// Input on the canvas: pointers and keys rotate the camera, move the light or probe a pixel.
 Object.assign(V.defaults, {resolution: 0});
 V.tool = "orbit";
 
@@ -34,7 +34,7 @@ V.moveLight = (right, up) => V.set({
 V.zoom = factor => V.set({
   camera_distance_mm: V.limit(V.params.camera_distance_mm * factor, 45, V.FARTHEST_MM),
 });
-// Move what is looked at along the screen, by parts of the picture's height.
+// Move the camera's target parallel to the screen, by fractions of the canvas height.
 V.pan = (right, up) => {
   const p = V.params;
   const height = 2 * p.camera_distance_mm * Math.tan(0.5 * p.camera_fov_deg * V.RAD);
@@ -46,14 +46,14 @@ V.pan = (right, up) => {
 
 V.speakPlace = () => {
   const p = V.params;
-  V.say(V.tool === "light"
+  V.announce(V.tool === "light"
     ? `Light ${Math.round(p.light_azimuth_deg)} degrees to the side, ${Math.round(p.light_elevation_deg)} up`
     : `Camera ${Math.round(p.camera_yaw_deg)} degrees to the side, ${Math.round(p.camera_pitch_deg)} up, ` +
       `${Math.round(p.camera_distance_mm)} millimeters away`);
 };
 
-// The canvas as large as its place, within what a frame may cost. A size that another hand set
-// stays until a resolution is chosen.
+// Resize the canvas to its container, within the cost limit of a frame. A size set by a script is
+// kept until a resolution is chosen.
 V.fitCanvas = () => {
   const port = document.getElementById("port");
   const [width, height] = [port.clientWidth, port.clientHeight];
@@ -72,7 +72,7 @@ V.fitCanvas = () => {
   return true;
 };
 
-// Where the canvas lies in its place: it keeps its shape.
+// Position of the canvas in its container; the aspect ratio is kept.
 V.shown = () => {
   const box = document.getElementById("port").getBoundingClientRect();
   const scale = Math.min(box.width / V.canvas.width, box.height / V.canvas.height);
@@ -161,7 +161,7 @@ V.buildHands = () => {
     else if (key === "-") V.zoom(1.1);
     else if (key === "Enter" || key === " ") V.showProbe();
     else if (key === "r") V.reset();
-    else if (tools[key]) { V.setTool(tools[key]); V.say(V.TOOLS[tools[key]]); }
+    else if (tools[key]) { V.setTool(tools[key]); V.announce(V.TOOLS[tools[key]]); }
     else return;
     event.preventDefault();
   });

@@ -32,7 +32,7 @@ V.program = (vertex, fragment, defines = {}) => {
   if (V.programs.has(key)) return V.programs.get(key);
   const gl = V.gl;
   const text = names => names.map(name => {
-    if (!(name in V.glsl)) throw new Error(`there is no GLSL chunk ${name}`);
+    if (!(name in V.glsl)) throw new Error(`GLSL chunk ${name} does not exist`);
     return V.glsl[name];
   }).join("\n");
   const head = stage => [
@@ -92,7 +92,7 @@ V.declarations = text => {
   }
   for (const name of used(/\bsample_(\w+)\s*\(/g)) {
     const texture = V.scene.textures[name];
-    if (!texture) continue; // its caller stands under #ifdef HAS_name
+    if (!texture) continue; // its caller is within #ifdef HAS_name
     if (texture.layers) {
       lines.push(`uniform sampler2DArray t_${name};`,
         `uniform vec4 t_${name}_low[${texture.layers}];`,
@@ -124,7 +124,7 @@ V.declarations = text => {
 V.use = (program, side, p, uniforms = {}) => {
   const gl = V.gl;
   gl.useProgram(program.handle);
-  // bound when all are uploaded: an upload takes the first unit
+  // bound after all uploads, as an upload uses the first unit
   const bound = [];
   const bind = (info, texture, target = gl.TEXTURE_2D) => bound.push([info, texture, target]);
   for (const [name, info] of program.uniforms) {
@@ -168,7 +168,7 @@ V.setUniform = (info, value) => {
     case gl.INT_VEC2: gl.uniform2iv(info.at, value); break;
     case gl.FLOAT_MAT3: gl.uniformMatrix3fv(info.at, false, value); break;
     case gl.FLOAT_MAT4: gl.uniformMatrix4fv(info.at, false, value); break;
-    default: throw new Error(`uniform ${info.name}: a type that is not known`);
+    default: throw new Error(`uniform ${info.name}: unknown type`);
   }
 };
 
@@ -231,7 +231,7 @@ V.tableOf = name => {
   return handle;
 };
 
-// Buffers of a pass on one side, made anew where a size or format changed.
+// Buffers of a pass on one side, recreated if a size or format changed.
 V.target = (side, pass, shapes) => {
   const gl = V.gl;
   const signature = JSON.stringify(shapes);
@@ -297,7 +297,7 @@ V.finishTarget = target => {
   });
 };
 
-// What a pass draws with.
+// Drawing context of a pass.
 V.context = (side, p, target) => ({
   p, side, size: target.size,
   clear: (...color) => {
@@ -320,7 +320,7 @@ V.context = (side, p, target) => ({
 V.read = (side, name) => {
   const gl = V.gl;
   const buffer = side.buffers.get(name);
-  if (!buffer) throw new Error(`there is no buffer ${name}`);
+  if (!buffer) throw new Error(`buffer ${name} does not exist`);
   const [width, height] = buffer.size;
   const channels = V.FORMATS[buffer.format][2];
   gl.bindFramebuffer(gl.FRAMEBUFFER, buffer.target.frame);

@@ -1,4 +1,4 @@
-// The packed scene: one gzip stream of arrays, undone into typed arrays.
+// Decode the packed scene: one gzip stream of arrays, into typed arrays.
 V.TYPES = {u1: Uint8Array, u2: Uint16Array, u4: Uint32Array, i2: Int16Array, i4: Int32Array,
   f4: Float32Array, f2: Uint16Array, f8: Float64Array};
 
@@ -29,8 +29,8 @@ V.inflate = async (text, count) => {
   return new Response(stream).arrayBuffer();
 };
 
-// Words of half as many texels a side, doubled linearly in whole numbers, and the steps of the
-// finest octave; as skinrig.viewer.packing.arrays.joined.
+// Words of half the resolution, upsampled linearly in integers, plus the steps of the finest octave;
+// as skinrig.viewer.packing.join_octave.
 V.joinOctaves = (buffer, entry) => {
   const coarse = V.unpackArray(buffer, entry.coarse);
   const steps = new Int8Array(V.unpackArray(buffer, entry.steps).buffer);

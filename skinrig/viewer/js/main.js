@@ -1,4 +1,4 @@
-// Start: load, draw, and the interface that tests and the controls share.
+// Start: load, draw, and the interface shared by tests and controls.
 V.merged = (base, change) => {
   const out = {...base};
   for (const [name, value] of Object.entries(change)) {
@@ -14,7 +14,7 @@ V.demand = new Set();
 // Change parameters; drawing waits for the next frame of the screen unless `now`.
 V.set = (change, now = false) => {
   for (const name of Object.keys(change)) {
-    if (!(name in V.params)) throw new Error(`there is no parameter ${name}`);
+    if (!(name in V.params)) throw new Error(`parameter ${name} does not exist`);
   }
   V.params = V.merged(V.params, change);
   V.changed.forEach(fn => fn(V.params));
@@ -51,15 +51,15 @@ V.base64 = floats => {
 };
 
 V.readNow = name => {
-  if (!V.bufferNames(V.params).includes(name)) throw new Error(`there is no buffer ${name}`);
+  if (!V.bufferNames(V.params).includes(name)) throw new Error(`buffer ${name} does not exist`);
   V.demand.add(name);
   V.drawGraph(V.sideA, V.params, V.demand);
   V.demand.delete(name);
   return V.read(V.sideA, name);
 };
 
-// Draw n frames; milliseconds of each, and what every pass costs. All passes are drawn anew, or,
-// with `light`, those that a turn of the light asks for.
+// Draw n frames; return the time of each and the cost of every pass. All passes are drawn or, with
+// `light`, those affected by a rotation of the light.
 V.bench = (n, {light = false} = {}) => {
   const azimuth = V.params.light_azimuth_deg;
   const frames = [];

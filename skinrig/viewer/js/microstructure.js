@@ -7,10 +7,10 @@
 //   convolved_s, convolved   heights after the first and the second pass
 //   microstructure     derivatives after the strain, and of the neutral relief on the same skin
 //
-// Drawn again only where weights or the window changed. The window follows what the middle of the
-// canvas shows, in steps of an eighth of its side, at the level whose pixels are as large as the
-// screen's, or the coarsest; where detail.js proves that nobody would see it, nothing is drawn and
-// all variance of the slopes is in the roughness.
+// Drawn again only if weights or the window changed. The window follows the center of the canvas, in
+// steps of an eighth of its side, at the level whose pixels have the size of the screen's, or the
+// coarsest. Where detail.js proves the effect invisible, it is omitted and all variance of the slopes
+// is in the roughness.
 V.microstructure = {};
 Object.assign(V.defaults, {
   microstructure: 2,          // 0 none, 1 static, 2 dynamic, 3 all three side by side
@@ -22,7 +22,7 @@ Object.assign(V.defaults, {
   microstructure_split_px: 256, variance_stretch: [0.5, 1.5, 33], strain_px: 512,
 });
 
-// Where the middle of the canvas meets the moved mesh: {uv, mm}; null where it does not.
+// Intersection of the canvas center with the moved mesh: {uv, mm}; null if there is none.
 V.microstructure.aim = p => {
   const key = V.weightsKey(p) + V.cameraKey(p) + V.screen().join();
   if (V.microstructure.aimed?.key === key) return V.microstructure.aimed.found;
@@ -62,7 +62,7 @@ V.microstructure.aim = p => {
   return found;
 };
 
-// Side of a window that holds all that the canvas shows, and the margins that fade.
+// Side of a window that covers the canvas and its fading margins.
 V.microstructure.side = p => {
   if (p.microstructure_window_px) return p.microstructure_window_px;
   const needed = Math.max(...V.screen()) / 0.75 + 2 * (p.microstructure_margin_px + 24);
@@ -87,7 +87,7 @@ V.microstructure.place = p => {
     const left = p.detail > 0.5 && error < p.detail_tolerance;
     V.detail.state.microstructure = {pixel_mm: found.mm, error, left_out: left};
     if (left) return [0, 0, facts.levels - 1, 0];
-    // a pixel of the window at least three quarters of the screen's: finer ones would be averaged
+    // window pixels of at least 3/4 of a screen pixel: finer ones would be averaged
     level = Math.max(0, Math.ceil(Math.log2(0.75e3 * found.mm / facts.pixel_um)));
     level = Math.min(level, facts.levels - 1);
   }
@@ -125,7 +125,7 @@ V.microstructure.patch = () => {
   return V.newTexture("R32F", [width, side], {data: out, filter: "nearest"});
 };
 
-// The scene's table of kernels as the shader takes it.
+// The scene's table of kernels in the shader's layout.
 V.microstructure.table = () => {
   const {kernel_alpha_breaks, kernel_alpha_lines, kernel_sigma_lines_mm} = V.scene.tables;
   const {stretch_range, alpha_limits} = V.microstructure.facts;
@@ -184,7 +184,7 @@ V.start.push(() => {
     p.microstructure_side_px = V.microstructure.side(p);
     p.microstructure_place = V.microstructure.place(p);
     const [, , level, shown] = p.microstructure_place;
-    // what pixels larger than the window's average is not shown either
+    // detail averaged by pixels larger than the window's is also unresolved
     const seen = p.microstructure_at ? level : Math.max(level,
       Math.log2(0.75e3 * (V.microstructure.aim(p)?.mm ?? 1) / facts.pixel_um));
     p.microstructure_variance = [facts.slope_rms[0] ** 2 / 2,

@@ -1,4 +1,4 @@
-// What stands in the panel.
+// Contents of the panel.
 V.has = (...names) => names.every(name => name in V.params);
 V.only = (...values) => values.filter(Boolean);
 
@@ -16,7 +16,7 @@ V.bufferLabel = name => {
   return V.BUFFERS[name] ?? V.capital(V.words(name));
 };
 
-// A range that shows a buffer: its 2nd to 98th percentile over what is not empty.
+// Display range of a buffer: 2nd to 98th percentile over non-empty pixels.
 V.rangeOf = name => {
   if (name === "display") return {view_low: 0, view_high: 1};
   const {values, channels} = V.readNow(name);
@@ -118,7 +118,7 @@ V.registerScattering = () => {
       show: v => `× ${v.toFixed(2)}`, off: p => !p.scattering, help: "Factor on all widths."},
     {group: "scattering", kind: "toggle", path: ["measured_translucency"], label: "Diffuse mean free path of this face",
       when: () => Boolean(profile), off: p => !p.scattering,
-      help: profile ? `Widths from 1/σtr: ${profile.told}. The edge response of the Gaussians is within ` +
+      help: profile ? `Widths from 1/σtr: ${profile.origin}. The edge response of the Gaussians is within ` +
         `${edge} % of the dipole.` : ""},
     {group: "scattering", kind: "choice", path: ["texturing"], label: "Texturing", off: p => !p.scattering,
       help: "A measured color map already contains scattering. Post-scatter texturing does not blur it twice.",
@@ -142,7 +142,7 @@ V.registerTraits = () => {
   if (Object.keys(surface).length) {
     V.controls.push({group: "traits", kind: "own", build: box => {
       const use = V.element("button", {type: "button"}, "Use fitted basis BRDFs");
-      use.onclick = () => { V.set({specular_model: "fitted"}); V.say("Specular model: fitted basis BRDFs"); };
+      use.onclick = () => { V.set({specular_model: "fitted"}); V.announce("Specular model: fitted basis BRDFs"); };
       box.append(V.element("p", {className: "help"},
         "Surface traits change the fitted basis BRDFs only."),
       V.element("div", {className: "buttons"}, use));
@@ -152,7 +152,7 @@ V.registerTraits = () => {
 };
 
 V.registerRelief = () => V.controls.push(
-  {group: "relief", kind: "range", path: ["relief"], min: 0, max: 2, zero: 1, label: "Pores and lines at rest",
+  {group: "relief", kind: "range", path: ["relief"], min: 0, max: 2, zero: 1, label: "Neutral pores and lines",
     show: v => `× ${v.toFixed(2)}`, help: "Factor on the slopes of the static surface topography."},
   {group: "relief", kind: "range", path: ["wrinkles"], min: 0, max: 2, zero: 1, label: "Wrinkles",
     show: v => `× ${v.toFixed(2)}`, when: () => Boolean(V.scene.facts.wrinkles),
@@ -199,7 +199,7 @@ V.buildPresets = box => {
     button.onclick = () => {
       const weights = Object.fromEntries(V.weightNames().map(one => [one, preset.weights?.[one] ?? 0]));
       V.set({...preset, weights});
-      V.say(`Expression: ${name}`);
+      V.announce(`Expression: ${name}`);
     };
     buttons.append(button);
     return [button, preset.weights ?? {}];
@@ -207,7 +207,7 @@ V.buildPresets = box => {
   box.append(buttons);
   return p => made.forEach(([button, weights]) => button.setAttribute("aria-pressed", same(p, weights)));
 };
-// Packed without an order; people look for the neutral face first.
+// Presets are packed without order; the neutral face is listed first.
 V.presetsInOrder = () => {
   const order = ["neutral", "happiness", "sadness", "surprise", "fear", "anger", "disgust", "smile", "sad smile",
     "anger and surprise", "exercise", "after exercise", "alcohol"];
@@ -215,7 +215,7 @@ V.presetsInOrder = () => {
   return Object.fromEntries(Object.entries(V.scene.presets ?? {}).sort(([a], [b]) => rank(a) - rank(b)));
 };
 
-// Two sets of parameters side by side.
+// Comparison of two sets of parameters side by side.
 V.buildComparison = box => {
   const keep = V.element("button", {type: "button"}, "Store as B");
   const swap = V.element("button", {type: "button"}, "Swap A and B");
@@ -224,14 +224,14 @@ V.buildComparison = box => {
     show: V.percent}, "split");
   keep.onclick = () => {
     V.set({compare: V.faceOf(V.params)});
-    V.say("B keeps the current settings; controls change A, left of the divider.");
+    V.announce("B keeps the current settings; controls change A, left of the divider.");
   };
   swap.onclick = () => {
     const held = V.params.compare;
     V.set({...held, compare: V.faceOf(V.params)});
-    V.say("A and B are swapped.");
+    V.announce("A and B are swapped.");
   };
-  end.onclick = () => { V.set({compare: null}); V.say("Comparison ended."); keep.focus(); };
+  end.onclick = () => { V.set({compare: null}); V.announce("Comparison ended."); keep.focus(); };
   box.append(V.element("p", {className: "label"}, "Compare A with B"),
     V.element("div", {className: "buttons"}, keep, swap, end), slider.box,
     V.element("p", {className: "help"}, "Controls change A, left of the divider. B is fixed."));

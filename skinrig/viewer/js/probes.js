@@ -1,4 +1,4 @@
-// A probe: what the buffers hold at one pixel, in their own units.
+// A probe: values of the buffers at one pixel, in their own units.
 V.probe = null;
 
 // One pixel of some buffers, x to the right and y down; arrays of four numbers.
@@ -58,7 +58,7 @@ V.readAt = (x, y) => {
   list.hidden = false;
   list.replaceChildren(...(rows.length ? rows : [["Outside the face", "–"]]).map(([what, value]) =>
     V.element("div", {}, V.element("dt", {}, what), V.element("dd", {}, value))));
-  V.say(rows.length ? rows.slice(0, 2).map(row => row.join(" ")).join(", ") : "Outside the face");
+  V.announce(rows.length ? rows.slice(0, 2).map(row => row.join(" ")).join(", ") : "Outside the face");
   return rows;
 };
 V.moveProbe = (right, down) => {

@@ -1,12 +1,12 @@
-// Fitted reflectance (Weyrich et al. 2006): shares of tabulated lobes under the surface traits, the
-// albedo under its own, and the fitted lobes beside the analytic specular part.
+// Fitted reflectance (Weyrich et al. 2006): weights of tabulated basis BRDFs edited by surface traits,
+// albedo edited by its traits, and the choice between fitted and analytic specular reflection.
 Object.assign(V.defaults, {traits: {}, measured_translucency: false, lobe_slope_rms: 0});
 
 V.profileName = p => p.measured_translucency && V.profiles.fitted ? "fitted" : "default";
 
 V.shareCount = () => 4 * (V.scene.textures.lobe_shares?.layers ?? 0);
 
-// Sum of the surface traits' pulls on the lobes, one number a lobe.
+// Sum of the surface traits' products with the basis BRDFs, one number per BRDF.
 V.traitPull = p => {
   const pull = new Float32Array(V.shareCount());
   const traits = V.scene.facts.surface_traits?.traits ?? {};
@@ -16,7 +16,7 @@ V.traitPull = p => {
   return pull;
 };
 
-// A matrix of K lobes in one of as many as there are channels; those that fill it up do nothing.
+// Pad a matrix of K basis BRDFs to the number of channels; padding has no effect.
 V.paddedGram = () => {
   const count = V.shareCount();
   const {gram, scale} = V.scene.facts.surface_traits ?? {gram: [], scale: []};
@@ -30,7 +30,7 @@ V.paddedGram = () => {
   return {gram: out, scale: Float32Array.from({length: count}, (_, i) => scale[i] ?? 1)};
 };
 
-// Amounts of the layers of the albedo traits: each trait has one for less and one for more of it.
+// Amounts of the layers of albedo traits: two per trait, for amounts below and above 0.
 V.albedoAmounts = p => (V.scene.facts.albedo_traits?.layers ?? [])
   .map(({name, end}) => Math.max(0, end * (p.traits[name] ?? 0)));
 

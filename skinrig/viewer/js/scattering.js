@@ -1,7 +1,7 @@
 // Screen-space scattering: a sum of Gaussians, each blurred from the one before.
 Object.assign(V.defaults, {scattering: true, texturing: "post", scattering_scale: 1});
 
-// Powers of the albedo before and behind the blur; "both" is what blurs a measured map twice.
+// Powers of the albedo before and after the blur; "both" blurs a measured map twice.
 V.POWERS = {post: [0, 1], pre: [1, 0], both: [0.5, 0.5]};
 V.SCATTER = {taps: 4, reach: 2.5, slantLimit: 4, interpolation: 0.75 ** 4};
 
@@ -11,7 +11,7 @@ V.profiles = {};
 V.profileName = () => "default";
 V.diffusionProfile = p => V.profiles[V.profileName(p)] ?? V.profiles.default;
 
-// Cut at its reach and summed in steps, a Gaussian is narrower than it was meant: this widens it.
+// Truncation and sampling narrow a Gaussian; this factor compensates.
 V.scatterWidening = () => {
   const {taps, reach} = V.SCATTER;
   let [sum, squares] = [1, 0];
@@ -27,7 +27,7 @@ V.start.push(() => {
   V.profiles.default = V.scene.facts.scattering;
 });
 
-// Called by the starter when all scripts have said what profiles there are.
+// Called at the start, after all scripts have registered their profiles.
 V.buildScattering = () => {
   const pixels = () => V.screen()[0] * V.screen()[1];
   const screen = {format: "RGBA16F", space: "screen"};

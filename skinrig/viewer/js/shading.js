@@ -3,13 +3,13 @@ Object.assign(V.defaults, {
   roughness: 1, specular_intensity: 1, relief: 1, f0: 0.028, specular_model: "analytic",
 });
 
-// What other scripts add to the surface:
+// Hooks by which other scripts extend the surface:
 //   chunks     GLSL pieces that hold the functions named below
 //   defines    preprocessor values
 //   slopes     names of `vec2 f(vec2 uv)`: slopes of relief, summed
 //   adjust     names of `void f(inout SurfacePoint s)`, called in order
 //   specular   by value of p.specular_model: name of `vec3 f(SurfacePoint s)`, 1/sr
-//   width      name of `float f(vec2 uv)`: how much wider than the profile light spreads, or null
+//   width      name of `float f(vec2 uv)`: width of scattering relative to the profile, or null
 //   after      passes whose buffers they read; key(p): what else they depend on
 V.surface = {
   chunks: ["static_relief"], defines: {}, slopes: [], adjust: [],
@@ -18,7 +18,7 @@ V.surface = {
 
 V.surfaceDefines = () => ({PI: "3.14159265358979", ...V.colorDefines(), ...V.surface.defines});
 
-// The functions that join what was added.
+// Functions that combine the hooks.
 V.surfaceJoin = p => {
   const name = "surface_join_" + p.specular_model;
   V.glsl[name] = [
@@ -32,13 +32,13 @@ V.surfaceJoin = p => {
   return name;
 };
 
-// Places of several heads: side by side, each a little behind.
+// Positions of several heads: side by side, each slightly behind the previous one.
 V.headShifts = p => Array.from({length: p.heads}, (_, i) => {
   const at = i - 0.5 * (p.heads - 1);
   return [185 * at, 0, -40 * Math.abs(at)];
 });
 
-// The camera's distance from which so many heads are seen whole.
+// Camera distance at which all heads are visible.
 V.FARTHEST_MM = 3000;
 V.framed = heads => {
   const [width, height] = V.screen();

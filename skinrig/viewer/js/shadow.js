@@ -1,8 +1,8 @@
-// Shadows of the key light: one depth pass along the light, drawn anew only where mesh or light
-// changed, and a filtered look-up for each pixel. A head shades itself, not its neighbors.
+// Shadows of the key light: one depth pass along the light, drawn again only if mesh or light changed,
+// and a filtered look-up per pixel. A head casts shadows on itself, not on its neighbors.
 //
 //   shadow_depth   height of the surface towards the light, mm; far below where there is none
-//   lit            share of the light that reaches a pixel, on demand
+//   lit            fraction of the light that reaches a pixel, on demand
 Object.assign(V.defaults, {shadows: 1, shadow_px: 1024, shadow_softness_mm: 2.5});
 V.start.push(() => { if (V.software()) V.params.shadow_px = 512; });
 

@@ -6,8 +6,7 @@
 // and the symmetric part of the map from skin to texture.
 V.strain = {SLIVER: 1e-6, FINE: 0, DEGENERATE: 1, NO_TEXTURE: 2};
 
-// Vertices at one place before and after the move share a number; `weld` tells which share one
-// before.
+// Vertices that coincide before and after the movement share an index; `weld` has the index before.
 V.strain.places = (moved, weld) => {
   const place = new Int32Array(weld.length);
   const split = new Map();
@@ -23,7 +22,7 @@ V.strain.places = (moved, weld) => {
   return {place, places};
 };
 
-// What each triangle does, in its own plane: kind, basis (9), twice its area, change (3), Q (4).
+// Deformation of each triangle in its plane: kind, basis (9), twice its area, change (3), Q (4).
 V.strain.triangles = (rest, moved, faces, uv) => {
   const count = faces.length / 3;
   const out = {
@@ -107,8 +106,8 @@ V.strain.triangles = (rest, moved, faces, uv) => {
   return out;
 };
 
-// A triangle's axes turned by the shortest way into the plane across `normal`: six numbers, valid
-// until the next call.
+// A triangle's axes rotated by the smallest angle to the plane perpendicular to `normal`: six numbers,
+// valid until the next call.
 V.strain.turned = new Float64Array(6);
 V.strain.carried = (basis, at, n, m) => {
   const c = basis[at + 6] * n[m] + basis[at + 7] * n[m + 1] + basis[at + 8] * n[m + 2];
@@ -144,7 +143,7 @@ V.strain.vertices = (rest, moved, faces, uv) => {
   for (let w = 0; w < places; w++) {
     if (widest[w] < 0) continue;
     const length = Math.hypot(normal[3 * w], normal[3 * w + 1], normal[3 * w + 2]);
-    const flat = length <= 1e-6 * area[widest[w]]; // triangles that face all ways
+    const flat = length <= 1e-6 * area[widest[w]]; // normals of the triangles cancel
     for (let m = 0; m < 3; m++) {
       normal[3 * w + m] = flat ? basis[9 * widest[w] + 6 + m] : normal[3 * w + m] / length;
     }
@@ -153,7 +152,7 @@ V.strain.vertices = (rest, moved, faces, uv) => {
   const count = rest.length / 3;
   const sum = new Float64Array(3 * places);
   const weight = new Float64Array(places);
-  // textures seen from both sides apart: what is folded there would cancel
+  // mirrored and unmirrored textures separately, as folded parts would cancel
   const both = new Float64Array(8 * count);
   const share = new Float64Array(2 * count);
   for (let f = 0; f < triangles; f++) {
@@ -196,7 +195,7 @@ V.strain.vertices = (rest, moved, faces, uv) => {
     if (weight[w] === 0 || part === 0) continue;
     const [t0, t1, t2] = [0, 1, 2].map(i => sum[3 * w + i] / weight[w]);
     const [m00, m01, m10, m11] = [0, 1, 2, 3].map(i => both[8 * vertex + 4 * side + i] / part);
-    // m = metric turn: the turn closest to m, a mirror image where the texture is one
+    // polar decomposition m = metric rotation: the rotation nearest to m, with reflection if mirrored
     let c = side === 0 ? m00 + m11 : m00 - m11;
     let s = side === 0 ? m10 - m01 : m10 + m01;
     const length = Math.hypot(c, s);
@@ -215,7 +214,7 @@ V.strain.vertices = (rest, moved, faces, uv) => {
   return {tensor, metric, valid};
 };
 
-// Positions in float64: what moves by a micrometer would be lost in float32 sums.
+// Positions in float64, as displacements of a micrometer would be lost in float32 sums.
 V.strain.moved = weights => {
   const sum = Float64Array.from(V.scene.mesh.positions);
   for (const [name, weight] of Object.entries(weights)) {
@@ -248,7 +247,7 @@ V.strain.upload = (side, p) => {
     gl.enableVertexAttribArray(V.ATTRIBUTES[name]);
     gl.vertexAttribPointer(V.ATTRIBUTES[name], width, gl.FLOAT, false, 0, 0);
   });
-  // the triangle of the lowest number has a pixel that several hold: it is drawn last
+  // a pixel of several triangles belongs to that of the lowest index, which is drawn last
   const drawn = new Uint32Array(faces.length);
   let count = 0;
   for (let f = faces.length - 3; f >= 0; f -= 3) {

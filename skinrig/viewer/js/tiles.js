@@ -1,24 +1,24 @@
-// Tiles of a large displacement, fetched from the server that the page came from: only those that
-// the window shows. Until they are here, the window has the coarser level's heights where known.
+// Tiles of a large displacement, fetched from the page's server, only those within the window. Until
+// they arrive, the window has the coarser level's heights if available.
 V.tiles = {arrived: 0, held: new Map(), asked: new Set(), failed: 0, MOST: 96};
 
 V.tiles.name = (level, row, column) => `${level}/${row}/${column}`;
 
-// Heights of a tile, um, row 0 at the top; null while it is on its way.
+// Heights of a tile, um, row 0 at the top; null while it is being fetched.
 V.tiles.of = (level, row, column) => {
   const name = V.tiles.name(level, row, column);
   const held = V.tiles.held.get(name);
   if (held) {
-    V.tiles.held.delete(name);  // the one used last is dropped last
+    V.tiles.held.delete(name);  // moved to the end: least recently used tiles are dropped first
     V.tiles.held.set(name, held);
     return held;
   }
   if (!V.tiles.asked.has(name)) {
     V.tiles.asked.add(name);
-    // what failed is not asked for again: the coarser level stays
+    // failed tiles are not requested again; the coarser level is kept
     V.tiles.fetch(name).catch(() => {
       V.tiles.failed += 1;
-      V.say?.("A displacement tile is missing; check that the server is running.");
+      V.announce?.("A displacement tile is missing; check that the server is running.");
     });
   }
   return null;
@@ -37,7 +37,7 @@ V.tiles.fetch = async name => {
   V.requestDraw();
 };
 
-// Put what is known of the window into the buffer being drawn.
+// Copy the available tiles of the window to the buffer being drawn.
 V.tiles.fill = ctx => {
   const gl = V.gl;
   const {tile_px} = V.microstructure.facts.tiles;

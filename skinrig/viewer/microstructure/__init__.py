@@ -1,1 +1,1 @@
-"""Microstructure assets of the viewer."""
+"""Build the microstructure assets of the viewer."""

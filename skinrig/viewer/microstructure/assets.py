@@ -1,10 +1,9 @@
-"""What the page needs to show microstructure: a patch, its table of kernels, and its roughness.
+"""Build the microstructure assets of the page: a patch, its table of kernels, and its roughness.
 
 The page grows a displacement from the patch (`skinrig.viewer.microstructure.relief_growth`) and
-convolves it by the strain of the pose. What a screen's pixel cannot resolve does not vanish: the
-variance of the slopes that are not drawn goes into the roughness of the highlight, by two tables
-that are computed here: how much of the variance each level of the pyramid keeps, and how the
-variance changes with the stretch of the skin.
+convolves it by the strain of the pose. The variance of slopes below a screen pixel is added to the
+roughness of the highlight. Two tables for this are computed here: the variance that each level of
+the pyramid retains, and its change with the stretch of the skin.
 """
 
 import math
@@ -24,14 +23,14 @@ from skinrig.viewer.microstructure import relief_growth
 from skinrig.viewer.microstructure.relief_growth import (
     STRETCH_RANGE,
     GrownRelief,
-    slope_rms,
-    strained_variance,
+    compute_slope_rms,
+    compute_strained_variance,
 )
 from skinrig.viewer.microstructure.tiles import TILE_PX, Pyramid
 from skinrig.viewer.scene import Assets, SceneError, SceneSource, Texture, ViewerScene
 
 PATCH_PX: Final = 256
-"""Side of the patch in the page: 3 to 4 mm of skin; some 80 kB."""
+"""Side of the patch in the page: 3 to 4 mm of skin, about 80 kB."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,10 +42,10 @@ class MicroRelief:
     height_um : ndarray of float32, shape (h, w)
         Finite; row 0 is the top.
     pixel_um : float
-        Length of skin that a pixel has.
+        Pixel size on the skin.
     table : KernelTable
     source : str
-        "measured" or "simulated", and from where; shown in the page.
+        "measured" or "simulated", with the origin; displayed in the page.
     """
 
     height_um: Float32Array
@@ -56,7 +55,7 @@ class MicroRelief:
 
 
 def read_fitted_relief(appearance: SkinAppearance) -> MicroRelief | None:
-    """Return the first site's relief of `skinrig fit microstructure`; None without that part."""
+    """Read the first site's relief of `skinrig fit microstructure`; None without that part."""
     part = describe_parts(appearance).get(MICROSTRUCTURE)
     if part is None:
         return None
@@ -72,14 +71,14 @@ def read_fitted_relief(appearance: SkinAppearance) -> MicroRelief | None:
 
 
 def simulate_relief(seed: int) -> MicroRelief:
-    """Return relief of the simulated skin of a forehead, `PATCH_PX` a side."""
+    """Simulate relief of a forehead's skin, `PATCH_PX` per side."""
     site, pixel_um = "forehead", 15.0
     skin = make_micro_skin(site, seed=seed, size_mm=1e-3 * pixel_um * PATCH_PX, texel_um=pixel_um)
     return MicroRelief(skin.height_um, pixel_um, FOREHEAD, f"simulated: {site}")
 
 
 def find_largest_square(height: Float32Array, valid: BoolArray) -> Float32Array:
-    """Return the largest square without holes; the first one in reading order of several.
+    """Return the largest square without holes; of several, the first in row order.
 
     Examples
     --------
@@ -94,22 +93,24 @@ def find_largest_square(height: Float32Array, valid: BoolArray) -> Float32Array:
         if (inside == n * n).any():
             top, left = np.argwhere(inside == n * n)[0]
             return np.ascontiguousarray(height[top : top + n, left : left + n])
-    raise SceneError("relief: got no valid pixel, expected some millimeters; use a larger patch")
+    raise SceneError(
+        "relief: got no valid pixel, expected some millimeters of skin; fit another session"
+    )
 
 
 SAMPLE_PX: Final = 512
-"""Side of the part of a displacement that its slopes are known from."""
+"""Side of the part of a displacement from which slope statistics are computed."""
 CELL_PX: Final = 56
 MAX_BREAKS: Final = 8
-"""Lines of alpha that the shader has room for, less one."""
+"""Maximum number of breakpoints of alpha in the shader."""
 MAX_REACH_PX: Final = 64
-"""Kernels that reach farther than this leave nothing of the window."""
+"""Maximum radius of kernels; larger ones would exceed the window."""
 
 
-def assets(source: SceneSource) -> Assets:
-    """Return the microstructure of a scene, or why there is none.
+def build_assets(source: SceneSource) -> Assets:
+    """Build the microstructure of a scene, or the reason for its omission.
 
-    A fitted relief comes before a simulated one; what is simulated on a captured face is said.
+    A fitted relief precedes a simulated one; simulated relief on a captured face is reported.
     """
     dynamic = source.appearances.get("dynamic")
     relief = None if dynamic is None else read_fitted_relief(dynamic)
@@ -117,29 +118,30 @@ def assets(source: SceneSource) -> Assets:
         return build_relief_assets(relief, source.mesh, seed=source.seed)
     made = build_relief_assets(simulate_relief(source.seed), source.mesh, seed=source.seed)
     if source.kind in ("dynamic", "dome", "model"):
-        told = "simulated, with the published kernels of a forehead; "
-        told += "`skinrig fit microstructure` adds measured ones"
-        made["left_out"] = (("microstructure of this face", told),)
+        reason = "simulated, with the published kernels of a forehead; "
+        reason += "`skinrig fit microstructure` adds measured ones"
+        made["left_out"] = (("microstructure of this face", reason),)
     return made
 
 
 def grow_relief(relief: MicroRelief, *, seed: int = 0) -> GrownRelief:
-    """Return what is grown in the page: the middle of the relief, without its mean and tilt.
+    """Prepare the center of a relief for growth, without its mean and tilt.
 
     Raises
     ------
     SceneError
-        For a relief too small to choose places from.
+        If the relief is too small.
     """
     side = min(*relief.height_um.shape, PATCH_PX) // relief_growth.STEP_PX * relief_growth.STEP_PX
-    cell = min(CELL_PX, relief_growth.max_cell_px(side))
+    cell = min(CELL_PX, relief_growth.compute_max_cell_px(side))
     if cell < 2 * relief_growth.STEP_PX:
         raise SceneError(
-            f"relief: got {relief.height_um.shape}, expected at least 96 pixels a side"
+            f"relief: got {relief.height_um.shape}, expected at least 96 pixels per side; measure "
+            "a larger patch"
         )
     top, left = ((n - side) // 2 for n in relief.height_um.shape)
     part = relief.height_um[top : top + side, left : left + side].astype(np.float64)
-    # a tilt would be a slope that no skin has, and steps where places meet
+    # a tilt would add a constant slope, and steps between blended positions
     y, x = (np.mgrid[:side, :side] - 0.5 * (side - 1)).reshape(2, -1)
     plane = np.stack([np.ones_like(x), x, y], axis=1)
     part -= (plane @ np.linalg.lstsq(plane, part.ravel(), rcond=None)[0]).reshape(side, side)
@@ -147,20 +149,20 @@ def grow_relief(relief: MicroRelief, *, seed: int = 0) -> GrownRelief:
 
 
 def build_relief_assets(relief: MicroRelief, mesh: Mesh, *, seed: int = 0) -> Assets:
-    """Return textures, tables and parameters of a relief on a mesh.
+    """Build textures, tables and parameters of a relief on a mesh.
 
     Parameters
     ----------
     relief : MicroRelief
     mesh : Mesh
-        Its texture's scale says how many pixels the grown displacement has.
+        Mesh; the scale of its texture determines the size of the grown displacement.
     seed : int
 
     Raises
     ------
     SceneError
-        For a table of more lines than the shader holds, or a texture whose scale is so uneven
-        that kernels reach too far.
+        If the table has more lines than the shader supports, or the texture's scale varies so much
+        that kernels are too wide.
     """
     growth = grow_relief(relief, seed=seed)
     table = relief.table
@@ -168,11 +170,11 @@ def build_relief_assets(relief: MicroRelief, mesh: Mesh, *, seed: int = 0) -> As
         raise SceneError(
             f"table: got {len(table.alpha_breaks)} breaks, expected at most {MAX_BREAKS}"
         )
-    scale = px_per_mm(mesh)
+    scale = compute_px_per_mm(mesh)
     virtual = round(1e3 / (relief.pixel_um * float(np.median(scale))))
     virtual = max(relief_growth.STEP_PX, virtual // relief_growth.STEP_PX * relief_growth.STEP_PX)
     virtual = min(virtual, relief_growth.MAX_LATTICE_PX // 2)
-    reach = reach_px(table, scale, virtual)
+    reach = compute_kernel_reach_px(table, scale, virtual)
     facts = {
         **{name: getattr(growth, name) for name in ("pixel_um", "cell_px", "choices", "seed")},
         "patch_px": growth.patch.shape[0],
@@ -182,7 +184,7 @@ def build_relief_assets(relief: MicroRelief, mesh: Mesh, *, seed: int = 0) -> As
         "stretch_range": list(table.stretch_range),
         "alpha_limits": list(ALPHA_LIMITS),
         "variance_stretch_range": list(STRETCH_RANGE),
-        "slope_rms": slope_rms(growth),
+        "slope_rms": compute_slope_rms(growth),
         "source": relief.source,
         "table": table.source,
     }
@@ -190,57 +192,57 @@ def build_relief_assets(relief: MicroRelief, mesh: Mesh, *, seed: int = 0) -> As
         "kernel_alpha_breaks": np.asarray([table.alpha_breaks], np.float32),
         "kernel_alpha_lines": np.asarray(table.alpha_lines, np.float32),
         "kernel_sigma_lines_mm": 1e-3 * np.asarray(table.sigma_lines_um(), np.float32),
-        "strained_variance": strained_variance(growth, table).astype(np.float32),
+        "strained_variance": compute_strained_variance(growth, table).astype(np.float32),
     }
     patch = Texture(growth.patch[..., None], "u16", "nearest")
     return Assets(textures={"relief_patch": patch}, tables=tables, facts={"microstructure": facts})
 
 
-def reach_px(table: KernelTable, scale: Float64Array, virtual_px: int) -> int:
-    """Return how many pixels of the displacement a kernel reaches, and two for its samples.
+def compute_kernel_reach_px(table: KernelTable, scale: Float64Array, virtual_px: int) -> int:
+    """Return the radius of the widest kernel in pixels, plus two for interpolation.
 
     Parameters
     ----------
     table : KernelTable
     scale : ndarray
-        Texture units per mm of skin, see `px_per_mm`.
+        Texture units per mm of skin, see `compute_px_per_mm`.
     virtual_px : int
         Side of the displacement.
 
     Raises
     ------
     SceneError
-        For more than `MAX_REACH_PX`.
+        If it exceeds `MAX_REACH_PX`.
     """
-    # the finest 1 % of a texture is slivers: kernels there are held at the window's margin
+    # the finest 1 % of a texture is slivers; kernels there are clipped at the window's margin
     finest = float(np.percentile(scale, 99.0))
     ends = np.array([*table.stretch_range, np.nextafter(1.0, 0.0), 1.0])
     widest_um = float(kernel_parameters(ends, table)[1].max())
     reach = math.ceil(4.0 * widest_um * 1e-3 * virtual_px * finest + 0.5) + 2
     if reach > MAX_REACH_PX:
         raise SceneError(
-            f"mesh: got kernels of {reach} px at the texture's finest places, expected at most "
-            f"{MAX_REACH_PX}: lengths differ too much over its texture"
+            f"mesh: got kernels of {reach} px where the texture is finest, expected at most "
+            f"{MAX_REACH_PX}; give a mesh with a more uniform texture scale"
         )
     return reach
 
 
 def add_displacement_tiles(scene: ViewerScene, pyramid: Pyramid) -> ViewerScene:
-    """Return a scene that fetches its relief as tiles in place of growing it from a patch.
+    """Return a scene that fetches its relief as tiles instead of growing it from a patch.
 
     Parameters
     ----------
     scene : ViewerScene
-        Its own relief, where it has one, is left out.
+        Scene; its own relief is omitted.
     pyramid : Pyramid
-        Of the displacement, in the texture of the scene's mesh.
+        Pyramid of the displacement in the texture of the scene's mesh.
 
     Raises
     ------
     SceneError
-        As of `build_relief_assets`.
+        See `build_relief_assets`.
     """
-    scale = px_per_mm(scene.mesh)
+    scale = compute_px_per_mm(scene.mesh)
     pixel_um = 1e3 / (pyramid.size * float(np.median(scale)))
     source = pyramid.levels[0]
     first = (pyramid.size - SAMPLE_PX) // 2
@@ -252,7 +254,7 @@ def add_displacement_tiles(scene: ViewerScene, pyramid: Pyramid) -> ViewerScene:
     facts |= {
         "virtual_px": pyramid.size,
         "levels": len(pyramid.levels),
-        "reach_px": reach_px(FOREHEAD, scale, pyramid.size),
+        "reach_px": compute_kernel_reach_px(FOREHEAD, scale, pyramid.size),
         "tiles": {"tile_px": TILE_PX, "low": pyramid.low, "high": pyramid.high},
     }
     bare = replace(
@@ -265,11 +267,13 @@ def add_displacement_tiles(scene: ViewerScene, pyramid: Pyramid) -> ViewerScene:
     return bare.with_assets(Assets(tables=made["tables"], facts={"microstructure": facts}))
 
 
-def px_per_mm(mesh: Mesh) -> Float64Array:
-    """Return texture units per mm of skin at the vertices of a mesh, by the root of areas."""
+def compute_px_per_mm(mesh: Mesh) -> Float64Array:
+    """Return texture units per mm of skin at vertices: square root of the ratio of areas."""
     rest = mesh.vertices_mm.astype(np.float64)
     found = strain(rest, rest, mesh.faces, mesh.uv)
     if not found.valid.any():
-        raise SceneError("mesh: got no triangle with an area in the texture")
+        raise SceneError(
+            "mesh: got no triangle with an area in the texture, expected some; check its texture"
+        )
     a, b, c = found.uv_metric[found.valid].T
     return np.asarray(np.sqrt(np.abs(a * c - b * b)))

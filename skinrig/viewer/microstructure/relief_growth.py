@@ -1,23 +1,22 @@
-"""A relief of any size grown from one small patch, a function of the pixel alone.
+"""Grow relief of any size from one small patch, as a function of the pixel only.
 
-A browser cannot hold a 16K displacement (textures end at 8K on many machines) and a page of 5 MB
-cannot carry one. So the page grows what it shows from a patch of some hundred pixels: on a lattice
-of equilateral triangles each corner carries its own place of the patch, and the three places of a
-triangle are blended. Shader and this module do the same arithmetic on the same integers.
+A 16K displacement exceeds the textures of many browsers (8K) and a page of 5 MB. The page therefore
+grows it from a patch of some hundred pixels. On a lattice of equilateral triangles, each corner has
+its own offset in the patch, and the three offsets of a triangle are blended. Shader and this module
+use the same integer arithmetic.
 
-What is fixed here:
+Definitions:
 
-- Corner (i, j) shows the patch moved by a whole number of `STEP_PX` pixels that a hash of (i, j)
-  and the seed chooses among all moves at which its hexagon stays within the patch. Whole numbers:
-  no sample lies between pixels, and levels of a mip pyramid up to `GROWN_LEVELS` move by whole
-  pixels too.
-- Weights are the barycentric ones to the power `WEIGHT_POWER`, divided by the root of their summed
-  squares: mean and variance are those of the patch where the three places are uncorrelated (Heitz
-  and Neyret 2018, eq. 2, without their transform of histograms, so a skewed histogram comes out
-  less skewed where places meet). Weights are continuous: there are no seams. Between places relief
-  is a mixture of up to three, which no skin has.
-- Level L > 0 blends the patch's own means over 2^L pixels with the weights at the pixel's centre:
-  what the mean of the grown relief is but for the weights' change over one pixel.
+- Corner (i, j) uses the patch at an offset of a multiple of `STEP_PX` pixels. A hash of (i, j) and
+  the seed chooses it among all offsets at which its hexagon is within the patch. With integer
+  offsets, samples are at pixels also in the levels of a mip pyramid up to `GROWN_LEVELS`.
+- Weights are barycentric weights to the power `WEIGHT_POWER`, divided by the root of their summed
+  squares. Mean and variance are those of the patch where the three parts are uncorrelated (Heitz
+  and Neyret 2018, eq. 2, without their histogram transform, so that a skewed histogram is less
+  skewed in blended regions). Weights are continuous, thus the relief is seamless. In blended
+  regions it is a mixture of up to three parts, unlike real skin.
+- Level L > 0 blends the patch's means over 2^L pixels with the weights at the pixel's center. This
+  is the mean of the grown relief, except for the change of the weights over one pixel.
 
 References
 ----------
@@ -36,24 +35,24 @@ from skinrig.arrays import Float32Array, Float64Array
 from skinrig.viewer.scene import SceneError
 
 GROWN_LEVELS: Final = 4
-"""Levels of a pyramid that can be grown: 0 (the patch's pixels) to GROWN_LEVELS - 1."""
+"""Number of pyramid levels that can be grown: 0 (the patch's pixels) to GROWN_LEVELS - 1."""
 STEP_PX: Final = 2 ** (GROWN_LEVELS - 1)
 MAX_LATTICE_PX: Final = 2**17
-"""Farther out the lattice's integers leave 32 bits."""
+"""Maximum coordinate, beyond which the lattice's integers exceed 32 bits."""
 MIN_MOVES: Final = 4
-"""Moves to choose from along each side; below, repetition would be seen at once."""
+"""Minimum number of offsets per axis; with fewer, repetition is obvious."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GrownRelief:
-    """A patch with what its growth is determined by.
+    """A patch with the parameters of its growth.
 
     Attributes
     ----------
     patch : ndarray of float32, shape (P, P)
-        Heights, um, of mean 0; row 0 is the top. P is a multiple of `STEP_PX`.
+        Heights, um, with mean 0; row 0 is the top. P is a multiple of `STEP_PX`.
     pixel_um : float
-        Length of skin that a pixel has, > 0.
+        Pixel size on the skin, > 0.
     cell_px : int
         Edge of the lattice's triangles, px.
     seed : int
@@ -66,7 +65,7 @@ class GrownRelief:
     seed: int
 
     def __post_init__(self) -> None:
-        """Refuse patches that a cell does not fit into."""
+        """Raise for patches that are too small for a cell."""
         shape = self.patch.shape
         if len(shape) != 2 or shape[0] != shape[1] or shape[0] % STEP_PX:
             raise SceneError(
@@ -81,46 +80,46 @@ class GrownRelief:
         if self.cell_px < 2 * STEP_PX or self.choices < MIN_MOVES:
             raise SceneError(
                 f"cell_px: got {self.cell_px} for a patch of {shape[0]} px, expected at least "
-                f"{2 * STEP_PX} and at most {max_cell_px(shape[0])}"
+                f"{2 * STEP_PX} and at most {compute_max_cell_px(shape[0])}"
             )
 
     @property
     def choices(self) -> int:
-        """Moves to choose from along each side."""
+        """Number of offsets per axis."""
         return _choices(self.patch.shape[0], self.cell_px)
 
 
-def reach_px(cell_px: int) -> int:
-    """Return how many pixels from its corner a place may be shown, a multiple of `STEP_PX`.
+def compute_reach_px(cell_px: int) -> int:
+    """Return the radius in which a corner's offset is used, a multiple of `STEP_PX`, px.
 
-    The hexagon's radius is one cell; a pixel of the coarsest level reaches half a step farther,
-    and corners lie on whole steps, up to half of one from the lattice's.
+    The hexagon's radius is one cell. Pixels of the coarsest level extend half a step farther, and
+    corners are rounded to whole steps, up to half a step from the lattice.
     """
     return STEP_PX * math.ceil((cell_px + STEP_PX + 1) / STEP_PX)
 
 
 def _choices(side_px: int, cell_px: int) -> int:
-    return (side_px - 2 * reach_px(cell_px)) // STEP_PX
+    return (side_px - 2 * compute_reach_px(cell_px)) // STEP_PX
 
 
-def max_cell_px(side_px: int) -> int:
-    """Return the largest cell that leaves `MIN_MOVES` moves in a patch of so many pixels."""
+def compute_max_cell_px(side_px: int) -> int:
+    """Return the largest cell with at least `MIN_MOVES` offsets per axis in a patch."""
     fits = [c for c in range(1, side_px) if _choices(side_px, c) >= MIN_MOVES]
     return max(fits, default=0)
 
 
 STRETCH_NODES: Final = 33
-"""Stretch ratios a side of the table of variances, evenly from 0.5 to 1.5."""
+"""Nodes per axis of the table of variances: stretch ratios at equal steps from 0.5 to 1.5."""
 STRETCH_RANGE: Final = (0.5, 1.5)
 MIN_LEVEL_PX: Final = 6
-"""Pixels a side of the coarsest level whose slopes are counted."""
+"""Minimum side of the coarsest evaluated level."""
 
 
-def slope_rms(growth: GrownRelief) -> list[float]:
-    """Return the rms of slopes that pixels of 2^level px still show, by level of a relief.
+def compute_slope_rms(growth: GrownRelief) -> list[float]:
+    """Return the RMS of slopes resolved by pixels of 2^level px, by level of a relief.
 
-    A slope is the gradient by central differences over two pixels of the level, as the page's
-    normals are; levels end where less than six pixels a side are left.
+    A slope is the gradient by central differences over two pixels of the level, as in the page's
+    normals. Levels with fewer than six pixels per side are not evaluated.
     """
     found = []
     height = growth.patch.astype(np.float64)
@@ -135,12 +134,12 @@ def slope_rms(growth: GrownRelief) -> list[float]:
     return found
 
 
-def strained_variance(growth: GrownRelief, table: KernelTable) -> Float64Array:
-    """Return how the variance of slopes changes under strain, relative to neutral skin.
+def compute_strained_variance(growth: GrownRelief, table: KernelTable) -> Float64Array:
+    """Return the variance of slopes under strain relative to neutral skin.
 
-    The kernels' transfer functions on the patch's power spectrum, averaged with that of the
-    patch turned by 90 degrees: what direction the relief has of its own is not followed. Slopes
-    are those of the deformed surface: heights over lengths that are stretched too.
+    It follows from the kernels' transfer functions and the patch's power spectrum, averaged with
+    that of the patch rotated by 90 degrees, as anisotropy of the relief is not modeled. Slopes are
+    those of the deformed surface: heights over stretched lengths.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""A displacement too large for a page or a graphics card: levels that halve, cut into tiles.
+"""Cut a displacement that exceeds page and graphics card into a pyramid of tiles.
 
-Level 0 is the file itself, read where it lies; coarser levels are means of two by two pixels,
-written once into a folder of their own. A tile is 16-bit words over the range of the whole map, so
-that its error is known before it is fetched.
+Level 0 is the file itself, memory-mapped. Coarser levels are means of two by two pixels, written
+once into a folder. A tile has 16-bit words over the range of the whole map, so that its error is
+known in advance.
 """
 
 from dataclasses import dataclass
@@ -15,15 +15,15 @@ from skinrig.atomic_file import replace_folder_atomically
 
 TILE_PX: Final = 256
 MIN_SIDE_PX: Final = 512
-"""Side of the smallest map, and of the coarsest level at least."""
+"""Minimum side of a map and of the coarsest level."""
 MAX_LEVELS: Final = 8
 ROWS_PER_READ: Final = 512
-"""Rows of a level that are read at a time."""
+"""Rows of a level per read."""
 MAX_WORD: Final = 65535
 
 
 class TileError(ValueError):
-    """A displacement that cannot be cut into tiles, or a tile that is not there."""
+    """An invalid displacement, or a missing tile."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +35,7 @@ class Pyramid:
     levels : tuple of ndarray or memory map, shape (S / 2^level,) * 2
         Heights, um, row 0 at the top (v = 1).
     low, high : float
-        Range of level 0, um; coarser levels lie within.
+        Range of level 0, um, which includes that of coarser levels.
     """
 
     levels: tuple[Any, ...]
@@ -44,12 +44,12 @@ class Pyramid:
 
     @property
     def size(self) -> int:
-        """Pixels a side of level 0."""
+        """Side of level 0, px."""
         return int(self.levels[0].shape[0])
 
     @property
     def step_um(self) -> float:
-        """Height between two words of a tile; the largest error of a tile is half of it."""
+        """Quantization step of heights, um; the maximum error is half of it."""
         return (self.high - self.low) / MAX_WORD
 
     def tile(self, level: int, row: int, column: int) -> bytes:
@@ -60,17 +60,17 @@ class Pyramid:
         level
             0 is the finest.
         row, column
-            Of the tile, from the upper left.
+            Index of the tile from the upper left.
 
         Returns
         -------
         bytes
-            Word 0 stands for `low`, 65535 for `high`.
+            Word 0 is `low`, word 65535 is `high`.
 
         Raises
         ------
         TileError
-            There is no such tile.
+            If the pyramid has no such tile.
         """
         if not 0 <= level < len(self.levels):
             raise TileError(f"level: got {level}, expected 0 to {len(self.levels) - 1}")
@@ -88,19 +88,19 @@ class Pyramid:
 
 
 def build(source: Any, folder: Path) -> Pyramid:
-    """Cut a displacement into levels.
+    """Build the levels of a displacement.
 
     Parameters
     ----------
     source : array or memory map, shape (S, S)
         Heights, um, finite; S is `MIN_SIDE_PX` times a power of two.
     folder : Path
-        For the coarser levels; made, and replaced where one is there. A third of the file's size.
+        Folder of the coarser levels, created or replaced; a third of the file's size.
 
     Raises
     ------
     TileError
-        For another shape, or heights that are not finite.
+        If the shape is invalid, or heights are not finite.
 
     Examples
     --------
@@ -131,24 +131,24 @@ def build(source: Any, folder: Path) -> Pyramid:
 
 
 def open_displacement(path: Path, folder: Path) -> Pyramid:
-    """Return the levels of a displacement file.
+    """Open a displacement file and build its levels.
 
     Parameters
     ----------
     path : Path
-        A .npy file of float32, um, as `skinrig apply microstructure` writes; it is not read whole.
+        A .npy file of float32, um, of `skinrig apply microstructure`; it is memory-mapped.
     folder : Path
-        As of `build`.
+        See `build`.
 
     Raises
     ------
     TileError
-        For a file of another kind, and as of `build`.
+        If the file is of another type; see also `build`.
     """
     try:
         source = np.load(path, mmap_mode="r", allow_pickle=False)
     except (ValueError, EOFError) as error:
-        raise TileError(f"{path}: not a .npy file of heights: {error}") from error
+        raise TileError(f"{path}: not a .npy file of heights ({error}); check the file") from error
     if not isinstance(source, np.ndarray) or source.dtype.kind != "f":
         kind = getattr(source, "dtype", type(source).__name__)
         raise TileError(f"{path}: got {kind}, expected an array of float32 heights, um")

@@ -45,11 +45,11 @@ def test_tab_completes_names(words, expected):
 @pytest.mark.parametrize(
     ("complete", "typed", "one"),
     [
-        (completion.subjects, "dark", "darkest"),
-        (completion.states, "sm", "smile"),
-        (completion.conditions, "lo", "lotion"),
-        (completion.stages, "chrom", "chromophores"),
-        (completion.sizes, "f", "full"),
+        (completion.complete_subjects, "dark", "darkest"),
+        (completion.complete_states, "sm", "smile"),
+        (completion.complete_conditions, "lo", "lotion"),
+        (completion.complete_stages, "chrom", "chromophores"),
+        (completion.complete_scales, "f", "full"),
     ],
 )
 def test_completions_begin_with_typed_text(complete, typed, one):

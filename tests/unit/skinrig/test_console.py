@@ -9,8 +9,8 @@ def test_json_is_the_only_thing_on_stdout(capsys):
     console = Console(as_json=True)
     console.print_line("for people")
     console.progress("working")
-    console.rows(("a", "b"), [(1, 2.0)])
-    console.document("skinrig.x/1", {"value": np.float32(2), "gone": float("nan")})
+    console.print_table(("a", "b"), [(1, 2.0)])
+    console.print_document("skinrig.x/1", {"value": np.float32(2), "gone": float("nan")})
     out, err = capsys.readouterr()
     assert json.loads(out) == {"schema": "skinrig.x/1", "value": 2.0, "gone": None}
     assert "for people" in err
@@ -20,7 +20,7 @@ def test_json_is_the_only_thing_on_stdout(capsys):
 def test_results_on_stdout_are_readable_without_json(capsys):
     console = Console()
     console.print_line("done")
-    console.document("skinrig.x/1", {})
+    console.print_document("skinrig.x/1", {})
     assert capsys.readouterr().out == "done\n"
 
 

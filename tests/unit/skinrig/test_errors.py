@@ -15,10 +15,10 @@ class StoreError(ValueError):
     ("error", "code"),
     [
         (KeyboardInterrupt(), errors.EXIT_INTERRUPTED),
-        (DeviceError("box silent"), errors.DEVICE_FAILED),
-        (StoreError("bad hash"), errors.BAD_INPUT),
-        (FileNotFoundError(2, "No such file", "x"), errors.BAD_INPUT),
-        (errors.MissingExtra("this", "usd"), errors.EXTRA_MISSING),
+        (DeviceError("box silent"), errors.EXIT_DEVICE_FAILED),
+        (StoreError("bad hash"), errors.EXIT_BAD_INPUT),
+        (FileNotFoundError(2, "No such file", "x"), errors.EXIT_BAD_INPUT),
+        (errors.MissingExtra("this", "usd"), errors.EXIT_EXTRA_MISSING),
         (ZeroDivisionError("division by zero"), errors.EXIT_BUG),
     ],
 )
@@ -27,7 +27,7 @@ def test_each_kind_of_failure_has_its_exit_code(error, code):
 
 
 def test_internal_fault_is_admitted_in_single_line():
-    text = errors.sentence(ZeroDivisionError("division by zero"))
+    text = errors.format_error(ZeroDivisionError("division by zero"))
     assert "defect of skinrig" in text
     assert "\n" not in text
 
@@ -45,7 +45,7 @@ def test_internal_fault_is_admitted_in_single_line():
     ],
 )
 def test_system_refusal_is_reported_with_file_and_remedy(error, words):
-    text = errors.sentence(error)
+    text = errors.format_error(error)
     assert text.startswith(f"{error.filename}: {error.strerror}")
     assert words in text
 
@@ -53,11 +53,11 @@ def test_system_refusal_is_reported_with_file_and_remedy(error, words):
 def test_non_text_file_is_reported_without_codec_terms():
     with pytest.raises(UnicodeDecodeError) as caught:
         b"ok\xff".decode()
-    assert errors.sentence(caught.value) == (
+    assert errors.format_error(caught.value) == (
         "text file: got byte 0xff at 2, expected UTF-8; check that it is the right file"
     )
 
 
 def test_full_disk_without_file_is_reported_without_errno():
-    text = errors.sentence(OSError(28, "No space left on device"))
+    text = errors.format_error(OSError(28, "No space left on device"))
     assert text.startswith("No space left on device; free space")

@@ -10,12 +10,12 @@ from skinrig.cli import main
 from skinrig.next_steps import (
     CALIBRATION_BY_TARGET,
     OPEN_COMMAND,
+    format_welcome,
     suggest,
     suggest_after_session,
-    welcome,
 )
 from skinrig.reporting import page
-from skinrig.reporting.page import document
+from skinrig.reporting.page import render_page
 from skinrig.workspace import scan
 
 
@@ -44,7 +44,7 @@ def commands(folder=Path()):
 
 
 def report_page():
-    return document("a report", [page.note("All checks.")], [page.Heading("Maps")])
+    return render_page("a report", [page.build_note("All checks.")], [page.Heading("Maps")])
 
 
 @pytest.fixture(autouse=True)
@@ -108,7 +108,7 @@ def test_a_demo_below_is_found():
     Path("demo").mkdir()
     session(Path("demo/session-a"))
     Path("demo/report.html").write_text(report_page())
-    text = welcome(Path(), "1")
+    text = format_welcome(Path(), "1")
     assert "In demo: 1 session, 1 report" in text
     assert f"{OPEN_COMMAND} {Path('demo/report.html')}" in text
 

@@ -51,9 +51,9 @@ def test_a_folder_of_other_maps_is_left_untouched(tmp_path):
     out = tmp_path / "maps"
     store.write(out, SkinAppearance({}, "measured", parameters={"kind": "appearance"}))
     before = hashlib.sha256((out / store.DOCUMENT_FILE).read_bytes()).hexdigest()
-    with pytest.raises(DynamicAppearanceError, match="nothing was touched"):
+    with pytest.raises(DynamicAppearanceError, match="it was not changed"):
         dynamic.add(out, FACIAL_COLOR, part(1.0))
-    with pytest.raises(DynamicAppearanceError, match="nothing was touched"):
+    with pytest.raises(DynamicAppearanceError, match="it was not changed"):
         dynamic.check_target(out)
     assert hashlib.sha256((out / store.DOCUMENT_FILE).read_bytes()).hexdigest() == before
 

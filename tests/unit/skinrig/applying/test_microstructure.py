@@ -156,5 +156,5 @@ def test_mismatched_reliefs_and_meshes_are_refused(rng, tmp_path):
     with pytest.raises(ApplyMicrostructureError, match=r"\.npy"):
         apply_microstructure(mesh, {}, np.zeros((5, 5)), out=tmp_path / "relief.exr")
     flat = BlendShapeMesh(mesh.vertices_mm, np.zeros_like(mesh.uv), mesh.faces, mesh.shapes)
-    with pytest.raises(ApplyMicrostructureError, match="no vertex"):
+    with pytest.raises(ApplyMicrostructureError, match="no triangle"):
         apply_microstructure(flat, {}, np.zeros((5, 5)), FOREHEAD)

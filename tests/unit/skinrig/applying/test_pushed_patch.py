@@ -33,7 +33,7 @@ def test_pulled_block_stretch_matches_closed_form(stretch, poisson):
     for axis in range(3):
         given[np.abs(nodes[:, axis] - low[axis]) < 1e-9, axis] = 0.0
     given[np.abs(nodes[:, 0] - 5.0) < 1e-9, 0] = 10.0 * (stretch - 1.0)
-    patch = pushed_patch.solve(one, given)
+    patch = pushed_patch.solve_equilibrium(one, given)
     across = 1 / np.sqrt(stretch)
     if poisson < 0.5:
         ratio = 2 * poisson / (1 - 2 * poisson)
@@ -55,14 +55,15 @@ def test_affine_border_motion_moves_interior_alike(rng):
     border |= (nodes[:, 2] > -1e-9) | (nodes[:, 2] < 1e-9 - one.depth_mm)
     given = np.where(border[:, None], nodes @ matrix.T, np.nan)
     assert (~border).any()
-    patch = pushed_patch.solve(one, given, steps=1)
+    patch = pushed_patch.solve_equilibrium(one, given, steps=1)
     np.testing.assert_allclose(patch.deformed_mm, nodes + nodes @ matrix.T, atol=1e-8)
 
 
 def test_volume_conservation_improves_as_poisson_nears_half():
     lost = [
         abs(
-            pushed_patch.push(block(6, poisson=p), Push(contact_mm=2.0), steps=1).volume_ratio - 1.0
+            pushed_patch.push_block(block(6, poisson=p), Push(contact_mm=2.0), steps=1).volume_ratio
+            - 1.0
         )
         for p in (0.3, 0.45, 0.49)
     ]
@@ -107,7 +108,7 @@ def linear_peer(one, moved_mm, *, quadratic=True):
 def small_push(one):
     nodes = nodes_of(one)
     given = shear(nodes, 1e-3, held_of(nodes, one.depth_mm))
-    patch = pushed_patch.solve(one, given, steps=1)
+    patch = pushed_patch.solve_equilibrium(one, given, steps=1)
     return patch.deformed_mm - patch.rest_mm
 
 
@@ -150,7 +151,7 @@ def test_strain_converges_with_the_mesh():
         given[held] = 0.0
         inside = ~held & (np.abs(nodes[:, 2] + 2.0) < 1e-9)
         given[inside, 0] = 0.5 * np.prod(np.cos(np.pi * nodes[inside, :2] / 10), axis=1)
-        patch = pushed_patch.solve(one, given, steps=2)
+        patch = pushed_patch.solve_equilibrium(one, given, steps=2)
         return {
             tuple(np.round(patch.rest_mm[v], 6)): (patch.strain().r_s[v], patch.strain().r_t[v])
             for v in np.unique(patch.surface)
@@ -166,7 +167,7 @@ def test_strain_converges_with_the_mesh():
 
 
 def test_the_surface_looks_out_and_covers_the_square():
-    patch = pushed_patch.push(block(), Push(depth_mm=0.1), steps=1)
+    patch = pushed_patch.push_block(block(), Push(depth_mm=0.1), steps=1)
     a, b, c = (patch.rest_mm[patch.surface[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     assert (normal[:, 2] > 0).all()
@@ -178,7 +179,7 @@ def test_the_surface_looks_out_and_covers_the_square():
 
 def test_probe_drags_skin_in_contact():
     probe = Push(depth_mm=0.5, shift_mm=(0.3, -0.2), contact_mm=2.0, center_mm=(1.0, 0.5))
-    patch = pushed_patch.push(block(6), probe, steps=2)
+    patch = pushed_patch.push_block(block(6), probe, steps=2)
     away = np.hypot(*(patch.rest_mm[:, :2] - (1.0, 0.5)).T)
     touched = (patch.rest_mm[:, 2] > -1e-9) & (away <= 2.0)
     moved = (patch.deformed_mm - patch.rest_mm)[touched]
@@ -189,7 +190,7 @@ def test_probe_drags_skin_in_contact():
 
 def test_skin_is_rougher_before_moving_probe_smoother_behind(rng):
     """Where the push compresses along x, slopes along x grow; where it stretches, they shrink."""
-    patch = pushed_patch.push(
+    patch = pushed_patch.push_block(
         block(8), Push(depth_mm=0.0, shift_mm=(1.0, 0.0), contact_mm=1.3), steps=2
     )
     neutral = 20.0 * gaussian_filter(rng.standard_normal((1000, 1000)), 1.5)
@@ -210,7 +211,7 @@ def test_push_beyond_equilibrium_is_reported():
     given = np.where(held_of(nodes, one.depth_mm)[:, None], 0.0, np.full(nodes.shape, np.nan))
     given[np.abs(nodes).sum(axis=1) < 1e-9] = (0.0, 0.0, -9.0)
     with pytest.raises(PushDiverged, match="no equilibrium beyond"):
-        pushed_patch.solve(one, given)
+        pushed_patch.solve_equilibrium(one, given)
 
 
 @pytest.mark.parametrize(
@@ -223,12 +224,15 @@ def test_push_beyond_equilibrium_is_reported():
         (lambda: Push(contact_mm=5.0), "contact_mm, tip_mm"),
         (lambda: Push(depth_mm=np.inf), "depth_mm"),
         (
-            lambda: pushed_patch.push(block(), Push(center_mm=(4.9, 0.0))),
+            lambda: pushed_patch.push_block(block(), Push(center_mm=(4.9, 0.0))),
             "within the block's edges",
         ),
-        (lambda: pushed_patch.solve(block(), np.zeros((3, 3))), "given_mm: got shape"),
-        (lambda: pushed_patch.solve(block(1), np.full((8, 3), np.nan)), "some nodes"),
-        (lambda: pushed_patch.solve(block(1), np.zeros((8, 3)), steps=0), "steps: got 0"),
+        (lambda: pushed_patch.solve_equilibrium(block(), np.zeros((3, 3))), "given_mm: got shape"),
+        (lambda: pushed_patch.solve_equilibrium(block(1), np.full((8, 3), np.nan)), "some nodes"),
+        (
+            lambda: pushed_patch.solve_equilibrium(block(1), np.zeros((8, 3)), steps=0),
+            "steps: got 0",
+        ),
     ],
 )
 def test_invalid_push_is_refused_by_name(make, message):
@@ -239,5 +243,5 @@ def test_invalid_push_is_refused_by_name(make, message):
 def test_missing_optional_part_is_named_in_message(monkeypatch):
     monkeypatch.setitem(sys.modules, "skfem", None)
     with pytest.raises(errors.MissingExtra, match=r"skinrig\[fem\]") as caught:
-        pushed_patch.push(block(), Push())
-    assert errors.exit_code(caught.value) == errors.EXTRA_MISSING
+        pushed_patch.push_block(block(), Push())
+    assert errors.exit_code(caught.value) == errors.EXIT_EXTRA_MISSING

@@ -124,7 +124,7 @@ def test_large_maps_are_written_next_to_folder(folder, sheet, tmp_path, monkeypa
     assert large.shape == (300, 300)
     shown = store.read(out).maps["displacement"]
     np.testing.assert_array_equal(shown.values, large[::2, ::2])
-    assert "every 2. pixel" in shown.description
+    assert "one of 2 pixels" in shown.description
 
 
 def test_spatial_noise_has_patch_height_and_deforms_alike(folder, sheet, tmp_path):

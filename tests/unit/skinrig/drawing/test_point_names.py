@@ -14,7 +14,7 @@ def boxes(axes):
 
 @pytest.mark.parametrize("count", [3, 12])
 def test_names_of_points_close_together_do_not_overlap(count):
-    figure, axes = figures.canvas(5.2, 3.4)
+    figure, axes = figures.create_canvas(5.2, 3.4)
     x = 1.0 + 0.01 * np.arange(count)
     axes.plot(x, x, "o", label="all of them")
     axes.set_xlim(0.5, 1.5)
@@ -35,7 +35,7 @@ def test_names_of_points_close_together_do_not_overlap(count):
 
 
 def test_name_avoids_lines_and_is_omitted_if_wide():
-    figure, axes = figures.canvas(5.2, 3.4)
+    figure, axes = figures.create_canvas(5.2, 3.4)
     axes.set_xlim(0.0, 1.0)
     axes.set_ylim(0.0, 1.0)
     line = np.array([[0.5, 0.5], [1.0, 0.6]])  # runs where a name stands first, up to the right

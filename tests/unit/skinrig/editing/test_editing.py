@@ -15,7 +15,7 @@ from skinrig.cli import main
 from skinrig.drawing import png
 from skinrig.editing import edit as editing
 from skinrig.editing.edit import EditError, EditRequest
-from skinrig.editing.spots import SpotOrder
+from skinrig.editing.spots import SpotRequest
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,9 @@ def test_an_edit_of_amount_zero_changes_no_bit(lab, capsys):
     assert store.read(out).files == store.read(paths[0]).files
     record = store.read(out).parameters["edit"]
     assert record["traits"] == {"tan": 0.0, "oily": 0.0}
-    assert store.read(out).inputs["appearance"] == contents.digest(paths[0] / store.DOCUMENT_FILE)
+    assert store.read(out).inputs["appearance"] == contents.hash_file(
+        paths[0] / store.DOCUMENT_FILE
+    )
 
 
 def test_tan_edit_darkens_only_albedo_as_in_population(source, library):
@@ -103,7 +105,10 @@ def test_oil_edit_changes_only_lobes_as_in_population(source, library):
     done = editing.edit_face(source, EditRequest(traits={"oily": 1.0}), library)
     assert "r_d" not in done.changed
     assert "lobe_residual" not in done.appearance.maps
-    assert ("lobe_residual", "is of the lobes before the edit") in done.appearance.left_out
+    assert (
+        "lobe_residual",
+        "residual of the basis BRDFs before the edit",
+    ) in done.appearance.left_out
     good = source.r_d.valid
     change = [
         float(
@@ -127,7 +132,7 @@ def test_mask_keeps_every_bit_where_black(traits, source, library, tmp_path):
     mask[10:40, 8:24] = 255
     (tmp_path / "mask.png").write_bytes(png.encode(mask))
     order = EditRequest(
-        traits=traits, mask=tmp_path / "mask.png", spots=(SpotOrder("freckles", 1.0, 3.0),)
+        traits=traits, mask=tmp_path / "mask.png", spots=(SpotRequest("freckles", 1.0, 3.0),)
     )
     done = editing.edit_face(source, order, library)
     most = 0.0
@@ -170,7 +175,7 @@ def test_single_colors_darkest_and_whitest_faces_survive(kind, dome_faces, libra
         new = editing.edit_face(face, EditRequest(traits={"tan": amount}), library)
         spotted = dataclasses.replace(face, appearance=new.appearance)
         moles = editing.edit_face(
-            spotted, EditRequest(traits={}, spots=(SpotOrder("moles", 1.0, 1.0),))
+            spotted, EditRequest(traits={}, spots=(SpotRequest("moles", 1.0, 1.0),))
         )
         for one in (new, moles):
             values = one.appearance.maps["r_d"].values[good]
@@ -205,7 +210,7 @@ def test_face_without_lobes_is_edited_in_albedo(source, library):
 
 
 def test_the_same_seed_makes_the_same_face(source, library):
-    order = EditRequest(traits={"tan": 1.0}, spots=(SpotOrder("freckles", 1.0),), seed=5)
+    order = EditRequest(traits={"tan": 1.0}, spots=(SpotRequest("freckles", 1.0),), seed=5)
     one, two = (editing.edit_face(source, order, library).appearance.maps["r_d"] for _ in range(2))
     np.testing.assert_array_equal(one.values, two.values)
     other = editing.edit_face(source, dataclasses.replace(order, seed=6), library)
@@ -228,8 +233,8 @@ def test_the_same_seed_makes_the_same_face(source, library):
         (["--trait", "tan=1", "--landmarks", "none.csv"], 3, "none.csv"),
         (["--trait", "tan=1000"], 3, "trait tan: got 1000, expected -10 to 10"),
         (["--trait", "tan=nan"], 3, "trait tan: got nan, expected -10 to 10"),
-        (["--trait", "tan=1", "--iterations", "0"], 3, "iterations: got 0, expected at least 1"),
-        (["--trait", "tan=1", "--seed", "-1"], 3, "seed: got -1, expected at least 0"),
+        (["--trait", "tan=1", "--iterations", "0"], 3, "--iterations: got 0, expected 1 or more"),
+        (["--trait", "tan=1", "--seed", "-1"], 3, "--seed: got -1, expected 0 or more"),
     ],
 )
 def test_invalid_edit_gives_clear_error_and_writes_nothing(argv, code, says, lab, capsys):
@@ -337,7 +342,7 @@ def test_landmark_table_in_texels_matches_mesh_landmarks(source, tmp_path):
     for name, (x, y) in picked.items():
         np.testing.assert_allclose(found[name], source.position[y, x])
     table.write_text("name,x,y\nchin,0,0\n")
-    with pytest.raises(face_textures.FaceError, match="shows no surface"):
+    with pytest.raises(face_textures.FaceError, match="not on the surface"):
         face_textures.read_landmarks(table, source)
     table.write_text("name,x,y,z\nchin,0,-60.5,nan\n")
     with pytest.raises(ValueError, match="finite"):

@@ -29,7 +29,7 @@ def drawn(cheek, kind="freckles", seed=3, mask=None, **more):
     position, skin, on = cheek
     where = on.astype(float) if mask is None else mask
     rng = np.random.default_rng(seed)
-    return pigment_spots.draw(kind, skin, position, on, where, rng=rng, **more)
+    return pigment_spots.draw_spots(kind, skin, position, on, where, rng=rng, **more)
 
 
 @pytest.mark.parametrize(("kind", "density"), [("freckles", 2.0), ("moles", 0.3)])
@@ -64,7 +64,7 @@ def test_a_spot_has_the_color_of_more_melanin(cheek):
 
     def left(c_m):
         skin = np.broadcast_to(table.lookup(c_m, 0.03), position.shape).astype(np.float32)
-        return pigment_spots.draw(
+        return pigment_spots.draw_spots(
             "freckles", skin, position, on, on, rng=np.random.default_rng(0)
         ).transmitted
 
@@ -140,4 +140,4 @@ def test_orders_that_cannot_be_drawn_are_refused(cheek):
         drawn(cheek, density_per_cm2=1e9)
     position, skin, on = cheek
     with pytest.raises(SpotError, match="expected skin"):
-        pigment_spots.draw("moles", 0 * skin, position, on, on, rng=np.random.default_rng(0))
+        pigment_spots.draw_spots("moles", 0 * skin, position, on, on, rng=np.random.default_rng(0))

@@ -15,7 +15,7 @@ from skinrig import consent, report
 from skinrig.appearances.dynamic import describe_parts
 from skinrig.cli import main
 from skinrig.editing import edit as editing
-from skinrig.editing.spots import SpotOrder
+from skinrig.editing.spots import SpotRequest
 from skinrig.exporting.export import export
 from skinrig.fitting.microstructure import fit_microstructure
 from skinrig.fitting.reflectance import fit_reflectance
@@ -157,7 +157,7 @@ def test_fitted_facial_color_leaves_within_the_consent_alone(tmp_path, monkeypat
 
 
 def test_an_edited_face_leaves_within_the_consent_alone(dome, tmp_path):
-    order = editing.EditRequest(traits={}, spots=(SpotOrder("freckles", 1.0, 3.0),))
+    order = editing.EditRequest(traits={}, spots=(SpotRequest("freckles", 1.0, 3.0),))
     editing.edit_folder(dome("dome"), order, out=tmp_path / "edited")
     assert store.read(tmp_path / "edited").parameters["edit"]["spots"]
     refused_beyond(tmp_path / "edited", tmp_path, "mtlx")
@@ -196,7 +196,7 @@ def test_traits_carry_consent_of_their_training_subjects(tmp_path, dome_faces):
 def test_page_of_measured_face_reports_subject_consent(dome, tmp_path):
     from skinrig.viewer import faces, packing
 
-    scene = faces.scene([dome("dome")], size=64)
+    scene = faces.build_scene([dome("dome")], size=64)
     assert scene.provenance[consent.CONSENT_KEY] == ["P042: research, until 2030-01-01"]
     assert packing.pack(scene).header["provenance"][consent.CONSENT_KEY] == list(
         scene.provenance[consent.CONSENT_KEY]
@@ -207,7 +207,7 @@ def test_page_of_measured_face_reports_subject_consent(dome, tmp_path):
 def test_page_of_simulated_face_names_no_subject(face_folder):
     from skinrig.viewer import faces
 
-    assert consent.CONSENT_KEY not in faces.scene([face_folder], size=64).provenance
+    assert consent.CONSENT_KEY not in faces.build_scene([face_folder], size=64).provenance
 
 
 def consent_of(html):
@@ -232,7 +232,7 @@ def test_report_names_subjects_and_permitted_uses(dome, tmp_path):
     assert "monday, pictures" in section
     assert "teaching" in section
     assert report.build([shown]) == html
-    both = report.make([shown / "monday", shown / "other"])
+    both = report.build_any([shown / "monday", shown / "other"])
     assert both.compared is not None
     assert "research, until 2030-01-01" in consent_of(both.html)
 

@@ -46,7 +46,7 @@ def test_photograph_maps_are_refused_for_surface_formats(tmp_path, to):
     values, valid = np.full((4, 4), 0.02, np.float32), np.ones((4, 4), bool)
     flat = SkinMap(values, MAP_UNITS["melanin"], valid=valid)
     maps = store.write(tmp_path / "flash", SkinAppearance({"melanin": flat}, "simulated"))
-    with pytest.raises(ExportError, match="holds melanin; expected maps, spectral, metahuman"):
+    with pytest.raises(ExportError, match="has melanin; choose maps, spectral, metahuman"):
         exporting.export(maps, tmp_path / "out", to=to)
     assert not (tmp_path / "out").exists()
     assert exporting.export(maps, tmp_path / "out", to="maps").files > 1
@@ -127,7 +127,7 @@ def test_a_failure_on_the_way_leaves_nothing(patch, tmp_path):
         face, files={n: d for n, d in face.files.items() if "obj" not in n}
     )
     folder = store.write(tmp_path / "face", without)
-    with pytest.raises(ValueError, match=r"holds no mesh\.obj"):
+    with pytest.raises(ValueError, match=r"mesh\.obj is missing"):
         exporting.export(folder, tmp_path / "out", to="mtlx")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["face"]
 

@@ -111,5 +111,5 @@ def test_errors_and_masks_are_written_on_request(picture, tmp_path):
 
 
 def test_missing_map_is_named_with_available_ones(picture, tmp_path):
-    with pytest.raises(ExportError, match="got roughness, expected of diffuse, hemoglobin"):
+    with pytest.raises(ExportError, match="got roughness, expected some of diffuse, hemoglobin"):
         maps.write(picture, tmp_path, ExportSettings(only=("roughness",)))

@@ -94,11 +94,11 @@ def test_unknown_or_unscanned_sites_are_omitted_with_reason():
     upper = SkinMap(position.values, "mm", valid=position.values[..., 1] > -20.0)
     found = probe_sites.map_translucency(probe({**MEASURED, "elbow": (0.6, 1.0, 1.5)}), upper)
     why = dict(found.left_out)
-    assert "not known" in why["elbow"]
+    assert "unknown" in why["elbow"]
     assert "the scan ends" in why["chin"]
     assert [site.name for site in found.sites] == ["forehead", "cheek"]
     np.testing.assert_array_equal(found.map.valid, upper.valid)
-    with pytest.raises(ProbeSiteError, match="elbow: its place"):
+    with pytest.raises(ProbeSiteError, match="elbow: unknown position"):
         probe_sites.map_translucency(probe({"elbow": (0.6, 1.0, 1.5)}), position)
 
 

@@ -107,7 +107,7 @@ def test_plan_without_crossed_frames_or_foreign_is_refused(rig, small, tmp_path,
     bare = replace(
         whole, steps=tuple(s for s in whole.steps if s.index.get("polarizer") != "crossed")
     )
-    with pytest.raises(plans.PlanningError, match="no crossed frame"):
+    with pytest.raises(plans.PlanningError, match="no crossed-polarized frame"):
         flash.forecast(rig, bare, plans.PlanRequest())
     file = tmp_path / "plan.json"
     file.write_text(json.dumps(whole.to_json()))
@@ -123,7 +123,7 @@ def test_chromophores_are_reconstructed_from_crossed_frames_alone(rig, tmp_path)
     from skinrig.calibrating.calibrate import calibrate
     from skinrig.simulating.simulation import simulate_session
 
-    plan = flash.crossed_plan(rig, repeats=1, power=1.0, darks=0)
+    plan = flash.build_crossed_plan(rig, repeats=1, power=1.0, darks=0)
     simulate_session("flash", tmp_path / "session-white", target="white", width_px=128)
     calibrate("white", [tmp_path / "session-white"], tmp_path / "calibration")
     simulate_session("flash", tmp_path / "session-face", subject="II", width_px=128, plan=plan)

@@ -27,12 +27,12 @@ from skinrig.planning import dome, dome_observation, plans
 )
 def test_invalid_want_is_reported(text, word):
     with pytest.raises(plans.PlanningError, match=word):
-        plans.parse_wants(text, "dome")
+        plans.parse_goals(text, "dome")
 
 
 def test_invalid_wanted_number_is_reported_as_written():
     with pytest.raises(plans.PlanningError, match="got melanin<=0%, expected above 0"):
-        plans.parse_wants("melanin<=0%", "flash")
+        plans.parse_goals("melanin<=0%", "flash")
 
 
 def test_errors_by_site_are_reported_with_colors():

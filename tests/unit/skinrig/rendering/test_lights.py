@@ -10,9 +10,9 @@ from skinrig.errors import UnusableError, UsageError
 from skinrig.rendering.lights import (
     Light,
     LightError,
-    directions,
-    environment_lights,
+    compute_pixel_directions,
     read_environment,
+    sample_environment_lights,
 )
 from skinrig.rendering.request import RenderRig, parse_lights, parse_subpixels
 
@@ -107,12 +107,12 @@ def test_a_light_that_cannot_shine_is_refused(fields):
 
 def test_environment_lights_give_its_irradiance_on_every_side():
     """Stratified draws: the sum over cosines has a few percent of noise with 400 lights."""
-    towards, solid = directions(32, 64)
+    towards, solid = compute_pixel_directions(32, 64)
     image = np.repeat(
         (1.0 + 20.0 * np.exp(30.0 * (towards @ [-0.6, 0.64, 0.48] - 1)))[..., None], 3, 2
     )
     image[..., 2] *= 0.5
-    lights = environment_lights(image, 400, rng=np.random.default_rng(1))
+    lights = sample_environment_lights(image, 400, rng=np.random.default_rng(1))
     ways = np.array([light.direction for light in lights])
     colors = np.array([light.intensity for light in lights])
     for normal in np.eye(3), -np.eye(3):
@@ -126,18 +126,18 @@ def test_environment_right_side_lights_left_of_facing_face():
     """Who stands inside and looks along +z has -x at the right hand."""
     image = np.zeros((16, 32, 3))
     image[8, 24] = 1.0
-    (light,) = environment_lights(image, 1, rng=np.random.default_rng(0))
+    (light,) = sample_environment_lights(image, 1, rng=np.random.default_rng(0))
     assert light.direction[0] < -0.98
     image = np.zeros((16, 32, 3))
     image[0, 3] = 1.0
-    (light,) = environment_lights(image, 1, rng=np.random.default_rng(0))
+    (light,) = sample_environment_lights(image, 1, rng=np.random.default_rng(0))
     assert light.direction[1] > 0.99
 
 
 def test_the_same_seed_draws_the_same_lights():
     image = np.random.default_rng(0).random((8, 16, 3))
     one, two, other = (
-        environment_lights(image, 5, rng=np.random.default_rng(s)) for s in (1, 1, 2)
+        sample_environment_lights(image, 5, rng=np.random.default_rng(s)) for s in (1, 1, 2)
     )
     assert one == two
     assert one != other
@@ -146,7 +146,7 @@ def test_the_same_seed_draws_the_same_lights():
 @pytest.mark.parametrize("image", [np.ones((4, 8)), -np.ones((4, 8, 3)), np.zeros((4, 8, 3))])
 def test_an_environment_without_light_is_refused(image):
     with pytest.raises(LightError, match="environment"):
-        environment_lights(image, 4, rng=np.random.default_rng(0))
+        sample_environment_lights(image, 4, rng=np.random.default_rng(0))
 
 
 def test_an_environment_is_read_from_a_file(tmp_path, stage):

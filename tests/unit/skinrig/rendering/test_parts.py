@@ -128,7 +128,9 @@ def test_shadow_widens_with_smaller_sigma_tr(model, monkeypatch):
     boundary = ShadowBoundary.on_plane(model, size_px=160)
     rise = {}
     for sigma in (MIN_SIGMA_TR_PER_MM, MAX_SIGMA_TR_PER_MM, None):
-        rise[sigma] = shadow.rise_mm(*shadow.profile(boundary.render(sigma, subpixels=1)))
+        rise[sigma] = shadow.measure_rise_mm(
+            *shadow.measure_profile(boundary.render(sigma, subpixels=1))
+        )
     assert np.all(rise[None] < 0.35)
     assert np.all(rise[MIN_SIGMA_TR_PER_MM] > rise[MAX_SIGMA_TR_PER_MM])
     ratio = rise[MIN_SIGMA_TR_PER_MM][:2] / rise[MAX_SIGMA_TR_PER_MM][:2]
@@ -139,7 +141,7 @@ def test_shadow_widens_with_smaller_sigma_tr(model, monkeypatch):
 def test_shadow_is_right_of_middle(model, monkeypatch):
     monkeypatch.setattr(shadow, "PATCH_TEXELS", 32)
     seen = ShadowBoundary.on_plane(model, size_px=48).render(None, subpixels=1)
-    place, level = shadow.profile(seen)
+    place, level = shadow.measure_profile(seen)
     assert np.all(level[place < -0.6, 1] > 0.2)
     assert np.all(level[place > 0.6] == 0.0)
 

@@ -12,7 +12,7 @@ from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from reconstruction.pipeline.probe.stages import CHANNEL_NAMES, PROFILE_FILE
 from skinrig import report
 from skinrig.reporting import first_screen, page, verdict
-from skinrig.reporting.sections.chromophore import panels
+from skinrig.reporting.sections.chromophore import draw_panels
 
 SHAPE = (40, 50)
 BANNED = (
@@ -57,8 +57,8 @@ def appearance_of(names, rng, **more):
 
 
 def panels_of(appearances, truths=None):
-    blocks = list(first_screen.strip(appearances, truths or {}))
-    return (blocks[0].data["panels"] if blocks else []), page.fragment(blocks)
+    blocks = list(first_screen.draw_first_screen(appearances, truths or {}))
+    return (blocks[0].data["panels"] if blocks else []), page.render_fragment(blocks)
 
 
 @pytest.mark.parametrize("rig", RIGS)
@@ -93,7 +93,7 @@ def test_probe_alone_shows_its_radial_profile():
 
 
 def test_light_stack_shows_normals_and_albedo(rng):
-    blocks = list(panels(appearance_of(RIGS["stereo"], rng), None))
+    blocks = list(draw_panels(appearance_of(RIGS["stereo"], rng), None))
     assert [one.text for one in blocks if isinstance(one, page.Heading)] == ["albedo", "normals"]
     titles = [[i.title for i in one.images] for one in blocks if isinstance(one, page.Images)]
     assert titles == [["estimate", "standard uncertainty"]] * 2
@@ -146,7 +146,7 @@ def test_captured_image_keeps_its_own_white_balance(rng):
 def test_verdict_has_at_most_25_words(words, got):
     name = " ".join(["word"] * words)
     checks = [page.Check(name, got, 1.0, "<=", "%"), page.Check("other", 0.1, 1.0, "<=")] * 17
-    sentence = verdict.headline(checks)
+    sentence = verdict.format_headline(checks)
     assert len(sentence.split()) <= 25
     assert (name in sentence) == (words <= verdict.MAX_NAME_WORDS)
     assert sentence.count(".") == 1
@@ -172,7 +172,9 @@ def reports(tmp_path_factory):
                 truth = SkinAppearance(maps, "simulated", parameters={"kind": "truth"})
                 store.write(folder / rig / run / "truth", truth)
         texts[rig] = report.build([folder / rig / "one"])
-        texts[f"{rig}, compared"] = report.make([folder / rig / run for run in ("one", "two")]).html
+        texts[f"{rig}, compared"] = report.build_any(
+            [folder / rig / run for run in ("one", "two")]
+        ).html
     return texts
 
 

@@ -141,7 +141,7 @@ def test_map_image_uses_scale_colors_and_gray_invalid(rng):
     seen = np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
     assert seen[3, 4].tolist() == [png.INVALID_GRAY] * 3
     fine = png.Scale(0.0, 1.0).colors(values).astype(int)
-    step = np.abs(np.diff(png.palette("viridis", 128).astype(int), axis=0)).max()
+    step = np.abs(np.diff(png.sample_palette("viridis", 128).astype(int), axis=0)).max()
     assert np.abs(seen - fine).max() <= step
     coarse = png.Scale(0.0, 1.0).encode(values, levels=8)
     eighth = np.asarray(Image.open(io.BytesIO(coarse)).convert("RGB")).astype(int)
@@ -159,13 +159,13 @@ def test_noise_image_takes_seven_bits_slope_far_fewer(rng):
 def test_colorbar_spans_colors_of_image(html):
     style = re.search(r"<style>(.*?)</style>", html, re.DOTALL)[1]
     stops = re.search(r"\.bar\.viridis\{background:linear-gradient\(90deg,([^)]*)\)", style)[1]
-    assert stops.split(",")[0] == "#" + bytes(png.palette("viridis", 2)[0]).hex()
+    assert stops.split(",")[0] == "#" + bytes(png.sample_palette("viridis", 2)[0]).hex()
     assert len(stops.split(",")) == page.BAR_STOPS
 
 
 def test_plot_is_well_formed_and_states_numbers():
     series = [figures.PlotSeries("red", [1.0, 2.0, 3.0], [1.0, 0.1, 0.01], [0.1, 0.01, 0.02])]
-    drawn = figures.curves("decay", "mm", "1/mm", series, log_y=True)
+    drawn = figures.draw_curves("decay", "mm", "1/mm", series, log_y=True)
     root = ElementTree.fromstring(drawn)
     assert root.get("role") == "img"
     assert root.get("aria-label") == "decay: 1/mm against mm; red 0.01 to 1 over 1 to 3"
@@ -176,7 +176,7 @@ def test_plot_is_well_formed_and_states_numbers():
 
 def test_plots_on_same_page_have_distinct_ids():
     plots = [
-        figures.curves(title, "x", "y", [figures.PlotSeries("one", [0.0, 1.0], [0.0, 1.0])])
+        figures.draw_curves(title, "x", "y", [figures.PlotSeries("one", [0.0, 1.0], [0.0, 1.0])])
         for title in ("first", "second")
     ]
     first, second = (set(re.findall(r' id="([^"]*)"', plot)) for plot in plots)
@@ -198,15 +198,15 @@ def test_simplified_plot_lines_keep_position():
 
 def test_worst_skin_is_named_even_if_check_passes():
     kept = page.Check("melanin", 5.0, 10.0, "<=", "%", worst="dark: 30 %", worst_got=25.0)
-    assert any("one group above the limit" in row for row in verdict.weaknesses([kept]))
+    assert any("one group above the limit" in row for row in verdict.list_weaknesses([kept]))
     even = page.Check("melanin", 5.0, 10.0, "<=", "%", worst="dark: 9 %", worst_got=8.0)
-    assert not any("one group above the limit" in row for row in verdict.weaknesses([even]))
+    assert not any("one group above the limit" in row for row in verdict.list_weaknesses([even]))
 
 
 def test_non_numeric_check_is_missed():
     missed = page.Check("error", float("nan"), 1.0, "<=")
-    assert verdict.headline([missed]) == "1 of 1 checks missed its limit."
-    assert verdict.weaknesses([missed]) == [("limit missed", "error", "–", "≤ 1", "")]
+    assert verdict.format_headline([missed]) == "1 of 1 checks missed its limit."
+    assert verdict.list_weaknesses([missed]) == [("limit missed", "error", "–", "≤ 1", "")]
 
 
 @pytest.mark.parametrize(
@@ -214,14 +214,14 @@ def test_non_numeric_check_is_missed():
 )
 def test_check_reads_same_in_table_and_verdict(unit, shown):
     check = page.Check("normals, median", 1.5, 1.0, "<=", unit)
-    assert f">{shown}</td>" in page.fragment([page.checks_table([check])])
-    summary = page.fragment(verdict.section([check])).split("<h2>Checks</h2>")[0]
+    assert f">{shown}</td>" in page.render_fragment([page.build_checks_table([check])])
+    summary = page.render_fragment(verdict.section([check])).split("<h2>Checks</h2>")[0]
     assert f">{shown}</td>" in summary.replace("\N{NO-BREAK SPACE}", " ")
 
 
 def test_narrow_cell_keeps_number_with_percent_sign():
     check = page.Check("melanin", 1.0, 2.0, "<=", "%", "bound 11 %", worst="dark: 20.8 %")
-    html = page.fragment([page.checks_table([check])])
+    html = page.render_fragment([page.build_checks_table([check])])
     assert "20.8\N{NO-BREAK SPACE}%" in html
     assert "11\N{NO-BREAK SPACE}%" in html
 

@@ -12,7 +12,7 @@ from skinrig.benchmarks.results import Limit, Point, StageBenchmark, Timing
 from skinrig.reporting import page
 from skinrig.reporting.folders import discover
 from skinrig.reporting.sections import subsurface
-from skinrig.reporting.sections.chromophore import panels
+from skinrig.reporting.sections.chromophore import draw_panels
 
 
 @pytest.fixture
@@ -104,7 +104,7 @@ def test_map_of_rounding_alone_shows_no_structure(rng):
 
     def shown(values):
         appearance = SkinAppearance({"gamut_distance": SkinMap(values, "1")}, "simulated")
-        return page.fragment(panels(appearance, None))
+        return page.render_fragment(draw_panels(appearance, None))
 
     assert "e-11" not in shown(noise)
     assert "0.009" in shown(noise * 1e9)
@@ -126,8 +126,10 @@ def test_a_medium_is_not_counted_as_a_person(tmp_path):
         appearances[subject] = SkinAppearance(
             {}, "simulated", parameters={"truth": name}, files=files
         )
-    assert "this report, 1 session<" in page.fragment(subsurface.over_people(appearances, truths))
-    no_truth_tells = page.fragment(subsurface.over_people(appearances))
+    assert "this report, 1 session<" in page.render_fragment(
+        subsurface.compare_people(appearances, truths)
+    )
+    no_truth_tells = page.render_fragment(subsurface.compare_people(appearances))
     assert "this report, 2 sessions<" in no_truth_tells
     del appearances["III"]
-    assert not list(subsurface.over_people(appearances, truths))
+    assert not list(subsurface.compare_people(appearances, truths))

@@ -140,7 +140,7 @@ def test_vertices_at_same_position_share_normal():
         ({"values": np.full((4, 4, 1), np.nan, np.float32)}, "NaN"),
         ({"values": np.zeros((3, 4, 1), np.float32), "fine": 4}, "even"),
         ({"values": np.zeros((8200, 1, 1), np.float32)}, "--size-px"),
-        ({"values": np.zeros((4, 4, 1), np.float32), "storage": "u4"}, "unknown"),
+        ({"values": np.zeros((4, 4, 1), np.float32), "storage": "u4"}, "expected a storage"),
     ],
 )
 def test_invalid_texture_is_refused(texture, what):

@@ -100,12 +100,12 @@ def test_page_with_failed_packing_leaves_older_page(scene, tmp_path, monkeypatch
 @pytest.mark.parametrize("size", [32, 8192])
 def test_size_too_large_for_page_is_refused(size):
     with pytest.raises(SceneError, match="expected 64 to 4096"):
-        faces.scene(size=size)
+        faces.build_scene(size=size)
 
 
 def test_landmarks_without_image_are_refused(tmp_path):
-    with pytest.raises(SceneError, match="name the folder"):
-        faces.scene(landmarks=tmp_path / "landmarks.csv")
+    with pytest.raises(SceneError, match="give the folder, too"):
+        faces.build_scene(landmarks=tmp_path / "landmarks.csv")
 
 
 def test_maps_unusable_on_face_are_refused_with_remedy(tmp_path):
@@ -120,7 +120,7 @@ def test_maps_unusable_on_face_are_refused_with_remedy(tmp_path):
     )
     store.write(tmp_path / "appearance", flat)
     with pytest.raises(SceneError, match="skinrig fit facial-color"):
-        faces.scene([tmp_path / "appearance"], size=64)
+        faces.build_scene([tmp_path / "appearance"], size=64)
 
 
 @pytest.mark.parametrize("name", ["panel", "controls", "costs", "drag", "probes", "tiles"])

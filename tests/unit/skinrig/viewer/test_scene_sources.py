@@ -84,7 +84,7 @@ def test_blood_from_image_maps_to_its_face_position(subject, folder):
     appearance, _ = dynamic_appearance.read(folder / "appearance")
     source = SceneSource(
         "dynamic",
-        procedural.viewer_mesh(subject),
+        procedural.build_viewer_mesh(subject),
         SIZE,
         0,
         subject,
@@ -117,12 +117,12 @@ def test_blood_from_image_maps_to_its_face_position(subject, folder):
 
 def test_image_without_landmarks_is_refused_with_remedy(folder):
     with pytest.raises(SceneError, match="--landmarks FILE"):
-        procedural.scene([folder / "appearance"], size=64)
+        procedural.build_scene([folder / "appearance"], size=64)
 
 
 def test_two_folders_of_same_kind_are_refused(folder):
     with pytest.raises(SceneError, match="same kind"):
-        procedural.scene([folder / "appearance", folder / "appearance"], size=64)
+        procedural.build_scene([folder / "appearance", folder / "appearance"], size=64)
 
 
 def test_mesh_reaching_outside_texture_is_refused(tmp_path):

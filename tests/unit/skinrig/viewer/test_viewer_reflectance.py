@@ -42,7 +42,7 @@ def forms(face):
 @pytest.fixture(scope="module")
 def traits(face):
     """Its surface traits."""
-    found = trait_assets.surface_traits(face)
+    found = trait_assets.build_surface_traits(face)
     assert found is not None
     return found
 
@@ -53,7 +53,10 @@ def test_chosen_table_meets_bound_and_next_coarser_misses(face):
     coarser = reflectance_assets.TRIED_SLABS[reflectance_assets.TRIED_SLABS.index(found.slabs) - 1]
     table = face.lobes.table[..., :3].astype(np.float64)
     back = reflectance_assets.average_slabs(table, coarser)
-    assert max(reflectance_assets.table_errors(back, table)) > reflectance_assets.MAX_SHAPE_ERROR
+    assert (
+        max(reflectance_assets.compute_table_errors(back, table))
+        > reflectance_assets.MAX_SHAPE_ERROR
+    )
 
 
 def test_factors_as_accurate_as_table_need_more_lookups(face, forms):
@@ -71,7 +74,7 @@ def test_errors_of_factors_fall_with_their_rank(forms):
 
 def test_atlas_stores_each_lobe_at_its_position(face):
     found = reflectance_assets.choose_table(face.lobes)
-    image = reflectance_assets.atlas(found)
+    image = reflectance_assets.build_atlas(found)
     assert image.shape == (found.slabs * 32, 90, 4)
     slab, d, h = 5, 17, 40
     expected = face.lobes.table[d, slab * 12 // found.slabs, h, :3]
@@ -192,7 +195,7 @@ def test_traits_of_other_materials_are_left_out(face):
     others = PageLobes(
         face.lobes, face.shares, face.mix[:, :5], ("a", "b", "c", "d", "e"), "fitted"
     )
-    assert trait_assets.surface_traits(others) is None
+    assert trait_assets.build_surface_traits(others) is None
 
 
 def test_opposite_traits_share_slider_chance_traits_have_none():
@@ -233,7 +236,7 @@ def test_filling_keeps_known_values_and_extends_them():
 
 
 def test_presets_name_only_available_face_parts():
-    found = faces.presets(["anger", "surprise", "exercise"])
+    found = faces.build_presets(["anger", "surprise", "exercise"])
     assert list(found) == [
         "neutral",
         "surprise",
@@ -261,7 +264,7 @@ def test_shapes_of_single_muscles_make_the_six_emotions():
         )
         for side in "LR"
     ] + ["jawOpen", "mouthPucker"]
-    found = faces.presets(names)
+    found = faces.build_presets(names)
     assert set(faces.EMOTION_STATES) <= set(found)
     assert all(0.0 < w <= 1.0 for weights in found.values() for w in weights.values())
     assert "after exercise" not in found  # no blood, no exercise

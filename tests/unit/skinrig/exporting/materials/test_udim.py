@@ -57,7 +57,7 @@ def test_each_tile_has_textures_and_first_has_maps(simulated_face, head, tmp_pat
     assert told["udim"] == {"tiles": [1001, 1002], "measured": [1001]}
     entry = told["files"]["textures/base_color.1002.exr"]
     assert entry["valid_share"] == 0.0
-    assert entry["what"].startswith("nothing was measured on this tile")
+    assert entry["what"].startswith("tile without measurements")
     text = (tmp_path / "skin.mtlx").read_text()
     assert "base_color.&lt;UDIM&gt;.exr" in text
     assert "1001" not in text
@@ -102,11 +102,9 @@ def test_usd_keeps_all_faces_and_their_coordinates(simulated_face, head, tmp_pat
 
 
 def test_multi_tile_mesh_needs_udim_and_rejects_gltf(simulated_face, head, tmp_path):
-    with pytest.raises(
-        UsageError, match="--udim: got none, but the mesh reaches over tiles 1001, "
-    ):
+    with pytest.raises(UsageError, match="--udim: got none for a mesh on tiles 1001, "):
         materialx.write(simulated_face, tmp_path, ExportSettings(mesh=head))
-    with pytest.raises(UnusableError, match="tiles 1001, 1002, but glTF knows one"):
+    with pytest.raises(UnusableError, match="tiles 1001, 1002, expected tile 1001"):
         gltf.write(simulated_face, tmp_path, ExportSettings(mesh=head))
     assert list(tmp_path.iterdir()) == []
 
@@ -114,7 +112,7 @@ def test_multi_tile_mesh_needs_udim_and_rejects_gltf(simulated_face, head, tmp_p
 @pytest.mark.parametrize(
     ("uv", "says"),
     [
-        ([[0.5, 0.5], [1.5, 0.5], [0.5, 0.9]], r"face 0 reaches from \[0.5, 0.5\] to \[1.5, 0.9\]"),
+        ([[0.5, 0.5], [1.5, 0.5], [0.5, 0.9]], r"face 0 extends from \[0.5, 0.5\] to \[1.5, 0.9\]"),
         ([[-0.9, 0.1], [-0.1, 0.1], [-0.5, 0.9]], "expected u from 0 to 10"),
         ([[10.1, 0.1], [10.9, 0.1], [10.5, 0.9]], "expected u from 0 to 10"),
     ],
@@ -135,7 +133,7 @@ def test_mesh_outside_first_tile_is_refused(patch, simulated_face, tmp_path):
     arrays = two_tiles(patch)
     arrays["uv"] = arrays["uv"] + [1.0, 0.0]
     np.savez(tmp_path / "back.npz", **arrays)
-    with pytest.raises(ExportError, match="lies on tiles 1002, 1003, expected faces on 1001"):
+    with pytest.raises(ExportError, match="got faces on tiles 1002, 1003, expected some on 1001"):
         Material.of(simulated_face, tmp_path / "back.npz")
 
 

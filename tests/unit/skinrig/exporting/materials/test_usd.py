@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from skinrig.errors import EXTRA_MISSING, MissingExtra, exit_code
+from skinrig.errors import EXIT_EXTRA_MISSING, MissingExtra, exit_code
 from skinrig.exporting.materials import usd
 from skinrig.exporting.materials.material import Material
 from skinrig.exporting.options import ExportSettings
@@ -116,5 +116,5 @@ def test_missing_usd_names_extra_and_writes_nothing(simulated_face, tmp_path, mo
     monkeypatch.setitem(sys.modules, "pxr", None)
     with pytest.raises(MissingExtra, match=r"skinrig\[usd\]") as error:
         usd.write(simulated_face, tmp_path, ExportSettings())
-    assert exit_code(error.value) == EXTRA_MISSING
+    assert exit_code(error.value) == EXIT_EXTRA_MISSING
     assert list(tmp_path.iterdir()) == []

@@ -13,7 +13,11 @@ from model.skin import SkinAppearance, SkinMap
 from skinrig.exporting.images import ImageFolder
 from skinrig.exporting.options import ExportSettings
 from skinrig.exporting.packs import color_deltas, delta_maps, detail_maps
-from skinrig.exporting.packs.detail_maps import ambient_visibility, make_periodic, periodic_normals
+from skinrig.exporting.packs.detail_maps import (
+    ambient_visibility,
+    compute_periodic_normals,
+    make_periodic,
+)
 
 SIDE = 48
 
@@ -78,7 +82,7 @@ def test_cavity_map_is_dark_only_in_wrinkle_creases(tmp_path):
 def test_cavity_without_valid_normals_is_not_made(tmp_path):
     out = ImageFolder(tmp_path, ExportSettings())
     told = detail_maps.write_cavity(np.zeros((8, 8, 2)), np.zeros((8, 8), bool), 8, out)
-    assert (told, out.left_out) == ({}, [("cavity", "no wrinkle normal is valid")])
+    assert (told, out.left_out) == ({}, [("cavity", "wrinkle normals have no valid texel")])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -116,7 +120,7 @@ def test_tiled_relief_has_no_seam_and_keeps_variance(rng):
 def test_micro_normals_match_relief_slopes_in_own_unit():
     x = np.arange(128)
     relief = 5.0 * np.sin(2 * np.pi * 3 * x / 128)[:, None] * np.ones((1, 128))  # um, rows
-    normals = periodic_normals(relief, 6.0)
+    normals = compute_periodic_normals(relief, 6.0)
     slope = 5.0 * 2 * np.pi * 3 / (128 * 6.0)
     found = normals[..., 1] / normals[..., 2]
     assert found.max() == pytest.approx(slope, rel=5e-3)

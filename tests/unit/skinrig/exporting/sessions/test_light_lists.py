@@ -13,7 +13,7 @@ from capture.importers.light_lists import find_light_list
 from capture.session import ConsentError, SubjectRecord
 from skinrig.exporting import export as exporting
 from skinrig.exporting.options import ExportError, ExportSettings
-from skinrig.exporting.sessions.light_lists import in_camera_frame
+from skinrig.exporting.sessions.light_lists import transform_to_camera_frame
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 SHAPE = (12, 16)
@@ -96,8 +96,12 @@ def test_light_at_camera_is_on_axis_above_up(rng):
     down, right = np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
     rotation = np.stack([right, np.cross(down, right), down])
     camera, beyond = np.array([[0.0, 600.0, 0.0]]), np.array([[0.0, 600.0, -300.0]])
-    np.testing.assert_allclose(in_camera_frame(camera, rotation), [[0, 0, 600]], atol=1e-9)
-    np.testing.assert_allclose(in_camera_frame(beyond, rotation), [[0, 300, 600]], atol=1e-9)
+    np.testing.assert_allclose(
+        transform_to_camera_frame(camera, rotation), [[0, 0, 600]], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        transform_to_camera_frame(beyond, rotation), [[0, 300, 600]], atol=1e-9
+    )
 
 
 def test_the_same_session_gives_the_same_bytes(session, tmp_path):

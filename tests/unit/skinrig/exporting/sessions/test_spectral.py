@@ -57,7 +57,7 @@ def test_reflectance_matches_two_layer_model_per_wavelength(flash, tmp_path):
     named = wavelengths(found, "T")
     assert sorted(named.values()) == spectra.WAVELENGTH_NM.tolist()
     assert header["spectralLayoutVersion"] == "1.0"
-    assert header["comments"].startswith("modelled")
+    assert header["comments"].startswith("modeled")
     picked = [400.0, 540.0, 700.0]
     for row, column in ((1, 2), (2, 3)):
         direct = two_layer_reflectance(
@@ -115,7 +115,7 @@ def test_document_separates_measured_from_unmeasured(flash, tmp_path):
 
 def test_bands_without_a_camera_have_no_wavelength(flash, tmp_path):
     nameless = SkinAppearance(dict(flash.maps), "simulated")
-    with pytest.raises(ExportError, match="no camera and illuminant"):
+    with pytest.raises(ExportError, match="camera and illuminant"):
         stokes.write_spectra(nameless, tmp_path, ExportSettings())
     with pytest.raises(ExportError, match="expected melanin and hemoglobin"):
         stokes.write_spectra(SkinAppearance({}, "simulated"), tmp_path, ExportSettings())

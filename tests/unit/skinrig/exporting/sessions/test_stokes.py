@@ -15,7 +15,7 @@ from capture.session import ConsentError, Session, SubjectRecord
 from skinrig.cli import main
 from skinrig.exporting.export import export
 from skinrig.exporting.options import ExportError, ExportSettings
-from skinrig.exporting.sessions.spectral import file_stem
+from skinrig.exporting.sessions.spectral import format_file_stem
 
 RIG = load_rig("gradient").resized(16)
 DAY = date(2030, 1, 1)
@@ -76,7 +76,9 @@ def test_both_polarizations_are_recovered_from_s0_and_s1(tmp_path):
         if step.kind != "gradient" or step.index["polarizer"] != "parallel":
             continue
         state = f"a000_{'n0' if step.index['caliper'] == 0 else 'p1'}"
-        header, found = read(tmp_path / f"out/{file_stem(state, str(step.index['pattern']))}.exr")
+        header, found = read(
+            tmp_path / f"out/{format_file_stem(state, str(step.index['pattern']))}.exr"
+        )
         s0, s1 = found["S0.535nm"], found["S1.535nm"]
         code = 1.0 / (WHITE - BLACK)
         np.testing.assert_allclose((s0 + s1) / 2, light(step, s0.shape), atol=0.51 * code)

@@ -87,5 +87,5 @@ def test_photographs_are_chosen_evenly_or_all():
     assert _select_evenly(shots, None) == shots
     chosen = [int(shot.light[1:]) for shot in _select_evenly(shots, 8)]
     assert set(np.diff(chosen)) == {5}
-    with pytest.raises(RenderingError, match="at least 1"):
+    with pytest.raises(RenderingError, match="1 or more"):
         _select_evenly(shots, 0)

@@ -85,7 +85,7 @@ def test_photograph_summary_pools_pixels_with_interval_over_photographs(rng):
         errors.compare_pair(exact, f * rgb, covered=covered, lit=lit)
         for f in (1.01, 1.02, 1.03, 1.1)
     ]
-    found = errors.summarize(pairs, rng=rng)
+    found = errors.summarize_pairs(pairs, rng=rng)
     assert found.pairs == 4
     assert found.pixels == 4 * np.count_nonzero(pairs[0].lit)
     assert 0.02 <= found.median <= 0.03
@@ -100,7 +100,7 @@ def test_errors_by_band_use_pixels_of_band(rng):
     factor = np.where(np.arange(SIDE)[:, None] < 12, 1.02, 1.2)[..., None]
     pair = errors.compare_pair(exact, factor * rgb, covered=covered, lit=lit)
     bands = np.where(np.arange(SIDE)[:, None] < 12, "light", "dark") + np.zeros((1, SIDE), "U1")
-    found = errors.by_band([pair], [np.where(covered, bands, "")])
+    found = errors.group_errors_by_band([pair], [np.where(covered, bands, "")])
     assert found["light"][1] == pytest.approx(0.02)
     assert found["dark"][1] == pytest.approx(0.2)
     assert found["light"][0] + found["dark"][0] == np.count_nonzero(pair.lit)
@@ -110,11 +110,11 @@ def test_images_that_cannot_be_compared_are_refused(rng):
     rgb, photo, covered, lit = scene(rng)
     with pytest.raises(RenderingError, match="expected"):
         errors.compare_pair(photo, rgb[:5], covered=covered, lit=lit)
-    with pytest.raises(RenderingError, match="no pixel"):
+    with pytest.raises(RenderingError, match="no unsaturated pixel"):
         errors.compare_pair(photo, rgb, covered=covered & False, lit=lit)
     dark = errors.compare_pair(photo, rgb, covered=covered, lit=lit & False)
     assert np.isnan(dark.median)
     with pytest.raises(RenderingError, match="no lit pixel"):
-        errors.summarize([dark], rng=rng)
+        errors.summarize_pairs([dark], rng=rng)
     with pytest.raises(RenderingError, match="variance"):
         Photograph(rgb, np.zeros((2, 2)), photo.valid)

@@ -73,14 +73,14 @@ def test_images_of_other_size_or_unpaired_are_named(light, tmp_path):
 def test_report_on_two_image_folders_compares_images(light, tmp_path):
     a = folder(tmp_path / "monday", light, samples=4)
     b = folder(tmp_path / "tuesday", 1.1 * light, samples=16, seconds=9.0)
-    done = report.make([a, b])
+    done = report.build_any([a, b])
     assert done.compared == ("A: monday", "B: tuesday")
     assert "1 of 1 images differ" in done.html
     assert "monday and tuesday" in done.html
     assert ">samples<" in done.html
     assert ">seconds<" not in done.html
-    assert done.html == report.make([a, b]).html
-    assert report.make([a, b], compare=False).compared is None
+    assert done.html == report.build_any([a, b]).html
+    assert report.build_any([a, b], compare=False).compared is None
 
 
 def test_images_in_two_runs_pair_by_folder_name(light, tmp_path):
@@ -93,7 +93,7 @@ def test_images_in_two_runs_pair_by_folder_name(light, tmp_path):
     found = run_comparison.pair_by_name(*(run.pictures for run in both))
     assert [name for name, _, _ in found] == ["pictures-front"]
     assert run_comparison.list_unpaired(*both) == [("pictures-side", "A: x")]
-    html = report.make(paths).html
+    html = report.build_any(paths).html
     assert "0 of 1 images differ" in html
     assert "Settings and records are equal" in html
 
@@ -118,7 +118,7 @@ def test_photograph_check_failing_once_is_reported_as_changed(light, tmp_path):
             "by_band": {},
         }
         folder(tmp_path / name, light, **told)
-    html = report.make([tmp_path / "a", tmp_path / "b"]).html
+    html = report.build_any([tmp_path / "a", tmp_path / "b"]).html
     assert "1 of 1 checks changed their verdict, 1 from kept to missed" in html
 
 

@@ -185,23 +185,23 @@ def test_two_inputs_of_same_kind_make_a_comparison(folders, given, compared):
 
 def test_comparison_of_other_than_two_runs_is_refused(folders):
     with pytest.raises(ReportError, match=r"a \(maps\).*truth \(truth\), expected two of one kind"):
-        report.make([folders["a"], folders["truth"]], compare=True)
+        report.build_any([folders["a"], folders["truth"]], compare=True)
     with pytest.raises(ReportError, match="does not exist"):
-        report.make([folders["a"], folders["a"] / "nothing"])
+        report.build_any([folders["a"], folders["a"] / "nothing"])
 
 
 def test_worsened_check_is_reported_first(folders):
-    done = report.make([folders["a"], folders["b"], folders["truth"]])
+    done = report.build_any([folders["a"], folders["b"], folders["truth"]])
     assert done.compared == ("A: a", "B: b")
     assert "1 of 1 checks changed their verdict, 1 from kept to missed." in done.html
     assert "1 of 1 maps differ significantly." in done.html
     assert "Errors against the ground truths" in done.html
     assert "parameter step" in done.html
-    assert done.html == report.make([folders["a"], folders["b"], folders["truth"]]).html
+    assert done.html == report.build_any([folders["a"], folders["b"], folders["truth"]]).html
 
 
 def test_comparison_without_truth_leaves_better_run_undecided(folders):
-    html = report.make([folders["a"], folders["b"]]).html
+    html = report.build_any([folders["a"], folders["b"]]).html
     assert "errors are unknown" in html
     assert "Errors against the ground truths" not in html
 
@@ -211,7 +211,7 @@ def test_two_runs_are_paired_by_folder_names(tmp_path, rng):
         (tmp_path / run).mkdir()
         write_maps(tmp_path / run / "face", rng)
     write_maps(tmp_path / "two" / "hand", rng)
-    html = report.make([tmp_path / "one", tmp_path / "two"]).html
+    html = report.build_any([tmp_path / "one", tmp_path / "two"]).html
     assert "Maps: face" in html
     assert "Only in one" in html
     assert "hand" in html
@@ -223,13 +223,13 @@ def test_runs_of_same_frames_are_reported_as_correlated(tmp_path, rng):
         write_maps(tmp_path / run / "face", rng)
     assert (
         "Both estimates are from the same frames"
-        in report.make([tmp_path / "one", tmp_path / "two"]).html
+        in report.build_any([tmp_path / "one", tmp_path / "two"]).html
     )
 
 
 def test_two_benchmarks_are_compared_setting_by_setting(tmp_path):
     paths = [write_bench(tmp_path / name / "bench.json", s) for name, s in (("x", 1.0), ("y", 2.0))]
-    html = report.make(paths).html
+    html = report.build_any(paths).html
     assert "Settings measured in both runs" in html
     assert '<td class="n">2</td>' in html  # seconds of B over those of A
 
@@ -243,12 +243,12 @@ def test_meshes_at_other_positions_are_not_subtracted(tmp_path, rng):
             "r_d": SkinMap(np.full((20, 20, 3), 0.3), "1", np.full((20, 20, 3), 0.01)),
         }
         store.write(tmp_path / name, SkinAppearance(maps, "simulated"))
-    html = report.make([tmp_path / "a", tmp_path / "b"]).html
+    html = report.build_any([tmp_path / "a", tmp_path / "b"]).html
     assert "texels of the two meshes differ by 8.0 mm" in html
 
 
 def test_errors_against_the_truth_come_with_their_band(folders):
-    rows = map_comparison.truth_errors(store.read(folders["b"]), store.read(folders["truth"]))
+    rows = map_comparison.list_truth_errors(store.read(folders["b"]), store.read(folders["truth"]))
     assert {row.skin for row in rows} == {"all", "melanin 0.05–0.1"}
     assert all(row.error == pytest.approx(30.0, abs=0.3) for row in rows)
     assert map_comparison.MAX_FRACTION_BEYOND > CHANCE_FRACTIONS[-1]

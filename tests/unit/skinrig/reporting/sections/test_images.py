@@ -44,7 +44,7 @@ def test_comparison_adds_limit_and_names_omissions(tmp_path):
         },
     )
     checks: list[page.Check] = []
-    body = page.fragment(pictures.section(folder, checks))
+    body = page.render_fragment(pictures.section(folder, checks))
     assert [check.passed for check in checks] == [False]
     assert "no surface" in body
     assert "light held out" in body
@@ -62,7 +62,7 @@ def test_report_finds_images_below_its_folder(tmp_path):
 def test_large_images_stay_in_their_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(pictures, "MAX_IMAGE_BYTES", 10)
     folder = a_folder(tmp_path / "pictures", view={"name": "C03"}, lights={})
-    body = page.fragment(pictures.section(folder, []))
+    body = page.render_fragment(pictures.section(folder, []))
     assert "Too large for this report: radiance.png" in body
     assert "data:image" not in body
 

@@ -31,8 +31,8 @@ FIT = {
 def table_of(fit):
     text = json.dumps({"fits": [fit], "tables": []}).encode()
     appearance = SkinAppearance({}, "simulated", files={KERNEL_FILE: text})
-    html = page.fragment(
-        microrelief.kernels(page.ReportedAppearance("gradient", appearance, None, []))
+    html = page.render_fragment(
+        microrelief.draw_kernels(page.ReportedAppearance("gradient", appearance, None, []))
     )
     head = re.findall(r"<th scope=\"col\"[^>]*>(.*?)</th>", html)
     cells = re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", html.split("<tbody>")[1])

@@ -32,7 +32,9 @@ def session(tmp_path):
 
 
 def test_omitted_effects_are_listed_before_built_ones(session):
-    html = page.fragment(sections_session.omissions([session("session-a", {"effects": EFFECTS})]))
+    html = page.render_fragment(
+        sections_session.list_omissions([session("session-a", {"effects": EFFECTS})])
+    )
     places = [html.index(word) for word in ("bounces", "lens", "shadows")]
     assert places == sorted(places)
     assert "1 of 3 effects simulated" in html
@@ -43,11 +45,13 @@ def test_omitted_effects_are_listed_before_built_ones(session):
 def test_sessions_of_similar_scenes_share_table_any_order(session):
     two = [session(name, {"effects": EFFECTS}) for name in ("session-b", "session-a")]
     other = session("session-c", {"effects": EFFECTS[:1]})
-    html = page.fragment(sections_session.omissions([*two, other]))
+    html = page.render_fragment(sections_session.list_omissions([*two, other]))
     assert html.count("<table") == 2
     assert "session-a, session-b" in html
-    assert html == page.fragment(sections_session.omissions([other, *reversed(two)]))
+    assert html == page.render_fragment(sections_session.list_omissions([other, *reversed(two)]))
 
 
 def test_measured_sessions_and_invalid_folders_report_no_omissions(session, tmp_path):
-    assert not list(sections_session.omissions([session("session-real", {}), tmp_path / "nowhere"]))
+    assert not list(
+        sections_session.list_omissions([session("session-real", {}), tmp_path / "nowhere"])
+    )

@@ -60,7 +60,7 @@ def test_surface_section_checks_normals_and_albedo_not_baseline(sphere):
     }
     checks: list[page.Check] = []
     both = (SkinAppearance(one, "simulated") for one in (maps, truth))
-    body = page.fragment(section(page.ReportedAppearance("head", *both, checks)))
+    body = page.render_fragment(section(page.ReportedAppearance("head", *both, checks)))
     assert [check.name for check in checks] == [
         "head: normals, mean error",
         "head: diffuse reflectance R_d, red, median error",
@@ -81,7 +81,7 @@ def test_surface_section_without_truth_shows_stderr_without_checks(sphere):
         "normals": SkinMap(normals, "1", np.full((60, 60, 3), 0.01), inside),
     }
     checks: list[page.Check] = []
-    body = page.fragment(
+    body = page.render_fragment(
         section(page.ReportedAppearance("head", SkinAppearance(maps, "simulated"), None, checks))
     )
     assert checks == []

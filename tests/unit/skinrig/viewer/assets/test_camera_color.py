@@ -89,7 +89,7 @@ def test_tabulated_sensor_renders_skin_like_srgb(tmp_path, monkeypatch):
     monkeypatch.setattr("capture.session.Session.open", lambda _: Named)
     found = facial_color.find_camera_color(source)
     assert found.known
-    assert "no color calibration" in found.provenance
+    assert "without color calibration" in found.provenance
     table = color_table.build(CAMERA, LIGHT, size=9, anisotropy=ANISOTROPY_SKIN)
     wanted = color_table.build(spectra.LINEAR_SRGB, "D65", size=9, anisotropy=ANISOTROPY_SKIN)
     assert np.abs(found.convert(table.rgb) - wanted.rgb).max() < 0.01

@@ -92,5 +92,5 @@ def test_too_few_or_flat_landmarks_are_refused(dome, rng):
     solid, _ = _landmarks(position, rng)
     level = {name: (x, y, 0.0) for name, (x, y, _) in solid.items()}
     flat = {name: tuple(_pixel(np.array(p)).tolist()) for name, p in level.items()}
-    with pytest.raises(SceneError, match="plane"):
+    with pytest.raises(SceneError, match="coplanar"):
         place_texels(position, normal, covered, landmarks_mm=level, landmarks_px=flat)

@@ -56,7 +56,7 @@ def test_fitted_base_is_included_with_holes_filled():
 
 def test_retained_rms_is_rms_of_zone_means():
     model = WrinkleModel(np.zeros((16, 16, 2), np.float32), (layer(),))
-    rows = wrinkle_assets.retained_rms(model, (16, 16))
+    rows = wrinkle_assets.compute_retained_rms(model, (16, 16))
     assert len(rows) == wrinkle_assets.ZONES_PER_LAYER
     assert [len(row) for row in rows] == [5] * wrinkle_assets.ZONES_PER_LAYER
     from model.texture_resampling import resample
@@ -73,7 +73,7 @@ def test_expressions_missing_in_mesh_omit_wrinkles():
     made = wrinkle_assets.build_model_assets(model, source("jawOpen"), origin="simulated")
     assert "textures" not in made
     assert made["left_out"] == (
-        ("wrinkles", "none of their expressions (anger, joy) is a blend shape of the mesh"),
+        ("wrinkles", "the mesh has no blend shape of their expressions (anger, joy)"),
     )
 
 
@@ -95,7 +95,7 @@ def test_wrinkles_of_simulated_person_explain_own_expressions():
     from rigsim.subject.person import make_subject
 
     person = make_subject("III", seed=0, size=256)
-    model = wrinkle_assets.simulated_model(person, size=256)
+    model = wrinkle_assets.fit_simulated_wrinkles(person, size=256)
     rest = encode(person.tangent_normal(), limit=None).astype(np.float64)
     for state in ("anger", "surprise", "happiness"):
         want = encode(person.with_expression(state).tangent_normal(), limit=None) - rest

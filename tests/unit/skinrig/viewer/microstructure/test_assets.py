@@ -37,7 +37,7 @@ def slope_variance(height, pixel, stretch=(1.0, 1.0)):
 @pytest.mark.parametrize(("r_s", "r_t"), [(1.25, 0.8125), (1.125, 1.0), (1.0, 0.75)])
 def test_slope_variance_under_strain_matches_convolved_relief(relief, r_s, r_t):
     growth = assets.grow_relief(relief)
-    table = relief_growth.strained_variance(growth, relief.table)
+    table = relief_growth.compute_strained_variance(growth, relief.table)
     ratios = np.linspace(*relief_growth.STRETCH_RANGE, relief_growth.STRETCH_NODES)
     found = table[np.searchsorted(ratios, r_s), np.searchsorted(ratios, r_t)]
     alpha, sigma_um = kernel_parameters([r_s, r_t], relief.table)
@@ -59,13 +59,13 @@ def test_slope_variance_under_strain_matches_convolved_relief(relief, r_s, r_t):
 
 
 def test_neutral_skin_keeps_its_variance(relief):
-    table = relief_growth.strained_variance(assets.grow_relief(relief), relief.table)
+    table = relief_growth.compute_strained_variance(assets.grow_relief(relief), relief.table)
     middle = relief_growth.STRETCH_NODES // 2
     np.testing.assert_allclose(table[middle, middle], 1.0, rtol=1e-9)
 
 
 def test_compressed_skin_is_rougher_and_stretched_skin_smoother(relief):
-    table = relief_growth.strained_variance(assets.grow_relief(relief), relief.table)
+    table = relief_growth.compute_strained_variance(assets.grow_relief(relief), relief.table)
     middle = relief_growth.STRETCH_NODES // 2
     along = table[:, middle, 0]
     assert along[middle - 6] > 1.5
@@ -73,7 +73,7 @@ def test_compressed_skin_is_rougher_and_stretched_skin_smoother(relief):
 
 
 def test_larger_pixels_show_less_of_the_slopes(relief):
-    rms = relief_growth.slope_rms(assets.grow_relief(relief))
+    rms = relief_growth.compute_slope_rms(assets.grow_relief(relief))
     assert len(rms) >= 5
     assert all(b < a for a, b in pairwise(rms))
     assert rms[5] < 0.1 * rms[0]

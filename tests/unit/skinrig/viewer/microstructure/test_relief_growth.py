@@ -62,7 +62,7 @@ def test_coarser_level_is_finer_mean_except_changing_weights(growth):
 def test_every_shown_position_is_inside_patch():
     # a patch of which each pixel is its own address, so that a wrap would show as a jump
     patch = np.arange(96.0 * 96.0).reshape(96, 96).astype(np.float32)
-    largest = relief_growth.max_cell_px(96)
+    largest = relief_growth.compute_max_cell_px(96)
     growth = GrownRelief(patch, 10.0, largest, 1)
     for level in range(GROWN_LEVELS):
         assert np.isfinite(window(growth, -37, -11, (200, 200), level=level)).all()

@@ -141,7 +141,7 @@ def test_only_the_loopback_address_listens(served):
 
 
 def test_a_taken_port_is_named(served):
-    with pytest.raises(SceneError, match=f"port: {served.port} cannot be used"):
+    with pytest.raises(SceneError, match=f"port: {served.port} is not usable"):
         with server.serve(b"", port=served.port):
             pass
     with pytest.raises(SceneError, match="port: got 70000"):
