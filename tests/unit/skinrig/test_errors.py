@@ -54,10 +54,26 @@ def test_non_text_file_is_reported_without_codec_terms():
     with pytest.raises(UnicodeDecodeError) as caught:
         b"ok\xff".decode()
     assert errors.sentence(caught.value) == (
-        "text file: got byte 0xff at 2, expected UTF-8; check that it is the right file"
+        "text file: got byte 0xff at 2, expected UTF-8; check that it is the right file "
+        "[SR-CLI-009]"
     )
 
 
 def test_full_disk_without_file_is_reported_without_errno():
     text = errors.sentence(OSError(28, "No space left on device"))
     assert text.startswith("No space left on device; free space")
+
+
+def test_wrapped_error_has_one_code_at_end():
+    inner = ValueError("left: no file; name another [SR-IMP-000]")
+    assert errors.sentence(ValueError(f"views: {inner}; repair it")) == (
+        "views: left: no file; name another; repair it [SR-IMP-000]"
+    )
+    both = errors.sentence(ValueError(f"views: {inner}; repair it [SR-REC-000]"))
+    assert both == "views: left: no file; name another; repair it [SR-REC-000]"
+    assert errors.message_code(both) == "SR-REC-000"
+
+
+def test_message_code_is_none_without_code_at_end():
+    assert errors.message_code("left: no file; name another") is None
+    assert errors.message_code("[SR-IMP-000] left: no file") is None
