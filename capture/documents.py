@@ -74,7 +74,7 @@ class InputError(ValueError):
     advice : str
         Advice to the user.
     code : str
-        Stable code such as ``SR-SES-001``, which ends the message; empty for rare errors.
+        Stable code such as ``SR-SES-000``, which ends the message; empty for rare errors.
 
     Examples
     --------
@@ -227,9 +227,12 @@ def read_toml(path: Path, *, error: type[InputError]) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as exc:
-        raise error("file not found", where=str(path)) from exc
+        advice = "Check the name, and the folder that the command runs in."
+        raise error("file not found", where=str(path), advice=advice, code="SR-CLI-012") from exc
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as exc:
-        raise error(f"is not TOML: {exc}", where=str(path)) from exc
+        advice = "Correct the file at that place."
+        what = f"is not TOML: {exc}"
+        raise error(what, where=str(path), advice=advice, code="SR-CLI-013") from exc
     except OSError as exc:
         raise error(f"cannot be read: {exc.strerror}", where=str(path)) from exc
 
@@ -252,7 +255,8 @@ def read_json(text: str | bytes, *, where: str, error: type[InputError]) -> Any:
         decoded = text.decode("utf-8") if isinstance(text, bytes) else text
         return json.loads(decoded, parse_constant=no_constant, object_pairs_hook=no_doubles)
     except (ValueError, RecursionError) as exc:
-        raise error(f"is not JSON: {exc}", where=where) from exc
+        advice = "Correct the file, or restore it from a copy."
+        raise error(f"is not JSON: {exc}", where=where, advice=advice, code="SR-CLI-014") from exc
 
 
 def canonical_json(data: object) -> bytes:

@@ -63,7 +63,7 @@ class SubjectRecord(Document):
         checks.check("pseudonym", self.pseudonym, good, "letters, digits, _ . - (no full name)")
         for scope in self.consent_scope:
             checks.check("consent_scope", scope, is_id(scope), ID_RULE)
-        checks.close()
+        checks.close(advice="Use a pseudonym without spaces.", code="SR-SES-011")
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +155,9 @@ def decode(data: bytes, *, where: str) -> tuple[Manifest, str]:
     if schema != SCHEMA:
         advice = "Read it with the version of skinrig that wrote it, or check the file."
         faults = [Fault("schema", repr(schema), SCHEMA)]
-        raise SessionError("has an unknown schema", where=where, faults=faults, advice=advice)
+        raise SessionError(
+            "has an unknown schema", where=where, faults=faults, advice=advice, code="SR-SES-007"
+        )
     found = content.pop(_SEAL_KEY, None)
     written, expected = seal({"schema": schema, **content})
     if found != expected or written != data:
@@ -163,7 +165,8 @@ def decode(data: bytes, *, where: str) -> tuple[Manifest, str]:
         got = str(found) if found != expected else "other bytes than were sealed"
         advice = "Restore session.json from a copy: it was changed after it was written."
         faults = [Fault(_SEAL_KEY, got, expected)]
-        raise SessionDamage("is damaged", where=where, faults=faults, advice=advice)
+        code = "SR-SES-005"
+        raise SessionDamage("is damaged", where=where, faults=faults, advice=advice, code=code)
     return parse_document(Manifest, content, where=where, error=SessionDamage), expected
 
 

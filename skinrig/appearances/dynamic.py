@@ -106,7 +106,7 @@ def read(
         commands = " or ".join(f"`{FIT_COMMANDS[name]}`" for name in parts)
         raise DynamicAppearanceError(
             f"{path}: got {', '.join(found) or 'maps that nothing was fitted to'}, expected "
-            f"{' or '.join(parts)}; {commands} makes it"
+            f"{' or '.join(parts)}; {commands} makes it [SR-REC-022]"
         )
     return appearance, found
 

@@ -234,6 +234,6 @@ def _map(face: Face, name: str) -> SkinMap:
         have: Mapping[str, SkinMap] = face.appearance.maps
         raise FaceError(
             f"{face.path}: has no map {name!r} (it has {', '.join(sorted(have)) or 'none'}); "
-            f"`skinrig reconstruct SESSION --maps {name}` of a dome session makes it"
+            f"`skinrig reconstruct SESSION --maps {name}` of a dome session makes it [SR-REC-023]"
         )
     return face.appearance.maps[name]

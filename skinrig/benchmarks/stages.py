@@ -15,7 +15,7 @@ from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.results import StageBenchmark
 from skinrig.benchmarks.stage import BenchmarkStage, descriptions
 from skinrig.console import Console, to_json_value
-from skinrig.errors import EXTRA_MISSING, exit_code, sentence
+from skinrig.errors import EXTRA_MISSING, exit_code, one_of, sentence
 
 STAGES: dict[str, str] = {name: entry["run"] for name, entry in descriptions().items()}
 """Module and function of each; a module is imported, and its kernels compiled, when it is run."""
@@ -71,8 +71,7 @@ def run_stages(
     """
     chosen = list(dict.fromkeys(names)) if names else bench_plan.order_small_stages(STAGES)
     for name in chosen:
-        if name not in STAGES:
-            raise BenchError(f"stage: got {name!r}, expected one of {', '.join(STAGES)}")
+        one_of("stage", name, STAGES, BenchError)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)  # a folder that cannot be is told before the work
     run = _Run(console, time.perf_counter() + budget_s, asked=bool(names), toy=toy, out=out)

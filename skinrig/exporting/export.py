@@ -100,7 +100,7 @@ def export(
     """
     one_of("to", to, (*APPEARANCE_FORMATS, *SESSION_FORMATS), ExportError)
     if Path(out).exists():
-        raise ExportError(f"{out}: exists; choose a new folder")
+        raise ExportError(f"{out}: exists; choose a new folder [SR-EXP-002]")
     order = delivery or ExportSettings()
     held: SkinAppearance | Session
     if to in SESSION_FORMATS:
@@ -111,7 +111,8 @@ def export(
             others = ", ".join(name for name in APPEARANCE_FORMATS if name not in SURFACE_FORMATS)
             raise ExportError(
                 f"to: got {to!r}, which is of a dome's maps (position, normals, r_d, lobes), but "
-                f"{source} holds {', '.join(held.maps) or 'none'}; expected {others}"
+                f"{source} holds {', '.join(held.maps) or 'none'}; expected {others}; choose one "
+                "[SR-EXP-004]"
             )
         if order.onto is not None:
             _appearance(order.onto, use, today)  # its maps are handed on, too
@@ -129,10 +130,13 @@ def _appearance(path: str | Path, use: str | None, today: date | None) -> SkinAp
 def _session(path: str | Path, use: str | None, today: date | None) -> Session:
     """Open an undamaged session whose subject agreed to a use."""
     if use is None:
-        raise UsageError("--use: got none; name the purpose of the copy, e.g. research")
+        raise UsageError("--use: got none; name the purpose of the copy [SR-EXP-001]")
     session = Session.open(path)
     session.require_consent(use, today=today)
     found = verify(path)
     if not found.ok:
-        raise ExportError(f"{path}: is damaged, nothing was copied: {found.problems[0]}")
+        raise ExportError(
+            f"{path}: is damaged, nothing was copied: {found.problems[0]}; restore it from a copy "
+            "[SR-EXP-003]"
+        )
     return session
