@@ -73,18 +73,34 @@ class InputError(ValueError):
         All faults, in document order.
     advice : str
         Advice to the user.
+    code : str
+        Stable code such as ``SR-SES-000``, which ends the message; empty for rare errors.
+
+    Examples
+    --------
+    >>> print(InputError("is closed", where="s1", advice="Start a new one.", code="SR-SES-000"))
+    s1: is closed
+      Start a new one. [SR-SES-000]
     """
 
     def __init__(
-        self, what: str, *, where: str = "", faults: Sequence[Fault] = (), advice: str = ""
+        self,
+        what: str,
+        *,
+        where: str = "",
+        faults: Sequence[Fault] = (),
+        advice: str = "",
+        code: str = "",
     ) -> None:
         self.what = what
         self.where = where
         self.faults = tuple(faults)
         self.advice = advice
+        self.code = code
         head = f"{where}: {what}" if where else what
         listed = "".join(f"\n  {fault}" for fault in self.faults)
-        super().__init__(head + listed + (f"\n  {advice}" if advice else ""))
+        text = head + listed + (f"\n  {advice}" if advice else "")
+        super().__init__(f"{text} [{code}]" if code else text)
 
     @classmethod
     def at(
@@ -96,19 +112,22 @@ class InputError(ValueError):
         *,
         where: object = "",
         advice: str = "",
+        code: str = "",
     ) -> Self:
         """Return the error of one fault, at a path in a document or file."""
-        return cls(problem, where=str(where), faults=[Fault(path, got, expected)], advice=advice)
+        faults = [Fault(path, got, expected)]
+        return cls(problem, where=str(where), faults=faults, advice=advice, code=code)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Keep the parts when the error is passed between processes."""
-        return (_rebuild, (type(self), self.what, self.where, self.faults, self.advice))
+        parts = (self.what, self.where, self.faults, self.advice, self.code)
+        return (_rebuild, (type(self), *parts))
 
 
 def _rebuild(
-    kind: type[InputError], what: str, where: str, faults: tuple[Fault, ...], advice: str
+    kind: type[InputError], what: str, where: str, faults: tuple[Fault, ...], advice: str, code: str
 ) -> InputError:
-    return kind(what, where=where, faults=faults, advice=advice)
+    return kind(what, where=where, faults=faults, advice=advice, code=code)
 
 
 class FaultCollector:
@@ -150,10 +169,11 @@ class FaultCollector:
         for field, value in values.items():
             self.check(field, value, math.isfinite(value) and value > 0, "a finite number > 0")
 
-    def close(self) -> None:
-        """Raise an error with all faults, or return."""
+    def close(self, *, advice: str = "", code: str = "") -> None:
+        """Raise an error with all faults, ``advice`` and ``code``, or return."""
         if self._faults:
-            raise self._error(f"{self._what} is not valid", faults=self._faults)
+            what = f"{self._what} is not valid"
+            raise self._error(what, faults=self._faults, advice=advice, code=code)
 
 
 def short_repr(value: object) -> str:
@@ -162,7 +182,15 @@ def short_repr(value: object) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def parse_document(kind: type[_T], data: object, *, where: str, error: type[InputError]) -> _T:
+def parse_document(
+    kind: type[_T],
+    data: object,
+    *,
+    where: str,
+    error: type[InputError],
+    advice: str = "",
+    code: str = "",
+) -> _T:
     """Build the frozen dataclass ``kind`` from decoded TOML or JSON, strictly.
 
     Parameters
@@ -175,6 +203,8 @@ def parse_document(kind: type[_T], data: object, *, where: str, error: type[Inpu
         Name of the file for the message.
     error : type of InputError
         Class of the error, raised once, with all faults.
+    advice, code : str
+        Advice and code of that error.
     """
     bad: list[Fault] = []
     try:
@@ -186,9 +216,9 @@ def parse_document(kind: type[_T], data: object, *, where: str, error: type[Inpu
         lines = exc.errors(include_url=False)
         known = {fault.path for fault in bad}
         bad += [f for line in lines for f in _faults(line, kind) if f.path not in known]
-        raise error(_count(bad), where=where, faults=bad) from exc
+        raise error(_count(bad), where=where, faults=bad, advice=advice, code=code) from exc
     if bad:
-        raise error(_count(bad), where=where, faults=bad)
+        raise error(_count(bad), where=where, faults=bad, advice=advice, code=code)
     return value
 
 
@@ -197,9 +227,12 @@ def read_toml(path: Path, *, error: type[InputError]) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as exc:
-        raise error("file not found", where=str(path)) from exc
+        advice = "Check the name, and the folder that the command runs in."
+        raise error("file not found", where=str(path), advice=advice, code="SR-CLI-012") from exc
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as exc:
-        raise error(f"is not TOML: {exc}", where=str(path)) from exc
+        advice = "Correct the file at that place."
+        what = f"is not TOML: {exc}"
+        raise error(what, where=str(path), advice=advice, code="SR-CLI-013") from exc
     except OSError as exc:
         raise error(f"cannot be read: {exc.strerror}", where=str(path)) from exc
 
@@ -222,7 +255,8 @@ def read_json(text: str | bytes, *, where: str, error: type[InputError]) -> Any:
         decoded = text.decode("utf-8") if isinstance(text, bytes) else text
         return json.loads(decoded, parse_constant=no_constant, object_pairs_hook=no_doubles)
     except (ValueError, RecursionError) as exc:
-        raise error(f"is not JSON: {exc}", where=where) from exc
+        advice = "Correct the file, or restore it from a copy."
+        raise error(f"is not JSON: {exc}", where=where, advice=advice, code="SR-CLI-014") from exc
 
 
 def canonical_json(data: object) -> bytes:

@@ -346,7 +346,9 @@ def rig_from_json(data: Mapping[str, Any], *, where: str = "rig") -> Rig:
     RigError
         With every fault's path, the value found and the value expected.
     """
-    return parse_document(Rig, translate_names(data), where=where, error=RigError)
+    advice = "Correct these entries of the rig file."
+    code = "SR-PLN-005"
+    return parse_document(Rig, data, where=where, error=RigError, advice=advice, code=code)
 
 
 def load_rig(name_or_path: str | Path) -> Rig:
@@ -375,11 +377,13 @@ def load_rig(name_or_path: str | Path) -> Rig:
         shipped = Path(str(files("capture"))) / "rigs"
         known = sorted(file.stem for file in shipped.glob("*.toml"))
         if text not in known:
-            hint = (
-                suggest_key(text, known)
-                or f"one of {', '.join(known)}, or the path of a .toml file"
+            expected = f"one of {', '.join(known)}, or the path of a .toml file"
+            raise RigError(
+                "rig not found",
+                faults=[Fault("rig", repr(text), expected, suggest_key(text, known))],
+                advice="Name a rig, or the path of a rig file.",
+                code="SR-PLN-006",
             )
-            raise RigError("rig not found", faults=[Fault("rig", repr(text), hint)])
         path = shipped / f"{text}.toml"
     return rig_from_json(read_toml(path, error=RigError), where=str(path))
 

@@ -135,6 +135,7 @@ def require_free(path: str | Path) -> None:
     if target.exists() and not (target / DOCUMENT_FILE).is_file() and any(_entries(target)):
         raise StoreError(
             f"{target}: exists and is not an APPEARANCE/ folder; nothing was written: name another"
+            " [SR-REC-004]"
         )
     parent = next(folder for folder in target.absolute().parents if folder.exists())
     if not parent.is_dir():
@@ -167,7 +168,8 @@ def read(path: str | Path, *, map_names: tuple[str, ...] | None = None) -> SkinA
     missing = [name for name in names if name not in document.maps]
     if missing:
         raise StoreError(
-            f"{folder}: has no map {missing[0]!r}; it has {', '.join(sorted(document.maps))}"
+            f"{folder}: has no map {missing[0]!r}; it has {', '.join(sorted(document.maps))}: "
+            "choose one of these [SR-REC-020]"
         )
     return SkinAppearance(
         maps={name: _read_map(folder, document.maps[name]) for name in names},
@@ -191,7 +193,7 @@ def read_document(folder: Path) -> _Document:
     except OSError as error:
         raise StoreError(
             f"{folder}: is not an APPEARANCE/ folder ({error.strerror}: {DOCUMENT_FILE}); "
-            "`skinrig reconstruct` makes one"
+            "`skinrig reconstruct` makes one [SR-REC-005]"
         ) from error
     try:
         loaded = json.loads(raw)
@@ -210,10 +212,7 @@ def read_document(folder: Path) -> _Document:
         where = ".".join(str(part) for part in first["loc"])
         raise StoreError(f"{path}: {where}: {first['msg']}") from error
     if _seal({k: v for k, v in loaded.items() if k != "seal"}) != document.seal:
-        raise StoreError(f"{path}: was changed after it was written (its seal does not fit)")
-    if version != SCHEMA:
-        maps = {FORMER_MAP_NAMES.get(name, name): entry for name, entry in document.maps.items()}
-        document = document.model_copy(update={"maps": maps})
+        raise _changed_error(path, "seal")
     return document
 
 
@@ -273,7 +272,7 @@ def _read_map(folder: Path, entry: _MapEntry) -> SkinMap:
             return None
         path = _inside(folder, file.file)
         if _digest(path) != file.sha256:
-            raise StoreError(f"{path}: was changed after it was written (its hash does not fit)")
+            raise _changed_error(path, "hash")
         image = read_exr(path)
         Checks(StoreError).shape(str(path), image, shape)
         return image
@@ -308,8 +307,15 @@ def _inside(folder: Path, name: str) -> Path:
 def _read_file(path: Path, sha256: str) -> bytes:
     data = path.read_bytes()
     if hashlib.sha256(data).hexdigest() != sha256:
-        raise StoreError(f"{path}: was changed after it was written (its hash does not fit)")
+        raise _changed_error(path, "hash")
     return data
+
+
+def _changed_error(path: Path, check: str) -> StoreError:
+    return StoreError(
+        f"{path}: was changed after it was written (its {check} does not fit); compute it again "
+        "into a new folder [SR-REC-003]"
+    )
 
 
 def _digest(path: Path) -> str:

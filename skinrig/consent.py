@@ -149,7 +149,7 @@ def require_consent(
             "sessions with `skinrig reconstruct` or `skinrig fit`.",
         )
     if records and use is None:
-        raise UsageError("--use: got none; name the purpose of the copy, e.g. research")
+        raise UsageError("--use: got none; name the purpose of the copy [SR-EXP-001]")
     day = today or datetime.now(UTC).date()
     for record in records:
         scope = [str(word) for word in record.get("consent_scope") or ()]

@@ -17,6 +17,7 @@ Exit codes:
 """
 
 import errno
+import re
 from collections.abc import Iterable, Sequence
 from typing import TypeVar
 
@@ -46,7 +47,7 @@ class MissingExtra(ImportError):
 
     def __init__(self, what: str, extra: str) -> None:
         super().__init__(
-            f"{what} needs the optional part '{extra}': pip install 'skinrig[{extra}]'"
+            f"{what} needs the optional part '{extra}': pip install 'skinrig[{extra}]' [SR-ENV-001]"
         )
 
 
@@ -83,7 +84,37 @@ def require_choice(
     for choice in known:
         if value == choice:
             return choice
-    raise error(f"{name}: got {value!r}, expected one of {', '.join(known)}")
+    raise error(
+        f"{name}: got {value!r}, expected one of {', '.join(known)}; choose one [SR-CLI-004]"
+    )
+
+
+_CODE = re.compile(r" \[(SR-[A-Z]{3}-[0-9]{3})\]")
+"""Code in a message. Codes are never reused; docs/how-to/troubleshooting.md has a row for each."""
+
+
+def message_code(message: str) -> str | None:
+    """Return the code at the end of an error message, or None.
+
+    Examples
+    --------
+    >>> message_code("weights: got 'a', expected name=value; correct it [SR-CLI-000]")
+    'SR-CLI-000'
+    """
+    found = re.search(_CODE.pattern + "$", message)
+    return found[1] if found else None
+
+
+def move_code_to_end(message: str) -> str:
+    """Return a message with one code, at its end: that of the outermost error that has one.
+
+    Examples
+    --------
+    >>> move_code_to_end("left: no file [SR-IMP-000]; name another")
+    'left: no file; name another [SR-IMP-000]'
+    """
+    codes = _CODE.findall(message)
+    return f"{_CODE.sub('', message)} [{codes[-1]}]" if codes else message
 
 
 def exit_code(error: BaseException) -> int:
@@ -112,15 +143,15 @@ def exit_code(error: BaseException) -> int:
 
 
 _ADVICE_BY_ERROR = {
-    errno.ENOENT: "check the name, and the folder that the command runs in",
+    errno.ENOENT: "check the name, and the folder that the command runs in [SR-CLI-001]",
     errno.EEXIST: "a file or folder of that name exists; name another",
     errno.ENOTDIR: "a part of this path is a file, expected a folder; name another",
     errno.EISDIR: "expected a file; name another",
-    errno.EACCES: "no permission; change its permissions, or name another",
-    errno.EPERM: "no permission; change its permissions, or name another",
+    errno.EACCES: "no permission; change its permissions, or name another [SR-CLI-002]",
+    errno.EPERM: "no permission; change its permissions, or name another [SR-CLI-002]",
     errno.EROFS: "the disk is mounted read-only; name another",
-    errno.ENOSPC: "free space, or name another disk, then run the same command again",
-    errno.EDQUOT: "free space, or name another disk, then run the same command again",
+    errno.ENOSPC: "free space, or name another disk, then run the command again [SR-CLI-003]",
+    errno.EDQUOT: "free space, or name another disk, then run the command again [SR-CLI-003]",
 }
 """Advice by the operating system's error number."""
 _OWN_PACKAGES = ("capture", "reconstruction", "model", "rigsim", "skinrig")
@@ -156,8 +187,12 @@ def format_interruption(given: Sequence[str]) -> str:
     return "interrupted; run the same command again"
 
 
-def format_error(error: BaseException) -> str:
-    """Return the message of an exception, one sentence without a traceback."""
+def sentence(error: BaseException) -> str:
+    """Return the message of an exception, without a traceback and with its code at the end."""
+    return move_code_to_end(_describe(error))
+
+
+def _describe(error: BaseException) -> str:
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
     if isinstance(error, OSError) and error.strerror and error.errno in _ADVICE_BY_ERROR:
@@ -168,12 +203,12 @@ def format_error(error: BaseException) -> str:
     if isinstance(error, UnicodeDecodeError):
         return (
             f"text file: got byte {error.object[error.start]:#04x} at {error.start}, expected "
-            "UTF-8; check that it is the right file"
+            "UTF-8; check that it is the right file [SR-CLI-009]"
         )
     text = str(error).strip() or type(error).__name__
     if exit_code(error) == EXIT_BUG:
         return (
             f"defect of skinrig ({type(error).__name__}: {text}); "
-            "run again with SKINRIG_TRACEBACK=1 and report the output"
+            "run again with SKINRIG_TRACEBACK=1 and report the output [SR-CLI-010]"
         )
     return text

@@ -27,6 +27,7 @@ API_PACKAGES = ("capture", "model", "reconstruction")
 SCHEMA = re.compile(r"skinrig\.[a-z.-]+/\d+")
 LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
 CITATIONS = "<!-- generated: citations -->"
+ERROR_CODES = "<!-- generated: error codes -->"
 DOI = re.compile(r"10\.\d{4,5}/[^\s,;\"'|]*[A-Za-z0-9)]")
 AUTHORS = re.compile(
     r"((?:(?:[A-Z]\. )*(?:de |van |von |d')?[A-Z][\w'’-]+(?:, and | and |, )?)+(?: et al\.)?),?"
@@ -91,6 +92,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
     if CITATIONS in markdown:
         markdown = markdown.replace(CITATIONS, citations_table())
+    if ERROR_CODES in markdown:
+        markdown = markdown.replace(ERROR_CODES, error_code_tables())
     return LINK.sub(lead, markdown)
 
 
@@ -100,6 +103,28 @@ def _filled(entries: Any, lists: dict[str, Any]) -> Any:
     if isinstance(entries, dict):
         return {title: _filled(entry, lists) for title, entry in entries.items()}
     return lists.get(entries, entries)
+
+
+# error codes -------------------------------------------------------------------------------------
+
+
+def error_code_tables() -> str:
+    """Return a table per area: code, message template, and the module that raises it."""
+    from tools.error_codes import AREAS, read_error_texts
+
+    rows: dict[str, dict[str, tuple[str, list[str]]]] = {area: {} for area in AREAS}
+    for text in read_error_texts(ROOT, PACKAGES):
+        _, paths = rows[text.code[3:6]].setdefault(text.code, (text.template, []))
+        if text.path not in paths:
+            paths.append(text.path)
+    lines = []
+    for area, found in rows.items():
+        lines += [f"### {AREAS[area]}", "", "| code | message | module |", "| --- | --- | --- |"]
+        for code, (template, paths) in found.items():
+            listed = ", ".join(f"`{path}`" for path in paths)
+            lines.append(f"| `{code}` | {_cell(template)} | {listed} |")
+        lines.append("")
+    return "\n".join(lines)
 
 
 # files of the repository -------------------------------------------------------------------------

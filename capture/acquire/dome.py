@@ -86,12 +86,13 @@ def check_safety(plan: Plan, rig: Rig, *, eyes: Eyes = "open") -> None:
             f"flicker: the plan gives {flicker.flashes_per_s:.1f} flashes per s and rms "
             f"{flicker.rms:.2f} of 3 to 65 Hz, open eyes allow less than "
             f"{limits.max_flashes_per_s:g} and {limits.max_flicker_rms:g}; nothing was lit: "
-            "change the order of the lights, or close or shield the eyes and give --eyes"
+            "change the order of the lights, or close or shield the eyes and give --eyes "
+            "[SR-CAP-011]"
         )
     if dose.led_ws > limits.dose_ws:
         raise AcquisitionError(
             f"light dose: {dose.led} would emit {dose.led_ws:.1f} Ws, the rig allows "
-            f"{limits.dose_ws:g} Ws per subject; nothing was lit: shorten the plan"
+            f"{limits.dose_ws:g} Ws per subject; nothing was lit: shorten the plan [SR-CAP-012]"
         )
 
 
@@ -101,7 +102,7 @@ def _check_box(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
         raise AcquisitionError(
             f"lights: the controller drives {limits.get('leds')} LEDs, the rig has "
             f"{len(rig.lights)}; numbers would mean other lights: use the rig file of this "
-            "controller"
+            "controller [SR-CAP-013]"
         )
     if int(limits.get("cameras", 0)) != len(rig.views):
         raise AcquisitionError(

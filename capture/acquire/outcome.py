@@ -211,7 +211,9 @@ class CaptureRun:
     def retry_limit_error(self, label: str, reason: str) -> AcquisitionError:
         """Return the error of a step that failed too often, with advice."""
         advice = recovery_advice(captured=bool(self.session.frames()))
-        return AcquisitionError(f"{label}: failed {MAX_ATTEMPTS} times ({reason}); {advice}")
+        return AcquisitionError(
+            f"{label}: failed {MAX_ATTEMPTS} times ({reason}); {advice} [SR-CAP-007]"
+        )
 
     def summarize(self, dead_leds: Iterable[int] = ()) -> AcquisitionResult:
         """Return the result, with the numbers of the LEDs that drew no current."""
@@ -239,7 +241,9 @@ def recovery_advice(*, captured: bool) -> str:
 
 def step_limit_error(step: Step, problem: str, *, action: str = "lit") -> AcquisitionError:
     """Return the error of a step beyond its controller's limits; nothing was ``action``."""
-    return AcquisitionError(f"step {step.id}: {problem}; nothing was {action}: change the plan")
+    return AcquisitionError(
+        f"step {step.id}: {problem}; nothing was {action}: change the plan [SR-CAP-008]"
+    )
 
 
 def require_trigger_line(name: str, camera: Camera, trigger_line: str) -> None:
@@ -247,5 +251,6 @@ def require_trigger_line(name: str, camera: Camera, trigger_line: str) -> None:
     if Trigger.EDGE not in camera.info.triggers:
         serial = camera.info.serial
         raise CameraError(
-            f"view {name!r}: the camera {serial} cannot be released by the {trigger_line}"
+            f"view {name!r}: the camera {serial} cannot be released by the {trigger_line}; use a "
+            "camera on the controller's line [SR-CAP-009]"
         )

@@ -179,7 +179,7 @@ def load(directory: str | Path, kind: str) -> Calibration:
     except OSError as exc:
         raise CalibrationMissing(
             f"{path}: no {kind} calibration there ({exc.strerror}); make one with"
-            f" `skinrig calibrate {kind} SESSION --out {shlex.quote(str(folder))}`"
+            f" `skinrig calibrate {kind} SESSION --out {shlex.quote(str(folder))}` [SR-CAL-013]"
         ) from exc
     document = _parse(path, raw)
     if FORMER_NAMES.get(document.kind, document.kind) != kind:
@@ -255,7 +255,7 @@ def _parse(path: Path, raw: bytes) -> _CalibrationFile:
     if document.get("sha256") != _seal(document):
         raise CalibrationDamaged(
             f"{path}: its content does not match its seal, so it was altered after it was written;"
-            " restore it or calibrate again"
+            " restore it or calibrate again [SR-CAL-014]"
         )
     try:
         return _CalibrationFile.model_validate_json(raw)

@@ -75,18 +75,19 @@ def require_valid(
     if calibration.rig != rig:
         raise CalibrationMismatch(
             f"{what}: made on rig {calibration.rig!r}, the session is of rig {rig!r}; calibrate"
-            f" rig {rig!r} and give its folder by --calibration"
+            f" rig {rig!r} and give its folder by --calibration [SR-CAL-005]"
         )
     missing = sorted(set(serials) - set(calibration.serials))
     if missing:
         raise CalibrationMismatch(
             f"{what}: made with devices {sorted(calibration.serials)}, the session used"
-            f" {missing}; calibrate these devices"
+            f" {missing}; calibrate these devices [SR-CAL-006]"
         )
     if not calibration.created <= on_date <= calibration.valid_until:
         raise CalibrationExpired(
             f"{what}: valid from {calibration.created} to {calibration.valid_until}, the session"
             f" is of {on_date}; run `skinrig calibrate {calibration.kind}` on frames of that time"
+            " [SR-CAL-007]"
         )
     return calibration
 

@@ -93,7 +93,7 @@ class Box:
         if hello.kind != self.kind:
             raise WrongDevice(
                 f"{self._port.url}: got a {hello.kind!r} controller with serial {hello.serial}, "
-                f"expected a {self.kind!r} controller; exchange the addresses"
+                f"expected a {self.kind!r} controller; exchange the addresses [SR-CAP-003]"
             )
         if serial and hello.serial != serial:
             raise WrongDevice(

@@ -202,7 +202,7 @@ def _entry(url: str) -> importlib.metadata.EntryPoint:
     if not colon or kind not in found:
         raise CameraUrlError(
             f"camera address: got {url!r}, expected KIND:REST with KIND one of "
-            f"{', '.join(sorted(found))}; for example hotfolder:incoming"
+            f"{', '.join(sorted(found))}; for example hotfolder:incoming [SR-CAP-032]"
         )
     return found[kind]
 
@@ -273,7 +273,7 @@ def check_frame(
         raise WrongExposure(
             f"camera {info.serial}: got {frame.exposure.exposure_s:g} s at ISO "
             f"{frame.exposure.iso}, expected {want.exposure_s:g} s at ISO {want.iso} "
-            f"({deviation:+.2f} stops off)"
+            f"({deviation:+.2f} stops off); set the camera to manual exposure and ISO [SR-CAP-031]"
         )
     if isinstance(frame.image, np.ndarray):
         shape = (info.height_px, info.width_px)
@@ -334,5 +334,5 @@ def check_serials(cameras: Mapping[str, Camera], expected: Sequence[tuple[str, s
         if got != serial:
             raise WrongCamera(
                 f"view {view!r}: got the camera {got}, expected {serial} (rig file); exchange "
-                "the addresses, or write the new serial number into the rig file"
+                "the addresses, or write the new serial number into the rig file [SR-CAP-030]"
             )

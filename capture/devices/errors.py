@@ -45,6 +45,9 @@ class CommandRefused(DeviceError, RuntimeError):
     """
 
     def __init__(self, text: str, code: int, reason: str) -> None:
-        super().__init__(f"{text!r} was refused with {code}: {reason}; nothing was done")
+        super().__init__(
+            f"{text!r} was refused with {code}: {reason}; nothing was done: remove the cause of "
+            f"{code} [SR-CAP-006]"
+        )
         self.text = text
         self.code = code

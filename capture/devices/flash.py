@@ -145,7 +145,7 @@ class FlashBox(Box):
             if waited_s >= timeout_s:
                 raise PortTimeout(
                     f"{self._port.url}: the flash is not ready after {timeout_s:g} s (charge "
-                    f"{state.charge:.2f}); check its mains and its emergency stop"
+                    f"{state.charge:.2f}); check its mains and its emergency stop [SR-CAP-010]"
                 )
             pause_s = min(max(state.ready_in_s, _MIN_WAIT_S), _CHARGE_POLL_S)
             self._port.listen(pause_s)

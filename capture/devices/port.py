@@ -223,7 +223,7 @@ class Port:
         if version != wire.PROTOCOL_VERSION:
             raise WrongDevice(
                 f"{self.url}: the controller speaks protocol {version}, expected "
-                f"{wire.PROTOCOL_VERSION}; update its firmware or this program"
+                f"{wire.PROTOCOL_VERSION}; update its firmware or this program [SR-CAP-004]"
             )
         self.boot = reply.boot
         return Hello(version, kind, serial_number, firmware, reply.boot)
@@ -331,7 +331,8 @@ class Port:
             number = getattr(exc, "errno", None)
             reason = os.strerror(number) if number and kind is LinkLost else str(exc)
             raise kind(
-                f"cannot open {self.url}: {reason}; {opening_advice(self.url, kind, number)}"
+                f"cannot open {self.url}: {reason}; "
+                f"{opening_advice(self.url, kind, number)} [SR-CAP-001]"
             ) from exc
         self._splitter.clear()
         self._lines.clear()
@@ -373,7 +374,7 @@ class Port:
         raise PortTimeout(
             f"{self.url}: no answer to {text!r} after {attempts} attempts of "
             f"{self._timeout_s:g} s; the command may have been executed; check cable and power, "
-            "then connect again"
+            "then connect again [SR-CAP-002]"
         )
 
     def _await_reply(self, seq: int) -> Reply | None:
@@ -420,8 +421,8 @@ class Port:
             self.statistics.reboots += 1
             raise BoxRebooted(
                 f"{self.url}: the controller has started again (epoch {frame.boot:04x}) and "
-                "lost its settings; it is dark and disarmed; connect again, then set it up "
-                "again"
+                "lost its settings; it is dark and disarmed; find the cause, then run the same "
+                "command with --resume [SR-CAP-005]"
             )
         if isinstance(frame, Event):
             if self._next_event is not None and frame.number > self._next_event:

@@ -35,7 +35,7 @@ def opening_advice(url: str, kind: type[Exception], number: int | None) -> str:
     if kind is PortBusy:
         return "another program uses it; close that program"
     if number == errno.EACCES:
-        return "no right to it: on Debian join the group dialout and log in again"
+        return "join the group that may use it (dialout on Debian), then log in again"
     if "://" in url:
-        return "does a server listen there?"
-    return "is it plugged in?"
+        return "does a server listen there? Start it, or correct the address"
+    return "is it plugged in? Check its cable, or correct the address"

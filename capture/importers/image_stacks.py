@@ -105,6 +105,8 @@ def import_light_list(
             "has too few images",
             where=str(directory),
             faults=[Fault("pictures", str(len(found.images)), "at least 3, one per light")],
+            advice="Name a folder with more images.",
+            code="SR-IMP-009",
         )
     near = mm_per_px is not None
     if mm_per_px is not None and not 0 < mm_per_px < 1e3:
@@ -190,7 +192,8 @@ def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, d
             "images differ",
             where=str(found.images[0].parent),
             faults=faults,
-            advice="All images must be of one camera and one setting.",
+            advice="Use images of one camera and one setting.",
+            code="SR-IMP-010",
         )
     return np.array(rows), first, notes
 

@@ -2,6 +2,7 @@
 
 import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -116,7 +117,11 @@ def _rgb_to_mosaic(rgb: UInt16Array) -> UInt16Array:
 
 
 def _error(what: str, where: str, path: str, got: str, expected: str) -> PhotoError:
-    return PhotoError(what, where=where, faults=[Fault(path, got, expected)], advice=_IMAGE_ADVICE)
+    return _photo_error(what, where, [Fault(path, got, expected)])
+
+
+def _photo_error(what: str, where: str, faults: Sequence[Fault]) -> PhotoError:
+    return PhotoError(what, where=where, faults=faults, advice=_IMAGE_ADVICE, code="SR-IMP-014")
 
 
 def _head(file: Path, where: str) -> bytes:
@@ -170,7 +175,7 @@ def _raw(file: Path, where: str) -> Photo:
             begins = repr(file.read_bytes()[:4])
             expected = f"those of a {kind}"
             raise _error(f"is not a {kind}", where, "first bytes", begins, expected) from exc
-        raise PhotoError(exc.what, where=where, faults=exc.faults, advice=_IMAGE_ADVICE) from exc
+        raise _photo_error(exc.what, where, exc.faults) from exc
     except NotImplementedError as exc:  # LibRaw's code for a filter array that it cannot describe
         raise _error("has an unknown filter array", where, "cell", str(exc), "2 x 2") from exc
     notes = []

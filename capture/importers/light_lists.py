@@ -91,7 +91,10 @@ def find_light_list(directory: Path, *, lights: Path | None = None) -> LightList
     """
     if not directory.is_dir():
         raise LightListError(
-            "folder not found", where=str(directory), advice="Name a folder of images."
+            "folder not found",
+            where=str(directory),
+            advice="Name a folder of images.",
+            code="SR-IMP-005",
         )
     directory, source = _folder(directory), lights or None
     if source is None:
@@ -211,6 +214,7 @@ def _source(directory: Path) -> Path:
         where=str(directory),
         faults=[Fault("lights", "none", "*.lp, lights.txt, light_directions.txt or chrome/")],
         advice="Put one next to the images, or name it with --lights.",
+        code="SR-IMP-006",
     )
 
 
@@ -276,6 +280,8 @@ def _find_image_file(name: str, directory: Path, source: Path) -> Path:
         "names a missing image",
         where=str(source),
         faults=[Fault("picture", repr(name), f"a file in {directory}")],
+        advice="Correct the name in the list, or add the file.",
+        code="SR-IMP-008",
     )
 
 
@@ -299,6 +305,7 @@ def _from_text(path: Path, directory: Path) -> LightList:
             where=str(path),
             faults=[Fault("lights", str(len(rows)), f"{len(pictures)}, one per image")],
             advice="Move images that do not belong to the series away, or name the mask *mask*.",
+            code="SR-IMP-007",
         )
     strengths = directory / "light_intensities.txt"
     intensity = None

@@ -104,7 +104,15 @@ def read_mesh(path: str | Path, *, unit: str = "mm") -> ScannedMesh:
     try:
         data = place.read_bytes() if place.stat().st_size <= MAX_FILE_BYTES else None
     except OSError as exc:
-        raise _error(place, "file", str(exc.strerror), "a file that can be read") from exc
+        raise MeshImportError.at(
+            "cannot be read",
+            "file",
+            str(exc.strerror),
+            "a mesh",
+            where=place,
+            advice="Check the name, and the folder that the command runs in.",
+            code="SR-IMP-016",
+        ) from exc
     if data is None:
         raise _error(place, "file", "a larger one", f"at most {MAX_FILE_BYTES} bytes")
     if not data.strip():
@@ -161,11 +169,16 @@ def import_mesh(
         advice = "Attachments are never replaced: make a new session for another scan."
         faults = [Fault("attachment", f"{SCAN_FILE}, attached before", "none of that name")]
         raise SessionError(
-            "contains a scan already", where=str(session), faults=faults, advice=advice
+            "contains a scan already",
+            where=str(session),
+            faults=faults,
+            advice=advice,
+            code="SR-IMP-001",
         )
     if found.closed and out is None:
         advice = "Name a folder for a copy with the mesh: --out COPY."
-        raise SessionError("the session is closed", where=str(session), advice=advice)
+        what = "the session is closed"
+        raise SessionError(what, where=str(session), advice=advice, code="SR-IMP-002")
     if out is not None:
         opened, reason = reopen_copy(session, out)
         with opened:
@@ -232,10 +245,21 @@ def _check_extent(extent_mm: Float64Array, scale: float, where: Path) -> None:
         return
     fitting = [u for u, s in MM_PER_UNIT.items() if low <= longest / scale * s <= high]
     hint = f"it would be in {' or '.join(fitting)}: --unit {fitting[0]}" if fitting else ""
-    fault = Fault("size", f"{longest:.4g} mm", f"{low:g} to {high:g} mm", hint)
-    raise MeshImportError("is implausible in size for a face", where=str(where), faults=[fault])
+    raise MeshImportError(
+        "is implausible in size for a face",
+        where=str(where),
+        faults=[Fault("size", f"{longest:.4g} mm", f"{low:g} to {high:g} mm", hint)],
+        advice="Give the unit of the file with --unit.",
+        code="SR-IMP-003",
+    )
 
 
 def _error(source: Path, field: str, got: str, expected: str) -> MeshImportError:
     faults = [Fault(field, got, expected)]
-    return MeshImportError("is not a mesh that can be used", where=str(source), faults=faults)
+    return MeshImportError(
+        "is not a mesh that can be used",
+        where=str(source),
+        faults=faults,
+        advice="Export it again as .ply or .obj with triangles.",
+        code="SR-IMP-004",
+    )

@@ -150,7 +150,10 @@ def _files(directory: Path) -> tuple[list[Path], list[str]]:
         return [directory], []
     if not directory.is_dir():
         raise PhotoError(
-            "folder not found", where=str(directory), advice="Name a folder or one file."
+            "folder not found",
+            where=str(directory),
+            advice="Name a folder or one file.",
+            code="SR-IMP-011",
         )
     files, ignored = [], []
     for file in sorted(directory.iterdir()):
@@ -163,6 +166,8 @@ def _files(directory: Path) -> tuple[list[Path], list[str]]:
             "contains no photographs",
             where=str(directory),
             faults=[Fault("files", f"{len(ignored)} other entries", "at least one photograph")],
+            advice="Name a folder with photographs.",
+            code="SR-IMP-012",
         )
     return files, ignored
 
@@ -185,6 +190,7 @@ def _inspect(files: Sequence[Path]) -> list[_Entry]:
             where=str(files[0].parent),
             faults=faults,
             advice="Repair these files or move them away; nothing was written.",
+            code="SR-IMP-013",
         )
     return entries
 

@@ -250,7 +250,9 @@ class Plan(Document):
         """
         if isinstance(data, str | bytes):
             data = read_json(data, where=where, error=PlanError)
-        return parse_document(Plan, translate_names(data), where=where, error=PlanError)
+        advice = "Correct these entries of the plan."
+        code = "SR-PLN-004"
+        return parse_document(Plan, data, where=where, error=PlanError, advice=advice, code=code)
 
 
 class StepSeries:

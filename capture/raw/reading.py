@@ -71,7 +71,13 @@ def _tags(buffer: memoryview, where: str) -> Directory | None:
 
 
 def _error(what: str, where: str, path: str, got: str, expected: str) -> RawError:
-    return RawError(what, where=where, faults=[Fault(path, got, expected)], advice=_RAW_ADVICE)
+    return RawError(
+        what,
+        where=where,
+        faults=[Fault(path, got, expected)],
+        advice=_RAW_ADVICE,
+        code="SR-IMP-015",
+    )
 
 
 def _decode_with_libraw(buffer: memoryview, tags: Directory | None, where: str) -> RawFrame:

@@ -77,10 +77,16 @@ def read_contents(path: Path) -> SessionContents:
             found = "a file" if path.exists() else "no such folder"
         faults = [Fault("folder", found, f"a folder with {MANIFEST_FILE}")]
         if (path / JOURNAL_FILE).is_file() and (path / JOURNAL_FILE).stat().st_size > 0:
-            advice = f"Restore {MANIFEST_FILE} from a copy: frames were committed here."
-            what = "has lost its manifest"
-            return SessionDamage(what, where=str(path), faults=faults, advice=advice)
-        return NotASession("is not a session", where=str(path), faults=faults, advice=advice)
+            return SessionDamage(
+                "has lost its manifest",
+                where=str(path),
+                faults=faults,
+                advice=f"Restore {MANIFEST_FILE} from a copy: frames were committed here.",
+                code="SR-SES-006",
+            )
+        return NotASession(
+            "is not a session", where=str(path), faults=faults, advice=advice, code="SR-SES-001"
+        )
 
     if path.is_file():
         raise no_session()

@@ -38,8 +38,8 @@ class DiskErrors:
         if isinstance(value, OSError) and not isinstance(value, SessionError):
             what = f"the disk refused: {value.strerror or value}"
             advice = "Free space or repair the disk, then resume; committed frames are safe."
-            error = SessionDiskError(what, where=str(value.filename or self._path), advice=advice)
-            raise error from value
+            where, code = str(value.filename or self._path), "SR-SES-013"
+            raise SessionDiskError(what, where=where, advice=advice, code=code) from value
 
 
 def write_new(disk: Disk, path: Path, data: bytes) -> None:
@@ -84,14 +84,11 @@ def write_manifest(disk: Disk, path: Path, manifest: bytes) -> None:
 
 def require_free(path: Path) -> None:
     """Raise an error unless the folder is new, empty, or left over from an interrupted creation."""
-    advice = "Choose a new folder, or resume the session that is there."
     if path.is_symlink() or (path.exists() and not path.is_dir()):
         kind = "a link" if path.is_symlink() else "a file"
-        faults = [Fault("folder", kind, "a new or empty folder")]
-        raise SessionError("cannot start here", where=str(path), faults=faults, advice=advice)
+        raise _occupied_error(path, "folder", kind, "a new or empty folder")
     if not path.parent.is_dir():
-        faults = [Fault("parent", "no such folder", "an existing folder")]
-        raise SessionError("cannot start here", where=str(path), faults=faults)
+        raise _occupied_error(path, "parent", "no such folder", "an existing folder")
     if not path.exists():
         return
     debris = {FRAMES_FOLDER, ORPHANS_FOLDER, JOURNAL_FILE, f"{MANIFEST_FILE}.part"}
@@ -104,8 +101,19 @@ def require_free(path: Path) -> None:
     written = (path / JOURNAL_FILE).exists() and (path / JOURNAL_FILE).stat().st_size > 0
     if found - debris or filled or written:
         got = ", ".join(sorted(found)[:5])
-        faults = [Fault("folder", f"a folder with {got}", "a new or empty folder")]
-        raise SessionError("cannot start here", where=str(path), faults=faults, advice=advice)
+        raise _occupied_error(path, "folder", f"a folder with {got}", "a new or empty folder")
+
+
+def _occupied_error(path: Path, field: str, got: str, expected: str) -> SessionError:
+    return SessionError.at(
+        "cannot start here",
+        field,
+        got,
+        expected,
+        where=path,
+        advice="Choose a new folder, or resume the session that is there.",
+        code="SR-SES-008",
+    )
 
 
 def move_orphans(disk: Disk, path: Path, contents: SessionContents) -> None:

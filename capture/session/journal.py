@@ -286,4 +286,5 @@ def _damage_error(
     place = where if byte is None else f"{where}, byte {byte}"
     advice = "Restore the journal from a copy; no line after this byte can be trusted."
     faults = [Fault(path, got, expected)]
-    return SessionDamage("is damaged", where=place, faults=faults, advice=advice)
+    code = "SR-SES-012"
+    return SessionDamage("is damaged", where=place, faults=faults, advice=advice, code=code)

@@ -65,7 +65,7 @@ class SubjectRecord(Document):
         checks.check("pseudonym", self.pseudonym, good, "letters, digits, _ . - (no full name)")
         for scope in self.consent_scope:
             checks.check("consent_scope", scope, is_id(scope), ID_RULE)
-        checks.close()
+        checks.close(advice="Use a pseudonym without spaces.", code="SR-SES-011")
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,8 +156,10 @@ def decode(data: bytes, *, where: str) -> tuple[Manifest, str]:
     schema = content.pop("schema", None)
     if schema not in READABLE_SCHEMAS:
         advice = "Read it with the version of skinrig that wrote it, or check the file."
-        faults = [Fault("schema", repr(schema), " or ".join(READABLE_SCHEMAS))]
-        raise SessionError("has an unknown schema", where=where, faults=faults, advice=advice)
+        faults = [Fault("schema", repr(schema), SCHEMA)]
+        raise SessionError(
+            "has an unknown schema", where=where, faults=faults, advice=advice, code="SR-SES-007"
+        )
     found = content.pop(_SEAL_KEY, None)
     written, expected = seal({"schema": schema, **content})
     if found != expected or written != data:
@@ -165,9 +167,8 @@ def decode(data: bytes, *, where: str) -> tuple[Manifest, str]:
         got = str(found) if found != expected else "other bytes than were sealed"
         advice = "Restore session.json from a copy: it was changed after it was written."
         faults = [Fault(_SEAL_KEY, got, expected)]
-        raise SessionDamage("is damaged", where=where, faults=faults, advice=advice)
-    for part in {"plan", "rig", "calibrations"} & content.keys():
-        content[part] = translate_names(content[part])
+        code = "SR-SES-005"
+        raise SessionDamage("is damaged", where=where, faults=faults, advice=advice, code=code)
     return parse_document(Manifest, content, where=where, error=SessionDamage), expected
 
 

@@ -176,19 +176,19 @@ class Session(SessionView):
         SessionDamage
             When manifest or journal differ from what was written, or a committed frame is missing.
         """
-        disk = disk or Disk()
-        place = Path(path)
+        disk, place = disk or Disk(), Path(path)
         read_undamaged_contents(place)
         with DiskErrors(place):
             descriptor = disk.open_append(place / JOURNAL_FILE)
         try:
             if not disk.lock(descriptor):
-                what = "another process is writing this session"
-                raise SessionLocked(what, where=str(place), advice="Wait for its end, or stop it.")
+                what, advice = "another process is writing this session", "Wait for its end."
+                raise SessionLocked(what, where=str(place), advice=advice, code="SR-SES-003")
             contents = read_undamaged_contents(place)  # again, under the lock
             if contents.walk.closed:
+                what = "the session is closed"
                 advice = "Start a new session; a closed one is never modified."
-                raise SessionError("the session is closed", where=str(place), advice=advice)
+                raise SessionError(what, where=str(place), advice=advice, code="SR-SES-002")
             with DiskErrors(place):
                 if contents.walk.torn:
                     _log.warning("%s: cut %d torn bytes", place / JOURNAL_FILE, contents.walk.torn)

@@ -77,7 +77,8 @@ def check_file(path: Path, line: FrameLine | AttachmentLine) -> bytes:
         got = f"{len(blob)} bytes, xxh128 {found}"
         faults = [Fault("content", got, f"{line.bytes} bytes, xxh128 {line.xxh128}")]
         advice = f"Restore the {what} from a copy, or take it again in a new session."
-        raise SessionDamage("is damaged", where=str(path), faults=faults, advice=advice)
+        code = "SR-SES-004"
+        raise SessionDamage("is damaged", where=str(path), faults=faults, advice=advice, code=code)
     return blob
 
 
@@ -225,7 +226,13 @@ class SessionView:
         if name not in self._attached:
             known = ", ".join(self._attached) or "none"
             faults = [Fault("attachment", short_repr(name), f"one of: {known}")]
-            raise SessionError("contains no such attachment", where=str(self.path), faults=faults)
+            raise SessionError(
+                "contains no such attachment",
+                where=str(self.path),
+                faults=faults,
+                advice="Name one of those listed.",
+                code="SR-SES-010",
+            )
         return self._attached[name]
 
     def attachment(self, name: str) -> bytes:
@@ -256,7 +263,9 @@ class SessionView:
             what = f"subject {self.subject.pseudonym} has not agreed to this use"
             faults = [Fault("scope", short_repr(scope), expected)]
             advice = "Ask the subject again, or keep the data inside the agreed scope."
-            raise ConsentError(what, where=str(self.path), faults=faults, advice=advice)
+            raise ConsentError(
+                what, where=str(self.path), faults=faults, advice=advice, code="SR-SES-009"
+            )
 
     @property
     def closed(self) -> bool:

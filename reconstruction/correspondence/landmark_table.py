@@ -44,8 +44,10 @@ def read_landmark_table(path: str | Path) -> dict[str, tuple[float, float]]:
         cells = [cell.strip() for cell in next(csv.reader([line]))]
         if not header:
             if cells != list(LANDMARK_COLUMNS):
-                hint = "correct the header"
-                raise LandmarkError(f"{where}: got columns {cells}, expected name, x, y; {hint}")
+                raise LandmarkError(
+                    f"{where}: got columns {cells}, expected name, x, y; correct the header "
+                    "[SR-REC-021]"
+                )
             header = True
             continue
         if len(cells) != len(LANDMARK_COLUMNS):

@@ -133,5 +133,5 @@ def require_patterns(names: Mapping[str, Any], *, polarizer: str, purpose: str) 
     raise MissingPatternsError(
         f"patterns: {purpose} needs the {polarizer} images to determine full light and three"
         f" gradients; got {', '.join(lit) or 'none'}; missing {', '.join(missing)};"
-        f" {' and '.join(needs)} would suffice; add them"
+        f" {' and '.join(needs)} would suffice; add them [SR-REC-016]"
     )

@@ -126,7 +126,7 @@ def order_stages(stages: Sequence[PipelineStage], want: Iterable[str]) -> list[P
         if product not in maker:
             raise StageError(
                 f"{by}: {product!r} is not a map that can be made here; "
-                f"expected one of {', '.join(sorted(maker))}"
+                f"expected one of {', '.join(sorted(maker))}; choose one [SR-REC-002]"
             )
         stage = maker[product]
         if stage in ordered:

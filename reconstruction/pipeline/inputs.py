@@ -127,8 +127,10 @@ class Inputs:
         if dome.scan is not None:
             found.scan = Path(dome.scan).read_bytes()
             if not found.scan.startswith(b"ply"):
-                hint = "convert it with `skinrig import mesh`, which takes .obj and .ply"
-                raise InputsError(f"scan: got {dome.scan}, expected a PLY mesh; {hint}")
+                raise InputsError(
+                    f"scan: got {dome.scan}, expected a PLY mesh; convert it with "
+                    "`skinrig import mesh`, which takes .obj and .ply [SR-REC-007]"
+                )
             found.hashes["scan"] = hashlib.sha256(found.scan).hexdigest()
         if dome.basis is not None:
             found.basis = Path(dome.basis)
@@ -189,13 +191,15 @@ class Inputs:
 def _require_some(folder: Path, rig: str) -> None:
     """Refuse a folder without a calibration of a rig: every quantity would be assumed."""
     if not folder.is_dir():
-        got = f"got {folder}, expected a CALIBRATION/ folder"
-        raise InputsError(f"calibration: {got}; make one with `skinrig calibrate`")
+        raise InputsError(
+            f"calibration: got {folder}, expected a CALIBRATION/ folder; make one with "
+            "`skinrig calibrate` [SR-CAL-010]"
+        )
     files = [path for kind in CALIBRATION_KINDS if (path := folder / f"{kind}.json").is_file()]
     if not files:
         raise InputsError(
             f"calibration: {folder} holds none, expected {', '.join(CALIBRATION_KINDS)} or some of "
-            "them (.json); make them with `skinrig calibrate`"
+            "them (.json); make them with `skinrig calibrate` [SR-CAL-011]"
         )
     rigs = set()
     for path in files:
@@ -206,7 +210,7 @@ def _require_some(folder: Path, rig: str) -> None:
     if rig not in rigs:
         raise InputsError(
             f"calibration: those in {folder} were made on rig {', '.join(sorted(rigs))}, expected "
-            f"the session's rig {rig}; omit --calibration, or give that rig's folder"
+            f"the session's rig {rig}; omit --calibration, or give that rig's folder [SR-CAL-012]"
         )
 
 

@@ -153,7 +153,7 @@ def crop(
     if not keep.any():
         raise ScanMeshError(
             f"crop: got no triangle of {len(keep)} in the box {box_mm}, expected the face; "
-            "check unit and frame of the scan"
+            "check unit and frame of the scan [SR-REC-010]"
         )
     return mesh.select_faces(keep)
 

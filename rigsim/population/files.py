@@ -215,7 +215,7 @@ def load_subject(text: str) -> SubjectFile:
     if text not in PRESET_NAMES:
         raise SubjectFileError(
             f"subject: got {text!r}, expected one of {', '.join(PRESET_NAMES)}, or a file "
-            f"NAME{SUBJECT_SUFFIX}"
+            f"NAME{SUBJECT_SUFFIX}; choose one [SR-SIM-005]"
         )
     return SubjectFile(preset=text)
 
@@ -263,8 +263,7 @@ def read_subject_file(path: str | Path) -> SubjectFile:
         if not Path(name).is_file():
             faults.append(Fault(key, name, "an existing file"))
     if faults:
-        number = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
-        raise SubjectFileError(number, where=str(path), faults=faults)
+        raise _faults_error(str(path), faults)
     for key, name in files.items():
         if key in MAP_RANGES:
             load_texture(key, name)
@@ -287,8 +286,18 @@ def _parse_document(document: Mapping[str, Any], where: str, faults: list[Fault]
             faults += error.faults
             wrong = {re.split(r"[.\[]", fault.path)[0] for fault in error.faults}
             if not wrong & rest.keys():  # an unknown key, such as "a.b"
-                raise SubjectFileError(error.what, where=where, faults=faults) from error
+                raise _faults_error(where, faults) from error
             rest = {key: value for key, value in rest.items() if key not in wrong}
+
+
+def _faults_error(where: str, faults: list[Fault]) -> SubjectFileError:
+    return SubjectFileError(
+        "1 fault" if len(faults) == 1 else f"{len(faults)} faults",
+        where=where,
+        faults=faults,
+        advice="Correct these keys of the file.",
+        code="SR-SIM-006",
+    )
 
 
 @functools.lru_cache(maxsize=8)

@@ -256,7 +256,10 @@ def choose_variant(
     if asked == "scalar":
         return VariantChoice(_SCALAR_VARIANTS[kind], "requested by SKINRIG_MITSUBA=scalar", "")
     if asked not in ("", "llvm"):
-        raise ValueError(f"SKINRIG_MITSUBA: got {asked!r}, expected scalar, llvm or nothing")
+        raise ValueError(
+            f"SKINRIG_MITSUBA: got {asked!r}, expected scalar, llvm or nothing; correct it, or "
+            "unset it [SR-ENV-005]"
+        )
     refused = []
     for path in find_llvm_libraries(environment) if libraries is None else libraries:
         verdict = check_library(path, cache=cache)

@@ -15,7 +15,7 @@ from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.results import StageBenchmark
 from skinrig.benchmarks.stage import BenchmarkStage, read_descriptions
 from skinrig.console import Console, to_json_value
-from skinrig.errors import EXIT_EXTRA_MISSING, exit_code, format_error
+from skinrig.errors import EXTRA_MISSING, exit_code, one_of, sentence
 
 STAGES: dict[str, str] = {name: entry["run"] for name, entry in read_descriptions().items()}
 """Module and function by stage. A module is imported, and its kernels are compiled, when the stage
@@ -72,10 +72,7 @@ def run_stages(
     """
     chosen = list(dict.fromkeys(names)) if names else bench_plan.order_small_stages(STAGES)
     for name in chosen:
-        if name not in STAGES:
-            raise BenchError(
-                f"stage: got {name!r}, expected one of {', '.join(STAGES)}; correct the name"
-            )
+        one_of("stage", name, STAGES, BenchError)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)  # folder errors are raised before any stage runs
     run = _Run(console, time.perf_counter() + budget_s, requested=bool(names), toy=toy, out=out)

@@ -81,7 +81,9 @@ def calibrate(
     require_choice("kind", kind, CALIBRATION_KINDS, CalibratingError)
     opened = [Session.open(path) for path in sessions]
     if not opened:
-        raise CalibratingError("sessions: got none, expected at least one folder; name it")
+        raise CalibratingError(
+            "sessions: got none, expected at least one folder; name it [SR-CAL-009]"
+        )
     made_on = created or max(s.manifest.created_at.date() for s in opened)
     given = TargetSessions(opened, Path(out), made_on)
     if kind == probe.FIBER_CALIBRATION_KIND:
@@ -121,7 +123,7 @@ class _Frames:
             some = ", ".join(serials[:3]) + (", ..." if len(serials) > 3 else "")
             raise CalibratingError(
                 f"cameras: got {len(serials)} ({some}), expected one: give sessions of one camera; "
-                "a dome needs `calibrate geometry` and `calibrate lights` only"
+                "a dome needs `calibrate geometry` and `calibrate lights` only [SR-CAL-004]"
             )
         self.about = {"serial": serials[0], **targets.provenance()}
         self.findings: list[str] = []
@@ -225,7 +227,7 @@ def _polarization(frames: _Frames) -> store.Calibration:
     count = int(np.count_nonzero(chosen))
     if not count:
         raise CalibratingError(
-            "malus frames: no pixel follows the analyser; capture bare rough metal"
+            "malus frames: no pixel follows the analyzer; capture bare rough metal [SR-CAL-003]"
         )
     # mean over n independent pixels: its variance is sum(var) / n^2
     mean = np.array([image[chosen].mean(axis=0) for image in images])

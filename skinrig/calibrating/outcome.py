@@ -84,8 +84,9 @@ class TargetSessions:
             wanted = " ".join([kind, *(f"{k}={v}" for k, v in index.items())])
             target = kind if kind != "subject" else "white"
             raise CalibratingError(
-                f"sessions: hold no frames of kind {wanted!r}; capture that target first (`skinrig"
-                f" simulate {rig} --target {target}`, or `skinrig capture {rig} --target {target}`)"
+                f"sessions: got no frames of kind {wanted!r}, expected some; capture that target "
+                f"first (`skinrig simulate {rig} --target {target}`, or `skinrig capture {rig} "
+                f"--target {target}`) [SR-CAL-001]"
             )
         return found
 

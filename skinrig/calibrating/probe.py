@@ -211,7 +211,7 @@ def _packaged_certificate(session: Session) -> PhantomCertificate:
     if session.source != "simulated":
         raise CalibratingError(
             "phantom: its optics are not known; give its certificate with --phantom FILE.json"
-            " (schema skinrig.phantom/1, see docs/how-to/calibrate-probe.md)"
+            " (schema skinrig.phantom/1, see docs/how-to/calibrate-probe.md) [SR-CAL-016]"
         )
     return packaged_certificate()
 

@@ -84,7 +84,7 @@ def capture_session(
         if "caliper" in needed and order.force_limit_n is None:
             raise UsageError(
                 "a capture with the caliper needs --force-limit N: the operator decides how much "
-                "force this skin may bear; no default exists"
+                "force this skin may bear; no default exists [SR-CAP-015]"
             )
     if order.out is None and not order.dry_run:
         raise UsageError("a capture needs --out SESSION; name a new folder, or add --dry-run")

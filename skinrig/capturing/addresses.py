@@ -76,7 +76,7 @@ def require_addresses(
     if missing:
         raise UsageError(
             f"the rig {rig.name!r} needs {' '.join(missing)}; --dry-run needs none, and "
-            "skinrig serve prints those of a simulation"
+            "skinrig serve prints those of a simulation [SR-CAP-033]"
         )
     for view in rig.views:  # checked before a controller is opened, which switches its light
         try:

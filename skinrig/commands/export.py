@@ -174,5 +174,6 @@ def _check_format(
     ):
         if (source / file).is_file() and to not in fitting:
             raise UnusableError(
-                f"--to: got {to!r}, but {source} holds {kind}; expected one of {', '.join(fitting)}"
+                f"--to: got {to!r}, but {source} holds {kind}; expected one of "
+                f"{', '.join(fitting)}; choose one [SR-EXP-005]"
             )

@@ -148,7 +148,7 @@ class RigCommand(Command):
                 raise
             raise UsageError(
                 f"{option}: not an option of the {self.name} rig (only of {', '.join(others)}); "
-                "remove it"
+                "remove it [SR-CLI-005]"
             ) from error
 
 
@@ -180,7 +180,9 @@ class RigGroup(Subcommands):
 
     def kind_of(self, rig: str) -> str:
         """Return the command of a rig that is not a command's name; here, raise."""
-        raise UnusableError(f"rig: got {rig!r}, expected one of {', '.join(self.commands)}")
+        raise UnusableError(
+            f"rig: got {rig!r}, expected one of {', '.join(self.commands)}; choose one [SR-CLI-006]"
+        )
 
 
 class RigFileGroup(RigGroup):

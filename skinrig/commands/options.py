@@ -71,7 +71,9 @@ NewMaps = Annotated[
 def check_output_file(context: typer.Context, out: Path | None) -> Path | None:
     """Refuse a folder as output file, before the computation starts."""
     if out is not None and not context.resilient_parsing and out.is_dir():
-        raise UnusableError(f"--out: {out} is a folder, expected a file to write; name a file")
+        raise UnusableError(
+            f"--out: {out} is a folder, expected a file to write; name a file [SR-CLI-011]"
+        )
     return out
 
 

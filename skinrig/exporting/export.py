@@ -100,7 +100,7 @@ def export(
     """
     require_choice("to", to, (*APPEARANCE_FORMATS, *SESSION_FORMATS), ExportError)
     if Path(out).exists():
-        raise ExportError(f"{out}: exists; choose a new folder")
+        raise ExportError(f"{out}: exists; choose a new folder [SR-EXP-002]")
     order = delivery or ExportSettings()
     held: SkinAppearance | Session
     if to in SESSION_FORMATS:
@@ -110,8 +110,9 @@ def export(
         if to in SURFACE_FORMATS and not any(name in held.maps for name in _DOME_MAPS):
             others = ", ".join(name for name in APPEARANCE_FORMATS if name not in SURFACE_FORMATS)
             raise ExportError(
-                f"--to: got {to!r}, which requires a dome's maps (position, normals, r_d, basis "
-                f"BRDFs), but {source} has {', '.join(held.maps) or 'none'}; choose {others}"
+                f"to: got {to!r}, which is of a dome's maps (position, normals, r_d, lobes), but "
+                f"{source} holds {', '.join(held.maps) or 'none'}; expected {others}; choose one "
+                "[SR-EXP-004]"
             )
         if order.onto is not None:
             _appearance(order.onto, use, today)  # its maps are exported, too
@@ -129,12 +130,13 @@ def _appearance(path: str | Path, use: str | None, today: date | None) -> SkinAp
 def _session(path: str | Path, use: str | None, today: date | None) -> Session:
     """Open a session after a check of its digests and of its subject's consent to a use."""
     if use is None:
-        raise UsageError("--use: got none; name the purpose of the copy, e.g. research")
+        raise UsageError("--use: got none; name the purpose of the copy [SR-EXP-001]")
     session = Session.open(path)
     session.require_consent(use, today=today)
     found = verify(path)
     if not found.ok:
         raise ExportError(
-            f"{path}: damaged, nothing was copied ({found.problems[0]}); restore the file"
+            f"{path}: is damaged, nothing was copied: {found.problems[0]}; restore it from a copy "
+            "[SR-EXP-003]"
         )
     return session

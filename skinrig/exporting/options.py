@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from skinrig.errors import UnusableError, UsageError
+from skinrig.errors import UsageError, one_of
 
 METERS_PER_UNIT: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of a scene unit, m."""
@@ -122,8 +122,8 @@ class ExportSettings:
             ("--normal-y", self.normal_y, GREEN_SIGN_BY_NORMAL_Y),
             ("--udim", self.udim, TILE_SEPARATORS),
         ):
-            if value is not None and value not in known:
-                raise UnusableError(f"{option}: got {value!r}, expected one of {', '.join(known)}")
+            if value is not None:
+                one_of(option, value, known)
         for name in self.only:
             if not _NAME_PATTERN.fullmatch(name):
                 raise UsageError(f"--only: got {name!r}, expected names separated by commas")

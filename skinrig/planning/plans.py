@@ -189,7 +189,9 @@ def parse_goals(text: str, rig: str) -> dict[str, float]:
     for part in filter(str.strip, text.split(",")):
         match = _GOAL_PATTERN.fullmatch(part)
         if match is None:
-            raise PlanOptionsError(f"--goals: got {part.strip()!r}, expected {known}")
+            raise PlanOptionsError(
+                f"--goals: got {part.strip()!r}, expected {known}; correct it [SR-PLN-001]"
+            )
         name, number, unit = match.groups()
         if name not in units:
             close = difflib.get_close_matches(name, units, 1)
@@ -197,7 +199,10 @@ def parse_goals(text: str, rig: str) -> dict[str, float]:
             others = [other for other, gives in GOAL_UNITS.items() if name in gives]
             if others:
                 hint = f"; {name} is planned for {', '.join(others)}"
-            raise PlanningError(f"--goals: got {name!r} of rig {rig!r}, expected {known}{hint}")
+            raise PlanningError(
+                f"--goals: got {name!r} of rig {rig!r}, expected {known}{hint}; choose a map of "
+                "this rig [SR-PLN-002]"
+            )
         if unit not in (None, units[name]):
             raise PlanOptionsError(f"--goals: got {name} in {unit}, expected {units[name]}")
         try:
@@ -301,7 +306,10 @@ def choose(
     if forecast is not None:
         plan = read_plan(forecast)
         if plan.rig != rig.name:
-            raise PlanningError(f"{forecast}: got a plan of {plan.rig!r}, expected {rig.name!r}")
+            raise PlanningError(
+                f"{forecast}: got a plan of {plan.rig!r}, expected {rig.name!r}; name a plan of "
+                "this rig [SR-PLN-003]"
+            )
         found: PlanChoice = own.forecast(rig, plan, asked)
     else:
         found = own.choose(rig, asked)

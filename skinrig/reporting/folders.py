@@ -92,7 +92,9 @@ def discover(paths: Sequence[Path]) -> ReportInputs:
     found = ReportInputs()
     for path in paths:
         if not path.exists():
-            raise ReportError(f"{path}: does not exist; give a folder that skinrig wrote")
+            raise ReportError(
+                f"{path}: does not exist; give a folder that skinrig wrote [SR-CLI-007]"
+            )
         below = [path, *sorted(path.iterdir())] if path.is_dir() else [path]
         for entry in below:
             if not entry.name.startswith("."):
@@ -100,7 +102,7 @@ def discover(paths: Sequence[Path]) -> ReportInputs:
     if found.is_empty:
         raise ReportError(
             f"{', '.join(map(str, paths))}: holds no session, appearance or benchmark; "
-            "`skinrig demo` makes all of them"
+            "`skinrig demo` makes all of them [SR-CLI-008]"
         )
     return found
 

@@ -94,7 +94,7 @@ def open_session(
             differing = "".join(f"\n  {line}" for line in lines)
             raise SimulationError(
                 f"{order.out}: cannot be resumed with these settings{differing}\n"
-                "  resume with the same settings, or name another folder"
+                "  resume with the same settings, or name another folder [SR-SIM-001]"
             )
         return session
     order.out.parent.mkdir(parents=True, exist_ok=True)

@@ -119,13 +119,19 @@ class SimulationOrder:
         for name, shown in _COUNT_OPTIONS.items():
             number = getattr(self, name, None)
             if number is not None and number < 1:
-                raise SimulationError(f"{shown}: got {number}, expected a number above 0, or none")
+                raise SimulationError(
+                    f"{shown}: got {number}, expected a number above 0, or none; correct it "
+                    "[SR-SIM-002]"
+                )
         require_size(self.size)
         if self.seed < 0:
             raise SimulationError(f"seed: got {self.seed}, expected 0 or more")
         width_px = getattr(self, "width_px", None)
         if width_px is not None and width_px < MIN_WIDTH_PX:
-            raise SimulationError(f"width: got {width_px}, expected {MIN_WIDTH_PX} pixels or more")
+            raise SimulationError(
+                f"width: got {width_px}, expected {MIN_WIDTH_PX} pixels or more; raise it "
+                "[SR-SIM-003]"
+            )
         if self.target is not None:
             require_choice("target", self.target, self.targets, SimulationError)
         self.check()
@@ -157,7 +163,7 @@ class SimulationOrder:
         for name in names:
             if getattr(self, name) != unset[name]:
                 raise SimulationOptionsError(
-                    f"{name}: not an option of the {subject} rig; remove it"
+                    f"{name}: not an option of the {subject} rig; remove it [SR-SIM-004]"
                 )
 
     def scene_switches(self) -> dict[str, Any]:
@@ -385,5 +391,7 @@ def order_for(rig: str, **options: Any) -> SimulationOrder:
         default = foreign[name].default
         if options.pop(name) not in ({} if default is MISSING else default, None):
             shown = name.removesuffix("_mm")
-            raise SimulationOptionsError(f"{shown}: not an option of the {rig} rig; remove it")
+            raise SimulationOptionsError(
+                f"{shown}: not an option of the {rig} rig; remove it [SR-SIM-004]"
+            )
     return ORDER_BY_RIG[rig](**options)

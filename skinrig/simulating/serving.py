@@ -115,7 +115,7 @@ def _build_served_rig(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
         if order.size != "small":
             raise SimulationError(
                 f"size: got {order.size!r}, expected small: larger pictures take longer to make "
-                "than the caliper waits for its host; use skinrig simulate gradient for them"
+                "than the caliper waits for its host; use skinrig simulate gradient [SR-SIM-007]"
             )
         rig = rig.cropped(GRADIENT_WIDTH_PX)
         scene = gradient.make_scene(rig, site=order.site, subject=subject, seed=seed)

@@ -474,7 +474,10 @@ FEW = Shoot(lights=10, views=2, width_px=60)
 @pytest.mark.parametrize(
     ("shoot", "says"),
     [
-        (dataclasses.replace(FEW, scan=False), "holds no scan; add one with `skinrig import mesh"),
+        (
+            dataclasses.replace(FEW, scan=False),
+            "got no scan, expected one; add it with `skinrig import mesh",
+        ),
         (dataclasses.replace(FEW, lights=1), "lights: got 1 that can be used, expected at least"),
         (dataclasses.replace(FEW, dead=(4,)), "lights: got 9 that can be used"),
         (dataclasses.replace(FEW, views=1), "views: got images of 1, expected at least 2"),

@@ -218,11 +218,11 @@ def test_dry_run_prints_plan_and_opens_nothing(capsys):
 
 
 @pytest.mark.parametrize(
-    ("argv", "code", "says"),
+    ("argv", "exit_code", "says", "code"),
     [
-        (["verify", "nothing"], 3, "is not a session"),
-        (["capture", "flash", "--out", "x"], 2, "--port flash=URL"),
-        (["plan", "flash", "--width", "many"], 2, "--width"),
+        (["verify", "nothing"], 3, "is not a session", "SR-SES-001"),
+        (["capture", "flash", "--out", "x"], 2, "--port flash=URL", "SR-CAP-033"),
+        (["plan", "flash", "--width", "many"], 2, "--width", None),
         (
             [
                 "capture",
@@ -236,18 +236,20 @@ def test_dry_run_prints_plan_and_opens_nothing(capsys):
             ],
             4,
             "no-such-port",
+            "SR-CAP-001",
         ),
     ],
 )
-def test_json_error_is_single_document(argv, code, says, capsys, tmp_path, monkeypatch):
+def test_json_error_is_single_document(argv, exit_code, says, code, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main([*argv, "--json"]) == code
+    assert main([*argv, "--json"]) == exit_code
     out, err = capsys.readouterr()
     document = json.loads(out)
     assert says in document.pop("error")
-    assert document == {"schema": "skinrig.error/1", "exit_code": code}
+    assert document == {"schema": "skinrig.error/1", "code": code, "exit_code": exit_code}
     assert says in err
-    assert main(argv) == code
+    assert code is None or err.rstrip().endswith(f"[{code}]")
+    assert main(argv) == exit_code
     assert "skinrig.error" not in capsys.readouterr().out
 
 

@@ -1,20 +1,24 @@
 """The documentation says what the code does: examples run, commands parse, links lead."""
 
 import ast
+import dataclasses
 import doctest
 import importlib
+import importlib.util
 import re
 import shlex
 import shutil
 import subprocess
+import sys
 import textwrap
+from collections import Counter
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import typer
-from fixtures.product_code import PACKAGES, modules, tree_of
+from fixtures.product_code import PACKAGES, modules, text_of, tree_of
 
 from capture.devices import wire
 from capture.plan.rig_kinds import RIG_KINDS
@@ -390,10 +394,78 @@ def source_texts():
     return texts + [path.read_text("utf-8") for path in sorted((ROOT / "tools").glob("*.sh"))]
 
 
+def load_tool(name):
+    """Load a module of tools/, which is not a package that is installed."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
+    sys.modules[name] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+error_codes = load_tool("error_codes")
+TROUBLESHOOTING = DOCS / "how-to" / "troubleshooting.md"
+
+
+def troubleshooting_rows():
+    """Code and message cells of the page's rows; the code is empty for findings and symptoms."""
+    lines = [line for line in TROUBLESHOOTING.read_text("utf-8").splitlines() if line[:1] == "|"]
+    table, rows = False, []
+    for cells in ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines):
+        if set(cells[0]) != {"-"}:
+            head = not cells[0] or error_codes.CODE.fullmatch(cells[0])
+            table = cells[0] == "code" or (table and bool(head))
+            rows += [cells[:2]] if table and cells[0] != "code" else []
+    return rows
+
+
+def code_faults(texts, listed):
+    """Faults of coded messages, and of the codes that the page lists."""
+    templates, codes = {}, {}
+    for text in texts:
+        templates.setdefault(text.code, set()).add(text.template)
+        codes.setdefault(text.template, set()).add(text.code)
+    faults = [f"{code}: {len(some)} messages" for code, some in templates.items() if len(some) > 1]
+    faults += [f"{'+'.join(sorted(some))}: 1 message" for some in codes.values() if len(some) > 1]
+    faults += [f"{code}: area" for code in templates if code[3:6] not in error_codes.AREAS]
+    faults += [f"{code}: not in the page" for code in templates.keys() - set(listed)]
+    faults += [f"{code}: not in the code" for code in set(listed) - templates.keys()]
+    return faults + [f"{code}: twice in the page" for code in set(listed) if listed.count(code) > 1]
+
+
+def test_error_codes_match_the_troubleshooting_page():
+    texts = error_codes.read_error_texts(ROOT, PACKAGES)
+    assert len({text.code for text in texts}) >= 50
+    assert code_faults(texts, [code for code, _ in troubleshooting_rows() if code]) == []
+
+
+def test_every_code_in_source_ends_a_message():
+    found = Counter((t.path, t.code) for t in error_codes.read_error_texts(ROOT, PACKAGES))
+    written = Counter(
+        (path.relative_to(ROOT).as_posix(), code)
+        for path in modules(*PACKAGES)
+        for code in error_codes.CODE.findall(text_of(path))
+        if not code.endswith("-000")  # the number of examples
+    )
+    assert written == found
+
+
+def test_code_check_finds_missing_and_ambiguous_codes():
+    text = error_codes.ErrorText("SR-SES-001", "is not a session; name one", "capture/a.py")
+    other = dataclasses.replace(text, template="is closed; start a new one")
+    assert code_faults([text], ["SR-SES-001"]) == []
+    assert code_faults([text], []) == ["SR-SES-001: not in the page"]
+    assert code_faults([], ["SR-SES-001"]) == ["SR-SES-001: not in the code"]
+    assert code_faults([text, text], ["SR-SES-001"] * 2) == ["SR-SES-001: twice in the page"]
+    assert code_faults([text, other], ["SR-SES-001"]) == ["SR-SES-001: 2 messages"]
+    twin = dataclasses.replace(text, code="SR-SES-002")
+    listed = ["SR-SES-001", "SR-SES-002"]
+    assert code_faults([text, twin], listed) == ["SR-SES-001+SR-SES-002: 1 message"]
+
+
 def test_messages_in_troubleshooting_are_messages_of_the_program():
-    page = DOCS / "how-to" / "troubleshooting.md"
-    heads = [line.split("|")[1] for line in page.read_text("utf-8").splitlines() if "| `" in line]
-    quotes = [quote for head in heads for quote in SPAN.findall(head)]
+    quotes = [
+        quote for code, head in troubleshooting_rows() if not code for quote in SPAN.findall(head)
+    ]
     assert len(quotes) > 30
     texts = "\n".join(source_texts())
     # three dots stand for what is filled in; `Checks` joins a name, what it got and expected

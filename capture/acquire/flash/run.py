@@ -327,6 +327,6 @@ def _sync_delay_s(rig: Rig, limits: Mapping[str, Any]) -> float:
         raise AcquisitionError(
             f"shutter_lag_s: got {lag_s:g} s in the rig file, the controller waits {most_s:g} s "
             "at most from camera line to flash; nothing was fired: every lit frame would be "
-            "dark; use a faster camera"
+            "dark; use a faster camera [SR-CAP-014]"
         )
     return lag_s

@@ -27,7 +27,7 @@ def check_eyes(run: CaptureRun, *, skin: bool) -> None:
     if skin and run.eyes == "open":
         raise AcquisitionError(
             "eyes: patterns change many times per second, and the patch may be next to an eye; "
-            "nothing was lit: close or shield the eyes and give --eyes"
+            "nothing was lit: close or shield the eyes and give --eyes [SR-CAP-017]"
         )
 
 
@@ -100,7 +100,7 @@ def check_force(limit_n: float | None, limits: Mapping[str, Any]) -> None:
     if not low <= limit_n <= high:
         raise AcquisitionError(
             f"force limit: got {limit_n:g} N, expected {low:g} to {high:g} N, the range of the "
-            "caliper's sensor; nothing has moved"
+            "caliper's sensor; nothing has moved: give a limit within it [SR-CAP-016]"
         )
 
 

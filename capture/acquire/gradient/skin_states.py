@@ -217,7 +217,7 @@ class SkinStates:
         if report.ended != "reached":
             raise AcquisitionError(
                 f"caliper: homing ended as {report.ended!r} at {report.reading_mm:.2f} mm; "
-                "nothing is held: check the home mark and the motor, then use --resume"
+                "nothing is held: check the home mark and the motor, then use --resume [SR-CAP-018]"
             )
         caliper.set_angle(angle_deg)
         caliper.dark()  # a person's hands are at the jaws now

@@ -166,7 +166,7 @@ class Head:
         return AcquisitionError(
             f"measurement of {placement}: refused, {reason}, {MAX_ATTEMPTS} times; no frame of "
             "it is kept. Check that the membrane is whole and the tube is on, and that no fold "
-            f"and no hair is under the rim; {recovery_advice(captured=captured)}"
+            f"and no hair is under the rim; {recovery_advice(captured=captured)} [SR-CAP-019]"
         )
 
     # waiting ---------------------------------------------------------------------------------
@@ -205,6 +205,7 @@ class Head:
                     f"camera: still at {self._format_temperature(camera_c)} after"
                     f" {CAMERA_TEMPERATURE_TIMEOUT_S:g} s; its dark current would not be that of"
                     " the dark frames: check its cooling, then run the same command with --resume"
+                    " [SR-CAP-020]"
                 )
             self._operator.stop_if_asked()
             self._box.listen(CAMERA_TEMPERATURE_POLL_S)

@@ -167,7 +167,7 @@ def _detect(unit: Float64Array) -> Float64Array:
             return centers
     raise ChartError(
         "image: no ColorChecker Classic found; show the whole chart, evenly lit, in focus and "
-        "larger than about 60 pixels; or give the centers of its corner patches"
+        "larger than about 60 pixels; or give the centers of its corner patches [SR-CAL-002]"
     )
 
 

@@ -65,7 +65,7 @@ class WhiteReference:
         if rgb.shape != self.signal.shape:
             raise ValueError(
                 f"rgb: got shape {rgb.shape}, expected {self.signal.shape} as the white reference;"
-                " take both with the same camera settings and demosaic"
+                " take both with the same camera settings and demosaic [SR-CAL-008]"
             )
         if not light > 0:
             raise ValueError(f"light: got {light}, expected > 0")

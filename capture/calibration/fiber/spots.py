@@ -170,7 +170,8 @@ def find_fiber_spots(
     if not fits:
         raise FiberSpotError(
             f"fiber spots: found none in the image, expected {count} in a row {pitch:.0f} px "
-            "apart; check that the light was on, the head on the phantom, and the exposures"
+            "apart; check that the light was on, the head on the phantom, and the exposures "
+            "[SR-CAL-015]"
         )
     typical = float(np.median([fit[2] for fit in fits]))
     whole = [fit for fit in fits if 0.5 * typical < fit[2] < 2.5 * typical]

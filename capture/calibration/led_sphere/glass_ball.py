@@ -221,7 +221,7 @@ def locate_ball(
     if len(found) == 0:
         raise BallError(
             "ball: no spot above the dark level; check that the lights were on, that the ball "
-            "is in the middle of the field, and the exposure"
+            "is in the middle of the field, and the exposure [SR-CAL-017]"
         )
     shift, votes = _vote(found, nominal[shows], pixel_mm)
     if votes < MIN_SPOTS:
@@ -286,6 +286,7 @@ def _require_field(
             f"ball: the field of {width:.1f} mm x {height:.1f} mm can show only"
             f" {int(inside.sum())} of {len(nominal)} lights in a ball of radius {radius_mm:g} mm,"
             f" expected {MIN_LIGHT_FRACTION:.0%} or more; photograph it with the whole sensor"
+            " [SR-CAL-018]"
         )
 
 

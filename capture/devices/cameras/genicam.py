@@ -224,10 +224,11 @@ class GenicamCamera:
             f"{incomplete} came with bytes missing: check the cable, or use a packed format"
             if incomplete
             else f"is the controller's trigger line plugged into the camera's {self._readout.line}?"
+            " Check the cable"
             if self._trigger is Trigger.EDGE
-            else "was it fired?"
+            else "was it fired? Fire it before the wait"
         )
-        raise FrameTimeout(f"{self._url}: no frame came in {timeout_s:g} s; {cause}")
+        raise FrameTimeout(f"{self._url}: no frame came in {timeout_s:g} s; {cause} [SR-CAP-026]")
 
     def abort(self) -> None:
         """Cancel what was armed."""

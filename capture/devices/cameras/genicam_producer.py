@@ -56,7 +56,9 @@ class GenicamLibrary:
             kind = type(error).__name__
             text = f"{action}: {' '.join(str(error).split()) or kind}"
             if kind in _BUSY_ERRORS:
-                raise CameraBusy(f"{text}; close the other program that has the camera") from error
+                raise CameraBusy(
+                    f"{text}; close the other program that has the camera [SR-CAP-023]"
+                ) from error
             if kind in _REFUSAL_ERRORS:
                 raise CameraError(text) from error
             raise LinkLost(
@@ -76,7 +78,7 @@ def load_library(url: str) -> GenicamLibrary:
         from harvesters import core
     except ImportError as error:
         raise MissingHarvesters(
-            f"{url}: needs the optional part 'genicam': pip install 'skinrig[genicam]'"
+            f"{url}: needs the optional part 'genicam': pip install 'skinrig[genicam]' [SR-ENV-003]"
         ) from error
     return GenicamLibrary(core, (genapi.GenericException, gentl.GenericException))
 
@@ -113,7 +115,7 @@ def producer_files(url: str, given: str) -> tuple[Path, ...]:
         raise CameraUrlError(
             f"{url}: found no GenTL producer (*.cti) {where}; install the camera maker's software, "
             f"then set {PRODUCER_PATH_VARIABLE} to the folder of its .cti file or add "
-            "?producer=FILE.cti"
+            "?producer=FILE.cti [SR-ENV-004]"
         )
     return tuple(files)
 
@@ -218,10 +220,10 @@ def connect_camera(
                 return Connection(library, acquirer, file, model=model, identifier=identifier)
         finally:
             _close_unused(library, file)
+    more = ", then close the other cameras, since they hide new ones" if _opened_producers else ""
     raise CameraUrlError(
         f"{url}: no such camera; found {', '.join(found) or 'none'} through "
-        f"{', '.join(file.name for file in files)}; plug it in and switch it on"
-        + (", then close the other cameras, since they hide new ones" if _opened_producers else "")
+        f"{', '.join(file.name for file in files)}; plug it in and switch it on{more} [SR-CAP-021]"
     )
 
 

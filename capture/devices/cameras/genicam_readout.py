@@ -289,7 +289,7 @@ def _black(features: Features, address: Address, chosen: PixelFormat, white: int
         raise CameraError(
             f"{address.url}: does not report its black level in DN; put the lens cap on, read "
             f"the median of a {chosen.name} frame in the manufacturer's viewer, and add "
-            "black=DN to the address"
+            "black=DN to the address [SR-CAP-024]"
         )
     if not 0 <= black < white:
         raise CameraError(

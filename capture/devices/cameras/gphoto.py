@@ -42,7 +42,8 @@ def open_camera(serial: str) -> GphotoCamera:
         import gphoto2
     except ImportError as error:
         raise MissingGphoto2(
-            f"gphoto2:{serial}: needs the optional part 'gphoto': pip install 'skinrig[gphoto]'"
+            f"gphoto2:{serial}: needs the optional part 'gphoto': pip install 'skinrig[gphoto]' "
+            "[SR-ENV-002]"
         ) from error
     return GphotoCamera(gphoto2, serial)
 
@@ -94,7 +95,7 @@ class GphotoCamera:
             camera.exit()
         raise CameraUrlError(
             f"gphoto2:{serial}: no such camera; found {', '.join(found) or 'none'}. A desktop's "
-            "file manager may hold it: unmount it there"
+            "file manager may hold it: unmount it there [SR-CAP-022]"
         )
 
     @property
@@ -195,7 +196,7 @@ class GphotoCamera:
                 if left_ms <= 0:
                     raise FrameTimeout(
                         f"gphoto2:{self._serial}: no new file came; is the controller's trigger "
-                        "line plugged into the camera?"
+                        "line plugged into the camera? Check the cable [SR-CAP-025]"
                     )
                 event = self._event(min(left_ms, EVENT_TIMEOUT_MS))
                 if event is not None and event[0] == self._library.GP_EVENT_FILE_ADDED:

@@ -81,7 +81,9 @@ class HotFolder:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         if not path.is_dir():
-            raise CameraUrlError(f"hotfolder:{path}: not a folder; make it, then try again")
+            raise CameraUrlError(
+                f"hotfolder:{path}: not a folder; make it, then try again [SR-CAP-027]"
+            )
         self._path = path
         self._clock = clock
         self._sleep = sleep
@@ -92,7 +94,7 @@ class HotFolder:
         if sample is None:
             raise CameraUrlError(
                 f"hotfolder:{path}: empty; take one test image into it, from which the camera "
-                "is identified"
+                "is identified [SR-CAP-028]"
             )
         frame = raw.read(sample)
         known = serial or frame.camera_serial or frame.camera_model
@@ -155,7 +157,7 @@ class HotFolder:
             if now >= deadline:
                 raise FrameTimeout(
                     f"hotfolder:{self._path}: no new raw file in {timeout_s:g} s; is the "
-                    "tethering program writing there?"
+                    "tethering program writing there? Set it to RAW and to this folder [SR-CAP-029]"
                 )
             self._sleep(FOLDER_POLL_S)
 

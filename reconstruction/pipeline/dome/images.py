@@ -98,8 +98,10 @@ class DomeImages:
             if not without.is_held_out(light, view):
                 self._shots.setdefault((view, light), []).append(record)
         if not self._shots:
-            hint = "give a session that has them"
-            raise InputsError(f"{session.path}: has no frames of kind {kind!r}; {hint}")
+            raise InputsError(
+                f"{session.path}: has no frames of kind {kind!r}; give a session of the dome that "
+                "has them [SR-REC-013]"
+            )
         views = {view for view, _ in self._shots}
         lights = {light for _, light in self._shots}
         self.views = tuple(v.name for v in session.rig.views if v.name in views)

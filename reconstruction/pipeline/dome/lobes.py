@@ -106,8 +106,10 @@ def fit_lobes(
     rank = inputs.rank or BASIS_RANK
     good = np.flatnonzero(point_r_d.valid)
     if len(good) < rank:
-        got = f"got {len(good)} points with an albedo, expected at least {rank}"
-        raise InputsError(f"lobes: {got}; choose a lower rank, or capture more lights")
+        raise InputsError(
+            f"lobes: got {len(good)} points with an albedo, expected at least {rank}; choose a "
+            "lower rank, or capture more lights [SR-REC-012]"
+        )
     drawn = np.sort(np.random.default_rng(0).permutation(good)[:BASIS_POINTS])
     fitted = []
     for part, samples in lumitexels.chunks():

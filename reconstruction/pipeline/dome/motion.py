@@ -117,7 +117,8 @@ def follow_head(
     if not found.usable.any():
         raise InputsError(
             f"{session.path}: the head was found in no tracking frame, expected at least one; "
-            "check that the scan is of this subject and that the cameras are calibrated"
+            "check that the scan is of this subject and that the cameras are calibrated "
+            "[SR-REC-011]"
         )
     # the scan was registered to all images jointly, so it is in the head's mean pose
     turn, shift = found.interpolate(when)

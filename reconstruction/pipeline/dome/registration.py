@@ -64,7 +64,7 @@ def register_mesh(dome: CalibratedDome, mesh: TriangleMesh) -> RigidFit:
         raise InputsError(
             f"surface: the scan was not found in the images: {exc}; {lost:.1f} % of their pixels "
             f"are saturated in every exposure, {seen:.1f} % are brighter than their noise; "
-            "check that the scan is of this subject, or capture again"
+            "check that the scan is of this subject, or capture again [SR-REC-009]"
         ) from exc
 
 

@@ -74,7 +74,8 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     weights = " ".join(weight_names(inputs.rank or BASIS_RANK))
     unscaled = (
         "r_d: the lights are not calibrated and an albedo has no scale without them; run "
-        "`skinrig calibrate lights` on sessions of the mirror spheres and the white target"
+        "`skinrig calibrate lights` on sessions of the mirror spheres and the white target "
+        "[SR-REC-008]"
     )
     refused = "" if dome.absolute else unscaled
     seen, turned = "surface lumitexels texture", "surface lumitexels point_normals texture"
@@ -123,8 +124,10 @@ def _surface(inputs: Inputs, dome: CalibratedDome) -> RefinedScan:
     """Clean and refine the scan, and register it to the dome."""
     session = inputs.session
     if inputs.scan is None and SCAN_FILE not in session.attachments():
-        hint = "add one with `skinrig import mesh FILE`"
-        raise InputsError(f"session {session.id}: holds no scan; {hint}")
+        raise InputsError(
+            f"session {session.id}: got no scan, expected one; add it with "
+            "`skinrig import mesh FILE` [SR-REC-006]"
+        )
     _require(dome)
     footprint = dome.pixel_mm
     points = int(np.clip(FACE_AREA_MM2 / footprint**2, *POINT_LIMITS))

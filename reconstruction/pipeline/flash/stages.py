@@ -160,10 +160,12 @@ def _frames(rig: FlashRig) -> Mapping[str, Any]:
         states = sorted({str(record.index.get("state")) for record in crossed})
         # photographs were imported without a choice of polarizers
         what = "photograph" if rig.imported else "crossed frame"
-        there = "none at all: is it finished?"
+        there = "none at all: finish it first"
         if states:
             there = f"those of {', '.join(states)}: choose one of them (--state {states[0]})"
-        raise InputsError(f"{session.path}: has no {what} of state {state!r}; it has {there}")
+        raise InputsError(
+            f"{session.path}: has no {what} of state {state!r}; it has {there} [SR-REC-001]"
+        )
     return images
 
 

@@ -111,14 +111,16 @@ class GradientImages:
             key = str(index["pattern"]), str(index["polarizer"])
             self._records.setdefault(name, {}).setdefault(key, []).append(record)
         if not found:
-            hint = "give a session of the gradient sphere"
-            raise InputsError(f"{session.path}: has no frames of kind 'gradient'; {hint}")
+            raise InputsError(
+                f"{session.path}: has no frames of kind 'gradient'; give a session of the gradient "
+                "sphere [SR-REC-014]"
+            )
         states = list(found.values())
         first = next((state for state in states if state.step == 0), None)
         if first is None:
             raise InputsError(
                 f"{session.path}: has no neutral state, caliper step 0, as the reference; "
-                "capture it"
+                "capture it [SR-REC-015]"
             )
         self.states = (first, *(state for state in states if state is not first))
         self._dark: Float32Array | None = None

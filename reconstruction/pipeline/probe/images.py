@@ -77,8 +77,10 @@ class ProbeImages:
             if placement is not None:
                 self._records.setdefault(placement, []).append(record)
         if not self._records:
-            hint = "give a session of the fiber probe"
-            raise InputsError(f"{session.path}: has no frames of kind {kind!r}; {hint}")
+            raise InputsError(
+                f"{session.path}: has no frames of kind {kind!r}; give a session of the fiber "
+                "probe [SR-REC-017]"
+            )
 
         def measured(placement: HeadPlacement, records: list[FrameRecord]) -> Measurement:
             means = _mean(records, "suction_mbar"), _mean(records, "camera_c")
@@ -99,8 +101,10 @@ class ProbeImages:
         if self._darks is None:
             records = self._session.frames("dark")
             if not records:
-                hint = "the camera's dark current is not known: capture with darks"
-                raise InputsError(f"{self._session.path}: has no frames of kind 'dark'; {hint}")
+                raise InputsError(
+                    f"{self._session.path}: has no frames of kind 'dark', so that the camera's "
+                    "dark current is not known; capture with darks [SR-REC-018]"
+                )
             temperature = _mean(records, "camera_c")
             self._darks = measure_darks(
                 [self._session.read(record).cfa for record in records],

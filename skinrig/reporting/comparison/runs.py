@@ -112,7 +112,9 @@ def split_sides(
         return None
     missing = [path for path in paths if not path.exists()]
     if missing:
-        raise ReportError(f"{missing[0]}: does not exist; give a folder that skinrig wrote")
+        raise ReportError(
+            f"{missing[0]}: does not exist; give a folder that skinrig wrote [SR-CLI-007]"
+        )
     kinds = {path: detect_kind(path) for path in paths}
     truths = [path for path in paths if kinds[path] == "truth"]
     runs = [path for path in paths if kinds[path] != "truth"]

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -134,6 +135,14 @@ def test_file_that_is_not_rig_gives_single_error(tmp_path, content, reason):
     file.write_bytes(content)
     with pytest.raises(RigError, match=reason):
         load_rig(file)
+
+
+def test_error_code_ends_message_and_survives_pickle(tmp_path):
+    with pytest.raises(RigError) as caught:
+        load_rig(tmp_path / "none.toml")
+    assert str(caught.value).endswith("[SR-CLI-012]")
+    copy = pickle.loads(pickle.dumps(caught.value))
+    assert (copy.code, str(copy)) == ("SR-CLI-012", str(caught.value))
 
 
 def test_unknown_name_errors_list_valid_names(flash):

@@ -53,11 +53,27 @@ def test_system_refusal_is_reported_with_file_and_remedy(error, words):
 def test_non_text_file_is_reported_without_codec_terms():
     with pytest.raises(UnicodeDecodeError) as caught:
         b"ok\xff".decode()
-    assert errors.format_error(caught.value) == (
-        "text file: got byte 0xff at 2, expected UTF-8; check that it is the right file"
+    assert errors.sentence(caught.value) == (
+        "text file: got byte 0xff at 2, expected UTF-8; check that it is the right file "
+        "[SR-CLI-009]"
     )
 
 
 def test_full_disk_without_file_is_reported_without_errno():
     text = errors.format_error(OSError(28, "No space left on device"))
     assert text.startswith("No space left on device; free space")
+
+
+def test_wrapped_error_has_one_code_at_end():
+    inner = ValueError("left: no file; name another [SR-IMP-000]")
+    assert errors.sentence(ValueError(f"views: {inner}; repair it")) == (
+        "views: left: no file; name another; repair it [SR-IMP-000]"
+    )
+    both = errors.sentence(ValueError(f"views: {inner}; repair it [SR-REC-000]"))
+    assert both == "views: left: no file; name another; repair it [SR-REC-000]"
+    assert errors.message_code(both) == "SR-REC-000"
+
+
+def test_message_code_is_none_without_code_at_end():
+    assert errors.message_code("left: no file; name another") is None
+    assert errors.message_code("[SR-IMP-000] left: no file") is None
