@@ -22,7 +22,6 @@ from capture.documents import (
     read_toml,
     suggest_key,
 )
-from capture.former_names import translate_names
 from capture.rig_parts import (
     AXIS_RULE,
     ID_RULE,

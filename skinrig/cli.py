@@ -159,7 +159,7 @@ def _report_failure(
     if print_message:
         print(f"skinrig: {message}", file=sys.stderr)
     # still one document only: a command prints its own last, after all that can fail
-    Console("--json" in arguments).document(
+    Console("--json" in arguments).print_document(
         "skinrig.error/1",
         {"error": message, "code": errors.message_code(message), "exit_code": code},
     )

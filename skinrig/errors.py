@@ -187,7 +187,7 @@ def format_interruption(given: Sequence[str]) -> str:
     return "interrupted; run the same command again"
 
 
-def sentence(error: BaseException) -> str:
+def format_error(error: BaseException) -> str:
     """Return the message of an exception, without a traceback and with its code at the end."""
     return move_code_to_end(_describe(error))
 

@@ -18,7 +18,6 @@ from capture.documents import (
     short_repr,
     suggest_key,
 )
-from capture.former_names import translate_names
 from capture.plan.suction import suction_overhead_s
 from capture.rig import ID_RULE, Rig, is_id
 

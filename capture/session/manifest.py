@@ -20,7 +20,6 @@ from capture.documents import (
     read_json,
     to_json_table,
 )
-from capture.former_names import translate_names
 from capture.plan import Plan
 from capture.rig import ID_RULE, Rig, is_id
 from capture.session.errors import SessionDamage, SessionError

@@ -167,7 +167,7 @@ def plot_compared_fronts(
         SVG with an alternative text. Thin lines join settings that both benchmarks measured.
     """
     figure, axes = figures.create_canvas(5.2, 3.4)
-    places: list[dict[str, tuple[float, float]]] = []
+    positions: list[dict[str, tuple[float, float]]] = []
     summaries = []
     for number, (label, document) in enumerate((a, b)):
         points = [p for p in document["points"] if p["error"] > 0.0]

@@ -15,7 +15,7 @@ from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.results import StageBenchmark
 from skinrig.benchmarks.stage import BenchmarkStage, read_descriptions
 from skinrig.console import Console, to_json_value
-from skinrig.errors import EXTRA_MISSING, exit_code, one_of, sentence
+from skinrig.errors import EXIT_EXTRA_MISSING, exit_code, format_error, require_choice
 
 STAGES: dict[str, str] = {name: entry["run"] for name, entry in read_descriptions().items()}
 """Module and function by stage. A module is imported, and its kernels are compiled, when the stage
@@ -72,7 +72,7 @@ def run_stages(
     """
     chosen = list(dict.fromkeys(names)) if names else bench_plan.order_small_stages(STAGES)
     for name in chosen:
-        one_of("stage", name, STAGES, BenchError)
+        require_choice("stage", name, STAGES, BenchError)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)  # folder errors are raised before any stage runs
     run = _Run(console, time.perf_counter() + budget_s, requested=bool(names), toy=toy, out=out)
@@ -135,9 +135,9 @@ class _Run:
                     self._take(name, made, size)
                     self.save()
         except ImportError as error:
-            if self.asked or exit_code(error) != EXIT_EXTRA_MISSING:
+            if self.requested or exit_code(error) != EXIT_EXTRA_MISSING:
                 raise
-            self.left_out.append((name, format_error(error)))
+            self.omitted.append((name, format_error(error)))
             return
         self._take(name, made, size)
 

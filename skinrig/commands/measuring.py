@@ -88,7 +88,7 @@ def bench(
 
         document = run_stages(stages, budget_s=budget, toy=smoke, out=out, console=console)
         if out is not None:
-            bench_table.write(document, out)
+            bench_table.write_tables(document, out)
     console.print_document(document.pop("schema"), document)
     if not document["passed"]:
         raise typer.Exit(errors.EXIT_LIMIT_MISSED)

@@ -38,7 +38,7 @@ def calibrate(
     sphere_mm
         Radius of the mirror sphere, mm (dome: lights).
     phantom
-        Certificate of the phantom, JSON (probe: fibre).
+        Certificate of the phantom, JSON (probe: fiber).
     kind
         Calibration: sensor, color, polarization or white (flash); geometry or lights (dome);
         sensor, lights or polarization (gradient); fiber (probe).

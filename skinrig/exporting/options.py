@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from skinrig.errors import UsageError, one_of
+from skinrig.errors import UsageError, require_choice
 
 METERS_PER_UNIT: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of a scene unit, m."""
@@ -123,7 +123,7 @@ class ExportSettings:
             ("--udim", self.udim, TILE_SEPARATORS),
         ):
             if value is not None:
-                one_of(option, value, known)
+                require_choice(option, value, known)
         for name in self.only:
             if not _NAME_PATTERN.fullmatch(name):
                 raise UsageError(f"--only: got {name!r}, expected names separated by commas")

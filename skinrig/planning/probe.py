@@ -103,7 +103,7 @@ def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
 
 def describe_rehearsal(_: PlanChoice) -> plans.Rehearsal:
     """Return the probe's phantom and its calibration."""
-    return plans.Rehearsal({"phantom": {}}, (("fibre", ("phantom",)),), ("subsurface",))
+    return plans.Rehearsal({"phantom": {}}, (("fiber", ("phantom",)),), ("subsurface",))
 
 
 def measure_errors(

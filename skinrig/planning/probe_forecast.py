@@ -195,7 +195,7 @@ def _fit_noisy_profiles(
     noise: bool,
 ) -> Sequence[Any]:
     """Fit profiles whose readings have the given variances."""
-    names = tuple(fibre.name for fibre in observation.probe.fibres)
+    names = tuple(fiber.name for fiber in observation.probe.fibers)
     radius = np.array(observation.probe.radius_mm)
     # gains come from a full exposure series on the phantom, up to the error of its reflectance
     gain = (

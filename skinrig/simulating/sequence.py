@@ -18,7 +18,7 @@ from rigsim.subject.perfusion import STATE_NAMES
 from rigsim.subject.perfusion_course import EventCourse, PromptedCourse
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.capturing.sequences import SequenceOrder, sequence_lines, sequence_plan
-from skinrig.errors import one_of
+from skinrig.errors import require_choice
 from skinrig.simulating import subject_records
 from skinrig.simulating.driving import build_result, drive_plan, open_session
 from skinrig.simulating.exposure_log import ExposureLog
@@ -56,7 +56,7 @@ INTERRUPTION_S = 10.0
 def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationResult:
     """Simulate a sequence with the flash rig; see `simulation.simulate`."""
     prompted = [state for state in STATE_NAMES if state != "neutral"]
-    one_of("sequence", sequence.state, prompted, SimulationError)
+    require_choice("sequence", sequence.state, prompted, SimulationError)
     width, seed = order.width_px or WIDTHS_PX[order.size], order.seed
     rig = load_rig("flash").resized(width)
     constant_s = order.relaxation_s

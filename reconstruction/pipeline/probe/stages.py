@@ -81,7 +81,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
         noise = CameraNoise.from_sensor(SensorCalibration.from_calibration(sensor, view.serial))
     uncalibrated = (
         "the fibers are not calibrated: capture a phantom of known optics (`--target phantom`), "
-        "and give the folder that `skinrig calibrate fibre` makes of it as --calibration "
+        "and give the folder that `skinrig calibrate fiber` makes of it as --calibration "
         "[SR-REC-019]"
     )
     profiles = partial(_profiles, inputs, fibers, noise)

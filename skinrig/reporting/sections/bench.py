@@ -45,7 +45,7 @@ def section(document: Mapping[str, Any], checks: list[page.Check]) -> Iterator[p
     ]
     yield page.Plots(plots)
     yield page.build_view("benchmark", stages=document["stages"])
-    bands = bench_table.bands(document)
+    bands = bench_table.list_band_rows(document)
     if bands:
         yield page.build_table(
             bench_table.BAND_COLUMNS, bands, caption="Error at the default setting by melanin band"
