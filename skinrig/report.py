@@ -200,7 +200,7 @@ def _appearance_section(subject: page.ReportedAppearance) -> Iterator[page.Block
     yield page.Heading(f"Maps: {subject.name}", level=2)
     images = [
         map_images.draw_color_image(f"{map_title(key)}, linear RGB", appearance.maps[key].values)
-        for key in ("picture", "specular_picture")
+        for key in ("image", "specular_image")
         if key in appearance.maps
     ]
     if images:

@@ -48,7 +48,7 @@ def scalar(
 
 def color(shown: SkinMap, white: float, part: Any = np.s_[:]) -> NDArray[np.uint8]:
     """Draw a linear RGB map with a white level."""
-    return masked(png.srgb8(shown.values[part] / white), shown.mask[part])
+    return masked(png.encode_srgb8(shown.values[part] / white), shown.mask[part])
 
 
 def normals(shown: SkinMap, part: Any = np.s_[:]) -> NDArray[np.uint8]:
@@ -95,7 +95,7 @@ def chromophores(demo: Path) -> None:
     found = store.read(demo / "appearance-flash-IV").maps
     truth = store.read(demo / "truth-flash-IV").maps
     part = face(found["melanin"])
-    images = [color(found["picture"], 0.5, part), color(found["specular_picture"], 0.1, part)]
+    images = [color(found["image"], 0.5, part), color(found["specular_image"], 0.1, part)]
     write_row("gallery-polarization.png", images)
     for name, high in (("melanin", 0.12), ("hemoglobin", 0.1)):
         estimate = found[name]
@@ -158,7 +158,7 @@ def screenshots(demo: Path) -> None:
         return
     with tempfile.TemporaryDirectory() as name, sync_playwright() as driver:
         live = Path(name) / "face.html"
-        live.write_text(page.build(faces.scene()), encoding="utf-8")
+        live.write_text(page.build(faces.build_scene()), encoding="utf-8")
         browser = driver.chromium.launch(executable_path=chromium, args=BROWSER)
         tab = browser.new_page(viewport={"width": 1200, "height": 780})
         tab.goto(live.as_uri() + VIEW)

@@ -36,7 +36,7 @@ def main() -> None:
         maps = store.read(folder / "maps").maps
     for text in dict.fromkeys((*done.assumed, *outcome.assumed)):
         print(f"assumed: {text}", file=sys.stderr)
-    picture = maps["picture"].values[FACE]
+    picture = maps["image"].values[FACE]
     panels = [png.encode_srgb8(picture / np.percentile(picture, 99))]
     for name, high in SCALES.items():
         part = maps[name]

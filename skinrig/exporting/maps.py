@@ -27,7 +27,7 @@ DOCUMENT_FILE: Final = "maps.json"
 SCHEMA: Final = "skinrig.export.maps/1"
 CHROMOPHORE_PACK: Final = "chromophores"
 """Name of the packed map: melanin in R, hemoglobin in G, as in texture libraries."""
-SRGB_MAPS: Final = ("picture", "specular_picture", "color")
+SRGB_MAPS: Final = ("image", "specular_image", "color")
 CAMERA_RGB_MAPS: Final = ("diffuse", "specular", "r_d", "reflectance", "albedo", "crossed")
 
 

@@ -23,7 +23,7 @@ MARGIN_PX: Final = 3
 """Around the valid pixels of a map, to which its image is cropped."""
 CAPTURED_IMAGE: Final = "captured image"
 KEYS_BY_QUANTITY: Final = {
-    CAPTURED_IMAGE: r"picture|crossed_a\d+_n0",
+    CAPTURED_IMAGE: r"image|crossed_a\d+_n0",
     "melanosome volume fraction": "melanin",
     "blood volume fraction": "hemoglobin",
     "surface normals": r"normals_refined|normals|normals_a\d+_n0",

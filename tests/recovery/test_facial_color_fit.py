@@ -129,7 +129,7 @@ def test_skin_without_blood_color_is_refused_with_alternatives(folder, tmp_path)
         )
     assert not (tmp_path / "moving").exists()
     (tmp_path / "calibration").symlink_to(folder / "calibration")
-    trials = interval_trials_flash._of_rig(done, tmp_path, "smile", TrialSubject("a", "b"))
+    trials = interval_trials_flash._rig_trials(done, tmp_path, "smile", TrialSubject("a", "b"))
     assert not list(trials)
 
 

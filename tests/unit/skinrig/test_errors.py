@@ -53,7 +53,7 @@ def test_system_refusal_is_reported_with_file_and_remedy(error, words):
 def test_non_text_file_is_reported_without_codec_terms():
     with pytest.raises(UnicodeDecodeError) as caught:
         b"ok\xff".decode()
-    assert errors.sentence(caught.value) == (
+    assert errors.format_error(caught.value) == (
         "text file: got byte 0xff at 2, expected UTF-8; check that it is the right file "
         "[SR-CLI-009]"
     )
@@ -66,10 +66,10 @@ def test_full_disk_without_file_is_reported_without_errno():
 
 def test_wrapped_error_has_one_code_at_end():
     inner = ValueError("left: no file; name another [SR-IMP-000]")
-    assert errors.sentence(ValueError(f"views: {inner}; repair it")) == (
+    assert errors.format_error(ValueError(f"views: {inner}; repair it")) == (
         "views: left: no file; name another; repair it [SR-IMP-000]"
     )
-    both = errors.sentence(ValueError(f"views: {inner}; repair it [SR-REC-000]"))
+    both = errors.format_error(ValueError(f"views: {inner}; repair it [SR-REC-000]"))
     assert both == "views: left: no file; name another; repair it [SR-REC-000]"
     assert errors.message_code(both) == "SR-REC-000"
 

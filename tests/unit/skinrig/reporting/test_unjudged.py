@@ -43,6 +43,6 @@ def test_pixels_without_a_value_are_counted():
 def test_maps_without_errors_report_no_numbers():
     picture = SkinMap(np.ones((4, 4, 3)), "1")
     body = page.render_fragment(
-        verdict.build_uncertainty_blocks(SkinAppearance({"picture": picture}, "measured"))
+        verdict.build_uncertainty_blocks(SkinAppearance({"image": picture}, "measured"))
     )
     assert "<table" not in body
