@@ -22,6 +22,7 @@ from capture.documents import (
     read_toml,
     suggest_key,
 )
+from capture.former_names import translate_names
 from capture.rig_parts import (
     AXIS_RULE,
     ID_RULE,
@@ -347,6 +348,7 @@ def rig_from_json(data: Mapping[str, Any], *, where: str = "rig") -> Rig:
     """
     advice = "Correct these entries of the rig file."
     code = "SR-PLN-005"
+    data = translate_names(data)
     return parse_document(Rig, data, where=where, error=RigError, advice=advice, code=code)
 
 

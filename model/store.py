@@ -213,6 +213,9 @@ def read_document(folder: Path) -> _Document:
         raise StoreError(f"{path}: {where}: {first['msg']}") from error
     if _seal({k: v for k, v in loaded.items() if k != "seal"}) != document.seal:
         raise _changed_error(path, "seal")
+    if version != SCHEMA:
+        maps = {FORMER_MAP_NAMES.get(name, name): entry for name, entry in document.maps.items()}
+        document = document.model_copy(update={"maps": maps})
     return document
 
 

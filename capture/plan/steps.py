@@ -18,6 +18,7 @@ from capture.documents import (
     short_repr,
     suggest_key,
 )
+from capture.former_names import translate_names
 from capture.plan.suction import suction_overhead_s
 from capture.rig import ID_RULE, Rig, is_id
 
@@ -251,6 +252,7 @@ class Plan(Document):
             data = read_json(data, where=where, error=PlanError)
         advice = "Correct these entries of the plan."
         code = "SR-PLN-004"
+        data = translate_names(data)
         return parse_document(Plan, data, where=where, error=PlanError, advice=advice, code=code)
 
 

@@ -20,6 +20,7 @@ from capture.documents import (
     read_json,
     to_json_table,
 )
+from capture.former_names import translate_names
 from capture.plan import Plan
 from capture.rig import ID_RULE, Rig, is_id
 from capture.session.errors import SessionDamage, SessionError
@@ -155,7 +156,7 @@ def decode(data: bytes, *, where: str) -> tuple[Manifest, str]:
     schema = content.pop("schema", None)
     if schema not in READABLE_SCHEMAS:
         advice = "Read it with the version of skinrig that wrote it, or check the file."
-        faults = [Fault("schema", repr(schema), SCHEMA)]
+        faults = [Fault("schema", repr(schema), " or ".join(READABLE_SCHEMAS))]
         raise SessionError(
             "has an unknown schema", where=where, faults=faults, advice=advice, code="SR-SES-007"
         )
@@ -168,6 +169,8 @@ def decode(data: bytes, *, where: str) -> tuple[Manifest, str]:
         faults = [Fault(_SEAL_KEY, got, expected)]
         code = "SR-SES-005"
         raise SessionDamage("is damaged", where=where, faults=faults, advice=advice, code=code)
+    for part in {"plan", "rig", "calibrations"} & content.keys():
+        content[part] = translate_names(content[part])
     return parse_document(Manifest, content, where=where, error=SessionDamage), expected
 
 
