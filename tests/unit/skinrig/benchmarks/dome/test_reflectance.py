@@ -1,4 +1,4 @@
-"""The points that the reflectance benchmark judges lobes by."""
+"""Points on which the reflectance benchmark evaluates lobes."""
 
 import numpy as np
 import pytest

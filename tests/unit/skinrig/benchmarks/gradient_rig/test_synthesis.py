@@ -1,4 +1,4 @@
-"""References of the benchmark of grown maps: blended tiles, and its measures of structure."""
+"""Peer and measures of the benchmark of grown maps: blended tiles, statistics of structure."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def patches(rng):
 
 
 def test_blended_tiles_keep_the_histogram_of_heights(patches, rng):
-    """The peer does what its method promises: quantiles within a twentieth of the range."""
+    """Tolerance of the peer's quantiles: a twentieth of the range."""
     found = synthesis.blend_hexagonal_tiles(patches, 400, edge_px=40, rng=rng)
     shares = np.linspace(0.05, 0.95, 19)
     ought = np.quantile(patches, shares)

@@ -14,7 +14,7 @@ from skinrig.evaluating.surface import RAYLEIGH_68
 
 
 def trials_of(rng, *, shared, scale=1.0, subjects=12, band="any"):
-    """Gaussian errors, part of whose variance all pixels of a subject share."""
+    """Draw Gaussian errors with a variance fraction `shared` common to a subject's pixels."""
     made = []
     for k in range(subjects):
         error = np.sqrt(shared) * rng.standard_normal()
@@ -40,13 +40,13 @@ def test_intervals_half_as_wide_as_errors_miss_coverage(rng):
 
 
 def test_correlated_pixel_errors_widen_coverage_like_subjects(rng):
-    """In 300 runs 95 % intervals of the coverage hold the true one in 90 to 99 %: 3.5 sigma."""
-    held = 0
+    """In 300 runs, 90 to 99.5 % of 95 % intervals contain the true coverage: 3.5 sigma."""
+    covered = 0
     for _ in range(300):
         low, high = pool_trials(trials_of(rng, shared=0.5), level=68).interval
-        held += low <= 0.6827 <= high
-    assert 0.90 < held / 300 < 0.995
-    # by pixels alone it would be a thousandth wide
+        covered += low <= 0.6827 <= high
+    assert 0.90 < covered / 300 < 0.995
+    # with independent pixels the width would be a thousandth
     assert high - low > 0.05
 
 

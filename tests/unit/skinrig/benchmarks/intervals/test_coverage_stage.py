@@ -44,7 +44,7 @@ def test_media_distinguish_axis_mirrored_or_across():
 
 @pytest.mark.parametrize("medium", intervals.ANISOTROPIC_MEDIA)
 def test_estimator_finds_axis_that_evaluates_media(medium):
-    """Exact decays: least along the direction in which light goes farthest."""
+    """Exact decays are smallest in the direction in which light propagates farthest."""
     true_deg = interval_trials_probe._farthest_deg(medium)
     angle = np.radians(np.arange(8) * 22.5)
     along = np.cos(2.0 * (angle - np.radians(true_deg)))

@@ -11,7 +11,7 @@ CONSTANT_S = 20.0
 
 
 def fit_of(rng, *, noise, too_sure=1.0):
-    """Return the document of a course in noise; `too_sure` halves its interval when 2."""
+    """Return the document of a fit to a noisy course; `too_sure` divides its intervals."""
     time_s = 5.5 * np.arange(30)
     fit = fit_course(
         time_s, 0.03 - 0.01 * np.exp(-time_s / CONSTANT_S) + noise * rng.standard_normal(30)

@@ -1,4 +1,4 @@
-"""Trials of intervals from documents written out here: honest are kept, halved ones are not."""
+"""Trials of intervals from synthetic documents: correct ones are kept, halved ones are missed."""
 
 import json
 
@@ -124,7 +124,7 @@ def test_ellipse_parameters_are_evaluated_at_any_axis_direction(axis_deg):
 
 
 def test_change_widths_are_reported_over_changing_pixels(rng):
-    """Rationale: over a change of nothing any width is infinite."""
+    """Widths relative to a change of zero are infinite."""
     rest = np.full((20, 20), 0.04)
     change = np.where(np.arange(20) < 12, 0.0, 0.01) * np.ones((20, 1))
     found = SkinMap(
