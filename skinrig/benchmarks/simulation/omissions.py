@@ -45,7 +45,7 @@ def measure_omissions(stage: BenchmarkStage) -> None:
         knobs |= {"effect": one.effect, "verdict": one.verdict}
         also: Knobs = {"seconds saved": one.with_s - one.without_s}
         if one.predicted_change is not None:
-            also["told by the rule"] = one.predicted_change
+            also["predicted by the rule"] = one.predicted_change
         stage.add(knobs, timing, ErrorEstimate.nonnegative(one.found, one.change_stderr), also)
         if one.verdict == "negligible":
             stage.limits["change", one.rig, one.subject, one.effect] = one.max_change
