@@ -19,8 +19,8 @@ class InstallationCheck:
     """Command or action that removes the fault; empty if none is needed."""
 
 
-FIX_KEY = "mend"
-"""Key of `InstallationCheck.fix` in the document skinrig.doctor/1."""
+FIX_KEY = "remedy"
+"""Key of `InstallationCheck.fix` in the document skinrig.doctor/2."""
 _OTHER_NAMES = {
     "serial": "pyserial",
     "cv2": "opencv-contrib-python-headless",

@@ -19,8 +19,8 @@ MAX_COLOR_DIFFERENCE: Final = 0.1
 """Maximum relative difference of red or blue over green from its median over the image. A white
 reference has one color under one illuminant; color shading of a lens adds a few percent."""
 MIN_EVEN_FRACTION: Final = 0.8
-"""Minimum fraction of the image that must be even: the rest may be margin or holder. A face
-that fills a sixth of the image before an even wall, or an eighth in the dark, leaves less."""
+"""Minimum fraction of the image that must be even; a margin or a holder may fill the rest. One
+face that fills a sixth of the image before an even wall, or an eighth in the dark, leaves less."""
 MIN_FILLED_FRACTION: Final = 0.95
 """Fraction of the image below which a warning reports a partly filled image: a speck of dust, with
 the blocks next to it, takes a hundredth."""

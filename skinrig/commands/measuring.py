@@ -106,6 +106,6 @@ def doctor(json: Json = False) -> None:
         [("ok" if f.fine else "!!", f.what, f.state, f.fix) for f in findings],
     )
     rows = [{**select_attributes(f, "what", "state", "fine"), FIX_KEY: f.fix} for f in findings]
-    console.print_document("skinrig.doctor/1", {"findings": rows})
+    console.print_document("skinrig.doctor/2", {"findings": rows})
     if not all(f.fine for f in findings):
         raise typer.Exit(errors.EXIT_EXTRA_MISSING)
