@@ -140,7 +140,7 @@ def test_rig_drawings_match_their_rig_files(tmp_path, monkeypatch):
         assert path.read_text("utf-8") == (DOCS / "images" / path.name).read_text("utf-8")
 
 
-def test_gallery_images_are_small_and_made_by_its_script():
+def test_gallery_images_are_small_and_scripted():
     page = (DOCS / "gallery/index.md").read_text("utf-8")
     shown = set(re.findall(r"\.\./images/([\w.-]+)\)", page))
     tools = [path.read_text("utf-8") for path in sorted((ROOT / "tools").glob("make_*.py"))]
