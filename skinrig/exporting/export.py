@@ -113,8 +113,8 @@ def export(
                 f"--to: got {to!r}, which requires a dome's maps (position, normals, r_d, basis "
                 f"BRDFs), but {source} has {', '.join(held.maps) or 'none'}; choose {others}"
             )
-        if order.onto is not None:
-            _appearance(order.onto, use, today)  # its maps are exported, too
+        if order.target_face is not None:
+            _appearance(order.target_face, use, today)  # its maps are exported, too
     write = load_writer(to)
     return export_sealed(Path(out), lambda part: write(held, part, order), now)
 
