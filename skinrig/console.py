@@ -1,4 +1,4 @@
-"""Output of commands: results on stdout, progress on stderr, one document with --json."""
+"""Print results of commands on stdout, progress on stderr, and one document with --json."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Demo: simulate, capture, calibrate, reconstruct, measure and report in one run."""
+"""Run the demo: simulate, capture, calibrate, reconstruct, measure and report."""
 
 import json
 import multiprocessing

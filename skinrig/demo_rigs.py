@@ -84,7 +84,7 @@ class DemoResults:
         self.add_table(title, ["quantity", "value"], light_rows(capture.light))
 
     def add_omissions(self, rig: str, capture: SimulationResult) -> None:
-        """Add a table of what a capture's simulator did not build."""
+        """Add a table of effects that a capture's simulator omitted."""
         title = f"Effects omitted by the simulator of the {rig}"
         self.add_table(title, ["effect", "reason"], capture.left_out)
 

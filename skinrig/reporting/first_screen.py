@@ -1,4 +1,4 @@
-"""First screen of a report: images of each quantity with its ground truth, to one color scale."""
+"""Draw the first screen of a report: each quantity and its ground truth on one color scale."""
 
 from __future__ import annotations
 

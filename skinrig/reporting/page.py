@@ -1,4 +1,4 @@
-"""Parts of the report page: checks, blocks drawn by templates, and the page itself."""
+"""Build the report page from checks and blocks drawn by templates."""
 
 from __future__ import annotations
 

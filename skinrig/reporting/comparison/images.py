@@ -112,7 +112,7 @@ def _difference(name: str, a: Path, b: Path) -> ImageDifference:
 
 
 def summarize_images(a: ComparedRun, b: ComparedRun) -> str:
-    """Return how many images differ, in a sentence; empty without common images."""
+    """Return the number of differing images in a sentence; empty without common images."""
     both = [
         one
         for _, path_a, path_b in pair_by_name(a.pictures, b.pictures)

@@ -1,4 +1,4 @@
-"""Difference of two estimates of one map, in its unit and in standard uncertainties."""
+"""Compare two estimates of one map, in its unit and in standard uncertainties."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ MAX_SIGMAS = 35.0
 
 @dataclass(frozen=True, slots=True)
 class MapDifference:
-    """How two estimates of a map differ, B less A.
+    """Difference of two estimates of a map, B minus A.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class MapDifference:
 
     @property
     def disagree(self) -> bool:
-        """Whether more pixels lie beyond three combined standard errors than chance leaves."""
+        """Whether more pixels than by chance exceed three combined standard uncertainties."""
         return bool(self.beyond) and self.beyond[-1] > MAX_FRACTION_BEYOND
 
 
@@ -215,7 +215,7 @@ class QuantityAccuracy:
 
 
 def list_truth_errors(appearance: SkinAppearance, truth: SkinAppearance) -> list[QuantityAccuracy]:
-    """Return the errors of an appearance by quantity and skin.
+    """List the errors of an appearance by quantity and skin.
 
     Parameters
     ----------

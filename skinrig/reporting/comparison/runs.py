@@ -1,4 +1,4 @@
-"""Two runs of a comparison: pairs of results and their settings."""
+"""Pair the results of two runs and compare their settings."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def _labels(a: Path, b: Path) -> tuple[str, str]:
 
 
 def pair_by_name(one: Mapping[str, T], other: Mapping[str, T]) -> list[tuple[str, T, T]]:
-    """Return what belongs together of two runs: by name of its folder, or the only ones."""
+    """Pair the folders of two runs by name; single folders are paired regardless of names."""
     if len(one) == len(other) == 1:
         (name_a, a), (name_b, b) = *one.items(), *other.items()
         return [(name_a if name_a == name_b else f"{name_a} and {name_b}", a, b)]
@@ -165,7 +165,7 @@ def list_unpaired(a: ComparedRun, b: ComparedRun) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True, slots=True)
 class MapsPair:
-    """Maps of two runs that belong together, and how they differ."""
+    """Corresponding maps of two runs with their differences."""
 
     name: str
     a: SkinAppearance
