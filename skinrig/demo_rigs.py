@@ -1,6 +1,6 @@
-"""Demo of each rig: simulate, capture, calibrate, reconstruct and measure.
+"""Run the demo of each rig: simulate, capture, calibrate, reconstruct and measure.
 
-Each rig runs in a process of its own, which compiles the kernels it imports. Modules that only one
+Each rig runs in its own process, which compiles the kernels it imports. Modules that only one
 rig needs are therefore imported in its function.
 """
 

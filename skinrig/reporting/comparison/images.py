@@ -1,4 +1,4 @@
-"""Comparison of image folders of two runs: renderings and analyses.
+"""Compare the image folders of two runs: renderings and analyses.
 
 Images are compared by their OpenEXR files where both have one, since those are linear; otherwise by
 the codes of their PNG files, whose exposure may differ between runs.
