@@ -25,5 +25,5 @@ def test_results_on_stdout_are_readable_without_json(capsys):
 
 
 def test_table_has_dash_for_missing_number(capsys):
-    Console().rows(("what", "share, %"), [("known", 71.239), ("unknown", float("nan"))])
+    Console().print_table(("what", "share, %"), [("known", 71.239), ("unknown", float("nan"))])
     assert capsys.readouterr().out.splitlines()[1:] == ["known    71.24", "unknown  –"]
