@@ -1,1 +1,1 @@
-"""The application: command line, demo, report and benchmark."""
+"""Run the application: command line, demo, report and benchmark."""

@@ -1,4 +1,4 @@
-"""Array types of this package, by element type."""
+"""Define the array types of this package by element type."""
 
 from typing import Any
 

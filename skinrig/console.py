@@ -1,4 +1,4 @@
-"""Output of commands: results on stdout, progress on stderr, one document with --json."""
+"""Print results of commands on stdout, progress on stderr, and one document with --json."""
 
 import json
 import math
@@ -101,7 +101,7 @@ class Console:
             self.print_table(("part", "figure", "value"), rows)
 
     def print_each(self, label: str, texts: Iterable[object]) -> None:
-        """Print each text on a line of its own, after a label."""
+        """Print each text on its own line, after a label."""
         for text in texts:
             self.print_line(f"{label}: {text}")
 

@@ -1,4 +1,4 @@
-"""Demo: simulate, capture, calibrate, reconstruct, measure and report in one run."""
+"""Run the demo: simulate, capture, calibrate, reconstruct, measure and report."""
 
 import json
 import multiprocessing
@@ -140,7 +140,7 @@ _Parts = dict[str, tuple[DemoResults, SecondsByStep]]
 
 
 def _run_in_processes(rigs: Sequence[str], order: _Order, at_once: int) -> _Parts:
-    """Run each rig in a process of its own; an error in one stops all."""
+    """Run each rig in its own process; an error in one stops all."""
     pool = ProcessPoolExecutor(
         at_once, mp_context=multiprocessing.get_context("spawn"), initializer=_die_when_interrupted
     )

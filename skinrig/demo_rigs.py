@@ -1,6 +1,6 @@
-"""Demo of each rig: simulate, capture, calibrate, reconstruct and measure.
+"""Run the demo of each rig: simulate, capture, calibrate, reconstruct and measure.
 
-Each rig runs in a process of its own, which compiles the kernels it imports. Modules that only one
+Each rig runs in its own process, which compiles the kernels it imports. Modules that only one
 rig needs are therefore imported in its function.
 """
 
@@ -84,7 +84,7 @@ class DemoResults:
         self.add_table(title, ["quantity", "value"], light_rows(capture.light))
 
     def add_omissions(self, rig: str, capture: SimulationResult) -> None:
-        """Add a table of what a capture's simulator did not build."""
+        """Add a table of effects that a capture's simulator omitted."""
         title = f"Effects omitted by the simulator of the {rig}"
         self.add_table(title, ["effect", "reason"], capture.left_out)
 

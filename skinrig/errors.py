@@ -1,4 +1,4 @@
-"""Errors of commands: one sentence and an exit code per exception.
+"""Map exceptions of commands to one sentence and an exit code.
 
 Exit codes:
 

@@ -1,4 +1,4 @@
-"""Environment of numerical libraries: cache of compiled kernels, and waiting of threads."""
+"""Configure numerical libraries: cache of compiled kernels, and waiting of threads."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""Suggestions of the next command, after a session and for the contents of a folder."""
+"""Suggest the next command, after a session and for the contents of a folder."""
 
 import shlex
 import sys

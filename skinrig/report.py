@@ -1,4 +1,4 @@
-"""One self-contained HTML page of measurements and their errors against ground truth."""
+"""Build a self-contained HTML page of measurements and their errors against ground truth."""
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence

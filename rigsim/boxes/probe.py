@@ -89,7 +89,7 @@ class ProbeUnit(Device):
         """Return limits and counts; the names include the units."""
         probe = self._probe
         return {
-            "fibers": len(probe.fibers),  # the wire protocol spells its key so
+            "fibres": len(probe.fibers),  # the wire protocol spells its key so
             "level_steps": LEVEL_STEPS,
             "shutter_min_ms": MIN_OPENING_MS,
             "shutter_max_ms": round(probe.max_open_s * 1e3, 6),

@@ -55,7 +55,7 @@ class Face:
     path: Path
     appearance: SkinAppearance
     landmarks: Landmarks
-    marked_by: str
+    landmark_source: str
 
     @property
     def position(self) -> Float64Array:

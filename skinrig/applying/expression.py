@@ -95,7 +95,7 @@ class ExpressionRequest:
         Divide the weights by their sum.
     clamp
         Range of a wrinkle zone's summed weight over blend shapes.
-    onto
+    target_face
         Target face to which the rig is transferred; None: the rig's own face.
     emotional
         Scale the blood of the whole face by the paper's factors for anger and fear.
@@ -108,7 +108,7 @@ class ExpressionRequest:
     clamp: Clamp = "unit"
     emotional: bool = False
     gain: float = 1.0
-    onto: TargetFace | None = None
+    target_face: TargetFace | None = None
 
 
 def parse_weights(text: str) -> dict[str, float]:
@@ -200,7 +200,7 @@ def apply_expression(
         name: {key: value for key, value in part.items() if "seconds" not in key}
         for name, part in done.figures.items()
     }
-    other = expression.onto
+    other = expression.target_face
     made = derive_appearance(
         *((appearance,) if other is None else (appearance, other.appearance)),
         maps=done.maps,
@@ -257,9 +257,9 @@ def _facial_color(
 ) -> None:
     rig = read_hemoglobin_rig(appearance)
     maps = appearance.maps
-    if expression.onto is not None:
-        rig = _transfer_rig(rig, expression.onto, done)
-        maps = expression.onto.appearance.maps
+    if expression.target_face is not None:
+        rig = _transfer_rig(rig, expression.target_face, done)
+        maps = expression.target_face.appearance.maps
     blend = rig.evaluate(
         expression.weights,
         gains=facial_color.GLOBAL_GAINS if expression.emotional else None,

@@ -232,7 +232,7 @@ def apply_microstructure(
         tiles_before=len(before),
         **select_attributes(found, "degenerate_share", "uv_degenerate_share", "uv_turned_share"),
         **pose.shares(),
-        **pose.stretches(),
+        **pose.compute_vertex_figures(),
     )
     return AppliedMicrostructure(journal.target, report)
 
@@ -282,7 +282,7 @@ class _Pose:
             "unresolved_share": float((narrow & ~changed).sum() / covered),
         }
 
-    def stretches(self) -> dict[str, Any]:
+    def compute_vertex_figures(self) -> dict[str, Any]:
         """Return the report's entries over vertices: stretch, range, pixel size."""
         found, good = self.strain, self.strain.valid
         if not good.any():

@@ -257,7 +257,7 @@ class ExpressionOptions:
             clamp=require_choice("--clamp", self.clamp, ("unit", "signed")),
             emotional=self.emotional,
             gain=self.gain,
-            onto=_read_target_face(self.target_face, self.landmarks or []),
+            target_face=_read_target_face(self.target_face, self.landmarks or []),
         )
 
 
@@ -341,12 +341,12 @@ def apply_microstructure(
     _report(console, out, done)
 
 
-def _read_target_face(onto: Path | None, landmarks: list[Path]) -> TargetFace | None:
-    """Read the target face of a rig and both tables of landmarks; None without `onto`."""
+def _read_target_face(folder: Path | None, landmarks: list[Path]) -> TargetFace | None:
+    """Read the target face of a rig and both tables of landmarks; None without a folder."""
     from model import store
     from skinrig.applying.expression import TargetFace
 
-    if onto is None:
+    if folder is None:
         if landmarks:
             raise UsageError("--landmarks: applies to a target face only; add --target-face")
         return None
@@ -357,9 +357,9 @@ def _read_target_face(onto: Path | None, landmarks: list[Path]) -> TargetFace | 
         )
     tables = [landmark_table.read_landmark_table(path) for path in landmarks]
     own, other = tables if tables else (None, None)
-    read = {"onto": onto / store.DOCUMENT_FILE}
+    read = {"onto": folder / store.DOCUMENT_FILE}
     read |= dict(zip(("landmarks of the rig", "landmarks of the other"), landmarks, strict=False))
-    found = store.read(onto)
+    found = store.read(folder)
     hashes = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in read.items()}
     return TargetFace(found, landmarks=other, landmarks_rig=own, hashes=hashes)
 

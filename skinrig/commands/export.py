@@ -76,7 +76,7 @@ class DeliveryOptions:
         same = select_attributes(self, "unit", "normal_y", "udim", "with_errors", "mesh")
         return ExportSettings(
             only=self.names,
-            onto=self.target_face,
+            target_face=self.target_face,
             landmarks=tuple(self.landmarks or ()),
             **same,
             **more,

@@ -1,4 +1,4 @@
-"""Help and command-line parsing: sections of commands, commands per rig, types of options."""
+"""Format help and parse the command line: sections of commands, commands per rig."""
 
 import re
 import sys

@@ -1,4 +1,4 @@
-"""Options shared by several commands, and commands made from functions with docstrings."""
+"""Define options of several commands, and create commands from functions with docstrings."""
 
 from __future__ import annotations
 

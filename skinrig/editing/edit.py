@@ -223,7 +223,7 @@ def edit_face(
         "mask": None if request.mask is None else request.mask.name,
         "spots": [dataclasses.asdict(spot) for spot in request.spots],
         **select_attributes(request, "region", "seed", "iterations"),
-        "landmarks": face.marked_by,
+        "landmarks": face.landmark_source,
         "changed": changed,
         "warnings": list(work.warnings),
         **work.record,

@@ -114,8 +114,8 @@ def export(
                 f"{source} holds {', '.join(held.maps) or 'none'}; expected {others}; choose one "
                 "[SR-EXP-004]"
             )
-        if order.onto is not None:
-            _appearance(order.onto, use, today)  # its maps are exported, too
+        if order.target_face is not None:
+            _appearance(order.target_face, use, today)  # its maps are exported, too
     write = load_writer(to)
     return export_sealed(Path(out), lambda part: write(held, part, order), now)
 

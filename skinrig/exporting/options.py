@@ -90,7 +90,7 @@ class ExportSettings:
     mesh
         Mesh with the maps' texture coordinates, optionally with blend shapes; None: the
         appearance's own.
-    onto
+    target_face
         APPEARANCE/ of a dome to whose texture facial color is mapped.
     landmarks
         Tables ``name,x,y`` of the flash image and of that texture, px.
@@ -109,7 +109,7 @@ class ExportSettings:
     with_errors: bool = False
     only: tuple[str, ...] = ()
     mesh: Path | None = None
-    onto: Path | None = None
+    target_face: Path | None = None
     landmarks: tuple[Path, ...] = ()
     place: SkinPosition | None = None
     camera: str | None = None

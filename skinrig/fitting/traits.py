@@ -138,7 +138,7 @@ def fit_traits(
             labels={
                 n: v.astype(float).tolist() for n, v in {**table.binary, **table.continuous}.items()
             },
-            landmarks=sorted({face.marked_by for face in faces}),
+            landmarks=sorted({face.landmark_source for face in faces}),
             inputs={"labels": hash_file(labels)} | {f.name: hash_document(f.path) for f in faces},
             left_out=[list(row) for row in left_out],
             consent=consent.merge_consent(*(face.appearance for face in faces)),

@@ -90,7 +90,7 @@ def predict(
         observation.melanin[skin],
         observation.hemoglobin[skin],
         relative[skin],
-        log_shading_std=observation.light_spread,
+        log_shading_std=observation.log_light_sd,
         model_scale=observation.mixing,
     )
     sigma, valid = {}, {}

@@ -51,7 +51,7 @@ class FlashObservation:
     """(3,) ratio of a superpixel's variance to a sensor pixel's, per channel."""
     table: Any
     """Color table of the camera and the light."""
-    light_spread: float
+    log_light_sd: float
     """Standard deviation of log illumination under the prior alone."""
     mixing: float = 1.0
     """Ratio of the model error's variance to that at `CONFIRM_PX` image width."""

@@ -95,7 +95,7 @@ class RenderRequest:
     camera: Camera
     lights: Sequence[Light]
     out: Path
-    effort: RenderSettings
+    settings: RenderSettings
     assumed: Sequence[str] = ()
     """Additional assumptions."""
 
@@ -105,16 +105,16 @@ class RenderRequest:
             surface,
             self.camera,
             self.lights,
-            subsurface=self.effort.subsurface,
-            subpixels=self.effort.subpixels,
-            shadow_samples=self.effort.shadow_samples,
+            subsurface=self.settings.subsurface,
+            subpixels=self.settings.subpixels,
+            shadow_samples=self.settings.shadow_samples,
             interior=None if interior is None else interior.with_surface(surface),
-            progress=self.effort.progress,
+            progress=self.settings.progress,
         )
 
     def exposure(self, rendering: Rendering) -> float:
         """Return the factor of the PNGs."""
-        return self.effort.exposure or choose_exposure(rendering.radiance, rendering.coverage)
+        return self.settings.exposure or choose_exposure(rendering.radiance, rendering.coverage)
 
     def record(self, subjects: Sequence[RenderModel], rendering: Rendering) -> dict[str, Any]:
         """Return the record of a rendering."""
@@ -131,10 +131,10 @@ class RenderRequest:
             "unit": RADIANCE_UNIT,
             "view": {**view, "columns": columns, "rows": rows},
             "lights": {name: names.count(name) for name in names},
-            "subsurface": self.effort.subsurface,
-            "samples": self.effort.subpixels**2,
-            "shadow_samples": self.effort.shadow_samples,
-            "seed": self.effort.seed,
+            "subsurface": self.settings.subsurface,
+            "samples": self.settings.subpixels**2,
+            "shadow_samples": self.settings.shadow_samples,
+            "seed": self.settings.seed,
             "skin_pixels": int(np.count_nonzero(rendering.coverage > 0.5)),
             "measured_pixels": int(np.count_nonzero(rendering.covered)),
             "lit_pixels": int(np.count_nonzero(rendering.lit)),
@@ -300,7 +300,7 @@ def draw_bases(
         If every model has fewer basis BRDFs than a rank.
     """
     drawing = _Drawing(request.out)
-    effort = request.effort
+    effort = request.settings
     models = {rank: _reduce_subjects(subjects, rank, effort) for rank in ranks}
     if not models:
         raise UsageError("--bases: got none, expected numbers of basis BRDFs, such as 1,2,4")

@@ -93,7 +93,7 @@ class Interior:
         Target error of the exiting flux, relative to the largest entering flux.
     """
 
-    laid: FittedSurface
+    surface: FittedSurface
     position_mm: Float32Array
     across_mm: Float32Array
     along_mm: Float32Array
@@ -142,7 +142,7 @@ class Interior:
 
     def with_surface(self, surface: FittedSurface) -> Interior:
         """Return the same elements with other maps on the same mesh with the same normals."""
-        return replace(self, laid=surface)
+        return replace(self, surface=surface)
 
     def compute_entered_flux(self, lighting: Lighting) -> Float64Array:
         """Return the flux entering each element, relative to a white patch, (S, 3)."""
@@ -151,7 +151,7 @@ class Interior:
         # several points per element anti-alias the shadow edges
         points = POINTS_PER_SIDE if len(lighting.lamps) < MIN_LIGHTS_FOR_ONE_POINT else 1
         offsets = (np.arange(points, dtype=np.float32) + np.float32(0.5)) / points - 0.5
-        eta = self.laid.model.eta
+        eta = self.surface.model.eta
         for u in offsets:
             for v in offsets:
                 place = self.position_mm + u * self.across_mm + v * self.along_mm
@@ -184,7 +184,7 @@ class Interior:
             position_mm,
             rows.r_d,
             rows.translucency_mm,
-            eta=self.laid.model.eta,
+            eta=self.surface.model.eta,
             tolerance=self.tolerance,
             entered_at=entered_at,
             workers=min(thread_count(), 4),

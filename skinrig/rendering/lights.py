@@ -53,7 +53,7 @@ class Light:
     """Distance at which `intensity` is stated, mm; None: that of the rig's origin."""
     axis: Vector | None = None
     """Direction of its axis, any length; None: towards the rig's origin."""
-    divisible: bool = True
+    is_divisible: bool = True
     """Whether a broad light is shaded in parts; False for parts of a larger source."""
     exponent: float = 0.0
     """Exponent of the cosine of the angle from its axis; 0: isotropic."""
@@ -176,7 +176,7 @@ class Light:
         """Divide a broad light into smaller ones of the same total; return others unchanged."""
         center, radius = self.disc()
         away = float(np.linalg.norm(center))
-        if not self.divisible or count < 2 or away == 0.0 or radius <= MAX_UNDIVIDED_RAD * away:
+        if not self.is_divisible or count < 2 or away == 0.0 or radius <= MAX_UNDIVIDED_RAD * away:
             return (self,)
         helper = np.eye(3)[int(np.argmin(np.abs(center)))]
         side = np.cross(helper, center)
@@ -316,7 +316,7 @@ def sample_environment_lights(
             direction=_check_triple("environment", "direction", towards.reshape(-1, 3)[pixel[k]]),
             intensity=_check_triple("environment", "intensity", color[k]),
             radius=float(radius[k]),
-            divisible=False,
+            is_divisible=False,
         )
         for k in range(count)
     )

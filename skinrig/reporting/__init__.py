@@ -1,1 +1,1 @@
-"""Sections, pictures and tables of the report."""
+"""Build the sections, images and tables of the report."""

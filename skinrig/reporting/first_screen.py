@@ -1,4 +1,4 @@
-"""First screen of a report: images of each quantity with its ground truth, to one color scale."""
+"""Draw the first screen of a report: each quantity and its ground truth on one color scale."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ KEYS_BY_QUANTITY: Final = {
     "diffuse reflectance": "r_d|albedo|diffuse_albedo",
     "diffuse mean free path, green": "translucency",
 }
-"""Quantities in the order of the first screen, and the maps that hold them, the best first."""
+"""Quantities in the order of the first screen, with patterns of their maps, the best first."""
 GRAY_MEANS: Final = "Gray pixels are masked: background, hair, eyes, or no valid estimate."
 NORMAL_LEGEND: Final = "x red, y green, z blue: −1 to 1"
 Box = tuple[FloatArray, FloatArray]
@@ -43,24 +43,24 @@ class Panel:
 
     title: str
     source: str
-    """Folder that holds the estimate."""
+    """Folder of the estimate."""
     images: tuple[page.Image, ...] = ()
     scale: page.ColorScale | None = None
-    """Color scale that all of its images share; None: each has its own, or none."""
+    """Common color scale of its images; None: each has its own, or none."""
     legend: str = ""
     plot: str = ""
-    """SVG drawing in place of images."""
+    """SVG drawing instead of images."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A map that may be shown for a quantity, with a second one at its color scale."""
+    """A map that may be displayed for a quantity, with a second one on its color scale."""
 
     name: str
     key: str
     estimate: SkinMap
     place: SkinMap | None
-    """Points of the mesh that the map lies on; None without one."""
+    """Surface points of the map's texels; None without a mesh."""
     other: SkinMap | None
     """Ground truth, or the map of a second run; None where neither is given."""
     other_place: SkinMap | None
@@ -90,10 +90,10 @@ def draw_first_screen(
     Parameters
     ----------
     appearances
-        By name. Each quantity is drawn from the first one that has a ground truth of it,
-        otherwise from the first one that holds it.
+        Appearances by name. Each quantity is drawn from the first one with a ground truth of it,
+        else from the first one that has it.
     truths
-        Ground truth by the name of the appearance; None where none is given.
+        Ground truth by the name of the appearance; None: not given.
     """
     panels: list[Panel] = []
     for title, pattern in KEYS_BY_QUANTITY.items():

@@ -1,4 +1,4 @@
-"""Contents of a report: appearances, ground truths, calibrations, sessions and documents."""
+"""Find the contents of a report: appearances, ground truths, calibrations, sessions, documents."""
 
 import contextlib
 import json
@@ -14,7 +14,7 @@ from skinrig.reporting.sections import images as image_section
 
 
 class ReportError(ValueError):
-    """The paths hold nothing to report."""
+    """Paths without results to report."""
 
 
 @dataclass(slots=True)

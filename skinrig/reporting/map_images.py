@@ -1,4 +1,4 @@
-"""Images of maps for the report; the alt text of each lists its numbers."""
+"""Draw maps for the report; each alternative text lists the map's numbers."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Labels of maps, strain steps and melanin bands in reports."""
+"""Format the labels of maps, strain steps and melanin bands in reports."""
 
 import re
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Parts of the report page: checks, blocks drawn by templates, and the page itself."""
+"""Build the report page from checks and blocks drawn by templates."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class ReportedAppearance:
 
 
 def find_worst(rows: Iterable[Row], size: Callable[[Row], float]) -> Row | None:
-    """Return the row of the largest finite size, where there are several."""
+    """Return the row of the largest finite size, if there are several."""
     finite = [row for row in rows if math.isfinite(size(row))]
     return max(finite, key=size) if len(finite) > 1 else None
 
@@ -191,7 +191,7 @@ class Collapsible(Block):
 
 @dataclass(frozen=True, slots=True)
 class View(Block):
-    """Results of a section, laid out by a template of its own."""
+    """Results of a section with their template."""
 
     template: str
     """Its name below ``reporting/templates``, without suffix."""
@@ -230,7 +230,7 @@ class Part:
 
 
 def format_number(value: float) -> str:
-    """Return a number with four significant digits, or a dash where there is none."""
+    """Format a number with four significant digits; a dash for missing ones."""
     return "–" if value is None or not np.isfinite(value) else f"{value:.4g}"
 
 
@@ -294,7 +294,7 @@ def build_assumptions_table(texts: Iterable[str]) -> Table:
 
 
 def build_view(template: str, **data: Any) -> View:
-    """Return the results of a section, to be laid out by a template."""
+    """Return the results of a section with their template."""
     return View(template, data)
 
 

@@ -1,4 +1,4 @@
-"""Tables of inputs, versions, parameters, assumptions and omitted stages of a map."""
+"""Build tables of inputs, versions, parameters, assumptions and omitted stages of a map."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence

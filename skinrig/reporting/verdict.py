@@ -1,4 +1,4 @@
-"""Verdict of a report: checks kept, largest errors, and uncertainties without ground truth."""
+"""Build the verdict of a report: passed checks, largest errors, uncertainties without truth."""
 
 from collections.abc import Iterable, Iterator, Sequence
 

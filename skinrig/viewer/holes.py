@@ -270,7 +270,7 @@ class ClosedMesh:
 
     mesh: Mesh
     charts: tuple[PatchChart, ...]
-    left_open_mm: tuple[float, ...]
+    open_loops_mm: tuple[float, ...]
 
     def paint_scene(self, scene: ViewerScene) -> ViewerScene:
         """Fill the patches in all measured textures of a scene."""
@@ -300,10 +300,10 @@ class ClosedMesh:
                 f"{min(lengths):.0f} to {max(lengths):.0f} mm circumference "
                 "not measured; closed by smooth patches with colors of their rims"
             )
-        if self.left_open_mm:
+        if self.open_loops_mm:
             rows["open holes"] = (
-                f"the texture has no space for {len(self.left_open_mm)} of up to "
-                f"{max(self.left_open_mm):.0f} mm circumference"
+                f"the texture has no space for {len(self.open_loops_mm)} of up to "
+                f"{max(self.open_loops_mm):.0f} mm circumference"
             )
         return tuple(rows.items())
 

@@ -326,7 +326,7 @@ def test_benchmark_sets_thread_wait_policy_before_library_loads():
         "    print([m for m in ('numba', 'numpy', 'scipy', 'cv2') if m in sys.modules])\n"
         "    raise SystemExit\n"
         "import skinrig.commands.measuring as measuring\n"
-        "measuring.wait_asleep = look\n"
+        "measuring.set_passive_waiting = look\n"
         "from skinrig.cli import main\n"
         "main(['bench', '--smoke'])"
     )

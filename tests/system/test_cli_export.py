@@ -87,7 +87,7 @@ def test_export_json_lists_written_and_omitted_items(dome, tmp_path, capsys):
         (["--to", "maps", "--use", "film"], 3, "P042 has not agreed"),
         (["--to", "fbx", "--use", "research"], 3, "expected one of maps, mtlx"),
         (["--to", "mtlx", "--use", "research", "--unit", "inch"], 3, "--unit: got 'inch'"),
-        (["--to", "gltf", "--use", "research", "--normal-y", "dx"], 2, "glTF knows gl alone"),
+        (["--to", "gltf", "--use", "research", "--normal-y", "dx"], 2, "the only one of glTF"),
         (["--to", "maps", "--use", "research", "--only", "melanin"], 3, "got melanin"),
         (["--to", "spectral", "--use", "research"], 3, "as of the flash rig"),
         (["--to", "metahuman", "--use", "research"], 3, "skinrig fit wrinkles"),

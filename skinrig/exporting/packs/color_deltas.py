@@ -108,7 +108,7 @@ def _colors(appearance: SkinAppearance, rig: Any, states: list[str], out: ImageF
         for state, blend in blends.items()
     }
     neutral = shown[NEUTRAL]
-    if out.delivery.onto is None:
+    if out.delivery.target_face is None:
         why = (
             "they are on the flash camera's image; give the dome's "
             "maps with --target-face, and two tables of landmarks"
@@ -129,18 +129,16 @@ def _on_texture(
     states: list[str],
 ) -> Colors:
     """Map colors to another appearance's texture: its albedo with the changes of the rig."""
-    if delivery.onto is None or len(delivery.landmarks) != 2:
+    if delivery.target_face is None or len(delivery.landmarks) != 2:
         raise ExportError(
             f"--landmarks: got {len(delivery.landmarks)} tables, expected two with --target-face: "
             "of the flash image, then of the texture; give both"
         )
-    other = store.read(delivery.onto)
+    other = store.read(delivery.target_face)
     albedo = other.maps.get("r_d")
     if albedo is None:
-        raise ExportError(
-            f"{delivery.onto}: got maps {', '.join(sorted(other.maps)) or 'none'}, expected r_d; "
-            "reconstruct it"
-        )
+        maps = ", ".join(sorted(other.maps)) or "none"
+        raise ExportError(f"{delivery.target_face}: got maps {maps}, expected r_d; reconstruct it")
     inside = 1.0 - fresnel.diffuse_external(fresnel.ETA_SKIN)
     base, valid = resize_map(inside * albedo.values.astype(np.float64), albedo.mask, COLOR_SIZE)
     source = _source_pixels(delivery, albedo.values.shape[:2])
@@ -153,7 +151,7 @@ def _on_texture(
         deltas[state] = base * carried
         deltas[state][~known] = 0.0
         valid &= known
-    layout = f"the texture of {delivery.onto.name}, by landmarks"
+    layout = f"the texture of {delivery.target_face.name}, by landmarks"
     return Colors(base, deltas, valid, layout, CAMERA_SPACE)
 
 

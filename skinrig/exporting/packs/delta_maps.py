@@ -57,8 +57,8 @@ def write(
     folder
         Existing, empty folder.
     delivery
-        Expressions by `only` (default: the first three), green of normals, names of tiles; `onto`
-        and `landmarks` map colors to a texture.
+        Expressions by `only` (default: the first three), green of normals, names of tiles;
+        `target_face` and `landmarks` map colors to a texture.
 
     Returns
     -------

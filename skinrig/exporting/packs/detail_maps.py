@@ -202,7 +202,7 @@ def write_scatter(out: ImageFolder) -> dict[str, Any]:
     dict
         JSON values; empty if omitted.
     """
-    onto = out.delivery.onto
+    onto = out.delivery.target_face
     if onto is None:
         why = "requires a model of `skinrig fit reflectance`; name it by --target-face"
         out.record_omission("scatter", why)

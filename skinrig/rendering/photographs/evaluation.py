@@ -62,7 +62,7 @@ class EvaluationSettings:
 class _Surface:
     """A model on its mesh, with precomputed data of all its images."""
 
-    laid: FittedSurface
+    surface: FittedSurface
     caster: Caster
     interior: Interior | None
     photographs: HeldOutPhotographs
@@ -71,7 +71,7 @@ class _Surface:
         shown = self.photographs.camera(shot), self.photographs.light(shot)
         below = self.interior
         return render_surface(
-            self.laid, *shown, subsurface=subsurface, caster=self.caster, interior=below
+            self.surface, *shown, subsurface=subsurface, caster=self.caster, interior=below
         )
 
     def render_ablations(

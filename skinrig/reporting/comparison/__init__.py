@@ -1,1 +1,1 @@
-"""Comparison pages: runs, maps, images and checks side by side."""
+"""Compare two runs side by side: maps, images and checks."""

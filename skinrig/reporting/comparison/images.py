@@ -1,4 +1,4 @@
-"""Comparison of image folders of two runs: renderings and analyses.
+"""Compare the image folders of two runs: renderings and analyses.
 
 Images are compared by their OpenEXR files where both have one, since those are linear; otherwise by
 the codes of their PNG files, whose exposure may differ between runs.
@@ -112,7 +112,7 @@ def _difference(name: str, a: Path, b: Path) -> ImageDifference:
 
 
 def summarize_images(a: ComparedRun, b: ComparedRun) -> str:
-    """Return how many images differ, in a sentence; empty without common images."""
+    """Return the number of differing images in a sentence; empty without common images."""
     both = [
         one
         for _, path_a, path_b in pair_by_name(a.pictures, b.pictures)

@@ -1,4 +1,4 @@
-"""Difference of two estimates of one map, in its unit and in standard uncertainties."""
+"""Compare two estimates of one map, in its unit and in standard uncertainties."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,33 +18,34 @@ from skinrig.unit_format import format_unit
 SIGMA_LEVELS = (1.0, 2.0, 3.0)
 """Combined standard uncertainties; fractions of pixels beyond them are listed."""
 CHANCE_FRACTIONS = (0.3173, 0.0455, 0.0027)
-"""Shares beyond them of two estimates with independent normal errors of the stated size."""
+"""Expected fractions beyond them, for independent normal errors of the stated size."""
 MAX_SIGMAS = 35.0
 """Cap of differences in standard uncertainties: probabilities beyond underflow."""
 
 
 @dataclass(frozen=True, slots=True)
 class MapDifference:
-    """How two estimates of a map differ, B less A.
+    """Difference of two estimates of a map, B minus A.
 
     Attributes
     ----------
     name, unit
-        Of the map; "°" for normals, whose difference is an angle and has no sign.
+        Name and unit of the map; "°" for normals, whose difference is an unsigned angle.
     pixels, only_a, only_b
-        Pixels that both have a value at, and those that one of them has.
+        Pixels with values of both, of A only and of B only.
     median_a, median_b
-        Of those that both have; NaN for normals.
+        Medians over the pixels of both; NaN for normals.
     bias, median, high
-        Median of the difference, and the median and 95th percentile of its size.
+        Median of the difference, and median and 95th percentile of its magnitude.
     combined
-        Median of the two standard errors' root sum of squares, in ``unit``; NaN without them.
+        Median of the combined standard uncertainty (root sum of squares), in ``unit``; NaN if
+        unknown.
     beyond
-        Shares of pixels farther apart than `SIGMA_LEVELS` combined standard errors; empty without
-        them.
+        Fractions of pixels that differ by more than `SIGMA_LEVELS` combined standard
+        uncertainties; empty if unknown.
     difference, sigmas
-        (H, W): signed difference and difference over the combined standard error, NaN where one
-        has no value; of several channels the mean and the farthest one.
+        (H, W): signed difference (mean of channels), and difference in combined standard
+        uncertainties (maximum of channels); NaN where one has no value.
     """
 
     name: str
@@ -64,13 +65,15 @@ class MapDifference:
 
     @property
     def disagree(self) -> bool:
-        """Whether more pixels lie beyond three combined standard errors than chance leaves."""
+        """Whether more pixels than by chance exceed three combined standard uncertainties."""
         return bool(self.beyond) and self.beyond[-1] > MAX_FRACTION_BEYOND
 
 
 MAX_FRACTION_BEYOND = 0.01
-"""Share of pixels beyond three combined standard errors up to which two estimates agree: chance
-leaves 0.27 %, and as neighbors share errors, that share itself scatters."""
+"""Maximum fraction of pixels beyond three combined standard uncertainties of estimates that agree.
+
+The expected fraction is 0.27 %; errors of neighbors are correlated, so that it varies.
+"""
 
 
 def compare_maps(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
@@ -79,21 +82,21 @@ def compare_maps(name: str, a: SkinMap, b: SkinMap) -> MapDifference:
     Parameters
     ----------
     name
-        Maps with "normals" in their name hold unit vectors, and standard errors of the angle in
-        each of two directions, rad.
+        Name; maps with "normals" in it have unit vectors, and standard uncertainties of the angle
+        in each of two directions, rad.
     a, b
-        Of the same shape, on the same pixels.
+        Maps of the same shape, on the same pixels.
 
     Raises
     ------
     ValueError
-        When shapes or units differ.
+        If shapes or units differ.
 
     Notes
     -----
-    The combined standard error takes both errors as independent. What the two share, a
-    calibration or the model's own error, cancels in the difference: pixels then lie closer
-    together than stated errors let expect, never farther.
+    The combined standard uncertainty assumes independent errors. Common errors, of a calibration or
+    the model, cancel in the difference, which is then smaller than the stated uncertainties
+    suggest, never larger.
 
     Examples
     --------
@@ -190,18 +193,18 @@ def _median(values: Float64Array) -> float:
 
 @dataclass(frozen=True, slots=True)
 class QuantityAccuracy:
-    """One error against the truth.
+    """Error of one quantity relative to the ground truth.
 
     Attributes
     ----------
     quantity, skin
-        What is in error, and on which skin: a band, a state, or "all".
+        Quantity, and the skin on which it is evaluated: a band, a strain step, or "all".
     unit
-        Of the error.
+        Unit of the error.
     error
-        Median, or what the quantity names.
+        Median error, or the statistic that the quantity names.
     interval
-        68 % bootstrap interval; NaN where none is known.
+        68 % bootstrap interval; NaN if unknown.
     coverage
         Coverage of the 68 % intervals; NaN where unknown.
     """
@@ -215,7 +218,7 @@ class QuantityAccuracy:
 
 
 def list_truth_errors(appearance: SkinAppearance, truth: SkinAppearance) -> list[QuantityAccuracy]:
-    """Return the errors of an appearance by quantity and skin.
+    """List the errors of an appearance by quantity and skin.
 
     Parameters
     ----------

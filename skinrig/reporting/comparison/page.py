@@ -1,4 +1,4 @@
-"""Comparison of two runs: changed checks, differing maps, and differing settings."""
+"""Build the comparison page of two runs: checks, maps and settings that differ."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -81,7 +81,7 @@ def _describe_difference(difference: MapDifference) -> str:
 
 
 def _format_run_path(run: ComparedRun) -> str:
-    """Return the last two parts of the path of a run: the rest is private."""
+    """Return the last two parts of the path of a run, as the rest is private."""
     return "/".join(run.path.resolve().parts[-2:])
 
 

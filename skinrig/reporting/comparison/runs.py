@@ -1,4 +1,4 @@
-"""Two runs of a comparison: pairs of results and their settings."""
+"""Pair the results of two runs and compare their settings."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ T = TypeVar("T")
 Kind = Literal["maps", "benchmark", "pictures", "run", "truth", "other"]
 COMPARABLE_KINDS: tuple[Kind, ...] = ("maps", "benchmark", "pictures", "run")
 MAX_SAME_POINT_MM = 1.0
-"""Texels of two meshes whose median distance is larger are not the same places."""
+"""Maximum median distance of equal texels of two meshes for them to be the same surface points."""
 
 
 @dataclass(slots=True)
@@ -39,7 +39,7 @@ class ComparedRun:
     found: ReportInputs
     appearances: dict[str, SkinAppearance]
     checks: list[page.Check] = field(default_factory=list)
-    """What its own report would judge."""
+    """Checks of the run's own report."""
 
     @property
     def pictures(self) -> dict[str, Path]:
@@ -57,11 +57,11 @@ class ComparedRun:
 
 
 def detect_kind(path: Path) -> Kind:
-    """Return what a path holds, as far as comparing goes.
+    """Return the kind of results in a path, for comparisons.
 
     "maps": one APPEARANCE/ folder; "truth": a TRUTH/ folder; "benchmark": a document of `skinrig
-    bench`, or a folder that holds one and no maps; "pictures": a folder of a rendering or an
-    analysis; "run": a folder with folders of maps or of pictures.
+    bench`, or a folder with one but without maps; "pictures": a folder of a rendering or an
+    analysis; "run": a folder with folders of maps or images.
     """
     if (path / store.DOCUMENT_FILE).is_file():
         kind = store.read_document(path).parameters.get("kind")
@@ -90,23 +90,23 @@ def _is_bench(path: Path) -> bool:
 def split_sides(
     paths: Sequence[Path], *, require_comparison: bool | None = None
 ) -> tuple[ComparedRun, ComparedRun] | None:
-    """Return the two runs to compare, or None where the paths are a collection.
+    """Return the two runs to compare, or None if the paths are a collection.
 
-    Exactly two paths of one kind, be it two sets of maps, two benchmarks, two folders of pictures
-    or two folders of runs, are compared; truths among the paths serve both. Everything else is a
-    collection, shown one after the other.
+    Exactly two paths of one kind are compared: two sets of maps, two benchmarks, two folders of
+    images or two folders of runs. Ground truths among the paths apply to both. Other paths are a
+    collection, reported one by one.
 
     Parameters
     ----------
     paths
-        As given to `skinrig report`.
-    insist
+        Arguments of `skinrig report`.
+    require_comparison
         True: compare or fail. False: never compare. None: by the rule above.
 
     Raises
     ------
     ReportError
-        When a comparison is insisted on, and paths are not two of one kind.
+        If a comparison is required, and paths are not two of one kind.
     """
     if require_comparison is False:
         return None
@@ -148,7 +148,7 @@ def _labels(a: Path, b: Path) -> tuple[str, str]:
 
 
 def pair_by_name(one: Mapping[str, T], other: Mapping[str, T]) -> list[tuple[str, T, T]]:
-    """Return what belongs together of two runs: by name of its folder, or the only ones."""
+    """Pair the folders of two runs by name; single folders are paired regardless of names."""
     if len(one) == len(other) == 1:
         (name_a, a), (name_b, b) = *one.items(), *other.items()
         return [(name_a if name_a == name_b else f"{name_a} and {name_b}", a, b)]
@@ -156,7 +156,7 @@ def pair_by_name(one: Mapping[str, T], other: Mapping[str, T]) -> list[tuple[str
 
 
 def list_unpaired(a: ComparedRun, b: ComparedRun) -> list[tuple[str, str]]:
-    """Return folders of maps or pictures that only one of two runs has: name, the run's label."""
+    """Return folders of maps or images of only one of two runs: name, the run's label."""
     found = []
     for one, other in ((a.appearances, b.appearances), (a.pictures, b.pictures)):
         if not len(one) == len(other) == 1:
@@ -167,7 +167,7 @@ def list_unpaired(a: ComparedRun, b: ComparedRun) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True, slots=True)
 class MapsPair:
-    """Maps of two runs that belong together, and how they differ."""
+    """Corresponding maps of two runs with their differences."""
 
     name: str
     a: SkinAppearance

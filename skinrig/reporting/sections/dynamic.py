@@ -44,7 +44,7 @@ ZONE_COLORS = np.array(
 
 
 def is_dynamic(appearance: SkinAppearance) -> bool:
-    """Return whether an appearance holds fitted parts of a moving face."""
+    """Return whether an appearance has fitted parts of a moving face."""
     return appearance.parameters.get("kind") == DYNAMIC_KIND
 
 

@@ -25,7 +25,7 @@ SHOWN_HISTOGRAM_FRACTION = 0.75
 
 
 def is_microrelief(appearance: SkinAppearance) -> bool:
-    """Return whether an appearance holds strain steps of skin."""
+    """Return whether an appearance has strain steps of skin."""
     return bool(evaluation.find_states(appearance))
 
 

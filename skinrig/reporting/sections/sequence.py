@@ -16,7 +16,7 @@ PLACE_COLORS = ("#2a78b8", "#d1602b", "#3f8f4f", "#8153a8", "#b8912a", "#555555"
 
 
 def is_sequence(appearance: SkinAppearance) -> bool:
-    """Return whether an appearance holds curves of a sequence."""
+    """Return whether an appearance has curves of a sequence."""
     return CURVES_FILE in appearance.files
 
 

@@ -37,7 +37,7 @@ METHOD_NAMES = {"photon_table": "photon table", "diffusion": "diffusion", "dipol
 
 
 def is_probe(appearance: SkinAppearance) -> bool:
-    """Return whether an appearance holds profiles of a fiber probe."""
+    """Return whether an appearance has profiles of a fiber probe."""
     return PROFILE_FILE in appearance.files or SUBSURFACE_FILE in appearance.files
 
 
@@ -80,7 +80,7 @@ def _plots(appearance: SkinAppearance) -> Iterator[page.Block]:
 
 
 def draw_first_profile(appearance: SkinAppearance) -> str:
-    """Return the plot of a probe's first radial profile as SVG; empty where there is none."""
+    """Return the plot of a probe's first radial profile as SVG; empty without profiles."""
     measured = evaluation.read_document(appearance, PROFILE_FILE)
     if measured is None or not measured["measurements"]:
         return ""

@@ -32,8 +32,8 @@ def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     Parameters
     ----------
     subject
-        With a map "position".
-        Its truth is of the same subject, on an atlas of its own; None: uncertainties only.
+        Appearance with a map "position". Its ground truth is of the same subject, on another
+        atlas; None: only uncertainties are reported.
     """
     appearance, truth = subject.appearance, subject.truth
     place = appearance.maps["position"]

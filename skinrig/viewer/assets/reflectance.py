@@ -195,10 +195,10 @@ class PageLobes:
 
 
 def build_lobe_assets(source: SceneSource, found: PageLobes) -> Assets:
-    """Return the assets of some lobes, which may hold those of traits too."""
+    """Build the assets of basis BRDFs, including those added by traits."""
     compact = choose_table(found.lobes)
     profile, widths, origin = _diffusion_of(source)
-    # the packer turns pictures over; this one's rows stand as the shader counts them
+    # the packer flips images vertically; the rows of this one must keep the shader's order
     rows = np.ascontiguousarray(build_atlas(compact)[::-1])
     textures = {
         "lobe_atlas": Texture(rows, "f16"),

@@ -141,7 +141,7 @@ def test_a_rig_is_applied_to_another_faces_blood(face, tmp_path):
         SkinAppearance({"hemoglobin": SkinMap(other, MAP_UNITS["hemoglobin"])}, "measured")
     )
     done = apply_expression(
-        folder, ExpressionRequest({"smile": 1.0}, onto=onto), out=tmp_path / "out"
+        folder, ExpressionRequest({"smile": 1.0}, target_face=onto), out=tmp_path / "out"
     )
     found = done.maps["hemoglobin"]
     assert found.values.shape == other.shape
@@ -150,7 +150,9 @@ def test_a_rig_is_applied_to_another_faces_blood(face, tmp_path):
     assert ("color", "requires a melanin map") in done.left_out
     empty = TargetFace(SkinAppearance({}, "measured"))
     with pytest.raises(ApplyError, match="hemoglobin"):
-        apply_expression(folder, ExpressionRequest({"smile": 1.0}, onto=empty), out=tmp_path / "no")
+        apply_expression(
+            folder, ExpressionRequest({"smile": 1.0}, target_face=empty), out=tmp_path / "no"
+        )
 
 
 def test_inputs_of_result_are_never_replaced(face, tmp_path):
@@ -190,13 +192,17 @@ def test_simulated_face_gives_simulated_result_sizes_must_fit(face, tmp_path):
     blood = SkinMap(np.full((60, 40), 0.03, np.float32), MAP_UNITS["hemoglobin"])
     melanin = SkinMap(np.full((30, 40), 0.03, np.float32), MAP_UNITS["melanin"])
     onto = TargetFace(SkinAppearance({"hemoglobin": blood}, "measured"), hashes={"onto": "abc"})
-    apply_expression(folder, ExpressionRequest({"smile": 1.0}, onto=onto), out=tmp_path / "out")
+    apply_expression(
+        folder, ExpressionRequest({"smile": 1.0}, target_face=onto), out=tmp_path / "out"
+    )
     written = store.read(tmp_path / "out")
     assert written.source == "simulated"  # the rig is
     assert written.inputs["onto"] == "abc"
     both = TargetFace(SkinAppearance({"hemoglobin": blood, "melanin": melanin}, "measured"))
     with pytest.raises(ApplyError, match="one size"):
-        apply_expression(folder, ExpressionRequest({"smile": 1.0}, onto=both), out=tmp_path / "no")
+        apply_expression(
+            folder, ExpressionRequest({"smile": 1.0}, target_face=both), out=tmp_path / "no"
+        )
 
 
 def test_the_same_evaluation_gives_the_same_bytes(face, tmp_path):

@@ -101,7 +101,7 @@ def test_damaged_date_is_not_a_consent(patch):
 
 
 def test_target_texture_of_colors_needs_consent(measured, face_folder, tmp_path):
-    order = ExportSettings(onto=measured)
+    order = ExportSettings(target_face=measured)
     with pytest.raises(ConsentError, match="P042"):
         exporting.export(
             face_folder, tmp_path / "out", to="maps", delivery=order, use="film", today=DAY
@@ -239,7 +239,7 @@ def test_an_expression_bears_the_consent_of_both_faces(tmp_path, rng):
         "measured",
         {consent.CONSENT_KEY: [{"pseudonym": "other", **told}]},
     )
-    expression = applying.ExpressionRequest({"smile": 1.0}, onto=applying.TargetFace(onto))
+    expression = applying.ExpressionRequest({"smile": 1.0}, target_face=applying.TargetFace(onto))
     applying.apply_expression(tmp_path / "moving", expression, out=tmp_path / "shown")
     shown = consent.read_consent(store.read(tmp_path / "shown"))
     assert [one["pseudonym"] for one in shown] == ["rig", "other"]

@@ -54,7 +54,7 @@ def test_quantity_without_estimate_is_reported_without_infinite_error():
     choice = plans.PlanChoice(rig, flash_plan(rig), (told,), 2.0, {}, ())
     first = plans.format_choice(choice)[0]
     assert "inf" not in first
-    assert "hemoglobin keeps no estimate" in first
+    assert "hemoglobin has no valid estimate" in first
     assert "wanted 20 %: NOT REACHED" in first
 
 

@@ -137,7 +137,7 @@ def test_site_is_omitted_only_if_others_determine_quantity(look):
 
 def test_plans_without_skin_or_darks_are_refused(rig):
     plan = probe_plan(rig, sites=SITES)
-    for kind, word in (("fibers", "no series on skin"), ("dark", "without light")):
+    for kind, word in (("fibers", "no series on skin"), ("dark", "no dark frame")):
         some = replace(plan, steps=tuple(s for s in plan.steps if s.kind != kind))
         with pytest.raises(plans.PlanningError, match=word):
             probe.read_settings(some)

@@ -74,7 +74,7 @@ def test_a_patch_bends_on_as_the_surface_does(scan):
 
 def test_patches_get_own_separate_charts(scan):
     closed = patch_charts.close_holes(scan)
-    assert closed.left_open_mm == ()
+    assert closed.open_loops_mm == ()
     new = closed.mesh.uv[len(scan.uv) :]
     assert new.min() > 0.0
     assert new.max() < 1.0
@@ -127,5 +127,5 @@ def test_texture_without_room_leaves_hole_open_and_reports(scan):
     )
     closed = patch_charts.close_holes(mesh)
     assert closed.charts == ()
-    assert len(closed.left_open_mm) >= 2
+    assert len(closed.open_loops_mm) >= 2
     assert closed.summary()[0][0] == "open holes"

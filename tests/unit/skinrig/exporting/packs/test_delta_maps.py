@@ -170,7 +170,7 @@ def test_colors_are_carried_onto_a_texture_by_landmarks(moving, tmp_path, rng):
     out = tmp_path / "out"
     out.mkdir()
     order = ExportSettings(
-        only=("fear",), onto=dome, landmarks=(tmp_path / "own.csv", tmp_path / "onto.csv")
+        only=("fear",), target_face=dome, landmarks=(tmp_path / "own.csv", tmp_path / "onto.csv")
     )
     delta_maps.write(moving, out, order)
     base, delta = read(out / "exr/base_color.exr"), read(out / "exr/cm1_delta.exr")
@@ -189,7 +189,7 @@ def test_colors_are_carried_onto_a_texture_by_landmarks(moving, tmp_path, rng):
         assert np.abs(at - 1.0).max() > 0.03
     np.testing.assert_allclose(base[64, 64], 0.923188 * albedo[0, 0], rtol=1e-4)
     with pytest.raises(ExportError, match="expected two with --target-face"):
-        delta_maps.write(moving, out, ExportSettings(onto=dome))
+        delta_maps.write(moving, out, ExportSettings(target_face=dome))
 
 
 def test_sizes_are_those_of_engines(moving, tmp_path, monkeypatch):

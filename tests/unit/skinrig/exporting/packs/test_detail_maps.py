@@ -179,7 +179,7 @@ def test_scatter_is_model_translucency_at_pack_size(patch, tmp_path, monkeypatch
     monkeypatch.setattr(detail_maps, "SCATTER_SIZE", patch.side)
     face = patch.face(parameters={"assumed": ["translucency is the population's", "other"]})
     onto = store.write(tmp_path / "model", face)
-    out = ImageFolder(tmp_path, ExportSettings(onto=onto))
+    out = ImageFolder(tmp_path, ExportSettings(target_face=onto))
     told = detail_maps.write_scatter(out)
     shown, depth = read(tmp_path / "exr/scatter.exr"), face.maps["translucency"]
     np.testing.assert_allclose(shown[depth.valid], depth.values[depth.valid], rtol=1e-6)
@@ -187,7 +187,7 @@ def test_scatter_is_model_translucency_at_pack_size(patch, tmp_path, monkeypatch
     assert out.left_out == []
     without = {n: m for n, m in face.maps.items() if n != "translucency"}
     bare = store.write(tmp_path / "bare", dataclasses.replace(face, maps=without))
-    out = ImageFolder(tmp_path, ExportSettings(onto=bare))
+    out = ImageFolder(tmp_path, ExportSettings(target_face=bare))
     assert detail_maps.write_scatter(out) == {}
     assert "skinrig fit reflectance" in out.left_out[0][1]
 
