@@ -107,7 +107,7 @@ def read(
     if not set(parts) & set(found):
         commands = " or ".join(f"`{FIT_COMMANDS[name]}`" for name in parts)
         raise DynamicAppearanceError(
-            f"{path}: got {', '.join(found) or 'maps that nothing was fitted to'}, expected "
+            f"{path}: got {', '.join(found) or 'maps without fitted parts'}, expected "
             f"{' or '.join(parts)}; {commands} makes it [SR-REC-022]"
         )
     return appearance, found

@@ -233,7 +233,7 @@ def _map(face: Face, name: str) -> SkinMap:
     if name not in face.appearance.maps:
         have: Mapping[str, SkinMap] = face.appearance.maps
         raise FaceError(
-            f"{face.path}: has no map {name!r} (it has {', '.join(sorted(have)) or 'none'}); "
-            f"`skinrig reconstruct SESSION --maps {name}` of a dome session makes it [SR-REC-023]"
+            f"{face.path}: got maps {', '.join(sorted(have)) or 'none'}, expected {name!r}; run "
+            f"`skinrig reconstruct SESSION --maps {name}` on a dome session [SR-REC-023]"
         )
     return face.appearance.maps[name]

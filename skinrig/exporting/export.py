@@ -110,8 +110,8 @@ def export(
         if to in SURFACE_FORMATS and not any(name in held.maps for name in _DOME_MAPS):
             others = ", ".join(name for name in APPEARANCE_FORMATS if name not in SURFACE_FORMATS)
             raise ExportError(
-                f"to: got {to!r}, which is of a dome's maps (position, normals, r_d, lobes), but "
-                f"{source} holds {', '.join(held.maps) or 'none'}; expected {others}; choose one "
+                f"--to: got {to!r}, which requires a dome's maps (position, normals, r_d, basis "
+                f"BRDFs), but {source} has {', '.join(held.maps) or 'none'}; choose {others} "
                 "[SR-EXP-004]"
             )
         if order.target_face is not None:

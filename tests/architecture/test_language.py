@@ -29,7 +29,7 @@ WORDS = {
         re.IGNORECASE,
     ),
     "a light for per light": re.compile(
-        r"\b(one|two|three|four|[0-9.]+|mm|um|px|seconds|pixels|texels|points|images|frames|shots"
+        r"\b(one|two|three|four|[0-9]+(?:\.[0-9]+)?|mm|um|px|seconds|pixels|texels|points|images|frames|shots"
         r"|lights|cameras|rays|samples|lines|files|folders|values|numbers|pairs|steps|exposures"
         r"|maps|rows|columns|colors|photographs|names|placements|directions|faces|lobes|sides)"
         r" an? (light|pixel|texel|side|image|picture|frame|shot|point|band|state|step|site|camera"

@@ -195,7 +195,7 @@ import sys
 from skinrig.simulating import probe
 from skinrig.capturing import plan_choice
 from skinrig.cli import main
-probe.PHOTONS = {"small": 2000}
+probe.TRUTH_PHOTONS = {"small": 2000}
 sys.exit(main(sys.argv[1:]))
 """
 
