@@ -1,14 +1,22 @@
 """Names of version 1 of the file formats, translated when a file is read.
 
-Version 2 of SESSION/ and CALIBRATION/ writes ``fiber`` and ``omission`` where version 1 wrote
-``fibre`` and ``left_out``. Files of version 1 are read, never rewritten: hashes and seals are
-checked on the bytes as written, before the translation.
+Version 2 of SESSION/ and CALIBRATION/ writes ``fiber``, ``analyzer`` and ``omission`` where
+version 1 wrote ``fibre``, ``analyser`` and ``left_out``. Files of version 1 are read, never
+rewritten: hashes and seals are checked on the bytes as written, before the translation.
 """
 
 from collections.abc import Mapping
 from typing import Any, Final
 
-FORMER_NAMES: Final[Mapping[str, str]] = {"fibre": "fiber", "fibres": "fibers"}
+FORMER_NAMES: Final[Mapping[str, str]] = {
+    "fibre": "fiber",
+    "fibres": "fibers",
+    "analyser_deg": "analyzer_deg",
+    "analyser_axis_deg": "analyzer_axis_deg",
+    "analyser_zero": "analyzer_zero",
+    "analyser_zero_rad": "analyzer_zero_rad",
+    "analyser_leak": "analyzer_leak",
+}
 """Present name of a key, a kind of steps or a kind of calibrations, by its name in version 1."""
 FORMER_KINDS: Final = {present: former for former, present in FORMER_NAMES.items()}
 """Kind of calibrations in version 1, which names the file, by its present name."""

@@ -93,7 +93,7 @@ class View(Document):
     """Saturation level, DN, at most 2**bit_depth - 1."""
     spectral_sensitivity: str = "Nikon 5100 (NPL)"
     """Name of the curves, see ``model.spectra.camera_sensitivity``."""
-    analyser_axis_deg: float | None = None
+    analyzer_axis_deg: float | None = None
     """Axis of the analyzer at rotator reading 0 (the parallel state), degrees, 0 <= axis < 180;
     None: no analyzer.
     """
@@ -144,9 +144,9 @@ class View(Document):
             self.black_level < self.white_level <= top,
             f"black_level {self.black_level} < white_level <= {top}",
         )
-        analyser = self.analyser_axis_deg
+        analyzer = self.analyzer_axis_deg
         checks.check(
-            "analyser_axis_deg", analyser, analyser is None or 0 <= analyser < 180, AXIS_RULE
+            "analyzer_axis_deg", analyzer, analyzer is None or 0 <= analyzer < 180, AXIS_RULE
         )
         checks.check("read_noise_e", self.read_noise_e, 0 <= self.read_noise_e < math.inf, ">= 0")
         checks.close()

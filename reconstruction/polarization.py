@@ -273,7 +273,7 @@ def _passed_field(absorbing: FloatArray, direction: FloatArray) -> FloatArray:
     return _normalized(np.cross(np.broadcast_to(absorbing, direction.shape), direction))
 
 
-def _analyser_absorbs(axes: PolarizerAxes, kind: np.dtype) -> tuple[FloatArray, FloatArray]:
+def _analyzer_absorbs(axes: PolarizerAxes, kind: np.dtype) -> tuple[FloatArray, FloatArray]:
     """Return the absorbing axes of the parallel and the crossed analyzer, in its plane."""
     parallel, crossed = np.asarray(axes.parallel), np.asarray(axes.crossed)
     film = _normalized(np.cross(parallel, crossed))
@@ -318,7 +318,7 @@ def _exit_weights(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     weights = []
     towards: BoolArray = np.ones(1, dtype=bool)
-    for absorbs in _analyser_absorbs(axes, normal.dtype):
+    for absorbs in _analyzer_absorbs(axes, normal.dtype):
         weight, towards = _polarized_over_unpolarized(
             normal, view, _passed_field(absorbs, view), eta
         )
@@ -361,7 +361,7 @@ def _tilted_leak(
     the field differently, so that the polarization of light out of the planes of symmetry rotates.
     """
     kind = view.dtype
-    absorbs_p, absorbs_c = _analyser_absorbs(axes, kind)
+    absorbs_p, absorbs_c = _analyzer_absorbs(axes, kind)
     through = [np.zeros(1, dtype=kind), np.zeros(1, dtype=kind)]
     for one in _by_light(light):
         to_light, to_view = np.broadcast_arrays(one, view)

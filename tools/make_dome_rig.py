@@ -44,7 +44,7 @@ def camera_positions() -> list[np.ndarray]:
 
 HEAD = """\
 # 150 LEDs and 16 cameras around the face, after Weyrich et al. 2005, section 5.
-# Made by tools/make_dome_rig.py. Frame: mm, origin at the subject's centre, +x right, +y up,
+# Made by tools/make_dome_rig.py. Frame: mm, origin at the subject's center, +x right, +y up,
 # +z where the subject looks.
 name = "dome"
 boxes = ["dome"]

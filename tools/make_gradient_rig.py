@@ -21,7 +21,7 @@ import trimesh
 LIGHTS_MM = 600.0
 BEHIND = -0.6  # cosine to +z; the subject's head and shoulders are below it
 ETA = 1.4
-ANALYSER_DEG = 90.0
+ANALYZER_DEG = 90.0
 
 
 def led_directions() -> np.ndarray:
@@ -52,7 +52,7 @@ def led_directions() -> np.ndarray:
 def polarizer_axis_deg(to_light: np.ndarray) -> float:
     """Return the polarizer axis, degrees, whose mirror reflection is along the analyzer's axis."""
     to_camera = np.array([0.0, 0.0, 1.0])
-    angle = np.radians(ANALYSER_DEG)
+    angle = np.radians(ANALYZER_DEG)
     wanted = np.array([np.cos(angle), np.sin(angle), 0.0])
     facet = to_light + to_camera
     facet /= np.linalg.norm(facet)
@@ -78,7 +78,7 @@ HEAD = """\
 name = "gradient"
 boxes = ["gradient_sphere", "caliper"]
 recycle_s = 0.0              # no light is a flash
-polarizer_move_s = 0.15      # analyser from parallel to crossed
+polarizer_move_s = 0.15      # analyzer from parallel to crossed
 
 [leds]                       # nominal, see capture.rig.LedLimits; measure an assembled sphere
 max_on_s = 0.5
@@ -120,7 +120,7 @@ cfa = "MONO"
 black_level = 64
 white_level = 4095
 spectral_sensitivity = "Nikon 5100 (NPL)"
-analyser_axis_deg = {analyser:.1f}     # axis at rotator reading 0, the parallel state
+analyzer_axis_deg = {analyzer:.1f}     # axis at rotator reading 0, the parallel state
 full_well_e = 13500.0
 read_noise_e = 13.0
 """
@@ -138,7 +138,7 @@ radius_mm = 6.0
 
 def main() -> None:
     directions = led_directions()
-    print(HEAD.format(count=len(directions), analyser=ANALYSER_DEG), end="")
+    print(HEAD.format(count=len(directions), analyzer=ANALYZER_DEG), end="")
     for number, direction in enumerate(directions):
         place = (direction * LIGHTS_MM).round(1) + 0.0
         axis = polarizer_axis_deg(place / np.linalg.norm(place)) % 180.0

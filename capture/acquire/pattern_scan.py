@@ -49,7 +49,7 @@ def analyzer_reading_deg(step: Step) -> float:
     >>> analyzer_reading_deg(Step("a", "ball", {}, {"polarizer": "crossed"}, ("cam",)))
     90.0
     """
-    given = step.settings.get("analyser_deg")
+    given = step.settings.get("analyzer_deg")
     return ANALYZER_DEG[str(step.settings["polarizer"])] if given is None else float(given)
 
 
@@ -98,7 +98,7 @@ class PatternScanner:
             light: dict[str, Value] = {
                 "pattern": str(step.settings["pattern"]),
                 "level": float(step.settings["level"]),
-                "analyser_deg": analyzer_reading_deg(step),
+                "analyzer_deg": analyzer_reading_deg(step),
             }
             if dead:
                 light["dead_lights"] = dead
@@ -150,7 +150,7 @@ class PatternScanner:
         ]
         sphere.load(rows)
         sphere.arm()
-        sphere.set_analyzer(rows[0].analyser_deg)
+        sphere.set_analyzer(rows[0].analyzer_deg)
         sphere.wait_settled()
         log.info("evaluation of the scan by the controller: %s", self._arm_scan(len(rows)))
         self._scans += 1

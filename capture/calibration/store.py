@@ -35,7 +35,7 @@ from capture.calibration.record import (
     require_plain_name,
 )
 from capture.calibration.validity import CalibrationDrift, measure_drift, require_valid
-from capture.former_names import FORMER_KINDS, FORMER_NAMES
+from capture.former_names import FORMER_KINDS, FORMER_NAMES, translate_names
 
 __all__ = [
     "CALIBRATION_KINDS",
@@ -196,11 +196,14 @@ def load(directory: str | Path, kind: str) -> Calibration:
             valid_until=date.fromisoformat(document.valid_until),
             source=document.source,
             values={
-                serial: {name: _quantity_from(q) for name, q in quantities.items()}
+                serial: {
+                    FORMER_NAMES.get(name, name): _quantity_from(q)
+                    for name, q in quantities.items()
+                }
                 for serial, quantities in document.values.items()
             },
             maps={name: _read_map(folder, name, m) for name, m in document.maps.items()},
-            notes=document.notes,
+            notes=translate_names(document.notes),
             inputs=document.inputs,
             versions=document.versions,
         )

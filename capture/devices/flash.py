@@ -33,7 +33,7 @@ class FlashReport:
     """Energy relative to a full flash, 0 to 1."""
     polarizer: Polarizer
     """Polarizer state that was last requested."""
-    analyser_deg: float
+    analyzer_deg: float
     """Reading of the rotator, degrees; 0 parallel, 90 crossed."""
     count: int
     """Number of flashes since manufacture, this one included."""
@@ -82,7 +82,7 @@ class FlashBox(Box):
         """Return the status bits."""
         return FlashStatus(int(self._number("STAT?")))
 
-    # analyser ---------------------------------------------------------------------------------
+    # analyzer ---------------------------------------------------------------------------------
 
     def set_polarizer(self, polarizer: str) -> None:
         """Start turning the analyzer to "parallel" or "crossed"."""
@@ -99,7 +99,7 @@ class FlashBox(Box):
         """Start turning the analyzer to a reading, in degrees."""
         self._port.ask(f"FLAS:POL:ANG {format_decimal('angle_deg', angle_deg, 9)}")
 
-    def analyser_deg(self) -> float:
+    def analyzer_deg(self) -> float:
         """Return the present or target reading of the analyzer, in degrees."""
         return self._number("FLAS:POL:ANG?")
 

@@ -28,7 +28,7 @@ class PatternRow:
 
     pattern: str
     """full, x, y, z, -x, -y, -z or dark."""
-    analyser_deg: float
+    analyzer_deg: float
     """Reading of the analyzer, degrees, 0 to 180; 0 is parallel, 90 crossed. Where it differs from
     the row before, the controller turns it first, in the dark; that time is not part of
     ``dwell_s``.
@@ -51,7 +51,7 @@ class PatternRow:
         'DARK:0:0:30000:1'
         """
         level = 0 if self.pattern == "dark" else round(self.level * LEVEL_STEPS)
-        angle = format_decimal("analyser_deg", self.analyser_deg, 3)
+        angle = format_decimal("analyzer_deg", self.analyzer_deg, 3)
         dwell_us = round(self.dwell_s * 1e6)
         return f"{_pattern(self.pattern).upper()}:{angle}:{level}:{dwell_us}:{self.mask:X}"
 
@@ -78,7 +78,7 @@ class GradientSphereBox(LedBox):
         """Return the status bits."""
         return SphereStatus(int(self._number("STAT?")))
 
-    # analyser ---------------------------------------------------------------------------------
+    # analyzer ---------------------------------------------------------------------------------
 
     def set_polarizer(self, polarizer: str) -> None:
         """Start turning the analyzer to "parallel" or "crossed"; refused while a light is on."""
@@ -90,7 +90,7 @@ class GradientSphereBox(LedBox):
         """Start turning the analyzer to a reading of 0 to 180 degrees."""
         self._port.ask(f"POL:ANG {format_decimal('angle_deg', angle_deg, 3)}")
 
-    def analyser_deg(self) -> float:
+    def analyzer_deg(self) -> float:
         """Return the present or target reading of the analyzer, in degrees."""
         return self._number("POL?")
 

@@ -197,7 +197,7 @@ def _inspect(files: Sequence[Path]) -> list[_Entry]:
 
 def _entry(file: Path, photo: Photo) -> _Entry:
     frame = photo.frame
-    view = make_placeholder_view(frame, analyser_axis_deg=0.0)
+    view = make_placeholder_view(frame, analyzer_axis_deg=0.0)
     return _Entry(
         file, hash_file(file), photo.encoding, view, frame.exposure_s, frame.iso, photo.notes
     )

@@ -122,7 +122,7 @@ def flash_calibration_plan(
     --------
     >>> from capture.rig import load_rig
     >>> plan = flash_calibration_plan(load_rig("flash"), "malus", repeats=1, darks=0)
-    >>> plan.steps[-1].index["analyser_deg"], plan.steps[-1].kind
+    >>> plan.steps[-1].index["analyzer_deg"], plan.steps[-1].kind
     (180.0, 'malus')
     """
     targets = get_args(Target)
@@ -141,7 +141,7 @@ def flash_calibration_plan(
         conditions = [({"polarizer": p}, {"polarizer": p, "power": 1.0}) for p in POLARIZER_STATES]
     else:
         conditions = [
-            ({"analyser_deg": a}, {"polarizer": "parallel", "analyser_deg": a, "power": 1.0})
+            ({"analyzer_deg": a}, {"polarizer": "parallel", "analyzer_deg": a, "power": 1.0})
             for a in MALUS_ANGLES_DEG
         ]
     for index, settings in conditions:

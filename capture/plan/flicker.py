@@ -205,7 +205,7 @@ def _insert_analyzer_rotations(steps: Sequence[Step], rig: Rig) -> list[LedRow]:
     rows: list[LedRow] = []
     before: object = None
     for step, row in zip(steps, led_rows(steps, rig), strict=True):
-        asked = step.settings.get("analyser_deg", step.settings.get("polarizer"))
+        asked = step.settings.get("analyzer_deg", step.settings.get("polarizer"))
         if rows and "pattern" in step.settings and asked != before:
             rows.append(LedRow((), 0.0, rig.polarizer_move_s))
         before = asked

@@ -223,7 +223,7 @@ def gradient_calibration_plan(
     else:
         for reading, levels in BALL_SERIES.items():
             polarizer = POLARIZER_STATES[round(reading / 90)]
-            every: dict[str, Value] = {} if reading in (0, 90) else {"analyser_deg": reading}
+            every: dict[str, Value] = {} if reading in (0, 90) else {"analyzer_deg": reading}
             for number, share in enumerate((*levels, 0.0)):
                 pattern = "full" if share else "dark"
                 light = {"pattern": pattern, "polarizer": polarizer}
@@ -259,7 +259,7 @@ def scan_duty(steps: Sequence[Step], rig: Rig) -> float:
     ends = np.zeros(len(rows))
     clock, before = 0.0, None
     for number, (step, row) in enumerate(zip(steps, rows, strict=True)):
-        asked = step.settings.get("analyser_deg", step.settings.get("polarizer"))
+        asked = step.settings.get("analyzer_deg", step.settings.get("polarizer"))
         clock += rig.polarizer_move_s if before not in (None, asked) else 0.0
         before = asked
         clock += row.dwell_s

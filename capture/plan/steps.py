@@ -39,7 +39,7 @@ POLARIZER_STATES: tuple[str, ...] = get_args(Polarizer)
 # settings every rig understands: name -> (types, test, expected value)
 _SETTING_RULES: Mapping[str, tuple[tuple[type, ...], Any, str]] = {
     "polarizer": ((str,), lambda v: v in POLARIZER_STATES, '"parallel" or "crossed"'),
-    "analyser_deg": ((int, float), lambda v: 0 <= v < 360, "0 <= degrees < 360"),
+    "analyzer_deg": ((int, float), lambda v: 0 <= v < 360, "0 <= degrees < 360"),
     "power": ((int, float), lambda v: 0 <= v <= 1, "0 <= power <= 1"),
     "exposure_s": ((int, float), lambda v: 0 < v < math.inf, "seconds > 0"),
     "iso": ((int, float), lambda v: 0 < v < math.inf, "> 0"),
@@ -76,7 +76,7 @@ class Step(Document):
         Indices of the step in its series, e.g. ``{"state": "neutral", "repeat": 0}``.
     settings : mapping of str to str, int, float or bool
         ``polarizer`` ("parallel" or "crossed"), ``power`` (0 to 1 of a light's full energy),
-        ``exposure_s`` (s), ``iso``; ``analyser_deg`` (rotator reading, degrees; 0 is parallel, 90
+        ``exposure_s`` (s), ``iso``; ``analyzer_deg`` (rotator reading, degrees; 0 is parallel, 90
         crossed) takes precedence over ``polarizer``. On the dome ``light`` (its name), or ``leds``
         (names joined by +), at ``level`` (0 to 1) for ``dwell_s``; in the gradient sphere
         ``pattern`` instead of lights; of the fiber probe ``suction_mbar`` and ``fiber`` (number of
@@ -220,7 +220,7 @@ class Plan(Document):
                 last_s = max(last_s, float(step.settings["start_s"]) + each_s[-1])
                 continue
             total += each_s[-1]
-            asked = step.settings.get("analyser_deg", step.settings.get("polarizer"))
+            asked = step.settings.get("analyzer_deg", step.settings.get("polarizer"))
             turn_s = rig.polarizer_move_s if asked not in (state, None) else 0.0
             state = state if asked is None else asked
             move_s = 0.0

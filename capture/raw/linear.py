@@ -267,11 +267,11 @@ def _bilinear(
 
 def _interpolate_sparse(plane: Float32Array, *, power: int) -> Float32Array:
     """Convolve a red or blue plane (zero elsewhere) with the triangle's ``power``, separably."""
-    side, centre = (np.float32(w**power) for w in _TRIANGLE_FILTER[:2])
-    rows = centre * plane
+    side, center = (np.float32(w**power) for w in _TRIANGLE_FILTER[:2])
+    rows = center * plane
     rows[1:] += side * plane[:-1]
     rows[:-1] += side * plane[1:]
-    both = centre * rows
+    both = center * rows
     both[:, 1:] += side * rows[:, :-1]
     both[:, :-1] += side * rows[:, 1:]
     return both

@@ -67,7 +67,7 @@ def transfer_rig(
     except landmark_field.LandmarkFieldError as error:
         raise RigTransferError(f"landmarks: {error}") from error
     stored = (min(rig.neutral_mean.shape[0], shape[0]), min(rig.neutral_mean.shape[1], shape[1]))
-    place = _centres(shape, stored)
+    place = _centers(shape, stored)
     moved, unsure_px = field.evaluate(place.reshape(-1, 2))
     source = place + moved.reshape(place.shape)
     located = unsure_px.reshape(stored) <= rig.radius_px
@@ -104,7 +104,7 @@ def transfer_rig(
     )
 
 
-def _centres(shape: tuple[int, int], stored: tuple[int, int]) -> Float64Array:
+def _centers(shape: tuple[int, int], stored: tuple[int, int]) -> Float64Array:
     """Return the positions of the cells' centers on the map, (h, w, 2) as (x, y) px."""
     rows, columns = (
         (np.arange(few) + 0.5) * full / few - 0.5 for full, few in zip(shape, stored, strict=True)

@@ -81,7 +81,7 @@ class MomentInversion:
     reflection: ReflectionMoments
     table: LobeResponseTable
     eta: float
-    analyser: Float64Array
+    analyzer: Float64Array
     starts: Float64Array
 
     @staticmethod
@@ -92,14 +92,14 @@ class MomentInversion:
         eta: float,
     ) -> MomentInversion:
         """Prepare the inversion with a table made for these lights."""
-        analyser, starts = np.zeros(2), np.zeros((2, 2, 2))
+        analyzer, starts = np.zeros(2), np.zeros((2, 2, 2))
         if lights is not None:
-            analyser = np.asarray(table.frame[:2] @ np.asarray(lights.analyser))
+            analyzer = np.asarray(table.frame[:2] @ np.asarray(lights.analyzer))
         if table.coefficients.size:
             lines = int(np.clip(3.0 / table.step, 65, 257))
             starts = np.empty((lines, lines, 2))
             kernels.fill_start_grid(table.coefficients, table.min_coordinate, table.step, starts)
-        return MomentInversion(reflection, table, eta, analyser, starts)
+        return MomentInversion(reflection, table, eta, analyzer, starts)
 
     def normals(
         self,
@@ -128,7 +128,7 @@ class MomentInversion:
             table.min_coordinate,
             table.step,
             self.starts,
-            self.analyser,
+            self.analyzer,
             self.eta,
             np.zeros((0, 3)) if view is None else view,
             np.zeros((0, 2)) if position is None else position,

@@ -219,7 +219,7 @@ def invert(  # type: ignore[no-untyped-def]
     min_coordinate,
     step,
     grid,
-    analyser,
+    analyzer,
     eta,
     view,
     position,
@@ -261,7 +261,7 @@ def invert(  # type: ignore[no-untyped-def]
     two = crossed.shape[1] > 0
     tabled = table.size > 0
     straight = frame[0, 0] == 1.0 and frame[1, 1] == 1.0 and frame[2, 2] == 1.0
-    polarized = two and tabled and (analyser[0] != 0.0 or analyser[1] != 0.0)
+    polarized = two and tabled and (analyzer[0] != 0.0 or analyzer[1] != 0.0)
     last = 16 if polarized else 0
     spread = np.empty(5)
     c, cov, turned = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
@@ -372,7 +372,7 @@ def invert(  # type: ignore[no-untyped-def]
                 break
             square = min(u0 * u0 + u1 * u1, 1.9)
             m = math.sqrt(1.0 - 0.25 * square)
-            fresh = _exit_ratio(u0 * m, u1 * m, 1.0 - 0.5 * square, analyser[0], analyser[1], eta)
+            fresh = _exit_ratio(u0 * m, u1 * m, 1.0 - 0.5 * square, analyzer[0], analyzer[1], eta)
             # relative change of the vector by the polarization's change
             change = abs(fresh - ratio) * abs(crossed[C_0, p]) / c0
             ratio = fresh

@@ -82,9 +82,9 @@ def facet_reflectance(lights: SphereLights, view: Float64Array, eta: float) -> F
         refractive index outside 1...4.
     """
     view, eta = require_unit_vectors("view", np.asarray(view, np.float64)[None])[0], _index(eta)
-    if abs(float(view @ np.asarray(lights.analyser))) > 1.0 - 5e-7:
+    if abs(float(view @ np.asarray(lights.analyzer))) > 1.0 - 5e-7:
         raise SphereLightsError(
-            f"view: got {view.tolist()}, along the analyzer's axis {list(lights.analyser)},"
+            f"view: got {view.tolist()}, along the analyzer's axis {list(lights.analyzer)},"
             " expected one across it; correct the rig's analyzer axis"
         )
     light = lights.directions
@@ -98,7 +98,7 @@ def facet_reflectance(lights: SphereLights, view: Float64Array, eta: float) -> F
     # a light along the view: s and p are equal, and any direction across serves
     s = np.where(size > 1e-9, s / np.maximum(size, 1e-9), view_frame(view)[0])
     p_in, p_out = np.cross(-light, s), np.cross(np.broadcast_to(view, s.shape), s)
-    a_s, a_p = s @ np.asarray(lights.analyser), p_out @ np.asarray(lights.analyser)
+    a_s, a_p = s @ np.asarray(lights.analyzer), p_out @ np.asarray(lights.analyzer)
     if len(lights.polarizers):
         e_s = np.sum(lights.polarizers * s, axis=1)
         e_p = np.sum(lights.polarizers * p_in, axis=1)

@@ -55,7 +55,7 @@ class SphereLights:
     intensities: Float64Array = field(default_factory=_none)
     leakage: Float64Array = field(default_factory=_none)
     polarizers: Float64Array = field(default_factory=_none)
-    analyser: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    analyzer: tuple[float, float, float] = (0.0, 1.0, 0.0)
     programmed: Float64Array = field(default_factory=_none)
     distance_mm: float = np.inf
     intensity_stderr: Float64Array = field(default_factory=_none)
@@ -67,7 +67,7 @@ class SphereLights:
         ways = require_unit_vectors("directions", self.directions)
         count = len(ways)
         check.require(count >= 4, "directions", f"{count} light(s)", "at least 4")
-        axis = require_unit_vectors("analyser", np.asarray(self.analyser, np.float64)[None])[0]
+        axis = require_unit_vectors("analyzer", np.asarray(self.analyzer, np.float64)[None])[0]
         # not given: stay empty, so that a later replace() of directions does not meet old ones
         for name in ("intensities", "leakage", "intensity_stderr", "leakage_stderr"):
             given = np.asarray(getattr(self, name), np.float64)
@@ -91,7 +91,7 @@ class SphereLights:
             check.require(along.max() <= 0.05, where, "a field along its own ray", "one across it")
         check.within("distance_mm", self.distance_mm, "(0, inf]")
         _keep(self, "directions", ways)
-        object.__setattr__(self, "analyser", tuple(float(a) for a in axis))
+        object.__setattr__(self, "analyzer", tuple(float(a) for a in axis))
 
     def _contents(self) -> tuple[object, ...]:
         values = (getattr(self, name) for name in self.__slots__)

@@ -220,8 +220,8 @@ def _clustered(found: Amplitudes, zones: int, rng: np.random.Generator) -> Float
     features = np.concatenate([found.values[:, good].T, 2.0 * places[good]], axis=1)
     best, least = None, np.inf
     for _ in range(8):
-        centres, label = kmeans2(features, zones, iter=30, minit="++", seed=rng, missing="warn")
-        cost = float((found.energy[good] * ((features - centres[label]) ** 2).sum(axis=1)).sum())
+        centers, label = kmeans2(features, zones, iter=30, minit="++", seed=rng, missing="warn")
+        cost = float((found.energy[good] * ((features - centers[label]) ** 2).sum(axis=1)).sum())
         if cost < least:
             best, least = label, cost
     assert best is not None  # noqa: S101

@@ -27,23 +27,23 @@ class Polarizers:
 
     light_extinction: float
     """Extinction ratio of the polarizer in front of each light, > 1; real ones have 1e3 to 1e4."""
-    analyser_extinction: float
+    analyzer_extinction: float
     """Extinction ratio of the analyzer in front of the camera, > 1."""
-    analyser_zero_deg: float
+    analyzer_zero_deg: float
     """True angle less the rotator's reading, degrees, -10 to 10."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        for name in ("light_extinction", "analyser_extinction"):
+        for name in ("light_extinction", "analyzer_extinction"):
             value = getattr(self, name)
             if not value > 1.0:
                 raise PolarizerError(f"{name}: got {value}, expected > 1 (inf is ideal film)")
-        if not -10.0 <= self.analyser_zero_deg <= 10.0:
+        if not -10.0 <= self.analyzer_zero_deg <= 10.0:
             raise PolarizerError(
-                f"analyser_zero_deg: got {self.analyser_zero_deg}, expected -10 to 10"
+                f"analyzer_zero_deg: got {self.analyzer_zero_deg}, expected -10 to 10"
             )
 
-    def analyzer_axis_deg(self, view: View, polarizer: str, analyser_deg: float | None) -> float:
+    def analyzer_axis_deg(self, view: View, polarizer: str, analyzer_deg: float | None) -> float:
         """Return the true transmission axis of the analyzer, degrees from the image's x axis.
 
         Parameters
@@ -52,19 +52,19 @@ class Polarizers:
             The camera; its nominal axis belongs to reading 0.
         polarizer
             "parallel" or "crossed".
-        analyser_deg
+        analyzer_deg
             Reading of the rotator; ``None`` takes that of the state.
         """
         if polarizer not in POLARIZER_READING_DEG:
             raise PolarizerError(f"polarizer: got {polarizer!r}, expected parallel or crossed")
-        reading = POLARIZER_READING_DEG[polarizer] if analyser_deg is None else analyser_deg
+        reading = POLARIZER_READING_DEG[polarizer] if analyzer_deg is None else analyzer_deg
         if not math.isfinite(reading):
-            raise PolarizerError(f"analyser_deg: got {reading}, expected a finite angle")
-        if view.analyser_axis_deg is None:
+            raise PolarizerError(f"analyzer_deg: got {reading}, expected a finite angle")
+        if view.analyzer_axis_deg is None:
             raise PolarizerError(
-                f"view {view.name!r}: has no analyser; give it an analyser_axis_deg"
+                f"view {view.name!r}: has no analyzer; give it an analyzer_axis_deg"
             )
-        return view.analyser_axis_deg + reading + self.analyser_zero_deg
+        return view.analyzer_axis_deg + reading + self.analyzer_zero_deg
 
 
 IDEAL_POLARIZERS = Polarizers(math.inf, math.inf, 0.0)
@@ -87,9 +87,9 @@ def draw_polarizers(rig: Rig) -> Polarizers:
     serials = "|".join(view.serial for view in rig.views)
     digest = hashlib.sha256(f"films of {serials}".encode()).digest()
     rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
-    light, analyser = np.exp(rng.uniform(math.log(1500.0), math.log(6000.0), 2))
+    light, analyzer = np.exp(rng.uniform(math.log(1500.0), math.log(6000.0), 2))
     zero = float(np.clip(rng.normal(0.0, 0.5), -1.2, 1.2))
-    return Polarizers(float(light), float(analyser), zero)
+    return Polarizers(float(light), float(analyzer), zero)
 
 
 def absorbing_axis(light: Light) -> Float64Array:

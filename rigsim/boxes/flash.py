@@ -62,7 +62,7 @@ class FlashPop:
     """Energy relative to a full pop, 0 to 1."""
     polarizer: Polarizer
     """Analyzer at its parallel (0 degrees) or crossed (90 degrees) stop."""
-    analyser_deg: float | None
+    analyzer_deg: float | None
     """Reading of the rotator in degrees when it is not at a requested stop."""
 
 
@@ -118,7 +118,7 @@ class FlashUnit(Device):
         self.power = 1.0
         self.sync_s = 0.0
         self.polarizer: Polarizer = "parallel"
-        self.analyser_deg: float | None = None
+        self.analyzer_deg: float | None = None
         self.last_report = ""
         self._turn(POLARIZER_READING_DEG["parallel"], now)
 
@@ -230,15 +230,15 @@ class FlashUnit(Device):
     def _set_polarizer(self, arguments: str, now: float) -> None:
         stop = parse_choice(arguments, ("PAR", "CROS"))
         self.polarizer = "parallel" if stop == "PAR" else "crossed"
-        self.analyser_deg = None
+        self.analyzer_deg = None
         self._turn(POLARIZER_READING_DEG[self.polarizer], now)
 
     def _get_polarizer(self, _: str, now: float) -> str:
         return "PAR" if self.polarizer == "parallel" else "CROS"
 
     def _set_angle(self, arguments: str, now: float) -> None:
-        self.analyser_deg = parse_number(arguments, *ANALYZER_RANGE_DEG, "degrees")
-        self._turn(self.analyser_deg, now)
+        self.analyzer_deg = parse_number(arguments, *ANALYZER_RANGE_DEG, "degrees")
+        self._turn(self.analyzer_deg, now)
 
     def _get_angle(self, _: str, now: float) -> str:
         return f"{self.angle_deg:.3f}"
@@ -317,7 +317,7 @@ class FlashUnit(Device):
         self._last_power = self.power
         self._pops.append(now)
         self.count += 1
-        self._on_light(FlashPop(token, now, self.power, self.polarizer, self.analyser_deg))
+        self._on_light(FlashPop(token, now, self.power, self.polarizer, self.analyzer_deg))
         self.last_report = ",".join(
             (
                 token,

@@ -50,7 +50,7 @@ class PatternLight:
     """World time when it came on, s."""
     t_off_s: float
     """World time when it went off, s."""
-    analyser_deg: float
+    analyzer_deg: float
     """Reading of the analyzer meanwhile, degrees; 0 parallel, 90 crossed."""
     led_shares: tuple[float, ...] = ()
     """Light of each LED relative to the pattern at this level: its gain, times its health (0 when
@@ -79,7 +79,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         health[list(faults.dead_leds)] = 0.0
         self._health = health
         self._shining: PatternLight | None = None  # light in progress; its end is not known yet
-        self.analyser_deg = 0.0
+        self.analyzer_deg = 0.0
         self._settled_at = 0.0
         super().__init__(wiring, self._on_pulse_end)
         self.reset(0.0, power_up=True)
@@ -109,7 +109,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
             "PATT?": self._lit_now,
             "POL": self._set_stop,
             "POL:ANG": self._set_angle,
-            "POL?": lambda *_: f"{self.analyser_deg:.3f}",
+            "POL?": lambda *_: f"{self.analyzer_deg:.3f}",
             "GAIN:CLE": self._clear_gains,
             "GAIN:DEF": self._define_gains,
             "GAIN:CRC?": lambda *_: f"{len(self._gains_sent)},{table_crc(self._gains_sent)}",
@@ -132,8 +132,8 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
 
     def _turn(self, reading_deg: float, now: float) -> None:
         start = max(now, self._settled_at)
-        self._settled_at = start + abs(reading_deg - self.analyser_deg) * self._s_per_deg
-        self.analyser_deg = reading_deg
+        self._settled_at = start + abs(reading_deg - self.analyzer_deg) * self._s_per_deg
+        self.analyzer_deg = reading_deg
 
     def _set_stop(self, arguments: str, now: float) -> None:
         self._set_angle(parse_choice(arguments, ("0", "90")), now)
@@ -187,7 +187,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
                 self.queue_event("LED:FAIL", str(led))
         shares = np.array(self.gains) / LEVEL_STEPS * self._health
         given = () if (shares == 1.0).all() else tuple(shares.tolist())
-        self._shining = PatternLight(pattern, level, now, now, self.analyser_deg, given)
+        self._shining = PatternLight(pattern, level, now, now, self.analyzer_deg, given)
 
     def _requested_pulses(
         self, pattern: str, level: float, on_s: float, off_s: float
@@ -235,7 +235,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
     ) -> list[LedPulse]:
         self._require_settled(now)
         times = led_table.pattern_start_times(
-            rows, reading_deg=self.analyser_deg, s_per_deg=self._s_per_deg
+            rows, reading_deg=self.analyzer_deg, s_per_deg=self._s_per_deg
         )
         found: list[LedPulse] = []
         for row, (_, lit_s) in zip(rows, times, strict=True):
@@ -249,7 +249,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         self._failed = set()
         return led_table.schedule_pattern_rows(
             rows,
-            reading_deg=self.analyser_deg,
+            reading_deg=self.analyzer_deg,
             s_per_deg=self._s_per_deg,
             settle_s=self._limits.settle_s,
         )
@@ -260,7 +260,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         row = run.rows[switch.row]
         if switch.action == "rotate":
             self.bank.all_off(now)
-            self._turn(row.analyser_deg, now)
+            self._turn(row.analyzer_deg, now)
         else:
             self._start_pattern(row.pattern, row.level, now)
 

@@ -184,7 +184,7 @@ class PatternRow(TableRow):
 
     pattern: str
     """full, x, y, z, -x, -y, -z or dark."""
-    analyser_deg: float
+    analyzer_deg: float
     """Reading of the analyzer, degrees; where it differs from the row before, the analyzer
     turns."""
     level_steps: int
@@ -196,7 +196,7 @@ class PatternRow(TableRow):
 
     def __str__(self) -> str:
         """Return the row in the canonical spelling that the table's checksum covers."""
-        angle = f"{self.analyser_deg:.3f}".rstrip("0").rstrip(".")
+        angle = f"{self.analyzer_deg:.3f}".rstrip("0").rstrip(".")
         text = f"{self.pattern.upper()}:{angle}:{self.level_steps}:{self.dwell_us}"
         return f"{text}:{self.mask:X}"
 
@@ -259,9 +259,9 @@ def pattern_start_times(
     found = []
     t_s = 0.0
     for row in rows:
-        lit_s = t_s + abs(row.analyser_deg - reading_deg) * s_per_deg
+        lit_s = t_s + abs(row.analyzer_deg - reading_deg) * s_per_deg
         found.append((t_s, lit_s))
-        reading_deg = row.analyser_deg
+        reading_deg = row.analyzer_deg
         t_s = lit_s + row.dwell_s
     return found
 

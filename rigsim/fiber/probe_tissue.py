@@ -30,7 +30,7 @@ RESTING_BLOOD_FRACTION: Final[Mapping[str, float]] = {
     "chin": 0.016,
     "abdomen": 0.005,
 }
-"""Volume fraction of blood in the dermis at rest, by site; of the whole dermis down to centimetres,
+"""Volume fraction of blood in the dermis at rest, by site; of the whole dermis down to centimeters,
 so less than what colors the face, whose vessels lie under the epidermis."""
 PRESET_MELANIN_FRACTION: Final = 0.25
 """Of the presets' melanin: theirs colors the faces of other rigs, while spectra of forearms ask for

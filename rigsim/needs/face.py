@@ -222,7 +222,7 @@ def lens_effect(scenery: ViewingConditions, level: float) -> Effect:
 def polarization_effect(rig: Rig, view: View) -> Effect:
     """Return whether light is kept as Stokes vectors: only polarizers make polarization visible."""
     films = [light.name for light in rig.lights if light.polarizer_axis_deg is not None]
-    if films or view.analyser_axis_deg is not None:
+    if films or view.analyzer_axis_deg is not None:
         reason = f"polarized: {len(films)} of {len(rig.lights)} lights, analyzer before {view.name}"
         return Effect(POLARIZATION_EFFECT, "built", reason)
     return Effect(

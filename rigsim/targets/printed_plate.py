@@ -126,7 +126,7 @@ def render_plate(  # type: ignore[no-untyped-def]
     rays
         Directions through the corners of pixels, shape (H + 1, W + 1, 3).
     eye_mm
-        Centre of projection, shape (3,).
+        Center of projection, shape (3,).
     rotation, place_mm
         From the plate's axes to the rig frame, and the position of its top left corner.
     paper

@@ -219,7 +219,7 @@ def _color(frames: _Frames) -> store.Calibration:
 def _polarization(frames: _Frames) -> store.Calibration:
     dark = frames.dark_level()
     shots = frames.require_frames("malus")
-    angles = np.deg2rad([frames.read_setting(record, "analyser_deg") for record, _ in shots])
+    angles = np.deg2rad([frames.read_setting(record, "analyzer_deg") for record, _ in shots])
     linear = _linear(shots)
     images = [each.rgb - dark for each in linear]
     valid = np.logical_and.reduce([each.valid for each in linear])

@@ -127,7 +127,7 @@ def _light_s(record: FrameRecord) -> float:
 
 
 def _reading_deg(record: FrameRecord) -> float:
-    reading = record.settings.get("analyser_deg")
+    reading = record.settings.get("analyzer_deg")
     if reading is not None:
         return float(reading)
     return ANALYZER_READING_DEG[str(record.settings["polarizer"])]
@@ -210,14 +210,14 @@ def _polarizer_summary(survey: SphereSurvey) -> tuple[tuple[str, str], ...]:
     leaked, glass = fit.leakage, fit.glass_leakage[fit.valid]
     low = f"9 of 10 lights below {100 * np.quantile(leaked, 0.9):.2f} %"
     rows = {
-        "analyser's misalignment": f"{zero:+.3f}° ± {error:.3f}°",
+        "analyzer's misalignment": f"{zero:+.3f}° ± {error:.3f}°",
         "extinction of the lights' films": _extinction(fit.light_leak, fit.light_leak_stderr),
-        "extinction of the analyser": _extinction(fit.analyser_leak, fit.analyser_leak_stderr),
+        "extinction of the analyzer": _extinction(fit.analyzer_leak, fit.analyzer_leak_stderr),
         "lights' polarizers off their axes": f"{np.degrees(survey.turn_scatter_rad):.2f}°",
         "glass leaks crossed": f"median {100 * np.median(glass):.2f} %,"
         f" highest {100 * glass.max():.1f} % of parallel",
         f"skin (eta {fit.eta:g}) will leak": f"median {100 * np.median(leaked):.3f} %, {low}",
-        "readings of the analyser": ", ".join(f"{r:g}" for r in survey.readings_deg),
+        "readings of the analyzer": ", ".join(f"{r:g}" for r in survey.readings_deg),
     }
     return tuple(rows.items())
 

@@ -65,7 +65,7 @@ def simulate_observation(
     sphere = nominal_sphere(small)
     scene = GradientScene(small, skin, sphere=sphere, seed=seed)
     rates = {
-        (pattern, polarizer): scene.radiance(pattern, grip=NEUTRAL, analyser_deg=reading)
+        (pattern, polarizer): scene.radiance(pattern, grip=NEUTRAL, analyzer_deg=reading)
         for pattern in LIGHT_PATTERNS
         if pattern != "dark"
         for polarizer, reading in (("parallel", 0.0), ("crossed", 90.0))

@@ -145,7 +145,7 @@ def test_persistent_fault_ends_dark_with_single_error(world, session, faults):
     assert not simulated.box("flash").armed
 
 
-@pytest.mark.parametrize("settings", [{"power": 0.001}, {"power": 1.0, "analyser_deg": 270.0}])
+@pytest.mark.parametrize("settings", [{"power": 0.001}, {"power": 1.0, "analyzer_deg": 270.0}])
 def test_plan_beyond_controller_limits_moves_and_lights_nothing(world, session, settings):
     simulated = world()
     more = {"polarizer": "parallel", "exposure_s": 0.008, "iso": 100, **settings}

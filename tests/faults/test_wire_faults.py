@@ -173,7 +173,7 @@ def noisy_run(ledger, world, url, requests):
         angle_deg = float(step % 181)
         box.set_analyzer(angle_deg)
         assert unit.angle_deg == angle_deg
-        assert box.analyser_deg() == angle_deg
+        assert box.analyzer_deg() == angle_deg
         box.ping()
         if step % 10 == 0:
             host.pop()

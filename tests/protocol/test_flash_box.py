@@ -261,7 +261,7 @@ def test_pop_informs_world_as_controller_reports(bench):
     assert report == "n.7,1500000,0.25000000,PAR,30.000,1"
     assert bench.ask("FLAS:LAST?") == report
     (pop,) = bench.world.pops
-    assert (pop.token, pop.t_s, pop.power, pop.analyser_deg) == ("n.7", 1.5, 0.25, 30.0)
+    assert (pop.token, pop.t_s, pop.power, pop.analyzer_deg) == ("n.7", 1.5, 0.25, 30.0)
     assert pop.polarizer == "parallel"
 
 

@@ -29,9 +29,9 @@ def test_controller_reports_identity_and_limits(bench):
 def test_settings_come_back_as_they_were_set(bench):
     box = bench.box()
     box.set_polarizer("crossed")
-    assert (box.polarizer(), box.analyser_deg()) == ("crossed", 90.0)
+    assert (box.polarizer(), box.analyzer_deg()) == ("crossed", 90.0)
     box.set_analyzer(22.5)
-    assert box.analyser_deg() == 22.5
+    assert box.analyzer_deg() == 22.5
     box.set_power(0.0625)
     assert box.power() == 0.0625
     box.set_lease(0.75)

@@ -86,7 +86,7 @@ def test_light_carries_its_own_end(bench):
     bench.wait(0.1)
     assert bench.ask("PATT?") == "DARK"
     (light,) = bench.world.switched
-    assert (light.pattern, light.level, light.analyser_deg) == ("-y", 0.3, 0.0)
+    assert (light.pattern, light.level, light.analyzer_deg) == ("-y", 0.3, 0.0)
     assert light.t_off_s - light.t_on_s == pytest.approx(0.08)
     assert light.led_shares == ()
 
@@ -113,7 +113,7 @@ def test_ongoing_light_is_recorded_up_to_now(bench):
     assert world.light_between(0.5, 0.9) == ()
 
 
-# analyser --------------------------------------------------------------------------------------
+# analyzer --------------------------------------------------------------------------------------
 
 
 def test_analyzer_rotation_takes_time(bench):
@@ -139,10 +139,10 @@ def test_light_and_analyzer_rotation_exclude_each_other(bench):
     bench.wait(TURN_S)
     bench.ask("PATT X,100")
     assert bench.code("POL 0") == Code.IGNORED
-    assert bench.unit.analyser_deg == 90.0
+    assert bench.unit.analyzer_deg == 90.0
     bench.wait(0.2)
     bench.ask("POL 0")
-    assert bench.world.switched[0].analyser_deg == 90.0
+    assert bench.world.switched[0].analyzer_deg == 90.0
 
 
 def test_rotation_after_table_check_requires_new_check(bench):
@@ -172,7 +172,7 @@ def test_scan_rotates_in_dark_and_reports_each_release(bench):
     assert (full.pattern, x.pattern, minus_x.pattern) == ("full", "x", "-x")
     assert full.t_off_s == x.t_on_s
     assert minus_x.t_on_s - x.t_off_s == pytest.approx(TURN_S)
-    assert (x.analyser_deg, minus_x.analyser_deg) == (0.0, 90.0)
+    assert (x.analyzer_deg, minus_x.analyzer_deg) == (0.0, 90.0)
     assert bench.ask("SEQ:POS?") == "DONE,3,4,r1"
     assert bench.ask("POL?") == "90.000"
     assert not bench.unit.lit

@@ -25,13 +25,13 @@ CALM = ("full", "z", "x", "y", "-x", "-y", "-z", "dark")
 
 
 class Witness:
-    """A scene whose pixels tell pattern, analyser and what the caliper held."""
+    """A scene whose pixels tell pattern, analyzer and what the caliper held."""
 
     def exposure(self, view_name, *, pops, exposure_s, seed, grip):
         lit_s = sum(pop.level * (pop.t_off_s - pop.t_on_s) for pop in pops)
         image = np.full((16, 16), 64, np.uint16)
         image[0, 0] = 1 + CALM.index(pops[0].pattern) if pops else 0
-        image[0, 1] = round(pops[0].analyser_deg) if pops else 0
+        image[0, 1] = round(pops[0].analyzer_deg) if pops else 0
         image[0, 2] = round(1e3 * lit_s / exposure_s)
         image[0, 3] = round(1e3 * grip.stretch)
         image[0, 4] = grip.step + 100
@@ -103,9 +103,9 @@ def test_armed_scan_of_sixteen_conditions_times_every_release(bench):
     assert box.step_time(16) is None
     position = box.position()
     assert (position.state, position.row, position.rows, position.token) == ("DONE", 15, 16, "r")
-    patterns = [(p.pattern, p.analyser_deg) for p in bench.world.switched]
+    patterns = [(p.pattern, p.analyzer_deg) for p in bench.world.switched]
     assert patterns == [(n, 0.0) for n in CALM[:7]] + [(n, 90.0) for n in CALM[6::-1]]
-    assert box.analyser_deg() == 90.0
+    assert box.analyzer_deg() == 90.0
 
 
 def test_camera_records_each_pattern_separately_under_its_analyzer(bench):
@@ -160,13 +160,13 @@ def test_analyzer_rotates_to_stops_and_any_reading(bench):
     box.set_polarizer("crossed")
     assert not box.is_settled() or not bench.world.virtual
     box.wait_settled()
-    assert (box.is_settled(), box.analyser_deg(), box.status().turning) == (True, 90.0, False)
+    assert (box.is_settled(), box.analyzer_deg(), box.status().turning) == (True, 90.0, False)
     box.set_analyzer(87.125)
     box.wait_settled()
-    assert box.analyser_deg() == 87.125
+    assert box.analyzer_deg() == 87.125
     box.set_polarizer("parallel")
     box.wait_settled()
-    assert box.analyser_deg() == 0.0
+    assert box.analyzer_deg() == 0.0
     with pytest.raises(ValueError, match="'parallel' or 'crossed'"):
         box.set_polarizer("none")
     with pytest.raises(ValueError, match="finite"):

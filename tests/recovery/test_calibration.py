@@ -269,8 +269,8 @@ def mirrored_light(count, light_extinction):
     return n, stokes
 
 
-def metal_frames(rng, *, zero_deg, light_extinction, analyser_extinction, jitter=0.004):
-    """A rough plate through an analyser at 13 angles, two frames each."""
+def metal_frames(rng, *, zero_deg, light_extinction, analyzer_extinction, jitter=0.004):
+    """A rough plate through an analyzer at 13 angles, two frames each."""
     sensor, shape = a_sensor(0, width_px=72)
     n, stokes = mirrored_light(shape[0] * shape[1], light_extinction)
     top = float(stokes[..., 0].max())
@@ -282,7 +282,7 @@ def metal_frames(rng, *, zero_deg, light_extinction, analyser_extinction, jitter
             passes_deg=90.0 + degrees - zero_deg,
             image_right=RIGHT,
             image_up=UP,
-            extinction=analyser_extinction,
+            extinction=analyzer_extinction,
         )
         light = 0.85 / top * (1 + jitter * rng.normal()) * seen.reshape(*shape, 1) * white_rgb()
         frames.append(
@@ -306,10 +306,10 @@ def malus_fit(seed, **films):
 def test_analyzer_zero_and_extinction_are_within_errors():
     """20 series with films of 1:800 and 1:1200; false-alarm rate 1e-3.
 
-    What leaks is least over most of the noise-free light: 1/1200 of the analyser and 1/800 of the
+    What leaks is least over most of the noise-free light: 1/1200 of the analyzer and 1/800 of the
     light's film, the latter weakened a little by Fresnel's smaller reflectance across its axis.
     """
-    films = {"zero_deg": 1.3, "light_extinction": 800.0, "analyser_extinction": 1200.0}
+    films = {"zero_deg": 1.3, "light_extinction": 800.0, "analyzer_extinction": 1200.0}
     fits = [malus_fit(seed, **films) for seed in range(20)]
     n, stokes = mirrored_light(1, 800.0)
     least, most = (
@@ -372,7 +372,7 @@ def test_ball_separates_into_diffuse_and_specular(extinction):
     """Rationale: independent polarized shading, films of finite extinction, angles up to 68 deg.
 
     Expected: diffuse to 0.1 % for ideal films (float32 and the turn of the plane by each light
-    taken as their mean); with a leak, 0.8 % more per 1 % of leak, since a leaking analyser passes
+    taken as their mean); with a leak, 0.8 % more per 1 % of leak, since a leaking analyzer passes
     (1 + leak)/2 of diffuse light.
     """
     n, _, diffuse, specular = ball(extinction=extinction)
@@ -430,9 +430,9 @@ def test_targets_captured_by_full_rig_calibrate_to_truth(kind, tmp_path):
             assert (np.abs(found.value - getattr(truth, name)) < 5 * found.stderr).all(), name
     elif kind == "polarization":
         films = draw_polarizers(rig)
-        zero, leak = get(serial, "analyser_zero_rad"), get(serial, "leak")
-        assert abs(zero.value + np.deg2rad(films.analyser_zero_deg)) < 5 * zero.stderr
-        least = 1 / films.light_extinction + 1 / films.analyser_extinction
+        zero, leak = get(serial, "analyzer_zero_rad"), get(serial, "leak")
+        assert abs(zero.value + np.deg2rad(films.analyzer_zero_deg)) < 5 * zero.stderr
+        least = 1 / films.light_extinction + 1 / films.analyzer_extinction
         # the plate turns the plane of polarization a little across the field, which adds
         assert (leak.value > 0.9 * least).all()
         assert (leak.value < least + 5e-4).all()

@@ -76,7 +76,7 @@ def true_intensities(scene, among):
     return light / light[among].mean()
 
 
-def true_leakage(scene, zero_deg=FILMS.analyser_zero_deg):
+def true_leakage(scene, zero_deg=FILMS.analyzer_zero_deg):
     """What a facet of skin at the origin leaks of each LED, by the simulator's own shading."""
     to_light, out = true_directions(scene), []
     to_camera = np.array([[0.0, 0.0, 1.0]])
@@ -99,7 +99,7 @@ def true_leakage(scene, zero_deg=FILMS.analyser_zero_deg):
                 passes_deg=90.0 + reading + zero_deg,
                 image_right=[1.0, 0.0, 0.0],
                 image_up=[0.0, 1.0, 0.0],
-                extinction=scene.films.analyser_extinction,
+                extinction=scene.films.analyzer_extinction,
             )[0]
             for reading in (0.0, 90.0)
         ]
@@ -164,12 +164,12 @@ def test_intensities_err_below_percent_and_as_stated(ball):
 def test_analyzer_and_polarizers_are_found(ball):
     scene, _, survey = ball
     films = survey.films
-    zero = np.degrees(films.misalignment_rad) - FILMS.analyser_zero_deg
+    zero = np.degrees(films.misalignment_rad) - FILMS.analyzer_zero_deg
     # LEDs' own axes scatter by a degree about what they are measured against: 0.09 for 132
     assert abs(zero) < 4 * np.degrees(films.misalignment_stderr_rad)
     assert np.degrees(films.misalignment_stderr_rad) < 0.11
     assert abs(films.light_leak * FILMS.light_extinction - 1) < 0.1
-    assert abs(films.analyser_leak * FILMS.analyser_extinction - 1) < 0.1
+    assert abs(films.analyzer_leak * FILMS.analyzer_extinction - 1) < 0.1
     true = true_leakage(scene)
     error = np.abs(films.leakage - true)[films.valid]
     assert np.median(error / true[films.valid]) < 0.05

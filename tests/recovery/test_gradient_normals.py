@@ -28,7 +28,7 @@ EDGE = (slice(6, -6), slice(6, -6))
 @dataclasses.dataclass(frozen=True)
 class Light:
     pattern: str
-    analyser_deg: float
+    analyzer_deg: float
     level: float = 1.0
     t_on_s: float = 0.0
     t_off_s: float = EXPOSURE_S
@@ -77,7 +77,7 @@ def mean_error_deg(found, truth):
 def test_noise_free_smooth_normals_err_below_third_degree():
     scene, sphere, seen, sharp = patch(96, smooth=True)
     images = {
-        (name, state): scene.radiance(name, grip=NEUTRAL, analyser_deg=angle)
+        (name, state): scene.radiance(name, grip=NEUTRAL, analyzer_deg=angle)
         for name in PATTERN_WEIGHTS
         for state, angle in (("parallel", 0.0), ("crossed", 90.0))
     }

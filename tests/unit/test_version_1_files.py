@@ -82,6 +82,10 @@ def test_plan_rig_and_calibration_have_present_names(folder):
     assert load_rig(folder / "rig-probe.toml").probe == load_rig("probe").probe
     found = calibrations.load(folder / "calibration", "fiber")
     assert (found.kind, float(found.values["SP-0001"]["gain"].value)) == ("fiber", 0.98)
+    turned = calibrations.load(folder / "calibration", "polarization").values["SIM-FLASH"]
+    assert float(turned["analyzer_zero_rad"].value) == 0.01
+    rig = Session.open(folder / "session-flash").rig
+    assert rig.views[0].analyzer_axis_deg == load_rig("flash").views[0].analyzer_axis_deg
 
 
 @pytest.mark.parametrize("part", ["session-flash/session.json", "appearance-flash/appearance.json"])

@@ -313,9 +313,9 @@ def _check_limits(plan: Plan, limits: Mapping[str, Any]) -> None:
         if not low <= power <= high:
             what = f"got power {power:g}, the controller allows {low:g} to {high:g}"
             raise step_limit_error(step, what, action="fired")
-        angle_deg = float(step.settings.get("analyser_deg", first))
+        angle_deg = float(step.settings.get("analyzer_deg", first))
         if not first <= angle_deg <= last:
-            what = f"got analyser_deg {angle_deg:g}, the controller allows {first:g} to {last:g}"
+            what = f"got analyzer_deg {angle_deg:g}, the controller allows {first:g} to {last:g}"
             raise step_limit_error(step, what, action="fired")
 
 

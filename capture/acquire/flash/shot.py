@@ -139,7 +139,7 @@ def _describe_light(report: FlashReport | None) -> dict[str, Value]:
         "token": str(report.token),
         "power": float(report.power),
         "polarizer": str(report.polarizer),
-        "analyser_deg": float(report.analyser_deg),
+        "analyzer_deg": float(report.analyzer_deg),
     }
 
 
@@ -152,8 +152,8 @@ def set_light(step: Step, box: FlashBox) -> None:
     """Turn the analyzer, set the power, and wait until a flash is possible."""
     power = flash_power(step)
     if power > 0:
-        if "analyser_deg" in step.settings:
-            box.set_analyzer(float(step.settings["analyser_deg"]))
+        if "analyzer_deg" in step.settings:
+            box.set_analyzer(float(step.settings["analyzer_deg"]))
         else:
             box.set_polarizer(str(step.settings["polarizer"]))
         box.set_power(power)

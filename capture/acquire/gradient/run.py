@@ -52,7 +52,7 @@ def check_sphere(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
         angle_deg = analyzer_reading_deg(step)
         if not low_deg <= angle_deg <= high_deg:
             what = (
-                f"got analyser_deg {angle_deg:g}, the controller turns from {low_deg:g} to "
+                f"got analyzer_deg {angle_deg:g}, the controller turns from {low_deg:g} to "
                 f"{high_deg:g}"
             )
             raise step_limit_error(step, what)

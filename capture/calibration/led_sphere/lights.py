@@ -157,7 +157,7 @@ class SpherePolarizers:
         and `leakage` follows from the polarizers alone.
     misalignment_rad, misalignment_stderr_rad : float
         True angle of the analyzer minus its reading.
-    light_leak, light_leak_stderr, analyser_leak, analyser_leak_stderr : float
+    light_leak, light_leak_stderr, analyzer_leak, analyzer_leak_stderr : float
         Inverse extinction ratios of the polarizers.
     eta : float
         Refractive index of the surface of `leakage`.
@@ -175,8 +175,8 @@ class SpherePolarizers:
     misalignment_stderr_rad: float
     light_leak: float
     light_leak_stderr: float
-    analyser_leak: float
-    analyser_leak_stderr: float
+    analyzer_leak: float
+    analyzer_leak_stderr: float
     eta: float
 
     def __post_init__(self) -> None:
@@ -207,14 +207,14 @@ class SpherePolarizers:
             valid=self.valid,
         )
         values[serial] = {
-            "analyser_zero_rad": _one(self.misalignment_rad, self.misalignment_stderr_rad),
+            "analyzer_zero_rad": _one(self.misalignment_rad, self.misalignment_stderr_rad),
             "light_leak": _one(self.light_leak, self.light_leak_stderr),
-            "analyser_leak": _one(self.analyser_leak, self.analyser_leak_stderr),
+            "analyzer_leak": _one(self.analyzer_leak, self.analyzer_leak_stderr),
             "eta": Quantity(np.array(self.eta)),
         }
         notes = {
             "leakage": "of a mirror reflection into the camera, crossed over parallel",
-            "analyser_zero": "true angle of the analyser less its reading; from +x towards +y",
+            "analyzer_zero": "true angle of the analyzer less its reading; from +x towards +y",
         }
         return make_device_calibration("polarization", values, notes, **about)
 
@@ -229,9 +229,9 @@ class SpherePolarizers:
         """
         table = _columns(calibration, rig, "polarization")
         leakage, glass, axis = (table.values_and_errors(name) for name in _LEAKAGE_FIELDS)
-        zero, light, analyser = (
+        zero, light, analyzer = (
             calibration.quantity(serial, name)
-            for name in ("analyser_zero_rad", "light_leak", "analyser_leak")
+            for name in ("analyzer_zero_rad", "light_leak", "analyzer_leak")
         )
         return cls(
             table.names,
@@ -241,7 +241,7 @@ class SpherePolarizers:
             table.flags("valid"),
             *_pair(zero),
             *_pair(light),
-            *_pair(analyser),
+            *_pair(analyzer),
             float(calibration.quantity(serial, "eta").value),
         )
 

@@ -48,7 +48,7 @@ class PolarizerFit:
         Deviation of each light's axis; shrunk to 0 where the readings leave its sign open.
     zero_rad, zero_stderr_rad : float
         True angle of the analyzer minus its reading.
-    light_leak, analyser_leak : float
+    light_leak, analyzer_leak : float
         Inverse extinction ratios.
     covariance : ndarray of float64, shape (L, 4, 4)
         Covariance of rotation, zero and the logarithms of both leaks, for each light.
@@ -65,7 +65,7 @@ class PolarizerFit:
     zero_rad: float
     zero_stderr_rad: float
     light_leak: float
-    analyser_leak: float
+    analyzer_leak: float
     covariance: Float64Array
     axis_scatter_rad: float
     chi2_per_dof: float
@@ -74,7 +74,7 @@ class PolarizerFit:
     def leak_stderr(self) -> tuple[float, float]:
         """Standard errors of the lights' and of the analyzer's leak."""
         a, b = np.sqrt(self.covariance[0, 2, 2]), np.sqrt(self.covariance[0, 3, 3])
-        return float(self.light_leak * a), float(self.analyser_leak * b)
+        return float(self.light_leak * a), float(self.analyzer_leak * b)
 
 
 def fit_polarizers(
@@ -152,16 +152,16 @@ def leakage(fit: PolarizerFit, reflection: FacetReflection) -> tuple[Float64Arra
         the best fit: leakage is quadratic in the angles, so that errors of either sign add to it.
     """
     count = len(fit.axis_error_rad)
-    shared = (fit.zero_rad, np.log(fit.light_leak), np.log(fit.analyser_leak))
+    shared = (fit.zero_rad, np.log(fit.light_leak), np.log(fit.analyzer_leak))
     at = np.stack([fit.axis_error_rad, *(np.full(count, x) for x in shared)], axis=-1)
     root = np.linalg.cholesky(fit.covariance + 1e-18 * np.eye(4))
     values = []
     # cubature of third degree: 2 n points at sqrt(n) standard deviations
     for column in range(4):
         for sign in (2.0, -2.0):
-            turn, zero, light, analyser = (at + sign * root[:, :, column]).T
+            turn, zero, light, analyzer = (at + sign * root[:, :, column]).T
             both = reflection.transmit_through_analyzer(
-                [0.0, np.pi / 2], turn, zero, np.exp(light), np.exp(analyser)
+                [0.0, np.pi / 2], turn, zero, np.exp(light), np.exp(analyzer)
             )
             values.append(both[1] / both[0])
     table = np.array(values)
@@ -246,9 +246,9 @@ class _PolarizerProblem:
         self.strength = np.sum(weight * u * values, axis=0) / np.where(power > 0, power, 1.0)
 
     def _transmitted(self, turn: Float64Array, shared: Float64Array) -> Float64Array:
-        zero, light, analyser = shared
+        zero, light, analyzer = shared
         return self.reflection.transmit_through_analyzer(
-            self.readings, turn, zero, np.exp(light), np.exp(analyser)
+            self.readings, turn, zero, np.exp(light), np.exp(analyzer)
         )
 
     def _objective(self, strength: Float64Array, turn: Float64Array, shared: Float64Array) -> float:
@@ -430,7 +430,7 @@ class _PolarizerProblem:
             zero_rad=float(self.shared[0]),
             zero_stderr_rad=float(np.sqrt(covariance[0, 1, 1])),
             light_leak=float(np.exp(self.shared[1])),
-            analyser_leak=float(np.exp(self.shared[2])),
+            analyzer_leak=float(np.exp(self.shared[2])),
             covariance=covariance,
             axis_scatter_rad=self.scatter,
             chi2_per_dof=per_dof,

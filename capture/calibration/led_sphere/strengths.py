@@ -181,14 +181,14 @@ def polarizer_table(
     safe = np.where(seen, parallel, 1.0)
     ratio = np.where(seen, crossed / safe, 0.0)
     ratio_stderr = np.where(seen, np.sqrt(c_var + ratio**2 * p_var) / safe, 0.0)
-    light_error, analyser_error = polarizers.leak_stderr
+    light_error, analyzer_error = polarizers.leak_stderr
     # axes are measured from the horizontal, which rotates fast with the direction near the poles
     upward = lights.directions[:, 1]
     horizon = np.linalg.norm(lights.directions_stderr, axis=1) / np.sqrt(2)
     horizon = horizon * np.abs(upward) / np.sqrt(np.maximum(1.0 - upward**2, 1e-6))
     turns = polarizers.axis_error_rad, np.hypot(polarizers.axis_error_stderr_rad, horizon)
     zero = polarizers.zero_rad, polarizers.zero_stderr_rad
-    leaks = polarizers.light_leak, light_error, polarizers.analyser_leak, analyser_error
+    leaks = polarizers.light_leak, light_error, polarizers.analyzer_leak, analyzer_error
     return SpherePolarizers(
         lights.names,
         *leakage(polarizers, skin),

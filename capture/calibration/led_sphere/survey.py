@@ -308,7 +308,7 @@ class _Scene:
         self, eta: float, to_light: Float64Array, to_camera: Float64Array, facing: Float64Array
     ) -> FacetReflection:
         """Return the lights with their mirror facets of a refractive index."""
-        axis, name = self.view.analyser_axis_deg, self.view.name
+        axis, name = self.view.analyzer_axis_deg, self.view.name
         if axis is None:
             text = f"view {name!r}: has no analyzer; this rig's polarizers cannot be calibrated"
             raise BallError(text)

@@ -104,7 +104,7 @@ class PolarizationCalibration:
     def to_calibration(self, **about: Unpack[Provenance]) -> Calibration:
         """Return this as a `Calibration` of kind "polarization" for one camera."""
         values = {
-            "analyser_zero_rad": self.zero_rad,
+            "analyzer_zero_rad": self.zero_rad,
             "leak": self.leak,
             "light_jitter": Quantity(np.array(self.light_jitter)),
         }
@@ -134,7 +134,7 @@ class PolarizationCalibration:
             intervals.append((low if low is not None else 1.0, high))
         return cls(
             colors=colors,
-            zero_rad=calibration.quantity(serial, "analyser_zero_rad"),
+            zero_rad=calibration.quantity(serial, "analyzer_zero_rad"),
             leak=calibration.quantity(serial, "leak"),
             extinction_interval=tuple(intervals),
             light_jitter=float(calibration.quantity(serial, "light_jitter").value),

@@ -59,7 +59,7 @@ class FacetReflection:
         Nominal transmission axis of each light's polarizer.
     image_right, image_up : ndarray of float64, shape (3,)
         Axes of the analyzer.
-    analyser_rad : float
+    analyzer_rad : float
         Nominal transmission axis of the analyzer at reading 0.
     eta : float
         Refractive index of the facets.
@@ -73,7 +73,7 @@ class FacetReflection:
     axis_rad: Float64Array
     image_right: Float64Array
     image_up: Float64Array
-    analyser_rad: float
+    analyzer_rad: float
     eta: float
 
     @classmethod
@@ -124,8 +124,8 @@ class FacetReflection:
         normal = half / np.linalg.norm(half, axis=1, keepdims=True)
         axis_rad = np.radians([light.polarizer_axis_deg or 0.0 for light in lights])
         film, image = (right, np.cross(beam, right)), (camera.rotation[0], -camera.rotation[1])
-        analyser_rad = float(np.radians(analyzer_deg))
-        return cls(to_light, to_camera, normal, *film, axis_rad, *image, analyser_rad, eta)
+        analyzer_rad = float(np.radians(analyzer_deg))
+        return cls(to_light, to_camera, normal, *film, axis_rad, *image, analyzer_rad, eta)
 
     def with_directions(self, to_light: Float64Array, eta: float) -> Self:
         """Return the reflection with lights in other directions, and of another index.
@@ -203,10 +203,10 @@ class FacetReflection:
         axes = self._image_axes()
         whole = np.sum(field**2, axis=-1)
         light = np.asarray(light_leak, np.float64)
-        analyser = np.asarray(analyzer_leak, np.float64)[..., None]
+        analyzer = np.asarray(analyzer_leak, np.float64)[..., None]
         rows = []
         for reading in np.atleast_1d(np.asarray(readings_rad, np.float64)):
-            angle = self.analyser_rad + reading + np.asarray(zero_rad, np.float64)
+            angle = self.analyzer_rad + reading + np.asarray(zero_rad, np.float64)
             angle = np.broadcast_to(angle, self.axis_rad.shape)[:, None]
             absorbs = -np.sin(angle) * self.image_right + np.cos(angle) * self.image_up
             # the transmitted field is perpendicular to the ray and to the absorbing axis
@@ -214,7 +214,7 @@ class FacetReflection:
             along = np.sum(field * passes, axis=-1) ** 2
             # Malus's law with leakage: the transmitted component, and a fraction of the absorbed
             # one.
-            behind = along + analyser * (whole - along)
+            behind = along + analyzer * (whole - along)
             rows.append(behind[:, 0] + light * behind[:, 1])
         return np.array(rows)
 

@@ -179,7 +179,7 @@ def _lights(inputs: Inputs, serial: str) -> SphereLights:
     )
     leakage = np.zeros(len(names))
     leakage_stderr = np.zeros(len(names))
-    axis_deg = rig.views[0].analyser_axis_deg
+    axis_deg = rig.views[0].analyzer_axis_deg
     axis_rad = math.radians(90.0 if axis_deg is None else axis_deg)
     if leak is not None:
         films = SpherePolarizers.from_calibration(leak, rig, serial)
@@ -189,7 +189,7 @@ def _lights(inputs: Inputs, serial: str) -> SphereLights:
         table.directions,
         intensities=table.intensities,
         leakage=leakage,
-        analyser=(math.cos(axis_rad), math.sin(axis_rad), 0.0),
+        analyzer=(math.cos(axis_rad), math.sin(axis_rad), 0.0),
         programmed=nominal.directions,
         distance_mm=float(np.mean(np.linalg.norm(place, axis=1))),
         intensity_stderr=table.intensities_stderr,

@@ -98,7 +98,7 @@ class FlashCourseScene(RigScene):
         pose: str,
         level: float,
         polarizer: str = "crossed",
-        analyser_deg: float | None = None,
+        analyzer_deg: float | None = None,
         *,
         view_name: str | None = None,
     ) -> Float32Array:
@@ -108,7 +108,7 @@ class FlashCourseScene(RigScene):
             if weight == 0.0:
                 continue
             shown = pose if self.movement else "neutral"
-            image = self._image(shown, node, polarizer, analyser_deg, view_name)
+            image = self._image(shown, node, polarizer, analyzer_deg, view_name)
             part = np.float32(weight) * image
             total = part if total is None else total + part
         if total is None:  # the weights sum to one
@@ -124,7 +124,7 @@ class FlashCourseScene(RigScene):
             level, pose = self.course.level(pop.t_s), self.course.pose(pop.t_s)
             if self._on_flash is not None:
                 self._on_flash(FlashEvent(pop.token, pop.t_s, level, pose))
-            return self.radiance(pose, level, pop.polarizer, pop.analyser_deg, view_name=view_name)
+            return self.radiance(pose, level, pop.polarizer, pop.analyzer_deg, view_name=view_name)
 
         return self._expose(
             self._camera(view_name),
@@ -138,9 +138,9 @@ class FlashCourseScene(RigScene):
 
     @cached_method
     def _image(
-        self, pose: str, level: float, polarizer: str, analyser_deg: float | None, view: str | None
+        self, pose: str, level: float, polarizer: str, analyzer_deg: float | None, view: str | None
     ) -> Float32Array:
-        return self.scene_at(pose, level).radiance(polarizer, analyser_deg, view_name=view)
+        return self.scene_at(pose, level).radiance(polarizer, analyzer_deg, view_name=view)
 
     def landmarks_px(self, pose: str = "neutral") -> dict[str, tuple[float, float]]:
         """Return the positions of named skin points in the first camera's image of a pose.

@@ -170,7 +170,7 @@ def render_polarized_with_mitsuba(
     return np.asarray(image[..., 0], np.float32)
 
 
-def describe_polarized_rig(rig: Rig, view: View, analyser_deg: float) -> dict[str, Any]:
+def describe_polarized_rig(rig: Rig, view: View, analyzer_deg: float) -> dict[str, Any]:
     """Return Mitsuba's scene of the rig with polarizers on the lights and the camera."""
     up = (0.0, 1.0, 0.0)
     place = np.asarray(view.position_mm)
@@ -179,8 +179,8 @@ def describe_polarized_rig(rig: Rig, view: View, analyser_deg: float) -> dict[st
         "type": "scene",
         "integrator": {"type": "volpath", "max_depth": 8},
         "sensor": perspective(view, "luminance", up=up),
-        "analyser": _polarizer_mesh(
-            place - [0.0, 0.0, 10.0], view.target_mm, 15.0 * half, analyser_deg
+        "analyzer": _polarizer_mesh(
+            place - [0.0, 0.0, 10.0], view.target_mm, 15.0 * half, analyzer_deg
         ),
         "ball": {
             "type": "sphere",

@@ -141,7 +141,7 @@ class FlashScene(FaceScene):
     def radiance(
         self,
         polarizer: str = "crossed",
-        analyser_deg: float | None = None,
+        analyzer_deg: float | None = None,
         *,
         view_name: str | None = None,
     ) -> Float32Array:
@@ -151,7 +151,7 @@ class FlashScene(FaceScene):
         ----------
         polarizer
             "parallel" or "crossed".
-        analyser_deg
+        analyzer_deg
             Reading of the analyzer's rotator in degrees; ``None`` takes that of the stop.
         view_name
             Name of the camera; ``None`` takes the first.
@@ -162,7 +162,7 @@ class FlashScene(FaceScene):
             Camera RGB without white balance, shape (H, W, 3), fraction of full scale.
         """
         view = self._camera(view_name)
-        passes_deg = self.films.analyzer_axis_deg(view, polarizer, analyser_deg)
+        passes_deg = self.films.analyzer_axis_deg(view, polarizer, analyzer_deg)
         white = self.white_rgb(view.name)
         shape = (view.height_px, view.width_px, 3)
         if isinstance(self.subject, Target) and self.subject.kind == "cap":
@@ -200,7 +200,7 @@ class FlashScene(FaceScene):
             self._camera(view_name),
             pops,
             pop_energy,
-            lambda pop: self.radiance(pop.polarizer, pop.analyser_deg, view_name=view_name),
+            lambda pop: self.radiance(pop.polarizer, pop.analyzer_deg, view_name=view_name),
             deviation=POP_ENERGY_DEVIATION,
             exposure_s=exposure_s,
             seed=seed,
@@ -309,7 +309,7 @@ class FlashScene(FaceScene):
             passes_deg=passes_deg,
             image_right=right,
             image_up=up,
-            extinction=self.films.analyser_extinction,
+            extinction=self.films.analyzer_extinction,
         )
 
     @cached_method

@@ -29,7 +29,7 @@ class GridAnalyzer:
         """Apply the analyzer to Stokes vectors of shape (3, H, W)."""
         key = (reading_deg, border_px)
         cos2, sin2 = self._frames.get(key, lambda: self._frame(*key))
-        leak = 1.0 / self._films.analyser_extinction
+        leak = 1.0 / self._films.analyzer_extinction
         turned = stokes[1] * cos2 + stokes[2] * sin2
         return np.asarray(
             np.float32(0.5 * (1.0 + leak)) * stokes[0] + np.float32(0.5 * (1.0 - leak)) * turned

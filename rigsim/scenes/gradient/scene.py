@@ -147,7 +147,7 @@ class GradientScene(RigScene):
         self._reliefs: LruCache[tuple[float, float], StretchedSkin] = LruCache(
             lambda _: MAX_CACHED_RELIEFS
         )
-        self._analyser = GridAnalyzer(self.films, self._view)
+        self._analyzer = GridAnalyzer(self.films, self._view)
         level = math.inf if on_s is None else GRADIENT_METER_RATE_PER_S * on_s
         seen = (self.sphere, self.lens, PixelNoise.of(self._sensor), level)
         self.needs = select_gradient_effects(rig, subject, *seen, motion is not None, effects)
@@ -204,7 +204,7 @@ class GradientScene(RigScene):
         """
         stokes = self.stokes(grip)
         return {
-            name: np.stack([self._analyser.analyze(s, reading) for s in stokes])
+            name: np.stack([self._analyzer.analyze(s, reading) for s in stokes])
             for name, reading in (("parallel", 0.0), ("crossed", 90.0))
         }
 
@@ -213,7 +213,7 @@ class GradientScene(RigScene):
         pattern: str,
         *,
         grip: GripState | None = None,
-        analyser_deg: float = 0.0,
+        analyzer_deg: float = 0.0,
         t_s: float | None = None,
         led_shares: tuple[float, ...] = (),
     ) -> Float32Array:
@@ -225,7 +225,7 @@ class GradientScene(RigScene):
             One of `rigsim.as_built.sphere.PATTERN_WEIGHTS`.
         grip
             State of the caliper's grip; targets need none.
-        analyser_deg
+        analyzer_deg
             Reading of the analyzer's rotator, degrees.
         t_s
             World time, s, which determines drift and jumps; None: neither.
@@ -255,7 +255,7 @@ class GradientScene(RigScene):
         )
         for m in np.flatnonzero(weights):
             stokes += weights[m] * wide[3 * m : 3 * m + 3, part, column]
-        image = self._analyser.analyze(stokes, analyser_deg, border_px=reach)
+        image = self._analyzer.analyze(stokes, analyzer_deg, border_px=reach)
         if reach:
             pixel_um = self.lens.pixel_on_subject_um
             image = shift_image(image, drift, pixel_um=pixel_um, border_px=reach)
@@ -298,7 +298,7 @@ class GradientScene(RigScene):
             lambda pop: self.radiance(
                 pop.pattern,
                 grip=grip,
-                analyser_deg=pop.analyser_deg,
+                analyzer_deg=pop.analyzer_deg,
                 t_s=0.5 * (pop.t_on_s + pop.t_off_s),
                 led_shares=pop.led_shares,
             ),

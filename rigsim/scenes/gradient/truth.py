@@ -106,7 +106,7 @@ def gradient_truth(scene: GradientScene, grips: Sequence[GripState]) -> SkinAppe
             "cutoff_period_um": lens.cutoff_period_um,
             "mean_wavelength_nm": lens.mean_wavelength_nm,
         },
-        "analyser_zero_deg": scene.films.analyser_zero_deg,
+        "analyzer_zero_deg": scene.films.analyzer_zero_deg,
         "drift_um": 0.0 if scene.motion is None else scene.motion.drift_um,
     }
     return SkinAppearance(

@@ -47,7 +47,7 @@ def measure_sphere_lights(stage: BenchmarkStage) -> None:
             outcome = stage.add(knobs, timing, bootstrap_median(error, bound, draws=400))
     aim = position / np.linalg.norm(position, axis=1, keepdims=True)
     off = np.degrees(np.linalg.norm(lights.directions - aim, axis=1))
-    zero = np.degrees(polarizers.misalignment_rad) - scene.films.analyser_zero_deg
+    zero = np.degrees(polarizers.misalignment_rad) - scene.films.analyzer_zero_deg
     stage.limits = {
         "direction": float(np.median(off[lights.seen])),
         "intensity": outcome.error,

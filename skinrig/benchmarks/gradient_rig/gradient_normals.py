@@ -95,7 +95,7 @@ def render_skin_patch(side: int, *, smooth: bool) -> SkinPatch:
     scene = GradientScene(rig, skin, sphere=sphere)
     images = {
         (name, polarizer): PATTERN_EXPOSURE_S
-        * scene.radiance(name, grip=NEUTRAL, analyser_deg=ANALYZER_DEG[polarizer])
+        * scene.radiance(name, grip=NEUTRAL, analyzer_deg=ANALYZER_DEG[polarizer])
         for name in PATTERN_NAMES
         for polarizer in ANALYZER_DEG
     }

@@ -239,10 +239,10 @@ def write_stokes(session: Session, folder: Path, delivery: ExportSettings) -> li
     names = [state.name for state in images.states]
     for name in only:
         require_choice("--only", name, names, ExportError)
-    axis = session.rig.view(camera).analyser_axis_deg
+    axis = session.rig.view(camera).analyzer_axis_deg
     if axis is None:
         raise ExportError(
-            f"{session.path}: axis of the rig's analyzer is missing; add analyser_axis_deg "
+            f"{session.path}: axis of the rig's analyzer is missing; add analyzer_axis_deg "
             "to the view"
         )
     what = (

@@ -89,7 +89,7 @@ def test_all_file_faults_are_listed_with_paths(tmp_path, flash):
         ("readout_ms", "did you mean readout_s? (x0.001)"),
         ("focal", "did you mean focal_mm? (in mm)"),
         ("f_numbr", "did you mean f_number?"),
-        ("analyser_axis_rad", "did you mean analyser_axis_deg? (x57.2958)"),
+        ("analyzer_axis_rad", "did you mean analyzer_axis_deg? (x57.2958)"),
     ],
 )
 def test_a_near_miss_is_suggested_with_its_factor(flash_json, wrong, suggestion):

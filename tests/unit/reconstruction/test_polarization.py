@@ -51,7 +51,7 @@ def test_partly_polarized_diffuse_light_is_taken_into_account(angle_deg, towards
     """Light leaving at an angle is polarized in the plane of exit: T_p > T_s."""
     normal = tilted(np.deg2rad(angle_deg), towards)
     t_s, t_p = fresnel_transmittance(normal[2], 1.4)
-    share = towards @ VERTICAL  # of the p direction along the vertical analyser
+    share = towards @ VERTICAL  # of the p direction along the vertical analyzer
     up = t_p * share**2 + t_s * (1 - share**2)
     side = t_p * (1 - share**2) + t_s * share**2
     diffuse, specular = 0.6, 0.2

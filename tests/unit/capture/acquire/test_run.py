@@ -61,7 +61,7 @@ class Box:
             t_box_s=float(self.shots),
             power=self.power,
             polarizer=self.polarizer,
-            analyser_deg=90.0 if self.polarizer == "crossed" else 0.0,
+            analyzer_deg=90.0 if self.polarizer == "crossed" else 0.0,
         )
 
     def trigger_cameras(self, token):

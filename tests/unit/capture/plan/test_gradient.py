@@ -127,7 +127,7 @@ def test_duty_matches_light_summed_in_small_time_steps(led):
     one = dataclasses.replace(RIG, lights=(RIG.lights[led],))
     signal = []
     for number, row in enumerate(led_rows(steps, one)):
-        signal += [0.0] * (1500 if number == 8 else 0)  # the analyser turns for 0.15 s
+        signal += [0.0] * (1500 if number == 8 else 0)  # the analyzer turns for 0.15 s
         signal += [row.light_levels(1)[0]] * round(row.dwell_s * 1e4)
     padded = np.r_[np.zeros(10_000), signal, np.zeros(10_000)]
     total = np.cumsum(padded)
@@ -192,7 +192,7 @@ def test_a_rig_without_a_caliper_is_refused():
 def test_plan_time_is_sum_of_light_rotations_moves():
     plan = gradient_plan(RIG, angles=[0], steps=(-2, 1), darks=0)
     light = 4 * 16 * 0.031 + 4 * 0.15
-    # 0.4 s a step of the jaws: one, one, three back across neutral; the analyser turns meanwhile
+    # 0.4 s a step of the jaws: one, one, three back across neutral; the analyzer turns meanwhile
     moves = 0.4 * (1 + 1 + 3) + 4 * RIG.caliper.settle_s
     assert plan.estimate_duration_s(RIG) == pytest.approx(light + moves)
 
@@ -212,7 +212,7 @@ def test_ball_is_lit_faint_to_bright_around_crossed():
     lit = [s for s in plan.steps if s.index["pattern"] == "full"]
     seen = Counter((s.index["reading"], s.settings["level"]) for s in lit)
     assert seen == {(r, v): 3 for r, levels in BALL_SERIES.items() for v in levels}
-    turned = {s.settings.get("analyser_deg") for s in lit if s.index["polarizer"] == "crossed"}
+    turned = {s.settings.get("analyzer_deg") for s in lit if s.index["polarizer"] == "crossed"}
     assert turned == {80, None, 100}
     assert {s.settings["polarizer"] for s in lit if s.index["reading"] == 0} == {"parallel"}
     dark = [s for s in plan.steps if s.index["pattern"] == "dark"]

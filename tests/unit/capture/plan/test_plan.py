@@ -53,7 +53,7 @@ def test_flats_are_pairs_at_eight_powers_or_more(flash):
 
 def test_malus_series_spans_180_degrees_in_thirteen_angles(flash):
     plan = flash_calibration_plan(flash, "malus", repeats=1)
-    angles = [s.settings["analyser_deg"] for s in plan.steps if s.kind == "malus"]
+    angles = [s.settings["analyzer_deg"] for s in plan.steps if s.kind == "malus"]
     assert angles == [15.0 * k for k in range(13)]
 
 
@@ -74,7 +74,7 @@ def test_a_plan_survives_its_json_and_a_pickle(flash, target):
 
 def test_estimate_sums_frame_read_outs_and_rotations_between(flash):
     plan = flash_plan(flash, darks=1, exposure_s=0.5)
-    # dark, parallel, crossed: three read-outs and exposures, the analyser set twice
+    # dark, parallel, crossed: three read-outs and exposures, the analyzer set twice
     assert plan.estimate_duration_s(flash) == pytest.approx(3 * (5.45 + 0.5) + 2 * 0.5)
 
 
@@ -102,8 +102,8 @@ def test_a_step_is_frozen_down_to_its_settings():
         ({"power": True}, "0 <= power <= 1"),
         ({"polarizer": "cross"}, '"parallel" or "crossed"'),
         ({"exposure_ms": 8.0}, "did you mean exposure_s? (x0.001)"),
-        ({"analyzer_deg": 8.0}, "did you mean analyser_deg?"),
-        ({"analyser_deg": 400.0}, "0 <= degrees < 360"),
+        ({"analyzer_deg": 8.0}, "did you mean analyzer_deg?"),
+        ({"analyzer_deg": 400.0}, "0 <= degrees < 360"),
         ({"exposure_s": 0.0}, "seconds > 0"),
     ],
 )

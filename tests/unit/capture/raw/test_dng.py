@@ -45,7 +45,7 @@ def encode(cfa, pattern, **changes):
         "captured_at": datetime(2026, 11, 21, 3, 4, 5, 678, tzinfo=UTC),
         "step_id": "S001",
         "session_id": "b1946ac9",
-        "light": {"polarizer": "crossed", "power": 0.5, "token": 7, "analyser_deg": 90.0},
+        "light": {"polarizer": "crossed", "power": 0.5, "token": 7, "analyzer_deg": 90.0},
     }
     return raw.encode_dng(cfa, **(description | changes))
 
@@ -108,7 +108,7 @@ def test_our_reader_returns_everything_that_was_written(dng, cfa, pattern):
     assert frame.noise_profile == (1.25e-5, 3.5e-8)
     assert frame.captured_at == datetime(2026, 11, 21, 3, 4, 5, 678, tzinfo=UTC)
     assert (frame.step_id, frame.session_id) == ("S001", "b1946ac9")
-    assert frame.light == {"polarizer": "crossed", "power": 0.5, "token": 7, "analyser_deg": 90.0}
+    assert frame.light == {"polarizer": "crossed", "power": 0.5, "token": 7, "analyzer_deg": 90.0}
     assert frame.color_illuminant == "D50" or mono
     assert frame.path == str(file)
 

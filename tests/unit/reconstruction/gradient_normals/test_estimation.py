@@ -451,7 +451,7 @@ def test_off_center_points_use_shifted_light_camera_directions(component):
 @pytest.mark.parametrize("turn_deg", [0.0, 23.0, 90.0])
 @pytest.mark.parametrize("tilt_deg", [0.0, 30.0, 45.0, 60.0])
 def test_flat_patch_has_normal_or_none_when_steep(tilt_deg, turn_deg):
-    """Across the analyser's axis, light mirrored beyond Brewster's angle tells nothing."""
+    """Across the analyzer's axis, light mirrored beyond Brewster's angle tells nothing."""
     lights = sphere()
     tilt, turn = np.radians(tilt_deg), np.radians(turn_deg)
     n = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])

@@ -34,7 +34,7 @@ SEED = 3
 
 
 class Witness:
-    """A scene whose pixels tell pattern, analyser, level and what the caliper held."""
+    """A scene whose pixels tell pattern, analyzer, level and what the caliper held."""
 
     def __init__(self, rig):
         self.rig = rig
@@ -44,7 +44,7 @@ class Witness:
         image[0, 0] += len(pops)
         for pop in pops:
             image[1, 0] = 1 + LIGHT_PATTERNS.index(pop.pattern)
-            image[1, 1] = round(pop.analyser_deg)
+            image[1, 1] = round(pop.analyzer_deg)
             image[1, 2] = round(1000 * pop.level)
             image[1, 3] = round(1e5 * (pop.t_off_s - pop.t_on_s))
         image[2, 0] = 1000 + round(grip.angle_deg)
@@ -138,7 +138,7 @@ def short(angles=(0,), steps=(-2, 2), patterns=FEW, **more):
 
 
 def check_frames(session):
-    """Fail unless every frame shows its own pattern, analyser and state, of one taping a state."""
+    """Fail unless every frame shows its own pattern, analyzer and state, of one taping a state."""
     tapings = {}
     for record in session.frames():
         cfa, settings = session.read(record).cfa, record.settings
@@ -592,7 +592,7 @@ def test_skin_capture_without_caliper_is_refused(make):
         ("sphere", {"cameras": 2}, "the sphere's controller has 2, the rig 1"),
         ("sphere", {"row_max_us": 20_000}, r"got dwell_s 0\.031"),
         ("sphere", {"settle_us": 15_000}, "do not fit"),
-        ("sphere", {"analyser_max_deg": 45.0}, "analyser_deg 90"),
+        ("sphere", {"analyser_max_deg": 45.0}, "analyzer_deg 90"),
         ("sphere", {"max_rows": 4}, "6 patterns, the controller holds 4"),
         ("caliper", {"aperture_mm": 10.0}, "its controller reports aperture_mm 10"),
         ("caliper", {"step_mm": 0.5}, r"its controller reports step_mm 0\.5"),

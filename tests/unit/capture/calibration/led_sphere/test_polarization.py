@@ -22,7 +22,7 @@ TWO_STATES = ((0, 0.2), (0, 1.0), (0, 8.0), (90, 8.0), (90, 60.0))
 
 def reflection(eta, to_light, to_camera):
     return FacetReflection.of(
-        RIG.lights, CAMERA, VIEW.analyser_axis_deg, eta, to_light=to_light, to_camera=to_camera
+        RIG.lights, CAMERA, VIEW.analyzer_axis_deg, eta, to_light=to_light, to_camera=to_camera
     )
 
 
@@ -34,7 +34,7 @@ SKIN = reflection(
 
 
 def spots(
-    rng, *, zero_deg, turn_deg, light_leak=1 / 2000, analyser_leak=1 / 3000, series=BOTH_SIDES
+    rng, *, zero_deg, turn_deg, light_leak=1 / 2000, analyzer_leak=1 / 3000, series=BOTH_SIDES
 ):
     """Return readings, rates, variances, which are good, and the truth."""
     turn = np.radians(rng.normal(0.0, turn_deg, len(PLACE)))
@@ -45,12 +45,12 @@ def spots(
     electrons = (
         strength
         * amount
-        * GLASS.transmit_through_analyzer(readings, turn, zero, light_leak, analyser_leak)
+        * GLASS.transmit_through_analyzer(readings, turn, zero, light_leak, analyzer_leak)
     )
     variance = electrons + 1000 * 13.0**2
     counted = electrons + np.sqrt(variance) * rng.standard_normal(electrons.shape)
     good = electrons < 9e5
-    leaked = SKIN.transmit_through_analyzer([0.0, np.pi / 2], turn, zero, light_leak, analyser_leak)
+    leaked = SKIN.transmit_through_analyzer([0.0, np.pi / 2], turn, zero, light_leak, analyzer_leak)
     truth = {"turn": turn, "zero": zero, "strength": strength, "leak": leaked[1] / leaked[0]}
     return readings, counted / amount, variance / amount**2, good, truth
 
@@ -62,14 +62,14 @@ def test_analyzer_polarizers_and_axes_are_within_their_errors(rng, zero_deg):
     assert abs(np.degrees(fit.zero_rad - truth["zero"])) < 0.1
     assert abs(fit.zero_rad - truth["zero"]) < 4 * fit.zero_stderr_rad
     for leak, error, true in zip(
-        (fit.light_leak, fit.analyser_leak), fit.leak_stderr, (1 / 2000, 1 / 3000), strict=True
+        (fit.light_leak, fit.analyzer_leak), fit.leak_stderr, (1 / 2000, 1 / 3000), strict=True
     ):
         assert abs(leak - true) < 4 * error
         assert error < 0.3 * true
     bound = chi2.ppf(1 - ALARM, len(PLACE))
     pull = (fit.strength - truth["strength"]) / fit.strength_stderr
     assert np.sum(pull**2) < bound
-    # axes share the error of the analyser's zero, which all of them are measured against
+    # axes share the error of the analyzer's zero, which all of them are measured against
     gap = fit.axis_error_rad - truth["turn"]
     own = gap - np.median(gap)
     assert np.sqrt(np.mean((own / fit.axis_error_stderr_rad) ** 2)) < 1.5

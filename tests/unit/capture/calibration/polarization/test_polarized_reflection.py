@@ -28,7 +28,7 @@ def by_ball(eta=1.52, lights=RIG.lights):
     return FacetReflection.of(
         lights,
         CAMERA,
-        VIEW.analyser_axis_deg,
+        VIEW.analyzer_axis_deg,
         eta,
         to_light=shown.to_light,
         to_camera=shown.to_camera,
@@ -39,7 +39,7 @@ def by_skin(eta=1.4):
     to_light = PLACE / np.linalg.norm(PLACE, axis=1, keepdims=True)
     to_camera = np.tile([0.0, 0.0, 1.0], (len(PLACE), 1))
     return FacetReflection.of(
-        RIG.lights, CAMERA, VIEW.analyser_axis_deg, eta, to_light=to_light, to_camera=to_camera
+        RIG.lights, CAMERA, VIEW.analyzer_axis_deg, eta, to_light=to_light, to_camera=to_camera
     )
 
 
@@ -108,7 +108,7 @@ def test_the_simulators_own_reflection_agrees():
             behind = shading.apply_analyzer(
                 stokes,
                 reflection.to_camera[k][None],
-                passes_deg=VIEW.analyser_axis_deg + reading + 0.7,
+                passes_deg=VIEW.analyzer_axis_deg + reading + 0.7,
                 image_right=[1.0, 0.0, 0.0],
                 image_up=[0.0, 1.0, 0.0],
                 extinction=3000.0,

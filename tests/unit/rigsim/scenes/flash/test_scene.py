@@ -30,7 +30,7 @@ class Fired:
     token: str = "t1"
     power: float = 1.0
     polarizer: str = "crossed"
-    analyser_deg: float | None = None
+    analyzer_deg: float | None = None
 
 
 PLAIN = {"choice": EMBREE, "subpixels": 1}
@@ -145,7 +145,7 @@ def test_images_behind_crossed_analyzers_sum_to_constant(real):
 
 
 def test_metal_target_is_dark_behind_crossed_analyzer(rig):
-    films = Polarizers(light_extinction=2000.0, analyser_extinction=3000.0, analyser_zero_deg=1.0)
+    films = Polarizers(light_extinction=2000.0, analyzer_extinction=3000.0, analyzer_zero_deg=1.0)
     scene = scene_of(rig, make_target("malus"), films=films)
     middle = np.s_[rig.views[0].height_px // 2, WIDTH // 2]
     angles = np.arange(0.0, 181.0, 15.0)
@@ -259,7 +259,7 @@ def test_polarizers_of_rig_follow_from_serial_number(rig):
     films = draw_polarizers(rig)
     assert films == draw_polarizers(rig)
     assert 1500.0 <= films.light_extinction <= 6000.0
-    assert abs(films.analyser_zero_deg) <= 1.2
+    assert abs(films.analyzer_zero_deg) <= 1.2
     view = dataclasses.replace(rig.views[0], serial="SR-0002")
     assert draw_polarizers(dataclasses.replace(rig, views=(view,))) != films
 

@@ -295,7 +295,7 @@ def test_ball_shows_leds_at_mirror_reflection_positions(rig):
 
 def test_crossed_polarizers_dim_ball_thousandfold_not_to_zero(rig):
     scene = GradientScene(rig.cropped(256), "ball")
-    parallel, crossed = (scene.radiance("full", analyser_deg=a) for a in (0.0, 90.0))
+    parallel, crossed = (scene.radiance("full", analyzer_deg=a) for a in (0.0, 90.0))
     assert 1e-4 < crossed.max() / parallel.max() < 5e-3
 
 

@@ -30,7 +30,7 @@ class Light:
     level: float = 1.0
     t_on_s: float = 0.0
     t_off_s: float = 0.018
-    analyser_deg: float = 0.0
+    analyzer_deg: float = 0.0
     led_shares: tuple[float, ...] = ()
 
 
@@ -61,7 +61,7 @@ def test_diffuser_gets_its_meter_rate_behind_any_analyzer(rig):
     """Tolerance: the corner of the field, and what the sphere as drawn is off its unit (none)."""
     flat = GradientScene(rig, "flat", films=IDEAL_POLARIZERS)
     for reading in (0.0, 90.0, 37.0):
-        image = flat.radiance("full", analyser_deg=reading)
+        image = flat.radiance("full", analyzer_deg=reading)
         np.testing.assert_allclose(image, FLAT_REFLECTANCE * GRADIENT_METER_RATE_PER_S, rtol=1e-4)
 
 
@@ -108,7 +108,7 @@ def test_crossed_polarizers_remove_specular_of_flat_patch(rig, flat_skin):
     moments = scene.moments(NEUTRAL)
     leak = moments["crossed"][0] / moments["parallel"][0]
     assert leak.max() < 0.02
-    turned = scene.radiance("full", grip=NEUTRAL, analyser_deg=80.0)
+    turned = scene.radiance("full", grip=NEUTRAL, analyzer_deg=80.0)
     # Malus: sin^2(10 degrees) = 3 %
     extra = (turned / moments["parallel"][0]).mean() - leak.mean()
     assert extra == pytest.approx(np.sin(np.radians(10.0)) ** 2, abs=0.01)

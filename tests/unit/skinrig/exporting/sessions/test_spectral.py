@@ -86,7 +86,7 @@ def test_fractions_outside_the_table_have_no_spectrum():
 
 
 def test_stokes_components_give_parallel_and_crossed_images(flash, tmp_path):
-    """An analyser along (across) the polarizer passes (S0 + S1) / 2 and (S0 - S1) / 2."""
+    """An analyzer along (across) the polarizer passes (S0 + S1) / 2 and (S0 - S1) / 2."""
     stokes.write_spectra(flash, tmp_path, ExportSettings())
     header, found = channels(tmp_path / "stokes.exr")
     assert header["comments"].startswith("measured")

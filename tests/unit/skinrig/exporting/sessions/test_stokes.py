@@ -108,7 +108,7 @@ def test_document_reports_axis_and_unmeasured_components(tmp_path):
         delivery=ExportSettings(only=("a000_n0",), with_errors=True),
     )
     told = json.loads((tmp_path / "out/stokes.json").read_text())
-    assert told["reference_axis_deg"] == RIG.views[0].analyser_axis_deg == 90.0
+    assert told["reference_axis_deg"] == RIG.views[0].analyzer_axis_deg == 90.0
     assert "S1 is -1 of" in told["image_frame"]
     assert "S2 and S3 were not measured" in told["what"]
     assert told["consent"][0]["pseudonym"] == "P042"
