@@ -306,7 +306,8 @@ def _public_names(folder: Path) -> list[str]:
 
 def _api_page(dotted: str, folder: Path, names: list[str]) -> str:
     text = ast.get_docstring(ast.parse((folder / "__init__.py").read_text("utf-8"))) or ""
-    lines = [f"# {dotted}", "", text, ""]
+    # a search for a term of the field leads to the manuals first
+    lines = ["---", "search:", "  boost: 0.1", "---", "", f"# {dotted}", "", text, ""]
     module = ""
     for name in names:
         if name.rpartition(".")[0] != module:
