@@ -4,14 +4,14 @@ import ast
 import io
 import re
 import tokenize
-from collections.abc import Iterator
-from functools import cache
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator
+from itertools import accumulate
 from pathlib import Path
 
 import pytest
+from fixtures.product_code import PACKAGES, ROOT, modules, text_of, tree_of
 
-ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("capture", "model", "reconstruction", "rigsim", "skinrig")
 HISTORY = ("CHANGELOG.md", "docs/decisions")
 """Quoted history keeps its words."""
 
@@ -62,13 +62,6 @@ def documents() -> list[Path]:
     ]
 
 
-@cache
-def modules(*packages: str) -> tuple[tuple[Path, ast.Module], ...]:
-    """Return the modules of packages with their syntax trees."""
-    paths = [path for package in packages for path in sorted((ROOT / package).rglob("*.py"))]
-    return tuple((path, ast.parse(path.read_text("utf-8"))) for path in paths)
-
-
 def identifier_words(name: str) -> str:
     """Return an identifier as separate words.
 
@@ -89,34 +82,34 @@ def names(tree: ast.AST) -> Iterator[tuple[int, str]]:
             yield node.lineno, node.id
 
 
-def texts(path: Path, tree: ast.AST) -> Iterator[tuple[int, str]]:
+def texts(path: Path) -> Iterator[tuple[int, str]]:
     """Yield strings and comments of a module, line by line, and the words of its names."""
-    for node in ast.walk(tree):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             for offset, line in enumerate(node.value.splitlines()):
                 yield node.lineno + offset, line
-    with tokenize.open(path) as file:
-        for token in tokenize.generate_tokens(io.StringIO(file.read()).readline):
-            if token.type == tokenize.COMMENT:
-                yield token.start[0], token.string
-    for line, name in names(tree):
+    for token in tokenize.generate_tokens(io.StringIO(text_of(path)).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.start[0], token.string
+    for line, name in names(tree_of(path)):
         yield line, identifier_words(name)
 
 
-def hits(lines: Iterator[tuple[int, str]]) -> Iterator[tuple[int, str]]:
-    """Yield lines that hold a word of the list, with the word."""
-    for number, line in lines:
-        for word, pattern in WORDS.items():
-            for found in pattern.finditer(line):
-                yield (
-                    number,
-                    f"{word}: {line[max(found.start() - 30, 0) : found.end() + 30].strip()}",
-                )
+def hits(lines: Iterable[tuple[int, str]]) -> Iterator[tuple[int, str]]:
+    """Yield the numbers of lines with a word of the list, and the word."""
+    known = list(lines)
+    text = "\n".join(line.replace("\n", " ") for _, line in known)
+    starts = list(accumulate((len(line) + 1 for _, line in known), initial=0))
+    for word, pattern in WORDS.items():
+        for found in pattern.finditer(text):
+            number = known[bisect_right(starts, found.start()) - 1][0]
+            around = text[max(found.start() - 30, 0) : found.end() + 30]
+            yield number, f"{word}: {' '.join(around.split())}"
 
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_package_texts_and_names_hold_no_dialect(package):
-    lines = [(path, hits(texts(path, tree))) for path, tree in modules(package)]
+    lines = [(path, hits(texts(path))) for path in modules(package)]
     lines += [
         (path, hits(enumerate(path.read_text("utf-8").splitlines(), 1)))
         for kind in ("html", "js", "toml")
@@ -139,8 +132,8 @@ def test_manuals_hold_no_dialect():
 
 def test_test_names_are_short_and_plain():
     found = []
-    for path, tree in modules("tests"):
-        for node in ast.walk(tree):
+    for path in modules("tests"):
+        for node in tree_of(path).body:
             if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
                 words = node.name.removeprefix("test_").split("_")
                 named = [text for _, text in hits(iter([(0, " ".join(words))]))]
@@ -152,8 +145,8 @@ def test_test_names_are_short_and_plain():
 def test_module_docstrings_state_and_do_not_ask():
     found = [
         str(path.relative_to(ROOT))
-        for path, tree in modules(*PACKAGES, "tests", "tools")
-        if QUESTION.match(ast.get_docstring(tree) or "")
+        for path in modules(*PACKAGES, "tests", "tools")
+        if QUESTION.match(ast.get_docstring(tree_of(path)) or "")
     ]
     assert not found, "\n".join(found)
 
@@ -161,8 +154,8 @@ def test_module_docstrings_state_and_do_not_ask():
 def test_constants_have_more_than_one_word():
     found = [
         f"{path.relative_to(ROOT)}:{node.lineno}: {target.id}"
-        for path, tree in modules(*PACKAGES)
-        for node in tree.body
+        for path in modules(*PACKAGES)
+        for node in tree_of(path).body
         if isinstance(node, (ast.Assign, ast.AnnAssign))
         for target in (node.targets if isinstance(node, ast.Assign) else [node.target])
         if isinstance(target, ast.Name)
@@ -175,8 +168,8 @@ def test_constants_have_more_than_one_word():
 def test_public_names_have_a_noun_or_verb():
     found = [
         f"{path.relative_to(ROOT)}:{node.lineno}: {node.name}"
-        for path, tree in modules(*PACKAGES)
-        for node in tree.body
+        for path in modules(*PACKAGES)
+        for node in tree_of(path).body
         if isinstance(node, (ast.FunctionDef, ast.ClassDef))
         and not node.name.startswith("_")
         and is_lone_adverb_or_participle(node.name)

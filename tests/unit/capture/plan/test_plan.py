@@ -102,7 +102,7 @@ def test_a_step_is_frozen_down_to_its_settings():
         ({"power": True}, "0 <= power <= 1"),
         ({"polarizer": "cross"}, '"parallel" or "crossed"'),
         ({"exposure_ms": 8.0}, "did you mean exposure_s? (x0.001)"),
-        ({"analyzer_deg": 8.0}, "did you mean analyzer_deg?"),
+        ({"analyser_dg": 8.0}, "did you mean analyzer_deg?"),
         ({"analyzer_deg": 400.0}, "0 <= degrees < 360"),
         ({"exposure_s": 0.0}, "seconds > 0"),
     ],
