@@ -81,7 +81,7 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
     if sequence.is_prompted:
         own = {"rise_s": constant_s, "fall_s": constant_s, "reaction_s": reaction_s}
         known: dict[str, Any] = {name: v for name, v in own.items() if v is not None}
-        course: Any = PromptedCourse(sequence.state, seed=seed, **known)
+        course: EventCourse | PromptedCourse = PromptedCourse(sequence.state, seed=seed, **known)
     else:
         course = EventCourse(sequence.state, constant_s)
     texels = TEXTURE_TEXELS_BY_WIDTH[int(width > MAX_COARSE_WIDTH_PX)]
@@ -104,14 +104,14 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
     before_s = _event_s(session)
     begun_s = time.time() if before_s is None else _last_s(session) + INTERRUPTION_S
     if before_s is not None and not sequence.is_prompted:
-        course.tell(before_s - begun_s, sequence.state)  # the event ended before this world began
+        course.prompt(before_s - begun_s, sequence.state)  # the event ended before this world began
 
     def prompt(world: Any, text: str) -> None:
         if text == sequence.state:
-            course.tell(world.now, text)
+            course.prompt(world.now, text)
 
     def signal(world: Any, text: str) -> None:
-        course.tell(world.now, text)
+        course.prompt(world.now, text)
 
     rig_seconds = drive_plan(order, session, rig, scene, prompt, signal=signal, begun_s=begun_s)
     about = subject_records.truth_parameters(order.subject, "flash", order.progress)
@@ -135,7 +135,7 @@ def _last_s(session: Session) -> float:
 
 def _write_truth(
     folder: Path,
-    scene: Any,
+    scene: FlashCourseScene,
     session: Session,
     sequence: SequenceOrder,
     flashes: Mapping[str, Mapping[str, Any]],
@@ -179,7 +179,7 @@ def _write_truth(
     }
     table = ["name,x,y", *(f"{name},{x:.3f},{y:.3f}" for name, (x, y) in places["neutral"].items())]
     rest = build_truth(
-        scene.at("neutral", 0.0), seed, session.content_hash, "neutral", parameters=parameters
+        scene.scene_at("neutral", 0.0), seed, session.content_hash, "neutral", parameters=parameters
     )
     files = {
         COURSE_FILE: (json.dumps(document, indent=1) + "\n").encode(),
@@ -189,7 +189,7 @@ def _write_truth(
     pose = sequence.state if sequence.is_prompted else "neutral"
     state = sequence.state
     full = build_truth(
-        scene.at(pose, 1.0), seed, session.content_hash, state, parameters=parameters
+        scene.scene_at(pose, 1.0), seed, session.content_hash, state, parameters=parameters
     )
     store.write(folder.with_name(f"{folder.name}-{sequence.state}"), full)
 

@@ -69,7 +69,7 @@ def boards_seen(scene, poses):
     sightings = {}
     lights = range(0, len(scene.rig.lights), 8)
     for pose in poses:
-        scene.show(pose)
+        scene.set_pose(pose)
         for view in scene.rig.views:
             frame = shot(scene, view.name, lights, exposure_s=0.02, seed=pose)
             found = find_board(linear_rgb(frame, demosaic="bilinear").rgb, BOARD)
@@ -212,7 +212,7 @@ def test_radius_error_of_percent_is_refused_misplaces_lights(mirrors):
     found = mirror_lights.locate_lights(seen, cameras, places, nominal_places(rig))
     gap = np.linalg.norm(found.position_mm - scene.truth()["position_mm"], axis=1)
     assert np.median(gap[found.valid]) > 2.0
-    scene.show(0)
+    scene.set_pose(0)
     edges = {}
     for name, camera in cameras.items():
         frame = shot(scene, name, range(len(rig.lights)), exposure_s=0.06)

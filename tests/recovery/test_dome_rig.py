@@ -125,8 +125,8 @@ def test_normals_beat_scan_and_published_estimate(dome, judged):
     assert refined.median < 0.9 * scan
     assert judged.errors["half_vector_normals"].median > 3 * normals.median
     # nominally 0.68; what 3.3 mm average of relief is told by a constant, not by each point
-    assert 0.6 < normals.coverage.share < 0.9
-    assert 0.6 < refined.coverage.share < 0.9
+    assert 0.6 < normals.coverage.fraction < 0.9
+    assert 0.6 < refined.coverage.fraction < 0.9
 
 
 def test_albedo_is_correct_except_for_pixel_averaging(judged):

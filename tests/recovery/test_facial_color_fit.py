@@ -61,7 +61,7 @@ def errors(folder, truths):
 def test_rig_estimates_state_blood_closer_than_neutral_map(fitted, folder, truths):
     """Vessels dilate unevenly by compartment: eq. (6) did not make the truth."""
     rows, _ = errors(folder, truths)
-    error = {(row.state, row.way): row.median_relative for row in rows}
+    error = {(row.state, row.method): row.median_relative for row in rows}
     for state in ("anger", "exercise"):
         assert error[state, PREDICTION_METHODS[1]] < 0.7 * error[state, PREDICTION_METHODS[3]]
         assert error[state, PREDICTION_METHODS[1]] < 0.15
@@ -69,7 +69,7 @@ def test_rig_estimates_state_blood_closer_than_neutral_map(fitted, folder, truth
     assert error["exercise", PREDICTION_METHODS[1]] < error["exercise", PREDICTION_METHODS[2]]
     # and a rig whose states are exchanged is no better than no rig
     exchanged = truths | {"exercise": truths["smile"], "smile": truths["exercise"]}
-    wrong = {(row.state, row.way): row.median_relative for row in errors(folder, exchanged)[0]}
+    wrong = {(row.state, row.method): row.median_relative for row in errors(folder, exchanged)[0]}
     assert wrong["exercise", PREDICTION_METHODS[1]] > 1.2 * error["exercise", PREDICTION_METHODS[1]]
 
 

@@ -163,7 +163,7 @@ def test_intensities_err_below_percent_and_as_stated(ball):
 
 def test_analyzer_and_polarizers_are_found(ball):
     scene, _, survey = ball
-    films = survey.films
+    films = survey.polarizers
     zero = np.degrees(films.misalignment_rad) - FILMS.analyzer_zero_deg
     # LEDs' own axes scatter by a degree about what they are measured against: 0.09 for 132
     assert abs(zero) < 4 * np.degrees(films.misalignment_stderr_rad)

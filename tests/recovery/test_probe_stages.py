@@ -52,7 +52,7 @@ def test_full_session_recovers_sigma_tr_and_dipole_misses(bench):
     assert found.maps["translucency"].values.shape == (256, 256, 3)
     report = build([bench])
     assert "Radial profiles" in report
-    assert "Translucency map" in report
+    assert "Map of the diffuse mean free path" in report
     assert "Traceback" not in report
 
 
