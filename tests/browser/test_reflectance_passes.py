@@ -307,6 +307,6 @@ def test_the_page_states_its_errors(fitted):
     text = fitted.viewer.page.locator("#panel").text_content()
     told = fitted.scene.facts["reflectance"]
     assert f"{100 * told['rms_error']:.2f} %" in text
-    assert "of the editor's" in text
-    assert "of R_d" in text
+    assert "Surface error:" in text
+    assert "of R_d at half strength" in text
     assert fitted.viewer.problems == []

@@ -17,7 +17,7 @@ from skinrig.simulating.orders import SimulationError
 @pytest.fixture
 def without_benchmarks(monkeypatch):
     """Benchmarks have tests of their own, and take as long as they are allowed to."""
-    monkeypatch.setattr("skinrig.benchmarks.stages.run_stages", lambda *_, **__: {"passed": True})
+    monkeypatch.setattr("skinrig.demo.run_stages", lambda *_, **__: {"passed": True})
 
 
 @pytest.mark.parametrize("rigs", ["submarine", "dome,submarine", "", "flash,"])
