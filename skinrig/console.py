@@ -107,7 +107,7 @@ class Console:
 
     def print_omissions(self, rows: Iterable[tuple[object, object]]) -> None:
         """Print what was omitted, with reasons."""
-        self.print_each("left out", (f"{what}: {why}" for what, why in rows))
+        self.print_each("omitted", (f"{what}: {why}" for what, why in rows))
 
     def print_document(self, schema: str, content: Mapping[str, Any]) -> None:
         """Print the command's JSON document if --json was given."""

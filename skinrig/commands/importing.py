@@ -59,7 +59,7 @@ def import_photos(
         after = f"reconstruct {place} --maps melanin,hemoglobin --out appearance{state}"
     else:
         console.print_line(
-            "left out: melanin and hemoglobin: they need color images, not grayscale"
+            "omitted: melanin and hemoglobin: they need color images, not grayscale"
         )
         after = f"verify {place}"
     console.print_line(f"next: skinrig {after}")

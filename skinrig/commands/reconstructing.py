@@ -163,7 +163,7 @@ def reconstruct(
         console.print_each("assumed", done.assumed)
         console.print_line(f"run: {', '.join(done.ran) or 'nothing'}")
         console.print_line(f"reused: {', '.join(done.reused) or 'nothing'}")
-        console.print_each("left out", (f"{what} ({why})" for what, why in done.omitted))
+        console.print_each("omitted", (f"{what} ({why})" for what, why in done.omitted))
         written = select_attributes(done, "ran", "reused", "assumed", "work")
         made.append({"path": folder, **written, "left_out": done.omitted})
     console.print_line(f"next: skinrig report {shell_quote(out)}")

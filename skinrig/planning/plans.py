@@ -391,7 +391,7 @@ def format_choice(choice: PlanChoice) -> list[str]:
         f"capture: {choice.seconds:.1f} s, {choice.full_seconds - choice.seconds:.1f} s less than "
         "the whole rig's plan"
     )
-    out += [f"left out: {what} ({why})" for what, why in choice.left_out]
+    out += [f"omitted: {what} ({why})" for what, why in choice.left_out]
     out += [
         f"light: {name.replace('_', ' ')} {_format_knob(v)}" for name, v in choice.light.items()
     ]

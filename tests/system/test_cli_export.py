@@ -130,7 +130,7 @@ def test_simulated_maps_need_no_use(tmp_path, capsys):
     )
     code, said = run(capsys, "export", folder, "--to", "spectral", "--out", tmp_path / "out")
     assert code == 0, said.err
-    assert "left out: stokes.exr" in said.out
+    assert "omitted: stokes.exr" in said.out
 
 
 def test_the_help_names_every_format():
