@@ -58,9 +58,7 @@ def import_photos(
         state = "" if shown == "neutral" else f" --state {shown}"
         after = f"reconstruct {place} --maps melanin,hemoglobin --out appearance{state}"
     else:
-        console.print_line(
-            "omitted: melanin and hemoglobin: they need color images, not grayscale"
-        )
+        console.print_line("omitted: melanin and hemoglobin: they need color images, not grayscale")
         after = f"verify {place}"
     console.print_line(f"next: skinrig {after}")
     console.print_document(
