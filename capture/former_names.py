@@ -25,15 +25,30 @@ FORMER_KINDS: Final = {present: former for former, present in FORMER_NAMES.items
 def translate_names(data: Any) -> Any:
     """Return decoded JSON or TOML with present names for keys and for values of ``kind``.
 
+    A table that has a name in both spellings keeps both, and data nested too deeply stay as they
+    are: the strict parser, which reads the result, refuses either with its place.
+
     Examples
     --------
     >>> translate_names({"kind": "fibres", "settings": {"fibre": 3}, "id": "fibre"})
     {'kind': 'fibers', 'settings': {'fiber': 3}, 'id': 'fibre'}
+    >>> translate_names({"fibre": 3, "fiber": 4})
+    {'fibre': 3, 'fiber': 4}
     """
+    try:
+        return _translate(data)
+    except RecursionError:
+        return data
+
+
+def _translate(data: Any) -> Any:
     if isinstance(data, list | tuple):
-        return [translate_names(item) for item in data]
+        return [_translate(item) for item in data]
     if not isinstance(data, Mapping):
         return data
-    table = {FORMER_NAMES.get(key, key): translate_names(value) for key, value in data.items()}
+    table = {}
+    for key, value in data.items():
+        present = FORMER_NAMES.get(key, key)
+        table[key if present in data else present] = _translate(value)
     kind = table.get("kind")
     return table | {"kind": FORMER_NAMES.get(kind, kind)} if isinstance(kind, str) else table

@@ -13,7 +13,7 @@ import pytest
 
 from capture import raw
 from capture.calibration import store as calibrations
-from capture.plan import Plan
+from capture.plan import Plan, PlanError
 from capture.rig import load_rig
 from capture.session import Session, SessionError, verify
 from model import store
@@ -86,6 +86,23 @@ def test_plan_rig_and_calibration_have_present_names(folder):
     assert float(turned["analyzer_zero_rad"].value) == 0.01
     rig = Session.open(folder / "session-flash").rig
     assert rig.views[0].analyzer_axis_deg == load_rig("flash").views[0].analyzer_axis_deg
+
+
+def test_name_in_both_spellings_is_refused(folder):
+    plan = json.loads((folder / "plan-probe.json").read_bytes())
+    (step,) = (s for s in plan["steps"] if s["id"] == "mask-f01-b0")
+    step["settings"]["fiber"] = 0
+    with pytest.raises(PlanError, match=r"settings\.fibre"):
+        Plan.from_json(plan)
+
+
+@pytest.mark.parametrize("depth", [300, 480, 900])
+def test_deeply_nested_plan_is_refused_by_name(depth):
+    nested = []
+    for _ in range(depth):
+        nested = [nested]
+    with pytest.raises(PlanError):
+        Plan.from_json({"rig": "probe", "steps": nested})
 
 
 @pytest.mark.parametrize("part", ["session-flash/session.json", "appearance-flash/appearance.json"])
