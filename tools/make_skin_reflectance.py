@@ -1,18 +1,20 @@
-"""Make ``rigsim/data/skin_reflectance_mc.npz``: reflectance of two-layer skin by Monte Carlo.
+"""Make ``rigsim/data/skin_reflectance_mc.npz``: reflectance of layered skin by Monte Carlo.
 
     python tools/make_skin_reflectance.py [--photons-scale 1] [--threads 2] [--seed 20100]
 
-Per wavelength a few stacks of increasing melanin are traced, and every returned photon's path
-lengths in epidermis and dermis are stored. A photon of weight w in a stack with (c_ref, 0) has
-weight w exp(-(c_m - c_ref) a - c_hd b) in one with (c_m, c_hd), where a and b are its path lengths
-times the absorption per unit of fraction: all absorptions are linear in the two fractions, and
-scattering does not depend on them. So one run serves all c_m >= c_ref with common random numbers,
-and the table is smooth and monotone in both fractions. Runs of more melanin, where photons are
-short-lived and cheap, take over smoothly between c_ref and 2.5 c_ref. The same photons, sorted by
-their distance from the beam, give the lateral profiles. Standard errors are those of independent
-batches.
+Lengths are in reduced mean free paths of the epidermis, so one table serves all wavelengths and
+all people. Its axes are the epidermis's scattering depth, its absorption depth, the fraction of
+that absorption in its basal third, and the dermis's absorption over its reduced scattering.
 
-Finished wavelengths are kept in the work folder; an interrupted run resumes from them.
+Per scattering depth a few stacks of increasing absorption are traced, and every returned photon's
+path lengths in the three layers are stored. A photon of weight w has weight w exp(-sum of path
+length times added absorption) in a stack that absorbs more. So one run serves all larger
+absorptions with common random numbers, and the table is smooth and monotone in them. Runs of more
+absorption, where photons are short-lived and cheap, take over smoothly. The same photons, sorted
+by their distance from the beam, give the lateral profiles. Standard errors are those of
+independent batches.
+
+Finished depths are kept in the work folder; an interrupted run resumes from them.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ import sys
 import time
 from collections.abc import Sequence
 from itertools import pairwise
+from math import inf
 from pathlib import Path
 
 import numba
@@ -32,74 +35,92 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from rigsim.tissue import skin_layers
+from rigsim.tissue import skin_layers, skin_transport
 from rigsim.tissue.photon_walk import ROULETTE_MAX_WEIGHT, ROULETTE_SURVIVAL
-from rigsim.tissue.skin_table import c_hd_axis, c_m_axis
-from rigsim.tissue.tissue_mc import EscapePaths, trace_escape_paths
+from rigsim.tissue.skin_transport import Axes
+from rigsim.tissue.tissue_mc import EscapePaths, Layer, LayerStack, trace_escape_paths
 
 FloatArray = NDArray[np.float64]
 
-RECIPE = 1  # raise it when the numbers change
-WAVELENGTH_NM = np.arange(400.0, 701.0, 10.0)
-NODES, LATERAL_NODES = 41, 9
-RING_EDGES_MM = np.concatenate([[0.0], np.geomspace(0.01, 15.0, 40)])
+RECIPE = 2  # raise it when the numbers change
 BATCHES = 40
-# Melanin of the traced stacks and photons of each; the darker, the shorter and cheaper the paths.
-RUNS = ((0.0, 600_000), (0.02, 1_200_000), (0.1, 4_000_000))
-TAKE_OVER = 2.5  # a run takes over fully at this multiple of its own melanin
+# Absorption depth of the traced epidermis and photons of each run.
+RUNS = ((0.0, 800_000), (0.7, 1_600_000), (3.0, 4_000_000))
+TAKE_OVER = 2.5  # a run takes over fully at this multiple of its own absorption
+BASAL = skin_layers.BASAL_THICKNESS_FRACTION
+RATIO = skin_layers.DERMIS_SCATTERING_RATIO
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def shares(c_m: FloatArray) -> FloatArray:
-    """Return each run's weight in the estimate at each c_m, (runs, nodes); columns sum to 1."""
-    result = np.zeros((len(RUNS), c_m.size))
+def shares(axes: Axes) -> FloatArray:
+    """Return each run's weight in the estimate, (runs, basal, absorption); sums over runs are 1."""
+    # The weaker absorption of both parts of the epidermis, over that of an even one.
+    weaker = np.minimum((1.0 - axes.basal) / (1.0 - BASAL), axes.basal / BASAL)
+    depth = weaker[:, None] * axes.absorption
+    result = np.zeros((len(RUNS), *depth.shape))
     result[0] = 1.0
-    for index, (c_ref, _) in enumerate(RUNS[1:], start=1):
-        t = np.clip((c_m / c_ref - 1.0) / (TAKE_OVER - 1.0), 0.0, 1.0)
+    for index, (traced, _) in enumerate(RUNS[1:], start=1):
+        t = np.clip((depth / traced - 1.0) / (TAKE_OVER - 1.0), 0.0, 1.0)
         ramp = t * t * (3.0 - 2.0 * t)
         result[:index] *= 1.0 - ramp
         result[index] = ramp
     return result
 
 
+def stack_of(scattering: float, absorption: float, least_dermis: float) -> LayerStack:
+    """Return the traced stack; lengths are in reduced mean free paths of the epidermis."""
+    per_mm = 1.0 / (1.0 - skin_layers.SKIN_ANISOTROPY)
+
+    def layer(thickness: float, sigma_a: float, scale: float) -> Layer:
+        return Layer(
+            thickness, sigma_a, scale * per_mm, skin_layers.SKIN_ANISOTROPY, skin_layers.ETA
+        )
+
+    even = absorption / scattering
+    return LayerStack(
+        (
+            layer((1.0 - BASAL) * scattering, even, 1.0),
+            layer(BASAL * scattering, even, 1.0),
+            layer(inf, RATIO * least_dermis, RATIO),
+        )
+    )
+
+
 def survivals(
-    paths: EscapePaths, wavelength_nm: float, c_ref: float, c_m: FloatArray, c_hd: FloatArray
+    paths: EscapePaths, scattering: float, traced: float, axes: Axes, used: NDArray[np.bool_]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return photon weights at each melanin (n, c_m) and their factors by blood (n, c_hd)."""
-    baseline = skin_layers.baseline_per_mm(wavelength_nm)
-    melanin = skin_layers.melanin_per_mm(wavelength_nm) - baseline
-    blood = skin_layers.blood_per_mm(wavelength_nm) - baseline
-    epidermis, dermis = paths.path_mm.T
-    in_blood = skin_layers.EPIDERMAL_BLOOD_RATIO * epidermis + dermis
-    by_melanin = np.exp(-np.outer(epidermis, (c_m - c_ref) * melanin))
-    by_melanin *= (paths.weight / paths.photons)[:, None]
-    return by_melanin, np.exp(-np.outer(in_blood, c_hd * blood))
+    """Return photon weights at the used (basal, absorption) nodes, and factors by the dermis."""
+    upper, basal, dermis = paths.path_mm.T
+    share, depth = np.broadcast_arrays(axes.basal[:, None], axes.absorption)
+    share, depth = share[used], depth[used]
+    added_upper = depth * (1.0 - share) / ((1.0 - BASAL) * scattering) - traced / scattering
+    added_basal = depth * share / (BASAL * scattering) - traced / scattering
+    by_epidermis = np.exp(-np.outer(upper, added_upper) - np.outer(basal, added_basal))
+    by_epidermis *= (paths.weight / paths.photons)[:, None]
+    return by_epidermis, np.exp(-np.outer(dermis, RATIO * (axes.dermis - axes.dermis[0])))
 
 
 def ring_sums(
-    paths: EscapePaths, wavelength_nm: float, c_ref: float, c_m: FloatArray, c_hd: FloatArray
+    paths: EscapePaths, weights: tuple[FloatArray, FloatArray], ring_edges: FloatArray
 ) -> FloatArray:
-    """Return the reflectance within each ring, shape (c_m, c_hd, rings)."""
-    by_melanin, by_blood = survivals(paths, wavelength_nm, c_ref, c_m, c_hd)
+    """Return the reflectance within each ring, shape (used nodes, dermis, rings)."""
     order = np.argsort(paths.radius_mm)
-    ends = np.searchsorted(paths.radius_mm[order], RING_EDGES_MM)
-    by_melanin, by_blood = by_melanin[order], by_blood[order]
-    return np.stack([by_melanin[a:b].T @ by_blood[a:b] for a, b in pairwise(ends)], axis=-1)
+    ends = np.searchsorted(paths.radius_mm[order], ring_edges)
+    by_epidermis, by_dermis = (part[order] for part in weights)
+    return np.stack([by_epidermis[a:b].T @ by_dermis[a:b] for a, b in pairwise(ends)], axis=-1)
 
 
-def simulate(
-    wavelength_nm: float, *, seed: int, scale: float, threads: int
-) -> dict[str, FloatArray]:
-    """Trace one wavelength; return reflectance and ring reflectance with their standard errors."""
-    c_m, c_hd = c_m_axis(NODES), c_hd_axis(NODES)
-    lateral_c_m, lateral_c_hd = c_m_axis(LATERAL_NODES), c_hd_axis(LATERAL_NODES)
-    fine, coarse = shares(c_m), shares(lateral_c_m)
+def simulate(scattering: float, *, seed: int, scale: float, threads: int) -> dict[str, FloatArray]:
+    """Trace one scattering depth; return reflectance and ring reflectance with their errors."""
+    axes, lateral = skin_transport.AXES, skin_transport.LATERAL_AXES
+    fine, coarse = shares(axes), shares(lateral)
+    edges = skin_transport.RING_EDGES / RATIO  # from reduced mean free paths of the dermis
     sums: dict[str, FloatArray] = {}
-    for index, (c_ref, photons) in enumerate(RUNS):
-        rng = np.random.default_rng([seed, round(wavelength_nm), index])
+    for index, (traced, photons) in enumerate(RUNS):
+        rng = np.random.default_rng([seed, round(1e4 * scattering), index])
         batches = trace_escape_paths(
-            skin_layers.skin_layer_stack(wavelength_nm, c_ref, 0.0),
+            stack_of(scattering, traced, float(axes.dermis[0])),
             photons=round(scale * photons),
             rng=rng,
             batches=BATCHES,
@@ -108,11 +129,10 @@ def simulate(
         used, used_coarse = fine[index] > 0.0, coarse[index] > 0.0
         table, rings = [], []
         for batch in batches:
-            by_melanin, by_blood = survivals(batch, wavelength_nm, c_ref, c_m[used], c_hd)
-            table.append(by_melanin.T @ by_blood)
-            rings.append(
-                ring_sums(batch, wavelength_nm, c_ref, lateral_c_m[used_coarse], lateral_c_hd)
-            )
+            by_epidermis, by_dermis = survivals(batch, scattering, traced, axes, used)
+            table.append(by_epidermis.T @ by_dermis)
+            weights = survivals(batch, scattering, traced, lateral, used_coarse)
+            rings.append(ring_sums(batch, weights, edges))
         _add(sums, "reflectance", np.array(table), fine[index], used)
         _add(sums, "lateral", np.array(rings), coarse[index], used_coarse)
     for name in ("reflectance", "lateral"):
@@ -121,10 +141,14 @@ def simulate(
 
 
 def _add(
-    sums: dict[str, FloatArray], name: str, batches: FloatArray, share: FloatArray, used: FloatArray
+    sums: dict[str, FloatArray],
+    name: str,
+    batches: FloatArray,
+    share: FloatArray,
+    used: NDArray[np.bool_],
 ) -> None:
     """Add one run's weighted mean and variance of the mean; batches are on the first axis."""
-    shape = (share.size, *batches.shape[2:])
+    shape = (*share.shape, *batches.shape[2:])
     mean = sums.setdefault(name, np.zeros(shape))
     variance = sums.setdefault(f"{name}_variance", np.zeros(shape))
     weight = share[used].reshape(-1, *[1] * (batches.ndim - 2))
@@ -134,33 +158,27 @@ def _add(
 
 def parameters(seed: int, scale: float) -> dict[str, object]:
     """Return all parameters that determine the table's values."""
-    wavelengths = [float(nm) for nm in WAVELENGTH_NM]
+    axes, lateral = skin_transport.AXES, skin_transport.LATERAL_AXES
     return {
         "recipe": RECIPE,
         "seed": seed,
         "photons_scale": scale,
-        "runs_c_m_and_photons": [list(run) for run in RUNS],
+        "runs_absorption_and_photons": [list(run) for run in RUNS],
         "batches": BATCHES,
         "take_over": TAKE_OVER,
-        "nodes": [NODES, LATERAL_NODES],
-        "ring_edges_mm": [float(edge) for edge in RING_EDGES_MM],
+        "axes": {name: getattr(axes, name).tolist() for name in Axes.__slots__},
+        "lateral_axes": {name: getattr(lateral, name).tolist() for name in Axes.__slots__},
+        "ring_edges": skin_transport.RING_EDGES.tolist(),
         "roulette": [ROULETTE_MAX_WEIGHT, ROULETTE_SURVIVAL],
-        "epidermis_mm": skin_layers.EPIDERMIS_MM,
         "eta": skin_layers.ETA,
         "g": skin_layers.SKIN_ANISOTROPY,
-        "epidermal_blood_share": skin_layers.EPIDERMAL_BLOOD_RATIO,
-        "wavelength_nm": wavelengths,
-        "melanin_per_mm": [skin_layers.melanin_per_mm(nm) for nm in wavelengths],
-        "blood_per_mm": [skin_layers.blood_per_mm(nm) for nm in wavelengths],
-        "baseline_per_mm": [skin_layers.baseline_per_mm(nm) for nm in wavelengths],
-        "epidermis_scattering_per_mm": [
-            skin_layers.epidermis_scattering_per_mm(nm) for nm in wavelengths
-        ],
+        "dermis_scattering_ratio": RATIO,
+        "basal_thickness_fraction": BASAL,
     }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Trace the missing wavelengths, then write the table."""
+    """Trace the missing depths, then write the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument(
         "--out", type=Path, default=ROOT / "rigsim" / "data" / "skin_reflectance_mc.npz"
@@ -177,14 +195,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     seconds = 0.0
     parts = []
-    for number, nm in enumerate(WAVELENGTH_NM, start=1):
-        part = folder / f"{nm:.0f}nm.npz"
+    depths = skin_transport.AXES.scattering
+    for number, depth in enumerate(depths, start=1):
+        part = folder / f"{depth:.4f}.npz"
         if not part.exists():
             start = time.perf_counter()
             # BLAS threads that spin between small products would take cores from the tracing
             # threads.
             with threadpool_limits(1):
-                sums = simulate(nm, seed=args.seed, scale=args.photons_scale, threads=args.threads)
+                sums = simulate(
+                    float(depth), seed=args.seed, scale=args.photons_scale, threads=args.threads
+                )
             unfinished = part.with_suffix(".partial")
             with unfinished.open("wb") as stream:
                 np.savez(stream, **sums, allow_pickle=False, seconds=time.perf_counter() - start)
@@ -193,7 +214,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             parts.append(dict(loaded))
         seconds += float(parts[-1]["seconds"])
         print(
-            f"{nm:.0f} nm ({number}/{WAVELENGTH_NM.size}), {seconds:.0f} s of tracing so far",
+            f"depth {depth:.3f} ({number}/{depths.size}), {seconds:.0f} s of tracing so far",
             file=sys.stderr,
         )
 
@@ -205,24 +226,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         "numpy": np.__version__,
         "numba": numba.__version__,
     }
+    every = skin_transport.LATERAL_SCATTERING_STEP
     columns = {
-        name: np.stack([part[name] for part in parts], axis=-1).astype(np.float32)
-        for name in (
-            "reflectance",
-            "reflectance_standard_error",
-            "lateral",
-            "lateral_standard_error",
-        )
+        name: np.stack([part[name] for part in chosen]).astype(np.float32)
+        for stem, chosen in (("reflectance", parts), ("lateral", parts[::every]))
+        for name in (stem, f"{stem}_standard_error")
     }
     args.out.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
         args.out,
-        wavelength_nm=WAVELENGTH_NM,
-        c_m=c_m_axis(NODES),
-        c_hd=c_hd_axis(NODES),
-        lateral_c_m=c_m_axis(LATERAL_NODES),
-        lateral_c_hd=c_hd_axis(LATERAL_NODES),
-        ring_edges_mm=RING_EDGES_MM,
         provenance=np.array(json.dumps(provenance, sort_keys=True)),
         allow_pickle=False,
         **columns,

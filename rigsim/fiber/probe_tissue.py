@@ -1,9 +1,7 @@
 """Tissues under a fiber probe, by site, rotation of the head and suction."""
 
-import dataclasses
 import json
 import math
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -13,9 +11,15 @@ import numpy as np
 
 from rigsim.arrays import Float64Array
 from rigsim.fiber.anisotropic_tissue import AnisotropicTissue
+from rigsim.subject.person_skin import PersonSkin, PersonSkinError, SiteSkin
 from rigsim.subject.pigment import MELANIN_PRESETS
-from rigsim.tissue import skin_layers
-from rigsim.tissue.skin_layers import ETA, SKIN_ANISOTROPY
+from rigsim.tissue.skin_layers import (
+    ETA,
+    SKIN_ANISOTROPY,
+    baseline_per_mm,
+    blood_per_mm,
+    skin_layer_stack,
+)
 from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportError
 
 Kind: TypeAlias = Literal["homogeneous", "layered", "anisotropic"]
@@ -24,17 +28,6 @@ MIN_SIGMA_A_PER_MM: Final = 1e-7
 """Smallest traced absorption, 1/mm: without absorption photons never end. A path of 1 m loses a
 ten-thousandth."""
 
-RESTING_BLOOD_FRACTION: Final[Mapping[str, float]] = {
-    "forehead": 0.005,
-    "cheek": 0.006,
-    "chin": 0.016,
-    "abdomen": 0.005,
-}
-"""Volume fraction of blood in the dermis at rest, by site; of the whole dermis down to centimeters,
-so less than what colors the face, whose vessels lie under the epidermis."""
-PRESET_MELANIN_FRACTION: Final = 0.25
-"""Of the presets' melanin: theirs colors the faces of other rigs, while spectra of forearms ask for
-about 0.003 (`rigsim.tissue.skin_table`), and so do the paper's sigma_tr. This project's choice."""
 INCOMPRESSIBLE_BLOOD_FRACTION: Final = 0.25
 """Fraction of the blood at rest that pressure does not displace."""
 CAPILLARY_PRESSURE_MBAR: Final = 30.0
@@ -188,10 +181,10 @@ def half_space(
 
 
 class SkinTissue:
-    """Skin of two layers: an epidermis with melanin on a dermis with blood.
+    """Skin of a person under the head.
 
-    Layers and coefficients are those of `rigsim.tissue.skin_layers`. Pressure under a head
-    displaces part of the blood; the remaining fraction of the blood at rest is
+    The layers are those of `rigsim.subject.person_skin`. Pressure under a head displaces part of
+    the blood; the remaining fraction of the blood at rest is
 
         BLOOD_KEPT + (1 - BLOOD_KEPT) exp(-pressure / CAPILLARY_MBAR),
 
@@ -200,53 +193,24 @@ class SkinTissue:
 
     Parameters
     ----------
-    preset
-        One of `rigsim.subject.pigment.MELANIN_PRESETS`.
-    seed
-        Of what differs between subjects and between the sites of one, >= 0.
-    melanin
-        Volume fraction of melanosomes of a face of this kind, instead of the preset's, 0.005 to
-        0.45.
-    blood
-        Factor of all blood, 0.1 to 4.
-
-    Raises
-    ------
-    TissueError
-        The preset is unknown, the seed negative, or a number out of range.
+    person
+        The person.
 
     Notes
     -----
     That pressure takes blood out of the skin under a probe is measured (Reif et al. 2008,
     doi:10.1117/1.2870115; Landis 1930, doi:10.1152/ajplegacy.1930.93.2.353, for the pressure in
-    capillaries); the law's form is this project's choice, and so are the blood at rest and its
-    differences by site. The nearest media of preset III under 60 mbar
-    (`rigsim.fiber.homogeneous_fit`) lie below the means in table 2 of Weyrich et al. 2006,
-    doi:10.1145/1141911.1141987: by 0.5 to 0.8 of its deviations in red, 1.3 to 1.6 in green, and
-    2.1 to 3.5 in blue, where a camera's band lets light through that is hardly absorbed.
+    capillaries); the law's form is this project's choice.
 
     Examples
     --------
-    >>> skin = SkinTissue("III", seed=1)
-    >>> skin.blood("cheek", 60.0) < skin.blood("cheek", 0.0) < skin.blood("chin", 0.0)
+    >>> skin = SkinTissue(PersonSkin.of_preset("III", seed=1))
+    >>> skin.blood("cheek", 60.0) < skin.blood("cheek", 0.0)
     True
     """
 
-    def __init__(
-        self, preset: str, *, seed: int = 0, melanin: float | None = None, blood: float = 1.0
-    ) -> None:
-        if preset not in MELANIN_PRESETS:
-            known = ", ".join(MELANIN_PRESETS)
-            raise TissueError(f"preset: got {preset!r}, expected one of {known}")
-        if seed < 0:
-            raise TissueError(f"seed: got {seed}, expected >= 0")
-        if melanin is not None and not 0.005 <= melanin <= 0.45:
-            raise TissueError(f"melanin: got {melanin}, expected 0.005 to 0.45")
-        if not 0.1 <= blood <= 4.0:
-            raise TissueError(f"blood: got {blood}, expected 0.1 to 4")
-        self.preset, self.seed, self._blood = preset, seed, blood
-        self._melanin = MELANIN_PRESETS[preset] if melanin is None else melanin
-        self._own = np.random.default_rng([seed, 0x736B]).standard_normal(2)
+    def __init__(self, person: PersonSkin) -> None:
+        self.person = person
 
     @property
     def kind(self) -> Kind:
@@ -254,13 +218,12 @@ class SkinTissue:
         return "layered"
 
     def melanin(self, site: str) -> float:
-        """Return the volume fraction of melanosomes in an epidermis of 0.25 mm."""
-        factor = math.exp(0.1 * float(self._own[0]) + 0.05 * self._drawn(site)[0])
-        return PRESET_MELANIN_FRACTION * self._melanin * factor
+        """Return the volume fraction of melanosomes in the epidermis."""
+        return self._at(site).c_m
 
     def epidermis_mm(self, site: str) -> float:
         """Return the epidermis's thickness, mm."""
-        return skin_layers.EPIDERMIS_MM * math.exp(0.06 * self._drawn(site)[1])
+        return self._at(site).tissue.epidermis_mm
 
     def blood(self, site: str, suction_mbar: float) -> float:
         """Return the volume fraction of blood in the dermis under the head."""
@@ -268,39 +231,29 @@ class SkinTissue:
         left = INCOMPRESSIBLE_BLOOD_FRACTION + (1.0 - INCOMPRESSIBLE_BLOOD_FRACTION) * math.exp(
             -pressure / CAPILLARY_PRESSURE_MBAR
         )
-        return left * self._rest(site)
+        return left * self._at(site).c_hd
 
     def optics(self, site: str, angle_deg: float, suction_mbar: float) -> TissueOptics:
         """Return the layers; the blood above what no pressure takes out is the absorber."""
         del angle_deg
-        rest = self._rest(site)
-        least = INCOMPRESSIBLE_BLOOD_FRACTION * rest
-        melanin, thickness = self.melanin(site), self.epidermis_mm(site)
-        stacks, absorber = [], []
-        for wavelength in SKIN_WAVELENGTHS_NM:
-            stack = skin_layers.skin_layer_stack(wavelength, melanin, least)
-            top = dataclasses.replace(stack.layers[0], thickness_mm=thickness)
-            stacks.append(dataclasses.replace(stack, layers=(top, *stack.layers[1:])))
-            # blood replaces bloodless tissue
-            dermis = skin_layers.blood_per_mm(wavelength) - skin_layers.baseline_per_mm(wavelength)
-            absorber.append([skin_layers.EPIDERMAL_BLOOD_RATIO * dermis, dermis])
-        amount = self.blood(site, suction_mbar) - least
-        return TissueOptics(SKIN_WAVELENGTHS_NM, tuple(stacks), np.array(absorber), amount)
-
-    def _rest(self, site: str) -> float:
-        if site not in RESTING_BLOOD_FRACTION:
-            known = ", ".join(RESTING_BLOOD_FRACTION)
-            raise TissueError(f"site: got {site!r}, expected one of {known}")
-        return (
-            self._blood
-            * RESTING_BLOOD_FRACTION[site]
-            * math.exp(0.15 * float(self._own[1]) + 0.1 * self._drawn(site)[2])
+        skin = self._at(site)
+        least = INCOMPRESSIBLE_BLOOD_FRACTION * skin.c_hd
+        stacks = tuple(
+            skin_layer_stack(nm, skin.c_m, least, skin.tissue) for nm in SKIN_WAVELENGTHS_NM
         )
+        # Blood replaces bloodless tissue.
+        dermis = blood_per_mm(
+            SKIN_WAVELENGTHS_NM, skin.tissue.oxygenation
+        ) - skin.tissue.baseline_amplitude * baseline_per_mm(SKIN_WAVELENGTHS_NM)
+        ratios = [skin.tissue.epidermal_blood_ratio] * (len(stacks[0].layers) - 1) + [1.0]
+        amount = self.blood(site, suction_mbar) - least
+        return TissueOptics(SKIN_WAVELENGTHS_NM, stacks, np.outer(dermis, ratios), amount)
 
-    def _drawn(self, site: str) -> tuple[float, float, float]:
-        rng = np.random.default_rng([self.seed, 0x7369, zlib.crc32(site.encode())])
-        a, b, c = rng.standard_normal(3)
-        return float(a), float(b), float(c)
+    def _at(self, site: str) -> SiteSkin:
+        try:
+            return self.person.at(site)
+        except PersonSkinError as error:
+            raise TissueError(str(error)) from error
 
 
 def phantom_certificate() -> Mapping[str, Any]:
@@ -372,12 +325,12 @@ def parse_tissue(text: str, *, seed: int = 0) -> ProbedTissue:
     --------
     >>> parse_tissue("homogeneous:0.04,1.5").sigma_s_prime_per_mm
     1.5
-    >>> parse_tissue("III", seed=2).preset
-    'III'
+    >>> parse_tissue("III", seed=2).kind
+    'layered'
     """
     name, colon, rest = text.partition(":")
     if not colon and name in MELANIN_PRESETS:
-        return SkinTissue(name, seed=seed)
+        return SkinTissue(PersonSkin.of_preset(name, seed=seed))
     try:
         numbers = [float(word) for word in rest.split(",")]
     except ValueError:

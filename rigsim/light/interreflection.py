@@ -30,7 +30,6 @@ from rigsim.geometry.atlas import Atlas, dilate_texture, sample, unwrap
 from rigsim.light.observed_skin import ObservedSkin
 from rigsim.light.surface_brdf import transmittance
 from rigsim.render import RAY_OFFSET_MM, Caster
-from rigsim.tissue.skin_table import SkinTable
 
 DEFAULT_MIN_BOUNCE_FRACTION: Final = 1e-3
 """Fraction of the first bounce below which further bounces are omitted."""
@@ -240,7 +239,7 @@ class InterreflectionColor:
         self._weights: Float32Array | None = None
         if bounces.spectral:
             weights = skin.band_weights(bounces.step)
-            spectra = SkinTable.load().spectra(coarse[:, 1], coarse[:, 2])[:, :: bounces.step]
+            spectra = skin.table.spectra(coarse[:, 1], coarse[:, 2])[:, :: bounces.step]
             cover = coarse[:, 3:6].mean(axis=1, keepdims=True)
             self._spectrum = np.asarray(spectra * cover, np.float32)
             self._channel = np.maximum(self._spectrum @ weights, MIN_REFLECTANCE).astype(np.float32)
@@ -290,7 +289,7 @@ def channel_approximation_error(skin: ObservedSkin) -> Float64Array:
     It is evaluated for typical skin.
     """
     weights = skin.band_weights()
-    typical = SkinTable.load().spectra(*(np.median(part) for part in skin.covered_chromophores()))
+    typical = skin.table.spectra(*(np.median(part) for part in skin.covered_chromophores()))
     return np.asarray(np.abs((typical**2 @ weights) / (typical @ weights) ** 2 - 1.0), np.float64)
 
 
@@ -312,7 +311,7 @@ def wavelength_step_error(skin: ObservedSkin, step: int) -> Float64Array:
     """
     ends = [[part.min(), np.median(part), part.max()] for part in skin.covered_chromophores()]
     melanin, blood = (axis.ravel() for axis in np.meshgrid(*ends))
-    spectra = SkinTable.load().spectra(melanin, blood)
+    spectra = skin.table.spectra(melanin, blood)
 
     def bounced(every: int) -> Float64Array:
         some, weights = spectra[:, ::every], skin.band_weights(every)

@@ -9,7 +9,7 @@ from rigsim.arrays import Float32Array, Float64Array
 from rigsim.subject import SimulatedSubject
 from rigsim.tissue.lateral_kernels import SIGMAS_MM, GaussianSum
 from rigsim.tissue.skin_color import SkinColor, skin_color
-from rigsim.tissue.skin_table import SkinTable
+from rigsim.tissue.skin_table import WAVELENGTH_NM, SkinTable
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,7 +27,7 @@ class ObservedSkin:
     @property
     def color(self) -> SkinColor:
         """Colors of skin of any pigment in the camera's channels."""
-        return skin_color(self.camera, self.illuminant)
+        return skin_color(self.camera, self.illuminant, self.subject.tissue)
 
     @property
     def blood_volume_fraction(self) -> Float32Array:
@@ -49,11 +49,14 @@ class ObservedSkin:
 
     def band_weights(self, step: int = 1) -> Float64Array:
         """Return each channel's weights at every ``step``-th wavelength of the skin's table."""
-        wavelength_nm = SkinTable.load().wavelength_nm[::step]
-        return spectra.band_weights(self.camera, self.illuminant, wavelength_nm)
+        return spectra.band_weights(self.camera, self.illuminant, WAVELENGTH_NM[::step])
+
+    @property
+    def table(self) -> SkinTable:
+        """Spectra of this person's skin of any pigment."""
+        return SkinTable.load(self.subject.tissue)
 
     def lateral_kernels(self) -> GaussianSum:
         """Return the lateral profile at the median melanin and hemoglobin, per channel."""
         melanin, blood = (float(np.median(part)) for part in self.covered_chromophores())
-        table = SkinTable.load()
-        return table.lateral_kernels(melanin, blood, self.band_weights()).gaussians(SIGMAS_MM)
+        return self.table.lateral_kernels(melanin, blood, self.band_weights()).gaussians(SIGMAS_MM)

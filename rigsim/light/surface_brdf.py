@@ -179,7 +179,9 @@ def skin_surface(
         Textures; oil is most on forehead, nose and chin, vellus hair on cheeks, temples and jaw.
     """
     points, regions = subject.perfusion.points_mm, subject.perfusion.regions
-    reflectance = skin_color(camera, light).rgb(subject.melanin, subject.hemoglobin(state))
+    reflectance = skin_color(camera, light, subject.tissue).rgb(
+        subject.melanin, subject.hemoglobin(state)
+    )
     hair = subject.hair[..., None]
     scale = np.float32(shading.interior_scale(ETA))
     over = np.asarray(HAIR_REFLECTANCE, np.float32)

@@ -5,7 +5,7 @@ A file is TOML; every key is optional, and unknown keys are errors:
 ================ ==================================================================================
 schema           "skinrig.subject/1"
 preset           pigment, "I" to "VI", "palest" or "darkest"; "III"
-melanin          volume fraction of melanosomes around which skin varies, 0.005 to 0.45; replaces it
+melanin          volume fraction of melanosomes around which skin varies, 0.001 to 0.45; replaces it
 blood            factor of all blood, 0.1 to 4
 freckles         0 to 1; drawn from the seed if omitted
 oil              factor of the surface fraction covered by oil, 0 to 3
@@ -37,16 +37,15 @@ from rigsim.geometry.mesh import Mesh, MeshError, load_mesh
 from rigsim.population.textures import MAP_RANGES, SubjectFileError, load_texture, resample_texture
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.subject import PRESET_NAMES, SimulatedSubject, make_subject, pigment
-from rigsim.subject.perfusion import MAX_HEMOGLOBIN
+from rigsim.subject.perfusion import MAX_HEMOGLOBIN, draw_perfusion
+from rigsim.subject.person_skin import MELANIN_RANGE, PersonSkin
 
 SCHEMA: Final = "skinrig.subject/1"
 SUBJECT_SUFFIX: Final = ".toml"
-PRESET_MELANIN_RANGE: Final = (0.005, 0.45)
-"""Range of the presets, for which tables of light in skin exist."""
 _FILE_KEYS: Final = ("mesh", *MAP_RANGES)
 _UNUSED_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
-    "gradient": ("blood", "freckles", "oil", *_FILE_KEYS),
-    "probe": ("freckles", "oil", *_FILE_KEYS),
+    "gradient": ("oil", *_FILE_KEYS),
+    "probe": ("oil", *_FILE_KEYS),
 }
 """Keys without effect in a rig: a patch of plain skin, and skin by its layers."""
 
@@ -77,7 +76,7 @@ class SubjectFile(Document):
         known = ", ".join(PRESET_NAMES)
         checks.check("preset", self.preset, self.preset in PRESET_NAMES, f"one of {known}")
         for name, low, high in (
-            ("melanin", *PRESET_MELANIN_RANGE),
+            ("melanin", *MELANIN_RANGE),
             ("blood", 0.1, 4.0),
             ("freckles", 0.0, 1.0),
             ("oil", 0.0, 3.0),
@@ -142,7 +141,13 @@ class SubjectFile(Document):
         )
         if self == SubjectFile(preset=self.preset, blood=self.blood, mesh=self.mesh):
             return found
-        perfusion = found.perfusion
+        perfusion = draw_perfusion(
+            found.perfusion.points_mm,
+            found.perfusion.regions,
+            pigment.typical_blood(self.melanosome_fraction),
+            seed=seed,
+            amount=self.blood,
+        )
         if self.melanin_map is not None:
             melanin = resample_texture("melanin_map", self.melanin_map, size)
         else:
@@ -167,13 +172,15 @@ class SubjectFile(Document):
 
     def patch(self, site: str, *, seed: int, size_mm: float) -> MicroSkin:
         """Return a patch of skin for the gradient sphere, see `make_micro_skin`."""
-        return make_micro_skin(
-            site, seed=seed, size_mm=size_mm, preset=self.nearest_preset, melanin=self.melanin
-        )
+        return make_micro_skin(site, seed=seed, size_mm=size_mm, person=self.skin(seed=seed))
 
     def tissue(self, *, seed: int) -> SkinTissue:
         """Return the skin below the fiber probe, see `SkinTissue`."""
-        return SkinTissue(self.nearest_preset, seed=seed, melanin=self.melanin, blood=self.blood)
+        return SkinTissue(self.skin(seed=seed))
+
+    def skin(self, *, seed: int) -> PersonSkin:
+        """Return the skin that every rig simulates."""
+        return PersonSkin(self.melanosome_fraction, self.blood, seed, self.freckles)
 
     def unused_keys(self, rig: str) -> tuple[str, ...]:
         """Return the given keys that have no effect in a rig."""
@@ -208,7 +215,7 @@ def load_subject(text: str) -> SubjectFile:
     Examples
     --------
     >>> load_subject("IV").melanosome_fraction
-    0.047
+    0.0425
     """
     if is_subject_file(text):
         return read_subject_file(text)

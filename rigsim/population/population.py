@@ -1,14 +1,14 @@
 """Draw a simulated population: 87 members in the groups of table 1 of Weyrich et al. 2006.
 
 Members are draws from distributions of melanin, blood, oil, freckles, age and beard. The groups
-differ only in the distributions below. **All of these are chosen** so that an analysis has
-something to find; they are not measurements, and nothing here is a statement about people.
+differ only in the distributions below. Those of melanin and blood follow measured faces (Lu et al.
+2025, doi:10.1038/s41597-025-04857-5). **All others are chosen** so that an analysis has something to find, and nothing here is a statement about people.
 
 ================= =========================================================================
 age               the paper's range of each group; both ends occur, otherwise uniform
-melanin           log-normal: median 0.016 (caucasian) or 0.032 (asian), sigma 0.35 or 0.30,
-                  drawn again outside 0.006 to 0.05 or 0.012 to 0.1; times 0.92 in women
-blood             log-normal, median 1, sigma 0.15; times 0.93 in women
+melanin           log-normal: median 0.021 (caucasian) or 0.033 (asian), sigma 0.45 or 0.40,
+                  drawn again outside 0.009 to 0.05 or 0.012 to 0.09; times 0.69 in women
+blood             log-normal, median 1, sigma 0.15; times 0.8 in women
 oil               log-normal, median 1, sigma 0.25; times 0.9 in women, less with age
 freckles          uniform, 0 to 0.9 (caucasian) or 0 to 0.35 (asian); fewer on dark skin
 beard             men of 17 and older: uniform, 0.05 to 1 (caucasian) or 0.05 to 0.65 (asian)
@@ -161,7 +161,13 @@ class Member:
             mesh=mesh,
             atlas=atlas,
             melanin=self._melanin(points, regions),
-            perfusion=draw_perfusion(points, regions, seed=self.seed, amount=self.blood),
+            perfusion=draw_perfusion(
+                points,
+                regions,
+                pigment.typical_blood(self.melanin),
+                seed=self.seed,
+                amount=self.blood,
+            ),
             roughness=even + np.float32(0.3),
             height_um=even,
             hair=relief.hair_map(points, seed=self.seed),
@@ -384,13 +390,13 @@ def _draw_member(group: Group, index: int, number: int, rng: np.random.Generator
     low, high = group.age_years
     age = float((low, high)[index] if index < 2 else rng.integers(low, high + 1))
     male, pale = group.sex == "male", group.ethnicity == "caucasian"
-    bounds = (0.006, 0.05) if pale else (0.012, 0.1)
+    bounds = (0.009, 0.05) if pale else (0.012, 0.09)
     melanin = 0.0
     while not bounds[0] <= melanin <= bounds[1]:
         spread = float(rng.standard_normal())
-        melanin = 0.016 * np.exp(0.35 * spread) if pale else 0.032 * np.exp(0.3 * spread)
-        melanin *= 1.0 if male else 0.92
-    blood = float(np.exp(0.15 * rng.standard_normal())) * (1.0 if male else 0.93)
+        melanin = 0.021 * np.exp(0.45 * spread) if pale else 0.033 * np.exp(0.4 * spread)
+        melanin *= 1.0 if male else 0.69
+    blood = float(np.exp(0.15 * rng.standard_normal())) * (1.0 if male else 0.8)
     aging = 1.0 - 0.006 * max(age - 30.0, 0.0)
     oil = float(np.exp(0.25 * rng.standard_normal())) * aging * (1.0 if male else 0.9)
     freckles = float(rng.uniform(0.0, 0.9 if pale else 0.35))

@@ -25,14 +25,17 @@ from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.polygon_net import polygon_edge_distance
 from rigsim.geometry.surface_noise import random_spots, smooth_noise, vessel_network
 from rigsim.package_data import package_table
-from rigsim.subject.pigment import MAX_MELANIN, MELANIN_PRESETS
+from rigsim.subject.person_skin import PersonSkin, PersonSkinError, SiteSkin
+from rigsim.subject.pigment import MAX_MELANIN
 from rigsim.tissue.lateral_kernels import SIGMAS_MM
 from rigsim.tissue.skin_layers import MAX_C_HD
 from rigsim.tissue.skin_table import SkinTable
 
 SiteName = Literal["forehead", "cheek", "chin"]
-PATCH_BLOOD_FRACTION: Final = 0.035
-"""Volume fraction of blood for the patch's lateral scattering."""
+PIGMENT_LOG_MEAN: Final = -0.050
+"""Mean of the logarithm of the patches' melanin over that of the site, from 18 patches of 4 mm."""
+PIGMENT_LOG_VARIANCE: Final = 0.099
+"""Variance of that logarithm."""
 SITE_NAMES: Final = get_args(SiteName)
 """Names of the sites."""
 
@@ -80,8 +83,8 @@ class MicroSkin:
     site: str
     """One of `SITE_NAMES`."""
     seed: int
-    preset: str
-    """Melanin, one of `rigsim.subject.pigment.MELANIN_PRESETS`."""
+    skin: SiteSkin
+    """Mean melanin and blood of the patch, and its other properties."""
     texel_um: float
     """Distance of texels, um."""
     height_um: Float32Array
@@ -97,8 +100,6 @@ class MicroSkin:
     poisson: float
     """Poisson's number of the tissue that bears it, 0 to 0.5. Below 0.5 fluid leaves or enters it
     while it is held, so that it thickens less than a fixed volume would."""
-    melanin: float | None = None
-    """Volume fraction of melanosomes; None: the preset's."""
 
     def __post_init__(self) -> None:
         shape = self.height_um.shape
@@ -124,11 +125,6 @@ class MicroSkin:
         """Return the side of the patch, mm."""
         return self.height_um.shape[0] * self.texel_um * 1e-3
 
-    @property
-    def melanin_fraction(self) -> float:
-        """Return the mean volume fraction of melanosomes of the patch."""
-        return MELANIN_PRESETS[self.preset] if self.melanin is None else self.melanin
-
 
 def make_micro_skin(
     site: SiteName | str,
@@ -137,7 +133,7 @@ def make_micro_skin(
     size_mm: float,
     texel_um: float = 10.0,
     preset: str = "III",
-    melanin: float | None = None,
+    person: PersonSkin | None = None,
 ) -> MicroSkin:
     """Draw a patch of skin.
 
@@ -153,9 +149,9 @@ def make_micro_skin(
     texel_um
         Distance of texels, 2 to 40 um; detail finer than two texels is omitted.
     preset
-        Melanin of the skin, one of `rigsim.subject.pigment.MELANIN_PRESETS`.
-    melanin
-        Volume fraction of melanosomes instead of the preset's, 0.005 to 0.45.
+        One of `rigsim.subject.pigment.MELANIN_PRESETS`.
+    person
+        Skin of the person; None: the preset's, with the same seed.
 
     Returns
     -------
@@ -174,15 +170,10 @@ def make_micro_skin(
     """
     if site not in _SITE_PARAMETERS:
         raise MicroSkinError(f"site: got {site!r}, expected one of {', '.join(SITE_NAMES)}")
-    if preset not in MELANIN_PRESETS:
-        raise MicroSkinError(
-            f"preset: got {preset!r}, expected one of {', '.join(MELANIN_PRESETS)}"
-        )
-    fraction = MELANIN_PRESETS[preset] if melanin is None else melanin
-    if not min(MELANIN_PRESETS.values()) <= fraction <= max(MELANIN_PRESETS.values()):
-        raise MicroSkinError(f"melanin: got {melanin}, expected 0.005 to 0.45")
-    if seed < 0:
-        raise MicroSkinError(f"seed: got {seed}, expected >= 0")
+    try:
+        skin = (person or PersonSkin.of_preset(preset, seed=seed)).at(site)
+    except PersonSkinError as error:
+        raise MicroSkinError(str(error)) from error
     if not TEXEL_RANGE_UM[0] <= texel_um <= TEXEL_RANGE_UM[1]:
         raise MicroSkinError(f"texel_um: got {texel_um}, expected {TEXEL_RANGE_UM}")
     if not SIZE_RANGE_MM[0] <= size_mm <= SIZE_RANGE_MM[1]:
@@ -199,15 +190,14 @@ def make_micro_skin(
     return MicroSkin(
         site=site,
         seed=seed,
-        preset=preset,
+        skin=skin,
         texel_um=texel_um,
         height_um=height,
-        albedo=_albedo(points, furrow, fraction, own),
+        albedo=_albedo(points, furrow, skin, own),
         alpha=_alpha(where, points, own),
         layer_um=np.asarray(where.layer_um * (1.0 - (1.0 - where.thin) * furrow), np.float32),
         stiffness_ratio=where.stiffness_ratio,
         poisson=where.poisson,
-        melanin=melanin,
     )
 
 
@@ -287,7 +277,7 @@ def _relief(
     )
 
 
-def _albedo(points: Float32Array, furrow: Float32Array, melanin: float, seed: int) -> Float32Array:
+def _albedo(points: Float32Array, furrow: Float32Array, skin: SiteSkin, seed: int) -> Float32Array:
     """Return diffuse reflectance: melanin in specks of 40 to 150 um, a few vessels and spots."""
     salt = 1000 * seed + 500
     speckle = 0.5 * smooth_noise(points, (0.15,), seed=salt)
@@ -302,17 +292,22 @@ def _albedo(points: Float32Array, furrow: Float32Array, melanin: float, seed: in
         seed=salt + 4,
         softness=4.0,
     )
-    c_m = melanin * np.exp(0.45 * speckle + 0.12 * slow + 0.5 * spots - 0.1 * furrow)
+    pattern = 0.45 * speckle + 0.12 * slow + 0.5 * spots - 0.1 * furrow
     vessels = vessel_network(points, 1.6, 0.04, seed=salt + 5)
     patchy = np.clip(smooth_noise(points, (1.1,), seed=salt + 6), 0.0, 1.0)
-    c_hd = 0.035 * np.exp(0.10 * slow + 0.8 * vessels * patchy)
-    table = SkinTable.load()
+    c_hd = skin.c_hd * np.exp(0.10 * slow + 0.8 * vessels * patchy)
+    table = SkinTable.load(skin.tissue)
     band = (table.wavelength_nm >= CAMERA_BAND_NM[0]) & (table.wavelength_nm <= CAMERA_BAND_NM[1])
-    nodes_m = np.geomspace(melanin / 12.0, min(12.0 * melanin, MAX_MELANIN), 48)
-    nodes_h = np.geomspace(0.01, 0.15, 24)
+    # The shift keeps the mean reflectance that of the site: R falls with the power p of melanin.
+    ends = table.spectra(skin.c_m * np.array([0.8, 1.25]), skin.c_hd)[:, band].mean(axis=-1)
+    p = -math.log(ends[1] / ends[0]) / math.log(1.25 / 0.8)
+    shift = 0.5 * p * PIGMENT_LOG_VARIANCE - PIGMENT_LOG_MEAN
+    c_m = skin.c_m * np.exp(pattern + shift)
+    nodes_m = np.geomspace(skin.c_m / 12.0, min(12.0 * skin.c_m, MAX_MELANIN), 48)
+    nodes_h = np.geomspace(skin.c_hd / 3.0, min(5.0 * skin.c_hd, MAX_C_HD), 24)
     tabulated = table.spectra(nodes_m[:, None], nodes_h[None, :])[..., band].mean(axis=-1)
     at_m = np.log(np.clip(c_m, nodes_m[0], nodes_m[-1]) / nodes_m[0])
-    at_h = np.log(np.clip(c_hd, nodes_h[0], min(nodes_h[-1], MAX_C_HD)) / nodes_h[0])
+    at_h = np.log(np.clip(c_hd, nodes_h[0], nodes_h[-1]) / nodes_h[0])
     at_m *= (len(nodes_m) - 1) / math.log(nodes_m[-1] / nodes_m[0])
     at_h *= (len(nodes_h) - 1) / math.log(nodes_h[-1] / nodes_h[0])
     return np.asarray(map_coordinates(tabulated, [at_m, at_h], order=1, mode="nearest"), np.float32)
@@ -326,9 +321,9 @@ def _alpha(where: _Site, points: Float32Array, seed: int) -> Float32Array:
 
 def lateral_kernel(skin: MicroSkin) -> tuple[Float64Array, Float64Array]:
     """Return widths in mm and weights of the Gaussians of the camera's band, shape (K,) each."""
-    table = SkinTable.load()
+    table = SkinTable.load(skin.skin.tissue)
     band = (table.wavelength_nm >= CAMERA_BAND_NM[0]) & (table.wavelength_nm <= CAMERA_BAND_NM[1])
     weights = (band / band.sum())[:, None]
-    kernels = table.lateral_kernels(skin.melanin_fraction, PATCH_BLOOD_FRACTION, weights)
+    kernels = table.lateral_kernels(skin.skin.c_m, skin.skin.c_hd, weights)
     gaussians = kernels.gaussians(SIGMAS_MM)
     return gaussians.sigmas_mm, gaussians.weights[0]

@@ -22,10 +22,6 @@ from rigsim.package_data import package_table
 MAX_HEMOGLOBIN: Final = 0.32
 """Largest volume fraction of blood, Jimenez et al. 2010, table 1."""
 
-BASE_BLOOD_FRACTION: Final = 0.018
-"""Blood volume fraction of facial skin between the regions; dermal values of 0.2 to 7 % are
-usual, Jacques 1998, "Skin optics summary", Oregon Medical Laser Center."""
-
 _REGION_GAIN: Final[Mapping[str, float]] = package_table("face")["region_gain"]
 
 _COMPARTMENT_FRACTIONS: Final = (0.56, 0.28, 0.16)
@@ -125,7 +121,12 @@ class Perfusion:
 
 
 def draw_perfusion(
-    points_mm: Float32Array, regions: Mapping[str, Float32Array], *, seed: int, amount: float = 1.0
+    points_mm: Float32Array,
+    regions: Mapping[str, Float32Array],
+    base: float,
+    *,
+    seed: int,
+    amount: float = 1.0,
 ) -> Perfusion:
     """Draw the vessels of a face and their response to each state.
 
@@ -135,6 +136,8 @@ def draw_perfusion(
         Points on the mean head, shape (..., 3).
     regions
         Masks of `rigsim.subject.face_regions.region_masks`.
+    base
+        Volume fraction of blood between the regions, see `rigsim.subject.pigment.typical_blood`.
     seed
         Any integer.
     amount
@@ -153,7 +156,7 @@ def draw_perfusion(
     for name, gain in _REGION_GAIN.items():
         mean += np.float32(gain * rng.uniform(0.75, 1.25)) * regions[name]
     contrast += 0.5 * regions["cheeks"] + 0.35 * regions["nose"] - 0.3 * regions["lips"]
-    mean *= np.float32(BASE_BLOOD_FRACTION * amount * rng.uniform(0.85, 1.15))
+    mean *= np.float32(base * amount * rng.uniform(0.85, 1.15))
 
     bed = 1.0 + 0.16 * contrast * smooth_noise(points_mm, (14.0, 6.0, 3.0), seed=seed + 41)
     loops = 1.0 + 0.24 * contrast * smooth_noise(points_mm, (2.6, 1.5, 0.9), seed=seed + 42)

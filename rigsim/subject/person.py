@@ -24,6 +24,7 @@ from rigsim.subject import (
 )
 from rigsim.subject.head import LANDMARKS_MM, build_head
 from rigsim.subject.perfusion import STATE_NAMES, Perfusion, StateError, draw_perfusion
+from rigsim.tissue.skin_layers import SKIN, TissueProperties
 
 PRESET_NAMES: Final = tuple(pigment.MELANIN_PRESETS)
 """Names of the presets, pale to dark."""
@@ -90,6 +91,8 @@ class SimulatedSubject:
     """The same face at rest; ``None`` for a face that is at rest itself."""
     beard: Float32Array | None = None
     """Amount of stubble below the surface, shape (N, N), 0 to 1; ``None``: none."""
+    tissue: TissueProperties = SKIN
+    """Properties of the skin except for melanin and blood."""
     oiliness: float = 1.0
     """Factor of the surface fraction covered by oil."""
     offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -333,15 +336,16 @@ def make_subject(
     points = face_regions.to_mean_head(atlas.position_mm, surface)
     regions = face_regions.region_masks(points)
     height = relief.height_um(points, regions, texel_mm=atlas.typical_texel_mm(), seed=seed)
+    melanin = pigment.MELANIN_PRESETS[preset]
     return SimulatedSubject(
         preset=preset,
         seed=seed,
         mesh=surface,
         atlas=atlas,
-        melanin=pigment.draw_melanin_map(
-            points, regions, pigment.MELANIN_PRESETS[preset], seed=seed
+        melanin=pigment.draw_melanin_map(points, regions, melanin, seed=seed),
+        perfusion=draw_perfusion(
+            points, regions, pigment.typical_blood(melanin), seed=seed, amount=blood
         ),
-        perfusion=draw_perfusion(points, regions, seed=seed, amount=blood),
         roughness=relief.roughness_map(points, regions, seed=seed),
         height_um=height,
         hair=relief.hair_map(points, seed=seed),

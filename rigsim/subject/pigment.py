@@ -13,20 +13,39 @@ MAX_MELANIN: Final = 0.5
 """Largest volume fraction, Jimenez et al. 2010, table 1."""
 
 MELANIN_PRESETS: Final[Mapping[str, float]] = {
-    "palest": 0.005,
-    "I": 0.007,
-    "II": 0.014,
-    "III": 0.028,
-    "IV": 0.047,
-    "V": 0.085,
-    "VI": 0.17,
-    "darkest": 0.45,
+    "palest": 0.008,
+    "I": 0.010,
+    "II": 0.0175,
+    "III": 0.0275,
+    "IV": 0.0425,
+    "V": 0.072,
+    "VI": 0.18,
+    "darkest": 0.25,
 }
-"""Volume fraction of melanosomes of each preset, for an epidermis of 0.25 mm. The ranges of
-Jacques 1998 ("Skin optics summary", Oregon Medical Laser Center) for lightly (1.3-6.3 %),
-moderately (11-16 %) and darkly (18-43 %) pigmented adults apply to a real epidermis of about
-0.07 mm, so they are divided by 3.5 here; the two ends are those of the range to be covered, and
-the darkest reflects less than real skin does."""
+"""Volume fraction of melanosomes of each preset, for the epidermis of
+`rigsim.tissue.skin_layers.SKIN`. I to VI have the median color of measured skin in the bands of the
+individual typology angle (`model/data/skin_percentiles.csv`)."""
+
+_BLOOD_PRESETS: Final = (0.0065, 0.0080, 0.0110, 0.0125, 0.0130, 0.0145, 0.018, 0.020)
+"""Volume fraction of blood in the dermis of each preset, between the regions of the face; likewise.
+"""
+
+
+def typical_blood(melanin: float) -> float:
+    """Return the blood volume fraction of measured skin of a pigment, between the face's regions.
+
+    Parameters
+    ----------
+    melanin
+        Volume fraction of melanosomes, > 0; beyond the presets the nearest one's blood is returned.
+
+    Examples
+    --------
+    >>> typical_blood(MELANIN_PRESETS["III"])
+    0.0125
+    """
+    at = np.log(list(MELANIN_PRESETS.values()))
+    return float(np.interp(np.log(melanin), at, _BLOOD_PRESETS))
 
 
 def draw_melanin_map(
@@ -46,7 +65,7 @@ def draw_melanin_map(
     regions
         Masks of `rigsim.subject.face_regions.region_masks`.
     base
-        Volume fraction of melanosomes around which the map varies, 0.001 to 0.45.
+        Volume fraction of melanosomes around which the map varies, 0.0005 to 0.45.
     seed
         Any integer; it also determines the areas without sun.
     freckles
@@ -57,8 +76,8 @@ def draw_melanin_map(
     ndarray of float32
         Volume fraction of melanosomes in the epidermis, shape (...), 0.0005 to 0.5.
     """
-    if not 0.001 <= base <= 0.45:
-        raise ValueError(f"base: got {base}, expected a melanin fraction from 0.001 to 0.45")
+    if not 0.0005 <= base <= 0.45:
+        raise ValueError(f"base: got {base}, expected a melanin fraction from 0.0005 to 0.45")
     if freckles is not None and not 0.0 <= freckles <= 1.0:
         raise ValueError(f"freckles: got {freckles}, expected 0 to 1")
     rng = np.random.default_rng([seed, 1])
@@ -66,7 +85,8 @@ def draw_melanin_map(
     step = 0.10 * smooth_noise(points_mm, (40.0, 18.0), seed=seed + 11)
     step += 0.05 * smooth_noise(points_mm, (7.0, 3.0, 1.4), seed=seed + 12)
     step += 0.12 * regions["forehead"] + 0.14 * regions["lids"] + 0.06 * regions["temples"]
-    step -= 0.55 * regions["lips"] + 0.10 * regions["neck"]
+    step += 0.10 * regions["neck"]
+    step -= 0.55 * regions["lips"]
     step += _suntan(points_mm, base, rng)
     step += _freckles(points_mm, regions, base, seed=seed, rng=rng, amount=freckles)
     step += _moles(points_mm, base, seed=seed, rng=rng)
@@ -75,7 +95,7 @@ def draw_melanin_map(
 
 
 def _suntan(points: Float32Array, base: float, rng: np.random.Generator) -> FloatArray:
-    """Return the suntan except under a cap or behind glasses; half a tan is in the base already."""
+    """Return the lack of suntan under a cap or behind glasses; the base is tanned skin."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     gain = float(rng.uniform(0.25, 0.5)) * (0.4 + 0.6 * float(np.exp(-base / 0.1)))
     if rng.random() < 0.5:
@@ -85,7 +105,7 @@ def _suntan(points: Float32Array, base: float, rng: np.random.Generator) -> Floa
         half_width, half_height = rng.uniform(22.0, 25.0), rng.uniform(13.0, 17.0)
         q = ((np.abs(x) - 34.0) / half_width) ** 4 + ((y - 21.0) / half_height) ** 4
         hidden = soft_step((1.0 - q) * 4.0) * soft_step((z + 40.0) / 5.0)
-    return gain * (0.45 - hidden)
+    return -gain * hidden
 
 
 def _freckles(

@@ -13,7 +13,7 @@ from numba import njit, prange
 
 from model import spectra
 from rigsim.arrays import Float32Array, Float64Array
-from rigsim.tissue.skin_layers import MAX_C_HD, MAX_C_M
+from rigsim.tissue.skin_layers import MAX_C_HD, MAX_C_M, SKIN, TissueProperties
 from rigsim.tissue.skin_table import SkinTable
 
 NODES_PER_AXIS: Final = 257
@@ -79,13 +79,15 @@ class SkinColor:
 
 
 @lru_cache(maxsize=8)
-def skin_color(camera: str, light: str) -> SkinColor:
-    """Return the skin color table of a camera under a light; it is built once.
+def skin_color(camera: str, light: str, tissue: TissueProperties = SKIN) -> SkinColor:
+    """Return the color table of a person's skin for a camera and a light; it is built once.
 
     Parameters
     ----------
     camera, light
         Names of `model.spectra`.
+    tissue
+        Properties of the skin except for melanin and blood.
 
     Returns
     -------
@@ -99,7 +101,7 @@ def skin_color(camera: str, light: str) -> SkinColor:
     >>> bool(fair[0] > fair[1] > fair[2])
     True
     """
-    table = SkinTable.load()
+    table = SkinTable.load(tissue)
     weights = spectra.band_weights(camera, light, table.wavelength_nm)
     position = np.linspace(0.0, 1.0, NODES_PER_AXIS)
     melanin = MAX_C_M * position**3

@@ -1,94 +1,92 @@
-"""Tabulated Monte Carlo reflectance of two-layer skin, and its interpolation.
+"""Reflectance spectra of one person's skin over melanin and blood, and their interpolation.
 
-The table is package data made by ``tools/make_skin_reflectance.py``; its optics are those of
-`rigsim.tissue.skin_layers`.
-
-Accuracy: the relative standard error has a median of 0.10 % where R > 0.3, 0.16 % where
-0.1 < R < 0.3, 0.35 % where R < 0.01, and is nowhere above 0.74 %. Interpolation adds at most 0.03 %
-(between the nodes, same photons), 0.002 % in the mean square. Lateral kernels are off by at most
-0.0021 of the light within any radius between the nodes, and their Gaussians by 0.017.
-
-Plausibility: against the mean of 100 forearms (Cooksey, Allen, Tsai 2017, doi:10.18434/M38597; nine
-wavelengths from 400 to 700 nm) the best fit is C_m = 0.0030, C_hd = 0.037 under a specular 0.04,
-with residuals of 0.035 root mean square and 0.051 at most: too bright below 500 nm, too dark above.
-A homogeneous epidermis of 0.25 mm needs that little melanin: C_m = 0.05 reflects 0.23 at
-700 nm where the forearms reflect 0.60, so fair skin lies below C_m = 0.01 and 0.05 is dark already.
+A table belongs to the properties of one person's skin (`rigsim.tissue.skin_layers`) and is
+interpolated from the Monte Carlo table of `rigsim.tissue.skin_transport`.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
-from importlib import resources
+from functools import cached_property, lru_cache
 from math import exp
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline, PchipInterpolator
+from scipy.interpolate import PchipInterpolator
 
 from rigsim.arrays import Float64Array
 from rigsim.tissue.lateral_kernels import LateralKernels
-from rigsim.tissue.skin_layers import MAX_C_HD, MAX_C_M
+from rigsim.tissue.skin_layers import (
+    BASAL_THICKNESS_FRACTION,
+    DERMIS_SCATTERING_RATIO,
+    MAX_C_HD,
+    MAX_C_M,
+    SKIN,
+    SkinCoefficients,
+    TissueProperties,
+    skin_coefficients,
+)
+from rigsim.tissue.skin_transport import SkinCoordinates, SkinTransport
 
-_TABLE_FILE = "skin_reflectance_mc.npz"
-EMPTY_RING_FRACTION = 1e-9  # fraction assigned to a far ring without photons
+WAVELENGTH_NM: Final = np.arange(400.0, 701.0, 10.0)
+"""Wavelengths of every table, nm."""
+NODES_PER_AXIS: Final = 41
+"""Nodes of melanin and of blood."""
+RING_EDGES_MM: Final = np.concatenate([[0.0], np.geomspace(0.01, 15.0, 40)])
+"""Edges of the rings of lateral profiles, mm."""
+MAX_CACHED_TABLES: Final = 16
+"""Number of cached tables; each takes 0.9 MB."""
 
 
 class SkinTableError(ValueError):
     """Error for a request outside the table."""
 
 
-def c_m_axis(nodes: int) -> Float64Array:
-    """Return melanin fractions from 0 to 0.5, equally spaced in their cube root."""
-    return np.asarray(MAX_C_M * np.linspace(0.0, 1.0, nodes) ** 3)
-
-
-def c_hd_axis(nodes: int) -> Float64Array:
-    """Return dermal blood fractions from 0 to 0.32, equally spaced in their cube root."""
-    return np.asarray(MAX_C_HD * np.linspace(0.0, 1.0, nodes) ** 3)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class SkinTable:
-    """Diffuse reflectance of two-layer skin over melanin, blood and wavelength."""
+    """Diffuse reflectance of a person's skin over melanin, blood and wavelength."""
 
+    tissue: TissueProperties
+    """All other properties of the skin."""
     wavelength_nm: Float64Array
     """Wavelengths in nm, 400 to 700 in steps of 10, shape (n_wavelength,)."""
     c_m: Float64Array
-    """Nodes of the volume fraction of melanosomes in the epidermis, 0 to 0.5, shape (n_m,)."""
+    """Nodes of the volume fraction of melanosomes in the epidermis, 0 to 0.5, equally spaced in
+    their cube root, shape (n_m,)."""
     c_hd: Float64Array
-    """Nodes of the volume fraction of blood in the dermis, 0 to 0.32, shape (n_h,)."""
+    """Nodes of the volume fraction of blood in the dermis, 0 to 0.32, likewise, shape (n_h,)."""
     reflectance: Float64Array
     """Diffuse reflectance at normal incidence without the specular part, in (0, 1),
     shape (n_m, n_h, n_wavelength)."""
-    standard_error: Float64Array
-    """Standard error of `reflectance`, same shape. Errors of different wavelengths are independent,
-    those of different fractions are strongly correlated (same photons)."""
-    lateral_c_m: Float64Array
-    """Nodes of melanin of the lateral profiles, shape (k_m,)."""
-    lateral_c_hd: Float64Array
-    """Nodes of blood of the lateral profiles, shape (k_h,)."""
-    ring_edges_mm: Float64Array
-    """Edges of the rings around the point of entry in mm, shape (rings + 1,)."""
-    lateral: Float64Array
-    """Reflectance that leaves within each ring, shape (k_m, k_h, rings, n_wavelength)."""
-    lateral_standard_error: Float64Array
-    """Standard error of `lateral`, same shape."""
-    provenance: Mapping[str, Any]
-    """Recipe version, seed, photons, optical constants and library versions."""
     _patches: Float64Array
     """log R with its slopes and twist per cell edge, shape (n_m, n_h, 4, n_wavelength)."""
-    _log_shares: Float64Array
-    """log of each ring's fraction of `lateral`, shape (k_m, k_h, rings, n_wavelength)."""
 
     @classmethod
-    def load(cls) -> SkinTable:
-        """Return the packaged table; it is read once."""
-        return _load()
+    def load(cls, tissue: TissueProperties = SKIN) -> SkinTable:
+        """Return the table of a person's skin; it is computed once, in 0.3 s.
+
+        Raises
+        ------
+        rigsim.tissue.skin_transport.SkinTransportError
+            When the properties lie outside the Monte Carlo table.
+        """
+        return _load(tissue)
+
+    @cached_property
+    def standard_error(self) -> Float64Array:
+        """Return the standard error of `reflectance`, same shape.
+
+        Errors of different fractions are strongly correlated (same photons).
+        """
+        transport = SkinTransport.load()
+        relative = [
+            transport.relative_error(_coordinates(coefficients, self.tissue))
+            for coefficients in _coefficients_by_wavelength(self.c_m, self.c_hd, self.tissue)
+        ]
+        shape = self.reflectance.shape[:2]
+        return self.reflectance * np.stack([part.reshape(shape) for part in relative], axis=-1)
 
     def spectra(self, c_m: ArrayLike, c_hd: ArrayLike) -> Float64Array:
         """Return reflectance spectra by smooth, monotone interpolation.
@@ -161,8 +159,8 @@ class SkinTable:
 
         Notes
         -----
-        Cubic splines of the logarithm of the ring fractions over the cube roots of the volume
-        fractions. Wavelengths of a channel are weighted by their reflectance.
+        Cubic splines of the logarithm of the ring fractions over the coordinates of
+        `rigsim.tissue.skin_transport`. Wavelengths of a channel are weighted by their reflectance.
 
         Examples
         --------
@@ -177,44 +175,63 @@ class SkinTable:
                 f"band_weights: expected finite numbers of shape ({n}, channels), one row for each "
                 f"wavelength, got shape {weights.shape}"
             )
-        log_share = self._log_shares
         for name, value, limit in (("c_m", c_m, MAX_C_M), ("c_hd", c_hd, MAX_C_HD)):
-            at = float(_fractions(name, np.asarray(value), limit)[0])
-            # Smooth in c itself: d/d(cbrt c) = 3 cbrt(c)^2 d/dc, so the slope over cbrt c is 0 at
-            # 0.
-            flat = (1, np.zeros(log_share.shape[1:]))
-            nodes = np.linspace(0.0, 1.0, log_share.shape[0])
-            log_share = CubicSpline(nodes, log_share, bc_type=(flat, "not-a-knot"))(at)
-        share = np.exp(log_share)
-        share /= share.sum(axis=0)
+            _fractions(name, np.asarray(value), limit)
+        one_m, one_h = np.array([float(c_m)]), np.array([float(c_hd)])
+        share = np.stack(
+            [
+                SkinTransport.load().ring_fractions(
+                    _coordinates(each, self.tissue),
+                    RING_EDGES_MM * DERMIS_SCATTERING_RATIO * each.scattering[0],
+                )
+                for each in _coefficients_by_wavelength(one_m, one_h, self.tissue)
+            ],
+            axis=-1,
+        )
         in_bands = (share * self.spectra(c_m, c_hd)) @ weights
-        return LateralKernels.from_rings(self.ring_edges_mm, in_bands.T)
+        return LateralKernels.from_rings(RING_EDGES_MM, in_bands.T)
 
 
-@cache
-def _load() -> SkinTable:
-    source = resources.files("rigsim").joinpath("data", _TABLE_FILE)
-    with source.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-        arrays = {
-            name: stored[name].astype(np.float64) for name in stored.files if name != "provenance"
-        }
-        provenance = json.loads(str(stored["provenance"]))
-    arrays["standard_error"] = arrays.pop("reflectance_standard_error")
-    patches = _hermite_patches(arrays["reflectance"])
-    log_shares = _log_shares(arrays["lateral"])
-    for array in (*arrays.values(), patches, log_shares):
+@lru_cache(maxsize=MAX_CACHED_TABLES)
+def _load(tissue: TissueProperties) -> SkinTable:
+    steps = np.linspace(0.0, 1.0, NODES_PER_AXIS) ** 3
+    c_m, c_hd = MAX_C_M * steps, MAX_C_HD * steps
+    transport = SkinTransport.load()
+    log_reflectance = [
+        transport.log_reflectance(_coordinates(coefficients, tissue))
+        for coefficients in _coefficients_by_wavelength(c_m, c_hd, tissue)
+    ]
+    shape = NODES_PER_AXIS, NODES_PER_AXIS
+    values = np.stack([part.reshape(shape) for part in log_reflectance], axis=-1)
+    arrays = WAVELENGTH_NM.copy(), c_m, c_hd, np.exp(values), _hermite_patches(values)
+    for array in arrays:
         array.setflags(write=False)
-    return SkinTable(provenance=provenance, _patches=patches, _log_shares=log_shares, **arrays)
+    return SkinTable(tissue, *arrays)
 
 
-def _log_shares(rings: Float64Array) -> Float64Array:
-    shares = rings / rings.sum(axis=2, keepdims=True)
-    return np.log(np.maximum(shares, EMPTY_RING_FRACTION))
+def _coefficients_by_wavelength(
+    c_m: Float64Array, c_hd: Float64Array, tissue: TissueProperties
+) -> list[SkinCoefficients]:
+    """Return the coefficients at each wavelength, of all pairs of fractions, shape (pairs,)."""
+    melanin, blood = (axis.ravel() for axis in np.meshgrid(c_m, c_hd, indexing="ij"))
+    return [skin_coefficients(nm, melanin, blood, tissue) for nm in WAVELENGTH_NM]
 
 
-def _hermite_patches(reflectance: Float64Array) -> Float64Array:
+def _coordinates(coefficients: SkinCoefficients, tissue: TissueProperties) -> SkinCoordinates:
+    scattering = float(coefficients.scattering[0])
+    basal_mm = BASAL_THICKNESS_FRACTION * tissue.epidermis_mm
+    basal = basal_mm * coefficients.basal
+    depth = (tissue.epidermis_mm - basal_mm) * coefficients.upper + basal
+    return SkinCoordinates(
+        tissue.epidermis_mm * scattering,
+        np.maximum(basal / depth, BASAL_THICKNESS_FRACTION),
+        depth,
+        coefficients.dermis / (DERMIS_SCATTERING_RATIO * scattering),
+    )
+
+
+def _hermite_patches(value: Float64Array) -> Float64Array:
     """Return value, two slopes and twist of log R at the nodes, per unit of node index."""
-    value = np.log(reflectance)
     by_m, by_h = (
         PchipInterpolator(np.arange(value.shape[axis]), value, axis=axis).derivative()(
             np.arange(value.shape[axis])

@@ -96,7 +96,8 @@ def gradient_truth(scene: GradientScene, grips: Sequence[GripState]) -> SkinAppe
     parameters: dict[str, object] = {
         "states": states,
         "site": skin.site,
-        "preset": skin.preset,
+        "melanin": skin.skin.c_m,
+        "blood": skin.skin.c_hd,
         "subject_seed": skin.seed,
         "alpha": rough,
         "lights": led_truth(scene.sphere, scene.optical_surface(rough)),

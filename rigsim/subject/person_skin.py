@@ -1,0 +1,184 @@
+"""The skin of one person, which every rig simulates: its layers by site, state and wavelength."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from math import exp
+from typing import Final
+
+import numpy as np
+
+from rigsim.arrays import Float32Array
+from rigsim.package_data import package_table
+from rigsim.subject import pigment
+from rigsim.subject.face_regions import region_masks
+from rigsim.subject.head import LANDMARKS_MM
+from rigsim.subject.perfusion import draw_perfusion
+from rigsim.tissue.skin_layers import SKIN, TissueProperties, skin_layer_stack
+from rigsim.tissue.tissue_mc import LayerStack
+
+MELANIN_RANGE: Final = (0.001, 0.45)
+"""Range of the volume fraction of melanosomes around which a person's skin varies."""
+SITE_RADIUS_MM: Final = 8.0
+"""Radius of a site of the face."""
+ABDOMEN: Final = "abdomen"
+_FACE_SITES: Final[Mapping[str, tuple[str, float, float, float]]] = package_table("face")["sites"]
+SITE_NAMES: Final = (*_FACE_SITES, ABDOMEN)
+"""Names of the sites."""
+_ABDOMEN_MELANIN_STEP: Final = -0.2
+"""Logarithm of the abdomen's melanin over the face's; it is out of the sun."""
+_ABDOMEN_BLOOD_RATIO: Final = 0.45
+"""Blood of the abdomen over that of the face between its regions: that of arms, median over 1,600
+people (Lu et al. 2025, doi:10.1038/s41597-025-04857-5)."""
+
+
+class PersonSkinError(ValueError):
+    """A person's skin with invalid properties, or an unknown site."""
+
+
+@dataclass(frozen=True, slots=True)
+class SiteSkin:
+    """Skin at one site in one state."""
+
+    c_m: float
+    """Volume fraction of melanosomes in the epidermis."""
+    c_hd: float
+    """Volume fraction of blood in the dermis."""
+    tissue: TissueProperties
+    """All other properties."""
+
+
+@dataclass(frozen=True, slots=True)
+class PersonSkin:
+    """What the skin of a person is made of; equal fields are the same person in every rig."""
+
+    melanin: float
+    """Volume fraction of melanosomes around which the skin varies, 0.001 to 0.45."""
+    blood: float = 1.0
+    """Factor of all blood, 0.1 to 4."""
+    seed: int = 0
+    """Seed of all random draws, >= 0."""
+    freckles: float | None = None
+    """Amount of freckles, 0 to 1; None: drawn."""
+    tissue: TissueProperties = SKIN
+    """All other properties."""
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("melanin", *MELANIN_RANGE),
+            ("blood", 0.1, 4.0),
+            ("seed", 0, 2**63),
+        ):
+            if not low <= (value := getattr(self, name)) <= high:
+                wanted = ">= 0" if name == "seed" else f"{low:g} to {high:g}"
+                raise PersonSkinError(f"{name}: got {value}, expected {wanted}")
+
+    @classmethod
+    def of_preset(cls, preset: str, *, seed: int = 0, blood: float = 1.0) -> PersonSkin:
+        """Return the skin of a preset of `rigsim.subject.pigment.MELANIN_PRESETS`.
+
+        Raises
+        ------
+        PersonSkinError
+            The preset is unknown, or a number is out of range.
+        """
+        if preset not in pigment.MELANIN_PRESETS:
+            known = ", ".join(pigment.MELANIN_PRESETS)
+            raise PersonSkinError(f"preset: got {preset!r}, expected one of {known}")
+        return cls(pigment.MELANIN_PRESETS[preset], blood, seed)
+
+    def at(self, site: str, state: str = "neutral") -> SiteSkin:
+        """Return the skin at a site: the mean over a disc of `SITE_RADIUS_MM` on the face.
+
+        Parameters
+        ----------
+        site
+            One of `SITE_NAMES`.
+        state
+            One of `rigsim.subject.perfusion.STATE_NAMES`; the abdomen has only "neutral".
+
+        Raises
+        ------
+        PersonSkinError
+            The site is unknown.
+        rigsim.subject.perfusion.StateError
+            The state is unknown.
+
+        Examples
+        --------
+        >>> skin = PersonSkin.of_preset("III", seed=1)
+        >>> skin.at("cheek").c_hd > skin.at("forehead").c_hd > skin.at("abdomen").c_hd
+        True
+        """
+        return _site_skin(self, site, state)
+
+
+@lru_cache(maxsize=64)
+def _site_skin(person: PersonSkin, site: str, state: str) -> SiteSkin:
+    base = pigment.typical_blood(person.melanin) * person.blood
+    if site == ABDOMEN:
+        rng = np.random.default_rng([person.seed, 0x6162])
+        melanin, blood = np.exp(rng.normal(0.0, (0.05, 0.1)))
+        return SiteSkin(
+            person.melanin * exp(_ABDOMEN_MELANIN_STEP) * float(melanin),
+            base * _ABDOMEN_BLOOD_RATIO * float(blood),
+            person.tissue,
+        )
+    if site not in _FACE_SITES:
+        raise PersonSkinError(f"site: got {site!r}, expected one of {', '.join(SITE_NAMES)}")
+    points = _disc(*_FACE_SITES[site])
+    regions = region_masks(points)
+    melanin_map = pigment.draw_melanin_map(
+        points, regions, person.melanin, seed=person.seed, freckles=person.freckles
+    )
+    perfusion = draw_perfusion(points, regions, base, seed=person.seed)
+    return SiteSkin(
+        float(np.exp(np.log(melanin_map).mean())),
+        float(perfusion.blood(state).mean()),
+        person.tissue,
+    )
+
+
+def _disc(landmark: str, height_mm: float, slope_x: float, slope_y: float) -> Float32Array:
+    """Return points of a disc on the mean head, 1 mm apart in front view, shape (n, 3)."""
+    steps = np.arange(-SITE_RADIUS_MM, SITE_RADIUS_MM + 0.5)
+    x, y = (part.ravel() for part in np.meshgrid(steps, steps))
+    disc = np.stack([x, y, height_mm + slope_x * x + slope_y * y], axis=-1)
+    inside = np.hypot(x, y) <= SITE_RADIUS_MM
+    return np.asarray(disc[inside] + np.array(LANDMARKS_MM[landmark]), np.float32)
+
+
+def layers(person: PersonSkin, site: str, state: str, wavelength_nm: float) -> LayerStack:
+    """Return the layers of a person's skin, as every rig simulates it.
+
+    Parameters
+    ----------
+    person
+        The person.
+    site
+        One of `SITE_NAMES`.
+    state
+        One of `rigsim.subject.perfusion.STATE_NAMES`.
+    wavelength_nm
+        Wavelength in nm, 380 to 780.
+
+    Returns
+    -------
+    LayerStack
+        See `rigsim.tissue.skin_layers.skin_layer_stack`.
+
+    Raises
+    ------
+    PersonSkinError
+        The site is unknown.
+
+    Examples
+    --------
+    >>> stack = layers(PersonSkin.of_preset("III"), "cheek", "neutral", 540.0)
+    >>> stack.layers[0].sigma_a_per_mm > stack.layers[-1].sigma_a_per_mm
+    True
+    """
+    skin = person.at(site, state)
+    return skin_layer_stack(wavelength_nm, skin.c_m, skin.c_hd, skin.tissue)
