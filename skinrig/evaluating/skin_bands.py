@@ -7,19 +7,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model import metrics, spectra, tissue_optics
+from model import skin_tone, spectra, tissue_optics
 from skinrig.arrays import Float64Array
 
 TYPOLOGY_NAMES: Final = ("very light", "light", "intermediate", "tan", "brown", "dark")
-TYPOLOGY_EDGES_DEG: Final = (55.0, 41.0, 28.0, 10.0, -30.0)
-"""Lower edges of all bands but the last, degrees (Chardon et al. 1991, see `model.metrics`)."""
-
-SRGB_TO_XYZ: Final = (
-    (0.4124564, 0.3575761, 0.1804375),
-    (0.2126729, 0.7151522, 0.0721750),
-    (0.0193339, 0.1191920, 0.9503041),
-)
-"""IEC 61966-2-1, D65."""
+"""Bands of `model.skin_tone.ITA_BANDS`, in words."""
 
 
 def typology_angle_deg(reflectance: ArrayLike) -> Float64Array:
@@ -41,13 +33,7 @@ def typology_angle_deg(reflectance: ArrayLike) -> Float64Array:
     [64.0, -73.0]
     """
     rgb = np.maximum(np.asarray(reflectance, np.float64), 0.0)
-    matrix = np.array(SRGB_TO_XYZ)
-    xyz = rgb @ matrix.T / matrix.sum(axis=1)
-    edge = 6.0 / 29.0
-    root = np.where(xyz > edge**3, np.cbrt(xyz), xyz / (3.0 * edge**2) + 4.0 / 29.0)
-    lightness = 116.0 * root[..., 1] - 16.0
-    b_star = 200.0 * (root[..., 1] - root[..., 2])
-    return np.asarray(metrics.individual_typology_angle_deg(lightness, b_star))
+    return skin_tone.ita(skin_tone.lab(rgb))
 
 
 def classify_typology(angle_deg: ArrayLike) -> NDArray[np.str_]:
@@ -58,8 +44,8 @@ def classify_typology(angle_deg: ArrayLike) -> NDArray[np.str_]:
     >>> classify_typology([60.0, 30.0, -31.0]).tolist()
     ['very light', 'intermediate', 'dark']
     """
-    angle = np.asarray(angle_deg, np.float64)
-    return np.array(TYPOLOGY_NAMES)[np.searchsorted(-np.array(TYPOLOGY_EDGES_DEG), -angle)]
+    band = skin_tone.ita_band(angle_deg).astype(np.intp)
+    return np.array(TYPOLOGY_NAMES)[np.where(band > 0, band, len(TYPOLOGY_NAMES)) - 1]
 
 
 @dataclass(frozen=True, slots=True)

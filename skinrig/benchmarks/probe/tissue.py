@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from capture.calibration.color.colorimetry import delta_e_2000
-from model import color_table, spectra
+from model import color_table, skin_tone, spectra
 from model.tissue_optics import layers as tissue_optics
 from rigsim.tissue.skin_table import SkinTable
 from skinrig.arrays import Float64Array
@@ -60,7 +60,7 @@ def measure_color_table(stage: BenchmarkStage) -> None:
     c_hd = 0.32 * rng.random(count) ** 3
     wavelength = spectra.WAVELENGTH_NM
     direct = tissue_optics.two_layer_reflectance(wavelength, c_m, c_hd)
-    reference = _lab(spectra.band_average(direct, spectra.LINEAR_SRGB, "D65"))
+    reference = skin_tone.lab(spectra.band_average(direct, spectra.LINEAR_SRGB, "D65"))
     stage.limits = {("smallest", between): np.nan for between in ("spline", "bilinear")}
     for size in (8, 16, 32, 64) if stage.toy else (8, 16, 32, 64, 128, 256, 512, 1024):
         timing, made = stage.time(
@@ -73,7 +73,7 @@ def measure_color_table(stage: BenchmarkStage) -> None:
             ("spline", made.lookup(c_m, c_hd)),
             ("bilinear", _bilinear(made, c_m, c_hd)),
         ):
-            difference = delta_e_2000(_lab(color), reference)
+            difference = delta_e_2000(skin_tone.lab(color), reference)
             outcome = _max_error(difference)
             stage.add({"size": size, "between nodes": between}, timing, outcome)
             if (size, between) == (BAND_TABLE_SIZE, "spline"):
@@ -105,13 +105,3 @@ def _bilinear(made: color_table.ColorTable, c_m: Float64Array, c_hd: Float64Arra
         (1 - x) * ((1 - y) * rgb[row, column] + y * rgb[row, column + 1])
         + x * ((1 - y) * rgb[row + 1, column] + y * rgb[row + 1, column + 1])
     )
-
-
-def _lab(linear_srgb: Float64Array) -> Float64Array:
-    """Convert linear sRGB to CIE Lab under D65, (..., 3)."""
-    xyz = linear_srgb @ np.linalg.inv(spectra.XYZ_TO_LINEAR_SRGB).T
-    ratio = xyz / np.linalg.inv(spectra.XYZ_TO_LINEAR_SRGB).sum(axis=1)
-    bend = (6 / 29) ** 3
-    f = np.where(ratio > bend, np.cbrt(ratio), ratio / (3 * (6 / 29) ** 2) + 4 / 29)
-    x, y, z = np.moveaxis(f, -1, 0)
-    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)
