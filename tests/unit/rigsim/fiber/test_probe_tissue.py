@@ -23,6 +23,7 @@ from rigsim.fiber.probe_tissue import (
     phantom_certificate,
 )
 from rigsim.fiber.profile import trace_fiber_profile
+from rigsim.subject.person_skin import PersonSkin, layers
 from rigsim.tissue import skin_layers
 
 RIG = load_rig("probe")
@@ -30,16 +31,30 @@ FALSE_ALARM = 4.5  # standard deviations; of some 100 normal values one in 1500 
 
 
 def test_suction_reduces_blood_to_residual_level():
-    skin = SkinTissue("III", seed=4)
+    skin = SkinTissue(PersonSkin.of_preset("III", seed=4))
     blood = [skin.blood("cheek", p) for p in (0.0, 3.0, 30.0, 60.0, 1e4)]
     assert blood[0] == blood[1] > blood[2] > blood[3] > blood[4]
     rest = blood[4] / probe_tissue.INCOMPRESSIBLE_BLOOD_FRACTION
     assert blood[2] == pytest.approx(rest * (0.25 + 0.75 * math.exp(-1.0)))
-    assert skin.blood("chin", 60.0) > 1.5 * skin.blood("forehead", 60.0)
+    assert skin.blood("chin", 60.0) > 1.5 * skin.blood("abdomen", 60.0)
+
+
+def test_skin_under_the_probe_is_that_of_the_face():
+    """Without pressure and at rest: the layers of the same person's cheek."""
+    person = PersonSkin.of_preset("IV", seed=4)
+    optics = SkinTissue(person).optics("cheek", 0.0, 0.0)
+    kept = SkinTissue(person).blood("cheek", 0.0) / person.at("cheek").c_hd
+    for index, nm in enumerate(optics.wavelength_nm):
+        face = layers(person, "cheek", "neutral", nm).layers
+        top, deep = (layer.sigma_a_per_mm for layer in optics.stacks[index].layers)
+        assert top == pytest.approx(face[0].sigma_a_per_mm, rel=1e-12)
+        bloodless = skin_layers.baseline_per_mm(nm)
+        at_rest = (deep + optics.amount * optics.absorber[index, 1] - bloodless) / kept
+        assert at_rest == pytest.approx(face[1].sigma_a_per_mm - bloodless, rel=1e-9)
 
 
 def test_layers_contain_requested_melanin_and_blood():
-    skin = SkinTissue("III", seed=4)
+    skin = SkinTissue(PersonSkin.of_preset("III", seed=4))
     optics = skin.optics("cheek", 0.0, 60.0)
     index = optics.wavelength_nm.index(560.0)
     got = [layer.sigma_a_per_mm for layer in optics.stacks[index].layers]
@@ -51,7 +66,7 @@ def test_layers_contain_requested_melanin_and_blood():
 
 def test_profile_under_suction_uses_reduced_blood():
     """Reweighted paths against photons of the layers themselves."""
-    skin = SkinTissue("II", seed=4)
+    skin = SkinTissue(PersonSkin.of_preset("II", seed=4))
     profiles = ProfileCache(RIG, skin, photons=12_000, seed=2, threads=1)
     optics = skin.optics("cheek", 0.0, 10.0)
     run = profiles._trace(optics)
@@ -60,13 +75,8 @@ def test_profile_under_suction_uses_reduced_blood():
         skin_layers.skin_layer_stack(nm, skin.melanin("cheek"), skin.blood("cheek", 10.0))
         for nm in optics.wavelength_nm
     ]
-    tops = [stack.layers[0].thickness_mm for stack in optics.stacks]
-    layers = [
-        type(stack)((type(stack.layers[0])(top, *_rest(stack.layers[0])), stack.layers[1]))
-        for stack, top in zip(stacks, tops, strict=True)
-    ]
     spectral = profiles.spectral_stack(
-        probe_tissue.TissueOptics(optics.wavelength_nm, tuple(layers), None, 0.0)
+        probe_tissue.TissueOptics(optics.wavelength_nm, tuple(stacks), None, 0.0)
     )
     own = trace_fiber_profile(
         spectral, radii_mm=RIG.probe.radius_mm, photons=12_000, rng=np.random.default_rng(9)
@@ -82,13 +92,11 @@ def test_profile_under_suction_uses_reduced_blood():
     assert worst(run.profile(10.0 * optics.amount)) > 5.0
 
 
-def _rest(layer):
-    return layer.sigma_a_per_mm, layer.sigma_s_per_mm, layer.g, layer.eta
-
-
 def test_profiles_do_not_depend_on_earlier_requests():
     def made(sites):
-        profiles = ProfileCache(RIG, SkinTissue("II"), photons=200, seed=3, threads=1)
+        profiles = ProfileCache(
+            RIG, SkinTissue(PersonSkin.of_preset("II")), photons=200, seed=3, threads=1
+        )
         return [profiles.profile(site, 0.0, 60.0).reflectance_per_mm2 for site in sites]
 
     np.testing.assert_array_equal(made(["cheek"])[0], made(["chin", "cheek"])[1])
@@ -168,4 +176,4 @@ def test_wrong_subjects_are_refused():
             parse_tissue(text)
     assert parse_tissue("homogeneous:0.1,2,0.9").g == 0.9
     with pytest.raises(TissueError, match="site"):
-        SkinTissue("III").optics("elbow", 0.0, 60.0)
+        SkinTissue(PersonSkin.of_preset("III")).optics("elbow", 0.0, 60.0)

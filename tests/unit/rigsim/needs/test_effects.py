@@ -24,6 +24,7 @@ from rigsim.needs.effects import (
     SceneEffects,
     decide_effect,
 )
+from rigsim.population.files import SubjectFile
 from rigsim.render.caster import Caster
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
@@ -31,6 +32,7 @@ from rigsim.scenes.probe.scene import ProbeScene
 from rigsim.sensor import expose_sensor, make_sensor
 from rigsim.subject.person import make_subject
 from rigsim.targets.flat import make_target
+from rigsim.tissue.skin_layers import PAPERS
 
 pytestmark = pytest.mark.render
 
@@ -134,7 +136,8 @@ def test_groove_occludes_sky_like_two_walls():
 
 @pytest.fixture(scope="module")
 def faces():
-    return {name: make_subject(name, seed=3, size=96) for name in ("II", "darkest")}
+    black = SubjectFile(melanin=0.45).face(seed=3, size=96)
+    return {"II": make_subject("II", seed=3, size=96), "black": black.face(seed=3, size=96)}
 
 
 @pytest.fixture(scope="module")
@@ -142,8 +145,8 @@ def flash():
     return load_rig("flash").resized(64)
 
 
-def test_pale_skin_needs_effects_negligible_on_darkest(flash, faces):
-    pale, dark = (FlashScene(flash, faces[name]).needs for name in ("II", "darkest"))
+def test_pale_skin_needs_effects_negligible_on_black(flash, faces):
+    pale, dark = (FlashScene(flash, faces[name]).needs for name in ("II", "black"))
     assert pale.builds(face_needs.SPECTRAL_EFFECT)
     assert dark[face_needs.SPECTRAL_EFFECT].verdict == "negligible"
     sizes = [needs[face_needs.INTERREFLECTION_EFFECT].over_noise for needs in (pale, dark)]
@@ -153,8 +156,8 @@ def test_pale_skin_needs_effects_negligible_on_darkest(flash, faces):
 def test_a_noisier_sensor_needs_less(flash, faces):
     sensor = make_sensor(flash.views[0])
     noisy = dataclasses.replace(sensor, read_noise_e=1e4)
-    sharp = FlashScene(flash, faces["darkest"], sensor=sensor).needs
-    coarse = FlashScene(flash, faces["darkest"], sensor=noisy).needs
+    sharp = FlashScene(flash, faces["black"], sensor=sensor).needs
+    coarse = FlashScene(flash, faces["black"], sensor=noisy).needs
     for name in (face_needs.INTERREFLECTION_EFFECT, face_needs.LATERAL_EFFECT):
         assert sharp.builds(name)
         assert coarse[name].verdict == "negligible"
@@ -170,7 +173,7 @@ def test_requested_effect_is_built_and_reported(flash, faces):
         assert effect.verdict == "asked"
         assert f"{effect.switch}=False requests it" in effect.reason
     assert (asked.lateral, asked.interreflections) == (False, False)
-    forced = FlashScene(flash, faces["darkest"], effects=SceneEffects(spectral=True))
+    forced = FlashScene(flash, faces["black"], effects=SceneEffects(spectral=True))
     assert forced.needs[face_needs.SPECTRAL_EFFECT].verdict == "built"
     assert "spectral=True requests it" in forced.needs[face_needs.SPECTRAL_EFFECT].reason
 
@@ -186,7 +189,7 @@ def grazing(rig, angle_deg=88.0):
 @pytest.mark.parametrize("power", [1.0, 0.02])
 def test_effect_sizes_are_bounds_under_grazing_light(flash, faces, power):
     """What faces the light is 29 times as bright as the plate, and beyond full scale."""
-    rig, face = grazing(flash), faces["darkest"]
+    rig, face = grazing(flash), faces["black"]
     scene = FlashScene(rig, face, power=power)
     noise = PixelNoise.of(scene.sensor())
 
@@ -206,7 +209,7 @@ def test_effect_sizes_are_bounds_under_grazing_light(flash, faces, power):
 def test_lens_effect_follows_highlight_brighter_than_dark_skin(flash, faces):
     """A bound on highlights: above what is found anywhere, though a few times at most."""
     for rig in (flash, grazing(flash, 60.0)):
-        scene = FlashScene(rig, faces["darkest"], effects=SceneEffects(lateral=False, optics=False))
+        scene = FlashScene(rig, faces["black"], effects=SceneEffects(lateral=False, optics=False))
         shown = scene.radiance("parallel") - scene.radiance("crossed")
         rough = float(scene.subject.roughness[scene.subject.atlas.covered].min())
         places = [light.position_mm for light in rig.lights]
@@ -245,7 +248,7 @@ def test_more_sensitive_of_two_cameras_decides(flash, faces):
     dull = dataclasses.replace(view, read_noise_e=2e4)
     keen = dataclasses.replace(view, name="keen", serial="SR-0002")
     alone, both, swapped = (
-        FlashScene(dataclasses.replace(flash, views=views), faces["darkest"]).needs
+        FlashScene(dataclasses.replace(flash, views=views), faces["black"]).needs
         for views in ((dull,), (dull, keen), (keen, dull))
     )
     assert alone[face_needs.INTERREFLECTION_EFFECT].verdict == "negligible"
