@@ -34,11 +34,13 @@ import numpy as np
 from capture.documents import Document, Fault, FaultCollector, parse_document, read_toml
 from rigsim.fiber.probe_tissue import ProbedTissue, SkinTissue, TissueError, parse_tissue
 from rigsim.geometry.mesh import Mesh, MeshError, load_mesh
+from rigsim.population.population import PopulationError, get_member
 from rigsim.population.textures import MAP_RANGES, SubjectFileError, load_texture, resample_texture
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.subject import PRESET_NAMES, SimulatedSubject, make_subject, pigment
 from rigsim.subject.perfusion import MAX_HEMOGLOBIN, draw_perfusion
 from rigsim.subject.person_skin import MELANIN_RANGE, PersonSkin
+from rigsim.subject.skin_tone import SkinToneError, is_skin_tone, melanin_of_tone
 
 SCHEMA: Final = "skinrig.subject/1"
 SUBJECT_SUFFIX: Final = ".toml"
@@ -200,12 +202,13 @@ def is_subject_file(text: str) -> bool:
 
 
 def load_subject(text: str) -> SubjectFile:
-    """Load the subject of a text: a preset or a file.
+    """Load the subject of a text: a preset, a skin tone or a file.
 
     Parameters
     ----------
     text
-        A preset, or the path of a file whose name ends in .toml.
+        A preset, a tone of `rigsim.subject.skin_tone`, or the path of a file whose name ends in
+        .toml.
 
     Raises
     ------
@@ -219,10 +222,15 @@ def load_subject(text: str) -> SubjectFile:
     """
     if is_subject_file(text):
         return read_subject_file(text)
+    if is_skin_tone(text):
+        try:
+            return SubjectFile(melanin=melanin_of_tone(text))
+        except SkinToneError as error:
+            raise SubjectFileError(f"{error}; choose one [SR-SIM-005]") from error
     if text not in PRESET_NAMES:
         raise SubjectFileError(
-            f"subject: got {text!r}, expected one of {', '.join(PRESET_NAMES)}, or a file "
-            f"NAME{SUBJECT_SUFFIX}; choose one [SR-SIM-005]"
+            f"subject: got {text!r}, expected one of {', '.join(PRESET_NAMES)}, ita:DEGREES, "
+            f"monk:1 to monk:10, or a file NAME{SUBJECT_SUFFIX}; choose one [SR-SIM-005]"
         )
     return SubjectFile(preset=text)
 
@@ -233,18 +241,28 @@ def load_tissue(text: str, *, seed: int) -> ProbedTissue:
     Parameters
     ----------
     text
-        A file, or an argument of `rigsim.fiber.probe_tissue.parse_tissue`.
+        A file, a skin tone, a member of the population, "P01" to "P87", or an argument of
+        `rigsim.fiber.probe_tissue.parse_tissue`.
     seed
         Seed of the variation between subjects.
     """
-    if is_subject_file(text):
+    if is_subject_file(text) or is_skin_tone(text):
         return load_subject(text).tissue(seed=seed)
+    if re.fullmatch(r"P\d+", text):
+        return SkinTissue(_member_skin(text))
     try:
         return parse_tissue(text, seed=seed)
     except TissueError as error:
         if ":" in text:  # a medium with wrong numbers
             raise
         raise TissueError(f"{error}, or a file NAME{SUBJECT_SUFFIX}") from error
+
+
+def _member_skin(name: str) -> PersonSkin:
+    try:
+        return get_member(name).skin
+    except PopulationError as error:
+        raise TissueError(f"subject: {error}") from error
 
 
 def read_subject_file(path: str | Path) -> SubjectFile:

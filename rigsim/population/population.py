@@ -2,7 +2,8 @@
 
 Members are draws from distributions of melanin, blood, oil, freckles, age and beard. The groups
 differ only in the distributions below. Those of melanin and blood follow measured faces (Lu et al.
-2025, doi:10.1038/s41597-025-04857-5). **All others are chosen** so that an analysis has something to find, and nothing here is a statement about people.
+2025, doi:10.1038/s41597-025-04857-5). **All others are chosen** so that an analysis has something
+to find, and nothing here is a statement about people.
 
 ================= =========================================================================
 age               the paper's range of each group; both ends occur, otherwise uniform
@@ -44,6 +45,7 @@ from rigsim.subject import SimulatedSubject, face_regions, pigment, relief
 from rigsim.subject.head import build_head
 from rigsim.subject.perfusion import draw_perfusion
 from rigsim.subject.person import SIZE_RANGE
+from rigsim.subject.person_skin import PersonSkin
 
 HEAD_SHAPES: Final = 6
 """Number of head shapes that the members share."""
@@ -126,6 +128,11 @@ class Member:
         seen |= {"beard"} if self.beard >= MIN_LABELED_STUBBLE else set()
         seen |= {"freckles"} if self.freckles >= MIN_LABELED_FRECKLES else set()
         return frozenset(seen)
+
+    @property
+    def skin(self) -> PersonSkin:
+        """The person's skin without conditions."""
+        return PersonSkin(self.melanin, self.blood, self.seed, self.freckles)
 
     def face(self, size: int = 256) -> SimulatedSubject:
         """Return the face, without conditions (see `surface`).

@@ -137,7 +137,10 @@ def test_groove_occludes_sky_like_two_walls():
 @pytest.fixture(scope="module")
 def faces():
     black = SubjectFile(melanin=0.45).face(seed=3, size=96)
-    return {"II": make_subject("II", seed=3, size=96), "black": black.face(seed=3, size=96)}
+    return {
+        "II": make_subject("II", seed=3, size=96),
+        "black": dataclasses.replace(black, tissue=PAPERS),  # an epidermis of 0.25 mm
+    }
 
 
 @pytest.fixture(scope="module")
