@@ -8,7 +8,7 @@ to find, and nothing here is a statement about people.
 ================= =========================================================================
 age               the paper's range of each group; both ends occur, otherwise uniform
 melanin           log-normal: median 0.021 (caucasian) or 0.033 (asian), sigma 0.45 or 0.40,
-                  drawn again outside 0.009 to 0.05 or 0.012 to 0.09; times 0.69 in women
+                  drawn again outside 0.0092 to 0.05 or 0.012 to 0.09; times 0.69 in women
 blood             log-normal, median 1, sigma 0.15; times 0.8 in women
 oil               log-normal, median 1, sigma 0.25; times 0.9 in women, less with age
 freckles          uniform, 0 to 0.9 (caucasian) or 0 to 0.35 (asian); fewer on dark skin
@@ -397,7 +397,7 @@ def _draw_member(group: Group, index: int, number: int, rng: np.random.Generator
     low, high = group.age_years
     age = float((low, high)[index] if index < 2 else rng.integers(low, high + 1))
     male, pale = group.sex == "male", group.ethnicity == "caucasian"
-    bounds = (0.009, 0.05) if pale else (0.012, 0.09)
+    bounds = (0.0092, 0.05) if pale else (0.012, 0.09)
     melanin = 0.0
     while not bounds[0] <= melanin <= bounds[1]:
         spread = float(rng.standard_normal())

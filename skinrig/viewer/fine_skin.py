@@ -52,11 +52,11 @@ class FineSkin:
     def hemoglobin(self) -> Float64Array:
         """Return the volume fraction of blood in the dermis of the neutral state, (N, N)."""
         found = draw_perfusion(
-                self._points,
-                self._regions,
-                pigment.typical_blood(pigment.MELANIN_PRESETS[self._person.preset]),
-                seed=self._person.seed,
-            )
+            self._points,
+            self._regions,
+            pigment.typical_blood(pigment.MELANIN_PRESETS[self._person.preset]),
+            seed=self._person.seed,
+        )
         return self._on_texture(found.blood("neutral"))
 
     def height_um(self) -> Float64Array:
