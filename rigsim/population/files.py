@@ -218,7 +218,7 @@ def load_subject(text: str) -> SubjectFile:
     Examples
     --------
     >>> load_subject("IV").melanosome_fraction
-    0.0425
+    0.0395
     """
     if is_subject_file(text):
         return read_subject_file(text)

@@ -7,8 +7,8 @@ to find, and nothing here is a statement about people.
 
 ================= =========================================================================
 age               the paper's range of each group; both ends occur, otherwise uniform
-melanin           log-normal: median 0.021 (caucasian) or 0.033 (asian), sigma 0.45 or 0.40,
-                  drawn again outside 0.0092 to 0.05 or 0.012 to 0.09; times 0.69 in women
+melanin           log-normal: median 0.0195 (caucasian) or 0.031 (asian), sigma 0.45 or 0.40,
+                  drawn again outside 0.0085 to 0.047 or 0.011 to 0.084; times 0.69 in women
 blood             log-normal, median 1, sigma 0.15; times 0.8 in women
 oil               log-normal, median 1, sigma 0.25; times 0.9 in women, less with age
 freckles          uniform, 0 to 0.9 (caucasian) or 0 to 0.35 (asian); fewer on dark skin
@@ -397,11 +397,11 @@ def _draw_member(group: Group, index: int, number: int, rng: np.random.Generator
     low, high = group.age_years
     age = float((low, high)[index] if index < 2 else rng.integers(low, high + 1))
     male, pale = group.sex == "male", group.ethnicity == "caucasian"
-    bounds = (0.0092, 0.05) if pale else (0.012, 0.09)
+    bounds = (0.0085, 0.047) if pale else (0.011, 0.084)
     melanin = 0.0
     while not bounds[0] <= melanin <= bounds[1]:
         spread = float(rng.standard_normal())
-        melanin = 0.021 * np.exp(0.45 * spread) if pale else 0.033 * np.exp(0.4 * spread)
+        melanin = 0.0195 * np.exp(0.45 * spread) if pale else 0.031 * np.exp(0.4 * spread)
         melanin *= 1.0 if male else 0.69
     blood = float(np.exp(0.15 * rng.standard_normal())) * (1.0 if male else 0.8)
     aging = 1.0 - 0.006 * max(age - 30.0, 0.0)

@@ -13,14 +13,14 @@ MAX_MELANIN: Final = 0.5
 """Largest volume fraction, Jimenez et al. 2010, table 1."""
 
 MELANIN_PRESETS: Final[Mapping[str, float]] = {
-    "palest": 0.008,
-    "I": 0.010,
-    "II": 0.0175,
-    "III": 0.0275,
-    "IV": 0.0425,
-    "V": 0.072,
-    "VI": 0.18,
-    "darkest": 0.25,
+    "palest": 0.0075,
+    "I": 0.0093,
+    "II": 0.016,
+    "III": 0.0255,
+    "IV": 0.0395,
+    "V": 0.066,
+    "VI": 0.16,
+    "darkest": 0.23,
 }
 """Volume fraction of melanosomes of each preset, for the epidermis of
 `rigsim.tissue.skin_layers.SKIN`. I to VI have the median color of measured skin in the bands of the

@@ -56,8 +56,8 @@ def typology_angle_deg(melanin: float) -> float:
 
     Examples
     --------
-    >>> round(typology_angle_deg(0.0275))
-    34
+    >>> round(typology_angle_deg(0.0255))
+    35
     """
     spectrum = SkinTable.load().spectra(melanin, typical_blood(melanin)) + SPHERE_SPECULAR
     rgb = spectrum @ spectra.band_weights(spectra.LINEAR_SRGB, "D65", WAVELENGTH_NM)

@@ -50,7 +50,7 @@ def test_every_preset_stays_inside_skin_model_ranges(preset):
 def test_the_presets_span_the_stated_range_in_order():
     values = [MELANIN_PRESETS[name] for name in PRESET_NAMES]
     assert values == sorted(values)
-    assert (values[0], values[-1]) == (0.008, 0.25)
+    assert (values[0], values[-1]) == (0.0075, 0.23)
 
 
 def test_face_has_adult_size_and_faces_camera(face):
