@@ -86,6 +86,29 @@ def unwrap(mesh: Mesh, size: int) -> Atlas:
     return Atlas(prim, position, normal.astype(np.float32), dp_du, dp_dv)
 
 
+def texture_of_vertices(mesh: Mesh, values: Float32Array, size: int) -> Float32Array:
+    """Interpolate vertex values to the texels of a mesh's texture.
+
+    Parameters
+    ----------
+    mesh
+        Any mesh with texture coordinates.
+    values
+        One value per vertex, shape (V,).
+    size
+        Texels along one side of the square texture.
+
+    Returns
+    -------
+    ndarray
+        Shape (size, size), float32; 0 where no surface is.
+    """
+    prim, weight = _rasterize(mesh.uv, mesh.faces, size)
+    column = np.ascontiguousarray(values, np.float32)[:, None]
+    texels = interpolate(column, mesh.faces, prim.reshape(-1), weight.reshape(-1, 2))
+    return texels.reshape(size, size)
+
+
 def interpolate(
     values: Float32Array, faces: Int32Array, prim: Int32Array, weight: Float32Array
 ) -> Float32Array:

@@ -29,9 +29,7 @@ from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.geometry.atlas import Atlas
 from rigsim.geometry.surface_noise import smooth_noise
 from rigsim.subject.face_regions import soft_step
-
-TENSION_RANGE: Final = (0.05, 0.10)
-"""Relative stretch of a person's skin at rest."""
+from rigsim.subject.tissue_pressure import draw_tension
 
 GROOVE_NARROWING: Final = 1.2
 """Narrowing of grooves relative to ridges; 0 is a cosine."""
@@ -228,7 +226,7 @@ def draw_wrinkle_lines(points_mm: Float32Array, covered: BoolArray, *, seed: int
         The lines of `WRINKLE_ZONES`.
     """
     rng = np.random.default_rng([seed, 22])
-    tension = float(rng.uniform(*TENSION_RANGE))
+    tension = draw_tension(rng)
     size = points_mm.shape[0]
     y, z = points_mm[..., 1], points_mm[..., 2]
     front = covered & (z > -60.0) & (y > -75.0) & (y < 90.0)  # no zone reaches farther

@@ -4,6 +4,10 @@ The blood at each point is that of a capillary bed, of the loops that rise from 
 vessels of the plexus. States change the radius of the vessels, region by region; a vessel's
 volume is proportional to the square of its radius. Since the compartments have separate patterns
 and responses, a state is not a scaled and shifted neutral map.
+
+The change of a state has two parts. The vascular part is the tone of the vessels: a table by
+region, for flush, pallor, exercise and alcohol. The mechanical part is the pressure of strained
+skin on its vessels (`rigsim.subject.tissue_pressure`), for states that move the face.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ from numpy.typing import ArrayLike
 from rigsim.arrays import Float32Array
 from rigsim.geometry.surface_noise import smooth_noise, vessel_network
 from rigsim.package_data import package_table
+from rigsim.subject.tissue_pressure import COMPARTMENT_PRESSURE_RATIOS, blood_ratio
 
 MAX_HEMOGLOBIN: Final = 0.32
 """Largest volume fraction of blood, Jimenez et al. 2010, table 1."""
@@ -31,9 +36,11 @@ _COMPARTMENT_RESPONSES: Final = (0.45, 1.0, 0.8)
 """Response of each compartment's vessels to a change of radius: loops are muscular and respond
 most; the bed mostly fills passively."""
 
-_STATE_CHANGES: Final[Mapping[str, Mapping[str, float]]] = package_table("face")["state_changes"]
+_VASCULAR_CHANGES: Final[Mapping[str, Mapping[str, float]]] = package_table("face")[
+    "vascular_changes"
+]
 
-STATE_NAMES: Final = tuple(_STATE_CHANGES)
+STATE_NAMES: Final = tuple(_VASCULAR_CHANGES)
 """Names of the states."""
 
 
@@ -58,32 +65,36 @@ class Perfusion:
     """Seed of the person's responses to the states."""
 
     def dilation(self, state: str) -> Float32Array:
-        """Return the relative change of the vessels' radius in a state, shape (...).
+        """Return the vascular change of the vessels' radius in a state, relative, shape (...).
 
         Raises
         ------
         StateError
             The state is unknown.
         """
-        if state not in _STATE_CHANGES:
+        if state not in _VASCULAR_CHANGES:
             raise StateError(f"state: got {state!r}, expected one of {', '.join(STATE_NAMES)}")
         change = np.zeros(self.points_mm.shape[:-1], np.float32)
         if state == "neutral":
             return change
-        for name, gain in _STATE_CHANGES[state].items():
+        for name, gain in _VASCULAR_CHANGES[state].items():
             change += np.float32(gain) * (1.0 if name == "all" else self.regions[name])
         # Each person has an own pattern of vessel response (observation 3).
         salt = self.seed + 60 + STATE_NAMES.index(state)
         own = 1.0 + 0.25 * smooth_noise(self.points_mm, (35.0, 15.0), seed=salt)
         return np.asarray(change * np.maximum(own, 0.0), np.float32)
 
-    def blood(self, state: str = "neutral") -> Float32Array:
+    def blood(
+        self, state: str = "neutral", pressure_mbar: Float32Array | None = None
+    ) -> Float32Array:
         """Return the blood volume fraction in the dermis.
 
         Parameters
         ----------
         state
             One of `STATE_NAMES`.
+        pressure_mbar
+            Change of the pressure around the vessels, mbar, shape (...); None: no change.
 
         Returns
         -------
@@ -99,7 +110,11 @@ class Perfusion:
         total = np.zeros(change.shape, np.float32)
         for index, answer in enumerate(_COMPARTMENT_RESPONSES):
             radius = np.maximum(1.0 + answer * change, 0.0)
-            total += self.compartments[..., index] * radius * radius
+            part = self.compartments[..., index] * radius * radius
+            if pressure_mbar is not None:
+                ratio = COMPARTMENT_PRESSURE_RATIOS[index]
+                part = part * blood_ratio(pressure_mbar, capillary_ratio=ratio)
+            total += part
         # Vessels fill the dermis at most up to the limit; the fold is monotonic.
         return np.asarray(total / (1.0 + (total / MAX_HEMOGLOBIN) ** 4) ** 0.25, np.float32)
 

@@ -1,10 +1,10 @@
 """Model the course of blood in time after prompts, exercise and alcohol.
 
-A state's vessels are dilated by a fraction of the dilation in `rigsim.subject.perfusion`, the
-state's level: 0 at rest, 1 in full. The level relaxes toward its target, with separate time
-constants of rise and fall. The person responds to a prompt after a reaction time that varies
-between prompts. The flush of exercise is largest when it ends, and decays; alcohol is absorbed
-after the drink.
+A state's vessels are dilated by a fraction of the dilation in `rigsim.subject.perfusion`. Strained
+skin presses them by the same fraction of its pressure. This fraction is the state's level: 0 at
+rest, 1 in full. It relaxes toward its target, with separate time constants of rise and fall. The
+person responds to a prompt after a reaction time that varies between prompts. The flush of exercise
+is largest when it ends, and decays; alcohol is absorbed after the drink.
 """
 
 import bisect
@@ -180,16 +180,25 @@ class EventCourse:
 
 @dataclass(frozen=True, slots=True)
 class FixedPerfusion(Perfusion):
-    """Vessels dilated by a fraction of one state's dilation, independent of the displayed state."""
+    """Vessels at a fraction of one state's change, independent of the displayed state."""
 
     base: str = "neutral"
     """State of the blood."""
     level: float = 0.0
-    """Fraction of its dilation, 0 to 1."""
+    """Fraction of its change, 0 to 1."""
+    pressure_mbar: Float32Array | None = None
+    """Change of the pressure around the vessels at level 1, mbar, shape (...); None: no change."""
 
     def dilation(self, state: str) -> Float32Array:
-        """Return the relative change of the vessels' radius, shape (...); ``state`` is not used."""
+        """Return the vascular change of the radius, shape (...); ``state`` is not used."""
         return np.asarray(np.float32(self.level) * Perfusion.dilation(self, self.base))
+
+    def blood(
+        self, state: str = "neutral", pressure_mbar: Float32Array | None = None
+    ) -> Float32Array:
+        """Return the blood volume fraction, shape (...); the arguments are not used."""
+        own = self.pressure_mbar
+        return Perfusion.blood(self, state, None if own is None else np.float32(self.level) * own)
 
 
 def fix_blood_level(subject: SimulatedSubject, state: str, level: float) -> SimulatedSubject:
@@ -202,7 +211,7 @@ def fix_blood_level(subject: SimulatedSubject, state: str, level: float) -> Simu
     state
         State of the blood, one of `rigsim.subject.perfusion.STATE_NAMES`.
     level
-        Fraction of the state's dilation of the vessels, 0 to 1.
+        Fraction of the state's dilation of the vessels and of its pressure on them, 0 to 1.
 
     Raises
     ------
@@ -222,7 +231,10 @@ def fix_blood_level(subject: SimulatedSubject, state: str, level: float) -> Simu
     _check_state(state)
     _require(0.0 <= level <= 1.0, "level", level, "0 to 1")
     own = subject.perfusion
-    held = FixedPerfusion(own.compartments, own.points_mm, own.regions, own.seed, state, level)
+    pressure = subject.tissue_pressure_mbar(state)
+    held = FixedPerfusion(
+        own.compartments, own.points_mm, own.regions, own.seed, state, level, pressure
+    )
     return dataclasses.replace(subject, perfusion=held)
 
 

@@ -12,7 +12,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from rigsim.arrays import Float32Array
-from rigsim.geometry.atlas import Atlas, unwrap
+from rigsim.geometry.atlas import Atlas, texture_of_vertices, unwrap
 from rigsim.geometry.mesh import Mesh, center_face, load_mesh
 from rigsim.subject import (
     expression_wrinkles,
@@ -21,6 +21,7 @@ from rigsim.subject import (
     landmarks,
     pigment,
     relief,
+    tissue_pressure,
 )
 from rigsim.subject.head import LANDMARKS_MM, build_head
 from rigsim.subject.perfusion import STATE_NAMES, Perfusion, StateError, draw_perfusion
@@ -59,6 +60,8 @@ class ExpressionPose:
     """Relief at rest and wrinkles, um, shape (N, N)."""
     normal: Float32Array
     """Unit normals of mesh, relief and wrinkles, shape (N, N, 3), rig frame."""
+    pressure_mbar: Float32Array
+    """Change of the pressure in the skin at each vertex, shape (V,), mbar."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,12 +109,43 @@ class SimulatedSubject:
     def hemoglobin(self, state: str = "neutral") -> Float32Array:
         """Return the blood volume fraction of the dermis in a state, shape (N, N), 0 to 0.32.
 
+        Parameters
+        ----------
+        state
+            One of `rigsim.subject.perfusion.STATE_NAMES`, independent of the pose. An expression
+            that the face shows has the amount of its pose, any other is complete.
+
         Raises
         ------
         rigsim.subject.perfusion.StateError
             The state is unknown.
         """
-        return self.perfusion.blood(state)
+        return self.perfusion.blood(state, self.tissue_pressure_mbar(state))
+
+    def tissue_pressure_mbar(self, state: str) -> Float32Array | None:
+        """Return the change of the pressure in the skin by the strain of an expression.
+
+        Parameters
+        ----------
+        state
+            As for `hemoglobin`.
+
+        Returns
+        -------
+        ndarray of float32 or None
+            Shape (N, N), mbar; 0 off the surface. None for states that do not move the face.
+        """
+        if state not in expressions.EXPRESSION_STRENGTHS:
+            return None
+        if self.pose is not None and self.pose.state == state:
+            pressure = self.pose.pressure_mbar
+        else:
+            rest = self.mesh if self.rest is None else self.rest.mesh
+            deltas = expressions.displacement_mm(rest, state, seed=self.seed)
+            pressure = tissue_pressure.expression_pressure_mbar(
+                rest, rest.vertices_mm + deltas, seed=self.seed
+            )
+        return texture_of_vertices(self.mesh, pressure, self.size)
 
     def with_expression(self, state: str, amount: float = 1.0) -> SimulatedSubject:
         """Return this face in an expression, with its wrinkles.
@@ -128,8 +162,8 @@ class SimulatedSubject:
         -------
         SimulatedSubject
             The same person with another mesh, atlas, relief and normals; triangles, texture
-            coordinates and the skin's composition stay. A posed face is posed from its rest. The
-            blood stays that of every state, see `hemoglobin`.
+            coordinates and the skin's composition stay. A posed face is posed from its rest. Its
+            blood in this state follows the strain of this pose, see `hemoglobin`.
 
         Raises
         ------
@@ -271,6 +305,9 @@ def _pose(rest: SimulatedSubject, state: str, amount: float) -> ExpressionPose:
             wrinkles=wrinkles,
             height_um=height,
             normal=relief.relief_normals(atlas, height),
+            pressure_mbar=tissue_pressure.expression_pressure_mbar(
+                rest.mesh, mesh.vertices_mm, seed=rest.seed
+            ),
         )
         _poses[key] = pose
     return pose

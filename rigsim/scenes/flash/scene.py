@@ -369,13 +369,14 @@ class FlashScene(FaceScene):
         self, view: View, moved: dict[str, NDArray[np.generic]]
     ) -> dict[str, NDArray[np.generic]]:
         """Return the fractions of this state mapped onto the face at rest."""
-        rest = self._face().rest
+        face = self._face()
+        rest = face.rest
         if rest is None:
             return flash_truth.rest_maps_of_unmoved_face(moved)
         caster = shared_flash_geometry(rest, self._choice).caster
         spread = self._blurred_textures(view) if self.lateral else None
         look = self._flash_camera(view, rest.mesh)
-        return flash_truth.truth_maps_at_rest(look, caster, rest, self.state, spread)
+        return flash_truth.truth_maps_at_rest(look, caster, face, self.state, spread)
 
     def _flash_camera(self, view: View, mesh: Mesh) -> FlashCamera:
         spread = None

@@ -63,7 +63,7 @@ def unblurred_maps(
 def truth_maps_at_rest(
     camera: FlashCamera,
     caster: Caster,
-    rest: SimulatedSubject,
+    moved: SimulatedSubject,
     state: str,
     blurred: Mapping[str, Float32Array] | None = None,
 ) -> dict[str, NDArray[np.generic]]:
@@ -75,15 +75,16 @@ def truth_maps_at_rest(
         Camera of the face at rest.
     caster
         Caster of its mesh.
-    rest
-        The face at rest.
+    moved
+        The face in its pose, or at rest.
     state
         State of its blood.
     blurred
         Textures of the moved face, see `FlashCamera.blurred_maps`: light scatters in the moved
         face, wherever the skin is then mapped. None: without lateral scattering.
     """
-    layers = {"melanin": rest.melanin, "hemoglobin": rest.hemoglobin(state), "hair": rest.hair}
+    rest = moved if moved.rest is None else moved.rest
+    layers = {"melanin": rest.melanin, "hemoglobin": moved.hemoglobin(state), "hair": rest.hair}
     if blurred is not None:
         layers |= {name: blurred[name] for name in BLURRED_FRACTIONS}
     picture = camera.observe_maps(caster, rest, layers)

@@ -144,6 +144,17 @@ def test_posed_subject_keeps_pose_when_blood_changes(rig, face, tired):
     )
 
 
+def test_truth_at_rest_has_blood_of_pose_amount(rig, face, rest, smile):
+    half = scene_of(rig, face.with_expression("smile", 0.5), "smile").truth()
+    neutral, full = rest.truth(), smile.truth()
+    both = neutral["mask"] & half["mask_at_rest"] & full["mask_at_rest"]
+
+    def change(truth):
+        return np.abs(truth["hemoglobin_at_rest"] - neutral["hemoglobin"])[both].mean()
+
+    assert 0.3 * change(full) < change(half) < 0.75 * change(full)
+
+
 def test_scenes_sharing_light_match_scenes_alone(rig, rest, tired):
     beside = tired.radiance()
     stranger = make_subject("II", seed=4, size=256)  # the same person, nothing shared
