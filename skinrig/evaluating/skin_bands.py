@@ -62,7 +62,7 @@ class MelaninBand:
     """Absorption in red light as measured by a fiber probe, 1/mm; higher in dark skin."""
     sigma_s_prime_per_mm: float
     """Reduced scattering in red light, 1/mm."""
-    hemoglobin: float = 0.05
+    hemoglobin: float
     """Blood volume fraction of that person's dermis."""
 
     def reflectance(self) -> Float64Array:
@@ -83,11 +83,11 @@ class MelaninBand:
 
 
 MELANIN_BANDS: Final = {
-    "light": MelaninBand("II", 0.014, (0.0, 0.02), 0.02, 1.4),
-    "medium": MelaninBand("IV", 0.047, (0.02, 0.07), 0.08, 1.2),
-    "dark": MelaninBand("VI", 0.17, (0.07, 0.51), 0.3, 1.0),
+    "light": MelaninBand("II", 0.016, (0.0, 0.026), 0.02, 1.4, 0.011),
+    "medium": MelaninBand("IV", 0.0395, (0.026, 0.08), 0.08, 1.2, 0.013),
+    "dark": MelaninBand("VI", 0.16, (0.08, 0.51), 0.3, 1.0, 0.018),
 }
-"""Bands from light to dark; melanin as in `rigsim.subject.pigment` (0.25 mm epidermis)."""
+"""Bands from light to dark; melanin as in `rigsim.subject.pigment`."""
 
 
 @cache
@@ -106,7 +106,7 @@ def classify_melanin(melanin: ArrayLike) -> NDArray[np.str_]:
 
     Examples
     --------
-    >>> classify_melanin([0.005, 0.02, 0.3]).tolist()
+    >>> classify_melanin([0.005, 0.03, 0.3]).tolist()
     ['light', 'medium', 'dark']
     """
     edges = [band.melanin_range[0] for band in MELANIN_BANDS.values()][1:]

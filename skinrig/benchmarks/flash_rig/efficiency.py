@@ -48,12 +48,12 @@ class TypicalSkin:
 
 
 TYPICAL_SKINS: Final = {
-    "palest": TypicalSkin(0.005, 0.03, 0.6, 0.02, 1.4),
-    "II": TypicalSkin(0.014, 0.05, 0.5, 0.03, 1.3),
-    "III": TypicalSkin(0.028, 0.05, 0.4, 0.05, 1.2),
-    "IV": TypicalSkin(0.047, 0.05, 0.3, 0.08, 1.2),
-    "V": TypicalSkin(0.085, 0.05, 0.2, 0.15, 1.1),
-    "VI": TypicalSkin(0.17, 0.05, 0.1, 0.3, 1.0),
+    "palest": TypicalSkin(0.0075, 0.0065, 0.6, 0.02, 1.4),
+    "II": TypicalSkin(0.016, 0.011, 0.5, 0.03, 1.3),
+    "III": TypicalSkin(0.0255, 0.0125, 0.4, 0.05, 1.2),
+    "IV": TypicalSkin(0.0395, 0.013, 0.3, 0.08, 1.2),
+    "V": TypicalSkin(0.066, 0.0145, 0.2, 0.15, 1.1),
+    "VI": TypicalSkin(0.16, 0.018, 0.1, 0.3, 1.0),
 }
 MIN_MEASURED_SIGMAS, MIN_EVALUATED_SIGMAS = 2.5, 10.0
 """Minimum distance of a fraction from 0, in standard errors. Below the first, nonnegative estimates
