@@ -13,6 +13,7 @@ from rigsim.arrays import Float64Array
 from rigsim.fiber.anisotropic_tissue import AnisotropicTissue
 from rigsim.subject.person_skin import PersonSkin, PersonSkinError, SiteSkin
 from rigsim.subject.pigment import MELANIN_PRESETS
+from rigsim.subject.tissue_pressure import INCOMPRESSIBLE_BLOOD_FRACTION, blood_ratio
 from rigsim.tissue.skin_layers import (
     ETA,
     SKIN_ANISOTROPY,
@@ -28,10 +29,6 @@ MIN_SIGMA_A_PER_MM: Final = 1e-7
 """Smallest traced absorption, 1/mm: without absorption photons never end. A path of 1 m loses a
 ten-thousandth."""
 
-INCOMPRESSIBLE_BLOOD_FRACTION: Final = 0.25
-"""Fraction of the blood at rest that pressure does not displace."""
-CAPILLARY_PRESSURE_MBAR: Final = 30.0
-"""Pressure in capillaries, against that of the head, mbar: about 23 mm of mercury."""
 CONTACT_PRESSURE_MBAR: Final = 3.0
 """Pressure under a head without suction, mbar."""
 
@@ -184,12 +181,9 @@ class SkinTissue:
     """Skin of a person under the head.
 
     The layers are those of `rigsim.subject.person_skin`. Pressure under a head displaces part of
-    the blood; the remaining fraction of the blood at rest is
-
-        BLOOD_KEPT + (1 - BLOOD_KEPT) exp(-pressure / CAPILLARY_MBAR),
-
-    with the suction as the pressure, for the rim's force is the suction times the cup's area and
-    the face's area is about that, and `CONTACT_PRESSURE_MBAR` of a head that is only laid on.
+    the blood (`rigsim.subject.tissue_pressure.blood_ratio`). The suction is the pressure, for the
+    rim's force is the suction times the cup's area and the face's area is about that. A head that
+    is only laid on has `CONTACT_PRESSURE_MBAR`.
 
     Parameters
     ----------
@@ -228,10 +222,7 @@ class SkinTissue:
     def blood(self, site: str, suction_mbar: float) -> float:
         """Return the volume fraction of blood in the dermis under the head."""
         pressure = max(suction_mbar, CONTACT_PRESSURE_MBAR)
-        left = INCOMPRESSIBLE_BLOOD_FRACTION + (1.0 - INCOMPRESSIBLE_BLOOD_FRACTION) * math.exp(
-            -pressure / CAPILLARY_PRESSURE_MBAR
-        )
-        return left * self._at(site).c_hd
+        return float(blood_ratio(pressure)) * self._at(site).c_hd
 
     def optics(self, site: str, angle_deg: float, suction_mbar: float) -> TissueOptics:
         """Return the layers; the blood above what no pressure takes out is the absorber."""

@@ -35,10 +35,11 @@ from rigsim.geometry.surface_strain import average_at_vertices, principal_log_st
 from rigsim.subject.face_regions import region_masks, to_mean_head
 
 INCOMPRESSIBLE_BLOOD_FRACTION: Final = 0.25
-"""Fraction of the blood at rest that no pressure displaces; that of the fiber probe."""
+"""Fraction of the blood at rest that no pressure displaces."""
 
 CAPILLARY_PRESSURE_MBAR: Final = 30.0
-"""Pressure in capillaries, mbar: about 23 mm of mercury; that of the fiber probe."""
+"""Pressure in capillaries, mbar: about 23 mm of mercury. Landis 1930,
+doi:10.1152/ajplegacy.1930.93.2.353."""
 
 COMPARTMENT_PRESSURE_RATIOS: Final = (1.0, 1.0, 0.65)
 """Pressure in bed, loops and plexus, relative to `CAPILLARY_PRESSURE_MBAR`; venules: 14.6 mm of

@@ -23,6 +23,7 @@ from rigsim.fiber.probe_tissue import (
     phantom_certificate,
 )
 from rigsim.fiber.profile import trace_fiber_profile
+from rigsim.subject import tissue_pressure
 from rigsim.subject.person_skin import PersonSkin, layers
 from rigsim.tissue import skin_layers
 
@@ -34,7 +35,7 @@ def test_suction_reduces_blood_to_residual_level():
     skin = SkinTissue(PersonSkin.of_preset("III", seed=4))
     blood = [skin.blood("cheek", p) for p in (0.0, 3.0, 30.0, 60.0, 1e4)]
     assert blood[0] == blood[1] > blood[2] > blood[3] > blood[4]
-    rest = blood[4] / probe_tissue.INCOMPRESSIBLE_BLOOD_FRACTION
+    rest = blood[4] / tissue_pressure.INCOMPRESSIBLE_BLOOD_FRACTION
     assert blood[2] == pytest.approx(rest * (0.25 + 0.75 * math.exp(-1.0)))
     assert skin.blood("chin", 60.0) > 1.5 * skin.blood("abdomen", 60.0)
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from twins.triangle_stretch import principal_stretches
 
-from rigsim.fiber import probe_tissue
 from rigsim.geometry.atlas import texture_of_vertices, unwrap
 from rigsim.geometry.mesh import Mesh, build_mesh
 from rigsim.geometry.surface_strain import average_at_vertices, principal_log_strains
@@ -154,14 +153,6 @@ def test_pure_shear_presses_blood_out_beyond_tension():
     assert none == 0.0
     assert abs(little) < 1e-9
     assert 0.0 < some < much
-
-
-def test_constants_are_those_of_the_probe():
-    for name in ("INCOMPRESSIBLE_BLOOD_FRACTION", "CAPILLARY_PRESSURE_MBAR"):
-        assert getattr(tissue_pressure, name) == getattr(probe_tissue, name)
-    skin = probe_tissue.SkinTissue("III", seed=1)
-    ratio = skin.blood("cheek", 60.0) / skin.blood("cheek", 20.0)
-    assert ratio == pytest.approx(float(blood_ratio(60.0) / blood_ratio(20.0)))
 
 
 def test_blood_ratio_is_bounded_and_smooth_at_rest():
