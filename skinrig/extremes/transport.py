@@ -25,11 +25,15 @@ def _layers(
     real: InputPrecision,
     *layers: tuple[float, float, float],
     eta: float = 1.4,
+    anisotropy: float = 0.0,
     directions: int | None = None,
 ) -> Float64Array:
     """Return the reflectance of layers of (sigma_a, sigma_s', thickness), in 1/mm and mm."""
     return tissue_optics.layer_stack_reflectance(
-        *(real(part) for part in zip(*layers, strict=True)), eta=eta, directions=directions
+        *(real(part) for part in zip(*layers, strict=True)),
+        eta=eta,
+        anisotropy=anisotropy,
+        directions=directions,
     )
 
 
@@ -151,6 +155,20 @@ def _conserving_layers(real: InputPrecision) -> str:
     white = _layers(real, (0.0, 5.0, 0.25), (0.0, 1.0, math.inf))
     entered = 1.0 - ((1.4 - 1.0) / (1.4 + 1.0)) ** 2  # all light but the specular reflection
     return expect_near(white, entered, absolute=2e-3)
+
+
+def _forward_peak(real: InputPrecision) -> str:
+    expect_error(lambda: _layers(real, (0.1, 1.0, 1.0), anisotropy=0.995), ValueError, "anisotropy")
+    found = [
+        [
+            _layers(real, (sigma_a, 1.0, thickness), anisotropy=0.99, directions=directions)
+            for sigma_a in (1e-3, 1.0, 50.0)
+            for thickness in (0.01, 1.0, math.inf)
+        ]
+        for directions in (None, 64)
+    ]
+    expect_within(found[0], 1e-6, 1.0, label="R_d")
+    return "g above 0.99 rejected; " + expect_near(found[0], found[1], relative=1e-4)
 
 
 def _pigment_ends(real: InputPrecision) -> str:
