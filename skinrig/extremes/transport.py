@@ -221,6 +221,20 @@ def _profile_broken(real: InputPrecision) -> str:
     return expect_near(both[1], both[0], relative=5e-3)
 
 
+def _profile_isotropic(real: InputPrecision) -> str:
+    r = np.linspace(0.3, 7.05, 28)
+    sigma_a, sigma_s = 0.1, np.array([[0.7], [1.5], [3.0]])
+    profile = photon_table.reflectance(r, sigma_a, sigma_s, g=0.0)
+    fit = subsurface.invert(r, real(profile), variance=real((0.01 * profile) ** 2))
+    expect_finite(fit.sigma_tr_per_mm, fit.valid, label="sigma_tr")
+    expect_valid_fraction(fit.valid, fraction_range=(0.0, 0.0))
+    skin = photon_table.reflectance(r, sigma_a, sigma_s, g=0.8)
+    usual = subsurface.invert(r, real(skin), variance=real((0.01 * skin) ** 2))
+    return "isotropic: not valid; g = 0.8: " + expect_valid_fraction(
+        usual.valid, fraction_range=(1.0, 1.0)
+    )
+
+
 def _one_photon(real: InputPrecision) -> str:
     stack = LayerStack((Layer(math.inf, 0.1, 10.0, 0.9, float(real(1.4))),))
     found = trace_photons(stack, photons=1, rng=np.random.default_rng(0))
