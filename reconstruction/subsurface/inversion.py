@@ -18,6 +18,8 @@ All three are compared with a profile in the same way:
   near fibers without a cutoff.
 - Each profile begins at the best of some hundred pairs on a grid, by logarithms, and again in a
   second valley of the misfit where there is one.
+- A medium of another asymmetry than the prior's (for the table, and with a variance) is found by a
+  second fit with any g, and is not valid, see `reconstruction.subsurface.asymmetry`.
 - A misfit (layers, a wrong scale) is reported, and absorbed by a relative model error, equal at all
   fibers and found from the residuals; the profile is fitted again with it. Such residuals
   correlate between neighboring fibers, and standard errors grow by that correlation.
@@ -45,7 +47,7 @@ from numpy.typing import ArrayLike, NDArray
 from model.checks import Checks
 from model.fresnel import ETA_SKIN
 from reconstruction.arrays import BoolArray, Float64Array, UInt8Array
-from reconstruction.subsurface import kernels, nearest
+from reconstruction.subsurface import asymmetry, kernels, nearest
 from reconstruction.subsurface.models import (
     FIT_METHODS,
     FiberOptics,
@@ -134,7 +136,15 @@ def invert(
         if model_error is not None:
             error = np.array([float(model_error), 0.0, 0.0])
             model = replace(model, error=error, bias=(0.0, 0.0))
-        return fit_profiles(batch, model)
+        fits = fit_profiles(batch, model)
+        if batch.logarithmic or g_error == 0.0:
+            return fits
+
+        def model_with(g: float, g_error: float) -> ProfileModel:
+            free = profile_model(method, light._replace(g=g, g_error=g_error), model.radius_mm)
+            return replace(free, error=model.error, bias=model.bias)
+
+        return asymmetry.compare_asymmetries(batch, fits, model_with)
 
     fits = layout.fit(batch, partial(profile_model, method, light), fit, PROFILES_PER_BATCH)
     return evaluate_fits(batch, fits, layout.shape, method)

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import gammaincc, stdtrit
 
 from reconstruction.arrays import BoolArray, Float64Array, Int64Array, UInt8Array, UInt16Array
+from reconstruction.subsurface.asymmetry import MAX_ASYMMETRY_GAIN
 from reconstruction.subsurface.models import Method
 from reconstruction.subsurface.profile_batch import Fits, OmissionReason, ProfileBatch
 from reconstruction.subsurface.profile_fit import MIN_OBSERVED_FIBERS, MISFIT_P_VALUE
@@ -44,6 +45,7 @@ class FitOutcome(IntFlag):
     OUTSIDE_DOMAIN = 16
     NOT_IDENTIFIED = 32
     WRONG_PROFILE = 64
+    ASYMMETRY_OUTSIDE_PRIOR = 128
     MISFIT = 256
     COEFFICIENTS_NOT_IDENTIFIED = 512
 
@@ -57,6 +59,9 @@ _REASON_BY_CODE = {
     FitOutcome.OUTSIDE_DOMAIN: "sigma_a / sigma_s' is outside the model's domain",
     FitOutcome.NOT_IDENTIFIED: "the profile does not determine sigma_tr",
     FitOutcome.WRONG_PROFILE: "no medium of this kind has such a profile, or its scale is wrong",
+    FitOutcome.ASYMMETRY_OUTSIDE_PRIOR: (
+        "the medium's asymmetry g is outside its prior; give g and g_error of this medium"
+    ),
     FitOutcome.MISFIT: "residuals exceed their errors; a model error accounts for the excess",
     FitOutcome.COEFFICIENTS_NOT_IDENTIFIED: "sigma_a and sigma_s' are not identified separately",
 }
@@ -278,6 +283,7 @@ def _outcomes(
         (FitOutcome.OUTSIDE_DOMAIN, ~fits.in_domain),
         (FitOutcome.NOT_IDENTIFIED, log_stderr > MAX_LOG_STDERR),
         (FitOutcome.WRONG_PROFILE, (off > MAX_LOG_RMS) | (fits.model_error > MAX_MODEL_ERROR)),
+        (FitOutcome.ASYMMETRY_OUTSIDE_PRIOR, fits.asymmetry_gain > MAX_ASYMMETRY_GAIN),
         (FitOutcome.MISFIT, misfit),
         (FitOutcome.COEFFICIENTS_NOT_IDENTIFIED, pair_stderr > MAX_PAIR_LOG_STDERR),
     ):

@@ -117,6 +117,8 @@ class Fits:
     """(N,): whether a coefficient is at its limit."""
     bias: Float64Array
     """(N,) systematic error of log sigma_tr due to the model."""
+    asymmetry_gain: Float64Array
+    """(N,) chi2 less that of a fit with any asymmetry, where that fits; 0 where not compared."""
 
     @classmethod
     def join(cls, parts: Sequence[tuple[NDArray[np.intp], Fits]]) -> Fits:
@@ -205,4 +207,5 @@ def fit_from(
         in_domain=model.contains(found.theta),
         at_bound=model.at_bound(found.theta),
         bias=model.systematic(found.theta),
+        asymmetry_gain=np.zeros(n),
     )

@@ -99,7 +99,8 @@ class TransportResult:
     """
 
     specular: float
-    """Reflected by the surfaces without ever being scattered, in [0, 1]."""
+    """Reflected by the surfaces without ever being scattered, in [0, 1]. The back surface of a
+    finite stack is included; `model.tissue_optics.adding_doubling` counts its part as diffuse."""
     reflectance: float
     """Diffuse reflectance: scattered light that exits upwards, without the specular part, in [0,
     1]."""

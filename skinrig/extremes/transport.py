@@ -25,11 +25,15 @@ def _layers(
     real: InputPrecision,
     *layers: tuple[float, float, float],
     eta: float = 1.4,
+    anisotropy: float = 0.0,
     directions: int | None = None,
 ) -> Float64Array:
     """Return the reflectance of layers of (sigma_a, sigma_s', thickness), in 1/mm and mm."""
     return tissue_optics.layer_stack_reflectance(
-        *(real(part) for part in zip(*layers, strict=True)), eta=eta, directions=directions
+        *(real(part) for part in zip(*layers, strict=True)),
+        eta=eta,
+        anisotropy=anisotropy,
+        directions=directions,
     )
 
 
@@ -153,6 +157,20 @@ def _conserving_layers(real: InputPrecision) -> str:
     return expect_near(white, entered, absolute=2e-3)
 
 
+def _forward_peak(real: InputPrecision) -> str:
+    expect_error(lambda: _layers(real, (0.1, 1.0, 1.0), anisotropy=0.995), ValueError, "anisotropy")
+    found = [
+        [
+            _layers(real, (sigma_a, 1.0, thickness), anisotropy=0.99, directions=directions)
+            for sigma_a in (1e-3, 1.0, 50.0)
+            for thickness in (0.01, 1.0, math.inf)
+        ]
+        for directions in (None, 64)
+    ]
+    expect_within(found[0], 1e-6, 1.0, label="R_d")
+    return "g above 0.99 rejected; " + expect_near(found[0], found[1], relative=1e-4)
+
+
 def _pigment_ends(real: InputPrecision) -> str:
     wavelength = real([400.0, 500.0, 600.0, 700.0])
     c_m, c_hd = real([0.0, 0.5])[:, None, None], real([0.0, 0.32])[:, None]
@@ -201,6 +219,20 @@ def _profile_broken(real: InputPrecision) -> str:
     both = np.asarray(fit.sigma_tr_per_mm)
     expect_valid_fraction(fit.valid, fraction_range=(1.0, 1.0))
     return expect_near(both[1], both[0], relative=5e-3)
+
+
+def _profile_isotropic(real: InputPrecision) -> str:
+    r = np.linspace(0.3, 7.05, 28)
+    sigma_a, sigma_s = 0.1, np.array([[0.7], [1.5], [3.0]])
+    profile = photon_table.reflectance(r, sigma_a, sigma_s, g=0.0)
+    fit = subsurface.invert(r, real(profile), variance=real((0.01 * profile) ** 2))
+    expect_finite(fit.sigma_tr_per_mm, fit.valid, label="sigma_tr")
+    expect_valid_fraction(fit.valid, fraction_range=(0.0, 0.0))
+    skin = photon_table.reflectance(r, sigma_a, sigma_s, g=0.8)
+    usual = subsurface.invert(r, real(skin), variance=real((0.01 * skin) ** 2))
+    return "isotropic: not valid; g = 0.8: " + expect_valid_fraction(
+        usual.valid, fraction_range=(1.0, 1.0)
+    )
 
 
 def _one_photon(real: InputPrecision) -> str:

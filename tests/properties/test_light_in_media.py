@@ -12,7 +12,7 @@ from model.dipole import kienle_patterson as diffusion
 from model.photon_table import disc_distances
 from model.photon_table import medium as photon_medium
 from model.photon_table import table as photon_table
-from model.tissue_optics import adding_doubling, layered_diffusion
+from model.tissue_optics import adding_doubling, discrete_ordinates, layered_diffusion
 
 CHEAP = settings(derandomize=True, deadline=None, max_examples=40, database=None)
 FEW = settings(CHEAP, max_examples=10)
@@ -286,7 +286,7 @@ def test_dipole_gather_of_negligible_areas_sends_no_light(tiny):
         fresnel.diffuse_external,
         fresnel.diffuse_internal_flux_moment,
         lambda eta: fresnel.reflectance(0.5, eta),
-        lambda eta: adding_doubling.quadrature(eta, 4),
+        lambda eta: discrete_ordinates.quadrature(eta, 4),
     ],
 )
 def test_impossible_refractive_index_raises_error(average, eta):
@@ -396,7 +396,7 @@ def test_layer_split_or_scaled_leaves_result_unchanged(sigma_a, sigma_s, thickne
 @FEW
 @given(eta=ETA, directions=st.sampled_from([4, 8, 12, 20]))
 def test_directions_of_layers_integrate_half_a_sphere(eta, directions):
-    rule = adding_doubling.quadrature(eta, directions)
+    rule = discrete_ordinates.quadrature(eta, directions)
     assert rule.mu.shape == rule.weight.shape == (directions,)
     assert np.all(np.diff(rule.mu) > 0.0)
     assert rule.mu[0] > 0.0

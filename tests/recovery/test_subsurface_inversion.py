@@ -66,12 +66,59 @@ def test_transport_inversion_recovers_sigma_tr_but_dipole_fails(sigma_a, sigma_s
     assert -0.25 < np.median(low) < -0.04
 
 
+OUTSIDE = np.uint16(subsurface.FitOutcome.ASYMMETRY_OUTSIDE_PRIOR)
+
+
+@pytest.mark.parametrize(
+    ("sigma_a", "sigma_s", "g", "bias"), [(0.04, 1.0, 0.0, 0.02), (0.1, 1.2, 0.3, 0.001)]
+)
+def test_media_outside_asymmetry_prior_are_not_valid(sigma_a, sigma_s, g, bias, rng):
+    """By a prior that has their g the same readings are valid and right."""
+    profiles, variance = readings(truth(medium(sigma_a, sigma_s, g), photons=60_000), rng, 20)
+    expected = effective_transport(sigma_a, sigma_s)
+    found = fit(profiles, variance)
+    assert np.all(found.outcome & OUTSIDE)
+    assert not found.valid.any()
+    assert "asymmetry g is outside" in found.reason((0,))
+    assert np.median(found.sigma_tr_per_mm) / expected - 1.0 > bias
+    informed = fit(profiles, variance, g=g, g_error=0.1)
+    assert informed.valid.all()
+    assert abs(np.median(informed.sigma_tr_per_mm) / expected - 1.0) < 0.01
+
+
+@pytest.mark.parametrize("g", [0.7, 0.94])
+def test_media_at_ends_of_asymmetry_prior_are_valid(g, rng):
+    """200 draws of two media; one false alarm is expected in 1000."""
+    alarms = []
+    for sigma_a, sigma_s in [(0.04, 1.0), (0.5, 2.0)]:
+        profiles, variance = readings(truth(medium(sigma_a, sigma_s, g), photons=30_000), rng, 100)
+        alarms.append(fit(profiles, variance).outcome & OUTSIDE)
+    assert np.count_nonzero(alarms) <= 3
+
+
+def test_far_fibers_widen_error_by_isotropic_scattering(rng):
+    """Beyond 2 mm no profile shows g; the interval covers what the near fibers would find."""
+    profiles, variance = readings(truth(medium(0.1, 0.7, 0.0), photons=60_000), rng, 20)
+    far = {"valid": RADIUS > 2.0}
+    expected = effective_transport(0.1, 0.7)
+    found = fit(profiles, variance, **far)
+    error = np.abs(found.sigma_tr_per_mm / expected - 1.0)
+    relative = found.sigma_tr_stderr / found.sigma_tr_per_mm
+    seen = found.valid
+    assert np.mean(seen) > 0.5
+    assert np.mean(error[seen] < 2.0 * relative[seen]) > 0.9
+    firm = fit(profiles, variance, g=0.825, g_error=0.0, **far)
+    narrow = firm.sigma_tr_stderr / firm.sigma_tr_per_mm
+    assert np.median(np.abs(firm.sigma_tr_per_mm / expected - 1.0) / narrow) > 2.0
+
+
 def test_layers_misfit_but_homogeneous_skin_fits(rng):
     layered = truth(medium(1.5, 2.5, 0.8, thickness=0.1), medium(0.05, 1.5, 0.8), photons=30_000)
     profiles, variance = readings(layered, rng, 10)
     found = fit(profiles, variance)
     assert np.all(found.outcome & np.uint16(subsurface.FitOutcome.MISFIT))
     assert np.all(found.model_error > 0.02)
+    assert not np.any(found.outcome & OUTSIDE)
     plain, variance = readings(truth(medium(0.05, 1.5, 0.8), photons=30_000), rng, 10)
     assert np.mean(fit(plain, variance).outcome == 0) >= 0.9
 

@@ -13,7 +13,7 @@ from reconstruction import subsurface
 from reconstruction.anisotropy.direction_harmonics import MIN_DIRECTIONS
 from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 from reconstruction.pipeline.probe.images import Measurement
-from reconstruction.subsurface import SubsurfaceFit
+from reconstruction.subsurface import FitOutcome, SubsurfaceFit
 from reconstruction.subsurface import nearest as nearest_medium
 
 METHOD_NAMES = ("photon_table", "diffusion", "dipole")
@@ -100,7 +100,9 @@ def fit_profiles(
         "source_core_mm": probe.source_core_mm,
     }
     fit = subsurface.invert(first.radius_mm, every, method=method, **setup)
-    if np.any(unlike := fit.bent[0] & (fit.model_error[0] > MAX_HOMOGENEOUS_MISFIT)):
+    other_g = (fit.outcome[0] & np.uint16(FitOutcome.ASYMMETRY_OUTSIDE_PRIOR)) != 0
+    bent = fit.bent[0] & ~other_g
+    if np.any(unlike := bent & (fit.model_error[0] > MAX_HOMOGENEOUS_MISFIT)):
         if method == METHOD_NAMES[0]:
             other = subsurface.nearest_medium(first.radius_mm, every, **setup)
         else:

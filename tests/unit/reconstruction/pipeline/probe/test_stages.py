@@ -20,11 +20,13 @@ MEDIUM = (0.08, 1.2)
 SIGMA_TR = math.sqrt(3 * MEDIUM[0] * sum(MEDIUM))
 
 
-def profile(site="cheek", *, angle=0.0, repeat=0, scale=1.0, common=0.0, noise=0.01, rng=None):
+def profile(
+    site="cheek", *, angle=0.0, repeat=0, scale=1.0, common=0.0, noise=0.01, rng=None, g=0.825
+):
     value = photon_table.reflectance(
         RADIUS,
         *MEDIUM,
-        g=0.825,
+        g=g,
         collection="fiber",
         core_mm=PROBE.fibers[0].core_mm,
         source_core_mm=PROBE.source_core_mm,
@@ -170,6 +172,16 @@ def test_independently_outlying_fibers_do_not_indicate_layers():
     )
     assert layered.mean() <= 0.05
     assert 0.5 < np.sqrt(np.mean(off[~layered] ** 2)) < 1.4
+
+
+def test_isotropic_medium_is_reported_not_valid():
+    """A bent misfit, but of a medium: no factor as of layers, and the reason is in the document."""
+    _, document = documents([profile(g=0.0)])
+    fit = fit_of(document, "photon_table")
+    assert not fit["valid"]
+    assert "asymmetry g is outside its prior" in fit["reason"]
+    assert fit["factor"] == 1.0
+    assert fit_of(documents([profile(g=0.8)])[1], "photon_table")["valid"]
 
 
 def test_head_rotation_is_layered_only_where_all_dimmed():
