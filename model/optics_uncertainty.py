@@ -54,7 +54,7 @@ class Nuisance:
 
 _JACQUES = "Jacques 2013, doi:10.1088/0031-9155/58/11/R37"
 NUISANCES: Final = (
-    Nuisance("epidermis_mm", 0.05, 0.12, True, "Sandby-Moller 2003, doi:10.1080/00015550310015419"),
+    Nuisance("epidermis_mm", 0.05, 0.15, True, "Xu 2017, doi:10.1016/j.jaad.2017.06.009"),
     Nuisance("oxygenation", 0.4, 0.95, False, _JACQUES),
     Nuisance("scattering_per_mm", 2.0 * 2.97, 2.0 * 6.87, True, f"{_JACQUES}, table 1, skin"),
     Nuisance("scattering_slope", 0.705, 2.453, False, f"{_JACQUES}, table 1, skin"),
