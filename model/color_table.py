@@ -1,6 +1,6 @@
 """The color of skin as a table over melanin and hemoglobin (Jimenez 2010, eq. 7)."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib import resources
 
@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline, RectBivariateSpline
 
-from model import spectra
+from model import optics_uncertainty, spectra
 from model.arrays import Float64Array
 from model.checks import Checks
 from model.fresnel import ETA_SKIN
-from model.tissue_optics import two_layer_reflectance
-from model.tissue_optics.layers import BETA_M, C_HD_MAX, C_HE_PER_C_HD, C_M_MAX, OXYGEN_SATURATION
+from model.tissue_optics import SKIN, TissueConstants, two_layer_reflectance
+from model.tissue_optics.constants import with_fractions
+from model.tissue_optics.layers import C_HD_MAX, C_M_MAX
 
 SPECTRAL_NODES = 41
 """Nodes along each axis of the stored spectral table, see tools/make_reflectance_table.py."""
@@ -50,6 +51,11 @@ class ColorTable:
     """Volume fraction of dermal blood at the end of the second axis."""
     anisotropy: float = 0.0
     """Mean cosine g of scattering behind the table."""
+    constants: TissueConstants = SKIN
+    """Thickness, scattering and other optics behind the table."""
+    optics_covariance: Float64Array | None = None
+    """Shape (n, n, 3, 3): covariance of log color by optics that a color does not determine, at
+    nodes evenly in the cube roots; None: the optics are exactly known."""
     cells: Float64Array = field(init=False, repr=False)
     """Shape (size-1, size-1, 3, 4, 4): coefficients of x^p y^q in each cell at [..., p, q], with
     x and y the fractions of the way across the cell."""
@@ -63,6 +69,12 @@ class ColorTable:
                 f"rgb: expected (size, size, 3) with size >= {_MIN_SIZE}, got {rgb.shape}"
             )
         Checks(ColorTableError).within("rgb", rgb, "(0, inf)")
+        if self.optics_covariance is not None:
+            covariance = np.array(self.optics_covariance, dtype=np.float64)
+            nodes = max(covariance.shape[0] if covariance.ndim else 0, 2)
+            Checks(ColorTableError).shape("optics_covariance", covariance, (nodes, nodes, 3, 3))
+            covariance.setflags(write=False)
+            object.__setattr__(self, "optics_covariance", covariance)
         rgb = rgb.copy()
         rgb.setflags(write=False)
         cells = _spline_cells(rgb)
@@ -126,6 +138,62 @@ class ColorTable:
             np.broadcast_arrays(by_i * di_dc[..., None], by_j * dj_dc[..., None]), axis=-1
         )
 
+    def log_covariance(self, c_m: ArrayLike, c_hd: ArrayLike) -> Float64Array:
+        """Return the covariance of log color by unknown optics, see `model.optics_uncertainty`.
+
+        Parameters
+        ----------
+        c_m, c_hd
+            Volume fractions within the table's range, broadcast.
+
+        Returns
+        -------
+        ndarray
+            Shape (..., 3, 3), interpolated linearly in the cube roots; 0 where the table's optics
+            are exactly known.
+
+        Raises
+        ------
+        ColorTableError
+            When a fraction lies outside the table.
+
+        Examples
+        --------
+        >>> table = build("Nikon 5100 (NPL)", "D65")
+        >>> bool(0.1 < table.log_covariance(0.02, 0.02)[1, 1] ** 0.5 < 0.3)
+        True
+        """
+        nodes = self.optics_covariance
+        size = 2 if nodes is None else nodes.shape[0]
+        i, j = Checks(ColorTableError).broadcast_together(
+            c_m=_node_index("c_m", c_m, self.c_m_max, size),
+            c_hd=_node_index("c_hd", c_hd, self.c_hd_max, size),
+        )
+        if nodes is None:
+            return np.zeros((*i.shape, 3, 3))
+        row, column = (np.minimum(x.astype(np.intp), size - 2) for x in (i, j))
+        x, y = (i - row)[..., None, None], (j - column)[..., None, None]
+        below = (1.0 - y) * nodes[row, column] + y * nodes[row, column + 1]
+        above = (1.0 - y) * nodes[row + 1, column] + y * nodes[row + 1, column + 1]
+        return np.asarray((1.0 - x) * below + x * above)
+
+    def melanin_optical_depth(self, c_m: ArrayLike) -> Float64Array:
+        """Return the optical depth of melanin at 550 nm, C_m times thickness times absorption.
+
+        A color determines this product. The volume fraction presumes the thickness of `constants`.
+
+        Parameters
+        ----------
+        c_m
+            Volume fraction of melanin, any shape.
+
+        Examples
+        --------
+        >>> round(float(build("Nikon 5100 (NPL)", "D65").melanin_optical_depth(0.02)), 4)
+        0.0812
+        """
+        return np.asarray(self.constants.melanin_depth_factor * np.asarray(c_m, dtype=np.float64))
+
     def _evaluate(
         self, c_m: ArrayLike, c_hd: ArrayLike
     ) -> tuple[Float64Array, Float64Array, Float64Array]:
@@ -156,9 +224,11 @@ def build(
     *,
     size: int = 128,
     anisotropy: float = 0.0,
-    beta_m: float = BETA_M,
-    oxygenation: float = OXYGEN_SATURATION,
+    constants: TissueConstants = SKIN,
+    beta_m: float | None = None,
+    oxygenation: float | None = None,
     eta: float = ETA_SKIN,
+    exact_optics: bool = False,
 ) -> ColorTable:
     """Build the color table of a camera under a light.
 
@@ -173,15 +243,18 @@ def build(
         Mean cosine g of scattering, in [0, 1). The paper's model has 0; skin has
         `model.tissue_optics.layers.ANISOTROPY_SKIN`, and where melanin exceeds a few percent it
         matters.
-    beta_m, oxygenation, eta
+    constants, beta_m, oxygenation, eta
         As in `model.tissue_optics.two_layer_reflectance`. For other values than the defaults, or a
         g that is not stored, the spectra are computed first: 1 s (g = 0) to 5 s instead of 0.1.
+    exact_optics
+        Whether the optics count as known exactly, as in simulated skin of the same constants. Else
+        `ColorTable.optics_covariance` states what colors of real skin differ by.
 
     Returns
     -------
     ColorTable
-        Epidermal blood is a quarter of dermal blood. Within 1e-4 (relative) of the reflectance
-        of `two_layer_reflectance` averaged over the camera's bands.
+        Within 1e-4 (relative) of the reflectance of `two_layer_reflectance` averaged over the
+        camera's bands. The axis of melanin presumes the constants' thickness of the epidermis.
 
     Raises
     ------
@@ -198,21 +271,49 @@ def build(
     --------
     >>> table = build("Nikon 5100 (NPL)", "D65")
     >>> table.lookup(0.02, 0.02).round(2).tolist()
-    [0.27, 0.2, 0.18]
+    [0.4, 0.26, 0.22]
     """
     if not isinstance(size, int | np.integer) or size < _MIN_SIZE:
         raise ColorTableError(
             f"size: expected a whole number of nodes, at least {_MIN_SIZE}, got {size}"
         )
     weights = spectra.band_weights(camera, illuminant)
-    log_reflectance = _log_spectra(anisotropy, beta_m, oxygenation, eta)
+    constants = with_fractions(constants, beta_m, oxygenation)
+    log_reflectance = _log_spectra(anisotropy, constants, eta)
     axes = spectral_axes(log_reflectance.shape[0])
     fine = spectral_axes(size)
     rgb = np.zeros((size, size, 3))
     for band, weight in enumerate(weights):
         spline = RectBivariateSpline(*axes, log_reflectance[..., band], s=0)
         rgb += np.exp(spline(*fine))[..., None] * weight
-    return ColorTable(camera, illuminant, rgb, anisotropy=anisotropy)
+    covariance = None
+    if not exact_optics:
+        few = spectral_axes(optics_uncertainty.COVARIANCE_NODES)
+        splines = [
+            RectBivariateSpline(*axes, values, s=0) for values in np.moveaxis(log_reflectance, 2, 0)
+        ]
+        nodes = np.exp(np.stack([spline(*few) for spline in splines], axis=-1))
+        covariance = optics_uncertainty.log_color_covariance(camera, illuminant, nodes)
+    return ColorTable(
+        camera,
+        illuminant,
+        rgb,
+        anisotropy=anisotropy,
+        constants=constants,
+        optics_covariance=covariance,
+    )
+
+
+@lru_cache(maxsize=16)
+def with_exact_optics(table: ColorTable) -> ColorTable:
+    """Return a table whose optics count as known exactly, the same object for the same table.
+
+    Examples
+    --------
+    >>> with_exact_optics(build("Nikon 5100 (NPL)", "D65")).optics_covariance is None
+    True
+    """
+    return table if table.optics_covariance is None else replace(table, optics_covariance=None)
 
 
 def spectral_reflectance(
@@ -246,7 +347,7 @@ def spectral_reflectance(
     melanin, blood = Checks(ColorTableError).broadcast_together(c_m=c_m, c_hd=c_hd)
     for name, values, most in (("c_m", melanin, C_M_MAX), ("c_hd", blood, C_HD_MAX)):
         Checks(ColorTableError).within(name, values, f"[0, {most}]")
-    log_reflectance = _log_spectra(anisotropy, BETA_M, OXYGEN_SATURATION, ETA_SKIN)
+    log_reflectance = _log_spectra(anisotropy, SKIN, ETA_SKIN)
     axes = spectral_axes(log_reflectance.shape[0])
     place = np.cbrt(melanin).reshape(-1), np.cbrt(blood).reshape(-1)
     found = np.empty((melanin.size, log_reflectance.shape[2]))
@@ -263,10 +364,9 @@ def spectral_axes(nodes: int) -> tuple[Float64Array, Float64Array]:
 
 
 @lru_cache(maxsize=8)
-def _log_spectra(anisotropy: float, beta_m: float, oxygenation: float, eta: float) -> Float64Array:
+def _log_spectra(anisotropy: float, constants: TissueConstants, eta: float) -> Float64Array:
     """Return log reflectance over (C_m, C_hd, wavelength), stored or computed."""
-    paper = (beta_m, oxygenation, eta) == (BETA_M, OXYGEN_SATURATION, ETA_SKIN)
-    if paper and anisotropy in STORED_ANISOTROPIES and C_HE_PER_C_HD == 0.25:
+    if (constants, eta) == (SKIN, ETA_SKIN) and anisotropy in STORED_ANISOTROPIES:
         source = resources.files("model").joinpath("data", "two_layer_reflectance.npz")
         with source.open("rb") as stream, np.load(stream) as stored:
             return np.asarray(stored[f"log_reflectance_g{anisotropy:g}"], dtype=np.float64)
@@ -275,8 +375,7 @@ def _log_spectra(anisotropy: float, beta_m: float, oxygenation: float, eta: floa
         spectra.WAVELENGTH_NM,
         u[:, None] ** 3,
         v[None, :] ** 3,
-        beta_m=beta_m,
-        oxygenation=oxygenation,
+        constants=constants,
         eta=eta,
         anisotropy=anisotropy,
     )

@@ -15,6 +15,7 @@ _FILE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,63}\.[a-z0-9]{1,8}")
 MAP_UNITS: Mapping[str, str] = MappingProxyType(
     {
         "melanin": "volume fraction of the epidermis",
+        "melanin_optical_depth": "1",
         "hemoglobin": "volume fraction of blood in the dermis",
         "shading": "1",
         "diffuse": "1",

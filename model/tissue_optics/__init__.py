@@ -1,6 +1,9 @@
 """Tissue optics: absorption of chromophores and reflectance of layered skin."""
 
-from model.tissue_optics.layers import TissueError as TissueError
+from model.tissue_optics.constants import PAPERS as PAPERS
+from model.tissue_optics.constants import SKIN as SKIN
+from model.tissue_optics.constants import TissueConstants as TissueConstants
+from model.tissue_optics.constants import TissueError as TissueError
 from model.tissue_optics.layers import blood_absorption as blood_absorption
 from model.tissue_optics.layers import layer_stack_reflectance as layer_stack_reflectance
 from model.tissue_optics.layers import skin_layers as skin_layers

@@ -10,15 +10,19 @@ from model.arrays import Float64Array
 from model.checks import Checks
 from model.fresnel import ETA_SKIN
 from model.tissue_optics import adding_doubling, discrete_ordinates, layered_diffusion
+from model.tissue_optics.constants import (
+    PAPERS,
+    SKIN,
+    TissueConstants,
+    TissueError,
+    with_fractions,
+)
 
 Tier = Literal["adding_doubling", "diffusion"]
 
-# Jimenez et al. 2010, doi:10.1145/1866158.1866167: Table 1 and figure 9.
+# Jimenez et al. 2010, doi:10.1145/1866158.1866167: Table 1.
 C_M_MAX = 0.5  # volume fraction of melanosomes in the epidermis
 C_HD_MAX = 0.32  # volume fraction of blood in the dermis
-C_HE_MAX = 0.1  # volume fraction of blood in the epidermis
-BETA_M = 0.61  # fraction of eumelanin in melanin
-C_HE_PER_C_HD = 0.25  # epidermal blood per dermal blood
 
 ANISOTROPY_SKIN = 0.8
 """Mean cosine g of scattering in skin: van Gemert et al. 1989, doi:10.1109/10.42108.
@@ -28,23 +32,14 @@ below. Where absorption is weak it makes little difference. Dark skin scatters o
 before it absorbs: with g = 0.8 and the same sigma_s' it reflects less, half at C_m = 0.5.
 """
 
-# Donner et al. 2008, doi:10.1145/1409060.1409093.
-OXYGEN_SATURATION = 0.75  # fraction of oxygenated hemoglobin
-EPIDERMIS_MM = 0.25  # thickness; the dermis below is semi-infinite
-DERMIS_SCATTERING = 0.5  # reduced scattering of the dermis relative to the epidermis
-
 TIER_NAMES: tuple[Tier, ...] = ("adding_doubling", "diffusion")
-
-
-class TissueError(ValueError):
-    """Error for a chromophore or an optical property outside the range of tissue."""
 
 
 _check = Checks(TissueError).within
 
 
 def blood_absorption(
-    wavelength_nm: ArrayLike, *, oxygenation: float = OXYGEN_SATURATION
+    wavelength_nm: ArrayLike, *, oxygenation: float = SKIN.oxygenation
 ) -> Float64Array:
     """Return the absorption of whole blood with 150 g/l of hemoglobin.
 
@@ -77,9 +72,10 @@ def skin_layers(
     c_m: ArrayLike,
     c_hd: ArrayLike,
     *,
-    beta_m: float = BETA_M,
+    constants: TissueConstants = PAPERS,
+    beta_m: float | None = None,
     c_he: ArrayLike | None = None,
-    oxygenation: float = OXYGEN_SATURATION,
+    oxygenation: float | None = None,
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return the optical properties of epidermis and dermis.
 
@@ -89,12 +85,12 @@ def skin_layers(
         Wavelengths in nm, shape (n,) or scalar, 380 to 780.
     c_m, c_hd
         Volume fractions of melanin (epidermis) and blood (dermis), broadcast together.
-    beta_m
-        Fraction of eumelanin in melanin, in [0, 1].
+    constants
+        Thickness, oxygenation, scattering and pigment, see `TissueConstants`.
+    beta_m, oxygenation
+        Fractions of eumelanin and of oxygenated hemoglobin, in [0, 1]; None: the constants'.
     c_he
-        Volume fraction of blood in the epidermis; None: c_hd/4.
-    oxygenation
-        Fraction of oxygenated hemoglobin in [0, 1].
+        Volume fraction of blood in the epidermis; None: by the constants' ratio to c_hd.
 
     Returns
     -------
@@ -112,32 +108,27 @@ def skin_layers(
     Donner et al. 2008, doi:10.1145/1409060.1409093.
     """
     melanin, dermal = np.asarray(c_m, dtype=np.float64), np.asarray(c_hd, dtype=np.float64)
-    epidermal = C_HE_PER_C_HD * dermal if c_he is None else np.asarray(c_he, dtype=np.float64)
-    for name, share in (
-        ("beta_m", beta_m),
-        ("c_m", melanin),
-        ("c_hd", dermal),
-        ("c_he", epidermal),
-    ):
+    constants = with_fractions(constants, beta_m, oxygenation)
+    ratio = constants.epidermal_blood_ratio
+    epidermal = ratio * dermal if c_he is None else np.asarray(c_he, dtype=np.float64)
+    for name, share in (("c_m", melanin), ("c_hd", dermal), ("c_he", epidermal)):
         _check(name, share, "[0, 1]")
     melanin, dermal, epidermal = np.broadcast_arrays(melanin, dermal, epidermal)
     _check("c_m + c_he", melanin + epidermal, "[0, 1]")
     wavelength = np.asarray(wavelength_nm, dtype=np.float64)
     spread = melanin.shape + (1,) * wavelength.ndim
     melanin, dermal, epidermal = (x.reshape(spread) for x in (melanin, dermal, epidermal))
-    blood = blood_absorption(wavelength, oxygenation=oxygenation)
-    baseline = spectra.baseline_absorption(wavelength)
-    pigment = beta_m * spectra.eumelanin_absorption(wavelength) + (
-        1.0 - beta_m
-    ) * spectra.pheomelanin_absorption(wavelength)
+    blood = blood_absorption(wavelength, oxygenation=constants.oxygenation)
+    baseline = constants.baseline_factor * spectra.baseline_absorption(wavelength)
+    pigment = constants.melanin_absorption(wavelength)
     sigma_a_epidermis = (
         melanin * pigment + epidermal * blood + (1.0 - melanin - epidermal) * baseline
     )
     sigma_a_dermis = dermal * blood + (1.0 - dermal) * baseline
     sigma_a = np.stack(np.broadcast_arrays(sigma_a_epidermis, sigma_a_dermis), axis=-1)
-    scattering = spectra.reduced_scattering(wavelength)
-    sigma_s = np.stack([scattering, DERMIS_SCATTERING * scattering], axis=-1)
-    thickness = np.array([EPIDERMIS_MM, np.inf])
+    scattering = constants.epidermal_scattering(wavelength)
+    sigma_s = np.stack([scattering, constants.dermis_scattering * scattering], axis=-1)
+    thickness = np.array([constants.epidermis_mm, np.inf])
     return (
         sigma_a,
         np.broadcast_to(sigma_s, sigma_a.shape),
@@ -150,15 +141,16 @@ def two_layer_reflectance(
     c_m: ArrayLike,
     c_hd: ArrayLike,
     *,
-    beta_m: float = BETA_M,
+    constants: TissueConstants = PAPERS,
+    beta_m: float | None = None,
     c_he: ArrayLike | None = None,
-    oxygenation: float = OXYGEN_SATURATION,
+    oxygenation: float | None = None,
     eta: float = ETA_SKIN,
     tier: Tier = "adding_doubling",
     anisotropy: float = 0.0,
     directions: int | None = None,
 ) -> Float64Array:
-    """Return the diffuse reflectance of skin: an epidermis of 0.25 mm on a deep dermis.
+    """Return the diffuse reflectance of skin: a thin epidermis on a deep dermis.
 
     Parameters
     ----------
@@ -167,12 +159,12 @@ def two_layer_reflectance(
     c_m, c_hd
         Volume fractions of melanin (epidermis) and blood (dermis), broadcast together; Jimenez
         2010, Table 1 has 0 to 0.5 and 0 to 0.32.
-    beta_m
-        Fraction of eumelanin in melanin, in [0, 1].
+    constants
+        Thickness, oxygenation, scattering and pigment, see `TissueConstants`.
+    beta_m, oxygenation
+        Fractions of eumelanin and of oxygenated hemoglobin, in [0, 1]; None: the constants'.
     c_he
-        Volume fraction of blood in the epidermis; None: c_hd/4.
-    oxygenation
-        Fraction of oxygenated hemoglobin in [0, 1].
+        Volume fraction of blood in the epidermis; None: by the constants' ratio to c_hd.
     eta
         Refractive index of skin relative to air.
     tier
@@ -204,7 +196,11 @@ def two_layer_reflectance(
     [0.17, 0.2, 0.34]
     """
     sigma_a, sigma_s_prime, thickness = skin_layers(
-        wavelength_nm, c_m, c_hd, beta_m=beta_m, c_he=c_he, oxygenation=oxygenation
+        wavelength_nm,
+        c_m,
+        c_hd,
+        constants=with_fractions(constants, beta_m, oxygenation),
+        c_he=c_he,
     )
     return layer_stack_reflectance(
         sigma_a,

@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.checks import Checks
-from model.color_table import ColorTable
+from model.color_table import ColorTable, with_exact_optics
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.chromophores import dark_spots, shading_prior
 from reconstruction.chromophores import face_kernels as kernels
 from reconstruction.chromophores import model_error as color_errors
 from reconstruction.chromophores import posterior as chromophore_posterior
+from reconstruction.chromophores.common_optics import add_optics_errors
 from reconstruction.chromophores.face_distribution import (
     FaceDistribution,
     add_systematic_errors,
@@ -71,7 +72,8 @@ def fit_face_distribution(
         Shape (..., 3): light of the pixels over that of a white reference, linear camera RGB; all
         skin of one person in one image. Not modified.
     table
-        Color table of the camera and the illumination of the image.
+        Color table of the camera and the illumination of the image. Unknown optics are common to
+        the face, so that they move the distribution without a change of its shape.
     prior
         Distribution of the pixels' shading, without the error common to all pixels.
     common_light
@@ -111,8 +113,16 @@ def fit_face_distribution(
     colors, noise, errors = _sampled(rgb, variance, model_error, valid)
     if len(colors) < MIN_FACE_PIXELS:
         return None
-    alone = chromophore_posterior.estimate(
-        colors, table, prior=prior, variance=noise, model_error=errors
+    whole_table, table = table, with_exact_optics(table)
+    alone = add_optics_errors(
+        chromophore_posterior.estimate(
+            colors, table, prior=prior, variance=noise, model_error=errors
+        ),
+        colors,
+        whole_table,
+        variance=noise,
+        model_error=errors,
+        log_light_sd=prior.sd,
     )
     colors, noise = colors[alone.valid].astype(np.float64), noise[alone.valid]
     errors = errors if errors.ndim == 2 else errors[alone.valid]
@@ -182,9 +192,9 @@ class FaceEstimate:
     """Estimates of the pixels, with and without the face distribution."""
 
     found: ChromophorePosterior
-    """Final estimate; an average of hypotheses in `spots`."""
+    """Final estimate; an average of hypotheses in `spots`. Standard errors include optics."""
     by_face: ChromophorePosterior
-    """Estimate with the face prior everywhere; the same as `found` without a face."""
+    """Estimate with the face prior everywhere, for errors within the face: by exact optics."""
     face: FaceDistribution | None
     """None where it was not fitted."""
     spots: BoolArray
@@ -211,18 +221,23 @@ def estimate_face(
         distribution adds no information.
     """
     errors: dict[str, Any] = {"variance": variance, "model_error": model_error}
-    known = partial(chromophore_posterior.estimate, rgb, table, prior=prior, **errors)
+    exact = with_exact_optics(table)
+    known = partial(chromophore_posterior.estimate, rgb, exact, prior=prior, **errors)
+    with_optics = partial(
+        add_optics_errors, rgb=rgb, table=table, log_light_sd=prior.sd, **errors
+    )
     face = None
     if has_white:
         face = fit_with_white_reference(rgb, table, **errors)
     by_face = known(face=face)
     if face is None:
-        return FaceEstimate(by_face, by_face, None, np.zeros(rgb.shape[:-1], bool))
+        return FaceEstimate(with_optics(by_face), by_face, None, np.zeros(rgb.shape[:-1], bool))
     alone = known()
     spots = dark_spots.is_lighter_than_face_prior(by_face, alone)
     if rgb.ndim == 3:
         spots |= dark_spots.is_locally_dark(rgb, variance=variance)
-    return FaceEstimate(dark_spots.average_hypotheses(by_face, alone, spots), by_face, face, spots)
+    found = dark_spots.average_hypotheses(by_face, alone, spots)
+    return FaceEstimate(with_optics(found), by_face, face, spots)
 
 
 def _sampled(

@@ -1,15 +1,20 @@
 """Invert linear camera RGB to melanin, hemoglobin and shading, with standard errors.
 
 Each pixel is fitted with the color table of the two-layer skin model (Jimenez et al. 2010,
-doi:10.1145/1866158.1866167, eq. 7), in the cube roots of both volume fractions.
+doi:10.1145/1866158.1866167, eq. 7), in the cube roots of both volume fractions. Thickness,
+oxygenation and scattering are nuisance parameters: their effect is part of each color's covariance
+(`model.optics_uncertainty`). A color determines the product of melanin's volume fraction and the
+thickness of the epidermis, the melanin optical depth.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import special
 
 from model.checks import Checks
 from model.color_table import ColorTable
@@ -42,14 +47,15 @@ class ChromophoreMaps:
     """Result of the chromophore fit; every map has the pixels' shape."""
 
     melanin: Float32Array
-    """Volume fraction of melanin in the epidermis, 3e-5 to 0.5; NaN where the input is unusable."""
+    """Volume fraction of melanin in an epidermis of the table's thickness, 3e-5 to 0.5; NaN where
+    the input is unusable. See `melanin_optical_depth`."""
     hemoglobin: Float32Array
     """Volume fraction of blood in the dermis, 2e-5 to 0.32; NaN where the input is unusable."""
     shading: Float32Array
     """Factor between the table's color and the pixel: fitted when free, else as given, times the
     most probable factor where the model error has a part common to the channels."""
     stderr_melanin: Float32Array
-    """Standard error of `melanin`: Fisher information of noise and model error together."""
+    """Standard error of `melanin`: Fisher information of noise, model error and unknown optics."""
     stderr_hemoglobin: Float32Array
     """Standard error of `hemoglobin`."""
     residual: Float32Array
@@ -67,6 +73,38 @@ class ChromophoreMaps:
     """The same for hemoglobin."""
     ambiguous: BoolArray
     """Darker skin under more light has the same color, with the shading free."""
+    depth_factor: float
+    """Melanin optical depth over `melanin`: thickness times melanin's absorption at 550 nm."""
+
+    @property
+    def melanin_optical_depth(self) -> Float32Array:
+        """Optical depth of melanin at 550 nm, which a color determines whatever the thickness."""
+        return np.asarray(np.float32(self.depth_factor) * self.melanin)
+
+    @property
+    def stderr_melanin_optical_depth(self) -> Float32Array:
+        """Standard error of `melanin_optical_depth`."""
+        return np.asarray(np.float32(self.depth_factor) * self.stderr_melanin)
+
+    def interval(
+        self, name: Literal["melanin", "hemoglobin"], probability: float
+    ) -> tuple[Float64Array, Float64Array]:
+        """Return the ends of an interval, symmetric in the cube root, in which errors are even.
+
+        Parameters
+        ----------
+        name
+            Chromophore.
+        probability
+            Nominal coverage, above 0 and below 1.
+        """
+        Checks(ChromophoreError).choice("name", name, ("melanin", "hemoglobin"))
+        Checks(ChromophoreError).within("probability", probability, "(0, 1)")
+        value = np.asarray(getattr(self, name), dtype=np.float64)
+        root = np.cbrt(value)
+        sigmas = float(special.ndtri(0.5 + 0.5 * probability))
+        half = sigmas * getattr(self, f"stderr_{name}") / (3.0 * np.square(root))
+        return np.maximum(root - half, 0.0) ** 3, (root + half) ** 3
 
     @property
     def identifiable(self) -> BoolArray:
@@ -94,14 +132,15 @@ def invert(
         over irradiance, a perfect white is 1). With the shading free any positive factor per
         pixel may be left in. Fitted in float32, whatever its type. Not modified.
     table
-        Color table of the camera and the illumination of the image.
+        Color table of the camera and the illumination of the image. Its `optics_covariance`, by
+        unknown optics at the color's first estimate, is added to the noise.
     shading
         None: a free factor per pixel. "known": the factor is 1. Array of shape (...) or number:
         the known factor.
     variance
         Noise variance of `rgb`, broadcast to its shape. None: 1 percent of each channel.
     model_error
-        Relative error of the table's colors, added to the noise: a standard error, one per channel,
+        Further relative error, such as of a rig, added to the noise: a standard error, one per channel,
         or a (3, 3) covariance. A covariance with s^2 in all its cells limits the knowledge of the
         shading to the relative standard error s; where s is above some 10 percent, skin has two
         solutions, which `reconstruction.chromophores.posterior` weights. None: 0.
@@ -163,6 +202,7 @@ def invert(
         _usable(valid, shape),
         free,
         covariance.astype(np.float32),
+        optics_triangles(table),
         np.ascontiguousarray(table.cells, dtype=np.float32),
         np.array([table.c_m_max, table.c_hd_max], dtype=np.float32),
         np.ascontiguousarray(start.projection, dtype=np.float32),
@@ -177,7 +217,7 @@ def invert(
     )
     named = dict(zip(kernels.INVERSION_MAPS, maps.reshape(len(maps), *shape), strict=True))
     flags = dict(zip(kernels.INVERSION_MASKS, masks.reshape(len(masks), *shape), strict=True))
-    return ChromophoreMaps(**named, **flags)
+    return ChromophoreMaps(**named, **flags, depth_factor=table.constants.melanin_depth_factor)
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,7 +259,7 @@ def compute_identifiability(
     Parameters
     ----------
     table
-        Color table of the camera and the light.
+        Color table of the camera and the light, with its covariance by unknown optics.
     shading
         None: free, around 1. "known": 1. A number: known, the light's level.
     variance
@@ -254,9 +294,11 @@ def compute_identifiability(
     noise = variance(seen) if callable(variance) else variance
     noise = np.zeros(3) if noise is None else np.asarray(noise, dtype=np.float64)
     covariance = model_covariance(model_error, variance is None)
+    covariance = add_brightness_variance(covariance) if shading is None else covariance
+    fractions = table.c_m_max * a**3, table.c_hd_max * b**3
     weights = _weights(
         np.broadcast_to(noise, seen.shape) / seen**2,
-        add_brightness_variance(covariance) if shading is None else covariance,
+        covariance + table.log_covariance(*fractions),
         free=shading is None,
     )
     gradient = np.stack([by_a / color, by_b / color], axis=-1)
@@ -313,6 +355,16 @@ def add_brightness_variance(covariance: Float64Array) -> Float64Array:
     """
     common = np.trace(covariance, axis1=-2, axis2=-1) / 3.0 + 1e-6
     return np.asarray(covariance + common[..., None, None])
+
+
+@lru_cache(maxsize=16)
+def optics_triangles(table: ColorTable) -> Float32Array:
+    """Return upper triangles of a table's covariance by unknown optics, (n, n, 6); n = 1: none."""
+    nodes = table.optics_covariance
+    if nodes is None:
+        return np.zeros((1, 1, 6), dtype=np.float32)
+    row, column = np.triu_indices(3)
+    return np.ascontiguousarray(nodes[..., row, column], dtype=np.float32)
 
 
 def _weights(

@@ -11,7 +11,7 @@ from numba import boolean, float32, float64, int64, njit, prange, void
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 from reconstruction.compiled import FASTMATH_CONTRACT, PIXEL_KERNEL_OPTIONS, readonly_array_type
 
-MAX_FIT_STEPS = 12
+MAX_FIT_STEPS = 20
 MAX_AXIS_STEP = 0.12
 """Longest step along an axis, as a fraction of it."""
 RELATIVE_STEP_TOL = 4e-3
@@ -26,6 +26,10 @@ NOISY_STEP_TOL = 3e-2
 """Step, relative to the value, that is the last one where the remaining misfit exceeds the gain."""
 CONVERGED_STEP = 2e-2
 """Step, relative to the value, up to which the last one counts as converged."""
+REWEIGHT_STEP = 0.02
+"""Fraction of an axis from the weights' position above which the weights are computed again."""
+MAX_REWEIGHTS = 8
+"""Maximum number of times that the weights are computed again."""
 OUTSIDE_SIGMAS = 4.0
 """Minimum residual, in standard errors, of a color outside the table ..."""
 OUTSIDE_DISTANCE = 0.02
@@ -152,6 +156,67 @@ def _guess(axes, y0, y1):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always", fastmath=FASTMATH_CONTRACT)
+def _covariance_at(nodes, a, b):  # type: ignore[no-untyped-def]
+    """Interpolate the upper triangle of a covariance bilinearly between its nodes."""
+    last = nodes.shape[0] - 1
+    y0, y1 = a * np.float32(last), b * np.float32(last)
+    i, j = min(int(y0), last - 1), min(int(y1), last - 1)
+    x, y = y0 - np.float32(i), y1 - np.float32(j)
+    w11 = x * y
+    w10, w01 = x - w11, y - w11
+    w00 = _ONE - x - w01
+    n00, n01, n10, n11 = nodes[i, j], nodes[i, j + 1], nodes[i + 1, j], nodes[i + 1, j + 1]
+    return (
+        w00 * n00[0] + w01 * n01[0] + w10 * n10[0] + w11 * n11[0],
+        w00 * n00[1] + w01 * n01[1] + w10 * n10[1] + w11 * n11[1],
+        w00 * n00[2] + w01 * n01[2] + w10 * n10[2] + w11 * n11[2],
+        w00 * n00[3] + w01 * n01[3] + w10 * n10[3] + w11 * n11[3],
+        w00 * n00[4] + w01 * n01[4] + w10 * n10[4] + w11 * n11[4],
+        w00 * n00[5] + w01 * n01[5] + w10 * n10[5] + w11 * n11[5],
+    )
+
+
+@njit(fastmath=FASTMATH_CONTRACT)
+def _color_weights(noise, model, optics, a, b, free):  # type: ignore[no-untyped-def]
+    """Return the weights of relative errors (6), those of brightness (3), and the latter's sum.
+
+    A free shading is projected out: W - W 1 1' W / (1' W 1), with t = W 1 / (1' W 1).
+    """
+    m01, m02, m12 = model[0, 1], model[0, 2], model[1, 2]
+    a00, a11, a22 = noise[0] + model[0, 0], noise[1] + model[1, 1], noise[2] + model[2, 2]
+    if optics.shape[0] > 1:
+        c00, c01, c02, c11, c12, c22 = _covariance_at(optics, a, b)
+        a00, a11, a22 = a00 + c00, a11 + c11, a22 + c22
+        m01, m02, m12 = m01 + c01, m02 + c02, m12 + c12
+    if m01 == 0.0 and m02 == 0.0 and m12 == 0.0:
+        x0, x3, x5 = 1.0 / float64(a00), 1.0 / float64(a11), 1.0 / float64(a22)
+        x1 = x2 = x4 = 0.0
+    else:
+        x0, x1, x2, x3, x4, x5 = _weights(
+            float64(a00), float64(a11), float64(a22), float64(m01), float64(m02), float64(m12)
+        )
+    t0, t1, t2 = x0 + x1 + x2, x1 + x3 + x4, x2 + x4 + x5
+    total = t0 + t1 + t2
+    whole = 1.0 / total
+    t0, t1, t2 = t0 * whole, t1 * whole, t2 * whole
+    if free:
+        x0, x1, x2 = x0 - t0 * t0 * total, x1 - t0 * t1 * total, x2 - t0 * t2 * total
+        x3, x4, x5 = x3 - t1 * t1 * total, x4 - t1 * t2 * total, x5 - t2 * t2 * total
+    return (
+        np.float32(x0),
+        np.float32(x1),
+        np.float32(x2),
+        np.float32(x3),
+        np.float32(x4),
+        np.float32(x5),
+        np.float32(t0),
+        np.float32(t1),
+        np.float32(t2),
+        np.float32(total),
+    )
+
+
+@njit(inline="always", fastmath=FASTMATH_CONTRACT)
 def _bounded(a, b, step_a, step_b, aa, ab, bb, ra, rb):  # type: ignore[no-untyped-def]
     """Limit a step to the table's edge, where the other chromophore is fitted alone."""
     if a + step_a < _MIN_AXIS_FRACTION or a + step_a > _ONE:
@@ -181,6 +246,7 @@ def _bounded(a, b, step_a, step_b, aa, ab, bb, ra, rb):  # type: ignore[no-untyp
         readonly_array_type(boolean, 1),  # usable (n,) or (1,)
         boolean,  # shading is free
         readonly_array_type(float32, 2),  # covariance of the model's relative error (3, 3)
+        readonly_array_type(float32, 3),  # covariance by optics on the axes (k, k, 6); k = 1: none
         readonly_array_type(float32, 5),  # cells of the color table
         readonly_array_type(float32, 1),  # ends of the axes as volume fractions (2,)
         readonly_array_type(float32, 2),  # projection of log rgb, and offset (2, 4)
@@ -202,6 +268,7 @@ def fit_pixels(  # type: ignore[no-untyped-def]
     usable,
     free,
     model,
+    optics,
     cells,
     ends,
     projection,
@@ -219,10 +286,8 @@ def fit_pixels(  # type: ignore[no-untyped-def]
     last = cells.shape[0]
     length = np.float32(last)
     grid = twin_log.shape[0]
-    m00, m01, m02 = model[0, 0], model[0, 1], model[0, 2]
-    m11, m12, m22 = model[1, 1], model[1, 2], model[2, 2]
-    plain = m01 == 0.0 and m02 == 0.0 and m12 == 0.0
-    common_variance = max(min(m01, m02, m12), _ZERO)
+    has_optics = optics.shape[0] > 1
+    common_variance = max(min(model[0, 1], model[0, 2], model[1, 2]), _ZERO)
     each_variance = variance.shape[0] > 1
     each_shading = shading.shape[0] > 1
     each_usable = usable.shape[0] > 1
@@ -251,44 +316,18 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                 for m in range(5):
                     masks[m, n] = False
                 continue
-            # Weights W of the relative errors; a free shading is projected out of them:
-            # W - W 1 1' W / (1' W 1), with t = W 1 / (1' W 1).
+            # Relative variances by noise, before the color is divided by its shading
             i0, i1, i2 = _ONE / d0, _ONE / d1, _ONE / d2
-            a00, a11, a22 = v0 * i0 * i0 + m00, v1 * i1 * i1 + m11, v2 * i2 * i2 + m22
-            if plain:
-                x0, x3, x5 = 1.0 / float64(a00), 1.0 / float64(a11), 1.0 / float64(a22)
-                x1 = x2 = x4 = 0.0
-            else:
-                x0, x1, x2, x3, x4, x5 = _weights(
-                    float64(a00),
-                    float64(a11),
-                    float64(a22),
-                    float64(m01),
-                    float64(m02),
-                    float64(m12),
-                )
-            t0, t1, t2 = x0 + x1 + x2, x1 + x3 + x4, x2 + x4 + x5
-            total = t0 + t1 + t2
-            whole = 1.0 / total
-            t0, t1, t2 = t0 * whole, t1 * whole, t2 * whole
-            s0, s1, s2 = np.float32(t0), np.float32(t1), np.float32(t2)
-            if free:
-                x0, x1, x2 = x0 - t0 * t0 * total, x1 - t0 * t1 * total, x2 - t0 * t2 * total
-                x3, x4, x5 = x3 - t1 * t1 * total, x4 - t1 * t2 * total, x5 - t2 * t2 * total
-            else:
+            v0, v1, v2 = v0 * i0 * i0, v1 * i1 * i1, v2 * i2 * i2
+            if not free:
                 unshaded = _ONE / known
                 d0, d1, d2 = d0 * unshaded, d1 * unshaded, d2 * unshaded
-            w = (
-                np.float32(x0),
-                np.float32(x1),
-                np.float32(x2),
-                np.float32(x3),
-                np.float32(x4),
-                np.float32(x5),
-            )
             l0, l1, l2 = math.log(d0), math.log(d1), math.log(d2)
             y0, y1 = _project(projection, l0, l1, l2)
             a, b = _guess(start_axes, y0, y1)
+            noise = v0, v1, v2
+            w = _color_weights(noise, model, optics, a, b, free)
+            a_of_weights, b_of_weights = a, b
             twin_brightness = -np.float32(np.inf)
             if free:
                 g0 = min(max(int(y0 + _HALF), 0), grid - 1)
@@ -302,7 +341,19 @@ def fit_pixels(  # type: ignore[no-untyped-def]
             e0 = e1 = e2 = _ZERO
             ga0 = ga1 = ga2 = gb0 = gb1 = gb2 = _ZERO
             done = False
+            reweights = 0
             for step in range(MAX_FIT_STEPS):
+                if has_optics and step > 0:
+                    moved = max(abs(a - a_of_weights), abs(b - b_of_weights))
+                    if moved > REWEIGHT_STEP and reweights < MAX_REWEIGHTS:
+                        reweights += 1
+                        w = _color_weights(noise, model, optics, a, b, free)
+                        a_of_weights, b_of_weights = a, b
+                        # of other weights, but the fold's guard stays on
+                        cost_before = np.float32(0.9 * MAX_FINITE)
+                    elif done:
+                        break
+                done = False
                 i, j = a * length, b * length
                 row, column = min(int(i), last - 1), min(int(j), last - 1)
                 x, y = i - np.float32(row), j - np.float32(column)
@@ -313,7 +364,7 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                 r0, r1, r2 = _ONE / f0, _ONE / f1, _ONE / f2
                 q0, q1, q2 = d0 * r0, d1 * r1, d2 * r2
                 if free:
-                    s = s0 * q0 + s1 * q1 + s2 * q2
+                    s = w[6] * q0 + w[7] * q1 + w[8] * q2
                     t = _ONE / s
                     e0, e1, e2 = q0 * t - _ONE, q1 * t - _ONE, q2 * t - _ONE
                 else:
@@ -397,7 +448,8 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                     or (longest < NOISY_STEP_TOL and gain < misfit)
                 ):
                     done = True
-                    break
+                    if not has_optics:
+                        break
             # The linear model gives the change of the residual by the last step.
             e0 -= ga0 * step_a + gb0 * step_b
             e1 -= ga1 * step_a + gb1 * step_b
@@ -405,11 +457,11 @@ def fit_pixels(  # type: ignore[no-untyped-def]
             residual = math.sqrt(max(_form(w, e0, e1, e2, e0, e1, e2), _ZERO))
             # The part of the residual that shading explains: all of the mean when free, else its
             # most probable part given the shading's variance.
-            shift = s0 * e0 + s1 * e1 + s2 * e2
+            shift = w[6] * e0 + w[7] * e1 + w[8] * e2
             if free:
                 s *= _ONE + shift
             else:
-                shift *= common_variance * np.float32(total)
+                shift *= common_variance * w[9]
                 s = np.float32(math.exp(shift))
             e0, e1, e2 = e0 - shift, e1 - shift, e2 - shift
             a = min(max(a, _MIN_AXIS_FRACTION), _ONE)

@@ -20,19 +20,24 @@ from reconstruction.chromophores import posterior_kernels as ridge
 from reconstruction.chromophores.face_distribution import FaceDistribution
 from reconstruction.chromophores.inversion import (
     DEFAULT_RELATIVE_NOISE,
+    ChromophoreMaps,
     add_brightness_variance,
     invert,
     model_covariance,
 )
 from reconstruction.chromophores.inversion_kernels import OUTSIDE_DISTANCE, OUTSIDE_SIGMAS
 from reconstruction.chromophores.lines import MELANIN_AXIS, equal_melanin_lines
-from reconstruction.chromophores.pixel_checks import ChromophoreError
+from reconstruction.chromophores.pixel_checks import ChromophoreError, is_usable_color
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 
 MIN_RELATIVE_NOISE = 2e-4
 """Minimum relative error of a color; smaller noise is raised to it. It corresponds to some 0.3
 percent of melanin."""
+POPULATION_MELANIN = 0.037
+"""Median melanin of measured spectra of skin (ISSA), as a volume fraction."""
+POPULATION_LOG_SD = 1.0
+"""Standard deviation of log melanin over people: types I to VI span 2.7."""
 _TASK_PIXELS = 1024
 _BAND_PIXELS = 1 << 16
 
@@ -52,6 +57,11 @@ class ChromophorePosterior:
     the standard deviation for a normal distribution."""
     stderr_hemoglobin: Float32Array
     """68 % credible half-width of `hemoglobin`."""
+    optics_stderr_melanin: Float32Array
+    """Part of `stderr_melanin` by optics that are unknown but common to a face's pixels; 0 where
+    each pixel has its own optics, or they are exact."""
+    optics_stderr_hemoglobin: Float32Array
+    """The same for `hemoglobin`."""
     residual: Float32Array
     """Root of the weighted square sum of the best color's residuals, in standard errors."""
     gamut_distance: Float32Array
@@ -80,7 +90,9 @@ def estimate(
     rgb
         Shape (..., 3): light of the pixel over that of a white reference, linear camera RGB.
     table
-        Color table of the camera and the illumination of the image.
+        Color table of the camera and the illumination of the image. Its covariance by unknown
+        optics is added to each pixel's; `reconstruction.chromophores.common_optics` treats optics
+        that are common to a face.
     prior
         Distribution of the pixels' shading.
     face
@@ -128,7 +140,8 @@ def estimate(
     ['0.80', '0.80']
     """
     colors = np.asarray(rgb, dtype=np.float32)
-    usual, covariances = _covariances(model_error, colors.shape[:-1], variance is None)
+    seen = is_usable_color(colors)
+    usual, covariances = _covariances(model_error, seen, variance is None)
     fitted = invert(colors, table, variance=variance, model_error=usual, valid=valid)
     shape = fitted.melanin.shape
     pixels = fitted.melanin.size
@@ -136,6 +149,17 @@ def estimate(
     ends = np.array([table.c_m_max, table.c_hd_max])
     fractions = np.stack([fitted.melanin, fitted.hemoglobin], axis=-1) / ends
     begin = np.clip(np.cbrt(np.where(usable[..., None], fractions, 0.1)), MIN_AXIS_FRACTION, 1.0)
+    if table.optics_covariance is not None:
+        # the free fit is on the light side of the fold; usual light finds the probable side
+        likely = invert(
+            colors,
+            table,
+            shading=float(np.exp(prior.mean)),
+            variance=variance,
+            model_error=model_covariance(usual, default_noise=False) + prior.sd**2,
+            valid=valid,
+        )
+        covariances = covariances + _optics_at(table, likely)
     noise = np.zeros(3) if variance is None else np.asarray(variance, dtype=np.float32)
     lines = equal_melanin_lines(table)
     maps = np.empty((len(ridge.POSTERIOR_MAPS), pixels), dtype=np.float32)
@@ -162,8 +186,11 @@ def estimate(
     outside = fitted.outside | (
         (named["residual"] > OUTSIDE_SIGMAS) & (fitted.gamut_distance > OUTSIDE_DISTANCE)
     )
+    none = np.zeros(shape, dtype=np.float32)
     return ChromophorePosterior(
         **named,
+        optics_stderr_melanin=none,
+        optics_stderr_hemoglobin=none,
         gamut_distance=fitted.gamut_distance,
         outside=outside,
         valid=usable & np.isfinite(named["melanin"]) & ~outside,
@@ -175,7 +202,11 @@ def _face_prior_costs(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the kernel's -2 log prior of melanin, and its four parameters of blood."""
     if face is None:
-        return np.zeros(MELANIN_AXIS.size), np.array([0.5, 1.0, 0.0, 1.0])
+        costs = np.zeros(MELANIN_AXIS.size)
+        if table.optics_covariance is not None:
+            away = np.log(table.c_m_max * MELANIN_AXIS**3 / POPULATION_MELANIN)
+            costs = np.square(away / POPULATION_LOG_SD)
+        return costs, np.array([0.5, 1.0, 0.0, 1.0])
     density = face.melanin.relative_density(np.log(table.c_m_max * MELANIN_AXIS**3))
     blood = face.blood
     return (
@@ -188,11 +219,11 @@ _UPPER_TRIANGLE = np.triu_indices(3)
 
 
 def _covariances(
-    model_error: ArrayLike | None, shape: tuple[int, ...], default_noise: bool
+    model_error: ArrayLike | None, seen: BoolArray, default_noise: bool
 ) -> tuple[ArrayLike | None, Float64Array]:
     """Return the mean model error, and the upper triangles of the pixels' covariances, (m, 6).
 
-    The mean error serves only the fit that finds the starting point.
+    The mean error serves only the fit that finds the starting point, over the pixels `seen`.
     """
     each = np.asarray(0.0 if model_error is None else model_error, dtype=np.float64)
     if each.ndim < 3:
@@ -200,7 +231,7 @@ def _covariances(
         covariances = add_brightness_variance(usual + MIN_RELATIVE_NOISE**2 * np.eye(3))[None]
         return model_error, covariances[(..., *_UPPER_TRIANGLE)]
     check = Checks(ChromophoreError)
-    check.shape("model_error", each, (*shape, 3, 3))
+    check.shape("model_error", each, (*seen.shape, 3, 3))
     each = each.reshape(-1, 3, 3)
     floor = (DEFAULT_RELATIVE_NOISE**2 if default_noise else 1e-12) + MIN_RELATIVE_NOISE**2
     triangles = np.empty((len(each), 6))
@@ -213,4 +244,17 @@ def _covariances(
         part = band[(slice(None), *_UPPER_TRIANGLE)] + brightness[:, None]
         part[:, [0, 3, 5]] += floor
         triangles[start : start + _BAND_PIXELS] = part
-    return each.mean(axis=0) if len(each) else None, triangles
+    known = each[seen.reshape(-1)]
+    return known.mean(axis=0) if len(known) else None, triangles
+
+
+def _optics_at(table: ColorTable, likely: ChromophoreMaps) -> Float64Array:
+    """Return upper triangles of the covariance by unknown optics at a fit, (n, 6)."""
+    melanin, blood = likely.melanin.reshape(-1), likely.hemoglobin.reshape(-1)
+    found = np.empty((len(melanin), 6))
+    for start in range(0, len(melanin), _BAND_PIXELS):
+        band = slice(start, start + _BAND_PIXELS)
+        c_m = np.clip(np.nan_to_num(melanin[band]), 0.0, table.c_m_max)
+        c_hd = np.clip(np.nan_to_num(blood[band]), 0.0, table.c_hd_max)
+        found[band] = table.log_covariance(c_m, c_hd)[(slice(None), *_UPPER_TRIANGLE)]
+    return found

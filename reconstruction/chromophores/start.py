@@ -25,6 +25,8 @@ START_GRID_SIZE = 256
 _SAMPLES_PER_AXIS = 384  # colors along each axis of the table that the grid is filled from
 _PLANE_MARGIN = 0.02  # fraction of the plane's extent around the table's colors
 _POLISH_STEPS = 3
+_USUAL_EXTENTS = (0.9, 0.8, 0.7, 0.6)
+"""Fractions of both axes that an unfolding direction is searched for, in this order."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +55,8 @@ def inverse_table_for(table: ColorTable, free_shading: bool) -> InverseColorTabl
     across = np.cross(by_a / rgb, by_b / rgb)
     normal = np.full(3, 1.0 / np.sqrt(3.0)) if free_shading else _unfolding_direction(across)
     facing = across @ normal
-    chosen = _light_side(facing) if free_shading else np.ones(a.shape, dtype=np.bool_)
+    folded = bool(facing.min() * facing.max() < 0.0)
+    chosen = _light_side(facing) if folded else np.ones(a.shape, dtype=np.bool_)
     plane = _plane(log_rgb[chosen], normal)
     y = log_rgb @ plane.T
     low, high = y[chosen].min(axis=0), y[chosen].max(axis=0)
@@ -102,18 +105,31 @@ def _unfolding_direction(across: Float64Array) -> Float64Array:
     """Return the unit vector that maximizes the minimum cosine to the surface's normals.
 
     All facets then project with the same orientation, so that the projection does not fold. As a
-    linear program: maximize m subject to n . d >= m for all unit normals n, |d_i| <= 1.
+    linear program: maximize m subject to n . d >= m for all unit normals n, |d_i| <= 1. A camera
+    that hardly separates blood from melanin can fold the surface in any direction; then only skin
+    of usual melanin and blood counts.
     """
-    facets = across[::8, ::8].reshape(-1, 3)
-    facets = facets / np.linalg.norm(facets, axis=1, keepdims=True)
+    facets = across[::8, ::8]
+    facets = facets / np.linalg.norm(facets, axis=-1, keepdims=True)
+    for extent in (1.0, *_USUAL_EXTENTS):
+        end = round(extent * len(facets))
+        direction, margin = _widest_cone(facets[:end, :end].reshape(-1, 3))
+        if margin > 1e-6:
+            break
+    return direction / np.linalg.norm(direction)
+
+
+def _widest_cone(facets: Float64Array) -> tuple[Float64Array, float]:
+    """Return the direction of the greatest minimum product with unit normals, and that product."""
     result = linprog(
         [0.0, 0.0, 0.0, -1.0],
         A_ub=np.c_[-facets, np.ones(len(facets))],
         b_ub=np.zeros(len(facets)),
         bounds=[(-1.0, 1.0)] * 3 + [(None, None)],
     )
-    direction = np.asarray(result.x[:3])
-    return direction / np.linalg.norm(direction)
+    if not result.x[3] > 0.0:
+        return np.asarray(facets.mean(axis=0)), 0.0
+    return np.asarray(result.x[:3]), float(result.x[3])
 
 
 def _light_side(facing: Float64Array) -> BoolArray:

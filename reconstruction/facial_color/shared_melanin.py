@@ -20,13 +20,13 @@ Jimenez et al. 2010, doi:10.1145/1866158.1866167, section 3.1
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from model.checks import Checks
-from model.color_table import ColorTable
+from model.color_table import ColorTable, with_exact_optics
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.chromophores import (
     ChromophoreError,
@@ -34,6 +34,7 @@ from reconstruction.chromophores import (
     invert,
     model_covariance,
 )
+from reconstruction.chromophores.common_optics import errors_within_face
 from reconstruction.chromophores.face import estimate_face
 from reconstruction.chromophores.inversion import DEFAULT_RELATIVE_NOISE
 from reconstruction.chromophores.pixel_checks import (
@@ -65,13 +66,17 @@ class SharedMelanin:
     melanin: Float32Array
     """Volume fraction of melanin in the epidermis; NaN where no state is usable."""
     stderr_melanin: Float32Array
-    """Its 68 % credible half-width, with noise, model error and second solutions."""
+    """Its 68 % credible half-width, with noise, model error, second solutions and optics."""
+    optics_stderr_melanin: Float32Array
+    """Part by optics that are unknown but common to all pixels."""
     noise_stderr_melanin: Float32Array
     """Part by noise alone: the difference to be expected in another set of images."""
     hemoglobin: Float32Array
     """(S, ...): volume fraction of blood in the dermis; NaN where the state is not usable."""
     stderr_hemoglobin: Float32Array
     """(S, ...): its standard error."""
+    optics_stderr_hemoglobin: Float32Array
+    """Part of it by optics that are unknown but common to all pixels and states."""
     noise_stderr_hemoglobin: Float32Array
     """(S, ...): part by noise alone."""
     change: Float32Array
@@ -177,11 +182,12 @@ def estimate_shared_melanin(
         check.require(len(shape) == 2, "shading_window_px", f"rgb {colors.shape}", "(S, H, W, 3)")
     check.within("state_variance_fraction", state_variance_fraction, "[0, 1]")
     seen = _States.of(colors, variance, valid)
+    exact = with_exact_optics(table)
     each_error, usual = _model_errors(model_error, shape, seen.usable)
     common = each_error * (1.0 - state_variance_fraction)
     least = state_variance_fraction * usual + MIN_RELATIVE_NOISE**2
     owns = _state_covariances(state_covariance, least, (states, *shape), seen.usable)
-    mean, mean_variance = _mean_color(seen, table, owns)
+    mean, mean_variance = _mean_color(seen, exact, owns)
     mean_rgb = np.exp(mean)
     error = _mean_color_covariance(owns, seen, common)
     found = estimate_face(
@@ -193,7 +199,7 @@ def estimate_shared_melanin(
         has_white=one_face,
     ).found
 
-    fit = _BloodFit(seen, mean, found, table, (common, owns), reference % states)
+    fit = _BloodFit(seen, mean, _within_face(found), exact, (common, owns), reference % states)
     free = np.zeros(seen.usable.shape, np.float32)
     of_pixels, of_states = fit(free, free)
     if shading_window_px is not None and states > 1:
@@ -207,9 +213,13 @@ def estimate_shared_melanin(
     named = {name: values.reshape(states, *shape) for name, values in of_states.items()}
     shading = np.exp(named.pop("log_shading"))
     del named["log_shading_variance"]
+    by_optics = found.optics_stderr_hemoglobin
+    named["stderr_hemoglobin"] = np.hypot(named["stderr_hemoglobin"], by_optics)
     return SharedMelanin(
         melanin=found.melanin,
         stderr_melanin=found.stderr_melanin,
+        optics_stderr_melanin=found.optics_stderr_melanin,
+        optics_stderr_hemoglobin=by_optics,
         noise_stderr_melanin=of_pixels[0].reshape(shape),
         **named,
         shading=shading,
@@ -217,6 +227,12 @@ def estimate_shared_melanin(
         valid_states=seen.usable.reshape(states, *shape) & found.valid,
         reference=reference % states,
     )
+
+
+def _within_face(found: ChromophorePosterior) -> ChromophorePosterior:
+    """Return an estimate with the error of melanin without that of common optics."""
+    within = errors_within_face(found.stderr_melanin, found.optics_stderr_melanin)
+    return replace(found, stderr_melanin=within)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,6 +20,7 @@ from model.facial_color import HemoglobinRig
 from model.skin import MAP_UNITS, SkinMap
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import model_error
+from reconstruction.chromophores.common_optics import errors_within_face
 from reconstruction.chromophores.pixel_checks import is_detectable
 from reconstruction.correspondence import expression_alignment
 from reconstruction.correspondence.expression_alignment import Alignment
@@ -196,7 +197,8 @@ def fit_facial_color(
         stderr={state: np.where(mask[state], noise[state], np.nan) for state in blood},
         stored_size=stored_size,
     )
-    good = is_detectable(shared.melanin, shared.stderr_melanin, shared.valid)
+    within = errors_within_face(shared.stderr_melanin, shared.optics_stderr_melanin)
+    good = is_detectable(shared.melanin, within, shared.valid)
     what = f"shared by {len(blood)} states"
     return FacialColorFit(
         rig=rig,
@@ -352,7 +354,7 @@ def _own_error(images: list[AlignedImage]) -> Float64Array:
 def _blood(shared: SharedMelanin, k: int) -> SkinMap:
     good = shared.valid_states[k] & ~shared.is_misfit[k]
     blood, stderr = shared.hemoglobin[k], shared.stderr_hemoglobin[k]
-    good &= is_detectable(blood, stderr, good)
+    good &= is_detectable(blood, errors_within_face(stderr, shared.optics_stderr_hemoglobin), good)
     what = "given the melanin that all states share"
     return masked_map(blood, stderr, good, MAP_UNITS["hemoglobin"], what)
 

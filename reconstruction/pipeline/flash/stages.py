@@ -19,7 +19,7 @@ from capture.calibration.store import Calibration
 from capture.session import FrameRecord, Session
 from model import color_table
 from model.checks import Checks
-from model.color_table import ColorTable
+from model.color_table import ColorTable, with_exact_optics
 from model.skin import MAP_UNITS, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import polarization
@@ -33,11 +33,12 @@ from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.masked_map import masked_map
 
-STAGE_REVISION = 7
+STAGE_REVISION = 8
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = tuple(
-    "melanin hemoglobin shading residual gamut_distance diffuse specular image specular_image "
+    "melanin melanin_optical_depth hemoglobin shading residual gamut_distance "
+    "diffuse specular image specular_image "
     "tsumura_melanin tsumura_hemoglobin melanin_noise_stderr hemoglobin_noise_stderr".split()
 )
 """Maps of a flash session."""
@@ -85,7 +86,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     table = {"camera": rig.camera, "illuminant": rig.illuminant}
     which = {"state": inputs.state, "repeat": inputs.repeat}
     by_color = table | model_error.data_hash()
-    of_skin = "melanin hemoglobin shading residual gamut_distance"
+    of_skin = "melanin melanin_optical_depth hemoglobin shading residual gamut_distance"
     of_skin += " melanin_noise_stderr hemoglobin_noise_stderr"
     both, shown = "diffuse specular", "image specular_image"
     return [
@@ -131,6 +132,9 @@ def load_skin_colors(
     camera: str, illuminant: str, *, has_white: bool
 ) -> tuple[ColorTable, ShadingPrior]:
     """Load the model of skin colors: the color table, and the prior of pixel brightness.
+
+    The table's covariance states what colors differ by where thickness, oxygenation and scattering
+    are not those of the model (`model.optics_uncertainty`).
 
     Parameters
     ----------
@@ -307,7 +311,8 @@ def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap]:
         rgb, table, prior=prior, variance=variance, model_error=errors, has_white=has_white
     )
     found, by_face = whole.found, whole.by_face
-    by_noise = partial(chromophore_posterior.estimate, rgb, table, prior=prior, variance=variance)
+    exact = with_exact_optics(table)
+    by_noise = partial(chromophore_posterior.estimate, rgb, exact, prior=prior, variance=variance)
     noise_alone = by_noise(face=whole.face)
     # the face's prior does not apply to moles, lips and eyelids, which can be other skin
     if whole.face is not None:
@@ -324,6 +329,8 @@ def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap]:
         good = is_detectable(usual, usual_error, usable & np.isfinite(noise))
         values, stderr = getattr(found, name), getattr(found, error)
         why = "invalid where noise and model error leave it unknown"
+        if name == "melanin":
+            why += f"; for an epidermis of {table.constants.epidermis_mm} mm"
         alone = "standard error by noise alone, without model error"
         return {
             name: masked_map(values, stderr, good, unit, why),
@@ -331,8 +338,18 @@ def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap]:
         }
 
     what = "relative distance of the color from the model's gamut"
+    of_melanin = chromophore("melanin")
+    factor = np.float32(table.constants.melanin_depth_factor)
+    presumed = of_melanin["melanin"]
     return {
-        **chromophore("melanin"),
+        **of_melanin,
+        "melanin_optical_depth": masked_map(
+            factor * presumed.values,
+            factor * map_stderr(presumed),
+            presumed.mask,
+            MAP_UNITS["melanin_optical_depth"],
+            "at 550 nm: volume fraction times thickness times absorption, whatever the thickness",
+        ),
         **chromophore("hemoglobin"),
         "shading": masked_map(found.shading, None, usable),
         "residual": masked_map(found.residual, None, usable),

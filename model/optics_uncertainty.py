@@ -1,0 +1,155 @@
+"""Uncertainty of skin's colors by optics that a color does not determine.
+
+Skin of one melanin optical depth and one blood volume fraction has no single color: thickness of
+the epidermis, oxygenation, scattering, baseline absorption and the kind of melanin differ between
+people and sites. These nuisance parameters have published ranges (`NUISANCES`). Their effect on the
+logarithm of a color is linearized around `model.tissue_optics.SKIN`: a covariance J P J', with the
+derivatives J at constant melanin optical depth at 550 nm and the priors' variances P. What the
+model then still leaves unexplained of measured reflectance spectra is added as the covariance of
+their residuals, by individual typology angle.
+
+The data file is made by ``tools/make_optics_uncertainty.py``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import resources
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import RectBivariateSpline
+
+from model import spectra
+from model.arrays import Float64Array
+from model.fresnel import ETA_SKIN, normal_reflectance
+
+DATA_FILE: Final = "optics_uncertainty.npz"
+COVARIANCE_NODES: Final = 33
+"""Nodes along each axis of a color table's covariance, evenly in the axes' cube roots."""
+
+
+@dataclass(frozen=True, slots=True)
+class Nuisance:
+    """A property of tissue that changes its color and is not estimated."""
+
+    name: str
+    """Field of `model.tissue_optics.TissueConstants`."""
+    low: float
+    """Lower end of the published range."""
+    high: float
+    """Upper end of the published range."""
+    is_log: bool
+    """Whether the distribution is of the logarithm."""
+    source: str
+    """Publication of the range."""
+
+    @property
+    def sd(self) -> float:
+        """Standard deviation, of the logarithm if `is_log`: the range is read as +-2 of them."""
+        ends = np.log([self.low, self.high]) if self.is_log else np.array([self.low, self.high])
+        return float(np.ptp(ends) / 4.0)
+
+
+_JACQUES = "Jacques 2013, doi:10.1088/0031-9155/58/11/R37"
+NUISANCES: Final = (
+    Nuisance("epidermis_mm", 0.05, 0.15, True, "Xu 2017, doi:10.1016/j.jaad.2017.06.009"),
+    Nuisance("oxygenation", 0.4, 0.95, False, _JACQUES),
+    Nuisance("scattering_per_mm", 2.0 * 2.97, 2.0 * 6.87, True, f"{_JACQUES}, table 1, skin"),
+    Nuisance("scattering_slope", 0.705, 2.453, False, f"{_JACQUES}, table 1, skin"),
+    Nuisance("baseline_factor", 0.5, 2.0, True, _JACQUES),
+    Nuisance("eumelanin_fraction", 0.3, 1.0, False, "Donner 2008, doi:10.1145/1409060.1409093"),
+)
+"""Nuisance parameters in the order of the stored derivatives."""
+
+
+@lru_cache(maxsize=1)
+def _stored() -> dict[str, Float64Array]:
+    source = resources.files("model").joinpath("data", DATA_FILE)
+    with source.open("rb") as stream, np.load(stream) as stored:
+        return {name: np.asarray(stored[name], dtype=np.float64) for name in stored.files}
+
+
+@lru_cache(maxsize=1)
+def _derivatives() -> Float64Array:
+    """Return d log R / d nuisance at the covariance's nodes, (n, n, nuisances, wavelengths)."""
+    gradient = _stored()["log_gradient"]
+    coarse = np.linspace(0.0, 1.0, gradient.shape[0])
+    fine = np.linspace(0.0, 1.0, COVARIANCE_NODES)
+    flat = gradient.reshape(coarse.size, coarse.size, -1)
+    found = [RectBivariateSpline(coarse, coarse, flat[..., k])(fine, fine) for k in range(flat.shape[2])]
+    return np.stack(found, axis=-1).reshape(fine.size, fine.size, *gradient.shape[2:])
+
+
+def log_color_covariance(
+    camera: str,
+    illuminant: str,
+    reflectance: Float64Array,
+    *,
+    without: Sequence[str] = (),
+    residual: bool = True,
+) -> Float64Array:
+    """Return the covariance of log color by unknown optics, per node of a color table.
+
+    Parameters
+    ----------
+    camera, illuminant
+        Names known to `model.spectra`.
+    reflectance
+        (n, n, 31): spectra of `model.tissue_optics.SKIN` at `COVARIANCE_NODES` nodes along each
+        axis of a color table, at `model.spectra.WAVELENGTH_NM`.
+    without
+        Names of nuisance parameters that are taken as exactly known.
+    residual
+        Whether to add the covariance of measured spectra's residuals.
+
+    Returns
+    -------
+    ndarray, shape (n, n, 3, 3)
+        Covariance of the natural logarithm of white-balanced camera RGB.
+    """
+    weights = spectra.band_weights(camera, illuminant)
+    color = reflectance @ weights
+    # d log color = sum over the wavelengths of (w R / color) d log R
+    share = reflectance[..., None] * weights / color[..., None, :]
+    sd = np.array([0.0 if n.name in without else n.sd for n in NUISANCES])
+    moved = np.einsum("ijkw,ijwc->ijck", _derivatives() * sd[:, None], share)
+    covariance = np.einsum("ijck,ijdk->ijcd", moved, moved)
+    if residual:
+        covariance = covariance + _residual_covariance(reflectance, share)
+    return np.asarray(covariance)
+
+
+def _residual_covariance(reflectance: Float64Array, share: Float64Array) -> Float64Array:
+    """Return the covariance of measured spectra's residuals, by each node's typology angle."""
+    stored = _stored()
+    of_band = [
+        np.einsum("kw,ijwc->ijck", factors, share) for factors in stored["residual_factors"]
+    ]
+    bands = np.stack([np.einsum("ijck,ijdk->ijcd", part, part) for part in of_band])
+    angle = typology_angle(reflectance + normal_reflectance(ETA_SKIN))
+    centers = stored["typology_angle_deg"]
+    place = np.interp(-angle, -centers, np.arange(centers.size))
+    low = np.minimum(place.astype(np.intp), centers.size - 2)
+    part = (place - low)[..., None, None]
+    i, j = np.indices(angle.shape)
+    return np.asarray((1.0 - part) * bands[low, i, j] + part * bands[low + 1, i, j])
+
+
+def typology_angle(reflectance: ArrayLike) -> Float64Array:
+    """Return the individual typology angle of spectra (..., 31) under D65, degrees, (...).
+
+    Examples
+    --------
+    >>> typology_angle(np.linspace(0.2, 0.6, 31)).round().tolist()
+    27.0
+    """
+    to_xyz = np.linalg.inv(spectra.XYZ_TO_LINEAR_SRGB)
+    rgb = spectra.band_average(reflectance, spectra.LINEAR_SRGB, "D65")
+    relative = np.maximum(rgb @ to_xyz.T / to_xyz.sum(axis=1), 1e-6)
+    linear = (841.0 / 108.0) * relative + 4.0 / 29.0
+    curved = np.where(relative > (6.0 / 29.0) ** 3, np.cbrt(relative), linear)
+    lightness = 116.0 * curved[..., 1] - 16.0
+    yellow = 200.0 * (curved[..., 1] - curved[..., 2])
+    return np.asarray(np.degrees(np.arctan2(lightness - 50.0, yellow)))
