@@ -69,9 +69,7 @@ def log_gradient() -> tuple[np.ndarray, np.ndarray]:
             ends = [usual - nuisance.sd, usual + nuisance.sd]
         if nuisance.name in ("oxygenation", "eumelanin_fraction"):
             ends = np.clip(ends, 0.0, 1.0)
-        low, high = (
-            log_reflectance(replace(SKIN, **{nuisance.name: float(end)})) for end in ends
-        )
+        low, high = (log_reflectance(replace(SKIN, **{nuisance.name: float(end)})) for end in ends)
         step = np.log(ends[1] / ends[0]) if nuisance.is_log else ends[1] - ends[0]
         found.append((high - low) / step)
         print(f"{nuisance.name}: standard deviation {nuisance.sd:.3f}", file=sys.stderr)

@@ -13,7 +13,7 @@ import numpy as np
 
 from model import spectra
 from model.color_table import SPECTRAL_NODES, STORED_ANISOTROPIES, spectral_axes
-from model.tissue_optics import two_layer_reflectance
+from model.tissue_optics import SKIN, two_layer_reflectance
 
 DIRECTIONS = {0.0: 16, 0.8: 24}
 
@@ -26,6 +26,7 @@ def main() -> None:
             spectra.WAVELENGTH_NM,
             axis_m[:, None] ** 3,
             axis_hd[None, :] ** 3,
+            constants=SKIN,
             anisotropy=anisotropy,
             directions=DIRECTIONS[anisotropy],
         )

@@ -10,13 +10,7 @@ from model.arrays import Float64Array
 from model.checks import Checks
 from model.fresnel import ETA_SKIN
 from model.tissue_optics import adding_doubling, discrete_ordinates, layered_diffusion
-from model.tissue_optics.constants import (
-    PAPERS,
-    SKIN,
-    TissueConstants,
-    TissueError,
-    with_fractions,
-)
+from model.tissue_optics.constants import PAPERS, SKIN, TissueConstants, TissueError, with_fractions
 
 Tier = Literal["adding_doubling", "diffusion"]
 
@@ -86,7 +80,8 @@ def skin_layers(
     c_m, c_hd
         Volume fractions of melanin (epidermis) and blood (dermis), broadcast together.
     constants
-        Thickness, oxygenation, scattering and pigment, see `TissueConstants`.
+        Thickness, oxygenation, scattering and pigment; `PAPERS` by default, see `SKIN` for
+        constants that agree with measured skin.
     beta_m, oxygenation
         Fractions of eumelanin and of oxygenated hemoglobin, in [0, 1]; None: the constants'.
     c_he
@@ -150,7 +145,7 @@ def two_layer_reflectance(
     anisotropy: float = 0.0,
     directions: int | None = None,
 ) -> Float64Array:
-    """Return the diffuse reflectance of skin: a thin epidermis on a deep dermis.
+    """Return the diffuse reflectance of skin: an epidermis on a deep dermis.
 
     Parameters
     ----------
@@ -160,7 +155,8 @@ def two_layer_reflectance(
         Volume fractions of melanin (epidermis) and blood (dermis), broadcast together; Jimenez
         2010, Table 1 has 0 to 0.5 and 0 to 0.32.
     constants
-        Thickness, oxygenation, scattering and pigment, see `TissueConstants`.
+        Thickness, oxygenation, scattering and pigment; `PAPERS` by default, see `SKIN` for
+        constants that agree with measured skin.
     beta_m, oxygenation
         Fractions of eumelanin and of oxygenated hemoglobin, in [0, 1]; None: the constants'.
     c_he

@@ -94,7 +94,10 @@ MELANIN_BANDS: Final = {
 def _reflectance(melanin: float, hemoglobin: float) -> Float64Array:
 
     spectrum = tissue_optics.two_layer_reflectance(
-        spectra.WAVELENGTH_NM, np.array([melanin]), np.array([hemoglobin])
+        spectra.WAVELENGTH_NM,
+        np.array([melanin]),
+        np.array([hemoglobin]),
+        constants=tissue_optics.SKIN,
     )
     found = np.asarray(spectra.band_average(spectrum, spectra.LINEAR_SRGB, "D65")[0], np.float64)
     found.setflags(write=False)

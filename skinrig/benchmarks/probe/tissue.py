@@ -7,7 +7,8 @@ import numpy as np
 
 from capture.calibration.color.colorimetry import delta_e_2000
 from model import color_table, skin_tone, spectra
-from model.tissue_optics import layers as tissue_optics
+from model.tissue_optics import SKIN, two_layer_reflectance
+from model.tissue_optics.layers import ANISOTROPY_SKIN
 from rigsim.tissue.skin_table import SkinTable
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.resampling import median_error
@@ -31,7 +32,7 @@ def measure_layered_reflectance(stage: BenchmarkStage) -> None:
     reference = truth.reflectance[rows, columns]
     stage.reference_error = float(100 * np.median(truth.standard_error[rows, columns] / reference))
     tiers: list[Knobs] = [{"tier": "diffusion"}]
-    for g in (0.0, tissue_optics.ANISOTROPY_SKIN):
+    for g in (0.0, ANISOTROPY_SKIN):
         for directions in (4, 8) if stage.toy else (4, 8, 16, 24):
             tiers.append({"tier": "adding_doubling", "g": g, "directions": directions})
 
@@ -39,7 +40,7 @@ def measure_layered_reflectance(stage: BenchmarkStage) -> None:
         options: dict[str, Any] = {"tier": "diffusion"}
         if knobs != options:
             options = {"anisotropy": float(knobs["g"]), "directions": int(knobs["directions"])}
-        return tissue_optics.two_layer_reflectance(truth.wavelength_nm, c_m, c_hd, **options)
+        return two_layer_reflectance(truth.wavelength_nm, c_m, c_hd, constants=SKIN, **options)
 
     def relative(found: Float64Array) -> Float64Array:
         return np.asarray(100 * np.abs(found / reference - 1))
@@ -59,7 +60,7 @@ def measure_color_table(stage: BenchmarkStage) -> None:
     c_m = 0.5 * rng.random(count) ** 3
     c_hd = 0.32 * rng.random(count) ** 3
     wavelength = spectra.WAVELENGTH_NM
-    direct = tissue_optics.two_layer_reflectance(wavelength, c_m, c_hd)
+    direct = two_layer_reflectance(wavelength, c_m, c_hd, constants=SKIN)
     reference = skin_tone.lab(spectra.band_average(direct, spectra.LINEAR_SRGB, "D65"))
     stage.limits = {("smallest", between): np.nan for between in ("spline", "bilinear")}
     for size in (8, 16, 32, 64) if stage.toy else (8, 16, 32, 64, 128, 256, 512, 1024):
