@@ -9,6 +9,11 @@ melanin          volume fraction of melanosomes around which skin varies, 0.001 
 blood            factor of all blood, 0.1 to 4
 freckles         0 to 1; drawn from the seed if omitted
 oil              factor of the surface fraction covered by oil, 0 to 3
+tissue_model     other properties of the skin: "skin" (typical) or "papers" (the papers' model)
+epidermis_mm     thickness of the epidermis, mm; this and the next ones replace those of the model,
+                 in the ranges of `rigsim.tissue.skin_layers.PROPERTY_RANGES`
+...              basal_melanin_fraction, epidermal_blood_ratio, oxygenation, scattering_per_mm,
+                 rayleigh_fraction, scattering_slope, baseline_amplitude, eumelanin_fraction
 mesh             file of the face's geometry, .npz or .obj
 melanin_map      texture of melanin, volume fraction of the epidermis, 0.0005 to 0.5
 hemoglobin_map   texture of blood at rest, volume fraction of the dermis, 0 to 0.31
@@ -41,9 +46,12 @@ from rigsim.subject import PRESET_NAMES, SimulatedSubject, make_subject, pigment
 from rigsim.subject.perfusion import MAX_HEMOGLOBIN, draw_perfusion
 from rigsim.subject.person_skin import MELANIN_RANGE, PersonSkin
 from rigsim.subject.skin_tone import SkinToneError, is_skin_tone, melanin_of_tone
+from rigsim.tissue.skin_layers import PAPERS, PROPERTY_RANGES, SKIN, TissueProperties
 
 SCHEMA: Final = "skinrig.subject/1"
 SUBJECT_SUFFIX: Final = ".toml"
+TISSUES: Final[Mapping[str, TissueProperties]] = {"skin": SKIN, "papers": PAPERS}
+"""Named properties of skin."""
 _FILE_KEYS: Final = ("mesh", *MAP_RANGES)
 _UNUSED_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
     "gradient": ("oil", *_FILE_KEYS),
@@ -64,6 +72,18 @@ class SubjectFile(Document):
     freckles: float | None = None
     """None: drawn."""
     oil: float = 1.0
+    tissue_model: str = "skin"
+    """One of `TISSUES`."""
+    epidermis_mm: float | None = None
+    """None: that of the model, as for the next ones."""
+    basal_melanin_fraction: float | None = None
+    epidermal_blood_ratio: float | None = None
+    oxygenation: float | None = None
+    scattering_per_mm: float | None = None
+    rayleigh_fraction: float | None = None
+    scattering_slope: float | None = None
+    baseline_amplitude: float | None = None
+    eumelanin_fraction: float | None = None
     mesh: str | None = None
     """Path; None: the procedural head."""
     melanin_map: str | None = None
@@ -77,11 +97,18 @@ class SubjectFile(Document):
         checks.check("schema", self.schema, self.schema == SCHEMA, repr(SCHEMA))
         known = ", ".join(PRESET_NAMES)
         checks.check("preset", self.preset, self.preset in PRESET_NAMES, f"one of {known}")
+        checks.check(
+            "tissue_model",
+            self.tissue_model,
+            self.tissue_model in TISSUES,
+            f"one of {', '.join(TISSUES)}",
+        )
         for name, low, high in (
             ("melanin", *MELANIN_RANGE),
             ("blood", 0.1, 4.0),
             ("freckles", 0.0, 1.0),
             ("oil", 0.0, 3.0),
+            *((name, *ends) for name, ends in PROPERTY_RANGES.items()),
         ):
             value = getattr(self, name)
             good = value is None or low <= value <= high
@@ -104,6 +131,13 @@ class SubjectFile(Document):
     def melanosome_fraction(self) -> float:
         """Volume fraction of melanosomes around which the skin varies."""
         return pigment.MELANIN_PRESETS[self.preset] if self.melanin is None else self.melanin
+
+    @property
+    def properties(self) -> TissueProperties:
+        """Properties of the skin except for melanin and blood."""
+        given = {name: getattr(self, name) for name in PROPERTY_RANGES}
+        own = {name: value for name, value in given.items() if value is not None}
+        return dataclasses.replace(TISSUES[self.tissue_model], **own)
 
     @property
     def nearest_preset(self) -> str:
@@ -170,7 +204,9 @@ class SubjectFile(Document):
                 perfusion,
                 compartments=np.asarray(perfusion.compartments * factor[..., None], np.float32),
             )
-        return dataclasses.replace(found, melanin=melanin, perfusion=perfusion, oiliness=self.oil)
+        return dataclasses.replace(
+            found, melanin=melanin, perfusion=perfusion, tissue=self.properties, oiliness=self.oil
+        )
 
     def patch(self, site: str, *, seed: int, size_mm: float) -> MicroSkin:
         """Return a patch of skin for the gradient sphere, see `make_micro_skin`."""
@@ -182,7 +218,9 @@ class SubjectFile(Document):
 
     def skin(self, *, seed: int) -> PersonSkin:
         """Return the skin that every rig simulates."""
-        return PersonSkin(self.melanosome_fraction, self.blood, seed, self.freckles)
+        return PersonSkin(
+            self.melanosome_fraction, self.blood, seed, self.freckles, self.properties
+        )
 
     def unused_keys(self, rig: str) -> tuple[str, ...]:
         """Return the given keys that have no effect in a rig."""

@@ -5,6 +5,7 @@ coefficients are evaluated independently of the estimators, so that the simulati
 equation with the estimators evaluated on it; only tabulated data are shared.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
 from typing import Final
@@ -58,11 +59,11 @@ class TissueProperties:
     melanosomes of Jacques 2013, 1; measured spectra agree with 0.6 to 0.95 alike."""
 
     def __post_init__(self) -> None:
-        for name, (low, high) in _PROPERTY_RANGES.items():
+        for name, (low, high) in PROPERTY_RANGES.items():
             _require_range(name, getattr(self, name), low, high)
 
 
-_PROPERTY_RANGES: Final = {
+PROPERTY_RANGES: Final[Mapping[str, tuple[float, float]]] = {
     "epidermis_mm": (0.03, 0.4),
     "basal_melanin_fraction": (BASAL_THICKNESS_FRACTION, 0.6),
     "epidermal_blood_ratio": (0.0, 1.0),
@@ -73,6 +74,7 @@ _PROPERTY_RANGES: Final = {
     "baseline_amplitude": (0.3, 3.0),
     "eumelanin_fraction": (0.0, 1.0),
 }
+"""Lowest and highest value of each property."""
 
 
 def _require_range(name: str, value: ArrayLike, low: float, high: float) -> None:

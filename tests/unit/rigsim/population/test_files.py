@@ -1,5 +1,6 @@
 """Subjects by a file: what it says is what the face, the patch and the tissue are made of."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -14,6 +15,7 @@ from rigsim.subject import pigment
 from rigsim.subject.perfusion import STATE_NAMES
 from rigsim.subject.person import make_subject
 from rigsim.subject.person_skin import PersonSkin
+from rigsim.tissue.skin_layers import PAPERS, SKIN
 
 SCHEMA = 'schema = "skinrig.subject/1"\n'
 
@@ -243,3 +245,20 @@ def test_a_mesh_is_named_once(person, tmp_path):
     (tmp_path / "face.obj").write_text(corners, encoding="utf-8")
     with pytest.raises(SubjectFileError, match="omit the other mesh"):
         read_subject_file(person('mesh = "face.obj"')).face(seed=0, size=64, mesh="other.obj")
+
+
+def test_properties_of_the_tissue_reach_every_rig(person):
+    ann = read_subject_file(person('tissue_model = "papers"\noxygenation = 0.5'))
+    expected = dataclasses.replace(PAPERS, oxygenation=0.5)
+    assert ann.face(seed=1, size=64).tissue == expected
+    assert ann.patch("cheek", seed=1, size_mm=0.3).skin.tissue == expected
+    top = ann.tissue(seed=1).optics("cheek", 0.0, 60.0).stacks[0].layers[0]
+    assert top.thickness_mm == expected.epidermis_mm
+    assert load_subject("III").face(seed=1, size=64).tissue == SKIN
+
+
+def test_impossible_tissue_is_refused_by_name(person):
+    with pytest.raises(SubjectFileError) as caught:
+        read_subject_file(person('tissue_model = "wax"\nepidermis_mm = 3.0'))
+    assert "tissue_model: got wax, expected one of skin, papers" in str(caught.value)
+    assert "epidermis_mm: got 3.0, expected 0.03 to 0.4" in str(caught.value)
