@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from model.skin import SkinAppearance
+from model.translucency_population import SiteMeasurement
 from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
 from reconstruction.pipeline.probe.stages import CHANNEL_NAMES, PROFILE_FILE, SUBSURFACE_FILE
 from skinrig.arrays import Float64Array
@@ -142,6 +143,31 @@ def compare_fits(appearance: SkinAppearance, truth: SkinAppearance) -> list[FitA
             found = parse_number(fit["sigma_tr_per_mm"]), parse_number(fit["sigma_tr_stderr"])
             rows.append(FitAccuracy(*known_by, sigma_tr, *found, (low, high), bool(fit["valid"])))
     return rows
+
+
+def site_measurements(name: str, fits: Mapping[str, Any]) -> list[SiteMeasurement]:
+    """Return the sites of a person with a value in every channel.
+
+    Parameters
+    ----------
+    name
+        Name of the person.
+    fits
+        Document of the fits, see `reconstruction.pipeline.probe.stages.SUBSURFACE_FILE`.
+    """
+    by_site: dict[str, list[Mapping[str, Any]]] = {}
+    for entry in fits["sites"]:
+        by_site.setdefault(entry["site"], []).append(entry)
+    return [
+        SiteMeasurement(
+            name,
+            site,
+            tuple(parse_number(entry["sigma_tr_per_mm"]) for entry in own),
+            tuple(parse_number(entry["sigma_tr_stderr"]) for entry in own),
+        )
+        for site, own in by_site.items()
+        if all(entry["sigma_tr_stderr"] is not None for entry in own)
+    ]
 
 
 @dataclass(frozen=True, slots=True)

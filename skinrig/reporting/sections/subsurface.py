@@ -9,13 +9,7 @@ import numpy as np
 
 from model import store
 from model.skin import SkinAppearance
-from model.translucency_population import (
-    PopulationTable,
-    SiteMeasurement,
-    summarize,
-    table,
-    weyrich_2005,
-)
+from model.translucency_population import PopulationTable, summarize, weyrich_2005
 from reconstruction.pipeline.probe.stages import (
     ANISOTROPY_FILE,
     CHANNEL_NAMES,
@@ -24,7 +18,7 @@ from reconstruction.pipeline.probe.stages import (
 )
 from skinrig.drawing import figures
 from skinrig.evaluating import subsurface as evaluation
-from skinrig.evaluating.subsurface import parse_number, parse_numbers, read_document
+from skinrig.evaluating.subsurface import parse_numbers, read_document, site_measurements
 from skinrig.reporting import map_images, page
 
 WIDTH_PX = 200
@@ -252,8 +246,6 @@ def _words(entry: Mapping[str, Any]) -> str:
     return words
 
 
-POPULATION_SIZE = 87
-"""Subjects of Weyrich et al. 2005."""
 MEDIUM_PREFIXES = ("homogeneous:", "anisotropic:")
 """Prefixes of the names of simulated media."""
 
@@ -280,9 +272,6 @@ def compare_people(
     if not people:
         return
     published = weyrich_2005()
-    drawn = table(
-        published.sample(POPULATION_SIZE, rng=np.random.default_rng(0)), sites=published.sites
-    )
     yield page.Heading("sigma_tr by person, 1/mm", level=2)
     yield page.build_note(
         "Standard deviations are over people. The second column of the published table has the "
@@ -294,12 +283,7 @@ def compare_people(
         pairs = zip(published.mean_per_mm[:, c], published.deviation_per_mm[:, c], strict=True)
         cells = (float(one) for pair in pairs for one in pair)
         rows.append(("published (Weyrich et al. 2005, table 2)", channel, *cells))
-    rows += _people_rows(
-        f"simulated, {POPULATION_SIZE} people drawn from the published table",
-        drawn,
-        published.sites,
-    )
-    measured = [one for name, fits in people.items() for one in _measured(name, fits)]
+    measured = [one for name, fits in people.items() for one in site_measurements(name, fits)]
     if measured:
         found = summarize(measured)
         many = "session" if len(people) == 1 else "sessions"
@@ -333,20 +317,3 @@ def _people_rows(
             row.append(float(found.deviation_per_mm[s, c]) if count > 1 else float("nan"))
         rows.append(tuple(row))
     return rows
-
-
-def _measured(name: str, fits: Mapping[str, Any]) -> list[SiteMeasurement]:
-    """Return the sites of a person with a value in every channel."""
-    by_site: dict[str, list[Mapping[str, Any]]] = {}
-    for entry in fits["sites"]:
-        by_site.setdefault(entry["site"], []).append(entry)
-    return [
-        SiteMeasurement(
-            name,
-            site,
-            tuple(parse_number(entry["sigma_tr_per_mm"]) for entry in own),
-            tuple(parse_number(entry["sigma_tr_stderr"]) for entry in own),
-        )
-        for site, own in by_site.items()
-        if all(entry["sigma_tr_stderr"] is not None for entry in own)
-    ]
