@@ -45,7 +45,8 @@ def test_van_de_hulst_slab_with_forward_scattering():
     assert ours == pytest.approx(0.09739, abs=1e-5)
 
 
-def test_the_three_layer_sample_of_mcml():
+@pytest.mark.parametrize("directions", [None, 32])
+def test_the_three_layer_sample_of_mcml(directions):
     # One million photons: the published value has a standard error of 0.0004.
     ours = layer_stack_reflectance(
         [1.0, 1.0, 2.0],
@@ -53,7 +54,7 @@ def test_the_three_layer_sample_of_mcml():
         [0.1, 0.1, 0.2],
         eta=1.37,
         anisotropy=(0.9, 0.0, 0.7),
-        directions=32,
+        directions=directions,
     )
     assert ours == pytest.approx(0.237544, abs=3 * 0.00043)
 
