@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib import resources
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +13,7 @@ from model import optics_uncertainty, spectra
 from model.arrays import Float64Array
 from model.checks import Checks
 from model.fresnel import ETA_SKIN
-from model.tissue_optics import SKIN, TissueConstants, two_layer_reflectance
+from model.tissue_optics import PAPERS, SKIN, TissueConstants, two_layer_reflectance
 from model.tissue_optics.constants import with_fractions
 from model.tissue_optics.layers import C_HD_MAX, C_M_MAX
 
@@ -22,6 +23,8 @@ COMPUTED_SPECTRAL_NODES = 29
 """Nodes along each axis when the spectral table must be computed first."""
 STORED_ANISOTROPIES = (0.0, 0.8)
 """Mean cosines g of scattering for which the spectral table is stored."""
+STORED_CONSTANTS: Final = {SKIN: "skin", PAPERS: "papers"}
+"""Names in the stored file of the constants for which the spectral table is stored."""
 _MIN_SIZE = 8
 _CHUNK_POINTS = 32_768
 
@@ -366,10 +369,11 @@ def spectral_axes(nodes: int) -> tuple[Float64Array, Float64Array]:
 @lru_cache(maxsize=8)
 def _log_spectra(anisotropy: float, constants: TissueConstants, eta: float) -> Float64Array:
     """Return log reflectance over (C_m, C_hd, wavelength), stored or computed."""
-    if (constants, eta) == (SKIN, ETA_SKIN) and anisotropy in STORED_ANISOTROPIES:
+    name = STORED_CONSTANTS.get(constants)
+    if name is not None and eta == ETA_SKIN and anisotropy in STORED_ANISOTROPIES:
         source = resources.files("model").joinpath("data", "two_layer_reflectance.npz")
         with source.open("rb") as stream, np.load(stream) as stored:
-            return np.asarray(stored[f"log_reflectance_g{anisotropy:g}"], dtype=np.float64)
+            return np.asarray(stored[f"{name}_g{anisotropy:g}"], dtype=np.float64)
     u, v = spectral_axes(COMPUTED_SPECTRAL_NODES)
     reflectance = two_layer_reflectance(
         spectra.WAVELENGTH_NM,

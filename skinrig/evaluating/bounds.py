@@ -18,7 +18,7 @@ def chromophore_bounds(
     The bound is the inverse of the Fisher information of a pixel's three channels about both cube
     roots and the log of the light, at the true chromophores. It includes the noise variance of the
     diffuse image, the model error, and the variance of the light's prior, but not the prior's
-    shape.
+    shape, nor unknown optics, which move all pixels of a face together.
 
     Parameters
     ----------
@@ -41,7 +41,10 @@ def chromophore_bounds(
     if wanted[0] is None or wanted[1] is None:
         return {}
     table = color_table.build(
-        str(built["camera"]), str(built["illuminant"]), anisotropy=ANISOTROPY_SKIN
+        str(built["camera"]),
+        str(built["illuminant"]),
+        anisotropy=ANISOTROPY_SKIN,
+        exact_optics=True,  # common to the face
     )
     c_m, c_hd = (m.values.astype(np.float64) for m in wanted if m is not None)
     with np.errstate(invalid="ignore"):
@@ -73,7 +76,7 @@ def relative_bounds(
     Parameters
     ----------
     table
-        Color table.
+        Color table; its covariance by unknown optics is included.
     c_m, c_hd
         (n,) true volume fractions, above 0.
     relative_variance
@@ -88,6 +91,7 @@ def relative_bounds(
     gradient = table.jacobian(c_m, c_hd) / color[..., None]
     gradient = gradient * np.stack([c_m, c_hd], axis=-1)[:, None, :]
     known = model_scale * model_error.load_covariance() + log_shading_std**2
+    known = known + table.log_covariance(c_m, c_hd)
     covariance = relative_variance[..., None] * np.eye(3) + known
     fisher = np.swapaxes(gradient, -1, -2) @ np.linalg.solve(covariance, gradient)
     aa, ab, bb = fisher[:, 0, 0], fisher[:, 0, 1], fisher[:, 1, 1]

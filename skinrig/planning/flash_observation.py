@@ -50,7 +50,7 @@ class FlashObservation:
     shares: Float64Array
     """(3,) ratio of a superpixel's variance to a sensor pixel's, per channel."""
     table: Any
-    """Color table of the camera and the light."""
+    """Color table of the camera and the light, for errors within a face: with exact optics."""
     log_light_sd: float
     """Standard deviation of log illumination under the prior alone."""
     mixing: float = 1.0
@@ -84,7 +84,10 @@ def simulate_observation(
     )
     bare = np.asarray(truth["mask"], bool) & (np.asarray(truth["melanin"]) > 0)
     table = color_table.build(
-        view.spectral_sensitivity, small.lights[0].illuminant, anisotropy=ANISOTROPY_SKIN
+        view.spectral_sensitivity,
+        small.lights[0].illuminant,
+        anisotropy=ANISOTROPY_SKIN,
+        exact_optics=True,
     )
     melanin, hemoglobin = (
         to_superpixels(np.asarray(truth[f"{name}_blurred"], np.float64), bare)

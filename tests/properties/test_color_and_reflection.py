@@ -26,7 +26,9 @@ VECTOR = st.tuples(*[st.floats(-1.0, 1.0)] * 3)
 
 @pytest.fixture(scope="module")
 def table():
-    return color_table.build("Nikon 5100 (NPL)", "D55", size=32, anisotropy=ANISOTROPY_SKIN)
+    return color_table.build(
+        "Nikon 5100 (NPL)", "D55", size=32, anisotropy=ANISOTROPY_SKIN, exact_optics=True
+    )
 
 
 def unit(vector):

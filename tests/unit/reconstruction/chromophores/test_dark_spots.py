@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from model import color_table
+from model.tissue_optics import PAPERS
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import shading_prior
 from reconstruction.chromophores.dark_spots import (
@@ -21,7 +22,9 @@ SIDE = 90
 
 @pytest.fixture(scope="module")
 def table():
-    return color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
+    return color_table.build(
+        "Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN, constants=PAPERS, exact_optics=True
+    )
 
 
 def smooth(rng, shape, length):
@@ -201,7 +204,9 @@ def test_non_skin_is_not_spot_and_is_ignored():
 
 def pixels(count):
     """Weigh some pixels of one color."""
-    table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
+    table = color_table.build(
+        "Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN, constants=PAPERS, exact_optics=True
+    )
     return estimate(np.full((count, 3), 0.3), table, prior=shading_prior.face_prior())
 
 

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from twins import chromophores as chromophore_reference
 
 from model import color_table
+from model.tissue_optics import PAPERS
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from reconstruction.chromophores import inversion as chromophores
 from reconstruction.chromophores.inversion import ChromophoreError, compute_identifiability, invert
@@ -17,7 +18,9 @@ MODES = [None, "known"]
 
 @pytest.fixture(scope="module")
 def table():
-    return color_table.build(CAMERA, "xenon flash", anisotropy=ANISOTROPY_SKIN)
+    return color_table.build(
+        CAMERA, "xenon flash", anisotropy=ANISOTROPY_SKIN, constants=PAPERS, exact_optics=True
+    )
 
 
 def grid_of_skin(size, lowest=0.001):
@@ -39,7 +42,9 @@ def weights_of(variance_relative, free):
 @pytest.mark.parametrize("light", ["xenon flash", "D65", "A"])
 @pytest.mark.parametrize("shading", MODES)
 def test_round_trip_is_exact_where_skin_is_determined(shading, light):
-    table = color_table.build(CAMERA, light, anisotropy=ANISOTROPY_SKIN)
+    table = color_table.build(
+        CAMERA, light, anisotropy=ANISOTROPY_SKIN, constants=PAPERS, exact_optics=True
+    )
     c_m, c_hd = grid_of_skin(160)
     maps = invert(table.lookup(c_m, c_hd), table, shading=shading)
     told = maps.valid & maps.identifiable  # standard errors below 100 % at 1 % noise

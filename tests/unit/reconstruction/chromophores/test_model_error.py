@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from model import color_table
+from model.tissue_optics import PAPERS
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error
 from reconstruction.chromophores.inversion import ChromophoreError
@@ -17,7 +18,9 @@ SIZE = 48
 
 @pytest.fixture(scope="module")
 def table():
-    return color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
+    return color_table.build(
+        "Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN, constants=PAPERS, exact_optics=True
+    )
 
 
 def picture(table, melanin=0.02, shading=1.0):

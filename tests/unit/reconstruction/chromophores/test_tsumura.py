@@ -14,7 +14,9 @@ def make_skin(rng, contrast):
     shape = SHAPE
     melanin = 0.03 * np.exp(0.5 * contrast * rng.laplace(size=shape))
     hemoglobin = 0.03 * np.exp(0.4 * contrast * rng.laplace(size=shape))
-    table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
+    table = color_table.build(
+        "Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN, exact_optics=True
+    )
     light = rng.uniform(0.2, 1.0, shape)
     color = table.lookup(np.clip(melanin, 0, 0.4), np.clip(hemoglobin, 0, 0.3))
     return melanin, hemoglobin, color * light[..., None]

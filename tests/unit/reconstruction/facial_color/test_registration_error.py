@@ -156,7 +156,9 @@ def test_misplaced_face_coverage_requires_registration_error(rng):
     Expected: at least the 68 % of the interval, less 8 for the texture of one face; without the
     error of place far less.
     """
-    table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
+    table = color_table.build(
+        "Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN, exact_optics=True
+    )
     blood = 0.03 * np.exp(0.25 * _texture(rng))
     melanin = 0.015 * np.exp(0.15 * _texture(rng))
     clean = 0.7 * table.lookup(melanin, blood)

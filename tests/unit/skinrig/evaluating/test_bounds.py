@@ -13,7 +13,7 @@ CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"
 
 @pytest.fixture(scope="module")
 def table():
-    return color_table.build(CAMERA, LIGHT, anisotropy=ANISOTROPY_SKIN)
+    return color_table.build(CAMERA, LIGHT, anisotropy=ANISOTROPY_SKIN, exact_optics=True)
 
 
 def test_nearly_unknown_shading_has_bound_of_free_shading(table):
