@@ -45,7 +45,7 @@ from rigsim.subject import SimulatedSubject, face_regions, pigment, relief
 from rigsim.subject.head import build_head
 from rigsim.subject.perfusion import draw_perfusion
 from rigsim.subject.person import SIZE_RANGE
-from rigsim.subject.person_skin import PersonSkin
+from rigsim.subject.person_skin import PersonSkin, draw_tissue
 
 HEAD_SHAPES: Final = 6
 """Number of head shapes that the members share."""
@@ -132,7 +132,9 @@ class Member:
     @property
     def skin(self) -> PersonSkin:
         """The person's skin without conditions."""
-        return PersonSkin(self.melanin, self.blood, self.seed, self.freckles)
+        return PersonSkin(
+            self.melanin, self.blood, self.seed, self.freckles, draw_tissue(self.seed)
+        )
 
     def face(self, size: int = 256) -> SimulatedSubject:
         """Return the face, without conditions (see `surface`).
@@ -182,6 +184,7 @@ class Member:
             beard=relief.stubble_map(
                 points, regions, self.beard, atlas.typical_texel_mm(), seed=self.seed
             ),
+            tissue=draw_tissue(self.seed),
             oiliness=self.oil,
         )
 

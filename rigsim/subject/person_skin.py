@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import exp
 from typing import Final
@@ -16,7 +16,7 @@ from rigsim.subject import pigment
 from rigsim.subject.face_regions import region_masks
 from rigsim.subject.head import LANDMARKS_MM
 from rigsim.subject.perfusion import draw_perfusion
-from rigsim.tissue.skin_layers import SKIN, TissueProperties, skin_layer_stack
+from rigsim.tissue.skin_layers import PROPERTY_RANGES, SKIN, TissueProperties, skin_layer_stack
 from rigsim.tissue.tissue_mc import LayerStack
 
 MELANIN_RANGE: Final = (0.001, 0.45)
@@ -32,6 +32,18 @@ _ABDOMEN_MELANIN_STEP: Final = -0.2
 _ABDOMEN_BLOOD_RATIO: Final = 0.45
 """Blood of the abdomen over that of the face between its regions: that of arms, median over 1,600
 people (Lu et al. 2025, doi:10.1038/s41597-025-04857-5)."""
+
+
+_TISSUE_DEVIATIONS: Final[Mapping[str, tuple[float, bool]]] = {
+    "oxygenation": (0.07, False),
+    "scattering_per_mm": (0.10, True),
+    "scattering_slope": (0.22, False),
+    "baseline_amplitude": (0.17, True),
+    "eumelanin_fraction": (0.09, False),
+}
+"""Standard deviations over people, of the logarithm where True. They are half of those that Jacques
+2013, doi:10.1088/0031-9155/58/11/R37, and Donner et al. 2008 give, which include differences
+of method; this project's choice."""
 
 
 class PersonSkinError(ValueError):
@@ -77,7 +89,7 @@ class PersonSkin:
 
     @classmethod
     def of_preset(cls, preset: str, *, seed: int = 0, blood: float = 1.0) -> PersonSkin:
-        """Return the skin of a preset of `rigsim.subject.pigment.MELANIN_PRESETS`.
+        """Return typical skin of a preset of `rigsim.subject.pigment.MELANIN_PRESETS`.
 
         Raises
         ------
@@ -148,6 +160,32 @@ def _disc(landmark: str, height_mm: float, slope_x: float, slope_y: float) -> Fl
     disc = np.stack([x, y, height_mm + slope_x * x + slope_y * y], axis=-1)
     inside = np.hypot(x, y) <= SITE_RADIUS_MM
     return np.asarray(disc[inside] + np.array(LANDMARKS_MM[landmark]), np.float32)
+
+
+def draw_tissue(seed: int, typical: TissueProperties = SKIN) -> TissueProperties:
+    """Draw the properties of a person's skin except for melanin and blood.
+
+    Parameters
+    ----------
+    seed
+        Seed of the person, >= 0.
+    typical
+        Properties around which people vary. The thickness does not vary: color depends on it by
+        the melanin per area, which is the person's.
+
+    Examples
+    --------
+    >>> draw_tissue(1) == draw_tissue(1), draw_tissue(1) == draw_tissue(2)
+    (True, False)
+    """
+    rng = np.random.default_rng([seed, 0x7469])
+    drawn = {}
+    for name, (deviation, of_logarithm) in _TISSUE_DEVIATIONS.items():
+        step = deviation * float(np.clip(rng.standard_normal(), -2.5, 2.5))
+        value = getattr(typical, name)
+        value = value * exp(step) if of_logarithm else value + step
+        drawn[name] = float(np.clip(value, *PROPERTY_RANGES[name]))
+    return replace(typical, **drawn)
 
 
 def layers(person: PersonSkin, site: str, state: str, wavelength_nm: float) -> LayerStack:
