@@ -78,7 +78,9 @@ def _derivatives() -> Float64Array:
     coarse = np.linspace(0.0, 1.0, gradient.shape[0])
     fine = np.linspace(0.0, 1.0, COVARIANCE_NODES)
     flat = gradient.reshape(coarse.size, coarse.size, -1)
-    found = [RectBivariateSpline(coarse, coarse, flat[..., k])(fine, fine) for k in range(flat.shape[2])]
+    found = [
+        RectBivariateSpline(coarse, coarse, flat[..., k])(fine, fine) for k in range(flat.shape[2])
+    ]
     return np.stack(found, axis=-1).reshape(fine.size, fine.size, *gradient.shape[2:])
 
 
@@ -124,9 +126,7 @@ def log_color_covariance(
 def _residual_covariance(reflectance: Float64Array, share: Float64Array) -> Float64Array:
     """Return the covariance of measured spectra's residuals, by each node's typology angle."""
     stored = _stored()
-    of_band = [
-        np.einsum("kw,ijwc->ijck", factors, share) for factors in stored["residual_factors"]
-    ]
+    of_band = [np.einsum("kw,ijwc->ijck", factors, share) for factors in stored["residual_factors"]]
     bands = np.stack([np.einsum("ijck,ijdk->ijcd", part, part) for part in of_band])
     angle = typology_angle(reflectance + normal_reflectance(ETA_SKIN))
     centers = stored["typology_angle_deg"]

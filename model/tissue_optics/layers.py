@@ -10,12 +10,7 @@ from model.arrays import Float64Array
 from model.checks import Checks
 from model.fresnel import ETA_SKIN
 from model.tissue_optics import adding_doubling, layered_diffusion
-from model.tissue_optics.constants import (
-    SKIN,
-    TissueConstants,
-    TissueError,
-    with_fractions,
-)
+from model.tissue_optics.constants import SKIN, TissueConstants, TissueError, with_fractions
 
 Tier = Literal["adding_doubling", "diffusion"]
 
