@@ -188,7 +188,10 @@ def main() -> None:
     rigs = [load_rig("flash").resized(width) for width in WIDTHS_PX]
     view = rigs[-1].views[0]
     table = color_table.build(
-        view.spectral_sensitivity, rigs[-1].lights[0].illuminant, anisotropy=ANISOTROPY_SKIN
+        view.spectral_sensitivity,
+        rigs[-1].lights[0].illuminant,
+        anisotropy=ANISOTROPY_SKIN,
+        exact_optics=True,
     )
     whites = [seen_by(FlashScene(rig, make_target("white")), view.cfa) for rig in rigs]
     rng = np.random.default_rng(0)

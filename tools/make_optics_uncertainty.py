@@ -17,7 +17,7 @@ Without SPECTRA, the stored residuals stay.
 
 from __future__ import annotations
 
-import hashlib
+import itertools
 import os
 import sys
 from dataclasses import replace
@@ -33,14 +33,17 @@ from model.fresnel import ETA_SKIN, normal_reflectance
 from model.optics_uncertainty import NUISANCES
 from model.tissue_optics import SKIN, two_layer_reflectance
 from model.tissue_optics.layers import ANISOTROPY_SKIN
+from skinrig.benchmarks.flash_rig.independent_skin import sets_residuals
 
 NODES = 17
 BANDS_DEG = (np.inf, 55.0, 41.0, 28.0, 10.0, -30.0, -np.inf)
 PER_BAND = 600
 FACTORS = 6
 DARKEST = 0.005
-"""Reflectance without the specular part below which a spectrum is not used: the subtraction's relative
-error dominates there (5 % of type VI, 0.6 % of V)."""
+"""Reflectance without the specular part below which a spectrum is not used.
+
+The subtraction's relative error dominates there (5 % of type VI, 0.6 % of V).
+"""
 TARGET = Path(__file__).resolve().parents[1] / "model/data" / optics_uncertainty.DATA_FILE
 
 
@@ -93,11 +96,6 @@ def read_spectra(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(reflectance, np.float64), np.array(subjects)
 
 
-def is_setting(subject: str) -> bool:
-    """Return whether a subject sets the residuals; the others judge."""
-    return int(hashlib.sha256(f"2025:{subject}".encode()).hexdigest(), 16) % 2 == 0
-
-
 class LinearModel:
     """Log spectra and their derivatives, interpolated in the cube roots of the fractions."""
 
@@ -147,14 +145,14 @@ def residual_factors(path: Path, log_r, gradient) -> tuple[np.ndarray, np.ndarra
     specular = normal_reflectance(ETA_SKIN)
     usable = np.isfinite(reflectance).all(axis=1)
     usable &= np.nan_to_num(reflectance).min(axis=1) > specular + DARKEST
-    usable &= np.array([is_setting(str(s)) for s in subjects])
+    usable &= np.array([sets_residuals(str(s)) for s in subjects])
     reflectance = reflectance[usable]
     angle = optics_uncertainty.typology_angle(reflectance)
     model = LinearModel(log_r, gradient)
     prior = np.diag([n.sd**2 for n in NUISANCES])
     rng = np.random.default_rng(0)
     factors, angles = [], []
-    for high, low in zip(BANDS_DEG[:-1], BANDS_DEG[1:], strict=True):
+    for high, low in itertools.pairwise(BANDS_DEG):
         of_band = np.flatnonzero((angle <= high) & (angle > low))
         chosen = rng.choice(of_band, min(PER_BAND, of_band.size), replace=False)
         seen = np.log(reflectance[chosen] - specular)

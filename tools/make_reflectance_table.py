@@ -3,8 +3,9 @@
 Run from the repository root; takes about a minute. The grid is uniform in the cube roots of
 melanin and dermal blood (Jimenez 2010, eq. 7) over Table 1's ranges, at 400 to 700 nm in steps of
 10; stored is the logarithm of the accurate tier's reflectance, for the paper's scattering (g = 0)
-and for skin's (g = 0.8), each with the constants of skin and of the papers. Cubic interpolation between the nodes is within 5e-5 of the tier itself;
-tests/unit/model/test_color_table.py checks that on random points.
+and for skin's (g = 0.8), each with the constants of skin and of the papers. Cubic interpolation
+between the nodes is within 5e-5 of the tier itself; tests/unit/model/test_color_table.py checks
+that on random points.
 """
 
 from pathlib import Path
@@ -12,12 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from model import spectra
-from model.color_table import (
-    SPECTRAL_NODES,
-    STORED_ANISOTROPIES,
-    STORED_CONSTANTS,
-    spectral_axes,
-)
+from model.color_table import SPECTRAL_NODES, STORED_ANISOTROPIES, STORED_CONSTANTS, spectral_axes
 from model.tissue_optics import two_layer_reflectance
 
 DIRECTIONS = {0.0: 16, 0.8: 24}

@@ -223,7 +223,10 @@ def estimate_face(
     errors: dict[str, Any] = {"variance": variance, "model_error": model_error}
     exact = with_exact_optics(table)
     known = partial(chromophore_posterior.estimate, rgb, exact, prior=prior, **errors)
-    with_optics = partial(add_optics_errors, rgb=rgb, table=table, log_light_sd=prior.sd, **errors)
+
+    def with_optics(found: ChromophorePosterior) -> ChromophorePosterior:
+        return add_optics_errors(found, rgb, table, log_light_sd=prior.sd, **errors)
+
     face = None
     if has_white:
         face = fit_with_white_reference(rgb, table, **errors)

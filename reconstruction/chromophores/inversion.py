@@ -140,8 +140,8 @@ def invert(
     variance
         Noise variance of `rgb`, broadcast to its shape. None: 1 percent of each channel.
     model_error
-        Further relative error, such as of a rig, added to the noise: a standard error, one per channel,
-        or a (3, 3) covariance. A covariance with s^2 in all its cells limits the knowledge of the
+        Further relative error, such as a rig's, added to the noise: a standard error, one per
+        channel, or a (3, 3) covariance. A covariance with s^2 in all its cells limits the knowledge of the
         shading to the relative standard error s; where s is above some 10 percent, skin has two
         solutions, which `reconstruction.chromophores.posterior` weights. None: 0.
     valid

@@ -106,7 +106,7 @@ def _not_a_number(real: InputPrecision) -> str:
 
 
 def _table() -> ColorTable:
-    return color_table.build("Nikon 5100 (NPL)", "D55", size=32)
+    return color_table.build("Nikon 5100 (NPL)", "D55", size=32, exact_optics=True)
 
 
 def _black_pixels(real: InputPrecision) -> str:

@@ -15,6 +15,7 @@ from capture.plan import Plan, flash_plan
 from capture.rig import Rig
 from model.skin import SkinAppearance
 from reconstruction.chromophores.pixel_checks import is_detectable
+from reconstruction.chromophores.separability import assess_camera
 from reconstruction.pipeline.flash.stages import MIN_SIGNAL_SIGMAS
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.evaluating import flash
@@ -270,6 +271,9 @@ def _choice(
         "valid_share": {name: found.valid_share(name) for name in CHROMOPHORE_NAMES},
     }
     full_s = flash_plan(rig, repeats=max(int(own["repeats"]), 1)).estimate_duration_s(rig)
+    camera = assess_camera(rig.views[0].spectral_sensitivity, rig.lights[0].illuminant)
+    if camera.loses:
+        reasons = (*reasons, camera.summary())
     return PlanChoice(rig, plan, forecasts, full_s, knobs, left_out, path, reasons, flashes)
 
 

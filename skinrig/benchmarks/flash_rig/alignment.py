@@ -106,7 +106,9 @@ class DisplacedFace:
 
 def load_color_table() -> ColorTable:
     """Build the color table from which the images are synthesized."""
-    return color_table.build(TABLE_CAMERA, TABLE_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
+    return color_table.build(
+        TABLE_CAMERA, TABLE_ILLUMINANT, anisotropy=ANISOTROPY_SKIN, exact_optics=True
+    )
 
 
 def face_mask(side: int) -> BoolArray:

@@ -119,7 +119,9 @@ def _chromophores(
 ) -> Iterator[tuple[str, EstimatorTrial]]:
     index = 0 if name == "melanin" else 1
 
-    table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
+    table = color_table.build(
+        "Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN, exact_optics=True
+    )
 
     def squared(noisy: Float64Array, sigma: Float64Array, true: float) -> Float64Array:
         found = chromophores.invert(

@@ -148,7 +148,9 @@ def noise_by_band() -> dict[str, float]:
 
     From the Cramér-Rao bound of hemoglobin at equal electrons of a white pixel.
     """
-    table = color_table.build("Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN)
+    table = color_table.build(
+        "Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN, exact_optics=True
+    )
     found = {}
     for name, band in MELANIN_BANDS.items():
         at = np.array([band.melanin, band.hemoglobin])

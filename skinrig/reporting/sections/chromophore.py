@@ -164,7 +164,7 @@ def draw_identifiability(appearances: Iterable[SkinAppearance]) -> Iterator[page
     yield page.Heading("Identifiability of chromophores", level=2)
     yield page.build_note(
         "Cramér-Rao bound on the relative standard uncertainty of an unbiased estimator, for "
-        f"{100 * IDENTIFIABILITY_NOISE:g} % noise per channel and the model error."
+        f"{100 * IDENTIFIABILITY_NOISE:g} % noise per channel, the model error, and unknown optics."
     )
     for camera, illuminant in sorted(tables):
         yield page.Heading(f"{camera}, {illuminant}")
