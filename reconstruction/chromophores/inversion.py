@@ -141,9 +141,10 @@ def invert(
         Noise variance of `rgb`, broadcast to its shape. None: 1 percent of each channel.
     model_error
         Further relative error, such as a rig's, added to the noise: a standard error, one per
-        channel, or a (3, 3) covariance. A covariance with s^2 in all its cells limits the knowledge of the
-        shading to the relative standard error s; where s is above some 10 percent, skin has two
-        solutions, which `reconstruction.chromophores.posterior` weights. None: 0.
+        channel, or a (3, 3) covariance. A covariance with s^2 in all its cells limits the
+        knowledge of the shading to the relative standard error s; where s is above some 10
+        percent, skin has two solutions, which `reconstruction.chromophores.posterior` weights.
+        None: 0.
     valid
         Shape (...): False where a pixel is saturated or masked otherwise. None: all may be used.
     shading_max
