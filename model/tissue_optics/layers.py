@@ -10,7 +10,12 @@ from model.arrays import Float64Array
 from model.checks import Checks
 from model.fresnel import ETA_SKIN
 from model.tissue_optics import adding_doubling, layered_diffusion
-from model.tissue_optics.constants import SKIN, TissueConstants, TissueError, with_fractions
+from model.tissue_optics.constants import (
+    SKIN_CONSTANTS,
+    TissueConstants,
+    TissueError,
+    with_fractions,
+)
 
 Tier = Literal["adding_doubling", "diffusion"]
 
@@ -33,7 +38,7 @@ _check = Checks(TissueError).within
 
 
 def blood_absorption(
-    wavelength_nm: ArrayLike, *, oxygenation: float = SKIN.oxygenation
+    wavelength_nm: ArrayLike, *, oxygenation: float = SKIN_CONSTANTS.oxygenation
 ) -> Float64Array:
     """Return the absorption of whole blood with 150 g/l of hemoglobin.
 
@@ -66,7 +71,7 @@ def skin_layers(
     c_m: ArrayLike,
     c_hd: ArrayLike,
     *,
-    constants: TissueConstants = SKIN,
+    constants: TissueConstants = SKIN_CONSTANTS,
     beta_m: float | None = None,
     c_he: ArrayLike | None = None,
     oxygenation: float | None = None,
@@ -135,7 +140,7 @@ def two_layer_reflectance(
     c_m: ArrayLike,
     c_hd: ArrayLike,
     *,
-    constants: TissueConstants = SKIN,
+    constants: TissueConstants = SKIN_CONSTANTS,
     beta_m: float | None = None,
     c_he: ArrayLike | None = None,
     oxygenation: float | None = None,
