@@ -282,7 +282,7 @@ def build(
     --------
     >>> table = build("Nikon 5100 (NPL)", "D65")
     >>> table.lookup(0.02, 0.02).round(2).tolist()
-    [0.4, 0.26, 0.22]
+    [0.35, 0.25, 0.22]
     """
     if not isinstance(size, int | np.integer) or size < _MIN_SIZE:
         raise ColorTableError(
@@ -353,7 +353,7 @@ def spectral_reflectance(
     Examples
     --------
     >>> spectral_reflectance(0.02, 0.02)[[5, 15, 25]].round(2).tolist()
-    [0.17, 0.2, 0.34]
+    [0.19, 0.24, 0.46]
     """
     melanin, blood = Checks(ColorTableError).broadcast_together(c_m=c_m, c_hd=c_hd)
     for name, values, most in (("c_m", melanin, C_M_MAX), ("c_hd", blood, C_HD_MAX)):

@@ -108,10 +108,11 @@ def skin_layers(
     """
     melanin, dermal = np.asarray(c_m, dtype=np.float64), np.asarray(c_hd, dtype=np.float64)
     constants = with_fractions(constants, beta_m, oxygenation)
+    for name, share in (("c_m", melanin), ("c_hd", dermal)):
+        _check(name, share, "[0, 1]")
     ratio = constants.epidermal_blood_ratio
     epidermal = ratio * dermal if c_he is None else np.asarray(c_he, dtype=np.float64)
-    for name, share in (("c_m", melanin), ("c_hd", dermal), ("c_he", epidermal)):
-        _check(name, share, "[0, 1]")
+    _check("c_he", epidermal, "[0, 1]")
     melanin, dermal, epidermal = np.broadcast_arrays(melanin, dermal, epidermal)
     _check("c_m + c_he", melanin + epidermal, "[0, 1]")
     wavelength = np.asarray(wavelength_nm, dtype=np.float64)
@@ -192,7 +193,7 @@ def two_layer_reflectance(
     --------
     >>> r = two_layer_reflectance([450.0, 550.0, 650.0], 0.02, 0.02)
     >>> r.round(2).tolist()
-    [0.17, 0.2, 0.34]
+    [0.19, 0.24, 0.46]
     """
     sigma_a, sigma_s_prime, thickness = skin_layers(
         wavelength_nm,

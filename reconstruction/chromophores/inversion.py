@@ -185,7 +185,7 @@ def invert(
     Examples
     --------
     >>> from model import color_table
-    >>> table = color_table.build("Nikon 5100 (NPL)", "D65")
+    >>> table = color_table.build("Nikon 5100 (NPL)", "D65", exact_optics=True)
     >>> maps = invert(0.8 * table.lookup([[0.02, 0.03]], [[0.05, 0.02]]), table)
     >>> [f"{value:.4f}" for value in maps.melanin[0]]
     ['0.0200', '0.0300']
@@ -290,9 +290,9 @@ def compute_identifiability(
     Examples
     --------
     >>> from model import color_table
-    >>> bounds = compute_identifiability(color_table.build("Nikon 5100 (NPL)", "D65"),
-    ...     shading="known")
-    >>> darker = np.searchsorted(bounds.c_m, 0.1), np.searchsorted(bounds.c_hd, 0.02)
+    >>> table = color_table.build("Nikon 5100 (NPL)", "D65", exact_optics=True)
+    >>> bounds = compute_identifiability(table, shading="known")
+    >>> darker = np.searchsorted(bounds.c_m, 0.4), np.searchsorted(bounds.c_hd, 0.002)
     >>> bool(bounds.stderr_melanin[darker] < 0.1), bool(bounds.hemoglobin_identifiable[darker])
     (True, False)
     """

@@ -142,8 +142,8 @@ def estimate(
     --------
     >>> from model import color_table
     >>> from reconstruction.chromophores.shading_prior import lognormal_prior
-    >>> table = color_table.build("Nikon 5100 (NPL)", "D65")
-    >>> color = 0.8 * table.lookup([[0.01, 0.02]], [[0.05, 0.05]])
+    >>> table = color_table.build("Nikon 5100 (NPL)", "D65", exact_optics=True)
+    >>> color = 0.8 * table.lookup([[0.01, 0.02]], [[0.02, 0.02]])
     >>> prior = lognormal_prior(0.7, 0.6)
     >>> found = estimate(color, table, prior=prior, variance=(1e-3 * color) ** 2)
     >>> [f"{value:.3f}" for value in found.melanin[0]]

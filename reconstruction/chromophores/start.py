@@ -55,8 +55,8 @@ def inverse_table_for(table: ColorTable, free_shading: bool) -> InverseColorTabl
     across = np.cross(by_a / rgb, by_b / rgb)
     normal = np.full(3, 1.0 / np.sqrt(3.0)) if free_shading else _unfolding_direction(across)
     facing = across @ normal
-    folded = bool(facing.min() * facing.max() < 0.0)
-    chosen = _light_side(facing) if folded else np.ones(a.shape, dtype=np.bool_)
+    most = np.sign(np.median(facing))
+    chosen = _light_side(facing) if free_shading else facing * most > 0.0
     plane = _plane(log_rgb[chosen], normal)
     y = log_rgb @ plane.T
     low, high = y[chosen].min(axis=0), y[chosen].max(axis=0)
@@ -141,6 +141,8 @@ def _light_side(facing: Float64Array) -> BoolArray:
     same = facing * np.sign(np.median(corner)) > 0.0
     regions, _ = ndimage.label(np.logical_and.accumulate(same, axis=0))
     seed = regions[: _SAMPLES_PER_AXIS // 8, _SAMPLES_PER_AXIS // 4 : _SAMPLES_PER_AXIS // 2]
+    if not seed.any():  # a coarse table is folded at its lightest skin too
+        return np.asarray(same)
     return np.asarray(regions == np.bincount(seed[seed > 0]).argmax())
 
 

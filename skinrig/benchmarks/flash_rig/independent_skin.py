@@ -219,7 +219,7 @@ def sets_residuals(subject: str) -> bool:
 
     Examples
     --------
-    >>> sum(sets_residuals(f"1-{k}") for k in range(1000)) // 100
-    5
+    >>> 450 < sum(sets_residuals(f"1-{k}") for k in range(1000)) < 550
+    True
     """
     return int(hashlib.sha256(f"2025:{subject}".encode()).hexdigest(), 16) % 2 == 0
