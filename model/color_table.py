@@ -9,11 +9,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline, RectBivariateSpline
 
-from model import optics_uncertainty, spectra
+from model import spectra
 from model.arrays import Float64Array
 from model.checks import Checks
 from model.fresnel import ETA_SKIN
-from model.tissue_optics import PAPERS, SKIN, TissueConstants, two_layer_reflectance
+from model.tissue_optics import (
+    PAPER_CONSTANTS,
+    SKIN_CONSTANTS,
+    TissueConstants,
+    two_layer_reflectance,
+)
+from model.tissue_optics import uncertainty as optics_uncertainty
 from model.tissue_optics.constants import with_fractions
 from model.tissue_optics.layers import C_HD_MAX, C_M_MAX
 
@@ -23,7 +29,7 @@ COMPUTED_SPECTRAL_NODES = 29
 """Nodes along each axis when the spectral table must be computed first."""
 STORED_ANISOTROPIES = (0.0, 0.8)
 """Mean cosines g of scattering for which the spectral table is stored."""
-STORED_CONSTANTS: Final = {SKIN: "skin", PAPERS: "papers"}
+STORED_CONSTANTS: Final = {SKIN_CONSTANTS: "skin", PAPER_CONSTANTS: "papers"}
 """Names in the stored file of the constants for which the spectral table is stored."""
 _MIN_SIZE = 8
 _CHUNK_POINTS = 32_768
@@ -54,7 +60,7 @@ class ColorTable:
     """Volume fraction of dermal blood at the end of the second axis."""
     anisotropy: float = 0.0
     """Mean cosine g of scattering behind the table."""
-    constants: TissueConstants = SKIN
+    constants: TissueConstants = SKIN_CONSTANTS
     """Thickness, scattering and other optics behind the table."""
     optics_covariance: Float64Array | None = None
     """Shape (n, n, 3, 3): covariance of log color by optics that a color does not determine, at
@@ -142,7 +148,9 @@ class ColorTable:
         )
 
     def log_covariance(self, c_m: ArrayLike, c_hd: ArrayLike) -> Float64Array:
-        """Return the covariance of log color by unknown optics, see `model.optics_uncertainty`.
+        """Return the covariance of log color by unknown optics.
+
+        `model.tissue_optics.uncertainty` defines it.
 
         Parameters
         ----------
@@ -227,7 +235,7 @@ def build(
     *,
     size: int = 128,
     anisotropy: float = 0.0,
-    constants: TissueConstants = SKIN,
+    constants: TissueConstants = SKIN_CONSTANTS,
     beta_m: float | None = None,
     oxygenation: float | None = None,
     eta: float = ETA_SKIN,
@@ -274,7 +282,7 @@ def build(
     --------
     >>> table = build("Nikon 5100 (NPL)", "D65")
     >>> table.lookup(0.02, 0.02).round(2).tolist()
-    [0.4, 0.26, 0.22]
+    [0.35, 0.25, 0.22]
     """
     if not isinstance(size, int | np.integer) or size < _MIN_SIZE:
         raise ColorTableError(
@@ -345,12 +353,12 @@ def spectral_reflectance(
     Examples
     --------
     >>> spectral_reflectance(0.02, 0.02)[[5, 15, 25]].round(2).tolist()
-    [0.17, 0.2, 0.34]
+    [0.19, 0.24, 0.46]
     """
     melanin, blood = Checks(ColorTableError).broadcast_together(c_m=c_m, c_hd=c_hd)
     for name, values, most in (("c_m", melanin, C_M_MAX), ("c_hd", blood, C_HD_MAX)):
         Checks(ColorTableError).within(name, values, f"[0, {most}]")
-    log_reflectance = _log_spectra(anisotropy, SKIN, ETA_SKIN)
+    log_reflectance = _log_spectra(anisotropy, SKIN_CONSTANTS, ETA_SKIN)
     axes = spectral_axes(log_reflectance.shape[0])
     place = np.cbrt(melanin).reshape(-1), np.cbrt(blood).reshape(-1)
     found = np.empty((melanin.size, log_reflectance.shape[2]))

@@ -9,7 +9,7 @@ to 0.3 mm without blood, oxygenation of 0.4 to 0.95 and blood volume fractions o
 (log-uniform). Melanin times thickness is log-normal around the medians of types I to VI. The
 individual typology angle of the result, specular reflection included, gives the type.
 
-Nothing here sets a constant of `model.optics_uncertainty`. About a quarter of an hour on one core.
+Nothing here sets a constant of `model.tissue_optics.uncertainty`. Takes some ten minutes.
 """
 
 import math
@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from model.optics_uncertainty import typology_angle
 from model.spectra import hemoglobin_extinction
+from model.tissue_optics.uncertainty import typology_angle
 from rigsim.tissue.skin_layers import ETA, SKIN_ANISOTROPY, baseline_per_mm
 from rigsim.tissue.tissue_mc import Layer, LayerStack, trace_photons
 

@@ -2,8 +2,8 @@
 
     python tools/make_optics_uncertainty.py [SPECTRA]
 
-The derivatives of log reflectance by the nuisance parameters of `model.optics_uncertainty` are
-central differences of adding-doubling, over one standard deviation to both sides, at constant
+Derivatives of log reflectance by the parameters of `model.tissue_optics.uncertainty` are central
+differences of adding-doubling, over one standard deviation to both sides, at constant
 melanin optical depth at 550 nm.
 
 SPECTRA is the workbook of the International Skin Spectra Archive (Lu et al. 2025,
@@ -27,12 +27,13 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 from scipy.spatial import cKDTree
 
-from model import optics_uncertainty, spectra
+from model import spectra
 from model.color_table import spectral_axes
 from model.fresnel import ETA_SKIN, normal_reflectance
-from model.optics_uncertainty import NUISANCES
-from model.tissue_optics import SKIN, two_layer_reflectance
+from model.tissue_optics import SKIN_CONSTANTS, two_layer_reflectance
+from model.tissue_optics import uncertainty as optics_uncertainty
 from model.tissue_optics.layers import ANISOTROPY_SKIN
+from model.tissue_optics.uncertainty import NUISANCE_PARAMETERS
 from skinrig.benchmarks.flash_rig.independent_skin import sets_residuals
 
 NODES = 17
@@ -53,7 +54,7 @@ def log_gradient() -> tuple[np.ndarray, np.ndarray]:
     c_m, c_hd = u[:, None] ** 3, v[None, :] ** 3
 
     def log_reflectance(constants):
-        ratio = SKIN.melanin_depth_factor / constants.melanin_depth_factor
+        ratio = SKIN_CONSTANTS.melanin_depth_factor / constants.melanin_depth_factor
         found = two_layer_reflectance(
             spectra.WAVELENGTH_NM,
             np.minimum(c_m * ratio, 1.0),
@@ -65,18 +66,20 @@ def log_gradient() -> tuple[np.ndarray, np.ndarray]:
         return np.log(found)
 
     found = []
-    for nuisance in NUISANCES:
-        usual = getattr(SKIN, nuisance.name)
+    for nuisance in NUISANCE_PARAMETERS:
+        usual = getattr(SKIN_CONSTANTS, nuisance.name)
         ends = [usual * np.exp(s * nuisance.sd) for s in (-1, 1)]
         if not nuisance.is_log:
             ends = [usual - nuisance.sd, usual + nuisance.sd]
         if nuisance.name in ("oxygenation", "eumelanin_fraction"):
             ends = np.clip(ends, 0.0, 1.0)
-        low, high = (log_reflectance(replace(SKIN, **{nuisance.name: float(end)})) for end in ends)
+        low, high = (
+            log_reflectance(replace(SKIN_CONSTANTS, **{nuisance.name: float(end)})) for end in ends
+        )
         step = np.log(ends[1] / ends[0]) if nuisance.is_log else ends[1] - ends[0]
         found.append((high - low) / step)
         print(f"{nuisance.name}: standard deviation {nuisance.sd:.3f}", file=sys.stderr)
-    return log_reflectance(SKIN), np.stack(found, axis=2)
+    return log_reflectance(SKIN_CONSTANTS), np.stack(found, axis=2)
 
 
 def read_spectra(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -149,7 +152,7 @@ def residual_factors(path: Path, log_r, gradient) -> tuple[np.ndarray, np.ndarra
     reflectance = reflectance[usable]
     angle = optics_uncertainty.typology_angle(reflectance)
     model = LinearModel(log_r, gradient)
-    prior = np.diag([n.sd**2 for n in NUISANCES])
+    prior = np.diag([n.sd**2 for n in NUISANCE_PARAMETERS])
     rng = np.random.default_rng(0)
     factors, angles = [], []
     for high, low in itertools.pairwise(BANDS_DEG):

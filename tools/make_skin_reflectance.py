@@ -45,10 +45,10 @@ FloatArray = NDArray[np.float64]
 RECIPE = 2  # raise it when the numbers change
 BATCHES = 40
 # Absorption depth of the traced epidermis and photons of each run.
-RUNS = ((0.0, 800_000), (0.7, 1_600_000), (3.0, 4_000_000))
+TRACED_RUNS = ((0.0, 800_000), (0.7, 1_600_000), (3.0, 4_000_000))
 TAKE_OVER = 2.5  # a run takes over fully at this multiple of its own absorption
-BASAL = skin_layers.BASAL_THICKNESS_FRACTION
-RATIO = skin_layers.DERMIS_SCATTERING_RATIO
+BASAL_FRACTION = skin_layers.BASAL_THICKNESS_FRACTION
+DERMIS_RATIO = skin_layers.DERMIS_SCATTERING_RATIO
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -56,11 +56,11 @@ ROOT = Path(__file__).resolve().parents[1]
 def shares(axes: Axes) -> FloatArray:
     """Return each run's weight in the estimate, (runs, basal, absorption); sums over runs are 1."""
     # The weaker absorption of both parts of the epidermis, over that of an even one.
-    weaker = np.minimum((1.0 - axes.basal) / (1.0 - BASAL), axes.basal / BASAL)
+    weaker = np.minimum((1.0 - axes.basal) / (1.0 - BASAL_FRACTION), axes.basal / BASAL_FRACTION)
     depth = weaker[:, None] * axes.absorption
-    result = np.zeros((len(RUNS), *depth.shape))
+    result = np.zeros((len(TRACED_RUNS), *depth.shape))
     result[0] = 1.0
-    for index, (traced, _) in enumerate(RUNS[1:], start=1):
+    for index, (traced, _) in enumerate(TRACED_RUNS[1:], start=1):
         t = np.clip((depth / traced - 1.0) / (TAKE_OVER - 1.0), 0.0, 1.0)
         ramp = t * t * (3.0 - 2.0 * t)
         result[:index] *= 1.0 - ramp
@@ -80,9 +80,9 @@ def stack_of(scattering: float, absorption: float, least_dermis: float) -> Layer
     even = absorption / scattering
     return LayerStack(
         (
-            layer((1.0 - BASAL) * scattering, even, 1.0),
-            layer(BASAL * scattering, even, 1.0),
-            layer(inf, RATIO * least_dermis, RATIO),
+            layer((1.0 - BASAL_FRACTION) * scattering, even, 1.0),
+            layer(BASAL_FRACTION * scattering, even, 1.0),
+            layer(inf, DERMIS_RATIO * least_dermis, DERMIS_RATIO),
         )
     )
 
@@ -94,11 +94,13 @@ def survivals(
     upper, basal, dermis = paths.path_mm.T
     share, depth = np.broadcast_arrays(axes.basal[:, None], axes.absorption)
     share, depth = share[used], depth[used]
-    added_upper = depth * (1.0 - share) / ((1.0 - BASAL) * scattering) - traced / scattering
-    added_basal = depth * share / (BASAL * scattering) - traced / scattering
+    added_upper = (
+        depth * (1.0 - share) / ((1.0 - BASAL_FRACTION) * scattering) - traced / scattering
+    )
+    added_basal = depth * share / (BASAL_FRACTION * scattering) - traced / scattering
     by_epidermis = np.exp(-np.outer(upper, added_upper) - np.outer(basal, added_basal))
     by_epidermis *= (paths.weight / paths.photons)[:, None]
-    return by_epidermis, np.exp(-np.outer(dermis, RATIO * (axes.dermis - axes.dermis[0])))
+    return by_epidermis, np.exp(-np.outer(dermis, DERMIS_RATIO * (axes.dermis - axes.dermis[0])))
 
 
 def ring_sums(
@@ -113,11 +115,11 @@ def ring_sums(
 
 def simulate(scattering: float, *, seed: int, scale: float, threads: int) -> dict[str, FloatArray]:
     """Trace one scattering depth; return reflectance and ring reflectance with their errors."""
-    axes, lateral = skin_transport.AXES, skin_transport.LATERAL_AXES
+    axes, lateral = skin_transport.TABLE_AXES, skin_transport.LATERAL_AXES
     fine, coarse = shares(axes), shares(lateral)
-    edges = skin_transport.RING_EDGES / RATIO  # from reduced mean free paths of the dermis
+    edges = skin_transport.RING_EDGES / DERMIS_RATIO  # from reduced mean free paths of the dermis
     sums: dict[str, FloatArray] = {}
-    for index, (traced, photons) in enumerate(RUNS):
+    for index, (traced, photons) in enumerate(TRACED_RUNS):
         rng = np.random.default_rng([seed, round(1e4 * scattering), index])
         batches = trace_escape_paths(
             stack_of(scattering, traced, float(axes.dermis[0])),
@@ -158,12 +160,12 @@ def _add(
 
 def parameters(seed: int, scale: float) -> dict[str, object]:
     """Return all parameters that determine the table's values."""
-    axes, lateral = skin_transport.AXES, skin_transport.LATERAL_AXES
+    axes, lateral = skin_transport.TABLE_AXES, skin_transport.LATERAL_AXES
     return {
         "recipe": RECIPE,
         "seed": seed,
         "photons_scale": scale,
-        "runs_absorption_and_photons": [list(run) for run in RUNS],
+        "runs_absorption_and_photons": [list(run) for run in TRACED_RUNS],
         "batches": BATCHES,
         "take_over": TAKE_OVER,
         "axes": {name: getattr(axes, name).tolist() for name in Axes.__slots__},
@@ -172,8 +174,8 @@ def parameters(seed: int, scale: float) -> dict[str, object]:
         "roulette": [ROULETTE_MAX_WEIGHT, ROULETTE_SURVIVAL],
         "eta": skin_layers.ETA,
         "g": skin_layers.SKIN_ANISOTROPY,
-        "dermis_scattering_ratio": RATIO,
-        "basal_thickness_fraction": BASAL,
+        "dermis_scattering_ratio": DERMIS_RATIO,
+        "basal_thickness_fraction": BASAL_FRACTION,
     }
 
 
@@ -195,7 +197,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     seconds = 0.0
     parts = []
-    depths = skin_transport.AXES.scattering
+    depths = skin_transport.TABLE_AXES.scattering
     for number, depth in enumerate(depths, start=1):
         part = folder / f"{depth:.4f}.npz"
         if not part.exists():

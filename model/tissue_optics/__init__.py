@@ -1,7 +1,7 @@
 """Tissue optics: absorption of chromophores and reflectance of layered skin."""
 
-from model.tissue_optics.constants import PAPERS as PAPERS
-from model.tissue_optics.constants import SKIN as SKIN
+from model.tissue_optics.constants import PAPER_CONSTANTS as PAPER_CONSTANTS
+from model.tissue_optics.constants import SKIN_CONSTANTS as SKIN_CONSTANTS
 from model.tissue_optics.constants import TissueConstants as TissueConstants
 from model.tissue_optics.constants import TissueError as TissueError
 from model.tissue_optics.layers import blood_absorption as blood_absorption

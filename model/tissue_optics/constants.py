@@ -1,4 +1,4 @@
-"""Optical constants of skin with a homogeneous epidermis on a deep dermis: SKIN and PAPERS."""
+"""Optical constants of skin with a homogeneous epidermis on a deep dermis."""
 
 from dataclasses import dataclass, replace
 from typing import Final
@@ -67,7 +67,7 @@ class TissueConstants:
 
         Examples
         --------
-        >>> SKIN.epidermal_scattering([500.0, 600.0]).round(2).tolist()
+        >>> SKIN_CONSTANTS.epidermal_scattering([500.0, 600.0]).round(2).tolist()
         [9.2, 7.1]
         """
         ratio = np.asarray(wavelength_nm, dtype=np.float64) / SCATTERING_WAVELENGTH_NM
@@ -82,7 +82,7 @@ class TissueConstants:
 
         Examples
         --------
-        >>> round(float(SKIN.melanin_absorption(550.0)), 1)
+        >>> round(float(SKIN_CONSTANTS.melanin_absorption(550.0)), 1)
         45.1
         """
         fraction = self.eumelanin_fraction
@@ -97,7 +97,7 @@ class TissueConstants:
         return self.epidermis_mm * float(self.melanin_absorption(OPTICAL_DEPTH_NM))
 
 
-SKIN: Final = TissueConstants(
+SKIN_CONSTANTS: Final = TissueConstants(
     epidermis_mm=0.09,
     epidermal_blood_ratio=0.0,
     oxygenation=0.75,
@@ -118,7 +118,7 @@ in the epidermis (Donner et al. 2008). Eumelanin: between the mixture of Donner 
 (0.61) and the melanosomes of Jacques (1); measured spectra fit equally well from 0.6 to 0.95.
 """
 
-PAPERS: Final = TissueConstants(
+PAPER_CONSTANTS: Final = TissueConstants(
     epidermis_mm=0.25,
     epidermal_blood_ratio=0.25,
     oxygenation=0.75,
@@ -137,7 +137,7 @@ PAPERS: Final = TissueConstants(
 
 Donner and Jensen 2006, doi:10.2312/EGWR/EGSR06/409-417; Donner et al. 2008,
 doi:10.1145/1409060.1409093; Jimenez et al. 2010, doi:10.1145/1866158.1866167. Of measured skin they
-explain 0.021 to 0.029 of reflectance poorly, against 0.005 to 0.019 with `SKIN` (RMS).
+explain 0.021 to 0.029 of reflectance poorly, against 0.005 to 0.019 with `SKIN_CONSTANTS` (RMS).
 """
 
 
@@ -148,7 +148,7 @@ def with_fractions(
 
     Examples
     --------
-    >>> with_fractions(SKIN, None, 0.5).oxygenation
+    >>> with_fractions(SKIN_CONSTANTS, None, 0.5).oxygenation
     0.5
     """
     given = {"eumelanin_fraction": eumelanin_fraction, "oxygenation": oxygenation}

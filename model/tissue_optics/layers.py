@@ -10,7 +10,13 @@ from model.arrays import Float64Array
 from model.checks import Checks
 from model.fresnel import ETA_SKIN
 from model.tissue_optics import adding_doubling, discrete_ordinates, layered_diffusion
-from model.tissue_optics.constants import PAPERS, SKIN, TissueConstants, TissueError, with_fractions
+from model.tissue_optics.constants import (
+    PAPER_CONSTANTS,
+    SKIN_CONSTANTS,
+    TissueConstants,
+    TissueError,
+    with_fractions,
+)
 
 Tier = Literal["adding_doubling", "diffusion"]
 
@@ -33,7 +39,7 @@ _check = Checks(TissueError).within
 
 
 def blood_absorption(
-    wavelength_nm: ArrayLike, *, oxygenation: float = SKIN.oxygenation
+    wavelength_nm: ArrayLike, *, oxygenation: float = SKIN_CONSTANTS.oxygenation
 ) -> Float64Array:
     """Return the absorption of whole blood with 150 g/l of hemoglobin.
 
@@ -66,7 +72,7 @@ def skin_layers(
     c_m: ArrayLike,
     c_hd: ArrayLike,
     *,
-    constants: TissueConstants = PAPERS,
+    constants: TissueConstants = PAPER_CONSTANTS,
     beta_m: float | None = None,
     c_he: ArrayLike | None = None,
     oxygenation: float | None = None,
@@ -104,10 +110,11 @@ def skin_layers(
     """
     melanin, dermal = np.asarray(c_m, dtype=np.float64), np.asarray(c_hd, dtype=np.float64)
     constants = with_fractions(constants, beta_m, oxygenation)
+    for name, share in (("c_m", melanin), ("c_hd", dermal)):
+        _check(name, share, "[0, 1]")
     ratio = constants.epidermal_blood_ratio
     epidermal = ratio * dermal if c_he is None else np.asarray(c_he, dtype=np.float64)
-    for name, share in (("c_m", melanin), ("c_hd", dermal), ("c_he", epidermal)):
-        _check(name, share, "[0, 1]")
+    _check("c_he", epidermal, "[0, 1]")
     melanin, dermal, epidermal = np.broadcast_arrays(melanin, dermal, epidermal)
     _check("c_m + c_he", melanin + epidermal, "[0, 1]")
     wavelength = np.asarray(wavelength_nm, dtype=np.float64)
@@ -136,7 +143,7 @@ def two_layer_reflectance(
     c_m: ArrayLike,
     c_hd: ArrayLike,
     *,
-    constants: TissueConstants = PAPERS,
+    constants: TissueConstants = PAPER_CONSTANTS,
     beta_m: float | None = None,
     c_he: ArrayLike | None = None,
     oxygenation: float | None = None,
@@ -189,7 +196,7 @@ def two_layer_reflectance(
     --------
     >>> r = two_layer_reflectance([450.0, 550.0, 650.0], 0.02, 0.02)
     >>> r.round(2).tolist()
-    [0.17, 0.2, 0.34]
+    [0.19, 0.24, 0.46]
     """
     sigma_a, sigma_s_prime, thickness = skin_layers(
         wavelength_nm,

@@ -20,7 +20,6 @@ from reconstruction.chromophores import dark_spots, shading_prior
 from reconstruction.chromophores import face_kernels as kernels
 from reconstruction.chromophores import model_error as color_errors
 from reconstruction.chromophores import posterior as chromophore_posterior
-from reconstruction.chromophores.common_optics import add_optics_errors
 from reconstruction.chromophores.face_distribution import (
     FaceDistribution,
     add_systematic_errors,
@@ -33,7 +32,7 @@ from reconstruction.chromophores.pixel_checks import (
     check_colors,
     is_usable_color,
 )
-from reconstruction.chromophores.posterior import ChromophorePosterior
+from reconstruction.chromophores.posterior import ChromophorePosterior, add_optics_errors
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION, evaluate_table
 

@@ -3,8 +3,8 @@
 Each pixel is fitted with the color table of the two-layer skin model (Jimenez et al. 2010,
 doi:10.1145/1866158.1866167, eq. 7), in the cube roots of both volume fractions. Thickness,
 oxygenation and scattering are nuisance parameters: their effect is part of each color's covariance
-(`model.optics_uncertainty`). A color determines the product of melanin's volume fraction and the
-thickness of the epidermis, the melanin optical depth.
+(`model.tissue_optics.uncertainty`). A color determines the product of melanin's volume fraction and
+the thickness of the epidermis, the melanin optical depth.
 """
 
 from collections.abc import Callable
@@ -39,6 +39,13 @@ DEFAULT_RELATIVE_NOISE = 0.01
 """Relative noise of each channel that is assumed when no variance is given."""
 MAX_IDENTIFIABLE_STDERR = 1.0
 """Relative standard error above which a chromophore counts as not identifiable."""
+POPULATION_MELANIN = 0.037
+"""Median melanin of measured spectra of skin (ISSA), as a volume fraction."""
+POPULATION_BLOOD = 0.011
+"""Median blood volume fraction of them."""
+POPULATION_LOG_SD = (1.0, 1.5)
+"""Standard deviations of log melanin and of log blood over people and sites. Types I to VI span
+2.7 in log melanin; published blood volume fractions of skin span 0.002 to 0.07, or 3.6."""
 _TASK_PIXELS = 8192
 
 
@@ -141,10 +148,9 @@ def invert(
         Noise variance of `rgb`, broadcast to its shape. None: 1 percent of each channel.
     model_error
         Further relative error, such as a rig's, added to the noise: a standard error, one per
-        channel, or a (3, 3) covariance. A covariance with s^2 in all its cells limits the
-        knowledge of the shading to the relative standard error s; where s is above some 10
-        percent, skin has two solutions, which `reconstruction.chromophores.posterior` weights.
-        None: 0.
+        channel, or a (3, 3) covariance. A covariance with s^2 in all its cells limits the knowledge
+        of the shading to the relative standard error s; where s is above some 10 percent, skin has
+        two solutions, which `reconstruction.chromophores.posterior` weights. None: 0.
     valid
         Shape (...): False where a pixel is saturated or masked otherwise. None: all may be used.
     shading_max
@@ -170,13 +176,16 @@ def invert(
     `ambiguous` marks both, and the estimate is the lighter one. Errors are those of the linearized
     fit; at a relative error of half and above they are rough.
 
+    With unknown optics, weak priors of both cube roots over people are added, see
+    `POPULATION_LOG_SD`; they matter where a color leaves a chromophore open by half.
+
     Maps are float32 for float64 input too: rounding changes them by less than 1e-4 of a standard
     error, with the shading known and with it free, where noise is 1 percent.
 
     Examples
     --------
     >>> from model import color_table
-    >>> table = color_table.build("Nikon 5100 (NPL)", "D65")
+    >>> table = color_table.build("Nikon 5100 (NPL)", "D65", exact_optics=True)
     >>> maps = invert(0.8 * table.lookup([[0.02, 0.03]], [[0.05, 0.02]]), table)
     >>> [f"{value:.4f}" for value in maps.melanin[0]]
     ['0.0200', '0.0300']
@@ -204,6 +213,7 @@ def invert(
         free,
         covariance.astype(np.float32),
         optics_triangles(table),
+        _axis_prior(table),
         np.ascontiguousarray(table.cells, dtype=np.float32),
         np.array([table.c_m_max, table.c_hd_max], dtype=np.float32),
         np.ascontiguousarray(start.projection, dtype=np.float32),
@@ -280,9 +290,9 @@ def compute_identifiability(
     Examples
     --------
     >>> from model import color_table
-    >>> bounds = compute_identifiability(color_table.build("Nikon 5100 (NPL)", "D65"),
-    ...     shading="known")
-    >>> darker = np.searchsorted(bounds.c_m, 0.1), np.searchsorted(bounds.c_hd, 0.02)
+    >>> table = color_table.build("Nikon 5100 (NPL)", "D65", exact_optics=True)
+    >>> bounds = compute_identifiability(table, shading="known")
+    >>> darker = np.searchsorted(bounds.c_m, 0.4), np.searchsorted(bounds.c_hd, 0.002)
     >>> bool(bounds.stderr_melanin[darker] < 0.1), bool(bounds.hemoglobin_identifiable[darker])
     (True, False)
     """
@@ -356,6 +366,16 @@ def add_brightness_variance(covariance: Float64Array) -> Float64Array:
     """
     common = np.trace(covariance, axis1=-2, axis2=-1) / 3.0 + 1e-6
     return np.asarray(covariance + common[..., None, None])
+
+
+def _axis_prior(table: ColorTable) -> Float32Array:
+    """Return means and precisions of the axes' fractions over people; zeros for exact optics."""
+    if table.optics_covariance is None:
+        return np.zeros(4, dtype=np.float32)
+    ends = np.array([table.c_m_max, table.c_hd_max])
+    mean = np.cbrt(np.array([POPULATION_MELANIN, POPULATION_BLOOD]) / ends)
+    sd = mean * np.array(POPULATION_LOG_SD) / 3.0  # c = c_max a^3, hence da = a d(ln c) / 3
+    return np.concatenate([mean, sd**-2.0]).astype(np.float32)
 
 
 @lru_cache(maxsize=16)

@@ -9,6 +9,7 @@ import numpy as np
 from numba import boolean, float32, float64, int64, njit, prange, void
 
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
+from reconstruction.chromophores.weight_kernels import color_weights, quadratic_form
 from reconstruction.compiled import FASTMATH_CONTRACT, PIXEL_KERNEL_OPTIONS, readonly_array_type
 
 MAX_FIT_STEPS = 20
@@ -100,36 +101,6 @@ def _solve(haa, hab, hbb, ra, rb):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always", fastmath=FASTMATH_CONTRACT)
-def _form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
-    """Return p' W q."""
-    return (
-        w[0] * p0 * q0
-        + w[3] * p1 * q1
-        + w[5] * p2 * q2
-        + w[1] * (p0 * q1 + p1 * q0)
-        + w[2] * (p0 * q2 + p2 * q0)
-        + w[4] * (p1 * q2 + p2 * q1)
-    )
-
-
-@njit(inline="always", fastmath=FASTMATH_CONTRACT)
-def _weights(a00, a11, a22, a01, a02, a12):  # type: ignore[no-untyped-def]
-    """Invert a symmetric 3 x 3 covariance; return w00, w01, w02, w11, w12, w22."""
-    c00 = a11 * a22 - a12 * a12
-    c01 = a02 * a12 - a01 * a22
-    c02 = a01 * a12 - a02 * a11
-    scale = 1.0 / (a00 * c00 + a01 * c01 + a02 * c02)
-    return (
-        c00 * scale,
-        c01 * scale,
-        c02 * scale,
-        (a00 * a22 - a02 * a02) * scale,
-        (a01 * a02 - a00 * a12) * scale,
-        (a00 * a11 - a01 * a01) * scale,
-    )
-
-
-@njit(inline="always", fastmath=FASTMATH_CONTRACT)
 def _project(rows, l0, l1, l2):  # type: ignore[no-untyped-def]
     """Transform log RGB to the coordinates of a start grid."""
     return (
@@ -153,67 +124,6 @@ def _guess(axes, y0, y1):  # type: ignore[no-untyped-def]
     a = w00 * n00[0] + w01 * n01[0] + w10 * n10[0] + w11 * n11[0]
     b = w00 * n00[1] + w01 * n01[1] + w10 * n10[1] + w11 * n11[1]
     return min(max(a, _MIN_AXIS_FRACTION), _ONE), min(max(b, _MIN_AXIS_FRACTION), _ONE)
-
-
-@njit(inline="always", fastmath=FASTMATH_CONTRACT)
-def _covariance_at(nodes, a, b):  # type: ignore[no-untyped-def]
-    """Interpolate the upper triangle of a covariance bilinearly between its nodes."""
-    last = nodes.shape[0] - 1
-    y0, y1 = a * np.float32(last), b * np.float32(last)
-    i, j = min(int(y0), last - 1), min(int(y1), last - 1)
-    x, y = y0 - np.float32(i), y1 - np.float32(j)
-    w11 = x * y
-    w10, w01 = x - w11, y - w11
-    w00 = _ONE - x - w01
-    n00, n01, n10, n11 = nodes[i, j], nodes[i, j + 1], nodes[i + 1, j], nodes[i + 1, j + 1]
-    return (
-        w00 * n00[0] + w01 * n01[0] + w10 * n10[0] + w11 * n11[0],
-        w00 * n00[1] + w01 * n01[1] + w10 * n10[1] + w11 * n11[1],
-        w00 * n00[2] + w01 * n01[2] + w10 * n10[2] + w11 * n11[2],
-        w00 * n00[3] + w01 * n01[3] + w10 * n10[3] + w11 * n11[3],
-        w00 * n00[4] + w01 * n01[4] + w10 * n10[4] + w11 * n11[4],
-        w00 * n00[5] + w01 * n01[5] + w10 * n10[5] + w11 * n11[5],
-    )
-
-
-@njit(fastmath=FASTMATH_CONTRACT)
-def _color_weights(noise, model, optics, a, b, free):  # type: ignore[no-untyped-def]
-    """Return the weights of relative errors (6), those of brightness (3), and the latter's sum.
-
-    A free shading is projected out: W - W 1 1' W / (1' W 1), with t = W 1 / (1' W 1).
-    """
-    m01, m02, m12 = model[0, 1], model[0, 2], model[1, 2]
-    a00, a11, a22 = noise[0] + model[0, 0], noise[1] + model[1, 1], noise[2] + model[2, 2]
-    if optics.shape[0] > 1:
-        c00, c01, c02, c11, c12, c22 = _covariance_at(optics, a, b)
-        a00, a11, a22 = a00 + c00, a11 + c11, a22 + c22
-        m01, m02, m12 = m01 + c01, m02 + c02, m12 + c12
-    if m01 == 0.0 and m02 == 0.0 and m12 == 0.0:
-        x0, x3, x5 = 1.0 / float64(a00), 1.0 / float64(a11), 1.0 / float64(a22)
-        x1 = x2 = x4 = 0.0
-    else:
-        x0, x1, x2, x3, x4, x5 = _weights(
-            float64(a00), float64(a11), float64(a22), float64(m01), float64(m02), float64(m12)
-        )
-    t0, t1, t2 = x0 + x1 + x2, x1 + x3 + x4, x2 + x4 + x5
-    total = t0 + t1 + t2
-    whole = 1.0 / total
-    t0, t1, t2 = t0 * whole, t1 * whole, t2 * whole
-    if free:
-        x0, x1, x2 = x0 - t0 * t0 * total, x1 - t0 * t1 * total, x2 - t0 * t2 * total
-        x3, x4, x5 = x3 - t1 * t1 * total, x4 - t1 * t2 * total, x5 - t2 * t2 * total
-    return (
-        np.float32(x0),
-        np.float32(x1),
-        np.float32(x2),
-        np.float32(x3),
-        np.float32(x4),
-        np.float32(x5),
-        np.float32(t0),
-        np.float32(t1),
-        np.float32(t2),
-        np.float32(total),
-    )
 
 
 @njit(inline="always", fastmath=FASTMATH_CONTRACT)
@@ -247,6 +157,7 @@ def _bounded(a, b, step_a, step_b, aa, ab, bb, ra, rb):  # type: ignore[no-untyp
         boolean,  # shading is free
         readonly_array_type(float32, 2),  # covariance of the model's relative error (3, 3)
         readonly_array_type(float32, 3),  # covariance by optics on the axes (k, k, 6); k = 1: none
+        readonly_array_type(float32, 1),  # prior of axis fractions: means and precisions (4,)
         readonly_array_type(float32, 5),  # cells of the color table
         readonly_array_type(float32, 1),  # ends of the axes as volume fractions (2,)
         readonly_array_type(float32, 2),  # projection of log rgb, and offset (2, 4)
@@ -269,6 +180,7 @@ def fit_pixels(  # type: ignore[no-untyped-def]
     free,
     model,
     optics,
+    prior,
     cells,
     ends,
     projection,
@@ -326,7 +238,7 @@ def fit_pixels(  # type: ignore[no-untyped-def]
             y0, y1 = _project(projection, l0, l1, l2)
             a, b = _guess(start_axes, y0, y1)
             noise = v0, v1, v2
-            w = _color_weights(noise, model, optics, a, b, free)
+            w = color_weights(noise, model, optics, a, b, free)
             a_of_weights, b_of_weights = a, b
             twin_brightness = -np.float32(np.inf)
             if free:
@@ -347,7 +259,7 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                     moved = max(abs(a - a_of_weights), abs(b - b_of_weights))
                     if moved > REWEIGHT_STEP and reweights < MAX_REWEIGHTS:
                         reweights += 1
-                        w = _color_weights(noise, model, optics, a, b, free)
+                        w = color_weights(noise, model, optics, a, b, free)
                         a_of_weights, b_of_weights = a, b
                         # of other weights, but the fold's guard stays on
                         cost_before = np.float32(0.9 * MAX_FINITE)
@@ -374,7 +286,9 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                     t = _ONE / mean
                     common = math.log(mean) - _ONE
                     e0, e1, e2 = q0 * t + common, q1 * t + common, q2 * t + common
-                cost = _form(w, e0, e1, e2, e0, e1, e2)
+                off_a, off_b = prior[0] - a, prior[1] - b
+                cost = quadratic_form(w, e0, e1, e2, e0, e1, e2)
+                cost += prior[2] * off_a * off_a + prior[3] * off_b * off_b
                 r0, r1, r2 = r0 * length, r1 * length, r2 * length
                 ga0, ga1, ga2 = x0 * r0, x1 * r1, x2 * r2
                 gb0, gb1, gb2 = y0_ * r0, y1_ * r1, y2_ * r2
@@ -391,11 +305,11 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                         break
                     continue
                 cost_before, a_before, b_before = cost, a, b
-                aa = _form(w, ga0, ga1, ga2, ga0, ga1, ga2)
-                ab = _form(w, ga0, ga1, ga2, gb0, gb1, gb2)
-                bb = _form(w, gb0, gb1, gb2, gb0, gb1, gb2)
-                ra = _form(w, ga0, ga1, ga2, e0, e1, e2)
-                rb = _form(w, gb0, gb1, gb2, e0, e1, e2)
+                aa = quadratic_form(w, ga0, ga1, ga2, ga0, ga1, ga2) + prior[2]
+                ab = quadratic_form(w, ga0, ga1, ga2, gb0, gb1, gb2)
+                bb = quadratic_form(w, gb0, gb1, gb2, gb0, gb1, gb2) + prior[3]
+                ra = quadratic_form(w, ga0, ga1, ga2, e0, e1, e2) + prior[2] * off_a
+                rb = quadratic_form(w, gb0, gb1, gb2, e0, e1, e2) + prior[3] * off_b
                 haa, hab, hbb = aa, ab, bb
                 step_a, step_b = _solve(aa, ab, bb, ra, rb)
                 if step > 1 and not free:
@@ -454,7 +368,7 @@ def fit_pixels(  # type: ignore[no-untyped-def]
             e0 -= ga0 * step_a + gb0 * step_b
             e1 -= ga1 * step_a + gb1 * step_b
             e2 -= ga2 * step_a + gb2 * step_b
-            residual = math.sqrt(max(_form(w, e0, e1, e2, e0, e1, e2), _ZERO))
+            residual = math.sqrt(max(quadratic_form(w, e0, e1, e2, e0, e1, e2), _ZERO))
             # The part of the residual that shading explains: all of the mean when free, else its
             # most probable part given the shading's variance.
             shift = w[6] * e0 + w[7] * e1 + w[8] * e2

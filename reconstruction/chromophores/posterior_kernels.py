@@ -24,7 +24,6 @@ import numpy as np
 from numba import boolean, float32, float64, int64, njit, prange, void
 
 from reconstruction.arrays import BoolArray, Float64Array
-from reconstruction.chromophores.lines import N_LINES
 from reconstruction.chromophores.ridge_kernels import (
     AXIS_START,
     MELANIN_STEP,
@@ -40,6 +39,7 @@ from reconstruction.chromophores.ridge_kernels import (
     prior_cost,
     quadratic_form,
 )
+from reconstruction.chromophores.start import N_LINES
 from reconstruction.compiled import FASTMATH_CONTRACT, PIXEL_KERNEL_OPTIONS, readonly_array_type
 
 N_PROBES = 8

@@ -9,8 +9,12 @@ from typing import NamedTuple
 from numba import float64, njit
 
 from reconstruction.arrays import Float64Array
-from reconstruction.chromophores.lines import N_LINE_NODES, N_LINES, NODES_PER_LINE
-from reconstruction.chromophores.start import MIN_AXIS_FRACTION
+from reconstruction.chromophores.start import (
+    MIN_AXIS_FRACTION,
+    N_LINE_NODES,
+    N_LINES,
+    NODES_PER_LINE,
+)
 from reconstruction.compiled import FASTMATH_CONTRACT
 
 N_NEWTON_STEPS = 4

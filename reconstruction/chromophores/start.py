@@ -55,8 +55,8 @@ def inverse_table_for(table: ColorTable, free_shading: bool) -> InverseColorTabl
     across = np.cross(by_a / rgb, by_b / rgb)
     normal = np.full(3, 1.0 / np.sqrt(3.0)) if free_shading else _unfolding_direction(across)
     facing = across @ normal
-    folded = bool(facing.min() * facing.max() < 0.0)
-    chosen = _light_side(facing) if folded else np.ones(a.shape, dtype=np.bool_)
+    most = np.sign(np.median(facing))
+    chosen = _light_side(facing) if free_shading else facing * most > 0.0
     plane = _plane(log_rgb[chosen], normal)
     y = log_rgb @ plane.T
     low, high = y[chosen].min(axis=0), y[chosen].max(axis=0)
@@ -141,6 +141,8 @@ def _light_side(facing: Float64Array) -> BoolArray:
     same = facing * np.sign(np.median(corner)) > 0.0
     regions, _ = ndimage.label(np.logical_and.accumulate(same, axis=0))
     seed = regions[: _SAMPLES_PER_AXIS // 8, _SAMPLES_PER_AXIS // 4 : _SAMPLES_PER_AXIS // 2]
+    if not seed.any():  # a coarse table is folded at its lightest skin too
+        return np.asarray(same)
     return np.asarray(regions == np.bincount(seed[seed > 0]).argmax())
 
 
@@ -191,3 +193,36 @@ def _twin_grid(
     place = place[inside]
     np.maximum.at(grid, (place[:, 0], place[:, 1]), log_rgb[inside].mean(axis=-1))
     return np.asarray(ndimage.grey_dilation(grid, size=(3, 3)), dtype=np.float32)
+
+
+N_LINES = 49
+"""Number of lines, each at one melanin value."""
+N_LINE_NODES = 65
+"""Blood values at which each line's colors are stored."""
+NODES_PER_LINE = 32
+"""Nodes of melanin's probability per line interval."""
+MELANIN_AXIS = np.linspace(float(MIN_AXIS_FRACTION), 1.0, (N_LINES - 1) * NODES_PER_LINE + 1)
+"""Fractions of the melanin axis, its cube root, at these nodes."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EqualMelaninLines:
+    """Log colors of skin along lines of equal melanin, each array (LINES, NODES, 3)."""
+
+    log_rgb: Float64Array
+    """Natural logarithm of the color over that of a white reference."""
+    by_a: Float64Array
+    """Derivative by the fraction of the melanin axis."""
+    by_b: Float64Array
+    """Derivative by the fraction of the blood axis."""
+
+
+@lru_cache(maxsize=16)
+def equal_melanin_lines(table: ColorTable) -> EqualMelaninLines:
+    """Return the lines of a table, cached for the tables used last."""
+    low = float(MIN_AXIS_FRACTION)
+    a, b = np.meshgrid(
+        np.linspace(low, 1.0, N_LINES), np.linspace(low, 1.0, N_LINE_NODES), indexing="ij"
+    )
+    color, by_a, by_b = evaluate_table(table, a, b)
+    return EqualMelaninLines(np.log(color), by_a / color, by_b / color)

@@ -34,7 +34,6 @@ from reconstruction.chromophores import (
     invert,
     model_covariance,
 )
-from reconstruction.chromophores.common_optics import errors_within_face
 from reconstruction.chromophores.face import estimate_face
 from reconstruction.chromophores.inversion import DEFAULT_RELATIVE_NOISE
 from reconstruction.chromophores.pixel_checks import (
@@ -42,7 +41,11 @@ from reconstruction.chromophores.pixel_checks import (
     check_mask,
     is_usable_color,
 )
-from reconstruction.chromophores.posterior import MIN_RELATIVE_NOISE, ChromophorePosterior
+from reconstruction.chromophores.posterior import (
+    MIN_RELATIVE_NOISE,
+    ChromophorePosterior,
+    errors_within_face,
+)
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 from reconstruction.facial_color import light_change

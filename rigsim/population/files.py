@@ -46,11 +46,11 @@ from rigsim.subject import PRESET_NAMES, SimulatedSubject, make_subject, pigment
 from rigsim.subject.perfusion import MAX_HEMOGLOBIN, draw_perfusion
 from rigsim.subject.person_skin import MELANIN_RANGE, PersonSkin
 from rigsim.subject.skin_tone import SkinToneError, is_skin_tone, melanin_of_tone
-from rigsim.tissue.skin_layers import PAPERS, PROPERTY_RANGES, SKIN, TissueProperties
+from rigsim.tissue.skin_layers import PAPER_SKIN, PROPERTY_RANGES, TYPICAL_SKIN, TissueProperties
 
 SCHEMA: Final = "skinrig.subject/1"
 SUBJECT_SUFFIX: Final = ".toml"
-TISSUES: Final[Mapping[str, TissueProperties]] = {"skin": SKIN, "papers": PAPERS}
+TISSUES: Final[Mapping[str, TissueProperties]] = {"skin": TYPICAL_SKIN, "papers": PAPER_SKIN}
 """Named properties of skin."""
 _FILE_KEYS: Final = ("mesh", *MAP_RANGES)
 _UNUSED_KEYS: Final[Mapping[str, tuple[str, ...]]] = {

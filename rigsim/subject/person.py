@@ -25,7 +25,7 @@ from rigsim.subject import (
 )
 from rigsim.subject.head import LANDMARKS_MM, build_head
 from rigsim.subject.perfusion import STATE_NAMES, Perfusion, StateError, draw_perfusion
-from rigsim.tissue.skin_layers import SKIN, TissueProperties
+from rigsim.tissue.skin_layers import TYPICAL_SKIN, TissueProperties
 
 PRESET_NAMES: Final = tuple(pigment.MELANIN_PRESETS)
 """Names of the presets, pale to dark."""
@@ -94,7 +94,7 @@ class SimulatedSubject:
     """The same face at rest; ``None`` for a face that is at rest itself."""
     beard: Float32Array | None = None
     """Amount of stubble below the surface, shape (N, N), 0 to 1; ``None``: none."""
-    tissue: TissueProperties = SKIN
+    tissue: TissueProperties = TYPICAL_SKIN
     """Properties of the skin except for melanin and blood."""
     oiliness: float = 1.0
     """Factor of the surface fraction covered by oil."""

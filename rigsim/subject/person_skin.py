@@ -16,16 +16,21 @@ from rigsim.subject import pigment
 from rigsim.subject.face_regions import region_masks
 from rigsim.subject.head import LANDMARKS_MM
 from rigsim.subject.perfusion import draw_perfusion
-from rigsim.tissue.skin_layers import PROPERTY_RANGES, SKIN, TissueProperties, skin_layer_stack
+from rigsim.tissue.skin_layers import (
+    PROPERTY_RANGES,
+    TYPICAL_SKIN,
+    TissueProperties,
+    skin_layer_stack,
+)
 from rigsim.tissue.tissue_mc import LayerStack
 
 MELANIN_RANGE: Final = (0.001, 0.45)
 """Range of the volume fraction of melanosomes around which a person's skin varies."""
 SITE_RADIUS_MM: Final = 8.0
 """Radius of a site of the face."""
-ABDOMEN: Final = "abdomen"
+ABDOMEN_SITE: Final = "abdomen"
 _FACE_SITES: Final[Mapping[str, tuple[str, float, float, float]]] = package_table("face")["sites"]
-SITE_NAMES: Final = (*_FACE_SITES, ABDOMEN)
+SITE_NAMES: Final = (*_FACE_SITES, ABDOMEN_SITE)
 """Names of the sites."""
 _ABDOMEN_MELANIN_STEP: Final = -0.2
 """Logarithm of the abdomen's melanin over the face's; it is out of the sun."""
@@ -74,7 +79,7 @@ class PersonSkin:
     """Seed of all random draws, >= 0."""
     freckles: float | None = None
     """Amount of freckles, 0 to 1; None: drawn."""
-    tissue: TissueProperties = SKIN
+    tissue: TissueProperties = TYPICAL_SKIN
     """All other properties."""
 
     def __post_init__(self) -> None:
@@ -130,7 +135,7 @@ class PersonSkin:
 @lru_cache(maxsize=64)
 def _site_skin(person: PersonSkin, site: str, state: str) -> SiteSkin:
     base = pigment.typical_blood(person.melanin) * person.blood
-    if site == ABDOMEN:
+    if site == ABDOMEN_SITE:
         rng = np.random.default_rng([person.seed, 0x6162])
         melanin, blood = np.exp(rng.normal(0.0, (0.05, 0.1)))
         return SiteSkin(
@@ -162,7 +167,7 @@ def _disc(landmark: str, height_mm: float, slope_x: float, slope_y: float) -> Fl
     return np.asarray(disc[inside] + np.array(LANDMARKS_MM[landmark]), np.float32)
 
 
-def draw_tissue(seed: int, typical: TissueProperties = SKIN) -> TissueProperties:
+def draw_tissue(seed: int, typical: TissueProperties = TYPICAL_SKIN) -> TissueProperties:
     """Draw the properties of a person's skin except for melanin and blood.
 
     Parameters

@@ -23,8 +23,8 @@ MELANIN_PRESETS: Final[Mapping[str, float]] = {
     "darkest": 0.23,
 }
 """Volume fraction of melanosomes of each preset, for the epidermis of
-`rigsim.tissue.skin_layers.SKIN`. I to VI have the median color of measured skin in the bands of the
-individual typology angle (`model/data/skin_percentiles.csv`)."""
+`rigsim.tissue.skin_layers.TYPICAL_SKIN`. I to VI have the median color of measured skin in the
+bands of the individual typology angle (`model/data/skin_percentiles.csv`)."""
 
 _BLOOD_PRESETS: Final = (0.0065, 0.0080, 0.0110, 0.0125, 0.0130, 0.0145, 0.018, 0.020)
 """Volume fraction of blood in the dermis of each preset, between the regions of the face; likewise.

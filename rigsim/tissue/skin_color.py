@@ -13,7 +13,7 @@ from numba import njit, prange
 
 from model import spectra
 from rigsim.arrays import Float32Array, Float64Array
-from rigsim.tissue.skin_layers import MAX_C_HD, MAX_C_M, SKIN, TissueProperties
+from rigsim.tissue.skin_layers import MAX_C_HD, MAX_C_M, TYPICAL_SKIN, TissueProperties
 from rigsim.tissue.skin_table import SkinTable
 
 NODES_PER_AXIS: Final = 257
@@ -79,7 +79,7 @@ class SkinColor:
 
 
 @lru_cache(maxsize=8)
-def skin_color(camera: str, light: str, tissue: TissueProperties = SKIN) -> SkinColor:
+def skin_color(camera: str, light: str, tissue: TissueProperties = TYPICAL_SKIN) -> SkinColor:
     """Return the color table of a person's skin for a camera and a light; it is built once.
 
     Parameters

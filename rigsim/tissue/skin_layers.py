@@ -83,12 +83,12 @@ def _require_range(name: str, value: ArrayLike, low: float, high: float) -> None
         raise TransportError(f"{name}: expected {low:g} <= {name} <= {high:g}, got {value!r}")
 
 
-SKIN: Final = TissueProperties()
+TYPICAL_SKIN: Final = TissueProperties()
 """Properties of typical skin. They agree with measured spectra: see `docs/decisions/0019`."""
 
 _DONNER_MIE_PER_MM: Final = 14.74 * REFERENCE_WAVELENGTH_NM**-0.22
 _DONNER_RAYLEIGH_PER_MM: Final = 2.2e11 * REFERENCE_WAVELENGTH_NM**-4.0
-PAPERS: Final = TissueProperties(
+PAPER_SKIN: Final = TissueProperties(
     epidermis_mm=0.25,
     epidermal_blood_ratio=0.25,
     eumelanin_fraction=0.61,
@@ -154,7 +154,7 @@ def baseline_per_mm(wavelength_nm: ArrayLike) -> Float64Array:
 
 
 def epidermis_scattering_per_mm(
-    wavelength_nm: ArrayLike, tissue: TissueProperties = SKIN
+    wavelength_nm: ArrayLike, tissue: TissueProperties = TYPICAL_SKIN
 ) -> Float64Array:
     """Return the reduced scattering of the epidermis in 1/mm; the dermis has half of it.
 
@@ -164,7 +164,7 @@ def epidermis_scattering_per_mm(
 
     Examples
     --------
-    >>> round(float(epidermis_scattering_per_mm(700.0, PAPERS)), 3)
+    >>> round(float(epidermis_scattering_per_mm(700.0, PAPER_SKIN)), 3)
     4.404
     """
     ratio = np.asarray(wavelength_nm, np.float64) / REFERENCE_WAVELENGTH_NM
@@ -188,7 +188,10 @@ class SkinCoefficients:
 
 
 def skin_coefficients(
-    wavelength_nm: ArrayLike, c_m: ArrayLike, c_hd: ArrayLike, tissue: TissueProperties = SKIN
+    wavelength_nm: ArrayLike,
+    c_m: ArrayLike,
+    c_hd: ArrayLike,
+    tissue: TissueProperties = TYPICAL_SKIN,
 ) -> SkinCoefficients:
     """Return the absorption and scattering of skin.
 
@@ -228,7 +231,7 @@ def skin_coefficients(
 
 
 def skin_layer_stack(
-    wavelength_nm: float, c_m: float, c_hd: float, tissue: TissueProperties = SKIN
+    wavelength_nm: float, c_m: float, c_hd: float, tissue: TissueProperties = TYPICAL_SKIN
 ) -> LayerStack:
     """Return the layers of skin at one wavelength.
 
@@ -256,7 +259,7 @@ def skin_layer_stack(
 
     Examples
     --------
-    >>> stack = skin_layer_stack(500.0, 0.1, 0.04, PAPERS)
+    >>> stack = skin_layer_stack(500.0, 0.1, 0.04, PAPER_SKIN)
     >>> [round(layer.sigma_a_per_mm, 3) for layer in stack.layers]
     [6.029, 0.515]
     """

@@ -23,7 +23,7 @@ from rigsim.tissue.skin_layers import (
     DERMIS_SCATTERING_RATIO,
     MAX_C_HD,
     MAX_C_M,
-    SKIN,
+    TYPICAL_SKIN,
     SkinCoefficients,
     TissueProperties,
     skin_coefficients,
@@ -64,7 +64,7 @@ class SkinTable:
     """log R with its slopes and twist per cell edge, shape (n_m, n_h, 4, n_wavelength)."""
 
     @classmethod
-    def load(cls, tissue: TissueProperties = SKIN) -> SkinTable:
+    def load(cls, tissue: TissueProperties = TYPICAL_SKIN) -> SkinTable:
         """Return the table of a person's skin; it is computed once, in 0.3 s.
 
         Raises

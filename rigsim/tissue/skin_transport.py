@@ -61,7 +61,7 @@ def _axes(*, basal: int, absorption: int, dermis: int) -> Axes:
     )
 
 
-AXES: Final = _axes(basal=4, absorption=41, dermis=29)
+TABLE_AXES: Final = _axes(basal=4, absorption=41, dermis=29)
 """Nodes of the reflectance."""
 LATERAL_AXES: Final = _axes(basal=2, absorption=11, dermis=15)
 """Nodes of the lateral profiles."""
@@ -83,7 +83,7 @@ class SkinTransport:
 
     reflectance: Float64Array
     """Diffuse reflectance at normal incidence without the specular part, in (0, 1), shape
-    (scattering, basal, absorption, dermis) of `AXES`."""
+    (scattering, basal, absorption, dermis) of `TABLE_AXES`."""
     standard_error: Float64Array
     """Standard error of `reflectance`, same shape. Errors at different scattering depths are
     independent, those at one depth are strongly correlated (same photons)."""
@@ -112,9 +112,9 @@ class SkinTransport:
         """
         _require_inside(at)
         tables = self._spline(np.log(at.scattering))
-        weights = _lagrange(AXES.basal, at.basal)
+        weights = _lagrange(TABLE_AXES.basal, at.basal)
         x, y = np.cbrt(at.absorption), np.log(at.dermis)
-        nodes = np.cbrt(AXES.absorption), np.log(AXES.dermis)
+        nodes = np.cbrt(TABLE_AXES.absorption), np.log(TABLE_AXES.dermis)
         found = np.zeros(at.basal.shape)
         for weight, table in zip(weights, tables, strict=True):
             if weight.any():
@@ -124,7 +124,12 @@ class SkinTransport:
     def relative_error(self, at: SkinCoordinates) -> Float64Array:
         """Return the relative standard error of the reflectance, shape (n,)."""
         lookup = RegularGridInterpolator(
-            (np.log(AXES.scattering), AXES.basal, np.cbrt(AXES.absorption), np.log(AXES.dermis)),
+            (
+                np.log(TABLE_AXES.scattering),
+                TABLE_AXES.basal,
+                np.cbrt(TABLE_AXES.absorption),
+                np.log(TABLE_AXES.dermis),
+            ),
             self.standard_error / self.reflectance,
         )
         depth = np.full(at.basal.shape, np.log(at.scattering))
@@ -169,7 +174,7 @@ def _require_inside(at: SkinCoordinates) -> None:
     for name, values, axis in zip(
         ("scattering depth", "basal fraction", "absorption depth", "dermis absorption"),
         at,
-        (AXES.scattering, AXES.basal, AXES.absorption, AXES.dermis),
+        (TABLE_AXES.scattering, TABLE_AXES.basal, TABLE_AXES.absorption, TABLE_AXES.dermis),
         strict=True,
     ):
         low, high = float(axis[0]), float(axis[-1])
@@ -205,7 +210,7 @@ def _load() -> SkinTransport:
     lateral = np.maximum(lateral / lateral.sum(axis=-1, keepdims=True), MIN_RING_FRACTION)
     for array in (reflectance, error, lateral):
         array.setflags(write=False)
-    depth = np.log(AXES.scattering)
+    depth = np.log(TABLE_AXES.scattering)
     return SkinTransport(
         reflectance,
         error,

@@ -97,7 +97,7 @@ def _reflectance(melanin: float, hemoglobin: float) -> Float64Array:
         spectra.WAVELENGTH_NM,
         np.array([melanin]),
         np.array([hemoglobin]),
-        constants=tissue_optics.SKIN,
+        constants=tissue_optics.SKIN_CONSTANTS,
     )
     found = np.asarray(spectra.band_average(spectrum, spectra.LINEAR_SRGB, "D65")[0], np.float64)
     found.setflags(write=False)

@@ -15,12 +15,12 @@ from capture.plan import Plan, flash_plan
 from capture.rig import Rig
 from model.skin import SkinAppearance
 from reconstruction.chromophores.pixel_checks import is_detectable
-from reconstruction.chromophores.separability import assess_camera
 from reconstruction.pipeline.flash.stages import MIN_SIGNAL_SIGMAS
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.evaluating import flash
 from skinrig.evaluating.bounds import relative_bounds
 from skinrig.planning import plans
+from skinrig.planning.camera_separability import assess_camera
 from skinrig.planning.flash_observation import (
     CHROMOPHORE_NAMES,
     CONFIRM_PX,

@@ -112,7 +112,7 @@ BREACHES = {
     "the packages stand on each other in one direction": ("model/skin.py", "import capture.rig"),
     "layers inside capture": ("capture/plan/dome.py", "import capture.session"),
     "layers inside reconstruction": (
-        "reconstruction/chromophores/lines.py",
+        "reconstruction/chromophores/start.py",
         "import reconstruction.registration.strain",
     ),
     "estimators import the model and nothing else of ours": (

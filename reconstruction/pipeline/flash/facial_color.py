@@ -20,8 +20,8 @@ from model.facial_color import HemoglobinRig
 from model.skin import MAP_UNITS, SkinMap
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import model_error
-from reconstruction.chromophores.common_optics import errors_within_face
 from reconstruction.chromophores.pixel_checks import is_detectable
+from reconstruction.chromophores.posterior import errors_within_face
 from reconstruction.correspondence import expression_alignment
 from reconstruction.correspondence.expression_alignment import Alignment
 from reconstruction.facial_color import registration_error as misplacement

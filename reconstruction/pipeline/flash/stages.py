@@ -134,7 +134,7 @@ def load_skin_colors(
     """Load the model of skin colors: the color table, and the prior of pixel brightness.
 
     The table's covariance states what colors differ by where thickness, oxygenation and scattering
-    are not those of the model (`model.optics_uncertainty`).
+    are not those of the model (`model.tissue_optics.uncertainty`).
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ import numpy as np
 
 from capture.calibration.color.colorimetry import delta_e_2000
 from model import color_table, skin_tone, spectra
-from model.tissue_optics import SKIN, two_layer_reflectance
+from model.tissue_optics import SKIN_CONSTANTS, two_layer_reflectance
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from rigsim.tissue.skin_table import SkinTable
 from skinrig.arrays import Float64Array
@@ -40,7 +40,9 @@ def measure_layered_reflectance(stage: BenchmarkStage) -> None:
         options: dict[str, Any] = {"tier": "diffusion"}
         if knobs != options:
             options = {"anisotropy": float(knobs["g"]), "directions": int(knobs["directions"])}
-        return two_layer_reflectance(truth.wavelength_nm, c_m, c_hd, constants=SKIN, **options)
+        return two_layer_reflectance(
+            truth.wavelength_nm, c_m, c_hd, constants=SKIN_CONSTANTS, **options
+        )
 
     def relative(found: Float64Array) -> Float64Array:
         return np.asarray(100 * np.abs(found / reference - 1))
@@ -60,7 +62,7 @@ def measure_color_table(stage: BenchmarkStage) -> None:
     c_m = 0.5 * rng.random(count) ** 3
     c_hd = 0.32 * rng.random(count) ** 3
     wavelength = spectra.WAVELENGTH_NM
-    direct = two_layer_reflectance(wavelength, c_m, c_hd, constants=SKIN)
+    direct = two_layer_reflectance(wavelength, c_m, c_hd, constants=SKIN_CONSTANTS)
     reference = skin_tone.lab(spectra.band_average(direct, spectra.LINEAR_SRGB, "D65"))
     stage.limits = {("smallest", between): np.nan for between in ("spline", "bilinear")}
     for size in (8, 16, 32, 64) if stage.toy else (8, 16, 32, 64, 128, 256, 512, 1024):

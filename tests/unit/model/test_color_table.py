@@ -5,7 +5,7 @@ import pytest
 
 from model import color_table, spectra
 from model.color_table import ColorTable, ColorTableError
-from model.tissue_optics import SKIN, two_layer_reflectance
+from model.tissue_optics import SKIN_CONSTANTS, two_layer_reflectance
 from model.tissue_optics.layers import C_HD_MAX, C_M_MAX
 
 
@@ -27,7 +27,12 @@ def test_lookup_is_band_average_of_accurate_tier(camera, anisotropy, rng):
     c_m, c_hd = fractions(rng, 60)
     table = color_table.build(camera, "D65", anisotropy=anisotropy)
     reflectance = two_layer_reflectance(
-        spectra.WAVELENGTH_NM, c_m, c_hd, constants=SKIN, anisotropy=anisotropy, directions=24
+        spectra.WAVELENGTH_NM,
+        c_m,
+        c_hd,
+        constants=SKIN_CONSTANTS,
+        anisotropy=anisotropy,
+        directions=24,
     )
     direct = spectra.band_average(reflectance, camera, "D65")
     np.testing.assert_allclose(table.lookup(c_m, c_hd), direct, rtol=1e-4)

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from model import spectra
-from model.tissue_optics import PAPERS, SKIN
+from model.tissue_optics import PAPER_CONSTANTS, SKIN_CONSTANTS
 from model.tissue_optics.layers import (
     C_HD_MAX,
     C_M_MAX,
@@ -25,7 +25,7 @@ NIST_MEAN = [0.185, 0.252, 0.328, 0.317, 0.323, 0.327, 0.447, 0.557, 0.602]
 
 
 def test_layers_hold_the_chromophores_of_their_depth():
-    sigma_a, sigma_s, thickness = skin_layers(500.0, 0.1, 0.08, constants=PAPERS)
+    sigma_a, sigma_s, thickness = skin_layers(500.0, 0.1, 0.08, constants=PAPER_CONSTANTS)
     pigment = 0.61 * 67.92 + 0.39 * 43.88
     epidermis = 0.1 * pigment + 0.02 * 11.200 + (1 - 0.1 - 0.02) * 0.0702
     dermis = 0.08 * 11.200 + 0.92 * 0.0702
@@ -49,7 +49,7 @@ def test_skin_has_thin_epidermis_without_blood():
 )
 def test_constants_that_no_tissue_has_are_refused(name, bad):
     with pytest.raises(TissueError, match=name):
-        replace(SKIN, **{name: bad})
+        replace(SKIN_CONSTANTS, **{name: bad})
 
 
 def test_deoxygenated_blood_is_darker_in_the_red_only():

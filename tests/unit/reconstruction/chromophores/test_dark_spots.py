@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model import color_table
-from model.tissue_optics import PAPERS
+from model.tissue_optics import PAPER_CONSTANTS
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import shading_prior
 from reconstruction.chromophores.dark_spots import (
@@ -23,7 +23,11 @@ SIDE = 90
 @pytest.fixture(scope="module")
 def table():
     return color_table.build(
-        "Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN, constants=PAPERS, exact_optics=True
+        "Nikon 5100 (NPL)",
+        "D55",
+        anisotropy=ANISOTROPY_SKIN,
+        constants=PAPER_CONSTANTS,
+        exact_optics=True,
     )
 
 
@@ -205,7 +209,11 @@ def test_non_skin_is_not_spot_and_is_ignored():
 def pixels(count):
     """Weigh some pixels of one color."""
     table = color_table.build(
-        "Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN, constants=PAPERS, exact_optics=True
+        "Nikon 5100 (NPL)",
+        "D55",
+        anisotropy=ANISOTROPY_SKIN,
+        constants=PAPER_CONSTANTS,
+        exact_optics=True,
     )
     return estimate(np.full((count, 3), 0.3), table, prior=shading_prior.face_prior())
 

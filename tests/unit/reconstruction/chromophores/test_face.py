@@ -5,7 +5,7 @@ import pytest
 from twins import chromophores as chromophore_reference
 
 from model import color_table
-from model.tissue_optics import PAPERS
+from model.tissue_optics import PAPER_CONSTANTS
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores import shading_prior
@@ -21,7 +21,11 @@ NOISE = 0.004
 @pytest.fixture(scope="module")
 def table():
     return color_table.build(
-        "Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN, constants=PAPERS, exact_optics=True
+        "Nikon 5100 (NPL)",
+        "D55",
+        anisotropy=ANISOTROPY_SKIN,
+        constants=PAPER_CONSTANTS,
+        exact_optics=True,
     )
 
 

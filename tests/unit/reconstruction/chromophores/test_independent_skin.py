@@ -15,7 +15,12 @@ from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import invert
 from reconstruction.chromophores import posterior as chromophore_posterior
-from reconstruction.chromophores.common_optics import add_optics_errors
+from reconstruction.chromophores.inversion import (
+    POPULATION_BLOOD,
+    POPULATION_LOG_SD,
+    POPULATION_MELANIN,
+)
+from reconstruction.chromophores.posterior import add_optics_errors
 from reconstruction.chromophores.shading_prior import lognormal_prior
 from reconstruction.chromophores.start import evaluate_table
 from skinrig.benchmarks.flash_rig import independent_skin as independent
@@ -23,7 +28,7 @@ from skinrig.benchmarks.flash_rig import independent_skin as independent
 
 def accuracies(exact_optics):
     found = []
-    for camera, illuminant in independent.CAMERAS:
+    for camera, illuminant in independent.JUDGED_CAMERAS:
         skins = independent.load_skins()
         table = color_table.build(
             camera, illuminant, anisotropy=ANISOTROPY_SKIN, exact_optics=exact_optics
@@ -38,7 +43,7 @@ def by_camera():
     return accuracies(exact_optics=False)
 
 
-@pytest.mark.parametrize("name", independent.TYPES)
+@pytest.mark.parametrize("name", independent.SKIN_TYPES)
 def test_independent_skin_is_valid_and_covered(by_camera, name):
     for found in by_camera:
         one = found[name]
@@ -61,7 +66,7 @@ def table():
 
 
 def test_fit_is_stationary_under_covariance_of_color(table, rng):
-    # plain NumPy: at the minimum of e' W e, the gradient g' W e is small against its deviation
+    # plain NumPy: at the minimum of e' W e and the prior, the force is small against its deviation
     c_m, c_hd = rng.uniform(0.01, 0.1, 400), rng.uniform(0.005, 0.03, 400)
     rgb = table.lookup(c_m, c_hd) * np.exp(0.05 * rng.standard_normal((400, 3)))
     found = invert(rgb, table, shading="known", variance=(0.005 * rgb) ** 2)
@@ -71,8 +76,12 @@ def test_fit_is_stationary_under_covariance_of_color(table, rng):
     slopes = np.stack([by_a / color, by_b / color], axis=-1)
     covariance = table.log_covariance(found.melanin, found.hemoglobin) + 0.005**2 * np.eye(3)
     weighted = np.swapaxes(slopes, 1, 2) @ np.linalg.inv(covariance)
-    fisher = weighted @ slopes
-    step = np.linalg.solve(fisher, weighted @ np.log(rgb / color)[..., None])[..., 0]
+    mean = np.cbrt([POPULATION_MELANIN / table.c_m_max, POPULATION_BLOOD / table.c_hd_max])
+    precision = (mean * POPULATION_LOG_SD / 3.0) ** -2.0
+    fisher = weighted @ slopes + np.diag(precision)
+    force = (weighted @ np.log(rgb / color)[..., None])[..., 0]
+    force += precision * (mean - np.stack([a, b], axis=-1))
+    step = np.linalg.solve(fisher, force[..., None])[..., 0]
     sigmas = np.abs(step) * np.sqrt(np.einsum("nii->ni", fisher))
     assert inside.mean() > 0.8
     assert np.median(sigmas[inside]) < 0.03
@@ -126,7 +135,7 @@ def test_posterior_with_unknown_optics_is_wider(table):
     assert wide.valid.all()
 
 
-def test_color_off_the_table_is_skin_within_the_covariance(table):
+def test_color_near_table_is_skin_of_unknown_optics(table):
     # 8 % from the table is outside for exact optics, and inside for skin of unknown optics
     color = table.lookup(0.04, 0.012)
     shifted = (color * np.exp([0.08, -0.04, 0.06]))[None]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from twins import chromophores as chromophore_reference
 
 from model import color_table
-from model.tissue_optics import PAPERS
+from model.tissue_optics import PAPER_CONSTANTS
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from reconstruction.chromophores import inversion as chromophores
 from reconstruction.chromophores.inversion import ChromophoreError, compute_identifiability, invert
@@ -19,7 +19,11 @@ MODES = [None, "known"]
 @pytest.fixture(scope="module")
 def table():
     return color_table.build(
-        CAMERA, "xenon flash", anisotropy=ANISOTROPY_SKIN, constants=PAPERS, exact_optics=True
+        CAMERA,
+        "xenon flash",
+        anisotropy=ANISOTROPY_SKIN,
+        constants=PAPER_CONSTANTS,
+        exact_optics=True,
     )
 
 
@@ -43,7 +47,7 @@ def weights_of(variance_relative, free):
 @pytest.mark.parametrize("shading", MODES)
 def test_round_trip_is_exact_where_skin_is_determined(shading, light):
     table = color_table.build(
-        CAMERA, light, anisotropy=ANISOTROPY_SKIN, constants=PAPERS, exact_optics=True
+        CAMERA, light, anisotropy=ANISOTROPY_SKIN, constants=PAPER_CONSTANTS, exact_optics=True
     )
     c_m, c_hd = grid_of_skin(160)
     maps = invert(table.lookup(c_m, c_hd), table, shading=shading)

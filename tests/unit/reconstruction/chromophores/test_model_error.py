@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model import color_table
-from model.tissue_optics import PAPERS
+from model.tissue_optics import PAPER_CONSTANTS
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error
 from reconstruction.chromophores.inversion import ChromophoreError
@@ -19,7 +19,11 @@ SIZE = 48
 @pytest.fixture(scope="module")
 def table():
     return color_table.build(
-        "Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN, constants=PAPERS, exact_optics=True
+        "Nikon 5100 (NPL)",
+        "D55",
+        anisotropy=ANISOTROPY_SKIN,
+        constants=PAPER_CONSTANTS,
+        exact_optics=True,
     )
 
 

@@ -3,7 +3,7 @@ import pytest
 from twins import chromophores as chromophore_reference
 
 from model import color_table
-from model.tissue_optics import PAPERS
+from model.tissue_optics import PAPER_CONSTANTS
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
 from reconstruction.chromophores.inversion import ChromophoreError, add_brightness_variance, invert
@@ -16,7 +16,11 @@ NOISE = 0.004
 @pytest.fixture(scope="module")
 def table():
     return color_table.build(
-        "Nikon 5100 (NPL)", "D55", anisotropy=ANISOTROPY_SKIN, constants=PAPERS, exact_optics=True
+        "Nikon 5100 (NPL)",
+        "D55",
+        anisotropy=ANISOTROPY_SKIN,
+        constants=PAPER_CONSTANTS,
+        exact_optics=True,
     )
 
 
@@ -177,7 +181,11 @@ def test_unexpected_light_levels_leave_finite_numbers(scale, table, prior):
 def test_non_skin_by_own_errors_is_masked(prior):
     """White cloth in a photograph whose background is rough: the usual error passes anything."""
     table = color_table.build(
-        "linear sRGB", "D65", anisotropy=ANISOTROPY_SKIN, constants=PAPERS, exact_optics=True
+        "linear sRGB",
+        "D65",
+        anisotropy=ANISOTROPY_SKIN,
+        constants=PAPER_CONSTANTS,
+        exact_optics=True,
     )
     light = np.exp(np.linspace(np.log(0.05), np.log(2.0), 9))[:, None, None]
     cloth = light * [[1.0, 0.96, 0.99], [1.0, 1.0, 1.0], [0.6, 0.9, 1.0], [0.9, 0.5, 0.9]]

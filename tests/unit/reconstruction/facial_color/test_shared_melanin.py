@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model import color_table
-from model.tissue_optics import PAPERS
+from model.tissue_optics import PAPER_CONSTANTS
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
 from reconstruction.chromophores import posterior as chromophore_posterior
@@ -18,7 +18,11 @@ MELANIN = 0.02
 @pytest.fixture(scope="module")
 def table():
     return color_table.build(
-        "Nikon 5100 (NPL)", "D65", anisotropy=ANISOTROPY_SKIN, constants=PAPERS, exact_optics=True
+        "Nikon 5100 (NPL)",
+        "D65",
+        anisotropy=ANISOTROPY_SKIN,
+        constants=PAPER_CONSTANTS,
+        exact_optics=True,
     )
 
 

@@ -32,7 +32,7 @@ from rigsim.scenes.probe.scene import ProbeScene
 from rigsim.sensor import expose_sensor, make_sensor
 from rigsim.subject.person import make_subject
 from rigsim.targets.flat import make_target
-from rigsim.tissue.skin_layers import PAPERS
+from rigsim.tissue.skin_layers import PAPER_SKIN
 
 pytestmark = pytest.mark.render
 
@@ -139,7 +139,7 @@ def faces():
     black = SubjectFile(melanin=0.45).face(seed=3, size=96)
     return {
         "II": make_subject("II", seed=3, size=96),
-        "black": dataclasses.replace(black, tissue=PAPERS),  # an epidermis of 0.25 mm
+        "black": dataclasses.replace(black, tissue=PAPER_SKIN),  # an epidermis of 0.25 mm
     }
 
 

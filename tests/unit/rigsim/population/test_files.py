@@ -15,7 +15,7 @@ from rigsim.subject import pigment
 from rigsim.subject.perfusion import STATE_NAMES
 from rigsim.subject.person import make_subject
 from rigsim.subject.person_skin import PersonSkin
-from rigsim.tissue.skin_layers import PAPERS, SKIN
+from rigsim.tissue.skin_layers import PAPER_SKIN, TYPICAL_SKIN
 
 SCHEMA = 'schema = "skinrig.subject/1"\n'
 
@@ -249,12 +249,12 @@ def test_a_mesh_is_named_once(person, tmp_path):
 
 def test_properties_of_the_tissue_reach_every_rig(person):
     ann = read_subject_file(person('tissue_model = "papers"\noxygenation = 0.5'))
-    expected = dataclasses.replace(PAPERS, oxygenation=0.5)
+    expected = dataclasses.replace(PAPER_SKIN, oxygenation=0.5)
     assert ann.face(seed=1, size=64).tissue == expected
     assert ann.patch("cheek", seed=1, size_mm=0.3).skin.tissue == expected
     top = ann.tissue(seed=1).optics("cheek", 0.0, 60.0).stacks[0].layers[0]
     assert top.thickness_mm == expected.epidermis_mm
-    assert load_subject("III").face(seed=1, size=64).tissue == SKIN
+    assert load_subject("III").face(seed=1, size=64).tissue == TYPICAL_SKIN
 
 
 def test_impossible_tissue_is_refused_by_name(person):

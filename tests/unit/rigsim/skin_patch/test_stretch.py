@@ -23,7 +23,7 @@ from rigsim.skin_patch.stretch import (
 )
 from rigsim.skin_patch.stretch_kernels import add_bending_forces, add_membrane_forces
 from rigsim.subject.person_skin import SiteSkin
-from rigsim.tissue.skin_layers import SKIN
+from rigsim.tissue.skin_layers import TYPICAL_SKIN
 
 Floats = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ def patch(height: Floats, *, layer_um: float = 8.0, texel_um: float = 10.0) -> M
     return MicroSkin(
         site="cheek",
         seed=0,
-        skin=SiteSkin(0.03, 0.01, SKIN),
+        skin=SiteSkin(0.03, 0.01, TYPICAL_SKIN),
         texel_um=texel_um,
         height_um=height.astype(np.float32),
         albedo=0.3 * even,

@@ -14,7 +14,7 @@ from rigsim.subject.perfusion import StateError
 from rigsim.subject.person import make_subject
 from rigsim.subject.person_skin import SITE_NAMES, PersonSkin, PersonSkinError, layers
 from rigsim.subject.skin_tone import MONK_ITA_DEG, melanin_of_tone, typology_angle_deg
-from rigsim.tissue.skin_layers import PAPERS
+from rigsim.tissue.skin_layers import PAPER_SKIN
 from rigsim.tissue.skin_table import SkinTable
 
 
@@ -42,14 +42,14 @@ def test_states_without_movement_change_blood_at_sites():
 
 
 def test_layers_have_the_pigments_of_the_site():
-    person = PersonSkin(0.05, seed=2, tissue=PAPERS)
+    person = PersonSkin(0.05, seed=2, tissue=PAPER_SKIN)
     for site in SITE_NAMES:
         skin = person.at(site)
         stack = layers(person, site, "neutral", 540.0)
         assert [layer.thickness_mm for layer in stack.layers] == [0.25, np.inf]
-        dark = layers(PersonSkin(0.1, seed=2, tissue=PAPERS), site, "neutral", 540.0)
+        dark = layers(PersonSkin(0.1, seed=2, tissue=PAPER_SKIN), site, "neutral", 540.0)
         assert dark.layers[0].sigma_a_per_mm > stack.layers[0].sigma_a_per_mm
-        assert skin.tissue == PAPERS
+        assert skin.tissue == PAPER_SKIN
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ from scipy.optimize import least_squares
 
 from rigsim.tissue import skin_layers, skin_table, skin_transport
 from rigsim.tissue.lateral_kernels import GAUSSIAN_SIGMAS_MM, LateralKernels
-from rigsim.tissue.skin_layers import PAPERS, SKIN, TissueProperties
+from rigsim.tissue.skin_layers import PAPER_SKIN, TYPICAL_SKIN, TissueProperties
 from rigsim.tissue.skin_table import RING_EDGES_MM, SkinTable, SkinTableError
-from rigsim.tissue.skin_transport import AXES, SkinTransport, SkinTransportError
+from rigsim.tissue.skin_transport import TABLE_AXES, SkinTransport, SkinTransportError
 from rigsim.tissue.tissue_mc import TransportError, trace_escape_paths, trace_photons
 
 # Wavelength (nm), C_m, C_hd, photons: fair to dark, bloodless to Soret peak, on and off the nodes.
@@ -38,7 +38,7 @@ UNUSUAL = TissueProperties(
     baseline_amplitude=1.5,
     eumelanin_fraction=1.0,
 )
-TISSUES = (SKIN, PAPERS, UNUSUAL)
+TISSUES = (TYPICAL_SKIN, PAPER_SKIN, UNUSUAL)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def table():
     return SkinTable.load()
 
 
-def traced(entries, *, seed, tissue=SKIN):
+def traced(entries, *, seed, tissue=TYPICAL_SKIN):
     """Photons traced now, per entry."""
     return [
         trace_photons(
@@ -132,7 +132,7 @@ def recipe():
 
 def test_recipe_makes_the_stored_numbers_from_other_photons(recipe):
     stored = SkinTransport.load()
-    made = recipe.simulate(float(AXES.scattering[6]), seed=1, scale=0.02, threads=2)
+    made = recipe.simulate(float(TABLE_AXES.scattering[6]), seed=1, scale=0.02, threads=2)
     some = np.s_[::3, ::10, ::9]
     error = np.hypot(made["reflectance_standard_error"][some], stored.standard_error[6][some])
     scores = (made["reflectance"][some] - stored.reflectance[6][some]) / error
@@ -145,11 +145,11 @@ def test_recipe_makes_the_stored_numbers_from_other_photons(recipe):
 
 
 def test_recipe_runs_divide_each_estimate_without_gaps(recipe):
-    shares = recipe.shares(AXES)
+    shares = recipe.shares(TABLE_AXES)
     np.testing.assert_allclose(shares.sum(axis=0), 1.0, rtol=1e-12)
-    for (traced_depth, _), share in zip(recipe.RUNS, shares, strict=True):
+    for (traced_depth, _), share in zip(recipe.TRACED_RUNS, shares, strict=True):
         # A run must not be reweighted to less absorption than it had, in either part.
-        upper = 1.5 * (1.0 - AXES.basal[:, None]) * AXES.absorption
+        upper = 1.5 * (1.0 - TABLE_AXES.basal[:, None]) * TABLE_AXES.absorption
         assert np.all(share[upper < traced_depth * (1.0 - 1e-9)] == 0.0)
 
 
@@ -158,7 +158,7 @@ def test_interrupted_recipe_resumes_and_ends_with_same_numbers(recipe, tmp_path)
     arguments = ["--photons-scale", "1e-4", "--work", str(tmp_path), "--out"]
     assert recipe.main([*arguments, str(tmp_path / "whole.npz")]) == 0
     parts = sorted(tmp_path.glob("*/*.npz"))
-    assert len(parts) == AXES.scattering.size
+    assert len(parts) == TABLE_AXES.scattering.size
     kept = {part: part.stat().st_mtime_ns for part in parts[1:]}
     parts[0].unlink()
     assert recipe.main([*arguments, str(tmp_path / "resumed.npz")]) == 0
@@ -191,7 +191,7 @@ def test_table_was_made_with_the_constants_of_today():
     assert found["eta"] == skin_layers.ETA
     assert found["dermis_scattering_ratio"] == skin_layers.DERMIS_SCATTERING_RATIO
     assert found["basal_thickness_fraction"] == skin_layers.BASAL_THICKNESS_FRACTION
-    for axes, name in ((AXES, "axes"), (skin_transport.LATERAL_AXES, "lateral_axes")):
+    for axes, name in ((TABLE_AXES, "axes"), (skin_transport.LATERAL_AXES, "lateral_axes")):
         for axis, nodes in found[name].items():
             np.testing.assert_allclose(getattr(axes, axis), nodes, rtol=1e-12)
 
@@ -324,7 +324,7 @@ def test_table_spectrum_fits_real_skin(table):
     assert rms < 0.02
     assert worst < 0.04
     # The papers' thick epidermis does not fit.
-    assert forearm_misfit(SkinTable.load(PAPERS))[1] > 1.5 * rms
+    assert forearm_misfit(SkinTable.load(PAPER_SKIN))[1] > 1.5 * rms
 
 
 def band_weights():

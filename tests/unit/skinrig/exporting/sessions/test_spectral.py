@@ -9,7 +9,7 @@ import pytest
 
 from model import color_table, spectra
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
-from model.tissue_optics import SKIN, two_layer_reflectance
+from model.tissue_optics import SKIN_CONSTANTS, two_layer_reflectance
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.sessions import spectral as stokes
@@ -65,7 +65,7 @@ def test_reflectance_matches_two_layer_model_per_wavelength(flash, tmp_path):
             picked,
             float(flash.maps["melanin"].values[row, column]),
             float(flash.maps["hemoglobin"].values[row, column]),
-            constants=SKIN,
+            constants=SKIN_CONSTANTS,
             anisotropy=ANISOTROPY_SKIN,
         )
         stored = [found[n][row, column] for w in picked for n, nm in named.items() if nm == w]

@@ -92,5 +92,5 @@ def test_tabulated_sensor_renders_skin_like_srgb(tmp_path, monkeypatch):
     assert "without color calibration" in found.provenance
     table = color_table.build(CAMERA, LIGHT, size=9, anisotropy=ANISOTROPY_SKIN)
     wanted = color_table.build(spectra.LINEAR_SRGB, "D65", size=9, anisotropy=ANISOTROPY_SKIN)
-    assert np.abs(found.convert(table.rgb) - wanted.rgb).max() < 0.01
+    assert np.abs(found.convert(table.rgb) - wanted.rgb).max() < 0.015
     assert np.abs(table.rgb - wanted.rgb).max() > 0.03

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model import color_table, optics_uncertainty, spectra
-from model.optics_uncertainty import NUISANCES
-from model.tissue_optics import SKIN, two_layer_reflectance
+from model import color_table, spectra
+from model.tissue_optics import SKIN_CONSTANTS, two_layer_reflectance
+from model.tissue_optics import uncertainty as optics_uncertainty
 from model.tissue_optics.layers import ANISOTROPY_SKIN
+from model.tissue_optics.uncertainty import NUISANCE_PARAMETERS
 
 CAMERA = "Nikon 5100 (NPL)", "D55"
 
@@ -19,8 +20,8 @@ def table():
 
 
 def color_of(constants, c_m, c_hd):
-    """Color by adding-doubling at the melanin optical depth of c_m in SKIN."""
-    c_m = c_m * SKIN.melanin_depth_factor / constants.melanin_depth_factor
+    """Color by adding-doubling at the melanin optical depth of c_m in SKIN_CONSTANTS."""
+    c_m = c_m * SKIN_CONSTANTS.melanin_depth_factor / constants.melanin_depth_factor
     reflectance = two_layer_reflectance(
         spectra.WAVELENGTH_NM, c_m, c_hd, constants=constants, anisotropy=ANISOTROPY_SKIN
     )
@@ -28,10 +29,10 @@ def color_of(constants, c_m, c_hd):
 
 
 def without_all_but(name):
-    return [n.name for n in NUISANCES if n.name != name]
+    return [n.name for n in NUISANCE_PARAMETERS if n.name != name]
 
 
-@pytest.mark.parametrize("nuisance", NUISANCES, ids=lambda n: n.name)
+@pytest.mark.parametrize("nuisance", NUISANCE_PARAMETERS, ids=lambda n: n.name)
 @pytest.mark.parametrize("c_m", [0.015, 0.06, 0.16])
 def test_each_nuisance_moves_colors_as_stated(nuisance, c_m):
     u, v = color_table.spectral_axes(optics_uncertainty.COVARIANCE_NODES)
@@ -44,9 +45,11 @@ def test_each_nuisance_moves_colors_as_stated(nuisance, c_m):
     found = optics_uncertainty.log_color_covariance(
         *CAMERA, reflectance, without=without_all_but(nuisance.name), residual=False
     )[i, j]
-    usual, step = getattr(SKIN, nuisance.name), 0.5 * nuisance.sd
+    usual, step = getattr(SKIN_CONSTANTS, nuisance.name), 0.5 * nuisance.sd
     ends = usual * np.exp([-step, step]) if nuisance.is_log else usual + np.array([-step, step])
-    low, high = (color_of(replace(SKIN, **{nuisance.name: end}), c_m, c_hd) for end in ends)
+    low, high = (
+        color_of(replace(SKIN_CONSTANTS, **{nuisance.name: end}), c_m, c_hd) for end in ends
+    )
     moved = np.log(high / low)
     np.testing.assert_allclose(np.sqrt(np.diag(found)), np.abs(moved), rtol=0.12, atol=2e-3)
 
@@ -71,7 +74,7 @@ def test_log_covariance_interpolates_and_exact_optics_has_none(table):
 
 
 def test_optical_depth_is_fraction_times_thickness_times_absorption(table):
-    depth = 0.02 * SKIN.epidermis_mm * float(SKIN.melanin_absorption(550.0))
+    depth = 0.02 * SKIN_CONSTANTS.epidermis_mm * float(SKIN_CONSTANTS.melanin_absorption(550.0))
     assert float(table.melanin_optical_depth(0.02)) == pytest.approx(depth)
 
 

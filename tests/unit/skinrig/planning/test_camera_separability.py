@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from reconstruction.chromophores import ChromophoreError
-from reconstruction.chromophores.separability import LOSS_RATIO, assess_camera
+from skinrig.planning.camera_separability import LOSS_RATIO, assess_camera
 
 
 def test_sigma_camera_loses_blood_nikon_does_not():

@@ -1,7 +1,7 @@
-"""How well a camera under a light separates melanin from blood, before a session.
+"""Bounds of melanin and blood for a camera under a light, before a session.
 
 The bound of each chromophore's relative error is that of the linearized color (Cramer-Rao), with
-noise and with the covariance by unknown optics (`model.optics_uncertainty`), at known shading.
+noise and the covariance by unknown optics (`model.tissue_optics.uncertainty`), at known shading.
 """
 
 from dataclasses import dataclass
