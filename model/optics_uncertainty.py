@@ -153,3 +153,29 @@ def typology_angle(reflectance: ArrayLike) -> Float64Array:
     lightness = 116.0 * curved[..., 1] - 16.0
     yellow = 200.0 * (curved[..., 1] - curved[..., 2])
     return np.asarray(np.degrees(np.arctan2(lightness - 50.0, yellow)))
+
+
+def sigma_spectra(reflectance: Float64Array) -> Float64Array:
+    """Return spectra with each nuisance parameter one standard deviation below and above its mean.
+
+    Parameters
+    ----------
+    reflectance
+        (n, n, 31), as for `log_color_covariance`.
+
+    Returns
+    -------
+    ndarray, shape (1 + 2 k, n, n, 31)
+        The given spectra, then two for each of the k `NUISANCES`, to first order in log R.
+
+    Examples
+    --------
+    >>> spectra_33 = np.full((COVARIANCE_NODES, COVARIANCE_NODES, 31), 0.4)
+    >>> sigma_spectra(spectra_33).shape
+    (13, 33, 33, 31)
+    """
+    steps = [np.zeros_like(reflectance)]
+    for index, nuisance in enumerate(NUISANCES):
+        step = nuisance.sd * _derivatives()[:, :, index]
+        steps += [-step, step]
+    return np.asarray(reflectance * np.exp(np.stack(steps)))
