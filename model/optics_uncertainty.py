@@ -156,7 +156,7 @@ def typology_angle(reflectance: ArrayLike) -> Float64Array:
 
 
 def sigma_spectra(reflectance: Float64Array) -> Float64Array:
-    """Return spectra with each nuisance parameter one standard deviation below and above its mean.
+    """Return spectra with each unknown of skin one standard deviation below and above its mean.
 
     Parameters
     ----------
@@ -166,16 +166,23 @@ def sigma_spectra(reflectance: Float64Array) -> Float64Array:
     Returns
     -------
     ndarray, shape (1 + 2 k, n, n, 31)
-        The given spectra, then two for each of the k `NUISANCES`, to first order in log R.
+        The given spectra, then two for each of the k unknowns, to first order in log R: the
+        `NUISANCES`, then the principal residuals of measured spectra of each node's typology angle.
 
     Examples
     --------
-    >>> spectra_33 = np.full((COVARIANCE_NODES, COVARIANCE_NODES, 31), 0.4)
-    >>> sigma_spectra(spectra_33).shape
-    (13, 33, 33, 31)
+    >>> found = sigma_spectra(np.full((COVARIANCE_NODES, COVARIANCE_NODES, 31), 0.4))
+    >>> found.shape[0] > 2 * len(NUISANCES), found.shape[1:]
+    (True, (33, 33, 31))
     """
-    steps = [np.zeros_like(reflectance)]
-    for index, nuisance in enumerate(NUISANCES):
-        step = nuisance.sd * _derivatives()[:, :, index]
-        steps += [-step, step]
-    return np.asarray(reflectance * np.exp(np.stack(steps)))
+    stored = _stored()
+    steps = list(np.moveaxis(_derivatives(), 2, 0) * _nuisance_sd()[:, None, None, None])
+    angle = typology_angle(reflectance + normal_reflectance(ETA_SKIN))
+    band = np.abs(angle[..., None] - stored["typology_angle_deg"]).argmin(axis=-1)
+    steps += list(np.moveaxis(stored["residual_factors"][band], 2, 0))
+    both = [np.zeros_like(reflectance), *(sign * step for step in steps for sign in (-1.0, 1.0))]
+    return np.asarray(reflectance * np.exp(np.stack(both)))
+
+
+def _nuisance_sd() -> Float64Array:
+    return np.array([nuisance.sd for nuisance in NUISANCES])

@@ -20,8 +20,10 @@ from model.optics_uncertainty import COVARIANCE_NODES
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from reconstruction.pipeline.flash.tone_kernels import MIN_RELATIVE_XYZ
 
-SENSITIVITY_SHIFT_SD_NM: Final = 1.5
+CENTER_SD_NM: Final = 1.5
 """Assumed standard deviation of the center of each channel between a camera and its nominal one."""
+WIDTH_SD: Final = 0.02
+"""Assumed relative standard deviation of the width of each channel, likewise."""
 MELANIN_RANGE: Final = (0.003, 0.45)
 """Volume fractions of melanosomes of the modeled skin."""
 BLOOD_RANGE: Final = (0.003, 0.03)
@@ -29,6 +31,7 @@ BLOOD_RANGE: Final = (0.003, 0.03)
 N_LIGHTNESS_NODES: Final = 6
 """Nodes of the covariance of the remaining error, in the logarithm of Y."""
 _STEP_NM: Final = 1.0
+_NOMINAL: Final = np.zeros(6)
 _TO_XYZ: Final = np.linalg.inv(spectra.XYZ_TO_LINEAR_SRGB)
 
 
@@ -41,7 +44,7 @@ class SkinColorCorrection:
     log_y: Float64Array
     """(n,): nodes of log Y of the covariance, increasing."""
     log_covariance: Float64Array
-    """(n, 3, 3): covariance of log XYZ by optics of the tissue and shifted sensitivities."""
+    """(n, 3, 3): covariance of log XYZ by unknown optics of the tissue and sensitivities."""
     nominal: ColorMatrix
     """Fit on the chart's published spectra, of white-balanced camera RGB."""
 
@@ -64,7 +67,7 @@ def skin_color_correction(
         Names known to `model.spectra`.
     has_chart
         Whether a chart calibrates the actual camera. Without one the nominal matrix is used, and
-        the remaining error has all that shifted sensitivities change.
+        the remaining error has all that other sensitivities change.
 
     Notes
     -----
@@ -72,21 +75,22 @@ def skin_color_correction(
     standard deviation off. It includes `model.skin_tone.sphere_specular`, as instruments do.
     """
     skin = _modeled_skin()
-    nominal = _fit_to_chart(camera, illuminant, np.zeros(3))
-    calibrated = nominal.to_linear_srgb(skin @ _weights(camera, illuminant, np.zeros(3)))
+    nominal = _fit_to_chart(camera, illuminant, _NOMINAL)
+    calibrated = nominal.to_linear_srgb(skin @ _weights(camera, illuminant, _NOMINAL))
     truth = spectra.band_average(skin, spectra.LINEAR_SRGB, "D65")
     log_truth, log_given = _log_xyz(truth), _log_xyz(calibrated)
     found = np.linalg.lstsq(_terms(log_given), log_truth - log_given, rcond=None)[0]
 
-    def error(matrix: ColorMatrix, shift_nm: Float64Array) -> Float64Array:
-        seen = _log_xyz(matrix.to_linear_srgb(skin @ _weights(camera, illuminant, shift_nm)))
+    def error(matrix: ColorMatrix, off: Float64Array) -> Float64Array:
+        seen = _log_xyz(matrix.to_linear_srgb(skin @ _weights(camera, illuminant, off)))
         return np.asarray(seen + _terms(seen) @ found - log_truth)
 
-    usual = error(nominal, np.zeros(3))
+    usual = error(nominal, _NOMINAL)
     products = usual[:, :, None] * usual[:, None, :]
-    for shift_nm in np.concatenate([np.eye(3), -np.eye(3)]) * SENSITIVITY_SHIFT_SD_NM:
-        matrix = _fit_to_chart(camera, illuminant, shift_nm) if has_chart else nominal
-        change = error(matrix, shift_nm) - usual
+    steps = np.diag([CENTER_SD_NM] * 3 + [WIDTH_SD] * 3)
+    for step in np.concatenate([steps, -steps]):
+        matrix = _fit_to_chart(camera, illuminant, step) if has_chart else nominal
+        change = error(matrix, step) - usual
         products += 0.5 * change[:, :, None] * change[:, None, :]
     edges = np.quantile(log_truth[:, 1], np.linspace(0.0, 1.0, N_LIGHTNESS_NODES + 1))
     place = np.clip(np.searchsorted(edges, log_truth[:, 1], side="right") - 1, 0, edges.size - 2)
@@ -114,24 +118,29 @@ def _inside(values: Float64Array, limits: tuple[float, float]) -> BoolArray:
     return (values >= limits[0]) & (values <= limits[1])
 
 
-def _weights(camera: str, illuminant: str, shift_nm: Float64Array) -> Float64Array:
-    """Return band weights of a camera whose channels are shifted, white-balanced, (31, 3)."""
-    if not shift_nm.any():
+def _weights(camera: str, illuminant: str, off: Float64Array) -> Float64Array:
+    """Return band weights of a camera that is not nominal, white-balanced, (31, 3).
+
+    Parameter `off`, (6,): shift of the center of each channel in nm, relative change of its width.
+    """
+    if not off.any():
         return spectra.band_weights(camera, illuminant)
     nm = np.arange(spectra.WAVELENGTH_NM[0], spectra.WAVELENGTH_NM[-1] + _STEP_NM, _STEP_NM)
-    channels = [
-        spectra.camera_sensitivity(camera, nm - shift)[:, channel]
-        for channel, shift in enumerate(shift_nm)
-    ]
+    nominal = spectra.camera_sensitivity(camera, nm)
+    channels = []
+    for channel in range(3):
+        center = float(np.average(nm, weights=np.abs(nominal[:, channel])))
+        source = center + (nm - center - off[channel]) / (1.0 + off[3 + channel])
+        channels.append(spectra.camera_sensitivity(camera, source)[:, channel])
     product = np.stack(channels, axis=1) * spectra.illuminant(illuminant, nm)[:, None]
     hats = np.stack([np.interp(nm, spectra.WAVELENGTH_NM, row) for row in np.eye(31)])
     found = hats @ product
     return np.asarray(found / found.sum(axis=0))
 
 
-def _fit_to_chart(camera: str, illuminant: str, shift_nm: Float64Array) -> ColorMatrix:
+def _fit_to_chart(camera: str, illuminant: str, off: Float64Array) -> ColorMatrix:
     """Fit the color matrix of white-balanced RGB as a calibration does, without noise."""
-    patches = chart_spectra(spectra.WAVELENGTH_NM) @ _weights(camera, illuminant, shift_nm)
+    patches = chart_spectra(spectra.WAVELENGTH_NM) @ _weights(camera, illuminant, off)
     named = illuminant if illuminant in WHITE_XYZ else "D50"
     white = neutral_white(patches).value
     fit = fit_matrix(patches, chart_reference(named), white=white, illuminant=named)

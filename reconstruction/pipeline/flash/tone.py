@@ -95,12 +95,7 @@ class ToneCamera:
             exact = np.zeros_like(correction.nominal.stderr)
             return cls(correction, replace(correction.nominal, stderr=exact), np.ones(3))
         correction = skin_color_correction(camera, illuminant)
-        nominal = correction.nominal.stderr
-        if nominal.shape == matrix.stderr.shape:
-            # the jackknife includes the misfit of patches, which the correction removes from skin
-            excess = np.square(matrix.stderr) - np.square(nominal / neutral)
-            matrix = replace(matrix, stderr=np.sqrt(np.maximum(excess, 0.0)))
-        return cls(correction, matrix, neutral)
+        return cls(correction, _without_misfit(matrix, correction.nominal, neutral), neutral)
 
     def lab(self, rgb: FloatArray, variance: FloatArray) -> tuple[Float32Array, Float32Array]:
         """Return CIE L*a*b* of skin with the surface reflection, and its covariance.
@@ -138,6 +133,20 @@ class ToneCamera:
             covariance,
         )
         return found, covariance
+
+
+def _without_misfit(
+    matrix: ColorMatrix, nominal: ColorMatrix, neutral: Float64Array
+) -> ColorMatrix:
+    """Reduce a matrix's standard errors by those of the nominal camera without noise.
+
+    The jackknife includes the misfit of patches, which the correction removes from skin.
+    """
+    if nominal.stderr.shape != matrix.stderr.shape:
+        return matrix
+    balanced = np.square(matrix.stderr * neutral)
+    share = max(1.0 - float(np.square(nominal.stderr).sum() / max(balanced.sum(), 1e-300)), 0.0)
+    return replace(matrix, stderr=matrix.stderr * np.sqrt(share))
 
 
 @dataclass(frozen=True, slots=True)
