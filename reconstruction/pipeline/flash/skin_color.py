@@ -12,7 +12,13 @@ from typing import Final
 
 import numpy as np
 
-from capture.calibration.color import ColorMatrix, chart_reference, fit_matrix, neutral_white
+from capture.calibration.color import (
+    ColorMatrix,
+    Method,
+    chart_reference,
+    fit_matrix,
+    neutral_white,
+)
 from capture.calibration.color.colorimetry import WHITE_XYZ, chart_spectra
 from model import color_table, optics_uncertainty, skin_tone, spectra
 from model.arrays import BoolArray, Float64Array
@@ -57,7 +63,7 @@ class SkinColorCorrection:
 
 @lru_cache(maxsize=8)
 def skin_color_correction(
-    camera: str, illuminant: str, *, has_chart: bool = True
+    camera: str, illuminant: str, *, has_chart: bool = True, method: Method = "linear"
 ) -> SkinColorCorrection:
     """Return the correction of skin's colors for a camera under a light; it is fitted once.
 
@@ -68,6 +74,8 @@ def skin_color_correction(
     has_chart
         Whether a chart calibrates the actual camera. Without one the nominal matrix is used, and
         the remaining error has all that other sensitivities change.
+    method
+        Method of the color matrix.
 
     Notes
     -----
@@ -75,11 +83,12 @@ def skin_color_correction(
     standard deviation off. It includes `model.skin_tone.sphere_specular`, as instruments do.
     """
     skin = _modeled_skin()
-    nominal = _fit_to_chart(camera, illuminant, _NOMINAL)
+    nominal = _fit_to_chart(camera, illuminant, _NOMINAL, method)
     calibrated = nominal.to_linear_srgb(skin @ _weights(camera, illuminant, _NOMINAL))
     truth = spectra.band_average(skin, spectra.LINEAR_SRGB, "D65")
     log_truth, log_given = _log_xyz(truth), _log_xyz(calibrated)
-    found = np.linalg.lstsq(_terms(log_given), log_truth - log_given, rcond=None)[0]
+    solved = np.linalg.lstsq(_terms(log_given), log_truth - log_given, rcond=None)[0]
+    found = np.asarray(solved, np.float64)
 
     def error(matrix: ColorMatrix, off: Float64Array) -> Float64Array:
         seen = _log_xyz(matrix.to_linear_srgb(skin @ _weights(camera, illuminant, off)))
@@ -89,7 +98,7 @@ def skin_color_correction(
     products = usual[:, :, None] * usual[:, None, :]
     steps = np.diag([CENTER_SD_NM] * 3 + [WIDTH_SD] * 3)
     for step in np.concatenate([steps, -steps]):
-        matrix = _fit_to_chart(camera, illuminant, step) if has_chart else nominal
+        matrix = _fit_to_chart(camera, illuminant, step, method) if has_chart else nominal
         change = error(matrix, step) - usual
         products += 0.5 * change[:, :, None] * change[:, None, :]
     edges = np.quantile(log_truth[:, 1], np.linspace(0.0, 1.0, N_LIGHTNESS_NODES + 1))
@@ -138,15 +147,13 @@ def _weights(camera: str, illuminant: str, off: Float64Array) -> Float64Array:
     return np.asarray(found / found.sum(axis=0))
 
 
-def _fit_to_chart(camera: str, illuminant: str, off: Float64Array) -> ColorMatrix:
+def _fit_to_chart(camera: str, illuminant: str, off: Float64Array, method: Method) -> ColorMatrix:
     """Fit the color matrix of white-balanced RGB as a calibration does, without noise."""
     patches = chart_spectra(spectra.WAVELENGTH_NM) @ _weights(camera, illuminant, off)
     named = illuminant if illuminant in WHITE_XYZ else "D50"
-    white = neutral_white(patches).value
-    fit = fit_matrix(patches, chart_reference(named), white=white, illuminant=named)
-    return ColorMatrix(
-        fit.matrix * white, fit.delta_e, fit.stderr * white, "linear", named, fit.fitted_delta_e
-    )
+    patches /= neutral_white(patches).value
+    reference = chart_reference(named)
+    return fit_matrix(patches, reference, white=np.ones(3), illuminant=named, method=method)
 
 
 def _log_xyz(linear_srgb: Float64Array) -> Float64Array:

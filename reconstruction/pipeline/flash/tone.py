@@ -94,7 +94,7 @@ class ToneCamera:
             correction = skin_color_correction(camera, illuminant, has_chart=False)
             exact = np.zeros_like(correction.nominal.stderr)
             return cls(correction, replace(correction.nominal, stderr=exact), np.ones(3))
-        correction = skin_color_correction(camera, illuminant)
+        correction = skin_color_correction(camera, illuminant, method=matrix.method)
         return cls(correction, _without_misfit(matrix, correction.nominal, neutral), neutral)
 
     def lab(self, rgb: FloatArray, variance: FloatArray) -> tuple[Float32Array, Float32Array]:
@@ -142,10 +142,10 @@ def _without_misfit(
 
     The jackknife includes the misfit of patches, which the correction removes from skin.
     """
-    if nominal.stderr.shape != matrix.stderr.shape:
-        return matrix
-    balanced = np.square(matrix.stderr * neutral)
-    share = max(1.0 - float(np.square(nominal.stderr).sum() / max(balanced.sum(), 1e-300)), 0.0)
+    balanced = np.square(matrix.stderr[:, :3] * neutral)
+    share = max(
+        1.0 - float(np.square(nominal.stderr[:, :3]).sum() / max(balanced.sum(), 1e-300)), 0.0
+    )
     return replace(matrix, stderr=matrix.stderr * np.sqrt(share))
 
 

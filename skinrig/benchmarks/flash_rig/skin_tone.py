@@ -21,7 +21,7 @@ from rigsim.tissue.skin_layers import SKIN, TissueProperties
 from rigsim.tissue.skin_table import WAVELENGTH_NM, SkinTable
 from skinrig.arrays import Float64Array, UInt8Array
 from skinrig.benchmarks.resampling import median_error
-from skinrig.benchmarks.results import ErrorEstimate
+from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage
 from skinrig.evaluating.skin_bands import MelaninBand
 
@@ -82,12 +82,12 @@ def measure_skin_tone(stage: BenchmarkStage) -> None:
             timing, found = stage.time(call, repeats=1, memory=None)
             medians, coverage = found.medians(found.error_deg), found.coverage()
             by_chart = found.medians(found.chart_error_deg)
-            extra: dict[str, str | int | float | bool] = {}
+            extra: Knobs = {}
             for place, band in enumerate(skin_tone.ITA_BANDS):
                 extra[f"median {band}"] = round(float(medians[place]), 2)
                 extra[f"matrix alone {band}"] = round(float(by_chart[place]), 2)
                 extra[f"coverage {band}, %"] = round(100.0 * float(coverage[place]))
-            knobs = {"camera": camera, "noise_percent": noise}
+            knobs: Knobs = {"camera": camera, "noise_percent": noise}
             stage.add(knobs, timing, median_error(np.abs(found.error_deg)), extra)
             if noise == NOISE_PERCENT[0]:
                 area[camera] = found
