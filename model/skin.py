@@ -26,6 +26,13 @@ MAP_UNITS: Mapping[str, str] = MappingProxyType(
         "position": "mm",
         "roughness": "1",
         "residual": "1",
+        "lab": "1",
+        "ita": "degree",
+        "monk": "1",
+        "monk_low": "1",
+        "monk_high": "1",
+        "erythema_index": "1",
+        "melanin_index": "1",
     }
 )
 """Units of the maps with a fixed meaning; maps of other names have their own."""

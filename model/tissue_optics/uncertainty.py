@@ -153,3 +153,36 @@ def typology_angle(reflectance: ArrayLike) -> Float64Array:
     lightness = 116.0 * curved[..., 1] - 16.0
     yellow = 200.0 * (curved[..., 1] - curved[..., 2])
     return np.asarray(np.degrees(np.arctan2(lightness - 50.0, yellow)))
+
+
+def sigma_spectra(reflectance: Float64Array) -> Float64Array:
+    """Return spectra with each unknown of skin one standard deviation below and above its mean.
+
+    Parameters
+    ----------
+    reflectance
+        (n, n, 31), as for `log_color_covariance`.
+
+    Returns
+    -------
+    ndarray, shape (1 + 2 k, n, n, 31)
+        The given spectra, then two for each of the k unknowns, to first order in log R: the
+        `NUISANCES`, then the principal residuals of measured spectra of each node's typology angle.
+
+    Examples
+    --------
+    >>> found = sigma_spectra(np.full((COVARIANCE_NODES, COVARIANCE_NODES, 31), 0.4))
+    >>> found.shape[0] > 2 * len(NUISANCES), found.shape[1:]
+    (True, (33, 33, 31))
+    """
+    stored = _stored()
+    steps = list(np.moveaxis(_derivatives(), 2, 0) * _nuisance_sd()[:, None, None, None])
+    angle = typology_angle(reflectance + normal_reflectance(ETA_SKIN))
+    band = np.abs(angle[..., None] - stored["typology_angle_deg"]).argmin(axis=-1)
+    steps += list(np.moveaxis(stored["residual_factors"][band], 2, 0))
+    both = [np.zeros_like(reflectance), *(sign * step for step in steps for sign in (-1.0, 1.0))]
+    return np.asarray(reflectance * np.exp(np.stack(both)))
+
+
+def _nuisance_sd() -> Float64Array:
+    return np.array([nuisance.sd for nuisance in NUISANCES])

@@ -21,6 +21,11 @@ MAP_WORDS: Final = {
     "translucency": "diffuse mean free path",
     "tsumura_melanin": "melanin, independent components",
     "tsumura_hemoglobin": "hemoglobin, independent components",
+    "lab": "CIE Lab",
+    "ita": "individual typology angle",
+    "monk": "Monk skin tone",
+    "monk_low": "lightest likely Monk skin tone",
+    "monk_high": "darkest likely Monk skin tone",
     "image": "captured image",
     "specular_image": "specular image",
 }
@@ -80,8 +85,10 @@ def uncertainty_title(name: str) -> str:
     --------
     >>> uncertainty_title("melanin"), uncertainty_title("normals")
     ('68 % credible half-width', 'standard uncertainty')
+    >>> uncertainty_title("melanin_index")
+    'standard uncertainty'
     """
-    posterior = name.startswith(("melanin", "hemoglobin"))
+    posterior = name.startswith(("melanin", "hemoglobin")) and not name.endswith("_index")
     return CREDIBLE_HALF_WIDTH if posterior else STANDARD_UNCERTAINTY
 
 

@@ -121,3 +121,27 @@ def chart_reference(illuminant: str = "D50") -> Float64Array:
     lab = np.array([[float(row[k]) for k in "Lab"] for row in _chart_rows()])
     d50 = white_point("D50")
     return _adapt(xyz_from_lab(lab, d50), d50, white_point(illuminant))
+
+
+def chart_spectra(wavelength_nm: ArrayLike) -> Float64Array:
+    """Return reflectance spectra of the ColorChecker Classic, shape (24, n).
+
+    Parameters
+    ----------
+    wavelength_nm
+        The n wavelengths in nm, 380 to 730; linear between samples 10 nm apart.
+
+    References
+    ----------
+    BabelColor average of 30 charts: D. Pascale 2006, RGB coordinates of the ColorChecker.
+
+    Examples
+    --------
+    >>> chart_spectra([450.0, 650.0])[18].round(2).tolist()
+    [0.89, 0.91]
+    """
+    from colour import SDS_COLOURCHECKERS  # takes a second to import, so only where it is used
+
+    nodes = np.asarray(wavelength_nm, dtype=np.float64)
+    patches = SDS_COLOURCHECKERS["BabelColor Average"].values()
+    return np.array([np.interp(nodes, patch.wavelengths, patch.values) for patch in patches])

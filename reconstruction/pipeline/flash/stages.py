@@ -30,6 +30,7 @@ from reconstruction.chromophores.face import estimate_face
 from reconstruction.chromophores.pixel_checks import is_detectable
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.pipeline import graph as stages
+from reconstruction.pipeline.flash import tone
 from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.masked_map import masked_map
 
@@ -39,7 +40,8 @@ STAGE_REVISION = 8
 MAP_NAMES = tuple(
     "melanin melanin_optical_depth hemoglobin shading residual gamut_distance "
     "diffuse specular image specular_image "
-    "tsumura_melanin tsumura_hemoglobin melanin_noise_stderr hemoglobin_noise_stderr".split()
+    "tsumura_melanin tsumura_hemoglobin melanin_noise_stderr hemoglobin_noise_stderr "
+    "lab ita monk monk_low monk_high erythema_index melanin_index".split()
 )
 """Maps of a flash session."""
 
@@ -95,6 +97,9 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
         stage("chromophores", "diffuse", of_skin, partial(_chromophores, rig), **by_color),
         stage("tsumura", "diffuse", "tsumura_melanin tsumura_hemoglobin", _tsumura),
         stage("pictures", both, shown, partial(_pictures, rig), **table),
+        *tone.tone_stages(
+            stage, (rig.color, rig.neutral), has_white=rig.white is not None, **table
+        ),
     ]
 
 

@@ -307,3 +307,13 @@ def test_retyped_chart_equals_published_chart():
         colorimetry.chart_reference("D50"), colorimetry.white_point("D50")
     )
     np.testing.assert_allclose(lab, published, atol=1e-9)
+
+
+def test_chart_spectra_have_the_chart_reference_colors():
+    from model import skin_tone
+
+    wavelength_nm = np.arange(400.0, 701.0, 10.0)
+    by_spectra = skin_tone.lab_of_spectra(colorimetry.chart_spectra(wavelength_nm), wavelength_nm)
+    white = colorimetry.white_point("D65")
+    published = colorimetry.lab_from_xyz(colorimetry.chart_reference("D65"), white)
+    assert np.median(colorimetry.delta_e_2000(by_spectra, published)) < 2.0
