@@ -167,12 +167,12 @@ def sigma_spectra(reflectance: Float64Array) -> Float64Array:
     -------
     ndarray, shape (1 + 2 k, n, n, 31)
         The given spectra, then two for each of the k unknowns, to first order in log R: the
-        `NUISANCES`, then the principal residuals of measured spectra of each node's typology angle.
+        `NUISANCE_PARAMETERS`, then the principal residuals of measured spectra of each node's typology angle.
 
     Examples
     --------
     >>> found = sigma_spectra(np.full((COVARIANCE_NODES, COVARIANCE_NODES, 31), 0.4))
-    >>> found.shape[0] > 2 * len(NUISANCES), found.shape[1:]
+    >>> found.shape[0] > 2 * len(NUISANCE_PARAMETERS), found.shape[1:]
     (True, (33, 33, 31))
     """
     stored = _stored()
@@ -185,4 +185,4 @@ def sigma_spectra(reflectance: Float64Array) -> Float64Array:
 
 
 def _nuisance_sd() -> Float64Array:
-    return np.array([nuisance.sd for nuisance in NUISANCES])
+    return np.array([nuisance.sd for nuisance in NUISANCE_PARAMETERS])

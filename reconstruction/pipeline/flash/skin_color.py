@@ -20,10 +20,11 @@ from capture.calibration.color import (
     neutral_white,
 )
 from capture.calibration.color.colorimetry import WHITE_XYZ, chart_spectra
-from model import color_table, optics_uncertainty, skin_tone, spectra
+from model import color_table, skin_tone, spectra
 from model.arrays import BoolArray, Float64Array
-from model.optics_uncertainty import COVARIANCE_NODES
+from model.tissue_optics import uncertainty as optics_uncertainty
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
+from model.tissue_optics.uncertainty import COVARIANCE_NODES
 from reconstruction.pipeline.flash.tone_kernels import MIN_RELATIVE_XYZ
 
 CENTER_SD_NM: Final = 1.5

@@ -17,7 +17,7 @@ from reconstruction.pipeline.flash.tone import ToneCamera
 from rigsim.subject.pigment import MELANIN_PRESETS, typical_blood
 from rigsim.subject.skin_tone import typology_angle_deg
 from rigsim.targets.flat import chart_reflectances
-from rigsim.tissue.skin_layers import SKIN, TissueProperties
+from rigsim.tissue.skin_layers import TYPICAL_SKIN, TissueProperties
 from rigsim.tissue.skin_table import WAVELENGTH_NM, SkinTable
 from skinrig.arrays import Float64Array, UInt8Array
 from skinrig.benchmarks.resampling import median_error
@@ -122,7 +122,7 @@ def draw_skin(tissues: int, *, per_tissue: int = 40) -> SkinSample:
             epidermis_mm=rng.uniform(0.05, 0.12),
             oxygenation=rng.uniform(0.5, 0.95),
             scattering_slope=rng.uniform(0.8, 2.2),
-            scattering_per_mm=rng.uniform(0.8, 1.2) * SKIN.scattering_per_mm,
+            scattering_per_mm=rng.uniform(0.8, 1.2) * TYPICAL_SKIN.scattering_per_mm,
         )
         melanin = np.geomspace(0.006, 0.35, per_tissue)
         blood = np.array([typical_blood(float(value)) for value in melanin])
