@@ -167,7 +167,8 @@ def sigma_spectra(reflectance: Float64Array) -> Float64Array:
     -------
     ndarray, shape (1 + 2 k, n, n, 31)
         The given spectra, then two for each of the k unknowns, to first order in log R: the
-        `NUISANCE_PARAMETERS`, then the principal residuals of measured spectra of each node's typology angle.
+        `NUISANCE_PARAMETERS`, then the principal residuals of measured spectra of each node's
+        typology angle.
 
     Examples
     --------
