@@ -6,7 +6,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from capture.calibration.color import colorimetry
-from model import color_table, merl, metrics, skin_reflectance, spectra
+from model import color_table, merl, metrics, optics_uncertainty, skin_reflectance, spectra
 from model.brdf import microfacet
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores, polarization
@@ -417,3 +417,22 @@ def test_topography_model_errors_only_widen_and_scale(seed, scale):
     np.testing.assert_array_equal(
         relief_errors.normal_stderr(normals, angles, valid & False), angles
     )
+
+
+@CHEAP
+@given(wavelength_nm=st.lists(st.floats(380.0, 730.0), min_size=1, max_size=9))
+def test_chart_spectra_are_reflectances(wavelength_nm):
+    found = colorimetry.chart_spectra(wavelength_nm)
+    assert found.shape == (24, len(wavelength_nm))
+    assert ((found > 0.0) & (found < 1.0)).all()
+
+
+@FEW
+@given(level=st.floats(0.01, 0.9))
+def test_sigma_spectra_surround_the_given_ones(level):
+    nodes = optics_uncertainty.COVARIANCE_NODES
+    given_spectra = np.full((nodes, nodes, 31), level)
+    found = optics_uncertainty.sigma_spectra(given_spectra)
+    np.testing.assert_array_equal(found[0], given_spectra)
+    product = found[1::2] * found[2::2]  # a step down and a step up of each unknown
+    np.testing.assert_allclose(product, level**2, rtol=1e-9)

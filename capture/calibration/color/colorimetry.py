@@ -138,7 +138,7 @@ def chart_spectra(wavelength_nm: ArrayLike) -> Float64Array:
     Examples
     --------
     >>> chart_spectra([450.0, 650.0])[18].round(2).tolist()
-    [0.89, 0.91]
+    [0.88, 0.92]
     """
     from colour import SDS_COLOURCHECKERS  # takes a second to import, so only where it is used
 

@@ -190,7 +190,7 @@ def monk_maps(lab: SkinMap, lab_covariance: LabCovariance) -> Mapping[str, SkinM
     """Return the nearest Monk tone, and those one standard error of L* lighter and darker."""
     colors = lab.values[lab.mask]
     # other coordinates move with lightness as their covariance with it makes them
-    of_lightness = lab_covariance.values[lab.mask][..., 0]
+    of_lightness = lab_covariance.values[..., 0][lab.mask]
     step = of_lightness / np.sqrt(np.maximum(of_lightness[..., :1], 1e-12))
     tones = nearest_monk_tone(np.stack([colors, colors + step, colors - step]))
     by_name = {"monk": tones[0], "monk_low": tones.min(axis=0), "monk_high": tones.max(axis=0)}

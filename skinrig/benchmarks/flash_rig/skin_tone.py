@@ -25,7 +25,7 @@ from skinrig.benchmarks.results import ErrorEstimate, Knobs
 from skinrig.benchmarks.stage import BenchmarkStage
 from skinrig.evaluating.skin_bands import MelaninBand
 
-LIGHT: Final = "D55"
+CHART_LIGHT: Final = "D55"
 NOISE_PERCENT: Final = (0.2, 1.0)
 """Noise per channel: the mean of 25 pixels, and a pixel."""
 CHART_NOISE: Final = 0.002
@@ -155,7 +155,9 @@ def draw_cameras(camera: str, count: int) -> list[CalibratedCamera]:
         patches = chart_reflectances() @ weights * white
         patches *= 1.0 + CHART_NOISE * rng.normal(size=patches.shape)
         neutral = neutral_white(patches).value
-        matrix = fit_matrix(patches, chart_reference(LIGHT), white=neutral, illuminant=LIGHT)
+        matrix = fit_matrix(
+            patches, chart_reference(CHART_LIGHT), white=neutral, illuminant=CHART_LIGHT
+        )
         found.append(CalibratedCamera(camera, weights, matrix, neutral))
     return found
 
@@ -169,7 +171,7 @@ def measure_cameras(
     for each in cameras:
         exact = skin.reflectance @ each.weights
         rgb = exact * (1.0 + noise * rng.normal(size=exact.shape))
-        conversion = ToneCamera.of(each.nominal, LIGHT, each.matrix, each.neutral)
+        conversion = ToneCamera.of(each.nominal, CHART_LIGHT, each.matrix, each.neutral)
         lab, covariance = conversion.lab(rgb, np.square(noise * rgb))
         errors.append(skin_tone.ita(lab) - skin.ita_deg)
         stderrs.append(skin_tone.ita_stderr(lab, covariance))
@@ -186,7 +188,7 @@ def measure_cameras(
 def draw_weights(camera: str, rng: np.random.Generator) -> Float64Array:
     """Draw a camera's band weights with shifted and widened channels, (31, 3)."""
     nm = np.arange(WAVELENGTH_NM[0], WAVELENGTH_NM[-1] + 1.0)
-    light = spectra.illuminant(LIGHT, nm)
+    light = spectra.illuminant(CHART_LIGHT, nm)
     nominal = spectra.camera_sensitivity(camera, nm)
     channels = []
     for channel, shift in enumerate(rng.normal(0.0, CENTER_SD_NM, 3)):
