@@ -27,7 +27,6 @@ All random properties are drawn from the seed, as for a preset.
 import dataclasses
 import functools
 import hashlib
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -50,7 +49,7 @@ from rigsim.tissue.skin_layers import PAPER_SKIN, PROPERTY_RANGES, TYPICAL_SKIN,
 
 SCHEMA: Final = "skinrig.subject/1"
 SUBJECT_SUFFIX: Final = ".toml"
-TISSUES: Final[Mapping[str, TissueProperties]] = {"skin": TYPICAL_SKIN, "papers": PAPER_SKIN}
+NAMED_TISSUES: Final[Mapping[str, TissueProperties]] = {"skin": TYPICAL_SKIN, "papers": PAPER_SKIN}
 """Named properties of skin."""
 _FILE_KEYS: Final = ("mesh", *MAP_RANGES)
 _UNUSED_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -73,7 +72,7 @@ class SubjectFile(Document):
     """None: drawn."""
     oil: float = 1.0
     tissue_model: str = "skin"
-    """One of `TISSUES`."""
+    """One of `NAMED_TISSUES`."""
     epidermis_mm: float | None = None
     """None: that of the model, as for the next ones."""
     basal_melanin_fraction: float | None = None
@@ -100,8 +99,8 @@ class SubjectFile(Document):
         checks.check(
             "tissue_model",
             self.tissue_model,
-            self.tissue_model in TISSUES,
-            f"one of {', '.join(TISSUES)}",
+            self.tissue_model in NAMED_TISSUES,
+            f"one of {', '.join(NAMED_TISSUES)}",
         )
         for name, low, high in (
             ("melanin", *MELANIN_RANGE),
@@ -137,15 +136,12 @@ class SubjectFile(Document):
         """Properties of the skin except for melanin and blood."""
         given = {name: getattr(self, name) for name in PROPERTY_RANGES}
         own = {name: value for name, value in given.items() if value is not None}
-        return dataclasses.replace(TISSUES[self.tissue_model], **own)
+        return dataclasses.replace(NAMED_TISSUES[self.tissue_model], **own)
 
     @property
     def nearest_preset(self) -> str:
         """Name of the preset with the nearest melanin, by its logarithm."""
-        presets = pigment.MELANIN_PRESETS
-        return min(
-            presets, key=lambda name: abs(math.log(presets[name] / self.melanosome_fraction))
-        )
+        return pigment.nearest_preset(self.melanosome_fraction)
 
     def face(
         self, *, seed: int, size: int = 512, mesh: Mesh | str | Path | None = None
@@ -264,7 +260,7 @@ def load_subject(text: str) -> SubjectFile:
         try:
             return SubjectFile(melanin=melanin_of_tone(text))
         except SkinToneError as error:
-            raise SubjectFileError(f"{error}; choose one [SR-SIM-005]") from error
+            raise SubjectFileError(str(error)) from error
     if text not in PRESET_NAMES:
         raise SubjectFileError(
             f"subject: got {text!r}, expected one of {', '.join(PRESET_NAMES)}, ita:DEGREES, "

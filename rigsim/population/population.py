@@ -165,18 +165,12 @@ class Member:
         mesh, atlas, points, regions = _lay_out_head(self.head, size)
         even = np.zeros((size, size), np.float32)
         return SimulatedSubject(
-            preset=_nearest_preset(self.melanin),
+            preset=pigment.nearest_preset(self.melanin),
             seed=self.seed,
             mesh=mesh,
             atlas=atlas,
             melanin=self._melanin(points, regions),
-            perfusion=draw_perfusion(
-                points,
-                regions,
-                pigment.typical_blood(self.melanin),
-                seed=self.seed,
-                amount=self.blood,
-            ),
+            perfusion=draw_perfusion(points, regions, self.skin.base_blood, seed=self.seed),
             roughness=even + np.float32(0.3),
             height_um=even,
             hair=relief.hair_map(points, seed=self.seed),
@@ -184,7 +178,7 @@ class Member:
             beard=relief.stubble_map(
                 points, regions, self.beard, atlas.typical_texel_mm(), seed=self.seed
             ),
-            tissue=draw_tissue(self.seed),
+            tissue=self.skin.tissue,
             oiliness=self.oil,
         )
 
@@ -428,11 +422,6 @@ def _draw_member(group: Group, index: int, number: int, rng: np.random.Generator
         head=int(rng.integers(HEAD_SHAPES)),
         applied=tuple((name, float(a)) for name, a in zip(worn, amounts, strict=False)),
     )
-
-
-def _nearest_preset(melanin: float) -> str:
-    presets = pigment.MELANIN_PRESETS
-    return min(presets, key=lambda name: abs(np.log(presets[name] / melanin)))
 
 
 @lru_cache(maxsize=HEAD_SHAPES)

@@ -106,6 +106,11 @@ class PersonSkin:
             raise PersonSkinError(f"preset: got {preset!r}, expected one of {known}")
         return cls(pigment.MELANIN_PRESETS[preset], blood, seed)
 
+    @property
+    def base_blood(self) -> float:
+        """Blood volume fraction between the regions of the face."""
+        return self.blood * pigment.typical_blood(self.melanin)
+
     def at(self, site: str, state: str = "neutral") -> SiteSkin:
         """Return the skin at a site: the mean over a disc of `SITE_RADIUS_MM` on the face.
 
@@ -134,13 +139,12 @@ class PersonSkin:
 
 @lru_cache(maxsize=64)
 def _site_skin(person: PersonSkin, site: str, state: str) -> SiteSkin:
-    base = pigment.typical_blood(person.melanin) * person.blood
     if site == ABDOMEN_SITE:
         rng = np.random.default_rng([person.seed, 0x6162])
         melanin, blood = np.exp(rng.normal(0.0, (0.05, 0.1)))
         return SiteSkin(
             person.melanin * exp(_ABDOMEN_MELANIN_STEP) * float(melanin),
-            base * _ABDOMEN_BLOOD_RATIO * float(blood),
+            person.base_blood * _ABDOMEN_BLOOD_RATIO * float(blood),
             person.tissue,
         )
     if site not in _FACE_SITES:
@@ -150,7 +154,7 @@ def _site_skin(person: PersonSkin, site: str, state: str) -> SiteSkin:
     melanin_map = pigment.draw_melanin_map(
         points, regions, person.melanin, seed=person.seed, freckles=person.freckles
     )
-    perfusion = draw_perfusion(points, regions, base, seed=person.seed)
+    perfusion = draw_perfusion(points, regions, person.base_blood, seed=person.seed)
     return SiteSkin(
         float(np.exp(np.log(melanin_map).mean())),
         float(perfusion.blood(state).mean()),

@@ -48,6 +48,17 @@ def typical_blood(melanin: float) -> float:
     return float(np.interp(np.log(melanin), at, _BLOOD_PRESETS))
 
 
+def nearest_preset(melanin: float) -> str:
+    """Return the name of the preset with the nearest melanin, by its logarithm.
+
+    Examples
+    --------
+    >>> nearest_preset(0.06)
+    'V'
+    """
+    return min(MELANIN_PRESETS, key=lambda name: abs(np.log(MELANIN_PRESETS[name] / melanin)))
+
+
 def draw_melanin_map(
     points_mm: Float32Array,
     regions: Mapping[str, Float32Array],

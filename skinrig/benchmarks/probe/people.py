@@ -21,7 +21,7 @@ from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating import subsurface as evaluation
 from skinrig.simulating.simulation import simulate_session
 
-SITES: Final = ("forehead", "cheek", "chin")
+PROBED_SITES: Final = ("forehead", "cheek", "chin")
 """Sites of table 2; its neck is measured below the chin."""
 
 
@@ -70,7 +70,7 @@ def _probe_people(
     found: list[SiteMeasurement] = []
     truth: dict[tuple[str, str], list[float]] = {}
     for seed, name in enumerate(names):
-        done = resimulate("probe", folder, subject=name, seed=seed, sites=SITES)
+        done = resimulate("probe", folder, subject=name, seed=seed, sites=PROBED_SITES)
         fits, known = reconstruct_maps(folder, done, ["subsurface"])
         document = evaluation.read_document(fits, SUBSURFACE_FILE)
         if document is not None:

@@ -20,7 +20,7 @@ from skinrig.arrays import Float64Array
 from skinrig.benchmarks.resampling import mean_error
 from skinrig.benchmarks.stage import BenchmarkStage
 
-SITE: Final = "cheek"
+COMPARED_SITE: Final = "cheek"
 PROBED_NM: Final = (440.0, 490.0, 540.0, 580.0, 620.0, 650.0)
 """Wavelengths of the light that is traced through the layers under the probe, nm."""
 DEPTH_NM: Final = 540.0
@@ -87,7 +87,7 @@ def _face(preset: str, *, size: int = 512) -> _SeenSkin:
 
 def _patch(preset: str) -> _SeenSkin:
     """Return the mean skin of the gradient rig's patch, scaled by its monochrome albedo."""
-    patch = load_subject(preset).patch(SITE, seed=0, size_mm=4.0)
+    patch = load_subject(preset).patch(COMPARED_SITE, seed=0, size_mm=4.0)
     skin = patch.skin
     spectrum = SkinTable.load(skin.tissue).spectra(skin.c_m, skin.c_hd)
     band = (WAVELENGTH_NM >= CAMERA_BAND_NM[0]) & (WAVELENGTH_NM <= CAMERA_BAND_NM[1])
@@ -100,13 +100,13 @@ def _probed(preset: str, photons: int) -> _SeenSkin:
     tissue = load_subject(preset).tissue(seed=0)
     traced = [
         trace_photons(
-            layers(tissue.person, SITE, "neutral", nm),
+            layers(tissue.person, COMPARED_SITE, "neutral", nm),
             photons=photons,
             rng=np.random.default_rng([round(nm)]),
         ).reflectance
         for nm in PROBED_NM
     ]
-    skin = tissue.person.at(SITE)
+    skin = tissue.person.at(COMPARED_SITE)
     spectrum = SkinTable.load(skin.tissue).spectra(skin.c_m, skin.c_hd)
     tabulated = np.interp(PROBED_NM, WAVELENGTH_NM, spectrum)
     ratio = np.interp(WAVELENGTH_NM, PROBED_NM, np.array(traced) / tabulated)

@@ -40,7 +40,7 @@ def test_suction_reduces_blood_to_residual_level():
     assert skin.blood("chin", 60.0) > 1.5 * skin.blood("abdomen", 60.0)
 
 
-def test_skin_under_the_probe_is_that_of_the_face():
+def test_probed_skin_is_that_of_the_face():
     """Without pressure and at rest: the layers of the same person's cheek."""
     person = PersonSkin.of_preset("IV", seed=4)
     optics = SkinTissue(person).optics("cheek", 0.0, 0.0)
