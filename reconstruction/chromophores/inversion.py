@@ -176,7 +176,7 @@ def invert(
     `ambiguous` marks both, and the estimate is the lighter one. Errors are those of the linearized
     fit; at a relative error of half and above they are rough.
 
-    With unknown optics, weak priors of both cube roots over people are added, see
+    With unknown optics and known shading, weak priors of both cube roots over people are added, see
     `POPULATION_LOG_SD`; they matter where a color leaves a chromophore open by half.
 
     Maps are float32 for float64 input too: rounding changes them by less than 1e-4 of a standard
@@ -213,7 +213,7 @@ def invert(
         free,
         covariance.astype(np.float32),
         optics_triangles(table),
-        _axis_prior(table),
+        _axis_prior(table, free),
         np.ascontiguousarray(table.cells, dtype=np.float32),
         np.array([table.c_m_max, table.c_hd_max], dtype=np.float32),
         np.ascontiguousarray(start.projection, dtype=np.float32),
@@ -368,9 +368,13 @@ def add_brightness_variance(covariance: Float64Array) -> Float64Array:
     return np.asarray(covariance + common[..., None, None])
 
 
-def _axis_prior(table: ColorTable) -> Float32Array:
-    """Return means and precisions of the axes' fractions over people; zeros for exact optics."""
-    if table.optics_covariance is None:
+def _axis_prior(table: ColorTable, free: bool) -> Float32Array:
+    """Return means and precisions of the axes' fractions over people.
+
+    They are zeros for exact optics, and for a free shading: a color then has one pair of
+    chromophores on the light side of the fold, and `posterior` has the priors.
+    """
+    if table.optics_covariance is None or free:
         return np.zeros(4, dtype=np.float32)
     ends = np.array([table.c_m_max, table.c_hd_max])
     mean = np.cbrt(np.array([POPULATION_MELANIN, POPULATION_BLOOD]) / ends)

@@ -134,7 +134,7 @@ def _pigment_corners(real: InputPrecision) -> str:
     # that much melanin hides the blood: the stated error of hemoglobin must be large
     off = np.abs(found.hemoglobin[2:] - c_hd[2:]) / found.stderr_hemoglobin[2:]
     expect_within(
-        found.stderr_hemoglobin[2:], 0.03, 1.0, label="standard error of hidden hemoglobin"
+        found.stderr_hemoglobin[2:], 0.003, 1.0, label="standard error of hidden hemoglobin"
     )
     return "melanin and visible hemoglobin exact; error of the hidden " + expect_within(
         off, 0.0, 3.0, label="standard errors"
