@@ -242,8 +242,8 @@ def main() -> None:
     document = {
         "log_covariance": covariance.round(15).tolist(),
         "by_picture": {
-            "transport": (scale_of_terms * PLANE.T @ transport @ PLANE).round(12).tolist(),
-            "fine": (scale_of_terms * PLANE.T @ fine @ PLANE).round(7).tolist(),
+            "transport": (scale_of_terms * PLANE.T @ transport @ PLANE).round(17).tolist(),
+            "fine": (scale_of_terms * PLANE.T @ fine @ PLANE).round(15).tolist(),
             "bounced": round(float(np.sqrt(scale_of_terms)) * bounced, 6),
             "scale_to_68_percent": round(scale_of_terms, 4),
             "pixels": sum(len(sample.error) for sample in samples),

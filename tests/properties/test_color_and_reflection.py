@@ -6,8 +6,9 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from capture.calibration.color import colorimetry
-from model import color_table, merl, metrics, optics_uncertainty, skin_reflectance, spectra
+from model import color_table, merl, metrics, skin_reflectance, spectra
 from model.brdf import microfacet
+from model.tissue_optics import uncertainty as optics_uncertainty
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores, polarization
 from reconstruction.chromophores import pixel_checks, shading_prior, tsumura

@@ -17,7 +17,7 @@ from rigsim.tissue.skin_layers import DERMIS_SCATTERING_RATIO, TissueProperties,
 from rigsim.tissue.skin_table import WAVELENGTH_NM, SkinTable
 from rigsim.tissue.tissue_mc import trace_photons
 from skinrig.arrays import Float64Array
-from skinrig.benchmarks.resampling import mean_error
+from skinrig.benchmarks.results import ErrorEstimate
 from skinrig.benchmarks.stage import BenchmarkStage
 
 COMPARED_SITE: Final = "cheek"
@@ -40,6 +40,8 @@ def measure_one_person(stage: BenchmarkStage) -> None:
     """Measure the difference of each rig's skin from that of the flash rig."""
     presets = ("III",) if stage.toy else ("I", "III", "VI")
     photons = 20_000 if stage.toy else 400_000
+    # Lightness falls by 0.4 per percent of reflectance, and photons are off by 1 / sqrt(n).
+    noise = 40.0 / math.sqrt(photons)
     worst_color, worst_depth = 0.0, 0.0
     for preset in presets:
         reference = _face(preset)
@@ -55,7 +57,12 @@ def measure_one_person(stage: BenchmarkStage) -> None:
             depth = 100.0 * abs(seen.sigma_tr_per_mm / reference.sigma_tr_per_mm - 1.0)
             at = round(float(np.interp(DEPTH_NM, WAVELENGTH_NM, seen.spectrum)), 4)
             extra = {"R(540)": at, "sigma_tr, 1/mm": round(seen.sigma_tr_per_mm, 3)}
-            stage.add({"preset": preset, "rig": rig}, timing, mean_error([difference]), extra)
+            stage.add(
+                {"preset": preset, "rig": rig},
+                timing,
+                ErrorEstimate.nonnegative(difference, noise),
+                extra,
+            )
             worst_color, worst_depth = max(worst_color, difference), max(worst_depth, depth)
     stage.limits = {"color": worst_color, "depth": worst_depth}
 

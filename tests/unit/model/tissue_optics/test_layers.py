@@ -35,13 +35,14 @@ def test_layers_hold_the_chromophores_of_their_depth():
 
 
 def test_skin_has_thin_epidermis_without_blood():
-    sigma_a, sigma_s, thickness = skin_layers(500.0, 0.1, 0.08)
+    sigma_a, sigma_s, thickness = skin_layers(500.0, 0.1, 0.08, constants=SKIN_CONSTANTS)
     pigment = 0.8 * 67.92 + 0.2 * 43.88
     dermis = 0.08 * 11.200 + 0.92 * 0.0702
     np.testing.assert_allclose(sigma_a, [0.1 * pigment + 0.9 * 0.0702, dermis], rtol=3e-4)
     np.testing.assert_allclose(sigma_s, [9.2, 4.6], rtol=1e-12)
     np.testing.assert_array_equal(thickness, [0.09, np.inf])
-    np.testing.assert_allclose(skin_layers(600.0, 0.1, 0.08)[1][1], 4.6 * 1.2**-1.421)
+    redder = skin_layers(600.0, 0.1, 0.08, constants=SKIN_CONSTANTS)[1]
+    np.testing.assert_allclose(redder[1], 4.6 * 1.2**-1.421)
 
 
 @pytest.mark.parametrize(

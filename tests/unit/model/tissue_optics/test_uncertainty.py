@@ -39,7 +39,9 @@ def test_each_nuisance_moves_colors_as_stated(nuisance, c_m):
     i, j = np.abs(u**3 - c_m).argmin(), np.abs(v**3 - 0.012).argmin()
     c_m, c_hd = u[i] ** 3, v[j] ** 3
     reflectance = np.broadcast_to(
-        two_layer_reflectance(spectra.WAVELENGTH_NM, c_m, c_hd, anisotropy=ANISOTROPY_SKIN),
+        two_layer_reflectance(
+            spectra.WAVELENGTH_NM, c_m, c_hd, constants=SKIN_CONSTANTS, anisotropy=ANISOTROPY_SKIN
+        ),
         (u.size, u.size, 31),
     )
     found = optics_uncertainty.log_color_covariance(
