@@ -196,7 +196,7 @@ def two_layer_reflectance(
     --------
     >>> r = two_layer_reflectance([450.0, 550.0, 650.0], 0.02, 0.02)
     >>> r.round(2).tolist()
-    [0.19, 0.24, 0.46]
+    [0.17, 0.2, 0.34]
     """
     sigma_a, sigma_s_prime, thickness = skin_layers(
         wavelength_nm,
