@@ -135,8 +135,18 @@ def record() -> None:
     write(rows)
 
 
+def is_readable(types_text: str) -> bool:
+    """Return whether argument types can be read back; those of named tuples cannot."""
+    try:
+        eval(types_text, {"__builtins__": {}}, _NAMES)
+    except (NameError, SyntaxError, TypeError):
+        return False
+    return True
+
+
 def write(rows: list[dict[str, Any]]) -> None:
-    """Write the list in an order that does not depend on the order of compilation."""
+    """Write the readable rows in an order that does not depend on the order of compilation."""
+    rows = [row for row in rows if is_readable(row["types"])]
     rows.sort(key=lambda row: (row["module"], row["function"], row["types"]))
     with LIST.open("w", encoding="utf-8", newline="") as stream:
         table = csv.DictWriter(
