@@ -36,7 +36,7 @@ def rig() -> Rig:
 
 @pytest.fixture(scope="module")
 def face():
-    return dome_reference.plain_face(size=512)
+    return dome_reference.plain_face("V", size=512)
 
 
 def in_blocks(image: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores import shading_prior
 from reconstruction.pipeline import recipes as pipeline
+from reconstruction.pipeline.flash import facial_color as facial_color_stage
 from reconstruction.pipeline.flash.facial_color import UnknownBloodError
 from skinrig.applying.expression import read_hemoglobin_rig
 from skinrig.benchmarks.intervals import flash as interval_trials_flash
@@ -97,7 +98,9 @@ def test_melanin_common_to_states_has_less_noise(fitted, folder, tmp_path):
     seen, built = one.maps["diffuse"], one.parameters["color_table"]
     alone = chromophore_posterior.estimate(
         np.where(seen.valid[..., None], seen.values, np.nan),
-        color_table.build(built["camera"], built["illuminant"], anisotropy=ANISOTROPY_SKIN),
+        color_table.build(
+            built["camera"], built["illuminant"], anisotropy=ANISOTROPY_SKIN, exact_optics=True
+        ),
         prior=shading_prior.face_prior(),
         variance=np.square(seen.stderr),
     )
@@ -113,8 +116,11 @@ def test_a_face_without_any_expression_is_refused(folder, tmp_path):
     assert not (tmp_path / "moving").exists()
 
 
-def test_skin_without_blood_color_is_refused_with_alternatives(folder, tmp_path):
+def test_skin_without_blood_color_is_refused_with_alternatives(folder, tmp_path, monkeypatch):
     """Such a face states no interval of blood either: the trial of intervals goes on."""
+    monkeypatch.setattr(
+        facial_color_stage, "is_detectable", lambda blood, stderr, good: np.zeros_like(good)
+    )
     done = simulate_session(
         "flash",
         tmp_path / "session-dark",
