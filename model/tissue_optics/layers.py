@@ -86,8 +86,8 @@ def skin_layers(
     c_m, c_hd
         Volume fractions of melanin (epidermis) and blood (dermis), broadcast together.
     constants
-        Thickness, oxygenation, scattering and pigment; `PAPERS` by default, see `SKIN` for
-        constants that agree with measured skin.
+        Thickness, oxygenation, scattering and pigment; `PAPER_CONSTANTS` by default;
+        `SKIN_CONSTANTS` agree with measured skin.
     beta_m, oxygenation
         Fractions of eumelanin and of oxygenated hemoglobin, in [0, 1]; None: the constants'.
     c_he
@@ -162,8 +162,8 @@ def two_layer_reflectance(
         Volume fractions of melanin (epidermis) and blood (dermis), broadcast together; Jimenez
         2010, Table 1 has 0 to 0.5 and 0 to 0.32.
     constants
-        Thickness, oxygenation, scattering and pigment; `PAPERS` by default, see `SKIN` for
-        constants that agree with measured skin.
+        Thickness, oxygenation, scattering and pigment; `PAPER_CONSTANTS` by default;
+        `SKIN_CONSTANTS` agree with measured skin.
     beta_m, oxygenation
         Fractions of eumelanin and of oxygenated hemoglobin, in [0, 1]; None: the constants'.
     c_he

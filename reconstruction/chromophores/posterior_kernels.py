@@ -37,9 +37,9 @@ from reconstruction.chromophores.ridge_kernels import (
     hermite,
     melanin_cost,
     prior_cost,
-    quadratic_form,
 )
 from reconstruction.chromophores.start import N_LINES
+from reconstruction.chromophores.weight_kernels import quadratic_form
 from reconstruction.compiled import FASTMATH_CONTRACT, PIXEL_KERNEL_OPTIONS, readonly_array_type
 
 N_PROBES = 8

@@ -15,6 +15,7 @@ from reconstruction.chromophores.start import (
     N_LINES,
     NODES_PER_LINE,
 )
+from reconstruction.chromophores.weight_kernels import quadratic_form
 from reconstruction.compiled import FASTMATH_CONTRACT
 
 N_NEWTON_STEPS = 4
@@ -52,19 +53,6 @@ class Ridge(NamedTuple):
     """Standard deviation of blood by the curvature."""
     clipped_step: Float64Array
     """Remaining step where an end of the axis limits the ridge; else 0."""
-
-
-@njit(fastmath=FASTMATH_CONTRACT)
-def quadratic_form(w, p0, p1, p2, q0, q1, q2):  # type: ignore[no-untyped-def]
-    """Return p' W q."""
-    return (
-        w[0] * p0 * q0
-        + w[3] * p1 * q1
-        + w[5] * p2 * q2
-        + w[1] * (p0 * q1 + p1 * q0)
-        + w[2] * (p0 * q2 + p2 * q0)
-        + w[4] * (p1 * q2 + p2 * q1)
-    )
 
 
 @njit(fastmath=FASTMATH_CONTRACT)

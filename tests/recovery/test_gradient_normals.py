@@ -57,7 +57,7 @@ def geometry(side):
 
 def patch(side, *, smooth, seed=11):
     rig = load_rig("gradient").cropped(side)
-    skin = make_micro_skin("forehead", seed=seed, size_mm=max(0.006 * side + 0.8, 1.2))
+    skin = make_micro_skin("forehead", seed=seed, size_mm=max(0.006 * side + 0.8, 1.2), preset="V")
     if smooth:
         height = gaussian_filter(skin.height_um, 8.0, mode="wrap").astype(np.float32)
         skin = dataclasses.replace(skin, height_um=height)
@@ -89,7 +89,7 @@ def test_noise_free_smooth_normals_err_below_third_degree():
 
 
 @pytest.mark.long
-def test_rig_noise_normals_err_below_1_6_degrees():
+def test_rig_noise_normals_err_below_1_5_degrees():
     side = 256
     scene, sphere, seen, sharp = patch(side, smooth=False)
     sensor = scene.sensor("cam")
@@ -106,14 +106,14 @@ def test_rig_noise_normals_err_below_1_6_degrees():
     options = {"lights": lights_of(sphere), "variance": noise, **geometry(side)}
     found = from_patterns(images, smoothing="wiener", **options)
     error = mean_error_deg(found, seen)
-    assert error <= 1.6
+    assert error <= 1.5
     # as announced: the root mean square of an error is 1.13 times its mean where it is Gaussian;
     # shadows, which nothing announces, add
     announced = float(np.degrees(found.stderr_rad[EDGE][found.valid[EDGE]].mean())) / 1.13
     assert 0.7 * announced < error < 1.5 * announced
     # what the lens takes away is more than what noise does, and no estimator's to give back
     blurred = float(np.degrees(angular_error_rad(seen[EDGE], sharp[EDGE])).mean())
-    assert mean_error_deg(found, sharp) < np.hypot(1.6, blurred) + 0.55
+    assert mean_error_deg(found, sharp) < np.hypot(1.5, blurred) + 0.5
     # it can fail: pixel by pixel, and with a sphere as nobody built it
     assert mean_error_deg(from_patterns(images, **options), seen) > 1.5
     assert mean_error_deg(from_patterns(images, smoothing="wiener"), seen) > 1.5
