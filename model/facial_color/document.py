@@ -14,6 +14,8 @@ from model.skin import MAP_UNITS, SkinMap
 
 SCHEMA: Final = "skinrig.facial-color/1"
 RIG_DOCUMENT: Final = "facial_color.json"
+_COMMON_KEY: Final = "common_log_sd"
+"""Key that documents of earlier versions lack."""
 _BLOOD_UNIT: Final = MAP_UNITS["hemoglobin"]
 _DOCUMENT_KEYS: Final = {"schema", "radius_px", "shape", "stored", "global_states", "states"}
 _NEUTRAL_TEXT: Final = "neutral state; linear volume fraction"
@@ -51,6 +53,7 @@ def to_maps(rig: HemoglobinRig) -> tuple[dict[str, SkinMap], bytes]:
         "shape": list(rig.neutral.shape),
         "stored": list(rig.neutral_mean.shape),
         "global_states": list(rig.global_states),
+        _COMMON_KEY: rig.common_log_sd,
         "states": states,
     }
     return maps, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode("utf-8")
@@ -71,6 +74,7 @@ def from_maps_and_document(maps: Mapping[str, SkinMap], document: bytes) -> Hemo
     version = loaded.get("schema") if isinstance(loaded, dict) else None
     if version != SCHEMA:
         raise FacialColorError(f"{RIG_DOCUMENT}: got schema {version!r}, expected {SCHEMA!r}")
+    common = _number(_COMMON_KEY, loaded.pop(_COMMON_KEY, 0.0))
     _require_equal("", loaded, _DOCUMENT_KEYS)
     shape, stored = (_size(key, loaded[key]) for key in ("shape", "stored"))
     radius = _number("radius_px", loaded["radius_px"])
@@ -109,6 +113,7 @@ def from_maps_and_document(maps: Mapping[str, SkinMap], document: bytes) -> Hemo
         states=states,
         radius_px=radius,
         global_states=tuple(listed),
+        common_log_sd=common,
     )
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import Final, Literal
 
@@ -89,7 +89,8 @@ class HemoglobinBlend:
     """Fraction of the valid pixels that were outside the limits and clamped."""
     stderr: FloatArray
     """Standard error of neutral map, scales and biases, and the model error of eq. (6). Given
-    errors of the maps count as common to a disc, which is the worst case for a bias."""
+    errors of the maps count as common to a disc, which is the worst case for a bias. The error
+    common to all blood is added."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,6 +108,7 @@ class HemoglobinRig(RigMaps):
         stderr: Mapping[str, ArrayLike] | None = None,
         global_states: Iterable[str] | None = None,
         stored_size: int | None = STORED_SIZE,
+        common_log_sd: float = 0.0,
     ) -> HemoglobinRig:
         """Fit a rig to measured maps.
 
@@ -129,6 +131,9 @@ class HemoglobinRig(RigMaps):
             States of the whole body; None: the given ones of `GLOBAL_STATES`.
         stored_size
             Cells per side of the stored maps, at most those of the map; None: as the map.
+        common_log_sd
+            Standard error of log blood that all pixels and states have in common, >= 0; `stderr`
+            is without it.
 
         Returns
         -------
@@ -154,7 +159,7 @@ class HemoglobinRig(RigMaps):
             global_states=global_states,
             stored_size=stored_size,
         )
-        return cls._from_rig_maps(maps)
+        return cls._from_rig_maps(replace(maps, common_log_sd=common_log_sd))
 
     @classmethod
     def _from_rig_maps(cls, maps: RigMaps) -> HemoglobinRig:
@@ -296,6 +301,7 @@ class HemoglobinRig(RigMaps):
         pixel = np.maximum(up[5], (up[0] * self.neutral_stderr) ** 2)
         pixel += (ROUNDING_ERROR * self.neutral) ** 2
         error = factor * np.sqrt(pixel + up[4] + base * base * up[3])
+        error = np.hypot(error, self.common_log_sd * blood)
         valid = self.valid & np.isfinite(blood)
         outside = valid & ((blood < limits[0]) | (blood > limits[1]))
         kind = self.neutral.dtype

@@ -84,11 +84,14 @@ class RigMaps:
     """Radius of the disc, px of the neutral map."""
     global_states: tuple[str, ...] = ()
     """Names of the states of the whole body."""
+    common_log_sd: float = 0.0
+    """Standard error of log blood that all pixels and states have in common."""
 
     def __post_init__(self) -> None:
         """Raise for maps that do not fit together."""
         shape = self.neutral.shape
         check = Checks(FacialColorError)
+        check.within("common_log_sd", self.common_log_sd, "[0, inf)")
         check.shape("neutral", self.neutral, ("H", "W"))
         check.shape("valid", self.valid, shape)
         check.shape("neutral_stderr", self.neutral_stderr, shape)

@@ -20,6 +20,7 @@ from reconstruction.chromophores import dark_spots, shading_prior
 from reconstruction.chromophores import face_kernels as kernels
 from reconstruction.chromophores import model_error as color_errors
 from reconstruction.chromophores import posterior as chromophore_posterior
+from reconstruction.chromophores.common_optics import estimate_common_optics
 from reconstruction.chromophores.face_distribution import (
     FaceDistribution,
     add_systematic_errors,
@@ -71,8 +72,8 @@ def fit_face_distribution(
         Shape (..., 3): light of the pixels over that of a white reference, linear camera RGB; all
         skin of one person in one image. Not modified.
     table
-        Color table of the camera and the illumination of the image. Unknown optics are common to
-        the face, so that they move the distribution without a change of its shape.
+        Color table of the camera and the illumination of the image. Its optics count as exact: see
+        `reconstruction.chromophores.common_optics` for those of a face.
     prior
         Distribution of the pixels' shading, without the error common to all pixels.
     common_light
@@ -112,16 +113,9 @@ def fit_face_distribution(
     colors, noise, errors = _sampled(rgb, variance, model_error, valid)
     if len(colors) < MIN_FACE_PIXELS:
         return None
-    whole_table, table = table, with_exact_optics(table)
-    alone = add_optics_errors(
-        chromophore_posterior.estimate(
-            colors, table, prior=prior, variance=noise, model_error=errors
-        ),
-        colors,
-        whole_table,
-        variance=noise,
-        model_error=errors,
-        log_light_sd=prior.sd,
+    table = with_exact_optics(table)
+    alone = chromophore_posterior.estimate(
+        colors, table, prior=prior, variance=noise, model_error=errors
     )
     colors, noise = colors[alone.valid].astype(np.float64), noise[alone.valid]
     errors = errors if errors.ndim == 2 else errors[alone.valid]
@@ -198,6 +192,8 @@ class FaceEstimate:
     """None where it was not fitted."""
     spots: BoolArray
     """Of the pixels' shape: pixels that may not be usual skin."""
+    log_color: Float32Array
+    """(3,): common error of log color by the face's optics, which the estimates are without."""
 
 
 def estimate_face(
@@ -219,25 +215,32 @@ def estimate_face(
         Whether a white reference at the face's position fixes the exposure. Without it the face
         distribution adds no information.
     """
-    errors: dict[str, Any] = {"variance": variance, "model_error": model_error}
-    exact = with_exact_optics(table)
-    known = partial(chromophore_posterior.estimate, rgb, exact, prior=prior, **errors)
-
-    def with_optics(found: ChromophorePosterior) -> ChromophorePosterior:
-        return add_optics_errors(found, rgb, table, log_light_sd=prior.sd, **errors)
-
-    face = None
-    if has_white:
-        face = fit_with_white_reference(rgb, table, **errors)
-    by_face = known(face=face)
-    if face is None:
-        return FaceEstimate(with_optics(by_face), by_face, None, np.zeros(rgb.shape[:-1], bool))
-    alone = known()
-    spots = dark_spots.is_lighter_than_face_prior(by_face, alone)
-    if rgb.ndim == 3:
-        spots |= dark_spots.is_locally_dark(rgb, variance=variance)
-    found = dark_spots.average_hypotheses(by_face, alone, spots)
-    return FaceEstimate(with_optics(found), by_face, face, spots)
+    common = estimate_common_optics(
+        rgb,
+        table,
+        prior=prior,
+        common_light=shading_prior.LOG_SHADING_SOFTNESS if has_white else prior.sd,
+        common_color=color_errors.load_error_terms().transport,
+    )
+    log_color = np.zeros(3) if common is None else common.log_color
+    factor = np.exp(-log_color).astype(np.float32)
+    errors: dict[str, Any] = {"variance": variance * factor**2, "model_error": model_error}
+    exact, plain = with_exact_optics(table), rgb * factor
+    known = partial(chromophore_posterior.estimate, plain, exact, prior=prior, **errors)
+    face = fit_with_white_reference(plain, exact, **errors) if has_white else None
+    found = by_face = known(face=face)
+    spots = np.zeros(rgb.shape[:-1], bool)
+    if face is not None:
+        alone = known()
+        spots = dark_spots.is_lighter_than_face_prior(by_face, alone)
+        if rgb.ndim == 3:
+            spots |= dark_spots.is_locally_dark(plain, variance=errors["variance"])
+        found = dark_spots.average_hypotheses(by_face, alone, spots)
+    if common is not None:
+        found = add_optics_errors(
+            found, rgb, table, common, variance=variance, model_error=model_error
+        )
+    return FaceEstimate(found, by_face, face, spots, log_color.astype(np.float32))
 
 
 def _sampled(

@@ -7,11 +7,9 @@ shading that they imply; and, where known, the distribution of melanin and blood
 estimate is the posterior median. Its 68 % credible half-width covers both solutions where both are
 possible.
 
-Thickness, scattering and oxygenation vary little within one face and much between people. They move
-all pixels of a face together, so that they change neither its contrasts nor the weights of pixels
-against each other. Pixels of a face are therefore estimated as if the optics were exact, and
-`add_optics_errors` adds the covariance of `ColorTable.log_covariance` to the standard errors and to
-the test of belonging to the table.
+Unknown optics move the colors of all pixels of a face together.
+`reconstruction.chromophores.common_optics` estimates this common error; pixels without it are
+estimated as if the optics were exact, and `add_optics_errors` adds what remains unknown.
 """
 
 from dataclasses import dataclass, replace
@@ -23,6 +21,7 @@ from model.checks import Checks
 from model.color_table import ColorTable
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.chromophores import posterior_kernels as ridge
+from reconstruction.chromophores.common_optics import CommonOptics
 from reconstruction.chromophores.face_distribution import FaceDistribution
 from reconstruction.chromophores.inversion import (
     DEFAULT_RELATIVE_NOISE,
@@ -36,20 +35,11 @@ from reconstruction.chromophores.inversion import (
 from reconstruction.chromophores.inversion_kernels import OUTSIDE_DISTANCE, OUTSIDE_SIGMAS
 from reconstruction.chromophores.pixel_checks import ChromophoreError, is_usable_color
 from reconstruction.chromophores.shading_prior import ShadingPrior
-from reconstruction.chromophores.start import (
-    MELANIN_AXIS,
-    MIN_AXIS_FRACTION,
-    equal_melanin_lines,
-    evaluate_table,
-)
+from reconstruction.chromophores.start import MELANIN_AXIS, MIN_AXIS_FRACTION, equal_melanin_lines
 
 MIN_RELATIVE_NOISE = 2e-4
 """Minimum relative error of a color; smaller noise is raised to it. It corresponds to some 0.3
 percent of melanin."""
-AXIS_SD = 0.3
-"""Standard deviation of both axes' fractions without a color: that of a uniform distribution."""
-MIN_COLOR_ERROR = 2e-3
-"""Relative error that keeps the weights of propagated optics finite."""
 _TASK_PIXELS = 1024
 _BAND_PIXELS = 1 << 16
 
@@ -276,32 +266,31 @@ def add_optics_errors(
     found: ChromophorePosterior,
     rgb: FloatArray,
     table: ColorTable,
+    common: CommonOptics,
     *,
     variance: FloatArray,
     model_error: FloatArray,
-    log_light_sd: float,
 ) -> ChromophorePosterior:
     """Add the errors by common optics to estimates made with exact optics.
 
     Parameters
     ----------
     found
-        Estimates by `model.color_table.with_exact_optics` of the table.
+        Estimates by `model.color_table.with_exact_optics` of the table, from colors without the
+        most probable common error.
     rgb, variance, model_error
         As given to `reconstruction.chromophores.posterior.estimate`; variance of the colors' shape.
     table
-        Table with its covariance by unknown optics; without one, `found` is returned.
-    log_light_sd
-        Standard deviation of the prior of log shading.
+        Table with its covariance by unknown optics.
+    common
+        Common error of the face's colors.
 
     Returns
     -------
     ChromophorePosterior
-        Standard errors with the optics' part, by linear propagation; `outside` and `valid` for
-        colors of skin with any of the optics.
+        Standard errors with the optics' part, which is a common factor of the face's melanin, and
+        one of its blood; `outside` and `valid` for colors of skin with any of the optics.
     """
-    if table.optics_covariance is None:
-        return found
     colors = np.asarray(rgb, dtype=np.float32)
     usable = is_usable_color(colors) & np.isfinite(found.melanin)
     errors = np.asarray(model_error, dtype=np.float64)
@@ -309,18 +298,8 @@ def add_optics_errors(
     if errors.ndim > 2:
         usual = errors[usable].mean(axis=0) if usable.any() else np.zeros((3, 3))
     fitted = invert(colors, table, variance=variance, model_error=usual)
-    relative = np.full((2, *found.melanin.shape), np.nan, dtype=np.float32)
-    places = np.flatnonzero(usable)
-    noise = np.broadcast_to(np.asarray(variance), colors.shape).reshape(-1, 3)
-    flat = colors.reshape(-1, 3)
-    for start in range(0, places.size, _BAND_PIXELS):
-        at = places[start : start + _BAND_PIXELS]
-        own = errors.reshape(-1, 3, 3)[at] if errors.ndim > 2 else errors
-        known = noise[at] / np.square(flat[at].astype(np.float64)) + MIN_COLOR_ERROR**2
-        covariance = known[:, :, None] * np.eye(3) + own + log_light_sd**2
-        fractions = found.melanin.reshape(-1)[at], found.hemoglobin.reshape(-1)[at]
-        relative.reshape(2, -1)[:, at] = _relative_errors(table, *fractions, covariance)
-    melanin, hemoglobin = relative[0] * found.melanin, relative[1] * found.hemoglobin
+    melanin = np.float32(common.log_melanin_sd) * found.melanin
+    hemoglobin = np.float32(common.log_blood_sd) * found.hemoglobin
     return replace(
         found,
         stderr_melanin=np.hypot(found.stderr_melanin, melanin),
@@ -342,19 +321,3 @@ def errors_within_face(stderr: FloatArray, optics_stderr: FloatArray) -> FloatAr
     0.3
     """
     return np.asarray(np.sqrt(np.maximum(np.square(stderr) - np.square(optics_stderr), 0.0)))
-
-
-def _relative_errors(
-    table: ColorTable, melanin: FloatArray, hemoglobin: FloatArray, covariance: Float64Array
-) -> Float64Array:
-    """Return the optics' relative errors of melanin and hemoglobin, (2, n)."""
-    a = np.clip(np.cbrt(melanin / table.c_m_max, dtype=np.float64), MIN_AXIS_FRACTION, 1.0)
-    b = np.clip(np.cbrt(hemoglobin / table.c_hd_max, dtype=np.float64), MIN_AXIS_FRACTION, 1.0)
-    color, by_a, by_b = evaluate_table(table, a, b)
-    slopes = np.stack([by_a / color, by_b / color], axis=-1)
-    weighted = np.swapaxes(slopes, 1, 2) @ np.linalg.inv(covariance)
-    gain = np.linalg.solve(weighted @ slopes + np.eye(2) / AXIS_SD**2, weighted)
-    optics = table.log_covariance(table.c_m_max * a**3, table.c_hd_max * b**3)
-    moved = np.einsum("nic,ncd,nid->in", gain, optics, gain)
-    # c = c_max a^3, hence dc / c = 3 da / a
-    return np.asarray(3.0 * np.sqrt(np.maximum(moved, 0.0)) / np.stack([a, b]))

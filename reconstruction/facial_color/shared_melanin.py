@@ -79,7 +79,7 @@ class SharedMelanin:
     stderr_hemoglobin: Float32Array
     """(S, ...): its standard error."""
     optics_stderr_hemoglobin: Float32Array
-    """Part of it by optics that are unknown but common to all pixels and states."""
+    """(S, ...): part of it by unknown optics, a factor common to all pixels and states."""
     noise_stderr_hemoglobin: Float32Array
     """(S, ...): part by noise alone."""
     change: Float32Array
@@ -167,7 +167,7 @@ def estimate_shared_melanin(
     --------
     >>> from model import color_table
     >>> from reconstruction.chromophores.shading_prior import lognormal_prior
-    >>> table = color_table.build("Nikon 5100 (NPL)", "D65")
+    >>> table = color_table.build("Nikon 5100 (NPL)", "D65", exact_optics=True)
     >>> color = 0.8 * table.lookup([[0.02], [0.02]], [[0.03], [0.05]])
     >>> given = {"prior": lognormal_prior(0.7, 0.6), "variance": (2e-3 * color) ** 2}
     >>> found = estimate_shared_melanin(color, table, **given)
@@ -193,16 +193,19 @@ def estimate_shared_melanin(
     mean, mean_variance = _mean_color(seen, exact, owns)
     mean_rgb = np.exp(mean)
     error = _mean_color_covariance(owns, seen, common)
-    found = estimate_face(
+    whole = estimate_face(
         mean_rgb.reshape(*shape, 3),
         table,
         prior=prior,
         variance=(mean_variance * mean_rgb**2).reshape(*shape, 3),
         model_error=error if error.ndim == 2 else error.reshape(*shape, 3, 3),
         has_white=one_face,
-    ).found
+    )
+    found, usable = whole.found, seen.usable[..., None]
+    plain = replace(seen, log_rgb=np.where(usable, seen.log_rgb - whole.log_color, 0.0))
+    mean -= whole.log_color
 
-    fit = _BloodFit(seen, mean, _within_face(found), exact, (common, owns), reference % states)
+    fit = _BloodFit(plain, mean, _within_face(found), exact, (common, owns), reference % states)
     free = np.zeros(seen.usable.shape, np.float32)
     of_pixels, of_states = fit(free, free)
     if shading_window_px is not None and states > 1:
@@ -216,8 +219,10 @@ def estimate_shared_melanin(
     named = {name: values.reshape(states, *shape) for name, values in of_states.items()}
     shading = np.exp(named.pop("log_shading"))
     del named["log_shading_variance"]
-    by_optics = found.optics_stderr_hemoglobin
+    factor = found.optics_stderr_hemoglobin / found.hemoglobin
+    by_optics = factor * named["hemoglobin"]
     named["stderr_hemoglobin"] = np.hypot(named["stderr_hemoglobin"], by_optics)
+    named["stderr_change"] = np.hypot(named["stderr_change"], factor * np.abs(named["change"]))
     return SharedMelanin(
         melanin=found.melanin,
         stderr_melanin=found.stderr_melanin,

@@ -6,10 +6,12 @@ A file is TOML; every key is optional, and unknown keys are errors:
 schema           "skinrig.subject/1"
 preset           pigment, "I" to "VI", "palest" or "darkest"; "III"
 melanin          volume fraction of melanosomes around which skin varies, 0.001 to 0.45; replaces it
+tone             "ita:DEGREES" or "monk:N": the melanin of a skin of that tone
 blood            factor of all blood, 0.1 to 4
 freckles         0 to 1; drawn from the seed if omitted
 oil              factor of the surface fraction covered by oil, 0 to 3
-tissue_model     other properties of the skin: "skin" (typical) or "papers" (the papers' model)
+tissue_model     other properties of the skin: "drawn" from the seed as people vary (default),
+                 "typical", or "papers" (the papers' model)
 epidermis_mm     thickness of the epidermis, mm; this and the next ones replace those of the model,
                  in the ranges of `rigsim.tissue.skin_layers.PROPERTY_RANGES`
 ...              basal_melanin_fraction, epidermal_blood_ratio, oxygenation, scattering_per_mm,
@@ -43,14 +45,19 @@ from rigsim.population.textures import MAP_RANGES, SubjectFileError, load_textur
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.subject import PRESET_NAMES, SimulatedSubject, make_subject, pigment
 from rigsim.subject.perfusion import MAX_HEMOGLOBIN, draw_perfusion
-from rigsim.subject.person_skin import MELANIN_RANGE, PersonSkin
+from rigsim.subject.person_skin import MELANIN_RANGE, PersonSkin, draw_tissue
 from rigsim.subject.skin_tone import SkinToneError, is_skin_tone, melanin_of_tone
 from rigsim.tissue.skin_layers import PAPER_SKIN, PROPERTY_RANGES, TYPICAL_SKIN, TissueProperties
 
 SCHEMA: Final = "skinrig.subject/1"
 SUBJECT_SUFFIX: Final = ".toml"
-NAMED_TISSUES: Final[Mapping[str, TissueProperties]] = {"skin": TYPICAL_SKIN, "papers": PAPER_SKIN}
-"""Named properties of skin."""
+DRAWN_TISSUE: Final = "drawn"
+"""Name of the properties that are drawn from the seed."""
+NAMED_TISSUES: Final[Mapping[str, TissueProperties]] = {
+    "typical": TYPICAL_SKIN,
+    "papers": PAPER_SKIN,
+}
+"""Named properties of skin that do not vary."""
 _FILE_KEYS: Final = ("mesh", *MAP_RANGES)
 _UNUSED_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
     "gradient": ("oil", *_FILE_KEYS),
@@ -66,13 +73,15 @@ class SubjectFile(Document):
     schema: str = SCHEMA
     preset: str = "III"
     melanin: float | None = None
-    """None: that of the preset."""
+    """None: that of the tone or the preset."""
+    tone: str | None = None
+    """A text of `rigsim.subject.skin_tone`; None: that of the preset."""
     blood: float = 1.0
     freckles: float | None = None
     """None: drawn."""
     oil: float = 1.0
-    tissue_model: str = "skin"
-    """One of `NAMED_TISSUES`."""
+    tissue_model: str = DRAWN_TISSUE
+    """`DRAWN_TISSUE`, or one of `NAMED_TISSUES`."""
     epidermis_mm: float | None = None
     """None: that of the model, as for the next ones."""
     basal_melanin_fraction: float | None = None
@@ -96,12 +105,9 @@ class SubjectFile(Document):
         checks.check("schema", self.schema, self.schema == SCHEMA, repr(SCHEMA))
         known = ", ".join(PRESET_NAMES)
         checks.check("preset", self.preset, self.preset in PRESET_NAMES, f"one of {known}")
-        checks.check(
-            "tissue_model",
-            self.tissue_model,
-            self.tissue_model in NAMED_TISSUES,
-            f"one of {', '.join(NAMED_TISSUES)}",
-        )
+        models = (DRAWN_TISSUE, *NAMED_TISSUES)
+        known = f"one of {', '.join(models)}"
+        checks.check("tissue_model", self.tissue_model, self.tissue_model in models, known)
         for name, low, high in (
             ("melanin", *MELANIN_RANGE),
             ("blood", 0.1, 4.0),
@@ -112,6 +118,13 @@ class SubjectFile(Document):
             value = getattr(self, name)
             good = value is None or low <= value <= high
             checks.check(name, value, good, f"{low:g} to {high:g}")
+        if self.tone is not None:
+            try:
+                melanin_of_tone(self.tone)
+            except SkinToneError as error:
+                raise SubjectFileError(str(error)) from error
+            alone = self.melanin is None and self.melanin_map is None
+            checks.check("tone", self.tone, alone, "no melanin or melanin_map together with it")
         if self.melanin_map is not None:
             drawn = self.melanin is None and self.freckles is None
             checks.check(
@@ -126,22 +139,20 @@ class SubjectFile(Document):
             )
         checks.close()
 
-    @property
-    def melanosome_fraction(self) -> float:
-        """Volume fraction of melanosomes around which the skin varies."""
-        return pigment.MELANIN_PRESETS[self.preset] if self.melanin is None else self.melanin
+    def melanosome_fraction(self, *, seed: int) -> float:
+        """Return the volume fraction of melanosomes around which the skin varies."""
+        if self.melanin is not None:
+            return self.melanin
+        if self.tone is not None:
+            return melanin_of_tone(self.tone, self.properties(seed=seed))
+        return pigment.MELANIN_PRESETS[self.preset]
 
-    @property
-    def properties(self) -> TissueProperties:
-        """Properties of the skin except for melanin and blood."""
+    def properties(self, *, seed: int) -> TissueProperties:
+        """Return the properties of the skin except for melanin and blood."""
         given = {name: getattr(self, name) for name in PROPERTY_RANGES}
         own = {name: value for name, value in given.items() if value is not None}
-        return dataclasses.replace(NAMED_TISSUES[self.tissue_model], **own)
-
-    @property
-    def nearest_preset(self) -> str:
-        """Name of the preset with the nearest melanin, by its logarithm."""
-        return pigment.nearest_preset(self.melanosome_fraction)
+        model = NAMED_TISSUES.get(self.tissue_model) or draw_tissue(seed)
+        return dataclasses.replace(model, **own)
 
     def face(
         self, *, seed: int, size: int = 512, mesh: Mesh | str | Path | None = None
@@ -168,15 +179,21 @@ class SubjectFile(Document):
             raise SubjectFileError(
                 f"mesh: the subject's file sets {self.mesh}; omit the other mesh"
             )
+        fraction = self.melanosome_fraction(seed=seed)
         found = make_subject(
-            self.nearest_preset, seed=seed, size=size, mesh=mesh or self.mesh, blood=self.blood
+            pigment.nearest_preset(fraction),
+            seed=seed,
+            size=size,
+            mesh=mesh or self.mesh,
+            blood=self.blood,
         )
-        if self == SubjectFile(preset=self.preset, blood=self.blood, mesh=self.mesh):
+        found = dataclasses.replace(found, tissue=self.properties(seed=seed), oiliness=self.oil)
+        if fraction == pigment.MELANIN_PRESETS[found.preset] and not self._has_own_maps:
             return found
         perfusion = draw_perfusion(
             found.perfusion.points_mm,
             found.perfusion.regions,
-            pigment.typical_blood(self.melanosome_fraction),
+            pigment.typical_blood(fraction),
             seed=seed,
             amount=self.blood,
         )
@@ -184,11 +201,7 @@ class SubjectFile(Document):
             melanin = resample_texture("melanin_map", self.melanin_map, size)
         else:
             melanin = pigment.draw_melanin_map(
-                perfusion.points_mm,
-                perfusion.regions,
-                self.melanosome_fraction,
-                seed=seed,
-                freckles=self.freckles,
+                perfusion.points_mm, perfusion.regions, fraction, seed=seed, freckles=self.freckles
             )
         if self.hemoglobin_map is not None:
             blood = resample_texture("hemoglobin_map", self.hemoglobin_map, size).astype(np.float64)
@@ -200,9 +213,11 @@ class SubjectFile(Document):
                 perfusion,
                 compartments=np.asarray(perfusion.compartments * factor[..., None], np.float32),
             )
-        return dataclasses.replace(
-            found, melanin=melanin, perfusion=perfusion, tissue=self.properties, oiliness=self.oil
-        )
+        return dataclasses.replace(found, melanin=melanin, perfusion=perfusion)
+
+    @property
+    def _has_own_maps(self) -> bool:
+        return any(v is not None for v in (self.freckles, self.melanin_map, self.hemoglobin_map))
 
     def patch(self, site: str, *, seed: int, size_mm: float) -> MicroSkin:
         """Return a patch of skin for the gradient sphere, see `make_micro_skin`."""
@@ -215,7 +230,11 @@ class SubjectFile(Document):
     def skin(self, *, seed: int) -> PersonSkin:
         """Return the skin that every rig simulates."""
         return PersonSkin(
-            self.melanosome_fraction, self.blood, seed, self.freckles, self.properties
+            self.melanosome_fraction(seed=seed),
+            self.blood,
+            seed,
+            self.freckles,
+            self.properties(seed=seed),
         )
 
     def unused_keys(self, rig: str) -> tuple[str, ...]:
@@ -251,16 +270,13 @@ def load_subject(text: str) -> SubjectFile:
 
     Examples
     --------
-    >>> load_subject("IV").melanosome_fraction
+    >>> load_subject("IV").melanosome_fraction(seed=0)
     0.0395
     """
     if is_subject_file(text):
         return read_subject_file(text)
     if is_skin_tone(text):
-        try:
-            return SubjectFile(melanin=melanin_of_tone(text))
-        except SkinToneError as error:
-            raise SubjectFileError(str(error)) from error
+        return SubjectFile(tone=text)
     if text not in PRESET_NAMES:
         raise SubjectFileError(
             f"subject: got {text!r}, expected one of {', '.join(PRESET_NAMES)}, ita:DEGREES, "
@@ -280,7 +296,7 @@ def load_tissue(text: str, *, seed: int) -> ProbedTissue:
     seed
         Seed of the variation between subjects.
     """
-    if is_subject_file(text) or is_skin_tone(text):
+    if is_subject_file(text) or is_skin_tone(text) or text in PRESET_NAMES:
         return load_subject(text).tissue(seed=seed)
     if re.fullmatch(r"P\d+", text):
         return SkinTissue(_member_skin(text))

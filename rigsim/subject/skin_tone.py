@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 from model import spectra
 from rigsim.subject.person_skin import MELANIN_RANGE
 from rigsim.subject.pigment import typical_blood
+from rigsim.tissue.skin_layers import TYPICAL_SKIN, TissueProperties
 from rigsim.tissue.skin_table import WAVELENGTH_NM, SkinTable
 
 ITA_PREFIX: Final = "ita:"
@@ -40,13 +41,15 @@ def is_skin_tone(text: str) -> bool:
     return text.startswith((ITA_PREFIX, MONK_PREFIX))
 
 
-def typology_angle_deg(melanin: float) -> float:
-    """Return the individual typology angle of typical skin with a melanosome volume fraction.
+def typology_angle_deg(melanin: float, tissue: TissueProperties = TYPICAL_SKIN) -> float:
+    """Return the individual typology angle of skin with a melanosome volume fraction.
 
     Parameters
     ----------
     melanin
         Volume fraction of melanosomes, 0.001 to 0.45.
+    tissue
+        All other properties of the skin.
 
     Returns
     -------
@@ -59,7 +62,8 @@ def typology_angle_deg(melanin: float) -> float:
     >>> round(typology_angle_deg(0.0255))
     35
     """
-    spectrum = SkinTable.load().spectra(melanin, typical_blood(melanin)) + SPHERE_SPECULAR
+    diffuse = SkinTable.load(tissue).spectra(melanin, typical_blood(melanin))
+    spectrum = diffuse + SPHERE_SPECULAR
     rgb = spectrum @ spectra.band_weights(spectra.LINEAR_SRGB, "D65", WAVELENGTH_NM)
     matrix = np.array(_SRGB_TO_XYZ)
     _, y, z = np.cbrt(rgb @ matrix.T / matrix.sum(axis=1))
@@ -67,7 +71,7 @@ def typology_angle_deg(melanin: float) -> float:
 
 
 @lru_cache(maxsize=64)
-def melanin_of_tone(text: str) -> float:
+def melanin_of_tone(text: str, tissue: TissueProperties = TYPICAL_SKIN) -> float:
     """Return the melanosome volume fraction of a person of a skin tone.
 
     Parameters
@@ -76,11 +80,14 @@ def melanin_of_tone(text: str) -> float:
         "ita:DEGREES", an individual typology angle, or "monk:N", the tone 1 to 10 of the Monk Skin
         Tone Scale. A person of a Monk tone has the angle of its color. The colors 1 to 3 and 10
         lie beyond skin, so the nearest possible angle is taken.
+    tissue
+        All other properties of the skin. The range of angles is that of typical skin; where this
+        skin has a smaller one, its end is taken.
 
     Raises
     ------
     SkinToneError
-        The text is malformed, or no skin has the angle.
+        The text is malformed, or no typical skin has the angle.
 
     Examples
     --------
@@ -105,7 +112,11 @@ def melanin_of_tone(text: str) -> float:
         )
 
     def difference(log_melanin: float) -> float:
-        return typology_angle_deg(float(np.exp(log_melanin))) - angle
+        return typology_angle_deg(float(np.exp(log_melanin)), tissue) - angle
 
-    ends = np.log(MELANIN_RANGE)
-    return float(np.clip(np.exp(brentq(difference, *ends, xtol=1e-9)), *MELANIN_RANGE))
+    pale, dark = np.log(MELANIN_RANGE)
+    if difference(pale) <= 0.0:
+        return MELANIN_RANGE[0]
+    if difference(dark) >= 0.0:
+        return MELANIN_RANGE[1]
+    return float(np.clip(np.exp(brentq(difference, pale, dark, xtol=1e-9)), *MELANIN_RANGE))

@@ -196,6 +196,7 @@ def fit_facial_color(
         valid=mask,
         stderr={state: np.where(mask[state], noise[state], np.nan) for state in blood},
         stored_size=stored_size,
+        common_log_sd=_common_log_sd(shared),
     )
     within = errors_within_face(shared.stderr_melanin, shared.optics_stderr_melanin)
     good = is_detectable(shared.melanin, within, shared.valid)
@@ -354,9 +355,18 @@ def _own_error(images: list[AlignedImage]) -> Float64Array:
 def _blood(shared: SharedMelanin, k: int) -> SkinMap:
     good = shared.valid_states[k] & ~shared.is_misfit[k]
     blood, stderr = shared.hemoglobin[k], shared.stderr_hemoglobin[k]
-    good &= is_detectable(blood, errors_within_face(stderr, shared.optics_stderr_hemoglobin), good)
+    good &= is_detectable(
+        blood, errors_within_face(stderr, shared.optics_stderr_hemoglobin[k]), good
+    )
     what = "given the melanin that all states share"
     return masked_map(blood, stderr, good, MAP_UNITS["hemoglobin"], what)
+
+
+def _common_log_sd(shared: SharedMelanin) -> float:
+    """Return the standard error of log blood by optics; it is one number for a face."""
+    relative = shared.optics_stderr_hemoglobin / shared.hemoglobin
+    known = relative[np.isfinite(relative)]
+    return float(np.median(known)) if known.size else 0.0
 
 
 def _change(shared: SharedMelanin, k: int) -> SkinMap:

@@ -316,8 +316,14 @@ def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap]:
         rgb, table, prior=prior, variance=variance, model_error=errors, has_white=has_white
     )
     found, by_face = whole.found, whole.by_face
-    exact = with_exact_optics(table)
-    by_noise = partial(chromophore_posterior.estimate, rgb, exact, prior=prior, variance=variance)
+    plain = np.exp(-whole.log_color)
+    by_noise = partial(
+        chromophore_posterior.estimate,
+        rgb * plain,
+        with_exact_optics(table),
+        prior=prior,
+        variance=variance * plain**2,
+    )
     noise_alone = by_noise(face=whole.face)
     # the face's prior does not apply to moles, lips and eyelids, which can be other skin
     if whole.face is not None:

@@ -15,6 +15,7 @@ from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import invert
 from reconstruction.chromophores import posterior as chromophore_posterior
+from reconstruction.chromophores.common_optics import CommonOptics
 from reconstruction.chromophores.inversion import (
     POPULATION_BLOOD,
     POPULATION_LOG_SD,
@@ -116,12 +117,13 @@ def test_common_optics_widen_errors_and_keep_estimates(table):
     rgb = (0.7 * table.lookup([0.02, 0.1], 0.012)).astype(np.float32)
     known = {"variance": (0.003 * rgb) ** 2, "model_error": 1e-6 * np.eye(3)}
     alone = chromophore_posterior.estimate(rgb, exact, prior=prior, **known)
-    whole = add_optics_errors(alone, rgb, table, log_light_sd=prior.sd, **known)
+    common = CommonOptics(np.zeros(3), 0.3, 0.2)
+    whole = add_optics_errors(alone, rgb, table, common, **known)
     np.testing.assert_array_equal(whole.melanin, alone.melanin)
     assert (whole.stderr_melanin > 2.0 * alone.stderr_melanin).any()
     within = whole.stderr_melanin**2 - whole.optics_stderr_melanin**2
     np.testing.assert_allclose(np.sqrt(within), alone.stderr_melanin, rtol=1e-3)
-    assert add_optics_errors(alone, rgb, exact, log_light_sd=prior.sd, **known) is alone
+    np.testing.assert_allclose(whole.optics_stderr_melanin, 0.3 * alone.melanin, rtol=1e-6)
 
 
 def test_posterior_with_unknown_optics_is_wider(table):

@@ -14,7 +14,7 @@ from rigsim.population.textures import SubjectFileError, resample_texture
 from rigsim.subject import pigment
 from rigsim.subject.perfusion import STATE_NAMES
 from rigsim.subject.person import make_subject
-from rigsim.subject.person_skin import PersonSkin
+from rigsim.subject.person_skin import PersonSkin, draw_tissue
 from rigsim.tissue.skin_layers import PAPER_SKIN, TYPICAL_SKIN
 
 SCHEMA = 'schema = "skinrig.subject/1"\n'
@@ -254,11 +254,25 @@ def test_properties_of_the_tissue_reach_every_rig(person):
     assert ann.patch("cheek", seed=1, size_mm=0.3).skin.tissue == expected
     top = ann.tissue(seed=1).optics("cheek", 0.0, 60.0).stacks[0].layers[0]
     assert top.thickness_mm == expected.epidermis_mm
-    assert load_subject("III").face(seed=1, size=64).tissue == TYPICAL_SKIN
+    typical = read_subject_file(person('tissue_model = "typical"'))
+    assert typical.face(seed=1, size=64).tissue == TYPICAL_SKIN
+    drawn = load_subject("III")
+    assert drawn.face(seed=1, size=64).tissue == drawn.skin(seed=1).tissue == draw_tissue(1)
 
 
 def test_impossible_tissue_is_refused_by_name(person):
     with pytest.raises(SubjectFileError) as caught:
         read_subject_file(person('tissue_model = "wax"\nepidermis_mm = 3.0'))
-    assert "tissue_model: got 'wax', expected one of skin, papers" in str(caught.value)
+    assert "tissue_model: got 'wax', expected one of drawn, typical, papers" in str(caught.value)
     assert "epidermis_mm: got 3.0, expected 0.03 to 0.4" in str(caught.value)
+
+
+def test_tone_in_file_replaces_melanin(person):
+    ann = read_subject_file(person('tone = "ita:40"'))
+    assert ann == dataclasses.replace(load_subject("ita:40"), preset=ann.preset)
+    pale, dark = (ann.melanosome_fraction(seed=seed) for seed in (1, 2))
+    assert pale != dark  # each seed's skin has its own optics
+    with pytest.raises(SubjectFileError, match="tone: got 'ita:40', expected no melanin"):
+        read_subject_file(person('tone = "ita:40"\nmelanin = 0.03'))
+    with pytest.raises(SubjectFileError, match="expected monk:1 to monk:10"):
+        read_subject_file(person('tone = "monk:11"'))

@@ -1,0 +1,138 @@
+"""Estimate the difference of one face's colors from the model's, by optics common to its skin.
+
+Thickness, scattering and oxygenation vary little within one face and much between people. They add
+one vector of log color to all pixels of a face, of known covariance (`ColorTable.log_covariance`).
+The light on the face is known up to its position. These covariances weight the color and the
+brightness of the face's median pixel in the estimate of its melanin and blood. The most probable
+common error follows; pixels without it are estimated as if the optics were exact.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from model.checks import Checks
+from model.color_table import ColorTable
+from reconstruction.arrays import Float64Array
+from reconstruction.chromophores.inversion import (
+    POPULATION_BLOOD,
+    POPULATION_LOG_SD,
+    POPULATION_MELANIN,
+)
+from reconstruction.chromophores.pixel_checks import (
+    ChromophoreError,
+    check_colors,
+    check_mask,
+    is_usable_color,
+)
+from reconstruction.chromophores.shading_prior import ShadingPrior
+from reconstruction.chromophores.start import MIN_AXIS_FRACTION
+
+LOG_FRACTION_STEP: Final = 0.05
+"""Step of the grid in log melanin and in log blood, at most a third of their standard errors."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CommonOptics:
+    """Common error of a face's colors, and the errors of its mean that remain."""
+
+    log_color: Float64Array
+    """(3,): most probable log color of the face over that of the model."""
+    log_melanin_sd: float
+    """Standard error of log melanin of the whole face."""
+    log_blood_sd: float
+    """Standard error of log blood of the whole face."""
+
+
+def estimate_common_optics(
+    rgb: ArrayLike,
+    table: ColorTable,
+    *,
+    prior: ShadingPrior,
+    common_light: float,
+    common_color: ArrayLike | None = None,
+    valid: ArrayLike | None = None,
+) -> CommonOptics | None:
+    """Estimate the common error of a face's colors.
+
+    Parameters
+    ----------
+    rgb
+        Shape (..., 3): light of the pixels over that of a white reference, linear camera RGB; all
+        skin of one person.
+    table
+        Color table of the camera and the illumination, with its covariance by unknown optics.
+    prior
+        Distribution of the pixels' shading.
+    common_light
+        Standard error of log light common to all pixels, above 0.
+    common_color
+        (3, 3): covariance of further relative color errors common to all pixels. None: 0.
+    valid
+        Shape (...): False where a pixel is masked. None: all may be used.
+
+    Returns
+    -------
+    CommonOptics or None
+        None without a usable pixel, or with a table of exact optics.
+
+    Raises
+    ------
+    ChromophoreError
+        When shapes or numbers do not fit.
+
+    Examples
+    --------
+    >>> from model import color_table
+    >>> from reconstruction.chromophores.shading_prior import lognormal_prior
+    >>> table = color_table.build("Nikon 5100 (NPL)", "D65")
+    >>> skin = 0.7 * table.lookup(np.full(100, 0.03), 0.011) * [1.06, 1.0, 1.0]
+    >>> prior = lognormal_prior(0.7, 0.5)
+    >>> found = estimate_common_optics(skin, table, prior=prior, common_light=0.1)
+    >>> bool(found.log_color[0] > found.log_color[1]), bool(0.05 < found.log_melanin_sd < 0.5)
+    (True, True)
+    """
+    check = Checks(ChromophoreError)
+    check.within("common_light", common_light, "(0, inf)")
+    colors = check_colors(rgb)
+    good = is_usable_color(colors)
+    if valid is not None:
+        good &= check_mask(valid, good.shape)
+    if table.optics_covariance is None or not good.any():
+        return None
+    total = np.cumsum(prior.density)
+    light = float(np.interp(0.5 * total[-1], total, prior.nodes))
+    seen = np.median(np.log(colors[good], dtype=np.float64), axis=0) - light
+
+    melanin, blood = (
+        np.exp(np.arange(np.log(end * MIN_AXIS_FRACTION**3), np.log(end), LOG_FRACTION_STEP))
+        for end in (table.c_m_max, table.c_hd_max)
+    )
+    c_m, c_hd = np.meshgrid(melanin, blood, indexing="ij")
+    rest = seen - np.log(table.lookup(c_m, c_hd))
+    optics = table.log_covariance(c_m, c_hd)
+    others = np.full((3, 3), common_light**2)
+    if common_color is not None:
+        others += check.numbers("common_color", common_color, (3, 3))
+    whole = optics + others
+    weighted = np.linalg.solve(whole, rest[..., None])
+    cost = (rest * weighted[..., 0]).sum(axis=-1) + np.linalg.slogdet(whole)[1]
+    for fraction, usual, sd in (
+        (c_m, POPULATION_MELANIN, POPULATION_LOG_SD[0]),
+        (c_hd, POPULATION_BLOOD, POPULATION_LOG_SD[1]),
+    ):
+        cost = cost + np.square(np.log(fraction / usual) / sd)
+    weight = np.exp(-0.5 * (cost - cost.min()))
+    weight /= weight.sum()
+
+    def deviation(fraction: Float64Array) -> float:
+        log = np.log(fraction)
+        mean = float((weight * log).sum())
+        return float(np.sqrt((weight * np.square(log - mean)).sum()))
+
+    error = (optics @ weighted)[..., 0]
+    return CommonOptics(
+        np.asarray((weight[..., None] * error).sum(axis=(0, 1))), deviation(c_m), deviation(c_hd)
+    )
