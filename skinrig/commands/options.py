@@ -92,7 +92,8 @@ Page = Annotated[
 Subject = Annotated[
     str,
     option(
-        "Simulated subject: preset I to VI, palest or darkest, or a file NAME.toml.",
+        "Simulated subject: preset I to VI, palest or darkest, ita:DEGREES, monk:N, or a file "
+        "NAME.toml.",
         autocompletion=completion.complete_subjects,
     ),
 ]

@@ -188,8 +188,8 @@ def simulate_dome(
     interreflections
         Simulate interreflection of skin even if its effect is not visible.
     subject
-        Simulated subject: preset I to VI, palest or darkest, a file NAME.toml, or P01 to P87 of
-        the simulated population.
+        Simulated subject: preset I to VI, palest or darkest, ita:DEGREES, monk:N, a file
+        NAME.toml, or P01 to P87 of the simulated population.
     condition
         Surface condition with amount 0 to 1, default 1: cold, hot, sweat, lotion, makeup, powder;
         repeatable.
@@ -270,9 +270,9 @@ def simulate_probe(
     Parameters
     ----------
     subject
-        Simulated subject: preset I to VI, palest or darkest, a file NAME.toml, or a medium,
-        homogeneous:A,S[,G] or anisotropic:A,S[,STRENGTH[,AXIS]] with A = sigma_a and S = sigma_s',
-        1/mm, and AXIS in degrees.
+        Simulated subject: preset I to VI, palest or darkest, ita:DEGREES, monk:N, a file
+        NAME.toml, or a medium, homogeneous:A,S[,G] or anisotropic:A,S[,STRENGTH[,AXIS]] with
+        A = sigma_a and S = sigma_s', 1/mm, and AXIS in degrees.
     """
     from skinrig.capturing.option_values import parse_floats, parse_names
     from skinrig.simulating.orders import ProbeOrder
