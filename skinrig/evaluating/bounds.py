@@ -6,6 +6,7 @@ from model import color_table
 from model.skin import SkinAppearance
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
+from reconstruction.chromophores.inversion import POPULATION_LOG_SD
 from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import Float64Array
 
@@ -15,10 +16,12 @@ def chromophore_bounds(
 ) -> dict[str, Float64Array]:
     """Return relative bounds of the standard errors of melanin and hemoglobin, each (H, W).
 
-    The bound is the inverse of the Fisher information of a pixel's three channels about both cube
-    roots and the log of the light, at the true chromophores. It includes the noise variance of the
-    diffuse image, the model error, and the variance of the light's prior, but not the prior's
-    shape, nor unknown optics, which move all pixels of a face together.
+    The bound has two parts. That of a pixel is the inverse of the Fisher information of its three
+    channels about both cube roots and the log of the light, at the true chromophores. It includes
+    the noise variance of the diffuse image, the model error, and the variance of the light's prior,
+    but not the prior's shape. That of the face is the error by unknown optics, which all pixels
+    have in common: the same information of the face's median color, without noise, with the light
+    known as for a white reference, and with the prior of both chromophores over people.
 
     Parameters
     ----------
@@ -44,7 +47,7 @@ def chromophore_bounds(
         str(built["camera"]),
         str(built["illuminant"]),
         anisotropy=ANISOTROPY_SKIN,
-        exact_optics=True,  # common to the face
+        exact_optics=True,
     )
     c_m, c_hd = (m.values.astype(np.float64) for m in wanted if m is not None)
     with np.errstate(invalid="ignore"):
@@ -54,10 +57,20 @@ def chromophore_bounds(
     noise = (diffuse.stderr[usable] / diffuse.values[usable]).astype(np.float64) ** 2
     prior = shading_prior.face_prior().sd
     relative = relative_bounds(table, c_m[usable], c_hd[usable], noise, log_shading_std=prior)
+    if not usable.any():
+        return {}
+    of_face = relative_bounds(
+        color_table.build(table.camera, table.illuminant, anisotropy=ANISOTROPY_SKIN),
+        np.median(c_m[usable], keepdims=True),
+        np.median(c_hd[usable], keepdims=True),
+        np.zeros((1, 3)),
+        log_shading_std=shading_prior.LOG_SHADING_SOFTNESS,
+        prior_log_std=POPULATION_LOG_SD,
+    )
     found = {}
-    for name, values in zip(("melanin", "hemoglobin"), relative, strict=True):
+    for name, values, common in zip(("melanin", "hemoglobin"), relative, of_face, strict=True):
         whole = np.full(usable.shape, np.nan)
-        whole[usable] = values
+        whole[usable] = np.hypot(values, common)
         found[name] = whole
     return found
 
@@ -70,6 +83,7 @@ def relative_bounds(
     *,
     log_shading_std: float,
     model_scale: float = 1.0,
+    prior_log_std: tuple[float, float] | None = None,
 ) -> tuple[Float64Array, Float64Array]:
     """Return the Cramér-Rao bounds of melanin and hemoglobin, relative, each (n,).
 
@@ -85,6 +99,8 @@ def relative_bounds(
         Prior standard deviation of the log of the light.
     model_scale
         Scale of the model error's variance.
+    prior_log_std
+        Standard deviations of the logs of melanin and hemoglobin over people. None: no prior.
     """
     color = table.lookup(c_m, c_hd)
     # d ln color / d c; multiplied by c it is the derivative by ln c, so that errors are relative
@@ -94,6 +110,8 @@ def relative_bounds(
     known = known + table.log_covariance(c_m, c_hd)
     covariance = relative_variance[..., None] * np.eye(3) + known
     fisher = np.swapaxes(gradient, -1, -2) @ np.linalg.solve(covariance, gradient)
+    if prior_log_std is not None:
+        fisher = fisher + np.diag(np.square(1.0 / np.array(prior_log_std)))
     aa, ab, bb = fisher[:, 0, 0], fisher[:, 0, 1], fisher[:, 1, 1]
     det = np.maximum(aa * bb - ab**2, 1e-12 * aa * bb)
     return np.sqrt(bb / det), np.sqrt(aa / det)
