@@ -200,3 +200,21 @@ def device_port(request):
     if url is None:
         pytest.skip("no --device-port was given")
     return url
+
+
+@pytest.fixture(scope="session")
+def typical_person(tmp_path_factory):
+    """Return a function from a preset to the file of a person whose optics are the model's.
+
+    Tests of an algorithm after the color model need it: another person's blood has an unknown
+    factor.
+    """
+    folder = tmp_path_factory.mktemp("typical")
+
+    def write(preset):
+        path = folder / f"typical-{preset}.toml"
+        lines = 'schema = "skinrig.subject/1"', f'preset = "{preset}"', 'tissue_model = "typical"'
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        return str(path)
+
+    return write

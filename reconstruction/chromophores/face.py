@@ -20,7 +20,7 @@ from reconstruction.chromophores import dark_spots, shading_prior
 from reconstruction.chromophores import face_kernels as kernels
 from reconstruction.chromophores import model_error as color_errors
 from reconstruction.chromophores import posterior as chromophore_posterior
-from reconstruction.chromophores.common_optics import estimate_common_optics
+from reconstruction.chromophores.common_optics import CommonOptics, estimate_common_optics
 from reconstruction.chromophores.face_distribution import (
     FaceDistribution,
     add_systematic_errors,
@@ -196,6 +196,30 @@ class FaceEstimate:
     """(3,): common error of log color by the face's optics, which the estimates are without."""
 
 
+def estimate_face_optics(
+    rgb: FloatArray, table: ColorTable, *, prior: ShadingPrior, has_white: bool
+) -> CommonOptics | None:
+    """Estimate the common error of the colors of a face before the flash rig.
+
+    Parameters
+    ----------
+    rgb, table, prior, has_white
+        See `estimate_face`.
+
+    Returns
+    -------
+    CommonOptics or None
+        See `reconstruction.chromophores.common_optics.estimate_common_optics`.
+    """
+    return estimate_common_optics(
+        rgb,
+        table,
+        prior=prior,
+        common_light=shading_prior.LOG_SHADING_SOFTNESS if has_white else prior.sd,
+        common_color=color_errors.load_error_terms().transport,
+    )
+
+
 def estimate_face(
     rgb: FloatArray,
     table: ColorTable,
@@ -215,13 +239,7 @@ def estimate_face(
         Whether a white reference at the face's position fixes the exposure. Without it the face
         distribution adds no information.
     """
-    common = estimate_common_optics(
-        rgb,
-        table,
-        prior=prior,
-        common_light=shading_prior.LOG_SHADING_SOFTNESS if has_white else prior.sd,
-        common_color=color_errors.load_error_terms().transport,
-    )
+    common = estimate_face_optics(rgb, table, prior=prior, has_white=has_white)
     log_color = np.zeros(3) if common is None else common.log_color
     factor = np.exp(-log_color).astype(np.float32)
     errors: dict[str, Any] = {"variance": variance * factor**2, "model_error": model_error}

@@ -190,7 +190,7 @@ def draw_tissue(seed: int, typical: TissueProperties = TYPICAL_SKIN) -> TissuePr
     rng = np.random.default_rng([seed, 0x7469])
     drawn = {}
     for name, (deviation, of_logarithm) in _TISSUE_DEVIATIONS.items():
-        step = deviation * float(np.clip(rng.standard_normal(), -2.5, 2.5))
+        step = deviation * float(np.clip(rng.standard_normal(), -2.0, 2.0))
         value = getattr(typical, name)
         value = value * exp(step) if of_logarithm else value + step
         drawn[name] = float(np.clip(value, *PROPERTY_RANGES[name]))

@@ -27,14 +27,15 @@ WIDTH_PX = 384
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(tmp_path_factory, typical_person) -> Path:
     base = tmp_path_factory.mktemp("facial-color")
+    person = typical_person("II")
     for target, kind in (("white", "white"), ("flat", "sensor")):
         session = base / f"session-{target}"
         simulate_session("flash", session, target=target, width_px=WIDTH_PX, seed=4)
         calibrate(kind, [session], base / "calibration")
     simulate_session(
-        "flash", base / "session-face", subject="II", states=STATES, width_px=WIDTH_PX, seed=4
+        "flash", base / "session-face", subject=person, states=STATES, width_px=WIDTH_PX, seed=4
     )
     return base
 

@@ -55,9 +55,12 @@ def simulate(tmp_path, order, **more):
 @pytest.mark.long
 @pytest.mark.render
 @pytest.mark.parametrize("movement", [False, True])
-def test_published_sequence_shows_frame_blood_without_transition(tmp_path, calibration, movement):
+def test_published_sequence_shows_frame_blood_without_transition(
+    tmp_path, calibration, typical_person, movement
+):
     """A smile stretches the chin, whose blood falls by 9 %; at the cheek it changes by 1 %."""
-    session = simulate(tmp_path, SequenceOrder(state="smile"), movement=movement)
+    order = SequenceOrder(state="smile")
+    session = simulate(tmp_path, order, subject=typical_person("III"), movement=movement)
     found, known = curves(session, calibration, tmp_path / "a")
     phases = found["phases"]
     assert (phases["captures"], phases["distinct"]) == (22, 20)
@@ -125,8 +128,11 @@ def test_happiness_that_moves_face_has_own_time_constant(tmp_path, calibration):
 @pytest.mark.long
 @pytest.mark.render
 @pytest.mark.parametrize(("state", "constant_s"), [("exercise", 20.0), ("alcohol", 1200.0)])
-def test_exercise_and_alcohol_show_their_courses(tmp_path, calibration, state, constant_s):
-    session = simulate(tmp_path, SequenceOrder(state=state), relaxation_s=constant_s)
+def test_exercise_and_alcohol_show_their_courses(
+    tmp_path, calibration, typical_person, state, constant_s
+):
+    order, person = SequenceOrder(state=state), typical_person("III")
+    session = simulate(tmp_path, order, subject=person, relaxation_s=constant_s)
     found, known = curves(session, calibration, tmp_path / "a")
     low, high = found["fit_of_all"]["interval_s"]
     assert low <= constant_s <= high

@@ -109,6 +109,7 @@ def _curves(inputs: Inputs) -> bytes:
             name: dict(zip(columns, curve, strict=True))
             for name, curve in zip(places, curves, strict=True)
         },
+        "common_log_stderr": blood.common_log_sd,
     }
     if prompt_s > 0:
         document |= _cycle_document(time, phase, blood, prompt_s, session, list(places))

@@ -10,14 +10,15 @@ then compared by brightness, poses by color alone.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from model.color_table import ColorTable
+from model.color_table import ColorTable, with_exact_optics
 from model.skin import SkinMap
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.chromophores import model_error
+from reconstruction.chromophores.face import estimate_face_optics
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.facial_color import shared_melanin
 from reconstruction.facial_color.perfusion_curves import DiscMeans, average_discs, disc_pixels
@@ -42,13 +43,33 @@ class SkinColorModel:
     prior: ShadingPrior
     model_error: FloatArray
     """Relative covariance of the table's colors."""
+    has_white: bool
+    """Whether a white reference fixes the exposure."""
 
     @staticmethod
     def of(rig: flash_stages.FlashRig) -> SkinColorModel:
         """Return the model of a session."""
         has_white = rig.white is not None
         colors = flash_stages.load_skin_colors(rig.camera, rig.illuminant, has_white=has_white)
-        return SkinColorModel(*colors, np.asarray(model_error.load_covariance()))
+        return SkinColorModel(*colors, np.asarray(model_error.load_covariance()), has_white)
+
+    def of_face(self, image: SkinMap) -> tuple[SkinColorModel, FloatArray, float]:
+        """Return the model with exact optics, and what a face's optics add to it.
+
+        These are the factor of the face's colors that leads to the model, and the standard error of
+        the log of its blood.
+
+        Parameters
+        ----------
+        image
+            Diffuse reflectance of the whole face.
+        """
+        rgb = np.where(image.mask[..., None], image.values, np.nan)
+        common = estimate_face_optics(rgb, self.table, prior=self.prior, has_white=self.has_white)
+        log_color = np.zeros(3) if common is None else common.log_color
+        exact = replace(self, table=with_exact_optics(self.table))
+        log_sd = 0.0 if common is None else common.log_blood_sd
+        return exact, np.exp(-log_color).astype(np.float32), log_sd
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +83,8 @@ class SiteBlood:
     the face has not moved."""
     moved: BoolArray
     """(N,): frames in which the face has moved."""
+    common_log_sd: float
+    """Standard error of the log of all blood, by optics of the face."""
 
 
 def average_disc_blood(
@@ -87,22 +110,26 @@ def average_disc_blood(
     moved
         (N,): frames in which the face has moved.
     """
+    # a disc alone hardly determines the optics, which are those of the face
+    exact, factor, common_log_sd = light.of_face(maps[0])
     found = [
-        _of_place(maps, name, place, radius_px, light, moved) for name, place in positions.items()
+        _of_place(maps, factor, (name, place), radius_px, exact, moved)
+        for name, place in positions.items()
     ]
     parts = zip(*((one.mean, one.stderr, one.pixels) for one, _ in found), strict=True)
     joined = DiscMeans(*map(np.concatenate, parts))
-    return SiteBlood(joined, np.array([of_pose for _, of_pose in found]), moved)
+    return SiteBlood(joined, np.array([of_pose for _, of_pose in found]), moved, common_log_sd)
 
 
 def _of_place(
     maps: Sequence[SkinMap],
-    name: str,
-    place: tuple[float, float],
+    factor: FloatArray,
+    position: tuple[str, tuple[float, float]],
     radius_px: float,
     light: SkinColorModel,
     moved: BoolArray,
 ) -> tuple[DiscMeans, float]:
+    name, place = position
     shape = maps[0].values.shape[:2]
     window_px = max(LIGHT_RADII * radius_px, LEAST_LIGHT_PX)
     rows, columns = disc_pixels(shape, name, place, radius_px)
@@ -110,8 +137,8 @@ def _of_place(
     bottom, right = (int(p.max() + 2 * window_px) + 1 for p in (rows, columns))
     patch = np.s_[top:bottom, left:right]
     valid = np.array([m.mask[patch] for m in maps])
-    rgb = np.array([m.values[patch] for m in maps])
-    variance = np.square([flash_stages.map_stderr(m)[patch] for m in maps])
+    rgb = np.array([factor * m.values[patch] for m in maps])
+    variance = np.square([factor * flash_stages.map_stderr(m)[patch] for m in maps])
     at = {name: (place[0] - left, place[1] - top)}
 
     def weighed(frames: BoolArray, smooth_px: float | None) -> DiscMeans:
