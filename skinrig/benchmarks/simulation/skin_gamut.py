@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from model import skin_tone
+from rigsim.population.files import load_subject
 from rigsim.population.population import draw_population
 from rigsim.subject.person_skin import PersonSkin
 from rigsim.subject.pigment import MELANIN_PRESETS
@@ -29,9 +30,15 @@ def measure_gamut(stage: BenchmarkStage) -> None:
     for preset in MELANIN_PRESETS:
         people = [PersonSkin.of_preset(preset, seed=seed) for seed in seeds]
         inside.append(_add_people(stage, preset, people))
+    drawn = [load_subject(preset).skin(seed=seed) for preset in MELANIN_PRESETS for seed in seeds]
+    of_drawn = _add_people(stage, "presets with drawn optics", drawn)
     members = [member.skin for member in draw_population()[: 8 if stage.toy else None]]
     share = _add_people(stage, "population", members)
-    stage.limits = {"presets": 100.0 * min(inside), "population": 100.0 * share}
+    stage.limits = {
+        "presets": 100.0 * min(inside),
+        "drawn": 100.0 * of_drawn,
+        "population": 100.0 * share,
+    }
     for name, band in MELANIN_BANDS.items():
         stage.by_band[name] = mean_error(_distances([PersonSkin.of_preset(band.preset)]))
 
