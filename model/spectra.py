@@ -4,6 +4,7 @@ The tables are CSV files in ``model/data``; each file's header names its source 
 Everything is sampled by linear interpolation at the wavelengths that the caller asks for.
 """
 
+import re
 from functools import cache, lru_cache
 from importlib import resources
 
@@ -44,6 +45,11 @@ _CAMERA_FILES = {
 }
 _DAYLIGHT_NOMINAL_K = {"D50": 5000.0, "D55": 5500.0, "D65": 6500.0}
 
+
+LED_PATTERN = re.compile(r"LED-([0-9]{3})-([0-9]{1,2})")
+"""Names of narrow-band LEDs: center and full width at half maximum, nm."""
+LED_SAMPLES_PER_WIDTH = 10
+_LED_HALF_RANGE = 1.6  # widths on either side of the center; 2e-4 of the light is beyond
 
 LINEAR_SRGB = "linear sRGB"
 """Name of the pseudo camera whose channels are the sRGB primaries."""
@@ -203,15 +209,17 @@ def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Ar
     Parameters
     ----------
     name
-        "D50", "D55", "D65" (CIE daylight), "A", "E" (equal energy), "LED-B3" (white LED) or
-        "xenon flash".
+        "D50", "D55", "D65" (CIE daylight), "A", "E" (equal energy), "LED-B3" (white LED), "xenon
+        flash", or a narrow-band LED by center and full width at half maximum, such as
+        "LED-590-20".
     wavelength_nm
-        Wavelengths in nm, shape (n,), 380 to 780 for daylight; the LED is 0 outside that range.
+        Wavelengths in nm, shape (n,), 380 to 780 for daylight; "LED-B3" is 0 outside that range.
 
     Returns
     -------
     ndarray
-        Shape (n,), relative power per wavelength interval, 100 at 560 nm.
+        Shape (n,), relative power per wavelength interval, 100 at 560 nm; of a narrow-band LED 100
+        at its center.
 
     Raises
     ------
@@ -223,6 +231,7 @@ def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Ar
     "xenon flash" is a smooth description of a photographic flash tube, not a measurement: a black
     body of 6000 K behind an envelope that absorbs the ultraviolet (logistic edge at 395 nm).
     Its correlated color temperature is about 5950 K. The weak visible xenon lines are omitted.
+    Narrow-band LEDs are Gaussian, this project's choice; measured ones are slightly skewed.
 
     References
     ----------
@@ -251,7 +260,48 @@ def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Ar
 
         body = _black_body(wavelength, 1.4388e7, FLASH_TEMPERATURE_K)
         return np.asarray(body * envelope(wavelength) / envelope(np.array(560.0)))
+    if LED_PATTERN.fullmatch(name):
+        center_nm, width_nm = led_band(name)
+        return np.asarray(100.0 * 0.5 ** np.square(2.0 * (wavelength - center_nm) / width_nm))
     raise SpectrumNameError(_unknown("light", name, illuminant_names()))
+
+
+def led_band(name: str) -> tuple[float, float]:
+    """Return center and full width at half maximum of a narrow-band LED, nm.
+
+    Raises
+    ------
+    SpectrumNameError
+        For the name of another light.
+
+    Examples
+    --------
+    >>> led_band("LED-590-20")
+    (590.0, 20.0)
+    """
+    match = LED_PATTERN.fullmatch(name)
+    if match is None or float(match[2]) == 0.0:
+        raise SpectrumNameError(
+            f"light {name!r} is not a narrow-band LED; name it LED-CENTER-WIDTH in nm, such as "
+            "LED-590-20"
+        )
+    return float(match[1]), float(match[2])
+
+
+def sampling(light_name: str) -> Float64Array:
+    """Return wavelengths in nm that resolve a light: `WAVELENGTH_NM`, or those of an LED, finer.
+
+    Examples
+    --------
+    >>> nm = sampling("LED-590-20")
+    >>> nm.size, nm[[0, 16, -1]].tolist(), sampling("D55").size
+    (33, [558.0, 590.0, 622.0], 31)
+    """
+    if LED_PATTERN.fullmatch(light_name) is None:
+        return WAVELENGTH_NM
+    center_nm, width_nm = led_band(light_name)
+    count = round(_LED_HALF_RANGE * LED_SAMPLES_PER_WIDTH)
+    return np.asarray(center_nm + width_nm / LED_SAMPLES_PER_WIDTH * np.arange(-count, count + 1))
 
 
 def color_matching_functions(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Array:
@@ -321,6 +371,33 @@ def band_average(
     weights = band_weights(camera, illuminant_name, wavelength_nm)
     Checks().shape("spectra", values, ("...", weights.shape[0]))
     return np.asarray(values @ weights)
+
+
+def gray_weights(camera: str, illuminant_name: str) -> Float64Array:
+    """Return weights that turn a sampled reflectance into the sum of a camera's channels.
+
+    Parameters
+    ----------
+    camera, illuminant_name
+        Names known to `camera_sensitivity` and `illuminant`.
+
+    Returns
+    -------
+    ndarray
+        Shape (n,) at the light's `sampling`; the sum is 1, so that a perfect white gives 1.
+
+    Examples
+    --------
+    >>> weights = gray_weights("Nikon 5100 (NPL)", "LED-590-20")
+    >>> round(float(weights @ sampling("LED-590-20")))
+    590
+    """
+    grid = sampling(illuminant_name)
+    fine = np.linspace(grid[0], grid[-1], 8 * (grid.size - 1) + 1)
+    response = illuminant(illuminant_name, fine) * camera_sensitivity(camera, fine).sum(axis=-1)
+    hats = np.maximum(1.0 - np.abs(fine - grid[:, None]) / (grid[1] - grid[0]), 0.0)
+    weights = hats @ response
+    return np.asarray(weights / weights.sum())
 
 
 def camera_white(camera: str, illuminant_name: str) -> Float64Array:
