@@ -10,6 +10,7 @@ parallel as behind crossed polarizers, for every subject.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -119,7 +120,7 @@ class FlashScene(FaceScene):
         self._choice = choice
         self._stage = shared_flash_geometry(self.subject, choice)
         self._caster = self._stage.caster
-        self._effects = effects
+        self._effects, self._power = effects, power
         self.needs = merge_selections([self._needs_of(view, power) for view in rig.views])
         self.lateral = self.needs.builds(face_needs.LATERAL_EFFECT)
         self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
@@ -175,6 +176,35 @@ class FlashScene(FaceScene):
         specular = self._apply_analyzer(picture.specular, view, passes_deg)
         return np.maximum((diffuse + specular[..., None]) * white, 0.0)
 
+    @cached_method
+    def under(self, led: str) -> "FlashScene":
+        """Return the scene with an LED of the flash heads instead of their tubes.
+
+        The LED has the position and the polarizer of the tube. Its power is set so that a white
+        reference gives `METERING_LEVEL` in the strongest channel, as for the flash.
+
+        Parameters
+        ----------
+        led
+            Name of its spectrum, such as "LED-590-20"; empty: the scene itself.
+        """
+        if not led:
+            return self
+        lights = tuple(replace(light, illuminant=led) for light in self.rig.lights)
+        return FlashScene(
+            replace(self.rig, lights=lights),
+            self.subject,
+            state=self.state,
+            movement=self.movement,
+            sensor=self.sensor(),
+            films=self.films,
+            seed=self.seed,
+            effects=self._effects,
+            power=self._power,
+            subpixels=self.subpixels,
+            choice=self._choice,
+        )
+
     def exposure(
         self, view_name: str, *, pops: Sequence[FlashPop], exposure_s: float, seed: int
     ) -> UInt16Array:
@@ -200,7 +230,9 @@ class FlashScene(FaceScene):
             self._camera(view_name),
             pops,
             pop_energy,
-            lambda pop: self.radiance(pop.polarizer, pop.analyzer_deg, view_name=view_name),
+            lambda pop: self.under(pop.led).radiance(
+                pop.polarizer, pop.analyzer_deg, view_name=view_name
+            ),
             deviation=POP_ENERGY_DEVIATION,
             exposure_s=exposure_s,
             seed=seed,
