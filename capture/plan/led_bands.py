@@ -70,6 +70,12 @@ def parse_led(name: str) -> tuple[float, float]:
     return float(match[1]), float(match[2])
 
 
+def led_names(plan: Plan) -> tuple[str, ...]:
+    """Return the LEDs under which a plan has frames, in the order of their first frame."""
+    found = [str(step.index["light"]) for step in plan.steps if "light" in step.index]
+    return tuple(name for name in dict.fromkeys(found) if _NAME_PATTERN.fullmatch(name))
+
+
 def add_led_frames(plan: Plan, leds: Sequence[str]) -> Plan:
     """Return a plan with one frame per LED next to each crossed frame of a subject.
 
