@@ -4,13 +4,13 @@ The tables are CSV files in ``model/data``; each file's header names its source 
 Everything is sampled by linear interpolation at the wavelengths that the caller asks for.
 """
 
-import re
 from functools import cache, lru_cache
 from importlib import resources
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model import led_spectra
 from model.arrays import Float64Array
 from model.checks import Checks
 
@@ -45,11 +45,6 @@ _CAMERA_FILES = {
 }
 _DAYLIGHT_NOMINAL_K = {"D50": 5000.0, "D55": 5500.0, "D65": 6500.0}
 
-
-LED_PATTERN = re.compile(r"LED-([0-9]{3})-([0-9]{1,2})")
-"""Names of narrow-band LEDs: center and full width at half maximum, nm."""
-LED_SAMPLES_PER_WIDTH = 10
-_LED_HALF_RANGE = 1.6  # widths on either side of the center; 2e-4 of the light is beyond
 
 LINEAR_SRGB = "linear sRGB"
 """Name of the pseudo camera whose channels are the sRGB primaries."""
@@ -260,32 +255,9 @@ def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Ar
 
         body = _black_body(wavelength, 1.4388e7, FLASH_TEMPERATURE_K)
         return np.asarray(body * envelope(wavelength) / envelope(np.array(560.0)))
-    if LED_PATTERN.fullmatch(name):
-        center_nm, width_nm = led_band(name)
-        return np.asarray(100.0 * 0.5 ** np.square(2.0 * (wavelength - center_nm) / width_nm))
+    if led_spectra.is_led(name):
+        return led_spectra.spectrum(name, wavelength)
     raise SpectrumNameError(_unknown("light", name, illuminant_names()))
-
-
-def led_band(name: str) -> tuple[float, float]:
-    """Return center and full width at half maximum of a narrow-band LED, nm.
-
-    Raises
-    ------
-    SpectrumNameError
-        For the name of another light.
-
-    Examples
-    --------
-    >>> led_band("LED-590-20")
-    (590.0, 20.0)
-    """
-    match = LED_PATTERN.fullmatch(name)
-    if match is None or float(match[2]) == 0.0:
-        raise SpectrumNameError(
-            f"light {name!r} is not a narrow-band LED; name it LED-CENTER-WIDTH in nm, such as "
-            "LED-590-20"
-        )
-    return float(match[1]), float(match[2])
 
 
 def sampling(light_name: str) -> Float64Array:
@@ -297,11 +269,7 @@ def sampling(light_name: str) -> Float64Array:
     >>> nm.size, nm[[0, 16, -1]].tolist(), sampling("D55").size
     (33, [558.0, 590.0, 622.0], 31)
     """
-    if LED_PATTERN.fullmatch(light_name) is None:
-        return WAVELENGTH_NM
-    center_nm, width_nm = led_band(light_name)
-    count = round(_LED_HALF_RANGE * LED_SAMPLES_PER_WIDTH)
-    return np.asarray(center_nm + width_nm / LED_SAMPLES_PER_WIDTH * np.arange(-count, count + 1))
+    return led_spectra.samples(light_name) if led_spectra.is_led(light_name) else WAVELENGTH_NM
 
 
 def color_matching_functions(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Array:
@@ -371,33 +339,6 @@ def band_average(
     weights = band_weights(camera, illuminant_name, wavelength_nm)
     Checks().shape("spectra", values, ("...", weights.shape[0]))
     return np.asarray(values @ weights)
-
-
-def gray_weights(camera: str, illuminant_name: str) -> Float64Array:
-    """Return weights that turn a sampled reflectance into the sum of a camera's channels.
-
-    Parameters
-    ----------
-    camera, illuminant_name
-        Names known to `camera_sensitivity` and `illuminant`.
-
-    Returns
-    -------
-    ndarray
-        Shape (n,) at the light's `sampling`; the sum is 1, so that a perfect white gives 1.
-
-    Examples
-    --------
-    >>> weights = gray_weights("Nikon 5100 (NPL)", "LED-590-20")
-    >>> round(float(weights @ sampling("LED-590-20")))
-    590
-    """
-    grid = sampling(illuminant_name)
-    fine = np.linspace(grid[0], grid[-1], 8 * (grid.size - 1) + 1)
-    response = illuminant(illuminant_name, fine) * camera_sensitivity(camera, fine).sum(axis=-1)
-    hats = np.maximum(1.0 - np.abs(fine - grid[:, None]) / (grid[1] - grid[0]), 0.0)
-    weights = hats @ response
-    return np.asarray(weights / weights.sum())
 
 
 def camera_white(camera: str, illuminant_name: str) -> Float64Array:

@@ -37,7 +37,7 @@ NUISANCE_SD: Final = np.array(
 _STEP: Final = 0.01  # of central differences
 
 
-@dataclass(frozen=True, slots=False)
+@dataclass(frozen=True)
 class BandSignals:
     """Signals of skin for one camera, its light, and LEDs."""
 
@@ -57,7 +57,7 @@ class BandSignals:
     def weights(self) -> Float64Array:
         """Weights of the wavelengths in each signal, (n, 3 + leds); each column sums to 1."""
         color = spectra.band_weights(self.camera, self.illuminant)
-        bands = [spectra.gray_weights(self.camera, name)[:, None] for name in self.leds]
+        bands = [gray_weights(self.camera, name)[:, None] for name in self.leds]
         return np.asarray(block_diag(color, *bands))
 
     def log_signals(self, skin: ArrayLike) -> Float64Array:
@@ -135,3 +135,32 @@ class BandSignals:
         moved = factors @ share
         rest = uncertainty.unstored_residual_variance(angle)[..., None, None]
         return np.asarray(np.swapaxes(moved, -1, -2) @ moved + rest * np.eye(moved.shape[-1]))
+
+
+def gray_weights(camera: str, illuminant_name: str) -> Float64Array:
+    """Return weights that turn a sampled reflectance into the sum of a camera's channels.
+
+    Parameters
+    ----------
+    camera, illuminant_name
+        Names known to `model.spectra`.
+
+    Returns
+    -------
+    ndarray
+        Shape (n,) at `model.spectra.sampling` of the light; the sum is 1, the signal of a white.
+
+    Examples
+    --------
+    >>> weights = gray_weights("Nikon 5100 (NPL)", "LED-590-20")
+    >>> round(float(weights @ spectra.sampling("LED-590-20")))
+    590
+    """
+    grid = spectra.sampling(illuminant_name)
+    fine = np.linspace(grid[0], grid[-1], 8 * (grid.size - 1) + 1)
+    response = spectra.illuminant(illuminant_name, fine) * spectra.camera_sensitivity(
+        camera, fine
+    ).sum(axis=-1)
+    hats = np.maximum(1.0 - np.abs(fine - grid[:, None]) / (grid[1] - grid[0]), 0.0)
+    weights = hats @ response
+    return np.asarray(weights / weights.sum())

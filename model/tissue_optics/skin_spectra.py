@@ -124,11 +124,11 @@ def log_reflectance(wavelength_nm: ArrayLike, skin: ArrayLike) -> Float64Array:
         melanin * relative[0] / relative[1] + (1.0 - fraction) * without * thickness,
         dermis / (SKIN_CONSTANTS.dermis_scattering * scattering),
     )
-    return _interpolate(np.broadcast_arrays(*coordinates))
+    return _interpolate(np.stack(np.broadcast_arrays(*coordinates)))
 
 
-def _interpolate(coordinates: list[Float64Array]) -> Float64Array:
-    """Return log R at given coordinates."""
+def _interpolate(coordinates: Float64Array) -> Float64Array:
+    """Return log R, (...), at given coordinates, (3, ...)."""
     check = Checks(TissueError)
     names = ("scattering depth", "absorption depth", "absorption over scattering of the dermis")
     places = []
@@ -139,9 +139,9 @@ def _interpolate(coordinates: list[Float64Array]) -> Float64Array:
         span = np.log((high + offset) / (low + offset))
         places.append(np.log((values + offset) / (low + offset)) / span * (count - 1))
     found = ndimage.map_coordinates(
-        _spline_coefficients(), np.stack([p.ravel() for p in places]), prefilter=False, mode="mirror"
+        _spline_coefficients(), np.stack(places), prefilter=False, mode="mirror"
     )
-    return np.asarray(found.reshape(coordinates[0].shape))
+    return np.asarray(found)
 
 
 @lru_cache(maxsize=1)

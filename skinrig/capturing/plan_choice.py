@@ -75,9 +75,7 @@ class DefaultPlan:
             return probe_calibration_plan(rig, target, repeats=repeats)
         if self.target is None:
             states = self.states or ("neutral",)
-            return flash_plan(
-                rig, states=states, repeats=repeats, interleave=True, leds=self.bands
-            )
+            return flash_plan(rig, states=states, repeats=repeats, interleave=True, leds=self.bands)
         if self.target == "white":
             return flash_plan(rig, states=("white",), repeats=max(4, repeats), leds=self.bands)
         target = self._check_target(("white", *FLASH_CALIBRATION_TARGETS))

@@ -17,18 +17,18 @@ from model import spectra
 from model.tissue_optics import SKIN_CONSTANTS
 from model.tissue_optics.band_signals import NUISANCE_SD, BandSignals
 from model.tissue_optics.skin_spectra import SKIN_PARAMETERS, typical_skin
-from reconstruction.chromophores.band_fit import MAX_STDERR_FRACTION, prior_moments
 from reconstruction.chromophores.shading_prior import face_prior
+from reconstruction.narrow_bands.band_fit import MAX_STDERR_FRACTION, prior_moments
 from reconstruction.pipeline.flash.oxygenation import SUPERPIXELS_PER_PX, WINDOW_MM
 from rigsim.scenes.flash.scene import METERING_LEVEL
 from rigsim.sensor import make_sensor
 from skinrig.arrays import Float64Array
 from skinrig.planning.camera_separability import TYPICAL_SKIN
 
-PEOPLE: Final[Mapping[str, str]] = {"light": "II", "medium": "IV", "dark": "VI"}
+SKIN_TYPES: Final[Mapping[str, str]] = {"light": "II", "medium": "IV", "dark": "VI"}
 """Skin types of the table."""
-REPORTED: Final = ("melanin_optical_depth", "blood", "oxygenation", "epidermis_mm")
-"""Reported properties, of `SKIN_PARAMETERS`; the thickness stands for the depth of melanin."""
+REPORTED_PROPERTIES: Final = ("melanin_optical_depth", "blood", "oxygenation", "epidermis_mm")
+"""Reported properties, of `SKIN_PARAMETERS`. Melanin by depth acts on signals like the thickness."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +36,11 @@ class LedInformation:
     """Bounds of one person's properties from the colors and some LEDs."""
 
     person: str
-    """Key of `PEOPLE`."""
+    """Key of `SKIN_TYPES`."""
     leds: tuple[str, ...]
     """LEDs that are used with the camera's colors."""
     stderr: Mapping[str, float]
-    """Standard errors by `REPORTED`; of all but oxygenation relative ones."""
+    """Standard errors by `REPORTED_PROPERTIES`; of all but oxygenation relative ones."""
     determined: tuple[str, ...]
     """Properties on which the signals have at least the information of the prior."""
 
@@ -88,7 +88,7 @@ def assess_leds(rig: Rig, plan: Plan, leds: Sequence[str]) -> tuple[LedInformati
     view = rig.views[0]
     whole = BandSignals(view.spectral_sensitivity, rig.lights[0].illuminant, tuple(leds))
     found = []
-    for person, kind in PEOPLE.items():
+    for person, kind in SKIN_TYPES.items():
         c_m, blood = TYPICAL_SKIN[kind]
         skin = typical_skin(c_m * SKIN_CONSTANTS.melanin_depth_factor, blood)
         light = np.exp(whole.log_signals(skin) + prior.mean)
@@ -102,7 +102,7 @@ def assess_leds(rig: Rig, plan: Plan, leds: Sequence[str]) -> tuple[LedInformati
             weights = np.linalg.inv(covariance[np.ix_(rows, rows)])
             fisher = slopes[rows].T @ weights @ slopes[rows] + np.diag(sd**-2.0)
             stderr = np.sqrt(np.diag(np.linalg.inv(fisher)))
-            at = {name: SKIN_PARAMETERS.index(name) for name in REPORTED}
+            at = {name: SKIN_PARAMETERS.index(name) for name in REPORTED_PROPERTIES}
             found.append(
                 LedInformation(
                     person,
@@ -114,9 +114,7 @@ def assess_leds(rig: Rig, plan: Plan, leds: Sequence[str]) -> tuple[LedInformati
     return tuple(found)
 
 
-def _noise_variance(
-    rig: Rig, plan: Plan, leds: Sequence[str], light: Float64Array
-) -> Float64Array:
+def _noise_variance(rig: Rig, plan: Plan, leds: Sequence[str], light: Float64Array) -> Float64Array:
     """Return the noise variance of each signal, averaged over the reconstruction's window."""
     view = rig.views[0]
     sensor = make_sensor(view)
@@ -142,7 +140,7 @@ def _noise_variance(
         levels = light[:3] if name not in leds else light[3 + list(leds).index(name)]
         noise = (gain * power * white * levels + floor) / sites / len(own) / power**2
         if name in leds:
-            variances.append([noise.sum() / white.sum() ** 2])
+            variances.append(np.array([noise.sum() / white.sum() ** 2]))
         else:
             variances.append(noise / white**2)
     return np.concatenate(variances)
@@ -153,7 +151,7 @@ def format_information(rows: Sequence[LedInformation]) -> list[str]:
 
     Examples
     --------
-    >>> errors = dict.fromkeys(REPORTED, 0.25)
+    >>> errors = dict.fromkeys(REPORTED_PROPERTIES, 0.25)
     >>> format_information([LedInformation("light", (), errors, ("blood",))])[1].split()
     ['colors', 'alone', '25', '%', '25', '%', '*', '0.250', '25', '%']
     """
@@ -161,7 +159,7 @@ def format_information(rows: Sequence[LedInformation]) -> list[str]:
     lines = []
     people = dict.fromkeys(row.person for row in rows)
     for person in people:
-        label = f"standard errors, {person} skin (type {PEOPLE[person]})"
+        label = f"absolute errors, {person} skin (type {SKIN_TYPES[person]})"
         lines.append(f"{label:<44}" + "".join(f"{head:>13}" for head in heads))
         for row in rows:
             if row.person != person:
@@ -169,11 +167,14 @@ def format_information(rows: Sequence[LedInformation]) -> list[str]:
             named = [":".join(led.split("-")[1:]) for led in row.leds]
             what = f"colors and LEDs {', '.join(named)}" if named else "colors alone"
             cells = []
-            for name in REPORTED:
+            for name in REPORTED_PROPERTIES:
                 value = row.stderr[name]
                 text = f"{value:.3f}" if name == "oxygenation" else f"{100 * value:.0f} %"
                 cells.append(f"{text}{' *' if name in row.determined else '  '}")
             lines.append(f"  {what:<42}" + "".join(f"{cell:>13}" for cell in cells))
     if lines:
-        lines.append("* the signals have at least the information of the prior over people")
+        lines.append(
+            "* the signals have at least the information of the prior over people; the thickness "
+            "is not separable from how melanin is distributed by depth"
+        )
     return lines

@@ -150,6 +150,7 @@ class PlanChoice:
 
     def to_document(self) -> dict[str, Any]:
         """Return the JSON document of the choice."""
+        leds = [row.to_document() for row in self.information]
         return {
             "schema": SCHEMA,
             "rig": self.rig.name,
@@ -158,7 +159,7 @@ class PlanChoice:
             **select_attributes(self, "knobs", "seconds", "full_seconds"),
             "saved_seconds": self.full_seconds - self.seconds,
             **select_attributes(self, "left_out", "path", "reasons", "light"),
-            **({"leds": [row.to_document() for row in self.information]} if self.information else {}),
+            **({"leds": leds} if leds else {}),
         }
 
 

@@ -11,8 +11,8 @@ from capture.calibration.color.white import WhiteReference
 from capture.session import FrameRecord, Session
 from model.skin import MAP_UNITS, SkinMap
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
-from reconstruction.chromophores.band_fit import OXYGENATION_SD, fit_bands, signal_table
 from reconstruction.chromophores.shading_prior import face_prior
+from reconstruction.narrow_bands.band_fit import OXYGENATION_SD, fit_bands, signal_table
 from reconstruction.pipeline.graph import PipelineStage
 from reconstruction.pipeline.masked_map import masked_map
 
@@ -71,18 +71,19 @@ def oxygenation_stage(
     kept = {name: value for name, value in which.items() if value is not None}
     records = [r for r in session.frames("subject", **kept) if "light" in r.index]
     leds = sorted({str(record.index["light"]) for record in records})
+    references = {} if white is None else white.leds
     refused = ""
     if not leds:
         refused = (
             "oxygenation: got a session without frames under narrow-band LEDs, whose colors do not "
             "determine it; capture with --bands, such as --bands 450,580,600"
         )
-    elif white is None or any(led not in white.leds for led in leds):
+    elif not set(leds) <= set(references):
         refused = (
             f"oxygenation: got frames under {', '.join(leds)} without their white references; "
             "capture target white with the same --bands, then `skinrig calibrate white`"
         )
-    run = partial(_maps, session, records, leds, open_reader, white, camera, illuminant)
+    run = partial(_maps, session, records, leds, open_reader, references, camera, illuminant)
     named = {"camera": camera, "illuminant": illuminant, "leds": leds, **which}
     return stage("oxygenation", "diffuse", " ".join(MAP_NAMES), run, refused, **named)
 
@@ -92,7 +93,7 @@ def _maps(
     records: Sequence[FrameRecord],
     leds: Sequence[str],
     open_reader: Callable[[], FrameReader],
-    white: WhiteReference,
+    references: Mapping[str, WhiteReference],
     camera: str,
     illuminant: str,
     diffuse: SkinMap,
@@ -106,9 +107,9 @@ def _maps(
         gray, noise = (
             part.sum(axis=-1, keepdims=True) for part in (2.0 * light.rgb, 4.0 * light.variance)
         )
-        value, variance, good = white.leds[led].balance(gray, variance=noise)
+        value, value_variance, good = references[led].balance(gray, variance=noise)
         signals.append(value)
-        variances.append(variance)
+        variances.append(value_variance)
         valid = valid & good & light.valid
     view = session.rig.view(records[0].camera)
     width_px = WINDOW_MM / (view.field_mm[0] / view.width_px) * SUPERPIXELS_PER_PX

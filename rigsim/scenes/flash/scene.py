@@ -178,15 +178,9 @@ class FlashScene(FaceScene):
 
     @cached_method
     def under(self, led: str) -> "FlashScene":
-        """Return the scene with an LED of the flash heads instead of their tubes.
+        """Return the scene under an LED of the flash heads, by its name; empty: the scene itself.
 
-        The LED has the position and the polarizer of the tube. Its power is set so that a white
-        reference gives `METERING_LEVEL` in the strongest channel, as for the flash.
-
-        Parameters
-        ----------
-        led
-            Name of its spectrum, such as "LED-590-20"; empty: the scene itself.
+        The LED has the tube's position, polarizer, and level of a white reference.
         """
         if not led:
             return self
