@@ -16,8 +16,9 @@ from skinrig.simulating.simulation import simulate_session
 pytestmark = pytest.mark.render
 
 LEDS = parse_bands("450,580,600")
-PLAIN = ("lateral", "interreflections", "spectral", "optics", "relief_shadows")
-NARROW = {"width_px": 96, "seed": 411}
+WIDTH_PX = 192  # with lateral scattering; at 96 px mosaic aliasing of skin detail exceeds noise
+PLAIN = ("interreflections", "spectral", "optics", "relief_shadows")
+NARROW = {"width_px": WIDTH_PX, "seed": 411}
 SUBJECT = """schema = "skinrig.subject/1"
 preset = "II"
 oxygenation = {oxygenation}
@@ -34,7 +35,7 @@ def calibrations(tmp_path_factory):
     folder = tmp_path_factory.mktemp("white")
     for name, bands in (("leds", LEDS), ("plain", ())):
         session = folder / f"session-{name}"
-        simulate_session("flash", session, target="white", width_px=96, bands=bands)
+        simulate_session("flash", session, target="white", width_px=WIDTH_PX, bands=bands)
         calibrate("white", [session], folder / name)
     return folder
 
@@ -73,12 +74,11 @@ def test_maps_recover_oxygenation_of_two_people(people, calibrations, tmp_path):
         found, skin = maps["oxygenation"], truth["mask"].values > 0.5
         np.testing.assert_allclose(truth["oxygenation"].values[skin], oxygenation, rtol=1e-6)
         good = found.valid & skin
-        # pixels of 5 mm mix brows, lips and shadow edges into skin
-        assert good.sum() > 0.8 * skin.sum()
+        assert good.sum() > 0.9 * skin.sum()
         medians[oxygenation] = np.median(found.values[good])
-        within = np.abs(found.values[good] - oxygenation) < 2.0 * found.stderr[good]
-        assert within.mean() > 0.9
-        assert np.median(found.stderr[good]) < 0.097
+        stderr = np.median(found.stderr[good])
+        assert abs(medians[oxygenation] - oxygenation) < 2.0 * stderr
+        assert np.std(found.values[good]) < stderr < 0.097
     assert medians[0.9] - medians[0.5] > 0.6 * 0.4
 
 
@@ -91,7 +91,7 @@ def test_session_stores_led_frames_as_controller_reported(people):
 
 
 def test_missing_led_frames_or_whites_are_refused(people, calibrations, tmp_path):
-    plan = flash_plan(load_rig("flash").resized(96), darks=1)
+    plan = flash_plan(load_rig("flash").resized(WIDTH_PX), darks=1)
     plain = simulate_session(
         "flash", tmp_path / "session-plain", plan=plan, leave_out=PLAIN, **NARROW
     )
