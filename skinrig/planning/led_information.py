@@ -28,7 +28,7 @@ from skinrig.planning.camera_separability import TYPICAL_SKIN
 SKIN_TYPES: Final[Mapping[str, str]] = {"light": "II", "medium": "IV", "dark": "VI"}
 """Skin types of the table."""
 REPORTED_PROPERTIES: Final = ("melanin_optical_depth", "blood", "oxygenation", "epidermis_mm")
-"""Reported properties, of `SKIN_PARAMETERS`. Melanin by depth acts on signals like the thickness."""
+"""Reported properties. Distribution of melanin by depth acts on signals like the thickness."""
 
 
 @dataclass(frozen=True, slots=True)
