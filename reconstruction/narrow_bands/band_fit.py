@@ -56,7 +56,7 @@ class BandFit:
     stderr: Float64Array
     """(n, 3): posterior standard deviations of log melanin, log blood and oxygenation."""
     noise_stderr: Float64Array
-    """(n, 3): the part of it by noise, for differences within one session."""
+    """(n, 3): the part of it by noise, by which repeats differ."""
     misfit: Float64Array
     """Squared distance from the model over its covariance, chi-squared for skin of the model."""
     valid: BoolArray

@@ -134,7 +134,7 @@ def _maps(
         f"mean over {WINDOW_MM:g} mm, with the prior's standard deviation of {OXYGENATION_SD:.3f}; "
         "invalid where that has more information than the signals"
     )
-    alone = "standard error by noise alone, for differences within a session"
+    alone = "standard error by noise alone, by which repeats of a session differ"
     return {
         "oxygenation": masked_map(
             on_image(found.oxygenation), on_image(found.stderr[:, 2]), good, unit, why

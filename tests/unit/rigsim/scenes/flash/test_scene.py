@@ -300,7 +300,7 @@ def test_white_reference_has_level_under_led(rig):
         assert middle.max() == pytest.approx(0.99 * METERING_LEVEL, rel=0.01)
 
 
-def test_led_sees_oxygenation_where_flash_does_not(rig, face):
+def test_led_light_depends_more_on_oxygenation(rig, face):
     """Expected: 30 points of oxygenation change light at 600 nm five times as much as green."""
     tissue = dataclasses.replace(face.tissue, oxygenation=0.45)
     deoxygenated = dataclasses.replace(face, tissue=tissue)
