@@ -177,6 +177,7 @@ def _sensor(frames: _Frames) -> store.Calibration:
 def _white(frames: _Frames) -> store.Calibration:
     dark = frames.dark_level()
     shots = frames.require_frames("subject", polarizer="crossed")
+    powers = _powers(frames, shots)
     linear = _linear(shots)
     for (record, _), image in zip(shots, linear, strict=True):
         what = f"frame {record.step_id} of state {record.index.get('state')!r}"
@@ -187,9 +188,9 @@ def _white(frames: _Frames) -> store.Calibration:
     for led in frames.led_names():
         under = frames.require_frames("subject", light=led)
         gray = [_sum_channels(image, dark) for image in _linear(under)]
-        leds[led] = _reference(frames, under, gray)
+        leds[led] = _reference(_powers(frames, under), gray)
     balanced = [replace(image, rgb=image.rgb - dark) for image in linear]
-    reference = replace(_reference(frames, shots, balanced), leds=leds)
+    reference = replace(_reference(powers, balanced), leds=leds)
     return reference.to_calibration(**frames.about)
 
 
@@ -199,9 +200,11 @@ def _sum_channels(image: raw.LinearImage, dark: Float32Array | float) -> raw.Lin
     return replace(image, rgb=total, variance=image.variance.sum(axis=-1, keepdims=True))
 
 
-def _reference(
-    frames: _Frames, shots: Shots, images: Sequence[raw.LinearImage]
-) -> white.WhiteReference:
+def _powers(frames: _Frames, shots: Shots) -> list[float]:
+    return [frames.read_setting(record, "power") for record, _ in shots]
+
+
+def _reference(powers: list[float], images: Sequence[raw.LinearImage]) -> white.WhiteReference:
     """Return the white reference of crossed images without their dark signal."""
     # The reference depolarizes: its diffuse light D splits evenly over both polarizations, so the
     # crossed image is D / 2. Hence D = 2 I_crossed, and var(D) = 4 var(I_crossed).
@@ -209,7 +212,7 @@ def _reference(
         [2.0 * image.rgb for image in images],
         variances=[4.0 * image.variance for image in images],
         valid=[image.valid for image in images],
-        lights=[frames.read_setting(record, "power") for record, _ in shots],
+        lights=powers,
         reflectance=WHITE_REFERENCE_REFLECTANCE,
         # no smooth fit: the gain of each pixel (PRNU) must cancel in the ratio to the reference
         degree=None,
