@@ -17,6 +17,7 @@ MAP_UNITS: Mapping[str, str] = MappingProxyType(
         "melanin": "volume fraction of the epidermis",
         "melanin_optical_depth": "1",
         "hemoglobin": "volume fraction of blood in the dermis",
+        "oxygenation": "fraction of oxygenated hemoglobin",
         "shading": "1",
         "diffuse": "1",
         "specular": "1",

@@ -10,6 +10,7 @@ from importlib import resources
 import numpy as np
 from numpy.typing import ArrayLike
 
+from model import led_spectra
 from model.arrays import Float64Array
 from model.checks import Checks
 
@@ -203,15 +204,17 @@ def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Ar
     Parameters
     ----------
     name
-        "D50", "D55", "D65" (CIE daylight), "A", "E" (equal energy), "LED-B3" (white LED) or
-        "xenon flash".
+        "D50", "D55", "D65" (CIE daylight), "A", "E" (equal energy), "LED-B3" (white LED), "xenon
+        flash", or a narrow-band LED by center and full width at half maximum, such as
+        "LED-590-20".
     wavelength_nm
-        Wavelengths in nm, shape (n,), 380 to 780 for daylight; the LED is 0 outside that range.
+        Wavelengths in nm, shape (n,), 380 to 780 for daylight; "LED-B3" is 0 outside that range.
 
     Returns
     -------
     ndarray
-        Shape (n,), relative power per wavelength interval, 100 at 560 nm.
+        Shape (n,), relative power per wavelength interval, 100 at 560 nm; of a narrow-band LED 100
+        at its center.
 
     Raises
     ------
@@ -223,6 +226,7 @@ def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Ar
     "xenon flash" is a smooth description of a photographic flash tube, not a measurement: a black
     body of 6000 K behind an envelope that absorbs the ultraviolet (logistic edge at 395 nm).
     Its correlated color temperature is about 5950 K. The weak visible xenon lines are omitted.
+    Narrow-band LEDs are Gaussian, this project's choice; measured ones are slightly skewed.
 
     References
     ----------
@@ -251,7 +255,21 @@ def illuminant(name: str, wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Ar
 
         body = _black_body(wavelength, 1.4388e7, FLASH_TEMPERATURE_K)
         return np.asarray(body * envelope(wavelength) / envelope(np.array(560.0)))
+    if led_spectra.is_led(name):
+        return led_spectra.spectrum(name, wavelength)
     raise SpectrumNameError(_unknown("light", name, illuminant_names()))
+
+
+def sampling(light_name: str) -> Float64Array:
+    """Return wavelengths in nm that resolve a light: `WAVELENGTH_NM`, or those of an LED, finer.
+
+    Examples
+    --------
+    >>> nm = sampling("LED-590-20")
+    >>> nm.size, nm[[0, 16, -1]].tolist(), sampling("D55").size
+    (33, [558.0, 590.0, 622.0], 31)
+    """
+    return led_spectra.samples(light_name) if led_spectra.is_led(light_name) else WAVELENGTH_NM
 
 
 def color_matching_functions(wavelength_nm: ArrayLike = WAVELENGTH_NM) -> Float64Array:

@@ -15,7 +15,7 @@ from capture.devices.port import PortTimeout
 FLASH_KIND = "flash"
 Polarizer = Literal["parallel", "crossed"]
 _POLARIZER_WORDS: Mapping[str, Polarizer] = {"PAR": "parallel", "CROS": "crossed"}
-_REPORT_FIELDS = "token,us,power,PAR|CROS,degrees,count"
+_REPORT_FIELDS = "token,us,power,PAR|CROS,degrees,count[,LED]"
 _MIN_WAIT_S = 0.02
 _CHARGE_POLL_S = 0.2
 """Longest silence while waiting, s; shorter than the shortest lease."""
@@ -37,6 +37,8 @@ class FlashReport:
     """Reading of the rotator, degrees; 0 parallel, 90 crossed."""
     count: int
     """Number of flashes since manufacture, this one included."""
+    led: str = ""
+    """Name of the LED that flashed instead of the tube, such as LED-590-20; empty: the tube."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +127,19 @@ class FlashBox(Box):
         """Return the delay from the camera line to the flash, in s."""
         return self._number("FLAS:SYNC?") / 1e6
 
+    def set_led(self, center_nm: float, width_nm: float) -> None:
+        """Replace the tube by an LED for the next flash: its center and full width, in nm."""
+        center, width = (
+            format_decimal(name, value, 9)
+            for name, value in (("center_nm", center_nm), ("width_nm", width_nm))
+        )
+        self._port.ask(f"FLAS:LED {center},{width}")
+
+    def led(self) -> str:
+        """Return the LED of the next flash, such as LED-590-20; empty: the tube."""
+        name = self._port.ask("FLAS:LED?")
+        return "" if name == "TUBE" else name
+
     def charge_state(self) -> ChargeState:
         """Return whether a flash is possible, and when it will be."""
         return self._read("FLAS:CHAR?", _charge_state, "charge,ready,ms")
@@ -192,9 +207,9 @@ def _charge_state(payload: str) -> ChargeState:
 
 
 def _parse_report(payload: str) -> FlashReport:
-    token, t_us, power, stop, angle_deg, count = payload.split(",")
+    token, t_us, power, stop, angle_deg, count, *led = payload.split(",")
     polarizer, t_s = _POLARIZER_WORDS[stop], int(t_us) / 1e6
-    return FlashReport(token, t_s, float(power), polarizer, float(angle_deg), int(count))
+    return FlashReport(token, t_s, float(power), polarizer, float(angle_deg), int(count), *led)
 
 
 DRIVER: Final = FlashBox

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Literal, get_args
 
+from capture.plan.led_bands import add_led_frames
 from capture.plan.steps import (
     POLARIZER_STATES,
     Index,
@@ -33,6 +34,7 @@ def flash_plan(
     power: float = 1.0,
     exposure_s: float = 0.008,
     iso: int = 100,
+    leds: Sequence[str] = (),
 ) -> Plan:
     """Plan parallel and crossed flash images of a subject in each of several states.
 
@@ -53,6 +55,9 @@ def flash_plan(
     exposure_s : float
         Exposure time, s; it includes the flash.
     iso : int
+    leds : sequence of str
+        Narrow-band LEDs, each with one more crossed frame per state and repeat; see
+        `capture.plan.led_bands.add_led_frames`.
 
     Returns
     -------
@@ -89,7 +94,7 @@ def flash_plan(
             index: Index = {"state": state, "polarizer": polarizer, "repeat": repeat}
             series.number("S", "subject", index, polarizer=polarizer, power=power)
         pair.reverse()
-    return series.plan()
+    return add_led_frames(series.plan(), leds)
 
 
 def flash_calibration_plan(

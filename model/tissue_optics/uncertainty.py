@@ -18,7 +18,7 @@ from importlib import resources
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RectBivariateSpline
 
 from model import skin_tone, spectra
@@ -129,12 +129,69 @@ def _residual_covariance(reflectance: Float64Array, share: Float64Array) -> Floa
     of_band = [np.einsum("kw,ijwc->ijck", factors, share) for factors in stored["residual_factors"]]
     bands = np.stack([np.einsum("ijck,ijdk->ijcd", part, part) for part in of_band])
     angle = typology_angle(reflectance + normal_reflectance(ETA_SKIN))
-    centers = stored["typology_angle_deg"]
-    place = np.interp(-angle, -centers, np.arange(centers.size))
-    low = np.minimum(place.astype(np.intp), centers.size - 2)
-    part = (place - low)[..., None, None]
+    low, part = _band_position(angle)
+    part = part[..., None, None]
     i, j = np.indices(angle.shape)
     return np.asarray((1.0 - part) * bands[low, i, j] + part * bands[low + 1, i, j])
+
+
+def residual_factors(angle_deg: ArrayLike, wavelength_nm: ArrayLike) -> Float64Array:
+    """Return the largest factors F of the covariance F'F of measured spectra's residuals in log R.
+
+    Parameters
+    ----------
+    angle_deg
+        Individual typology angles, degrees, any shape; those beyond the stored ones count as these.
+    wavelength_nm
+        Wavelengths in nm, shape (w,), interpolated linearly between `model.spectra.WAVELENGTH_NM`;
+        beyond them the nearest one counts.
+
+    Returns
+    -------
+    ndarray, shape (..., f, w)
+
+    Examples
+    --------
+    >>> residual_factors([20.0, -30.0], [550.0, 560.0]).shape
+    (2, 12, 2)
+    """
+    stored = _stored()
+    grid = spectra.WAVELENGTH_NM
+    nm = np.clip(np.asarray(wavelength_nm, np.float64), grid[0], grid[-1])
+    hats = np.maximum(1.0 - np.abs(grid[:, None] - nm) / (grid[1] - grid[0]), 0.0)
+    low, part = _band_position(np.asarray(angle_deg, np.float64))
+    part = part[..., None, None]
+    factors = stored["residual_factors"] @ hats
+    both = np.sqrt(1.0 - part) * factors[low], np.sqrt(part) * factors[low + 1]
+    return np.concatenate(both, axis=-2)
+
+
+def unstored_residual_variance(angle_deg: ArrayLike) -> Float64Array:
+    """Return a variance per wavelength for the factors of the residuals that are not stored.
+
+    It is that of the smallest stored factor, of which none of the others is larger.
+
+    Parameters
+    ----------
+    angle_deg
+        Individual typology angles, degrees, any shape.
+
+    Examples
+    --------
+    >>> float(np.sqrt(unstored_residual_variance(35.0)).round(4))
+    0.0032
+    """
+    smallest = np.square(_stored()["residual_factors"][:, -1]).mean(axis=-1)
+    low, part = _band_position(np.asarray(angle_deg, np.float64))
+    return np.asarray((1.0 - part) * smallest[low] + part * smallest[low + 1])
+
+
+def _band_position(angle_deg: Float64Array) -> tuple[NDArray[np.intp], Float64Array]:
+    """Return the band of typology angles below each angle, and the fraction of the next one."""
+    centers = _stored()["typology_angle_deg"]
+    place = np.interp(-angle_deg, -centers, np.arange(centers.size))
+    low = np.minimum(place.astype(np.intp), centers.size - 2)
+    return low, np.asarray(place - low)
 
 
 def typology_angle(reflectance: ArrayLike) -> Float64Array:

@@ -6,7 +6,9 @@ is refused while the analyzer turns (-213), before the tube has recovered (103: 
 proportional to the last power), beyond the pops per minute (101), before the charge suffices
 (-213), and with the emergency stop open (107). It fails with -240 when the tube does not ignite;
 the camera line has pulsed by then, so that frame is dark. ``FLAS:SYNC`` sets the delay from the
-camera line to the pop, for cameras whose shutters take time to open. The answer follows the pop;
+camera line to the pop, for cameras whose shutters take time to open. ``FLAS:LED`` replaces the
+tube by a narrow-band LED of the heads for the next pop, with the same energy, charge and timing;
+after that pop, or when made dark, the tube is back. The answer follows the pop;
 any command that makes dark before the pop prevents it (-240 too). Modelling lamps include their own
 end and go out before a pop; their driver trips when too hot (102).
 """
@@ -37,6 +39,9 @@ LAMP_RANGE_MS = (1.0, 500.0)
 ANALYZER_RANGE_DEG = (0.0, 180.0)
 SYNC_RANGE_US = (0.0, 50_000.0)
 """Delay from camera line to pop; an answer must not block the line for longer."""
+LED_CENTER_RANGE_NM = (420.0, 680.0)
+LED_WIDTH_RANGE_NM = (5.0, 50.0)
+"""LEDs of the emulated heads, which have one of each center and width."""
 POP_WINDOW_S = 60.0
 POLARIZER_READING_DEG: dict[Polarizer, float] = {"parallel": 0.0, "crossed": 90.0}
 
@@ -64,6 +69,8 @@ class FlashPop:
     """Analyzer at its parallel (0 degrees) or crossed (90 degrees) stop."""
     analyzer_deg: float | None
     """Reading of the rotator in degrees when it is not at a requested stop."""
+    led: str = ""
+    """Name of the LED's spectrum in `model.spectra`; empty: the flash tube."""
 
 
 @dataclass(slots=True)
@@ -120,6 +127,7 @@ class FlashUnit(Device):
         self.polarizer: Polarizer = "parallel"
         self.analyzer_deg: float | None = None
         self.last_report = ""
+        self.led = ""
         self._turn(POLARIZER_READING_DEG["parallel"], now)
 
     def capabilities(self) -> Mapping[str, Any]:
@@ -131,6 +139,8 @@ class FlashUnit(Device):
             "analyser_max_deg": ANALYZER_RANGE_DEG[1],
             "sync_min_us": SYNC_RANGE_US[0],
             "sync_max_us": SYNC_RANGE_US[1],
+            "led_min_nm": LED_CENTER_RANGE_NM[0],
+            "led_max_nm": LED_CENTER_RANGE_NM[1],
             "lamp_min_ms": LAMP_RANGE_MS[0],
             "lamp_max_ms": LAMP_RANGE_MS[1],
             "recycle_s": self.rig.recycle_s,
@@ -149,6 +159,8 @@ class FlashUnit(Device):
             "FLAS:POW?": self._get_power,
             "FLAS:SYNC": self._set_sync,
             "FLAS:SYNC?": lambda *_: f"{1e6 * self.sync_s:.0f}",
+            "FLAS:LED": self._set_led,
+            "FLAS:LED?": lambda *_: self.led or "TUBE",
             "FLAS:CHAR?": self._get_charge,
             "FLAS:FIRE": self._fire,
             "FLAS:LAST?": lambda *_: self.last_report or "NONE",
@@ -194,8 +206,9 @@ class FlashUnit(Device):
         self._now = max(now, self._now)
 
     def go_dark(self, now: float) -> None:
-        """Switch the lamps off and prevent a pending pop."""
+        """Switch the lamps off, prevent a pending pop, and return to the tube."""
         self._lamps_out(now)
+        self.led = ""
         if self._coming is not None:
             self._coming = None
             self._outcome = CommandRefused(Code.HARDWARE, "made dark before the pop")
@@ -253,6 +266,13 @@ class FlashUnit(Device):
 
     def _set_sync(self, arguments: str, now: float) -> None:
         self.sync_s = parse_number(arguments, *SYNC_RANGE_US, "us") / 1e6
+
+    def _set_led(self, arguments: str, now: float) -> None:
+        center, comma, width = arguments.partition(",")
+        CommandRefused.raise_if(not comma, Code.SYNTAX, "expected center,width in nm")
+        center_nm = parse_number(center, *LED_CENTER_RANGE_NM, "nm")
+        width_nm = parse_number(width, *LED_WIDTH_RANGE_NM, "nm")
+        self.led = f"LED-{center_nm:.0f}-{width_nm:.0f}"
 
     def charge(self, now: float) -> float:
         """Return the energy in the capacitor at `now`, 0 to 1 of a full pop."""
@@ -317,7 +337,8 @@ class FlashUnit(Device):
         self._last_power = self.power
         self._pops.append(now)
         self.count += 1
-        self._on_light(FlashPop(token, now, self.power, self.polarizer, self.analyzer_deg))
+        pop = FlashPop(token, now, self.power, self.polarizer, self.analyzer_deg, self.led)
+        self._on_light(pop)
         self.last_report = ",".join(
             (
                 token,
@@ -326,8 +347,10 @@ class FlashUnit(Device):
                 self._get_polarizer("", now),
                 self._get_angle("", now),
                 str(self.count),
+                *([self.led] if self.led else []),
             )
         )
+        self.led = ""
         self._outcome = self.last_report
 
     # lamps ------------------------------------------------------------------------------------

@@ -101,7 +101,7 @@ def skin_color(camera: str, light: str, tissue: TissueProperties = TYPICAL_SKIN)
     >>> bool(fair[0] > fair[1] > fair[2])
     True
     """
-    table = SkinTable.load(tissue)
+    table = SkinTable.load(tissue, spectra.sampling(light))
     weights = spectra.band_weights(camera, light, table.wavelength_nm)
     position = np.linspace(0.0, 1.0, NODES_PER_AXIS)
     melanin = MAX_C_M * position**3

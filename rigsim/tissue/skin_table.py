@@ -51,7 +51,7 @@ class SkinTable:
     tissue: TissueProperties
     """All other properties of the skin."""
     wavelength_nm: Float64Array
-    """Wavelengths in nm, 400 to 700 in steps of 10, shape (n_wavelength,)."""
+    """Wavelengths in nm, shape (n_wavelength,)."""
     c_m: Float64Array
     """Nodes of the volume fraction of melanosomes in the epidermis, 0 to 0.5, equally spaced in
     their cube root, shape (n_m,)."""
@@ -64,15 +64,24 @@ class SkinTable:
     """log R with its slopes and twist per cell edge, shape (n_m, n_h, 4, n_wavelength)."""
 
     @classmethod
-    def load(cls, tissue: TissueProperties = TYPICAL_SKIN) -> SkinTable:
+    def load(
+        cls, tissue: TissueProperties = TYPICAL_SKIN, wavelength_nm: ArrayLike = WAVELENGTH_NM
+    ) -> SkinTable:
         """Return the table of a person's skin; it is computed once, in 0.3 s.
+
+        Parameters
+        ----------
+        tissue
+            Properties of the skin except for melanin and blood.
+        wavelength_nm
+            Wavelengths in nm, shape (n_wavelength,).
 
         Raises
         ------
         rigsim.tissue.skin_transport.SkinTransportError
             When the properties lie outside the Monte Carlo table.
         """
-        return _load(tissue)
+        return _load(tissue, tuple(np.asarray(wavelength_nm, np.float64).tolist()))
 
     @cached_property
     def standard_error(self) -> Float64Array:
@@ -83,7 +92,7 @@ class SkinTable:
         transport = SkinTransport.load()
         relative = [
             transport.relative_error(_coordinates(coefficients, self.tissue))
-            for coefficients in _coefficients_by_wavelength(self.c_m, self.c_hd, self.tissue)
+            for coefficients in self._coefficients(self.c_m, self.c_hd)
         ]
         shape = self.reflectance.shape[:2]
         return self.reflectance * np.stack([part.reshape(shape) for part in relative], axis=-1)
@@ -133,6 +142,9 @@ class SkinTable:
         else:
             _interpolate_f64(self._patches, flat_m, flat_h, out)
         return out.reshape(*melanin.shape, -1)
+
+    def _coefficients(self, c_m: Float64Array, c_hd: Float64Array) -> list[SkinCoefficients]:
+        return _coefficients_by_wavelength(c_m, c_hd, self.tissue, self.wavelength_nm)
 
     def lateral_kernels(
         self, c_m: float, c_hd: float, band_weights: ArrayLike | None = None
@@ -184,7 +196,7 @@ class SkinTable:
                     _coordinates(each, self.tissue),
                     RING_EDGES_MM * DERMIS_SCATTERING_RATIO * each.scattering[0],
                 )
-                for each in _coefficients_by_wavelength(one_m, one_h, self.tissue)
+                for each in self._coefficients(one_m, one_h)
             ],
             axis=-1,
         )
@@ -193,28 +205,29 @@ class SkinTable:
 
 
 @lru_cache(maxsize=MAX_CACHED_TABLES)
-def _load(tissue: TissueProperties) -> SkinTable:
+def _load(tissue: TissueProperties, wavelength_nm: tuple[float, ...]) -> SkinTable:
+    wavelengths = np.array(wavelength_nm)
     steps = np.linspace(0.0, 1.0, NODES_PER_AXIS) ** 3
     c_m, c_hd = MAX_C_M * steps, MAX_C_HD * steps
     transport = SkinTransport.load()
     log_reflectance = [
         transport.log_reflectance(_coordinates(coefficients, tissue))
-        for coefficients in _coefficients_by_wavelength(c_m, c_hd, tissue)
+        for coefficients in _coefficients_by_wavelength(c_m, c_hd, tissue, wavelengths)
     ]
     shape = NODES_PER_AXIS, NODES_PER_AXIS
     values = np.stack([part.reshape(shape) for part in log_reflectance], axis=-1)
-    arrays = WAVELENGTH_NM.copy(), c_m, c_hd, np.exp(values), _hermite_patches(values)
+    arrays = wavelengths, c_m, c_hd, np.exp(values), _hermite_patches(values)
     for array in arrays:
         array.setflags(write=False)
     return SkinTable(tissue, *arrays)
 
 
 def _coefficients_by_wavelength(
-    c_m: Float64Array, c_hd: Float64Array, tissue: TissueProperties
+    c_m: Float64Array, c_hd: Float64Array, tissue: TissueProperties, wavelength_nm: Float64Array
 ) -> list[SkinCoefficients]:
     """Return the coefficients at each wavelength, of all pairs of fractions, shape (pairs,)."""
     melanin, blood = (axis.ravel() for axis in np.meshgrid(c_m, c_hd, indexing="ij"))
-    return [skin_coefficients(nm, melanin, blood, tissue) for nm in WAVELENGTH_NM]
+    return [skin_coefficients(nm, melanin, blood, tissue) for nm in wavelength_nm]
 
 
 def _coordinates(coefficients: SkinCoefficients, tissue: TissueProperties) -> SkinCoordinates:

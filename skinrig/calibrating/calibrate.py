@@ -1,7 +1,7 @@
 """Estimate calibrations from sessions of targets and save them in CALIBRATION/."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
 
@@ -133,6 +133,11 @@ class _Frames:
         found = self._targets.require_frames("flash", kind, **index)
         return [(record, session.read(record)) for record, session in found]
 
+    def led_names(self) -> list[str]:
+        """Return the names of the narrow-band LEDs that subjects or targets were lit with."""
+        found = self._targets.frames("subject")
+        return sorted({str(r.index["light"]) for r, _ in found if "light" in r.index})
+
     def read_setting(self, record: FrameRecord, name: str) -> float:
         """Return a numeric setting that a frame was captured with."""
         try:
@@ -172,25 +177,46 @@ def _sensor(frames: _Frames) -> store.Calibration:
 def _white(frames: _Frames) -> store.Calibration:
     dark = frames.dark_level()
     shots = frames.require_frames("subject", polarizer="crossed")
-    powers = [frames.read_setting(record, "power") for record, _ in shots]
+    powers = _powers(frames, shots)
     linear = _linear(shots)
     for (record, _), image in zip(shots, linear, strict=True):
         what = f"frame {record.step_id} of state {record.index.get('state')!r}"
         frames.findings += white_reference.check_white_reference(
             image.rgb - dark, image.valid, what
         )
+    leds = {}
+    for led in frames.led_names():
+        under = frames.require_frames("subject", light=led)
+        gray = [_sum_channels(image, dark) for image in _linear(under)]
+        leds[led] = _reference(_powers(frames, under), gray)
+    balanced = [replace(image, rgb=image.rgb - dark) for image in linear]
+    reference = replace(_reference(powers, balanced), leds=leds)
+    return reference.to_calibration(**frames.about)
+
+
+def _sum_channels(image: raw.LinearImage, dark: Float32Array | float) -> raw.LinearImage:
+    """Return the sum of the channels without the dark signal, (H, W, 1)."""
+    total = (image.rgb - dark).sum(axis=-1, keepdims=True)
+    return replace(image, rgb=total, variance=image.variance.sum(axis=-1, keepdims=True))
+
+
+def _powers(frames: _Frames, shots: Shots) -> list[float]:
+    return [frames.read_setting(record, "power") for record, _ in shots]
+
+
+def _reference(powers: list[float], images: Sequence[raw.LinearImage]) -> white.WhiteReference:
+    """Return the white reference of crossed images without their dark signal."""
     # The reference depolarizes: its diffuse light D splits evenly over both polarizations, so the
     # crossed image is D / 2. Hence D = 2 I_crossed, and var(D) = 4 var(I_crossed).
-    reference = white.white_reference(
-        [2.0 * (image.rgb - dark) for image in linear],
-        variances=[4.0 * image.variance for image in linear],
-        valid=[image.valid for image in linear],
+    return white.white_reference(
+        [2.0 * image.rgb for image in images],
+        variances=[4.0 * image.variance for image in images],
+        valid=[image.valid for image in images],
         lights=powers,
         reflectance=WHITE_REFERENCE_REFLECTANCE,
         # no smooth fit: the gain of each pixel (PRNU) must cancel in the ratio to the reference
         degree=None,
     )
-    return reference.to_calibration(**frames.about)
 
 
 WHITE_REFERENCE_REFLECTANCE = 0.99

@@ -53,6 +53,8 @@ class DefaultPlan:
     """Repeats of the probe's placements, or of the flash rig's expressions, interleaved."""
     states: Sequence[str] = ()
     """Flash rig: expressions of the subject; empty: neutral."""
+    bands: Sequence[str] = ()
+    """Flash rig: narrow-band LEDs, for a subject or target white."""
 
     def of(self, rig: Rig) -> Plan:
         """Return the default plan of a rig for these options."""
@@ -73,9 +75,9 @@ class DefaultPlan:
             return probe_calibration_plan(rig, target, repeats=repeats)
         if self.target is None:
             states = self.states or ("neutral",)
-            return flash_plan(rig, states=states, repeats=repeats, interleave=True)
+            return flash_plan(rig, states=states, repeats=repeats, interleave=True, leds=self.bands)
         if self.target == "white":
-            return flash_plan(rig, states=("white",), repeats=max(4, repeats))
+            return flash_plan(rig, states=("white",), repeats=max(4, repeats), leds=self.bands)
         target = self._check_target(("white", *FLASH_CALIBRATION_TARGETS))
         return flash_calibration_plan(rig, target)
 
@@ -133,6 +135,12 @@ def choose_plan(
     if options.states and not flash:
         raise UsageError(
             "--state: an option of the flash rig's default plan of a subject; remove it"
+        )
+    white = file is None and target == "white" and "flash" in rig.boxes
+    if options.bands and not (flash or white):
+        raise UsageError(
+            "--bands: an option of the flash rig's default plan of a subject or of target white; "
+            "remove it"
         )
     if options.repeats != 1 and not flash and (file is not None or rig.probe is None):
         raise UsageError(

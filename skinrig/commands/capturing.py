@@ -90,6 +90,7 @@ def capture_flash(
     target: Annotated[str | None, target_option("flash")] = None,
     state: list[str] | None = None,
     repeats: options.Pairs = 1,
+    bands: options.Bands = None,
 ) -> None:
     """Capture with a flash rig: expressions of a face, a time sequence, or a target.
 
@@ -101,7 +102,14 @@ def capture_flash(
     state
         Expression or condition of the face, such as smile; repeatable; default: neutral.
     """
-    chosen = {"repeats": repeats, "sequence": sequence.order(), "states": tuple(state or ())}
+    from capture.plan.led_bands import parse_bands
+
+    chosen = {
+        "repeats": repeats,
+        "sequence": sequence.order(),
+        "states": tuple(state or ()),
+        "bands": parse_bands(bands) if bands else (),
+    }
     _capture(context, common, common.order(), target, **chosen)
 
 

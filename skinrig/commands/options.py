@@ -109,6 +109,14 @@ Sites = Annotated[
     option("Sites of the probe, separated by commas: forehead,cheek,chin; default: the plan's."),
 ]
 Pairs = Annotated[int, option("Image pairs per expression (flash).", "--repeats")]
+Bands = Annotated[
+    str | None,
+    option(
+        "Narrow-band LEDs, centers in nm with optional full widths, such as 450,580:12: one more "
+        "crossed frame each (flash); default: none.",
+        "--bands",
+    ),
+]
 Placements = Annotated[int, option("Placements per site and direction (probe).", "--repeats")]
 AllBrackets = Annotated[
     bool, option("Record every exposure bracket (probe only).", "--all-brackets")

@@ -10,7 +10,7 @@ import typer
 from skinrig import errors
 from skinrig.atomic_file import write_atomically
 from skinrig.commands.help import RigCommand, RigGroup
-from skinrig.commands.options import Json, Subject, check_output_file, command, option
+from skinrig.commands.options import Bands, Json, Subject, check_output_file, command, option
 from skinrig.console import Console, select_attributes
 from skinrig.next_steps import shell_quote
 from skinrig.unit_format import format_quantity
@@ -90,12 +90,19 @@ def plan_flash(
     common: PlanOptions,
     goals: Annotated[str, _goals_option("melanin<=12%,hemoglobin<=25%")] = "",
     width: PlanWidth = None,
+    bands: Bands = None,
 ) -> None:
     """Choose the fewest image pairs and flash powers of the flash rig that reach given errors.
 
+    With --bands, a table lists what each LED adds on light, medium and dark skin.
+
     Example: skinrig plan flash --goals "melanin<=12%,hemoglobin<=25%" --subject II
+
+    Example: skinrig plan flash --bands 450,580,600 --out plan.json
     """
-    _plan("flash", common, goals, width)
+    from capture.plan.led_bands import parse_bands
+
+    _plan("flash", common, goals, width, leds=parse_bands(bands) if bands else ())
 
 
 @plan_app.command("gradient", cls=RigCommand)
@@ -130,6 +137,7 @@ def _plan(
     goals: str,
     width: int | None = None,
     max_lights: int | None = None,
+    leds: tuple[str, ...] = (),
 ) -> None:
     """Choose a plan, print its forecast and write it."""
     from skinrig.planning.plans import choose, format_choice
@@ -150,6 +158,7 @@ def _plan(
         width_px=width,
         max_lights=max_lights,
         min_valid_fraction=common.min_valid_fraction,
+        leds=leds,
         **asked,
     )
     for line in format_choice(choice):

@@ -120,6 +120,7 @@ def simulate_flash(
     state: States = None,
     camera_offset_mm: float = 0.0,
     relaxation: float | None = None,
+    bands: options.Bands = None,
 ) -> None:
     """Simulate the flash rig: expressions of a face, a time sequence, or a target.
 
@@ -132,6 +133,7 @@ def simulate_flash(
     camera_offset_mm
         Offset of the face from the white reference towards the camera, mm; negative: away.
     """
+    from capture.plan.led_bands import parse_bands
     from skinrig.simulating.orders import FlashOrder
 
     console = Console(common.json)
@@ -144,6 +146,7 @@ def simulate_flash(
         nearer_mm=camera_offset_mm,
         sequence=sequence.order(),
         relaxation_s=relaxation,
+        bands=parse_bands(bands) if bands else (),
     )
     _simulate(order, console, "sequence" if order.sequence is not None else target)
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from capture.plan import Plan, flash_plan
+from capture.plan.led_bands import add_led_frames, led_names
 from capture.rig import Rig
 from model.skin import SkinAppearance
 from reconstruction.chromophores.pixel_checks import is_detectable
@@ -27,6 +28,7 @@ from skinrig.planning.flash_observation import (
     FlashObservation,
     simulate_observation,
 )
+from skinrig.planning.led_information import assess_leds
 from skinrig.planning.plans import PlanChoice, PlanRequest
 
 REPEAT_CHOICES = (1, 2, 4, 8, 16)
@@ -108,6 +110,8 @@ def predict(
 def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
     """Choose the shortest plan that reaches the goals; of equal ones, that with the least light.
 
+    Frames under the LEDs of the request are added to it.
+
     Parameters
     ----------
     rig
@@ -160,7 +164,7 @@ def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
         "repeats": len(own),
         "power": sum(powers) / len(powers),
         "darks": sum(step.kind == "dark" for step in plan.steps),
-        "parallel": len(shots) > len(crossed),
+        "parallel": any(step.index.get("polarizer") == "parallel" for step in shots),
     }
     observation = simulate_observation(rig, request.subject, seed=request.seed)
     return _choice(rig, observation, plan, settings, request)
@@ -238,6 +242,10 @@ def _choice(
     path: tuple[Mapping[str, float], ...] = (),
     reasons: tuple[str, ...] = (),
 ) -> PlanChoice:
+    if request.leds and led_names(plan):
+        raise plans.PlanOptionsError("--bands: the plan has frames under LEDs; remove the option")
+    plan = add_led_frames(plan, request.leds)
+    leds = led_names(plan)
     parallel = bool(settings.get("parallel", False))
     own = {name: settings[name] for name in ("repeats", "power", "darks")}
     found = predict(observation, **own)
@@ -255,11 +263,14 @@ def _choice(
         ),
     )
     powers = [float(step.settings.get("power", 0.0)) for step in plan.steps]
+    tube_powers = [
+        power for power, step in zip(powers, plan.steps, strict=True) if "light" not in step.index
+    ]
     pops = sum(power > 0 for power in powers)
     energy = sum(light.energy_ws or 0.0 for light in rig.lights)
     flashes: dict[str, Any] = {
         "pops": pops,
-        "flash_ws": energy * sum(powers),
+        "flash_ws": energy * sum(tube_powers),
         "pops_per_min_limit": rig.max_pops_per_min,
         "flashes_per_s": min(
             rig.max_pops_per_min / 60.0, pops / max(plan.estimate_duration_s(rig), 1e-9)
@@ -270,11 +281,15 @@ def _choice(
         "polarizers": ["parallel", "crossed"] if parallel else ["crossed"],
         "valid_share": {name: found.valid_share(name) for name in CHROMOPHORE_NAMES},
     }
-    full_s = flash_plan(rig, repeats=max(int(own["repeats"]), 1)).estimate_duration_s(rig)
+    full = flash_plan(rig, repeats=max(int(own["repeats"]), 1), leds=leds)
+    full_s = full.estimate_duration_s(rig)
+    information = assess_leds(rig, plan, leds) if leds else ()
     camera = assess_camera(rig.views[0].spectral_sensitivity, rig.lights[0].illuminant)
     if camera.loses:
         reasons = (*reasons, camera.summary())
-    return PlanChoice(rig, plan, forecasts, full_s, knobs, left_out, path, reasons, flashes)
+    return PlanChoice(
+        rig, plan, forecasts, full_s, knobs, left_out, path, reasons, flashes, information
+    )
 
 
 def _explain_shortfall(

@@ -25,6 +25,7 @@ from skinrig.capturing.light_safety import light_figures
 from skinrig.capturing.plan_choice import read_plan
 from skinrig.console import select_attributes
 from skinrig.errors import UsageError, require_choice
+from skinrig.planning.led_information import LedInformation, format_information
 from skinrig.unit_format import format_quantity
 
 SCHEMA = "skinrig.plan-choice/1"
@@ -91,6 +92,8 @@ class PlanRequest:
     """Minimum fraction of the whole rig's valid estimates that stays valid."""
     max_lights: int | None = None
     """Maximum number of lights (dome)."""
+    leds: tuple[str, ...] = ()
+    """Narrow-band LEDs to add (flash), see `capture.plan.led_bands.parse_bands`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +129,8 @@ class PlanChoice:
     """Why a goal is not reached, or assumptions of the forecast."""
     flashes: Mapping[str, Any] = field(default_factory=dict)
     """Light figures of flashes, for rigs without LEDs."""
+    information: tuple[LedInformation, ...] = ()
+    """Bounds with and without narrow-band LEDs (flash); empty without any."""
 
     @property
     def seconds(self) -> float:
@@ -145,6 +150,7 @@ class PlanChoice:
 
     def to_document(self) -> dict[str, Any]:
         """Return the JSON document of the choice."""
+        leds = [row.to_document() for row in self.information]
         return {
             "schema": SCHEMA,
             "rig": self.rig.name,
@@ -153,6 +159,7 @@ class PlanChoice:
             **select_attributes(self, "knobs", "seconds", "full_seconds"),
             "saved_seconds": self.full_seconds - self.seconds,
             **select_attributes(self, "left_out", "path", "reasons", "light"),
+            **({"leds": leds} if leds else {}),
         }
 
 
@@ -395,7 +402,7 @@ def format_choice(choice: PlanChoice) -> list[str]:
     out += [
         f"light: {name.replace('_', ' ')} {_format_knob(v)}" for name, v in choice.light.items()
     ]
-    return out
+    return out + format_information(choice.information)
 
 
 def _format_site_errors(errors: Mapping[str, Sequence[float]]) -> str:

@@ -36,13 +36,16 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
         mesh=str(order.mesh or ""),
         states=list(states),
         **select_attributes(
-            order, "repeats", "movement", *(["nearer_mm"] if order.nearer_mm else [])
+            order,
+            "repeats",
+            "movement",
+            *(["nearer_mm"] if order.nearer_mm else []),
+            *(["bands"] if order.bands else []),
         ),
     )
     # plan and scenes are built first, so that an error leaves no session folder
-    plan = order.plan or DefaultPlan(**select_attributes(order, "target", "states", "repeats")).of(
-        rig
-    )
+    details = select_attributes(order, "target", "states", "repeats", "bands")
+    plan = order.plan or DefaultPlan(**details).of(rig)
     scenes = _scenes(rig, order, plan)
     first = next(iter(scenes.values()))
     session = open_session(order, plan, rig, settings, first)
@@ -54,10 +57,18 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
     if target is not None:
         return build_result(order, session, first, rig_seconds, None)
     truth = truth_folder(order.out)
+    has_leds = any("light" in step.settings for step in plan.steps)
     about = subject_records.truth_parameters(order.subject, "flash", order.progress)
     for state, scene in scenes.items():
         folder = truth if state == states[0] else truth.with_name(f"{truth.name}-{state}")
-        appearance = build_truth(scene, order.seed, session.content_hash, state, parameters=about)
+        appearance = build_truth(
+            scene,
+            order.seed,
+            session.content_hash,
+            state,
+            parameters=about,
+            with_oxygenation=has_leds,
+        )
         store.write(folder, appearance)
     blur_mm = tuple(float(width) for width in first.resolution_mm())
     return build_result(order, session, first, rig_seconds, truth, blur_mm=blur_mm)

@@ -100,7 +100,13 @@ def scale_landmarks(pixels: Mapping[str, tuple[float, float]]) -> dict[str, list
 
 
 def build_truth(
-    scene: Any, seed: int, session: str, state: str, *, parameters: Mapping[str, Any] | None = None
+    scene: Any,
+    seed: int,
+    session: str,
+    state: str,
+    *,
+    parameters: Mapping[str, Any] | None = None,
+    with_oxygenation: bool = False,
 ) -> SkinAppearance:
     """Return the ground truth of a face's scene at superpixels, with further `parameters`."""
     maps: Mapping[str, NDArray[Any]] = scene.truth()
@@ -120,6 +126,9 @@ def build_truth(
         known = name.removesuffix("_at_rest").removesuffix("_blurred")
         unit = "mm" if name.endswith("_mm") else MAP_UNITS.get(known, "1")
         kept[_TRUTH_NAMES.get(name, name)] = SkinMap(small, unit, valid=valid)
+    if with_oxygenation:
+        oxygenation = np.full(whole.shape, scene.subject.tissue.oxygenation, np.float32)
+        kept["oxygenation"] = SkinMap(oxygenation, MAP_UNITS["oxygenation"], valid=whole)
     kept["mask"] = SkinMap(whole.astype(np.float32), "1")
     return SkinAppearance(
         kept,

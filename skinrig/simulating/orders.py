@@ -213,6 +213,8 @@ class FlashOrder(FaceOrder):
     nearer_mm: float = 0.0
     """Distance, mm, by which the face is nearer to the camera than the white reference; below 0
     farther. The flashes are nearer by the same distance; the lens focuses on the reference."""
+    bands: tuple[str, ...] = ()
+    """Narrow-band LEDs with one crossed frame each, see `capture.plan.led_bands.parse_bands`."""
     sequence: SequenceOrder | None = None
     """Sequence in time instead of ``states``."""
     relaxation_s: float | None = None
@@ -236,8 +238,13 @@ class FlashOrder(FaceOrder):
                 f"{self.exclusive_subject}; remove it"
             )
         SimulationOrder.check(self)
+        if self.bands and (self.plan is not None or self.target not in (None, "white")):
+            raise SimulationOptionsError(
+                "bands: an option of the default plan of a subject or of target white; a plan has "
+                "its own frames, so remove it"
+            )
         if self.sequence is not None:
-            self.refuse_options(self.rig, "target", "repeats", "states")
+            self.refuse_options(self.rig, "target", "repeats", "states", "bands")
         elif self.relaxation_s is not None:
             raise SimulationOptionsError("relaxation: an option of sequences; remove it")
 

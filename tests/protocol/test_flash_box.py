@@ -456,3 +456,21 @@ def test_a_reset_does_not_charge_or_cool_anything(bench):
     bench.now += 0.2
     bench.ask("SYST:ARM")
     assert bench.code("FLAS:FIRE b") == Code.RECYCLE
+
+
+def test_led_lights_next_pop_only(bench):
+    bench.ask("SYST:ARM")
+    bench.ask("FLAS:LED 590,20")
+    assert bench.ask("FLAS:LED?") == "LED-590-20"
+    assert bench.ask("FLAS:FIRE a").split(",")[-1] == "LED-590-20"
+    bench.now += 60.0 / RIG.max_pops_per_min
+    bench.ask("SYST:ARM")
+    assert bench.ask("FLAS:LED?") == "TUBE"
+    assert len(bench.ask("FLAS:FIRE b").split(",")) == 6
+    assert [pop.led for pop in bench.world.pops] == ["LED-590-20", ""]
+
+
+def test_dark_returns_to_tube(bench):
+    bench.ask("FLAS:LED 450,12")
+    bench.ask("SAFE")
+    assert bench.ask("FLAS:LED?") == "TUBE"

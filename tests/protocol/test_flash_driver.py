@@ -267,3 +267,14 @@ def test_nonfinite_numbers_are_never_sent(liar, value):
             send(value)
     with pytest.raises(ValueError, match="polarizer"):
         box.set_polarizer("left")
+
+
+def test_led_flashes_once_and_is_reported(bench):
+    box = bench.box()
+    box.set_led(590.0, 20.0)
+    assert box.led() == "LED-590-20"
+    box.wait_charged(5.0)
+    box.arm()
+    assert box.fire("shot-1").led == "LED-590-20"
+    assert box.led() == ""
+    assert box.last_pop().led == "LED-590-20"

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from capture.acquire.flash.shot import ShotTiming, flash_power, set_light, shoot
+from capture.acquire.flash.shot import ShotTiming, flash_power, set_light, shoot, step_led
 from capture.acquire.outcome import (
     MAX_ATTEMPTS,
     AcquisitionError,
@@ -17,6 +17,7 @@ from capture.acquire.outcome import (
 )
 from capture.devices.flash import FlashBox, FlashReport
 from capture.plan import Plan, Step, Value
+from capture.plan.led_bands import parse_led
 from capture.rig import Rig
 
 log = logging.getLogger(__name__)
@@ -313,10 +314,22 @@ def _check_limits(plan: Plan, limits: Mapping[str, Any]) -> None:
         if not low <= power <= high:
             what = f"got power {power:g}, the controller allows {low:g} to {high:g}"
             raise step_limit_error(step, what, action="fired")
+        if led := step_led(step):
+            _check_led(step, led, limits)
         angle_deg = float(step.settings.get("analyzer_deg", first))
         if not first <= angle_deg <= last:
             what = f"got analyzer_deg {angle_deg:g}, the controller allows {first:g} to {last:g}"
             raise step_limit_error(step, what, action="fired")
+
+
+def _check_led(step: Step, led: str, limits: Mapping[str, Any]) -> None:
+    center_nm, _ = parse_led(led)
+    low, high = (float(limits.get(f"led_{end}_nm", 0.0)) for end in ("min", "max"))
+    if not high:
+        raise step_limit_error(step, f"got light {led}, the controller has no LEDs", action="fired")
+    if not low <= center_nm <= high:
+        what = f"got light {led}, the controller has LEDs of {low:g} to {high:g} nm"
+        raise step_limit_error(step, what, action="fired")
 
 
 def _sync_delay_s(rig: Rig, limits: Mapping[str, Any]) -> float:

@@ -10,6 +10,7 @@ from capture.devices.flash import FlashBox, FlashReport
 from capture.devices.port import CommandRefused
 from capture.devices.wire import Code
 from capture.plan import Step, Value
+from capture.plan.led_bands import parse_led
 
 CHARGE_TIMEOUT_S = 60.0
 SHUTTER_PRESS_TIMEOUT_S = 60.0
@@ -98,6 +99,10 @@ def _expose(
         box.arm()
         report = box.fire(token)
         box.dark()
+        if report.led != (wanted := step_led(step)):
+            raise FrameRefused(
+                f"light: got {report.led or 'the flash tube'}, expected {wanted or 'the tube'}"
+            )
     elif Trigger.EDGE in triggers.values():
         box.trigger_cameras(token)
     timeouts_s = {name: frame_timeout_s(step, run.rig.view(name)) for name in chosen}
@@ -135,7 +140,7 @@ def _describe_light(report: FlashReport | None) -> dict[str, Value]:
     if report is None:
         return {"light": "none", "power": 0.0}
     return {
-        "light": "flash",
+        "light": str(report.led or "flash"),
         "token": str(report.token),
         "power": float(report.power),
         "polarizer": str(report.polarizer),
@@ -148,6 +153,11 @@ def flash_power(step: Step) -> float:
     return 0.0 if step.kind == "dark" else float(step.settings.get("power", 1.0))
 
 
+def step_led(step: Step) -> str:
+    """Return the name of a step's LED, empty for the flash tube."""
+    return str(step.settings.get("light", ""))
+
+
 def set_light(step: Step, box: FlashBox) -> None:
     """Turn the analyzer, set the power, and wait until a flash is possible."""
     power = flash_power(step)
@@ -157,6 +167,8 @@ def set_light(step: Step, box: FlashBox) -> None:
         else:
             box.set_polarizer(str(step.settings["polarizer"]))
         box.set_power(power)
+        if led := step_led(step):
+            box.set_led(*parse_led(led))
         box.wait_charged(CHARGE_TIMEOUT_S)
 
 

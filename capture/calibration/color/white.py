@@ -1,7 +1,8 @@
 """White reference: illumination and camera response per pixel, from a white tile."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Unpack
 
 import numpy as np
@@ -33,12 +34,15 @@ class WhiteReference:
     valid : ndarray of bool, shape (H, W)
     residual : ndarray of float64, shape (3,)
         Relative scatter of the tile around the smooth fit; 0 without smoothing.
+    leds : mapping of str to WhiteReference
+        References of the sum of the channels under narrow-band LEDs, shape (H, W, 1), by name.
     """
 
     signal: Float32Array
     stderr: Float32Array
     valid: BoolArray
     residual: Float64Array
+    leds: "Mapping[str, WhiteReference]" = field(default_factory=dict)
 
     def balance(
         self, rgb: NDArray, *, light: float = 1.0, variance: NDArray | None = None
@@ -88,8 +92,9 @@ class WhiteReference:
             {"mean_signal": Quantity(white), "residual": Quantity(self.residual)},
             {"unit": "fraction of full scale for reflectance 1 at unit light"},
             maps={
-                "signal": np.where(self.valid[..., None], self.signal, np.float32(0.0)),
-                "stderr": np.where(self.valid[..., None], self.stderr, np.float32(0.0)),
+                prefix + name: np.where(one.valid[..., None], values, np.float32(0.0))
+                for prefix, one in {"": self, **_with_prefixes(self.leds)}.items()
+                for name, values in (("signal", one.signal), ("stderr", one.stderr))
             },
             **about,
         )
@@ -97,15 +102,29 @@ class WhiteReference:
     @classmethod
     def from_calibration(cls, calibration: Calibration, serial: str) -> "WhiteReference":
         """Return the white reference of one camera from a loaded `Calibration`."""
-        signal, stderr = calibration.maps["signal"], calibration.maps["stderr"]
-        valid = np.logical_and.reduce(signal > 0, axis=-1)
-        blank = np.float32(np.nan)
-        return cls(
-            np.where(valid[..., None], signal, blank).astype(np.float32),
-            np.where(valid[..., None], stderr, blank).astype(np.float32),
-            valid,
-            calibration.quantity(serial, "residual").value,
-        )
+        residual, blank = calibration.quantity(serial, "residual").value, np.float32(np.nan)
+
+        def reference(prefix: str, leds: "Mapping[str, WhiteReference]") -> WhiteReference:
+            signal = np.atleast_3d(calibration.maps[f"{prefix}signal"])
+            stderr = np.atleast_3d(calibration.maps[f"{prefix}stderr"])
+            valid = np.logical_and.reduce(signal > 0, axis=-1)
+            return cls(
+                np.where(valid[..., None], signal, blank).astype(np.float32),
+                np.where(valid[..., None], stderr, blank).astype(np.float32),
+                valid,
+                residual,
+                leds,
+            )
+
+        named = [match for name in calibration.maps if (match := _LED_MAP.fullmatch(name))]
+        return reference("", {f"LED-{m[2]}-{m[3]}": reference(m[1], {}) for m in named})
+
+
+_LED_MAP = re.compile(r"(led_([0-9]{3})_([0-9]{1,2})_)signal")
+
+
+def _with_prefixes(leds: Mapping[str, WhiteReference]) -> dict[str, WhiteReference]:
+    return {f"{name.lower().replace('-', '_')}_": one for name, one in leds.items()}
 
 
 def white_reference(

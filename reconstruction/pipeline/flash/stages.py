@@ -30,7 +30,7 @@ from reconstruction.chromophores.face import estimate_face
 from reconstruction.chromophores.pixel_checks import is_detectable
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.flash import tone
+from reconstruction.pipeline.flash import oxygenation, tone
 from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.masked_map import masked_map
 
@@ -41,7 +41,8 @@ MAP_NAMES = tuple(
     "melanin melanin_optical_depth hemoglobin shading residual gamut_distance "
     "diffuse specular image specular_image "
     "tsumura_melanin tsumura_hemoglobin melanin_noise_stderr hemoglobin_noise_stderr "
-    "lab ita monk monk_low monk_high erythema_index melanin_index".split()
+    "lab ita monk monk_low monk_high erythema_index melanin_index "
+    "oxygenation oxygenation_noise_stderr".split()
 )
 """Maps of a flash session."""
 
@@ -99,6 +100,9 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
         stage("pictures", both, shown, partial(_pictures, rig), **table),
         *tone.tone_stages(
             stage, (rig.color, rig.neutral), has_white=rig.white is not None, **table
+        ),
+        oxygenation.oxygenation_stage(
+            stage, rig.session, partial(_image_reader, rig), rig.white, which=which, **table
         ),
     ]
 
@@ -200,7 +204,8 @@ def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], FlashImage
 
     def mean_image(records: Sequence[FrameRecord]) -> FlashImage:
         linear = linear_light(records)
-        sizes, name = {image.rgb.shape for image in linear}, f"{records[0].index['polarizer']}"
+        sizes = {image.rgb.shape for image in linear}
+        name = records[0].index.get("polarizer") or records[0].index["light"]
         expected = "one camera setting; choose frames of one"
         Checks(InputsError).require(len(sizes) == 1, f"{name} frames", f"sizes {sizes}", expected)
         power = sum(float(record.settings.get("power", 1.0)) for record in records)

@@ -10,6 +10,7 @@ parallel as behind crossed polarizers, for every subject.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -119,7 +120,7 @@ class FlashScene(FaceScene):
         self._choice = choice
         self._stage = shared_flash_geometry(self.subject, choice)
         self._caster = self._stage.caster
-        self._effects = effects
+        self._effects, self._power = effects, power
         self.needs = merge_selections([self._needs_of(view, power) for view in rig.views])
         self.lateral = self.needs.builds(face_needs.LATERAL_EFFECT)
         self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
@@ -175,6 +176,29 @@ class FlashScene(FaceScene):
         specular = self._apply_analyzer(picture.specular, view, passes_deg)
         return np.maximum((diffuse + specular[..., None]) * white, 0.0)
 
+    @cached_method
+    def under(self, led: str) -> "FlashScene":
+        """Return the scene under an LED of the flash heads, by its name; empty: the scene itself.
+
+        The LED has the tube's position, polarizer, and level of a white reference.
+        """
+        if not led:
+            return self
+        lights = tuple(replace(light, illuminant=led) for light in self.rig.lights)
+        return FlashScene(
+            replace(self.rig, lights=lights),
+            self.subject,
+            state=self.state,
+            movement=self.movement,
+            sensor=self.sensor(),
+            films=self.films,
+            seed=self.seed,
+            effects=self._effects,
+            power=self._power,
+            subpixels=self.subpixels,
+            choice=self._choice,
+        )
+
     def exposure(
         self, view_name: str, *, pops: Sequence[FlashPop], exposure_s: float, seed: int
     ) -> UInt16Array:
@@ -200,7 +224,9 @@ class FlashScene(FaceScene):
             self._camera(view_name),
             pops,
             pop_energy,
-            lambda pop: self.radiance(pop.polarizer, pop.analyzer_deg, view_name=view_name),
+            lambda pop: self.under(pop.led).radiance(
+                pop.polarizer, pop.analyzer_deg, view_name=view_name
+            ),
             deviation=POP_ENERGY_DEVIATION,
             exposure_s=exposure_s,
             seed=seed,

@@ -30,6 +30,7 @@ class Box:
         self.log, self.fail_at, self.shots = log, fail_at, 0
         self.limits = {"power_min": 0.03125, "power_max": 1.0}
         self.polarizer, self.power, self.line = "parallel", 0.0, []
+        self.led, self.forgotten = "", 0
 
     def arm(self):
         self.log.append("arm")
@@ -46,6 +47,12 @@ class Box:
     def set_power(self, power):
         self.power = power
 
+    def set_led(self, center_nm, width_nm):
+        self.led = f"LED-{center_nm:.0f}-{width_nm:.0f}"
+        if self.forgotten:  # such as after a power cut
+            self.forgotten -= 1
+            self.led = ""
+
     def wait_charged(self, timeout_s):
         pass
 
@@ -56,7 +63,9 @@ class Box:
         self.log.append(f"fire {token} {self.polarizer}")
         for camera in self.line:
             camera.expose()
+        led, self.led = self.led, ""
         return SimpleNamespace(
+            led=led,
             token=token,
             t_box_s=float(self.shots),
             power=self.power,
@@ -337,3 +346,49 @@ def test_camera_unreleasable_by_controller_is_refused_before_flash(plan, session
     with pytest.raises(CameraError, match="hot folder"):
         run(plan, session, Box(log), camera)
     assert not [entry for entry in log if entry.startswith("fire")]
+
+
+@pytest.fixture
+def led_plan():
+    return flash_plan(RIG, darks=1, leds=("LED-590-20",))
+
+
+@pytest.fixture
+def led_session(tmp_path, led_plan):
+    made = Session.create(
+        tmp_path / "led",
+        plan=led_plan,
+        rig=RIG,
+        devices={},
+        subject=SubjectRecord("p"),
+        source="measured",
+    )
+    yield made
+    made.release()
+
+
+LED_LIMITS = {"power_min": 0.03125, "power_max": 1.0, "led_min_nm": 420, "led_max_nm": 680}
+
+
+def test_frame_under_wrong_light_is_retaken(led_plan, led_session):
+    box = Box([])
+    box.limits, box.forgotten = LED_LIMITS, 1
+    run(led_plan, led_session, box, Camera())
+    lights = [r.line.actual["light"] for r in led_session.frames("subject")]
+    assert lights == ["flash", "flash", "LED-590-20"]
+    assert [r.line.actual["tries"] for r in led_session.frames("subject")] == [1, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("limits", "why"),
+    [
+        ({"led_max_nm": 0}, "the controller has no LEDs"),
+        ({"led_min_nm": 600}, "the controller has LEDs of 600 to 680 nm"),
+    ],
+)
+def test_missing_led_is_refused_before_flash(led_plan, led_session, limits, why):
+    box = Box([])
+    box.limits = LED_LIMITS | limits
+    with pytest.raises(AcquisitionError, match=why):
+        run(led_plan, led_session, box, Camera())
+    assert box.shots == 0

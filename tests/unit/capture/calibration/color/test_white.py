@@ -1,3 +1,4 @@
+import dataclasses
 from datetime import date
 
 import numpy as np
@@ -102,3 +103,23 @@ def test_unusable_tiles_state_the_reason():
     white = white_reference([image], variances=[variance], valid=[valid])
     with pytest.raises(ValueError, match="same camera settings"):
         white.balance(image[:10])
+
+
+def test_led_references_survive_calibration_file(tmp_path):
+    rng = np.random.default_rng(7)
+    images, variances, valid = zip(*(tile(rng) for _ in range(2)), strict=True)
+    gray = white_reference(
+        [image.sum(axis=-1, keepdims=True) for image in images],
+        variances=[variance.sum(axis=-1, keepdims=True) for variance in variances],
+        valid=valid,
+        degree=None,
+    )
+    whole = dataclasses.replace(reference(rng), leds={"LED-590-20": gray})
+    made = whole.to_calibration(
+        serial="C1", rig="flash", source="simulated", created=date(2026, 11, 21)
+    )
+    store.save(made, tmp_path)
+    loaded = WhiteReference.from_calibration(store.load(tmp_path, "white"), "C1")
+    assert list(loaded.leds) == ["LED-590-20"]
+    np.testing.assert_array_equal(loaded.leds["LED-590-20"].signal, gray.signal)
+    np.testing.assert_array_equal(loaded.signal, whole.signal)

@@ -31,6 +31,7 @@ class Fired:
     power: float = 1.0
     polarizer: str = "crossed"
     analyzer_deg: float | None = None
+    led: str = ""
 
 
 PLAIN = {"choice": EMBREE, "subpixels": 1}
@@ -287,3 +288,31 @@ def test_invalid_options_are_named(rig, face, real):
         real.exposure("cam", pops=(Fired(power=1.5),), exposure_s=0.0, seed=0)
     with pytest.raises(PolarizerError, match=r"light_extinction: got 1\.0"):
         Polarizers(1.0, 2.0, 0.0)
+
+
+def test_white_reference_has_level_under_led(rig):
+    """Expected: the same strongest level as under the flash, in the channel of the LED."""
+    scene = scene_of(rig, make_target("white"), films=IDEAL_POLARIZERS, optics=False)
+    for led, channel in (("LED-450-20", 2), ("LED-600-20", 0)):
+        light = scene.under(led).radiance("crossed")
+        middle = light[light.shape[0] // 2, light.shape[1] // 2]
+        assert middle.argmax() == channel
+        assert middle.max() == pytest.approx(0.99 * METERING_LEVEL, rel=0.01)
+
+
+def test_led_light_depends_more_on_oxygenation(rig, face):
+    """Expected: 30 points of oxygenation change light at 600 nm five times as much as green."""
+    tissue = dataclasses.replace(face.tissue, oxygenation=0.45)
+    deoxygenated = dataclasses.replace(face, tissue=tissue)
+    change = {}
+    for led in ("", "LED-600-20"):
+        pair = [
+            scene_of(rig, one, films=IDEAL_POLARIZERS, lateral=False, optics=False).under(led)
+            for one in (face, deoxygenated)
+        ]
+        mask = pair[0].truth()["mask"]
+        one, other = (scene.radiance("crossed")[mask] for scene in pair)
+        channel = 0 if led else 1  # red of the LED, green of the flash
+        change[led] = abs(np.log(other[:, channel] / one[:, channel]).mean())
+    assert change["LED-600-20"] > 5.0 * change[""]
+    assert change["LED-600-20"] > 0.03

@@ -1,0 +1,1 @@
+"""Estimators from camera colors together with signals under narrow-band LEDs."""
