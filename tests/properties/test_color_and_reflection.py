@@ -10,8 +10,8 @@ from model import color_table, merl, metrics, skin_reflectance, spectra
 from model.brdf import microfacet
 from model.tissue_optics import uncertainty as optics_uncertainty
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction import chromophores, polarization
-from reconstruction.chromophores import pixel_checks, shading_prior, tsumura
+from reconstruction import chromophores, polarization, tsumura
+from reconstruction.chromophores import pixel_checks, shading_prior
 from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.gradient_normals import lobe_response, sphere_lights
 from reconstruction.normal_integration import relief_errors

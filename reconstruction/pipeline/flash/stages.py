@@ -22,9 +22,9 @@ from model.checks import Checks
 from model.color_table import ColorTable, with_exact_optics
 from model.skin import MAP_UNITS, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction import polarization
+from reconstruction import polarization, tsumura
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
-from reconstruction.chromophores import dark_spots, model_error, shading_prior, tsumura
+from reconstruction.chromophores import dark_spots, model_error, shading_prior
 from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores.face import estimate_face
 from reconstruction.chromophores.pixel_checks import is_detectable
@@ -34,7 +34,7 @@ from reconstruction.pipeline.flash import oxygenation, tone
 from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.masked_map import masked_map
 
-STAGE_REVISION = 8
+STAGE_REVISION = 9
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = tuple(

@@ -4,7 +4,7 @@ from scipy import integrate
 
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction.chromophores.tsumura import UnmixingError, tsumura_ica
+from reconstruction.tsumura import UnmixingError, tsumura_ica
 
 SHAPE = (60, 80)
 
