@@ -138,20 +138,13 @@ class PeopleValues:
         rounded: dict[str, Knob] = {key: round(float(v), digits) for key, v in values.items()}
         return {"people": n, **rounded, "bias, %": round(bias, 2)}
 
-    def trends(self, columns: ArrayLike, *, digits: int = 4) -> dict[str, Knob]:
-        """Return differences between groups of people in the mean of quantities.
+    def trends(self, k: int, *, digits: int = 4) -> dict[str, Knob]:
+        """Return differences of a quantity between groups of people, and its change with age.
 
-        Least squares on sex, ethnicity, products and age together. Empty with too few people.
-
-        Parameters
-        ----------
-        columns
-            Indices of quantities, which are averaged.
-        digits
-            Decimal places.
+        Least squares on sex, ethnicity, products and age together; the same for the true values.
+        Empty with too few people.
         """
-        pick = np.asarray(columns, np.intp)
-        found, true = (v[:, pick].mean(axis=1) for v in (self.estimated, self.true))
+        found, true = self.estimated[:, k], self.true[:, k]
         known = np.isfinite(found)
         traits = {name: values[known] for name, values in label_traits(self.members).items()}
         design = np.stack([np.ones(int(known.sum())), *traits.values()], axis=1)

@@ -80,11 +80,9 @@ def measure_people(stage: BenchmarkStage) -> None:
     timing = Timing.single((time.perf_counter() - began) / len(members))
     columns = np.arange(people.true.shape[1]).reshape(len(REGION_LANDMARKS), -1)
     for q, quantity in enumerate(QUANTITY_NAMES):
-        trends = people.trends(columns[:, q])
-        for r, region in enumerate(REGION_LANDMARKS):
+        for k, region in zip(columns[:, q].tolist(), REGION_LANDMARKS, strict=True):
             knobs: Knobs = {"region": region, "quantity": quantity}
-            k = int(columns[r, q])
-            stage.add(knobs, timing, people.error(k), people.describe(k) | (trends if not r else {}))
+            stage.add(knobs, timing, people.error(k), people.describe(k) | people.trends(k))
         stage.limits["exchange", quantity] = people.exchange_probability(columns[:, q])
     stage.limits["pull"] = people.largest_pull()
 
@@ -108,7 +106,7 @@ def capture_people(
     PeopleValues
         `QUANTITY_NAMES` of each region of `REGION_LANDMARKS`, quantities running fastest.
     """
-    shown = {target: size for target in ("charuco", "mirror", "white")}
+    shown = dict.fromkeys(("charuco", "mirror", "white"), size)
     kinds = (("geometry", ("charuco",)), ("lights", ("mirror", "white")))
     calibrate_simulated("dome", folder, shown, kinds, seed=DOME_SEED)
     rows = []
@@ -189,10 +187,7 @@ def true_regions(truth: SkinAppearance) -> Float64Array:
         floor = float(maps["r_d_floor"].values.reshape(-1)[some].mean())
 
         def reflect(
-            light: Float64Array,
-            view: Float64Array,
-            packed: Any = packed,
-            floor: float = floor,
+            light: Float64Array, view: Float64Array, packed: Any = packed, floor: float = floor
         ) -> Float64Array:
             heights = zip(light[:, 2], view[:, 2], strict=True)
             through = np.array([surface_brdf.boundary_transmittance(*pair) for pair in heights])
@@ -278,7 +273,7 @@ def _region_texels(
     appearance: SkinAppearance, truth: SkinAppearance, valid: BoolArray
 ) -> list[Int64Array]:
     """Return the flat indices of valid texels of each region."""
-    landmarks = truth.parameters[TRUE_LANDMARKS_KEY]
+    landmarks: Any = truth.parameters[TRUE_LANDMARKS_KEY]
     place = appearance.maps["position"].values.reshape(-1, 3).astype(np.float64)
     out = []
     for names in REGION_LANDMARKS.values():
