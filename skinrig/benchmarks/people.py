@@ -115,7 +115,7 @@ class PeopleValues:
         as_good = np.count_nonzero(exchanged >= np.trace(products) * (1.0 - 1e-12))
         return (1 + int(as_good)) / (1 + N_EXCHANGES)
 
-    def describe(self, k: int, *, digits: int = 4) -> dict[str, Knob]:
+    def describe(self, k: int, *, digits: int = 5) -> dict[str, Knob]:
         """Return mean and standard deviation over people of a quantity, for a benchmark's point.
 
         Standard errors are those of people drawn from a population, for a normal distribution.
@@ -138,7 +138,7 @@ class PeopleValues:
         rounded: dict[str, Knob] = {key: round(float(v), digits) for key, v in values.items()}
         return {"people": n, **rounded, "bias, %": round(bias, 2)}
 
-    def trends(self, k: int, *, digits: int = 4) -> dict[str, Knob]:
+    def trends(self, k: int, *, digits: int = 5) -> dict[str, Knob]:
         """Return differences of a quantity between groups of people, and its change with age.
 
         Least squares on sex, ethnicity, products and age together; the same for the true values.
