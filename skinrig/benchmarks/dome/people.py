@@ -56,7 +56,7 @@ CAP_GRID: Final = (24, 24)
 """Directions of the specular reflectance, by polar angle and azimuth."""
 N_TRUE_TEXELS: Final = 300
 """Texels of a region at which the true BRDF is evaluated, drawn at random."""
-RANK: Final = 16
+N_BASIS_BRDFS: Final = 16
 """Basis BRDFs of a face; with the 4 of the default, regions become alike."""
 FULL_DOME: Final = {"lights": 48, "views": 6, "width_px": 480}
 TOY_DOME: Final = {"lights": 24, "views": 4, "width_px": 240}
@@ -65,7 +65,7 @@ OMITTED_EFFECTS: Final = ("subsurface", "interreflections")
 DOME_SEED: Final = 0
 """Seed of the dome, the same for all people: one calibration serves all."""
 TOY_PEOPLE: Final = 2
-UP: Final = (0.0, 0.0, 1.0)
+SURFACE_NORMAL: Final = (0.0, 0.0, 1.0)
 
 Reflection = Callable[[Float64Array, Float64Array], Float64Array]
 """Return f_r of a surface with normal +z, (M,), 1/sr, by directions of light and view, (M, 3)."""
@@ -113,8 +113,8 @@ def capture_people(
     for member in members:
         kept: Any = {"subject": member.name, "leave_out": OMITTED_EFFECTS, **size}
         done = resimulate("dome", folder, seed=DOME_SEED, **kept)
-        want = ("normals_refined", "r_d", *weight_names(RANK))
-        found, truth = reconstruct_maps(folder, done, want, dome=DomeOptions(rank=RANK))
+        want = ("normals_refined", "r_d", *weight_names(N_BASIS_BRDFS))
+        found, truth = reconstruct_maps(folder, done, want, dome=DomeOptions(rank=N_BASIS_BRDFS))
         rows.append((*estimate_regions(found, truth), true_regions(truth)))
     values = np.array(rows).reshape(len(members), 3, -1)
     return PeopleValues(tuple(members), values[:, 0], values[:, 1], values[:, 2])
@@ -151,7 +151,7 @@ def estimate_regions(
         mixture = own.mean(axis=0) @ lobes.mix
 
         def reflect(light: Float64Array, view: Float64Array, x: Float64Array = mixture) -> Any:
-            return brdf_basis.evaluate(x, basis, light, view, UP)
+            return brdf_basis.evaluate(x, basis, light, view, SURFACE_NORMAL)
 
         specular = specular_reflectance(reflect)
         values[r] = specular, facet_roughness(reflect), *_mean(albedo.values, texels)
@@ -191,7 +191,9 @@ def true_regions(truth: SkinAppearance) -> Float64Array:
         ) -> Float64Array:
             heights = zip(light[:, 2], view[:, 2], strict=True)
             through = np.array([surface_brdf.boundary_transmittance(*pair) for pair in heights])
-            lobes = [surface_brdf.evaluate_brdf(one, UP, light, view)[1] for one in packed]
+            lobes = [
+                surface_brdf.evaluate_brdf(one, SURFACE_NORMAL, light, view)[1] for one in packed
+            ]
             return np.asarray(np.mean(lobes, axis=0) - floor / np.pi * through)
 
         values[r] = (

@@ -11,7 +11,9 @@ from skinrig.benchmarks.stage import BenchmarkStage
 def skin(*, roughness, oil=0.0):
     """Return the surface part of the simulator's BRDF."""
     packed = np.array([0.4, 0.3, 0.2, roughness, oil, 0.0, 1.0], np.float32)
-    return lambda light, view: surface_brdf.evaluate_brdf(packed, people.UP, light, view)[1]
+    return lambda light, view: surface_brdf.evaluate_brdf(
+        packed, people.SURFACE_NORMAL, light, view
+    )[1]
 
 
 @pytest.mark.parametrize("roughness", [0.2, 0.3, 0.4])
