@@ -14,6 +14,7 @@ from skinrig.evaluating.skin_bands import MELANIN_BANDS
 
 # simulated sessions, surveys and faces: over 5 s of processor time even when small
 HEAVY = {
+    "brdf-people",
     "dome-geometry",
     "editing",
     "gradient-normals",
@@ -27,6 +28,7 @@ HEAVY = {
     "render-model",
     "sphere-lights",
     "traits",
+    "translucency-people",
 }
 MIN_POINTS = 4
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from model.skin import SkinAppearance, SkinMap
 from model.store import read
+from reconstruction.pipeline.inputs import DomeOptions
 from reconstruction.pipeline.recipes import reconstruct
 from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
@@ -174,8 +175,9 @@ def truth_folder(done: SimulationResult) -> Path:
 
 
 def reconstruct_maps(
-    folder: Path, done: SimulationResult, want: Sequence[str]
+    folder: Path, done: SimulationResult, want: Sequence[str], *, dome: DomeOptions | None = None
 ) -> tuple[SkinAppearance, SkinAppearance]:
     """Reconstruct a subject's maps into FOLDER/maps; return them and the ground truth."""
-    reconstruct(done.session, want=want, out=folder / "maps", calibration=folder / "calibration")
+    maps, calibration = folder / "maps", folder / "calibration"
+    reconstruct(done.session, want=want, out=maps, calibration=calibration, dome=dome)
     return read(folder / "maps"), read(truth_folder(done))

@@ -9,12 +9,12 @@ from typing import Final
 
 import numpy as np
 
-from model.translucency_population import CHANNEL_NAMES, SiteMeasurement, summarize, weyrich_2005
+from model.translucency_population import CHANNEL_NAMES, SITE_OF_LABEL, weyrich_2005
 from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from rigsim.fiber.probe_tissue import phantom_certificate
-from rigsim.population.population import draw_population
+from rigsim.population.population import Member
 from skinrig.benchmarks.intervals.trials import reconstruct_maps, resimulate
-from skinrig.benchmarks.resampling import mean_error
+from skinrig.benchmarks.people import PeopleValues, choose_members
 from skinrig.benchmarks.results import Timing
 from skinrig.benchmarks.stage import BenchmarkStage
 from skinrig.calibrating.calibrate import calibrate
@@ -23,58 +23,60 @@ from skinrig.simulating.simulation import simulate_session
 
 PROBED_SITES: Final = ("forehead", "cheek", "chin")
 """Sites of table 2; its neck is measured below the chin."""
+TOY_PEOPLE: Final = 2
 
 
 def measure_people(stage: BenchmarkStage) -> None:
     """Measure mean and deviation of sigma_tr over members of the population."""
-    members = draw_population()[:: 44 if stage.toy else 16]
+    members = choose_members(1)[: TOY_PEOPLE if stage.toy else None]
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as place:
-        found, truth = _probe_people(Path(place), [member.name for member in members])
-    seconds = (time.perf_counter() - began) / len(members)
+        people = probe_people(Path(place), members)
+    timing = Timing.single((time.perf_counter() - began) / len(members))
     published = weyrich_2005()
-    table = summarize(found)
     worst = 0.0
-    for s, site in enumerate(table.sites):
+    for k in range(people.true.shape[1]):
+        s, c = divmod(k, len(CHANNEL_NAMES))
+        site = SITE_OF_LABEL.get(PROBED_SITES[s], PROBED_SITES[s])
         p = published.sites.index(site)
-        for c, channel in enumerate(CHANNEL_NAMES):
-            here = [one for one in found if _site(one) == site]
-            measured = np.array([one.sigma_tr_per_mm[c] for one in here])
-            true = np.array([truth[one.subject, one.site][c] for one in here])
-            errors = 100.0 * np.abs(measured / true - 1.0)
-            extra = {
-                "people": int(table.count[s, c]),
-                "mean, 1/mm": round(float(table.mean_per_mm[s, c]), 3),
-                "deviation, 1/mm": round(float(table.deviation_per_mm[s, c]), 3),
-                "published mean, 1/mm": float(published.mean_per_mm[p, c]),
-                "published deviation, 1/mm": float(published.deviation_per_mm[p, c]),
-            }
-            knobs = {"site": site, "channel": channel}
-            stage.add(knobs, Timing.single(seconds), mean_error(errors.tolist()), extra)
-            worst = max(worst, float(np.median(errors)))
-    stage.limits = {"error": worst}
+        extra = people.describe(k) | {
+            "published mean": float(published.mean_per_mm[p, c]),
+            "published deviation": float(published.deviation_per_mm[p, c]),
+        }
+        knobs = {"site": site, "channel": CHANNEL_NAMES[c]}
+        worst = max(worst, stage.add(knobs, timing, people.error(k), extra).error)
+    stage.limits = {
+        "error": worst,
+        "pull": people.largest_pull(),
+        "exchange": people.exchange_probability(np.arange(people.true.shape[1])),
+    }
 
 
-def _site(measurement: SiteMeasurement) -> str:
-    return "neck" if measurement.site == "chin" else measurement.site
+def probe_people(folder: Path, members: Sequence[Member]) -> PeopleValues:
+    """Simulate and fit probe sessions of people; return sigma_tr in 1/mm, site by site.
 
-
-def _probe_people(
-    folder: Path, names: Sequence[str]
-) -> tuple[list[SiteMeasurement], dict[tuple[str, str], list[float]]]:
-    """Return the fitted sites of people, and the true sigma_tr by person and site."""
+    Parameters
+    ----------
+    folder
+        Empty folder of the sessions. One calibration serves all people.
+    members
+        Members of the population.
+    """
     phantom, paper = folder / "session-phantom", folder / "block.json"
     simulate_session("probe", phantom, target="phantom", seed=1)
     paper.write_text(json.dumps(dict(phantom_certificate())), encoding="utf-8")
     calibrate("fiber", [phantom], folder / "calibration", phantom=paper)
-    found: list[SiteMeasurement] = []
-    truth: dict[tuple[str, str], list[float]] = {}
-    for seed, name in enumerate(names):
-        done = resimulate("probe", folder, subject=name, seed=seed, sites=PROBED_SITES)
+    shape = (len(members), len(PROBED_SITES), len(CHANNEL_NAMES))
+    estimated, stderr, true = np.full((3, *shape), np.nan)
+    for row, member in enumerate(members):
+        done = resimulate("probe", folder, subject=member.name, seed=row, sites=PROBED_SITES)
         fits, known = reconstruct_maps(folder, done, ["subsurface"])
         document = evaluation.read_document(fits, SUBSURFACE_FILE)
-        if document is not None:
-            found += evaluation.site_measurements(name, document)
+        for one in [] if document is None else evaluation.site_measurements(member.name, document):
+            at = row, PROBED_SITES.index(one.site)
+            estimated[at], stderr[at] = one.sigma_tr_per_mm, one.stderr_per_mm
         for entry in evaluation.true_profiles(known).values():
-            truth[name, str(entry["site"])] = list(entry["sigma_tr_per_mm"])
-    return found, truth
+            true[row, PROBED_SITES.index(str(entry["site"]))] = entry["sigma_tr_per_mm"]
+    return PeopleValues(
+        tuple(members), *(v.reshape(len(members), -1) for v in (estimated, stderr, true))
+    )
