@@ -158,27 +158,45 @@ def measure_independent_skin(stage: BenchmarkStage) -> None:
     """Measure error, coverage and valid fraction by skin type over table sizes and optics."""
     skins = load_skins()
     side = 96 if stage.toy else 2048
+    sizes = (16, 128) if stage.toy else (8, 16, 32, 128)
     for camera, illuminant in JUDGED_CAMERAS:
         rgb = noisy_colors(skins, camera, illuminant)
         image = rgb[np.arange(side * side) % len(rgb)].reshape(side, side, 3).astype(np.float32)
         variance = np.square(CHANNEL_NOISE * image)
+        seconds: dict[tuple[str, bool, int], float] = {}
         for exact in (True, False):
-            for size in (16, 128) if stage.toy else (8, 16, 32, 128):
+            for size in sizes:
                 table = color_table.build(
                     camera, illuminant, size=size, anisotropy=ANISOTROPY_SKIN, exact_optics=exact
                 )
                 timing, _ = stage.time(
                     lambda: chromophores.invert(image, table, shading="known", variance=variance)
                 )
+                seconds["known", exact, size] = timing.seconds
                 by_type, off = accuracy_by_type(table, skins, rgb)
                 least = min(one.valid for one in by_type.values())
                 covered = {f"within 68 %, {k}": round(v.within_68, 2) for k, v in by_type.items()}
+                optics = "exact" if exact else "unknown"
                 stage.add(
-                    {"camera": camera, "optics": "exact" if exact else "unknown", "table": size},
+                    {"camera": camera, "optics": optics, "type": "all", "table": size},
                     timing,
                     median_error(100.0 * off),
                     {"least valid share": round(least, 3), **covered},
                 )
+                for index, name in enumerate(SKIN_TYPES):
+                    stage.add(
+                        {"camera": camera, "optics": optics, "type": name, "table": size},
+                        timing,
+                        median_error(100.0 * off[skins.skin_type == index]),
+                    )
+                if size == sizes[-1]:
+                    free, _ = stage.time(
+                        lambda: chromophores.invert(image, table, variance=variance)
+                    )
+                    seconds["free", exact, size] = free.seconds
+        for shading in ("known", "free"):
+            with_optics, without = (seconds[shading, exact, sizes[-1]] for exact in (False, True))
+            stage.limits["time", side, shading, camera] = with_optics / without
         for name, one in by_type.items():
             stage.limits["valid", name, camera] = one.valid
             stage.limits["bias", name, camera] = abs(one.bias - 1.0)
