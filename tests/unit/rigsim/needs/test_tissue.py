@@ -136,7 +136,7 @@ def test_tissue_size_bounds_change_of_patch():
 
 
 def test_predicted_fiber_profiles_agree_with_photons():
-    """Ratio of two people's readings, mean over 14 fibers; its photon noise is about 4 %."""
+    """Logarithm of the ratio of two people's readings, mean over 14 fibers; photon noise 0.06."""
     rig, person = load_rig("probe"), PersonSkin(0.03, tissue=PERSON)
     other = dataclasses.replace(PERSON, oxygenation=0.1, scattering_per_mm=18.0)
     tissue = SkinTissue(person)
@@ -144,13 +144,13 @@ def test_predicted_fiber_profiles_agree_with_photons():
         predict_profiles(rig, tissue, other)[0] / predict_profiles(rig, tissue, PERSON)[0]
     )
     each = [
-        ProfileCache(rig, SkinTissue(one), photons=40_000, seed=1).profile("forehead")
+        ProfileCache(rig, SkinTissue(one), photons=10_000, seed=2).profile("forehead")
         for one in (dataclasses.replace(person, tissue=other), person)
     ]
     found = np.log(each[0].reflectance_per_mm2 / each[1].reflectance_per_mm2)
     near = slice(0, 14)
-    assert np.abs((found - told)[near].mean(axis=0)).max() < 0.1
-    assert np.abs(told[near].mean(axis=0)).max() > 0.25
+    assert np.abs((found - told)[near].mean(axis=0)).max() < 0.2
+    assert np.abs(told[near].mean(axis=0)).min() > 0.8
 
 
 def test_probe_builds_what_readings_show():
