@@ -122,6 +122,16 @@ class SceneEffects:
     """Blur and diffraction of the lens."""
     relief_shadows: bool | None = None
     """Shadows of the relief on itself; on a face, those of the wrinkles after movement."""
+    thickness: bool | None = None
+    """The person's thickness of the epidermis, instead of a typical one."""
+    melanin_depth: bool | None = None
+    """The person's melanin by depth."""
+    oxygenation: bool | None = None
+    """The person's oxygenation of blood."""
+    scattering: bool | None = None
+    """The person's scattering of skin."""
+    absorption: bool | None = None
+    """The person's baseline absorption, kind of melanin and blood in the epidermis."""
     spectral_step: int | None = None
     """Interreflection uses every n-th of the table's wavelengths; None: by the selection's rule."""
     last_bounce: float | None = None

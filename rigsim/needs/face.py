@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from rigsim.needs.effects import (
     SceneEffects,
     decide_effect,
 )
+from rigsim.needs.tissue import RULE_WAVELENGTH_STEP, SkinSample, select_tissue_effects
 from rigsim.render import Caster
 from rigsim.render.depth_of_field import depth_range, tabulate_defocus
 from rigsim.subject import SimulatedSubject
@@ -107,10 +109,8 @@ def select_face_effects(
     pixel_mm = scenery.view.distance_mm / scenery.view.focal_px
     kernels = skin.lateral_kernels()
     lost = edge_loss(kernels.sigmas_mm, kernels.weights, pixel_mm)
-    more = level * [
-        interreflection_over_direct(share, float(reflectance)) for reflectance in peak_reflectance
-    ]
-    more = np.minimum(more, 1.0)
+    bounced = np.array([interreflection_over_direct(share, float(r)) for r in peak_reflectance])
+    more = np.minimum(level * bounced, 1.0)
     unseen = more / noise.sigma(more)  # where no direct light arrives, the noise is least
     bounces = decide_effect(
         INTERREFLECTION_EFFECT,
@@ -131,6 +131,13 @@ def select_face_effects(
     )
     return [
         *texture_effects(skin),
+        *_tissue_effects(
+            skin,
+            scenery,
+            level=level,
+            lost=lost if effects.lateral is not False else np.zeros_like(lost),
+            gain=1.0 + bounced if bounces.is_built else np.ones_like(bounced),
+        ),
         Effect(
             SHADOW_EFFECT,
             "built",
@@ -261,6 +268,29 @@ def texture_effects(skin: ObservedSkin) -> list[Effect]:
             f"reflectance is {least:.2g} to {most:.2g} times its median's",
         ),
     ]
+
+
+def _tissue_effects(
+    skin: ObservedSkin,
+    scenery: ViewingConditions,
+    *,
+    level: FloatArray,
+    lost: FloatArray,
+    gain: FloatArray,
+) -> list[Effect]:
+    """Return whether a face requires each property of its tissue."""
+    sample = SkinSample.from_extremes(
+        *skin.covered_chromophores(), skin.band_weights(RULE_WAVELENGTH_STEP)
+    )
+    change = partial(
+        sample.change_over_noise,
+        skin.subject.tissue,
+        level=level,
+        lost=lost,
+        gain=gain,
+        noise=scenery.noise,
+    )
+    return select_tissue_effects(skin.subject.tissue, change, scenery.effects)
 
 
 def max_reflectance_rgb(skin: ObservedSkin) -> Float64Array:

@@ -1,6 +1,7 @@
 """Select the effects of light that the gradient sphere's images of a skin patch require."""
 
 import math
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -21,9 +22,11 @@ from rigsim.needs.effects import (
     decide_effect,
     omitted_effects,
 )
+from rigsim.needs.tissue import RULE_WAVELENGTH_STEP, SkinSample, select_tissue_effects
 from rigsim.render.lens_blur import Lens
-from rigsim.skin_patch.microrelief import MicroSkin, lateral_kernel
-from rigsim.tissue.skin_layers import ETA
+from rigsim.skin_patch.microrelief import CAMERA_BAND_NM, MicroSkin, lateral_kernel
+from rigsim.tissue.skin_layers import ETA, MAX_C_HD, MAX_C_M
+from rigsim.tissue.skin_table import WAVELENGTH_NM
 
 OPTICS_EFFECT: Final = "diffraction and defocus"
 
@@ -34,6 +37,10 @@ ANALYZED_TEXELS: Final = 384
 """Texels along each side of the evaluated part of the patch."""
 
 HORIZON_SECTORS: Final = 8
+
+PIGMENT_RANGE: Final = (0.25, 1.0, 4.0)
+BLOOD_RANGE: Final = (0.7, 1.0, 3.0)
+"""Melanin and blood of a patch's texels over those of its site, from 18 patches of 4 mm."""
 
 
 def select_gradient_effects(
@@ -139,9 +146,19 @@ def _skin_effects(
     pixel_mm = 1e-3 * lens.pixel_on_subject_um
     lost = float(edge_loss(sigmas, weights[None], pixel_mm).max())
     level = min(1.0, white * brightest)
+    # light that other walls receive changes with the reflectance, too
+    change = partial(
+        _sample_patch(skin).change_over_noise,
+        skin.skin.tissue,
+        level=level,
+        lost=lost if effects.lateral is not False else 0.0,
+        gain=1.0 + more,
+        noise=noise,
+    )
     deg = (math.degrees(math.atan(steepest)), math.degrees(math.atan(lowest)))
     return [
         Effect(face.RELIEF_EFFECT, "built", f"pixels of {1e3 * pixel_mm:.1f} um resolve it"),
+        *select_tissue_effects(skin.skin.tissue, change, effects),
         decide_effect(
             face.SHADOW_EFFECT,
             noise.change_over_noise(1.0) if steepest > lowest else 0.0,
@@ -164,6 +181,17 @@ def _skin_effects(
             reason=f"walls of grooves receive up to {100 * share:.1f} % of the light from others",
         ),
     ]
+
+
+def _sample_patch(skin: MicroSkin) -> SkinSample:
+    """Return the least, mean and largest pigment and blood of a patch, in the camera's band."""
+    wavelength = WAVELENGTH_NM[::RULE_WAVELENGTH_STEP]
+    band = (wavelength >= CAMERA_BAND_NM[0]) & (wavelength <= CAMERA_BAND_NM[1])
+    return SkinSample.from_extremes(
+        np.minimum(skin.skin.c_m * np.array(PIGMENT_RANGE), MAX_C_M),
+        np.minimum(skin.skin.c_hd * np.array(BLOOD_RANGE), MAX_C_HD),
+        (band / band.sum())[:, None],
+    )
 
 
 def _scatter_hidden_light(

@@ -14,6 +14,7 @@ doi:10.1016/j.colsurfb.2005.12.013). Relief governs how skin folds at such moder
 numbers without a citation, are this project's choice, within those ranges.
 """
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
@@ -28,7 +29,7 @@ from rigsim.package_data import package_table
 from rigsim.subject.person_skin import PersonSkin, PersonSkinError, SiteSkin
 from rigsim.subject.pigment import MAX_MELANIN
 from rigsim.tissue.lateral_kernels import SIGMAS_MM
-from rigsim.tissue.skin_layers import MAX_C_HD
+from rigsim.tissue.skin_layers import MAX_C_HD, TissueProperties
 from rigsim.tissue.skin_table import SkinTable
 
 SiteName = Literal["forehead", "cheek", "chin"]
@@ -182,10 +183,7 @@ def make_micro_skin(
     if count > MAX_TEXELS:
         raise MicroSkinError(f"size_mm: got {count} texels per side, expected <= {MAX_TEXELS}")
     where = _SITE_PARAMETERS[site]
-    places = (np.arange(count) - 0.5 * (count - 1)) * texel_um * 1e-3
-    points = np.zeros((count, count, 3), np.float32)
-    points[..., 0], points[..., 1] = places[None, :], places[::-1, None]
-    own = len(SITE_NAMES) * seed + SITE_NAMES.index(site)
+    points, own = _texel_positions_mm(count, texel_um), _patch_seed(site, seed)
     height, furrow = _relief(where, points, texel_um * 1e-3, own)
     return MicroSkin(
         site=site,
@@ -199,6 +197,45 @@ def make_micro_skin(
         stiffness_ratio=where.stiffness_ratio,
         poisson=where.poisson,
     )
+
+
+def change_patch_tissue(patch: MicroSkin, tissue: TissueProperties) -> MicroSkin:
+    """Return a patch of `make_micro_skin` with other tissue, the same patch for the same tissue.
+
+    Parameters
+    ----------
+    patch
+        The patch.
+    tissue
+        Properties of its skin except for melanin and blood.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> patch = make_micro_skin("cheek", seed=3, size_mm=0.5)
+    >>> other = change_patch_tissue(patch, replace(patch.skin.tissue, scattering_per_mm=12.0))
+    >>> bool((other.albedo > patch.albedo).all()), other.height_um is patch.height_um
+    (True, True)
+    """
+    if tissue == patch.skin.tissue:
+        return patch
+    where, skin = _SITE_PARAMETERS[patch.site], dataclasses.replace(patch.skin, tissue=tissue)
+    points = _texel_positions_mm(len(patch.layer_um), patch.texel_um)
+    furrow = (1.0 - patch.layer_um / where.layer_um) / (1.0 - where.thin)  # of `make_micro_skin`
+    albedo = _albedo(points, furrow, skin, _patch_seed(patch.site, patch.seed))
+    return dataclasses.replace(patch, skin=skin, albedo=albedo)
+
+
+def _texel_positions_mm(count: int, texel_um: float) -> Float32Array:
+    """Return the positions of a patch's texels, shape (count, count, 3)."""
+    places = (np.arange(count) - 0.5 * (count - 1)) * texel_um * 1e-3
+    points = np.zeros((count, count, 3), np.float32)
+    points[..., 0], points[..., 1] = places[None, :], places[::-1, None]
+    return points
+
+
+def _patch_seed(site: str, seed: int) -> int:
+    return len(SITE_NAMES) * seed + SITE_NAMES.index(site)
 
 
 def _relief(

@@ -90,7 +90,8 @@ class SimulatedFaceOptions:
         Face mesh, .npz or .obj; default: the built-in head.
     omit
         Visible effects to omit from the simulation, separated by commas: lateral (or
-        subsurface), interreflections, spectral, optics, relief_shadows.
+        subsurface), interreflections, spectral, optics, relief_shadows, thickness, melanin_depth,
+        oxygenation, scattering, absorption.
     movement
         Deform the face with its expressions, or change its blood volume only.
     """
@@ -237,7 +238,7 @@ def simulate_gradient(
     ----------
     omit
         Visible effects to omit from the simulation, separated by commas: shadows, lateral,
-        interreflections, optics.
+        interreflections, optics, thickness, melanin_depth, oxygenation, scattering, absorption.
     """
     from skinrig.capturing.option_values import parse_floats, parse_names, parse_range
     from skinrig.simulating.orders import GradientOrder

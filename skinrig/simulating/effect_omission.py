@@ -4,11 +4,28 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Final
 
+TISSUE_SWITCHES: Final = ("thickness", "melanin_depth", "oxygenation", "scattering", "absorption")
+"""Switches of `rigsim.needs.tissue.TISSUE_RULES`: without a property, that of typical skin."""
+
 SWITCHES_BY_RIG: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
-        "flash": ("lateral", "interreflections", "spectral", "optics", "relief_shadows"),
-        "dome": ("subsurface", "interreflections", "spectral", "optics", "relief_shadows"),
-        "gradient": ("shadows", "lateral", "interreflections", "optics"),
+        "flash": (
+            "lateral",
+            "interreflections",
+            "spectral",
+            "optics",
+            "relief_shadows",
+            *TISSUE_SWITCHES,
+        ),
+        "dome": (
+            "subsurface",
+            "interreflections",
+            "spectral",
+            "optics",
+            "relief_shadows",
+            *TISSUE_SWITCHES,
+        ),
+        "gradient": ("shadows", "lateral", "interreflections", "optics", *TISSUE_SWITCHES),
         "probe": (),
     }
 )

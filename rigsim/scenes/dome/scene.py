@@ -43,6 +43,7 @@ from rigsim.needs import face as face_needs
 from rigsim.needs.dome import min_noise, select_dome_effects
 from rigsim.needs.effect_sizes import max_exchange_fraction
 from rigsim.needs.effects import AUTOMATIC_EFFECTS, PixelNoise, SceneEffects
+from rigsim.needs.tissue import select_face_tissue
 from rigsim.population import conditions as skin_conditions
 from rigsim.render import Caster
 from rigsim.render.variant import VariantChoice
@@ -134,6 +135,7 @@ class DomeScene(FaceScene):
         scenery = self._scenery(rig.views[0], self._caster, share, noise, effects)
         white = None if on_s is None else on_s * self._white_level_at_origin()
         self.needs = select_dome_effects(rig, self.subject, state, scenery, white, movement, motion)
+        self.subject = select_face_tissue(self.subject, self.needs)
         self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
         self.subsurface = self.needs.builds(face_needs.LATERAL_EFFECT)
         self.optics = self.needs.builds(face_needs.LENS_EFFECT)

@@ -43,6 +43,7 @@ from rigsim.needs.effects import (
     merge_selections,
 )
 from rigsim.needs.flash import select_flash_effects
+from rigsim.needs.tissue import select_face_tissue
 from rigsim.render import camera_rays
 from rigsim.render.depth_of_field import depth_range, tabulate_defocus
 from rigsim.render.variant import VariantChoice
@@ -122,6 +123,7 @@ class FlashScene(FaceScene):
         self._caster = self._stage.caster
         self._effects, self._power = effects, power
         self.needs = merge_selections([self._needs_of(view, power) for view in rig.views])
+        self.subject = select_face_tissue(self.subject, self.needs)
         self.lateral = self.needs.builds(face_needs.LATERAL_EFFECT)
         self.interreflections = self.needs.builds(face_needs.INTERREFLECTION_EFFECT)
         self.optics = self.needs.builds(face_needs.LENS_EFFECT)

@@ -25,6 +25,7 @@ from rigsim.light.lobe_moments import MicrofacetSurface
 from rigsim.needs.effects import AUTOMATIC_EFFECTS, PixelNoise, SceneEffects
 from rigsim.needs.face import INTERREFLECTION_EFFECT, LATERAL_EFFECT, SHADOW_EFFECT
 from rigsim.needs.gradient import OPTICS_EFFECT, select_gradient_effects
+from rigsim.needs.tissue import select_patch_tissue
 from rigsim.render.lens_blur import Lens, blur_images, focused_lens
 from rigsim.scenes.exposing import RigScene, SceneError, full_power_duration_s
 from rigsim.scenes.gradient.analyzer import GridAnalyzer
@@ -127,7 +128,7 @@ class GradientScene(RigScene):
             raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
         if sectors < 4 or sectors % 4:
             raise SceneError(f"sectors: got {sectors}, expected a multiple of 4")
-        self.rig, self.subject = rig, subject
+        self.rig = rig
         self.films = draw_polarizers(rig) if films is None else films
         self.sphere = nominal_sphere(rig) if sphere is None else sphere
         self.motion, self.seed = motion, seed
@@ -152,6 +153,7 @@ class GradientScene(RigScene):
         seen = (self.sphere, self.lens, PixelNoise.of(self._sensor), level)
         self.needs = select_gradient_effects(rig, subject, *seen, motion is not None, effects)
         """Effects with their verdicts and reasons."""
+        self.subject = select_patch_tissue(subject, self.needs)
         self.shadows = self.needs.builds(SHADOW_EFFECT)
         self.optics = self.needs.builds(OPTICS_EFFECT)
         self.lateral = self.needs.builds(LATERAL_EFFECT)

@@ -26,7 +26,8 @@ from rigsim.fiber.homogeneous_fit import fit_homogeneous_medium
 from rigsim.fiber.probe_profile import BandProfile, ProfileCache, probe_fibers
 from rigsim.fiber.probe_tissue import HomogeneousTissue, ProbedTissue, TissueError
 from rigsim.needs.effects import PixelNoise
-from rigsim.needs.probe import select_probe_effects
+from rigsim.needs.probe import equivalent_pixels, select_probe_effects
+from rigsim.needs.tissue import select_probed_tissue
 from rigsim.scenes.exposing import RigScene, SceneError, full_power_duration_s
 from rigsim.sensor import Sensor, expose_sensor, make_sensor
 from rigsim.world.suction import HeadState
@@ -98,7 +99,6 @@ class ProbeScene(RigScene):
         self._view = rig.views[0]
         dark = {"dark_e_per_s": DARK_CURRENT_E_PER_S, "vignetting": LENS_VIGNETTING}
         self._sensor = make_sensor(self._view, **dark) if sensor is None else sensor
-        self.profiles = ProfileCache(rig, tissue, photons=photons, seed=seed)
         self.white = spectra.camera_white(self._view.spectral_sensitivity, rig.lights[0].illuminant)
         images = fiber_unit_images(self.build, self._view)
         self._images = np.ascontiguousarray(images.reshape(len(images), -1).T)
@@ -112,8 +112,11 @@ class ProbeScene(RigScene):
             self.build,
             noise=PixelNoise.of(self._sensor),
             hot=float(self.hot_e_per_s.max()) * MAX_USUAL_EXPOSURE_S / full_e,
+            spot_pixels=equivalent_pixels(images),
         )
         """Effects with their verdicts and reasons."""
+        built = select_probed_tissue(tissue, self.needs)
+        self.profiles = ProfileCache(rig, built, photons=photons, seed=seed)
 
     def sensor(
         self, view_name: str | None = None, *, camera_c: float = DARK_CURRENT_REFERENCE_C

@@ -26,6 +26,7 @@ from model.tissue_optics import uncertainty as optics_uncertainty
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores
 from skinrig.arrays import BoolArray, Float64Array
+from skinrig.benchmarks.measurement import measure_processor_seconds
 from skinrig.benchmarks.resampling import median_error
 from skinrig.benchmarks.stage import BenchmarkStage
 
@@ -158,12 +159,14 @@ def measure_independent_skin(stage: BenchmarkStage) -> None:
     """Measure error, coverage and valid fraction by skin type over table sizes and optics."""
     skins = load_skins()
     side = 96 if stage.toy else 2048
+    sizes = (16, 128) if stage.toy else (8, 16, 32, 128)
     for camera, illuminant in JUDGED_CAMERAS:
         rgb = noisy_colors(skins, camera, illuminant)
         image = rgb[np.arange(side * side) % len(rgb)].reshape(side, side, 3).astype(np.float32)
         variance = np.square(CHANNEL_NOISE * image)
+        seconds: dict[tuple[str, bool], float] = {}
         for exact in (True, False):
-            for size in (16, 128) if stage.toy else (8, 16, 32, 128):
+            for size in sizes:
                 table = color_table.build(
                     camera, illuminant, size=size, anisotropy=ANISOTROPY_SKIN, exact_optics=exact
                 )
@@ -173,12 +176,31 @@ def measure_independent_skin(stage: BenchmarkStage) -> None:
                 by_type, off = accuracy_by_type(table, skins, rgb)
                 least = min(one.valid for one in by_type.values())
                 covered = {f"within 68 %, {k}": round(v.within_68, 2) for k, v in by_type.items()}
+                optics = "exact" if exact else "unknown"
                 stage.add(
-                    {"camera": camera, "optics": "exact" if exact else "unknown", "table": size},
+                    {"camera": camera, "optics": optics, "type": "all", "table": size},
                     timing,
                     median_error(100.0 * off),
                     {"least valid share": round(least, 3), **covered},
                 )
+                for index, name in enumerate(SKIN_TYPES):
+                    stage.add(
+                        {"camera": camera, "optics": optics, "type": name, "table": size},
+                        timing,
+                        median_error(100.0 * off[skins.skin_type == index]),
+                    )
+                if size == sizes[-1]:
+                    for shading, known in (("known", 1.0), ("free", None)):
+                        # processor time: other programs do not change the ratio
+                        seconds[shading, exact] = measure_processor_seconds(
+                            lambda: chromophores.invert(
+                                image, table, shading=known, variance=variance
+                            ),
+                            3,
+                        )
+        for shading in ("known", "free"):
+            with_optics, without = (seconds[shading, exact] for exact in (False, True))
+            stage.limits["time", side, shading, camera] = with_optics / without
         for name, one in by_type.items():
             stage.limits["valid", name, camera] = one.valid
             stage.limits["bias", name, camera] = abs(one.bias - 1.0)

@@ -1,6 +1,7 @@
 """Benchmark of effects that scenes omit: change of pixels over noise, and saved time."""
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterator
 from functools import partial
 from typing import Any
@@ -11,12 +12,13 @@ from capture.rig import load_rig
 from rigsim.fiber.probe_tissue import HomogeneousTissue
 from rigsim.needs.face import LATERAL_EFFECT
 from rigsim.needs.probe import COLOR_EFFECT, CROSSTALK_EFFECT, DARK_CURRENT_EFFECT, WINGS_EFFECT
+from rigsim.needs.tissue import TISSUE_RULES
 from rigsim.scenes.probe.scene import MAX_USUAL_EXPOSURE_S, ProbeScene
 from rigsim.world.suction import HeadState
 from skinrig.arrays import Float32Array
 from skinrig.benchmarks.measurement import measure_processor_time
 from skinrig.benchmarks.results import ErrorEstimate, Knobs, Timing
-from skinrig.benchmarks.simulation import omission_cases
+from skinrig.benchmarks.simulation import omission_cases, tissue_omissions
 from skinrig.benchmarks.simulation.omission_cases import ComparedScene, EffectComparison
 from skinrig.benchmarks.stage import BenchmarkStage
 
@@ -29,6 +31,8 @@ incidence (cos 88 degrees)."""
 DOME_PX = 100
 GRADIENT_PX = 128
 N_DOME_LIGHTS = 3
+N_PEOPLE = 20
+N_TOY_PEOPLE = 2
 
 
 def measure_omissions(stage: BenchmarkStage) -> None:
@@ -49,6 +53,8 @@ def measure_omissions(stage: BenchmarkStage) -> None:
         stage.add(knobs, timing, ErrorEstimate.nonnegative(one.found, one.change_stderr), also)
         if one.verdict == "negligible":
             stage.limits["change", one.rig, one.subject, one.effect] = one.max_change
+    for rig in tissue_omissions.RIG_NAMES:
+        _add_tissue(stage, rig)
     built = [one for one in found if one.verdict == "built"]
     predicted = [
         one
@@ -60,6 +66,24 @@ def measure_omissions(stage: BenchmarkStage) -> None:
         default=0.0,
     )
     stage.reference_error = max(one.change_stderr for one in found)
+
+
+def _add_tissue(stage: BenchmarkStage, rig: str) -> None:
+    """Add scenes of drawn people with the tissue that the rules select, against all of it."""
+    count = N_TOY_PEOPLE if stage.toy else N_PEOPLE
+    found = list(tissue_omissions.compare_scenes(rig, count))
+    omitted = Counter(name for one in found for name in one.omitted)
+    knobs: Knobs = {"rig": rig, "subject": f"{count} people"}
+    knobs |= {"effect": "tissue", "verdict": "by the rules"}
+    growth = max(one.error_growth for one in found)
+    also: Knobs = {f"omitted, {rule.name}": omitted[rule.name] for rule in TISSUE_RULES}
+    also["seconds saved"] = sum(one.all_s - one.selected_s for one in found)
+    also["growth of a pixel's error"] = growth
+    spent_s = sum(one.selected_s for one in found)
+    timing = Timing.single(spent_s, no_memory_reason=NO_MEMORY_REASON)
+    change = max(one.change for one in found)
+    stage.add(knobs, timing, ErrorEstimate.nonnegative(change, 0.0), also)
+    stage.limits["growth", rig, count] = growth
 
 
 def _changes_more_than_effect(comparison: EffectComparison) -> bool:
