@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 
@@ -165,9 +165,10 @@ def _compare_probe(person: PersonSkin, power: float) -> TissueComparison:
     """
     del power
     rig = load_rig("probe")
-    scene = ProbeScene(rig, SkinTissue(person))
-    omitted, tissues = _negligible(scene.needs), (scene.tissue, scene.profiles.tissue)
-    have, lack = (predict_profiles(rig, scene.tissue, one.person.tissue) for one in tissues)
+    skin = SkinTissue(person)
+    scene = ProbeScene(rig, skin)
+    omitted, tissues = _negligible(scene.needs), (skin, cast(SkinTissue, scene.profiles.tissue))
+    have, lack = (predict_profiles(rig, skin, one.person.tissue) for one in tissues)
     images = fiber_unit_images(scene.build, rig.views[0])
     sigma = float(PixelNoise.of(scene.sensor()).sigma(1.0)) / equivalent_pixels(images) ** 0.5
     all_s, selected_s = (
