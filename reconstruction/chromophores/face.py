@@ -198,6 +198,8 @@ class FaceEstimate:
     """None where it was not fitted."""
     spots: BoolArray
     """Of the pixels' shape: pixels that may not be usual skin."""
+    alone_shading: Float32Array
+    """Shading where each pixel is estimated alone."""
 
 
 def estimate_face(
@@ -231,13 +233,14 @@ def estimate_face(
         face = fit_with_white_reference(rgb, table, **errors)
     by_face = known(face=face)
     if face is None:
-        return FaceEstimate(with_optics(by_face), by_face, None, np.zeros(rgb.shape[:-1], bool))
+        none = np.zeros(rgb.shape[:-1], bool)
+        return FaceEstimate(with_optics(by_face), by_face, None, none, by_face.shading)
     alone = known()
     spots = dark_spots.is_lighter_than_face_prior(by_face, alone)
     if rgb.ndim == 3:
         spots |= dark_spots.is_locally_dark(rgb, variance=variance)
     found = dark_spots.average_hypotheses(by_face, alone, spots)
-    return FaceEstimate(with_optics(found), by_face, face, spots)
+    return FaceEstimate(with_optics(found), by_face, face, spots, alone.shading)
 
 
 def _sampled(

@@ -64,6 +64,9 @@ class ChromophorePosterior:
     """Volume fraction of blood in the dermis: the median; NaN where the input is unusable."""
     shading: Float32Array
     """Light on the pixel over that on a white reference: exponential of the mean logarithm."""
+    log_shading_sd: Float32Array
+    """Standard deviation of the logarithm of `shading`, by noise and by the chromophores that the
+    color leaves open; without unknown optics."""
     stderr_melanin: Float32Array
     """68 % credible half-width: distance from `melanin` that contains 68.3 % of the probability;
     the standard deviation for a normal distribution."""
@@ -331,6 +334,42 @@ def add_optics_errors(
         outside=fitted.outside,
         valid=usable & np.isfinite(found.hemoglobin) & ~fitted.outside,
     )
+
+
+def propagate_optics_to_shading(
+    table: ColorTable, melanin: float, hemoglobin: float, *, log_light_sd: float
+) -> float:
+    """Return the standard error of log shading by optics that are common to a face's pixels.
+
+    Parameters
+    ----------
+    table
+        Table with its covariance by unknown optics; without one, the error is 0.
+    melanin, hemoglobin
+        Typical volume fractions of the face.
+    log_light_sd
+        Standard deviation of the prior of log shading.
+
+    Examples
+    --------
+    >>> from model import color_table
+    >>> table = color_table.build("Nikon 5100 (NPL)", "D65")
+    >>> light = propagate_optics_to_shading(table, 0.01, 0.015, log_light_sd=0.6)
+    >>> dark = propagate_optics_to_shading(table, 0.1, 0.015, log_light_sd=0.6)
+    >>> 0.05 < light < dark
+    True
+    """
+    if table.optics_covariance is None:
+        return 0.0
+    c_m, c_hd = np.array([melanin]), np.array([hemoglobin])
+    a = np.clip(np.cbrt(c_m / table.c_m_max), MIN_AXIS_FRACTION, 1.0)
+    b = np.clip(np.cbrt(c_hd / table.c_hd_max), MIN_AXIS_FRACTION, 1.0)
+    color, by_a, by_b = evaluate_table(table, a, b)
+    slopes = np.stack([by_a / color, by_b / color], axis=-1)[0]
+    # log color = log light + slopes @ axes + error: the light's gain in a linear estimate
+    total = log_light_sd**2 + AXIS_SD**2 * slopes @ slopes.T + MIN_COLOR_ERROR**2 * np.eye(3)
+    gain = log_light_sd**2 * np.linalg.inv(total).sum(axis=0)
+    return float(np.sqrt(max(gain @ table.log_covariance(c_m, c_hd)[0] @ gain, 0.0)))
 
 
 def errors_within_face(stderr: FloatArray, optics_stderr: FloatArray) -> FloatArray:

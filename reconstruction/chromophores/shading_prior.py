@@ -24,6 +24,9 @@ CONTAMINATION_PROBABILITY = 0.01
 """Probability that a pixel does not follow the distribution ..."""
 CONTAMINATION_LOG_SIGMA = 1.5
 """... but a normal one with this standard deviation of log shading and the same mean."""
+MAX_OFFSET_PIXELS = 20_000
+"""Pixels from which a common error of the shading is estimated."""
+_OFFSET_STEP = 0.005
 _LOG_LOW, _LOG_HIGH, _LOG_STEP = -8.0, 5.0, 0.05
 MIN_SOFTNESS = _LOG_STEP
 """Minimum softness: the width of the bins and of the nodes' spacing."""
@@ -90,6 +93,35 @@ class ShadingPrior:
         return ShadingPrior(
             self.low + reach[0] * self.step, self.step, np.maximum(wide, np.finfo(float).tiny)
         )
+
+    def find_offset(self, log_shading: ArrayLike) -> float:
+        """Return the most likely error common to many pixels' log shading.
+
+        Parameters
+        ----------
+        log_shading
+            (n,), finite; at least one. More than `MAX_OFFSET_PIXELS` are thinned evenly.
+
+        Returns
+        -------
+        float
+            Difference of the given log shading from pixels of this distribution, -1 to 1.
+
+        Examples
+        --------
+        >>> prior = lognormal_prior(0.7, 0.3)
+        >>> pixels = np.repeat(prior.nodes, np.rint(1e3 * prior.density * prior.step).astype(int))
+        >>> round(prior.find_offset(pixels + 0.2), 2)
+        0.2
+        """
+        given = np.asarray(log_shading, np.float64).ravel()
+        Checks(ShadingPriorError).require(given.size, "log_shading", "nothing", "pixels; add some")
+        given = given[:: -(-given.size // MAX_OFFSET_PIXELS)]
+        offsets = np.arange(-1.0, 1.0 + 0.5 * _OFFSET_STEP, _OFFSET_STEP)
+        likelihood = np.log(self.density)
+        # one offset at a time: the array of all pairs is large
+        total = [np.interp(given - offset, self.nodes, likelihood).sum() for offset in offsets]
+        return float(offsets[int(np.argmax(total))])
 
 
 def lognormal_prior(center: float, log_sd: float) -> ShadingPrior:

@@ -13,7 +13,7 @@ import numpy as np
 
 from capture.calibration.color import ColorMatrix, chart_reference, fit_matrix, neutral_white
 from model import skin_tone, spectra
-from reconstruction.pipeline.flash.tone import ToneCamera
+from reconstruction.pipeline.skin_tone.maps import ToneCamera
 from rigsim.subject.pigment import MELANIN_PRESETS, typical_blood
 from rigsim.subject.skin_tone import typology_angle_deg
 from rigsim.targets.flat import chart_reflectances
