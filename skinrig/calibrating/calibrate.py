@@ -119,6 +119,7 @@ class _Frames:
         self._targets = targets
         self.rig = targets.rig
         self.imported = targets.imported
+        self.developed = any(s.manifest.has_developed_images for s in targets.sessions)
         serials = sorted(targets.serials)
         if len(serials) != 1:
             some = ", ".join(serials[:3]) + (", ..." if len(serials) > 3 else "")
@@ -151,16 +152,16 @@ class _Frames:
         darks = [
             image.rgb
             for image in _linear(
-                [(r, session.read(r)) for r, session in found], imported=self.imported
+                [(r, session.read(r)) for r, session in found], developed=self.developed
             )
         ]
         return np.mean(darks, axis=0, dtype=np.float32) if darks else 0.0
 
 
-def _linear(shots: Shots, *, imported: bool = False) -> list[raw.LinearImage]:
+def _linear(shots: Shots, *, developed: bool = False) -> list[raw.LinearImage]:
     """Return linear camera RGB of frames at half the sensor's resolution."""
-    # an imported image has one cell per pixel
-    demosaic: raw.Demosaic = "superpixel" if imported else "centered"
+    # a developed image has one cell per pixel
+    demosaic: raw.Demosaic = "superpixel" if developed else "centered"
     return [raw.linear_rgb(frame, demosaic=demosaic) for _, frame in shots]
 
 
@@ -208,7 +209,7 @@ WHITE_REFERENCE_REFLECTANCE = 0.99
 def _color(frames: _Frames) -> store.Calibration:
     dark = frames.dark_level()
     shots = frames.require_frames("chart", polarizer="crossed")
-    linear = _linear(shots, imported=frames.imported)
+    linear = _linear(shots, developed=frames.developed)
     image = np.mean([each.rgb - dark for each in linear], axis=0)
     valid = np.logical_and.reduce([each.valid for each in linear])
     centers = chart.find_chart(image)

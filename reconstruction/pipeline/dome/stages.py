@@ -33,7 +33,6 @@ from reconstruction.pipeline.dome.registration import register_mesh
 from reconstruction.pipeline.hold_out import HoldOutError
 from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.skin_tone import maps as tone
-from reconstruction.pipeline.skin_tone.maps import SkinReflectance
 from reconstruction.scan import mesh as scan_mesh
 from reconstruction.scan.mesh import RefinedScan
 from reconstruction.surface import errors as surface_errors
@@ -102,15 +101,11 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
             refined,
             partial(refine_normals, dome),
         ),
-        stage("skin reflectance", "r_d", tone.REFLECTANCE, _skin_reflectance),
+        stage("skin reflectance", "r_d", tone.REFLECTANCE, tone.reflectance_of_albedo),
         stage("erythema", tone.REFLECTANCE, "erythema_index", tone.erythema_map),
         # cameras of a dome are not calibrated by a chart: their nominal sensitivities are used
         *tone.tone_stages(stage, (None, None), refused=refused, **spectra),
     ]
-
-
-def _skin_reflectance(r_d: SkinMap) -> SkinReflectance:
-    return SkinReflectance.of_map(r_d).with_common_errors()
 
 
 def _dome(inputs: Inputs) -> CalibratedDome:

@@ -208,8 +208,7 @@ def _frames(rig: FlashRig) -> Mapping[str, Any]:
 def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], FlashImage]:
     """Return a function that averages frames of one polarizer state and subtracts dark frames."""
     session = rig.session
-    # an imported image has one cell per pixel; a sensor mosaic has one per 2 x 2 sites
-    demosaic: raw.Demosaic = "superpixel" if rig.imported else "centered"
+    demosaic: raw.Demosaic = "superpixel" if session.manifest.has_developed_images else "centered"
     gain, read_noise = _noise(rig.sensor)
 
     def linear_light(records: Sequence[FrameRecord]) -> list[raw.LinearImage]:

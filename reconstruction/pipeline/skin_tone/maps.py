@@ -13,7 +13,7 @@ import numpy as np
 
 from capture.calibration.color import ColorMatrix
 from capture.calibration.color.colorimetry import delta_e_2000, xyz_to_linear_srgb
-from model import skin_tone, spectra
+from model import fresnel, skin_tone, spectra
 from model.skin import MAP_UNITS, SkinMap
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray, UInt8Array
 from reconstruction.pipeline.graph import PipelineStage
@@ -135,6 +135,24 @@ class SkinReflectance:
             self.log_variance + log_variance,
             self.valid & valid,
         )
+
+
+def reflectance_of_albedo(r_d: SkinMap) -> SkinReflectance:
+    """Return reflectance at normal incidence, all light collected, as instruments measure it.
+
+    Parameters
+    ----------
+    r_d
+        Diffuse albedo of the dome: a factor between the transmittances of the boundary, into the
+        skin and out of it (Weyrich et al. 2006, doi:10.1145/1141911.1141987, eq. 6). Its errors by
+        normals and positions scale the channels together.
+    """
+    entering = 1.0 - fresnel.normal_reflectance(fresnel.ETA_SKIN)
+    leaving = 1.0 - fresnel.diffuse_external(fresnel.ETA_SKIN)
+    scale = np.float32(entering * leaving)
+    error = None if r_d.stderr is None else scale * r_d.stderr
+    scaled = replace(r_d, values=scale * r_d.values, stderr=error)
+    return SkinReflectance.of_map(scaled).with_common_errors()
 
 
 @dataclass(frozen=True, slots=True)
