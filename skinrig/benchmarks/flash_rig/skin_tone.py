@@ -2,7 +2,8 @@
 
 A chart calibrates the flash rig's camera. Those of the dome have the lights' white alone, and their
 albedo has an error that the channels share. Skin is that of the simulator with varied properties,
-on which no color matrix and no correction was fitted. Cameras differ from their nominal sensitivities: channels are shifted and widened.
+on which no color matrix and no correction was fitted. Cameras differ from their nominal
+sensitivities: channels are shifted and widened.
 """
 
 from collections.abc import Sequence
