@@ -59,6 +59,9 @@ def estimate_face_light(
     shading is averaged in windows of 3 x 3 pixels as a linear function of log brightness (He, Sun,
     Tang 2013, doi:10.1109/TPAMI.2012.213), which keeps the edges of shadows and of pigment.
 
+    The level by brightness is that of the measured distribution of shading. It is the mean of two
+    fits, to the light's pattern by color and to that of skin of one color.
+
     The position of the face limits how well brightness determines the level:
     `reconstruction.chromophores.shading_prior.LOG_SHADING_SOFTNESS`.
     """
@@ -84,7 +87,10 @@ def estimate_face_light(
             usual = shading_prior.face_prior(softness=shading_prior.MIN_SOFTNESS)
             by_brightness = shading_prior.LOG_SHADING_SOFTNESS
             weight = by_color**2 / (by_color**2 + by_brightness**2)
-            log_light -= weight * usual.find_offset(log_light[valid])
+            # where color misses pigment, its pattern is too flat and that of brightness too wide
+            even_skin = brightness + np.median((log_light - brightness)[valid])
+            offsets = [usual.find_offset(pattern[valid]) for pattern in (log_light, even_skin)]
+            log_light -= weight * float(np.mean(offsets))
             common = float(np.sqrt(weight)) * by_brightness
     return FaceLight(
         np.where(valid, log_light, 0.0).astype(np.float32),
