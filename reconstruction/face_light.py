@@ -1,7 +1,7 @@
 """Light on each pixel of a face, which turns diffuse light into the reflectance of skin.
 
-Color tells how the light varies over a face, but its level only as well as the tissue's optics are
-known. Brightness tells the level: skin that faces the lamps gets as much light as a white
+Color determines how the light varies over a face, but its level only as well as the tissue's optics
+are known. Brightness determines the level: skin that faces the lamps gets as much light as a white
 reference in its place. Both are averaged by their uncertainties.
 """
 

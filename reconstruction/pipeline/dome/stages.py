@@ -101,8 +101,8 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
             refined,
             partial(refine_normals, dome),
         ),
-        stage("skin reflectance", "r_d", tone.REFLECTANCE, tone.reflectance_of_albedo),
-        stage("erythema", tone.REFLECTANCE, "erythema_index", tone.erythema_map),
+        stage("skin reflectance", "r_d", tone.REFLECTANCE_PRODUCT, tone.reflectance_of_albedo),
+        stage("erythema", tone.REFLECTANCE_PRODUCT, "erythema_index", tone.erythema_map),
         # cameras of a dome are not calibrated by a chart: their nominal sensitivities are used
         *tone.tone_stages(stage, (None, None), refused=refused, **spectra),
     ]

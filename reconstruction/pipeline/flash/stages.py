@@ -107,7 +107,9 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
         stage("chromophores", "diffuse", of_skin, partial(_chromophores, rig), **by_color),
         stage("tsumura", "diffuse", "tsumura_melanin tsumura_hemoglobin", _tsumura),
         stage("pictures", both, shown, partial(_pictures, rig), **table),
-        stage("skin reflectance", "diffuse face_light", tone.REFLECTANCE, _skin_reflectance),
+        stage(
+            "skin reflectance", "diffuse face_light", tone.REFLECTANCE_PRODUCT, _skin_reflectance
+        ),
         stage("erythema", "diffuse", "erythema_index", _erythema),
         *tone.tone_stages(
             stage, (rig.color, rig.neutral), refused="" if rig.has_white else NEEDS_WHITE, **table

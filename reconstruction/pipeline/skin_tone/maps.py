@@ -37,7 +37,7 @@ MAP_NAMES: Final = (
     "melanin_index",
 )
 """Names of the maps."""
-REFLECTANCE: Final = "skin_reflectance"
+REFLECTANCE_PRODUCT: Final = "skin_reflectance"
 """Name of the product that the stages read."""
 MONK_STEP: Final = 0.5
 """Step of L*, a* and b* to which colors are rounded before the nearest Monk tone: at most 0.43 off
@@ -71,10 +71,10 @@ def tone_stages(
     tone_camera = partial(ToneCamera.of, camera, illuminant, *color)
     both, tones = "lab lab_covariance", "monk monk_low monk_high"
     return [
-        stage("lab", REFLECTANCE, both, partial(lab_map, tone_camera), refused, **table),
+        stage("lab", REFLECTANCE_PRODUCT, both, partial(lab_map, tone_camera), refused, **table),
         stage("ita", both, "ita", ita_map),
         stage("monk", both, tones, monk_maps),
-        stage("melanin_index", REFLECTANCE, "melanin_index", melanin_index_map, refused),
+        stage("melanin_index", REFLECTANCE_PRODUCT, "melanin_index", melanin_index_map, refused),
     ]
 
 

@@ -115,7 +115,7 @@ def run(want, *, refused="", diffuse=None):
     """Run the stages of tone after a stage that yields reflectance."""
     stage = graph.make_stage_factory({"revision": 1})
     given = SkinReflectance.of_map(diffuse or skin_image())
-    source = stage("source", "", tone.REFLECTANCE, lambda: given)
+    source = stage("source", "", tone.REFLECTANCE_PRODUCT, lambda: given)
     made = tone.tone_stages(stage, (None, None), refused=refused, camera=NIKON, illuminant=LIGHT)
     return graph.run_stages([source, *made], want)
 
