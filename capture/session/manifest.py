@@ -104,6 +104,16 @@ class Manifest(Document):
     versions: Mapping[str, str] = field(default_factory=dict)
     extra: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def has_developed_images(self) -> bool:
+        """Whether imported photographs are developed images, not the mosaic of a sensor.
+
+        A developed image has one cell of 2 x 2 equal sites per pixel.
+        """
+        listed = self.extra.get("photographs", [])
+        photos = listed if isinstance(listed, list) else []
+        return any(photo.get("encoding") != "raw" for photo in photos if isinstance(photo, dict))
+
     def __post_init__(self) -> None:
         checks = FaultCollector("Session", SessionError)
         checks.check("id", self.id, is_id(self.id), ID_RULE)

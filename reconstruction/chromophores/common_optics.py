@@ -44,6 +44,8 @@ class CommonOptics:
     """Standard error of log melanin of the whole face."""
     log_blood_sd: float
     """Standard error of log blood of the whole face."""
+    log_light_sd: float
+    """Standard error of log light of the whole face."""
 
 
 def estimate_common_optics(
@@ -102,9 +104,7 @@ def estimate_common_optics(
         good &= check_mask(valid, good.shape)
     if table.optics_covariance is None or not good.any():
         return None
-    total = np.cumsum(prior.density)
-    light = float(np.interp(0.5 * total[-1], total, prior.nodes))
-    seen = np.median(np.log(colors[good], dtype=np.float64), axis=0) - light
+    seen = np.median(np.log(colors[good], dtype=np.float64), axis=0) - prior.median
 
     melanin, blood = (
         np.exp(np.arange(np.log(end * MIN_AXIS_FRACTION**3), np.log(end), LOG_FRACTION_STEP))
@@ -133,6 +133,13 @@ def estimate_common_optics(
         return float(np.sqrt((weight * np.square(log - mean)).sum()))
 
     error = (optics @ weighted)[..., 0]
+    # conditional mean and variance of the common light, given the chromophores
+    moved = common_light**2 * weighted[..., 0].sum(axis=-1)
+    left = common_light**2 - common_light**4 * np.linalg.inv(whole).sum(axis=(-1, -2))
+    variance = float((weight * (left + np.square(moved - (weight * moved).sum()))).sum())
     return CommonOptics(
-        np.asarray((weight[..., None] * error).sum(axis=(0, 1))), deviation(c_m), deviation(c_hd)
+        np.asarray((weight[..., None] * error).sum(axis=(0, 1))),
+        deviation(c_m),
+        deviation(c_hd),
+        float(np.sqrt(max(variance, 0.0))),
     )

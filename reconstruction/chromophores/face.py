@@ -192,8 +192,16 @@ class FaceEstimate:
     """None where it was not fitted."""
     spots: BoolArray
     """Of the pixels' shape: pixels that may not be usual skin."""
-    log_color: Float32Array
-    """(3,): common error of log color by the face's optics, which the estimates are without."""
+    common: CommonOptics | None
+    """Common error of the face's colors, which the estimates are without; None: exact optics."""
+    alone_shading: Float32Array
+    """Shading where each pixel is estimated alone."""
+
+    @property
+    def log_color(self) -> Float32Array:
+        """Common error of log color, (3,)."""
+        found = np.zeros(3) if self.common is None else self.common.log_color
+        return found.astype(np.float32)
 
 
 def estimate_face_optics(
@@ -211,11 +219,14 @@ def estimate_face_optics(
     CommonOptics or None
         See `reconstruction.chromophores.common_optics.estimate_common_optics`.
     """
+    # the median light is known for a whole face, not for a part of it
+    known = has_white and np.count_nonzero(is_usable_color(rgb)) >= MIN_FACE_PIXELS
+    usual = shading_prior.face_prior(softness=shading_prior.MIN_SOFTNESS) if known else prior
     return estimate_common_optics(
         rgb,
         table,
-        prior=prior,
-        common_light=shading_prior.LOG_SHADING_SOFTNESS if has_white else prior.sd,
+        prior=usual,
+        common_light=shading_prior.LOG_SHADING_SOFTNESS if known else prior.sd,
         common_color=color_errors.load_error_terms().transport,
     )
 
@@ -246,7 +257,7 @@ def estimate_face(
     exact, plain = with_exact_optics(table), rgb * factor
     known = partial(chromophore_posterior.estimate, plain, exact, prior=prior, **errors)
     face = fit_with_white_reference(plain, exact, **errors) if has_white else None
-    found = by_face = known(face=face)
+    found = by_face = alone = known(face=face)
     spots = np.zeros(rgb.shape[:-1], bool)
     if face is not None:
         alone = known()
@@ -258,7 +269,7 @@ def estimate_face(
         found = add_optics_errors(
             found, rgb, table, common, variance=variance, model_error=model_error
         )
-    return FaceEstimate(found, by_face, face, spots, log_color.astype(np.float32))
+    return FaceEstimate(found, by_face, face, spots, common, alone.shading)
 
 
 def _sampled(

@@ -54,6 +54,9 @@ class ChromophorePosterior:
     """Volume fraction of blood in the dermis: the median; NaN where the input is unusable."""
     shading: Float32Array
     """Light on the pixel over that on a white reference: exponential of the mean logarithm."""
+    log_shading_sd: Float32Array
+    """Standard deviation of the logarithm of `shading`, by noise and by the chromophores that the
+    color leaves open; without unknown optics."""
     stderr_melanin: Float32Array
     """68 % credible half-width: distance from `melanin` that contains 68.3 % of the probability;
     the standard deviation for a normal distribution."""

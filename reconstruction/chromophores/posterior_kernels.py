@@ -69,6 +69,7 @@ POSTERIOR_MAPS = (
     "stderr_melanin",
     "stderr_hemoglobin",
     "residual",
+    "log_shading_sd",
 )
 
 _MAX_NODES = (N_LINES - 1) * MIN_NODES + N_FINE
@@ -229,7 +230,8 @@ def _integrate_ridge(  # type: ignore[no-untyped-def]
 ):
     """Sum over melanin along the ridge, and over blood across it.
 
-    Returns the number of edges along melanin, the sum of log shadings, and bins per unit of blood.
+    Returns the number of edges along melanin, the sums of log shadings and of their squares, and
+    bins per unit of blood.
     """
     cost, slope, shade = ridge.cost, ridge.slope, ridge.log_shading
     blood, blood_slope = ridge.blood, ridge.blood_slope
@@ -245,7 +247,7 @@ def _integrate_ridge(  # type: ignore[no-untyped-def]
     each = max(MIN_NODES, N_FINE // live)
     count = 0
     total_a[0] = 0.0
-    mean_shade = 0.0
+    mean_shade = square_shade = 0.0
     for k in range(N_LINES - 1):
         if not between[k] < lowest + NEGLIGIBLE_COST:
             continue
@@ -286,10 +288,11 @@ def _integrate_ridge(  # type: ignore[no-untyped-def]
                         bins[m] += density * (min(stop, m + 1.0) - max(start, float64(m)))
                         m += 1
                 mean_shade += mass * t
+                square_shade += mass * t * t
             count += 1
             edges_a[count] = _volume(k, (f + 1.0) / each, end)
             total_a[count] = total_a[count - 1] + mass
-    return count, mean_shade, per_b
+    return count, mean_shade, square_shade, per_b
 
 
 @njit(
@@ -312,7 +315,7 @@ def _integrate_ridge(  # type: ignore[no-untyped-def]
             float64, 1
         ),  # -2 log probability of melanin at MELANIN_AXIS, 0 at the greatest
         readonly_array_type(float64, 1),  # of blood: see blood_cost
-        float32[:, ::1],  # maps (6, n): see MAPS
+        float32[:, ::1],  # maps (7, n): see POSTERIOR_MAPS
         int64,  # pixels a task
     ),
     **PIXEL_KERNEL_OPTIONS,
@@ -355,7 +358,7 @@ def integrate_posteriors(  # type: ignore[no-untyped-def]
         bins = np.empty(N_BINS)
         for n in range(task * block, min(pixels, (task + 1) * block)):
             if not usable[n]:
-                for m in range(6):
+                for m in range(len(POSTERIOR_MAPS)):
                     maps[m, n] = np.nan
                 continue
             d0, d1, d2 = float64(rgb[n, 0]), float64(rgb[n, 1]), float64(rgb[n, 2])
@@ -368,7 +371,7 @@ def integrate_posteriors(  # type: ignore[no-untyped-def]
             )
             sums = edges_a, total_a, bins
             blood_ends = b_low, b_high
-            count, mean_shade, per_b = _integrate_ridge(
+            count, mean_shade, square_shade, per_b = _integrate_ridge(
                 ridge,
                 cross_ridge,
                 between,
@@ -384,12 +387,15 @@ def integrate_posteriors(  # type: ignore[no-untyped-def]
                 edges_b[m + 1] = ends[1] * (b_low + (m + 1) / per_b) ** 3
                 total_b[m + 1] = total_b[m] + bins[m]
             if not total_a[count] > 0.0:  # the posterior is 0 along the whole ridge
-                for m in range(6):
+                for m in range(len(POSTERIOR_MAPS)):
                     maps[m, n] = np.nan
                 continue
             center, reach = _median_and_half_width(edges_a, total_a, count)
             maps[0, n], maps[3, n] = center, reach
             center, reach = _median_and_half_width(edges_b, total_b, N_BINS)
             maps[1, n], maps[4, n] = center, reach
-            maps[2, n] = math.exp(mean_shade / total_a[count])
+            mean_shade /= total_a[count]
+            maps[2, n] = math.exp(mean_shade)
             maps[5, n] = math.sqrt(color_lowest)
+            variance_shade = square_shade / total_a[count] - mean_shade * mean_shade
+            maps[6, n] = math.sqrt(max(variance_shade, 0.0))

@@ -70,6 +70,12 @@ class ShadingPrior:
         return float((self.nodes * self.density).sum() * self.step)
 
     @property
+    def median(self) -> float:
+        """Median of log shading."""
+        share = np.cumsum(self.density) - 0.5 * self.density
+        return float(np.interp(0.5 / self.step, share, self.nodes))
+
+    @property
     def sd(self) -> float:
         """Standard deviation of log shading."""
         return float(np.sqrt(((self.nodes - self.mean) ** 2 * self.density).sum() * self.step))

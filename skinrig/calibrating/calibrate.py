@@ -118,6 +118,8 @@ class _Frames:
     def __init__(self, targets: TargetSessions) -> None:
         self._targets = targets
         self.rig = targets.rig
+        self.imported = targets.imported
+        self.developed = any(s.manifest.has_developed_images for s in targets.sessions)
         serials = sorted(targets.serials)
         if len(serials) != 1:
             some = ", ".join(serials[:3]) + (", ..." if len(serials) > 3 else "")
@@ -152,13 +154,20 @@ class _Frames:
     def dark_level(self) -> Float32Array | float:
         """Return the mean dark signal above the black level, (h, w, 3); 0 without dark frames."""
         found = self._targets.frames("dark")
-        darks = [image.rgb for image in _linear([(r, session.read(r)) for r, session in found])]
+        darks = [
+            image.rgb
+            for image in _linear(
+                [(r, session.read(r)) for r, session in found], developed=self.developed
+            )
+        ]
         return np.mean(darks, axis=0, dtype=np.float32) if darks else 0.0
 
 
-def _linear(shots: Shots) -> list[raw.LinearImage]:
+def _linear(shots: Shots, *, developed: bool = False) -> list[raw.LinearImage]:
     """Return linear camera RGB of frames at half the sensor's resolution."""
-    return [raw.linear_rgb(frame, demosaic="centered") for _, frame in shots]
+    # a developed image has one cell per pixel
+    demosaic: raw.Demosaic = "superpixel" if developed else "centered"
+    return [raw.linear_rgb(frame, demosaic=demosaic) for _, frame in shots]
 
 
 def _sensor(frames: _Frames) -> store.Calibration:
@@ -225,7 +234,8 @@ WHITE_REFERENCE_REFLECTANCE = 0.99
 
 def _color(frames: _Frames) -> store.Calibration:
     dark = frames.dark_level()
-    linear = _linear(frames.require_frames("chart", polarizer="crossed"))
+    shots = frames.require_frames("chart", polarizer="crossed")
+    linear = _linear(shots, developed=frames.developed)
     image = np.mean([each.rgb - dark for each in linear], axis=0)
     valid = np.logical_and.reduce([each.valid for each in linear])
     centers = chart.find_chart(image)
@@ -239,7 +249,16 @@ def _color(frames: _Frames) -> store.Calibration:
         white=neutral.value,
         valid=patches.valid,
     )
-    return color.to_calibration(fit, neutral, **frames.about)
+    exposure = None
+    if frames.imported:
+        of_shots = {color.describe_exposure(record.settings) for record, _ in shots}
+        if len(of_shots) > 1:
+            raise CalibratingError(
+                f"chart photographs: got exposures {', '.join(sorted(of_shots))} s ISO, expected "
+                "one; import those of one exposure"
+            )
+        exposure = of_shots.pop()
+    return color.to_calibration(fit, neutral, exposure=exposure, **frames.about)
 
 
 def _polarization(frames: _Frames) -> store.Calibration:

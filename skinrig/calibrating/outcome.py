@@ -52,6 +52,11 @@ class TargetSessions:
         """Serial numbers of all cameras."""
         return {view.serial for session in self.sessions for view in session.rig.views}
 
+    @property
+    def imported(self) -> bool:
+        """Whether the frames are imported photographs."""
+        return any("photographs" in session.manifest.extra for session in self.sessions)
+
     def provenance(self) -> dict[str, Any]:
         """Return rig, source, date and inputs of the calibration."""
         return {

@@ -22,6 +22,7 @@ def import_photos(
     /,
     out: Out,
     rig: str | None = None,
+    target: Annotated[str | None, choice("chart")] = None,
     subject: str = "unnamed",
     consent: Consent = None,
     consent_expires: ConsentExpires = None,
@@ -37,6 +38,8 @@ def import_photos(
         Folder of photographs, or one file.
     rig
         Rig whose camera took the photographs, so that its calibrations apply; default: none.
+    target
+        Photographed target, a color chart in the light of the photographs; default: a subject.
     subject
         Pseudonym of the subject.
     """
@@ -46,14 +49,22 @@ def import_photos(
 
     console = Console(json)
     person = parse_subject(subject, consent, consent_expires)
-    done = bring_in(directory, out=out, rig=None if rig is None else load_rig(rig), subject=person)
+    done = bring_in(
+        directory,
+        out=out,
+        rig=None if rig is None else load_rig(rig),
+        kind="chart" if target else "subject",
+        subject=person,
+    )
     console.print_each("assumed", done.assumed)
     console.print_each("ignored", done.ignored)
     console.print_line(
         f"{done.path}: {format_count(done.frames, 'photograph')}, states {', '.join(done.states)}"
     )
     place = shell_quote(out)
-    if done.color_states:
+    if target:
+        after = f"calibrate color {place} --out calibration"
+    elif done.color_states:
         shown = "neutral" if "neutral" in done.color_states else done.color_states[0]
         state = "" if shown == "neutral" else f" --state {shown}"
         after = f"reconstruct {place} --maps melanin,hemoglobin --out appearance{state}"

@@ -308,7 +308,7 @@ def test_mixture_is_midway_and_contains_both(pair, errors, where):
         each = np.full(1, value, np.float32), np.full(1, error, np.float32)
         one, yes = np.ones(1, np.float32), np.ones(1, bool)
         return chromophore_posterior.ChromophorePosterior(
-            each[0], each[0], one, each[1], each[1], 0 * one, 0 * one, one, one, ~yes, yes
+            each[0], each[0], one, one, each[1], each[1], 0 * one, 0 * one, one, one, ~yes, yes
         )
 
     face, alone = (weighed(*each) for each in zip(pair, errors, strict=True))

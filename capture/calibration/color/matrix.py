@@ -1,5 +1,6 @@
 """Fit a camera matrix to the patches of a chart, with its Delta E."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, Unpack
 
@@ -24,6 +25,9 @@ from capture.calibration.record import (
 
 Method: TypeAlias = Literal["linear", "root_polynomial"]
 
+EXPOSURE_NOTE = "exposure_s_iso"
+"""Note of a calibration by photographs: exposure time in seconds times ISO speed."""
+EXPOSURE_UNKNOWN = "unknown"
 NEUTRAL_PATCHES = slice(18, 23)  # white to neutral 3.5; the black patch is too specular
 
 
@@ -202,8 +206,42 @@ def neutral_white(
     return Quantity(ratio.mean(axis=0), ratio.std(axis=0, ddof=1) / np.sqrt(use.sum()))
 
 
-def to_calibration(fit: ColorMatrix, white: Quantity, **about: Unpack[Provenance]) -> Calibration:
-    """Return a fit as a `Calibration` of kind "color" for one camera."""
+def describe_exposure(settings: Mapping[str, object]) -> str:
+    """Return exposure time times ISO speed of a photograph, or `EXPOSURE_UNKNOWN`.
+
+    Parameters
+    ----------
+    settings
+        "exposure_s" in seconds and "iso".
+
+    Examples
+    --------
+    >>> describe_exposure({"exposure_s": 0.01, "iso": 200}), describe_exposure({"iso": 200})
+    ('2', 'unknown')
+    """
+    found = settings.get("exposure_s"), settings.get("iso")
+    if None in found:
+        return EXPOSURE_UNKNOWN
+    return f"{float(str(found[0])) * float(str(found[1])):.6g}"
+
+
+def to_calibration(
+    fit: ColorMatrix, white: Quantity, *, exposure: str | None = None, **about: Unpack[Provenance]
+) -> Calibration:
+    """Return a fit as a `Calibration` of kind "color" for one camera.
+
+    Parameters
+    ----------
+    fit
+        Matrix of the chart.
+    white
+        Camera RGB of a white surface, from the chart.
+    exposure
+        `describe_exposure` of the photographs of the chart, whose white is then that of other
+        photographs; None: the rig's, which other calibrations describe.
+    about
+        Provenance.
+    """
     return make_single_device_calibration(
         "color",
         {
@@ -218,6 +256,7 @@ def to_calibration(fit: ColorMatrix, white: Quantity, **about: Unpack[Provenance
             "method": fit.method,
             "illuminant": fit.illuminant,
             "delta_e": "CIEDE2000, each patch held out of its fit",
+            **({} if exposure is None else {EXPOSURE_NOTE: exposure}),
         },
         **about,
     )

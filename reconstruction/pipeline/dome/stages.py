@@ -32,6 +32,7 @@ from reconstruction.pipeline.dome.motion import DomeHeadMotion, follow_head
 from reconstruction.pipeline.dome.registration import register_mesh
 from reconstruction.pipeline.hold_out import HoldOutError
 from reconstruction.pipeline.inputs import Inputs, InputsError
+from reconstruction.pipeline.skin_tone import maps as tone
 from reconstruction.scan import mesh as scan_mesh
 from reconstruction.scan.mesh import RefinedScan
 from reconstruction.surface import errors as surface_errors
@@ -54,7 +55,8 @@ TEXTURE_LIMITS: Final = (128, 2048)
 def map_names(rank: int = BASIS_RANK) -> tuple[str, ...]:
     """Return the names of the maps of a dome session."""
     first = ("position", "half_vector_normals", "normals", "r_d")
-    return (*first, *weight_names(rank), "lobe_residual", "normals_refined", "samples")
+    last = "lobe_residual", "normals_refined", "samples"
+    return (*first, *weight_names(rank), *last, *tone.MAP_NAMES)
 
 
 WEIGHT_NAMES = weight_names()
@@ -81,6 +83,8 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     seen, turned = "surface lumitexels texture", "surface lumitexels point_normals texture"
     lit, lobes = "lumitexels point_normals point_r_d", "basis weights basis_file"
     refined = f"normals_refined {weights} lobe_residual {BASIS_FILE}"
+    view, light = inputs.session.rig.views[0], inputs.session.rig.lights[0]
+    spectra = {"camera": view.spectral_sensitivity, "illuminant": light.illuminant}
     return [
         stage("surface", "", "surface", partial(_surface, inputs, dome)),
         stage("texture", "surface", f"texture position {MESH_FILE}", _texture),
@@ -97,6 +101,10 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
             refined,
             partial(refine_normals, dome),
         ),
+        stage("skin reflectance", "r_d", tone.REFLECTANCE_PRODUCT, tone.reflectance_of_albedo),
+        stage("erythema", tone.REFLECTANCE_PRODUCT, "erythema_index", tone.erythema_map),
+        # cameras of a dome are not calibrated by a chart: their nominal sensitivities are used
+        *tone.tone_stages(stage, (None, None), refused=refused, **spectra),
     ]
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from capture import raw
 from capture.calibration.color import ColorMatrix
+from capture.calibration.color.matrix import EXPOSURE_NOTE, EXPOSURE_UNKNOWN, describe_exposure
 from capture.calibration.color.matrix import from_calibration as color_matrix_from
 from capture.calibration.color.white import WhiteReference
 from capture.calibration.polarization import PolarizationCalibration
@@ -29,20 +30,24 @@ from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores.face import estimate_face
 from reconstruction.chromophores.pixel_checks import is_detectable
 from reconstruction.chromophores.shading_prior import ShadingPrior
+from reconstruction.face_light import FaceLight, estimate_face_light
 from reconstruction.pipeline import graph as stages
-from reconstruction.pipeline.flash import oxygenation, tone
+from reconstruction.pipeline.flash import oxygenation
 from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.masked_map import masked_map
+from reconstruction.pipeline.skin_tone import maps as tone
+from reconstruction.pipeline.skin_tone.maps import SkinReflectance
 
 STAGE_REVISION = 9
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
-MAP_NAMES = tuple(
-    "melanin melanin_optical_depth hemoglobin shading residual gamut_distance "
+MAP_NAMES = (
+    *"melanin melanin_optical_depth hemoglobin shading residual gamut_distance "
     "diffuse specular image specular_image "
-    "tsumura_melanin tsumura_hemoglobin melanin_noise_stderr hemoglobin_noise_stderr "
-    "lab ita monk monk_low monk_high erythema_index melanin_index "
-    "oxygenation oxygenation_noise_stderr".split()
+    "tsumura_melanin tsumura_hemoglobin melanin_noise_stderr hemoglobin_noise_stderr".split(),
+    *tone.MAP_NAMES,
+    "oxygenation",
+    "oxygenation_noise_stderr",
 )
 """Maps of a flash session."""
 
@@ -67,6 +72,8 @@ class FlashRig:
     color: ColorMatrix | None
     neutral: Float64Array | None
     """Camera RGB of a white surface that the color matrix was fitted with."""
+    chart_white: Float64Array | None
+    """Camera RGB of white in the light and exposure of photographs, by a photograph of a chart."""
     camera: str
     """Name of the spectral sensitivities of the color table."""
     illuminant: str
@@ -81,6 +88,11 @@ class FlashRig:
         """Whether the frames are imported photographs."""
         return "photographs" in self.session.manifest.extra
 
+    @property
+    def has_white(self) -> bool:
+        """Whether a white reference, or a chart in its place, fixes the brightness."""
+        return self.white is not None or self.chart_white is not None
+
 
 def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     """Return the stages of a flash session; see `graph.run_stages`."""
@@ -90,7 +102,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     which = {"state": inputs.state, "repeat": inputs.repeat}
     by_color = table | model_error.data_hash()
     of_skin = "melanin melanin_optical_depth hemoglobin shading residual gamut_distance"
-    of_skin += " melanin_noise_stderr hemoglobin_noise_stderr"
+    of_skin += " melanin_noise_stderr hemoglobin_noise_stderr face_light"
     both, shown = "diffuse specular", "image specular_image"
     return [
         stage("frames", "", "parallel crossed", partial(_frames, rig), **which),
@@ -98,8 +110,12 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
         stage("chromophores", "diffuse", of_skin, partial(_chromophores, rig), **by_color),
         stage("tsumura", "diffuse", "tsumura_melanin tsumura_hemoglobin", _tsumura),
         stage("pictures", both, shown, partial(_pictures, rig), **table),
+        stage(
+            "skin reflectance", "diffuse face_light", tone.REFLECTANCE_PRODUCT, _skin_reflectance
+        ),
+        stage("erythema", "diffuse", "erythema_index", _erythema),
         *tone.tone_stages(
-            stage, (rig.color, rig.neutral), has_white=rig.white is not None, **table
+            stage, (rig.color, rig.neutral), refused="" if rig.has_white else NEEDS_WHITE, **table
         ),
         oxygenation.oxygenation_stage(
             stage, rig.session, partial(_image_reader, rig), rig.white, which=which, **table
@@ -117,12 +133,18 @@ def load_flash_rig(inputs: Inputs) -> FlashRig:
         return inputs.load(kind, [view.serial], otherwise)
 
     sensor = load("sensor", "the frames' noise is that of their own noise profiles")
+    malus = load("polarization", "the polarizers are perfect")
+    matrix = load("color", "images show balanced camera RGB as if it were linear sRGB")
+    neutral = matrix.quantity(view.serial, "white_rgb").value if matrix else None
+    by_chart = None
     balance = "a white reference would fill 80 % of the range"
     if "photographs" in session.manifest.extra:
         balance = "white is the white balance recorded in the file"
+        if matrix is not None and neutral is not None and EXPOSURE_NOTE in matrix.notes:
+            by_chart = neutral * _exposure_over_chart(shots, matrix.notes[EXPOSURE_NOTE])
+            balance = "white is that of the chart, photographed in the face's place and light"
+            balance += " with the same aperture"
     white = load("white", f"the light is even and {balance}")
-    malus = load("polarization", "the polarizers are perfect")
-    matrix = load("color", "images show balanced camera RGB as if it were linear sRGB")
     illuminant = session.rig.lights[0].illuminant
     inputs.noted["color_table"] = {"camera": view.spectral_sensitivity, "illuminant": illuminant}
     return FlashRig(
@@ -131,10 +153,19 @@ def load_flash_rig(inputs: Inputs) -> FlashRig:
         WhiteReference.from_calibration(white, view.serial) if white else None,
         PolarizationCalibration.from_calibration(malus, view.serial) if malus else None,
         color_matrix_from(matrix, view.serial) if matrix else None,
-        matrix.quantity(view.serial, "white_rgb").value if matrix else None,
+        neutral,
+        by_chart if white is None else None,
         view.spectral_sensitivity,
         illuminant,
     )
+
+
+def _exposure_over_chart(shots: Sequence[FrameRecord], of_chart: str) -> float:
+    """Return the exposure of photographs over that of the chart; 1 where one is not recorded."""
+    own = describe_exposure(shots[0].settings) if shots else EXPOSURE_UNKNOWN
+    if EXPOSURE_UNKNOWN in (own, of_chart):
+        return 1.0
+    return float(own) / float(of_chart)
 
 
 def load_skin_colors(
@@ -185,8 +216,7 @@ def _frames(rig: FlashRig) -> Mapping[str, Any]:
 def _image_reader(rig: FlashRig) -> Callable[[Sequence[FrameRecord]], FlashImage]:
     """Return a function that averages frames of one polarizer state and subtracts dark frames."""
     session = rig.session
-    # an imported image has one cell per pixel; a sensor mosaic has one per 2 x 2 sites
-    demosaic: raw.Demosaic = "superpixel" if rig.imported else "centered"
+    demosaic: raw.Demosaic = "superpixel" if session.manifest.has_developed_images else "centered"
     gain, read_noise = _noise(rig.sensor)
 
     def linear_light(records: Sequence[FrameRecord]) -> list[raw.LinearImage]:
@@ -284,6 +314,12 @@ def _separate(
     }
 
 
+NEEDS_WHITE = (
+    "lab, ita, monk: got a session without a white reference, whose brightness is unknown; "
+    "expected a white calibration, or photographs with a color calibration; make one with "
+    "`skinrig calibrate white` or `skinrig calibrate color`, then give --calibration"
+)
+"""Reason for a refusal."""
 MIN_SIGNAL_SIGMAS = 5.0
 """Signal-to-noise ratio below which a pixel is background, not skin."""
 ASSUMED_WHITE_LEVEL = 0.8
@@ -291,6 +327,8 @@ ASSUMED_WHITE_LEVEL = 0.8
 
 
 def _assumed_white(rig: FlashRig) -> Float32Array:
+    if rig.chart_white is not None:  # as the diffuse light, twice that of one polarization
+        return np.asarray(2.0 * rig.chart_white, np.float32)
     record = rig.session.frames("subject", state=rig.inputs.state)[0]
     neutral = rig.session.read(record).neutral
     level = np.full(3, ASSUMED_WHITE_LEVEL)
@@ -311,8 +349,18 @@ def map_stderr(skin_map: SkinMap) -> Float32Array:
     return np.zeros_like(skin_map.values) if skin_map.stderr is None else skin_map.stderr
 
 
-def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap]:
-    has_white = rig.white is not None
+def _skin_reflectance(diffuse: SkinMap, face_light: FaceLight) -> SkinReflectance:
+    """Divide the diffuse light by the light on each pixel."""
+    light = face_light.log_light, face_light.log_variance, face_light.valid
+    return SkinReflectance.of_map(diffuse).in_light(*light)
+
+
+def _erythema(diffuse: SkinMap) -> SkinMap:
+    return tone.erythema_map(SkinReflectance.of_map(diffuse))
+
+
+def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap | FaceLight]:
+    has_white = rig.has_white
     table, prior = load_skin_colors(rig.camera, rig.illuminant, has_white=has_white)
     rgb = np.where(diffuse.mask[..., None], diffuse.values, np.nan)
     variance = np.square(map_stderr(diffuse))
@@ -358,6 +406,7 @@ def _chromophores(rig: FlashRig, diffuse: SkinMap) -> Mapping[str, SkinMap]:
     factor = np.float32(table.constants.melanin_depth_factor)
     presumed = of_melanin["melanin"]
     return {
+        "face_light": estimate_face_light(whole, rgb),
         **of_melanin,
         "melanin_optical_depth": masked_map(
             factor * presumed.values,

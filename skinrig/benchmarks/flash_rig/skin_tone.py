@@ -1,7 +1,9 @@
-"""Benchmark of the typology angle through cameras that a chart calibrated.
+"""Benchmark of the typology angle through cameras of the flash rig and of the dome.
 
-Skin is that of the simulator with varied properties, on which no color matrix and no correction was
-fitted. Cameras differ from their nominal sensitivities: channels are shifted and widened.
+A chart calibrates the flash rig's camera. Those of the dome have the lights' white alone, and their
+albedo has an error that the channels share. Skin is that of the simulator with varied properties,
+on which no color matrix and no correction was fitted. Cameras differ from their nominal
+sensitivities: channels are shifted and widened.
 """
 
 from collections.abc import Sequence
@@ -13,7 +15,8 @@ import numpy as np
 
 from capture.calibration.color import ColorMatrix, chart_reference, fit_matrix, neutral_white
 from model import skin_tone, spectra
-from reconstruction.pipeline.flash.tone import ToneCamera
+from model.skin import SkinMap
+from reconstruction.pipeline.skin_tone.maps import ToneCamera, reflectance_of_albedo
 from rigsim.subject.pigment import MELANIN_PRESETS, typical_blood
 from rigsim.subject.skin_tone import typology_angle_deg
 from rigsim.targets.flat import chart_reflectances
@@ -26,8 +29,13 @@ from skinrig.benchmarks.stage import BenchmarkStage
 from skinrig.evaluating.skin_bands import MelaninBand
 
 CHART_LIGHT: Final = "D55"
+DOME_LIGHT: Final = "LED-B3"
+DOME_ERROR_PERCENT: Final = (2.0, 0.5)
+"""Errors of the dome's albedo: common to the channels, and of each."""
 NOISE_PERCENT: Final = (0.2, 1.0)
 """Noise per channel: the mean of 25 pixels, and a pixel."""
+BOUNDARY_TRANSMITTANCE: Final = 0.89755
+"""Into smooth skin of index 1.4 at normal incidence times out of it, diffuse: 0.97222 * 0.92320."""
 CHART_NOISE: Final = 0.002
 CENTER_SD_NM: Final = 1.5
 """Standard deviation of the center of a channel, as in a batch of cameras."""
@@ -91,12 +99,52 @@ def measure_skin_tone(stage: BenchmarkStage) -> None:
             stage.add(knobs, timing, median_error(np.abs(found.error_deg)), extra)
             if noise == NOISE_PERCENT[0]:
                 area[camera] = found
+        add_dome(stage, camera, count, skin)
     for camera, found in area.items():
         mean = 100.0 * float(found.coverage().mean())
         stage.limits["error", camera] = float(found.medians(found.error_deg).max())
         stage.limits["low", camera] = stage.limits["high", camera] = mean
     first = area[spectra.camera_names()[0]]
     stage.measure_bands(partial(_error_of_band, first))
+
+
+def add_dome(stage: BenchmarkStage, camera: str, count: int, skin: SkinSample) -> None:
+    """Add the row of a camera in the dome."""
+    timing, found = stage.time(partial(measure_dome, camera, count, skin), repeats=1, memory=None)
+    extra: Knobs = {}
+    for name, median, inside in zip(
+        skin_tone.ITA_BANDS, found.medians(found.error_deg), found.coverage(), strict=True
+    ):
+        extra[f"median {name}"] = round(float(median), 2)
+        extra[f"coverage {name}, %"] = round(100.0 * float(inside))
+    knobs: Knobs = {"camera": f"{camera}, dome", "noise_percent": DOME_ERROR_PERCENT[1]}
+    stage.add(knobs, timing, median_error(np.abs(found.error_deg)), extra)
+
+
+def measure_dome(camera: str, count: int, skin: SkinSample) -> ToneErrors:
+    """Measure skin by its albedo in the dome, through cameras without a chart."""
+    rng = np.random.default_rng([_SEED, 3])
+    common, own = (percent / 100.0 for percent in DOME_ERROR_PERCENT)
+    conversion = ToneCamera.of(camera, DOME_LIGHT, None, None)
+    errors, stderrs = [], []
+    for _ in range(count):
+        exact = skin.reflectance @ draw_weights(camera, rng, light=DOME_LIGHT)
+        shared = 1.0 + common * rng.normal(size=(len(exact), 1))
+        # the albedo is a factor between the transmittances of the boundary
+        r_d = exact * shared * (1.0 + own * rng.normal(size=exact.shape)) / BOUNDARY_TRANSMITTANCE
+        stderr = np.hypot(common, own) * r_d
+        good = np.ones((len(r_d), 1), np.bool_)
+        albedo = SkinMap(
+            r_d[:, None].astype(np.float32), "1", stderr[:, None].astype(np.float32), good
+        )
+        given = reflectance_of_albedo(albedo)
+        lab, covariance = conversion.lab(
+            given.rgb[:, 0], given.variance[:, 0], given.log_variance[:, 0]
+        )
+        errors.append(skin_tone.ita(lab) - skin.ita_deg)
+        stderrs.append(skin_tone.ita_stderr(lab, covariance))
+    found = np.concatenate(errors)
+    return ToneErrors(found, np.concatenate(stderrs), np.tile(skin.band, count), found)
 
 
 def _error_of_band(found: ToneErrors, band: MelaninBand) -> ErrorEstimate:
@@ -185,17 +233,19 @@ def measure_cameras(
     )
 
 
-def draw_weights(camera: str, rng: np.random.Generator) -> Float64Array:
+def draw_weights(
+    camera: str, rng: np.random.Generator, *, light: str = CHART_LIGHT
+) -> Float64Array:
     """Draw a camera's band weights with shifted and widened channels, (31, 3)."""
     nm = np.arange(WAVELENGTH_NM[0], WAVELENGTH_NM[-1] + 1.0)
-    light = spectra.illuminant(CHART_LIGHT, nm)
+    power = spectra.illuminant(light, nm)
     nominal = spectra.camera_sensitivity(camera, nm)
     channels = []
     for channel, shift in enumerate(rng.normal(0.0, CENTER_SD_NM, 3)):
         center = float(np.average(nm, weights=np.abs(nominal[:, channel])))
         scale = 1.0 + WIDTH_SD * float(rng.normal())
         own = spectra.camera_sensitivity(camera, center + (nm - center - shift) / scale)
-        channels.append(own[:, channel] * light)
+        channels.append(own[:, channel] * power)
     hats = np.stack([np.interp(nm, WAVELENGTH_NM, row) for row in np.eye(WAVELENGTH_NM.size)])
     found = hats @ np.stack(channels, axis=1)
     return np.asarray(found / found.sum(axis=0))

@@ -117,7 +117,7 @@ def test_common_optics_widen_errors_and_keep_estimates(table):
     rgb = (0.7 * table.lookup([0.02, 0.1], 0.012)).astype(np.float32)
     known = {"variance": (0.003 * rgb) ** 2, "model_error": 1e-6 * np.eye(3)}
     alone = chromophore_posterior.estimate(rgb, exact, prior=prior, **known)
-    common = CommonOptics(np.zeros(3), 0.3, 0.2)
+    common = CommonOptics(np.zeros(3), 0.3, 0.2, 0.1)
     whole = add_optics_errors(alone, rgb, table, common, **known)
     np.testing.assert_array_equal(whole.melanin, alone.melanin)
     assert (whole.stderr_melanin > 2.0 * alone.stderr_melanin).any()

@@ -74,24 +74,27 @@ def _root(ratio):  # type: ignore[no-untyped-def]
 
 @njit(**PIXEL_KERNEL_OPTIONS)
 def fill_lab(  # type: ignore[no-untyped-def]
-    rgb, variance, white, matrices, coefficients, nodes, lab, covariance
+    rgb, variance, scaled, white, matrices, coefficients, nodes, lab, covariance
 ):
     """Fill Lab and its covariance, (n, 3) and (n, 3, 3).
 
-    Parameters: light (n, 3) in the matrix's camera RGB and its variance; white (3,) in it;
+    Parameters: light (n, 3) in the matrix's camera RGB and its variance; of the errors that scale
+    all channels together, the light that they scale (n, 3) and their relative variance (n,); white
+    (3,);
     the matrix, the variances of its elements, both (3, k), the map of its XYZ to XYZ under D65
     (3, 3) and that white (3,); the correction (7, 3); log Y (m,) and the covariances of the
     corrected log XYZ there (m, 3, 3).
     """
     matrix, matrix_variance, to_xyz, white_xyz = matrices
+    scaled_rgb, scale_variance = scaled
     log_y, log_covariance = nodes
     n, terms_count = rgb.shape[0], matrix.shape[1]
     for chunk in prange((n + CHUNK_PIXELS - 1) // CHUNK_PIXELS):
         terms, white_terms = np.empty(terms_count), np.empty(terms_count)
         slopes, by_terms = np.empty((terms_count, 3)), np.empty((3, 3))
         by_row, log_xyz = np.empty(3), np.empty(3)
-        change, by_input = np.empty((3, 3)), np.empty((3, 6))
-        inputs, to_lab = np.empty(6), np.empty((3, 3))
+        change, by_input = np.empty((3, 3)), np.empty((3, 7))
+        inputs, to_lab = np.empty(7), np.empty((3, 3))
         total = np.empty((3, 3))
         _fill_terms(white[0], white[1], white[2], white_terms, slopes)
         for i in range(chunk * CHUNK_PIXELS, min((chunk + 1) * CHUNK_PIXELS, n)):
@@ -103,7 +106,8 @@ def fill_lab(  # type: ignore[no-untyped-def]
                     by_terms[row, channel] = 0.0
                     for k in range(terms_count):
                         by_terms[row, channel] += matrix[row, k] * slopes[k, channel]
-            # d log XYZ by noise of the channels, then by errors of the matrix
+            inputs[6] = scale_variance[i]
+            # d log XYZ by noise of the channels, by errors of the matrix, and by a common factor
             for row in range(3):
                 value = 0.0
                 for k in range(terms_count):
@@ -111,6 +115,7 @@ def fill_lab(  # type: ignore[no-untyped-def]
                         value += to_xyz[row, other] * matrix[other, k] * terms[k]
                 value = max(value, MIN_RELATIVE_XYZ)
                 log_xyz[row] = math.log(value)
+                by_input[row, 6] = 0.0
                 for channel in range(3):
                     by_input[row, 3 + channel] = to_xyz[row, channel] / value
                     by_input[row, channel] = 0.0
@@ -118,6 +123,7 @@ def fill_lab(  # type: ignore[no-untyped-def]
                         by_input[row, channel] += (
                             to_xyz[row, other] * by_terms[other, channel] / value
                         )
+                    by_input[row, 6] += by_input[row, channel] * scaled_rgb[i, channel]
             _correct(log_xyz, coefficients, change)
             place = np.interp(log_xyz[1], log_y, np.arange(log_y.size) * 1.0)
             low = min(int(place), log_y.size - 2)
@@ -133,7 +139,7 @@ def fill_lab(  # type: ignore[no-untyped-def]
                 for b in range(3):
                     found = (1.0 - part) * log_covariance[low, a, b]
                     found += part * log_covariance[low + 1, a, b]
-                    for k in range(6):
+                    for k in range(7):
                         one = other_one = 0.0
                         for c in range(3):
                             one += change[a, c] * by_input[c, k]

@@ -25,7 +25,7 @@ from model.arrays import BoolArray, Float64Array
 from model.tissue_optics import uncertainty as optics_uncertainty
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from model.tissue_optics.uncertainty import COVARIANCE_NODES
-from reconstruction.pipeline.flash.tone_kernels import MIN_RELATIVE_XYZ
+from reconstruction.pipeline.skin_tone.kernels import MIN_RELATIVE_XYZ
 
 CENTER_SD_NM: Final = 1.5
 """Assumed standard deviation of the center of each channel between a camera and its nominal one."""

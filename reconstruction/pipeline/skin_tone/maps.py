@@ -1,4 +1,8 @@
-"""Maps of skin tone of the flash rig: Lab, typology angle, Monk tone, erythema, melanin index."""
+"""Maps of skin tone: Lab, typology angle, Monk tone, erythema and melanin index.
+
+All describe the skin itself, whatever its angle to the light: their input is the reflectance of
+skin, with shading removed.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -9,22 +13,32 @@ import numpy as np
 
 from capture.calibration.color import ColorMatrix
 from capture.calibration.color.colorimetry import delta_e_2000, xyz_to_linear_srgb
-from model import skin_tone, spectra
+from model import fresnel, skin_tone, spectra
 from model.skin import MAP_UNITS, SkinMap
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray, UInt8Array
-from reconstruction.pipeline.flash import tone_kernels
-from reconstruction.pipeline.flash.skin_color import SkinColorCorrection, skin_color_correction
 from reconstruction.pipeline.graph import PipelineStage
 from reconstruction.pipeline.masked_map import masked_map
+from reconstruction.pipeline.skin_tone import kernels
+from reconstruction.pipeline.skin_tone.chart_correction import (
+    SkinColorCorrection,
+    skin_color_correction,
+)
 
 SURFACE_REFLECTION: Final = skin_tone.sphere_specular()
 """Reflectance added to diffuse reflectance before Lab: the bands of the typology angle and the
 published colors of skin come from spheres that include the surface reflection (d/8)."""
-NEEDS_WHITE: Final = (
-    "lab, ita, monk: got a session without a white reference, whose brightness is unknown; "
-    "expected a white calibration; make one with `skinrig calibrate white`, then give --calibration"
+MAP_NAMES: Final = (
+    "lab",
+    "ita",
+    "monk",
+    "monk_low",
+    "monk_high",
+    "erythema_index",
+    "melanin_index",
 )
-"""Reason for a refusal."""
+"""Names of the maps."""
+REFLECTANCE_PRODUCT: Final = "skin_reflectance"
+"""Name of the product that the stages read."""
 MONK_STEP: Final = 0.5
 """Step of L*, a* and b* to which colors are rounded before the nearest Monk tone: at most 0.43 off
 in color difference."""
@@ -36,11 +50,11 @@ def tone_stages(
     stage: Callable[..., PipelineStage],
     color: tuple[ColorMatrix | None, Float64Array | None],
     *,
-    has_white: bool,
+    refused: str,
     camera: str,
     illuminant: str,
 ) -> list[PipelineStage]:
-    """Return the stages that make the maps of skin tone from the map `diffuse`.
+    """Return the stages that make the maps of skin tone from the product `skin_reflectance`.
 
     Parameters
     ----------
@@ -48,23 +62,97 @@ def tone_stages(
         Factory of stages, see `graph.make_stage_factory`.
     color
         Matrix of the color calibration, and the camera RGB of white that belongs to it; or None.
-    has_white
-        Whether a white reference fixes the brightness; without one all but the erythema index are
-        refused.
+    refused
+        Why brightness is unknown, so that all but the erythema index are refused; empty: known.
     camera, illuminant
         Names of spectra.
     """
     table = {"camera": camera, "illuminant": illuminant}
     tone_camera = partial(ToneCamera.of, camera, illuminant, *color)
-    refused = "" if has_white else NEEDS_WHITE
     both, tones = "lab lab_covariance", "monk monk_low monk_high"
     return [
-        stage("lab", "diffuse", both, partial(lab_map, tone_camera), refused, **table),
+        stage("lab", REFLECTANCE_PRODUCT, both, partial(lab_map, tone_camera), refused, **table),
         stage("ita", both, "ita", ita_map),
         stage("monk", both, tones, monk_maps),
-        stage("erythema", "diffuse", "erythema_index", erythema_map),
-        stage("melanin_index", "diffuse", "melanin_index", melanin_index_map, refused),
+        stage("melanin_index", REFLECTANCE_PRODUCT, "melanin_index", melanin_index_map, refused),
     ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SkinReflectance:
+    """Diffuse reflectance of skin in camera RGB, white = 1, with shading removed."""
+
+    rgb: Float32Array
+    """(H, W, 3); positive where valid."""
+    variance: Float32Array
+    """Variance of each channel by errors that the channels do not share."""
+    log_variance: Float32Array
+    """(H, W): relative variance by errors that scale the channels together."""
+    valid: BoolArray
+
+    @classmethod
+    def of_map(cls, reflectance: SkinMap) -> "SkinReflectance":
+        """Return a map's reflectance, whose errors are those of each channel.
+
+        Parameters
+        ----------
+        reflectance
+            Three channels with standard errors.
+        """
+        good = reflectance.mask & (reflectance.values > 0.0).all(axis=-1)
+        values = np.where(good[..., None], reflectance.values, np.float32(1.0))
+        error = np.zeros_like(values) if reflectance.stderr is None else reflectance.stderr
+        none = np.zeros(good.shape, np.float32)
+        return cls(values, np.square(np.where(good[..., None], error, 0.0)), none, good)
+
+    def with_common_errors(self) -> "SkinReflectance":
+        """Return the same with the smallest relative variance of the channels as a common one.
+
+        It suits errors that are not noise, such as those of normals and positions: they scale all
+        channels.
+        """
+        relative = self.variance / np.square(self.rgb)
+        common = relative.min(axis=-1)
+        own = (relative - common[..., None]) * np.square(self.rgb)
+        return replace(self, variance=own, log_variance=self.log_variance + common)
+
+    def in_light(
+        self, log_light: Float32Array, log_variance: Float32Array, valid: BoolArray
+    ) -> "SkinReflectance":
+        """Divide by the light on each pixel.
+
+        Parameters
+        ----------
+        log_light, log_variance
+            (H, W): logarithm of the light over that on a white reference, and its variance.
+        valid
+            Where the light is known.
+        """
+        light = np.exp(np.where(valid, log_light, 0.0))[..., None]
+        return SkinReflectance(
+            np.asarray(self.rgb / light, np.float32),
+            np.asarray(self.variance / np.square(light), np.float32),
+            self.log_variance + log_variance,
+            self.valid & valid,
+        )
+
+
+def reflectance_of_albedo(r_d: SkinMap) -> SkinReflectance:
+    """Return reflectance at normal incidence, all light collected, as instruments measure it.
+
+    Parameters
+    ----------
+    r_d
+        Diffuse albedo of the dome: a factor between the transmittances of the boundary, into the
+        skin and out of it (Weyrich et al. 2006, doi:10.1145/1141911.1141987, eq. 6). Its errors by
+        normals and positions scale the channels together.
+    """
+    entering = 1.0 - fresnel.normal_reflectance(fresnel.ETA_SKIN)
+    leaving = 1.0 - fresnel.diffuse_external(fresnel.ETA_SKIN)
+    scale = np.float32(entering * leaving)
+    error = None if r_d.stderr is None else scale * r_d.stderr
+    scaled = replace(r_d, values=scale * r_d.values, stderr=error)
+    return SkinReflectance.of_map(scaled).with_common_errors()
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,19 +185,23 @@ class ToneCamera:
         correction = skin_color_correction(camera, illuminant, method=matrix.method)
         return cls(correction, _without_misfit(matrix, correction.nominal, neutral), neutral)
 
-    def lab(self, rgb: FloatArray, variance: FloatArray) -> tuple[Float32Array, Float32Array]:
+    def lab(
+        self, rgb: FloatArray, variance: FloatArray, log_variance: FloatArray | float = 0.0
+    ) -> tuple[Float32Array, Float32Array]:
         """Return CIE L*a*b* of skin with the surface reflection, and its covariance.
 
         Parameters
         ----------
         rgb, variance
             (n, 3): diffuse reflectance in camera RGB, white = 1, and its variance.
+        log_variance
+            (n,) or one: relative variance by errors that scale the channels together.
 
         Returns
         -------
         lab : ndarray of float32, shape (n, 3)
         covariance : ndarray of float32, shape (n, 3, 3)
-            By noise and the white's error, the matrix, and the remaining error of the correction.
+            By these errors, the matrix, and the remaining error of the correction.
         """
         light = (rgb + SURFACE_REFLECTION) * self.neutral
         noise = variance * np.square(self.neutral)
@@ -117,9 +209,13 @@ class ToneCamera:
         adapted = to_xyz @ xyz_to_linear_srgb(np.eye(3), illuminant=self.matrix.illuminant).T
         found = np.empty(light.shape, np.float32)
         covariance = np.empty((*light.shape, 3), np.float32)
-        tone_kernels.fill_lab(
+        kernels.fill_lab(
             np.ascontiguousarray(light, np.float64),
             np.ascontiguousarray(noise, np.float64),
+            (
+                np.ascontiguousarray(rgb * self.neutral, np.float64),
+                np.array(np.broadcast_to(log_variance, len(light)), np.float64),
+            ),
             np.asarray(self.neutral, np.float64),
             (
                 np.ascontiguousarray(self.matrix.matrix),
@@ -157,18 +253,18 @@ class LabCovariance:
 
 
 def lab_map(
-    camera: Callable[[], ToneCamera], diffuse: SkinMap
+    camera: Callable[[], ToneCamera], skin_reflectance: SkinReflectance
 ) -> Mapping[str, SkinMap | LabCovariance]:
     """Return `lab` with its standard errors, and `lab_covariance`."""
-    good = diffuse.mask & (diffuse.values > 0.0).all(axis=-1)
-    rgb = diffuse.values[good]
-    stderr = np.zeros_like(rgb) if diffuse.stderr is None else diffuse.stderr[good]
-    found, covariance = camera().lab(rgb, np.square(stderr))
-    values = np.zeros(diffuse.values.shape, np.float32)
+    given, good = skin_reflectance, skin_reflectance.valid
+    found, covariance = camera().lab(
+        given.rgb[good], given.variance[good], given.log_variance[good]
+    )
+    values = np.zeros(given.rgb.shape, np.float32)
     whole = np.zeros((*values.shape, 3), np.float32)
     values[good], whole[good] = found, covariance
     error = np.sqrt(np.maximum(np.diagonal(whole, axis1=-2, axis2=-1), 0.0))
-    what = "CIE L*, a*, b* under D65 with the surface reflection that a sphere d/8 includes"
+    what = "CIE L*, a*, b* of skin under D65, surface reflection as in a sphere d/8 included"
     return {
         "lab": masked_map(values, error, good, MAP_UNITS["lab"], what),
         "lab_covariance": LabCovariance(whole),
@@ -182,7 +278,7 @@ def ita_map(lab: SkinMap, lab_covariance: LabCovariance) -> SkinMap:
     colors = lab.values[lab.mask]
     angle[lab.mask] = skin_tone.ita(colors)
     error[lab.mask] = skin_tone.ita_stderr(colors, lab_covariance.values[lab.mask])
-    what = "individual typology angle, degrees; a surface that is tilted from the light is darker"
+    what = "individual typology angle of skin, degrees"
     return masked_map(angle, error, lab.mask, MAP_UNITS["ita"], what)
 
 
@@ -240,35 +336,27 @@ def nearest_monk_tone(lab_color: FloatArray) -> UInt8Array:
     return np.asarray(tone.ravel()[index])
 
 
-def erythema_map(diffuse: SkinMap) -> SkinMap:
+def erythema_map(skin_reflectance: SkinReflectance) -> SkinMap:
     """Return the erythema index of the camera's red and green channels; shading cancels."""
-    values, error, good = _channels(diffuse)
-    found = skin_tone.erythema_index(values[..., 0], values[..., 1])
-    stderr = skin_tone.erythema_index_stderr(
-        values[..., 0], values[..., 1], error[..., 0], error[..., 1]
-    )
+    red, green, _ = np.moveaxis(skin_reflectance.rgb, -1, 0)
+    errors = np.moveaxis(np.sqrt(skin_reflectance.variance), -1, 0)
+    found = skin_tone.erythema_index(red, green)
+    stderr = skin_tone.erythema_index_stderr(red, green, errors[0], errors[1])
     what = f"100 log10(red / green), {_BANDS_NOTE}"
-    return masked_map(found, stderr, good, MAP_UNITS["erythema_index"], what)
+    return masked_map(found, stderr, skin_reflectance.valid, MAP_UNITS["erythema_index"], what)
 
 
-def melanin_index_map(diffuse: SkinMap) -> SkinMap:
+def melanin_index_map(skin_reflectance: SkinReflectance) -> SkinMap:
     """Return the melanin index of the camera's red channel."""
-    values, error, good = _channels(diffuse)
-    found = skin_tone.melanin_index(values[..., 0])
-    stderr = skin_tone.melanin_index_stderr(values[..., 0], error[..., 0])
+    red = skin_reflectance.rgb[..., 0]
+    variance = skin_reflectance.variance[..., 0] + np.square(red) * skin_reflectance.log_variance
+    found = skin_tone.melanin_index(red)
+    stderr = skin_tone.melanin_index_stderr(red, np.sqrt(variance))
     what = f"100 log10(1 / red), {_BANDS_NOTE}"
-    return masked_map(found, stderr, good, MAP_UNITS["melanin_index"], what)
+    return masked_map(found, stderr, skin_reflectance.valid, MAP_UNITS["melanin_index"], what)
 
 
 _BANDS_NOTE: Final = (
     "this camera's channels without surface reflection: not comparable with other cameras, nor "
     "with the narrow bands of instruments"
 )
-
-
-def _channels(diffuse: SkinMap) -> tuple[Float32Array, Float32Array, BoolArray]:
-    """Return channels, 1 where they are unknown, their standard errors and the known pixels."""
-    good = diffuse.mask & (diffuse.values > 0.0).all(axis=-1)
-    values = np.where(good[..., None], diffuse.values, np.float32(1.0))
-    error = np.zeros_like(values) if diffuse.stderr is None else diffuse.stderr
-    return values, error, good

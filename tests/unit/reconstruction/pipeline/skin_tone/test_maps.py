@@ -10,8 +10,8 @@ from capture.calibration.color.colorimetry import delta_e_2000
 from model import skin_tone, spectra
 from model.skin import SkinMap
 from reconstruction.pipeline import graph
-from reconstruction.pipeline.flash import tone
-from reconstruction.pipeline.flash.tone import ToneCamera
+from reconstruction.pipeline.skin_tone import maps as tone
+from reconstruction.pipeline.skin_tone.maps import SkinReflectance, ToneCamera
 from rigsim.subject.pigment import typical_blood
 from rigsim.targets.flat import chart_reflectances
 from rigsim.tissue.skin_layers import TissueProperties
@@ -111,28 +111,26 @@ def skin_image(side=24):
     return SkinMap(values, "1", 0.01 * values, valid)
 
 
-def run(want, *, has_white=True, diffuse=None):
+def run(want, *, refused="", diffuse=None):
     """Run the stages of tone after a stage that yields reflectance."""
     stage = graph.make_stage_factory({"revision": 1})
-    source = stage("source", "", "diffuse", lambda: diffuse or skin_image())
-    made = tone.tone_stages(
-        stage, (None, None), has_white=has_white, camera=NIKON, illuminant=LIGHT
-    )
+    given = SkinReflectance.of_map(diffuse or skin_image())
+    source = stage("source", "", tone.REFLECTANCE_PRODUCT, lambda: given)
+    made = tone.tone_stages(stage, (None, None), refused=refused, camera=NIKON, illuminant=LIGHT)
     return graph.run_stages([source, *made], want)
 
 
 def test_unasked_maps_are_left_out():
     outcome = run(["ita"])
     assert outcome.ran == ("source", "lab", "ita")
-    assert {name for name, _ in outcome.omitted} == {"monk", "erythema", "melanin_index"}
+    assert {name for name, _ in outcome.omitted} == {"monk", "melanin_index"}
     assert outcome.products["ita"].unit == "degree"
     assert not outcome.products["ita"].mask[:, 0].any()
 
 
-def test_lab_without_white_is_refused():
-    with pytest.raises(graph.StageError, match="without a white reference"):
-        run(["monk"], has_white=False)
-    assert run(["erythema_index"], has_white=False).ran == ("source", "erythema")
+def test_maps_of_unknown_brightness_are_refused():
+    with pytest.raises(graph.StageError, match="unknown brightness"):
+        run(["monk"], refused="unknown brightness")
 
 
 def test_monk_interval_contains_tone_and_widens():
@@ -167,21 +165,79 @@ def test_erythema_index_ignores_shading_and_masks_black():
     image = skin_image()
     values = image.values.copy()
     values[0, 1] = 0.0
-    index = tone.erythema_map(SkinMap(values, "1", image.stderr, image.valid))
+    given = SkinReflectance.of_map(SkinMap(values, "1", image.stderr, image.valid))
+    index = tone.erythema_map(given)
     known = index.values[index.mask]
     np.testing.assert_allclose(known, 100 * np.log10(1 / 0.66), atol=1e-3)
     np.testing.assert_allclose(
         index.stderr[index.mask], 100 / np.log(10) * 0.01 * 2**0.5, rtol=1e-4
     )
     assert not index.mask[0, 1]
-    melanin = tone.melanin_index_map(image)
+    melanin = tone.melanin_index_map(SkinReflectance.of_map(image))
     assert np.ptp(melanin.values[melanin.mask]) > 50.0  # shading does not cancel here
+
+
+def test_division_by_light_undoes_shading():
+    image = SkinReflectance.of_map(skin_image())
+    rows = np.log(image.rgb[..., 0])
+    known = np.ones(image.valid.shape, bool)
+    known[-1] = False
+    flat = image.in_light(rows, np.full_like(rows, 0.05**2), known)
+    assert np.ptp(tone.melanin_index_map(flat).values[flat.valid]) < 1e-3
+    assert np.ptp(tone.melanin_index_map(image).values[flat.valid]) > 50.0
+    assert not flat.valid[-1].any()
+    error = tone.melanin_index_map(flat).stderr[flat.valid]
+    np.testing.assert_allclose(error, 100 / np.log(10) * np.hypot(0.01, 0.05), rtol=1e-3)
+
+
+def test_common_error_moves_all_channels_together():
+    rng = np.random.default_rng(9)
+    matrix, white = calibrated(NIKON)
+    camera = ToneCamera.of(NIKON, LIGHT, matrix, white)
+    rgb = np.array([[0.45, 0.3, 0.22]])
+    drawn = camera.lab(rgb * np.exp(0.03 * rng.normal(size=(20_000, 1))), np.zeros((1, 3)))[0]
+    with_it = camera.lab(rgb, np.zeros((1, 3)), 0.03**2)[1]
+    without = camera.lab(rgb, np.zeros((1, 3)))[1]
+    np.testing.assert_allclose((with_it - without)[0], np.cov(drawn.T), rtol=0.06, atol=0.02)
+    # the same variance in each channel alone moves the hue as well
+    alone = camera.lab(rgb, np.square(0.03 * rgb))[1]
+    assert alone[0, 1, 1] - without[0, 1, 1] > 5.0 * (with_it - without)[0, 1, 1]
+
+
+def test_smallest_relative_error_becomes_common():
+    image = SkinReflectance.of_map(
+        SkinMap(
+            np.full((1, 1, 3), 0.5, np.float32),
+            "1",
+            np.array([[[0.01, 0.02, 0.05]]], np.float32),
+            np.ones((1, 1), bool),
+        )
+    ).with_common_errors()
+    assert np.sqrt(image.log_variance[0, 0]) == pytest.approx(0.02)
+    total = image.variance + image.log_variance[..., None] * np.square(image.rgb)
+    np.testing.assert_allclose(np.sqrt(total[0, 0]), [0.01, 0.02, 0.05], rtol=1e-4)
+
+
+def test_albedo_becomes_reflectance_at_normal_incidence():
+    """Fresnel's equations written out: light enters along the normal and leaves everywhere."""
+    cosine = (np.arange(20_000) + 0.5) / 20_000
+    inside = np.sqrt(1.0 - (1.0 - cosine**2) / 1.4**2)
+    s = (cosine - 1.4 * inside) / (cosine + 1.4 * inside)
+    p = (1.4 * cosine - inside) / (1.4 * cosine + inside)
+    transmitted = 1.0 - 0.5 * (s**2 + p**2)
+    expected = (1.0 - (0.4 / 2.4) ** 2) * np.mean(2.0 * cosine * transmitted)
+    image = skin_image()
+    found = tone.reflectance_of_albedo(image)
+    ratio = found.rgb[found.valid] / image.values[found.valid]
+    np.testing.assert_allclose(ratio, expected, rtol=1e-3)
+    np.testing.assert_allclose(np.sqrt(found.log_variance[found.valid]), 0.01, rtol=1e-3)
+    assert found.variance[found.valid].max() < 1e-9
 
 
 def test_empty_image_gives_empty_maps():
     image = skin_image()
     blank = SkinMap(image.values, "1", image.stderr, np.zeros(image.mask.shape, bool))
     camera = partial(ToneCamera.of, NIKON, LIGHT, None, None)
-    made = tone.lab_map(camera, blank)
+    made = tone.lab_map(camera, SkinReflectance.of_map(blank))
     assert not made["lab"].mask.any()
     assert not tone.monk_maps(made["lab"], made["lab_covariance"])["monk"].values.any()

@@ -1,0 +1,1 @@
+"""Maps of skin tone, which several rigs share."""
