@@ -180,10 +180,7 @@ class FlashScene(FaceScene):
 
     @cached_method
     def under(self, led: str) -> "FlashScene":
-        """Return the scene under an LED of the flash heads, by its name; empty: the scene itself.
-
-        The LED has the tube's position, polarizer, and level of a white reference.
-        """
+        """Return the scene with an LED in place of each tube, by its name; empty: itself."""
         if not led:
             return self
         lights = tuple(replace(light, illuminant=led) for light in self.rig.lights)
