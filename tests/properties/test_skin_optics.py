@@ -83,7 +83,7 @@ def test_common_error_ignores_order_and_single_outliers(table, melanin, blood, t
 
 @FEW
 @given(within=st.floats(0.0, 10.0), optics=st.floats(0.0, 10.0))
-def test_errors_within_face_and_by_optics_add_in_squares(within, optics):
+def test_errors_of_face_and_optics_add_squared(within, optics):
     whole = np.hypot(within, optics)
     back = chromophore_posterior.errors_within_face(np.array(whole), np.array(optics))
     assert float(back) == pytest.approx(within, abs=1e-6 * (1.0 + whole))
