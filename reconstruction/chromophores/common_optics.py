@@ -21,12 +21,7 @@ from reconstruction.chromophores.inversion import (
     POPULATION_LOG_SD,
     POPULATION_MELANIN,
 )
-from reconstruction.chromophores.pixel_checks import (
-    ChromophoreError,
-    check_colors,
-    check_mask,
-    is_usable_color,
-)
+from reconstruction.chromophores.pixel_checks import ChromophoreError, check_colors, is_usable_color
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 
@@ -55,7 +50,6 @@ def estimate_common_optics(
     prior: ShadingPrior,
     common_light: float,
     common_color: ArrayLike | None = None,
-    valid: ArrayLike | None = None,
 ) -> CommonOptics | None:
     """Estimate the common error of a face's colors.
 
@@ -72,8 +66,6 @@ def estimate_common_optics(
         Standard error of log light common to all pixels, above 0.
     common_color
         (3, 3): covariance of further relative color errors common to all pixels. None: 0.
-    valid
-        Shape (...): False where a pixel is masked. None: all may be used.
 
     Returns
     -------
@@ -100,8 +92,6 @@ def estimate_common_optics(
     check.within("common_light", common_light, "(0, inf)")
     colors = check_colors(rgb)
     good = is_usable_color(colors)
-    if valid is not None:
-        good &= check_mask(valid, good.shape)
     if table.optics_covariance is None or not good.any():
         return None
     seen = np.median(np.log(colors[good], dtype=np.float64), axis=0) - prior.median
