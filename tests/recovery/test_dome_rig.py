@@ -167,7 +167,7 @@ def test_nominal_cameras_fail_bounds_met_by_calibrated_cameras(dome, judged):
     assert drawn.errors[red].median > 1.2 * judged.errors[red].median
 
 
-def test_tracked_head_errs_less_than_ignored_motion(dome, monkeypatch):
+def test_tracked_head_errs_less_than_ignored_motion(dome, typical_person, monkeypatch):
     from rigsim.subject import head_motion
 
     # far enough to show at this size of a pixel
@@ -177,7 +177,8 @@ def test_tracked_head_errs_less_than_ignored_motion(dome, monkeypatch):
         # light between parts of the face would be worked out for each frame
         alone = {"leave_out": ("subsurface", "interreflections")}
         # every other light of the same dome: each frame of a head that moves is seen anew
-        half = SMALL | alone | {"lights": SMALL["lights"] // 2}
+        person = {"subject": typical_person("III")}
+        half = SMALL | alone | person | {"lights": SMALL["lights"] // 2}
         simulate_session("dome", dome / "session-move", move=True, **half)
     want = ["normals", "r_d"]
     calibration = dome / "calibration"
