@@ -12,12 +12,21 @@ from model.facial_color.state_maps import NEUTRAL
 from model.skin import SkinAppearance, SkinMap
 from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import BoolArray, FloatArray
+from skinrig.evaluating.flash import BOUND_FACTOR
 
 PREDICTION_METHODS: Final = ("measured map", "rig, eq. (6)", "one gain", "neutral map")
 """Predictions of an expression's blood volume fraction: as measured, by the rig, by one gain of the
 neutral map, or the neutral map unchanged."""
 MAX_LEVEL_ERROR: Final = 0.15
 """Limit of the median relative error of an expression's blood, the same as that of other maps."""
+
+
+def level_limit(rig: HemoglobinRig) -> float:
+    """Return the limit of the median relative error of an expression's blood.
+
+    It is that of other maps, or 1.3 standard errors of the log of all blood by unknown optics.
+    """
+    return max(MAX_LEVEL_ERROR, BOUND_FACTOR * rig.common_log_sd)
 
 
 @dataclass(frozen=True, slots=True)

@@ -214,7 +214,7 @@ def _color_errors(
         if row.method == evaluation.PREDICTION_METHODS[1]:
             text = f"blood volume fraction of {row.state}, median error"
             got, worst = row.median_relative, _worst_band(row.state, banded)
-            limit = evaluation.MAX_LEVEL_ERROR
+            limit = evaluation.level_limit(rig)
             subject.check_fraction(text, got, limit, coverage=row.coverage, worst=worst)
     yield page.build_view("facial_errors", states=states, changes=changes, banded=banded)
     labels = list(dict.fromkeys(row.state for row in states))
