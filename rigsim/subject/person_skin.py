@@ -47,8 +47,8 @@ _TISSUE_DEVIATIONS: Final[Mapping[str, tuple[float, bool]]] = {
     "eumelanin_fraction": (0.0875, False),
 }
 """Standard deviations over people, of the logarithm where True. They are an eighth of the ranges of
-Jacques 2013, doi:10.1088/0031-9155/58/11/R37, and Donner et al. 2008: two standard deviations span
-a half of a range, because ranges include differences of method. With three quarters, a tenth of the
+Jacques 2013, doi:10.1088/0031-9155/58/11/R37, and Donner et al. 2008: +-2 standard deviations span
+half of a range, because ranges include differences of method. With three quarters, a tenth of the
 population lies outside 5 to 95 % of measured skin."""
 
 

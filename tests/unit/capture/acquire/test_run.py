@@ -137,18 +137,18 @@ def plan():
     return flash_plan(RIG, darks=1, states=("neutral", "smile"))
 
 
-@pytest.fixture
-def session(tmp_path, plan):
+def created(path, plan):
+    """Create a session, and release it after the test."""
     made = Session.create(
-        tmp_path / "s",
-        plan=plan,
-        rig=RIG,
-        devices={},
-        subject=SubjectRecord("p"),
-        source="measured",
+        path, plan=plan, rig=RIG, devices={}, subject=SubjectRecord("p"), source="measured"
     )
     yield made
     made.release()
+
+
+@pytest.fixture
+def session(tmp_path, plan):
+    yield from created(tmp_path / "s", plan)
 
 
 def run(plan, session, box, camera, **more):
@@ -355,16 +355,7 @@ def led_plan():
 
 @pytest.fixture
 def led_session(tmp_path, led_plan):
-    made = Session.create(
-        tmp_path / "led",
-        plan=led_plan,
-        rig=RIG,
-        devices={},
-        subject=SubjectRecord("p"),
-        source="measured",
-    )
-    yield made
-    made.release()
+    yield from created(tmp_path / "led", led_plan)
 
 
 LED_LIMITS = {"power_min": 0.03125, "power_max": 1.0, "led_min_nm": 420, "led_max_nm": 680}

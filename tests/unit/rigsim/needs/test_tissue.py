@@ -140,7 +140,7 @@ def test_predicted_fiber_profiles_agree_with_photons():
     rig, person = load_rig("probe"), PersonSkin(0.03, tissue=PERSON)
     other = dataclasses.replace(PERSON, oxygenation=0.1, scattering_per_mm=18.0)
     tissue = SkinTissue(person)
-    told = np.log(
+    predicted = np.log(
         predict_profiles(rig, tissue, other)[0] / predict_profiles(rig, tissue, PERSON)[0]
     )
     each = [
@@ -149,8 +149,8 @@ def test_predicted_fiber_profiles_agree_with_photons():
     ]
     found = np.log(each[0].reflectance_per_mm2 / each[1].reflectance_per_mm2)
     near = slice(0, 14)
-    assert np.abs((found - told)[near].mean(axis=0)).max() < 0.2
-    assert np.abs(told[near].mean(axis=0)).min() > 0.8
+    assert np.abs((found - predicted)[near].mean(axis=0)).max() < 0.2
+    assert np.abs(predicted[near].mean(axis=0)).min() > 0.8
 
 
 def test_probe_builds_what_readings_show():
