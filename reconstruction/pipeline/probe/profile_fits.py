@@ -108,6 +108,7 @@ def fit_profiles(
         else:
             setup |= {"method": method, "common_error": nearest_medium.LOG_FACTOR_SIGMA}
             other = subsurface.invert(first.radius_mm, every, **setup)
+        unlike &= _is_closer(value, setup["variance"], other, fit, unlike)
         unlike = _layered(profiles, unlike, other.scale[0])
         fit = _merge_fits(fit, other, np.broadcast_to(unlike, fit.valid.shape))
 
@@ -126,6 +127,31 @@ def fit_profiles(
             ProfileFit(profile, _select_fits(fit, (0, number)), log_stderr[number], *changes)
         )
     return found
+
+
+def _is_closer(
+    value: Float64Array,
+    variance: Float64Array,
+    other: SubsurfaceFit,
+    fit: SubsurfaceFit,
+    unlike: BoolArray,
+) -> BoolArray:
+    """Return where another fit is closer to the bright fibers, over the colors in doubt, (M, 1).
+
+    Errors that far fibers share, as of stray light, bend the profile of a homogeneous medium, too.
+    A medium up to a factor then follows the far fibers and leaves the bright ones. Layers are a
+    property of the tissue, so that the colors decide together.
+    """
+    bright = fit.used[0] & (value > 0.0) & (variance < (nearest_medium.MAX_LOG_NOISE * value) ** 2)
+    bright &= unlike[..., None]
+    safe = np.where(bright, value, 1.0)
+    weight = np.where(bright, 1.0 / (variance / safe**2 + MAX_HOMOGENEOUS_MISFIT**2), 0.0)
+
+    def misfit(of: SubsurfaceFit) -> Float64Array:
+        ratio = np.where(bright, of.predicted_per_mm2[0] / safe, 1.0)
+        return np.asarray((weight * np.log(ratio) ** 2).sum(axis=(1, 2)))
+
+    return np.asarray(misfit(other) < misfit(fit))[:, None]
 
 
 def _layered(

@@ -21,11 +21,20 @@ SIGMA_TR = math.sqrt(3 * MEDIUM[0] * sum(MEDIUM))
 
 
 def profile(
-    site="cheek", *, angle=0.0, repeat=0, scale=1.0, common=0.0, noise=0.01, rng=None, g=0.825
+    site="cheek",
+    *,
+    angle=0.0,
+    repeat=0,
+    scale=1.0,
+    common=0.0,
+    noise=0.01,
+    rng=None,
+    g=0.825,
+    medium=MEDIUM,
 ):
     value = photon_table.reflectance(
         RADIUS,
-        *MEDIUM,
+        *medium,
         g=g,
         collection="fiber",
         core_mm=PROBE.fibers[0].core_mm,
@@ -172,6 +181,29 @@ def test_independently_outlying_fibers_do_not_indicate_layers():
     )
     assert layered.mean() <= 0.05
     assert 0.5 < np.sqrt(np.mean(off[~layered] ** 2)) < 1.4
+
+
+def test_stray_light_in_far_fibers_is_not_layers():
+    """Thirty draws of 5 % per fiber, and of stray light 1.5 standard uncertainties off.
+
+    The far fibers share it, so that it bends the profile of a homogeneous medium.
+    """
+    rng = np.random.default_rng(17)
+    medium, stray, own = (0.37, 2.1), 8e-8, 4e-8
+    far = np.arange(28)[:, None] >= 21
+    torn = [profile(medium=medium, repeat=k) for k in range(30)]
+    for one in torn:
+        value, variance = one.reflectance.reflectance_per_mm2, one.reflectance.variance
+        variance[:] = (0.004 * value) ** 2 + (own * far) ** 2
+        value *= np.exp(0.05 * rng.standard_normal((28, 1)))
+        value += 1.5 * stray * far + np.sqrt(variance) * rng.standard_normal((28, 3))
+        one.reflectance.common_per_mm2[:] = stray * far
+    fits = profile_fits.fit_profiles(torn, PROBE)
+    layered = np.array([fit.fit.scale != 1.0 for fit in fits])
+    sigma_tr = math.sqrt(3 * medium[0] * sum(medium))
+    off = np.array([fit.fit.sigma_tr_per_mm / sigma_tr - 1.0 for fit in fits])
+    assert layered.mean() <= 0.03
+    assert np.median(np.abs(off)) < 0.02
 
 
 def test_isotropic_medium_is_reported_not_valid():
