@@ -81,12 +81,13 @@ def check_installation(*, probe_renderer: bool = True) -> list[InstallationCheck
 
 
 def _renderer() -> InstallationCheck:
-    from rigsim.render import variant
+    from rigsim.mitsuba import variant
 
     choice = variant.choose_variant()
-    fast = choice.name.startswith("llvm")
-    fix = "" if fast else "for speed install LLVM 17 or newer: apt-get install libllvm19"
-    return InstallationCheck("Mitsuba variant", f"{choice.name} ({choice.why})", True, fix)
+    vectorized = choice.is_vectorized
+    fix = "" if vectorized else "for Mitsuba install LLVM 17 or newer: apt-get install libllvm19"
+    found = f"{choice.name} ({choice.why}); renderer of sessions: {choice.renderer}"
+    return InstallationCheck("Mitsuba variant", found, True, fix)
 
 
 def _serial_ports() -> InstallationCheck:

@@ -1,15 +1,15 @@
 """Draw an actual fiber probe: gains, spots in the image, crosstalk and stray light."""
 
 import dataclasses
+import functools
 import math
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.special import erfc
 
-from capture.rig import Rig, View
-from rigsim.arrays import Float32Array, Float64Array
+from capture.rig import Rig
+from rigsim.arrays import Float64Array
 
 SPOT_RADIUS_PX: Final = 12.0
 """Nominal radius of a fiber's end in the camera's image."""
@@ -106,8 +106,9 @@ class ActualProbe:
             raise ProbeBuildError(f"edge_px: got {self.edge_px}, expected > 0")
 
 
+@functools.lru_cache(maxsize=4)
 def build_probe(rig: Rig, *, seed: int, tolerances: ProbeTolerances | None = None) -> ActualProbe:
-    """Draw an actual probe.
+    """Draw an actual probe; the same object for the same arguments.
 
     Parameters
     ----------
@@ -165,45 +166,6 @@ def build_probe(rig: Rig, *, seed: int, tolerances: ProbeTolerances | None = Non
         size.wings,
         size.veil,
     )
-
-
-def fiber_unit_images(build: ActualProbe, view: View) -> Float32Array:
-    """Return the image of each fiber's light, wings and veil included.
-
-    All images have the same flux, up to losses of the wings outside the sensor: that of a uniform
-    spot of nominal radius and height 1, pi (radius^2 + edge^2).
-
-    Parameters
-    ----------
-    build
-        The probe.
-    view
-        The camera.
-
-    Returns
-    -------
-    ndarray of float32
-        Shape (F, H, W), >= 0, for light that comes out of one fiber each.
-    """
-    y = np.arange(view.height_px, dtype=np.float64)[:, None]
-    x = np.arange(view.width_px, dtype=np.float64)[None, :]
-    out = np.empty((len(build.spot_px), view.height_px, view.width_px), np.float32)
-    nominal = math.pi * (SPOT_RADIUS_PX**2 + build.edge_px**2)
-    for image, place, radius, uneven in zip(
-        out, build.spot_px, build.radius_px, build.unevenness, strict=True
-    ):
-        u, v = (x - place[0]) / radius, (y - place[1]) / radius
-        square = u * u + v * v
-        away = radius * np.sqrt(square)
-        disc = 0.5 * erfc((away - radius) / (math.sqrt(2.0) * build.edge_px))
-        inside = np.minimum(square, 1.5)
-        light = 1.0 + uneven[0] * u + uneven[1] * v + uneven[2] * (2.0 * inside - 1.0)
-        disc *= np.where(disc > 1e-12, np.maximum(light, 0.0), 0.0)
-        disc *= nominal / disc.sum()
-        wing = (away * away + radius * radius) ** -1.5
-        wing *= nominal * radius / (2.0 * math.pi)
-        image[:] = (1.0 - build.wings) * disc + build.wings * wing + build.veil
-    return out
 
 
 def _draw_truncated_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> Float64Array:

@@ -29,7 +29,8 @@ from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.atlas import Atlas, dilate_texture, sample, unwrap
 from rigsim.light.observed_skin import ObservedSkin
 from rigsim.light.surface_brdf import transmittance
-from rigsim.render import RAY_OFFSET_MM, Caster
+from rigsim.mitsuba.olat import RAY_OFFSET_MM
+from rigsim.render import Caster
 
 DEFAULT_MIN_BOUNCE_FRACTION: Final = 1e-3
 """Fraction of the first bounce below which further bounces are omitted."""

@@ -5,6 +5,7 @@ each light, the rows that face it are tested against the mesh, and the arriving 
 summed into the pixels.
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
@@ -24,7 +25,8 @@ from rigsim.light.olat_kernels import (
     UINT16_FULL_SCALE,
 )
 from rigsim.light.surface_brdf import MAX_R_D
-from rigsim.render import RAY_OFFSET_MM, Caster, GBuffer, g_buffer
+from rigsim.mitsuba.led_array import DISC_POINTS, disc_points
+from rigsim.render import Caster, GBuffer, g_buffer
 from rigsim.render.depth_of_field import LensImage, depth_before_focus, tabulate_defocus
 
 SurfaceLookup = Callable[[GBuffer, Int32Array], tuple[Float32Array, Float32Array]]
@@ -33,13 +35,6 @@ with a coating (n, 11)."""
 
 RAYS_PER_BAND: Final = 1 << 20
 """Camera rays per batch; bounds memory at full resolution."""
-
-
-INVERSE_PLASTIC_NUMBER: Final = 0.7548776662466927
-"""Inverse of the plastic number, the root of x^3 = x + 1."""
-
-DISC_POINTS: Final = 1 << 12
-"""Points on a light's disc, assigned to rows cyclically."""
 
 
 NORMAL_SCALE: Final = 32767.0
@@ -217,16 +212,19 @@ def find_hits(
     )
     starts = np.flatnonzero(np.diff(owner, prepend=-1))
     pixels, begins = owner[starts], np.append(starts, len(owner)).astype(np.int32)
-    lens = None
-    if settings.optics:
-        toward = depth_before_focus(view, position)
-        depths = float(toward.min(initial=0.0)), float(toward.max(initial=0.0))
-        spread = tabulate_defocus(view, settings.illuminant, subpixels=k, depths_mm=depths)
-        lens = LensImage(spread, (height, width), pixels, begins, slots, toward)
     shape, eye = (height, width), np.asarray(view.position_mm, np.float64)
-    return Hits(
-        shape, k, pixels, begins, position, normals, prim, slots, uv, packed, eye, kind, lens
-    )
+    hits = Hits(shape, k, pixels, begins, position, normals, prim, slots, uv, packed, eye, kind)
+    return lens_of_hits(hits, view, settings) if settings.optics else hits
+
+
+def lens_of_hits(hits: Hits, view: View, settings: CameraSettings) -> Hits:
+    """Return hits with the blur of the camera's lens."""
+    toward = depth_before_focus(view, hits.position_mm)
+    depths = float(toward.min(initial=0.0)), float(toward.max(initial=0.0))
+    k = hits.subpixels
+    spread = tabulate_defocus(view, settings.illuminant, subpixels=k, depths_mm=depths)
+    lens = LensImage(spread, hits.shape, hits.pixel, hits.first, hits.slot, toward)
+    return dataclasses.replace(hits, lens=lens)
 
 
 def pixel_order(
@@ -322,12 +320,6 @@ def is_lamp_visible(hits: Hits, caster: Caster, lamp: Lamp) -> BoolArray:
     return visible
 
 
-def shadow_ray_origins(hits: Hits, caster: Caster) -> Float32Array:
-    """Return the origins of the rows' shadow rays, above their triangles, shape (n, 3)."""
-    offset = np.float32(RAY_OFFSET_MM) * caster.face_normals[hits.prim]
-    return np.asarray(hits.position_mm + offset, np.float32)
-
-
 def sum_rows(
     hits: Hits, red: Float32Array, green: Float32Array, blue: Float32Array, color: Float32Array
 ) -> Float32Array:
@@ -386,18 +378,3 @@ def shade_rows(
     light = (center, axis, float(lamp.exponent))
     kernels.shade_rows(samples, light, visible, extra, diffuse, faded, rows)
     return sum_rows(hits, rows[0], rows[1], rows[2], color)
-
-
-def disc_points(count: int) -> tuple[Float32Array, Float32Array]:
-    """Return points of the unit disc, shape (count,) each, in a low-discrepancy order.
-
-    The additive sequence of the plastic number is mapped to the disc with uniform density: the
-    radius is the square root of one coordinate, so that equal areas receive equal numbers.
-    """
-    index = np.arange(count)
-    u, v = (
-        (0.5 + index * INVERSE_PLASTIC_NUMBER) % 1.0,
-        (0.5 + index * INVERSE_PLASTIC_NUMBER**2) % 1.0,
-    )
-    radius, angle = np.sqrt(u), 2.0 * np.pi * v
-    return (radius * np.cos(angle)).astype(np.float32), (radius * np.sin(angle)).astype(np.float32)

@@ -14,7 +14,7 @@ from rigsim.light.surface_brdf import (
     transmittance,
     two_way_transmittance,
 )
-from rigsim.render import RAY_OFFSET_MM
+from rigsim.mitsuba.olat import RAY_OFFSET_MM
 
 ROWS_PER_CHUNK: Final = 1 << 13
 """Rows per thread at a time."""

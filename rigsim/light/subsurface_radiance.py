@@ -34,6 +34,8 @@ class SurfaceIllumination:
 
     visible: Float32Array
     """Visible fraction of each light's disc, shape (N, N, L), 0 to 1."""
+    relief: Float32Array | None
+    """The same in the shadows of the texture's relief alone; None: none."""
     irradiance: Float32Array
     """Irradiance of the surface over that of a plate at the rig's origin that faces the camera,
     without polarizers, shape (N, N)."""
@@ -96,6 +98,7 @@ def illuminate_surface(
     normal = subject.normal.reshape(-1, 3)
     mesh_normal = atlas.normal.reshape(-1, 3)
     visible = np.empty((size * size, len(lights)), np.float32)
+    shadows = None if relief is None else np.ones_like(visible)
     irradiance = np.zeros(size * size, np.float32)
     entered = np.zeros(size * size, np.float32)
     for k, light in enumerate(lights):
@@ -107,10 +110,11 @@ def illuminate_surface(
             radius_mm=light.radius_mm,
             samples=FLASH_SHADOW_SAMPLES,
         )
-        if relief is not None:
-            visible[:, k] *= relief.on_texture(
+        if relief is not None and shadows is not None:
+            shadows[:, k] = relief.on_texture(
                 atlas.position_mm, light.position_mm, radius_mm=light.radius_mm
             ).reshape(-1)
+            visible[:, k] *= shadows[:, k]
         to_light, falloff = direction_and_falloff(light, position)
         cosine = np.maximum(np.einsum("ij,ij->i", normal, to_light), 0.0)
         falling = np.float32(weights[k]) * falloff * cosine * visible[:, k]
@@ -127,9 +131,25 @@ def illuminate_surface(
     entered[~covered] = 0.0
     return SurfaceIllumination(
         visible.reshape(size, size, len(lights)),
+        None if shadows is None else shadows.reshape(size, size, len(lights)),
         irradiance.reshape(size, size),
         entered.reshape(size, size),
     )
+
+
+def inner_albedo(subject: SimulatedSubject, reflectance: Float32Array) -> Float32Array:
+    """Return the light that leaves skin or hair over that which enters, shape (N, N, 3).
+
+    Parameters
+    ----------
+    subject
+        The face.
+    reflectance
+        Diffuse reflectance of its skin, shape (N, N, 3).
+    """
+    hair = subject.hair[..., None]
+    covering = np.asarray(HAIR_REFLECTANCE, np.float32) * hair
+    return np.float32(shading.interior_scale(ETA)) * ((1.0 - hair) * reflectance + covering)
 
 
 def render_subsurface_radiance(
@@ -163,7 +183,7 @@ def render_subsurface_radiance(
     covering = np.asarray(HAIR_REFLECTANCE, np.float32) * hair
     within = surface.entered[..., None]
     if interreflection is not None:
-        outside = scale * ((1.0 - hair) * reflectance + covering)
+        outside = inner_albedo(subject, reflectance)
         color = InterreflectionColor(interreflection, skin, outside, reflectance)
         covered = subject.atlas.covered
         sums = interreflection.exchange.coarsen(

@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike
 
 from rigsim.arrays import BoolArray, Float32Array, Int32Array
 from rigsim.geometry.mesh import Mesh
-from rigsim.render.renderer import load_mitsuba, pad_memory
-from rigsim.render.variant import VariantChoice, choose_variant
+from rigsim.mitsuba.memory import pad_memory
+from rigsim.mitsuba.startup import load_mitsuba
+from rigsim.mitsuba.variant import VariantChoice, choose_variant
 
 RAYS_PER_CALL: Final = 1 << 22
 """Rays per call; bounds the memory of a ray batch."""
@@ -48,11 +49,6 @@ class Caster:
             edges = corners[:, 1:] - corners[:, :1]
             self._face_normals = normalize(np.cross(edges[:, 0], edges[:, 1]))
         return self._face_normals
-
-    @property
-    def scene(self) -> Any:
-        """Mitsuba's scene of the mesh, for kernels that trace and shade in one pass, or None."""
-        return self._tracer.scene
 
     def first_hit(self, origins: ArrayLike, directions: ArrayLike) -> RayHits:
         """Find the first triangle on each ray.
@@ -114,7 +110,7 @@ class _MitsubaTracer:
         parameters["vertex_positions"] = pad_memory(np.ravel(mesh.vertices_mm))
         parameters["faces"] = pad_memory(np.ravel(mesh.faces).astype(np.uint32))
         parameters.update()
-        self.scene: Any = mi.load_dict({"type": "scene", "mesh": shape})
+        self._scene: Any = mi.load_dict({"type": "scene", "mesh": shape})
 
     def _ray(
         self, mi: Any, origins: Float32Array, directions: Float32Array, length: Any = None
@@ -131,7 +127,7 @@ class _MitsubaTracer:
         import drjit as dr
 
         ray = self._ray(mi, origins, directions)
-        hit = self.scene.ray_intersect_preliminary(ray, coherent=True)
+        hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
         dr.eval(hit)  # otherwise each of the reads below would trace again
         valid = np.array(hit.is_valid())
         prim = np.where(valid, np.array(hit.prim_index).astype(np.int64), -1).astype(np.int32)
@@ -142,7 +138,7 @@ class _MitsubaTracer:
         self, origins: Float32Array, directions: Float32Array, length: Float32Array
     ) -> BoolArray:
         mi = load_mitsuba(self._choice)
-        hit = self.scene.ray_test(self._ray(mi, origins, directions, length), coherent=True)
+        hit = self._scene.ray_test(self._ray(mi, origins, directions, length), coherent=True)
         return np.array(hit, np.bool_)
 
 
@@ -151,7 +147,6 @@ class _EmbreeTracer:
         from embreex import rtcore_scene
         from embreex.mesh_construction import TriangleMesh
 
-        self.scene: Any = None
         self._scene = rtcore_scene.EmbreeScene()
         TriangleMesh(self._scene, mesh.vertices_mm, mesh.faces)
 

@@ -1,7 +1,6 @@
 """Trace a camera's rays on a mesh, and the visible fraction of a light from its points."""
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,11 +9,9 @@ from capture.rig import View
 from rigsim.arrays import BoolArray, Float32Array, Int32Array
 from rigsim.as_built.dome import undistort
 from rigsim.geometry.atlas import interpolate
+from rigsim.mitsuba.olat import RAY_OFFSET_MM
+from rigsim.mitsuba.render_error import RenderError
 from rigsim.render.caster import Caster, normalize
-from rigsim.render.renderer import RenderError
-
-RAY_OFFSET_MM: Final = 0.02
-"""Distance by which shadow rays start above the surface; far above float32 steps at 200 mm."""
 
 
 @dataclass(frozen=True, slots=True)

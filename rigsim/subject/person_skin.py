@@ -9,6 +9,7 @@ from math import exp
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rigsim.arrays import Float32Array
 from rigsim.package_data import package_table
@@ -152,28 +153,58 @@ def _site_skin(person: PersonSkin, site: str, state: str) -> SiteSkin:
             person.base_blood * _ABDOMEN_BLOOD_RATIO * float(blood),
             person.tissue,
         )
+    steps = np.arange(-SITE_RADIUS_MM, SITE_RADIUS_MM + 0.5)
+    x, y = np.meshgrid(steps, steps)
+    inside = np.hypot(x, y) <= SITE_RADIUS_MM
+    melanin, blood = skin_maps(person, site, state, x[inside], y[inside])
+    return SiteSkin(float(np.exp(np.log(melanin).mean())), float(blood.mean()), person.tissue)
+
+
+def skin_maps(
+    person: PersonSkin, site: str, state: str, x_mm: ArrayLike, y_mm: ArrayLike
+) -> tuple[Float32Array, Float32Array]:
+    """Return melanin and blood at points of the mean head around a site.
+
+    Parameters
+    ----------
+    person
+        The person.
+    site
+        One of `SITE_NAMES` on the face.
+    state
+        One of `rigsim.subject.perfusion.STATE_NAMES`.
+    x_mm, y_mm
+        Offsets from the site in front view, to the face's left and up, mm, shape (...).
+
+    Returns
+    -------
+    melanin, blood : ndarray of float32
+        Volume fractions of melanosomes and of blood, shape (...).
+
+    Raises
+    ------
+    PersonSkinError
+        The site is not on the face.
+
+    Examples
+    --------
+    >>> skin = PersonSkin.of_preset("III")
+    >>> melanin, blood = skin_maps(skin, "cheek", "neutral", [0.0, 4.0], 0.0)
+    >>> melanin.shape, bool((blood > 0.0).all())
+    ((2,), True)
+    """
     if site not in _FACE_SITES:
         raise PersonSkinError(f"site: got {site!r}, expected one of {', '.join(SITE_NAMES)}")
-    points = _disc(*_FACE_SITES[site])
+    landmark, height_mm, slope_x, slope_y = _FACE_SITES[site]
+    x, y = np.broadcast_arrays(np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64))
+    offset = np.stack([x, y, height_mm + slope_x * x + slope_y * y], axis=-1)
+    points = np.asarray(offset + np.array(LANDMARKS_MM[landmark]), np.float32)
     regions = region_masks(points)
-    melanin_map = pigment.draw_melanin_map(
+    melanin = pigment.draw_melanin_map(
         points, regions, person.melanin, seed=person.seed, freckles=person.freckles
     )
     perfusion = draw_perfusion(points, regions, person.base_blood, seed=person.seed)
-    return SiteSkin(
-        float(np.exp(np.log(melanin_map).mean())),
-        float(perfusion.blood(state).mean()),
-        person.tissue,
-    )
-
-
-def _disc(landmark: str, height_mm: float, slope_x: float, slope_y: float) -> Float32Array:
-    """Return points of a disc on the mean head, 1 mm apart in front view, shape (n, 3)."""
-    steps = np.arange(-SITE_RADIUS_MM, SITE_RADIUS_MM + 0.5)
-    x, y = (part.ravel() for part in np.meshgrid(steps, steps))
-    disc = np.stack([x, y, height_mm + slope_x * x + slope_y * y], axis=-1)
-    inside = np.hypot(x, y) <= SITE_RADIUS_MM
-    return np.asarray(disc[inside] + np.array(LANDMARKS_MM[landmark]), np.float32)
+    return melanin, perfusion.blood(state)
 
 
 def draw_tissue(seed: int, typical: TissueProperties = TYPICAL_SKIN) -> TissueProperties:

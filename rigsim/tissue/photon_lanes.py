@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigsim.arrays import Float32Array, Float64Array, UInt32Array
-from rigsim.render import load_mitsuba
-from rigsim.render.variant import choose_variant
+from rigsim.mitsuba.startup import load_mitsuba
+from rigsim.mitsuba.variant import choose_variant
 from rigsim.tissue.photon_walk import ROULETTE_MAX_WEIGHT, ROULETTE_SURVIVAL, TALLY_COUNT
 
 PHOTONS_PER_LANE: Final = (32, 256)
@@ -44,7 +44,7 @@ class LaneTallies:
 
 
 def is_usable() -> bool:
-    """Return whether Dr.Jit can compile for this processor (see `rigsim.render.variant`)."""
+    """Return whether Dr.Jit can compile for this processor (see `rigsim.mitsuba.variant`)."""
     return choose_variant("mono").is_vectorized
 
 

@@ -98,6 +98,10 @@ Subject = Annotated[
     ),
 ]
 Scale = Annotated[str, choice("small", "full")]
+Renderer = Annotated[
+    str,
+    choice("mitsuba", "fast", text="Renderer: scenes of Mitsuba, or compiled loops without it."),
+]
 Width = Annotated[int | None, option("Image width, pixels; default: that of the scale.")]
 Resume = Annotated[bool, option("Continue an interrupted session.", "--resume")]
 Site = Annotated[

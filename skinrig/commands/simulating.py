@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -100,13 +100,14 @@ class SimulatedFaceOptions:
     mesh: Path | None = None
     movement: Annotated[bool, typer.Option("--movement/--no-movement")] = True
     omit: str | None = None
+    renderer: options.Renderer = "mitsuba"
 
     def ordered(self) -> dict[str, Any]:
         """Return the fields that requests of faces share."""
         from skinrig.capturing.option_values import parse_names
 
         order = {"width_px": self.width, "leave_out": parse_names(self.omit) or ()}
-        return order | select_attributes(self, "mesh", "movement")
+        return order | select_attributes(self, "mesh", "movement", "renderer")
 
 
 @simulate_app.command("flash", cls=RigCommand)
@@ -229,6 +230,7 @@ def simulate_gradient(
     angles: options.Angles = None,
     steps: options.Steps = None,
     omit: str | None = None,
+    renderer: options.Renderer = "mitsuba",
 ) -> None:
     """Simulate the gradient sphere: a patch of skin in a caliper, or a target.
 
@@ -252,6 +254,7 @@ def simulate_gradient(
         angles=parse_floats(angles, "--angles"),
         steps=parse_range(steps, "--steps"),
         leave_out=parse_names(omit) or (),
+        renderer=cast(Any, renderer),
     )
     _simulate(order, console, target)
 

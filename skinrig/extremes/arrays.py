@@ -12,7 +12,7 @@ from model.traits import reduced_spaces
 from reconstruction import normal_integration, polarization
 from reconstruction import photometric_stereo as stereo
 from reconstruction.surface import texture_fill
-from rigsim import render
+from rigsim.mitsuba import render_error, scene_radiance
 from skinrig.extremes.expectations import (
     ExpectationError,
     expect_error,
@@ -200,8 +200,8 @@ def _light_in_renderer(_: InputPrecision) -> str:
         ]
     for emitter in emitters:
         expect_error(
-            lambda emitter=emitter: render.radiance(scene(emitter), kind="rgb", samples=1),  # type: ignore[misc]
-            render.RenderError,
+            lambda emitter=emitter: scene_radiance.radiance(scene(emitter), kind="rgb", samples=1),  # type: ignore[misc]
+            render_error.RenderError,
             "light",
         )
     return f"RenderError naming the light, for {len(emitters)} lights"

@@ -10,9 +10,10 @@ import numpy as np
 
 from capture.rig import load_rig
 from model.brdf import microfacet
-from rigsim import render, sensor
+from rigsim import sensor
 from rigsim.geometry.mesh import MeshError, build_mesh, vertex_normals
 from rigsim.light import surface_brdf
+from rigsim.mitsuba import render_error, scene_radiance
 from rigsim.render import Caster, visibility
 from rigsim.sensor import make_sensor
 from skinrig.arrays import Float64Array, FloatArray
@@ -204,5 +205,7 @@ def _negative_environment(_: InputPrecision) -> str:
         "integrator": {"type": "path"},
     }
     return expect_error(
-        lambda: render.radiance(scene, kind="rgb", samples=1), render.RenderError, "light.radiance"
+        lambda: scene_radiance.radiance(scene, kind="rgb", samples=1),
+        render_error.RenderError,
+        "light.radiance",
     )

@@ -18,8 +18,9 @@ from reconstruction.surface import model_normals
 from rigsim.light.lateral import scatter_laterally
 from rigsim.light.led_light import white_intensity
 from rigsim.light.surface_brdf import skin_surface
+from rigsim.mitsuba.olat import RAY_OFFSET_MM
 from rigsim.population import files as subject_file
-from rigsim.render import RAY_OFFSET_MM, Caster
+from rigsim.render import Caster
 from rigsim.sensor import make_sensor
 from skinrig.arrays import BoolArray, Float64Array, FloatArray
 

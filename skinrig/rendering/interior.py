@@ -13,7 +13,8 @@ from model.dipole import gather as dipole_gather
 from model.dipole.gather import SourceTree
 from model.skin_reflectance import transmittance
 from rigsim.geometry.atlas import unwrap
-from rigsim.render import Caster, thread_count, visibility
+from rigsim.mitsuba.startup import thread_count
+from rigsim.render import Caster, visibility
 from skinrig.arrays import Float32Array, Float64Array, Int32Array
 from skinrig.rendering.geometry import FittedSurface, SurfacePointSamples
 from skinrig.rendering.lights import Light

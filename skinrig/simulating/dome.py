@@ -14,8 +14,9 @@ from capture.plan import Plan
 from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
 from capture.plan.rows import step_lights
 from capture.rig import Rig, load_rig
-from model.skin import SkinAppearance
+from model.skin import SkinAppearance, SkinMap
 from rigsim.as_built.dome import build_dome
+from rigsim.mitsuba.variant import choose_renderer
 from rigsim.needs.effects import SceneEffects, max_on_time_s
 from rigsim.population import files as subject_file
 from rigsim.population.conditions import ConditionError, validate_conditions
@@ -86,8 +87,9 @@ def simulate_dome(order: DomeOrder) -> SimulationResult:
     truth = None
     if order.target is None:
         truth = truth_folder(order.out)
-        appearance = scene.truth_appearance()
-        parameters = appearance.parameters | scan | {"landmarks_mm": _landmarks(scene.subject)}
+        appearance = _with_hair(scene.truth_appearance(), scene)
+        landmarks = _landmarks(scene.subject)
+        parameters = {**appearance.parameters, **scan, "landmarks_mm": landmarks}
         driving.write_truth(
             truth,
             order,
@@ -139,11 +141,19 @@ def _member(order: DomeOrder) -> Member | None:
         raise SimulationError(f"subject: {error}") from error
 
 
+def _with_hair(truth: SkinAppearance, scene: Any) -> SkinAppearance:
+    """Return the ground truth with the fraction of skin behind hair."""
+    what = "fraction behind hair of brows and lashes"
+    bare = scene.surface(scene.rig.views[0]).bare
+    hair = SkinMap(1.0 - bare, "1", valid=scene.subject.atlas.covered, description=what)
+    return dataclasses.replace(truth, maps={**truth.maps, "hair": hair})
+
+
 def _truth_files(scene: Any, truth: SkinAppearance, seed: int) -> dict[str, bytes]:
     """Return the true mesh, its expressions, and the reflection in held-out directions."""
     mesh, landmarks = scene.subject.mesh, scene.subject.landmarks_mm()
     return {
-        TRUE_MESH_FILE: encode_binary_ply(mesh.vertices_mm, mesh.faces),
+        TRUE_MESH_FILE: encode_binary_ply(mesh.vertices_mm, mesh.faces, mesh.uv),
         BLEND_SHAPES_FILE: _blend_shapes(scene.subject),
         TEST_FILE: make_test(
             scene,
@@ -300,6 +310,7 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
         conditions=conditions,
         on_s=max_on_time_s(plan),
         effects=SceneEffects.from_switches(_skin_light_effects(order)),
+        choice=choose_renderer(order.renderer),
     )
 
 

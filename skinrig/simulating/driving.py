@@ -36,6 +36,15 @@ def list_effects(scene: Any) -> tuple[Mapping[str, Any], ...]:
     return tuple(scene.needs.document())
 
 
+def record_renderer(scene: Any) -> Mapping[str, str]:
+    """Return the renderer of a scene's images and the reason, for the manifest."""
+    variant = getattr(scene, "variant", None)
+    if variant is None:
+        return {"name": "none", "why": "closed forms and photon walks make the images"}
+    name = getattr(scene, "renderer", variant.renderer)
+    return {"name": name, "variant": variant.name, "why": variant.why}
+
+
 def manifest_settings(order: SimulationOrder, **rig_settings: Any) -> dict[str, Any]:
     """Return the settings of a simulation for its session's manifest.
 
@@ -53,6 +62,8 @@ def manifest_settings(order: SimulationOrder, **rig_settings: Any) -> dict[str, 
     }
     if order.plan is not None:
         asked["plan"] = order.plan.to_json()
+    if order.renderer != "mitsuba":
+        asked["renderer"] = order.renderer
     if order.leave_out:
         asked["leave_out"] = list(order.leave_out)
     return asked | rig_settings
@@ -111,7 +122,11 @@ def open_session(
         or SubjectRecord(subject_records.pseudonym(order.subject, order.seed), SIMULATED_USES),
         source="simulated",
         seed=order.seed,
-        extra={"simulation": dict(settings), "effects": [dict(one) for one in list_effects(scene)]},
+        extra={
+            "simulation": dict(settings),
+            "effects": [dict(one) for one in list_effects(scene)],
+            "renderer": record_renderer(scene),
+        },
         now=None if created is None else (lambda: created),
     )
 

@@ -6,6 +6,7 @@ from capture.plan import Plan
 from capture.rig import Rig, load_rig
 from model import store
 from rigsim import targets
+from rigsim.mitsuba.variant import choose_renderer
 from rigsim.needs.effects import SceneEffects
 from rigsim.population import files as subject_file
 from rigsim.scenes.flash.scene import FlashScene
@@ -92,6 +93,7 @@ def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:
             seed=seed,
             power=power,
             effects=SceneEffects.from_switches(order.scene_switches()),
+            choice=choose_renderer(order.renderer),
         )
         for state in order.states
     }

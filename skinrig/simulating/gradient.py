@@ -9,6 +9,7 @@ from capture.plan.gradient import group_by_state, strain_state
 from capture.rig import Rig, load_rig
 from capture.session import Session
 from rigsim.as_built.sphere import build_sphere
+from rigsim.mitsuba.variant import Renderer, choose_renderer
 from rigsim.needs.effects import SceneEffects, max_on_time_s
 from rigsim.population import files as subject_file
 from rigsim.scenes.gradient.scene import GradientScene
@@ -58,6 +59,7 @@ def simulate_gradient(order: GradientOrder) -> SimulationResult:
         seed=order.seed,
         plan=plan,
         without=order.scene_switches(),
+        renderer=order.renderer,
     )
     session, log = driving.open_logged_session(order, plan, rig, asked, scene, GripLog)
     rig_seconds = driving.drive_plan(
@@ -80,6 +82,7 @@ def make_scene(
     seed: int = 0,
     plan: Plan | None = None,
     without: Mapping[str, Any] | None = None,
+    renderer: Renderer = "mitsuba",
 ) -> Any:
     """Return the scene of a target or a patch of skin in the sphere, with its actual LEDs.
 
@@ -95,6 +98,8 @@ def make_scene(
         Plan whose caliper angles set the size of the skin; default any angle.
     without
         Omitted effects of the skin, see `skinrig.simulating.effect_omission`.
+    renderer
+        Renderer of the patch; "mitsuba" only where its shadow rays are affordable.
     """
     sphere = build_sphere(rig, seed=seed)
     if target is not None:
@@ -118,6 +123,7 @@ def make_scene(
         seed=seed,
         on_s=on_s,
         effects=SceneEffects.from_switches(without or {}),
+        choice=choose_renderer(renderer) if renderer == "fast" else None,
     )
 
 

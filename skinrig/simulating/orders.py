@@ -12,6 +12,7 @@ from capture.plan.dome import DomeTarget
 from capture.plan.gradient import GradientTarget
 from capture.plan.probe import ProbeTarget
 from capture.session import SubjectRecord
+from rigsim.mitsuba.variant import Renderer
 from skinrig.capturing.sequences import SequenceOrder
 from skinrig.errors import UsageError, require_choice
 from skinrig.simulating.effect_omission import omission_arguments
@@ -103,6 +104,8 @@ class SimulationOrder:
     target: str | None = None
     plan: Plan | None = None
     """Plan to capture instead of the rig's default plan."""
+    renderer: Renderer = "mitsuba"
+    """Renderer of the images of faces and patches."""
     leave_out: tuple[str, ...] = ()
     """Omitted effects of skin, see `skinrig.simulating.effect_omission`."""
     resume: bool = False
@@ -124,6 +127,7 @@ class SimulationOrder:
                     "[SR-SIM-002]"
                 )
         require_size(self.size)
+        require_choice("renderer", self.renderer, get_args(Renderer), SimulationError)
         if self.seed < 0:
             raise SimulationError(f"seed: got {self.seed}, expected 0 or more")
         width_px = getattr(self, "width_px", None)

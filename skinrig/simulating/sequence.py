@@ -12,6 +12,7 @@ import numpy as np
 from capture.rig import load_rig
 from capture.session import Session
 from model import store
+from rigsim.mitsuba.variant import choose_renderer
 from rigsim.population import files as subject_file
 from rigsim.scenes.flash.course import FlashCourseScene, FlashEvent
 from rigsim.subject.perfusion import STATE_NAMES
@@ -98,7 +99,15 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
         if log is not None:  # None until the session is open; flashes begin later
             log.add(dataclasses.asdict(flash))
 
-    scene = FlashCourseScene(rig, person, course, seed=seed, movement=order.movement, on_flash=note)
+    scene = FlashCourseScene(
+        rig,
+        person,
+        course,
+        seed=seed,
+        movement=order.movement,
+        on_flash=note,
+        choice=choose_renderer(order.renderer),
+    )
     session = open_session(order, plan, rig, asked, scene)
     log = ExposureLog(truth.with_name(f"{truth.name}.flashes.jsonl"), resume=order.resume)
     before_s = _event_s(session)

@@ -13,9 +13,11 @@ from capture.plan.probe import PHANTOM_SITE, PROBE_SITES
 from capture.rig import Probe, Rig, load_rig
 from capture.session import Session
 from rigsim.as_built.dome import build_dome
+from rigsim.mitsuba.variant import Renderer, choose_renderer
 from rigsim.population import files as subject_file
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
+from rigsim.scenes.gradient.reference import NEUTRAL_GRIP
 from rigsim.world.serve import serve_world
 from rigsim.world.suction import HeadState
 from skinrig.arrays import UInt16Array
@@ -52,6 +54,8 @@ class ServeOrder:
     subject: str = "III"
     size: str = "small"
     seed: int = 0
+    renderer: Renderer = "mitsuba"
+    """Renderer of a face's images."""
     site: str | None = None
     """Site of the skin (gradient rig only)."""
     resume: Path | None = None
@@ -118,16 +122,18 @@ def _build_served_rig(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
                 "than the caliper waits for its host; use skinrig simulate gradient [SR-SIM-007]"
             )
         rig = rig.cropped(GRADIENT_WIDTH_PX)
-        scene = gradient.make_scene(rig, site=order.site, subject=subject, seed=seed)
+        scene = gradient.make_scene(
+            rig, site=order.site, subject=subject, seed=seed, renderer=order.renderer
+        )
         # rendered before the first request, so that no client waits for it
-        scene.lighting()
+        scene.moments(NEUTRAL_GRIP)
         return rig, scene
     if rig.probe is not None:
         return rig, _probe_scene(rig, rig.probe, subject, seed)
     dome = "dome" in rig.boxes
     width = (simulating_dome if dome else flash).WIDTHS_PX[order.size]
     rig = rig.resized(width) if width != rig.views[0].width_px else rig
-    return rig, (_dome_scene if dome else _flash_scene)(rig, subject, seed)
+    return rig, (_dome_scene if dome else _flash_scene)(rig, order)
 
 
 def _next_step(rig_name: str, rig: Rig, urls: Mapping[str, str], resume: Path | None) -> str:
@@ -152,16 +158,18 @@ def _shots_made(session: Path | None, rig: Rig) -> Mapping[str, int]:
     return count_shots(opened)
 
 
-def _flash_scene(rig: Rig, subject: str, seed: int) -> Any:
-    scene = FlashScene(rig, subject_file.load_subject(subject).face(seed=seed), seed=seed)
+def _flash_scene(rig: Rig, order: ServeOrder) -> Any:
+    face = subject_file.load_subject(order.subject).face(seed=order.seed)
+    scene = FlashScene(rig, face, seed=order.seed, choice=choose_renderer(order.renderer))
     # rendered before the first request, so that no client waits for it
     scene.radiance("crossed")
     return scene
 
 
-def _dome_scene(rig: Rig, subject: str, seed: int) -> Any:
-    person = subject_file.load_subject(subject).face(seed=seed)
-    return DomeScene(rig, person, dome=build_dome(rig, seed=seed), seed=seed)
+def _dome_scene(rig: Rig, order: ServeOrder) -> Any:
+    face = subject_file.load_subject(order.subject).face(seed=order.seed)
+    built, choice = build_dome(rig, seed=order.seed), choose_renderer(order.renderer)
+    return DomeScene(rig, face, dome=built, seed=order.seed, choice=choice)
 
 
 def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int) -> Any:

@@ -12,8 +12,9 @@ from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import build_mesh
 from rigsim.light.interreflection import Interreflection
 from rigsim.light.surface_brdf import SkinSurface
+from rigsim.mitsuba.scene_radiance import radiance
 from rigsim.needs.effects import SceneEffects
-from rigsim.render import Caster, radiance
+from rigsim.render import Caster
 from rigsim.scenes.dome import reference as dome_reference
 from rigsim.scenes.dome.reference import DirectScene
 from rigsim.scenes.dome.scene import DomeScene
@@ -152,7 +153,7 @@ def test_subsurface_scattering_reddens_hard_shadow(small, face):
 
 
 def test_plain_kernel_adds_the_same_subsurface_light(small, face):
-    from rigsim.render.variant import VariantChoice
+    from rigsim.mitsuba.variant import VariantChoice
 
     plain = VariantChoice("scalar_rgb", "asked for by the test", "")
     inside = SceneEffects(lateral=True, interreflections=False)

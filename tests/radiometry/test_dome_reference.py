@@ -16,7 +16,7 @@ import pytest
 from scipy import stats
 
 from capture.rig import Rig, load_rig
-from rigsim.render import look_at
+from rigsim.mitsuba.scene_radiance import look_at
 from rigsim.scenes.dome import reference as dome_reference
 from rigsim.scenes.dome.reference import PlainScene
 

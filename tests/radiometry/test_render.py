@@ -8,7 +8,8 @@ import pytest
 from capture.rig import View, load_rig
 from rigsim import render
 from rigsim.geometry.mesh import Mesh, MeshError, build_mesh
-from rigsim.render.variant import VariantChoice, choose_variant
+from rigsim.mitsuba import scene_radiance
+from rigsim.mitsuba.variant import VariantChoice, choose_variant
 
 pytestmark = pytest.mark.render
 
@@ -155,7 +156,7 @@ def test_rays_never_slip_between_closed_surface_triangles(choice, view):
 
 def test_white_plate_under_constant_light_renders_albedo():
     """Mitsuba itself, by a described scene: radiance = albedo times the sky's radiance."""
-    image = render.radiance(
+    image = scene_radiance.radiance(
         {
             "type": "scene",
             "integrator": {"type": "path", "max_depth": 2},

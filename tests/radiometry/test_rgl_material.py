@@ -5,15 +5,15 @@ import pytest
 
 from model.brdf import recipe as brdf_recipe
 from model.brdf import rgl
-from rigsim import render
-from rigsim.render.variant import choose_variant
+from rigsim.mitsuba import startup
+from rigsim.mitsuba.variant import choose_variant
 
 pytestmark = pytest.mark.render
 
 
 @pytest.fixture(scope="module")
 def mi():
-    return render.load_mitsuba(choose_variant("rgb"))
+    return startup.load_mitsuba(choose_variant("rgb"))
 
 
 def half_sphere(rng, count, *, lowest=0.1):

@@ -95,17 +95,21 @@ def fitted_slope(true, estimated):
 @pytest.mark.long
 @pytest.mark.render
 def test_two_second_course_is_recovered_within_errors(tmp_path, calibration):
+    """Three seeds, at most one 95 % interval of which misses: a false alarm of 0.7 %."""
     order = SequenceOrder(state="anger", shot_period_s="10.25")
-    session = simulate(tmp_path, order, movement=False, relaxation_s=2.0)
-    found, known = curves(session, calibration, tmp_path / "a")
-    assert (found["phases"]["captures"], found["phases"]["distinct"]) == (44, 40)
-    together = found["fit_of_all"]
-    assert together["known"] == "estimated"
-    low, high = together["interval_s"]
-    assert low <= 2.0 <= high
-    assert high - low < 1.5
-    levels = np.array([known[frame["step"]]["level"] for frame in found["frames"]])
-    assert np.sum((levels > 0.15) & (levels < 0.85)) > 10
+    contained = []
+    for seed in (0, 1, 2):
+        session = simulate(tmp_path / str(seed), order, movement=False, relaxation_s=2.0, seed=seed)
+        found, known = curves(session, calibration, tmp_path / f"a{seed}")
+        assert (found["phases"]["captures"], found["phases"]["distinct"]) == (44, 40)
+        together = found["fit_of_all"]
+        assert together["known"] == "estimated"
+        low, high = together["interval_s"]
+        contained.append(low <= 2.0 <= high)
+        assert high - low < 1.5
+        levels = np.array([known[frame["step"]]["level"] for frame in found["frames"]])
+        assert np.sum((levels > 0.15) & (levels < 0.85)) > 10
+    assert sum(contained) >= 2
 
 
 @pytest.mark.long

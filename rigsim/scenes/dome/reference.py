@@ -8,24 +8,33 @@ facets and GGX oil, all from textures) is composed of Mitsuba's own materials.
 import dataclasses
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from functools import partial
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
 from capture.rig import Rig, View, load_rig
 from rigsim.arrays import BoolArray, Float32Array, Float64Array
 from rigsim.geometry.atlas import dilate_texture
+from rigsim.light.skin_material import describe_skin
 from rigsim.light.surface_brdf import ETA_OIL, OIL_SMOOTHING, SkinSurface
-from rigsim.needs.effects import SceneEffects
-from rigsim.render import MovableLightScene, radiance
-from rigsim.render.scene_radiance import (
+from rigsim.mitsuba.led_array import led_table
+from rigsim.mitsuba.rig_camera import describe_camera
+from rigsim.mitsuba.scene_radiance import (
+    MovableLightScene,
+    load_description,
     matte_plastic,
     perspective,
     plastic_scale,
     point_light_rig,
+    radiance,
     rough_metal,
 )
+from rigsim.mitsuba.startup import load_mitsuba
+from rigsim.mitsuba.variant import Renderer, choose_renderer, choose_variant
+from rigsim.needs.effects import SceneEffects
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import SimulatedSubject, make_subject
 from rigsim.tissue.skin_layers import ETA
@@ -38,7 +47,8 @@ class RenderTiming:
     """Time and error of one method that renders the dome's lights one at a time."""
 
     seconds: float
-    """Time per light, s; for ours with its fraction of the camera rays, which serve all lights."""
+    """Processor seconds per light; ours include their fraction of the camera rays, which serve all
+    lights."""
     error: float
     """Root mean square error over all images, relative to their mean."""
     mean_ratio: float
@@ -46,20 +56,14 @@ class RenderTiming:
     squared_by_tile: Float64Array
     """Squared relative error per tile of 16 x 16 pixels that shows skin, for its standard error."""
 
+    def cost_over(self, other: "RenderTiming") -> float:
+        """Return the cost over another method's at equal noise: its square counts as time."""
+        return self.seconds / other.seconds * (self.error / other.error) ** 2
 
-@dataclass(frozen=True, slots=True)
-class IntegratorComparison:
-    """Three methods for one view of the dome, with the same number of rays per pixel."""
 
-    ours: RenderTiming
-    path: RenderTiming
-    """Mitsuba's path tracer, direct light only."""
-    direct: RenderTiming
-    """Mitsuba's direct integrator, which samples the light only."""
-
-    def speed_up(self, timing: RenderTiming) -> float:
-        """Speed-up of ours at equal noise; the square of the noise ratio counts as time."""
-        return timing.seconds / self.ours.seconds * min(1.0, (timing.error / self.ours.error) ** 2)
+Method = Literal["olat", "fast", "path", "direct"]
+"""Ours by Mitsuba's scene and by compiled loops; Mitsuba's path tracer and direct integrator, which
+samples the light only, both with direct light only."""
 
 
 def plain_face(preset: str = "III", *, size: int = 512) -> SimulatedSubject:
@@ -95,8 +99,8 @@ def compare_integrators(
     reference_subpixels: int = 6,
     rounds: int = 2,
     sampler: str = "stratified",
-) -> IntegratorComparison:
-    """Render one view of the dome by three methods, one light at a time.
+) -> dict[Method, RenderTiming]:
+    """Render one view of the dome by several methods, one light at a time.
 
     Parameters
     ----------
@@ -115,9 +119,9 @@ def compare_integrators(
 
     Returns
     -------
-    IntegratorComparison
-        The three methods alternate at each light. Compilation, parsing and the construction of
-        meshes are not timed; tracing our camera rays is.
+    dict
+        The methods alternate at each light. Compilation, parsing and the construction of meshes
+        are not timed; tracing our camera rays is.
     """
     rig = point_light_rig(load_rig("dome").resized(width_px).subset(views=["C02"]))
     view, face = rig.views[0], plain_face()
@@ -132,39 +136,95 @@ def compare_integrators(
     samples = subpixels**2
     for renderer in theirs.values():
         renderer.radiance((0.0, 0.0, 700.0), samples=samples)
-    _per_steradian(PlainScene(rig, face, subpixels=subpixels), 0)
-    best = {"ours": math.inf, "path": math.inf, "direct": math.inf}
-    images: dict[str, list[Float32Array]] = {}
-    for _ in range(rounds):
-        spent = dict.fromkeys(best, 0.0)
-        images = {name: [] for name in best}
-        scene = PlainScene(rig, face, subpixels=subpixels)
-        scene.surface(view)
-        start = time.perf_counter()
-        scene.radiance(view.name, [chosen[0]])
-        first = time.perf_counter() - start
+    best: dict[Method, float] = {}
+    images: dict[Method, list[Float32Array]] = {}
+    for _ in range(1 + rounds):  # the first compiles
+        spent: dict[Method, float] = dict.fromkeys(get_args(Method), 0.0)
+        images = {name: [] for name in spent}
+        ours: dict[Method, PlainScene] = {}
+        for name in _OWN_RENDERERS:
+            choice = choose_renderer(_OWN_RENDERERS[name])
+            scene = PlainScene(rig, face, subpixels=subpixels, choice=choice)
+            scene.surface(view)
+            once = partial(scene.radiance, view.name, [chosen[0]])
+            first, again = _processor_seconds(once), _processor_seconds(once)
+            spent[name] += max(first - again, 0.0) * lights / len(rig.lights)
+            ours[name] = scene
         for n, k in enumerate(chosen):
-            start = time.perf_counter()
-            scene.radiance(view.name, [k])
-            spent["ours"] += time.perf_counter() - start
-            images["ours"].append(_per_steradian(scene, k))
+            for name, scene in ours.items():
+                spent[name] += _processor_seconds(partial(scene.radiance, view.name, [k]))
+                images[name].append(_per_steradian(scene, k))
             for name, renderer in theirs.items():
-                start = time.perf_counter()
+                begin = time.process_time()
                 image = renderer.radiance(rig.lights[k].position_mm, samples=samples, seed=n)
-                spent[name] += time.perf_counter() - start
+                spent[name] += time.process_time() - begin
                 images[name].append(2.0 * image[..., :3])
-        look = max(first - spent["ours"] / lights, 0.0)
-        spent["ours"] += look * lights / len(rig.lights)
-        best = {name: min(best[name], spent[name] / lights) for name in best}
+        best = {k: min(best.get(k, math.inf), s / lights) for k, s in spent.items() if images[k]}
 
-    def way(name: str) -> RenderTiming:
+    def timing(name: Method) -> RenderTiming:
         found = np.stack(images[name])
         difference = (found - reference).astype(np.float64)
         error = float(np.sqrt(np.mean(difference**2)) / reference.mean())
         squared = _mean_square_by_tile(difference / reference.mean(), reference > 0.0)
         return RenderTiming(best[name], error, float(found.mean() / reference.mean()), squared)
 
-    return IntegratorComparison(way("ours"), way("path"), way("direct"))
+    return {name: timing(name) for name in best}
+
+
+_OWN_RENDERERS: Final[dict[Method, Renderer]] = {"olat": "mitsuba", "fast": "fast"}
+
+
+def _processor_seconds(call: Callable[[], object]) -> float:
+    begin = time.process_time()
+    call()
+    return time.process_time() - begin
+
+
+OLAT_ROUNDING: Final = 2e-4
+"""Relative error of `olat` by its 16-bit stored normals and reflectances."""
+
+
+def measure_agreement_with_path(
+    *, width_px: int = 48, runs: int = 25, samples: int = 4096, subpixels: int = 64
+) -> float:
+    """Return the fraction of pixels where `olat` is within 3 standard errors of Mitsuba's `path`.
+
+    Both render one scene: a face with relief, oil and vellus hair in front of a small LED.
+
+    Parameters
+    ----------
+    width_px
+        Width of the image.
+    runs, samples
+        Runs of the path tracer with different seeds, for its standard error, and samples per pixel
+        of each.
+    subpixels
+        Rays of `olat` along each side of a pixel.
+    """
+    rig = point_light_rig(load_rig("dome").resized(width_px).subset(views=["C02"]))
+    scene, light = DirectScene(rig, make_subject("III", size=512)), rig.lights[45]
+    place = np.array(light.position_mm)
+    mi = load_mitsuba(choose_variant("rgb"))
+    described = load_description(
+        mi,
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 2},
+            "sensor": describe_camera(rig.views[0]),
+            "skin": {
+                "type": "mesh",
+                "mesh": _face(scene).mesh,
+                "bsdf": describe_skin(scene.texture(rig.views[0])),
+            },
+            "led": {"type": "ledarray", "table": led_table(place, -place / np.linalg.norm(place))},
+        },
+    )
+    images = np.stack([mi.render(described, spp=samples, seed=k).numpy() for k in range(runs)])
+    mean, error = images.mean(axis=0), images.std(axis=0, ddof=1) / math.sqrt(runs)
+    olat = mi.load_dict({"type": "olat", "subpixels": subpixels})
+    difference = np.abs(mi.render(described, integrator=olat).numpy() - mean)
+    lit = mean > 1e-3 * mean.max()
+    return float((difference < 3.0 * np.hypot(error, OLAT_ROUNDING * mean))[lit].mean())
 
 
 def _mean_square_by_tile(

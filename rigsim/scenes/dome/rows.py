@@ -16,8 +16,9 @@ from rigsim.light.lateral_scattering import LateralScattering
 from rigsim.light.led_light import lobe_exponent
 from rigsim.light.olat import CameraSettings, Hits, Lamp, find_hits
 from rigsim.light.olat_kernels import MATT_ROWS, METAL_ROWS, SKIN_ROWS
-from rigsim.light.olat_vector import VectorizedShader
+from rigsim.light.skin_material import describe_skin, describe_target
 from rigsim.render import Caster, GBuffer
+from rigsim.scenes.dome.rendering import MitsubaScene, RenderedView
 from rigsim.scenes.exposing import SceneError
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.head_motion import HeadMotion
@@ -63,7 +64,8 @@ class DomeRows:
         self._how = how
         most = len(dome.rig.views) if self._motion is None else 2
         self._hits: LruCache[tuple[str, float], tuple[Hits, Caster]] = LruCache(lambda _: most)
-        self._vector: LruCache[tuple[str, float], VectorizedShader] = LruCache(lambda _: most)
+        self._rendered: LruCache[tuple[str, float], RenderedView] = LruCache(lambda _: most)
+        self._scenes: LruCache[tuple[str, float], MitsubaScene] = LruCache(lambda _: most)
 
     def pose_time_s(self, t_s: float) -> float:
         """Return the time that determines the head's pose, s; 0 for a fixed head."""
@@ -97,11 +99,49 @@ class DomeRows:
         """
         return self._hits.get((view.name, t_s), lambda: self._trace_rows(view, t_s, texture))
 
-    def vectorized_shader(
-        self, view: View, t_s: float, hits: Hits, caster: Caster
-    ) -> VectorizedShader:
-        """Return the compiled shader of `visible_rows`; cached as long as they are."""
-        return self._vector.get((view.name, t_s), lambda: VectorizedShader(hits, caster))
+    def rendered_view(
+        self, view: View, t_s: float, texture: Callable[[str], Float32Array]
+    ) -> RenderedView:
+        """Return a camera's hits in Mitsuba's scene; see `visible_rows`."""
+        return self._rendered.get((view.name, t_s), lambda: self._observe(view, t_s, texture))
+
+    def _observe(
+        self, view: View, t_s: float, texture_of: Callable[[str], Float32Array]
+    ) -> RenderedView:
+        camera = view.spectral_sensitivity
+
+        def build() -> MitsubaScene:
+            subject = self._reflecting()
+            if isinstance(subject, Target):
+                material = describe_target(subject, camera, self._how.illuminant)
+                return MitsubaScene(subject.mesh, material, self._caster.choice)
+            caster, layers = self._posed(t_s, texture_of(camera))
+            return MitsubaScene(caster.mesh, describe_skin(layers), caster.choice)
+
+        scene = self._scenes.get((camera, self._twitch_amount(t_s)), build)
+        lamps = tuple(self.lamp(k, t_s) for k in range(len(self._dome.rig.lights)))
+        moved, distortion = self._moved(view, t_s), self._dome.distortion.get(view.name)
+        return scene.observe(moved, lamps, self._how, distortion)
+
+    def _reflecting(self) -> SimulatedSubject | Target:
+        subject = self._subject
+        if isinstance(subject, Target) and subject.kind == "source":
+            raise SceneError(
+                f"target {subject.name!r}: got one that emits light, expected one that reflects"
+            )
+        return subject
+
+    def _twitch_amount(self, t_s: float) -> float:
+        return 0.0 if self._motion is None else self._motion.twitch_amount(t_s)
+
+    def _moved(self, view: View, t_s: float) -> View:
+        rotation, shift = self._pose(t_s)
+        return dataclasses.replace(
+            view,
+            position_mm=_vector((np.asarray(view.position_mm) - shift) @ rotation),
+            target_mm=_vector((np.asarray(view.target_mm) - shift) @ rotation),
+            up=_vector(np.asarray(view.up) @ rotation),
+        )
 
     def _pose(self, t_s: float) -> tuple[Float64Array, Float64Array]:
         return (np.eye(3), np.zeros(3)) if self._motion is None else self._motion.pose(t_s)
@@ -109,30 +149,24 @@ class DomeRows:
     def _trace_rows(
         self, view: View, t_s: float, texture_of: Callable[[str], Float32Array]
     ) -> tuple[Hits, Caster]:
-        rotation, shift = self._pose(t_s)
-        moved = dataclasses.replace(
-            view,
-            position_mm=_vector((np.asarray(view.position_mm) - shift) @ rotation),
-            target_mm=_vector((np.asarray(view.target_mm) - shift) @ rotation),
-            up=_vector(np.asarray(view.up) @ rotation),
-        )
-        how, distortion = self._how, self._dome.distortion.get(view.name)
-        subject, caster = self._subject, self._caster
+        moved, distortion = self._moved(view, t_s), self._dome.distortion.get(view.name)
+        subject = self._reflecting()
         if isinstance(subject, Target):
-            if subject.kind == "source":
-                raise SceneError(
-                    f"target {subject.name!r}: got one that emits light, expected one that reflects"
-                )
-            return observe_target(caster, moved, subject, how, distortion), caster
-        amount = 0.0 if self._motion is None else self._motion.twitch_amount(t_s)
-        texture = texture_of(view.spectral_sensitivity)
-        if amount > 0.0 and self._motion is not None:
-            mesh, atlas = self._motion.apply_twitch(subject.mesh, amount), subject.atlas
-            caster = Caster(mesh, choice=caster.choice)
-            # The relief turns with the surface below it.
-            turned = dilate_texture(unwrap(mesh, atlas.size).normal - atlas.normal, atlas.covered)
-            texture = np.concatenate([texture[..., :-3], texture[..., -3:] + turned], axis=-1)
-        return observe_face(caster, moved, texture, how, distortion), caster
+            caster = self._caster
+            return observe_target(caster, moved, subject, self._how, distortion), caster
+        caster, layers = self._posed(t_s, texture_of(view.spectral_sensitivity))
+        return observe_face(caster, moved, layers, self._how, distortion), caster
+
+    def _posed(self, t_s: float, layers: Float32Array) -> tuple[Caster, Float32Array]:
+        """Return the mesh and the texture of a face at a time."""
+        subject, amount = self._subject, self._twitch_amount(t_s)
+        if self._motion is None or isinstance(subject, Target) or amount <= 0.0:
+            return self._caster, layers
+        mesh, atlas = self._motion.apply_twitch(subject.mesh, amount), subject.atlas
+        # The relief turns with the surface below it.
+        turned = dilate_texture(unwrap(mesh, atlas.size).normal - atlas.normal, atlas.covered)
+        turned_layers = np.concatenate([layers[..., :-3], layers[..., -3:] + turned], axis=-1)
+        return Caster(mesh, choice=self._caster.choice), turned_layers
 
 
 def _vector(values: Float64Array) -> tuple[float, float, float]:

@@ -39,6 +39,8 @@ from rigsim.light.olat import CameraSettings, Hits, Lamp
 from rigsim.light.olat_kernels import SKIN_ROWS
 from rigsim.light.relief_shadow import ReliefShadow
 from rigsim.light.surface_brdf import SkinSurface, skin_surface
+from rigsim.mitsuba.image_hits import AddedLight
+from rigsim.mitsuba.variant import VariantChoice
 from rigsim.needs import face as face_needs
 from rigsim.needs.dome import min_noise, select_dome_effects
 from rigsim.needs.effect_sizes import max_exchange_fraction
@@ -46,7 +48,6 @@ from rigsim.needs.effects import AUTOMATIC_EFFECTS, PixelNoise, SceneEffects
 from rigsim.needs.tissue import select_face_tissue
 from rigsim.population import conditions as skin_conditions
 from rigsim.render import Caster
-from rigsim.render.variant import VariantChoice
 from rigsim.scenes.dome import truth as dome_truth
 from rigsim.scenes.dome.rows import DomeRows, DomeSubsurfaceRadiance, normalize
 from rigsim.scenes.exposing import FaceScene, SceneError, full_power_duration_s
@@ -94,7 +95,8 @@ class DomeScene(FaceScene):
     subpixels
         Rays along each side of a pixel.
     choice
-        Mitsuba variant; ``None`` chooses.
+        Mitsuba variant; ``None`` chooses. A vectorized one renders Mitsuba's scene by the
+        integrator `olat`; otherwise compiled loops shade.
     """
 
     def __init__(
@@ -152,6 +154,11 @@ class DomeScene(FaceScene):
         self._frames: LruCache[tuple[str, int, float], Float32Array] = LruCache(
             lambda frame: max(MAX_CACHED_FRAMES, FRAME_CACHE_BYTES // frame.nbytes)
         )
+
+    @property
+    def variant(self) -> VariantChoice:
+        """Return the variant that renders the images, with the reason."""
+        return self._caster.choice
 
     @cached_method
     def _scattering(self, camera: str) -> LateralScattering:
@@ -289,7 +296,11 @@ class DomeScene(FaceScene):
             For a target; only faces have these maps.
         """
         self._face()
-        hits, _ = self._rows.visible_rows(self._camera(view_name), 0.0, self._texture)
+        view = self._camera(view_name)
+        if self._caster.choice.renderer == "mitsuba":
+            seen = self._rows.rendered_view(view, 0.0, self._texture)
+            return dome_truth.image_truth_maps(seen.surface_hits())
+        hits, _ = self._visible_rows(view, 0.0)
         return dome_truth.image_truth_maps(hits)
 
     def truth_appearance(self, view_name: str | None = None) -> SkinAppearance:
@@ -359,6 +370,10 @@ class DomeScene(FaceScene):
         """Return the face's reflection for a camera, under its conditions."""
         return self._surface(view.spectral_sensitivity)
 
+    def texture(self, view: View) -> Float32Array:
+        """Return the face's surface and normals for a camera, (N, N, 10) or (N, N, 14)."""
+        return self._texture(view.spectral_sensitivity)
+
     @cached_method
     def _surface(self, camera: str) -> SkinSurface:
         face = self._face()
@@ -378,7 +393,7 @@ class DomeScene(FaceScene):
         shape = (view.height_px, view.width_px, 3)
         if isinstance(self.subject, Target) and self.subject.kind == "cap":
             return np.zeros(shape, np.float32)
-        hits, caster = self._rows.visible_rows(view, t_s, self._texture)
+        hits, caster = self._visible_rows(view, t_s)
         lamp = self._rows.lamp(light, t_s)
         gain = np.float32(self.dome.gain.get(view.name, 1.0))
         color = gain * self.intensity(light, view_name=view.name)
@@ -387,11 +402,16 @@ class DomeScene(FaceScene):
             glow = self._glow.on_rows(hits, lamp, view, light, t_s)
         diffuse = not (self.subsurface and glow is not None)
         relief = self._relief_of(hits, lamp)
-        if hits.kind == SKIN_ROWS and caster.scene is not None:
-            rows = self._rows.vectorized_shader(view, t_s, hits, caster)
-            return rows.shade_rows(lamp, color, glow, diffuse=diffuse, relief=relief)
+        if self._caster.choice.renderer == "mitsuba":
+            seen = self._rows.rendered_view(view, t_s, self._texture)
+            return seen.scene.render(seen, light, color, AddedLight(glow, relief, not diffuse))
         visible = olat.is_lamp_visible(hits, caster, lamp)
         return olat.shade_rows(hits, lamp, visible, color, glow, diffuse=diffuse, relief=relief)
+
+    def _visible_rows(self, view: View, t_s: float) -> tuple[Hits, Caster]:
+        if self._caster.choice.renderer == "mitsuba":
+            return self._rows.rendered_view(view, t_s, self._texture).hits, self._caster
+        return self._rows.visible_rows(view, t_s, self._texture)
 
     def _relief_of(self, hits: Hits, lamp: Lamp) -> Float32Array | None:
         """Return the fraction of a light that the texture's relief leaves to each row."""

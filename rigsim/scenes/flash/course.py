@@ -17,6 +17,7 @@ from capture.rig import Rig
 from rigsim.arrays import Float32Array, UInt16Array
 from rigsim.boxes.flash import FlashPop
 from rigsim.caching import cached_method
+from rigsim.mitsuba.variant import VariantChoice
 from rigsim.needs.effects import EffectSelection, omitted_effects
 from rigsim.scenes.exposing import RigScene, SceneError
 from rigsim.scenes.flash.scene import POP_ENERGY_DEVIATION, FlashScene, pop_energy
@@ -59,6 +60,8 @@ class FlashCourseScene(RigScene):
         Whether the face moves with the expression, or only its blood changes.
     on_flash
         Called with each flash that a camera recorded.
+    choice
+        Mitsuba variant; ``None`` chooses.
     """
 
     def __init__(
@@ -70,9 +73,11 @@ class FlashCourseScene(RigScene):
         seed: int = 0,
         movement: bool = True,
         on_flash: Callable[[FlashEvent], None] | None = None,
+        choice: VariantChoice | None = None,
     ) -> None:
         self.rig, self.subject, self.course = rig, subject, course
         self.seed, self.movement, self._on_flash = seed, movement, on_flash
+        self._choice = choice
 
     def scene_at(self, pose: str, level: float) -> FlashScene:
         """Return the scene of a pose and one of `BLOOD_LEVELS`; those of a pose share rays."""
@@ -81,7 +86,12 @@ class FlashCourseScene(RigScene):
     @cached_method
     def _scene(self, pose: str, level: float) -> FlashScene:
         subject = fix_blood_level(self.subject, self.course.state, level)
-        return FlashScene(self.rig, subject, state=pose, seed=self.seed)
+        return FlashScene(self.rig, subject, state=pose, seed=self.seed, choice=self._choice)
+
+    @property
+    def variant(self) -> VariantChoice:
+        """Return the variant that renders the images, with the reason."""
+        return self.scene_at("neutral", BLOOD_LEVELS[0]).variant
 
     @cached_property
     def needs(self) -> EffectSelection:  # type: ignore[override]

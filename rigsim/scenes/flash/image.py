@@ -6,24 +6,17 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from capture.rig import Rig, View
 from rigsim import shading
-from rigsim.arrays import BoolArray, Float32Array, Float64Array
-from rigsim.as_built.polarizers import Polarizers, absorbing_axis
+from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import dilate_texture, sample
 from rigsim.light.observed_skin import ObservedSkin
-from rigsim.light.olat import pixel_order
-from rigsim.light.subsurface_radiance import (
-    SubsurfaceRadiance,
-    direction_and_falloff,
-    scatter_through_pigment,
-)
-from rigsim.render import Caster, GBuffer, RenderError, g_buffer
+from rigsim.light.subsurface_radiance import SubsurfaceRadiance, scatter_through_pigment
+from rigsim.mitsuba.render_error import RenderError
 from rigsim.render.depth_of_field import DefocusKernels, LensImage, depth_before_focus
+from rigsim.scenes.flash.surfaces import CameraHits, FlashSurface
 from rigsim.subject import SimulatedSubject
-from rigsim.targets import Target
 from rigsim.tissue.skin_layers import ETA
 
 RAYS_PER_BAND: Final = 1 << 21
@@ -36,6 +29,7 @@ light is in units of unfiltered irradiance over pi: each polarizer transmits hal
 _LIGHT_NAMES: Final = ("diffuse", "specular", "shading")
 
 ImageLayers = dict[str, Float32Array]
+TraceRows = Callable[[View, int, tuple[int, int]], CameraHits]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,30 +52,26 @@ class FlashImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlashCamera:
-    """One camera of the rig with its polarizers, lights and lens."""
+    """One camera of the rig with its lens."""
 
     rig: Rig
     """The rig."""
     view: View
     """The camera."""
-    polarizers: Polarizers
-    """The polarizers."""
-    weights: Float64Array
-    """Energy of each light over the total of a plate at the origin, mm^2."""
     subpixels: int
     """Rays along each side of a pixel."""
     defocus: DefocusKernels | None = None
     """Blur kernels of the lens; None: sharp everywhere."""
 
     def observe_face(
-        self, caster: Caster, subject: SimulatedSubject, state: str, glow: SubsurfaceRadiance
+        self, surface: FlashSurface, subject: SimulatedSubject, state: str, glow: SubsurfaceRadiance
     ) -> FlashImage:
         """Render a face.
 
         Parameters
         ----------
-        caster
-            The face's mesh.
+        surface
+            The face's surface.
         subject, state
             The face, and its state.
         glow
@@ -92,27 +82,25 @@ class FlashCamera:
         FlashImage
             With all ground-truth maps except those of `blurred_maps`.
         """
-        textures = _textures(subject, state, glow)
-        return self._in_bands(caster, lambda buffers: self._see_skin(buffers, textures))
+        textures = _textures(subject, state, glow, surface.shadows(glow.surface))
+        return self._in_bands(surface.trace, lambda hits: self._see_skin(surface, hits, textures))
 
-    def observe_target(self, caster: Caster, target: Target) -> FlashImage:
+    def observe_target(self, surface: FlashSurface) -> FlashImage:
         """Render a target that reflects.
 
         Parameters
         ----------
-        caster
-            The target's mesh.
-        target
-            A diffuse or a metal target.
+        surface
+            The target's surface.
 
         Returns
         -------
         FlashImage
             Without ground-truth maps.
         """
-        return self._in_bands(caster, lambda buffers: self._see_target(buffers, target))
+        return self._in_bands(surface.trace, lambda hits: self._see_target(surface, hits))
 
-    def _in_bands(self, caster: Caster, see: Callable[[GBuffer], ImageLayers]) -> FlashImage:
+    def _in_bands(self, trace: TraceRows, see: Callable[[CameraHits], ImageLayers]) -> FlashImage:
         k, view = self.subpixels, self.view
         rows_per_band = max(1, RAYS_PER_BAND // (view.width_px * k * k))
         around = 0 if self.defocus is None else self.defocus.radius
@@ -121,12 +109,12 @@ class FlashCamera:
             bottom = min(top + rows_per_band, view.height_px)
             first = max(top - around, 0)
             rows = (first, min(bottom + around, view.height_px))
-            buffers = g_buffer(caster, view, subpixels=k, rows=rows)
-            parts = see(buffers)
-            small, coverage = _shrink(parts, buffers.mask, k)
+            hits = trace(view, k, rows)
+            parts = see(hits)
+            small, coverage = _average(parts, hits)
             small["reached"] = coverage
             if self.defocus is not None:
-                small |= _blur_through_lens(parts, buffers, view, self.defocus)
+                small |= _blur_through_lens(parts, hits, view, self.defocus)
             inner = slice(top - first, bottom - first)
             bands.append(({name: part[inner] for name, part in small.items()}, coverage[inner]))
         maps: ImageLayers = {
@@ -140,9 +128,7 @@ class FlashCamera:
                 )
         diffuse, specular, white = (maps.pop(name) for name in _LIGHT_NAMES)
         reached = maps.pop("reached")
-        return FlashImage(
-            diffuse.reshape(*coverage.shape, 3, 3), specular, white, maps, coverage, reached
-        )
+        return FlashImage(diffuse, specular, white, maps, coverage, reached)
 
     def blurred_maps(
         self, subject: SimulatedSubject, state: str, glow: SubsurfaceRadiance
@@ -175,14 +161,14 @@ class FlashCamera:
         }
 
     def observe_maps(
-        self, caster: Caster, subject: SimulatedSubject, maps: Mapping[str, Float32Array]
+        self, surface: FlashSurface, subject: SimulatedSubject, maps: Mapping[str, Float32Array]
     ) -> FlashImage:
         """Render maps of a face without light.
 
         Parameters
         ----------
-        caster
-            The face's mesh.
+        surface
+            The face's surface.
         subject
             The face.
         maps
@@ -194,95 +180,49 @@ class FlashCamera:
             With these ground-truth maps only; no light.
         """
         textures = _dilate_textures(maps, subject)
-        return self._in_bands(caster, lambda buffers: self._see_maps(buffers, textures))
+        return self._in_bands(surface.trace, lambda hits: _dark(hits) | _look_up(textures, hits))
 
-    def _see_maps(self, buffers: GBuffer, textures: dict[str, Float32Array]) -> ImageLayers:
-        inside, uv, *_ = buffers.hit_samples()
-        everywhere = np.ones(len(inside), np.bool_)
-        parts = {"diffuse": np.zeros((len(inside), 3, 3), np.float32)}
-        parts |= {name: np.zeros((len(inside), 3), np.float32) for name in _LIGHT_NAMES[1:]}
-        for name, layer in textures.items():
-            values = sample(layer, uv, everywhere)
-            parts[name] = values[:, 0] if values.shape[1] == 1 else values
-        return {name: _scatter(values, inside, buffers.mask) for name, values in parts.items()}
-
-    def _see_skin(self, buffers: GBuffer, textures: dict[str, Float32Array]) -> ImageLayers:
-        inside, uv, position, _, to_camera = buffers.hit_samples()
-        everywhere = np.ones(len(inside), np.bool_)
-        seen = {name: sample(layer, uv, everywhere) for name, layer in textures.items()}
-        normal = seen["normals"]
-        normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
-        right = self.view.axes[0]
-        leaving = shading.exit_stokes(normal, to_camera, eta=ETA, image_right=right)
-        alpha = np.clip(seen["roughness"][:, 0], *shading.ALPHA_RANGE)
-        bare = 1.0 - seen["hair"]  # hair occludes the skin and its specular reflection
-        specular = np.zeros_like(leaving)
-        for k, light in enumerate(self.rig.lights):
-            to_light, falloff = direction_and_falloff(light, position)
-            lobe = shading.specular_stokes(
-                normal,
-                to_light,
-                to_camera,
-                alpha,
-                eta=ETA,
-                light_absorbs=absorbing_axis(light),
-                image_right=right,
-                extinction=self.polarizers.light_extinction,
-            )
-            strength = np.float32(self.weights[k] * math.pi) * falloff * seen["visible"][:, k]
-            specular += strength[:, None] * lobe
+    def _see_skin(
+        self, surface: FlashSurface, hits: CameraHits, textures: ImageLayers
+    ) -> ImageLayers:
+        seen = _look_up(textures, hits)
+        leaving, specular = surface.skin_stokes(hits, self.view, seen)
         scale = np.float32(shading.interior_scale(ETA))
-        parts = {
+        seen.pop("shadows", None)
+        return {
             "diffuse": WHITE_SCALE * leaving[:, :, None] * seen.pop("glow")[:, None, :],
-            "specular": WHITE_SCALE * bare * specular,
-            "shading": WHITE_SCALE * scale * seen.pop("entered") * leaving,
-            "position_mm": position,
-            "uv": uv,
+            "specular": WHITE_SCALE * specular,
+            "shading": WHITE_SCALE * scale * seen.pop("entered")[:, None] * leaving,
+            "position_mm": hits.position_mm,
+            "uv": hits.uv,
+            **seen,
         }
-        del seen["visible"]
-        parts |= {
-            name: values[:, 0] if values.shape[1] == 1 else values for name, values in seen.items()
-        }
-        return {name: _scatter(values, inside, buffers.mask) for name, values in parts.items()}
 
-    def _see_target(self, buffers: GBuffer, target: Target) -> ImageLayers:
-        inside, uv, position, normal, to_camera = buffers.hit_samples()
-        camera, spectrum = self.view.spectral_sensitivity, self.rig.lights[0].illuminant
-        rgb = _nearest(target.rgb(camera, spectrum), uv)
-        leak = 1.0 / self.polarizers.light_extinction
-        diffuse = np.zeros((len(inside), 3, 3), np.float32)
-        specular = np.zeros((len(inside), 3), np.float32)
-        for k, light in enumerate(self.rig.lights):
-            to_light, falloff = direction_and_falloff(light, position)
-            strength = WHITE_SCALE * np.float32(self.weights[k]) * falloff
-            if target.kind == "metal":
-                lobe = shading.specular_stokes(
-                    normal,
-                    to_light,
-                    to_camera,
-                    target.alpha,
-                    eta=ETA,
-                    light_absorbs=absorbing_axis(light),
-                    image_right=self.view.axes[0],
-                    extinction=self.polarizers.light_extinction,
-                    metal=float(target.palette.mean()),
-                )
-                specular += np.float32(math.pi) * strength[:, None] * lobe
-            else:
-                cosine = np.maximum(np.einsum("ij,ij->i", normal, to_light), 0.0)
-                passed = np.float32(0.5 * (1.0 + leak)) * strength * cosine
-                diffuse[:, 0] += passed[:, None] * rgb
-        parts = {"diffuse": diffuse, "specular": specular, "shading": np.zeros_like(specular)}
-        return {name: _scatter(values, inside, buffers.mask) for name, values in parts.items()}
+    def _see_target(self, surface: FlashSurface, hits: CameraHits) -> ImageLayers:
+        parts = _dark(hits)
+        diffuse, specular = surface.target_light(hits, self.view)
+        parts["diffuse"][:, 0] = WHITE_SCALE * diffuse
+        return parts | {"specular": WHITE_SCALE * specular}
+
+
+def _dark(hits: CameraHits) -> ImageLayers:
+    """Return light of zero at hits."""
+    parts = {name: np.zeros((hits.count, 3), np.float32) for name in _LIGHT_NAMES}
+    return parts | {"diffuse": np.zeros((hits.count, 3, 3), np.float32)}
+
+
+def _look_up(textures: ImageLayers, hits: CameraHits) -> ImageLayers:
+    """Return textures at hits, shape (n[, C])."""
+    everywhere = np.ones(hits.count, np.bool_)
+    return {name: sample(layer, hits.uv, everywhere) for name, layer in textures.items()}
 
 
 def _textures(
-    subject: SimulatedSubject, state: str, glow: SubsurfaceRadiance
-) -> dict[str, Float32Array]:
-    """Return the texture maps that the camera samples, shape (N, N, C) each."""
+    subject: SimulatedSubject, state: str, glow: SubsurfaceRadiance, shadows: Float32Array | None
+) -> ImageLayers:
+    """Return the textures that the camera samples, shape (N, N[, C]) each."""
     layers = {
         "glow": glow.scattered,
-        "visible": glow.surface.visible,
         "reflectance": glow.reflectance,
         "normals": subject.normal,
         "irradiance": glow.surface.irradiance,
@@ -292,67 +232,50 @@ def _textures(
         "melanin": subject.melanin,
         "hemoglobin": subject.hemoglobin(state),
     }
+    if shadows is not None:
+        layers["shadows"] = shadows
     if subject.rest is not None:
         layers["position_at_rest_mm"] = subject.rest.atlas.position_mm
     return _dilate_textures(layers, subject)
 
 
-def _dilate_textures(
-    layers: Mapping[str, Float32Array], subject: SimulatedSubject
-) -> dict[str, Float32Array]:
-    """Return textures with dilated borders, so that sampling may interpolate, (N, N, C) each."""
-    covered = subject.atlas.covered
-    return {name: dilate_texture(np.atleast_3d(layer), covered) for name, layer in layers.items()}
-
-
-def _scatter(values: Float32Array, inside: NDArray[np.int_], mask: BoolArray) -> Float32Array:
-    out = np.zeros((mask.size, *values.shape[1:]), np.float32)
-    out[inside] = values
-    return out.reshape(*mask.shape, *values.shape[1:])
+def _dilate_textures(layers: Mapping[str, Float32Array], subject: SimulatedSubject) -> ImageLayers:
+    """Return textures with dilated borders, so that sampling may interpolate."""
+    return {name: dilate_texture(layer, subject.atlas.covered) for name, layer in layers.items()}
 
 
 def _blur_through_lens(
-    parts: ImageLayers, buffers: GBuffer, view: View, spread: DefocusKernels
+    parts: ImageLayers, hits: CameraHits, view: View, spread: DefocusKernels
 ) -> ImageLayers:
-    """Return the parts of an image after lens blur, at the sensor's resolution."""
-    k = spread.subpixels
-    order, pixel, first, slot = pixel_order(buffers.mask, k)
-    shape = (buffers.mask.shape[0] // k, buffers.mask.shape[1] // k)
-    toward = depth_before_focus(view, buffers.position_mm.reshape(-1, 3)[order])
-    lens = LensImage(spread, shape, pixel, first, slot, toward)
-    light = [parts[name].reshape(buffers.mask.size, -1)[order] for name in ("diffuse", "specular")]
-    seen = lens.render(np.concatenate([*light, np.ones((len(order), 1), np.float32)], axis=1))
-    wide = light[0].shape[1]
-    return {
-        "diffuse": seen[..., :wide].reshape(*shape, *parts["diffuse"].shape[2:]),
-        "specular": seen[..., wide:-1],
-        "reached": seen[..., -1],
-    }
+    """Return the light and the coverage after lens blur, at the sensor's resolution."""
+    toward = depth_before_focus(view, hits.position_mm)
+    lens = LensImage(spread, hits.shape, hits.pixel, hits.first, hits.slot, toward)
+    blurred = {"diffuse": parts["diffuse"], "specular": parts["specular"]}
+    blurred["reached"] = np.ones(hits.count, np.float32)
+    return _split(lens.render(_joined(blurred)), blurred)
 
 
-def _shrink(parts: ImageLayers, mask: BoolArray, k: int) -> tuple[ImageLayers, Float32Array]:
+def _average(parts: ImageLayers, hits: CameraHits) -> tuple[ImageLayers, Float32Array]:
     """Average over pixels: light over the whole pixel, maps over its covered part."""
-
-    def mean(image: Float32Array) -> Float32Array:
-        height, width = image.shape[0] // k, image.shape[1] // k
-        flat = image.reshape(height, k, width, k, -1)
-        return np.asarray(flat.mean(axis=(1, 3)), np.float32)
-
-    coverage = mean(mask.astype(np.float32))
-    share = np.maximum(coverage, 1e-6)
-    out = {}
-    for name, image in parts.items():
-        small = mean(image)
-        if name not in _LIGHT_NAMES:
-            small /= share
-        if name == "normals":
-            small /= np.maximum(np.linalg.norm(small, axis=-1, keepdims=True), 1e-6)
-        out[name] = small[..., 0] if image.ndim == 2 else small
-    return out, coverage[..., 0]
+    coverage = hits.coverage()
+    out = _split(hits.average(_joined(parts)), parts)
+    for name in _LIGHT_NAMES:
+        out[name] *= coverage.reshape(*hits.shape, *[1] * (out[name].ndim - 2))
+    if "normals" in out:
+        normal = out["normals"]
+        out["normals"] = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+    return out, coverage
 
 
-def _nearest(texture: Float32Array, uv: Float32Array) -> Float32Array:
-    size = texture.shape[0]
-    column = np.clip((uv[:, 0] * size).astype(np.int64), 0, size - 1)
-    row = np.clip(((1.0 - uv[:, 1]) * size).astype(np.int64), 0, size - 1)
-    return texture[row, column]
+def _joined(parts: ImageLayers) -> Float32Array:
+    """Return layers as columns, shape (n, C)."""
+    return np.concatenate([part.reshape(len(part), -1) for part in parts.values()], axis=1)
+
+
+def _split(image: Float32Array, parts: ImageLayers) -> ImageLayers:
+    """Invert `_joined` for an image, shape (H, W, C)."""
+    out, end = {}, 0
+    for name, part in parts.items():
+        start, end = end, end + math.prod(part.shape[1:])
+        out[name] = image[..., start:end].reshape(*image.shape[:2], *part.shape[1:])
+    return out

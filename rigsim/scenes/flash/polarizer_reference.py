@@ -1,8 +1,8 @@
-"""Compare the flash rig's closed-form polarization with Mitsuba's polarizers, in time and error.
+"""Compare the flash rig's renderer with Mitsuba's polarizers, in time and error.
 
 A sphere of polarizing plastic replaces the face, in front of two point flashes behind polarizers
-and a camera behind an analyzer. Mitsuba traces paths through the polarizers; the closed forms
-derive both images from one set of rays.
+and a camera behind an analyzer. Mitsuba's `volpath` traces paths through the polarizers; `olat`
+derives both images from one set of rays.
 """
 
 import dataclasses
@@ -15,13 +15,13 @@ import numpy as np
 
 from capture.rig import Rig, View, load_rig
 from rigsim import shading
-from rigsim.arrays import BoolArray, Float32Array
-from rigsim.as_built.polarizers import absorbing_axis
+from rigsim.arrays import Float32Array
+from rigsim.as_built.polarizers import IDEAL_POLARIZERS, Polarizers
 from rigsim.geometry.mesh import Mesh, build_mesh, grid_faces
-from rigsim.light.subsurface_radiance import direction_and_falloff
-from rigsim.render import Caster, g_buffer, look_at, radiance
-from rigsim.render.scene_radiance import perspective
-from rigsim.render.variant import choose_variant
+from rigsim.mitsuba.scene_radiance import look_at, perspective, radiance
+from rigsim.mitsuba.startup import load_mitsuba
+from rigsim.mitsuba.variant import choose_variant
+from rigsim.scenes.flash.surfaces import FlashLights, MitsubaSurface
 
 SPHERE_RADIUS_MM: Final = 80.0
 ETA: Final = 1.4
@@ -38,26 +38,26 @@ ANALYZER_AXIS_DEG: Final = {"parallel": 90.0, "crossed": 0.0}
 class PolarizerComparison:
     """Time and error of both methods, for the parallel and the crossed image together."""
 
-    closed_form_s: float
-    """Seconds for both images by closed forms."""
-    mitsuba_s: float
-    """Seconds for both images by Mitsuba."""
-    closed_form_error: dict[str, float]
-    """Relative root mean square error of each image by closed forms."""
-    mitsuba_error: dict[str, float]
-    """The same for Mitsuba's images."""
+    olat_s: float
+    """Seconds for both images by `olat`."""
+    volpath_s: float
+    """Seconds for both images by `volpath`."""
+    olat_error: dict[str, float]
+    """Relative root mean square error of each image by `olat`."""
+    volpath_error: dict[str, float]
+    """The same by `volpath`."""
     mean_ratio: dict[str, float]
-    """Mean of Mitsuba's image over that of the reference: 1 up to noise."""
+    """Mean of `volpath`'s image over that of the reference: 1 up to noise."""
 
     @property
     def speed_up(self) -> float:
-        """Speed-up of the closed forms."""
-        return self.mitsuba_s / self.closed_form_s
+        """Speed-up of `olat`."""
+        return self.volpath_s / self.olat_s
 
     @property
     def noise_ratio(self) -> float:
-        """Error of Mitsuba over that of the closed forms; the worse of both images."""
-        return min(self.mitsuba_error[k] / self.closed_form_error[k] for k in ANALYZER_AXIS_DEG)
+        """Error of `volpath` over that of `olat`; the worse of both images."""
+        return min(self.volpath_error[k] / self.olat_error[k] for k in ANALYZER_AXIS_DEG)
 
 
 def compare_polarizer_models(
@@ -70,50 +70,51 @@ def compare_polarizer_models(
     width_px
         Side of the square images.
     samples
-        Samples per pixel of Mitsuba's path tracer.
+        Samples per pixel of `volpath`.
     subpixels
-        Rays along each side of a pixel of the closed forms.
+        Rays along each side of a pixel of `olat`.
     seed
-        Seed of Mitsuba's sampler.
+        Seed of the sampler of `volpath`.
 
     Returns
     -------
     PolarizerComparison
-        Best times of three alternating runs, and errors. Compilation and the construction of our
-        rays' mesh are not timed; parsing of Mitsuba's scene is. Errors are evaluated where the
-        sphere covers the whole pixel, against closed forms with twelve rays along each side, on
-        which both methods agree up to noise (see ``mean_ratio``).
+        Best times of three alternating runs, and errors. Compilation and the construction of the
+        sphere's mesh are not timed; parsing of the other scene is. Errors are evaluated where the
+        sphere covers the whole pixel, against `olat` with twelve rays along each side, on which
+        both methods agree up to noise (see ``mean_ratio``).
     """
     rig, view = reference_rig(width_px)
-    # One variant for both, so that no time is spent on switching.
-    caster = Caster(sphere_mesh(), choice=choose_variant("mono_polarized"))
-    render_closed_forms(rig, view, caster, subpixels=subpixels)
+    sphere = plastic_sphere(rig)
+    render_by_olat(sphere, view, subpixels=subpixels)
     render_polarized_with_mitsuba(rig, view, "parallel", samples=samples, seed=seed)
 
-    closed_form_s = mitsuba_s = math.inf
+    olat_s = volpath_s = math.inf
     for _ in range(3):
+        load_mitsuba(choose_variant("rgb"))
         start = time.perf_counter()
-        ours = render_closed_forms(rig, view, caster, subpixels=subpixels)
-        between = time.perf_counter()
+        ours = render_by_olat(sphere, view, subpixels=subpixels)
+        olat_s = min(olat_s, time.perf_counter() - start)
+        load_mitsuba(choose_variant("mono_polarized"))
+        start = time.perf_counter()
         theirs = {
             name: render_polarized_with_mitsuba(rig, view, name, samples=samples, seed=seed + k)
             for k, name in enumerate(ANALYZER_AXIS_DEG)
         }
-        closed_form_s = min(closed_form_s, between - start)
-        mitsuba_s = min(mitsuba_s, time.perf_counter() - between)
+        volpath_s = min(volpath_s, time.perf_counter() - start)
 
-    truth = render_closed_forms(rig, view, caster, subpixels=12)
-    whole = _wholly_covered(view, caster)
+    truth = render_by_olat(sphere, view, subpixels=12)
+    whole = sphere.trace(view, 4, (0, view.height_px)).coverage() == 1.0
 
     def error(image: Float32Array, name: str) -> float:
         difference = (image - truth[name])[whole].astype(np.float64)
         return float(np.sqrt(np.mean(difference**2)) / truth[name][whole].mean())
 
     return PolarizerComparison(
-        closed_form_s=closed_form_s,
-        mitsuba_s=mitsuba_s,
-        closed_form_error={name: error(ours[name], name) for name in ANALYZER_AXIS_DEG},
-        mitsuba_error={name: error(theirs[name], name) for name in ANALYZER_AXIS_DEG},
+        olat_s=olat_s,
+        volpath_s=volpath_s,
+        olat_error={name: error(ours[name], name) for name in ANALYZER_AXIS_DEG},
+        volpath_error={name: error(theirs[name], name) for name in ANALYZER_AXIS_DEG},
         mean_ratio={
             name: float(theirs[name][whole].mean() / truth[name][whole].mean())
             for name in ANALYZER_AXIS_DEG
@@ -121,46 +122,43 @@ def compare_polarizer_models(
     )
 
 
-def render_closed_forms(
-    rig: Rig, view: View, caster: Caster, *, subpixels: int
+def plastic_sphere(rig: Rig, polarizers: Polarizers = IDEAL_POLARIZERS) -> MitsubaSurface:
+    """Return the sphere as a `skincoat` in front of the rig's flashes behind their polarizers."""
+    plastic = {
+        "type": "skincoat",
+        "distribution": "ggx",
+        "int_ior": ETA,
+        "r_d": SPHERE_ALBEDO,
+        "alpha": SPHERE_ALPHA,
+    }
+    weights = np.full(len(rig.lights), FLASH_INTENSITY)
+    flashes = FlashLights(rig.lights, polarizers, weights)
+    return MitsubaSurface(sphere_mesh(), plastic, flashes, choose_variant("rgb"))
+
+
+def render_by_olat(
+    sphere: MitsubaSurface, view: View, *, subpixels: int
 ) -> dict[str, Float32Array]:
-    """Return both images by closed forms, shape (H, W), in radiance."""
-    buffers = g_buffer(caster, view, subpixels=subpixels)
-    inside, _, position, normal, to_camera = buffers.hit_samples()
+    """Return both images by `olat`, shape (H, W), in radiance."""
+    hits = sphere.trace(view, subpixels, (0, view.height_px))
+    inside, facets = sphere.reflected(hits, view)
+    stokes = (facets + inside[:, :1] * sphere.leaving(hits, view)) / np.float32(np.pi)
+    way = np.asarray(view.position_mm, np.float32) - hits.position_mm
+    to_camera = way / np.linalg.norm(way, axis=1, keepdims=True)
     right, up, _ = view.axes
-    leaving = shading.exit_stokes(normal, to_camera, eta=ETA, image_right=right)
-    stokes = np.zeros_like(leaving)
-    for light in rig.lights:
-        to_light, falloff = direction_and_falloff(light, position)
-        absorbs = absorbing_axis(light)
-        cosine = np.maximum(np.einsum("ij,ij->i", normal, to_light), 0.0)
-        entry = shading.entry_transmittance(normal, to_light, eta=ETA, light_absorbs=absorbs)
-        lobe = shading.specular_stokes(
-            normal,
-            to_light,
-            to_camera,
-            SPHERE_ALPHA,
-            eta=ETA,
-            light_absorbs=absorbs,
-            image_right=right,
-        )
-        inner = np.float32(SPHERE_ALBEDO / math.pi) * cosine * entry
-        stokes += np.float32(FLASH_INTENSITY) * falloff[:, None] * (lobe + inner[:, None] * leaving)
     images = {}
     for name, angle in ANALYZER_AXIS_DEG.items():
-        full = np.zeros(buffers.mask.size, np.float32)
-        full[inside] = shading.apply_analyzer(
+        light = shading.apply_analyzer(
             stokes, to_camera, passes_deg=angle, image_right=right, image_up=up
         )
-        shape = (view.height_px, subpixels, view.width_px, subpixels)
-        images[name] = full.reshape(shape).mean(axis=(1, 3))
+        images[name] = hits.average(light[:, None])[..., 0] * hits.coverage()
     return images
 
 
 def render_polarized_with_mitsuba(
     rig: Rig, view: View, name: str, *, samples: int, seed: int
 ) -> Float32Array:
-    """Render one image by Mitsuba's path tracer through polarizers, shape (H, W)."""
+    """Render one image by Mitsuba's `volpath` through polarizers, shape (H, W)."""
     image = radiance(
         describe_polarized_rig(rig, view, ANALYZER_AXIS_DEG[name]),
         kind="mono_polarized",
@@ -173,15 +171,11 @@ def render_polarized_with_mitsuba(
 def describe_polarized_rig(rig: Rig, view: View, analyzer_deg: float) -> dict[str, Any]:
     """Return Mitsuba's scene of the rig with polarizers on the lights and the camera."""
     up = (0.0, 1.0, 0.0)
-    place = np.asarray(view.position_mm)
-    half = math.tan(0.5 * view.width_px / view.focal_px)
     scene: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "volpath", "max_depth": 8},
         "sensor": perspective(view, "luminance", up=up),
-        "analyzer": _polarizer_mesh(
-            place - [0.0, 0.0, 10.0], view.target_mm, 15.0 * half, analyzer_deg
-        ),
+        "analyzer": describe_analyzer(view, analyzer_deg),
         "ball": {
             "type": "sphere",
             "radius": SPHERE_RADIUS_MM,
@@ -209,13 +203,21 @@ def describe_polarized_rig(rig: Rig, view: View, analyzer_deg: float) -> dict[st
     return scene
 
 
+def describe_analyzer(view: View, passes_deg: float) -> dict[str, Any]:
+    """Return Mitsuba's description of a polarizer in front of a camera."""
+    before = np.asarray(view.position_mm) - [0.0, 0.0, 10.0]
+    half = math.tan(0.5 * view.width_px / view.focal_px)
+    return _polarizer_mesh(before, view.target_mm, 15.0 * half, passes_deg)
+
+
 def reference_rig(width_px: int) -> tuple[Rig, View]:
-    """Return the flash rig and its camera, cropped to a square that the sphere fills."""
+    """Return the flash rig with point flashes, its camera cropped to a square around the sphere."""
     rig = load_rig("flash")
     view = rig.views[0]
     pixel_um = 2.2 * SPHERE_RADIUS_MM / width_px / view.distance_mm * view.focal_mm * 1e3
     square = dataclasses.replace(view, width_px=width_px, height_px=width_px, pixel_um=pixel_um)
-    return dataclasses.replace(rig, views=(square,)), square
+    points = tuple(dataclasses.replace(light, radius_mm=1e-3) for light in rig.lights)
+    return dataclasses.replace(rig, views=(square,), lights=points), square
 
 
 def sphere_mesh(*, columns: int = 480, rows: int = 240) -> Mesh:
@@ -237,8 +239,3 @@ def _polarizer_mesh(position: Any, faces: Any, half_mm: float, passes_deg: float
         "to_world": matrix,
         "bsdf": {"type": "polarizer", "theta": {"type": "spectrum", "value": passes_deg}},
     }
-
-
-def _wholly_covered(view: View, caster: Caster) -> BoolArray:
-    mask = g_buffer(caster, view, subpixels=4).mask
-    return np.asarray(mask.reshape(view.height_px, 4, view.width_px, 4).all(axis=(1, 3)))

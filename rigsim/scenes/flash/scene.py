@@ -34,6 +34,7 @@ from rigsim.light.subsurface_radiance import (
     illuminate_surface,
     render_subsurface_radiance,
 )
+from rigsim.mitsuba.variant import VariantChoice
 from rigsim.needs import face as face_needs
 from rigsim.needs.effects import (
     AUTOMATIC_EFFECTS,
@@ -46,11 +47,19 @@ from rigsim.needs.flash import select_flash_effects
 from rigsim.needs.tissue import select_face_tissue
 from rigsim.render import camera_rays
 from rigsim.render.depth_of_field import depth_range, tabulate_defocus
-from rigsim.render.variant import VariantChoice
 from rigsim.scenes.exposing import FaceScene, SceneError
 from rigsim.scenes.flash import truth as flash_truth
 from rigsim.scenes.flash.image import FlashCamera, FlashImage
 from rigsim.scenes.flash.stage import shared_flash_geometry
+from rigsim.scenes.flash.surfaces import (
+    FastSurface,
+    FlashSurface,
+    MitsubaSurface,
+    describe_face,
+    describe_flash_target,
+    flash_lights,
+    unlit_surface,
+)
 from rigsim.sensor import Sensor
 from rigsim.subject import SimulatedSubject, landmarks
 from rigsim.targets import Target
@@ -117,10 +126,12 @@ class FlashScene(FaceScene):
             raise SceneError(f"power: got {power}, expected above 0 to 1")
         super().__init__(rig, subject, state, movement, sensor, seed, subpixels)
         self.films = draw_polarizers(rig) if films is None else films
-        self._weights = _light_weights(rig)
+        self._flashes = flash_lights(rig, self.films)
         self._choice = choice
         self._stage = shared_flash_geometry(self.subject, choice)
         self._caster = self._stage.caster
+        self.variant = self._caster.choice
+        """Variant that renders the images, with the reason."""
         self._effects, self._power = effects, power
         self.needs = merge_selections([self._needs_of(view, power) for view in rig.views])
         self.subject = select_face_tissue(self.subject, self.needs)
@@ -132,7 +143,7 @@ class FlashScene(FaceScene):
         noise, share = PixelNoise.of(self._sensors[view.name]), self._stage.exchange_fraction
         scenery = self._scenery(view, self._caster, share, noise, self._effects)
         white = np.asarray(self.white_rgb(view.name), np.float64) * power
-        seen = (scenery, white, self._weights, self.movement)
+        seen = (scenery, white, self._flashes.weights, self.movement)
         return select_flash_effects(self.rig, self.subject, self.state, *seen)
 
     def white_rgb(self, view_name: str | None = None) -> Float32Array:
@@ -360,13 +371,12 @@ class FlashScene(FaceScene):
 
     def _surface_light(self, subject: SimulatedSubject) -> SurfaceIllumination:
         wrinkled = self.needs.builds(face_needs.WRINKLE_SHADOW_EFFECT)
-        key = (self.rig.lights, tuple(self._weights.tolist()), self.films, wrinkled)
-        known = self._stage.light
+        key, known = (*self._flashes.key, wrinkled), self._stage.light
         if key not in known:
             known[key] = illuminate_surface(
                 subject,
                 self.rig.lights,
-                self._weights,
+                self._flashes.weights,
                 self.films,
                 caster=self._caster,
                 relief=ReliefShadow(subject) if wrinkled else None,
@@ -378,15 +388,14 @@ class FlashScene(FaceScene):
         """Return the maps that are blurred like the light; only the ground truth requires them."""
         if not self.lateral:
             return flash_truth.unblurred_maps(self._flash_image(view))
-        look = FlashCamera(self.rig, view, self.films, self._weights, self.subpixels)
-        return look.observe_maps(
-            self._stage.caster, self._face(), self._blurred_textures(view)
-        ).maps
+        look = FlashCamera(self.rig, view, self.subpixels)
+        surface = unlit_surface(self._caster, self._flashes)
+        return look.observe_maps(surface, self._face(), self._blurred_textures(view)).maps
 
     @cached_method
     def _blurred_textures(self, view: View) -> Mapping[str, Float32Array]:
         """Return the textures of those maps, of the moved face."""
-        look = FlashCamera(self.rig, view, self.films, self._weights, self.subpixels)
+        look = FlashCamera(self.rig, view, self.subpixels)
         glow = self._skin_glow(view.spectral_sensitivity)
         return look.blurred_maps(self._face(), self.state, glow)
 
@@ -398,10 +407,11 @@ class FlashScene(FaceScene):
         rest = face.rest
         if rest is None:
             return flash_truth.rest_maps_of_unmoved_face(moved)
-        caster = shared_flash_geometry(rest, self._choice).caster
         spread = self._blurred_textures(view) if self.lateral else None
         look = self._flash_camera(view, rest.mesh)
-        return flash_truth.truth_maps_at_rest(look, caster, face, self.state, spread)
+        caster = shared_flash_geometry(rest, self._choice).caster
+        surface = unlit_surface(caster, self._flashes)
+        return flash_truth.truth_maps_at_rest(look, surface, face, self.state, spread)
 
     def _flash_camera(self, view: View, mesh: Mesh) -> FlashCamera:
         spread = None
@@ -410,15 +420,26 @@ class FlashScene(FaceScene):
             spread = tabulate_defocus(
                 view, self._illuminant, subpixels=self.subpixels, depths_mm=depths
             )
-        return FlashCamera(self.rig, view, self.films, self._weights, self.subpixels, spread)
+        return FlashCamera(self.rig, view, self.subpixels, spread)
 
     @cached_method
     def _flash_image(self, view: View) -> FlashImage:
         look, subject = self._flash_camera(view, self.subject.mesh), self.subject
-        if isinstance(subject, SimulatedSubject):
-            glow = self._skin_glow(view.spectral_sensitivity)
-            return look.observe_face(self._caster, subject, self.state, glow)
-        return look.observe_target(self._caster, subject)
+        if isinstance(subject, Target):
+            return look.observe_target(self._surface(view))
+        glow = self._skin_glow(view.spectral_sensitivity)
+        return look.observe_face(self._surface(view), subject, self.state, glow)
+
+    def _surface(self, view: View) -> FlashSurface:
+        subject, camera = self.subject, view.spectral_sensitivity
+        if not self._caster.choice.is_vectorized:
+            target = subject if isinstance(subject, Target) else None
+            return FastSurface(self._caster, self._flashes, target)
+        if isinstance(subject, Target):
+            material = describe_flash_target(subject, camera, self._illuminant)
+        else:
+            material = describe_face(subject, self._skin_glow(camera).reflectance)
+        return MitsubaSurface(subject.mesh, material, self._flashes, self._caster.choice)
 
 
 def pop_energy(pop: FlashPop) -> float:
@@ -426,24 +447,3 @@ def pop_energy(pop: FlashPop) -> float:
     if not 0.0 <= pop.power <= 1.0:
         raise SceneError(f"power of pop {pop.token!r}: got {pop.power}, expected 0 to 1")
     return pop.power
-
-
-def _light_weights(rig: Rig) -> Float64Array:
-    """Return each light's energy over the total of a plate at the origin, mm^2."""
-    energy, share = [], []
-    view_axis = np.asarray(rig.views[0].axes[2])
-    for light in rig.lights:
-        if light.energy_ws is None:
-            raise SceneError(
-                f"light {light.name!r}: got no energy_ws, expected a flash; add energy_ws"
-            )
-        place = np.asarray(light.position_mm)
-        squared = float(place @ place)
-        energy.append(light.energy_ws)
-        share.append(light.energy_ws * float(place @ view_axis) / squared**1.5)
-    total = float(np.sum(share))
-    if not total > 0.0:
-        raise SceneError(
-            "lights: got none that reaches a plate at the origin facing the camera, expected one"
-        )
-    return np.asarray(energy) / total

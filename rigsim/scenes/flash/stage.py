@@ -6,9 +6,9 @@ from weakref import WeakValueDictionary
 from rigsim.geometry.mesh import Mesh
 from rigsim.light.interreflection import Interreflection, interreflection_for
 from rigsim.light.subsurface_radiance import SurfaceIllumination
+from rigsim.mitsuba.variant import VariantChoice
 from rigsim.needs.effect_sizes import max_exchange_fraction
 from rigsim.render import Caster
-from rigsim.render.variant import VariantChoice
 from rigsim.subject import SimulatedSubject
 from rigsim.targets import Target
 

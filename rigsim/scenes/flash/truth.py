@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from rigsim.arrays import BoolArray, Float32Array
 from rigsim.population.population import MAX_SKIN_HAIR
-from rigsim.render import Caster
 from rigsim.scenes.flash.image import FlashCamera, FlashImage
+from rigsim.scenes.flash.surfaces import FlashSurface
 from rigsim.subject import SimulatedSubject
 
 MAX_FOREIGN_LIGHT_FRACTION: Final = 0.01
@@ -62,7 +62,7 @@ def unblurred_maps(
 
 def truth_maps_at_rest(
     camera: FlashCamera,
-    caster: Caster,
+    surface: FlashSurface,
     moved: SimulatedSubject,
     state: str,
     blurred: Mapping[str, Float32Array] | None = None,
@@ -73,8 +73,8 @@ def truth_maps_at_rest(
     ----------
     camera
         Camera of the face at rest.
-    caster
-        Caster of its mesh.
+    surface
+        Its surface.
     moved
         The face in its pose, or at rest.
     state
@@ -87,7 +87,7 @@ def truth_maps_at_rest(
     layers = {"melanin": rest.melanin, "hemoglobin": moved.hemoglobin(state), "hair": rest.hair}
     if blurred is not None:
         layers |= {name: blurred[name] for name in BLURRED_FRACTIONS}
-    picture = camera.observe_maps(caster, rest, layers)
+    picture = camera.observe_maps(surface, rest, layers)
     seen = dict(picture.maps)
     if blurred is None:
         seen |= unblurred_maps(picture, VOLUME_FRACTIONS)

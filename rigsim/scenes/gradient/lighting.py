@@ -1,7 +1,9 @@
 """Light a patch of skin by the gradient rig's LEDs: twelve images per strain step.
 
 Per state one full image is computed, as Stokes vectors for each of the four moments of the light
-(see `rigsim.light.lobe_moments`); patterns and analyzer angles are sums of these.
+(see `rigsim.light.lobe_moments`); patterns and analyzer angles are sums of these. The LEDs' light
+on the relief comes from a Mitsuba scene (`rigsim.scenes.gradient.rendering`), or for large
+images from tables and horizons.
 """
 
 import math
@@ -23,7 +25,8 @@ from rigsim.light.lobe_moments import (
 from rigsim.light.relief_shadow import hidden_sky_fraction, horizon_tangent
 from rigsim.light.shadowed_lights import subtract_hidden_led
 from rigsim.scenes.gradient.patch import PatchSurface
-from rigsim.skin_patch.microrelief import MicroSkin, lateral_kernel
+from rigsim.scenes.gradient.rendering import TracedLight
+from rigsim.skin_patch.microrelief import MicroSkin
 from rigsim.tissue.skin_layers import ETA
 
 BLOCK_ROWS: Final = 128
@@ -34,8 +37,8 @@ SMOOTH_ALPHA: Final = 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PatchLighting:
-    """Lighting data that do not change with the state."""
+class TabulatedLight:
+    """Light of the LEDs from a table over normals, less that of LEDs below the horizon."""
 
     sphere: ActualSphere
     surface: MicrofacetSurface
@@ -44,34 +47,10 @@ class PatchLighting:
     """LEDs in the table; with shadows only those above the patch's plane."""
     sectors: int
     """Number of directions with horizons, interpolated in between. 0: no shadows."""
-    sigmas_mm: Float64Array
-    """Widths of the lateral kernel of the skin; empty: light leaves where it entered."""
-    weights: Float64Array
-    """Their weights, sum 1."""
-    groove_sectors: int = 0
-    """Number of sky directions for interreflection in grooves; 0: none."""
 
-    def stokes(
-        self, patch: PatchSurface, height_um: Float32Array, *, margin: int, pitch_um: float
-    ) -> Float32Array:
-        """Return the image of a patch before the lens, as Stokes vectors of the moments.
-
-        Parameters
-        ----------
-        patch
-            The surface.
-        height_um
-            Heights with ``margin`` more samples on all sides, which cast shadows.
-        margin
-            Number of those samples.
-        pitch_um
-            Sample pitch, um.
-
-        Returns
-        -------
-        ndarray of float32
-            Shape (12, H, W): Stokes vector of each moment, radiance.
-        """
+    def packed(self, wide: PatchSurface, *, margin: int, pitch_um: float) -> Float32Array:
+        """Return Stokes vectors and entering light; see `TracedLight`."""
+        patch = wide.crop(margin)
         rows, columns = patch.skin.shape
         packed = np.empty((16, rows, columns), np.float32)
         for first in range(0, rows, BLOCK_ROWS):
@@ -79,31 +58,9 @@ class PatchLighting:
             found = self._unshadowed_moments(patch, part)
             packed[:, part] = found.T.reshape(16, -1, columns)
         if self.sectors:
+            height_um = wide.relief_um + wide.bulge_um
             self._remove_hidden(patch, height_um, margin, pitch_um, packed)
-        packed[:12, ~patch.skin] = 0.0
-        entering = self._scatter_laterally(packed[12:], patch.skin, 1e-3 * pitch_um)
-        if self.groove_sectors:
-            grid = {"margin": margin, "sectors": self.groove_sectors}
-            hidden = hidden_sky_fraction(
-                height_um, patch.normals, pixel_um=pitch_um, boundaries=True, **grid
-            )
-            entering += self._groove_interreflection(hidden, entering, patch, 1e-3 * pitch_um)
-        right = self.surface.image_right
-        eye = np.asarray(self.surface.eye_mm, np.float32)
-        scale = np.float32(shading.interior_scale(ETA) / math.pi)
-        out = packed[:12]
-        for first in range(0, rows, BLOCK_ROWS):
-            part = slice(first, first + BLOCK_ROWS)
-            n = patch.normals[part].reshape(-1, 3)
-            to_camera = eye - np.stack(
-                [patch.x_mm[part], patch.y_mm[part], np.zeros_like(patch.x_mm[part])], axis=-1
-            ).reshape(-1, 3)
-            to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
-            leaves = shading.exit_stokes(n, to_camera, eta=ETA, image_right=right)
-            leaves = leaves.T.reshape(3, -1, columns) * (scale * patch.albedo[part])
-            for m in range(4):
-                out[3 * m : 3 * m + 3, part] += leaves * entering[m, part]
-        return out
+        return packed
 
     def _unshadowed_moments(self, patch: PatchSurface, part: slice) -> Float32Array:
         n = patch.normals[part].reshape(-1, 3)
@@ -143,6 +100,70 @@ class PatchLighting:
                     tangents[k] = np.ascontiguousarray(full[inner, inner])
             horizon = (tangents[pair[0]], tangents[pair[1]], float(where[led]) - int(where[led]))
             subtract_hidden_led(packed, patch, horizon, self.sphere, led, self.surface)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchLighting:
+    """Lighting data that do not change with the state."""
+
+    direct: TracedLight | TabulatedLight
+    """Light of the LEDs on the relief."""
+    sigmas_mm: Float64Array
+    """Widths of the lateral kernel of the skin; empty: light leaves where it entered."""
+    weights: Float64Array
+    """Their weights, sum 1."""
+    groove_sectors: int = 0
+    """Number of sky directions for interreflection in grooves; 0: none."""
+
+    def stokes(self, wide: PatchSurface, *, margin: int, pitch_um: float) -> Float32Array:
+        """Return the image of a patch before the lens, as Stokes vectors of the moments.
+
+        Parameters
+        ----------
+        wide
+            The surface, with ``margin`` more samples on all sides, which cast shadows.
+        margin
+            Number of those samples.
+        pitch_um
+            Sample pitch, um.
+
+        Returns
+        -------
+        ndarray of float32
+            Shape (12, H, W): Stokes vector of each moment, radiance.
+        """
+        patch = wide.crop(margin)
+        rows, columns = patch.skin.shape
+        packed = self.direct.packed(wide, margin=margin, pitch_um=pitch_um)
+        packed[:12, ~patch.skin] = 0.0
+        entering = self._scatter_laterally(packed[12:], patch.skin, 1e-3 * pitch_um)
+        if self.groove_sectors:
+            grid = {"margin": margin, "sectors": self.groove_sectors}
+            hidden = hidden_sky_fraction(
+                wide.relief_um + wide.bulge_um,
+                patch.normals,
+                pixel_um=pitch_um,
+                boundaries=True,
+                **grid,
+            )
+            entering += self._groove_interreflection(hidden, entering, patch, 1e-3 * pitch_um)
+        surface = self.direct.surface
+        right = surface.image_right
+        eye = np.asarray(surface.eye_mm, np.float32)
+        scale = np.float32(shading.interior_scale(ETA) / math.pi)
+        out = packed[:12]
+        for first in range(0, rows, BLOCK_ROWS):
+            part = slice(first, first + BLOCK_ROWS)
+            n = patch.normals[part].reshape(-1, 3)
+            to_camera = eye - np.stack(
+                [patch.x_mm[part], patch.y_mm[part], np.zeros_like(patch.x_mm[part])], axis=-1
+            ).reshape(-1, 3)
+            to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+            leaves = shading.exit_stokes(n, to_camera, eta=ETA, image_right=right)
+            leaves = leaves.T.reshape(3, -1, columns) * (scale * patch.albedo[part])
+            for m in range(4):
+                out[3 * m : 3 * m + 3, part] += leaves * entering[m, part]
+        return out
 
     def _groove_interreflection(
         self, hidden: Float32Array, entering: Float32Array, patch: PatchSurface, pitch_mm: float
@@ -185,7 +206,7 @@ class PatchLighting:
         return out
 
 
-def tabulate_patch_lighting(
+def tabulate_light(
     skin: MicroSkin,
     sphere: ActualSphere,
     surface: MicrofacetSurface,
@@ -193,15 +214,13 @@ def tabulate_patch_lighting(
     half_field_mm: float,
     sectors: int,
     table_size: int | None,
-    lateral: bool = True,
-    groove_sectors: int = 0,
-) -> PatchLighting:
-    """Tabulate the light on a patch of skin.
+) -> TabulatedLight:
+    """Tabulate the LEDs' light on a patch of skin.
 
     Parameters
     ----------
     skin
-        The patch: its roughness and its pigment.
+        The patch, for its roughness.
     sphere
         The LEDs.
     surface
@@ -213,12 +232,8 @@ def tabulate_patch_lighting(
         patch's plane where the relief tilts that way.
     table_size
         Nodes along each axis of the normals; None chooses by roughness.
-    lateral
-        Whether light scatters laterally in the skin.
-    groove_sectors
-        Number of sky directions for interreflection in grooves; 0: none.
     """
-    leds = tuple(k for k, (_, _, z) in enumerate(sphere.position_mm) if not sectors or z > 0.0)
+    leds = lit_leds(sphere, shadows=sectors > 0)
     alphas = (float(skin.alpha.min()), float(skin.alpha.max()))
     table = tabulate_moments(
         sphere,
@@ -229,5 +244,9 @@ def tabulate_patch_lighting(
         fields=2 if half_field_mm < 1.6 else 3,
         leds=leds,
     )
-    sigmas, weights = lateral_kernel(skin) if lateral else (np.zeros(0), np.zeros(0))
-    return PatchLighting(sphere, surface, table, leds, sectors, sigmas, weights, groove_sectors)
+    return TabulatedLight(sphere, surface, table, leds, sectors)
+
+
+def lit_leds(sphere: ActualSphere, *, shadows: bool) -> tuple[int, ...]:
+    """Return the LEDs that light a patch: with shadows those above its plane, otherwise all."""
+    return tuple(k for k, (_, _, z) in enumerate(sphere.position_mm) if not shadows or z > 0.0)

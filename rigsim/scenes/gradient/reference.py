@@ -1,8 +1,9 @@
-"""Check `GradientScene` by independent means: traced shadow rays, and Mitsuba.
+"""Check `GradientScene` by independent means: traced shadow rays, and Mitsuba's own materials.
 
-Mitsuba does not support a polarizer on each of many lights here, so the comparison uses the sum of
-both analyzer stops under unpolarized LEDs. The patch is uniform in pigment and roughness, its LEDs
-are points, and light leaves the skin where it entered.
+The rays judge both renderers with their own relief and closed forms. Mitsuba's path tracer adds
+reflection by other equations, and interreflection. It does not support a polarizer on each of many
+lights here, so the comparison uses the sum of both analyzer stops under unpolarized LEDs. The patch
+is uniform in pigment and roughness, its LEDs are points, and light leaves where it entered.
 """
 
 import dataclasses
@@ -21,15 +22,17 @@ from rigsim.as_built.polarizers import Polarizers
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, REFERENCE_DISTANCE_MM
 from rigsim.geometry.mesh import Mesh, build_mesh, grid_faces
 from rigsim.light.lobe_moments import led_moments
-from rigsim.needs.effects import SceneEffects
-from rigsim.render import Caster, MovableLightScene
-from rigsim.render.scene_radiance import (
+from rigsim.mitsuba.scene_radiance import (
+    MovableLightScene,
     matte_plastic,
     perspective,
     plastic_scale,
     point_light_rig,
     rough_metal,
 )
+from rigsim.mitsuba.variant import Renderer, choose_renderer
+from rigsim.needs.effects import SceneEffects
+from rigsim.render import Caster
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.tissue.skin_layers import ETA
@@ -73,10 +76,11 @@ def plain_scene(
     *,
     width_px: int,
     subpixels: int = 2,
-    sectors: int = 32,
+    sectors: int | None = None,
     table_size: int | None = None,
     shadows: bool = True,
     interreflections: bool = False,
+    renderer: Renderer = "fast",
 ) -> GradientScene:
     """Return the patch under unpolarized point LEDs, without lens and lateral scattering."""
     return GradientScene(
@@ -89,6 +93,7 @@ def plain_scene(
         subpixels=subpixels,
         sectors=sectors,
         table_size=table_size,
+        choice=choose_renderer(renderer),
     )
 
 

@@ -8,7 +8,6 @@ faces the camera gives `GRADIENT_METER_RATE_PER_S` full scales per second under 
 behind the parallel analyzer as behind the crossed one.
 """
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Final, Literal, TypeAlias
@@ -22,6 +21,7 @@ from rigsim.as_built.sphere import PATTERN_WEIGHTS, ActualSphere, diffuser_radia
 from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.caching import LruCache
 from rigsim.light.lobe_moments import MicrofacetSurface
+from rigsim.mitsuba.variant import VariantChoice
 from rigsim.needs.effects import AUTOMATIC_EFFECTS, PixelNoise, SceneEffects
 from rigsim.needs.face import INTERREFLECTION_EFFECT, LATERAL_EFFECT, SHADOW_EFFECT
 from rigsim.needs.gradient import OPTICS_EFFECT, select_gradient_effects
@@ -29,13 +29,19 @@ from rigsim.needs.tissue import select_patch_tissue
 from rigsim.render.lens_blur import Lens, blur_images, focused_lens
 from rigsim.scenes.exposing import RigScene, SceneError, full_power_duration_s
 from rigsim.scenes.gradient.analyzer import GridAnalyzer
-from rigsim.scenes.gradient.lighting import PatchLighting, tabulate_patch_lighting
+from rigsim.scenes.gradient.lighting import PatchLighting
 from rigsim.scenes.gradient.patch import (
     SHADOW_MARGIN_PX,
     PatchSurface,
     Relief,
     sample_grid,
     sample_patch,
+)
+from rigsim.scenes.gradient.renderer_choice import (
+    LightSettings,
+    choose_patch_renderer,
+    light_patch,
+    scale_leds,
 )
 from rigsim.scenes.gradient.target import target_moments
 from rigsim.sensor import Sensor, make_sensor
@@ -63,9 +69,6 @@ IMAGE_CACHE_BYTES: Final = 2**29
 
 MAX_CACHED_LIGHTINGS: Final = 2
 """Number of cached lightings: LEDs may change by gains and failures."""
-
-GROOVE_SECTORS: Final = 16
-"""Number of sky directions for interreflection in grooves."""
 
 MAX_CACHED_RELIEFS: Final = 4
 """Number of cached stretched patches."""
@@ -95,12 +98,13 @@ class GradientScene(RigScene):
     on_s
         Longest exposure of the plan, s, for the sizes of effects; None: such that the brightest
         skin is at full scale.
-    sectors
-        Number of directions with horizons, a multiple of 4.
     subpixels
         Samples along each side of a pixel.
-    table_size
-        Nodes of the table of moments along each axis of the normals; None chooses by roughness.
+    sectors, table_size
+        Request the fast renderer with these settings, see `LightSettings`.
+    choice
+        Mitsuba variant, for images of any size; None chooses: the fast renderer for large ones. A
+        vectorized one renders a Mitsuba scene, unless `variant` names a reason.
     """
 
     channels = ()
@@ -116,9 +120,10 @@ class GradientScene(RigScene):
         seed: int = 0,
         effects: SceneEffects = AUTOMATIC_EFFECTS,
         on_s: float | None = None,
-        sectors: int = 32,
+        sectors: int | None = None,
         subpixels: int = 1,
         table_size: int | None = None,
+        choice: VariantChoice | None = None,
     ) -> None:
         if len(rig.views) != 1:
             raise SceneError(f"views: got {len(rig.views)}, expected 1")
@@ -126,13 +131,11 @@ class GradientScene(RigScene):
             raise SceneError(f"subject: got {subject!r}, expected ball, flat, dark or skin")
         if subpixels < 1:
             raise SceneError(f"subpixels: got {subpixels}, expected at least 1")
-        if sectors < 4 or sectors % 4:
-            raise SceneError(f"sectors: got {sectors}, expected a multiple of 4")
         self.rig = rig
         self.films = draw_polarizers(rig) if films is None else films
         self.sphere = nominal_sphere(rig) if sphere is None else sphere
         self.motion, self.seed = motion, seed
-        self.sectors, self.subpixels, self.table_size = sectors, subpixels, table_size
+        self.subpixels = subpixels
         self._view = rig.views[0]
         self._sensor = make_sensor(self._view)
         self._lighting: LruCache[tuple[float, ...], PatchLighting] = LruCache(
@@ -158,6 +161,14 @@ class GradientScene(RigScene):
         self.optics = self.needs.builds(OPTICS_EFFECT)
         self.lateral = self.needs.builds(LATERAL_EFFECT)
         self.interreflections = self.needs.builds(INTERREFLECTION_EFFECT)
+        self._settings = LightSettings(
+            self.shadows, self.lateral, self.interreflections, sectors, table_size
+        )
+        samples = self.subpixels**2 * self._view.width_px * self._view.height_px
+        self.variant = choose_patch_renderer(
+            choice, self.subject, self.sphere, samples, self._settings
+        )
+        """Variant that renders the patch, with the reason."""
 
     @property
     def lens(self) -> Lens:
@@ -375,7 +386,7 @@ class GradientScene(RigScene):
             if isinstance(self.subject, MicroSkin) and grip is not None:
                 picture = self._render(grip, jump_mm, shares)
             else:
-                sphere, extinction = self._make_lighting(shares), self.films.light_extinction
+                sphere, extinction = scale_leds(self.sphere, shares), self.films.light_extinction
                 picture = target_moments(
                     str(self.subject), self._view, sphere, extinction, seed=self.seed
                 )
@@ -392,15 +403,12 @@ class GradientScene(RigScene):
         s = self.subpixels
         margin = SHADOW_MARGIN_PX if self.shadows or self.interreflections else 0
         wide = self.surface(grip, subpixels=s, border_px=DRIFT_MARGIN_PX + margin, jump_mm=jump_mm)
-        patch = wide.crop(s * margin)
         raw = self.lighting(shares).stokes(
-            patch,
-            wide.relief_um + wide.bulge_um,
-            margin=s * margin,
-            pitch_um=self.lens.pixel_on_subject_um / s,
+            wide, margin=s * margin, pitch_um=self.lens.pixel_on_subject_um / s
         )
         if self.optics:
-            return blur_images(raw, self.lens, depth_mm=patch.height_mm, subpixels=s)
+            depth_mm = wide.crop(s * margin).height_mm
+            return blur_images(raw, self.lens, depth_mm=depth_mm, subpixels=s)
         k, h, w = raw.shape
         return np.asarray(raw.reshape(k, h // s, s, w // s, s).mean(axis=(2, 4)), np.float32)
 
@@ -414,25 +422,16 @@ class GradientScene(RigScene):
         """
 
         def make() -> PatchLighting:
-            return tabulate_patch_lighting(
+            return light_patch(
                 self.skin,
-                self._make_lighting(led_fractions),
+                scale_leds(self.sphere, led_fractions),
                 self.optical_surface(float(np.median(self.skin.alpha))),
-                half_field_mm=0.5 * max(self._view.field_mm) + 0.1,
-                sectors=self.sectors if self.shadows else 0,
-                table_size=self.table_size,
-                lateral=self.lateral,
-                groove_sectors=GROOVE_SECTORS if self.interreflections else 0,
+                self._view,
+                self.variant,
+                self._settings,
             )
 
         return self._lighting.get(led_fractions, make)
-
-    def _make_lighting(self, shares: tuple[float, ...]) -> ActualSphere:
-        if not shares:
-            return self.sphere
-        if len(shares) != len(self.sphere.intensity) or min(shares) < 0.0:
-            raise SceneError(f"led_shares: got {len(shares)} numbers, expected one >= 0 per LED")
-        return dataclasses.replace(self.sphere, intensity=self.sphere.intensity * np.array(shares))
 
     def optical_surface(self, alpha: float) -> MicrofacetSurface:
         """Return the reflection of a surface of a roughness, with the camera."""

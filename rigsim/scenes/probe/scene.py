@@ -20,15 +20,17 @@ from capture.rig import Rig
 from model import spectra
 from model.skin import SkinAppearance
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
-from rigsim.as_built.probe import ActualProbe, build_probe, fiber_unit_images
+from rigsim.as_built.probe import ActualProbe, build_probe
 from rigsim.boxes.source_shutter import SourceLight
 from rigsim.fiber.homogeneous_fit import fit_homogeneous_medium
 from rigsim.fiber.probe_profile import BandProfile, ProfileCache, probe_fibers
 from rigsim.fiber.probe_tissue import HomogeneousTissue, ProbedTissue, TissueError
+from rigsim.mitsuba.variant import choose_variant
 from rigsim.needs.effects import PixelNoise
 from rigsim.needs.probe import equivalent_pixels, select_probe_effects
 from rigsim.needs.tissue import select_probed_tissue
 from rigsim.scenes.exposing import RigScene, SceneError, full_power_duration_s
+from rigsim.scenes.probe.detector import render_fiber_images
 from rigsim.sensor import Sensor, expose_sensor, make_sensor
 from rigsim.world.suction import HeadState
 
@@ -78,6 +80,9 @@ class ProbeScene(RigScene):
         Photons per site and angle.
     """
 
+    renderer: Final = "mitsuba"
+    """Renderer of the detector's image, with any variant."""
+
     def __init__(
         self,
         rig: Rig,
@@ -97,10 +102,12 @@ class ProbeScene(RigScene):
                 f"build: got {len(self.build.gain)} fibers, expected {len(rig.probe.fibers)}"
             )
         self._view = rig.views[0]
+        self.variant = choose_variant("rgb")
+        """Variant that renders the fibers' ends, with the reason."""
         dark = {"dark_e_per_s": DARK_CURRENT_E_PER_S, "vignetting": LENS_VIGNETTING}
         self._sensor = make_sensor(self._view, **dark) if sensor is None else sensor
         self.white = spectra.camera_white(self._view.spectral_sensitivity, rig.lights[0].illuminant)
-        images = fiber_unit_images(self.build, self._view)
+        images = render_fiber_images(self.build, self._view)
         self._images = np.ascontiguousarray(images.reshape(len(images), -1).T)
         self.hot_e_per_s = _hot_pixels(self._sensor, images.shape[1:])
         """Added dark current of hot pixels at `DARK_CURRENT_REFERENCE_C`, electrons/s,

@@ -11,7 +11,8 @@ from capture.calibration.fiber.readings import FiberReadings, read_fibers
 from capture.calibration.fiber.spots import FiberSpots
 from capture.plan.probe import exposure_series_s
 from capture.rig import load_rig
-from rigsim.as_built.probe import ProbeTolerances, build_probe, fiber_unit_images
+from rigsim.as_built.probe import ProbeTolerances, build_probe
+from rigsim.scenes.probe.detector import render_fiber_images
 from rigsim.sensor import expose_sensor, fixed_pattern, make_sensor
 from skinrig.arrays import Float64Array, UInt16Array
 from skinrig.benchmarks.resampling import bootstrap_columns_median
@@ -85,7 +86,7 @@ def _bench(*, draws: int) -> _ProbeCamera:
     # the brightest fiber reaches half of full scale in the shortest exposure
     light = 0.5 / times[0] * np.geomspace(1, 10.0**-LIGHT_DECADES, len(build.gain))[:, None]
     light = light * np.array([0.6, 1.0, 0.5])
-    images = fiber_unit_images(build, view).astype(np.float64)
+    images = render_fiber_images(build, view).astype(np.float64)
     colors = color_masks(shape, view.cfa)
     response = fixed_pattern(sensor, shape).response.astype(np.float64)
     rate = np.zeros(shape)

@@ -10,7 +10,8 @@ from numba import njit
 
 from capture.rig import load_rig
 from rigsim.fiber.profile import trace_fiber_profile
-from rigsim.render import RenderError, look_at, radiance
+from rigsim.mitsuba.render_error import RenderError
+from rigsim.mitsuba.scene_radiance import look_at, radiance
 from rigsim.tissue.tissue_mc import Layer, LayerStack, trace_photons
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.measurement import LIMIT_CORES, measure_processor_time

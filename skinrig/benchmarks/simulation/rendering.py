@@ -9,33 +9,39 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from capture.rig import load_rig
-from rigsim.as_built.sphere import PATTERN_WEIGHTS
-from rigsim.render import Caster
-from rigsim.render.scene_radiance import point_light_rig
-from rigsim.render.variant import choose_variant
+from rigsim.as_built.sphere import PATTERN_WEIGHTS, build_sphere
+from rigsim.mitsuba.scene_radiance import point_light_rig
+from rigsim.mitsuba.variant import Renderer, choose_renderer, choose_variant
+from rigsim.needs.effects import SceneEffects
 from rigsim.scenes.dome import reference as dome_scenes
 from rigsim.scenes.flash import polarizer_reference as flash_scenes
+from rigsim.scenes.flash.scene import FlashScene
 from rigsim.scenes.gradient import reference as gradient_scenes
-from rigsim.skin_patch.microrelief import MicroSkin
+from rigsim.scenes.gradient.reference import NEUTRAL_GRIP
+from rigsim.scenes.gradient.scene import GradientScene
+from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
+from rigsim.subject import make_subject
 from skinrig.arrays import Float32Array, Float64Array, Int64Array
 from skinrig.benchmarks import resident_memory
-from skinrig.benchmarks.measurement import measure_processor_time
+from skinrig.benchmarks.measurement import measure_processor_seconds, measure_processor_time
 from skinrig.benchmarks.resampling import bootstrap_interval, bootstrap_tiled_rms
 from skinrig.benchmarks.results import ErrorEstimate, Knobs, Timing
 from skinrig.benchmarks.stage import BenchmarkStage
 
-NO_MEMORY_REASON = "three methods run in turn in one process, which keeps all their scenes"
+NO_MEMORY_REASON = "the methods run in turn in one process, which keeps all their scenes"
 
 
 def measure_dome(stage: BenchmarkStage) -> None:
-    """Measure one view of the dome, one light at a time (OLAT), by three methods.
+    """Measure one view of the dome, one light at a time (OLAT), by several methods.
 
     The full size is that of the rig's cameras. Mitsuba uses stratified samples, which are as
     uniform as our regular rays; with its default, independent samples it is twice as noisy.
+    Seconds are processor time.
     """
     width, lights = (64, 2) if stage.toy else (1300, 4)
     efforts = (1, 2) if stage.toy else (1, 3, 2)
     fine = 4 if stage.toy else 6
+    found: dict[dome_scenes.Method, dome_scenes.RenderTiming] = {}
     for subpixels in efforts:
         found = dome_scenes.compare_integrators(
             width_px=width,
@@ -44,14 +50,17 @@ def measure_dome(stage: BenchmarkStage) -> None:
             reference_subpixels=fine,
             rounds=2 if subpixels == efforts[-1] else 1,
         )
-        for name in ("ours", "path", "direct"):
-            way = getattr(found, name)
+        for name, way in found.items():
             timing = Timing.single(way.seconds, no_memory_reason=NO_MEMORY_REASON)
             stage.add({"way": name, "rays": subpixels**2}, timing, _method_error(way))
     stage.measure_bands(lambda band: _on_skin(band.preset, 64 if stage.toy else 650, fine))
-    stage.limits["over_path"] = found.speed_up(found.path)
-    stage.limits["over_direct"] = found.speed_up(found.direct)
-    finest = stage.find_point(way="ours", rays=max(efforts) ** 2)
+    ours = found["olat"]
+    stage.limits["over_fast"] = ours.cost_over(found["fast"])
+    stage.limits["over_path"] = found["path"].cost_over(ours)
+    stage.limits["over_direct"] = found["direct"].cost_over(ours)
+    effort = {"runs": 4, "samples": 64, "subpixels": 8} if stage.toy else {}
+    stage.limits["agreement"] = 100.0 * dome_scenes.measure_agreement_with_path(**effort)
+    finest = stage.find_point(way="olat", rays=max(efforts) ** 2)
     stage.reference_error = finest.error * max(efforts) / fine
     stage.description_values["rays"] = fine**2
 
@@ -82,19 +91,20 @@ REFERENCE_RAYS = 144
 
 
 def measure_flash(stage: BenchmarkStage) -> None:
-    """Measure both polarization images by closed forms and by Mitsuba's own polarizers."""
+    """Measure both polarization images by `olat` and by `volpath` through Mitsuba's polarizers.
+
+    The images of a face are also rendered by the fast way of machines without LLVM.
+    """
     efforts = ((1, 2), (2, 4)) if stage.toy else ((1, 4), (2, 16), (3, 64))
     width = 48 if stage.toy else 256
     rig, view = flash_scenes.reference_rig(width)
-    caster = Caster(flash_scenes.sphere_mesh(), choice=choose_variant("mono_polarized"))
-    truth = flash_scenes.render_closed_forms(
-        rig, view, caster, subpixels=round(REFERENCE_RAYS**0.5)
-    )
+    sphere = flash_scenes.plastic_sphere(rig)
+    truth = flash_scenes.render_by_olat(sphere, view, subpixels=round(REFERENCE_RAYS**0.5))
     worse = partial(_larger_error, truth=truth)
     for subpixels, _ in efforts:
         stage.measure(
-            {"way": "closed form", "subpixels": subpixels},
-            lambda: flash_scenes.render_closed_forms(rig, view, caster, subpixels=subpixels),
+            {"way": "olat", "subpixels": subpixels},
+            lambda: flash_scenes.render_by_olat(sphere, view, subpixels=subpixels),
             worse,
             repeats=3,
             memory=None,
@@ -103,7 +113,7 @@ def measure_flash(stage: BenchmarkStage) -> None:
     for _, samples in efforts:
         image = partial(flash_scenes.render_polarized_with_mitsuba, rig, view, samples=samples)
         stage.measure(
-            {"way": "mitsuba", "samples": samples},
+            {"way": "volpath", "samples": samples},
             lambda: {
                 name: image(name, seed=k) for k, name in enumerate(flash_scenes.ANALYZER_AXIS_DEG)
             },
@@ -111,11 +121,39 @@ def measure_flash(stage: BenchmarkStage) -> None:
             repeats=3,
             memory=None,
         )
+    over_fast, difference = _olat_over_fast(64 if stage.toy else 384)
+    stage.limits = {"difference": difference}
     if not stage.toy:
         final = flash_scenes.compare_polarizer_models(
             width_px=width, samples=efforts[-1][1], subpixels=1
         )
-        stage.limits = {"speed_up": final.speed_up, "noise": final.noise_ratio}
+        stage.limits |= {"speed_up": final.speed_up, "noise": final.noise_ratio}
+        stage.limits["over_fast"] = over_fast
+
+
+def _olat_over_fast(width_px: int) -> tuple[float, float]:
+    """Compare both renderers of the flash rig: processor time, and relative difference of means.
+
+    Light between points of the skin is left out: both take it from the same textures.
+    """
+    rig, face = load_rig("flash").resized(width_px), make_subject("III")
+    effects = SceneEffects(lateral=False, interreflections=False)
+    scalar = choose_variant("rgb", environment={"SKINRIG_MITSUBA": "scalar"})
+    ways = {"olat": choose_variant("rgb"), "fast": scalar}
+    spent: dict[str, list[float]] = {way: [] for way in ways}
+    mean: dict[str, float] = {}
+    scenes = []  # those of a way share the light on the surface, as long as one lives
+    for _ in range(6):  # the first compiles
+        for way, choice in ways.items():
+            scene = FlashScene(rig, face, effects=effects, choice=choice)
+            scenes.append(scene)
+            seconds, images = measure_processor_time(
+                lambda: [scene.radiance(name) for name in flash_scenes.ANALYZER_AXIS_DEG]
+            )
+            spent[way].append(seconds)
+            mean[way] = float(np.mean(images))
+    ratio = float(np.median(spent["olat"][1:]) / np.median(spent["fast"][1:]))
+    return ratio, abs(mean["olat"] / mean["fast"] - 1.0)
 
 
 def _larger_error(found: dict[str, Float32Array], truth: dict[str, Float32Array]) -> ErrorEstimate:
@@ -129,24 +167,25 @@ def _larger_error(found: dict[str, Float32Array], truth: dict[str, Float32Array]
 
 
 N_LIT_CONDITIONS = 14
-"""Conditions that Mitsuba renders; two of the 16 are dark."""
+"""Conditions that Mitsuba's path tracer renders; two of the 16 are dark."""
 
-BEST_KNOBS: Knobs = {"way": "moments", "subpixels": 2, "sectors": 32, "table": 65}
+BEST_KNOBS: Knobs = {"way": "fast", "subpixels": 2, "sectors": 32, "table": 65}
 
 
 def measure_gradient(stage: BenchmarkStage) -> None:
-    """Measure renderings of one state of skin under all conditions, by moments and by Mitsuba.
+    """Measure renderings of one state of skin under all conditions, by three methods.
 
-    The reference of both is the sum over all LEDs with a shadow ray to each. Seconds are processor
-    time. Ours include the table, which is common to all states of a session, and one state.
+    The reference of all is the sum over all LEDs with a shadow ray to each. Seconds are processor
+    time. Ours include one state, and the fast renderer's table, which serves all of a session.
     """
-    width = 48 if stage.toy else 192
+    width = 48 if stage.toy else 256
     skin = gradient_scenes.plain_skin(width * 0.006 + 0.9)
     rng = np.random.default_rng(0)
     pixels = np.sort(rng.choice(width * width, 200 if stage.toy else 1500, replace=False))
     plain = gradient_scenes.plain_scene(skin, width_px=width)
     reference, _ = gradient_scenes.trace_pixels(plain, pixels, subpixels=2 if stage.toy else 4)
     best, without = _by_moments(stage, skin, width, pixels, reference)
+    traced = _by_olat(stage, skin, width, pixels, reference)
     for samples in (4,) if stage.toy else (16, 64):
         ways = []
         for number, pattern in enumerate(("full", "x")):
@@ -162,7 +201,7 @@ def measure_gradient(stage: BenchmarkStage) -> None:
             )
         error = math.sqrt(sum(way.error**2 for way in ways) / 2.0)
         seconds = N_LIT_CONDITIONS * sum(way.seconds for way in ways) / 2.0
-        knobs: Knobs = {"way": "Mitsuba", "samples": samples}
+        knobs: Knobs = {"way": "path", "samples": samples}
         _add(stage, knobs, seconds, error, rise.mb, len(pixels))
     # the error of independent samples falls with 1 / sqrt(seconds)
     at_equal_error = seconds * (error / best.error) ** 2
@@ -170,9 +209,46 @@ def measure_gradient(stage: BenchmarkStage) -> None:
     stage.limits = {
         ("speed_up", samples): at_equal_error / best.seconds,
         "error": 100.0 * best.error,
+        "traced_error": 100.0 * traced.error,
         "mean": off,
         "shadows": without.error / best.error,
+        "traced_seconds": _condition_seconds("mitsuba", width),
+        "fast_seconds": _condition_seconds("fast", width),
     }
+
+
+def _by_olat(
+    stage: BenchmarkStage, skin: MicroSkin, width: int, pixels: Int64Array, reference: Float64Array
+) -> gradient_scenes.ReferenceComparison:
+    """Add the integrator's settings with a shadow ray per sample and LED; return 2 x 2 samples."""
+    plain = partial(gradient_scenes.plain_scene, skin, width_px=width, renderer="mitsuba")
+    gradient_scenes.scene_pixels(plain(subpixels=1), pixels)  # compiles the kernels
+    for subpixels in (1, 2) if stage.toy else (1, 3, 2):
+        scene = plain(subpixels=subpixels)
+        with resident_memory.track_peak() as rise:
+            spent_s, found = measure_processor_time(
+                partial(gradient_scenes.scene_pixels, scene, pixels)
+            )
+        way = gradient_scenes.compare_with_reference(found, reference, spent_s)
+        knobs: Knobs = {"way": scene.variant.renderer, "subpixels": subpixels}
+        _add(stage, knobs, spent_s, way.error, rise.mb, len(pixels))
+    return way
+
+
+def _condition_seconds(renderer: Renderer, width: int) -> float:
+    """Return the least processor seconds of a session's 16 conditions of one state."""
+    rig = load_rig("gradient").cropped(width)
+    skin = make_micro_skin("forehead", size_mm=width * 0.006 + 0.9)
+
+    def render() -> None:
+        scene = GradientScene(
+            rig, skin, sphere=build_sphere(rig, seed=0), choice=choose_renderer(renderer)
+        )
+        for pattern in PATTERN_WEIGHTS:
+            for analyzer_deg in (0.0, 90.0):
+                scene.radiance(pattern, grip=NEUTRAL_GRIP, analyzer_deg=analyzer_deg)
+
+    return measure_processor_seconds(render, 2)
 
 
 def _by_moments(
@@ -193,7 +269,7 @@ def _by_moments(
             spent_s, (_, found) = measure_processor_time(
                 lambda: (scene.lighting(), gradient_scenes.scene_pixels(scene, pixels))
             )
-        knobs: Knobs = {"way": "moments", "subpixels": subpixels}
+        knobs: Knobs = {"way": "fast", "subpixels": subpixels}
         knobs |= {"sectors": sectors, "table": table}
         way = gradient_scenes.compare_with_reference(found, reference, spent_s)
         _add(stage, knobs, spent_s, way.error, rise.mb, len(pixels))

@@ -9,7 +9,6 @@ from typing import Any, Final, cast
 import numpy as np
 
 from capture.rig import load_rig
-from rigsim.as_built.probe import fiber_unit_images
 from rigsim.fiber.probe_profile import ProfileCache
 from rigsim.fiber.probe_tissue import SkinTissue
 from rigsim.needs.effects import EffectSelection, PixelNoise, SceneEffects
@@ -20,6 +19,7 @@ from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.scenes.gradient.reference import NEUTRAL_GRIP
 from rigsim.scenes.gradient.scene import GRADIENT_METER_RATE_PER_S, GradientScene
+from rigsim.scenes.probe.detector import render_fiber_images
 from rigsim.scenes.probe.scene import ProbeScene
 from rigsim.skin_patch.microrelief import change_patch_tissue, make_micro_skin
 from rigsim.subject.person_skin import PersonSkin, draw_tissue
@@ -169,7 +169,7 @@ def _compare_probe(person: PersonSkin, power: float) -> TissueComparison:
     scene = ProbeScene(rig, skin)
     omitted, tissues = _negligible(scene.needs), (skin, cast(SkinTissue, scene.profiles.tissue))
     have, lack = (predict_profiles(rig, skin, one.person.tissue) for one in tissues)
-    images = fiber_unit_images(scene.build, rig.views[0])
+    images = render_fiber_images(scene.build, rig.views[0])
     sigma = float(PixelNoise.of(scene.sensor()).sigma(1.0)) / equivalent_pixels(images) ** 0.5
     all_s, selected_s = (
         measure_processor_seconds(

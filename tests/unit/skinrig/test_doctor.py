@@ -3,6 +3,7 @@ import types
 
 import pytest
 
+from rigsim.mitsuba import variant
 from skinrig import doctor
 
 
@@ -35,3 +36,13 @@ def test_missing_producers_report_variable_to_set(with_harvesters, monkeypatch):
     (finding,) = producers()
     assert finding.state == "none"
     assert "GENICAM_GENTL64_PATH" in finding.fix
+
+
+@pytest.mark.parametrize(("asked", "renderer"), [("scalar", "fast"), ("", "mitsuba")])
+def test_renderer_of_sessions_is_reported(asked, renderer, monkeypatch):
+    monkeypatch.setenv("SKINRIG_MITSUBA", asked)
+    if asked == "" and not variant.choose_variant().is_vectorized:
+        pytest.skip("no LLVM library of version 17 or newer")
+    (finding,) = [one for one in doctor.check_installation() if one.what == "Mitsuba variant"]
+    assert finding.state.endswith(f"renderer of sessions: {renderer}")
+    assert ("apt-get install" in finding.fix) == (renderer == "fast")

@@ -10,9 +10,9 @@ import pytest
 
 from capture.rig import load_rig
 from rigsim.light.relief_shadow import HORIZON_DIRECTIONS, HORIZON_SOFTNESS_RAD, ReliefShadow
+from rigsim.mitsuba.variant import VariantChoice, choose_variant
 from rigsim.needs.effects import SceneEffects
 from rigsim.needs.face import WRINKLE_SHADOW_EFFECT
-from rigsim.render.variant import VariantChoice, choose_variant
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject.person import make_subject

@@ -217,7 +217,7 @@ def test_lens_effect_follows_highlight_brighter_than_dark_skin(flash, faces):
         rough = float(scene.subject.roughness[scene.subject.atlas.covered].min())
         places = [light.position_mm for light in rig.lights]
         bound = effect_sizes.max_highlight(
-            scene.subject.mesh, places, scene._weights, rig.views[0].position_mm, rough
+            scene.subject.mesh, places, scene._flashes.weights, rig.views[0].position_mm, rough
         )
         peak = float((bound * scene.white_rgb()).max())
         assert shown.max() < peak

@@ -11,6 +11,7 @@ from scipy.special import j1
 
 from capture.rig import Rig, load_rig
 from rigsim.light.olat import pixel_order
+from rigsim.mitsuba.variant import VariantChoice
 from rigsim.needs import face as face_needs
 from rigsim.needs.effects import PixelNoise, SceneEffects
 from rigsim.render.caster import Caster
@@ -23,7 +24,6 @@ from rigsim.render.depth_of_field import (
 )
 from rigsim.render.lens_blur import BlurError, focused_lens
 from rigsim.render.rays import GBuffer, camera_rays, g_buffer, trace
-from rigsim.render.variant import VariantChoice
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject.person import make_subject
 

@@ -5,9 +5,9 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from capture.rig import Rig
+from rigsim.mitsuba.variant import VariantChoice
 from rigsim.needs.effects import SceneEffects
 from rigsim.render.caster import Caster
-from rigsim.render.variant import VariantChoice
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject import face_regions, landmarks
 from rigsim.subject.expressions import displacement_mm

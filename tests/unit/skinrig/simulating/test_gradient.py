@@ -5,10 +5,12 @@ import pytest
 from capture.plan.gradient import gradient_calibration_plan, gradient_plan
 from capture.rig import load_rig
 from capture.session import verify
+from rigsim.mitsuba.variant import choose_renderer
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.capturing.option_values import parse_floats, parse_range
 from skinrig.capturing.plan_choice import choose_plan, needed_boxes
 from skinrig.errors import UsageError
+from skinrig.simulating.driving import record_renderer
 from skinrig.simulating.gradient import make_scene
 from skinrig.simulating.orders import SimulationError
 from skinrig.simulating.simulation import simulate_session
@@ -69,6 +71,22 @@ def test_angles_are_for_skin_in_a_caliper_only(tmp_path):
         choose_plan(RIG, None, "ball", steps=(0, 1))
     with pytest.raises(UsageError, match="--angles"):
         choose_plan(RIG, tmp_path / "plan.json", None, steps=(0, 1))
+
+
+@pytest.mark.parametrize(
+    ("width", "renderer", "found", "why"),
+    [
+        (32, "mitsuba", choose_renderer("mitsuba").renderer, ""),
+        (32, "fast", "fast", "requested"),
+        (640, "mitsuba", "fast", "shadow rays per state exceed"),
+    ],
+)
+def test_wide_skin_falls_back_to_fast_renderer(width, renderer, found, why):
+    rig = RIG.cropped(width)
+    scene = make_scene(rig, plan=gradient_plan(rig, angles=[0]), renderer=renderer)
+    record = record_renderer(scene)
+    assert record["name"] == found
+    assert why in record["why"]
 
 
 def test_skin_patch_covers_field_in_every_state():

@@ -11,8 +11,8 @@ from capture.rig import Rig, load_rig
 from rigsim.as_built.dome import ActualDome, DomeTolerances, build_dome, distort
 from rigsim.light import olat
 from rigsim.light.led_light import DOME_METER_RATE_PER_S
+from rigsim.mitsuba.variant import VariantChoice, choose_variant
 from rigsim.needs.effects import SceneEffects
-from rigsim.render.variant import VariantChoice, choose_variant
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.exposing import SceneError
 from rigsim.subject.head_motion import HeadMotionError, draw_head_motion

@@ -5,8 +5,8 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from capture.rig import Rig, load_rig
+from rigsim.mitsuba.variant import VariantChoice
 from rigsim.needs.effects import SceneEffects
-from rigsim.render.variant import VariantChoice
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject import landmarks

@@ -10,8 +10,8 @@ import pytest
 from capture.calibration.color.chart import find_chart
 from capture.rig import Rig, load_rig
 from rigsim.as_built.polarizers import IDEAL_POLARIZERS, PolarizerError, Polarizers, draw_polarizers
+from rigsim.mitsuba.variant import VariantChoice
 from rigsim.needs.effects import SceneEffects
-from rigsim.render.variant import VariantChoice
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.flash.scene import FLAT_FIELD_LEVEL, METERING_LEVEL, FlashScene
 from rigsim.sensor import make_sensor

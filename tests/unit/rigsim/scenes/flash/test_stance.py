@@ -5,9 +5,9 @@ import pytest
 
 from capture.rig import Rig, load_rig
 from rigsim.as_built.polarizers import IDEAL_POLARIZERS
+from rigsim.mitsuba.variant import VariantChoice
 from rigsim.needs.effects import SceneEffects
 from rigsim.render.depth_of_field import depth_range
-from rigsim.render.variant import VariantChoice
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject import landmarks
 from rigsim.subject.person import SimulatedSubject, SubjectError

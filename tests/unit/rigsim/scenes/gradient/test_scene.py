@@ -10,6 +10,7 @@ from capture.rig import load_rig
 from rigsim.as_built.polarizers import IDEAL_POLARIZERS
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, build_sphere
 from rigsim.boxes.gradient_sphere import PatternLight
+from rigsim.mitsuba.variant import choose_renderer
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.gradient.resolution import SineRelief, make_sine_relief_scene
 from rigsim.scenes.gradient.scene import GRADIENT_METER_RATE_PER_S, GradientScene
@@ -52,9 +53,12 @@ def flat_skin(skin):
     )
 
 
-@pytest.fixture(scope="module")
-def scene(rig, skin):
-    return GradientScene(rig, skin, table_size=33)
+@pytest.fixture(scope="module", params=["mitsuba", "fast"])
+def scene(request, rig, skin):
+    """The patch by each renderer; without LLVM both are the fast one."""
+    if request.param == "fast":
+        return GradientScene(rig, skin, table_size=33)
+    return GradientScene(rig, skin)
 
 
 def test_diffuser_gets_its_meter_rate_behind_any_analyzer(rig):
@@ -101,10 +105,11 @@ def test_slopes_right_and_up_brighten_x_y_patterns(scene):
         assert abs(np.corrcoef(ratio, normals[..., 1 - axis][inner].ravel())[0, 1]) < 0.5
 
 
-def test_crossed_polarizers_remove_specular_of_flat_patch(rig, flat_skin):
+@pytest.mark.parametrize("table_size", [None, 33], ids=["mitsuba", "fast"])
+def test_crossed_polarizers_remove_specular_of_flat_patch(rig, flat_skin, table_size):
     """Black skin, ideal films: what is left in the middle is what is off the central view."""
     black = dataclasses.replace(flat_skin, albedo=np.zeros_like(flat_skin.albedo))
-    scene = GradientScene(rig, black, films=IDEAL_POLARIZERS, table_size=33)
+    scene = GradientScene(rig, black, films=IDEAL_POLARIZERS, table_size=table_size)
     moments = scene.moments(NEUTRAL)
     leak = moments["crossed"][0] / moments["parallel"][0]
     assert leak.max() < 0.02
@@ -121,9 +126,10 @@ def test_crossed_images_show_pigment(scene):
     assert np.corrcoef(crossed[inner].ravel(), surface.albedo[inner].ravel())[0, 1] > 0.8
 
 
-def test_jaws_are_dark_and_end_at_the_aperture(rig, flat_skin):
+@pytest.mark.parametrize("table_size", [None, 33], ids=["mitsuba", "fast"])
+def test_jaws_are_dark_and_end_at_the_aperture(rig, flat_skin, table_size):
     narrow = GripState(90.0, -4, 0.24, 1.0, True, False)
-    image = GradientScene(rig, flat_skin, table_size=33).radiance("full", grip=narrow)
+    image = GradientScene(rig, flat_skin, table_size=table_size).radiance("full", grip=narrow)
     pixel_mm = 0.006
     y = -(np.arange(SIDE) - 0.5 * (SIDE - 1)) * pixel_mm
     jaw, between = np.abs(y) > 0.12 + 0.03, np.abs(y) < 0.12 - 0.03
@@ -226,6 +232,23 @@ def test_invalid_scene_requests_are_refused(rig, skin, scene):
         GradientScene(rig, skin, sectors=7)
     with pytest.raises(SceneError, match="subject"):
         GradientScene(rig, "cube")
+
+
+def test_unaffordable_patches_name_the_fast_renderer(rig, skin):
+    """What Mitsuba does not render falls back with the reason; it never differs silently."""
+    smooth = dataclasses.replace(skin, alpha=np.full_like(skin.alpha, 0.01))
+    full = load_rig("gradient")
+    for made, why in (
+        (GradientScene(full, skin), "3.3e+08 shadow rays per state exceed 2.5e+07"),
+        (GradientScene(rig, skin, sectors=16), "sectors: requested settings of the fast renderer"),
+        (GradientScene(rig, smooth), "roughness 0.01 is below 0.02"),
+        (GradientScene(rig, "flat"), "closed forms render the target flat"),
+        (GradientScene(rig, skin, choice=choose_renderer("fast")), "requested"),
+    ):
+        assert (made.variant.renderer, made.variant.why) == ("fast", why)
+    chosen = choose_renderer("mitsuba")
+    assert GradientScene(rig, skin).variant == chosen
+    assert GradientScene(full, skin, choice=chosen).variant == chosen
 
 
 def test_cliffs_of_75_degrees_are_dark_but_finite():

@@ -7,19 +7,15 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import ncx2
 
 from capture.rig import load_rig
 from model import spectra
-from rigsim.as_built.probe import (
-    SPOT_RADIUS_PX,
-    ProbeBuildError,
-    ProbeTolerances,
-    build_probe,
-    fiber_unit_images,
-)
+from rigsim.as_built.probe import SPOT_RADIUS_PX, ProbeBuildError, ProbeTolerances, build_probe
 from rigsim.boxes.source_shutter import SourceLight
 from rigsim.fiber.probe_tissue import HomogeneousTissue
 from rigsim.scenes.exposing import SceneError
+from rigsim.scenes.probe.detector import render_fiber_images
 from rigsim.scenes.probe.scene import DARK_CURRENT_E_PER_S, PROBE_METER_RATE_PER_S, ProbeScene
 from rigsim.world.suction import HeadState
 
@@ -37,7 +33,7 @@ NOMINAL = ProbeTolerances(
     wings=0.0,
     veil=0.0,
 )
-AREA_PX = math.pi * (SPOT_RADIUS_PX**2 + ProbeTolerances().edge_px ** 2)
+AREA_PX = math.pi * SPOT_RADIUS_PX**2
 FALSE_ALARM = 4.0  # standard deviations: 6e-5 of normal values lie beyond
 
 
@@ -68,38 +64,98 @@ def test_spot_center_reaches_eight_tenths_in_shortest_exposure():
         * 2.0 ** (-22 * 2 / 3)
     )
     middle = light[64, 33]
-    assert middle.max() == pytest.approx(0.8, rel=1e-4)
+    assert middle.max() == pytest.approx(0.8, rel=3e-3)  # samples of the flux
     white = spectra.camera_white(VIEW.spectral_sensitivity, RIG.lights[0].illuminant)
     np.testing.assert_allclose(middle / middle.max(), white, rtol=1e-5)
 
 
 def test_spot_flux_is_its_area_at_any_position():
     ideal = dataclasses.replace(build_probe(RIG, seed=3), wings=0.0, veil=0.0)
-    flux = fiber_unit_images(ideal, VIEW).sum(axis=(1, 2), dtype=np.float64)
+    flux = render_fiber_images(ideal, VIEW).sum(axis=(1, 2), dtype=np.float64)
     np.testing.assert_allclose(flux, AREA_PX, rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def even_ends():
+    even = np.zeros((28, 3))
+    return dataclasses.replace(build_probe(RIG, seed=3), wings=0.0, veil=0.0, unevenness=even)
+
+
+def blurred_disc(build, fiber):
+    """The exact image of a disc blurred by a Gaussian and by the pixels' width.
+
+    A Gaussian around a pixel falls into the disc with the probability of a noncentral chi-square.
+    """
+    y, x = np.mgrid[: VIEW.height_px, : VIEW.width_px]
+    square = (x - build.spot_px[fiber, 0]) ** 2 + (y - build.spot_px[fiber, 1]) ** 2
+    variance = build.edge_px**2 + 1.0 / 12.0
+    near = square < 20.0**2
+    exact = np.zeros(near.shape)
+    exact[near] = ncx2.cdf(build.radius_px[fiber] ** 2 / variance, 2, square[near] / variance)
+    return exact * AREA_PX / exact.sum()
+
+
+@pytest.mark.parametrize("fiber", [0, 9, 27])
+def test_spot_is_disc_convolved_with_lens_and_pixel(even_ends, fiber):
+    image = render_fiber_images(even_ends, VIEW)[fiber]
+
+    def misfit(**change):
+        exact = blurred_disc(dataclasses.replace(even_ends, **change), fiber)
+        near = exact > 0.0
+        return np.sqrt(np.mean((image - exact)[near] ** 2))
+
+    assert misfit() < 3e-3
+    assert misfit(edge_px=1.25) > 3e-3
+    assert misfit(radius_px=1.005 * even_ends.radius_px) > 3e-3
+
+
+def test_light_over_fiber_end_is_tilted_as_built(even_ends):
+    tilted = dataclasses.replace(even_ends, unevenness=np.tile([0.1, -0.05, 0.08], (28, 1)))
+    image, even = (render_fiber_images(build, VIEW)[9] for build in (tilted, even_ends))
+    x, y = even_ends.spot_px[9].round().astype(int)
+    u, v = (np.array([[x, y]]) - even_ends.spot_px[9])[0] / even_ends.radius_px[9]
+    away = 6.0 / even_ends.radius_px[9]
+
+    def light(u, v):
+        return 1.0 + 0.1 * u - 0.05 * v + 0.08 * (2.0 * (u * u + v * v) - 1.0)
+
+    for right, down in ((0, 0), (6, 0), (-6, 0), (0, 6), (0, -6)):
+        expected = light(u + right / 6 * away, v + down / 6 * away)
+        found = image[y + down, x + right] / even[y + down, x + right]
+        assert found == pytest.approx(expected, abs=0.01)
+
+
+def test_touching_spots_are_rendered_apart(even_ends):
+    """A spot's image does not have light of a neighbor 10 pixels away."""
+    near = np.array(even_ends.spot_px)
+    near[10] = near[9] + [10.0, 0.0]
+    close = render_fiber_images(dataclasses.replace(even_ends, spot_px=near), VIEW)
+    np.testing.assert_allclose(close.sum(axis=(1, 2)), AREA_PX, rtol=1e-5)
+    alone = render_fiber_images(even_ends, VIEW)
+    assert np.abs(close[9] - alone[9]).max() < 0.02
 
 
 def test_wings_and_veil_add_stated_light():
     build = dataclasses.replace(build_probe(RIG, seed=3), wings=0.0, veil=5e-5)
-    image = fiber_unit_images(build, VIEW)[4]
+    image = render_fiber_images(build, VIEW)[4]
     assert image[0, 1000] == np.float32(5e-5)
     winged = dataclasses.replace(build, wings=0.01, veil=0.0)
     # the sensor holds all of the disc and the part of the wings that a wide strip catches
-    flux = fiber_unit_images(winged, VIEW)[14].sum(dtype=np.float64) / AREA_PX
+    flux = render_fiber_images(winged, VIEW)[14].sum(dtype=np.float64) / AREA_PX
     assert 0.997 < flux < 1.0
     place = build.spot_px[14].round().astype(int)
-    near, far = fiber_unit_images(winged, VIEW)[14][place[1], place[0] + np.array([150, 300])]
+    near, far = render_fiber_images(winged, VIEW)[14][place[1], place[0] + np.array([150, 300])]
     assert near / far == pytest.approx(8.0, rel=0.05)
 
 
 def test_spots_are_at_actual_positions_off_nominal(scene):
-    images = fiber_unit_images(
+    images = render_fiber_images(
         dataclasses.replace(scene.build, wings=0.0, veil=0.0, unevenness=np.zeros((28, 3))), VIEW
     )
     y, x = np.mgrid[: VIEW.height_px, : VIEW.width_px]
     flux = images.sum(axis=(1, 2))
     found = np.stack([(images * x).sum(axis=(1, 2)), (images * y).sum(axis=(1, 2))], axis=1)
-    np.testing.assert_allclose(found / flux[:, None], scene.build.spot_px, atol=0.01)
+    np.testing.assert_allclose(found / flux[:, None], scene.build.spot_px, atol=0.015)
     nominal = np.array([fiber.spot_px for fiber in RIG.probe.fibers])
     off = np.linalg.norm(scene.build.spot_px - nominal, axis=1)
     assert 0.5 < off.mean() < 6.0
@@ -131,7 +187,7 @@ def test_reflectance_reaches_the_pixels_in_the_channels_ratio(noiseless):
     reflectance = noiseless.profile(CHEEK).reflectance_per_mm2
     taken = noiseless.build.crosstalk @ (noiseless.build.gain[:, None] * reflectance)
     light = PROBE_METER_RATE_PER_S * exposure_s * taken * noiseless.white
-    images = fiber_unit_images(noiseless.build, VIEW)
+    images = render_fiber_images(noiseless.build, VIEW)
     x, y = noiseless.build.spot_px[2].round().astype(int)
     box = np.s_[y - 16 : y + 16, x - 16 : x + 16]
     full = VIEW.white_level - VIEW.black_level

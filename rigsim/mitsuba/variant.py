@@ -84,6 +84,10 @@ class LibraryCheck:
     """Version when usable, otherwise the reason in words."""
 
 
+Renderer = Literal["mitsuba", "fast"]
+"""Renderers of a session's images: Mitsuba's scenes, or compiled loops with Embree's rays."""
+
+
 @dataclass(frozen=True, slots=True)
 class VariantChoice:
     """The selected Mitsuba variant, with the reason."""
@@ -94,6 +98,11 @@ class VariantChoice:
     """Reason in words, for users."""
     library: str
     """Path of the LLVM library; empty for scalar variants."""
+
+    @property
+    def renderer(self) -> Renderer:
+        """Return the renderer of a scene with this variant."""
+        return "mitsuba" if self.is_vectorized else "fast"
 
     @property
     def is_vectorized(self) -> bool:
@@ -211,6 +220,19 @@ def probe_library(path: Path, *, timeout_s: float = PROBE_TIMEOUT_S) -> LibraryC
     if done.returncode < 0:
         message = f"it ended the probe by signal {-done.returncode}"
     return LibraryCheck(str(path), False, message)
+
+
+def choose_renderer(renderer: Renderer) -> VariantChoice:
+    """Return the variant of a renderer: "mitsuba" needs LLVM, otherwise its reason is in `why`.
+
+    Examples
+    --------
+    >>> choose_renderer("fast").renderer
+    'fast'
+    """
+    if renderer == "fast":
+        return VariantChoice(_SCALAR_VARIANTS["rgb"], "requested", "")
+    return choose_variant("rgb")
 
 
 def choose_variant(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rigsim.render import variant
+from rigsim.mitsuba import variant
 
 INSTALLED = variant.find_llvm_libraries({})
 

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,25 +11,27 @@ from numpy.typing import ArrayLike
 from capture.rig import Rig, View
 from rigsim.arrays import Float32Array, Float64Array
 from rigsim.geometry.mesh import Mesh
-from rigsim.render.renderer import RenderError, load_mitsuba
-from rigsim.render.variant import Kind, choose_variant
+from rigsim.mitsuba.memory import pad_memory
+from rigsim.mitsuba.render_error import RenderError
+from rigsim.mitsuba.startup import load_mitsuba
+from rigsim.mitsuba.variant import Kind, choose_variant
 
 
 def radiance(
     description: Mapping[str, Any], *, kind: Kind, samples: int, seed: int = 0
 ) -> Float32Array:
-    """Render a described scene.
+    """Render a described scene; with a box filter, its bytes do not depend on threads.
 
     Parameters
     ----------
     description
         Mitsuba's scene dictionary, with numbers, texts and arrays only; a ``to_world`` is a 4 x 4
-        array, a ``bitmap`` an image; a shape of type ``mesh`` has a `rigsim.geometry.mesh.Mesh` as
-        ``mesh``.
+        array, a ``bitmap`` an image, a ``grid`` an array of voxels (z, y, x, channels); a shape of
+        type ``mesh`` has a `rigsim.geometry.mesh.Mesh` as ``mesh``.
     kind
-        Variant kind, see `rigsim.render.variant.choose_variant`.
+        Variant kind, see `rigsim.mitsuba.variant.choose_variant`.
     samples
-        Samples per pixel.
+        Samples per pixel, at least 1.
     seed
         Seed of the sampler.
 
@@ -46,12 +48,38 @@ def radiance(
     """
     _refuse_negative_light(description)
     mi = load_mitsuba(choose_variant(kind))
-    scene = mi.load_dict(_with_transforms(mi, description))
-    image = np.array(mi.TensorXf(mi.render(scene, spp=samples, seed=seed)).numpy(), np.float32)
+    scene = load_description(mi, description)
+    parts = []
+    for k, part in enumerate(_powers_of_two(samples)):
+        try:
+            film = mi.render(scene, spp=part, seed=seed + k * PART_SEED_STEP)
+        except RuntimeError as error:
+            raise _find_cause(error) from None
+        parts.append(part * np.asarray(mi.TensorXf(film).numpy(), np.float64))
+    image = (np.sum(parts, axis=0) / samples).astype(np.float32)
     bad = int(np.count_nonzero(~np.isfinite(image).all(axis=-1)))
     if bad:
         raise RenderError(f"Mitsuba gave {bad} pixels that are not finite, expected none")
     return image
+
+
+PART_SEED_STEP: Final = 1 << 24
+"""Distance between the seeds of an image's parts; callers count seeds by ones."""
+
+
+def _powers_of_two(samples: int) -> list[int]:
+    """Return powers of two with a given sum: Mitsuba adds others in the order of its threads."""
+    return [1 << k for k in reversed(range(samples.bit_length())) if samples >> k & 1]
+
+
+def _find_cause(error: BaseException) -> BaseException:
+    """Return the plugin's own error; Mitsuba replaces its message by a general one."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, RenderError):
+            return cause
+        cause = cause.__cause__ or cause.__context__
+    return error
 
 
 _EMISSION_KEYS = ("radiance", "irradiance", "intensity")
@@ -92,7 +120,7 @@ class MovableLightScene:
     def __init__(self, description: Mapping[str, Any], *, kind: Kind) -> None:
         self._choice = choose_variant(kind)
         mi = load_mitsuba(self._choice)
-        self._scene = mi.load_dict(_with_transforms(mi, description))
+        self._scene = load_description(mi, description)
         self._parameters = mi.traverse(self._scene)
 
     def radiance(self, light_mm: ArrayLike, *, samples: int, seed: int = 0) -> Float32Array:
@@ -217,6 +245,19 @@ def plastic_scale(eta: float) -> float:
     return eta * eta * (1.0 - inner)
 
 
+def load_description(mi: Any, description: Mapping[str, Any]) -> Any:
+    """Return Mitsuba's object of a description; see `radiance` for what it may contain.
+
+    Parameters
+    ----------
+    mi
+        The module ``mitsuba`` with a variant.
+    description
+        Dictionary of a scene or of one of its parts.
+    """
+    return mi.load_dict(_with_transforms(mi, description))
+
+
 def _with_transforms(mi: Any, description: Mapping[str, Any]) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for name, value in description.items():
@@ -224,8 +265,11 @@ def _with_transforms(mi: Any, description: Mapping[str, Any]) -> dict[str, Any]:
             out[name] = _shape(mi, name, value)
         elif isinstance(value, Mapping):
             out[name] = _with_transforms(mi, value)
-        elif isinstance(value, np.ndarray) and name == "bitmap":
-            out[name] = mi.Bitmap(np.ascontiguousarray(value, np.float32))
+        elif isinstance(value, np.ndarray) and name in ("bitmap", "table"):
+            image = value if value.ndim == 3 else value[..., None]
+            out[name] = mi.Bitmap(np.ascontiguousarray(image, np.float32))
+        elif isinstance(value, np.ndarray) and name == "grid":
+            out[name] = mi.VolumeGrid(np.ascontiguousarray(value, np.float32))
         elif name == "to_world":
             out[name] = mi.ScalarTransform4f(np.asarray(value, np.float64))
         else:
@@ -237,7 +281,10 @@ def _shape(mi: Any, name: str, description: Mapping[str, Any]) -> Any:
     """Return Mitsuba's mesh with normals, texture coordinates and a material."""
     mesh: Mesh = description["mesh"]
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(_with_transforms(mi, description["bsdf"]))
+    for part in ("bsdf", "interior"):
+        if part in description:
+            properties[part] = mi.load_dict(_with_transforms(mi, description[part]))
+    properties["face_normals"] = bool(description.get("face_normals", False))
     shape = mi.Mesh(
         name,
         len(mesh.vertices_mm),
@@ -247,9 +294,9 @@ def _shape(mi: Any, name: str, description: Mapping[str, Any]) -> Any:
         props=properties,
     )
     parameters = mi.traverse(shape)
-    parameters["vertex_positions"] = np.ravel(mesh.vertices_mm)
-    parameters["vertex_normals"] = np.ravel(mesh.normals)
-    parameters["vertex_texcoords"] = np.ravel(mesh.uv)
-    parameters["faces"] = np.ravel(mesh.faces).astype(np.uint32)
+    parameters["vertex_positions"] = pad_memory(mesh.vertices_mm)
+    parameters["vertex_normals"] = pad_memory(mesh.normals)
+    parameters["vertex_texcoords"] = pad_memory(mesh.uv)
+    parameters["faces"] = pad_memory(mesh.faces.astype(np.uint32))
     parameters.update()
     return shape

@@ -1,0 +1,1 @@
+"""Voxel skin below a boundary: the integrator `tissue`."""

@@ -1,0 +1,146 @@
+"""Processes that render: they share kernels, read images on one core, and ignore threads."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from rigsim.mitsuba.memory import pad_memory
+from rigsim.mitsuba.startup import share_kernels
+from rigsim.mitsuba.variant import choose_variant
+
+ROOT = Path(__file__).parents[4]
+
+SCENE = """
+import json, os, sys
+import numpy as np
+from capture.rig import load_rig
+from rigsim.mitsuba.scene_radiance import radiance
+from rigsim.mitsuba.startup import load_mitsuba
+from rigsim.mitsuba.variant import choose_variant
+from rigsim.scenes.dome.reference import DirectScene, PlainScene, describe_dome, plain_face
+mi = load_mitsuba(choose_variant("rgb"))
+import drjit as dr
+rig = load_rig("dome").resized(64).subset(views=["C02"])
+face = plain_face(size=64)
+def render(seed=0):
+    plain = describe_dome(PlainScene(rig, face), rig.views[0], "path")
+    return [
+        DirectScene(rig, face).radiance("C02", [3, 40]),
+        *(radiance(plain, kind="rgb", samples=n, seed=seed) for n in (16, 24, 100)),
+    ]
+"""
+
+COMPILED = (
+    SCENE
+    + """
+dr.set_flag(dr.JitFlag.KernelHistory, True)
+render()
+kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+print(json.dumps(sum(not k["cache_hit"] for k in kernels)))
+"""
+)
+
+THREADED = (
+    SCENE
+    + """
+import hashlib
+def digest(images):
+    return [hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest() for image in images]
+found = []
+for count in (1, 2, 4, 4):
+    dr.set_thread_count(count)
+    assert dr.thread_count() == count
+    found.append(digest(render()))
+print(json.dumps([found, digest(render(seed=1))]))
+"""
+)
+
+ONE_CORE = """
+import json, os, sys
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+from rigsim.mitsuba.startup import load_mitsuba
+from rigsim.mitsuba.variant import choose_variant
+mi = load_mitsuba(choose_variant("rgb"))
+print(json.dumps(list(mi.Bitmap(sys.argv[1]).size())))
+"""
+
+needs_llvm = pytest.mark.skipif(
+    not choose_variant("rgb").is_vectorized, reason="kernels are compiled by LLVM alone"
+)
+
+
+def run(script, *arguments, timeout_s=240, **environment):
+    done = subprocess.run(
+        [sys.executable, "-c", script, *arguments],
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+        capture_output=True,
+        text=True,
+        timeout=timeout_s,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@needs_llvm
+@pytest.mark.render
+@pytest.mark.long
+def test_second_process_compiles_nothing(tmp_path):
+    folder = str(tmp_path / "kernels")
+    assert run(COMPILED, DRJIT_CACHE_DIR=folder) > 5
+    for _ in range(3):  # memory that is aligned by chance would compile some kernel again
+        assert run(COMPILED, DRJIT_CACHE_DIR=folder) == 0
+
+
+@needs_llvm
+@pytest.mark.render
+@pytest.mark.long
+def test_images_do_not_depend_on_threads():
+    found, other_seed = run(THREADED)
+    assert found[1:] == found[:1] * 3
+    assert [a == b for a, b in zip(found[0], other_seed, strict=True)] == [True, *[False] * 3]
+
+
+@pytest.mark.render
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs sched_setaffinity")
+def test_image_is_read_on_one_core(tmp_path):
+    path = tmp_path / "ones.exr"
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"Y": np.ones((512, 256), np.float32)}) as file:
+        file.write(str(path))
+    assert run(ONE_CORE, str(path), timeout_s=60) == [256, 512]
+
+
+def test_kernels_go_to_the_users_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    environment = {}
+    share_kernels(environment)
+    assert environment == {"DRJIT_CACHE_DIR": str(tmp_path / "skinrig" / "drjit")}
+    assert Path(environment["DRJIT_CACHE_DIR"]).is_dir()
+    share_kernels(asked := {"DRJIT_CACHE_DIR": "elsewhere"})
+    assert asked == {"DRJIT_CACHE_DIR": "elsewhere"}
+
+
+def test_missing_user_cache_leaves_drjits_own(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    environment = {}
+    share_kernels(environment)
+    assert environment == {}
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.uint32, np.float64])
+@pytest.mark.parametrize("size", [1, 17, 1000])
+def test_padded_memory_is_aligned_and_equal(dtype, size):
+    values = np.arange(size).astype(dtype)
+    for _ in range(8):  # allocations differ in their alignment
+        row = pad_memory(values)
+        assert row.ctypes.data % 64 == 0
+        assert row.dtype == dtype
+        np.testing.assert_array_equal(row, values)
