@@ -1,0 +1,1 @@
+"""Reference world: voxel skin that no reconstruction equation describes."""

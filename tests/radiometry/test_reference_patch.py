@@ -1,0 +1,72 @@
+"""Patches of a person as voxels: place, color and noise of their images."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from capture.rig import load_rig
+from rigsim.mitsuba.variant import choose_variant
+from rigsim.scenes.reference.patch import draw_patch, pixel_truth, predict_patch, render_patch
+from rigsim.subject.person_skin import PersonSkin
+
+pytestmark = [
+    pytest.mark.render,
+    pytest.mark.skipif(
+        not choose_variant("mono").is_vectorized, reason="Dr.Jit finds no LLVM 17 or newer here"
+    ),
+]
+
+
+@pytest.fixture(scope="module")
+def patch():
+    """Skin whose quarter at +x, +y has much melanin."""
+    drawn = draw_patch(PersonSkin.of_preset("II"), "cheek", field_mm=16.0, voxel_mm=0.5)
+    melanin = np.full_like(drawn.melanin, 0.015)
+    melanin[np.ix_(drawn.x_mm > 0.0, drawn.x_mm > 0.0)] = 0.2
+    return replace(drawn, melanin=melanin, blood=np.full_like(drawn.blood, 0.01))
+
+
+def darkest_quarter(image):
+    """Row and column of the darkest quarter."""
+    quarters = image.mean(axis=-1).reshape(2, 2, 2, 2).mean(axis=(1, 3))
+    return np.unravel_index(quarters.argmin(), quarters.shape)
+
+
+def test_dark_quarter_is_upper_right_everywhere(patch):
+    """Rationale: row 0 is at the top, and x points to the right, as in the flash rig's images."""
+    rig = load_rig("flash")
+    melanin, _ = pixel_truth(patch, 4)
+    voxels = render_patch(patch, rig, width_px=4, samples=64, seed=0)
+    fast = predict_patch(patch, rig, width_px=4)
+    assert darkest_quarter(-melanin[..., None]) == (0, 1)
+    assert darkest_quarter(voxels.rgb) == (0, 1)
+    assert darkest_quarter(fast) == (0, 1)
+
+
+def test_noise_of_patch_falls_with_samples(patch):
+    """Tolerance: factor 2 of the expected ratio of 4; variances of 48 values err by 20 %."""
+    rig = load_rig("flash")
+    few, many = (
+        np.mean(render_patch(patch, rig, width_px=4, samples=samples, seed=1).variance)
+        for samples in (32, 128)
+    )
+    assert 2.0 < few / many < 8.0
+
+
+@pytest.mark.long
+def test_relief_changes_light_by_few_percent():
+    """Rationale: slopes of .15 rms and grooves of 15 um leave the light within 10 %."""
+    rig, person = load_rig("flash"), PersonSkin.of_preset("II")
+    options = {"field_mm": 2.0, "voxel_mm": 0.05, "alpha": 0.15}
+    flat, uneven = (
+        render_patch(
+            draw_patch(person, "forehead", relief=relief, **options),
+            rig,
+            width_px=4,
+            samples=1024,
+            seed=2,
+        ).rgb.mean(axis=(0, 1))
+        for relief in (False, True)
+    )
+    assert 1e-4 < np.abs(uneven / flat - 1.0).max() < 0.1
