@@ -17,6 +17,7 @@ NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
     "usd": "open skin.usdc, in Blender with skin_in_blender.py; usd.json lists assumptions",
     "spectral": "read spectral.json: which bands are measured and which are modeled",
     "metahuman": "read delta_maps.json: layout and encoding of the deltas",
+    "mitsuba": "read README.txt: how to load the scene, and where it differs from the session",
     "stokes": "read stokes.json: axis, channels, and components not measured",
     "lp": "skinrig import lp DIR --out SESSION reads the folder back",
 }
@@ -25,7 +26,7 @@ NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
 
 FORMATS: Final = (
     *("maps", "mtlx", "gltf", "usd", "spectral", "metahuman", "merl", "rgl"),
-    *("mhl", "frames", "event-model", "lp", "stokes"),
+    *("mhl", "frames", "event-model", "lp", "stokes", "mitsuba"),
 )
 """Formats of appearances, then of sessions; the writers are imported with the chosen one."""
 
@@ -135,7 +136,7 @@ def export(
         APPEARANCE/ or SESSION/ folder.
     to
         Format. Appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. Session: mhl,
-        frames, lp, stokes, event-model.
+        frames, lp, stokes, event-model, mitsuba (simulated dome).
     use
         Purpose of the copy, such as research, which the subjects' consent must include; required
         for measured data.

@@ -1,0 +1,1 @@
+"""Export simulated sessions as scenes of the renderer Mitsuba."""
