@@ -248,6 +248,9 @@ def plastic_scale(eta: float) -> float:
 def load_description(mi: Any, description: Mapping[str, Any]) -> Any:
     """Return Mitsuba's object of a description; see `radiance` for what it may contain.
 
+    Parts are loaded one after the other. In parallel, threads decide the order of the parts, and
+    the code of a kernel follows it: another process would compile the same kernel again.
+
     Parameters
     ----------
     mi
@@ -255,7 +258,7 @@ def load_description(mi: Any, description: Mapping[str, Any]) -> Any:
     description
         Dictionary of a scene or of one of its parts.
     """
-    return mi.load_dict(_with_transforms(mi, description))
+    return mi.load_dict(_with_transforms(mi, description), parallel=False)
 
 
 def _with_transforms(mi: Any, description: Mapping[str, Any]) -> dict[str, Any]:
@@ -283,7 +286,7 @@ def _shape(mi: Any, name: str, description: Mapping[str, Any]) -> Any:
     properties = mi.Properties()
     for part in ("bsdf", "interior"):
         if part in description:
-            properties[part] = mi.load_dict(_with_transforms(mi, description[part]))
+            properties[part] = mi.load_dict(_with_transforms(mi, description[part]), parallel=False)
     properties["face_normals"] = bool(description.get("face_normals", False))
     shape = mi.Mesh(
         name,

@@ -94,7 +94,8 @@ def run(script, *arguments, timeout_s=240, **environment):
 def test_second_process_compiles_nothing(tmp_path):
     folder = str(tmp_path / "kernels")
     assert run(COMPILED, DRJIT_CACHE_DIR=folder) > 5
-    for _ in range(3):  # memory that is aligned by chance would compile some kernel again
+    # memory that is aligned by chance, or parts in the order of threads, would compile some again
+    for _ in range(3):
         assert run(COMPILED, DRJIT_CACHE_DIR=folder) == 0
 
 
