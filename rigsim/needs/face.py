@@ -38,7 +38,7 @@ LENS_EFFECT = "depth of field and lens blur"
 BAND_EFFECT = "bands of the camera"
 RELIEF_EFFECT = "relief of the skin"
 PIGMENT_EFFECT = "pattern of pigment"
-WRINKLE_SHADOW_EFFECT = "shadows of wrinkles"
+RELIEF_SHADOW_EFFECT = "shadows of relief"
 
 TEXEL_STEP = 16
 """Every n-th texel's reflectance is evaluated."""
@@ -156,7 +156,7 @@ def select_face_effects(
         *thinned,
         further_bounces_effect(bounces, share * float(peak_reflectance.max())),
         lens_effect(scenery, peak),
-        wrinkle_shadow_effect(skin.subject, scenery, peak),
+        relief_shadow_effect(skin.subject, scenery, peak),
     ]
 
 
@@ -169,34 +169,25 @@ def movement_effect(subject: SimulatedSubject, requested: bool, name: str) -> Ef
     return Effect(name, "built", "the state moves the face", switch="movement")
 
 
-def wrinkle_shadow_effect(
+def relief_shadow_effect(
     subject: SimulatedSubject, scenery: ViewingConditions, level: float
 ) -> Effect:
-    """Return whether the relief of a moved face shadows itself.
-
-    Pores of a face at rest tilt less than 4 degrees and are not built: under grazing light they
-    would reduce its cosine by up to a tenth, see docs/concepts/omissions.md.
-    """
-    if subject.pose is None:
-        return Effect(
-            WRINKLE_SHADOW_EFFECT, "unmodeled", "pores of a face at rest tilt the surface only"
-        )
+    """Return whether the relief of a face shadows itself."""
     covered = subject.atlas.covered
     across, along = (mm[covered] for mm in subject.atlas.texel_mm())
     down, right = (
         np.asarray(slope)[covered] for slope in np.gradient(subject.height_um.astype(np.float64))
     )
     steepest = 1e-3 * float(np.hypot(right / across, down / along).max(initial=0.0))
-    # Light at the elevation of the steepest slope has irradiance sin(elevation) = s / sqrt(1 +
-    # s^2),
-    # and a wrinkle may hide all of it.
+    # Light at the elevation of the steepest slope s has irradiance sin(elevation) =
+    # s / sqrt(1 + s^2), and the relief may hide all of it.
     most = min(1.0, steepest / math.hypot(1.0, steepest) * level)
     return decide_effect(
-        WRINKLE_SHADOW_EFFECT,
+        RELIEF_SHADOW_EFFECT,
         most / float(scenery.noise.sigma(0.0)),
         scenery.effects.relief_shadows,
         switch="relief_shadows",
-        reason=f"wrinkles as steep as {math.degrees(math.atan(steepest)):.0f} degrees",
+        reason=f"relief as steep as {math.degrees(math.atan(steepest)):.0f} degrees",
     )
 
 

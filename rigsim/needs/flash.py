@@ -46,7 +46,7 @@ def select_flash_effects(
             made.append(
                 Effect(face.LENS_EFFECT, "negligible", "the image is uniform", 0.0, "optics")
             )
-        made.append(Effect(face.WRINKLE_SHADOW_EFFECT, "absent", f"{subject.name} has none"))
+        made.append(Effect(face.RELIEF_SHADOW_EFFECT, "absent", f"{subject.name} has none"))
         return EffectSelection((*made, *omitted_effects("flash")))
     skin = scenery.observe_skin(subject, state)
     brightest = face.max_reflectance_rgb(skin)

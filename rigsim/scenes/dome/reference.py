@@ -69,7 +69,8 @@ samples the light only, both with direct light only."""
 def plain_face(preset: str = "III", *, size: int = 512) -> SimulatedSubject:
     """Return a face whose normals are those of its mesh, without pores and wrinkles."""
     face = make_subject(preset, size=size)
-    return dataclasses.replace(face, normal=face.atlas.normal)
+    level = np.zeros_like(face.height_um)
+    return dataclasses.replace(face, normal=face.atlas.normal, height_um=level)
 
 
 DIRECT_LIGHT_EFFECTS: Final = SceneEffects(lateral=False, interreflections=False)

@@ -144,7 +144,7 @@ class DomeScene(FaceScene):
         self._relief: ReliefShadow | None = None
         self._glow: DomeSubsurfaceRadiance | None = None
         if isinstance(self.subject, SimulatedSubject):
-            if self.needs.builds(face_needs.WRINKLE_SHADOW_EFFECT):
+            if self.needs.builds(face_needs.RELIEF_SHADOW_EFFECT):
                 self._relief = ReliefShadow(self.subject)
             if self.subsurface or self.interreflections:
                 self._glow = DomeSubsurfaceRadiance(self._scattering)

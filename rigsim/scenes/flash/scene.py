@@ -370,8 +370,8 @@ class FlashScene(FaceScene):
         )
 
     def _surface_light(self, subject: SimulatedSubject) -> SurfaceIllumination:
-        wrinkled = self.needs.builds(face_needs.WRINKLE_SHADOW_EFFECT)
-        key, known = (*self._flashes.key, wrinkled), self._stage.light
+        shaded = self.needs.builds(face_needs.RELIEF_SHADOW_EFFECT)
+        key, known = (*self._flashes.key, shaded), self._stage.light
         if key not in known:
             known[key] = illuminate_surface(
                 subject,
@@ -379,7 +379,7 @@ class FlashScene(FaceScene):
                 self._flashes.weights,
                 self.films,
                 caster=self._caster,
-                relief=ReliefShadow(subject) if wrinkled else None,
+                relief=ReliefShadow(subject) if shaded else None,
             )
         return known[key]
 

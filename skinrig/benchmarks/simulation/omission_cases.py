@@ -234,7 +234,7 @@ def compare_dome_face(
         yield from compared.compare(render, {"relief_shadows": (True, False)})
         return
     compared = ComparedScene("dome", preset, scene)
-    names = ("subsurface", "interreflections", "spectral", "optics")
+    names = ("subsurface", "interreflections", "spectral", "optics", "relief_shadows")
     yield from compared.compare(
         render, {**dict.fromkeys(names, (True, False)), "last_bounce": (1e-7, None)}
     )

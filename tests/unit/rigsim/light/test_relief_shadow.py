@@ -12,7 +12,7 @@ from capture.rig import load_rig
 from rigsim.light.relief_shadow import HORIZON_DIRECTIONS, HORIZON_SOFTNESS_RAD, ReliefShadow
 from rigsim.mitsuba.variant import VariantChoice, choose_variant
 from rigsim.needs.effects import SceneEffects
-from rigsim.needs.face import WRINKLE_SHADOW_EFFECT
+from rigsim.needs.face import RELIEF_SHADOW_EFFECT
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.subject.person import make_subject
@@ -100,7 +100,7 @@ def test_wrinkles_shade_moved_face_equally_in_both_renderers(face):
     lit = DomeScene(rig, face, state="surprise", effects=flat, choice=EMBREE).radiance(view)
     scene = DomeScene(rig, face, state="surprise", effects=plain, choice=EMBREE)
     shaded = scene.radiance(view)
-    assert scene.needs[WRINKLE_SHADOW_EFFECT].verdict == "built"
+    assert scene.needs[RELIEF_SHADOW_EFFECT].verdict == "built"
     assert (shaded <= lit + 1e-6 * lit.max()).all()
     assert (lit - shaded).max() > 0.02 * lit.max()
     compiled = DomeScene(rig, face, state="surprise", effects=plain)
@@ -111,21 +111,26 @@ def test_wrinkles_shade_moved_face_equally_in_both_renderers(face):
     assert differ.mean() < 0.002  # rays that two tracers judge differently
 
 
-def test_face_at_rest_is_unchanged_reporting_missing_effect(face):
+@pytest.mark.parametrize("state", ["neutral", "surprise"])
+def test_relief_shades_face_at_rest_and_moved(face, state):
     rig = load_rig("flash").resized(64)
-    rest = FlashScene(rig, face, choice=EMBREE)
-    assert rest.needs[WRINKLE_SHADOW_EFFECT].verdict == "unmodeled"
-    moved, plain = (
+    shaded, plain = (
         FlashScene(
             rig,
             face,
-            state="surprise",
+            state=state,
             effects=SceneEffects(relief_shadows=on, lateral=False, interreflections=False),
             choice=EMBREE,
         )
         for on in (None, False)
     )
-    assert moved.needs[WRINKLE_SHADOW_EFFECT].verdict == "built"
-    assert plain.needs[WRINKLE_SHADOW_EFFECT].verdict == "asked"
-    assert (moved.radiance() <= plain.radiance() + 1e-6).all()
-    assert (moved.radiance() < plain.radiance() - 1e-5).any()
+    assert shaded.needs[RELIEF_SHADOW_EFFECT].verdict == "built"
+    assert plain.needs[RELIEF_SHADOW_EFFECT].verdict == "asked"
+    assert (shaded.radiance() <= plain.radiance() + 1e-6).all()
+    assert (shaded.radiance() < plain.radiance() - 1e-5).any()
+
+
+def test_level_skin_at_rest_needs_no_shadows(face):
+    level = dataclasses.replace(face, height_um=np.zeros_like(face.height_um))
+    scene = FlashScene(load_rig("flash").resized(64), level, choice=EMBREE)
+    assert scene.needs[RELIEF_SHADOW_EFFECT].verdict == "negligible"

@@ -125,7 +125,7 @@ def test_states_without_movement_change_blood_only_as_reported(rest, smile, stil
     said = dict(still.omitted)
     assert said["movement of the face with the states"] == "movement=False requests it"
     assert "movement of the face with the states" not in dict(smile.omitted)
-    assert smile.needs.builds("shadows of wrinkles")
+    assert smile.needs.builds("shadows of relief")
 
 
 def test_global_states_keep_pose_neutral_skips_rest_maps(rest, tired):
