@@ -11,26 +11,17 @@ from rigsim.arrays import Float32Array
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import build_mesh
 from rigsim.light.interreflection import Interreflection
-from rigsim.light.surface_brdf import SkinSurface
 from rigsim.mitsuba.scene_radiance import radiance
 from rigsim.needs.effects import SceneEffects
 from rigsim.render import Caster
 from rigsim.scenes.dome import reference as dome_reference
-from rigsim.scenes.dome.reference import DirectScene
+from rigsim.scenes.dome.reference import MattScene
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.subject import make_subject
 
 pytestmark = pytest.mark.render
 
 LIGHT = 45
-
-
-class MattScene(DirectScene):
-    """A dome whose skin does not shine: the diffuse term behind the boundary alone."""
-
-    def _surface(self, camera: str) -> SkinSurface:
-        surface = super()._surface(camera)
-        return dataclasses.replace(surface, bare=np.zeros_like(surface.bare))
 
 
 def matt_image(

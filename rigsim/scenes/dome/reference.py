@@ -92,6 +92,14 @@ class PlainScene(DirectScene):
         return dataclasses.replace(surface, fuzz=none, bare=np.ones_like(none))
 
 
+class MattScene(DirectScene):
+    """A dome whose skin does not shine: the diffuse term behind the boundary alone."""
+
+    def _surface(self, camera: str) -> SkinSurface:
+        surface = super()._surface(camera)
+        return dataclasses.replace(surface, bare=np.zeros_like(surface.bare))
+
+
 def compare_integrators(
     *,
     width_px: int,
