@@ -167,7 +167,7 @@ def main() -> None:
         return
     missing = compile_all(given.processes)
     if missing:
-        print(f"compile_kernels: {missing} kernels are compiled when first called", file=sys.stderr)
+        print(f"compile_kernels: kernels not compiled now, but when first called: {missing}", file=sys.stderr)
 
 
 if __name__ == "__main__":
