@@ -200,19 +200,44 @@ def invert(
     colors = check_colors(rgb)
     shape = colors.shape[:-1]
     free, known = _shading(shading, shape)
-    pixels = int(np.prod(shape, dtype=np.int64))
-    maps = np.empty((len(kernels.INVERSION_MAPS), pixels), dtype=np.float32)
-    masks = np.empty((len(kernels.INVERSION_MASKS), pixels), dtype=np.bool_)
     covariance = model_covariance(model_error, variance is None)
     covariance = add_brightness_variance(covariance) if free else covariance
-    start = inverse_table_for(table, free)
     brightest = np.inf if shading_max is None else shading_max
     Checks(ChromophoreError).within("shading_max", brightest, "(0, inf]")
-    kernels.fit_pixels(
+    start = inverse_table_for(table, free)
+    maps, masks = _fit(
         np.ascontiguousarray(colors).reshape(-1, 3),
         _variance(variance, shape),
+        (free, known, _usable(valid, shape)),
+        covariance,
+        table,
+        start.axes if free or table.optics_covariance is None else _axes_with_optics(table),
+        (np.float32(np.log(brightest)), np.float32(limit)),
+    )
+    named = dict(zip(kernels.INVERSION_MAPS, maps.reshape(len(maps), *shape), strict=True))
+    flags = dict(zip(kernels.INVERSION_MASKS, masks.reshape(len(masks), *shape), strict=True))
+    return ChromophoreMaps(**named, **flags, depth_factor=table.constants.melanin_depth_factor)
+
+
+def _fit(
+    rgb: Float32Array,
+    variance: Float32Array,
+    shading: tuple[bool, Float32Array, BoolArray],
+    covariance: Float64Array,
+    table: ColorTable,
+    start_axes: Float32Array,
+    limits: tuple[np.float32, np.float32],
+) -> tuple[Float32Array, BoolArray]:
+    """Fit pixels (n, 3) from a start grid; return maps and masks, see `kernels.fit_pixels`."""
+    maps = np.empty((len(kernels.INVERSION_MAPS), len(rgb)), dtype=np.float32)
+    masks = np.empty((len(kernels.INVERSION_MASKS), len(rgb)), dtype=np.bool_)
+    free, known, usable = shading
+    start = inverse_table_for(table, free)
+    kernels.fit_pixels(
+        rgb,
+        variance,
         known,
-        _usable(valid, shape),
+        usable,
         free,
         covariance.astype(np.float32),
         optics_triangles(table),
@@ -220,18 +245,39 @@ def invert(
         np.ascontiguousarray(table.cells, dtype=np.float32),
         np.array([table.c_m_max, table.c_hd_max], dtype=np.float32),
         np.ascontiguousarray(start.projection, dtype=np.float32),
-        start.axes,
+        start_axes,
         start.twin_log,
-        np.float32(np.log(brightest)),
+        limits[0],
         np.float32(start.side),
-        np.float32(limit),
+        limits[1],
         maps,
         masks,
         _TASK_PIXELS,
     )
-    named = dict(zip(kernels.INVERSION_MAPS, maps.reshape(len(maps), *shape), strict=True))
-    flags = dict(zip(kernels.INVERSION_MASKS, masks.reshape(len(masks), *shape), strict=True))
-    return ChromophoreMaps(**named, **flags, depth_factor=table.constants.melanin_depth_factor)
+    return maps, masks
+
+
+@lru_cache(maxsize=16)
+def _axes_with_optics(table: ColorTable) -> Float32Array:
+    """Return the start grid for a known shading, moved by unknown optics and people's priors.
+
+    It is the fit of the grid's own colors with the default noise, and saves a third of the steps.
+    """
+    axes = inverse_table_for(table, False).axes
+    color, _, _ = evaluate_table(table, *np.moveaxis(axes.reshape(-1, 2).astype(np.float64), 1, 0))
+    one, all_usable = np.ones(1, np.float32), np.ones(1, np.bool_)
+    maps, masks = _fit(
+        np.ascontiguousarray(color, np.float32),
+        np.zeros((1, 3), np.float32),
+        (False, one, all_usable),
+        model_covariance(None, True),
+        table,
+        axes,
+        (np.float32(np.inf), np.float32(MAX_IDENTIFIABLE_STDERR)),
+    )
+    ends = np.array([[table.c_m_max], [table.c_hd_max]])
+    moved = np.cbrt(maps[:2] / ends).astype(np.float32).T.reshape(axes.shape)
+    return np.where(masks[0].reshape(*axes.shape[:2], 1), moved, axes)
 
 
 @dataclass(frozen=True, slots=True)
