@@ -167,7 +167,8 @@ def main() -> None:
         return
     missing = compile_all(given.processes)
     if missing:
-        print(f"compile_kernels: kernels not compiled now, but when first called: {missing}", file=sys.stderr)
+        text = f"compile_kernels: kernels to compile when first called: {missing}"
+        print(text, file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -3,11 +3,10 @@
 from reconstruction.chromophores.inversion import (
     ChromophoreMaps,
     Identifiability,
-    add_brightness_variance,
     compute_identifiability,
     invert,
-    model_covariance,
 )
+from reconstruction.chromophores.model_error import add_brightness_variance, model_covariance
 from reconstruction.chromophores.pixel_checks import ChromophoreError
 
 __all__ = [

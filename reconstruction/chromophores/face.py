@@ -26,7 +26,6 @@ from reconstruction.chromophores.face_distribution import (
     add_systematic_errors,
     fit_distribution,
 )
-from reconstruction.chromophores.inversion import add_brightness_variance
 from reconstruction.chromophores.pixel_checks import (
     ChromophoreError,
     broadcast_to_pixels,
@@ -301,7 +300,7 @@ def _weights(relative: Float64Array, errors: Float64Array) -> tuple[Float64Array
     # With V = W^-1 and an unknown common log factor t, minimizing (e - t 1)' W (e - t 1) over t
     # gives t = s' e with s = W 1 / (1' W 1), and leaves the weights W - W 1 1' W / (1' W 1).
     total = (relative + MIN_COLOR_ERROR**2)[:, :, None] * np.eye(3) + errors
-    weights = np.linalg.inv(add_brightness_variance(total))
+    weights = np.linalg.inv(color_errors.add_brightness_variance(total))
     row = weights.sum(axis=-1)
     whole = row.sum(axis=-1)
     weights -= row[:, :, None] * row[:, None, :] / whole[:, None, None]

@@ -20,6 +20,7 @@ from model.checks import Checks
 from model.color_table import ColorTable
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.chromophores import inversion_kernels as kernels
+from reconstruction.chromophores.model_error import add_brightness_variance, model_covariance
 from reconstruction.chromophores.pixel_checks import (
     ChromophoreError,
     broadcast_to_pixels,
@@ -35,8 +36,6 @@ from reconstruction.chromophores.start import (
 
 Shading = Literal["known"] | ArrayLike | None
 
-DEFAULT_RELATIVE_NOISE = 0.01
-"""Relative noise of each channel that is assumed when no variance is given."""
 MAX_IDENTIFIABLE_STDERR = 1.0
 """Relative standard error above which a chromophore counts as not identifiable."""
 POPULATION_MELANIN = 0.037
@@ -259,10 +258,7 @@ def _fit(
 
 @lru_cache(maxsize=16)
 def _axes_with_optics(table: ColorTable) -> Float32Array:
-    """Return the start grid for a known shading, moved by unknown optics and people's priors.
-
-    It is the fit of the grid's own colors with the default noise, and saves a third of the steps.
-    """
+    """Return the fit of the start grid's own colors, moved by unknown optics and priors."""
     axes = inverse_table_for(table, False).axes
     color, _, _ = evaluate_table(table, *np.moveaxis(axes.reshape(-1, 2).astype(np.float64), 1, 0))
     one, all_usable = np.ones(1, np.float32), np.ones(1, np.bool_)
@@ -375,46 +371,6 @@ def compute_identifiability(
         stderr_hemoglobin=3.0 * np.sqrt(aa / det) / b,
         ambiguous=ambiguous,
     )
-
-
-def model_covariance(model_error: ArrayLike | None, default_noise: bool) -> Float64Array:
-    """Return the (3, 3) covariance of relative errors that `invert` adds to the noise.
-
-    Parameters
-    ----------
-    model_error
-        None, a relative standard error, one per channel, or a covariance.
-    default_noise
-        Whether to add the 1 percent that replaces an unknown variance.
-    """
-    error = np.zeros(3) if model_error is None else np.asarray(model_error, dtype=np.float64)
-    check = Checks(ChromophoreError)
-    check.numbers("model_error", error, (), (3,), (3, 3))
-    covariance = error
-    if error.ndim < 2:
-        check.within("model_error", error, "[0, inf)")
-        covariance = np.diag(np.broadcast_to(error, (3,)) ** 2)
-    least = np.linalg.eigvalsh(covariance).min()
-    good = np.allclose(covariance, covariance.T) and least >= -1e-12
-    check.require(good, "model_error", covariance, "symmetric, eigenvalues >= 0; correct it")
-    # The floor, single precision of the colors themselves, keeps the weights finite.
-    floor = DEFAULT_RELATIVE_NOISE**2 if default_noise else 1e-12
-    return np.asarray(covariance + floor * np.eye(3))
-
-
-def add_brightness_variance(covariance: Float64Array) -> Float64Array:
-    """Add brightness variance to a covariance whose weights have brightness projected out.
-
-    The added variance cancels in those weights. A covariance without it is singular, and its
-    inverse would lose all digits.
-
-    Parameters
-    ----------
-    covariance
-        (..., 3, 3), of relative errors.
-    """
-    common = np.trace(covariance, axis1=-2, axis2=-1) / 3.0 + 1e-6
-    return np.asarray(covariance + common[..., None, None])
 
 
 def _axis_prior(table: ColorTable, free: bool) -> Float32Array:

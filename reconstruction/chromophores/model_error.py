@@ -22,10 +22,15 @@ from importlib import resources
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 
+from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
+from reconstruction.chromophores.pixel_checks import ChromophoreError
 
+DEFAULT_RELATIVE_NOISE = 0.01
+"""Relative noise of each channel that is assumed when no variance is given."""
 MODEL_ERROR_FILE = "data/chromophore_model_error.json"
 
 
@@ -247,3 +252,43 @@ def _document() -> dict[str, Any]:
     text = resources.files("reconstruction").joinpath(MODEL_ERROR_FILE).read_text(encoding="utf-8")
     found: dict[str, Any] = json.loads(text)
     return found
+
+
+def model_covariance(model_error: ArrayLike | None, default_noise: bool) -> Float64Array:
+    """Return the (3, 3) covariance of relative errors that `invert` adds to the noise.
+
+    Parameters
+    ----------
+    model_error
+        None, a relative standard error, one per channel, or a covariance.
+    default_noise
+        Whether to add the 1 percent that replaces an unknown variance.
+    """
+    error = np.zeros(3) if model_error is None else np.asarray(model_error, dtype=np.float64)
+    check = Checks(ChromophoreError)
+    check.numbers("model_error", error, (), (3,), (3, 3))
+    covariance = error
+    if error.ndim < 2:
+        check.within("model_error", error, "[0, inf)")
+        covariance = np.diag(np.broadcast_to(error, (3,)) ** 2)
+    least = np.linalg.eigvalsh(covariance).min()
+    good = np.allclose(covariance, covariance.T) and least >= -1e-12
+    check.require(good, "model_error", covariance, "symmetric, eigenvalues >= 0; correct it")
+    # The floor, single precision of the colors themselves, keeps the weights finite.
+    floor = DEFAULT_RELATIVE_NOISE**2 if default_noise else 1e-12
+    return np.asarray(covariance + floor * np.eye(3))
+
+
+def add_brightness_variance(covariance: Float64Array) -> Float64Array:
+    """Add brightness variance to a covariance whose weights have brightness projected out.
+
+    The added variance cancels in those weights. A covariance without it is singular, and its
+    inverse would lose all digits.
+
+    Parameters
+    ----------
+    covariance
+        (..., 3, 3), of relative errors.
+    """
+    common = np.trace(covariance, axis1=-2, axis2=-1) / 3.0 + 1e-6
+    return np.asarray(covariance + common[..., None, None])

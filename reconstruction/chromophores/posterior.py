@@ -24,15 +24,17 @@ from reconstruction.chromophores import posterior_kernels as ridge
 from reconstruction.chromophores.common_optics import CommonOptics
 from reconstruction.chromophores.face_distribution import FaceDistribution
 from reconstruction.chromophores.inversion import (
-    DEFAULT_RELATIVE_NOISE,
     POPULATION_LOG_SD,
     POPULATION_MELANIN,
     ChromophoreMaps,
-    add_brightness_variance,
     invert,
-    model_covariance,
 )
 from reconstruction.chromophores.inversion_kernels import OUTSIDE_DISTANCE, OUTSIDE_SIGMAS
+from reconstruction.chromophores.model_error import (
+    DEFAULT_RELATIVE_NOISE,
+    add_brightness_variance,
+    model_covariance,
+)
 from reconstruction.chromophores.pixel_checks import ChromophoreError, is_usable_color
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MELANIN_AXIS, MIN_AXIS_FRACTION, equal_melanin_lines

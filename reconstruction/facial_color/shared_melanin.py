@@ -35,7 +35,7 @@ from reconstruction.chromophores import (
     model_covariance,
 )
 from reconstruction.chromophores.face import estimate_face
-from reconstruction.chromophores.inversion import DEFAULT_RELATIVE_NOISE
+from reconstruction.chromophores.model_error import DEFAULT_RELATIVE_NOISE
 from reconstruction.chromophores.pixel_checks import (
     broadcast_to_pixels,
     check_mask,

@@ -11,7 +11,8 @@ from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores import shading_prior
 from reconstruction.chromophores.face import fit_face_distribution
 from reconstruction.chromophores.face_distribution import ContaminatedNormal, FaceDistribution
-from reconstruction.chromophores.inversion import ChromophoreError, add_brightness_variance
+from reconstruction.chromophores.inversion import ChromophoreError
+from reconstruction.chromophores.model_error import add_brightness_variance
 from reconstruction.chromophores.posterior import estimate
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 

@@ -9,8 +9,8 @@ from twins import chromophores as chromophore_reference
 from model import color_table
 from model.tissue_optics import PAPER_CONSTANTS
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
-from reconstruction.chromophores import inversion as chromophores
 from reconstruction.chromophores.inversion import ChromophoreError, compute_identifiability, invert
+from reconstruction.chromophores.model_error import DEFAULT_RELATIVE_NOISE
 
 CAMERA = "Nikon 5100 (NPL)"
 MODES = [None, "known"]
@@ -335,7 +335,7 @@ def test_mismatched_arguments_are_refused_by_name(arguments, message, table):
 
 def test_default_noise_is_one_percent(table):
     color = table.lookup([0.02], [0.05])
-    stated = invert(color, table, variance=(chromophores.DEFAULT_RELATIVE_NOISE * color) ** 2)
+    stated = invert(color, table, variance=(DEFAULT_RELATIVE_NOISE * color) ** 2)
     np.testing.assert_allclose(
         invert(color, table).stderr_melanin, stated.stderr_melanin, rtol=1e-4
     )

@@ -6,7 +6,8 @@ from model import color_table
 from model.tissue_optics import PAPER_CONSTANTS
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
-from reconstruction.chromophores.inversion import ChromophoreError, add_brightness_variance, invert
+from reconstruction.chromophores.inversion import ChromophoreError, invert
+from reconstruction.chromophores.model_error import add_brightness_variance
 from reconstruction.chromophores.posterior import estimate
 from reconstruction.chromophores.shading_prior import lognormal_prior
 
