@@ -2,7 +2,7 @@
 
 .. code-block:: python
 
-    "type": "olat", "subpixels": 2, "offset_mm": 0.004
+    "type": "olat", "subpixels": 2, "offset_mm": 0.004, "shadows": True
 
 Camera rays through a regular grid in each pixel are traced once. For each light, one shadow ray
 goes from each hit to a point of the light's disc, from a low-discrepancy sequence; the reflection
@@ -53,6 +53,7 @@ class _Olat:
         if self.subpixels < 1:
             raise ValueError(f"olat, subpixels: got {self.subpixels}, expected at least 1")
         self.offset_mm = float(properties.get("offset_mm", RAY_OFFSET_MM))
+        self.shadows = bool(properties.get("shadows", True))
         self._disc = tuple(mi.Float(pad_memory(p)) for p in disc_points(DISC_POINTS))
 
     def render(
@@ -64,14 +65,17 @@ class _Olat:
         develop: bool = True,
         evaluate: bool = True,
     ) -> Any:
-        mi = self.mi
         camera = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        return self.mi.TensorXf(self.image(scene, camera))
+
+    def image(self, scene: Any, sensor: Any) -> Float32Array:
+        """Return the image of a camera under all lights, (H, W, C)."""
         total = None
-        for _, image in self.stream(scene, camera):
+        for _, image in self.stream(scene, sensor):
             total = image if total is None else total + image
         if total is None:
             raise ValueError("olat: got a scene without lights, expected at least one")
-        return mi.TensorXf(total)
+        return total
 
     def stream(
         self, scene: Any, sensor: Any, lights: Sequence[int] | None = None
@@ -258,8 +262,8 @@ class _Olat:
         way, axis = camera - band.start, _opaque_vector(mi, dr, right)
 
         def reflect(bsdf: Any, kept: Any, film: FilmedLight) -> tuple[list[Any], Any]:
-            stokes, inside, front = bsdf.reflected_stokes(kept, film, way, axis)
-            return [*inside, *stokes], front
+            stokes, entered, r_d, lit = bsdf.reflected_stokes(kept, film, way, axis)
+            return [*(dr.inv_pi * entered * c for c in r_d), *stokes], lit
 
         total = self._reflected(scene, band, emitter, light, added.visible, reflect, 6)
         if added.replaces_diffuse:
@@ -298,10 +302,11 @@ class _Olat:
             here = front if mask is None else front & mask
             facing |= here
             total = [dr.select(here, c, t) for t, c in zip(total, values, strict=True)]
-        ray = mi.Ray3f(band.start, target / far)
-        ray.maxt = 0.999 * far
         active &= facing
-        active &= ~scene.ray_test(ray, True, active)
+        if self.shadows:
+            ray = mi.Ray3f(band.start, target / far)
+            ray.maxt = 0.999 * far
+            active &= ~scene.ray_test(ray, True, active)
         if visible is not None:
             strength *= _upload(mi, visible)
         arriving = [*strength, *[dr.mean(strength)] * (channels - 3)]

@@ -185,11 +185,11 @@ class _SkinCoat:
 
     def reflected_stokes(
         self, words: list[Any], light: FilmedLight, way_to_camera: Any, right: Any
-    ) -> tuple[Stokes, list[Any], Any]:
-        """Return what `stored` points reflect of a light behind a polarizer.
+    ) -> tuple[Stokes, Any, list[Any], Any]:
+        """Return what `stored` points make of a light behind a polarizer.
 
-        These are the Stokes vector of the surface terms times cos(light), the radiance behind the
-        boundary in three channels, and where the surface is lit.
+        These are the Stokes vector of the surface terms times cos(light), the light that enters,
+        cosine included, r_d, and where the surface is lit.
         """
         dr = self.dr
         normal, r_d, values = self.restored(words)
@@ -200,10 +200,9 @@ class _SkinCoat:
         cl, cv = dr.clip(nl, MIN_COSINE, 1.0), dr.clip(nv, MIN_COSINE, 1.0)
         facets, volume = self.surface_lobes(values, cl, cv, nh, lh)
         s0, s1, s2 = reflect_light(dr, facets, light, to_camera, right)
-        entered = entering_light(dr, normal, light, self.material["int_ior"])
-        inside = [dr.inv_pi * cl * entered * c for c in r_d]
-        surface = (cl * (s0 + volume), cl * s1, cl * s2)
-        return surface, inside, (nl > 0.0) & (nv > 0.0)
+        entered = cl * entering_light(dr, normal, light, self.material["int_ior"])
+        seen = dr.select(nv > 0.0, cl, 0.0)
+        return (seen * (s0 + volume), seen * s1, seen * s2), entered, r_d, nl > 0.0
 
     def leaving_stokes(self, words: list[Any], way_to_camera: Any, right: Any) -> Stokes:
         """Return the Stokes vector toward the camera of radiance 1 behind the boundary."""

@@ -10,7 +10,7 @@ from capture.rig import load_rig
 from rigsim.as_built.sphere import build_sphere
 from rigsim.light.lobe_moments import MicrofacetSurface, sum_led_moments
 from rigsim.mitsuba.led_array import led_table
-from rigsim.mitsuba.led_moments import polarizer_table
+from rigsim.mitsuba.rig_camera import describe_camera
 from rigsim.mitsuba.scene_radiance import load_description
 from rigsim.mitsuba.startup import load_mitsuba
 from rigsim.mitsuba.variant import choose_variant
@@ -144,7 +144,7 @@ def test_subpixels_are_means_of_a_finer_image(skin, choice):
         scene.sphere, scene.optical_surface(0.25), (), True, scene.rig.views[0], choice
     )
     up = list(lit_leds(scene.sphere, shadows=True))[:5]
-    table = polarizer_table(scene.sphere.absorbs[up], scene.sphere.weights[up])
+    table = scene.sphere.weights[up]
     described = load_description(mi, describe_relief(patch, light.led_rows(up)))
     coarse, fine = (
         np.array(
@@ -165,11 +165,8 @@ def test_subpixels_are_means_of_a_finer_image(skin, choice):
 
 def test_wrong_scenes_of_ledmoments_are_refused(choice):
     mi = load_mitsuba(choice)
-    weights = np.ones((1, 4))
-    integrator = load_description(
-        mi, {"type": "ledmoments", "table": polarizer_table(np.array([[1.0, 0.0, 0.0]]), weights)}
-    )
-    ground = {"type": "rectangle", "bsdf": {"type": "skincoat", "vellus": 0.001}}
+    integrator = load_description(mi, {"type": "ledmoments", "table": np.ones((1, 4))})
+    ground = {"type": "rectangle", "bsdf": {"type": "diffuse"}}
     leds = {
         "type": "ledarray",
         "table": led_table([[0, 0, 9], [1, 0, 9]], [[0, 0, -1], [0, 0, -1]]),
@@ -180,12 +177,45 @@ def test_wrong_scenes_of_ledmoments_are_refused(choice):
     surface = MicrofacetSurface(0.25, ETA, view.position_mm, view.axes[0], 300.0)
     light = TracedLight(sphere, surface, (), True, view, choice)
     camera = load_description(mi, light.camera((4, 4), 6.0))
-    for emitters, message in ((leds, "got 2 LEDs of a ledarray, expected 1"), (one, "vellus")):
+    for emitters, message in ((leds, "got 2 LEDs of a ledarray, expected 1"), (one, "a skincoat")):
         scene = load_description(mi, {"type": "scene", "ground": ground, "leds": emitters})
         with pytest.raises(ValueError, match=message):
-            integrator.moments(scene, camera)
+            integrator.image(scene, camera)
     with pytest.raises(Exception, match="expected finite"):
         load_description(mi, {"type": "ledmoments", "table": np.ones((2, 5))})
+
+
+def test_coated_skin_agrees_with_olat(choice):
+    """Rationale: `olat` has the unpolarized formulas of hair, coating and diffuse term. Expected:
+    S0 and the entering light, led out, add up to its image. Tolerance: rounding of float32."""
+    mi = load_mitsuba(choice)
+    coat = {"type": "skincoat", "r_d": 0.5, "oil": 0.3, "vellus": 0.005, "bare": 0.9}
+    coat |= {"film": 0.5, "film_alpha": 0.2, "film_ior": 1.5, "powder": 0.2}
+    place = np.array([[0.0, 100.0, 600.0], [-400.0, 0.0, 300.0]])
+    axis = -place / np.linalg.norm(place, axis=1, keepdims=True)
+    bare = {"type": "ledarray", "table": led_table(place, axis, intensity=[3e5, 1e5, 2e5])}
+    film = led_table(place, axis, intensity=2e5, absorbs=[[0, 0, 1]] * 2, leak=1.0)
+    camera = load_description(mi, describe_camera(load_rig("flash").resized(24).views[0]))
+    images = []
+    for leds, integrator in (
+        (bare, {"type": "olat"}),
+        (bare | {"table": film}, {"type": "ledmoments", "table": [[1.0, 0.0, 0.5, 0.0]] * 2}),
+    ):
+        ball = {"type": "sphere", "radius": 90.0, "bsdf": coat}
+        scene = load_description(mi, {"type": "scene", "ball": ball, "leds": leds})
+        table = {"table": np.array(integrator["table"])} if "table" in integrator else {}
+        how = load_description(mi, integrator | table | {"subpixels": 1})
+        images.append(np.array(mi.render(scene, integrator=how, sensor=camera)))
+        hits = how.trace(scene, camera)
+        (leaving,) = how.leaving_stokes(hits, [1.0, 0.0, 0.0])
+    expected, moments = images
+    out = np.zeros(expected.shape[:2])
+    out.flat[hits.bands[0].pixel] = np.array(leaving[0])
+    total = moments[..., 0] + moments[..., 12] * out * 0.5 / np.pi
+    np.testing.assert_allclose(total, expected.mean(axis=-1), atol=1e-5 * expected.max())
+    np.testing.assert_array_equal(moments[..., 6], 0.5 * moments[..., 0])
+    assert (moments[..., 0] > 0.3 * expected.mean(axis=-1)).any()
+    assert not moments[..., 3].any()
 
 
 THREAD_SCRIPT = """

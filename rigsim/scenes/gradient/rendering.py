@@ -15,7 +15,6 @@ from rigsim.light.led_light import lobe_exponent
 from rigsim.light.lobe_moments import MicrofacetSurface
 from rigsim.light.skin_material import describe_texture
 from rigsim.mitsuba.led_array import led_table
-from rigsim.mitsuba.led_moments import polarizer_table
 from rigsim.mitsuba.rig_camera import describe_camera
 from rigsim.mitsuba.scene_radiance import load_description
 from rigsim.mitsuba.startup import load_mitsuba
@@ -79,23 +78,21 @@ class TracedLight:
         mi = load_mitsuba(self.choice)
         scene = load_description(mi, describe_relief(wide, self.led_rows(lit)))
         camera = load_description(mi, self.camera((rows, columns), pitch_um))
-        weights = self.sphere.weights[lit]
         integrator = load_description(
             mi,
             {
                 "type": "ledmoments",
-                "table": polarizer_table(self.sphere.absorbs[lit], weights),
-                "extinction": float(self.surface.extinction),
+                "table": self.sphere.weights[lit],
                 "shadows": self.shadows,
                 "offset_mm": RAY_OFFSET_MM,
                 "subpixels": 1,
             },
         )
-        image = integrator.moments(scene, camera)
+        image = integrator.image(scene, camera)
         return np.ascontiguousarray(np.moveaxis(image, -1, 0))
 
     def led_rows(self, lit: Sequence[int]) -> Float32Array:
-        """Return the rows of some LEDs for `rigsim.mitsuba.led_array`, shape (N, 12)."""
+        """Return the rows of some LEDs for `rigsim.mitsuba.led_array`, shape (N, 16)."""
         place = self.sphere.position_mm[lit]
         power = self.sphere.intensity[lit, None] * REFERENCE_DISTANCE_MM**2
         return led_table(
@@ -104,6 +101,8 @@ class TracedLight:
             intensity=np.repeat(power, 3, axis=1),
             exponent=[lobe_exponent(self.sphere.nominal.lights[k]) for k in lit],
             radius_mm=self.sphere.radius_mm[lit],
+            absorbs=self.sphere.absorbs[lit],
+            leak=1.0 / self.surface.extinction,
         )
 
     def camera(self, shape: tuple[int, int], pitch_um: float) -> dict[str, Any]:
@@ -145,8 +144,7 @@ def relief_grid(patch: PatchSurface) -> ReliefGrid:
 def describe_relief(patch: PatchSurface, leds: Float32Array) -> dict[str, Any]:
     """Return the description of a patch between the caliper's jaws, under LEDs.
 
-    Its `skincoat` has the relief's GGX facets as an oil film of the skin's index and roughness on
-    the whole surface; the jaws are matt.
+    The jaws are matt.
 
     Parameters
     ----------
@@ -164,10 +162,8 @@ def describe_relief(patch: PatchSurface, leds: Float32Array) -> dict[str, Any]:
             "mesh": relief_grid(patch),
             "bsdf": {
                 "type": "skincoat",
+                "distribution": "ggx",
                 "int_ior": ETA,
-                "oil_ior": ETA,
-                "oil_smoothing": 1.0,
-                "oil": 1.0,
                 "r_d": describe_texture(np.repeat(albedo[..., None], 3, axis=-1)),
                 "alpha": describe_texture(patch.alpha),
                 "bare": describe_texture(patch.skin.astype(np.float32)),
