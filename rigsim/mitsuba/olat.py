@@ -11,12 +11,15 @@ between surfaces is left out. `mi.render` returns the sum over all lights; `stre
 for each light, so that memory does not grow with their number.
 
 `shade_polarized` gives Stokes vectors at the camera for LEDs behind polarizers, also in variants
-without polarization.
+without polarization. With `analyzer_deg`, images are those behind an analyzer: the angle of its
+transmission axis from the image's x axis toward its top, and `analyzer_leak`, its transmittance
+across that axis over the one along it.
 
 Lights are the LEDs of each `ledarray` and any other emitter as one. The BSDF `skincoat` is looked
 up once for each hit; any other BSDF is evaluated for each light.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
@@ -28,7 +31,7 @@ from rigsim.mitsuba.image_hits import NOTHING_ADDED, AddedLight, HitBand, ImageH
 from rigsim.mitsuba.led_array import DISC_POINTS, disc_points
 from rigsim.mitsuba.memory import pad_memory
 from rigsim.mitsuba.plugin_class import define_plugin
-from rigsim.mitsuba.polarized_light import FilmedLight
+from rigsim.mitsuba.polarized_light import FilmedLight, double_angle
 
 RAYS_PER_BAND: Final = 1 << 21
 """Camera rays that are traced together; bounds memory at full resolution."""
@@ -54,6 +57,10 @@ class _Olat:
             raise ValueError(f"olat, subpixels: got {self.subpixels}, expected at least 1")
         self.offset_mm = float(properties.get("offset_mm", RAY_OFFSET_MM))
         self.shadows = bool(properties.get("shadows", True))
+        self.analyzer: tuple[float, float] | None = None
+        if "analyzer_deg" in properties:
+            leak = float(properties.get("analyzer_leak", 0.0))
+            self.analyzer = (math.radians(float(properties["analyzer_deg"])), leak)
         self._disc = tuple(mi.Float(pad_memory(p)) for p in disc_points(DISC_POINTS))
 
     def render(
@@ -85,7 +92,10 @@ class _Olat:
         numbered = [(e, k) for e in scene.emitters() for k in range(_light_count(e))]
         for n in range(len(numbered)) if lights is None else lights:
             emitter, k = numbered[n]
-            parts = self.shade(scene, hits, emitter, k)
+            if self.analyzer is None:
+                parts = self.shade(scene, hits, emitter, k)
+            else:
+                parts = self._shade_analyzed(scene, sensor, hits, emitter, k, *self.analyzer)
             color = emitter.strength(k) if hasattr(emitter, "strength") else np.ones(3)
             yield n, self.develop(hits, parts, color)
 
@@ -140,6 +150,37 @@ class _Olat:
             self._shade_polarized(scene, hits.camera, band, emitter, light, right, added.part(rows))
             for band, rows in hits.parts()
         ]
+
+    def _shade_analyzed(
+        self,
+        scene: Any,
+        sensor: Any,
+        hits: ImageHits,
+        emitter: Any,
+        light: int,
+        angle_rad: float,
+        leak: float,
+    ) -> list[Any]:
+        """Return the radiance behind the analyzer, in the format of `shade`."""
+        mi, dr = self.mi, self.dr
+        left, up, _ = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)[:3, :3].T
+        absorbs = math.sin(angle_rad) * left + math.cos(angle_rad) * up
+        right, film = (_opaque_vector(mi, dr, axis) for axis in (-left, absorbs))
+        polarized = self.shade_polarized(scene, hits, emitter, light, -left)
+        out = []
+        for band, (surface, inside), leaving in zip(
+            hits.bands, polarized, self.leaving_stokes(hits, -left), strict=True
+        ):
+            to_camera = dr.normalize(hits.camera - band.start)
+            cos2, sin2 = double_angle(dr, right, dr.cross(film, to_camera), to_camera)
+            glossy, matt = (
+                0.5 * ((1.0 + leak) * s0 + (1.0 - leak) * (cos2 * s1 - sin2 * s2))
+                for s0, s1, s2 in (surface, leaving)
+            )
+            parts = [glossy + matt * c for c in inside]
+            dr.eval(parts)
+            out.append(parts)
+        return out
 
     def leaving_stokes(self, hits: ImageHits, right: ArrayLike) -> list[list[Any]]:
         """Return the Stokes vector at the camera of radiance 1 behind each band's boundary."""

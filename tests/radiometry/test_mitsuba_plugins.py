@@ -287,6 +287,26 @@ def test_each_streamed_image_is_one_light(mi):
     assert np.abs(images[0] - images[1]).max() > 0.1 * total.max()
 
 
+def test_analyzers_across_each_other_add_up(mi):
+    """Rationale: two ideal analyzers at 90 degrees transmit all light. Tolerance: across a ray at
+    an angle a off the axis, their axes are within a^2 / 2 of 90 degrees. The first blocks most of
+    the reflection of LEDs whose polarizers cross it."""
+    table = led_table(**LEDS, intensity=1e5, absorbs=[[0.0, 1.0, 0.0]] * 2, leak=0.01)
+    leds = {"type": "ledarray", "table": table}
+    scene = load_description(mi, ball({"r_d": 0.0}, leds=leds))
+    crossed, parallel = (
+        np.array(mi.render(scene, integrator=mi.load_dict({"type": "olat", "analyzer_deg": deg})))
+        for deg in (90.0, 0.0)
+    )
+    leaky = {"type": "olat", "analyzer_deg": 90.0, "analyzer_leak": 1.0}
+    total = np.array(mi.render(scene, integrator=mi.load_dict(leaky)))
+    view = load_rig("flash").resized(48).view("cam")
+    corner = np.hypot(view.width_px, view.height_px) / (2.0 * view.focal_px)
+    np.testing.assert_allclose(crossed + parallel, total, rtol=0.5 * corner**2)
+    assert corner < 0.3
+    assert parallel.max() > 5.0 * crossed.max()
+
+
 def test_a_scene_without_lights_is_refused(mi):
     scene = load_description(mi, {k: v for k, v in ball().items() if k != "leds"})
     with pytest.raises(ValueError, match="without lights"):
