@@ -136,7 +136,7 @@ def export(
         APPEARANCE/ or SESSION/ folder.
     to
         Format. Appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. Session: mhl,
-        frames, lp, stokes, event-model, mitsuba (simulated dome).
+        frames, lp, stokes, event-model, mitsuba (simulated dome, flash, gradient).
     use
         Purpose of the copy, such as research, which the subjects' consent must include; required
         for measured data.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
@@ -174,16 +173,15 @@ def _blend_shapes(subject: Any) -> bytes:
     """Return the neutral face and each expression's displacements as the bytes of an .npz."""
     rest = subject.mesh if subject.rest is None else subject.rest.mesh
     shapes = subject.blend_shapes()
-    out = io.BytesIO()
-    np.savez_compressed(
-        out,
-        vertices_mm=rest.vertices_mm,
-        faces=rest.faces,
-        uv=rest.uv,
-        shape_names=np.array(list(shapes)),
-        shape_deltas_mm=np.array(list(shapes.values()), np.float16),
+    return driving.encode_arrays(
+        {
+            "vertices_mm": rest.vertices_mm,
+            "faces": rest.faces,
+            "uv": rest.uv,
+            "shape_names": np.array(list(shapes)),
+            "shape_deltas_mm": np.array(list(shapes.values()), np.float16),
+        }
     )
-    return out.getvalue()
 
 
 def small_dome(

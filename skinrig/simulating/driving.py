@@ -1,11 +1,14 @@
 """Run plans on simulated rigs and record their sessions and ground truth."""
 
+import io
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
+
+import numpy as np
 
 from capture.acquire import Operator, run_plan
 from capture.devices.camera import open_camera
@@ -173,6 +176,13 @@ def write_truth(
     inputs = {"session": session.content_hash}
     truth = replace(appearance, parameters=parameters, inputs=inputs, seed=order.seed)
     store.write(folder, truth if files is None else replace(truth, files=files))
+
+
+def encode_arrays(arrays: Mapping[str, Any]) -> bytes:
+    """Return arrays as the bytes of a compressed .npz; equal arrays give equal bytes."""
+    out = io.BytesIO()
+    np.savez_compressed(out, **arrays)
+    return out.getvalue()
 
 
 def build_result(

@@ -1,5 +1,6 @@
 """Simulate captures with the flash rig: a face or a target, with the ground truth."""
 
+import dataclasses
 from typing import Any
 
 from capture.plan import Plan
@@ -10,14 +11,27 @@ from rigsim.mitsuba.variant import choose_renderer
 from rigsim.needs.effects import SceneEffects
 from rigsim.population import files as subject_file
 from rigsim.scenes.flash.scene import FlashScene
+from rigsim.scenes.flash.truth import face_surface
 from rigsim.subject.perfusion import STATE_NAMES
 from skinrig.capturing.plan_choice import DefaultPlan
 from skinrig.console import select_attributes
 from skinrig.errors import require_choice
 from skinrig.simulating import subject_records
-from skinrig.simulating.driving import build_result, drive_plan, manifest_settings, open_session
+from skinrig.simulating.driving import (
+    build_result,
+    drive_plan,
+    encode_arrays,
+    manifest_settings,
+    open_session,
+)
 from skinrig.simulating.flash_truth import WIDTHS_PX, _stance_offset_mm, build_truth
-from skinrig.simulating.orders import FlashOrder, SimulationError, SimulationResult, truth_folder
+from skinrig.simulating.orders import (
+    SURFACE_FILE,
+    FlashOrder,
+    SimulationError,
+    SimulationResult,
+    truth_folder,
+)
 from skinrig.simulating.sequence import simulate_sequence
 
 
@@ -70,6 +84,10 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
             parameters=about,
             with_oxygenation=has_leds,
         )
+        if state == states[0]:
+            surface = face_surface(scene.subject, state, rig, scene.white_rgb())
+            files = {SURFACE_FILE: encode_arrays(surface)}
+            appearance = dataclasses.replace(appearance, files=files)
         store.write(folder, appearance)
     blur_mm = tuple(float(width) for width in first.resolution_mm())
     return build_result(order, session, first, rig_seconds, truth, blur_mm=blur_mm)

@@ -14,6 +14,7 @@ from rigsim.needs.effects import SceneEffects, max_on_time_s
 from rigsim.population import files as subject_file
 from rigsim.scenes.gradient.scene import GradientScene
 from rigsim.scenes.gradient.truth import gradient_truth as ground_truth
+from rigsim.scenes.gradient.truth import scene_surface
 from rigsim.skin_patch.motion import PatchMotion
 from rigsim.skin_patch.stretch import required_size_mm
 from rigsim.world.taped_skin import GripState
@@ -21,7 +22,7 @@ from skinrig.capturing.plan_choice import DefaultPlan
 from skinrig.console import select_attributes
 from skinrig.simulating import driving
 from skinrig.simulating.exposure_log import SceneLog
-from skinrig.simulating.orders import GradientOrder, SimulationResult, truth_folder
+from skinrig.simulating.orders import SURFACE_FILE, GradientOrder, SimulationResult, truth_folder
 
 WIDTHS_PX = {"small": 256, "full": 2048}
 ANGLES_DEG: dict[str, tuple[float, ...] | None] = {"small": (0.0,), "full": None}
@@ -68,7 +69,9 @@ def simulate_gradient(order: GradientOrder) -> SimulationResult:
     truth = None
     if order.target is None:
         truth = truth_folder(order.out)
-        driving.write_truth(truth, order, session, ground_truth(scene, log.list_grips(session)))
+        grips = log.list_grips(session)
+        files = {SURFACE_FILE: driving.encode_arrays(scene_surface(scene, grips))}
+        driving.write_truth(truth, order, session, ground_truth(scene, grips), files=files)
     log.remove()
     return driving.build_result(order, session, scene, rig_seconds, truth, light=light)
 

@@ -77,6 +77,10 @@ def truth_folder(session: Path) -> Path:
     return session.with_name(f"truth-{session.name.removeprefix('session-')}")
 
 
+SURFACE_FILE = "surface.npz"
+"""Surface of a scene in the ground truth of the flash and the gradient rig, for renderers."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimulationOrder:
     """Options common to all simulations; each rig's order adds its own.

@@ -1,4 +1,4 @@
-"""The exported scenes of a session, rendered by Mitsuba, against the project's compiled renderer.
+"""The exported scenes of sessions, rendered by Mitsuba, against the project's compiled formulas.
 
 Rationale: the export has the face, LEDs and cameras of a simulated session. A process that imports
 nothing of the project renders it with stock materials, another with the project's plugins. The
@@ -11,20 +11,14 @@ triangles' frames against the rig's frame), fixed beforehand.
 
 import dataclasses
 import json
-import math
-import re
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
-import OpenEXR
 import pytest
-from scipy import stats
+from exported_scenes import change_map, render, replace_in, sum_blocks, worst_z
 
 from capture.session import Session
 from rigsim.as_built.dome import build_dome
-from rigsim.mitsuba.variant import choose_renderer, choose_variant
+from rigsim.mitsuba.variant import choose_renderer
 from rigsim.needs.effects import SceneEffects
 from rigsim.population import files as subject_file
 from rigsim.scenes.dome.scene import DomeScene
@@ -33,25 +27,7 @@ from skinrig.simulating.simulation import simulate_session
 
 pytestmark = [pytest.mark.render, pytest.mark.long]
 
-ROOT = Path(__file__).parents[2]
-RUNS, SAMPLES, BLOCK = 24, 32, 8
-SYSTEMATIC = 1e-3
-FALSE_ALARM = 1e-3
 SEED = 3
-RENDER = f"""
-import sys
-import numpy as np
-import mitsuba as mi
-mi.set_variant(sys.argv[1])
-if sys.argv[6]:
-    sys.path.insert(0, sys.argv[6])
-    import rigsim.mitsuba
-scene = mi.load_file(sys.argv[2], light=sys.argv[3])
-runs = [mi.render(scene, sensor=int(sys.argv[4]), spp={SAMPLES}, seed=k) for k in range({RUNS})]
-np.save(sys.argv[5], np.stack([np.array(mi.TensorXf(run).numpy()) for run in runs]))
-ours = {{name.split(".")[0] for name in sys.modules}} & {{"rigsim", "skinrig"}}
-assert bool(ours) == bool(sys.argv[6])
-"""
 
 
 class LocalReflection(DomeScene):
@@ -63,7 +39,9 @@ class LocalReflection(DomeScene):
             subject,
             dome=dome,
             subpixels=subpixels,
-            effects=SceneEffects(lateral=False, interreflections=False, optics=False),
+            effects=SceneEffects(
+                lateral=False, interreflections=False, optics=False, relief_shadows=False
+            ),
             choice=choose_renderer("fast"),
         )
 
@@ -98,31 +76,6 @@ def scene_folder(session, tmp_path):
     return out
 
 
-def render(folder, light, sensor, file="scene-stock.xml"):
-    """Return the images of `RUNS` seeds by a new process, with plugins for `scene.xml` alone."""
-    out = folder / "images.npy"
-    choice = choose_variant("rgb")
-    plugins = str(ROOT) if file == "scene.xml" else ""
-    arguments = [choice.name, str(folder / file), light, str(sensor), str(out), plugins]
-    environment = {"DRJIT_LIBLLVM_PATH": choice.library, "HOME": str(folder.parent)}
-    done = subprocess.run(
-        [sys.executable, "-I", "-c", RENDER, *arguments],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return np.load(out)
-
-
-def sum_blocks(images):
-    height, width = (BLOCK * (n // BLOCK) for n in images.shape[-3:-1])
-    cut = images[..., :height, :width, :].astype(np.float64)
-    grid = (*images.shape[:-3], height // BLOCK, BLOCK, width // BLOCK, BLOCK, 3)
-    return cut.reshape(grid).sum(axis=(-4, -2))
-
-
 def render_ours(session, light, sensor, file="scene-stock.xml"):
     """Return block sums at the finest grid of rays, and their deviation over three grids."""
     dome = build_dome(session.rig, seed=session.seed)
@@ -136,17 +89,6 @@ def render_ours(session, light, sensor, file="scene-stock.xml"):
         for subpixels in (6, 7, 8)
     ]
     return sums[-1], np.std(sums, axis=0, ddof=1)
-
-
-def worst_z(found, runs):
-    """Return the largest |z| of the blocks that Mitsuba lights, and its limit."""
-    ours, deviation = found
-    sums = sum_blocks(runs)
-    mean, stderr = sums.mean(axis=0), sums.std(axis=0, ddof=1) / math.sqrt(RUNS)
-    lit = mean > 1e-3 * mean.max()
-    error = np.sqrt(stderr**2 + deviation**2 + (SYSTEMATIC * mean) ** 2)
-    limit = stats.t.isf(0.5 * (1.0 - (1.0 - FALSE_ALARM) ** (1.0 / lit.sum())), RUNS - 1)
-    return np.abs((ours - mean)[lit] / error[lit]).max(), limit
 
 
 @pytest.fixture(scope="module")
@@ -163,25 +105,11 @@ def test_mitsuba_renders_the_projects_image(session, scene_folder, file, light, 
     assert worst < limit
 
 
-def flip_texture(folder):
-    scene = folder / "scene-stock.xml"
-    flipped = '<boolean name="flip_tex_coords" value="false" />'
-    text, count = re.subn(r'<boolean name="flip_tex_coords" [^>]*>', flipped, scene.read_text())
-    assert count == 1
-    scene.write_text(text)
-
-
-def change_map(name, change):
-    def edit(folder):
-        path = folder / "textures" / f"{name}.exr"
-        with OpenEXR.File(str(path)) as file:
-            channels = {key: np.array(one.pixels) for key, one in file.channels().items()}
-        (key,) = channels
-        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        with OpenEXR.File(header, {key: change(channels[key])}) as file:
-            file.write(str(path))
-
-    return edit
+flip_texture = replace_in(
+    "scene-stock.xml",
+    r'<boolean name="flip_tex_coords" [^>]*>',
+    '<boolean name="flip_tex_coords" value="false" />',
+)
 
 
 DEFECTS = {

@@ -9,7 +9,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from capture.rig import Rig
+from rigsim import shading
 from rigsim.arrays import BoolArray, Float32Array
+from rigsim.light.observed_skin import ObservedSkin
+from rigsim.light.subsurface_radiance import inner_albedo
 from rigsim.population.population import MAX_SKIN_HAIR
 from rigsim.scenes.flash.image import FlashCamera, FlashImage
 from rigsim.scenes.flash.surfaces import FlashSurface
@@ -101,6 +105,44 @@ def rest_maps_of_unmoved_face(
     """Return the same maps for a face that has not moved, from those of `truth_maps`."""
     return {
         f"{name}_at_rest": maps[name] for name in (*VOLUME_FRACTIONS, *BLURRED_FRACTIONS, "mask")
+    }
+
+
+def face_surface(
+    face: SimulatedSubject, state: str, rig: Rig, white_rgb: Float32Array
+) -> dict[str, NDArray[np.generic]]:
+    """Return a face for other renderers, as the rig's first camera observes it.
+
+    Parameters
+    ----------
+    face
+        The face in its pose.
+    state
+        State of its blood.
+    rig
+        The rig: the camera's sensitivities and the lights' spectrum.
+    white_rgb
+        See `FlashScene.white_rgb`.
+
+    Returns
+    -------
+    dict
+        ``vertices_mm``, ``faces`` and ``uv``: the mesh in its pose. Textures of shape (N, N[, 3]),
+        float32: ``r_d``, the light that leaves skin or hair over that which enters; ``roughness``,
+        GGX alpha; ``bare``, fraction not behind hair; ``normals``, unit, rig frame, with relief.
+        ``white_rgb``: as given.
+    """
+    camera, illuminant = rig.views[0].spectral_sensitivity, rig.lights[0].illuminant
+    skin = ObservedSkin(face, state, camera, illuminant)
+    return {
+        "vertices_mm": face.mesh.vertices_mm,
+        "faces": face.mesh.faces,
+        "uv": face.mesh.uv,
+        "r_d": inner_albedo(face, skin.reflectance()),
+        "roughness": np.clip(face.roughness, *shading.ALPHA_RANGE),
+        "bare": np.float32(1.0) - face.hair,
+        "normals": face.normal,
+        "white_rgb": white_rgb,
     }
 
 

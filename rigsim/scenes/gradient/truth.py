@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from rigsim import shading
@@ -13,11 +15,15 @@ from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.sphere import ActualSphere
 from rigsim.light.lobe_moments import MicrofacetSurface, led_moments
 from rigsim.render.lens_blur import blur_images
-from rigsim.scenes.gradient.patch import PatchSurface
+from rigsim.scenes.gradient.patch import SHADOW_MARGIN_PX, PatchSurface
 from rigsim.world.taped_skin import GripState
 
 if TYPE_CHECKING:
     from rigsim.scenes.gradient.scene import GradientScene
+
+
+MAX_SURFACE_PX: Final = 512
+"""Pixels across the surface of `scene_surface`, without margins: 12 MB before compression."""
 
 
 def format_state_name(angle_deg: float, step: int) -> str:
@@ -113,6 +119,34 @@ def gradient_truth(scene: GradientScene, grips: Sequence[GripState]) -> SkinAppe
     return SkinAppearance(
         maps, "simulated", parameters=parameters, left_out=tuple(scene.omitted), seed=scene.seed
     )
+
+
+def scene_surface(
+    scene: GradientScene, grips: Sequence[GripState]
+) -> dict[str, NDArray[np.generic]]:
+    """Return the surface of the first neutral state for other renderers.
+
+    Parameters
+    ----------
+    scene
+        A patch of skin.
+    grips
+        The states; one has step 0.
+
+    Returns
+    -------
+    dict
+        The fields of `PatchSurface` at pixel centers, up to `MAX_SURFACE_PX` around the image's
+        center and with `SHADOW_MARGIN_PX` more on all sides, without drift. ``unit``: full scales
+        per second per unit of radiance of `rigsim.light.lobe_moments`.
+    """
+    neutral = next(grip for grip in grips if grip.step == 0)
+    view = scene.rig.views[0]
+    beyond = max(0, (max(view.width_px, view.height_px) - MAX_SURFACE_PX) // 2)
+    wide = scene.surface(neutral, border_px=max(0, SHADOW_MARGIN_PX - beyond))
+    patch = wide.crop(max(0, beyond - SHADOW_MARGIN_PX))
+    arrays = {one.name: getattr(patch, one.name) for one in dataclasses.fields(patch)}
+    return {**arrays, "unit": np.array(scene.unit)}
 
 
 def _placement(scene: GradientScene, grip: GripState) -> Float64Array:

@@ -1,4 +1,4 @@
-"""Write a simulated face for Mitsuba: its mesh, the maps of its reflection, and its material."""
+"""Write simulated skin for Mitsuba: its mesh, the maps of its reflection, and its material."""
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -11,6 +11,7 @@ from rigsim.geometry.atlas import Atlas, dilate_texture, unwrap
 from rigsim.geometry.mesh import Mesh
 from rigsim.light.surface_brdf import ETA_OIL, OIL_SMOOTHING
 from rigsim.mitsuba.scene_radiance import plastic_scale
+from rigsim.scenes.gradient.rendering import ReliefGrid
 from rigsim.tissue.skin_layers import ETA
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
 from skinrig.exporting.images import write_channels
@@ -21,6 +22,8 @@ TEXTURES_FOLDER: Final = "textures"
 SKIN_ID: Final = "skin"
 BLEND_PARTS: Final = 2.0
 """Materials that a blend of weight 1/2 averages: each has twice its strength, so that they add."""
+POLARIZED_PARTS: Final = 2.0
+"""Transmittance of the parallel analyzer for specular over that for diffuse light."""
 COATING_PROPERTIES: Final[Mapping[str, str]] = {
     "film": "film",
     "film_alpha": "film_alpha",
@@ -56,19 +59,52 @@ def write_skin(truth: SkinAppearance, mesh: Mesh, folder: Path) -> tuple[str, ..
     tuple of str
         Names of the maps, each in ``textures/NAME.exr``; row 0 is v = 1.
     """
+    return write_maps(_surface_maps(truth), mesh, folder)
+
+
+def write_maps(
+    maps: Mapping[str, Float32Array],
+    mesh: Mesh | ReliefGrid,
+    folder: Path,
+    *,
+    specular_parts: float = 1.0,
+) -> tuple[str, ...]:
+    """Write a mesh and the maps on it, with those that Mitsuba's own materials need.
+
+    Parameters
+    ----------
+    maps
+        Maps by name, shape (N, N[, 3]).
+    mesh
+        The mesh, mm, rig frame. A relief has the skin's normals itself, and its maps, of shape
+        (H, W[, 3]), cover its whole texture.
+    folder
+        Existing folder.
+    specular_parts
+        Factor of the specular reflection of the stock material.
+
+    Returns
+    -------
+    tuple of str
+        As of `write_skin`.
+    """
     (folder / MESH_FILE).write_bytes(encode_ply(mesh))
     (folder / TEXTURES_FOLDER).mkdir()
-    maps = _surface_maps(truth)
-    atlas = unwrap(mesh, len(maps["r_d"]))
-    tangent = rotate_to_triangles(atlas, mesh, maps["normals"])
-    maps |= {
+    maps = {
+        **maps,
         "stock_diffuse": np.float32(BLEND_PARTS * plastic_scale(ETA)) * maps["r_d"],
-        "stock_specular": np.float32(BLEND_PARTS) * maps["bare"],
-        "stock_oil_roughness": np.float32(OIL_SMOOTHING) * maps["roughness"],
-        "stock_normals": np.float32(0.5) * (tangent + np.float32(1.0)),
+        "stock_specular": np.float32(BLEND_PARTS * specular_parts) * maps["bare"],
     }
+    covered = None
+    if "oil" in maps:
+        maps["stock_oil_roughness"] = np.float32(OIL_SMOOTHING) * maps["roughness"]
+    if isinstance(mesh, Mesh):
+        atlas = unwrap(mesh, len(maps["r_d"]))
+        tangent = rotate_to_triangles(atlas, mesh, maps["normals"])
+        maps["stock_normals"] = np.float32(0.5) * (tangent + np.float32(1.0))
+        covered = atlas.covered
     for name, values in maps.items():
-        filled = _fill(values, atlas.covered)
+        filled = values if covered is None else _fill(values, covered)
         channels = {"Y" if filled.ndim == 2 else "RGB": filled}
         about = {"unit": "1", "colorSpace": "raw", "comments": _COMMENTS.get(name, "")}
         write_channels(folder / TEXTURES_FOLDER / f"{name}.exr", channels, about)
@@ -149,7 +185,7 @@ def rotate_to_triangles(atlas: Atlas, mesh: Mesh, normals: FloatArray) -> Float3
     return np.asarray(turned / np.linalg.norm(turned, axis=-1, keepdims=True), np.float32)
 
 
-def encode_ply(mesh: Mesh) -> bytes:
+def encode_ply(mesh: Mesh | ReliefGrid) -> bytes:
     """Return a mesh as the bytes of a binary PLY with normals and texture coordinates u, v.
 
     Examples
@@ -197,17 +233,20 @@ def _read(name: str, file: str) -> Element:
     return build_texture(name, f"{TEXTURES_FOLDER}/{file}.exr")
 
 
-def describe_skin_coat(maps: Collection[str]) -> Element:
+def describe_skin_coat(maps: Collection[str], *, is_ggx: bool = False) -> Element:
     """Return the skin as the plugin `skincoat`.
 
     Parameters
     ----------
     maps
         Names of the written maps; those of a coating are optional.
+    is_ggx
+        Whether the skin's facets are GGX, otherwise Beckmann.
     """
     properties = {**SKIN_PROPERTIES, **COATING_PROPERTIES}
     read = [_read(name, file) for name, file in properties.items() if file in maps]
-    return build_plugin("bsdf", "skincoat", *read)
+    kind = build_property("distribution", "ggx" if is_ggx else "beckmann")
+    return build_plugin("bsdf", "skincoat", kind, *read)
 
 
 def describe_stock_skin() -> Element:
@@ -219,6 +258,27 @@ def describe_stock_skin() -> Element:
         _describe_facets("beckmann", ETA, "roughness"),
         _describe_facets("ggx", ETA_OIL, "stock_oil_roughness"),
     )
+    return _add_interior(facets, has_normals=True)
+
+
+def describe_polarized_skin(polarizer: str, has_normals: bool) -> Element:
+    """Return skin behind an analyzer by Mitsuba's own materials, without polarization.
+
+    Parameters
+    ----------
+    polarizer
+        "parallel", or "crossed", without specular reflection.
+    has_normals
+        Whether a map has the skin's normals.
+    """
+    facets = _describe_facets("ggx", ETA, "roughness")
+    if polarizer == "crossed":
+        facets = build_plugin("bsdf", "diffuse", build_property("reflectance", (0.0, 0.0, 0.0)))
+    return _add_interior(facets, has_normals=has_normals)
+
+
+def _add_interior(facets: Element, *, has_normals: bool) -> Element:
+    """Return facets over a diffuse interior, each at its full strength."""
     interior = build_plugin(
         "bsdf",
         "plastic",
@@ -227,11 +287,11 @@ def describe_stock_skin() -> Element:
         build_property("specular_reflectance", 0.0),
         _read("diffuse_reflectance", "stock_diffuse"),
     )
-    blend = build_plugin(
-        "bsdf", "blendbsdf", build_property("weight", 1.0 / BLEND_PARTS), interior, facets
-    )
-    normals = _read("normalmap", "stock_normals")
-    return build_plugin("bsdf", "normalmap", normals, blend)
+    weight = build_property("weight", 1.0 / BLEND_PARTS)
+    blend = build_plugin("bsdf", "blendbsdf", weight, interior, facets)
+    if not has_normals:
+        return blend
+    return build_plugin("bsdf", "normalmap", _read("normalmap", "stock_normals"), blend)
 
 
 def _describe_facets(distribution: str, eta: float, roughness: str) -> Element:

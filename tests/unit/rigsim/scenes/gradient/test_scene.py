@@ -16,6 +16,7 @@ from rigsim.scenes.gradient.resolution import SineRelief, make_sine_relief_scene
 from rigsim.scenes.gradient.scene import GRADIENT_METER_RATE_PER_S, GradientScene
 from rigsim.scenes.gradient.target import FLAT_REFLECTANCE
 from rigsim.scenes.gradient.truth import gradient_truth as ground_truth
+from rigsim.scenes.gradient.truth import scene_surface
 from rigsim.sensor import fixed_pattern
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.skin_patch.motion import PatchMotion
@@ -292,3 +293,17 @@ def test_a_level_patch_mirrors_the_sphere_evenly(rig, flat_skin):
     moments = level.moments(NEUTRAL)
     specular = (moments["parallel"] - moments["crossed"])[0, 6:-6, 6:-6]
     assert np.ptp(specular) < 0.03 * specular.mean()
+
+
+@pytest.mark.parametrize("most", [512, 40, 16], ids=["whole", "less margin", "center"])
+def test_stored_surface_is_bounded_around_the_center(rig, skin, monkeypatch, most):
+    monkeypatch.setattr("rigsim.scenes.gradient.truth.MAX_SURFACE_PX", most)
+    scene = GradientScene(rig, skin, table_size=33)
+    side = min(SIDE, most)
+    found = scene_surface(scene, [dataclasses.replace(NEUTRAL, step=1), NEUTRAL])
+    wide = scene.surface(NEUTRAL, border_px=40).crop((SIDE - side) // 2)
+    for field in dataclasses.fields(wide):
+        expected = getattr(wide, field.name)
+        assert expected.shape[:2] == (side + 80, side + 80)
+        np.testing.assert_array_equal(found[field.name], expected)
+    assert found["unit"] == scene.unit

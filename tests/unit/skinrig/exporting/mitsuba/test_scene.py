@@ -17,11 +17,18 @@ from capture.session import Session, SubjectRecord
 from model import store
 from model.skin import SkinAppearance, SkinMap
 from rigsim.as_built.dome import build_dome
+from rigsim.as_built.polarizers import draw_polarizers
+from rigsim.as_built.sphere import build_sphere
 from rigsim.geometry.atlas import unwrap
-from rigsim.mitsuba.led_array import LED_COLUMNS
+from rigsim.mitsuba.led_array import FILM_COLUMNS, LED_COLUMNS
+from rigsim.mitsuba.rig_camera import DISTORTION_NAMES
 from rigsim.scanner.flaws import encode_binary_ply
 from skinrig.exporting import export as exporting
+from skinrig.exporting.mitsuba import dome as dome_scene
+from skinrig.exporting.mitsuba import flash as flash_scene
+from skinrig.exporting.mitsuba import gradient as gradient_scene
 from skinrig.exporting.mitsuba import lights, skin
+from skinrig.exporting.mitsuba.cameras import describe_rig_camera
 from skinrig.exporting.options import ExportError
 from skinrig.simulating.dome import small_dome
 
@@ -34,7 +41,7 @@ def make_session(path, *, rig="dome", source="simulated", effects=()):
     drawn = small_dome(drawn, lights=2, views=2, width_px=32) if rig == "dome" else drawn
     session = Session.create(
         path,
-        plan=dome_plan(drawn) if rig == "dome" else _flash_plan(drawn),
+        plan=dome_plan(drawn) if rig == "dome" else _default_plan(drawn),
         rig=drawn,
         devices={},
         subject=SubjectRecord("simulated-III-0", ("research",)),
@@ -47,10 +54,10 @@ def make_session(path, *, rig="dome", source="simulated", effects=()):
     return Session.open(path)
 
 
-def _flash_plan(rig):
+def _default_plan(rig):
     from skinrig.capturing.plan_choice import DefaultPlan
 
-    return DefaultPlan(target=None, states=("neutral",), repeats=1, bands=()).of(rig)
+    return DefaultPlan(target=None).of(rig)
 
 
 def make_truth(patch, **maps):
@@ -163,7 +170,7 @@ def test_tables_of_lights_are_those_of_the_plugin(session, tmp_path):
 def test_only_coated_skin_has_a_film(session, patch, tmp_path):
     export(session, tmp_path / "out")
     scene = ElementTree.parse(tmp_path / "out" / "scene.xml").getroot()
-    bare = {one.get("name") for one in scene.findall("bsdf/texture")}
+    bare = {one.get("name") for one in scene.findall("bsdf/*")} - {"distribution"}
     assert bare == {"r_d", "alpha", "oil", "vellus", "bare", "normals"}
     film = {
         name: np.full((SIDE, SIDE), 0.3, np.float32) for name in skin.COATING_PROPERTIES.values()
@@ -171,7 +178,8 @@ def test_only_coated_skin_has_a_film(session, patch, tmp_path):
     (tmp_path / "coated").mkdir()
     maps = skin.write_skin(make_truth(patch, **film), patch.mesh(), tmp_path / "coated")
     coat = skin.describe_skin_coat(maps)
-    assert {one.get("name") for one in coat} - bare == {"film", "film_alpha", "film_ior", "powder"}
+    coated = {one.get("name") for one in coat.findall("texture")}
+    assert coated - bare == {"film", "film_alpha", "film_ior", "powder"}
 
 
 def test_intensity_gives_white_plate_its_signal(session):
@@ -179,7 +187,7 @@ def test_intensity_gives_white_plate_its_signal(session):
     from rigsim.light.led_light import white_intensity
 
     dome = build_dome(session.rig, seed=4)
-    (led, *_) = lights.list_lights(dome)
+    (led, *_) = dome_scene.list_lights(dome)
     signal = led.intensity / np.pi / 700.0**2
     white = white_intensity(dome.rig.lights[0], dome.rig.views[0]) / 700.0**2
     np.testing.assert_allclose(signal, white)
@@ -214,9 +222,72 @@ def test_measured_session_has_no_scene(tmp_path):
 
 
 def test_session_of_other_rig_has_no_scene(tmp_path):
-    session = make_session(tmp_path / "session-f", rig="flash")
-    with pytest.raises(ExportError, match="got the rig flash, expected the dome"):
+    session = make_session(tmp_path / "session-p", rig="probe")
+    with pytest.raises(ExportError, match="got the rig probe, expected one of dome, flash"):
         export(session, tmp_path / "out")
+
+
+def test_flashes_light_the_white_reference_as_metered():
+    """A white that faces the camera, behind two polarizers, has the signal of the reference."""
+    rig = load_rig("flash")
+    films, white = draw_polarizers(rig), np.array([0.4, 0.8, 0.5])
+    signal = np.zeros(3)
+    for light in flash_scene.list_lights(rig, films, white):
+        place = np.asarray(light.position_mm)
+        cosine = place @ np.array(rig.views[0].axes[2]) / np.linalg.norm(place)
+        signal += 0.25 / np.pi * light.intensity * cosine / (place @ place)
+        assert light.leak == pytest.approx(1.0 / films.light_extinction)
+        assert abs(light.absorbs @ light.axis) < 1e-9
+    np.testing.assert_allclose(signal, white, rtol=1e-6)
+
+
+def test_opposite_patterns_sum_to_the_full_one():
+    rig = load_rig("gradient")
+    sphere = build_sphere(rig, seed=2)
+    leds = gradient_scene.list_lights(sphere, draw_polarizers(rig), 3.0)
+    levels = gradient_scene.list_patterns(sphere)
+    np.testing.assert_allclose(levels["x"] + levels["-x"], levels["full"])
+    assert len(leds) == len(levels["full"]) < len(rig.lights)
+    assert min(led.position_mm[2] for led in leds) > 0.0
+    assert min(level.min() for level in levels.values()) >= 0.0
+    assert np.ptp(levels["z"]) > 0.3
+
+
+def test_stock_flash_scene_lacks_crossed_specular(patch, tmp_path):
+    """Materials of both analyzer stops, with levels and polarizers of the lights."""
+    rig = load_rig("flash")
+    flashes = flash_scene.list_lights(rig, draw_polarizers(rig), np.ones(3))
+    levels = lights.single_lights(flashes)
+    lights.write_light_tables(flashes, levels, tmp_path)
+    lights.write_stock_lights(flashes, levels, tmp_path)
+    table = np.loadtxt(tmp_path / "lights" / "all.csv", delimiter=",", skiprows=1)
+    assert table.shape == (len(flashes), len(LED_COLUMNS) + len(FILM_COLUMNS))
+    spot = ElementTree.parse(tmp_path / "lights-stock" / "all.xml").getroot()[0]
+    value = float(spot.find("rgb").get("value").split(",")[0])
+    assert value == pytest.approx(0.25 * flashes[0].intensity[0], rel=1e-6)
+    kinds = [
+        {one.get("type") for one in skin.describe_polarized_skin(name, True).iter("bsdf")}
+        for name in ("parallel", "crossed")
+    ]
+    assert kinds[0] ^ kinds[1] == {"roughconductor", "diffuse"}
+
+
+def test_camera_has_the_distortion_of_its_lens():
+    bent = (-0.12, 0.05, 1e-3, -2e-3, 0.01)
+    camera = describe_rig_camera(load_rig("dome").views[0], bent)
+    found = {one.get("name"): one.get("value") for one in camera.findall("float")}
+    assert [float(found[name]) for name in DISTORTION_NAMES] == list(bent)
+    assert float(found["focal_px"]) == pytest.approx(load_rig("dome").views[0].focal_px)
+
+
+@pytest.mark.parametrize("rig", ["flash", "gradient"])
+def test_truth_without_surface_has_no_scene(patch, tmp_path, rig):
+    made = make_session(tmp_path / "session-a", rig=rig)
+    truth = _fields(make_truth(patch)) | {"inputs": {"session": made.content_hash}}
+    store.write(tmp_path / "truth-a", SkinAppearance(**truth))
+    with pytest.raises(ExportError, match=r"no surface\.npz.*SR-EXP-010"):
+        export(made, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_session_without_its_truth_has_no_scene(session, tmp_path):
