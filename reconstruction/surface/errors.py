@@ -38,6 +38,11 @@ truth blurred by their pixels.
 This value and the two above were fitted on these faces (types V, I and II, 2.1 mm per pixel)."""
 R_D_ERROR_PER_RAD: Final = 0.5
 """Relative error of the albedo by that of the normal, 1/rad, with lights in all directions."""
+INTERIOR_R_D_ERROR: Final = 0.007
+"""Error of the albedo, over its mean over channels, by light that a Lambertian interior lacks.
+
+Light that entered obliquely leaves forward. The fitted lobes take a part of it, relatively more on
+dark skin. Set on voxel skin of 12 people, types I to VI; see docs/validation/voxel-skin.md."""
 N_NEIGHBOR_RINGS: Final = 2
 """Rings of neighbors over which the albedo's change is averaged, as one point has few edges."""
 MIN_SPACING_PX: Final = 0.25
@@ -174,4 +179,33 @@ def add_albedo_errors(
     stderr = np.hypot(r_d.stderr, UNRESOLVED_R_D_PX * pixel_mm * change)
     relative = np.hypot(SHARED_R_D_ERROR, R_D_ERROR_PER_RAD * normals.stderr[:, :1])
     stderr = np.hypot(stderr, relative * np.abs(r_d.values))
+    return PointValues(r_d.values, np.where(r_d.valid[:, None], stderr, 0.0), r_d.valid)
+
+
+def interior_error(r_d: FloatArray) -> Float64Array:
+    """Return the standard error of the albedo by directions of light from below the surface.
+
+    Parameters
+    ----------
+    r_d
+        (..., C): albedo.
+
+    Returns
+    -------
+    ndarray
+        (..., C): proportional to a channel's part of the albedo; at most the albedo's size.
+
+    Examples
+    --------
+    >>> interior_error(np.array([0.4, 0.3, 0.2])).round(4).tolist()
+    [0.0093, 0.007, 0.0047]
+    """
+    size = np.abs(np.asarray(r_d, np.float64))
+    mean = np.maximum(size.mean(axis=-1, keepdims=True), INTERIOR_R_D_ERROR)
+    return np.asarray(size * (INTERIOR_R_D_ERROR / mean), np.float64)
+
+
+def add_interior_errors(r_d: PointValues) -> PointValues:
+    """Add `interior_error` to the standard errors of the albedo."""
+    stderr = np.hypot(r_d.stderr, interior_error(r_d.values))
     return PointValues(r_d.values, np.where(r_d.valid[:, None], stderr, 0.0), r_d.valid)

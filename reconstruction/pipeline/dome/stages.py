@@ -40,7 +40,7 @@ from reconstruction.surface import estimates
 from reconstruction.surface.estimates import PointValues
 from reconstruction.surface.texture import SurfaceTexture
 
-STAGE_REVISION = 4
+STAGE_REVISION = 5
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 SCAN_FILE: Final = "scan.ply"
@@ -89,7 +89,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
         stage("surface", "", "surface", partial(_surface, inputs, dome)),
         stage("texture", "surface", f"texture position {MESH_FILE}", _texture),
         stage("motion", "surface", "motion", partial(_motion, inputs, dome)),
-        stage("lumitexels", "surface motion", "lumitexels", partial(_lumitexels, dome)),
+        stage("lumitexels", "surface motion", "lumitexels", partial(sample_surface, dome)),
         stage("sample counts", "lumitexels texture", "samples", _counts),
         stage("half-vector normals", "lumitexels texture", "half_vector_normals", _half_vectors),
         stage("normals", seen, "point_normals normals", partial(_normals, dome)),
@@ -183,9 +183,10 @@ def _motion(inputs: Inputs, dome: CalibratedDome, surface: RefinedScan) -> DomeH
     return found
 
 
-def _lumitexels(
+def sample_surface(
     dome: CalibratedDome, surface: RefinedScan, motion: DomeHeadMotion | None
 ) -> SurfaceSampleStore:
+    """Sample all images at the points of a surface; ``motion`` is None for a fixed head."""
     if motion is not None and motion.still:
         motion = None
     if motion is not None:
@@ -228,12 +229,19 @@ def _normals(
     lumitexels: SurfaceSampleStore,
     texture: SurfaceTexture,
 ) -> Mapping[str, Any]:
+    found = measure_normals(dome, surface, lumitexels)
+    return {"point_normals": found, "normals": texture.normals(found, "world frame")}
+
+
+def measure_normals(
+    dome: CalibratedDome, surface: RefinedScan, lumitexels: SurfaceSampleStore
+) -> PointValues:
+    """Estimate the normals at a surface's points, with all of their errors."""
     found = lumitexels.collect(
         "normals",
         lambda part, samples: estimates.normals_from_shading(samples, surface.normals[part]),
     )
-    found = surface_errors.add_normal_errors(found, surface, dome.pixel_mm)
-    return {"point_normals": found, "normals": texture.normals(found, "world frame")}
+    return surface_errors.add_normal_errors(found, surface, dome.pixel_mm)
 
 
 def _albedo(
@@ -243,6 +251,19 @@ def _albedo(
     point_normals: PointValues,
     texture: SurfaceTexture,
 ) -> Mapping[str, Any]:
+    found = measure_albedo(dome, surface, lumitexels, point_normals)
+    what = "diffuse reflectance, camera RGB over that of a perfect white"
+    r_d = texture.map(found.values, found.stderr, found.valid, "1", what)
+    return {"point_r_d": found, "r_d": r_d}
+
+
+def measure_albedo(
+    dome: CalibratedDome,
+    surface: RefinedScan,
+    lumitexels: SurfaceSampleStore,
+    point_normals: PointValues,
+) -> PointValues:
+    """Estimate R_d at a surface's points, with all of its errors."""
     good = point_normals.valid
     typical = float(np.median(point_normals.stderr[good, 0])) if good.any() else 0.02
     found = lumitexels.collect(
@@ -252,6 +273,4 @@ def _albedo(
         ),
     )
     found = surface_errors.add_albedo_errors(found, point_normals, surface, dome.pixel_mm)
-    what = "diffuse reflectance, camera RGB over that of a perfect white"
-    r_d = texture.map(found.values, found.stderr, found.valid, "1", what)
-    return {"point_r_d": found, "r_d": r_d}
+    return surface_errors.add_interior_errors(found)

@@ -197,3 +197,17 @@ def test_uniform_albedo_error_is_noise_and_scale_error():
     np.testing.assert_allclose(tilted.stderr, np.hypot(np.hypot(0.002, scale), 0.003), rtol=1e-6)
     none = dataclasses.replace(even, valid=np.zeros(count, bool))
     assert not surface_errors.add_albedo_errors(none, plain(surface), surface, 2.0).stderr.any()
+
+
+def test_interior_error_grows_on_dark_skin():
+    """Expected: the same percentage in all channels, inverse to the mean albedo, at most 100 %."""
+    values = np.array([[0.5, 0.4, 0.3], [0.1, 0.06, 0.04], [1e-4, 0.0, -1e-4], [0.3, 0.2, 0.1]])
+    valid = np.array([True, True, True, False])
+    noise = np.full(values.shape, 1e-3)
+    found = surface_errors.add_interior_errors(PointValues(values, noise, valid))
+    term = np.sqrt(np.square(found.stderr[:2]) - 1e-6) / values[:2]
+    expected = surface_errors.INTERIOR_R_D_ERROR / values[:2].mean(axis=1, keepdims=True)
+    np.testing.assert_allclose(term, np.broadcast_to(expected, term.shape), rtol=1e-6)
+    assert np.all(surface_errors.interior_error(values[2:3]) <= np.abs(values[2:3]))
+    assert not found.stderr[3].any()
+    assert_clean(PointValues(found.values * valid[:, None], found.stderr, valid))
