@@ -38,7 +38,7 @@ BROWSER = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshad
 READY_MS = 90_000
 VIEW = "#weights.anger=1&weights.surprise=0.6"
 """Settings of the live page, as its *Copy link* writes them."""
-VOXEL_PX = 48
+VOXEL_PX = 32
 HIDE_TIME = "document.getElementById('time').style.visibility = 'hidden'"
 """Run times differ between runs: they stay out of the image."""
 
@@ -154,12 +154,12 @@ def voxel_skin() -> None:
     """Draw freckled skin by Mitsuba as voxels and by the fast renderer's equations."""
     patch = draw_patch(PersonSkin.of_preset("II"), "cheek", field_mm=24.0, voxel_mm=0.375)
     rig = load_rig("flash")
-    voxels = render_patch(patch, rig, width_px=VOXEL_PX, samples=256, seed=0).rgb
+    voxels = render_patch(patch, rig, width_px=VOXEL_PX, samples=1024, seed=0).rgb
     fast = predict_patch(patch, rig, width_px=VOXEL_PX)
     change = 0.5 + 5.0 * (voxels / fast - 1.0)
     codes = [png.encode_srgb8(image / fast.max()) for image in (voxels, fast)]
     codes.append(np.rint(255 * np.clip(change, 0.0, 1.0)).astype(np.uint8))
-    write_row("gallery-voxels.png", [code.repeat(6, axis=0).repeat(6, axis=1) for code in codes])
+    write_row("gallery-voxels.png", [code.repeat(8, axis=0).repeat(8, axis=1) for code in codes])
 
 
 def screenshots(demo: Path) -> None:

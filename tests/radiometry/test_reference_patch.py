@@ -44,6 +44,11 @@ def test_dark_quarter_is_upper_right_everywhere(patch):
     assert darkest_quarter(fast) == (0, 1)
 
 
+def test_width_that_splits_voxels_is_refused(patch):
+    with pytest.raises(ValueError, match="a divisor of"):
+        pixel_truth(patch, 5)
+
+
 def test_noise_of_patch_falls_with_samples(patch):
     """Tolerance: factor 2 of the expected ratio of 4; variances of 48 values err by 20 %."""
     rig = load_rig("flash")

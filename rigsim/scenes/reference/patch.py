@@ -344,6 +344,8 @@ def _pixel_means(patch: SkinPatch, values: Float64Array, width_px: int) -> Float
     """Return means over the image's pixels, row 0 at the top, shape (H, W, C)."""
     edge = np.searchsorted(patch.x_mm, [-0.5 * patch.field_mm, 0.5 * patch.field_mm])
     inner = values[edge[0] : edge[1], edge[0] : edge[1]]
+    if len(inner) % width_px:
+        raise ValueError(f"width_px: got {width_px}, expected a divisor of {len(inner)} voxels")
     return _block_mean(inner, width_px)[::-1]
 
 
