@@ -41,6 +41,11 @@ FINEST, COARSEST = 0.0125, 0.04
 FIELD_MM = 1.0
 """Step of the differences by which the tables depend on a point's position in the field."""
 
+INTERIOR_SHAPE_STDERR = 0.05
+"""Standard error of the observed position of a matte interior, over its length. Shallow light of
+real skin leaves more obliquely than Lambert's law states; voxel skin of types I to VI, drawn with
+other seeds than the validation's, is off by this (docs/validation/voxel-skin.md)."""
+
 F_X, F_Y, SCALE, CONCENTRATION, SYS_XX, SYS_XY, SYS_YY = range(7)
 """Layers of a table: observed position (2); full light over a white diffuser's; length of the mean
 vector to the lights; covariance of the observed position from the lights' errors (3)."""
@@ -206,6 +211,11 @@ def _cached(
             layers[part, SYS_XX] += move[:, 0] ** 2
             layers[part, SYS_XY] += move[:, 0] * move[:, 1]
             layers[part, SYS_YY] += move[:, 1] ** 2
+    if matte:
+        move = INTERIOR_SHAPE_STDERR * layers[:, :2]
+        layers[:, SYS_XX] += move[:, 0] ** 2
+        layers[:, SYS_XY] += move[:, 0] * move[:, 1]
+        layers[:, SYS_YY] += move[:, 1] ** 2
     layers[:, :2] -= places  # the deviation from the normal's own position is smooth
     grid = layers.reshape(len(axis), len(axis), -1)
     coefficients = np.stack(

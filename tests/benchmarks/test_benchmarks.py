@@ -23,6 +23,7 @@ HEAVY = {
     "normal-integration",
     "omissions",
     "probe-session",
+    "reference-probe",
     "render-dome",
     "render-gradient",
     "render-model",

@@ -40,7 +40,7 @@ from reconstruction.pipeline.gradient.strain_kernels import (
 from reconstruction.pipeline.inputs import Inputs
 from reconstruction.pipeline.sensor_noise import ElectronNoise
 
-STAGE_REVISION = 7
+STAGE_REVISION = 8
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = ("normals", "height", "diffuse_normals", "crossed", "strain", "histograms", "kernels")

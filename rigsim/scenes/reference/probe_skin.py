@@ -105,12 +105,11 @@ def read_person(
     pressed = float(blood_ratio(max(rig.probe.suction_mbar, CONTACT_PRESSURE_MBAR)))
     patch = draw_patch(person, site, field_mm=FIELD_MM, voxel_mm=PROBE_VOXEL_MM)
     flat = person.at(site)
+    melanin, blood = (part.astype(np.float64) for part in (patch.melanin, pressed * patch.blood))
     runs = []
     for k, wavelength_nm in enumerate(SKIN_WAVELENGTHS_NM):
         stack = skin_layer_stack(wavelength_nm, flat.c_m, pressed * flat.c_hd, flat.tissue)
-        absorption = columns(
-            wavelength_nm, patch.melanin.astype(np.float64), pressed * patch.blood.astype(np.float64), flat.tissue
-        )
+        absorption = columns(wavelength_nm, melanin, blood, flat.tissue)
         skin = UnevenLayers(stack, absorption[-len(stack.layers) :], patch.voxel_mm)
         rng = np.random.default_rng([seed, k])
         runs.append(

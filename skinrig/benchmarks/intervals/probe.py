@@ -76,10 +76,23 @@ def run_trials(
 
 
 def _subject(folder: Path, subject: str, seed: int, **options: Any) -> SimulationResult:
-    """Simulate a subject under a probe that is calibrated with the subject's own phantom.
+    """Simulate a subject under a probe that is calibrated with the subject's own phantom."""
+    calibrate_with_own_block(folder, seed)
+    return resimulate("probe", folder, subject=subject, seed=seed, **options)
+
+
+def calibrate_with_own_block(folder: Path, seed: int) -> Path:
+    """Calibrate the probe with a phantom of its own certificate; return FOLDER/calibration.
 
     Subjects with a common calibration would have its errors and the phantom's in common, and would
     count as one draw.
+
+    Parameters
+    ----------
+    folder
+        As in `flash.run_trials`; a previous calibration is replaced.
+    seed
+        Seed of the subject.
     """
     phantom = folder / "session-phantom"
     shutil.rmtree(phantom, ignore_errors=True)
@@ -90,7 +103,7 @@ def _subject(folder: Path, subject: str, seed: int, **options: Any) -> Simulatio
     paper = folder / "block.json"
     paper.write_text(json.dumps(draw_certificate(np.random.default_rng([seed, BLOCK_SEED_OFFSET]))))
     calibrate("fiber", [phantom], folder / "calibration", phantom=paper)
-    return resimulate("probe", folder, subject=subject, seed=seed, **options)
+    return folder / "calibration"
 
 
 def draw_certificate(rng: np.random.Generator) -> dict[str, Any]:
