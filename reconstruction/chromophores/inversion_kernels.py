@@ -21,15 +21,13 @@ AXIS_STEP_TOL = 1e-3
 """The same as a fraction of the axis."""
 GAIN_TOL = 1e-3
 """The same as the square of the step in standard errors."""
-OPTICS_GAIN_TOL = 4e-3
-"""The same where errors by unknown optics, common to many pixels, exceed those of noise."""
 MISFIT_GAIN_TOL = 1e-2
 """Addition to it per squared residual: with a misfit more digits are within the noise."""
 NOISY_STEP_TOL = 3e-2
 """Step, relative to the value, that is the last one where the remaining misfit exceeds the gain."""
 CONVERGED_STEP = 2e-2
 """Step, relative to the value, up to which the last one counts as converged."""
-REWEIGHT_STEP = 0.04
+REWEIGHT_STEP = 0.02
 """Fraction of an axis from the weights' position above which the weights are computed again."""
 MAX_REWEIGHTS = 8
 """Maximum number of times that the weights are computed again."""
@@ -201,7 +199,7 @@ def fit_pixels(  # type: ignore[no-untyped-def]
     length = np.float32(last)
     grid = twin_log.shape[0]
     has_optics = optics.shape[0] > 1
-    gain_tol = np.float32(OPTICS_GAIN_TOL if has_optics else GAIN_TOL)
+    gain_tol = np.float32(GAIN_TOL)
     common_variance = max(min(model[0, 1], model[0, 2], model[1, 2]), _ZERO)
     each_variance = variance.shape[0] > 1
     each_shading = shading.shape[0] > 1
