@@ -76,7 +76,7 @@ class RepairReport:
 
 
 def repair_mesh(
-    mesh: TriangleMesh, *, max_hole_mm: float = 40.0
+    mesh: TriangleMesh, *, max_hole_mm: float = 40.0, min_surface_fraction: float = 1.0
 ) -> tuple[TriangleMesh, RepairReport]:
     """Repair a scan to one manifold, oriented surface.
 
@@ -86,12 +86,14 @@ def repair_mesh(
         As scanned.
     max_hole_mm : float
         Holes with a longer rim stay open; >= 0.
+    min_surface_fraction : float
+        Area of the smallest connected surface to keep, relative to the largest one, 0 to 1.
 
     Returns
     -------
     mesh : TriangleMesh
-        The largest connected surface, oriented like the majority of its triangles, normals
-        outward.
+        The largest connected surfaces, one by default, oriented like the majority of their
+        triangles, normals outward.
     report : RepairReport
 
     Raises
@@ -117,7 +119,7 @@ def repair_mesh(
     mesh, split = _split_pinches(mesh)
     counts["pinched vertices"] = split
     before = len(mesh.faces)
-    mesh = largest_surface(mesh)
+    mesh = largest_surface(mesh, min_fraction=min_surface_fraction)
     counts["triangles of islands"] = before - len(mesh.faces)
     mesh, filled = _fill_holes(mesh, max_hole_mm)
     counts["holes filled"] = filled
@@ -158,11 +160,11 @@ def crop(
     return mesh.select_faces(keep)
 
 
-def largest_surface(mesh: TriangleMesh) -> TriangleMesh:
-    """Return the connected surface of the largest area."""
+def largest_surface(mesh: TriangleMesh, *, min_fraction: float = 1.0) -> TriangleMesh:
+    """Return the connected surface of the largest area, and others of at least a fraction of it."""
     group = _face_groups(mesh.faces)
     area = np.bincount(group, np.linalg.norm(mesh.face_vectors(), axis=1))
-    return mesh.select_faces(group == int(np.argmax(area)))
+    return mesh.select_faces((area >= min_fraction * area.max())[group])
 
 
 def boundary_edges(faces: Int64Array) -> Int64Array:
