@@ -109,6 +109,7 @@ for command in (
 ):
     app.command(cls=Command)(command)
 dynamic.fit_app.command("traits", cls=Command)(editing.fit_traits)
+dynamic.fit_app.command("template", cls=Command)(reconstructing.fit_template)
 app.add_typer(simulating.simulate_app, name="simulate")
 app.add_typer(capturing.capture_app, name="capture")
 app.add_typer(capturing.serve_app, name="serve")

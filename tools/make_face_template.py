@@ -8,6 +8,7 @@ joined by a Delaunay triangulation in the heads' ray coordinates; edges are then
 increases the least angle on the skin.
 """
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,7 @@ def rim(surface):
     (u0, u1), (v0, v1) = U_RANGE, V_RANGE
     corners = np.array([(u0, v0), (u1, v0), (u1, v1), (u0, v1), (u0, v0)])
     found = []
-    for a, b in zip(corners[:-1], corners[1:], strict=True):
+    for a, b in pairwise(corners):
         line = a + np.linspace(0.0, 1.0, 2001)[:, None] * (b - a)
         points = surface(line)
         length = np.linalg.norm(np.diff(points, axis=0), axis=1)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from capture.arrays import Float32Array, Float64Array, Int32Array, Int64Array
 from capture.documents import Fault, InputError
@@ -41,13 +42,22 @@ class ScannedMesh:
     about: Mapping[str, str | int | float | bool]
     """Provenance: hash and kind of the file, unit, counts."""
 
-    def to_ply(self) -> bytes:
-        """Return the mesh as a binary PLY with float32 positions (and ``s``, ``t``)."""
+    def to_ply(self, properties: Mapping[str, ArrayLike] | None = None) -> bytes:
+        """Return the mesh as a binary PLY with float32 positions (and ``s``, ``t``).
+
+        Parameters
+        ----------
+        properties : mapping of str to array_like, shape (V,), optional
+            Further float32 properties of the vertices, by name.
+        """
         fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
         columns = [self.vertices_mm]
         if self.uv is not None:
             fields += [("s", "<f4"), ("t", "<f4")]
             columns.append(self.uv)
+        for name, values in (properties or {}).items():
+            fields.append((name, "<f4"))
+            columns.append(np.asarray(values, np.float32)[:, None])
         names = "".join(f"property float {name}\n" for name, _ in fields)
         header = (
             "ply\nformat binary_little_endian 1.0\ncomment unit mm\n"

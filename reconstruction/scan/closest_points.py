@@ -9,11 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from reconstruction.arrays import BoolArray, Float64Array, Int64Array
-from reconstruction.scan.repair import (
-    TriangleMesh,
-    boundary_edges,
-    repair_mesh,
-)
+from reconstruction.scan.repair import TriangleMesh, boundary_edges, repair_mesh
 
 MIN_SURFACE_FRACTION: Final = 0.03
 """Area, relative to the largest surface, below which a connected surface is an island."""

@@ -27,11 +27,16 @@ class FaceTemplate:
     """Named points of its surface, each of shape (3,)."""
 
     def __post_init__(self) -> None:
+        self.texture()
+
+    def texture(self) -> Float64Array:
+        """Return the texture coordinates of each triangle's corners, shape (F, 3, 2)."""
         if self.mesh.corner_uv is None:
             raise ScanMeshError(
                 "template: got no texture coordinates, expected some; export the template with "
                 "its texture coordinates [SR-REC-026]"
             )
+        return self.mesh.corner_uv
 
     def vertex_areas_mm2(self) -> Float64Array:
         """Return a third of the area of the triangles at each vertex, shape (V,)."""

@@ -50,9 +50,7 @@ class SurfaceStiffness:
         """
         weighted = sparse.diags(factor[self.vertex]) @ self.bending
         bending = length_mm**4 * (self.bending.T @ weighted)
-        return (
-            bending + stretch_fraction * length_mm**2 * (self.stretch.T @ self.stretch)
-        ).tocsc()
+        return (bending + stretch_fraction * length_mm**2 * (self.stretch.T @ self.stretch)).tocsc()
 
 
 def surface_stiffness(mesh: TriangleMesh) -> SurfaceStiffness:
@@ -81,9 +79,7 @@ def surface_stiffness(mesh: TriangleMesh) -> SurfaceStiffness:
     wide.eliminate_zeros()
     area = vertex_areas_mm2(mesh)
     size = np.diff(joined.indptr)
-    rings = [
-        (joined if size[i] >= MIN_RING else wide)[i].indices for i in range(count)
-    ]
+    rings = [(joined if size[i] >= MIN_RING else wide)[i].indices for i in range(count)]
     rows, columns, values, owners, first = [], [], [], [], 0
     for k in np.unique([len(ring) for ring in rings]).tolist():
         here = np.array([i for i, ring in enumerate(rings) if len(ring) == k])

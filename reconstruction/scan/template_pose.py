@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from reconstruction.arrays import Float64Array, Int64Array
+from reconstruction.arrays import Float64Array, FloatArray, Int64Array
 from reconstruction.scan.closest_points import ScanSurface
 from reconstruction.scan.face_template import FaceTemplate
 from reconstruction.scan.repair import ScanMeshError
@@ -239,7 +239,7 @@ def _starts(template: FaceTemplate, scan: ScanSurface) -> list[TemplatePose]:
 
 
 def _protruding(
-    vertices_mm: Float64Array, normals: Float64Array, count: int
+    vertices_mm: Float64Array, normals: FloatArray, count: int
 ) -> tuple[Float64Array, Float64Array]:
     """Return the points that protrude most from their surroundings, and the normals of these."""
     rows = _thinned(vertices_mm)
@@ -250,8 +250,7 @@ def _protruding(
     other = np.concatenate([np.asarray(one, np.int64) for one in near])
     members = np.bincount(owner, minlength=len(p))
     mean_p, mean_n = (
-        np.stack([np.bincount(owner, x[other, k], len(p)) for k in range(3)], -1)
-        / members[:, None]
+        np.stack([np.bincount(owner, x[other, k], len(p)) for k in range(3)], -1) / members[:, None]
         for x in (p, n)
     )
     mean_n /= np.maximum(np.linalg.norm(mean_n, axis=1, keepdims=True), 1e-9)

@@ -2,8 +2,8 @@
 
 Non-rigid iterative closest points with decreasing stiffness. Each step moves the template towards
 the planes at the closest points of the scan, so that it may slide along the surface, and penalizes
-the bending of its displacement. Points without counterpart (holes, borders, other normals, outliers)
-follow their neighbors.
+the bending of its displacement. Vertices without counterpart (holes, borders, other normals,
+outliers) follow their neighbors.
 
 References
 ----------

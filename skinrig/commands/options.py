@@ -89,6 +89,9 @@ STDOUT_MARK = "-"
 Page = Annotated[
     Path, typer.Option("-o", "--out", callback=check_output_page, help="HTML file to write.")
 ]
+MeshFile = Annotated[
+    Path, typer.Option("-o", "--out", callback=check_output_page, help="PLY file to write, mm.")
+]
 Subject = Annotated[
     str,
     option(

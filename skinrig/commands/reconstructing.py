@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 from typing import Annotated
 
 import typer
 
 from skinrig.commands import completion
-from skinrig.commands.options import Json, Out, command
+from skinrig.commands.dynamic import print_fit
+from skinrig.commands.options import Json, MeshFile, Out, choice, command
 from skinrig.commands.renamed_options import replace_former_values
 from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import UnusableError
@@ -207,3 +209,71 @@ def assign_output_folders(sessions: Sequence[Path], out: Path) -> list[Path]:
             f" {len(names)} sessions; name another folder"
         )
     return [out / name for name in names]
+
+
+@command
+def fit_template(
+    scan: Path,
+    /,
+    out: MeshFile,
+    template: Path | None = None,
+    landmarks: Path | None = None,
+    template_landmarks: Path | None = None,
+    unit: Annotated[str, choice("mm", "cm", "m", "inch")] = "mm",
+    search: Annotated[str, choice("auto", "always", "never")] = "auto",
+    steps: int = 12,
+    json: Json = False,
+) -> None:
+    """Wrap a face template onto a scan, so that scans share triangles and texture layout.
+
+    The fit is deterministic. The mesh stays in the scan's frame.
+
+    Example: skinrig fit template session-smile --out smile.ply
+
+    Example: skinrig fit template scan.obj --unit m --landmarks points.csv --out wrapped.ply
+
+    Parameters
+    ----------
+    scan
+        Scanned mesh, .obj or .ply, or a session with a scan.
+    template
+        Mesh with texture coordinates, mm: .obj or .ply; default: an average face.
+    landmarks
+        CSV table name,x,y,z of the template's named points on the scan, mm.
+    template_landmarks
+        CSV table name,x,y,z of named points of your own template, mm.
+    unit
+        Length unit of the scan's file: mm, cm, m or inch.
+    search
+        Search of the face's pose: auto (where the frames differ), always or never.
+    steps
+        Number of stiffness steps.
+    """
+    from skinrig.fitting.template import TemplateFiles
+    from skinrig.fitting.template import fit_template as fit
+
+    console = Console(json)
+    found = fit(
+        TemplateFiles(scan, template, landmarks, template_landmarks, unit),
+        out=out,
+        search={"auto": None, "always": True, "never": False}[search],
+        steps=steps,
+        progress=console.progress,
+    )
+    figures = {
+        "vertices": len(found.valid),
+        "valid_fraction": float(found.valid.mean()),
+        "rms_mm": found.rms_mm,
+        "median_across_mm": median(found.across_mm[found.valid].tolist()),
+        "median_along_mm": median(found.along_mm[found.valid].tolist()),
+        "folded": found.folded,
+        "scale": found.pose.scale,
+        "match": found.pose.match,
+    }
+    console.print_table(("figure", "value"), figures.items())
+    session = shell_quote(scan) if scan.is_dir() else "SESSION"
+    console.print_line(
+        f"next: skinrig reconstruct {session} --scan {shell_quote(out)} --maps normals "
+        "--out appearance"
+    )
+    print_fit(console, "template", out, figures)
