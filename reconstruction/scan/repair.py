@@ -161,10 +161,12 @@ def crop(
 
 
 def largest_surface(mesh: TriangleMesh, *, min_fraction: float = 1.0) -> TriangleMesh:
-    """Return the connected surface of the largest area, and others of at least a fraction of it."""
+    """Return the connected surface of the largest area, and others above a fraction of it."""
     group = _face_groups(mesh.faces)
     area = np.bincount(group, np.linalg.norm(mesh.face_vectors(), axis=1))
-    return mesh.select_faces((area >= min_fraction * area.max())[group])
+    keep = area > min_fraction * area.max()
+    keep[int(np.argmax(area))] = True
+    return mesh.select_faces(keep[group])
 
 
 def boundary_edges(faces: Int64Array) -> Int64Array:

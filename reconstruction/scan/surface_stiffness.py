@@ -57,8 +57,8 @@ def surface_stiffness(mesh: TriangleMesh) -> SurfaceStiffness:
     """Return the stiffness of a welded surface.
 
     At each vertex, the displacements of its neighbors relative to its own are fitted by a linear
-    map of the neighbors' positions. What remains is bending: for a quadratic displacement over a
-    plane, the sum of the squared residuals is about the squared second derivative times the area.
+    map of the neighbors' positions. What remains is bending: for a displacement c x^2 / 2 over a
+    plane of regular triangles, the sum of the squared residuals is 3/8 c^2 times the area.
 
     Parameters
     ----------

@@ -221,7 +221,7 @@ def fit_template(
     template_landmarks: Path | None = None,
     unit: Annotated[str, choice("mm", "cm", "m", "inch")] = "mm",
     search: Annotated[str, choice("auto", "always", "never")] = "auto",
-    steps: int = 12,
+    steps: int = 8,
     json: Json = False,
 ) -> None:
     """Wrap a face template onto a scan, so that scans share triangles and texture layout.

@@ -47,7 +47,7 @@ def fit_template(
     *,
     out: Path,
     search: bool | None = None,
-    steps: int = 12,
+    steps: int = 8,
     progress: Callable[[str], None] | None = None,
 ) -> WrappedTemplate:
     """Wrap a template onto a scan and write it as a PLY in the scan's frame, mm.

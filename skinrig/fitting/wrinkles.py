@@ -156,8 +156,8 @@ def _check_textures(appearances: Mapping[str, SkinAppearance]) -> list[str]:
     if any(len(first & one) < 0.5 * min(len(first), len(one)) for one in places.values()):
         raise WrinkleInputError(
             f"appearances: {', '.join(places)} have different texture layouts, expected one; "
-            "give each session the same template wrapped onto its scan (`skinrig simulate dome "
-            "--wrapped`, or `skinrig reconstruct --scan`)"
+            "wrap the same template onto each session's scan (`skinrig fit template`) and "
+            "reconstruct with it (`skinrig reconstruct --scan`)"
         )
     return [state for state in appearances if state not in places]
 

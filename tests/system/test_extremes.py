@@ -10,7 +10,10 @@ from skinrig.extremes import expectations
 from skinrig.report import build
 
 CASES = extremes.read_cases()
-HEAVY = {"kernel of flat skin"}  # searches all kernels twice
+HEAVY = {
+    "kernel of flat skin",  # searches all kernels twice
+    *("half of a face", "coarse scan", "scan turned by 90 degrees", "scan 100 m away"),
+}
 
 
 @pytest.mark.parametrize(
