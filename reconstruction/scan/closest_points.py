@@ -15,7 +15,7 @@ MIN_SURFACE_FRACTION: Final = 0.03
 """Area, relative to the largest surface, below which a connected surface is an island."""
 PIECE_EDGE_MM: Final = 4.0
 """Longest edge of the pieces into which triangles are divided for the search."""
-CANDIDATES: Final = 6
+NEAREST_PIECES: Final = 6
 """Number of nearest pieces whose triangles are examined exactly."""
 NORMAL_SMOOTHINGS: Final = 2
 """Averages of the scan's normals over neighboring vertices, against the noise of ranges."""
@@ -66,7 +66,7 @@ class ScanSurface:
         -------
         ClosestPoints
         """
-        _, near = self._tree.query(points_mm, k=min(CANDIDATES, self._tree.n))
+        _, near = self._tree.query(points_mm, k=min(NEAREST_PIECES, self._tree.n))
         triangle = self._owner[near.reshape(len(points_mm), -1)]
         corners = self.mesh.vertices_mm[self.mesh.faces[triangle]]  # (N, K, 3, 3)
         weight = closest_barycentric(points_mm[:, None], corners)

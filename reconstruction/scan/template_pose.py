@@ -27,7 +27,7 @@ MAX_STARTS: Final = 10
 """Largest number of points of the scan that are tried as the tip of the nose."""
 START_DISTANCE_MM: Final = 25.0
 """Smallest distance between such points."""
-SPINS: Final = 10
+SPINS_PER_START: Final = 10
 """Rotations about the normal of each start."""
 COARSE_POINTS, FINE_POINTS = 160, 900
 """Points of the template in the coarse and in the fine fits."""
@@ -232,7 +232,7 @@ def _starts(template: FaceTemplate, scan: ScanSurface) -> list[TemplatePose]:
     poses = []
     for place, normal in zip(found, normals, strict=True):
         base = _turn_onto(ways[0], normal)
-        for angle in 2.0 * np.pi * np.arange(SPINS) / SPINS:
+        for angle in 2.0 * np.pi * np.arange(SPINS_PER_START) / SPINS_PER_START:
             rotation = _rotation(angle * normal) @ base
             poses.append(TemplatePose(rotation, place - rotation @ tips[0], 1.0))
     return poses

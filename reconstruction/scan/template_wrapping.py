@@ -34,8 +34,8 @@ LENGTH_RANGE_MM: Final = (5.0, 100.0)
 """Smoothing lengths of the last and of the first step."""
 FREE_STRETCH, LANDMARK_STRETCH = 3e-4, 0.03
 """Weights of stretch relative to bending, without and with landmarks. Stretch bounds displacements
-where there is no scan; with landmarks, it keeps their displacement from growing beyond them."""
-ROUNDS: Final = 2
+without a scan; with landmarks, it keeps their displacement from growing beyond them."""
+ROUNDS_PER_STEP: Final = 2
 """Searches of closest points for each stiffness."""
 SLIDE_WEIGHT: Final = 3e-3
 """Weight of distances along the surface, relative to those across it."""
@@ -65,9 +65,9 @@ PRIOR_LENGTH_MM: Final = 20.0
 """Stiffness of the model of the errors: deformations that the steps before the last excluded."""
 UNCERTAINTY_SAMPLES: Final = 16
 """Number of draws; the standard uncertainties scatter by about 15 %."""
-ACROSS_SCALE_MM, ALONG_SCALE_MM = 3.0, 9.0
-"""Standard deviations of the errors of unit weight across and along the surface, from simulated
-people of seeds 0 to 7; evaluate them on other seeds."""
+FREE_SCALES_MM, LANDMARK_SCALES_MM = (3.0, 9.0), (4.3, 17.0)
+"""Standard deviations of errors of unit weight, across and along the surface, without and with
+landmarks, from simulated people of seeds 0 to 7; evaluate them on other seeds."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,15 +137,15 @@ def wrap_template(
             f"{', '.join(template.landmarks_mm)}; correct the names [SR-REC-027]"
         )
     surface = scan if isinstance(scan, ScanSurface) else ScanSurface(scan)
-    tell = progress or (lambda text: None)
-    tell("pose of the template")
+    report = progress or (lambda text: None)
+    report("pose of the template")
     pose = estimate_pose(template, surface, landmarks_mm=given, search=search)
     fit = _Wrapping(template, surface, pose, given)
     lengths = np.geomspace(LENGTH_RANGE_MM[1], LENGTH_RANGE_MM[0], steps) * pose.scale
     for number, length_mm in enumerate(lengths, start=1):
-        for _ in range(ROUNDS):
+        for _ in range(ROUNDS_PER_STEP):
             fit.step(float(length_mm))
-        tell(f"wrapping {number} of {steps}: {fit.rms_mm:.2f} mm RMS")
+        report(f"wrapping {number} of {steps}: {fit.rms_mm:.2f} mm RMS")
     fit.unfold(float(lengths[-1]))
     return fit.result()
 
@@ -277,7 +277,8 @@ class _Wrapping:
             total[:, 0] += across**2
             total[:, 1] += np.sum(drawn**2, axis=1) - across**2
         across, along = np.sqrt(total / UNCERTAINTY_SAMPLES).T
-        return ACROSS_SCALE_MM * across, ALONG_SCALE_MM * along
+        scales = LANDMARK_SCALES_MM if len(self.goals) else FREE_SCALES_MM
+        return scales[0] * across, scales[1] * along
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,8 +17,8 @@ from skinrig.extremes.expectations import (
 )
 from skinrig.extremes.inputs import InputPrecision
 
-SEED = 300
-STEPS = 4
+PERSON_SEED = 300
+STIFFNESS_STEPS = 4
 QUARTER_TURN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 """By 90 degrees about the vertical axis."""
 
@@ -33,12 +33,14 @@ def _wrapped(
     shift_mm: float = 0.0,
 ) -> str:
     """Check RMS error of the valid vertices, mm, and the range of the valid fraction."""
-    face = simulate_scan(SEED, "neutral", triangles=triangles)
+    face = simulate_scan(PERSON_SEED, "neutral", triangles=triangles)
     scan, turn = face.scan, np.eye(3) if rotation is None else rotation
     if keep is not None:
         scan = scan.select_faces(keep(scan.vertices_mm[scan.faces].mean(axis=1)) > 0.0)
     moved = np.asarray(real(scan.vertices_mm @ turn.T + shift_mm), np.float64)
-    found = wrap_template(load_default_template(), TriangleMesh(moved, scan.faces), steps=STEPS)
+    found = wrap_template(
+        load_default_template(), TriangleMesh(moved, scan.faces), steps=STIFFNESS_STEPS
+    )
     gap = found.mesh.vertices_mm - (face.true_vertices_mm @ turn.T + shift_mm)
     expect_near(found.folded, 0)
     expect_valid_fraction(found.valid, fraction_range=limits[1:])

@@ -24,13 +24,22 @@ from skinrig.arrays import Float64Array
 from skinrig.benchmarks.results import ErrorEstimate, Timing
 from skinrig.benchmarks.stage import BenchmarkStage
 
-STATES: Final = ("neutral", "smile", "anger", "neutral", "surprise", "fear", "neutral", "disgust")
+PEOPLE_STATES: Final = (
+    "neutral",
+    "smile",
+    "anger",
+    "neutral",
+    "surprise",
+    "fear",
+    "neutral",
+    "disgust",
+)
 """States of the people, in the order of their seeds."""
 FIRST_SEED: Final = 100
 """The settings were chosen with seeds 0 to 7."""
 LANDMARK_NOISE_MM: Final = 0.5
 """Standard deviation of a landmark's position along each axis."""
-FEATURES: Final = ("nose", "eye", "brow", "lip", "mouth", "lid", "fold", "chin", "glabella")
+FEATURE_WORDS: Final = ("nose", "eye", "brow", "lip", "mouth", "lid", "fold", "chin", "glabella")
 """First words of the landmarks that a person can find; cheeks and jaws have no marks."""
 
 
@@ -108,7 +117,7 @@ def _carry_landmarks(
     """Return the landmarks of features on another face: the offset of the nearest vertex."""
     own, found = template.mesh.vertices_mm, {}
     for name, point in template.landmarks_mm.items():
-        if name.split()[0] in FEATURES:
+        if name.split()[0] in FEATURE_WORDS:
             nearest = int(np.argmin(np.linalg.norm(own - point, axis=1)))
             found[name] = point + true_vertices_mm[nearest] - own[nearest]
     return found
@@ -118,7 +127,7 @@ def measure_template(stage: BenchmarkStage) -> None:
     """Measure errors over the number of steps, without and with landmarks and search."""
     count = 1 if stage.toy else 20
     seeds = range(FIRST_SEED, FIRST_SEED + count)
-    faces = [simulate_scan(seed, STATES[seed % len(STATES)]) for seed in seeds]
+    faces = [simulate_scan(seed, PEOPLE_STATES[seed % len(PEOPLE_STATES)]) for seed in seeds]
     settings = [(steps, False, False) for steps in ((2, 4) if stage.toy else (2, 4, 8, 16))]
     settings += [] if stage.toy else [(8, True, False), (8, False, True)]
     for steps, landmarks, search in settings:
