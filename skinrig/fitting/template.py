@@ -70,9 +70,7 @@ def fit_template(
         If the scan is not of a face, or the template has no texture coordinates.
     """
     if files.template_landmarks is not None and files.template is None:
-        raise UsageError(
-            "--template-landmarks: applies to your own template only; add --template [SR-CLI-012]"
-        )
+        raise UsageError("--template-landmarks: applies to your own template only; add --template")
     template, layout = _read_template(files)
     points = None if files.landmarks is None else read_point_table(files.landmarks)
     found = wrap_template(
@@ -123,18 +121,16 @@ def _read_template(files: TemplateFiles) -> tuple[FaceTemplate, _Layout]:
         uv[faces] = corner_uv
         return template, _Layout(np.arange(len(uv)), faces, uv)
     read = read_mesh(files.template)
-    if read.uv is None:
-        raise ScanMeshError(
-            f"--template: {files.template} has no texture coordinates, expected some; export the "
-            "template with its texture coordinates [SR-REC-026]"
-        )
-    faces = read.faces.astype(np.int64)
-    uv, vertices = read.uv.astype(np.float64), read.vertices_mm.astype(np.float64)
-    mesh = weld(TriangleMesh(vertices, faces, uv[faces]))
+    faces, vertices = read.faces.astype(np.int64), read.vertices_mm.astype(np.float64)
+    corner_uv = None if read.uv is None else read.uv.astype(np.float64)[faces]
+    mesh = weld(TriangleMesh(vertices, faces, corner_uv))
     vertex = np.asarray(cKDTree(mesh.vertices_mm).query(vertices)[1], np.int64)
     points = {} if files.template_landmarks is None else read_point_table(files.template_landmarks)
     landmarks = {name: np.array(point) for name, point in points.items()}
-    return FaceTemplate(mesh, landmarks), _Layout(vertex, faces, uv)
+    template = FaceTemplate(mesh, landmarks)
+    uv = np.zeros((len(vertices), 2))
+    uv[faces] = template.texture()
+    return template, _Layout(vertex, faces, uv)
 
 
 def _read_scan(files: TemplateFiles) -> TriangleMesh:
@@ -144,7 +140,7 @@ def _read_scan(files: TemplateFiles) -> TriangleMesh:
         if SCAN_FILE not in session.attachments():
             raise ScanMeshError(
                 f"session {session.id}: got no scan, expected one; give the file of a scan, or add "
-                "it with `skinrig import mesh` [SR-REC-006]"
+                "it with `skinrig import mesh`"
             )
         return load_ply(session.attachment(SCAN_FILE))
     read = read_mesh(files.scan, unit=files.unit)

@@ -76,7 +76,7 @@ def test_landmarks_of_template_need_template(scan, tmp_path, capsys):
     out = tmp_path / "wrapped.ply"
     command = ["fit", "template", str(scan), "--template-landmarks", str(table), "--out", str(out)]
     assert main(command) == 2
-    assert "SR-CLI-012" in capsys.readouterr().err
+    assert "add --template" in capsys.readouterr().err
 
 
 def test_landmark_table_of_image_is_refused(scan, tmp_path, capsys):
