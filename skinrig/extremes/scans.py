@@ -53,7 +53,9 @@ def _half(real: InputPrecision) -> str:
 
 
 def _coarse(real: InputPrecision) -> str:
-    return _wrapped(real, (3.0, 0.4, 1.0), triangles=500)
+    return expect_error(
+        lambda: _wrapped(real, (2.0, 0.2, 1.0), triangles=500), ScanMeshError, "SR-REC-024"
+    )
 
 
 def _turned(real: InputPrecision) -> str:
