@@ -116,9 +116,9 @@ def _read_template(files: TemplateFiles) -> tuple[FaceTemplate, _Layout]:
     """Return the template, welded, and the layout of its file."""
     if files.template is None:
         template = load_default_template()
-        faces, corner_uv = template.mesh.faces, template.texture()
+        faces = template.mesh.faces
         uv = np.zeros((len(template.mesh.vertices_mm), 2))
-        uv[faces] = corner_uv
+        uv[faces] = template.texture()
         return template, _Layout(np.arange(len(uv)), faces, uv)
     read = read_mesh(files.template)
     faces, vertices = read.faces.astype(np.int64), read.vertices_mm.astype(np.float64)
