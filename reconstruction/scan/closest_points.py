@@ -102,8 +102,8 @@ def closest_barycentric(points: Float64Array, corners: Float64Array) -> Float64A
     Examples
     --------
     >>> triangle = np.array([[0.0, 0, 0], [2, 0, 0], [0, 2, 0]])
-    >>> closest_barycentric(np.array([1.0, -3.0, 5.0]), triangle)
-    array([0.5, 0.5, 0. ])
+    >>> closest_barycentric(np.array([1.0, -3.0, 5.0]), triangle).tolist()
+    [0.5, 0.5, 0.0]
     """
     a, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
     ab, ac, ap = b - a, c - a, points - a

@@ -338,11 +338,11 @@ def folded_triangles(mesh: TriangleMesh) -> BoolArray:
     --------
     >>> flat = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 0]])
     >>> faces = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
-    >>> folded_triangles(TriangleMesh(flat, faces)).any()
-    np.False_
+    >>> bool(folded_triangles(TriangleMesh(flat, faces)).any())
+    False
     >>> flat[4] = [0.5, -0.2, 0]
-    >>> folded_triangles(TriangleMesh(flat, faces))
-    array([ True, False, False, False])
+    >>> folded_triangles(TriangleMesh(flat, faces)).tolist()
+    [True, False, False, False]
     """
     around = mesh.normals().astype(np.float64)[mesh.faces].sum(axis=1)
     return np.asarray(np.einsum("fk,fk->f", mesh.face_vectors(), around) <= 0.0)

@@ -23,11 +23,13 @@ HEAVY = {
     "normal-integration",
     "omissions",
     "probe-session",
+    "reference-dome",
     "reference-probe",
     "render-dome",
     "render-gradient",
     "render-model",
     "sphere-lights",
+    "template",
     "traits",
     "translucency-people",
 }

@@ -127,8 +127,12 @@ def measure_template(stage: BenchmarkStage) -> None:
     """Measure errors over the number of steps, without and with landmarks and search."""
     count = 1 if stage.toy else 20
     seeds = range(FIRST_SEED, FIRST_SEED + count)
-    faces = [simulate_scan(seed, PEOPLE_STATES[seed % len(PEOPLE_STATES)]) for seed in seeds]
-    settings = [(steps, False, False) for steps in ((2, 4) if stage.toy else (2, 4, 8, 16))]
+    triangles = 8_000 if stage.toy else 40_000
+    faces = [
+        simulate_scan(seed, PEOPLE_STATES[seed % len(PEOPLE_STATES)], triangles=triangles)
+        for seed in seeds
+    ]
+    settings = [(steps, False, False) for steps in ((2, 3, 4, 5) if stage.toy else (2, 4, 8, 16))]
     settings += [] if stage.toy else [(8, True, False), (8, False, True)]
     for steps, landmarks, search in settings:
         found, seconds = [], []
