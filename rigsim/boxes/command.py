@@ -102,6 +102,25 @@ def parse_number(text: str, low: float, high: float, unit: str) -> float:
     return value
 
 
+def parse_decimal(
+    text: str, low: float, high: float, unit: str, *, digits: int
+) -> int:
+    """Parse the number of a command to whole multiples of ``10**-digits``, halves rounded up.
+
+    The range is that of the number as it was sent.
+
+    Examples
+    --------
+    >>> parse_decimal("0.0005", 0.0, 1.0, "degrees", digits=3)
+    1
+    """
+    parse_number(text, low, high, unit)
+    whole, _, part = text.lstrip("-").partition(".")
+    nano = int(whole) * 10**9 + int(part.ljust(9, "0"))
+    unit_nano = 10 ** (9 - digits)
+    return (2 * (-nano if text[0] == "-" else nano) + unit_nano) // (2 * unit_nano)
+
+
 def parse_choice(text: str, names: tuple[str, ...]) -> str:
     """Parse the word of a command, upper case, or refuse with -102."""
     if text.upper() not in names:

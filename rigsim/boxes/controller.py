@@ -15,6 +15,7 @@ import numpy as np
 
 from capture.devices import wire
 from capture.devices.wire import Code, Event, Reply, Request
+from rigsim.boxes.box_clock import add_us, elapsed_us, on_clock
 from rigsim.boxes.command import (
     Command,
     CommandHandler,
@@ -27,6 +28,8 @@ from rigsim.boxes.device import Device
 
 FIRMWARE_VERSION = "1.0"
 MAX_CACHED_REPLIES = 8
+MAX_KEPT_ANSWER_BYTES = 160
+"""Longest answer that is kept, newline included; only the limits are longer, and read anew."""
 MAX_QUEUED_ERRORS = 16
 CAPABILITY_CHUNK_CHARS = 48
 """Characters of the limits per line: a short line survives a bad cable."""
@@ -64,6 +67,7 @@ class Controller:
 
         `announce`: print a banner and send a BOOT event when ready; a brown-out is silent.
         """
+        now = on_clock(now)
         self.device.advance(now)
         self.device.go_dark(now)
         self._reset_state(now, boot_s=boot_s)
@@ -81,7 +85,7 @@ class Controller:
         self._lease_ms = DEFAULT_LEASE_MS
         self._lease_end = math.inf
         self._powered_at = now
-        self._ready_at = now + boot_s
+        self._ready_at = add_us(now, 1e6 * boot_s)
         self.armed = False
         self.tripped = False
         self.device.reset(now, power_up=True)
@@ -96,6 +100,7 @@ class Controller:
 
     def advance(self, now: float) -> bytes:
         """Advance time to `now`, in s, and return unsolicited output."""
+        now = on_clock(now)
         output = b""
         while (due := self.deadline()) <= now:
             self.device.advance(due)
@@ -116,6 +121,7 @@ class Controller:
 
     def feed(self, data: bytes, now: float) -> bytes:
         """Process bytes from the host at `now`, in s, and return the answer."""
+        now = on_clock(now)
         output = self.advance(now)
         if now < self._ready_at:
             return output
@@ -152,6 +158,8 @@ class Controller:
             answers.append((request.seq, request.text, b""))
         for seq, text, answer in answers:
             if self._same_request(seq, text, frame):
+                if len(answer) > MAX_KEPT_ANSWER_BYTES:
+                    break
                 return answer
             if seq == frame.seq:
                 refused = CommandRefused(Code.SEQ_REUSED)
@@ -225,7 +233,7 @@ class Controller:
     # lease and arming -------------------------------------------------------------------------
 
     def _renew_lease(self, now: float) -> None:
-        self._lease_end = now + self._lease_ms / 1e3 if self.armed else math.inf
+        self._lease_end = add_us(now, 1e3 * self._lease_ms) if self.armed else math.inf
 
     def _disarm(self, now: float) -> None:
         self.armed = False
@@ -248,7 +256,7 @@ class Controller:
             "SYST:WDOG?": lambda *_: str(self._lease_ms),
             "SYST:ARM": self._arm,
             "SYST:ARM?": lambda *_: str(int(self.armed)),
-            "SYST:PING?": lambda _, now: str(round((now - self._powered_at) * 1e6)),
+            "SYST:PING?": lambda _, now: str(elapsed_us(self._powered_at, now)),
             "SAFE": self._safe,
             "ABOR": self._safe,
             "STAT?": self._status,

@@ -10,6 +10,7 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import Rig
+from rigsim.boxes.box_clock import elapsed_us, on_clock
 from rigsim.boxes.command import Command, CommandRefused, parse_token
 from rigsim.boxes.faults import NO_FAULTS, Faults
 
@@ -157,7 +158,7 @@ class Device(ABC):
 
     def clock_us(self, now: float) -> int:
         """Return the time since power-up, us."""
-        return round((now - self._powered_at) * 1e6)
+        return elapsed_us(self._powered_at, now)
 
     def light_now(self, now: float) -> Sequence[Any]:
         """Return the intervals of light that have not ended, as emitted so far."""
@@ -173,4 +174,4 @@ class Device(ABC):
 
     def _stop_opens_s(self) -> float:
         """Return when the emergency stop will open, s; inf where it is open."""
-        return math.inf if self.interlock else self.faults.interlock_after
+        return math.inf if self.interlock else on_clock(self.faults.interlock_after)

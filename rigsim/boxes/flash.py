@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from capture.devices.wire import Code
+from rigsim.boxes.box_clock import add_us, ceil_ms, elapsed_s, elapsed_us, rotation_us
 from rigsim.boxes.command import (
     Command,
     CommandHandler,
@@ -27,7 +28,7 @@ from rigsim.boxes.command import (
     PendingReply,
     build_command_table,
     parse_choice,
-    parse_number,
+    parse_decimal,
     parse_token,
 )
 from rigsim.boxes.device import Device, Wiring
@@ -42,7 +43,7 @@ SYNC_RANGE_US = (0.0, 50_000.0)
 LED_CENTER_RANGE_NM = (420.0, 680.0)
 LED_WIDTH_RANGE_NM = (5.0, 50.0)
 """LEDs of the emulated heads, which have one of each center and width."""
-POP_WINDOW_S = 60.0
+POP_WINDOW_US = 60_000_000
 POLARIZER_READING_DEG: dict[Polarizer, float] = {"parallel": 0.0, "crossed": 90.0}
 
 CHARGER_HEADROOM = 1.05
@@ -53,6 +54,10 @@ LAMP_TAU_S = 20.0
 """Time constant of the lamp driver's temperature, s."""
 HEAT_TRIP, HEAT_CLEAR = 0.8, 0.5
 """Temperatures at which the lamp's driver trips and recovers; 1 is its steady state."""
+HEAT_TOLERANCE = 1e-6
+"""Error of a temperature that a controller computes in single precision."""
+POWER_STEPS = 100_000_000
+"""Steps of the power from zero to full."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +103,8 @@ class FlashUnit(Device):
         rig, faults = self.rig, self.faults
         self._pops_per_min = math.floor(rig.max_pops_per_min)
         self._s_per_deg = rig.polarizer_move_s / 90.0
+        self._quarter_turn_us = round(1e6 * rig.polarizer_move_s)
+        self._recycle_us = round(1e6 * rig.recycle_s)
         headroom = math.log(CHARGER_HEADROOM / (CHARGER_HEADROOM - 1.0))
         self._charge_tau_s = faults.slow_charge * CHARGE_TIME_FRACTION * rig.recycle_s / headroom
         self._now = 0.0
@@ -109,9 +116,9 @@ class FlashUnit(Device):
         self._pops: deque[float] = deque(maxlen=max(1, self._pops_per_min))
         self._volt = 1.0  # relative to full, at `_volt_at`; initially charged
         self._volt_at = 0.0
-        self._last_pop = -math.inf
-        self._last_power = 0.0
+        self._recycled_at = 0.0
         self._coming: tuple[float, str] | None = None  # time of the next pop, and its token
+        self._answer_at = 0.0  # of the last delayed pop, even if it was prevented
         self._outcome: str | CommandRefused = ""
         self.angle_deg = 0.0
         self._settled_at = 0.0
@@ -122,12 +129,13 @@ class FlashUnit(Device):
     def reset(self, now: float, *, power_up: bool) -> None:
         """Restore the power-up settings: parallel, full power, dark."""
         super().reset(now, power_up=power_up)
-        self.power = 1.0
-        self.sync_s = 0.0
+        self.power_steps = POWER_STEPS
+        self.sync_us = 0
         self.polarizer: Polarizer = "parallel"
         self.analyzer_deg: float | None = None
         self.last_report = ""
         self.led = ""
+        self._answer_at = now if power_up else self._answer_at
         self._turn(POLARIZER_READING_DEG["parallel"], now)
 
     def capabilities(self) -> Mapping[str, Any]:
@@ -158,7 +166,7 @@ class FlashUnit(Device):
             "FLAS:POW": self._set_power,
             "FLAS:POW?": self._get_power,
             "FLAS:SYNC": self._set_sync,
-            "FLAS:SYNC?": lambda *_: f"{1e6 * self.sync_s:.0f}",
+            "FLAS:SYNC?": lambda *_: str(self.sync_us),
             "FLAS:LED": self._set_led,
             "FLAS:LED?": lambda *_: self.led or "TUBE",
             "FLAS:CHAR?": self._get_charge,
@@ -182,7 +190,8 @@ class FlashUnit(Device):
         if not self._lamp.lit:
             return math.inf
         span = (1.0 - self._lamp.heat) / (1.0 - HEAT_TRIP)
-        return min(self._lamp.end_s, self._now + LAMP_TAU_S * math.log(max(span, 1.0)))
+        trips_us = math.ceil(1e6 * LAMP_TAU_S * math.log(max(span, 1.0)))
+        return min(self._lamp.end_s, add_us(self._now, trips_us))
 
     def advance(self, now: float) -> None:
         """Advance time to `now`, in s."""
@@ -192,7 +201,7 @@ class FlashUnit(Device):
             if self._coming is not None and self._coming[0] <= due:
                 self._pop(due)
             if lamp_ends:
-                if self._lamp.heat >= HEAT_TRIP - 1e-9:
+                if self._lamp.heat >= HEAT_TRIP - HEAT_TOLERANCE:
                     self._lamp.hot = True
                 self._lamps_out(due)
         self._heat_until(now)
@@ -202,7 +211,8 @@ class FlashUnit(Device):
     def _heat_until(self, now: float) -> None:
         lamp = self._lamp
         goal = 1.0 if lamp.lit else 0.0
-        lamp.heat = goal + (lamp.heat - goal) * math.exp(-max(0.0, now - self._now) / LAMP_TAU_S)
+        passed_s = max(0.0, elapsed_s(self._now, now))
+        lamp.heat = goal + (lamp.heat - goal) * math.exp(-passed_s / LAMP_TAU_S)
         self._now = max(now, self._now)
 
     def go_dark(self, now: float) -> None:
@@ -230,14 +240,15 @@ class FlashUnit(Device):
 
     def states(self, now: float) -> dict[int, bool]:
         """Return bits 16 turning, 32 no pop possible yet, 64 lamp on, 128 too hot."""
-        waits = self._wait_for_fire(now)[0] > 0.0
+        waits = self._wait_for_fire(now)[0] > 0
         return {16: self.is_busy(now), 32: waits, 64: self._lamp.lit, 128: self._lamp.hot}
 
     # analyzer ---------------------------------------------------------------------------------
 
     def _turn(self, reading_deg: float, now: float) -> None:
-        start = max(now, self._settled_at)
-        self._settled_at = start + abs(reading_deg - self.angle_deg) * self._s_per_deg
+        turn_mdeg = round(1e3 * (reading_deg - self.angle_deg))
+        turn_us = rotation_us(turn_mdeg, self._quarter_turn_us)
+        self._settled_at = add_us(max(now, self._settled_at), turn_us)
         self.angle_deg = reading_deg
 
     def _set_polarizer(self, arguments: str, now: float) -> None:
@@ -250,7 +261,8 @@ class FlashUnit(Device):
         return "PAR" if self.polarizer == "parallel" else "CROS"
 
     def _set_angle(self, arguments: str, now: float) -> None:
-        self.analyzer_deg = parse_number(arguments, *ANALYZER_RANGE_DEG, "degrees")
+        reading_mdeg = parse_decimal(arguments, *ANALYZER_RANGE_DEG, "degrees", digits=3)
+        self.analyzer_deg = reading_mdeg / 1e3
         self._turn(self.analyzer_deg, now)
 
     def _get_angle(self, _: str, now: float) -> str:
@@ -259,20 +271,30 @@ class FlashUnit(Device):
     # flash ------------------------------------------------------------------------------------
 
     def _set_power(self, arguments: str, now: float) -> None:
-        self.power = parse_number(arguments, MIN_POWER, 1.0, "of full power")
+        self.power_steps = parse_decimal(arguments, MIN_POWER, 1.0, "of full power", digits=8)
+
+    @property
+    def power(self) -> float:
+        """Power of the next pops relative to full."""
+        return self.power_steps / POWER_STEPS
+
+    @property
+    def sync_s(self) -> float:
+        """Time from the camera line to the pop, s."""
+        return self.sync_us / 1e6
 
     def _get_power(self, _: str, now: float) -> str:
         return f"{self.power:.8f}"
 
     def _set_sync(self, arguments: str, now: float) -> None:
-        self.sync_s = parse_number(arguments, *SYNC_RANGE_US, "us") / 1e6
+        self.sync_us = parse_decimal(arguments, *SYNC_RANGE_US, "us", digits=0)
 
     def _set_led(self, arguments: str, now: float) -> None:
         center, comma, width = arguments.partition(",")
         CommandRefused.raise_if(not comma, Code.SYNTAX, "expected center,width in nm")
-        center_nm = parse_number(center, *LED_CENTER_RANGE_NM, "nm")
-        width_nm = parse_number(width, *LED_WIDTH_RANGE_NM, "nm")
-        self.led = f"LED-{center_nm:.0f}-{width_nm:.0f}"
+        center_nm = parse_decimal(center, *LED_CENTER_RANGE_NM, "nm", digits=0)
+        width_nm = parse_decimal(width, *LED_WIDTH_RANGE_NM, "nm", digits=0)
+        self.led = f"LED-{center_nm}-{width_nm}"
 
     def charge(self, now: float) -> float:
         """Return the energy in the capacitor at `now`, 0 to 1 of a full pop."""
@@ -281,43 +303,43 @@ class FlashUnit(Device):
     def _voltage(self, now: float) -> float:
         # V(t) = V_end - (V_end - V_0) exp(-t / tau), cut at full; the energy is V^2.
         gap = CHARGER_HEADROOM - self._volt
-        return min(
-            1.0, CHARGER_HEADROOM - gap * math.exp(-(now - self._volt_at) / self._charge_tau_s)
-        )
+        passed_s = elapsed_s(self._volt_at, now)
+        return min(1.0, CHARGER_HEADROOM - gap * math.exp(-passed_s / self._charge_tau_s))
 
-    def _wait_for_fire(self, now: float) -> tuple[float, Code, str]:
-        """Return the time until FIRE is accepted, in s, with the code and text of the refusal."""
+    def _wait_for_fire(self, now: float) -> tuple[int, Code, str]:
+        """Return the time until FIRE is accepted, in us, with the code and text of the refusal."""
         # The charge suffices from V = sqrt(power) on: t = tau ln((V_end - V) / (V_end -
         # sqrt(power))).
         need = math.sqrt(self.power)
         gap = (CHARGER_HEADROOM - self._voltage(now)) / (CHARGER_HEADROOM - need)
         full = len(self._pops) == self._pops_per_min
-        coming_s = -math.inf if self._coming is None else self._coming[0] - now
+        charging_us = 1e6 * self._charge_tau_s * math.log(max(gap, 1.0))
+        window_us = POP_WINDOW_US - elapsed_us(self._pops[0], now) if full else 0
         waits = [
-            (coming_s, Code.IGNORED, "about to pop"),
-            (self._settled_at - now, Code.IGNORED, "analyzer turning"),
-            (self._last_pop + self.rig.recycle_s * self._last_power - now, Code.RECYCLE, "tube"),
-            (self._pops[0] + POP_WINDOW_S - now if full else 0.0, Code.DUTY, "pops per minute"),
-            (self._charge_tau_s * math.log(max(gap, 1.0)), Code.IGNORED, "charging"),
+            (elapsed_us(now, self._answer_at), Code.IGNORED, "about to pop"),
+            (elapsed_us(now, self._settled_at), Code.IGNORED, "analyzer turning"),
+            (elapsed_us(now, self._recycled_at), Code.RECYCLE, "tube"),
+            (window_us, Code.DUTY, "pops per minute"),
+            (math.floor(charging_us + 0.5), Code.IGNORED, "charging"),
         ]
         return max(waits, key=lambda wait: wait[0])
 
     def _get_charge(self, _: str, now: float) -> str:
-        wait_ms = math.ceil(max(0.0, self._wait_for_fire(now)[0]) * 1e3)
+        wait_ms = ceil_ms(max(0, self._wait_for_fire(now)[0]))
         return f"{self.charge(now):.4f},{int(wait_ms == 0)},{wait_ms}"
 
     def _fire(self, arguments: str, now: float) -> str | PendingReply:
         token = parse_token(arguments)
         self._require_closed_stop()
-        wait_s, code, why = self._wait_for_fire(now)
-        # a shorter wait is below the microsecond resolution of the clock
-        if wait_s > 1e-6:
-            raise CommandRefused(code, f"{why}, {math.ceil(wait_s * 1e3)} ms")
+        wait_us, code, why = self._wait_for_fire(now)
+        if wait_us > 0:
+            raise CommandRefused(code, f"{why}, {ceil_ms(wait_us)} ms")
         self._lamps_out(now)
         self._on_trigger(now)
-        at_s = now + self.sync_s
+        at_s = add_us(now, self.sync_us)
         self._coming = (at_s, token)
-        if self.sync_s > 0.0:
+        self._answer_at = at_s
+        if self.sync_us > 0:
             return PendingReply(at_s, lambda: self._outcome)
         self._pop(now)
         if isinstance(self._outcome, CommandRefused):
@@ -333,8 +355,9 @@ class FlashUnit(Device):
             self._outcome = CommandRefused(Code.HARDWARE, "the tube did not ignite")
             return
         self._volt = math.sqrt(max(0.0, self._voltage(now) ** 2 - self.power))
-        self._volt_at = self._last_pop = now
-        self._last_power = self.power
+        self._volt_at = now
+        recycle_us = (2 * self._recycle_us * self.power_steps + POWER_STEPS) // (2 * POWER_STEPS)
+        self._recycled_at = add_us(now, recycle_us)
         self._pops.append(now)
         self.count += 1
         pop = FlashPop(token, now, self.power, self.polarizer, self.analyzer_deg, self.led)
@@ -361,11 +384,11 @@ class FlashUnit(Device):
             CommandRefused.raise_if(length, Code.SYNTAX, "expected OFF")
             self._lamps_out(now)
             return
-        span_ms = parse_number(length, *LAMP_RANGE_MS, "ms")
+        span_us = parse_decimal(length, *LAMP_RANGE_MS, "ms", digits=3)
         self._require_closed_stop()
         CommandRefused.raise_if(self._lamp.hot, Code.THERMAL, f"wait until below {HEAT_CLEAR:g}")
         CommandRefused.raise_if(self.faults.lamp_dead, Code.HARDWARE, "the lamp draws no current")
         if not self._lamp.lit:
             self._lamp.lit = True
             self._lamp_since = now
-        self._lamp.end_s = now + span_ms / 1e3
+        self._lamp.end_s = add_us(now, span_us)

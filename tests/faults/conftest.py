@@ -8,6 +8,7 @@ from collections import Counter
 from contextlib import ExitStack
 
 import pytest
+from fixtures.compiled.sides import choose_side, on_both_sides
 
 from capture.devices.flash import FlashBox
 from capture.devices.port import (
@@ -21,6 +22,23 @@ from capture.devices.port import (
 from capture.devices.wire import Code
 from rigsim.boxes.controller import Controller
 from rigsim.world.serve import serve_world
+
+
+EMULATED_ONLY = {
+    "test_controller_missing_any_rule_is_detected": "leaves rules of the emulation out",
+    "test_answer_cache_is_queue_of_eight": "reads the emulated queue",
+}
+"""Tests that exchange parts of the emulation, with what they exchange."""
+
+
+def pytest_generate_tests(metafunc):
+    files = ("test_wire_faults.py", "test_wire_capture.py", "test_stateful_boxes.py")
+    on_both_sides(metafunc, long=files)
+
+
+@pytest.fixture(autouse=True)
+def box_side(request, monkeypatch):
+    return choose_side(request, monkeypatch, EMULATED_ONLY)
 
 
 @pytest.fixture(autouse=True)

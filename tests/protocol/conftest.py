@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import serial
+from fixtures.compiled.sides import choose_side, on_both_sides
 from serial import rfc2217
 
 from capture.devices.camera import open_camera
@@ -21,6 +22,26 @@ from rigsim.world import World
 from rigsim.world.serve import serve_world
 
 NAMES = (f"protocol-{number}" for number in itertools.count())
+
+EMULATED_ONLY = {
+    "test_controller_of_other_kind_is_refused": "renames the emulated class",
+    "test_an_answer_that_makes_no_sense_is_named": "lets the emulated box lie",
+    "test_charge_falls_by_power_recovers_within_recycle_time": "reads the emulated capacitor",
+}
+"""Tests that exchange parts of the emulation, with what they exchange."""
+
+
+def pytest_generate_tests(metafunc):
+    on_both_sides(
+        metafunc,
+        quick=("test_box_manuals.py", "test_flash_box.py", "test_box_fuzz.py"),
+        long=("test_flash_driver.py", "test_flash_sequence.py"),
+    )
+
+
+@pytest.fixture(autouse=True)
+def box_side(request, monkeypatch):
+    return choose_side(request, monkeypatch, EMULATED_ONLY)
 
 
 class Photometer:

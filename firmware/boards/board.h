@@ -1,0 +1,40 @@
+/* What a board provides: 20 functions at most, and a box uses some of them.
+ *
+ * All are called from the main loop only, return at once, and act before they return.
+ */
+#ifndef FIRMWARE_BOARD_H
+#define FIRMWARE_BOARD_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+/* Every box. */
+void board_start(void);                               /* pins dark, clock and line running */
+int64_t board_now_us(void);                           /* since board_start, never backwards */
+bool board_read(char *byte);                          /* next byte from the host, if any */
+void board_send(const char *data, uint16_t size);     /* bytes to the host */
+uint16_t board_random_epoch(void);                    /* another number after each reset */
+void board_feed_watchdog(void);                       /* the hardware resets 0.1 s after the last */
+bool board_stop_is_open(void);                        /* emergency stop contact */
+void board_release_cameras(uint32_t mask);            /* pulse the lines of the mask's bits */
+
+/* Lights, and the one stage that a box turns. */
+bool board_set_led(uint16_t led, double level);       /* 0 to 1; false: it draws no current.
+                                                         Modeling lamps are LED 0. */
+bool board_pop(double power, uint16_t center_nm, uint16_t width_nm); /* false: did not ignite */
+void board_turn(int32_t position);                    /* analyzer, ring: 0.001 degrees; cover:
+                                                         fiber, -1 for all */
+
+/* Caliper. */
+bool board_drive_jaws(double distance_mm);            /* false: steps were lost */
+double board_jaws_mm(void);                           /* where the jaws are, by their encoder */
+double board_force_n(void);                           /* by the sensor, not tared */
+void board_hold_skin(bool hold);                      /* clamps of the jaws */
+
+/* Probe. */
+bool board_move_shutter(bool open);                   /* false: the blades do not follow */
+void board_set_suction(double mbar);                  /* 0: pump off, vent open */
+bool board_gauge_mbar(double *mbar);                  /* false: the gauge draws no current */
+double board_camera_c(void);                          /* degrees Celsius */
+
+#endif
