@@ -26,13 +26,14 @@ void board_turn(int32_t position);                    /* analyzer, ring: 0.001 d
                                                          fiber, -1 for all */
 
 /* Caliper. */
-bool board_drive_jaws(double distance_mm);            /* false: steps were lost */
-double board_jaws_mm(void);                           /* where the jaws are, by their encoder */
-double board_force_n(void);                           /* by the sensor, not tared */
-void board_hold_skin(bool hold);                      /* clamps of the jaws */
+void board_start_jaws(double target_mm, bool back);   /* motor on; back: return, after a trip */
+bool board_drive_jaws(double distance_mm);            /* true: they are at the home mark */
+void board_read_jaws(double *distance_mm, double *force_n); /* encoder; NaN N: dead sensor */
+void board_hold_skin(bool hold);                      /* clamps of the jaws; tare by the box */
 
 /* Probe. */
-bool board_move_shutter(bool open);                   /* false: the blades do not follow */
+void board_move_shutter(bool open);
+bool board_shutter_is(bool open);                     /* the blades' sensor */
 void board_set_suction(double mbar);                  /* 0: pump off, vent open */
 bool board_gauge_mbar(double *mbar);                  /* false: the gauge draws no current */
 double board_camera_c(void);                          /* degrees Celsius */

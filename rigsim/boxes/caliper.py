@@ -23,16 +23,18 @@ from dataclasses import dataclass
 from typing import Any
 
 from capture.devices.wire import Code
+from rigsim.boxes.box_clock import add_us, elapsed_s, elapsed_us
 from rigsim.boxes.command import (
     Command,
     CommandHandler,
     CommandRefused,
     build_command_table,
-    parse_number,
+    parse_decimal,
 )
 from rigsim.boxes.device import Device, Wiring
 
 CALIPER_CONTROL_PERIOD_S = 5e-3
+_PERIOD_US = 5000
 """Period in which position and force are sampled while the motor runs, s."""
 MAX_CAPTURE_STEPS = 15
 FORCE_LIMIT_N = (0.05, 10.0)
@@ -47,8 +49,8 @@ HOMING_SPEED_FRACTION = 0.5
 MIN_DETACHMENT_FORCE_N = 0.05
 DETACHED_FORCE_FRACTION = 0.25
 """Fraction of the force that remains one control period after the skin has detached."""
-RELEASE_TIME_S = 0.25
-"""Time after a force trip, s; a force still beyond the limit then releases the skin."""
+RELEASE_TIME_US = 250_000
+"""Time after a force trip, us; a force still beyond the limit then releases the skin."""
 
 _STEP_PATTERN = re.compile(r"-?[0-9]{1,3}")
 
@@ -75,16 +77,18 @@ class _Move:
 
     @property
     def arrives_s(self) -> float:
-        return self.start_s + abs(self.to_mm - self.from_mm) / self.speed_mm_per_s
+        span_us = 1e6 * (abs(self.to_mm - self.from_mm) / self.speed_mm_per_s)
+        return add_us(self.start_s, span_us)
 
     @property
     def next_s(self) -> float:
-        return min(self.start_s + (self.ticks + 1) * CALIPER_CONTROL_PERIOD_S, self.arrives_s)
+        return min(add_us(self.start_s, (self.ticks + 1) * _PERIOD_US), self.arrives_s)
 
     def driven_to_mm(self, now: float) -> float:
         if now >= self.arrives_s:
             return self.to_mm
-        return self.from_mm + self.direction * self.speed_mm_per_s * (now - self.start_s)
+        passed_s = elapsed_s(self.start_s, now)
+        return self.from_mm + self.direction * self.speed_mm_per_s * passed_s
 
 
 class CaliperUnit(Device):
@@ -235,7 +239,8 @@ class CaliperUnit(Device):
             self._on_change(now)
             self._end(move, "DETACHED", now)
         elif math.isfinite(move.tripped_s):
-            if abs(force_n) >= limit_n and (lost or now > move.tripped_s + RELEASE_TIME_S):
+            late = elapsed_us(move.tripped_s, now) > RELEASE_TIME_US
+            if abs(force_n) >= limit_n and (lost or late):
                 self._release(now, "FORCE")
             elif lost:
                 self._lose_steps(move, now)
@@ -359,14 +364,14 @@ class CaliperUnit(Device):
         return self._begin(to_mm, now, homing=False)
 
     def _turn(self, arguments: str, now: float) -> None:
-        angle_deg = parse_number(arguments, 0.0, 180.0, "degrees")
+        angle_deg = parse_decimal(arguments, 0.0, 180.0, "degrees", digits=3) / 1e3
         if angle_deg not in self._caliper.angles_deg:
             known = ", ".join(f"{angle:g}" for angle in self._caliper.angles_deg)
             raise CommandRefused(Code.OUT_OF_RANGE, f"expected one of {known} degrees")
         self._require_fit(now)
         self._require_free()
         turns_s = abs(angle_deg - self.angle_deg) / ROTATION_DEG_PER_S
-        self._turning = (now + turns_s, angle_deg)
+        self._turning = (add_us(now, 1e6 * turns_s), angle_deg)
         self.advance(now)
 
     # skin -------------------------------------------------------------------------------------
@@ -388,7 +393,7 @@ class CaliperUnit(Device):
         return f"{self.measured_force_n:.3f}"
 
     def _set_limit(self, arguments: str, now: float) -> None:
-        limit_n = parse_number(arguments, *FORCE_LIMIT_N, "N")
+        limit_n = parse_decimal(arguments, *FORCE_LIMIT_N, "N", digits=3) / 1e3
         if abs(self.measured_force_n) >= limit_n:
             raise CommandRefused(
                 Code.FORCE, f"there are {self.measured_force_n:.3f} N now; CAL:REL first"

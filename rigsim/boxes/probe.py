@@ -26,7 +26,7 @@ from rigsim.boxes.command import (
     CommandRefused,
     PendingReply,
     build_command_table,
-    parse_number,
+    parse_decimal,
     parse_token,
 )
 from rigsim.boxes.device import Device, Wiring
@@ -182,7 +182,8 @@ class ProbeUnit(Device):
     def _place(self, arguments: str, now: float) -> None:
         label, _, angle = arguments.partition(",")
         site = parse_token(label)
-        angle_deg = parse_number(angle, 0.0, 360.0, "degrees, less than 360")
+        angle_mdeg = parse_decimal(angle, 0.0, 360.0, "degrees, less than 360", digits=3)
+        angle_deg = angle_mdeg / 1e3
         CommandRefused.raise_if(
             angle_deg == 360.0, Code.OUT_OF_RANGE, "expected 0 to less than 360 degrees"
         )
@@ -208,10 +209,12 @@ class ProbeUnit(Device):
         length, comma, suction = rest.partition(",")
         if on.upper() != "ON" or not comma:
             raise CommandRefused(Code.SYNTAX, "expected ON,<ms>,<mbar> or VENT")
-        span_ms = parse_number(length, MIN_SUCTION_MS, self._probe.max_suction_s * 1e3, "ms")
-        mbar = parse_number(suction, MIN_SUCTION_MBAR, self._probe.max_suction_mbar, "mbar")
+        longest_ms = self._probe.max_suction_s * 1e3
+        span_us = parse_decimal(length, MIN_SUCTION_MS, longest_ms, "ms", digits=3)
+        most_mbar = self._probe.max_suction_mbar
+        ubar = parse_decimal(suction, MIN_SUCTION_MBAR, most_mbar, "mbar", digits=3)
         self._require_closed_stop()
-        return self.pump.draw(span_ms / 1e3, mbar, now)
+        return self.pump.draw(span_us, ubar / 1e3, now)
 
     # light ------------------------------------------------------------------------------------
 
@@ -231,11 +234,12 @@ class ProbeUnit(Device):
             return ""
         what, _, length = arguments.partition(",")
         CommandRefused.raise_if(what.upper() != "OPEN", Code.SYNTAX, "expected OPEN,<ms> or CLOSE")
-        span_ms = parse_number(length, MIN_OPENING_MS, self._probe.max_open_s * 1e3, "ms")
+        longest_ms = self._probe.max_open_s * 1e3
+        span_us = parse_decimal(length, MIN_OPENING_MS, longest_ms, "ms", digits=3)
         self._require_closed_stop()
         if self.shutter.level > 0 and not self.pump.has_reached_target:
             raise CommandRefused(Code.IGNORED, "the head is not held; PUMP ON, and wait")
-        at_s, outcome = self.shutter.open(span_ms / 1e3, now)
+        at_s, outcome = self.shutter.open(span_us, now)
         return PendingReply(at_s, outcome)
 
     def _get_shutter(self, _: str, now: float) -> str:

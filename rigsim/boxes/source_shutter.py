@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from capture.devices.wire import Code
 from capture.rig import LedLimits
+from rigsim.boxes.box_clock import add_us, ceil_ms, elapsed_s, elapsed_us
 from rigsim.boxes.command import CommandRefused
 from rigsim.boxes.device import Device, Wiring
 
@@ -72,7 +73,8 @@ class SourceShutter:
         self._weak = faults.weak_leds.get(0, 1.0)
         self._opening: _Opening | None = None
         self._light_since: float | None = None
-        self._settled_s = -math.inf
+        self._settled_s = 0.0
+        self._answer_s = 0.0  # when the answer to the last opening is due
         self.level = 0
         self.count = 0
         self.dose_ws = 0.0
@@ -104,8 +106,9 @@ class SourceShutter:
 
     def remaining_ms(self, now: float) -> int:
         """Return the remaining open time of the shutter, ms."""
-        left_s = 0.0 if self._opening is None else self._opening.ends_s - now
-        return max(0, math.ceil(left_s * 1e3)) if math.isfinite(left_s) else 0
+        if self._opening is None or math.isinf(self._opening.ends_s):
+            return 0
+        return max(0, ceil_ms(elapsed_us(now, self._opening.ends_s)))
 
     def _light_interval(self, t_on_s: float, t_off_s: float) -> SourceLight:
         return SourceLight(self.level / LEVEL_STEPS * self._weak, t_on_s, t_off_s, self.fiber)
@@ -145,7 +148,7 @@ class SourceShutter:
     def _shut(self, opening: _Opening, how: str, now: float) -> None:
         """Close the blades at a time chosen by the controller or the host."""
         if self._rng.random() < self._jam:
-            opening.ends_s, opening.jams_s = math.inf, now + JAM_DETECTION_S
+            opening.ends_s, opening.jams_s = math.inf, add_us(now, 1e6 * JAM_DETECTION_S)
             return
         self._end(opening, how, now)
 
@@ -171,7 +174,8 @@ class SourceShutter:
             return
         light = self._light_interval(self._light_since, now)
         self._light_since = None
-        self.dose_ws += self._power_w * self.level / LEVEL_STEPS * (now - light.t_on_s)
+        lit_s = elapsed_s(light.t_on_s, now)
+        self.dose_ws += self._power_w * self.level / LEVEL_STEPS * lit_s
         if light.t_off_s > light.t_on_s:
             self._on_light(light)
 
@@ -181,17 +185,18 @@ class SourceShutter:
 
     # commands ------------------------------------------------------------------------
 
-    def open(self, seconds: float, now: float) -> tuple[float, Callable[[], str | CommandRefused]]:
+    def open(self, span_us: int, now: float) -> tuple[float, Callable[[], str | CommandRefused]]:
         """Begin an opening; return when its outcome is known, and the function that returns it."""
         CommandRefused.raise_if(self.jammed, Code.HARDWARE, "the shutter is stuck open; SHUT CLOSE")
         self.require_closed(now)
-        give_ws = self._power_w * self.level / LEVEL_STEPS * seconds
+        CommandRefused.raise_if(now < self._answer_s, Code.IGNORED, "the shutter is open")
+        give_ws = self._power_w * self.level / LEVEL_STEPS * (span_us / 1e6)
         if self.dose_ws + give_ws > self.dose_limit_ws:
             dose = f"{self.dose_ws + give_ws:.3f} of {self.dose_limit_ws:g} Ws"
             raise CommandRefused(Code.LIGHT_DOSE, dose)
         self.count += 1
-        clears_s = now + MIN_OPENING_MS / 1e3
-        opening = _Opening(self.count, clears_s, clears_s + seconds)
+        self._answer_s = clears_s = add_us(now, 1e3 * MIN_OPENING_MS)
+        opening = _Opening(self.count, clears_s, add_us(clears_s, span_us))
         self._opening = opening
 
         def outcome() -> str | CommandRefused:
@@ -219,7 +224,7 @@ class SourceShutter:
         opening = self._opening
         if opening is None or not opening.open:
             self._opening = None
-        elif self._rng.random() < self._jam or math.isfinite(opening.jams_s):
+        elif math.isfinite(opening.jams_s) or self._rng.random() < self._jam:
             self._give_up(opening, now)
         else:
             self._end(opening, outcome, now)
@@ -247,12 +252,13 @@ class SourceShutter:
         self.require_closed(now)
         if fiber != self.fiber:
             self.fiber = fiber
-            self._settled_s = now + COVER_MOVE_S
+            self._settled_s = add_us(now, 1e6 * COVER_MOVE_S)
 
     def forget(self, *, power_up: bool, now: float) -> None:
         """Restore the power-up settings; the source is dark already, no fiber covered."""
         if power_up:
             self.last_report = ""
+            self._answer_s = now
         if self.fiber is not None:
             self.fiber = None
-            self._settled_s = now + COVER_MOVE_S
+            self._settled_s = add_us(now, 1e6 * COVER_MOVE_S)

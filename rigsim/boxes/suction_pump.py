@@ -13,6 +13,7 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import Probe
+from rigsim.boxes.box_clock import add_us, ceil_ms, elapsed_us
 from rigsim.boxes.command import CommandRefused
 from rigsim.boxes.device import Device, SuctionLoad
 from rigsim.boxes.source_shutter import SourceShutter
@@ -70,7 +71,8 @@ class _Draw:
 
     @property
     def next_s(self) -> float:
-        return min(self.start_s + (self.ticks + 1) * PUMP_CONTROL_PERIOD_S, self.ends_s)
+        tick_us = (self.ticks + 1) * 1e6 * PUMP_CONTROL_PERIOD_S
+        return min(add_us(self.start_s, tick_us), self.ends_s)
 
 
 class SuctionPump:
@@ -97,7 +99,7 @@ class SuctionPump:
         self._shutter = shutter
         self._draw: _Draw | None = None
         # a separate clock keeps the skin's rest through a reset of the controller
-        self._rested_s = -math.inf
+        self._rested_s = 0.0
         self.count = 0
         self.placement: tuple[str, float] | None = None
         self.last_report = ""
@@ -116,14 +118,12 @@ class SuctionPump:
 
     def remaining_rest_ms(self, now: float) -> int:
         """Return the remaining rest time of the skin, ms."""
-        # a shorter rest is below the microsecond resolution of the clock
-        rest_s = self._rested_s - now
-        return math.ceil(rest_s * 1e3) if rest_s > 1e-6 and not self.is_pumping else 0
+        return 0 if self.is_pumping else ceil_ms(max(0, elapsed_us(now, self._rested_s)))
 
     def state(self, now: float) -> str:
         """Return ``ON,mbar,ms left``, ``REST,ms left`` or ``VENT``."""
         if self._draw is not None:
-            left_ms = math.ceil((self._draw.ends_s - now) * 1e3)
+            left_ms = ceil_ms(elapsed_us(now, self._draw.ends_s))
             return f"ON,{self._draw.wanted_mbar:g},{left_ms}"
         rest_ms = self.remaining_rest_ms(now)
         return f"REST,{rest_ms}" if rest_ms else "VENT"
@@ -157,7 +157,7 @@ class SuctionPump:
             self._fail(draw, "HIGH", now)
         elif draw.held and reading < LOST_SHARE * draw.wanted_mbar:
             self._fail(draw, "LOST", now)
-        elif not draw.held and now >= draw.start_s + MAX_PUMPING_S:
+        elif not draw.held and elapsed_us(draw.start_s, now) >= 1e6 * MAX_PUMPING_S:
             self._fail(draw, "LOW", now)
         elif now >= draw.ends_s:
             self._end(draw, "TIMED", now)
@@ -165,7 +165,7 @@ class SuctionPump:
     def _end(self, draw: _Draw, how: str, now: float) -> None:
         self._draw = None
         self._load.vent(now)
-        self._rested_s = now + self._probe.rest_s
+        self._rested_s = add_us(now, 1e6 * self._probe.rest_s)
         self.last_report = f"{draw.number},{how},{draw.mbar:.1f},{self._box.clock_us(now)}"
         self._box.queue_event("PUMP:END", self.last_report)
         self._shutter.abort_opening(now, "PUMP")
@@ -188,7 +188,7 @@ class SuctionPump:
         self.placement = None
         self._load.remove(now)
 
-    def draw(self, seconds: float, mbar: float, now: float) -> str:
+    def draw(self, span_us: int, mbar: float, now: float) -> str:
         """Switch the pump on until its own end; return the number of this interval of suction."""
         if self._draw is not None:
             raise CommandRefused(Code.IGNORED, "the pump is on; PUMP VENT first")
@@ -198,7 +198,7 @@ class SuctionPump:
             raise CommandRefused(Code.RECYCLE, f"skin, {rest_ms} ms")
         self.read(now)
         self.count += 1
-        self._draw = _Draw(self.count, now, now + seconds, mbar)
+        self._draw = _Draw(self.count, now, add_us(now, span_us), mbar)
         self._load.start_suction(mbar, now)
         return str(self.count)
 

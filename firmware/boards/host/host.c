@@ -2,6 +2,8 @@
  *
  * All state of the core lies in one section, so that one library serves many boxes in turn.
  */
+#include <string.h>
+
 #include "boards/board.h"
 #include "core/core.h"
 
@@ -13,11 +15,12 @@ struct host_board {
   bool (*set_led)(uint16_t led, double level);
   bool (*pop)(double power, uint16_t center_nm, uint16_t width_nm);
   void (*turn)(int32_t position);
+  void (*start_jaws)(double target_mm, bool back);
   bool (*drive_jaws)(double distance_mm);
-  double (*jaws_mm)(void);
-  double (*force_n)(void);
+  void (*read_jaws)(double *distance_mm, double *force_n);
   void (*hold_skin)(bool hold);
-  bool (*move_shutter)(bool open);
+  void (*move_shutter)(bool open);
+  bool (*shutter_is)(bool open);
   void (*set_suction)(double mbar);
   bool (*gauge_mbar)(double *mbar);
   double (*camera_c)(void);
@@ -50,8 +53,16 @@ void host_power_up(int64_t now, bool cold) { core_power_up(now, cold); }
 void host_announce(int64_t now) { core_announce(now); }
 void host_feed(const char *data, uint16_t size, int64_t now) { core_feed(data, size, now); }
 void host_advance(int64_t now) { core_advance(now); }
-void host_query(char *line, uint16_t size) { core_handle_bare_line(line, size); }
-void host_hello(char *line, uint16_t size) { core_handle_framed_line(line, size); }
+/* Ask without a trace, even from within a call of the board. */
+static void ask(void (*handle)(char *, uint16_t), char *line, uint16_t size) {
+  static char before[1u << 19];
+  memcpy(before, host_state(), host_state_size());
+  handle(line, size);
+  memcpy(host_state(), before, host_state_size());
+}
+
+void host_query(char *line, uint16_t size) { ask(core_handle_bare_line, line, size); }
+void host_hello(char *line, uint16_t size) { ask(core_handle_framed_line, line, size); }
 
 void board_send(const char *data, uint16_t size) { board.send(data, size); }
 uint16_t board_random_epoch(void) { return board.random_epoch(); }
@@ -62,11 +73,14 @@ bool board_pop(double power, uint16_t center_nm, uint16_t width_nm) {
   return board.pop(power, center_nm, width_nm);
 }
 void board_turn(int32_t position) { board.turn(position); }
+void board_start_jaws(double target_mm, bool back) { board.start_jaws(target_mm, back); }
 bool board_drive_jaws(double distance_mm) { return board.drive_jaws(distance_mm); }
-double board_jaws_mm(void) { return board.jaws_mm(); }
-double board_force_n(void) { return board.force_n(); }
+void board_read_jaws(double *distance_mm, double *force_n) {
+  board.read_jaws(distance_mm, force_n);
+}
 void board_hold_skin(bool hold) { board.hold_skin(hold); }
-bool board_move_shutter(bool open) { return board.move_shutter(open); }
+void board_move_shutter(bool open) { board.move_shutter(open); }
+bool board_shutter_is(bool open) { return board.shutter_is(open); }
 void board_set_suction(double mbar) { board.set_suction(mbar); }
 bool board_gauge_mbar(double *mbar) { return board.gauge_mbar(mbar); }
 double board_camera_c(void) { return board.camera_c(); }
