@@ -15,19 +15,20 @@ from collections.abc import Sequence
 
 from capture.devices.wire import Code
 from rigsim.boxes import led_table
+from rigsim.boxes.box_clock import add_us
 from rigsim.boxes.command import (
     Command,
     CommandHandler,
     CommandRefused,
     build_command_table,
     parse_integer,
-    parse_number,
+    parse_decimal,
 )
 from rigsim.boxes.device import Wiring
 from rigsim.boxes.led_sequencer import LED_RANGE_MS, LedSequencer, SequenceRun
 from rigsim.boxes.led_table import LEVEL_STEPS, LedPulse, LedTableRow, SequenceEvent
 
-DEFAULT_LED_MS = 100.0
+DEFAULT_LED_US = 100_000
 
 
 class DomeUnit(LedSequencer[LedTableRow]):
@@ -111,10 +112,10 @@ class DomeUnit(LedSequencer[LedTableRow]):
         CommandRefused.raise_if(len(parts) > 3, Code.SYNTAX, "expected LEDS,MS,LEVEL")
         leds = self._leds(parts[0])
         longest_ms = min(LED_RANGE_MS[1], self._limits.max_on_s * 1e3)
-        span_ms = (
-            parse_number(parts[1], LED_RANGE_MS[0], longest_ms, "ms")
+        span_us = (
+            parse_decimal(parts[1], LED_RANGE_MS[0], longest_ms, "ms", digits=3)
             if len(parts) > 1
-            else DEFAULT_LED_MS
+            else DEFAULT_LED_US
         )
         level = parse_integer(parts[2], 1, LEVEL_STEPS) / LEVEL_STEPS if len(parts) > 2 else 1.0
         if len({*leds, *self.bank.lit}) > self._limits.max_at_once:
@@ -125,7 +126,7 @@ class DomeUnit(LedSequencer[LedTableRow]):
         dead = [led for led in leds if led in self.bank.dead]
         if dead:
             raise CommandRefused(Code.HARDWARE, f"LED {dead[0]} draws no current")
-        end_s = now + span_ms / 1e3
+        end_s = add_us(now, span_us)
         wanted = [LedPulse(led, level, now, end_s) for led in leds]
         self.bank.require_within_limits(wanted, now)
         self._require_flicker_limits(wanted, now)

@@ -21,6 +21,7 @@ import numpy as np
 
 from capture.devices.wire import Code
 from rigsim.boxes import led_table
+from rigsim.boxes.box_clock import add_us, ceil_ms, elapsed_us, rotation_us
 from rigsim.boxes.command import (
     Command,
     CommandHandler,
@@ -28,13 +29,13 @@ from rigsim.boxes.command import (
     build_command_table,
     parse_choice,
     parse_integer,
-    parse_number,
+    parse_decimal,
 )
 from rigsim.boxes.device import Wiring
 from rigsim.boxes.led_sequencer import LED_RANGE_MS, LedSequencer, SequenceRun
 from rigsim.boxes.led_table import LEVEL_STEPS, LedPulse, SequenceEvent, table_crc
 
-DEFAULT_LED_MS = 100.0
+DEFAULT_LED_US = 100_000
 _GAINS_PATTERN = re.compile(r"[0-9]{1,4}(\+[0-9]{1,4})*")
 
 
@@ -72,6 +73,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
     def __init__(self, wiring: Wiring) -> None:
         rig, faults = wiring.rig, wiring.faults
         self._s_per_deg = rig.polarizer_move_s / 90.0
+        self._quarter_turn_us = round(1e6 * rig.polarizer_move_s)
         self._shares = led_table.pattern_led_fractions(rig.lights)
         health = np.ones(len(rig.lights))
         for led, share in faults.weak_leds.items():
@@ -131,15 +133,17 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         return super().states(now) | {1024: self.is_analyzer_rotating(now)}
 
     def _turn(self, reading_deg: float, now: float) -> None:
-        start = max(now, self._settled_at)
-        self._settled_at = start + abs(reading_deg - self.analyzer_deg) * self._s_per_deg
+        turn_mdeg = round(1e3 * (reading_deg - self.analyzer_deg))
+        turn_us = rotation_us(turn_mdeg, self._quarter_turn_us)
+        self._settled_at = add_us(max(now, self._settled_at), turn_us)
         self.analyzer_deg = reading_deg
 
     def _set_stop(self, arguments: str, now: float) -> None:
         self._set_angle(parse_choice(arguments, ("0", "90")), now)
 
     def _set_angle(self, arguments: str, now: float) -> None:
-        reading_deg = round(parse_number(arguments, *led_table.ANALYZER_RANGE_DEG, "degrees"), 3)
+        limits_deg = led_table.ANALYZER_RANGE_DEG
+        reading_deg = parse_decimal(arguments, *limits_deg, "degrees", digits=3) / 1e3
         self._require_still()
         CommandRefused.raise_if(self.lit, Code.IGNORED, "a light is on; PATT DARK first")
         self._sequence_armed = False
@@ -147,8 +151,8 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
 
     def _require_settled(self, now: float) -> None:
         if self.is_analyzer_rotating(now):
-            wait_ms = (self._settled_at - now) * 1e3
-            raise CommandRefused(Code.IGNORED, f"analyzer turning, {wait_ms:.0f} ms")
+            wait_ms = ceil_ms(elapsed_us(now, self._settled_at))
+            raise CommandRefused(Code.IGNORED, f"analyzer turning, {wait_ms} ms")
 
     # light ------------------------------------------------------------------------------------
 
@@ -207,13 +211,15 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
             self.bank.all_off(now)
             return
         longest_ms = min(LED_RANGE_MS[1], self._limits.max_on_s * 1e3)
-        span_ms = (
-            parse_number(more[0], LED_RANGE_MS[0], longest_ms, "ms") if more else DEFAULT_LED_MS
+        span_us = (
+            parse_decimal(more[0], LED_RANGE_MS[0], longest_ms, "ms", digits=3)
+            if more
+            else DEFAULT_LED_US
         )
         level = parse_integer(more[1], 1, LEVEL_STEPS) / LEVEL_STEPS if len(more) > 1 else 1.0
         self._require_closed_stop()
         self._require_settled(now)
-        end_s = now + span_ms / 1e3
+        end_s = add_us(now, span_us)
         wanted = self._requested_pulses(pattern, level, now, end_s)
         self.bank.require_within_limits(wanted, now)
         self._require_flicker_limits(wanted, now)
@@ -235,14 +241,13 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
     ) -> list[LedPulse]:
         self._require_settled(now)
         times = led_table.pattern_start_times(
-            rows, reading_deg=self.analyzer_deg, s_per_deg=self._s_per_deg
+            rows, reading_deg=self.analyzer_deg, quarter_turn_us=self._quarter_turn_us
         )
         found: list[LedPulse] = []
         for row, (_, lit_s) in zip(rows, times, strict=True):
-            start_s = now + lit_s
-            found += self._requested_pulses(
-                row.pattern, row.level, start_s, start_s + row.dwell_us * 1e-6
-            )
+            start_s = add_us(now, 1e6 * lit_s)
+            end_s = add_us(start_s, row.dwell_us)
+            found += self._requested_pulses(row.pattern, row.level, start_s, end_s)
         return found
 
     def _schedule(self, rows: Sequence[led_table.PatternRow]) -> list[SequenceEvent]:
@@ -250,7 +255,7 @@ class GradientSphereUnit(LedSequencer[led_table.PatternRow]):
         return led_table.schedule_pattern_rows(
             rows,
             reading_deg=self.analyzer_deg,
-            s_per_deg=self._s_per_deg,
+            quarter_turn_us=self._quarter_turn_us,
             settle_s=self._limits.settle_s,
         )
 

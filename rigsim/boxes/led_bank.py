@@ -8,12 +8,15 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import LedLimits, Rig
+from rigsim.boxes.box_clock import add_us, elapsed_s, elapsed_us
 from rigsim.boxes.command import CommandRefused
 from rigsim.boxes.faults import Faults
 from rigsim.boxes.led_table import LedPulse
 
 TRIP_RESET_FRACTION = 0.5
 """Temperature below which a hot LED may be lit again, relative to the trip temperature."""
+HEAT_TOLERANCE = 1e-6
+"""Error of a temperature that a controller computes in single precision."""
 
 
 class LedBank:
@@ -75,13 +78,15 @@ class LedBank:
             due = min(due, end_s)
             if level > trip:
                 ratio = (level - float(self._heat[led])) / (level - trip)
-                due = min(due, self._heat_at + tau * math.log(max(ratio, 1.0)))
+                trips_us = math.ceil(1e6 * tau * math.log(max(ratio, 1.0)))
+                due = min(due, add_us(self._heat_at, trips_us))
         return due
 
     def advance(self, now: float) -> list[int]:
         """Advance time to `now`, at most one deadline; return LEDs that have tripped."""
         self._heat_until(now)
-        tripped = [k for k in self._lit if self._heat[k] >= self.limits.thermal_trip - 1e-9]
+        trip = self.limits.thermal_trip - HEAT_TOLERANCE
+        tripped = [k for k in self._lit if self._heat[k] >= trip]
         for led in tripped:
             self._hot[led] = True
         for led in [k for k, (_, _, end_s) in self._lit.items() if end_s <= now]:
@@ -96,7 +101,7 @@ class LedBank:
         goal = np.zeros(self.count)
         for led, (level, _, _) in self._lit.items():
             goal[led] = level
-        fade = math.exp(-(now - self._heat_at) / self.limits.thermal_tau_s)
+        fade = math.exp(-elapsed_s(self._heat_at, now) / self.limits.thermal_tau_s)
         self._heat = goal + (self._heat - goal) * fade
         self._heat_at = now
 
@@ -120,7 +125,7 @@ class LedBank:
         level, since, _ = self._lit.pop(led)
         if now <= since:
             return
-        self._dose_ws[led] += self._power_w[led] * level * (now - since)
+        self._dose_ws[led] += self._power_w[led] * level * elapsed_s(since, now)
         self._past.setdefault(led, deque(maxlen=256)).append(LedPulse(led, level, since, now))
         self._on_light(LedPulse(led, level * self._weak.get(led, 1.0), since, now))
 
@@ -166,7 +171,7 @@ class LedBank:
             heat = self._heat_after(led, new, now)
             if heat >= limits.thermal_trip:
                 raise CommandRefused(Code.THERMAL, f"LED {led} would reach {heat:.2f}")
-            give = sum(pulse.level * (pulse.t_off_s - pulse.t_on_s) for pulse in new)
+            give = sum(pulse.level * elapsed_s(pulse.t_on_s, pulse.t_off_s) for pulse in new)
             dose = float(self._dose_ws[led] + self._power_w[led] * give)
             if dose > limits.dose_ws:
                 raise CommandRefused(
@@ -184,25 +189,29 @@ class LedBank:
             # the request replaces light in progress, but its energy so far counts
             past.append(LedPulse(led, self._lit[led][0], self._lit[led][1], now))
         pulses = [*past, *new]
-        on = np.array([pulse.t_on_s for pulse in pulses])
-        off = np.array([pulse.t_off_s for pulse in pulses])
+        # whole microseconds: equal windows have equal means, whatever the time of day
+        window_us = round(1e6 * window)
+        on = np.array([elapsed_us(now, pulse.t_on_s) for pulse in pulses])
+        off = np.array([elapsed_us(now, pulse.t_off_s) for pulse in pulses])
         level = np.array([pulse.level for pulse in pulses])
         times = np.concatenate([on, off])
         order = np.argsort(times, kind="stable")
         times, rate = times[order], np.cumsum(np.concatenate([level, -level])[order])
-        given = np.concatenate([[0.0], np.cumsum(rate[:-1] * np.diff(times))])
+        given = np.concatenate([[0.0], np.cumsum(rate[:-1] * (np.diff(times) / 1e6))])
         # the mean is greatest where light ends, or where a window's far edge leaves darkness
-        ends = np.concatenate([off[len(past) :], on + window, off[: len(past)] + window])
+        ends = np.concatenate([off[len(past) :], on + window_us, off[: len(past)] + window_us])
         ends = ends[(ends > on[len(past) :].min()) & (ends <= off[len(past) :].max())]
-        mean = np.interp(ends, times, given) - np.interp(ends - window, times, given)
+        mean = np.interp(ends, times, given) - np.interp(ends - window_us, times, given)
         return float(mean.max()) / window
 
     def _heat_after(self, led: int, new: Sequence[LedPulse], now: float) -> float:
         """Return the highest temperature that an LED will reach."""
         heat, at, most = float(self._heat[led]), now, 0.0
         for pulse in sorted(new, key=lambda pulse: pulse.t_on_s):
-            heat *= math.exp(-max(0.0, pulse.t_on_s - at) / self.limits.thermal_tau_s)
-            fade = math.exp(-(pulse.t_off_s - pulse.t_on_s) / self.limits.thermal_tau_s)
+            dark_s = max(0.0, elapsed_s(at, pulse.t_on_s))
+            lit_s = elapsed_s(pulse.t_on_s, pulse.t_off_s)
+            heat *= math.exp(-dark_s / self.limits.thermal_tau_s)
+            fade = math.exp(-lit_s / self.limits.thermal_tau_s)
             heat = pulse.level + (heat - pulse.level) * fade
             at, most = pulse.t_off_s, max(most, heat)
         return most

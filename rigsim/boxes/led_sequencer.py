@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from capture.devices.wire import Code
+from rigsim.boxes.box_clock import add_us
 from rigsim.boxes.command import (
     Command,
     CommandHandler,
@@ -55,6 +56,11 @@ class SequenceRun(Generic[RowT]):
     pending: list[SequenceEvent]
     state: str = "RUN"
     row: int = -1
+
+    @property
+    def next_s(self) -> float:
+        """World time of the next event, s."""
+        return add_us(self.start_s, 1e6 * self.pending[0].t_s)
 
 
 class LedSequencer(Device, Generic[RowT]):
@@ -162,7 +168,7 @@ class LedSequencer(Device, Generic[RowT]):
         run = self._run
         due = self.bank.deadline()
         if run is not None and run.pending:
-            due = min(due, run.start_s + run.pending[0].t_s)
+            due = min(due, run.next_s)
         return due
 
     def advance(self, now: float) -> None:
@@ -170,7 +176,7 @@ class LedSequencer(Device, Generic[RowT]):
         while (due := self.deadline()) <= now:
             self._advance_bank(due)
             run = self._run
-            while run is not None and run.pending and run.start_s + run.pending[0].t_s <= due:
+            while run is not None and run.pending and run.next_s <= due:
                 self._switch(run, run.pending.pop(0), due)
         self._advance_bank(now)
 

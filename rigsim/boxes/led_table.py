@@ -1,6 +1,5 @@
 """Parse and schedule the rows of light that hosts send to controllers with LEDs."""
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from capture.devices.wire import Code
 from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import Light
 from rigsim.arrays import Float64Array
+from rigsim.boxes.box_clock import add_us, rotation_us
 from rigsim.boxes.command import CommandRefused, parse_number
 
 LEVEL_STEPS = 1000
@@ -148,14 +148,15 @@ def schedule_rows(
     `settle_s` after the row's turn, when only its own LEDs are on and steady.
     """
     found: list[SequenceEvent] = []
-    start_s = 0.0
+    overlap_us, settle_us = round(1e6 * overlap_s), round(1e6 * settle_s)
+    start_us = 0
     for place, row in enumerate(rows):
         if place:
-            found.append(SequenceEvent(start_s - overlap_s, "on", place))
-        found.append(SequenceEvent(start_s, "turn", place))
-        found.append(SequenceEvent(start_s + settle_s, "pulse", place))
-        start_s += row.dwell_s
-    found.append(SequenceEvent(start_s, "end", len(rows) - 1))
+            found.append(SequenceEvent((start_us - overlap_us) / 1e6, "on", place))
+        found.append(SequenceEvent(start_us / 1e6, "turn", place))
+        found.append(SequenceEvent((start_us + settle_us) / 1e6, "pulse", place))
+        start_us += row.dwell_us
+    found.append(SequenceEvent(start_us / 1e6, "end", len(rows) - 1))
     return sorted(found, key=lambda switch: switch.t_s)
 
 
@@ -165,16 +166,18 @@ def pulses_from_rows(
     """Return the light of a sequence that begins at `start_s`, per LED without gaps or overlap."""
     found: list[LedPulse] = []
     going: dict[int, tuple[float, float]] = {}  # LED -> level, since
-    t_s = start_s
+    t_us = 0
     for place, row in enumerate(rows):
+        t_s = add_us(start_s, t_us)
         for led in [k for k in going if k not in row.leds or going[k][0] != row.level]:
             level, since = going.pop(led)
             found.append(LedPulse(led, level, since, t_s))
         before = rows[place - 1].leds if place else ()
         for led in row.leds:
             early = overlap_s if place and led not in before else 0.0
-            going.setdefault(led, (row.level, t_s - early))
-        t_s += row.dwell_s
+            going.setdefault(led, (row.level, add_us(t_s, -1e6 * early)))
+        t_us += row.dwell_us
+    t_s = add_us(start_s, t_us)
     return found + [LedPulse(led, level, since, t_s) for led, (level, since) in going.items()]
 
 
@@ -205,7 +208,7 @@ def parse_pattern_name(text: str) -> str:
     """Parse the pattern name of a command, or refuse."""
     name = text.lower()
     if name not in LIGHT_PATTERNS:
-        raise CommandRefused(Code.SYNTAX, f"expected {' or '.join(LIGHT_PATTERNS).upper()}")
+        raise CommandRefused(Code.SYNTAX, f"expected {' or '.join(map(str.upper, LIGHT_PATTERNS))}")
     return name
 
 
@@ -243,7 +246,7 @@ def pattern_led_fractions(lights: Sequence[Light]) -> dict[str, Float64Array]:
 
 
 def pattern_start_times(
-    rows: Sequence[PatternRow], *, reading_deg: float, s_per_deg: float
+    rows: Sequence[PatternRow], *, reading_deg: float, quarter_turn_us: int
 ) -> list[tuple[float, float]]:
     """Return the start of each row's analyzer rotation and of its light, s.
 
@@ -253,21 +256,22 @@ def pattern_start_times(
         The scan; it begins at 0 s.
     reading_deg
         Reading of the analyzer before the scan, degrees.
-    s_per_deg
-        Rotation time per degree, s.
+    quarter_turn_us
+        Time of a rotation by 90 degrees, us.
     """
     found = []
-    t_s = 0.0
+    t_us = 0
     for row in rows:
-        lit_s = t_s + abs(row.analyzer_deg - reading_deg) * s_per_deg
-        found.append((t_s, lit_s))
+        angle_mdeg = round(1e3 * (row.analyzer_deg - reading_deg))
+        lit_us = t_us + rotation_us(angle_mdeg, quarter_turn_us)
+        found.append((t_us / 1e6, lit_us / 1e6))
         reading_deg = row.analyzer_deg
-        t_s = lit_s + row.dwell_s
+        t_us = lit_us + row.dwell_us
     return found
 
 
 def schedule_pattern_rows(
-    rows: Sequence[PatternRow], *, reading_deg: float, s_per_deg: float, settle_s: float
+    rows: Sequence[PatternRow], *, reading_deg: float, quarter_turn_us: int, settle_s: float
 ) -> list[SequenceEvent]:
     """Return all events of a scan, in order of time.
 
@@ -276,11 +280,11 @@ def schedule_pattern_rows(
     """
     found: list[SequenceEvent] = []
     end_s = 0.0
-    times = pattern_start_times(rows, reading_deg=reading_deg, s_per_deg=s_per_deg)
+    times = pattern_start_times(rows, reading_deg=reading_deg, quarter_turn_us=quarter_turn_us)
     for place, (row, (turn_s, lit_s)) in enumerate(zip(rows, times, strict=True)):
-        if not math.isclose(turn_s, lit_s, abs_tol=1e-12):
+        if turn_s != lit_s:
             found.append(SequenceEvent(turn_s, "rotate", place))
         found.append(SequenceEvent(lit_s, "light", place))
-        found.append(SequenceEvent(lit_s + settle_s, "pulse", place))
-        end_s = lit_s + row.dwell_s
+        found.append(SequenceEvent(add_us(lit_s, 1e6 * settle_s), "pulse", place))
+        end_s = add_us(lit_s, row.dwell_us)
     return [*found, SequenceEvent(end_s, "end", len(rows) - 1)]

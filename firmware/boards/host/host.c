@@ -55,7 +55,7 @@ void host_feed(const char *data, uint16_t size, int64_t now) { core_feed(data, s
 void host_advance(int64_t now) { core_advance(now); }
 /* Ask without a trace, even from within a call of the board. */
 static void ask(void (*handle)(char *, uint16_t), char *line, uint16_t size) {
-  static char before[1u << 19];
+  static char before[1u << 20];
   memcpy(before, host_state(), host_state_size());
   handle(line, size);
   memcpy(host_state(), before, host_state_size());

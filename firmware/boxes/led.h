@@ -1,0 +1,91 @@
+/* Boxes with LEDs: the bank with its limits, the eyes' guard, and the table's sequencer. */
+#ifndef FIRMWARE_LED_H
+#define FIRMWARE_LED_H
+
+#include "boxes/box.h"
+
+#define LEVEL_STEPS 1000
+#define ROW_MIN_US 2000
+#define LED_DEFAULT_US 100000
+#define HISTORY 16384      /* pulses of the last second that the driver remembers */
+#define LED_PULSES 1700    /* of one LED: a table's and the history's */
+#define LIGHT_CHANGES 8192 /* distinct times at which a judged light changes */
+
+/* One row of the table. */
+struct row {
+  uint32_t dwell_us, mask;
+  uint16_t level; /* thousandths, 0 when dark */
+#ifdef QUARTER_TURN_US
+  uint8_t pattern;
+  int32_t reading_mdeg;
+#else
+  uint8_t count; /* of the LEDs, ascending */
+  uint8_t leds[MAX_AT_ONCE];
+#endif
+};
+
+struct pulse {
+  double level;
+  us_t on, off;
+  uint16_t led;
+};
+
+/* A requested light gives its pulses to `visit`, in order: those of one LED, or of all (-1). */
+typedef void visit_pulse(const struct pulse *pulse, void *context);
+typedef void requested_light(int32_t only, visit_pulse *visit, void *context);
+
+struct loads {
+  double duty, heat, dose_ws;
+};
+
+/* bank */
+void bank_build(void);
+bool bank_is_lit(uint16_t led);
+bool bank_any_lit(void);
+bool bank_has_tripped(void);
+double bank_dose_ws(uint16_t led);
+void bank_new_subject(void);
+us_t bank_deadline(void);
+bool bank_advance(void); /* false: a driver has tripped, LED:HOT was said */
+bool bank_switch_on(uint16_t led, double level, us_t end); /* false: it draws no current */
+void bank_switch_off(uint16_t led);
+void bank_all_off(void);
+/* Pulses since a time, and those in progress that have an end. */
+void bank_visit_since(us_t start, visit_pulse *visit, void *context);
+enum code bank_require_within_limits(requested_light *light, struct loads *most);
+
+/* eyes */
+double guard_flashes_per_s(requested_light *past, requested_light *light);
+double guard_rms(requested_light *light);
+bool guard_is_full(void); /* the last light had too many changes to be judged */
+
+/* sequencer */
+extern struct row table[MAX_ROWS];
+uint16_t sequencer_rows(void);
+enum code refuse_running(void);
+void disarm_sequence(void);
+enum code require_flicker_limits(requested_light *light, double *flashes, double *rms);
+bool sequencer_is_lit(void);
+uint16_t sequencer_status(void);
+void sequencer_reset(bool power_up);
+/* Level, time and mask of a row, as text and checked. */
+enum code parse_row_light(const char *level, const char *dwell, const char *mask, bool is_dark,
+                          struct row *row);
+enum code refuse_above(flash_text before, int64_t limit, flash_text after);
+
+/* What the kind of box adds. */
+enum action { NOTHING, EARLY_ON, TURN, ROTATE, LIGHT, PULSE, END };
+struct step {
+  us_t at; /* since the run's start */
+  enum action action;
+  uint16_t row;
+};
+void kind_first_step(struct step *step);
+void kind_next_step(struct step *step); /* from one step to the next; none is left: NOTHING */
+void kind_switch(const struct step *step);
+requested_light table_light;
+enum code kind_require_ready(void); /* before a table is judged */
+enum code parse_row(char *text, struct row *row);
+void put_row(struct text *text, const struct row *row);
+
+#endif
