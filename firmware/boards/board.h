@@ -9,7 +9,8 @@
 #include <stdint.h>
 
 /* Every box. */
-void board_start(void);                               /* pins dark, clock and line running */
+bool board_start(void);                               /* pins dark, clock and line on; true: memory
+                                                         that survives a reset was lost */
 int64_t board_now_us(void);                           /* since board_start, never backwards */
 bool board_read(char *byte);                          /* next byte from the host, if any */
 void board_send(const char *data, uint16_t size);     /* bytes to the host */

@@ -95,7 +95,7 @@ static void end_move(flash_text how, bool by_force) {
   put_char(&text, ',');
   put_flash(&text, how);
   put_char(&text, ',');
-  put_int(&text, (int64_t)rint((distance_mm - APERTURE_MM) / STEP_MM));
+  put_int(&text, scaled((distance_mm - APERTURE_MM) / STEP_MM, 0));
   put_number(&text, by_force ? unit.trip_mm : distance_mm, 3);
   put_number(&text, by_force ? unit.trip_n : force, 3);
   put_clock(&text);
@@ -285,7 +285,7 @@ COMMAND(do_cal_step_abs) {
   TRY(require_fit());
   TRY(require_limit());
   if (!unit.homed) return refuse(CODE_IGNORED, P("CAL:HOME first"));
-  double to_mm = APERTURE_MM + step * STEP_MM;
+  double to_mm = APERTURE_MM + (double)step * STEP_MM;
   if (unit.barred && unit.barred_direction * (to_mm - unit.barred_mm) >= 0.0) {
     refuse(CODE_FORCE, P("the limit was met at "));
     put_real(reason(), unit.barred_mm, 3);

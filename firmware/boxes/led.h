@@ -7,9 +7,14 @@
 #define LEVEL_STEPS 1000
 #define ROW_MIN_US 2000
 #define LED_DEFAULT_US 100000
-#define HISTORY 16384      /* pulses of the last second that the driver remembers */
+/* Pulses of the last second that the driver remembers; a pattern is one of each LED. */
+#ifdef QUARTER_TURN_US
+#define HISTORY 16384
+#else
+#define HISTORY 4096
+#endif
 #define LED_PULSES 1700    /* of one LED: a table's and the history's */
-#define LIGHT_CHANGES 8192 /* distinct times at which a judged light changes */
+#define LIGHT_CHANGES 4096 /* distinct times at which a judged light changes */
 
 /* One row of the table. */
 struct row {

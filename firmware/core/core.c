@@ -175,7 +175,7 @@ static void record_error(enum code code, const char *why) {
     code = CODE_QUEUE_OVERFLOW;
     why = core.reason_data;
   }
-  struct error *error = &core.errors[(core.errors_first + core.errors_count++) % ERRORS];
+  struct error *error = &core.errors[((uint16_t)core.errors_first + core.errors_count++) % ERRORS];
   error->code = (int16_t)code;
   struct text text;
   text_start(&text, error->reason, ERROR_BYTES);
@@ -467,7 +467,7 @@ static bool is_repeated(const struct request *request) {
   for (uint8_t k = 0; k <= KEPT_ANSWERS; k++) {
     bool last = k == KEPT_ANSWERS;
     if (last && !core.pending) break;
-    const struct kept_answer *kept = &core.kept[(core.kept_next + k) % KEPT_ANSWERS];
+    const struct kept_answer *kept = &core.kept[((uint16_t)core.kept_next + k) % KEPT_ANSWERS];
     const struct request *before = last ? &core.under_way : &kept->request;
     if (before->length == 0 || before->seq != request->seq) continue;
     if (before->hash == request->hash && before->length == request->length) {

@@ -19,6 +19,7 @@ from capture.devices.port import Port
 from capture.rig import load_rig
 from rigsim.boxes.faults import Faults
 from rigsim.world import World
+from rigsim.world.rig_boxes import BOXES
 from rigsim.world.serve import serve_world
 
 NAMES = (f"protocol-{number}" for number in itertools.count())
@@ -26,6 +27,15 @@ NAMES = (f"protocol-{number}" for number in itertools.count())
 EMULATED_ONLY = {
     "test_controller_of_other_kind_is_refused": "renames the emulated class",
     "test_an_answer_that_makes_no_sense_is_named": "lets the emulated box lie",
+    "test_host_and_controller_spell_rows_identically": "reads the emulated table",
+    "test_heat_and_dose_limits_match_other_led_controllers": "sets the emulated dose",
+    "test_led_dose_accumulates_and_its_limit_applies": "sets the emulated dose",
+    "test_overheated_led_goes_out_despite_all_limits": "leaves the emulated limits out",
+    "test_subject_dose_is_counted_and_limited": "sets the emulated dose",
+    "test_another_table_than_was_sent_is_noticed": "exchanges the emulated checksum",
+    "test_analyzer_that_never_arrives_is_abandoned": "holds the emulated analyzer",
+    "test_a_caliper_that_never_arrives_is_given_up": "holds the emulated jaws",
+    "test_a_cover_that_never_arrives_is_given_up": "holds the emulated cover",
     "test_charge_falls_by_power_recovers_within_recycle_time": "reads the emulated capacitor",
 }
 """Tests that exchange parts of the emulation, with what they exchange."""
@@ -34,8 +44,12 @@ EMULATED_ONLY = {
 def pytest_generate_tests(metafunc):
     on_both_sides(
         metafunc,
-        quick=("test_box_manuals.py", "test_flash_box.py", "test_box_fuzz.py"),
-        long=("test_flash_driver.py", "test_flash_sequence.py"),
+        quick=("test_box_manuals.py", "test_flash_box.py"),
+        long=(
+            *("test_box_fuzz.py", "test_boxes_side_by_side.py", "test_flash_sequence.py"),
+            *(f"test_{kind}_box.py" for kind in ("dome", "gradient_sphere", "caliper", "probe")),
+            *(f"test_{kind}_driver.py" for kind in BOXES),
+        ),
     )
 
 

@@ -1,0 +1,163 @@
+/* The board `mps2`: Arm's MPS2 with a Cortex-M3 (AN385) or a Cortex-M7 (AN500), as in QEMU.
+ *
+ * UART 0 is the line. QEMU has no pins: UART 1 names each change of one: microseconds, pin, value.
+ * The hardware behind the pins is ideal. An epoch is loaded into memory before the start.
+ */
+#include "boards/board.h"
+#include "core/text.h"
+
+#define REGISTER(address) (*(volatile uint32_t *)(address))
+#define COUNTER REGISTER(0x40028018u)
+#define PRESCALE REGISTER(0x4002801Cu)
+#define CLOCK_MHZ 25u
+#define TIMER_CTRL REGISTER(0x40000000u)
+#define TIMER_VALUE REGISTER(0x40000004u)
+#define TIMER_RELOAD REGISTER(0x40000008u)
+#define TIMER_CLEAR REGISTER(0x4000000Cu)
+#define LINE 0x40004000u
+#define PINS 0x40005000u
+#define UART_DATA 0x0u
+#define UART_STATE 0x4u
+#define UART_CTRL 0x8u
+#define UART_CLEAR 0xCu
+#define UART_BAUD 0x10u
+#define STATE_OUT_FULL 1u
+#define STATE_IN_FULL 2u
+#define NVIC_ENABLE REGISTER(0xE000E100u)
+#define NVIC_CLEAR REGISTER(0xE000E280u)
+#define IRQ_LINE (1u << 0)
+#define IRQ_TIMER (1u << 8)
+#define CPACR REGISTER(0xE000ED88u)
+#define EPOCH REGISTER(0x203FFFF0u)
+
+extern uint32_t data_load[], data_start[], data_end[], bss_start[], bss_end[], stack_top[];
+int main(void);
+void board_reset(void);
+
+static double jaws_mm = 8.3;
+static double suction_mbar;
+static bool shutter_open;
+
+void board_reset(void) {
+#ifdef __ARM_FP
+  CPACR |= 0xFu << 20;
+  __asm volatile("dsb\n isb");
+#endif
+  for (uint32_t *from = data_load, *to = data_start; to < data_end;) *to++ = *from++;
+  for (uint32_t *to = bss_start; to < bss_end;) *to++ = 0;
+  main();
+}
+
+static void halt(void) {
+  for (;;) {
+  }
+}
+
+__attribute__((section(".vectors"), used)) static void *const VECTORS[16] = {
+    stack_top, (void *)board_reset, (void *)halt, (void *)halt, (void *)halt, (void *)halt};
+
+static void put_byte(uint32_t uart, char byte) {
+  while (REGISTER(uart + UART_STATE) & STATE_OUT_FULL) {
+  }
+  REGISTER(uart + UART_DATA) = (uint8_t)byte;
+}
+
+static void show(const char *pin, double value) {
+  char data[64];
+  struct text text;
+  text_start(&text, data, sizeof data);
+  put_int(&text, board_now_us());
+  put_char(&text, ' ');
+  put_string(&text, pin);
+  put_char(&text, ' ');
+  put_real(&text, value, 3);
+  put_char(&text, '\n');
+  for (uint16_t k = 0; k < text.used; k++) put_byte(PINS, data[k]);
+}
+
+bool board_start(void) {
+  PRESCALE = CLOCK_MHZ - 1u; /* the counter is free-running: no tick can be missed */
+  for (uint32_t uart = LINE; uart <= PINS; uart += PINS - LINE) {
+    REGISTER(uart + UART_BAUD) = CLOCK_MHZ * 1000000u / 115200u;
+    REGISTER(uart + UART_CTRL) = uart == LINE ? 1u | 2u | 8u : 1u;
+  }
+  TIMER_RELOAD = TIMER_VALUE = CLOCK_MHZ * 1000u; /* wakes the processor each millisecond */
+  TIMER_CTRL = 1u | 8u;
+  __asm volatile("cpsid i");
+  NVIC_ENABLE = IRQ_LINE | IRQ_TIMER;
+  return true;
+}
+
+int64_t board_now_us(void) {
+  static uint32_t before;
+  static int64_t high;
+  uint32_t count = COUNTER;
+  if (count < before) high += INT64_C(1) << 32;
+  before = count;
+  return high | count;
+}
+
+bool board_read(char *byte) {
+  if (!(REGISTER(LINE + UART_STATE) & STATE_IN_FULL)) return false;
+  *byte = (char)REGISTER(LINE + UART_DATA);
+  return true;
+}
+
+void board_send(const char *data, uint16_t size) {
+  while (size--) put_byte(LINE, *data++);
+}
+
+uint16_t board_random_epoch(void) { return (uint16_t)EPOCH++; }
+
+/* Sleep until a byte or the next millisecond. */
+void board_feed_watchdog(void) {
+  __asm volatile("wfi");
+  TIMER_CLEAR = 1u;
+  REGISTER(LINE + UART_CLEAR) = 2u;
+  NVIC_CLEAR = IRQ_LINE | IRQ_TIMER;
+}
+
+bool board_stop_is_open(void) { return false; }
+void board_release_cameras(uint32_t mask) { show("camera", (double)mask); }
+
+bool board_set_led(uint16_t led, double level) {
+  char pin[8] = "led";
+  struct text text;
+  text_start(&text, pin, sizeof pin);
+  put_string(&text, "led");
+  put_int(&text, led);
+  if (level >= 0.0) show(pin, level);
+  return true;
+}
+
+bool board_pop(double power, uint16_t center_nm, uint16_t width_nm) {
+  (void)center_nm, (void)width_nm;
+  show("pop", power);
+  return true;
+}
+
+void board_turn(int32_t position) { show("turn", (double)position); }
+void board_start_jaws(double target_mm, bool back) { (void)target_mm, (void)back; }
+bool board_drive_jaws(double distance_mm) {
+  jaws_mm = distance_mm;
+  return distance_mm > 7.95 && distance_mm < 8.05;
+}
+void board_read_jaws(double *distance_mm, double *force_n) {
+  *distance_mm = jaws_mm;
+  *force_n = 0.0;
+}
+void board_hold_skin(bool hold) { show("hold", hold); }
+void board_move_shutter(bool open) {
+  if (open != shutter_open) show("shutter", open);
+  shutter_open = open;
+}
+bool board_shutter_is(bool open) { return open == shutter_open; }
+void board_set_suction(double mbar) {
+  suction_mbar = mbar;
+  show("suction", mbar);
+}
+bool board_gauge_mbar(double *mbar) {
+  *mbar = suction_mbar;
+  return true;
+}
+double board_camera_c(void) { return 5.0; }
