@@ -5,7 +5,7 @@ PYTEST := .venv/bin/python -m pytest
 # files in the order of tests/conftest.py, the longest first, not that of how many tests they have
 WORKERS := -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
-.PHONY: help setup browser demo test test-long lint docs bench clean
+.PHONY: help setup browser firmware demo test test-long lint docs bench clean
 
 help:
 	@echo "make demo       simulate, capture, calibrate, reconstruct, report (leaves ./demo)"
@@ -14,6 +14,7 @@ help:
 	@echo "make lint       ruff, mypy and the import contracts"
 	@echo "make docs       the documentation site, into ./site (open site/index.html)"
 	@echo "make browser    Chromium and what else the tests in a browser need (else they skip)"
+	@echo "make firmware   firmware of the boxes, and what emulates its microcontrollers (else those tests skip)"
 	@echo "make bench      error against run time of each stage"
 	@echo "each sets up what it needs in .venv first"
 
@@ -24,6 +25,9 @@ setup: .venv/.ready
 
 browser: .venv/.ready
 	@tools/setup_browser.sh
+
+firmware:
+	@tools/setup_firmware.sh
 
 demo: .venv/.ready
 	@$(SKINRIG) demo --out demo

@@ -7,6 +7,9 @@ import platform
 import sys
 from dataclasses import dataclass
 
+from capture.devices.checkup import judge_controller
+from capture.devices.port import Port
+
 
 @dataclass(frozen=True, slots=True)
 class InstallationCheck:
@@ -21,6 +24,7 @@ class InstallationCheck:
 
 FIX_KEY = "remedy"
 """Key of `InstallationCheck.fix` in the document skinrig.doctor/2."""
+_PROTOCOL = "compare the firmware with docs/reference/wire-protocol.md"
 _OTHER_NAMES = {
     "serial": "pyserial",
     "cv2": "opencv-contrib-python-headless",
@@ -46,6 +50,15 @@ _EXTRA_PACKAGES = {
     "playwright": "browser",
     "skfem": "fem",
 }
+
+
+def check_controller(url: str) -> list[InstallationCheck]:
+    """Judge the controller at a serial URL; nothing lights, moves or sucks."""
+    with Port(url) as port:
+        return [
+            InstallationCheck(found.what, found.state, found.fine, "" if found.fine else _PROTOCOL)
+            for found in judge_controller(port)
+        ]
 
 
 def check_installation(*, probe_renderer: bool = True) -> list[InstallationCheck]:

@@ -291,6 +291,22 @@ class Port:
         self.events.clear()
         return events
 
+    def exchange_raw(self, data: bytes, seconds: float) -> list[bytes]:
+        """Send bytes as they are and return the lines that came within `seconds`, for a test.
+
+        It returns after the first line; damaged lines are among them.
+        """
+        self._check_thread()
+        with self._translate_errors("write"):
+            self._serial.write(data)
+        lines: list[bytes] = []
+        end_s = self.clock.monotonic() + seconds
+        while not lines and self.clock.monotonic() < end_s:
+            with self._translate_errors("read"):
+                received = self._serial.read(max(1, self._serial.in_waiting))
+            lines += self._splitter.feed(received)
+        return lines
+
     def reopen(self, url: str | None = None) -> Hello:
         """Close the port, open it again (at `url` when given) and repeat hello."""
         self.close()

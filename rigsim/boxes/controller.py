@@ -27,6 +27,8 @@ from rigsim.boxes.command import (
 from rigsim.boxes.device import Device
 
 FIRMWARE_VERSION = "1.0"
+PROTOCOL_MINOR = 1
+"""Revision of the protocol's text; a controller without it in its limits is of revision 0."""
 MAX_CACHED_REPLIES = 8
 MAX_KEPT_ANSWER_BYTES = 160
 """Longest answer that is kept, newline included; only the limits are longer, and read anew."""
@@ -278,6 +280,7 @@ class Controller:
         table = {
             "kind": self.device.kind,
             "protocol": self._protocol,
+            "protocol_minor": PROTOCOL_MINOR,
             "lease_min_ms": LEASE_RANGE_MS[0],
             "lease_max_ms": LEASE_RANGE_MS[1],
             **self.device.capabilities(),

@@ -12,7 +12,7 @@ from skinrig.commands import completion
 from skinrig.commands.options import Json, command
 from skinrig.commands.renamed_options import FORMER_STAGES, replace_former_values
 from skinrig.console import Console, select_attributes
-from skinrig.doctor import FIX_KEY, check_installation
+from skinrig.doctor import FIX_KEY, check_controller, check_installation
 from skinrig.kernel_cache import set_passive_waiting
 
 BUDGET_S = 600.0
@@ -94,13 +94,20 @@ def bench(
         raise typer.Exit(errors.EXIT_LIMIT_MISSED)
 
 
-def doctor(json: Json = False) -> None:
+def doctor(
+    port: Annotated[
+        str, typer.Option(metavar="URL", help="judge the controller at this port instead")
+    ] = "",
+    json: Json = False,
+) -> None:
     """Check the installation: packages, renderer, threads and ports, and how to fix faults.
 
-    Example: skinrig doctor
+    With a port it judges the controller there: identity, clock, latency, lease and refusals.
+
+    Examples: skinrig doctor;  skinrig doctor --port /dev/ttyUSB0
     """
     console = Console(json)
-    findings = check_installation()
+    findings = check_controller(port) if port else check_installation()
     console.print_table(
         ("", "what", "state", "fix"),
         [("ok" if f.fine else "!!", f.what, f.state, f.fix) for f in findings],
@@ -108,4 +115,4 @@ def doctor(json: Json = False) -> None:
     rows = [{**select_attributes(f, "what", "state", "fine"), FIX_KEY: f.fix} for f in findings]
     console.print_document("skinrig.doctor/2", {"findings": rows})
     if not all(f.fine for f in findings):
-        raise typer.Exit(errors.EXIT_EXTRA_MISSING)
+        raise typer.Exit(errors.EXIT_DEVICE_FAILED if port else errors.EXIT_EXTRA_MISSING)
