@@ -312,6 +312,7 @@ COMMAND(do_flas_fire) {
     return code;
   }
   lamps_out();
+  core_update_clock();
   board_release_cameras(1);
   struct text token;
   text_start(&token, unit.token, sizeof unit.token);
@@ -371,6 +372,7 @@ COMMAND(get_flas_lamp) {
 
 COMMAND(do_cam_trig) {
   TRY(parse_token(arguments));
+  core_update_clock();
   board_release_cameras(1);
   put_string(answer, arguments);
   put_char(answer, ',');

@@ -276,6 +276,7 @@ COMMAND(do_trig) {
   struct text token;
   text_start(&token, unit.token, sizeof unit.token);
   put_string(&token, arguments);
+  core_update_clock();
   unit.run = RUN;
   unit.run_row = -1;
   unit.run_rows = unit.rows;
@@ -337,6 +338,7 @@ COMMAND(get_cam_mask) {
 COMMAND(do_cam_trig) {
   TRY(parse_token(arguments));
   TRY(refuse_running());
+  core_update_clock();
   board_release_cameras(unit.mask);
   put_string(answer, arguments);
   put_char(answer, ',');

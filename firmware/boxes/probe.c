@@ -443,6 +443,7 @@ static enum code open_shutter(int64_t span) {
     put_flash(reason(), P(" Ws"));
     return CODE_LIGHT_DOSE;
   }
+  core_update_clock();
   unit.number = ++kept.openings;
   unit.shutter = OPENING;
   unit.outcome = MADE_DARK;
@@ -537,6 +538,7 @@ COMMAND(get_fib) {
 
 COMMAND(do_cam_trig) {
   TRY(parse_token(arguments));
+  core_update_clock();
   board_release_cameras(1);
   put_string(answer, arguments);
   put_number(answer, core_clock_us());

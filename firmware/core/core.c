@@ -81,6 +81,10 @@ static const FLASH struct command COMMANDS[] = {BOX_COMMANDS(X)};
 static const FLASH char CAPABILITIES[] = BOX_CAPABILITIES;
 
 us_t core_now(void) { return core.now; }
+void core_update_clock(void) {
+  us_t now = board_now_us();
+  if (now > core.now) core.now = now;
+}
 us_t core_clock_us(void) { return core.now - core.powered_at; }
 us_t ceil_ms(us_t duration) { return -floor_divide(-duration, 1000); }
 double seconds_of(us_t duration) { return (double)duration / 1e6; }

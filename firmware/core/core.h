@@ -65,6 +65,7 @@ void core_handle_bare_line(char *line, uint16_t size);
 /* For boxes. */
 us_t core_now(void);
 us_t core_clock_us(void); /* since power-up */
+void core_update_clock(void); /* before an act that times others: parsing took time */
 /* Refuse with the text of a code and "; detail"; `reason` may be added to. */
 enum code refuse(enum code code, flash_text detail);
 struct text *reason(void);
