@@ -7,6 +7,7 @@ its limits as the text of SYST:CAP?, and the numbers that its code computes with
 written by hand, so that the firmware and the emulated box cannot drift apart.
 """
 
+# ruff: noqa: SLF001 - the numbers are those that the emulated boxes compute with
 import json
 from pathlib import Path
 
@@ -182,7 +183,8 @@ def limits_header(name: str, rig: Rig, faults: Faults = NO_FAULTS) -> str:
     box = reference_box(name, rig, faults)
     limits = box._get_capabilities("", 0.0).rpartition("*")[0]
     lines = [
-        f"/* Limits of the {name} box of rig {rig.name!r}: made by tools/make_firmware_limits.py. */",
+        f"/* Limits of the {name} box of rig {rig.name!r}.",
+        " * Made by tools/make_firmware_limits.py. */",
         "#ifndef FIRMWARE_LIMITS_H",
         "#define FIRMWARE_LIMITS_H",
         "",

@@ -102,9 +102,7 @@ def parse_number(text: str, low: float, high: float, unit: str) -> float:
     return value
 
 
-def parse_decimal(
-    text: str, low: float, high: float, unit: str, *, digits: int
-) -> int:
+def parse_decimal(text: str, low: float, high: float, unit: str, *, digits: int) -> int:
     """Parse the number of a command to whole multiples of ``10**-digits``, halves rounded up.
 
     The range is that of the number as it was sent.

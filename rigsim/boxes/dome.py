@@ -21,8 +21,8 @@ from rigsim.boxes.command import (
     CommandHandler,
     CommandRefused,
     build_command_table,
-    parse_integer,
     parse_decimal,
+    parse_integer,
 )
 from rigsim.boxes.device import Wiring
 from rigsim.boxes.led_sequencer import LED_RANGE_MS, LedSequencer, SequenceRun

@@ -23,7 +23,6 @@ from capture.devices.wire import Code
 from rigsim.boxes.controller import Controller
 from rigsim.world.serve import serve_world
 
-
 EMULATED_ONLY = {
     "test_controller_missing_any_rule_is_detected": "leaves rules of the emulation out",
     "test_answer_cache_is_queue_of_eight": "reads the emulated queue",

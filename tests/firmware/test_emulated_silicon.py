@@ -71,8 +71,8 @@ def test_each_shot_is_one_camera_edge_and_pop(flash):
         port.ask("SYST:ARM")
         port.ask(f"FLAS:FIRE shot.{shot}")
         port.listen(0.05)
+    port.ask("SAFE")
     with pytest.raises(CommandRefused) as caught:
-        port.ask("SAFE")
         port.ask("FLAS:FIRE unarmed")
     assert caught.value.code == Code.NOT_ARMED
     target.wait_for(lambda: len(rises(target, pin("pop"))) >= 4)

@@ -1,19 +1,28 @@
 """The firmware's limits are the rigs', its code is clean, and it behaves as the emulated boxes."""
 
-import shutil
+import os
 import subprocess
+import sys
 
 import pytest
-from fixtures.compiled.fuzzing import differences, texts_of
-from fixtures.compiled.library import COMPILER, FIRMWARE, SOURCES, build_library, load_tool
-from fixtures.product_code import text_of
+from fixtures.compiled.fuzzing import differences
+from fixtures.compiled.library import COMPILER, FIRMWARE, SOURCES, load_tool
+from fixtures.product_code import ROOT, text_of
 
-from rigsim.boxes.box_clock import add_us
 from rigsim.world.rig_boxes import BOXES
 
 MAX_BOARD_FUNCTIONS = 20
 MAX_LINES = 5000
-QUICK_LINES, LONG_LINES = 4000, 200_000
+QUICK_LINES = 2000
+LONG_LINES = int(os.environ.get("FIRMWARE_FUZZ_LINES", "12000"))
+SANITIZED = """
+from fixtures.compiled import fuzzing, library
+library.FLAGS += ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g")
+found, sent = fuzzing.differences("{name}", lines=1500, seed=5)
+assert found == [], found
+print(sent)
+"""
+"""A program that compares a box under the sanitizers of memory and of undefined behavior."""
 each_box = pytest.mark.parametrize("name", SOURCES)
 needs_cc = pytest.mark.skipif(COMPILER is None, reason="compiled firmware: no C compiler `cc`")
 
@@ -59,3 +68,23 @@ def test_firmware_answers_as_emulated_box_byte_for_byte(name):
 def test_firmware_answers_as_emulated_box_long_run(name):
     found, sent = differences(name, lines=LONG_LINES, seed=12)
     assert (found, sent) == ([], LONG_LINES)
+
+
+@needs_cc
+@pytest.mark.long
+@each_box
+def test_firmware_is_clean_under_sanitizers(name):
+    runtime = subprocess.run(
+        [COMPILER, "-print-file-name=libasan.so"], check=True, capture_output=True, text=True
+    ).stdout.strip()
+    if not os.path.isabs(runtime):
+        pytest.skip(f"compiled firmware: {COMPILER} has no libasan")
+    places = os.pathsep.join((str(ROOT), str(ROOT / "tests")))
+    more = {"LD_PRELOAD": runtime, "ASAN_OPTIONS": "detect_leaks=0", "PYTHONPATH": places}
+    done = subprocess.run(
+        [sys.executable, "-c", SANITIZED.format(name=name)],
+        env=os.environ | more,
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout.strip()) == (0, "1500"), done.stderr[-2000:]

@@ -10,7 +10,6 @@ from fixtures.compiled.fuzzing import differences
 from fixtures.compiled.library import COMPILER, FIRMWARE, build_library, load_tool
 from fixtures.product_code import ROOT, text_of
 
-
 with (ROOT / "tests/data/firmware_mutants.toml").open("rb") as file:
     MUTANTS = tomllib.load(file)["mutants"]
 LEAST = 30

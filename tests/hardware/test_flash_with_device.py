@@ -12,6 +12,9 @@ from capture.devices.wire import Code
 
 @pytest.fixture
 def box(device_port):
+    with Port(device_port) as port:
+        if port.hello().kind != "flash":
+            pytest.skip("another box than the flash")
     with FlashBox(Port(device_port)) as box:
         box.reset()
         yield box
@@ -55,9 +58,3 @@ def test_silent_host_leaves_controller_dark_and_disarmed(box):
     assert "WDOG:TRIP" in [event.name for event in events]
     assert not box.is_lamp_lit()
     assert not box.is_armed()
-
-
-def test_controller_clock_runs_at_host_rate(box):
-    before = box.ping()
-    box.port.listen(1.0)
-    assert box.ping() - before == pytest.approx(1.0, abs=0.1)

@@ -1,4 +1,5 @@
-/* Limits of the dome box of rig 'dome': made by tools/make_firmware_limits.py. */
+/* Limits of the dome box of rig 'dome'.
+ * Made by tools/make_firmware_limits.py. */
 #ifndef FIRMWARE_LIMITS_H
 #define FIRMWARE_LIMITS_H
 

@@ -1,4 +1,5 @@
-/* Limits of the flash box of rig 'flash': made by tools/make_firmware_limits.py. */
+/* Limits of the flash box of rig 'flash'.
+ * Made by tools/make_firmware_limits.py. */
 #ifndef FIRMWARE_LIMITS_H
 #define FIRMWARE_LIMITS_H
 

@@ -1,4 +1,5 @@
-/* Limits of the gradient_sphere box of rig 'gradient': made by tools/make_firmware_limits.py. */
+/* Limits of the gradient_sphere box of rig 'gradient'.
+ * Made by tools/make_firmware_limits.py. */
 #ifndef FIRMWARE_LIMITS_H
 #define FIRMWARE_LIMITS_H
 

@@ -1,4 +1,5 @@
-/* Limits of the probe box of rig 'probe': made by tools/make_firmware_limits.py. */
+/* Limits of the probe box of rig 'probe'.
+ * Made by tools/make_firmware_limits.py. */
 #ifndef FIRMWARE_LIMITS_H
 #define FIRMWARE_LIMITS_H
 

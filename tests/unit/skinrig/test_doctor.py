@@ -1,10 +1,13 @@
 import importlib.util
+import json
 import types
 
 import pytest
 
 from rigsim.mitsuba import variant
+from rigsim.world.serve import serve_world
 from skinrig import doctor
+from skinrig.cli import main
 
 
 @pytest.fixture
@@ -46,3 +49,12 @@ def test_renderer_of_sessions_is_reported(asked, renderer, monkeypatch):
     (finding,) = [one for one in doctor.check_installation() if one.what == "Mitsuba variant"]
     assert finding.state.endswith(f"renderer of sessions: {renderer}")
     assert ("apt-get install" in finding.fix) == (renderer == "fast")
+
+
+def test_port_is_judged_instead_of_installation(capsys):
+    with serve_world("flash", pty=True) as served:
+        status = main(["doctor", "--port", served.addresses["flash"], "--json"])
+    findings = json.loads(capsys.readouterr().out)["findings"]
+    assert status == 0
+    assert {finding["what"] for finding in findings} >= {"identity", "clock", "lease", "refusals"}
+    assert all(finding["fine"] for finding in findings)
