@@ -5,24 +5,19 @@ import dataclasses
 
 import numpy as np
 import pytest
-from fixtures.compiled.targets import TARGETS, start_dome_of, start_target
-from fixtures.operators import by_operator
+from fixtures.compiled.targets import TARGETS, start_target
 
 from capture.acquire import run_plan
 from capture.devices.camera import open_camera
 from capture.devices.checkup import CHECKS
-from capture.devices.dome import DomeBox
 from capture.devices.flash import FlashBox
 from capture.devices.port import CommandRefused, Port
 from capture.devices.wire import Code
 from capture.plan import flash_plan
-from capture.plan.dome import dome_plan
-from capture.plan.rows import step_lights
 from capture.rig import load_rig
 from capture.session import Session, SubjectRecord
 from rigsim.boxes.faults import Faults
 from rigsim.boxes.flash import FlashPop
-from rigsim.boxes.led_table import LedPulse
 from rigsim.world import World
 
 # pyserial leaves ports to the collector
@@ -191,89 +186,4 @@ def test_whole_session_is_captured_with_emulated_box(flash, tmp_path):
     edges = len(rises(target, pin("pop"))), len(rises(target, pin("camera")))
     assert edges == (lit, lit)  # dark frames are released by the host
     assert lit >= 4
-    session.release()
-
-
-class LightCounter:
-    """A scene whose pixels count the LEDs that were on, and name the last."""
-
-    def exposure(self, view_name, *, pops, exposure_s, seed):
-        image = np.full((16, 16), 64, np.uint16)
-        image[0, 0] += len(pops)
-        image[1, 0] = max((pop.led for pop in pops), default=0)
-        return image
-
-
-class PinnedDome(PinnedWorld):
-    """A world whose LEDs and cameras are those of a dome's pins."""
-
-    def __init__(self, rig, target):
-        self.world = World(rig, clock="real", scene=LightCounter(), faults=Faults(baud=0.0))
-        self.name = self.world.register("pins-dome")
-        self._lit = {}
-        self._offset_s = None
-        self.world.box("dome").device.light_now = self._light_now
-        target.on_edge = self._follow
-
-    def _follow(self, edge):
-        with self.world.lock:
-            if self._offset_s is None:
-                self._offset_s = self.world.now - edge.t_s
-            now = edge.t_s + self._offset_s
-            if edge.pin == "camera":
-                self.world._trigger(now, int(edge.value))
-            elif edge.pin.startswith("led"):
-                self._switch(int(edge.pin[3:]), edge.value, now)
-
-    def _switch(self, led, level, now):
-        if level > 0.0:
-            self._lit[led] = level, now
-        elif led in self._lit:
-            before, since = self._lit.pop(led)
-            self.world._light.add(LedPulse(led, before, since, now))
-
-    def _light_now(self, now):
-        lit = self._lit.items()
-        return [LedPulse(led, level, since, max(now, since)) for led, (level, since) in lit]
-
-
-def test_whole_session_is_captured_with_emulated_dome(tmp_path):
-    dome = load_rig("dome")
-    lights = [light.name for light in dome.lights[:12]]
-    rig = dome.subset(lights=lights, views=["C00", "C05"]).resized(16)
-    plan = dome_plan(rig, tracking_interval=10)
-    target = start_dome_of(rig, tmp_path)
-    pinned = PinnedDome(rig, target)
-    session = Session.create(
-        tmp_path / "s",
-        plan=plan,
-        rig=rig,
-        devices={},
-        subject=SubjectRecord("p"),
-        source="simulated",
-        seed=7,
-    )
-    cameras = {view.name: open_camera(f"sim://{pinned.name}/{view.name}") for view in rig.views}
-    with contextlib.closing(target), DomeBox(Port(target.url, timeout_s=0.5)) as box:
-        run_plan(
-            plan,
-            rig,
-            boxes={"dome": box},
-            cameras=cameras,
-            session=session,
-            **by_operator({"eyes": "closed"}),
-        )
-    for camera in cameras.values():
-        camera.close()
-    pinned.world.unregister()
-    assert session.pending_frames() == []
-    numbers = {light.name: number for number, light in enumerate(rig.lights)}
-    for record in session.frames():
-        names = step_lights(record.step)
-        cfa = session.read(record).cfa
-        assert cfa[0, 0] - 64 == len(names), record.step_id
-        if names:
-            assert cfa[1, 0] == max(numbers[name] for name in names)
-    steps = [step for step in plan.steps if step_lights(step)]
-    assert len(target.of_pin("camera")) >= len(steps) > 20
     session.release()
