@@ -7,9 +7,6 @@ import platform
 import sys
 from dataclasses import dataclass
 
-from capture.devices.checkup import judge_controller
-from capture.devices.port import Port
-
 
 @dataclass(frozen=True, slots=True)
 class InstallationCheck:
@@ -54,6 +51,9 @@ _EXTRA_PACKAGES = {
 
 def check_controller(url: str) -> list[InstallationCheck]:
     """Judge the controller at a serial URL; nothing lights, moves or sucks."""
+    from capture.devices.checkup import judge_controller
+    from capture.devices.port import Port
+
     with Port(url) as port:
         return [
             InstallationCheck(found.what, found.state, found.fine, "" if found.fine else _PROTOCOL)

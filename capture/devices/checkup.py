@@ -22,7 +22,7 @@ MAX_CLOCK_ERROR = 0.01
 CLOCK_SPAN_S = 2.0
 MAX_LATENCY_S = 0.25
 """A host repeats its request after this time, s."""
-PINGS = 30
+PING_COUNT = 30
 SLACK_S = 0.2
 _UNARMED: Final = {
     "flash": "FLAS:FIRE checkup",
@@ -102,7 +102,7 @@ def _ping(port: Port) -> tuple[float, float, float]:
 
 def check_latency(port: Port) -> str:
     """Measure the time of an answer; a host repeats its request when it takes too long."""
-    spans_s = [_ping(port)[2] for _ in range(PINGS)]
+    spans_s = [_ping(port)[2] for _ in range(PING_COUNT)]
     middle_s = statistics.median(spans_s)
     CheckupFault.raise_unless(middle_s < MAX_LATENCY_S, "latency", middle_s, "less than 0.25 s")
     return f"median {1e3 * middle_s:.1f} ms, longest {1e3 * max(spans_s):.1f} ms"
@@ -201,7 +201,7 @@ def check_stop(port: Port) -> str:
     return "open" if int(port.ask("STAT?")) & 256 else "closed"
 
 
-CHECKS: Final[dict[str, Callable[[Port], str]]] = {
+CONTROLLER_CHECKS: Final[dict[str, Callable[[Port], str]]] = {
     "identity": check_identity,
     "limits": check_limits,
     "latency": check_latency,
@@ -220,11 +220,11 @@ def judge_controller(port: Port) -> list[CheckupResult]:
     Raises
     ------
     DeviceError
-        When there is no controller at the other end.
+        When nothing answers at the other end.
     """
     port.hello()
     results = []
-    for what, check in CHECKS.items():
+    for what, check in CONTROLLER_CHECKS.items():
         try:
             results.append(CheckupResult(what, check(port), fine=True))
         except (CheckupFault, DeviceError) as fault:

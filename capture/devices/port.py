@@ -241,7 +241,7 @@ class Port:
         self._check_thread()
         if self.boot == wire.UNKNOWN_BOOT:
             raise BoxRebooted(
-                f"{self.url}: the epoch of the controller is not known; call hello() first"
+                f"{self.url}: the controller's epoch is not known; call hello() first"
             )
         reply = self._exchange(text, attempts=1 + self._retries, knock=False)
         if reply.code != Code.OK:
@@ -285,26 +285,20 @@ class Port:
         """Listen to the line for `seconds` and return the events that came, oldest first."""
         self._check_thread()
         for frame in self._received(seconds):
-            # an answer to no pending request is stale
-            self.statistics.stale += isinstance(frame, Reply)
+            self.statistics.stale += isinstance(frame, Reply)  # to no pending request
         events = list(self.events)
         self.events.clear()
         return events
 
     def exchange_raw(self, data: bytes, seconds: float) -> list[bytes]:
-        """Send bytes as they are and return the lines that came within `seconds`, for a test.
-
-        It returns after the first line; damaged lines are among them.
-        """
+        """Send bytes as they are; return the first lines that come within `seconds`, for a test."""
         self._check_thread()
-        with self._translate_errors("write"):
-            self._serial.write(data)
         lines: list[bytes] = []
         end_s = self.clock.monotonic() + seconds
-        while not lines and self.clock.monotonic() < end_s:
-            with self._translate_errors("read"):
-                received = self._serial.read(max(1, self._serial.in_waiting))
-            lines += self._splitter.feed(received)
+        with self._translate_errors("exchange bytes"):
+            self._serial.write(data)
+            while not lines and self.clock.monotonic() < end_s:
+                lines += self._splitter.feed(self._serial.read(max(1, self._serial.in_waiting)))
         return lines
 
     def reopen(self, url: str | None = None) -> Hello:

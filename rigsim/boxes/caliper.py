@@ -23,12 +23,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from capture.devices.wire import Code
-from rigsim.boxes.box_clock import add_us, elapsed_s, elapsed_us
 from rigsim.boxes.command import (
     Command,
     CommandHandler,
     CommandRefused,
+    add_us,
     build_command_table,
+    elapsed_s,
+    elapsed_us,
     parse_decimal,
 )
 from rigsim.boxes.device import Device, Wiring

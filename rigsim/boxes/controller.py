@@ -15,13 +15,15 @@ import numpy as np
 
 from capture.devices import wire
 from capture.devices.wire import Code, Event, Reply, Request
-from rigsim.boxes.box_clock import add_us, elapsed_us, on_clock
 from rigsim.boxes.command import (
     Command,
     CommandHandler,
     CommandRefused,
     PendingReply,
+    add_us,
     build_command_table,
+    elapsed_us,
+    on_clock,
     parse_number,
 )
 from rigsim.boxes.device import Device
@@ -31,7 +33,7 @@ PROTOCOL_MINOR = 1
 """Revision of the protocol's text; a controller without it in its limits is of revision 0."""
 MAX_CACHED_REPLIES = 8
 MAX_KEPT_ANSWER_BYTES = 160
-"""Longest answer that is kept, newline included; only the limits are longer, and read anew."""
+"""Longest answer that is kept, newline included; only the limits are longer, and are made again."""
 MAX_QUEUED_ERRORS = 16
 CAPABILITY_CHUNK_CHARS = 48
 """Characters of the limits per line: a short line survives a bad cable."""

@@ -10,8 +10,7 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import Rig
-from rigsim.boxes.box_clock import elapsed_us, on_clock
-from rigsim.boxes.command import Command, CommandRefused, parse_token
+from rigsim.boxes.command import Command, CommandRefused, elapsed_us, on_clock, parse_token
 from rigsim.boxes.faults import NO_FAULTS, Faults
 
 STATUS_INTERLOCK = 256

@@ -15,11 +15,11 @@ from collections.abc import Sequence
 
 from capture.devices.wire import Code
 from rigsim.boxes import led_table
-from rigsim.boxes.box_clock import add_us
 from rigsim.boxes.command import (
     Command,
     CommandHandler,
     CommandRefused,
+    add_us,
     build_command_table,
     parse_decimal,
     parse_integer,

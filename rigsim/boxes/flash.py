@@ -20,16 +20,20 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from capture.devices.wire import Code
-from rigsim.boxes.box_clock import add_us, ceil_ms, elapsed_s, elapsed_us, rotation_us
 from rigsim.boxes.command import (
     Command,
     CommandHandler,
     CommandRefused,
     PendingReply,
+    add_us,
     build_command_table,
+    ceil_ms,
+    elapsed_s,
+    elapsed_us,
     parse_choice,
     parse_decimal,
     parse_token,
+    rotation_us,
 )
 from rigsim.boxes.device import Device, Wiring
 

@@ -21,15 +21,18 @@ import numpy as np
 
 from capture.devices.wire import Code
 from rigsim.boxes import led_table
-from rigsim.boxes.box_clock import add_us, ceil_ms, elapsed_us, rotation_us
 from rigsim.boxes.command import (
     Command,
     CommandHandler,
     CommandRefused,
+    add_us,
     build_command_table,
+    ceil_ms,
+    elapsed_us,
     parse_choice,
     parse_decimal,
     parse_integer,
+    rotation_us,
 )
 from rigsim.boxes.device import Wiring
 from rigsim.boxes.led_sequencer import LED_RANGE_MS, LedSequencer, SequenceRun

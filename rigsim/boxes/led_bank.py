@@ -8,8 +8,7 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import LedLimits, Rig
-from rigsim.boxes.box_clock import add_us, elapsed_s, elapsed_us
-from rigsim.boxes.command import CommandRefused
+from rigsim.boxes.command import CommandRefused, add_us, elapsed_s, elapsed_us
 from rigsim.boxes.faults import Faults
 from rigsim.boxes.led_table import LedPulse
 

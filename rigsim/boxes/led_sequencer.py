@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from capture.devices.wire import Code
-from rigsim.boxes.box_clock import add_us
 from rigsim.boxes.command import (
     Command,
     CommandHandler,
     CommandRefused,
+    add_us,
     build_command_table,
     parse_choice,
     parse_integer,

@@ -12,8 +12,7 @@ from capture.devices.wire import Code
 from capture.plan.steps import LIGHT_PATTERNS
 from capture.rig import Light
 from rigsim.arrays import Float64Array
-from rigsim.boxes.box_clock import add_us, rotation_us
-from rigsim.boxes.command import CommandRefused, parse_number
+from rigsim.boxes.command import CommandRefused, add_us, parse_number, rotation_us
 
 LEVEL_STEPS = 1000
 ROW_RANGE_US = (2_000, 500_000)

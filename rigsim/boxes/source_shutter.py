@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 from capture.devices.wire import Code
 from capture.rig import LedLimits
-from rigsim.boxes.box_clock import add_us, ceil_ms, elapsed_s, elapsed_us
-from rigsim.boxes.command import CommandRefused
+from rigsim.boxes.command import CommandRefused, add_us, ceil_ms, elapsed_s, elapsed_us
 from rigsim.boxes.device import Device, Wiring
 
 LEVEL_STEPS = 1000

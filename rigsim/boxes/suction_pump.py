@@ -13,8 +13,7 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import Probe
-from rigsim.boxes.box_clock import add_us, ceil_ms, elapsed_us
-from rigsim.boxes.command import CommandRefused
+from rigsim.boxes.command import CommandRefused, add_us, ceil_ms, elapsed_us
 from rigsim.boxes.device import Device, SuctionLoad
 from rigsim.boxes.source_shutter import SourceShutter
 

@@ -9,7 +9,7 @@ from fixtures.compiled.targets import TARGETS, start_target
 
 from capture.acquire import run_plan
 from capture.devices.camera import open_camera
-from capture.devices.checkup import CHECKS
+from capture.devices.checkup import CONTROLLER_CHECKS
 from capture.devices.flash import FlashBox
 from capture.devices.port import CommandRefused, Port
 from capture.devices.wire import Code
@@ -42,11 +42,11 @@ def running(request):
         yield target, port
 
 
-@pytest.mark.parametrize("check", CHECKS)
+@pytest.mark.parametrize("check", CONTROLLER_CHECKS)
 def test_image_passes_check_of_hardware(running, check):
     _, port = running
     port.hello()
-    assert CHECKS[check](port)
+    assert CONTROLLER_CHECKS[check](port)
 
 
 @pytest.fixture(params=["posix", "mega2560", "mps2-an385"])

@@ -5,7 +5,7 @@ Nothing lights, moves or sucks here; what does is in test_flash_with_device.py.
 
 import pytest
 
-from capture.devices.checkup import CHECKS
+from capture.devices.checkup import CONTROLLER_CHECKS
 from capture.devices.port import Port
 
 QUIET = {
@@ -25,9 +25,9 @@ def port(device_port):
         yield port
 
 
-@pytest.mark.parametrize("check", CHECKS)
+@pytest.mark.parametrize("check", CONTROLLER_CHECKS)
 def test_controller_passes_check(port, check):
-    assert CHECKS[check](port)
+    assert CONTROLLER_CHECKS[check](port)
 
 
 def test_setting_is_kept_until_reset(port):

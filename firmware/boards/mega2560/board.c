@@ -27,8 +27,8 @@
 #define PIN_JAW_DIRECTION 3 /* PC3, D34 */
 /* PORTL: inputs with pull-ups */
 #define PIN_STOP 0      /* PL0, D49: emergency stop, low is closed */
-#define PIN_LIGHT_FAULT 1 /* PL1, D48: low is no current */
-#define PIN_POP_FAULT 2 /* PL2, D47: low is no ignition */
+#define PIN_LIGHT_FAULT 1 /* PL1, D48: low reports a missing current */
+#define PIN_POP_FAULT 2 /* PL2, D47: low reports a missing ignition */
 #define PIN_HOME 3      /* PL3, D46: home mark, low is seen */
 #define PIN_BLADES_OPEN 4 /* PL4, D45: blades' sensor, low is open */
 /* analog: A0 force, A1 gauge, A2 temperature; level: OC4A (PH3, D6), suction OC4B (PH4, D7) */

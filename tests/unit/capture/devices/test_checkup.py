@@ -6,7 +6,12 @@ import json
 import pytest
 
 from capture.devices import wire
-from capture.devices.checkup import CHECKS, CheckupFault, judge_controller, protocol_minor
+from capture.devices.checkup import (
+    CONTROLLER_CHECKS,
+    CheckupFault,
+    judge_controller,
+    protocol_minor,
+)
 from capture.devices.flash import FlashBox
 from capture.devices.port import Port, WrongDevice
 from capture.rig import load_rig
@@ -39,7 +44,7 @@ def serve():
 @pytest.mark.parametrize("kind", BOXES)
 def test_emulated_controllers_pass_all_checks(serve, kind):
     results = judge_controller(serve(kind))
-    assert [result.what for result in results] == list(CHECKS)
+    assert [result.what for result in results] == list(CONTROLLER_CHECKS)
     assert all(result.fine for result in results), results
 
 
@@ -88,7 +93,7 @@ def test_broken_rule_is_named_by_its_check(serve, monkeypatch, break_rule, check
     port = serve()
     port.hello()
     with pytest.raises(CheckupFault, match="expected"):
-        CHECKS[check](port)
+        CONTROLLER_CHECKS[check](port)
 
 
 # versions --------------------------------------------------------------------------------------
