@@ -51,10 +51,9 @@ _EXTRA_PACKAGES = {
 
 def check_controller(url: str) -> list[InstallationCheck]:
     """Judge the controller at a serial URL; nothing lights, moves or sucks."""
-    from capture.devices.checkup import judge_controller
-    from capture.devices.port import Port
+    from capture.devices.checkup import CheckupPort, judge_controller
 
-    with Port(url) as port:
+    with CheckupPort(url) as port:
         return [
             InstallationCheck(found.what, found.state, found.fine, "" if found.fine else _PROTOCOL)
             for found in judge_controller(port)

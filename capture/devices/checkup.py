@@ -34,6 +34,21 @@ _UNARMED: Final = {
 """By kind, a command that is refused unless armed."""
 
 
+class CheckupPort(Port):
+    """A port that can also send what is not a request."""
+
+    def exchange_raw(self, data: bytes, seconds: float) -> list[bytes]:
+        """Send bytes as they are and return the first lines that come within `seconds`."""
+        self._check_thread()
+        lines: list[bytes] = []
+        end_s = self.clock.monotonic() + seconds
+        with self._translate_errors("exchange bytes"):
+            self._serial.write(data)
+            while not lines and self.clock.monotonic() < end_s:
+                lines += self._splitter.feed(self._serial.read(max(1, self._serial.in_waiting)))
+        return lines
+
+
 class CheckupFault(Exception):
     """A controller that breaks a rule of the protocol."""
 
@@ -67,7 +82,7 @@ def protocol_minor(limits: dict[str, object]) -> int:
     return minor if isinstance(minor, int) else 0
 
 
-def check_identity(port: Port) -> str:
+def check_identity(port: CheckupPort) -> str:
     """Compare the two names that a controller gives itself."""
     hello = port.hello()
     maker, *rest = port.ask("*IDN?").split(",")
@@ -78,7 +93,7 @@ def check_identity(port: Port) -> str:
     return f"{hello.kind} {hello.serial}, {rest[0]}, firmware {hello.firmware}"
 
 
-def check_limits(port: Port) -> str:
+def check_limits(port: CheckupPort) -> str:
     """Read the limits in parts and as a whole, and compare version and lease."""
     limits = port.capabilities()
     CheckupFault.raise_unless(
@@ -92,7 +107,7 @@ def check_limits(port: Port) -> str:
     return f"protocol {wire.PROTOCOL_VERSION}.{protocol_minor(limits)}, {len(limits)} limits"
 
 
-def _ping(port: Port) -> tuple[float, float, float]:
+def _ping(port: CheckupPort) -> tuple[float, float, float]:
     """Return the controller's clock, the host's clock in the middle of the query, and its time."""
     start_s = time.monotonic()
     clock_s = int(port.ask("SYST:PING?")) / 1e6
@@ -100,7 +115,7 @@ def _ping(port: Port) -> tuple[float, float, float]:
     return clock_s, 0.5 * (start_s + end_s), end_s - start_s
 
 
-def check_latency(port: Port) -> str:
+def check_latency(port: CheckupPort) -> str:
     """Measure the time of an answer; a host repeats its request when it takes too long."""
     spans_s = [_ping(port)[2] for _ in range(PING_COUNT)]
     middle_s = statistics.median(spans_s)
@@ -108,7 +123,7 @@ def check_latency(port: Port) -> str:
     return f"median {1e3 * middle_s:.1f} ms, longest {1e3 * max(spans_s):.1f} ms"
 
 
-def check_clock(port: Port) -> str:
+def check_clock(port: CheckupPort) -> str:
     """Compare the rates of the controller's clock and of the host's within 1 %.
 
     Of several queries the quickest counts: its time is known best.
@@ -134,7 +149,7 @@ def _code(port: Port, text: str) -> int:
     return int(Code.OK)
 
 
-def check_refusals(port: Port) -> str:
+def check_refusals(port: CheckupPort) -> str:
     """Send what must be refused, framed, damaged, foreign, repeated and bare."""
     kind = port.hello().kind
     port.ask("SAFE")
@@ -170,7 +185,7 @@ def check_refusals(port: Port) -> str:
     return f"{len(expected) + 5} refused as specified"
 
 
-def check_retries(port: Port) -> str:
+def check_retries(port: CheckupPort) -> str:
     """Send one frame twice: the answer is the same, and the clock in it has not moved."""
     frame = wire.encode(Request(11, port.boot, "SYST:PING?"))
     answers = [port.exchange_raw(frame, SLACK_S) for _ in range(2)]
@@ -180,7 +195,7 @@ def check_retries(port: Port) -> str:
     return "a repeated frame gets its first answer"
 
 
-def check_lease(port: Port) -> str:
+def check_lease(port: CheckupPort) -> str:
     """Arm, fall silent, and find the controller disarmed by itself."""
     lease_ms = LEASE_RANGE_MS[0]
     port.ask(f"SYST:WDOG {lease_ms}")
@@ -196,12 +211,12 @@ def check_lease(port: Port) -> str:
     return f"disarmed itself after {lease_ms} ms, and at SAFE"
 
 
-def check_stop(port: Port) -> str:
+def check_stop(port: CheckupPort) -> str:
     """Report the emergency stop; a person opens and closes it for the bring-up."""
     return "open" if int(port.ask("STAT?")) & 256 else "closed"
 
 
-CONTROLLER_CHECKS: Final[dict[str, Callable[[Port], str]]] = {
+CONTROLLER_CHECKS: Final[dict[str, Callable[[CheckupPort], str]]] = {
     "identity": check_identity,
     "limits": check_limits,
     "latency": check_latency,
@@ -214,7 +229,7 @@ CONTROLLER_CHECKS: Final[dict[str, Callable[[Port], str]]] = {
 """What is judged, in order."""
 
 
-def judge_controller(port: Port) -> list[CheckupResult]:
+def judge_controller(port: CheckupPort) -> list[CheckupResult]:
     """Run all checks on an open port and return their results; it is disarmed at the end.
 
     Raises
@@ -234,13 +249,13 @@ def judge_controller(port: Port) -> list[CheckupResult]:
 
 
 def _require_frame(
-    port: Port, data: bytes, fits: Callable[[object], bool], expected: object
+    port: CheckupPort, data: bytes, fits: Callable[[object], bool], expected: object
 ) -> None:
     frames = [wire.decode(line) for line in port.exchange_raw(data, SLACK_S)]
     CheckupFault.raise_unless(any(map(fits, frames)), repr(data), frames, expected)
 
 
-def _require_code(port: Port, data: bytes, code: Code) -> None:
+def _require_code(port: CheckupPort, data: bytes, code: Code) -> None:
     _require_frame(
         port, data, lambda frame: isinstance(frame, Reply) and frame.code == code, int(code)
     )

@@ -241,7 +241,7 @@ class Port:
         self._check_thread()
         if self.boot == wire.UNKNOWN_BOOT:
             raise BoxRebooted(
-                f"{self.url}: the controller's epoch is not known; call hello() first"
+                f"{self.url}: the epoch of the controller is not known; call hello() first"
             )
         reply = self._exchange(text, attempts=1 + self._retries, knock=False)
         if reply.code != Code.OK:
@@ -285,21 +285,11 @@ class Port:
         """Listen to the line for `seconds` and return the events that came, oldest first."""
         self._check_thread()
         for frame in self._received(seconds):
-            self.statistics.stale += isinstance(frame, Reply)  # to no pending request
+            # an answer to no pending request is stale
+            self.statistics.stale += isinstance(frame, Reply)
         events = list(self.events)
         self.events.clear()
         return events
-
-    def exchange_raw(self, data: bytes, seconds: float) -> list[bytes]:
-        """Send bytes as they are; return the first lines that come within `seconds`, for a test."""
-        self._check_thread()
-        lines: list[bytes] = []
-        end_s = self.clock.monotonic() + seconds
-        with self._translate_errors("exchange bytes"):
-            self._serial.write(data)
-            while not lines and self.clock.monotonic() < end_s:
-                lines += self._splitter.feed(self._serial.read(max(1, self._serial.in_waiting)))
-        return lines
 
     def reopen(self, url: str | None = None) -> Hello:
         """Close the port, open it again (at `url` when given) and repeat hello."""

@@ -9,7 +9,7 @@ from fixtures.compiled.targets import TARGETS, start_target
 
 from capture.acquire import run_plan
 from capture.devices.camera import open_camera
-from capture.devices.checkup import CONTROLLER_CHECKS
+from capture.devices.checkup import CONTROLLER_CHECKS, CheckupPort
 from capture.devices.flash import FlashBox
 from capture.devices.port import CommandRefused, Port
 from capture.devices.wire import Code
@@ -36,7 +36,7 @@ BUSY_SLACK_S = 0.1
 @pytest.fixture(scope="module", params=BOARDS, ids=lambda pair: "-".join(pair))
 def running(request):
     target = start_target(*request.param)
-    with contextlib.closing(target), Port(target.url, timeout_s=0.5) as port:
+    with contextlib.closing(target), CheckupPort(target.url, timeout_s=0.5) as port:
         hello = port.hello()
         assert hello.kind == request.param[1]
         yield target, port
@@ -54,7 +54,7 @@ def flash(request):
     target = start_target(request.param, "flash")
     names = {"mega2560": {"camera": "A0", "pop": "A1", "light": "A3"}}
     names = names.get(request.param, {})
-    with contextlib.closing(target), Port(target.url, timeout_s=0.5) as port:
+    with contextlib.closing(target), CheckupPort(target.url, timeout_s=0.5) as port:
         port.hello()
         yield target, port, lambda pin: names.get(pin, pin)
 
@@ -102,7 +102,7 @@ def test_killed_host_leaves_lamp_dark_within_lease(flash):
 
 def test_dome_steps_release_cameras_once_a_row():
     target = start_target("mps2-an500", "dome")
-    with contextlib.closing(target), Port(target.url, timeout_s=0.5) as port:
+    with contextlib.closing(target), CheckupPort(target.url, timeout_s=0.5) as port:
         port.hello()
         rows = 12
         port.ask("SAFE:EYES CLOSED")

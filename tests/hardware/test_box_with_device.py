@@ -5,8 +5,7 @@ Nothing lights, moves or sucks here; what does is in test_flash_with_device.py.
 
 import pytest
 
-from capture.devices.checkup import CONTROLLER_CHECKS
-from capture.devices.port import Port
+from capture.devices.checkup import CONTROLLER_CHECKS, CheckupPort
 
 QUIET = {
     "flash": ("FLAS:POW 0.5", "FLAS:POW?", "0.50000000"),
@@ -20,7 +19,7 @@ QUIET = {
 
 @pytest.fixture
 def port(device_port):
-    with Port(device_port) as port:
+    with CheckupPort(device_port) as port:
         port.hello()
         yield port
 

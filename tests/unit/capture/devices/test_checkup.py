@@ -32,7 +32,7 @@ def serve():
     def serve(kind="flash", **faults):
         rig = load_rig(BOXES[kind].rig)
         served = serve_world(rig, pty=True, faults=Faults(baud=0.0, **faults))
-        port = Port(served.addresses[kind])
+        port = CheckupPort(served.addresses[kind])
         opened.extend((served, port))
         return port
 
