@@ -9,6 +9,7 @@ from capture.devices import wire
 from capture.devices.checkup import (
     CONTROLLER_CHECKS,
     CheckupFault,
+    CheckupPort,
     judge_controller,
     protocol_minor,
 )
