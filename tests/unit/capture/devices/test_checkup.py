@@ -42,7 +42,10 @@ def serve():
         one.close()
 
 
-@pytest.mark.parametrize("kind", BOXES)
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(kind, marks=() if kind == "flash" else pytest.mark.long) for kind in BOXES],
+)
 def test_emulated_controllers_pass_all_checks(serve, kind):
     results = judge_controller(serve(kind))
     assert [result.what for result in results] == list(CONTROLLER_CHECKS)
