@@ -52,7 +52,7 @@ def test_image_passes_check_of_hardware(running, check):
 @pytest.fixture(params=["posix", "mega2560", "mps2-an385"])
 def flash(request):
     target = start_target(request.param, "flash")
-    names = {"mega2560": {"camera": "A0", "pop": "A1", "light": "A3"}}
+    names = {"mega2560": {"camera": "A0", "pop": "A1", "led0": "A3"}}
     names = names.get(request.param, {})
     with contextlib.closing(target), CheckupPort(target.url, timeout_s=0.5) as port:
         port.hello()
@@ -86,7 +86,7 @@ def test_each_shot_is_one_camera_edge_and_pop(flash):
 
 def test_killed_host_leaves_lamp_dark_within_lease(flash):
     target, port, pin = flash
-    light = "A3" if pin("light") == "A3" else "led0" if "mps2" in target.board else "light"
+    light = pin("led0")
     port.ask(f"SYST:WDOG {round(1e3 * LEASE_S)}")
     port.ask("SYST:ARM")
     port.ask("FLAS:LAMP ON,500")

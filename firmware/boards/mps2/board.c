@@ -4,7 +4,7 @@
  * The hardware behind the pins is ideal. An epoch is loaded into memory before the start.
  */
 #include "boards/board.h"
-#include "core/text.h"
+#include "boards/ideal.h"
 
 #define REGISTER(address) (*(volatile uint32_t *)(address))
 #define COUNTER REGISTER(0x40028018u)
@@ -34,10 +34,6 @@ extern uint32_t data_load[], data_start[], data_end[], bss_start[], bss_end[], s
 int main(void);
 void board_reset(void);
 
-static double jaws_mm = 8.3;
-static double suction_mbar;
-static bool shutter_open;
-
 void board_reset(void) {
 #ifdef __ARM_FP
   CPACR |= 0xFu << 20;
@@ -62,16 +58,11 @@ static void put_byte(uint32_t uart, char byte) {
   REGISTER(uart + UART_DATA) = (uint8_t)byte;
 }
 
-static void show(const char *pin, double value) {
+void show_pin(const char *pin, double value) {
   char data[64];
   struct text text;
   text_start(&text, data, sizeof data);
-  put_int(&text, board_now_us());
-  put_char(&text, ' ');
-  put_string(&text, pin);
-  put_char(&text, ' ');
-  put_real(&text, value, 3);
-  put_char(&text, '\n');
+  format_pin(&text, pin, value);
   for (uint16_t k = 0; k < text.used; k++) put_byte(PINS, data[k]);
 }
 
@@ -116,48 +107,3 @@ void board_feed_watchdog(void) {
   REGISTER(LINE + UART_CLEAR) = 2u;
   NVIC_CLEAR = IRQ_LINE | IRQ_TIMER;
 }
-
-bool board_stop_is_open(void) { return false; }
-void board_release_cameras(uint32_t mask) { show("camera", (double)mask); }
-
-bool board_set_led(uint16_t led, double level) {
-  char pin[8] = "led";
-  struct text text;
-  text_start(&text, pin, sizeof pin);
-  put_string(&text, "led");
-  put_int(&text, led);
-  if (level >= 0.0) show(pin, level);
-  return true;
-}
-
-bool board_pop(double power, uint16_t center_nm, uint16_t width_nm) {
-  (void)center_nm, (void)width_nm;
-  show("pop", power);
-  return true;
-}
-
-void board_turn(int32_t position) { show("turn", (double)position); }
-void board_start_jaws(double target_mm, bool back) { (void)target_mm, (void)back; }
-bool board_drive_jaws(double distance_mm) {
-  jaws_mm = distance_mm;
-  return distance_mm > 7.95 && distance_mm < 8.05;
-}
-void board_read_jaws(double *distance_mm, double *force_n) {
-  *distance_mm = jaws_mm;
-  *force_n = 0.0;
-}
-void board_hold_skin(bool hold) { show("hold", hold); }
-void board_move_shutter(bool open) {
-  if (open != shutter_open) show("shutter", open);
-  shutter_open = open;
-}
-bool board_shutter_is(bool open) { return open == shutter_open; }
-void board_set_suction(double mbar) {
-  suction_mbar = mbar;
-  show("suction", mbar);
-}
-bool board_gauge_mbar(double *mbar) {
-  *mbar = suction_mbar;
-  return true;
-}
-double board_camera_c(void) { return 5.0; }

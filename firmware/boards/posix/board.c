@@ -4,6 +4,7 @@
  */
 #define _XOPEN_SOURCE 600
 #include "boards/board.h"
+#include "boards/ideal.h"
 
 #include <fcntl.h>
 #include <poll.h>
@@ -14,12 +15,13 @@
 #include <unistd.h>
 
 static int terminal;
-static double jaws_mm = 8.3;
-static double suction_mbar;
-static bool shutter_open;
 
-static void show(const char *pin, double value) {
-  printf("%lld %s %g\n", (long long)board_now_us(), pin, value);
+void show_pin(const char *pin, double value) {
+  char data[64];
+  struct text text;
+  text_start(&text, data, sizeof data);
+  format_pin(&text, pin, value);
+  fputs(data, stdout);
   fflush(stdout);
 }
 
@@ -72,39 +74,3 @@ uint16_t board_random_epoch(void) {
 }
 
 void board_feed_watchdog(void) {}
-bool board_stop_is_open(void) { return false; }
-void board_release_cameras(uint32_t mask) { show("camera", mask); }
-bool board_set_led(uint16_t led, double level) {
-  if (level >= 0.0) show(led ? "led" : "light", level);
-  return true;
-}
-bool board_pop(double power, uint16_t center_nm, uint16_t width_nm) {
-  (void)center_nm, (void)width_nm;
-  show("pop", power);
-  return true;
-}
-void board_turn(int32_t position) { show("turn", position); }
-void board_start_jaws(double target_mm, bool back) { (void)target_mm, (void)back; }
-bool board_drive_jaws(double distance_mm) {
-  jaws_mm = distance_mm;
-  return distance_mm > 7.95 && distance_mm < 8.05;
-}
-void board_read_jaws(double *distance_mm, double *force_n) {
-  *distance_mm = jaws_mm;
-  *force_n = 0.0;
-}
-void board_hold_skin(bool hold) { show("hold", hold); }
-void board_move_shutter(bool open) {
-  if (open != shutter_open) show("shutter", open);
-  shutter_open = open;
-}
-bool board_shutter_is(bool open) { return open == shutter_open; }
-void board_set_suction(double mbar) {
-  suction_mbar = mbar;
-  show("suction", mbar);
-}
-bool board_gauge_mbar(double *mbar) {
-  *mbar = suction_mbar;
-  return true;
-}
-double board_camera_c(void) { return 5.0; }
