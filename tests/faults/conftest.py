@@ -26,6 +26,7 @@ from rigsim.world.serve import serve_world
 EMULATED_ONLY = {
     "test_controller_missing_any_rule_is_detected": "leaves rules of the emulation out",
     "test_answer_cache_is_queue_of_eight": "reads the emulated queue",
+    "test_controller_obeys_rules_on_noisy_line_long_run": "its short run is made on both sides",
 }
 """Tests that exchange parts of the emulation, with what they exchange."""
 
