@@ -33,7 +33,7 @@ EMULATED_ONLY = {
 
 def pytest_generate_tests(metafunc):
     files = ("test_wire_faults.py", "test_wire_capture.py", "test_stateful_boxes.py")
-    on_both_sides(metafunc, long=files)
+    on_both_sides(metafunc, long=files)  # the compiled side is marked pytest.mark.long
 
 
 @pytest.fixture(autouse=True)
