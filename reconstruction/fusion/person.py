@@ -8,6 +8,7 @@ melanin and a blood of its own. Gauss-Newton steps eliminate the regions by the 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -26,14 +27,13 @@ from reconstruction.fusion.signals import (
     RigBands,
     SignalTable,
     clip_to_range,
+    evaluate_signals,
 )
 
 UNKNOWN_VARIANCE: Final = 1e6
 """Variance of a signal that was not measured."""
 ITERATIONS: Final = 8
-"""Gauss-Newton steps; the last ones change the properties by less than 0.01 standard deviations."""
-REBUILD_SD: Final = 0.25
-"""Change of a property, in standard deviations, after which the table is computed again."""
+"""Gauss-Newton steps; the last ones change the properties by little."""
 START_SPREAD: Final = (0.3, 0.4)
 """Standard deviations of log melanin and log blood over a face, as a start."""
 MIN_SPREAD: Final = 0.05
@@ -76,14 +76,14 @@ class Regions:
         return Regions(self.values, covariance)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class PersonSkin:
     """Estimates of what one person's skin has in common.
 
     Attributes
     ----------
-    table
-        Signals at the estimated properties.
+    rigs
+        Rigs of the signals.
     properties_sd
         (6,): properties, in standard deviations of their priors.
     offset
@@ -101,7 +101,7 @@ class PersonSkin:
         measurements.
     """
 
-    table: SignalTable
+    rigs: tuple[RigBands, ...]
     properties_sd: Float64Array
     offset: Float64Array
     mean: Float64Array
@@ -110,10 +110,15 @@ class PersonSkin:
     regions: Float64Array
     log_evidence: float
 
+    @cached_property
+    def table(self) -> SignalTable:
+        """Signals over melanin and blood at the estimated properties."""
+        return SignalTable.build(self.rigs, self.properties_sd)
+
     @property
     def offset_columns(self) -> slice:
         """Columns of the offset in `covariance`."""
-        return slice(N_PROPERTIES, N_PROPERTIES + self.table.n_signals)
+        return slice(N_PROPERTIES, N_PROPERTIES + 3 * len(self.rigs))
 
 
 def estimate_person(
@@ -176,17 +181,14 @@ def estimate_person(
     prior[-2:, -2:] = np.diag(np.array(POPULATION_LOG_SD) ** -2.0)
     if start is None:
         common = np.concatenate([np.zeros(6 + size), POPULATION_MEAN])
-        table = SignalTable.build(rigs, common[:6])
         spread = np.diag(np.square(START_SPREAD))
         x = np.tile(POPULATION_MEAN, (count, 1))
     else:
         common = np.concatenate([start.properties_sd, start.offset, start.mean])
-        table, spread, x = start.table, start.spread, start.regions.copy()
+        spread, x = start.spread, start.regions.copy()
     usual = np.concatenate([np.zeros(6 + size), POPULATION_MEAN])
     for _ in range(ITERATIONS):
-        if np.abs(common[:6] - table.properties_sd).max() > REBUILD_SD:
-            table = SignalTable.build(rigs, common[:6])
-        step = _normal_equations(table, x, common, spread, seen, weight)
+        step = _normal_equations(rigs, x, common, spread, seen, weight)
         by_common = step.common + prior
         gradient = step.gradient - prior @ (common - usual)
         change = np.linalg.solve(by_common, gradient)
@@ -197,8 +199,8 @@ def estimate_person(
         common[:6] = np.clip(common[:6], -MAX_PROPERTY_SD, MAX_PROPERTY_SD)
         covariance = np.linalg.inv(by_common)
         spread = _spread(x - common[-2:], step, covariance)
-    evidence = _log_evidence(table, x, common, usual, prior, spread, seen, weight)
-    return PersonSkin(table, common[:6], common[6:-2], common[-2:], covariance, spread, x, evidence)
+    evidence = _log_evidence(rigs, x, common, usual, prior, spread, seen, weight)
+    return PersonSkin(tuple(rigs), common[:6], common[6:-2], common[-2:], covariance, spread, x, evidence)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,7 +225,7 @@ class _Step:
 
 
 def _normal_equations(
-    table: SignalTable,
+    rigs: Sequence[RigBands],
     x: Float64Array,
     common: Float64Array,
     spread: Float64Array,
@@ -231,9 +233,7 @@ def _normal_equations(
     weight: Float64Array,
 ) -> _Step:
     count, size = seen.shape
-    values, slopes = table.evaluate(x)
-    by_property = table.evaluate_properties(x)
-    values = values + by_property @ (common[:6] - table.properties_sd)
+    values, slopes, by_property = evaluate_signals(rigs, x, common[:6])
     rest = seen - values - common[6:-2]
     by_common = np.concatenate(
         [by_property, np.broadcast_to(np.eye(size), (count, size, size))], axis=-1
@@ -275,7 +275,7 @@ def _spread(off: Float64Array, step: _Step, covariance: Float64Array) -> Float64
 
 
 def _log_evidence(
-    table: SignalTable,
+    rigs: Sequence[RigBands],
     x: Float64Array,
     common: Float64Array,
     usual: Float64Array,
@@ -285,15 +285,14 @@ def _log_evidence(
     weight: Float64Array,
 ) -> float:
     """Return the log marginal likelihood by Laplace's approximation, up to a constant."""
-    values = table.evaluate(x)[0]
-    values = values + table.evaluate_properties(x) @ (common[:6] - table.properties_sd)
+    values = evaluate_signals(rigs, x, common[:6])[0]
     rest = seen - values - common[6:-2]
     off = x - common[-2:]
     tight = np.linalg.inv(spread)
     cost = np.einsum("ks,kst,kt->", rest, weight, rest) + np.einsum("ka,ab,kb->", off, tight, off)
     away = common - usual
     cost += away @ prior @ away
-    step = _normal_equations(table, x, common, spread, seen, weight)
+    step = _normal_equations(rigs, x, common, spread, seen, weight)
     curved = np.linalg.slogdet(step.common + prior)[1]
     curved -= np.linalg.slogdet(step.own_inverse)[1].sum()
     known = np.linalg.slogdet(prior)[1] + len(x) * np.linalg.slogdet(tight)[1]

@@ -35,19 +35,26 @@ MAX_PROPERTY_SD: Final = 3.0
 """Largest deviation of a property from its prior's mean, in standard deviations."""
 GRID_NODES: Final = 28
 """Nodes along log melanin and log blood; interpolation errs by less than 1e-3 in log signal."""
+_PROPERTY_STRIDE: Final = 3
 _DEPTH_FACTOR: Final = SKIN_CONSTANTS.melanin_depth_factor
 LOG_RANGE: Final = (
     (float(np.log(5e-4 * _DEPTH_FACTOR)), float(np.log(C_M_MAX * _DEPTH_FACTOR))),
     (float(np.log(5e-4)), float(np.log(C_HD_MAX))),
 )
 """Ranges of log melanin optical depth at 550 nm and of log blood volume fraction."""
+_STEP_LOG: Final = 0.01  # of central differences in log melanin and log blood
 _STEP_SD: Final = 0.1  # of central differences, in standard deviations
 
-SIGMA_TR_OFFSET: Final = np.array([-0.05, -0.3, -0.4])
-"""Log sigma_tr of a probe's red, green and blue light on layered, pressed skin, less the dermis's.
+PRESSED_BLOOD: Final = (0.5, 0.5)
+"""Blood under a probe's head over that of free skin, and the standard deviation of its logarithm.
 
-The head displaces blood, and the wavelengths that are absorbed least travel farthest. Set on two
-simulated people, types III and V."""
+Pressure takes blood out of the skin (Reif et al. 2008, doi:10.1117/1.2870115); its amount is
+assumed."""
+SIGMA_TR_OFFSET: Final = np.array([-0.3, -0.55, -0.65])
+"""Log sigma_tr of a probe's red, green and blue light on layered skin, less the dermis's.
+
+The dermis's is a mean over the wavelengths of a channel, but those absorbed least travel farthest.
+Set on two simulated people, types III and V."""
 SIGMA_TR_SD: Final = (0.15, 0.1)
 """Deviation of log sigma_tr of a probe on layered, pressed skin from the dermis's: standard
 deviations common to the channels, and of each channel."""
@@ -79,11 +86,12 @@ class RigBands:
         """Return the three signals of skin (..., 8), see `model.tissue_optics.skin_spectra`.
 
         sigma_tr is the mean of its logarithm over the wavelengths of a channel, plus
-        `SIGMA_TR_OFFSET`.
+        `SIGMA_TR_OFFSET`, of skin with `PRESSED_BLOOD`.
         """
         bands = self.bands
         if self.kind == "sigma_tr":
-            log_mean = log_sigma_tr(bands.wavelength_nm, skin) @ bands.weights
+            pressed = skin * np.where(np.arange(skin.shape[-1]) == 1, PRESSED_BLOOD[0], 1.0)
+            log_mean = log_sigma_tr(bands.wavelength_nm, pressed) @ bands.weights
             return np.asarray(log_mean + SIGMA_TR_OFFSET)
         return bands.log_signals(skin)
 
@@ -124,6 +132,57 @@ def skin_of_person(log_skin: ArrayLike, properties_sd: ArrayLike) -> Float64Arra
     return np.concatenate([np.exp(at), rest], axis=-1)
 
 
+def evaluate_signals(
+    rigs: Sequence[RigBands], log_skin: Float64Array, properties_sd: Float64Array
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Return signals of a few places with their derivatives, without a table.
+
+    Parameters
+    ----------
+    rigs
+        Rigs, three signals each.
+    log_skin
+        (K, 2): log melanin optical depth and log blood, within `LOG_RANGE`.
+    properties_sd
+        (6,): see `skin_of_person`.
+
+    Returns
+    -------
+    values : ndarray
+        (K, S).
+    slopes : ndarray
+        (K, S, 2): derivatives by log melanin and log blood.
+    by_property : ndarray
+        (K, S, 6): derivatives by the properties, per standard deviation.
+
+    Examples
+    --------
+    >>> rigs = (RigBands("dome", "Nikon 5100 (NPL)", "LED-B3"),)
+    >>> values, slopes, _ = evaluate_signals(rigs, np.log([[0.2, 0.01]]), np.zeros(6))
+    >>> np.exp(values).round(2).tolist(), bool((slopes < 0.0).all())
+    ([[0.26, 0.18, 0.12]], True)
+    """
+
+    def signals(skin: Float64Array) -> Float64Array:
+        return np.concatenate([rig.log_signals(skin) for rig in rigs], axis=-1)
+
+    limit = MAX_PROPERTY_SD
+    moved, spans = [skin_of_person(log_skin, properties_sd)], []
+    for k in range(2):
+        step = _STEP_LOG * (np.arange(2) == k)
+        moved += [skin_of_person(log_skin + sign * step, properties_sd) for sign in (-1.0, 1.0)]
+        spans.append(2.0 * _STEP_LOG)
+    for k in range(N_PROPERTIES):
+        ends = np.clip(properties_sd[k] + np.array([-_STEP_SD, _STEP_SD]), -limit, limit)
+        at = [np.where(np.arange(N_PROPERTIES) == k, end, properties_sd) for end in ends]
+        moved += [skin_of_person(log_skin, one) for one in at]
+        spans.append(float(np.ptp(ends)))
+    found = signals(np.stack(moved))
+    change = (found[2::2] - found[1::2]) / np.array(spans)[:, None, None]
+    derivatives = np.moveaxis(change, 0, -1)
+    return found[0], derivatives[..., :2], derivatives[..., 2:]
+
+
 @dataclass(frozen=True, eq=False)
 class SignalTable:
     """Signals of all rigs over melanin and blood around one person's properties.
@@ -137,7 +196,8 @@ class SignalTable:
     values
         Shape (n, n, S): signals over log melanin and log blood.
     by_property
-        Shape (n, n, S, 6): derivatives by the properties, per standard deviation.
+        Shape (m, m, S, 6): derivatives by the properties at every third node, per standard
+        deviation.
     """
 
     rigs: tuple[RigBands, ...]
@@ -172,12 +232,9 @@ class SignalTable:
             skin = skin_of_person(nodes, place)
             return np.concatenate([rig.log_signals(skin) for rig in rigs], axis=-1)
 
-        columns = []
-        for k in range(N_PROPERTIES):
-            ends = np.clip(at[k] + np.array([-_STEP_SD, _STEP_SD]), -MAX_PROPERTY_SD, 3.0)
-            both = [signals(np.where(np.arange(N_PROPERTIES) == k, end, at)) for end in ends]
-            columns.append((both[1] - both[0]) / float(np.ptp(ends)))
-        return cls(tuple(rigs), at, signals(at), np.stack(columns, axis=-1))
+        few = nodes[::_PROPERTY_STRIDE, ::_PROPERTY_STRIDE]
+        by_property = evaluate_signals(rigs, few.reshape(-1, 2), at)[2]
+        return cls(tuple(rigs), at, signals(at), by_property.reshape(*few.shape[:2], -1, 6))
 
     @cached_property
     def _splines(self) -> list[RectBivariateSpline]:
@@ -208,11 +265,12 @@ class SignalTable:
 
     def evaluate_properties(self, log_skin: Float64Array) -> Float64Array:
         """Return derivatives of the signals by the properties, (N, S, 6), at (N, 2)."""
+        count = len(self.by_property)
         places = [
-            (log_skin[:, k] - low) / (high - low) * (GRID_NODES - 1)
+            (log_skin[:, k] - low) / (high - low) * (count - 1)
             for k, (low, high) in enumerate(LOG_RANGE)
         ]
-        flat = self.by_property.reshape(GRID_NODES, GRID_NODES, -1)
+        flat = self.by_property.reshape(count, count, -1)
         found = [map_coordinates(flat[..., k], places, order=1) for k in range(flat.shape[-1])]
         return np.stack(found, axis=-1).reshape(-1, self.n_signals, N_PROPERTIES)
 
@@ -247,7 +305,8 @@ def residual_covariance(rigs: Sequence[RigBands], log_skin: Float64Array) -> Flo
     -------
     ndarray
         Shape (S, S). Reflectances of different rigs share the residuals of measured spectra;
-        sigma_tr has `SIGMA_TR_SD`, independent of them.
+        sigma_tr has `SIGMA_TR_SD` and an unknown
+        `PRESSED_BLOOD`, independent of them.
     """
     skin = skin_of_person(log_skin, np.zeros(N_PROPERTIES))
     whole = np.exp(log_reflectance(spectra.WAVELENGTH_NM, skin)) + normal_reflectance(ETA_SKIN)
@@ -268,6 +327,10 @@ def residual_covariance(rigs: Sequence[RigBands], log_skin: Float64Array) -> Flo
         covariance[np.ix_(light, light)] = factors.T @ factors
     unstored = np.where(light, uncertainty.unstored_residual_variance(angle), 0.0)
     depth = np.outer(~light, ~light) * SIGMA_TR_SD[0] ** 2
+    if not light.all():
+        slopes = evaluate_signals(rigs, log_skin[None], np.zeros(N_PROPERTIES))[1][0, :, 1]
+        by_blood = np.where(light, 0.0, PRESSED_BLOOD[1] * slopes)
+        depth = depth + np.outer(by_blood, by_blood)
     return np.asarray(
         covariance + np.diag(unstored) + depth + np.diag(np.where(light, 0.0, SIGMA_TR_SD[1] ** 2))
     )

@@ -137,7 +137,11 @@ class OffsetModel:
 
 
 def estimate_texels(
-    person: PersonSkin, colors: Sequence[RigColors], errors: OffsetModel
+    person: PersonSkin,
+    colors: Sequence[RigColors],
+    errors: OffsetModel,
+    *,
+    iterations: int = TEXEL_ITERATIONS,
 ) -> Iterator[tuple[slice, TexelSkin]]:
     """Estimate melanin and blood of texels, block by block.
 
@@ -149,6 +153,8 @@ def estimate_texels(
         Colors by one or more rigs, of the same N texels.
     errors
         Covariances of the signals' errors.
+    iterations
+        Gauss-Newton steps, at least 1.
 
     Yields
     ------
@@ -163,14 +169,18 @@ def estimate_texels(
     if not colors:
         raise FusionError("colors: got none, expected those of one rig or more")
     count = len(colors[0].valid)
+    if iterations < 1:
+        raise FusionError(f"iterations: got {iterations}, expected at least 1")
     if any(len(one.valid) != count for one in colors):
         raise FusionError("colors: got different numbers of texels, expected one number")
     for start in range(0, count, BLOCK_TEXELS):
         block = slice(start, min(start + BLOCK_TEXELS, count))
-        yield block, _solve(person, [one.part(block) for one in colors], errors)
+        yield block, _solve(person, [one.part(block) for one in colors], errors, iterations)
 
 
-def _solve(person: PersonSkin, colors: Sequence[RigColors], errors: OffsetModel) -> TexelSkin:
+def _solve(
+    person: PersonSkin, colors: Sequence[RigColors], errors: OffsetModel, iterations: int
+) -> TexelSkin:
     table = person.table
     count, size = len(colors[0].valid), table.n_signals
     by_noise, seen = [], []
@@ -183,8 +193,8 @@ def _solve(person: PersonSkin, colors: Sequence[RigColors], errors: OffsetModel)
         seen.append(np.where(usable[:, None], one.log_rgb, 0.0) - person.offset[at])
     tight = np.linalg.inv(person.spread)
     x = np.tile(person.mean, (count, 1))
-    for _ in range(TEXEL_ITERATIONS):
-        values, slopes = _signals(person, x)
+    for _ in range(iterations):
+        values, slopes = table.evaluate(x)
         hessian = np.tile(tight, (count, 1, 1))
         gradient = -(x - person.mean) @ tight
         weights = []
@@ -199,7 +209,7 @@ def _solve(person: PersonSkin, colors: Sequence[RigColors], errors: OffsetModel)
             gradient += np.einsum("nac,nc->na", scaled, off)
         step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
         x = clip_to_range(x + np.clip(step, -MAX_STEP, MAX_STEP))
-    values, slopes = _signals(person, x)
+    values, slopes = table.evaluate(x)
     covariance = np.linalg.inv(hessian)
     by_property = table.evaluate_properties(x)
     # a texel's estimate by the common unknowns: properties, offsets, mean
@@ -251,15 +261,6 @@ def _solve(person: PersonSkin, colors: Sequence[RigColors], errors: OffsetModel)
         np.where(known > 2, chi2 / np.maximum(known - 2, 1), 0.0),
         inside,
     )
-
-
-def _signals(person: PersonSkin, x: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Return signals and slopes at the person's properties."""
-    values, slopes = person.table.evaluate(x)
-    change = person.properties_sd - person.table.properties_sd
-    if np.abs(change).max() > 0.0:
-        values = values + person.table.evaluate_properties(x) @ change
-    return values, slopes
 
 
 def eumelanin_slope() -> float:

@@ -51,6 +51,12 @@ def fuse(
     found = fuse(given, out=out, progress=console.progress)
     rows = summarize(found)
     console.print_table(("map", "median", "68 % interval, %", "common to the face, %"), rows)
+    console.print_table(
+        ("rig", "probability that it is faulty", "p value of its gains"),
+        [(check.rig, round(check.probability, 4), check.p_value) for check in found.checks],
+    )
+    if found.contradiction is not None:
+        console.print_line(f"contradiction: {found.contradiction}")
     console.print_each("assumed", found.measured.assumed)
     console.print_omissions(found.measured.left_out)
     console.print_line(f"{out}: {', '.join(sorted(found.appearance.maps))}")
@@ -62,6 +68,7 @@ def fuse(
             "maps": sorted(found.appearance.maps),
             "rows": rows,
             "fusion": found.appearance.parameters["fusion"],
+            "contradiction": found.contradiction,
             "left_out": found.measured.left_out,
         },
     )

@@ -10,6 +10,7 @@ import numpy as np
 from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from model.skin_reflectance import NORMAL_MAPS, TRANSLUCENCY_MAP
+from reconstruction.fusion.consistency import RigCheck, check_rigs, name_faulty_rig
 from reconstruction.fusion.person import PersonSkin
 from reconstruction.fusion.signals import PROPERTY_NAMES, RigBands
 from reconstruction.fusion.texels import (
@@ -38,6 +39,12 @@ FUSION_KEY: Final = "fusion"
 """Key in `parameters` of the person's common properties and of each map's rigs."""
 OWN_SUFFIX: Final = "_texel_stderr"
 """Suffix of maps of standard errors without those common to the face."""
+QUANTITY_BY_RIG: Final[Mapping[str, str]] = {
+    "dome": "R_d",
+    "flash": "diffuse light",
+    "probe": "sigma_tr",
+}
+"""Quantity of a rig in the name of a contradiction."""
 FUSED_MAPS: Final = ("melanin", "melanin_optical_depth", "hemoglobin", "r_d", TRANSLUCENCY_MAP)
 """Maps that the fusion estimates; all others are carried over."""
 
@@ -75,6 +82,13 @@ class FusedDouble:
     person: PersonSkin
     errors: OffsetModel
     measured: Measurements
+    checks: tuple[RigCheck, ...]
+
+    @property
+    def contradiction(self) -> str | None:
+        """The rig that contradicts the others, in words; None without a clear one."""
+        named = name_faulty_rig(self.checks)
+        return None if named is None else named.describe(QUANTITY_BY_RIG[named.rig])
 
 
 def fuse(
@@ -124,6 +138,7 @@ def fuse_sources(
     measured = measure(sources, given)
     report("common properties of the skin")
     person, errors = measured.estimate_person()
+    checks = check_rigs(measured.rigs, measured.regions(errors), errors, person)
     base = sources.get("dome") or sources.by_rig["flash"]
     maps = dict(base.appearance.maps)
     carried = [name for name in maps if name not in FUSED_MAPS]
@@ -146,6 +161,7 @@ def fuse_sources(
             "maps": provenance,
             "common": describe_person(person, measured.rigs),
             "translucency_p_value": p_value,
+            "checks": describe_checks(checks),
         },
     }
     appearance = derive_appearance(
@@ -156,7 +172,7 @@ def fuse_sources(
         left_out=(*base.appearance.left_out, *measured.left_out),
         files=dict(base.appearance.files),
     )
-    return FusedDouble(appearance, person, errors, measured)
+    return FusedDouble(appearance, person, errors, measured, checks)
 
 
 def _assumed(source: Source) -> list[str]:
@@ -205,9 +221,8 @@ def measure(sources: Sources, given: FusionInputs) -> Measurements:
         left_out += [(f"probe: {site}", why) for site, why in placed.left_out]
         camera, illuminant, _ = probe.spectra()
         bands = RigBands("probe", camera, illuminant, "sigma_tr")
-    base = dome or flash
-    assert base is not None  # `read_sources` requires one
-    first = base.appearance.maps["r_d" if dome is not None else "diffuse"]
+    name = "r_d" if dome is not None else "diffuse"
+    first = (sources.get("dome") or sources.by_rig["flash"]).appearance.maps[name]
     return Measurements(
         tuple(colors),
         (first.values.shape[0], first.values.shape[1]),
@@ -382,3 +397,23 @@ def describe_person(person: PersonSkin, rigs: Sequence[RigBands]) -> dict[str, A
         "log_melanin_stderr": float(sd[-2]),
         "log_blood_stderr": float(sd[-1]),
     }
+
+
+def describe_checks(checks: Sequence[RigCheck]) -> list[dict[str, Any]]:
+    """Return the agreement of the rigs, as JSON values.
+
+    Parameters
+    ----------
+    checks
+        Of all rigs.
+    """
+    return [
+        {
+            "rig": check.rig,
+            "probability_faulty": check.probability,
+            "log_gain": check.log_gain.tolist(),
+            "stderr": check.stderr.tolist(),
+            "p_value": check.p_value,
+        }
+        for check in checks
+    ]

@@ -1,7 +1,7 @@
 """Signals of one person on one texture, and what the person's skin has in common."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -132,17 +132,16 @@ class Measurements:
         known
             Properties that count as typical, see `reconstruction.fusion.person.estimate_person`.
         """
-        person, at = None, POPULATION_MEAN
-        for _ in range(2):  # the second time with the errors of skin of this color
-            errors = self.errors(at)
-            given = self.regions(errors) if regions is None else regions
-            person = estimate_person(
-                self.rigs, given, errors.offset_covariance, start=person, known=known
-            )
-            at = person.mean
-        assert person is not None
-        table = SignalTable.build(self.rigs, person.properties_sd)
-        return replace(person, table=table), errors
+        errors = self.errors(POPULATION_MEAN)
+        given = self.regions(errors) if regions is None else regions
+        first = estimate_person(self.rigs, given, errors.offset_covariance, known=known)
+        # again with the errors of skin of this color
+        errors = self.errors(first.mean)
+        given = self.regions(errors) if regions is None else regions
+        person = estimate_person(
+            self.rigs, given, errors.offset_covariance, start=first, known=known
+        )
+        return person, errors
 
 
 def _add_sigma_tr(

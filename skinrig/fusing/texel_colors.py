@@ -151,7 +151,6 @@ class FlashColors:
         covariance = model_error.image_covariance(values, variance, good)
         covariance += (variance / values**2)[..., None] * np.eye(3)
         log_rgb = np.log(values)
-        height, width = good.shape
         if placement is None:
             rows, columns = np.indices(good.shape)
             pixel = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64)
