@@ -200,7 +200,9 @@ def estimate_person(
         covariance = np.linalg.inv(by_common)
         spread = _spread(x - common[-2:], step, covariance)
     evidence = _log_evidence(rigs, x, common, usual, prior, spread, seen, weight)
-    return PersonSkin(tuple(rigs), common[:6], common[6:-2], common[-2:], covariance, spread, x, evidence)
+    return PersonSkin(
+        tuple(rigs), common[:6], common[6:-2], common[-2:], covariance, spread, x, evidence
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

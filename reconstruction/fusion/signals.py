@@ -31,7 +31,7 @@ SignalKind = Literal["reflectance", "sigma_tr"]
 PROPERTY_NAMES: Final = SKIN_PARAMETERS[2:]
 """Properties of skin that one person has in common."""
 N_PROPERTIES: Final = len(PROPERTY_NAMES)
-MAX_PROPERTY_SD: Final = 3.0
+MAX_PROPERTY_SD: Final = 2.4
 """Largest deviation of a property from its prior's mean, in standard deviations."""
 GRID_NODES: Final = 28
 """Nodes along log melanin and log blood; interpolation errs by less than 1e-3 in log signal."""

@@ -178,11 +178,28 @@ def estimate_texels(
         yield block, _solve(person, [one.part(block) for one in colors], errors, iterations)
 
 
-def _solve(
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solution:
+    """Estimates of a block's texels, and what they rest on."""
+
+    x: Float64Array
+    """(N, 2)."""
+    hessian: Float64Array
+    """(N, 2, 2)."""
+    seen: list[Float64Array]
+    """Colors by rig without the person's offsets, (N, 3)."""
+    weights: list[Float64Array]
+    """Inverse covariances by rig, lowered at outliers, (N, 3, 3)."""
+    stated: list[Float64Array]
+    """Inverse covariances by rig, as stated."""
+
+
+def _iterate(
     person: PersonSkin, colors: Sequence[RigColors], errors: OffsetModel, iterations: int
-) -> TexelSkin:
+) -> _Solution:
+    """Take Gauss-Newton steps, with weights that follow a t distribution."""
     table = person.table
-    count, size = len(colors[0].valid), table.n_signals
+    count = len(colors[0].valid)
     by_noise, seen = [], []
     for one in colors:
         at = table.columns(one.rig)
@@ -209,6 +226,18 @@ def _solve(
             gradient += np.einsum("nac,nc->na", scaled, off)
         step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
         x = clip_to_range(x + np.clip(step, -MAX_STEP, MAX_STEP))
+    return _Solution(x, hessian, seen, weights, by_noise)
+
+
+def _solve(
+    person: PersonSkin, colors: Sequence[RigColors], errors: OffsetModel, iterations: int
+) -> TexelSkin:
+    """Estimate the texels of a block with their errors."""
+    table = person.table
+    count = len(colors[0].valid)
+    solved = _iterate(person, colors, errors, iterations)
+    x, hessian, seen, weights = solved.x, solved.hessian, solved.seen, solved.weights
+    tight = np.linalg.inv(person.spread)
     values, slopes = table.evaluate(x)
     covariance = np.linalg.inv(hessian)
     by_property = table.evaluate_properties(x)
@@ -216,7 +245,7 @@ def _solve(
     by_common = np.zeros((count, 2, len(person.covariance)))
     by_common[..., -2:] = covariance @ tight
     chi2, known = np.zeros(count), np.zeros(count)
-    for one, weight, full, y in zip(colors, weights, by_noise, seen, strict=True):
+    for one, weight, full, y in zip(colors, weights, solved.stated, seen, strict=True):
         at = table.columns(one.rig)
         scaled = covariance @ np.swapaxes(slopes[:, at], -1, -2) @ weight
         by_common[..., :N_PROPERTIES] -= scaled @ by_property[:, at]
@@ -232,11 +261,41 @@ def _solve(
     inside = ((x > low + RANGE_MARGIN) & (x < high - RANGE_MARGIN)).all(axis=-1)
     both = np.einsum("naa->na", covariance + spread)
     inside &= (known > 0) & (both < MAX_LOG_STDERR**2).all(axis=-1)
+    estimate, own, common = _estimate_signals(person, colors, errors, solved, by_common)
+    return TexelSkin(
+        x,
+        covariance,
+        spread,
+        melanin,
+        estimate,
+        own,
+        common,
+        np.where(known > 2, chi2 / np.maximum(known - 2, 1), 0.0),
+        inside,
+    )
+
+
+def _estimate_signals(
+    person: PersonSkin,
+    colors: Sequence[RigColors],
+    errors: OffsetModel,
+    solved: _Solution,
+    by_common: Float64Array,
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Return the signals of the skin, and their own and common variances, (N, S) each.
+
+    A signal is that of the model, of its unexplained part, and of the place's own skin.
+    """
+    table = person.table
+    values, slopes = table.evaluate(solved.x)
+    by_property = table.evaluate_properties(solved.x)
+    covariance = np.linalg.inv(solved.hessian)
+    count, size = values.shape
     # what a signal's residual states of the place's own skin
     gains = np.zeros((count, size, size))
     kept = errors.unexplained @ np.linalg.inv(errors.offset_covariance)
     estimate = values + kept @ person.offset
-    for one, weight, y in zip(colors, weights, seen, strict=True):
+    for one, weight, y in zip(colors, solved.weights, solved.seen, strict=True):
         at = table.columns(one.rig)
         gains[:, at, at] = errors.local[at, at] @ weight
         estimate[:, at] += np.einsum("ncd,nd->nc", gains[:, at, at], y - values[:, at])
@@ -250,17 +309,7 @@ def _solve(
     own += np.einsum("nst,ts->ns", whole, errors.local)
     left = np.diag(errors.unexplained - kept @ errors.unexplained)
     common = np.einsum("nsp,pq,nsq->ns", moved, person.covariance, moved) + left
-    return TexelSkin(
-        x,
-        covariance,
-        spread,
-        melanin,
-        estimate,
-        own,
-        common,
-        np.where(known > 2, chi2 / np.maximum(known - 2, 1), 0.0),
-        inside,
-    )
+    return estimate, own, common
 
 
 def eumelanin_slope() -> float:

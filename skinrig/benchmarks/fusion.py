@@ -121,7 +121,7 @@ def draw_face(
     fractions = np.clip(fractions, 6e-4, [0.45, 0.25])
     spectrum = table.spectra(*fractions.T.astype(np.float32)).astype(np.float64)
     depth = SKIN_CONSTANTS.melanin_depth_factor
-    unexplained = residual_covariance(RIGS, mean + [np.log(depth), 0.0])
+    unexplained = residual_covariance(RIGS, mean + np.array([np.log(depth), 0.0]))
     calibration = np.zeros((6, 6))
     calibration[:3, :3] = 0.02**2 + 0.005**2 * np.eye(3)
     calibration[3:, 3:] = 0.1**2 + 0.003**2 * np.eye(3)
@@ -177,7 +177,9 @@ def _draw_table(rng: np.random.Generator) -> SkinTable:
 def measure_fusion(stage: BenchmarkStage) -> None:
     """Measure errors and coverage over rigs and iterations, and the trials of faulty rigs."""
     count, texels = (2, 800) if stage.toy else (N_PEOPLE, 1600)
-    faces = [draw_face(PEOPLE[k % len(PEOPLE)], FIRST_SEED + k, texels=texels) for k in range(count)]
+    faces = [
+        draw_face(PEOPLE[k % len(PEOPLE)], FIRST_SEED + k, texels=texels) for k in range(count)
+    ]
     settings = [("dome", TEXEL_ITERATIONS), ("flash", TEXEL_ITERATIONS)]
     settings += [("dome+flash", n) for n in ((2, 5) if stage.toy else (1, 2, 3, 5, 8))]
     by_setting = {one: _add_point(stage, faces, *one) for one in settings}

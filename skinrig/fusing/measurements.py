@@ -9,7 +9,7 @@ import numpy as np
 from reconstruction.chromophores.model_error import load_covariance
 from reconstruction.fusion.person import POPULATION_MEAN, PersonSkin, Regions, estimate_person
 from reconstruction.fusion.regions import hide_signals, summarize_regions
-from reconstruction.fusion.signals import FusionError, RigBands, SignalTable, residual_covariance
+from reconstruction.fusion.signals import FusionError, RigBands, residual_covariance
 from reconstruction.fusion.texels import OffsetModel, RigColors
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.fitting import probe_sites

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+
 from model import store
 from model.facial_color.coarse_maps import coarse_grid
 from model.facial_color.document import RIG_DOCUMENT, from_maps_and_document
