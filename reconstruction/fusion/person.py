@@ -32,7 +32,7 @@ from reconstruction.fusion.signals import (
 
 UNKNOWN_VARIANCE: Final = 1e6
 """Variance of a signal that was not measured."""
-ITERATIONS: Final = 8
+PERSON_ITERATIONS: Final = 8
 """Gauss-Newton steps; the last ones change the properties by little."""
 START_SPREAD: Final = (0.3, 0.4)
 """Standard deviations of log melanin and log blood over a face, as a start."""
@@ -187,7 +187,7 @@ def estimate_person(
         common = np.concatenate([start.properties_sd, start.offset, start.mean])
         spread, x = start.spread, start.regions.copy()
     usual = np.concatenate([np.zeros(6 + size), POPULATION_MEAN])
-    for _ in range(ITERATIONS):
+    for _ in range(PERSON_ITERATIONS):
         step = _normal_equations(rigs, x, common, spread, seen, weight)
         by_common = step.common + prior
         gradient = step.gradient - prior @ (common - usual)

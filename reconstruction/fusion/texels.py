@@ -164,7 +164,7 @@ def estimate_texels(
     Raises
     ------
     FusionError
-        If there is no color, or rigs have different numbers of texels.
+        Without a color, or if rigs have different numbers of texels.
     """
     if not colors:
         raise FusionError("colors: got none, expected those of one rig or more")

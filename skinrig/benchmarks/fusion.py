@@ -37,19 +37,19 @@ from skinrig.benchmarks.results import ErrorEstimate, Timing
 from skinrig.benchmarks.stage import BenchmarkStage
 from skinrig.fusing.measurements import LOCAL_SHARE
 
-PEOPLE: Final = ("I", "II", "III", "IV", "V", "VI")
+SKIN_TYPES: Final = ("I", "II", "III", "IV", "V", "VI")
 """Skin types of the people, repeated in the order of their seeds."""
 N_PEOPLE: Final = 30
 FIRST_SEED: Final = 900
-CAMERA: Final = "Nikon 5100 (NPL)"
-RIGS: Final = (RigBands("dome", CAMERA, "LED-B3"), RigBands("flash", CAMERA, "D55"))
+CAMERA_NAME: Final = "Nikon 5100 (NPL)"
+RIGS: Final = (RigBands("dome", CAMERA_NAME, "LED-B3"), RigBands("flash", CAMERA_NAME, "D55"))
 TEXEL_ERROR: Final[Mapping[str, float]] = {"dome": 0.05, "flash": 0.01}
 """Relative standard errors of a texel's color."""
 LIGHT_SD: Final = 0.6
 """Standard deviation of log light on a texel in the flash image."""
 SHARED_TEXELS: Final = 8
 """Neighboring texels with one error of the dome."""
-FAULTS: Final[Mapping[str, tuple[str, tuple[float, float, float]]]] = {
+RIG_FAULTS: Final[Mapping[str, tuple[str, tuple[float, float, float]]]] = {
     "dome, red gain": ("dome", (0.2, 0.0, 0.0)),
     "dome, white balance": ("dome", (0.15, 0.0, -0.15)),
     "flash, red gain": ("flash", (-0.2, 0.0, 0.0)),
@@ -178,7 +178,8 @@ def measure_fusion(stage: BenchmarkStage) -> None:
     """Measure errors and coverage over rigs and iterations, and the trials of faulty rigs."""
     count, texels = (2, 800) if stage.toy else (N_PEOPLE, 1600)
     faces = [
-        draw_face(PEOPLE[k % len(PEOPLE)], FIRST_SEED + k, texels=texels) for k in range(count)
+        draw_face(SKIN_TYPES[k % len(SKIN_TYPES)], FIRST_SEED + k, texels=texels)
+        for k in range(count)
     ]
     settings = [("dome", TEXEL_ITERATIONS), ("flash", TEXEL_ITERATIONS)]
     settings += [("dome+flash", n) for n in ((2, 5) if stage.toy else (1, 2, 3, 5, 8))]
@@ -257,8 +258,8 @@ def _run_trials(count: int, *, texels: int) -> tuple[int, int]:
     """Return how many faulty rigs were named, and how many people without a fault alarmed."""
     named = alarms = 0
     for trial in range(count):
-        skin_type = PEOPLE[trial % len(PEOPLE)]
-        rig, gain = list(FAULTS.values())[trial % len(FAULTS)]
+        skin_type = SKIN_TYPES[trial % len(SKIN_TYPES)]
+        rig, gain = list(RIG_FAULTS.values())[trial % len(RIG_FAULTS)]
         for faults in ({}, {rig: gain}):
             seed = FIRST_SEED + 100 + trial
             face = draw_face(skin_type, seed, texels=texels, log_gain=faults)

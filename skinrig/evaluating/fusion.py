@@ -16,7 +16,7 @@ MAX_MATCH_DISTANCE_MM: Final = 1.5
 """Maximum distance of a texel from the surface point whose ground truth it is compared with."""
 MIN_TEXELS: Final = 50
 """Fewer compared texels give no figures."""
-CHROMOPHORES: Final = ("melanin", "hemoglobin")
+CHROMOPHORE_MAPS: Final = ("melanin", "hemoglobin")
 CHANNEL_NAMES: Final = ("red", "green", "blue")
 
 
@@ -82,9 +82,9 @@ def compare_fused(
     if "flash" in single and "flash" in truths and placement is not None:
         truth = truths["flash"]
         known = truth.maps["melanin"].mask & (truth.maps["melanin"].values > 0.0)
-        values = np.stack([truth.maps[name].values for name in CHROMOPHORES], axis=-1)
+        values = np.stack([truth.maps[name].values for name in CHROMOPHORE_MAPS], axis=-1)
         near, true = _match(position, truth.maps["position_mm"], known, values)
-        for k, name in enumerate(CHROMOPHORES):
+        for k, name in enumerate(CHROMOPHORE_MAPS):
             if name not in single["flash"].maps:
                 continue
             one = single["flash"].maps[name]
