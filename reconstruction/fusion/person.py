@@ -172,7 +172,7 @@ def estimate_person(
     variances = np.einsum("kss->ks", regions.covariance)
     if not (variances < UNKNOWN_VARIANCE).any():
         raise FusionError("regions: got no known signal, expected one or more")
-    weight = np.linalg.inv(regions.covariance)
+    weight = np.asarray(np.linalg.inv(regions.covariance), np.float64)
     seen = np.where(variances < UNKNOWN_VARIANCE, regions.values, 0.0)
     scale = np.where(np.isin(np.arange(N_PROPERTIES), known), 1e-6, 1.0)
     prior = np.zeros((size + 8, size + 8))
@@ -197,7 +197,7 @@ def estimate_person(
         x = clip_to_range(x + np.clip(moved, -1.0, 1.0))
         common = common + change
         common[:6] = np.clip(common[:6], -MAX_PROPERTY_SD, MAX_PROPERTY_SD)
-        covariance = np.linalg.inv(by_common)
+        covariance = np.asarray(np.linalg.inv(by_common), np.float64)
         spread = _spread(x - common[-2:], step, covariance)
     evidence = _log_evidence(rigs, x, common, usual, prior, spread, seen, weight)
     return PersonSkin(

@@ -239,7 +239,7 @@ def _solve(
     x, hessian, seen, weights = solved.x, solved.hessian, solved.seen, solved.weights
     tight = np.linalg.inv(person.spread)
     values, slopes = table.evaluate(x)
-    covariance = np.linalg.inv(hessian)
+    covariance = np.asarray(np.linalg.inv(hessian), np.float64)
     by_property = table.evaluate_properties(x)
     # a texel's estimate by the common unknowns: properties, offsets, mean
     by_common = np.zeros((count, 2, len(person.covariance)))

@@ -213,7 +213,7 @@ def _add_point(
     mean = {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
     for name in [name for name in rows[0] if name.endswith("coverage")]:
         spread = float(np.std([row[name] for row in rows]))
-        mean[name.replace("coverage", "half")] = spread / np.sqrt(len(rows))
+        mean[name.replace("coverage", "half")] = spread / float(np.sqrt(len(rows)))
     errors = np.array([row["melanin"] for row in rows])
     half = float(errors.std() / np.sqrt(len(errors)))
     stage.add(

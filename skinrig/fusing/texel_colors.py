@@ -42,9 +42,15 @@ Texels: TypeAlias = slice | BoolArray | Int64Array
 class ColorSource(Protocol):
     """Colors of a rig on a texture of H x W texels."""
 
-    bands: RigBands
-    calibration: Float64Array
-    """(3, 3): covariance of the calibration's errors in log color."""
+    @property
+    def bands(self) -> RigBands:
+        """Channels of the rig."""
+        ...
+
+    @property
+    def calibration(self) -> Float64Array:
+        """Covariance of the calibration's errors in log color, (3, 3)."""
+        ...
 
     @property
     def valid(self) -> BoolArray:
