@@ -25,6 +25,10 @@ Pixels average over relief and borders of shadow everywhere. Set on two simulate
 per pixel, types III and V, whose R_d was 2 to 4 % too low."""
 FLASH_CHANNEL_ERROR: Final = 0.003
 """Relative standard error of a channel of the flash rig's white reference over the others."""
+PLACED_LIGHT_SD: Final = 1.0
+"""Standard deviation of log light of a face's median texel.
+
+The usual light is that of the median pixel of an image, which shows oblique skin smaller."""
 MIN_VALID_SHARE: Final = 0.99
 """Least fraction of valid pixels around a texel's place in an image."""
 LOG_R_D_OVER_REFLECTANCE: Final = -float(
@@ -172,7 +176,8 @@ class FlashColors:
             [log_rgb - prior.median, np.stack(parts, axis=-1), good[..., None].astype(float)], -1
         )
         image = np.where(good[..., None], image, 0.0)
-        calibration = FLASH_CHANNEL_ERROR**2 * np.eye(3) + shading_prior.LOG_SHADING_SOFTNESS**2
+        light = shading_prior.LOG_SHADING_SOFTNESS if placement is None else PLACED_LIGHT_SD
+        calibration = FLASH_CHANNEL_ERROR**2 * np.eye(3) + light**2
         bands = RigBands("flash", camera, illuminant)
         return cls(bands, calibration, image, pixel, visible, prior.sd**2)
 
