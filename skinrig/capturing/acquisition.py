@@ -18,6 +18,7 @@ from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session, SubjectRecord
 from skinrig.capturing.addresses import open_box, open_with_retry, require_addresses
+from skinrig.capturing.camera_colors import nominal_camera_colors
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.capturing.plan_choice import needed_boxes, write_plan
 from skinrig.capturing.sequences import sequence_lines
@@ -149,6 +150,7 @@ def _run(
                 eyes=order.eyes,
                 force_limit_n=order.force_limit_n,
                 all_brackets=order.all_brackets,
+                camera_colors=nominal_camera_colors(rig),
             )
         session.close()
         omitted = dict(session.omitted_steps())

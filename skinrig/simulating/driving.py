@@ -19,6 +19,7 @@ from model import store
 from model.skin import SkinAppearance
 from rigsim.world import World
 from skinrig.capturing.addresses import open_box
+from skinrig.capturing.camera_colors import nominal_camera_colors
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.simulating import subject_records
 from skinrig.simulating.exposure_log import SceneLog
@@ -272,6 +273,7 @@ def drive_plan(
             cameras=cameras,
             session=session,
             operator=operator,
+            camera_colors=nominal_camera_colors(rig),
             **run,
         )
         session.close()
