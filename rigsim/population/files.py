@@ -13,8 +13,8 @@ oil              factor of the surface fraction covered by oil, 0 to 3
 tissue_model     other properties of the skin: "drawn" from the seed as people vary (default),
                  "typical", or "papers" (the papers' model)
 epidermis_mm     thickness of the epidermis, mm; this and the next ones replace those of the model,
-                 in the ranges of `rigsim.tissue.skin_layers.PROPERTY_RANGES`
-...              basal_melanin_fraction, epidermal_blood_ratio, oxygenation, scattering_per_mm,
+                 in the ranges of `rigsim.tissue.skin_layers.PROPERTY_RANGES`. Melanin per area stays
+...              site_contrast, basal_melanin_fraction, epidermal_blood_ratio, oxygenation, scattering_per_mm,
                  rayleigh_fraction, scattering_slope, baseline_amplitude, eumelanin_fraction
 mesh             file of the face's geometry, .npz or .obj
 melanin_map      texture of melanin, volume fraction of the epidermis, 0.0005 to 0.5
@@ -84,6 +84,7 @@ class SubjectFile(Document):
     """`DRAWN_TISSUE`, or one of `NAMED_TISSUES`."""
     epidermis_mm: float | None = None
     """None: that of the model, as for the next ones."""
+    site_contrast: float | None = None
     basal_melanin_fraction: float | None = None
     epidermal_blood_ratio: float | None = None
     oxygenation: float | None = None
