@@ -17,9 +17,7 @@ MIN_DEVIATION: Final = 1e-6
 
 
 def interpolate_thickness(
-    tissue: TissueProperties,
-    ratio: FloatArray,
-    evaluate: Callable[[TissueProperties], FloatArray],
+    tissue: TissueProperties, ratio: FloatArray, evaluate: Callable[[TissueProperties], FloatArray]
 ) -> FloatArray:
     """Return the reflectance of skin with a map of thickness.
 
@@ -39,8 +37,9 @@ def interpolate_thickness(
 
     Examples
     --------
+    >>> ratio = np.array([0.9, 1.0])
     >>> found = interpolate_thickness(
-    ...     TissueProperties(), np.array([0.9, 1.0]), lambda skin: np.full((2, 1), skin.epidermis_mm))
+    ...     TissueProperties(), ratio, lambda skin: np.full((2, 1), skin.epidermis_mm))
     >>> found.round(6).ravel().tolist()
     [0.081, 0.09]
     """

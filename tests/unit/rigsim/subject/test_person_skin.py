@@ -12,13 +12,7 @@ from rigsim.subject.face_regions import from_mean_head
 from rigsim.subject.head import LANDMARKS_MM
 from rigsim.subject.perfusion import StateError
 from rigsim.subject.person import make_subject
-from rigsim.subject.person_skin import (
-    SITE_NAMES,
-    PersonSkin,
-    PersonSkinError,
-    draw_tissue,
-    layers,
-)
+from rigsim.subject.person_skin import SITE_NAMES, PersonSkin, PersonSkinError, draw_tissue, layers
 from rigsim.subject.skin_tone import MONK_ITA_DEG, melanin_of_tone, typology_angle_deg
 from rigsim.tissue.skin_layers import (
     PAPER_SKIN,
@@ -27,8 +21,7 @@ from rigsim.tissue.skin_layers import (
     melanin_per_mm,
     skin_coefficients,
 )
-from rigsim.tissue.skin_table import WAVELENGTH_NM
-from skinrig.benchmarks.simulation.skin_gamut import measure_face
+from rigsim.tissue.skin_table import WAVELENGTH_NM, interpolate_spectra
 
 
 @pytest.mark.parametrize("seed", [0, 3])
@@ -87,7 +80,15 @@ def test_unknown_site_and_preset_are_refused():
 
 def measured_angle(person):
     """Return the typology angle of the mean of three sites as an instrument measures it."""
-    lab = skin_tone.lab_of_spectra(measure_face(person), WAVELENGTH_NM)
+    sites = [person.at(site) for site in ("forehead", "cheek", "chin")]
+    spectrum = np.mean(
+        [
+            interpolate_spectra(np.array([s.c_m]), np.array([s.c_hd]), s.tissue, WAVELENGTH_NM)[0]
+            for s in sites
+        ],
+        axis=0,
+    )
+    lab = skin_tone.lab_of_spectra(spectrum + skin_tone.sphere_specular(), WAVELENGTH_NM)
     return float(skin_tone.ita(lab))
 
 

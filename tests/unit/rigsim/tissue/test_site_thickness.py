@@ -45,7 +45,8 @@ def test_even_thickness_is_evaluated_once():
 @pytest.fixture(scope="module")
 def skin():
     """Return a face with drawn thickness."""
-    return ObservedSkin(load_subject("IV").face(seed=2, size=96), "neutral", "Nikon 5100 (NPL)", "D55")
+    face = load_subject("IV").face(seed=2, size=96)
+    return ObservedSkin(face, "neutral", "Nikon 5100 (NPL)", "D55")
 
 
 def test_fractions_of_own_color_are_own_fractions(skin):
