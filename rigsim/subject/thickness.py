@@ -1,7 +1,7 @@
 """Thickness of the epidermis over a face, relative to that between its regions.
 
-The ratios are in `rigsim/data/face.toml`: means of 118 people of both sexes by ultrasound
-(doi:10.1186/s12880-022-00839-w, table 2). Ultrasound gives 0.17 to 0.22 mm, twice the thickness by
+The ratios are in `rigsim/data/face.toml`: means of 118 people by ultrasound (Meng et al. 2022,
+doi:10.1186/s12880-022-00839-w, table 2). Ultrasound gives 0.17 to 0.22 mm, twice the thickness by
 histology. An offset common to all sites would make the real contrast larger.
 """
 
