@@ -51,8 +51,8 @@ _TISSUE_DEVIATIONS: Final[Mapping[str, tuple[float, bool]]] = {
 }
 """Standard deviations over people, of the logarithm where True: a tenth of each published range.
 Ranges are those of Jacques 2013, doi:10.1088/0031-9155/58/11/R37, and Donner et al. 2008; 0.05 to
-0.12 mm for the thickness (mean 0.069, deviation 0.023 mm over people and sites, Tsugita et al. 2013,
-doi:10.1111/srt.12021). Ranges include differences of method. With an eighth, 2 of the 87
+0.12 mm for the thickness: mean 0.069, deviation 0.023 mm over people and sites (Tsugita et al.
+2013, doi:10.1111/srt.12021). Ranges include differences of method. With an eighth, 2 of the 87
 people of the population lie outside 5 to 95 % of measured skin."""
 
 

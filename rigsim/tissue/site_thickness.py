@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from rigsim.arrays import Float32Array, FloatArray
+from rigsim.arrays import FloatArray
 from rigsim.tissue.skin_layers import TissueProperties
 
 LOG_RATIO_STEP: Final = 0.1
@@ -47,7 +47,7 @@ def interpolate_thickness(
     if not position.size or np.abs(position).max() * LOG_RATIO_STEP < MIN_DEVIATION:
         return evaluate(tissue.with_thickness_ratio(1.0))
     first, last = floor(position.min()), floor(position.max()) + 1
-    total: Float32Array | float = 0.0
+    total: FloatArray | float = 0.0
     for node in range(first, last + 1):
         weight = np.maximum(1.0 - np.abs(position - node), 0.0)
         if weight.any():

@@ -194,8 +194,9 @@ def analyze_simulated(
         analyze(data, basis, by_label=data.name == "dataset B", method=method, rng=rng)
         for data in sets
     )
-    kind = {"source": "simulated", "data": SAMPLES_DATA}
-    _write(out, found, basis, spheres=found[1], method=method, **kind)
+    _write(
+        out, found, basis, spheres=found[1], method=method, source="simulated", data=SAMPLES_DATA
+    )
     return found
 
 
