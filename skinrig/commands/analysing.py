@@ -45,7 +45,8 @@ def analyse_brdf(
     Parameters
     ----------
     appearances
-        APPEARANCE/ folders of dome sessions with basis BRDFs; none: simulated faces.
+        APPEARANCE/ folders of dome sessions with basis BRDFs; none: simulated BRDF samples of
+        faces, without images.
     merl_basis
         Folder of the MERL tables used in the reconstruction; default: built-in materials.
     points
@@ -63,6 +64,7 @@ def analyse_brdf(
     if points is not None and points < 20:
         raise UnusableError(f"--points: got {points}, expected 20 or more; raise it")
     console = Console(json)
+    data = analysing_brdf.SESSIONS_DATA if appearances else analysing_brdf.SAMPLES_DATA
     if appearances:
         each = points or analysing_brdf.N_POINTS_PER_FACE
         given: dict[str, Any] = {"labels": labels, "basis": merl_basis, "method": how, "seed": seed}
@@ -90,8 +92,11 @@ def analyse_brdf(
         if document["points_lost"]:
             lost = document["points_lost"]
             console.print_line(f"{document['name']}: {lost} points without specular reflection")
+    console.print_line(f"data: {data}")
     console.print_line(f"{out}: figure-14.png, figure-15.png, curves.csv, analysis.json")
-    console.print_document("skinrig.analyse-brdf/1", {"out": out, "datasets": documents})
+    console.print_document(
+        "skinrig.analyse-brdf/1", {"out": out, "data": data, "datasets": documents}
+    )
 
 
 def _plateaus(document: dict[str, Any]) -> list[object]:
