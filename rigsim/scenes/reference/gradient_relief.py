@@ -28,7 +28,7 @@ RELIEF_VOXEL_MM: Final = 1e-3 * RELIEF_TEXEL_UM
 
 RELIEF_ROUGHNESS: Final = 0.3
 """Beckmann roughness of the boundary. Connections through a smoother relief are rare and bright:
-at 0.05 a pixel has 20 times the noise. Light that facets reflect onto each other is lost, 10 %."""
+images at 0.05 have 20 times the noise. Light that facets reflect onto each other is lost, 10 %."""
 
 
 def draw_grooves(person: PersonSkin, site: str, rig: Rig) -> SkinPatch:
