@@ -31,6 +31,9 @@ FIRST_SEED: Final = 1
 SLOPED_MOMENTS: Final = (1, 2)
 """Moments whose contrast is that of the slopes."""
 
+NO_NOISE: Final = 1e-12
+"""Replaces a standard error of zero in a division."""
+
 
 @dataclass(frozen=True, slots=True)
 class MomentContrast:
@@ -81,7 +84,7 @@ def compare_contrast(voxels: Float64Array, fast: Float64Array) -> MomentContrast
         math.sqrt(float(rest @ rest) / (rest.size - 2) / power),
         math.sqrt(power / known.size),
         misfit,
-        spread / max(2.0 * misfit, math.sqrt(spread)),
+        spread / max(2.0 * misfit, math.sqrt(spread), NO_NOISE),
     )
 
 
