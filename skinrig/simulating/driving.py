@@ -63,6 +63,8 @@ def manifest_settings(order: SimulationOrder, **rig_settings: Any) -> dict[str, 
         "subject": subject_records.manifest_record(order.subject),
         "target": order.target or "",
     }
+    if order.session_seed is not None:
+        asked["session_seed"] = order.session_seed
     if order.plan is not None:
         asked["plan"] = order.plan.to_json()
     if order.renderer != "mitsuba":
@@ -222,7 +224,7 @@ def drive_plan(
     Parameters
     ----------
     order
-        Order of the simulation, with the world's seed and the progress callback.
+        Order of the simulation, with the world's seeds and the progress callback.
     session, rig
         Session, open for writing, and the nominal rig.
     scene
@@ -246,7 +248,12 @@ def drive_plan(
         Time elapsed on the rig's clock, s.
     """
     world = World(
-        rig, seed=order.seed, clock="virtual", scene=scene, shots_made=count_shots(session)
+        rig,
+        seed=order.noise_seed,
+        subject_seed=order.seed,
+        clock="virtual",
+        scene=scene,
+        shots_made=count_shots(session),
     )
     name = world.register(session.id)
     boxes = {

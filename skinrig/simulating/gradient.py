@@ -58,6 +58,7 @@ def simulate_gradient(order: GradientOrder) -> SimulationResult:
         site=order.site,
         subject=order.subject,
         seed=order.seed,
+        noise_seed=order.noise_seed,
         plan=plan,
         without=order.scene_switches(),
         renderer=order.renderer,
@@ -83,6 +84,7 @@ def make_scene(
     site: str | None = None,
     subject: str = "III",
     seed: int = 0,
+    noise_seed: int | None = None,
     plan: Plan | None = None,
     without: Mapping[str, Any] | None = None,
     renderer: Renderer = "mitsuba",
@@ -96,7 +98,9 @@ def make_scene(
     target : str, optional
         "ball", "flat" or "dark"; a patch of skin by default.
     site, subject, seed
-        Properties of the skin; the seed is also that of the sphere and of the patch's motion.
+        Properties of the skin; the seed is also that of the sphere.
+    noise_seed
+        Seed of the noise, the patch's motion and the place of a target; None: `seed`.
     plan : Plan, optional
         Plan whose caliper angles set the size of the skin; default any angle.
     without
@@ -105,8 +109,9 @@ def make_scene(
         Renderer of the patch; "mitsuba" only where its shadow rays are affordable.
     """
     sphere = build_sphere(rig, seed=seed)
+    session_seed = seed if noise_seed is None else noise_seed
     if target is not None:
-        return GradientScene(rig, cast(Any, target), sphere=sphere, seed=seed)
+        return GradientScene(rig, cast(Any, target), sphere=sphere, seed=session_seed)
     angles = {float(s.index["angle"]) for s in plan.steps if strain_state(s)} if plan else set()
     size_mm = required_size_mm(
         max(rig.views[0].field_mm),
@@ -122,8 +127,8 @@ def make_scene(
         rig,
         skin,
         sphere=sphere,
-        motion=PatchMotion(seed),
-        seed=seed,
+        motion=PatchMotion(session_seed),
+        seed=session_seed,
         on_s=on_s,
         effects=SceneEffects.from_switches(without or {}),
         choice=choose_renderer(renderer) if renderer == "fast" else None,

@@ -102,7 +102,10 @@ class SimulationOrder:
     size: str = "small"
     """"small" or "full"; each rig has its own meaning."""
     seed: int = 0
-    """Seed of the subject, the sensor and the controllers."""
+    """Seed of the subject and of the rig as built; without `session_seed` also of the capture."""
+    session_seed: int | None = None
+    """Seed of one capture of the same subject with the same rig: noise, position, motion, scan and
+    controllers. None: `seed`, and the face at the center of the rig."""
     subject: str = "III"
     """Preset of the skin, or a file NAME.toml, see `rigsim.population.files`."""
     target: str | None = None
@@ -132,8 +135,10 @@ class SimulationOrder:
                 )
         require_size(self.size)
         require_choice("renderer", self.renderer, get_args(Renderer), SimulationError)
-        if self.seed < 0:
-            raise SimulationError(f"seed: got {self.seed}, expected 0 or more")
+        for name in ("seed", "session_seed"):
+            number = getattr(self, name)
+            if number is not None and number < 0:
+                raise SimulationError(f"{name}: got {number}, expected 0 or more")
         width_px = getattr(self, "width_px", None)
         if width_px is not None and width_px < MIN_WIDTH_PX:
             raise SimulationError(
@@ -152,6 +157,11 @@ class SimulationOrder:
             raise SimulationOptionsError(
                 "plan: an option of subjects; targets and sequences have their own, so remove it"
             )
+
+    @property
+    def noise_seed(self) -> int:
+        """Seed of everything that differs between two captures of one subject."""
+        return self.seed if self.session_seed is None else self.session_seed
 
     def check_rig_of_plan(self) -> None:
         """Raise for a plan of another rig."""

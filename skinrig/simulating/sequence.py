@@ -15,6 +15,7 @@ from model import store
 from rigsim.mitsuba.variant import choose_renderer
 from rigsim.population import files as subject_file
 from rigsim.scenes.flash.course import FlashCourseScene, FlashEvent
+from rigsim.subject.head_motion import draw_head_position
 from rigsim.subject.perfusion import STATE_NAMES
 from rigsim.subject.perfusion_course import EventCourse, PromptedCourse
 from skinrig.arrays import BoolArray, Float64Array
@@ -72,6 +73,8 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
         "relaxation_s": constant_s,
         "movement": order.movement,
     }
+    if order.session_seed is not None:
+        asked["session_seed"] = order.session_seed
     reaction_s = sequence.reaction_s
     if reaction_s is not None and not 0 <= reaction_s < np.inf:
         raise SimulationError(f"reaction: got {reaction_s}, expected seconds >= 0")
@@ -82,12 +85,15 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
     if sequence.is_prompted:
         own = {"rise_s": constant_s, "fall_s": constant_s, "reaction_s": reaction_s}
         known: dict[str, Any] = {name: v for name, v in own.items() if v is not None}
-        course: EventCourse | PromptedCourse = PromptedCourse(sequence.state, seed=seed, **known)
+        course: EventCourse | PromptedCourse = PromptedCourse(
+            sequence.state, seed=order.noise_seed, **known
+        )
     else:
         course = EventCourse(sequence.state, constant_s)
     texels = TEXTURE_TEXELS_BY_WIDTH[int(width > MAX_COARSE_WIDTH_PX)]
     subject = subject_file.load_subject(order.subject)
     person = subject.face(seed=seed, size=texels, mesh=order.mesh)
+    person = person.translate(draw_head_position(order.session_seed))
     plan = sequence_plan(rig, sequence)
     if order.progress is not None:
         for line in sequence_lines(plan):
@@ -103,7 +109,7 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
         rig,
         person,
         course,
-        seed=seed,
+        seed=order.noise_seed,
         movement=order.movement,
         on_flash=note,
         choice=choose_renderer(order.renderer),
