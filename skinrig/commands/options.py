@@ -50,6 +50,13 @@ def choice(*values: str, text: str | None = None, metavar: str | None = None) ->
 
 Json = Annotated[bool, option("Print exactly one JSON document on stdout.", "--json")]
 Seed = Annotated[int, option("Random seed.")]
+DaysAgo = Annotated[
+    int,
+    option(
+        "Day of the session, days before today; LEDs and frame of dome and sphere are those of "
+        "that day."
+    ),
+]
 SessionSeed = Annotated[
     int | None,
     option(

@@ -56,6 +56,7 @@ class SimulateOptions:
     scale: options.Scale = "small"
     seed: options.Seed = 0
     session_seed: options.SessionSeed = None
+    days_ago: options.DaysAgo = 0
     plan: Path | None = None
     consent: options.Consent = None
     consent_expires: options.ConsentExpires = None
@@ -78,7 +79,7 @@ class SimulateOptions:
         order = {"subject": subject, "plan": plan, "person": person, "progress": console.progress}
         return (
             order
-            | select_attributes(self, "out", "seed", "session_seed", "resume")
+            | select_attributes(self, "out", "seed", "session_seed", "days_ago", "resume")
             | {"size": self.scale}
         )
 

@@ -14,6 +14,7 @@ from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
 from capture.plan.rows import step_lights
 from capture.rig import Rig, load_rig
 from model.skin import SkinAppearance, SkinMap
+from rigsim.as_built.aging import age_dome
 from rigsim.as_built.dome import build_dome
 from rigsim.mitsuba.variant import choose_renderer
 from rigsim.needs.effects import SceneEffects, max_on_time_s
@@ -284,7 +285,7 @@ def _plan(rig: Rig, target: str | None, size: str) -> Plan:
 
 
 def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
-    built = build_dome(rig, seed=order.seed)
+    built = age_dome(build_dome(rig, seed=order.seed), order.rig_age, seed=order.seed)
     if order.target == "dark":
         return DomeScene(rig, make_target("dark"), dome=built, seed=order.noise_seed)
     if order.target is not None:

@@ -63,15 +63,23 @@ def manifest_settings(order: SimulationOrder, **rig_settings: Any) -> dict[str, 
         "subject": subject_records.manifest_record(order.subject),
         "target": order.target or "",
     }
-    if order.session_seed is not None:
-        asked["session_seed"] = order.session_seed
     if order.plan is not None:
         asked["plan"] = order.plan.to_json()
     if order.renderer != "mitsuba":
         asked["renderer"] = order.renderer
     if order.leave_out:
         asked["leave_out"] = list(order.leave_out)
-    return asked | rig_settings
+    return asked | rig_settings | session_settings(order)
+
+
+def session_settings(order: SimulationOrder) -> dict[str, Any]:
+    """Return the given settings that differ between sessions of one subject."""
+    found: dict[str, Any] = {}
+    if order.session_seed is not None:
+        found["session_seed"] = order.session_seed
+    if order.days_ago:
+        found["days_ago"] = order.days_ago
+    return found
 
 
 @contextmanager
@@ -114,7 +122,7 @@ def open_session(
             )
         return session
     order.out.parent.mkdir(parents=True, exist_ok=True)
-    created = order.created
+    created = order.captured_at
     return Session.create(
         order.out,
         plan=plan,

@@ -8,6 +8,7 @@ from capture.plan import Plan
 from capture.plan.gradient import group_by_state, strain_state
 from capture.rig import Rig, load_rig
 from capture.session import Session
+from rigsim.as_built.aging import RigAge, age_sphere
 from rigsim.as_built.sphere import build_sphere
 from rigsim.mitsuba.variant import Renderer, choose_renderer
 from rigsim.needs.effects import SceneEffects, max_on_time_s
@@ -59,6 +60,7 @@ def simulate_gradient(order: GradientOrder) -> SimulationResult:
         subject=order.subject,
         seed=order.seed,
         noise_seed=order.noise_seed,
+        age=order.rig_age,
         plan=plan,
         without=order.scene_switches(),
         renderer=order.renderer,
@@ -85,6 +87,7 @@ def make_scene(
     subject: str = "III",
     seed: int = 0,
     noise_seed: int | None = None,
+    age: RigAge | None = None,
     plan: Plan | None = None,
     without: Mapping[str, Any] | None = None,
     renderer: Renderer = "mitsuba",
@@ -101,6 +104,8 @@ def make_scene(
         Properties of the skin; the seed is also that of the sphere.
     noise_seed
         Seed of the noise, the patch's motion and the place of a target; None: `seed`.
+    age
+        State of the rig on the day of the session; None: as built.
     plan : Plan, optional
         Plan whose caliper angles set the size of the skin; default any angle.
     without
@@ -109,6 +114,8 @@ def make_scene(
         Renderer of the patch; "mitsuba" only where its shadow rays are affordable.
     """
     sphere = build_sphere(rig, seed=seed)
+    if age is not None:
+        sphere = age_sphere(sphere, age, seed=seed)
     session_seed = seed if noise_seed is None else noise_seed
     if target is not None:
         return GradientScene(rig, cast(Any, target), sphere=sphere, seed=session_seed)

@@ -22,7 +22,7 @@ from skinrig.arrays import BoolArray, Float64Array
 from skinrig.capturing.sequences import SequenceOrder, sequence_lines, sequence_plan
 from skinrig.errors import require_choice
 from skinrig.simulating import subject_records
-from skinrig.simulating.driving import build_result, drive_plan, open_session
+from skinrig.simulating.driving import build_result, drive_plan, open_session, session_settings
 from skinrig.simulating.exposure_log import ExposureLog
 from skinrig.simulating.flash_truth import WIDTHS_PX, build_truth, scale_landmarks, to_superpixels
 from skinrig.simulating.orders import (
@@ -72,9 +72,8 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
         "sequence": sequence.document(),
         "relaxation_s": constant_s,
         "movement": order.movement,
+        **session_settings(order),
     }
-    if order.session_seed is not None:
-        asked["session_seed"] = order.session_seed
     reaction_s = sequence.reaction_s
     if reaction_s is not None and not 0 <= reaction_s < np.inf:
         raise SimulationError(f"reaction: got {reaction_s}, expected seconds >= 0")

@@ -13,7 +13,6 @@ from skinrig.simulating.driving import manifest_settings
 from skinrig.simulating.gradient import make_scene
 from skinrig.simulating.orders import DomeOrder, SimulationError
 
-
 TEXELS = 64
 
 
