@@ -15,12 +15,13 @@ the maps gives the verdict at a stated false-alarm rate.
 """
 
 import csv
+import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from scipy import stats
@@ -132,6 +133,10 @@ class SessionAgreement:
     def same(self) -> bool:
         """Whether no quantity has changed."""
         return not self.changed
+
+    def document(self) -> dict[str, Any]:
+        """Return the verdict as JSON values."""
+        return {"same": self.same, "verdict": str(self), **dataclasses.asdict(self)}
 
     def __str__(self) -> str:
         """Return the verdict in a sentence."""

@@ -111,23 +111,32 @@ class RigDay:
         return RigDay(protocol, folder, days_ago)
 
     def capture(
-        self, person: Mapping[str, Any], *, seed: int, calibration: Path | None = None
+        self,
+        person: Mapping[str, Any],
+        *,
+        seed: int,
+        state: str = "neutral",
+        calibration: Path | None = None,
     ) -> SkinAppearance:
         """Capture a person and return the maps.
 
         Parameters
         ----------
         person
-            Options that describe the person and their state, such as subject, seed and states.
+            Options that describe the person, such as subject and seed.
         seed
             Seed of the session.
+        state
+            Expression or condition of the face.
         calibration
             Folder of another day's calibration; None: that of the day.
         """
         for path in (self.folder / "session-person", *self.folder.glob("truth-*")):
             shutil.rmtree(path, ignore_errors=True)
         shutil.rmtree(self.folder / "maps", ignore_errors=True)
+        states: dict[str, Any] = {"flash": {"states": (state,)}, "dome": {"state": state}}
         options = {"seed": RIG_SEED, **self.protocol.options, **person}
+        options |= states.get(self.protocol.rig, {})
         done = simulate_session(
             self.protocol.rig,
             self.folder / "session-person",
@@ -137,5 +146,6 @@ class RigDay:
         )
         used = calibration or self.folder / "calibration"
         maps = self.folder / "maps"
-        reconstruct(done.session, want=list(self.protocol.maps), out=maps, calibration=used)
+        want = list(self.protocol.maps)
+        reconstruct(done.session, want=want, out=maps, calibration=used, state=state)
         return read(maps)
