@@ -44,6 +44,8 @@ REGION_NAMES: Final = tuple(
 MIN_REGION_SAMPLES: Final = 16
 CORRELATED_SAMPLES: Final = 4.0
 """Samples with common noise: demosaicing and interpolation correlate neighbors."""
+SHAPE: Final = "shape"
+"""Name of the deformation between two sessions."""
 WHOLE: Final = "the whole skin"
 MAX_NAMED_MAPS: Final = 4
 """Maps that the verdict names."""
@@ -62,8 +64,8 @@ class QuantityAgreement:
     name
         Name of the map, with its channel.
     unit
-        "%" of the mean of both sessions, "degrees", or "1" for the ratio of mean squares of a
-        relief, less 1.
+        "%" of the mean of both sessions, "degrees", "px" or "mm" of a deformation, or "1" for the
+        ratio of mean squares of a relief, less 1.
     samples
         Number of common samples.
     rms, stated
@@ -99,7 +101,8 @@ class QuantityAgreement:
         """Return the change in words, such as "melanin +12 % at upper left, 5.0 sigma"."""
         size = f"{self.change:+.3g}" + ("" if self.unit == "1" else f" {self.unit}")
         where = f"over {self.place}" if self.place == WHOLE else f"at {self.place}"
-        title = map_title(self.name.split(",")[0]) + self.name[len(self.name.split(",")[0]) :]
+        stem, comma, channel = self.name.partition(",")
+        title = (stem if stem == SHAPE else map_title(stem)) + comma + channel
         return f"{title} {size} {where}, {abs(self.sigmas):.3g} standard uncertainties"
 
 
@@ -176,12 +179,15 @@ def compare_sessions(
     names = [name for name in one.quantities if name in other.quantities]
     pairing = pair_samples(one, other)
     shared = a.parameters.get("color_table") == b.parameters.get("color_table")
-    limit = 1.0 - (1.0 - false_alarm) ** (1.0 / max(len(names), 1))
+    count = len(names) + (pairing.shape is not None)
+    limit = 1.0 - (1.0 - false_alarm) ** (1.0 / max(count, 1))
     found = []
     for name in names:
         compared = _Compared.of(name, one, pairing, shared)
         if compared is not None:
             found.append(compared.summarize(limit))
+    if pairing.shape is not None and (shape := _Compared.of_shape(one, pairing)) is not None:
+        found.append(shape.summarize(limit))
     if not found:
         raise SessionError(
             f"sessions: got no common skin of {', '.join(names) or 'any map'}, expected at least "
@@ -219,7 +225,7 @@ class _Compared:
         Names of the K regions.
     """
 
-    quantity: ComparedQuantity
+    name: str
     unit: str
     samples: int
     rms: float
@@ -266,7 +272,7 @@ class _Compared:
             means.append(size)
         known = _session_errors().get(session_error_name(a), (1.0, 1.0))
         return _Compared(
-            quantity=a,
+            name=a.name,
             unit={"level": "%", "direction": "degrees", "structure": "1"}[a.kind],
             samples=len(rows),
             rms=float(np.sqrt(np.mean(difference**2))),
@@ -276,6 +282,30 @@ class _Compared:
             noise=np.array(errors),
             stated=np.array(means),
             fractions=known if shared else (max(known[0], 1.0), max(known[1], 1.0)),
+        )
+
+    @staticmethod
+    def of_shape(maps: SessionMaps, pairing: Pairing) -> "_Compared | None":
+        """Return the deformation between two sessions."""
+        shape = pairing.shape
+        if shape is None:
+            return None
+        regions = list(_regions(maps, pairing.rows))
+        if not regions:
+            return None
+        stated = np.broadcast_to(shape.stderr[:, None], shape.moved.shape)
+        size = np.array([np.sqrt(np.mean(stated[i] ** 2, axis=0)) for _, i in regions])
+        return _Compared(
+            name=SHAPE,
+            unit=shape.unit,
+            samples=len(pairing.rows),
+            rms=float(np.sqrt(np.mean(shape.moved**2))),
+            rms_stated=float(np.sqrt(np.mean(stated**2))),
+            names=tuple(name for name, _ in regions),
+            change=np.array([shape.moved[i].mean(axis=0) for _, i in regions]),
+            noise=np.zeros_like(size),
+            stated=size,
+            fractions=_session_errors()[f"{SHAPE}, {shape.unit}"],
         )
 
     def summarize(self, limit: float) -> QuantityAgreement:
@@ -297,9 +327,9 @@ class _Compared:
                 if abs(sigmas) > abs(best[1]):
                     best = (got, sigmas, name)
         p_value = float(stats.chi2.sf(chi_square, degrees))
-        scale = {"%": 100.0, "degrees": math.degrees(1.0), "1": 1.0}[self.unit]
+        scale = {"%": 100.0, "degrees": math.degrees(1.0)}.get(self.unit, 1.0)
         return QuantityAgreement(
-            self.quantity.name,
+            self.name,
             self.unit,
             self.samples,
             self.rms,
@@ -361,4 +391,6 @@ def region_changes(
         if got is not None:
             whole = np.isfinite(got.change).all(axis=1)
             found[name] = (got.change, got.noise, got.stated, whole)
+    if (shape := _Compared.of_shape(one, pairing)) is not None:
+        found[SHAPE] = (shape.change, shape.noise, shape.stated, np.ones(len(shape.change), bool))
     return found

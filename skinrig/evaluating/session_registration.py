@@ -1,5 +1,7 @@
 """Pair the samples of two sessions' maps: by texture, surface, image structure or site."""
 
+from __future__ import annotations
+
 import dataclasses
 from dataclasses import dataclass
 from typing import Final
@@ -17,14 +19,37 @@ from skinrig.evaluating.session_maps import SessionMaps
 
 MAX_TEXTURE_DISTANCE_MM: Final = 5.0
 """Maximum median distance of equal texels, after rigid registration, of one parameterization."""
+MAX_TURN_RAD: Final = np.pi / 4.0
+"""Maximum rotation between two sessions, whose heads both face +z."""
 MAX_PAIR_DISTANCE_MM: Final = 1.0
 """Maximum distance of paired points of two surfaces of different parameterizations."""
+SCAN_ERROR_MM: Final = 0.5
+"""Standard uncertainty of a scanned point along the normal, after a rigid fit."""
 MIN_REGISTERED_FRACTION: Final = 0.1
 """Minimum fraction of A's skin that a registration of images must place."""
 N_SURFACE_STEPS: Final = 20
 MAX_FIT_POINTS: Final = 5_000
 KEPT_FRACTION: Final = 0.8
 """Fraction of nearest pairs of a rigid step; the others have no partner."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ComparedShape:
+    """Deformation of the skin between two sessions, beyond rotation, shift and, of images, size.
+
+    Attributes
+    ----------
+    moved
+        (M, C): displacement of each pair, px in an image, mm along the normal on a surface.
+    stderr
+        (M,): standard uncertainty along each axis.
+    unit
+        "px" or "mm".
+    """
+
+    moved: Float64Array
+    stderr: Float64Array
+    unit: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +66,8 @@ class Pairing:
         How they were found, in words.
     moved
         B, with images resampled at the pixels of A; `others` are its samples.
+    shape
+        Deformation from A to B; None where it is not known.
     """
 
     rows: Int64Array
@@ -48,6 +75,7 @@ class Pairing:
     rotation: Float64Array
     how: str
     moved: SessionMaps
+    shape: ComparedShape | None = None
 
 
 def pair_samples(a: SessionMaps, b: SessionMaps) -> Pairing:
@@ -79,9 +107,16 @@ def _pair_surfaces(a: SessionMaps, b: SessionMaps) -> Pairing:
         if len(both) >= 3:
             rotation, shift = _fit_rigid(b.position_mm[both], a.position_mm[both])
             apart = b.position_mm[both] @ rotation.T + shift - a.position_mm[both]
-            if np.median(np.linalg.norm(apart, axis=1)) <= MAX_TEXTURE_DISTANCE_MM:
+            along = np.sum(apart * a.normals[both], axis=1, keepdims=True)
+            known = np.isfinite(along[:, 0])
+            shape = ComparedShape(
+                np.where(known[:, None], along, 0.0), np.full(len(both), SCAN_ERROR_MM), "mm"
+            )
+            turn_rad = Rotation.from_matrix(rotation).magnitude()
+            near = np.median(np.linalg.norm(apart, axis=1)) <= MAX_TEXTURE_DISTANCE_MM
+            if near and turn_rad <= MAX_TURN_RAD:
                 how = "by their common texture, after a rigid fit"
-                return Pairing(both, both, rotation, how, b)
+                return Pairing(both, both, rotation, how, b, shape)
     known = [np.flatnonzero(one.seen & np.isfinite(one.position_mm).all(axis=1)) for one in (a, b)]
     if min(len(index) for index in known) < 3:
         none = np.zeros(0, np.int64)
@@ -113,7 +148,7 @@ def _fit_rigid(
 def _pair_images(a: SessionMaps, b: SessionMaps) -> Pairing:
     """Pair pixels by image structure, or else by the outline of the skin."""
     seen = [one.seen.reshape(one.shape) for one in (a, b)]
-    source, good, how = None, seen[0], ""
+    source, error, good, how = None, None, seen[0], ""
     for marks, name in ((None, "structure"), (_shifted_corners(a, b), "shift and structure")):
         try:
             found = expression_alignment.align(
@@ -128,14 +163,29 @@ def _pair_images(a: SessionMaps, b: SessionMaps) -> Pairing:
             continue
         if found.valid.sum() >= MIN_REGISTERED_FRACTION * seen[0].sum():
             source, good = found.source_px.astype(np.float64), found.valid & seen[0]
-            how = f"by the {name} of the skin"
+            error, how = found.error_px.astype(np.float64), f"by the {name} of the skin"
             break
     if source is None:
         source, good = _by_outline(*seen)
         how = "by the outline of the skin: its structure does not match"
     moved = _warp(b, source)
     rows = np.flatnonzero(good & moved.seen.reshape(a.shape))
-    return Pairing(rows, rows, np.eye(3), how, moved)
+    shape = None
+    if error is not None:
+        away = _beyond_similarity(a, source.reshape(-1, 2), rows)
+        shape = ComparedShape(away, error.reshape(-1)[rows] / np.sqrt(2.0), "px")
+    return Pairing(rows, rows, np.eye(3), how, moved, shape)
+
+
+def _beyond_similarity(a: SessionMaps, source_px: Float64Array, rows: Int64Array) -> Float64Array:
+    """Return the displacement of pixels that no shift, rotation and size explains, (M, 2), px."""
+    line, column = np.divmod(rows, a.shape[1])
+    place = column + 1j * line
+    goal = source_px[rows, 0] + 1j * source_px[rows, 1]
+    design = np.stack([place, np.ones_like(place)], axis=1)
+    factors, *_ = np.linalg.lstsq(design, goal, rcond=None)
+    rest = goal - design @ factors
+    return np.stack([rest.real, rest.imag], axis=1)
 
 
 def _shifted_corners(
