@@ -199,6 +199,8 @@ def _shifted_corners(
         seen = one.seen.reshape(one.shape)
         image = one.structure if one.structure.ndim == 2 else one.structure.mean(axis=-1)
         flat.append(np.where(seen, image - image[seen].mean(), 0.0) if seen.any() else 0.0 * image)
+    if not all(np.ptp(image) > 0.0 for image in flat):
+        return None
     down, across = phase_cross_correlation(flat[1], flat[0], normalization=None)[0]
     height, width = a.shape
     places = {

@@ -176,7 +176,7 @@ def measure_transport(stage: BenchmarkStage) -> None:
     lights = ("below",) if stage.toy else tuple(LIGHT_WAYS)
     size = {"width_px": 40, "texels": 64, "samples": 64}
     if not stage.toy:
-        size = {"width_px": 80, "texels": 256, "samples": 128}
+        size = {"width_px": 64, "texels": 128, "samples": 64}
     cases = build_cases(people, lights, **size)
 
     def errors(images: Sequence[Float64Array]) -> tuple[list[float], list[float]]:
