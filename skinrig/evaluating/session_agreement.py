@@ -1,7 +1,7 @@
 """Decide whether two sessions show the same person in the same state.
 
-Each map is reduced to the differences of its means over nine regions of the registered skin, or
-over the sites of a fiber probe. Their errors have three parts:
+Each map is reduced to the median differences over nine regions of the registered skin, or over the
+sites of a fiber probe. Their errors have three parts:
 
 - noise, independent between pixels;
 - an error common to one region, such as that of light and registration;
@@ -10,8 +10,9 @@ over the sites of a fiber probe. Their errors have three parts:
 The last two are fractions of the stated standard uncertainties, measured between simulated sessions
 (`skinrig/data/session_errors.csv`, `skinrig bench --stage repeatability`). They are smaller than 1
 because the unknown optics of a person's skin are the same in both sessions, if the camera and the
-light are. Otherwise both fractions are 1. A chi-squared test per map with a Sidak correction over
-the maps gives the verdict at a stated false-alarm rate.
+light are. Otherwise both fractions are 1. Each map has two tests: one of its mean over the whole
+skin, and a chi-squared test of all regions. A Sidak correction over tests and maps gives the
+verdict at a stated false-alarm rate.
 """
 
 import csv
@@ -47,6 +48,8 @@ CORRELATED_SAMPLES: Final = 4.0
 SHAPE: Final = "shape"
 """Name of the deformation between two sessions."""
 WHOLE: Final = "the whole skin"
+WHOLE_PREFERENCE: Final = 1.25
+"""Factor by which a region must be more significant than the whole skin to be named."""
 MAX_NAMED_MAPS: Final = 4
 """Maps that the verdict names."""
 
@@ -76,7 +79,8 @@ class QuantityAgreement:
     change, sigmas
         Change there in `unit`, B minus A, and in standard uncertainties between sessions.
     p_value
-        Probability of larger differences of all regions without a change.
+        Probability of larger differences without a change: of the whole skin, or of all regions
+        together.
     changed
         Whether it is below the limit of one quantity.
     """
@@ -257,11 +261,12 @@ class _Compared:
         change, errors, means = [], [], []
         for _, inside in regions:
             count = max(inside.size / (1.0 if maps.kind == "sites" else CORRELATED_SAMPLES), 1.0)
-            square = np.sqrt(np.mean(noise[inside] ** 2, axis=0) / count)
-            size = np.sqrt(np.mean(stated[inside] ** 2, axis=0))
-            got = difference[inside].mean(axis=0)
+            # medians: samples at oblique rims and at shadow edges are outliers
+            square = np.sqrt(np.pi / 2.0 * np.mean(noise[inside] ** 2, axis=0) / count)
+            size = np.median(stated[inside], axis=0)
+            got = np.median(difference[inside], axis=0)
             if a.kind == "level":
-                level = 0.5 * np.abs(va[inside].mean(axis=0) + vb[inside].mean(axis=0))
+                level = 0.5 * np.abs(np.median(va[inside] + vb[inside], axis=0))
                 got, square, size = got / level, square / level, size / level
             elif a.kind == "structure":
                 ratio = np.mean(difference[inside] ** 2) / np.mean(stated[inside] ** 2)
@@ -311,7 +316,7 @@ class _Compared:
     def summarize(self, limit: float) -> QuantityAgreement:
         """Return the test of all regions against a p-value limit."""
         face, region = self.fractions
-        chi_square, degrees = 0.0, 0
+        chi_square, degrees, whole = 0.0, 0, []
         best = (0.0, 0.0, WHOLE)
         for k in range(self.change.shape[1]):
             change, common = self.change[:, k], face * self.stated[:, k]
@@ -324,9 +329,14 @@ class _Compared:
             for name, weight in tests:
                 got = float(weight @ change)
                 sigmas = got / math.sqrt(float(weight @ covariance @ weight))
-                if abs(sigmas) > abs(best[1]):
+                if name == WHOLE:
+                    whole.append(abs(sigmas))
+                least = abs(best[1]) * (WHOLE_PREFERENCE if best[2] == WHOLE else 1.0)
+                if abs(sigmas) > least:
                     best = (got, sigmas, name)
-        p_value = float(stats.chi2.sf(chi_square, degrees))
+        # a change of the whole skin, and any pattern of changes: Sidak over the tests of both
+        likely = min(2.0 * stats.norm.sf(max(whole)), stats.chi2.sf(chi_square, degrees))
+        p_value = float(1.0 - (1.0 - likely) ** (1 + len(whole)))
         scale = {"%": 100.0, "degrees": math.degrees(1.0)}.get(self.unit, 1.0)
         return QuantityAgreement(
             self.name,

@@ -30,8 +30,8 @@ PRESETS: Final = ("I", "II", "III", "IV", "V", "VI")
 SITES: Final = ("forehead", "cheek", "nose", "chin", "temple")
 CHANGED_STATE: Final = "exercise"
 """State with blood in the whole face."""
-FIRST_PERSON: Final = 100
-"""Seed of the first person: lower ones set the errors between sessions."""
+FIRST_PERSON: Final = 104
+"""Number of the first person: lower ones set the errors between sessions."""
 WIDTHS_PX: Final[Mapping[str, int]] = {"flash": 128, "dome": 240, "gradient": 128, "probe": 0}
 PEOPLE: Final[Mapping[str, int]] = {"flash": 20, "dome": 6, "gradient": 5, "probe": 6}
 TOY_WIDTH_PX: Final = 64
