@@ -316,7 +316,13 @@ def draw_lumitexels(drawn: list[DrawnLumitexel]) -> bytes:
         axis.set_ylim(-1.1, 1.05)
         axis.set_aspect("equal")
         axis.tick_params(labelsize=7)
-    axes[0][0].legend(fontsize=7, loc="upper left")
+    marks = {
+        label: mark
+        for axis in axes[0]
+        for mark, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    names, drawings = list(marks), list(marks.values())
+    figure.legend(drawings, names, fontsize=8, loc="outside lower center", ncols=len(names))
     if shaded is not None:
         bar = figure.colorbar(shaded, ax=list(axes[0]), shrink=0.8)
         bar.set_label("pi x BRDF, mean of the channels (1: perfect white)", fontsize=8)
