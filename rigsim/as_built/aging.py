@@ -130,19 +130,24 @@ def age_dome(built: ActualDome, age: RigAge, *, seed: int) -> ActualDome:
         dataclasses.replace(
             light,
             power_w=None if light.power_w is None else light.power_w * float(factor),
-            position_mm=tuple(grown * x for x in light.position_mm),
+            position_mm=_scale(light.position_mm, grown),
         )
         for light, factor in zip(lights, factors, strict=True)
     )
     views = tuple(
         dataclasses.replace(
             view,
-            position_mm=tuple(grown * x for x in view.position_mm),
-            target_mm=tuple(grown * x for x in view.target_mm),
+            position_mm=_scale(view.position_mm, grown),
+            target_mm=_scale(view.target_mm, grown),
         )
         for view in built.rig.views
     )
     return dataclasses.replace(built, rig=dataclasses.replace(built.rig, lights=aged, views=views))
+
+
+def _scale(point: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
+    x, y, z = point
+    return factor * x, factor * y, factor * z
 
 
 def age_sphere(built: ActualSphere, age: RigAge, *, seed: int) -> ActualSphere:
