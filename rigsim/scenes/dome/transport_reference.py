@@ -25,7 +25,7 @@ GLOBAL_DEPTH: Final = 8
 
 def render_transport(
     scene: DomeScene, view: View, light: int, *, depth: int, samples: int, runs: int
-) -> tuple[Float64Array, Float64Array]:
+) -> Float64Array:
     """Render one light of a dome with paths up to a length.
 
     Parameters
@@ -39,12 +39,12 @@ def render_transport(
     depth
         Path length, 2: direct light.
     samples, runs
-        Samples per pixel, and runs with different seeds, at least 2.
+        Samples per pixel, and runs with different seeds; run k of any depth has the same seed.
 
     Returns
     -------
-    mean, stderr : ndarray of float64, shape (H, W, 3)
-        Camera RGB, up to one factor for all images of a light, and its standard error by the runs.
+    ndarray of float64, shape (runs, H, W, 3)
+        Camera RGB, up to one factor for all images of a light.
     """
     if not isinstance(scene.subject, SimulatedSubject):
         raise TypeError(f"scene: got the target {scene.subject.name!r}, expected a face")
@@ -61,5 +61,4 @@ def render_transport(
     images: list[Float32Array] = [
         radiance(described, kind="rgb", samples=samples, seed=run)[..., :3] for run in range(runs)
     ]
-    stack = np.array(images, np.float64)
-    return stack.mean(axis=0), stack.std(axis=0, ddof=1) / np.sqrt(runs)
+    return np.array(images, np.float64)

@@ -145,8 +145,11 @@ def build_cases(
             index = int(np.argmax(unit @ np.array(LIGHT_WAYS[name])))
             light = dataclasses.replace(build_true_light(direct, index, VIEW_NAME), exponent=0.0)
             shot = {"samples": samples, "runs": REFERENCE_RUNS}
-            once, _ = render_transport(direct, rig.views[0], index, depth=DIRECT_DEPTH, **shot)
-            every, error = render_transport(direct, rig.views[0], index, depth=GLOBAL_DEPTH, **shot)
+            direct_runs = render_transport(direct, rig.views[0], index, depth=DIRECT_DEPTH, **shot)
+            beyond = render_transport(direct, rig.views[0], index, depth=GLOBAL_DEPTH, **shot)
+            beyond -= direct_runs
+            once = direct_runs.mean(axis=0)
+            error = beyond.std(axis=0, ddof=1) / np.sqrt(REFERENCE_RUNS)
             camera = CameraPose.nominal(rig.views[0])
             made = render_surface(surface, camera, light, subsurface="local", caster=caster)
             skin = made.covered & (once.mean(axis=-1) > 0.0)
@@ -161,8 +164,8 @@ def build_cases(
                     caster,
                     camera,
                     light,
-                    made.radiance + factor * (every - once),
-                    factor * np.sqrt(2.0) * error,
+                    made.radiance + factor * beyond.mean(axis=0),
+                    factor * error,
                     made.radiance + exchange,
                     skin,
                 )
