@@ -28,7 +28,7 @@ import numpy as np
 from scipy import stats
 
 from model.skin import SkinAppearance
-from skinrig.arrays import BoolArray, Float64Array, Int64Array
+from skinrig.arrays import Float64Array, Int64Array
 from skinrig.evaluating.session_maps import ComparedQuantity, SessionMaps, read_session_maps
 from skinrig.evaluating.session_registration import Pairing, pair_samples
 from skinrig.reporting.map_names import map_title
@@ -377,7 +377,7 @@ def _regions(maps: SessionMaps, rows: Int64Array) -> Iterator[tuple[str, Int64Ar
 
 def region_changes(
     a: SkinAppearance, b: SkinAppearance
-) -> dict[str, tuple[Float64Array, Float64Array, Float64Array, BoolArray]]:
+) -> dict[str, tuple[Float64Array, Float64Array, Float64Array]]:
     """Return the differences of regions, to set the errors between sessions.
 
     Parameters
@@ -388,8 +388,7 @@ def region_changes(
     Returns
     -------
     dict
-        By quantity: change, noise and stated standard uncertainty, each (K, C), and whether a row
-        has all of them, (K,).
+        By quantity: change, noise and stated standard uncertainty, each (K, C).
     """
     one, other = read_session_maps(a), read_session_maps(b)
     if one is None or other is None:
@@ -399,8 +398,7 @@ def region_changes(
     for name in one.quantities.keys() & other.quantities.keys():
         got = _Compared.of(name, one, pairing, True)
         if got is not None:
-            whole = np.isfinite(got.change).all(axis=1)
-            found[name] = (got.change, got.noise, got.stated, whole)
+            found[name] = (got.change, got.noise, got.stated)
     if (shape := _Compared.of_shape(one, pairing)) is not None:
-        found[SHAPE] = (shape.change, shape.noise, shape.stated, np.ones(len(shape.change), bool))
+        found[SHAPE] = (shape.change, shape.noise, shape.stated)
     return found

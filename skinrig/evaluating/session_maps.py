@@ -8,8 +8,9 @@ from typing import Final, Literal
 import numpy as np
 
 from model.skin import SkinAppearance, SkinMap
+from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.evaluating.subsurface import RECOMMENDED_METHOD, SUBSURFACE_FILE, read_document
+from skinrig.evaluating.subsurface import RECOMMENDED_METHOD, read_document
 
 Kind = Literal["level", "direction", "structure"]
 
@@ -186,8 +187,8 @@ def _read_probe(appearance: SkinAppearance) -> SessionMaps | None:
                 table[k] = np.mean(rows[site, channel], axis=0)
         valid = np.isfinite(table).all(axis=1)
         name = f"sigma_tr, {channel}"
-        columns = (np.nan_to_num(table[:, k : k + 1]) for k in range(3))
-        quantities[name] = ComparedQuantity(name, "level", *columns, valid)
+        value, stderr, noise = np.nan_to_num(table).T[..., None]
+        quantities[name] = ComparedQuantity(name, "level", value, stderr, noise, valid)
     nowhere = np.full((len(sites), 3), np.nan)
     seen = np.ones(len(sites), np.bool_)
     return SessionMaps(

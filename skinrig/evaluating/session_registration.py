@@ -14,7 +14,7 @@ from skimage.registration import phase_cross_correlation
 
 from reconstruction.correspondence import expression_alignment
 from reconstruction.registration import RegistrationError, dense_flow
-from skinrig.arrays import Float64Array, Int64Array
+from skinrig.arrays import BoolArray, Float64Array, Int64Array
 from skinrig.evaluating.session_maps import SessionMaps
 
 MAX_TEXTURE_DISTANCE_MM: Final = 5.0
@@ -148,7 +148,10 @@ def _fit_rigid(
 def _pair_images(a: SessionMaps, b: SessionMaps) -> Pairing:
     """Pair pixels by image structure, or else by the outline of the skin."""
     seen = [one.seen.reshape(one.shape) for one in (a, b)]
-    source, error, good, how = None, None, seen[0], ""
+    source: Float64Array | None = None
+    error: Float64Array | None = None
+    good: BoolArray = seen[0]
+    how = ""
     for marks, name in ((None, "structure"), (_shifted_corners(a, b), "shift and structure")):
         try:
             found = expression_alignment.align(
@@ -236,10 +239,7 @@ def _warp(maps: SessionMaps, source_px: Float64Array) -> SessionMaps:
     return dataclasses.replace(maps, shape=at.shape[:2], quantities=moved, seen=seen)
 
 
-def _by_outline(
-    one: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
-    other: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
-) -> tuple[Float64Array, np.ndarray[tuple[int, ...], np.dtype[np.bool_]]]:
+def _by_outline(one: BoolArray, other: BoolArray) -> tuple[Float64Array, BoolArray]:
     """Return where each pixel of one mask is in the other when their bounding boxes are matched."""
     rows, columns = np.indices(one.shape)
     source = np.zeros((*one.shape, 2))

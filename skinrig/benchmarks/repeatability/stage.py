@@ -20,7 +20,7 @@ from skinrig.benchmarks.repeatability.sessions import RigDay, RigProtocol, choos
 from skinrig.benchmarks.resampling import mean_error
 from skinrig.benchmarks.results import Timing
 from skinrig.benchmarks.stage import BenchmarkStage
-from skinrig.evaluating.session_agreement import SessionError, compare_sessions
+from skinrig.evaluating.session_agreement import SessionError, compare_sessions, region_changes
 
 DAYS_AGO: Final = (30, 0)
 """Days of the two sessions, before today."""
@@ -76,6 +76,8 @@ class RigTrials:
     ----------
     ratios
         Rms difference, stated one, and their ratio, by map, one per pair of one person.
+    common
+        Changes in stated uncertainties by map: mean over regions, and their deviation.
     false_alarms, pairs
         Pairs of one person judged as changed, and all.
     found, changed
@@ -83,6 +85,7 @@ class RigTrials:
     """
 
     ratios: dict[str, list[tuple[float, float, float]]] = field(default_factory=dict)
+    common: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     false_alarms: int = 0
     pairs: int = 0
     found: int = 0
@@ -96,6 +99,10 @@ class RigTrials:
         for one in verdict.quantities:
             figures = (one.rms, one.stated, one.ratio)
             self.ratios.setdefault(one.name, []).append(figures)
+        for name, (change, _, stated) in region_changes(a, b).items():
+            relative = change / stated
+            spread = float(relative.std(axis=0, ddof=1).mean()) if len(relative) > 1 else 0.0
+            self.common.setdefault(name, []).append((float(relative.mean()), spread))
 
     def judge_changed(self, a: SkinAppearance, b: SkinAppearance) -> None:
         """Compare sessions of two people or of two states."""
@@ -187,10 +194,13 @@ def measure_repeatability(stage: BenchmarkStage) -> Iterator[None]:
             timing = Timing.single((time.perf_counter() - begun) / count)
             for quantity, rows in trials.ratios.items():
                 rms, stated, ratios = np.array(rows).T
+                face, region = np.sqrt(np.mean(np.square(trials.common[quantity]), axis=0)).tolist()
                 extra = {
                     "rms difference": float(np.sqrt(np.mean(rms**2))),
                     "stated": float(np.sqrt(np.mean(stated**2))),
                     "pairs": len(ratios),
+                    "common to the face, stated uncertainties": face,
+                    "common to a region": region,
                 }
                 knobs = {"rig": rig, "quantity": quantity}
                 stage.add(knobs, timing, mean_error(ratios), extra)
