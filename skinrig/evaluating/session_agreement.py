@@ -45,9 +45,9 @@ REGION_NAMES: Final = tuple(
 MIN_REGION_SAMPLES: Final = 16
 CORRELATED_SAMPLES: Final = 4.0
 """Samples with common noise: demosaicing and interpolation correlate neighbors."""
-SHAPE: Final = "shape"
+SHAPE_QUANTITY: Final = "shape"
 """Name of the deformation between two sessions."""
-WHOLE: Final = "the whole skin"
+WHOLE_SKIN: Final = "the whole skin"
 WHOLE_PREFERENCE: Final = 1.25
 """Factor by which a region must be more significant than the whole skin to be named."""
 MAX_NAMED_MAPS: Final = 4
@@ -104,9 +104,9 @@ class QuantityAgreement:
     def __str__(self) -> str:
         """Return the change in words, such as "melanin +12 % at upper left, 5.0 sigma"."""
         size = f"{self.change:+.3g}" + ("" if self.unit == "1" else f" {self.unit}")
-        where = f"over {self.place}" if self.place == WHOLE else f"at {self.place}"
+        where = f"over {self.place}" if self.place == WHOLE_SKIN else f"at {self.place}"
         stem, comma, channel = self.name.partition(",")
-        title = (stem if stem == SHAPE else map_title(stem)) + comma + channel
+        title = (stem if stem == SHAPE_QUANTITY else map_title(stem)) + comma + channel
         return f"{title} {size} {where}, {abs(self.sigmas):.3g} standard uncertainties"
 
 
@@ -301,7 +301,7 @@ class _Compared:
         stated = np.broadcast_to(shape.stderr[:, None], shape.moved.shape)
         size = np.array([np.sqrt(np.mean(stated[i] ** 2, axis=0)) for _, i in regions])
         return _Compared(
-            name=SHAPE,
+            name=SHAPE_QUANTITY,
             unit=shape.unit,
             samples=len(pairing.rows),
             rms=float(np.sqrt(np.mean(shape.moved**2))),
@@ -310,14 +310,14 @@ class _Compared:
             change=np.array([shape.moved[i].mean(axis=0) for _, i in regions]),
             noise=np.zeros_like(size),
             stated=size,
-            fractions=_session_errors()[f"{SHAPE}, {shape.unit}"],
+            fractions=_session_errors()[f"{SHAPE_QUANTITY}, {shape.unit}"],
         )
 
     def summarize(self, limit: float) -> QuantityAgreement:
         """Return the test of all regions against a p-value limit."""
         face, region = self.fractions
         chi_square, degrees, whole = 0.0, 0, []
-        best = (0.0, 0.0, WHOLE)
+        best = (0.0, 0.0, WHOLE_SKIN)
         for k in range(self.change.shape[1]):
             change, common = self.change[:, k], face * self.stated[:, k]
             own = self.noise[:, k] ** 2 + (region * self.stated[:, k]) ** 2
@@ -325,13 +325,13 @@ class _Compared:
             chi_square += float(change @ np.linalg.solve(covariance, change))
             degrees += len(change)
             mean = np.full(len(change), 1.0 / len(change))
-            tests = [(WHOLE, mean), *zip(self.names, np.eye(len(change)), strict=True)]
+            tests = [(WHOLE_SKIN, mean), *zip(self.names, np.eye(len(change)), strict=True)]
             for name, weight in tests:
                 got = float(weight @ change)
                 sigmas = got / math.sqrt(float(weight @ covariance @ weight))
-                if name == WHOLE:
+                if name == WHOLE_SKIN:
                     whole.append(abs(sigmas))
-                least = abs(best[1]) * (WHOLE_PREFERENCE if best[2] == WHOLE else 1.0)
+                least = abs(best[1]) * (WHOLE_PREFERENCE if best[2] == WHOLE_SKIN else 1.0)
                 if abs(sigmas) > least:
                     best = (got, sigmas, name)
         # a change of the whole skin, and any pattern of changes: Sidak over the tests of both
@@ -400,5 +400,5 @@ def region_changes(
         if got is not None:
             found[name] = (got.change, got.noise, got.stated)
     if (shape := _Compared.of_shape(one, pairing)) is not None:
-        found[SHAPE] = (shape.change, shape.noise, shape.stated)
+        found[SHAPE_QUANTITY] = (shape.change, shape.noise, shape.stated)
     return found

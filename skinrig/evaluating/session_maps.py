@@ -19,7 +19,7 @@ LEVEL_MAPS: Final = ("melanin", "hemoglobin", "oxygenation", "r_d")
 depth and skin tone are not among them: they repeat the same errors, or depend on the light."""
 STRUCTURE_MAPS: Final = ("height_", "normals_")
 """Prefixes of the maps of a patch, whose relief is compared pixel by pixel."""
-CHANNELS: Final = ("red", "green", "blue")
+CHANNEL_NAMES: Final = ("red", "green", "blue")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +151,7 @@ def _levels(name: str, one: SkinMap, noise: SkinMap | None) -> Iterator[Compared
     if whole.values.shape[1] == 1:
         yield whole
         return
-    for k, channel in enumerate(CHANNELS):
+    for k, channel in enumerate(CHANNEL_NAMES):
         part = {key: getattr(whole, key)[:, k : k + 1] for key in ("values", "stderr", "noise")}
         yield dataclasses.replace(whole, name=f"{name}, {channel}", **part)
 
@@ -180,7 +180,7 @@ def _read_probe(appearance: SkinAppearance) -> SessionMaps | None:
         return None
     sites = tuple(dict.fromkeys(site for site, _ in rows))
     quantities = {}
-    for channel in CHANNELS:
+    for channel in CHANNEL_NAMES:
         table = np.full((len(sites), 3), np.nan)
         for k, site in enumerate(sites):
             if (site, channel) in rows:

@@ -34,7 +34,7 @@ from skinrig.rendering.transport import SkinExchange
 from skinrig.rendering.truth import build_true_light, build_true_model
 
 VIEW_NAME: Final = "C07"
-PEOPLE: Final[Mapping[str, int]] = {"I": 11, "II": 12, "III": 13, "VI": 14}
+SEED_BY_PRESET: Final[Mapping[str, int]] = {"I": 11, "II": 12, "III": 13, "VI": 14}
 """Seed by preset."""
 LIGHT_WAYS: Final[Mapping[str, tuple[float, float, float]]] = {
     "front": (0.0, 0.0, 1.0),
@@ -121,7 +121,7 @@ def build_cases(
     Parameters
     ----------
     people, lights
-        Keys of `PEOPLE` and of `LIGHT_WAYS`.
+        Keys of `SEED_BY_PRESET` and of `LIGHT_WAYS`.
     width_px, texels
         Width of the images, and side of the maps.
     samples
@@ -132,7 +132,7 @@ def build_cases(
     unit = place / np.linalg.norm(place, axis=1, keepdims=True)
     cases = []
     for preset in people:
-        face = make_subject(preset, seed=PEOPLE[preset], size=texels)
+        face = make_subject(preset, seed=SEED_BY_PRESET[preset], size=texels)
         direct, full = (
             DomeScene(
                 rig, face, effects=SceneEffects(lateral=False, interreflections=with_exchange)
@@ -175,7 +175,7 @@ def build_cases(
 
 def measure_transport(stage: BenchmarkStage) -> None:
     """Measure errors of direct light and of paths, over people, lights and samples."""
-    people = ("I",) if stage.toy else tuple(PEOPLE)
+    people = ("I",) if stage.toy else tuple(SEED_BY_PRESET)
     lights = ("below",) if stage.toy else tuple(LIGHT_WAYS)
     size = {"width_px": 40, "texels": 64, "samples": 64}
     if not stage.toy:

@@ -26,14 +26,14 @@ DAYS_AGO: Final = (30, 0)
 """Days of the two sessions, before today."""
 AGES_DAYS: Final = (30, 90, 365)
 """Ages at which calibrations are compared with today's."""
-PRESETS: Final = ("I", "II", "III", "IV", "V", "VI")
-SITES: Final = ("forehead", "cheek", "nose", "chin", "temple")
+SKIN_PRESETS: Final = ("I", "II", "III", "IV", "V", "VI")
+PATCH_SITES: Final = ("forehead", "cheek", "nose", "chin", "temple")
 CHANGED_STATE: Final = "exercise"
 """State with blood in the whole face."""
 FIRST_PERSON: Final = 104
 """Number of the first person: lower ones set the errors between sessions."""
 WIDTHS_PX: Final[Mapping[str, int]] = {"flash": 128, "dome": 240, "gradient": 128, "probe": 0}
-PEOPLE: Final[Mapping[str, int]] = {"flash": 20, "dome": 6, "gradient": 5, "probe": 6}
+PEOPLE_BY_RIG: Final[Mapping[str, int]] = {"flash": 20, "dome": 6, "gradient": 5, "probe": 6}
 TOY_WIDTH_PX: Final = 64
 
 
@@ -58,13 +58,13 @@ def describe_person(rig: str, number: int) -> dict[str, Any]:
     >>> describe_person("flash", 7), describe_person("dome", 3)
     ({'subject': 'II', 'seed': 7}, {'subject': 'P04'})
     """
-    preset = PRESETS[number % len(PRESETS)]
+    preset = SKIN_PRESETS[number % len(SKIN_PRESETS)]
     if rig == "flash":
         return {"subject": preset, "seed": number}
     if rig == "dome":
         return {"subject": f"P{number % 87 + 1:02d}"}
     if rig == "gradient":
-        return {"subject": preset, "site": SITES[number % len(SITES)]}
+        return {"subject": preset, "site": PATCH_SITES[number % len(PATCH_SITES)]}
     return {"subject": f"ita:{65 - 9 * (number % 12)}"}
 
 
@@ -181,7 +181,7 @@ def measure_drifts(
 
 def measure_repeatability(stage: BenchmarkStage) -> Iterator[None]:
     """Measure differences between sessions, verdicts and drifts, one rig after the other."""
-    people = {"flash": 1} if stage.toy else PEOPLE
+    people = {"flash": 1} if stage.toy else PEOPLE_BY_RIG
     alarms = pairs = found = changed = 0
     for rig, count in people.items():
         width = TOY_WIDTH_PX if stage.toy else WIDTHS_PX[rig]
