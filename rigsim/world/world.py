@@ -74,6 +74,8 @@ class World:
         The rig; by default the shipped flash rig.
     seed
         Seeds controllers, faults and sensors: same seed, same bytes.
+    subject_seed
+        Seeds the mechanics of the subject's skin; None: `seed`.
     clock
         ``"virtual"``: time passes when a client waits; ``"real"``: it passes continuously.
     scene
@@ -105,6 +107,7 @@ class World:
         rig: Rig | None = None,
         *,
         seed: int = 0,
+        subject_seed: int | None = None,
         clock: Literal["virtual", "real"] = "virtual",
         scene: Scene | None = None,
         faults: Faults | None = None,
@@ -120,17 +123,20 @@ class World:
         self._light = light = LightRecord()
         self.pops, self.switched = light.pops, light.switched
         self.grips: list[tuple[float, GripState]] = []
+        person = seed if subject_seed is None else subject_seed
         self.skin: TapedSkin | None = None
         if self.rig.caliper is not None:
             stiffness = self.faults.skin_stiff
-            self.skin = TapedSkin(self.rig.caliper, seed=seed, stiffness=stiffness)
+            self.skin = TapedSkin(
+                self.rig.caliper, seed=person, tape_seed=seed, stiffness=stiffness
+            )
             self._note_grip(0.0)
         self.head: ProbeHead | None = None
         if self.rig.probe is not None:
             kept_c, fails_after_s = self.rig.probe.camera_c, self.faults.camera_warms_after
             self.head = ProbeHead(
                 CameraCooler(kept_c, fails_after_s=fails_after_s),
-                seed=seed,
+                seed=person,
                 leak=self.faults.pump_leak,
                 pump_dead=self.faults.pump_dead,
                 lifts_after_s=self.faults.head_lifts_after,

@@ -99,6 +99,62 @@ def analyse_brdf(
     )
 
 
+@analyse_app.command("lumitexel", cls=Command)
+@command
+def analyse_lumitexel(
+    appearance: Path,
+    session: Path,
+    /,
+    *,
+    out: Out,
+    calibration: Path | None = None,
+    at: list[str] | None = None,
+    seed: int = 0,
+    json: Json = False,
+) -> None:
+    """Draw the BRDF samples of points of a face over the hemisphere of light directions.
+
+    Example: skinrig analyse lumitexel appearance session-dome --calibration calibration --out
+    lumitexels
+
+    Parameters
+    ----------
+    appearance
+        APPEARANCE/ folder of the dome session, with normals.
+    session
+        Its SESSION/ folder.
+    calibration
+        CALIBRATION/ folder; default: the rig's nominal geometry.
+    at
+        Point on the skin, mm, rig frame, such as 0,60,70; repeatable; default: a point with many
+        visible lights and one with many occluded ones.
+    seed
+        Random seed of the chosen points.
+    """
+    from skinrig.analysing import lumitexel
+    from skinrig.rendering.request import parse_triple
+
+    points = []
+    for text in at or ():
+        point = parse_triple(text)
+        if point is None:
+            raise UsageError(f"--at: got {text!r}, expected three numbers, mm: 0,60,70")
+        points.append(point)
+    console = Console(json)
+    found = lumitexel.analyze_lumitexels(
+        out, appearance, session, calibration=calibration, points_mm=tuple(points), seed=seed
+    )
+    for one in found["lumitexels"]:
+        console.print_line(
+            f"point {one['position_mm']} mm: {one['samples_of_the_view']} samples of camera "
+            f"{one['view']}, {one['samples_of_all_views']} of all; "
+            f"{one['occluded_lights']} lights not seen"
+        )
+    console.print_line(f"{out}: {', '.join(lumitexel.OUTPUT_FILES)}")
+    figures = {name: value for name, value in found.items() if name != "schema"}
+    console.print_document("skinrig.analyse-lumitexel/1", {"out": out, **figures})
+
+
 def _plateaus(document: dict[str, Any]) -> list[object]:
     """Return the plateau for 5, 2 and 10 % of the fall in error, and the rank at noise level."""
     by_share, at_noise = document["plateau_by_share"], document["rank_at_noise"]

@@ -55,6 +55,8 @@ class SimulateOptions:
     out: options.Out
     scale: options.Scale = "small"
     seed: options.Seed = 0
+    session_seed: options.SessionSeed = None
+    days_ago: options.DaysAgo = 0
     plan: Path | None = None
     consent: options.Consent = None
     consent_expires: options.ConsentExpires = None
@@ -75,7 +77,11 @@ class SimulateOptions:
             person = parse_subject(name, self.consent or SIMULATED_USES, self.consent_expires)
         plan = None if self.plan is None else read_plan(self.plan)
         order = {"subject": subject, "plan": plan, "person": person, "progress": console.progress}
-        return order | select_attributes(self, "out", "seed", "resume") | {"size": self.scale}
+        return (
+            order
+            | select_attributes(self, "out", "seed", "session_seed", "days_ago", "resume")
+            | {"size": self.scale}
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
 from capture.plan.rows import step_lights
 from capture.rig import Rig, load_rig
 from model.skin import SkinAppearance, SkinMap
+from rigsim.as_built.aging import age_dome
 from rigsim.as_built.dome import build_dome
 from rigsim.mitsuba.variant import choose_renderer
 from rigsim.needs.effects import SceneEffects, max_on_time_s
@@ -24,7 +25,7 @@ from rigsim.scanner.flaws import encode_binary_ply
 from rigsim.scanner.pods import ScannerSettings, scan_face, wrap_template
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.dome.targets import TARGET_POSES, make_target_scene, plate_normals
-from rigsim.subject.head_motion import draw_head_motion
+from rigsim.subject.head_motion import draw_head_motion, draw_head_position
 from rigsim.subject.perfusion import STATE_NAMES
 from rigsim.targets import make_target
 from skinrig.console import select_attributes
@@ -284,11 +285,12 @@ def _plan(rig: Rig, target: str | None, size: str) -> Plan:
 
 
 def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
-    built = build_dome(rig, seed=order.seed)
+    built = age_dome(build_dome(rig, seed=order.seed), order.rig_age, seed=order.seed)
     if order.target == "dark":
-        return DomeScene(rig, make_target("dark"), dome=built, seed=order.seed)
+        return DomeScene(rig, make_target("dark"), dome=built, seed=order.noise_seed)
     if order.target is not None:
-        return make_target_scene(order.target, rig, seed=order.seed, dome=built)  # type: ignore[arg-type]
+        seed = order.noise_seed
+        return make_target_scene(order.target, rig, seed=seed, dome=built)  # type: ignore[arg-type]
     conditions = dict(order.conditions)
     if (one := _member(order)) is not None:
         person = one.face(TEXTURE_TEXELS)
@@ -296,7 +298,8 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
     else:
         subject = subject_file.load_subject(order.subject)
         person = subject.face(seed=order.seed, size=TEXTURE_TEXELS, mesh=order.mesh)
-    motion = draw_head_motion(order.seed) if order.move else None
+    person = person.translate(draw_head_position(order.session_seed))
+    motion = draw_head_motion(order.noise_seed) if order.move else None
     return DomeScene(
         rig,
         person,
@@ -304,7 +307,7 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
         motion=motion,
         state=order.state,
         movement=order.movement,
-        seed=order.seed,
+        seed=order.noise_seed,
         conditions=conditions,
         on_s=max_on_time_s(plan),
         effects=SceneEffects.from_switches(_skin_light_effects(order)),
@@ -333,10 +336,10 @@ def _attach_scan(session: Any, scene: Any, order: DomeOrder) -> dict[str, Any]:
     scanner = ScannerSettings(triangles=SCAN_TRIANGLES[order.size])
     mesh = scene.subject.mesh
     if order.wrapped:
-        rng = np.random.default_rng([order.seed, 7, STATE_NAMES.index(order.state)])
+        rng = np.random.default_rng([order.noise_seed, 7, STATE_NAMES.index(order.state)])
         scan = wrap_template(mesh, rng=rng, scanner=scanner)
     else:
-        scan = scan_face(mesh, rng=np.random.default_rng([order.seed, 7]), scanner=scanner)
+        scan = scan_face(mesh, rng=np.random.default_rng([order.noise_seed, 7]), scanner=scanner)
     if SCAN_FILE not in session.attachments():
         kind = "template wrapped onto a scan" if order.wrapped else "scanned mesh"
         session.attach(SCAN_FILE, scan.ply, about={"kind": kind, "unit": "mm"})

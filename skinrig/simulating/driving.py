@@ -70,7 +70,17 @@ def manifest_settings(order: SimulationOrder, **rig_settings: Any) -> dict[str, 
         asked["renderer"] = order.renderer
     if order.leave_out:
         asked["leave_out"] = list(order.leave_out)
-    return asked | rig_settings
+    return asked | rig_settings | session_settings(order)
+
+
+def session_settings(order: SimulationOrder) -> dict[str, Any]:
+    """Return the given settings that differ between sessions of one subject."""
+    found: dict[str, Any] = {}
+    if order.session_seed is not None:
+        found["session_seed"] = order.session_seed
+    if order.days_ago:
+        found["days_ago"] = order.days_ago
+    return found
 
 
 @contextmanager
@@ -113,7 +123,7 @@ def open_session(
             )
         return session
     order.out.parent.mkdir(parents=True, exist_ok=True)
-    created = order.created
+    created = order.captured_at
     return Session.create(
         order.out,
         plan=plan,
@@ -223,7 +233,7 @@ def drive_plan(
     Parameters
     ----------
     order
-        Order of the simulation, with the world's seed and the progress callback.
+        Order of the simulation, with the world's seeds and the progress callback.
     session, rig
         Session, open for writing, and the nominal rig.
     scene
@@ -247,7 +257,12 @@ def drive_plan(
         Time elapsed on the rig's clock, s.
     """
     world = World(
-        rig, seed=order.seed, clock="virtual", scene=scene, shots_made=count_shots(session)
+        rig,
+        seed=order.noise_seed,
+        subject_seed=order.seed,
+        clock="virtual",
+        scene=scene,
+        shots_made=count_shots(session),
     )
     name = world.register(session.id)
     boxes = {
