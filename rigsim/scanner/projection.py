@@ -1,0 +1,126 @@
+"""Light of a stripe projector: displayed levels, emitted light, and its blur on skin.
+
+Stripes vary along one axis of the display, so their blur is one-dimensional. Defocus blurs by a
+normal distribution. Light that enters skin leaves it at a distance: the kernel exp(-r / l) / r in
+the plane has the transfer function 1 / sqrt(1 + (w l)^2).
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import ndimage
+
+from capture.rig import View
+from rigsim.arrays import Float32Array, Float64Array
+
+DISPLAY_LEVELS: Final = 255
+"""Largest level of the display, 8 bits."""
+BLACK_LEAKAGE: Final = 1.0 / 800.0
+"""Emitted light of a black pixel over that of a white one; chosen, as of common displays."""
+SUBSAMPLES: Final = 4
+"""Samples per projector pixel of blurred stripes."""
+DEFOCUS_PX: Final = (0.5, 1.0, 2.0, 4.0, 8.0)
+"""Standard deviations of defocus for which blurred stripes are tabulated, projector pixels."""
+SCATTERING_PX: Final = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+"""Mean free paths for which they are tabulated, projector pixels."""
+LENS_BLUR_PX: Final = 0.6
+"""Standard deviation of a projector's blur in focus, projector pixels; chosen."""
+
+
+def stripe_levels(length_px: int, period_px: int, phase_steps: int, pattern: int) -> Float64Array:
+    """Return the levels of a pattern along its axis, 0 to 255, shape (length_px,).
+
+    Parameters
+    ----------
+    length_px
+        Columns or rows of the display.
+    period_px, phase_steps
+        See `capture.rig.Scanner`.
+    pattern
+        Number of the pattern: bits of the Gray code, then steps of the sinusoid.
+
+    Raises
+    ------
+    ValueError
+        For a number beyond the last pattern.
+
+    Examples
+    --------
+    >>> stripe_levels(8, 4, 3, 0).astype(int).tolist()
+    [0, 0, 0, 0, 255, 255, 255, 255]
+    >>> stripe_levels(8, 4, 3, 2).astype(int).tolist()[::2]
+    [255, 0, 255, 0]
+    """
+    bits = math.ceil(math.log2(2 * length_px / period_px))
+    if not 0 <= pattern < bits + phase_steps:
+        raise ValueError(f"pattern: got {pattern}, expected 0 to {bits + phase_steps - 1}")
+    place = np.arange(length_px)
+    if pattern < bits:
+        cell = place // (period_px // 2)
+        code = cell ^ (cell >> 1)
+        return np.asarray(DISPLAY_LEVELS * (code >> (bits - 1 - pattern) & 1), np.float64)
+    angle = 2.0 * np.pi * (place / period_px - (pattern - bits) / phase_steps)
+    return np.rint(0.5 * DISPLAY_LEVELS * (1.0 + np.cos(angle)))
+
+
+def emitted_light(levels: ArrayLike, gamma: float) -> Float64Array:
+    """Return the light of displayed levels relative to white, 0 to 1."""
+    share = (np.asarray(levels, np.float64) / DISPLAY_LEVELS) ** gamma
+    return np.asarray(BLACK_LEAKAGE + (1.0 - BLACK_LEAKAGE) * share)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BlurredStripes:
+    """Light of one pattern for tabulated amounts of defocus and scattering."""
+
+    table: Float32Array
+    """Shape (defocus, scattering, samples); samples from half a pixel before pixel 0."""
+
+    @classmethod
+    def of(cls, light: Float64Array) -> "BlurredStripes":
+        """Blur the light of a pattern along its axis, shape (length_px,); no light is beside it."""
+        margin = len(light)
+        fine = np.repeat(np.pad(light, margin), SUBSAMPLES)
+        wave = 2.0 * np.pi * np.fft.rfftfreq(len(fine), 1.0 / SUBSAMPLES)
+        spectrum = np.fft.rfft(fine)
+        rows = [
+            [
+                np.fft.irfft(
+                    spectrum
+                    * np.exp(-0.5 * (wave * sigma) ** 2)
+                    / np.sqrt(1.0 + (wave * length) ** 2),
+                    len(fine),
+                )[margin * SUBSAMPLES : (margin + len(light)) * SUBSAMPLES]
+                for length in SCATTERING_PX
+            ]
+            for sigma in DEFOCUS_PX
+        ]
+        return cls(np.asarray(rows, np.float32))
+
+    def at(
+        self, place_px: Float64Array, defocus_px: Float64Array, scattering_px: Float64Array
+    ) -> Float32Array:
+        """Return the light at places on the display, shape (n,); 0 beside the display."""
+        rows = np.interp(np.log(defocus_px), np.log(DEFOCUS_PX), np.arange(len(DEFOCUS_PX)))
+        lengths = np.interp(scattering_px, SCATTERING_PX, np.arange(len(SCATTERING_PX)))
+        sample = (place_px + 0.5) * SUBSAMPLES - 0.5
+        found = ndimage.map_coordinates(
+            self.table, [rows, lengths, sample], order=1, mode="nearest", output=np.float32
+        )
+        length = self.table.shape[2] / SUBSAMPLES
+        return np.where((place_px >= -0.5) & (place_px < length - 0.5), found, np.float32(0.0))
+
+
+def defocus_blur_px(projector: View, distance_mm: Float64Array) -> Float64Array:
+    """Return the blur's standard deviation at distances along the axis, projector pixels.
+
+    A thin lens images a point as a disc of diameter ``A f |z - z_f| / (z (z_f - f))`` with
+    A = f / N; the deviation of a disc along one axis is a quarter of its diameter.
+    """
+    focus_mm, f = projector.focus_distance_mm, projector.focal_mm
+    z = np.maximum(distance_mm, 2.0 * f)
+    disc_mm = f / projector.f_number * f * np.abs(z - focus_mm) / (z * (focus_mm - f))
+    return np.hypot(LENS_BLUR_PX, 0.25 * disc_mm / (1e-3 * projector.pixel_um))
