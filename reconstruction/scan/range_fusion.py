@@ -17,7 +17,7 @@ from reconstruction.arrays import Float64Array
 from reconstruction.scan.repair import ScanMeshError, TriangleMesh
 from reconstruction.scan.triangulation import RangeMap
 
-BAND_VOXELS: Final = 3.0
+BAND_VOXELS: Final = 2.0
 """Distance from the surface within which voxels are used, in sides of a voxel."""
 MIN_COSINE: Final = 0.2
 """Smallest cosine of incidence at a camera that is fused: 78 degrees."""
@@ -90,7 +90,7 @@ def _mean_distance(
     maps: Sequence[RangeMap], points_mm: Float64Array, band_mm: float
 ) -> tuple[Float64Array, Float64Array]:
     """Return the signed distance of points, > 0 outside, and its inverse variance."""
-    total, weights = np.zeros(len(points_mm)), np.zeros(len(points_mm))
+    total, weights, precision = np.zeros((3, len(points_mm)))
     for one in maps:
         pixel = one.camera.project(points_mm)
         way = np.linalg.norm(points_mm - one.camera.center_mm, axis=1)
@@ -98,10 +98,13 @@ def _mean_distance(
         across = (before - way) * cosine
         seen = np.isfinite(across) & (np.abs(across) < band_mm)
         inverse = 1.0 / np.maximum(variance[seen] * cosine[seen] ** 2, 1e-12)
-        total[seen] += inverse * across[seen]
-        weights[seen] += inverse
+        # far from a map's surface its distance along the ray is no longer that to the surface
+        near = inverse * (1.0 - np.abs(across[seen]) / band_mm)
+        total[seen] += near * across[seen]
+        weights[seen] += near
+        precision[seen] += inverse
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(weights > 0, total / weights, np.nan), weights
+        return np.where(weights > 0, total / weights, np.nan), precision
 
 
 def _sample_ranges(

@@ -136,7 +136,7 @@ def decode_stripes(
     check.shape("usable", good, size)
     mean, amplitude, angle, fit = _fit_sinusoid(steps)
     turn = 2.0 * np.pi * np.arange(code.steps)[:, None, None] / code.steps
-    floor = np.maximum(amplitude, 1e-300)
+    floor = np.maximum(amplitude, np.finfo(np.float32).tiny)
     angle_variance = np.sum(
         (np.sin(turn - angle) * 2.0 / (code.steps * floor)) ** 2 * noise, axis=0
     )
@@ -181,7 +181,9 @@ def _misfit_ratio(misfit: Float64Array, noise: Float64Array, good: BoolArray) ->
         ndimage.uniform_filter(np.where(good, values, 0.0), MISFIT_WINDOW_PX, mode="constant")
         for values in (misfit, noise)
     ]
-    return np.maximum(around[0] / np.maximum(around[1], 1e-300), 1.0) if noise.any() else noise + 1
+    if not noise.any():
+        return np.ones(noise.shape)
+    return np.where(good, np.maximum(around[0] / np.maximum(around[1], 1e-30), 1.0), 1.0)
 
 
 def _gray_to_number(bits: BoolArray) -> Int64Array:

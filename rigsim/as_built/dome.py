@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike
 from capture.rig import Rig, View
 from rigsim.arrays import Float64Array
 
+UNDISTORT_TOL: Final = 1e-14
+"""Largest remaining difference of slopes."""
 UNDISTORT_STEPS: Final = 12
 """Newton steps from image to ray; each doubles the number of correct digits."""
 
@@ -161,6 +163,8 @@ def undistort(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
     right, down = np.array([step, 0.0]), np.array([0.0, step])
     for _ in range(UNDISTORT_STEPS):
         miss = distort(found, distortion) - wanted
+        if np.abs(miss).max(initial=0.0) < UNDISTORT_TOL:
+            break
         gx = (distort(found + right, distortion) - distort(found - right, distortion)) / (2 * step)
         gy = (distort(found + down, distortion) - distort(found - down, distortion)) / (2 * step)
         det = gx[..., 0] * gy[..., 1] - gx[..., 1] * gy[..., 0]

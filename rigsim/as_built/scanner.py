@@ -11,7 +11,7 @@ from rigsim.arrays import Float64Array
 from rigsim.as_built.dome import DomeTolerances, draw_distortion, perturb_view
 
 SCANNER_TOLERANCES: Final = DomeTolerances(distortion=0.05)
-"""Tolerances of the scanner's cameras and projectors: those of the dome, with lenses that distort."""
+"""Tolerances of the scanner's cameras and projectors: those of the dome, with distortion."""
 GAMMA_DEVIATION: Final = 0.03
 """Standard deviation of a projector's exponent about 1 after its own linearization; chosen."""
 

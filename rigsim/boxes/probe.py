@@ -29,7 +29,6 @@ from rigsim.boxes.command import (
     parse_number,
     parse_token,
 )
-from rigsim.boxes.device import Device, Wiring
 from rigsim.boxes.contact_probe.source_shutter import (
     COVER_MOVE_S,
     LEVEL_STEPS,
@@ -45,6 +44,7 @@ from rigsim.boxes.contact_probe.suction_pump import (
     Gauge,
     SuctionPump,
 )
+from rigsim.boxes.device import Device, Wiring
 
 __all__ = ["ProbeUnit", "SourceLight"]
 

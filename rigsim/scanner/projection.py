@@ -11,10 +11,9 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import ndimage
 
 from capture.rig import View
-from rigsim.arrays import Float32Array, Float64Array
+from rigsim.arrays import Float32Array, Float64Array, Int32Array
 
 DISPLAY_LEVELS: Final = 255
 """Largest level of the display, 8 bits."""
@@ -22,7 +21,7 @@ BLACK_LEAKAGE: Final = 1.0 / 800.0
 """Emitted light of a black pixel over that of a white one; chosen, as of common displays."""
 SUBSAMPLES: Final = 4
 """Samples per projector pixel of blurred stripes."""
-DEFOCUS_PX: Final = (0.5, 1.0, 2.0, 4.0, 8.0)
+DEFOCUS_PX: Final = tuple(0.5 * 1.15**k for k in range(20))
 """Standard deviations of defocus for which blurred stripes are tabulated, projector pixels."""
 SCATTERING_PX: Final = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Mean free paths for which they are tabulated, projector pixels."""
@@ -100,18 +99,62 @@ class BlurredStripes:
         ]
         return cls(np.asarray(rows, np.float32))
 
-    def at(
-        self, place_px: Float64Array, defocus_px: Float64Array, scattering_px: Float64Array
-    ) -> Float32Array:
-        """Return the light at places on the display, shape (n,); 0 beside the display."""
+    def at(self, places: "DisplayPlaces", *, scattered: bool) -> Float32Array:
+        """Return the light at places on the display, with scattering or without, shape (n,)."""
+        flat = self.table.reshape(-1)
+        samples = self.table.shape[2]
+        if not scattered:
+            first = places.row * (len(SCATTERING_PX) * samples) + places.sample
+            return _mixed(flat, first, places.beyond_sample)
+        first = (places.row * len(SCATTERING_PX) + places.length) * samples + places.sample
+        near = _mixed(flat, first, places.beyond_sample)
+        far = _mixed(flat, first + samples, places.beyond_sample)
+        return near + places.beyond_length * (far - near)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DisplayPlaces:
+    """Places on a display with their blur, prepared for `BlurredStripes.at`; shape (n,) each."""
+
+    row: Int32Array
+    """Nearest tabulated defocus."""
+    length: Int32Array
+    """Tabulated mean free path below."""
+    beyond_length: Float32Array
+    """Fraction of the way to the next one."""
+    sample: Int32Array
+    """Sample before the place."""
+    beyond_sample: Float32Array
+    """Fraction of the way to the next one."""
+
+    @classmethod
+    def of(
+        cls,
+        place_px: Float64Array,
+        length_px: int,
+        defocus_px: Float64Array,
+        scattering_px: Float64Array,
+    ) -> "DisplayPlaces":
+        """Prepare places along an axis of ``length_px`` pixels; they lie on the display."""
         rows = np.interp(np.log(defocus_px), np.log(DEFOCUS_PX), np.arange(len(DEFOCUS_PX)))
         lengths = np.interp(scattering_px, SCATTERING_PX, np.arange(len(SCATTERING_PX)))
-        sample = (place_px + 0.5) * SUBSAMPLES - 0.5
-        found = ndimage.map_coordinates(
-            self.table, [rows, lengths, sample], order=1, mode="nearest", output=np.float32
+        length = np.minimum(lengths.astype(np.int32), len(SCATTERING_PX) - 2)
+        last = length_px * SUBSAMPLES - 2
+        samples = np.clip((place_px + 0.5) * SUBSAMPLES - 0.5, 0.0, last + 1.0)
+        sample = np.minimum(samples.astype(np.int32), last)
+        return cls(
+            np.rint(rows).astype(np.int32),
+            length,
+            (lengths - length).astype(np.float32),
+            sample,
+            (samples - sample).astype(np.float32),
         )
-        length = self.table.shape[2] / SUBSAMPLES
-        return np.where((place_px >= -0.5) & (place_px < length - 0.5), found, np.float32(0.0))
+
+
+def _mixed(values: Float32Array, first: Int32Array, beyond: Float32Array) -> Float32Array:
+    """Return values between an entry and the next."""
+    low = values[first]
+    return low + beyond * (values[first + 1] - low)
 
 
 def defocus_blur_px(projector: View, distance_mm: Float64Array) -> Float64Array:

@@ -4,11 +4,11 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import replace
 
+from rigsim.boxes.contact_probe.source_shutter import SourceLight
 from rigsim.boxes.flash import FlashPop
 from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.boxes.led_table import LedPulse
 from rigsim.boxes.scanner import ProjectorLight
-from rigsim.boxes.contact_probe.source_shutter import SourceLight
 
 SwitchedLight = LedPulse | PatternLight | SourceLight | ProjectorLight
 Light = FlashPop | SwitchedLight
