@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from capture.plan import Plan, flash_calibration_plan, flash_plan
-from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
+from capture.plan.dome import DomeTarget, add_scan, dome_calibration_plan, dome_plan
 from capture.plan.gradient import (
     GradientTarget,
     gradient_calibration_plan,
@@ -64,8 +64,9 @@ class DefaultPlan:
             return gradient_calibration_plan(rig, self._check_target(get_args(GradientTarget)))
         if "dome" in rig.boxes:
             if self.target is None:
-                return dome_plan(rig)
-            return dome_calibration_plan(rig, self._check_target(get_args(DomeTarget)))
+                return add_scan(dome_plan(rig), rig)
+            target = self._check_target(get_args(DomeTarget))
+            return add_scan(dome_calibration_plan(rig, target), rig)
         repeats = self.repeats
         if rig.probe is not None:
             if self.target is None:

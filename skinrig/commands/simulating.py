@@ -165,6 +165,7 @@ def simulate_dome(
     move: bool = False,
     state: OneState = None,
     wrapped: bool = False,
+    scanner: bool = False,
     subsurface: bool = False,
     interreflections: bool = False,
     condition: Annotated[
@@ -188,6 +189,9 @@ def simulate_dome(
         Simulate head motion during the capture.
     wrapped
         Scan with a wrapped template mesh, so that all expressions share one texture layout.
+    scanner
+        Scan with projected stripes instead of an attached mesh; with target charuco, capture them
+        on the board too.
     subsurface
         Simulate subsurface scattering even if its effect is not visible.
     interreflections
@@ -212,6 +216,7 @@ def simulate_dome(
         move=move,
         states=tuple(state or ("neutral",)),
         wrapped=wrapped,
+        scanner=scanner,
         subsurface=subsurface,
         interreflections=interreflections,
         conditions=parse_amounts(condition or (), "--condition", default=1.0),

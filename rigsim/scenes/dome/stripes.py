@@ -17,7 +17,7 @@ from capture.scanner import STRIPE_AXES
 from model import spectra
 from rigsim.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt16Array
 from rigsim.as_built.dome import project_points
-from rigsim.as_built.scanner import ActualScanner
+from rigsim.as_built.scanner import ActualScanner, build_scanner
 from rigsim.boxes.scanner import ProjectorLight
 from rigsim.geometry.atlas import sample
 from rigsim.light.led_light import DOME_METER_RATE_PER_S, METERING_LED
@@ -31,9 +31,11 @@ from rigsim.scanner.projection import (
     emitted_light,
     stripe_levels,
 )
+from rigsim.scenes.dome.scene import DomeScene
+from rigsim.scenes.dome.targets import TargetScene
 from rigsim.scenes.exposing import SceneError, full_power_duration_s
 from rigsim.sensor import expose_sensor, make_sensor
-from rigsim.targets.printed_plate import CELL_MM, Plate
+from rigsim.targets.printed_plate import CELL_MM, Plate, charuco_board
 
 SKIN_SCATTERING_MM: Final = 1.37
 """Mean length 1 / sigma_tr of lateral scattering in skin at green, mm: Jensen et al. 2001,
@@ -211,6 +213,11 @@ class StripeScene:
         self._rooms: dict[str, Float64Array] = {}
         self._tables: dict[tuple[str, str, int], BlurredStripes] = {}
 
+    @property
+    def view_names(self) -> frozenset[str]:
+        """Names of the scanner's cameras."""
+        return frozenset(self.scanner.views)
+
     def forget(self) -> None:
         """Trace the surface again, which has moved."""
         self._seen.clear()
@@ -325,6 +332,20 @@ class StripeScene:
                 for k, axis in enumerate(STRIPE_AXES)
             },
         )
+
+
+def scan_face(scene: DomeScene, *, seed: int) -> None:
+    """Put the scanner of a scene's rig, as built, in front of its face, at rest at time 0."""
+    if scene.rig.scanner is not None:
+        surface = StripedFace(Caster(scene.subject.mesh), scene.texture)
+        scene.stripes = StripeScene(build_scanner(scene.rig.scanner, seed=seed), surface, seed=seed)
+
+
+def scan_board(scene: TargetScene, *, seed: int) -> None:
+    """Put the scanner of a scene's rig, as built, in front of its board."""
+    if scene.rig.scanner is not None:
+        surface = StripedBoard(charuco_board(), scene.plate_pose)
+        scene.stripes = StripeScene(build_scanner(scene.rig.scanner, seed=seed), surface, seed=seed)
 
 
 def projector_intensity(projector: Projector, view: View) -> float:

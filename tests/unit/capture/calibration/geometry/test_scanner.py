@@ -85,9 +85,7 @@ def test_projectors_calibrate_as_inverse_cameras(scanner, actual, rng):
             length += (column[:, 0] - lamp.project(there)[:, 0]) / (ahead / 0.01)
         miss = device.center_mm + length[:, None] * rays - points
         error = np.sqrt(np.mean(np.einsum("nk,nk->n", miss, rays) ** 2))
-        assert (
-            error < 0.15
-        )  # 0.03 px: 0.03 mm in an image, 3 to 4 times that in depth
+        assert error < 0.15  # 0.03 px: 0.03 mm in an image, 3 to 4 times that in depth
         assert 0.3 < error / found.depth_stderr_mm[camera, projector] < 2.5
         assert found.devices[projector].image_size == (800, 1280)
         nominal = next(p for p in scanner.projectors if p.name == projector).pinhole
