@@ -153,7 +153,8 @@ POD_CAMERAS_DEG = ((-18.0, 8.0), (18.0, -8.0))  # azimuth and elevation from its
 def scanner_place(azimuth_deg: float, elevation_deg: float) -> list[float]:
     a, e = np.radians([azimuth_deg, elevation_deg])
     place = SCANNER_MM * np.array([np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)])
-    return (np.round(place + [0.0, 0.0, -40.0], 1) + 0.0).tolist()
+    place[2] -= 40.0  # around the middle of a head
+    return (place.round(1) + 0.0).tolist()
 
 
 def main() -> None:
