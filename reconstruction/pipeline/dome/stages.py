@@ -153,11 +153,8 @@ def _surface(inputs: Inputs, dome: CalibratedDome) -> RefinedScan:
         mesh = session.attachment(SCAN_FILE) if inputs.scan is None else inputs.scan
     scan = scan_mesh.prepare_scan(mesh, points=points)
     fit = register_mesh(dome, scan.coarse)
-    if decoded is not None:
-        _, nearest = cKDTree(decoded.mesh.vertices_mm).query(scan.points_mm)
-        moved_mm = float(np.sqrt(np.mean(np.square(fit.stderr[3:]))))
-        stderr = np.hypot(decoded.stderr_mm[nearest], moved_mm)
-        scan = replace(scan, stderr_mm=stderr.astype(np.float32))
+    # a calibrated scanner places the face better than the images do, unless the head has moved
+    placed = decoded is not None and decoded.calibrated and not fit.is_significant()
     inputs.noted["registration"] = {
         "rotation": fit.rotation.tolist(),
         "translation_mm": fit.translation_mm.tolist(),
@@ -166,8 +163,14 @@ def _surface(inputs: Inputs, dome: CalibratedDome) -> RefinedScan:
         "converged": fit.converged,
         "points": len(scan.points_mm),
         "pixel_mm": footprint,
+        "applied": not placed,
     }
-    return scan.transform(fit.rotation, fit.translation_mm)
+    if decoded is not None:
+        _, nearest = cKDTree(decoded.mesh.vertices_mm).query(scan.points_mm)
+        moved_mm = 0.0 if placed else float(np.sqrt(np.mean(np.square(fit.stderr[3:]))))
+        stderr = np.hypot(decoded.stderr_mm[nearest], moved_mm)
+        scan = replace(scan, stderr_mm=stderr.astype(np.float32))
+    return scan if placed else scan.transform(fit.rotation, fit.translation_mm)
 
 
 def _require(dome: CalibratedDome) -> None:

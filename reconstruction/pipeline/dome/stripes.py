@@ -36,6 +36,8 @@ class DecodedScan:
     """
     record: Mapping[str, Any]
     """JSON values for the record of the maps."""
+    calibrated: bool
+    """Whether the scanner is calibrated, and with it the mesh's place in the rig frame."""
 
 
 def has_stripes(session: Session) -> bool:
@@ -88,7 +90,7 @@ def decode_scan(inputs: Inputs) -> DecodedScan:
     scanner = session.rig.scanner
     if scanner is None:
         raise ValueError(f"session {session.id}: got no scanner, expected one; see has_stripes")
-    devices, depth_mm = _devices(inputs, scanner)
+    devices, depth_mm, calibrated = _devices(inputs, scanner)
     pixel_mm = float(np.median([v.distance_mm / v.focal_px for v in scanner.views]))
     voxel_mm = max(VOXEL_PIXELS * pixel_mm, MIN_VOXEL_MM)
     maps: list[RangeMap] = []
@@ -116,16 +118,17 @@ def decode_scan(inputs: Inputs) -> DecodedScan:
         "noise_mm": float(np.median(noise_mm)),
         "calibration_mm": depth_mm,
     }
-    return DecodedScan(mesh, np.hypot(noise_mm, depth_mm), record)
+    return DecodedScan(mesh, np.hypot(noise_mm, depth_mm), record, calibrated)
 
 
-def _devices(inputs: Inputs, scanner: Scanner) -> tuple[Mapping[str, CameraPose], float]:
-    """Return cameras and projectors, and the standard error of depth by their calibration, mm."""
+def _devices(inputs: Inputs, scanner: Scanner) -> tuple[Mapping[str, CameraPose], float, bool]:
+    """Return cameras and projectors, their standard error of depth, mm, and whether calibrated."""
     pinholes = [*scanner.views, *(projector.pinhole for projector in scanner.projectors)]
     serials = {pinhole.name: pinhole.serial for pinhole in pinholes}
     nominal = "the scanner has the nominal geometry of the rig file"
     found = inputs.load("scanner", list(serials.values()), nominal)
     if found is None:
-        return {pinhole.name: CameraPose.nominal(pinhole) for pinhole in pinholes}, 0.0
+        return {pinhole.name: CameraPose.nominal(pinhole) for pinhole in pinholes}, 0.0, False
     depths = [float(found.quantity(view.serial, "depth_stderr_mm").value) for view in scanner.views]
-    return poses_from_calibration(found, serials), float(np.sqrt(np.mean(np.square(depths))))
+    depth_mm = float(np.sqrt(np.mean(np.square(depths))))
+    return poses_from_calibration(found, serials), depth_mm, True
