@@ -110,7 +110,7 @@ class Scanner(Document):
 
     def __post_init__(self) -> None:
         checks = FaultCollector("Scanner", RigError)
-        names = [row.name for row in (*self.projectors, *self.views)]
+        names = [row.name for row in self.projectors] + [row.name for row in self.views]
         differ = len({name.casefold() for name in names}) == len(names)
         checks.check("projectors", names, bool(self.projectors) and differ, "names that differ")
         known = {view.name for view in self.views}

@@ -19,7 +19,7 @@ DISPLAY_LEVELS: Final = 255
 """Largest level of the display, 8 bits."""
 BLACK_LEAKAGE: Final = 1.0 / 800.0
 """Emitted light of a black pixel over that of a white one; chosen, as of common displays."""
-SUBSAMPLES: Final = 4
+SAMPLES_PER_PIXEL: Final = 4
 """Samples per projector pixel of blurred stripes."""
 DEFOCUS_PX: Final = tuple(0.5 * 1.15**k for k in range(20))
 """Standard deviations of defocus for which blurred stripes are tabulated, projector pixels."""
@@ -80,10 +80,10 @@ class BlurredStripes:
 
     @classmethod
     def of(cls, light: Float64Array) -> "BlurredStripes":
-        """Blur the light of a pattern along its axis, shape (length_px,); no light is beside it."""
+        """Blur the light of a pattern along its axis, shape (length_px,), dark around it."""
         margin = len(light)
-        fine = np.repeat(np.pad(light, margin), SUBSAMPLES)
-        wave = 2.0 * np.pi * np.fft.rfftfreq(len(fine), 1.0 / SUBSAMPLES)
+        fine = np.repeat(np.pad(light, margin), SAMPLES_PER_PIXEL)
+        wave = 2.0 * np.pi * np.fft.rfftfreq(len(fine), 1.0 / SAMPLES_PER_PIXEL)
         spectrum = np.fft.rfft(fine)
         rows = [
             [
@@ -92,7 +92,7 @@ class BlurredStripes:
                     * np.exp(-0.5 * (wave * sigma) ** 2)
                     / np.sqrt(1.0 + (wave * length) ** 2),
                     len(fine),
-                )[margin * SUBSAMPLES : (margin + len(light)) * SUBSAMPLES]
+                )[margin * SAMPLES_PER_PIXEL : (margin + len(light)) * SAMPLES_PER_PIXEL]
                 for length in SCATTERING_PX
             ]
             for sigma in DEFOCUS_PX
@@ -139,8 +139,8 @@ class DisplayPlaces:
         rows = np.interp(np.log(defocus_px), np.log(DEFOCUS_PX), np.arange(len(DEFOCUS_PX)))
         lengths = np.interp(scattering_px, SCATTERING_PX, np.arange(len(SCATTERING_PX)))
         length = np.minimum(lengths.astype(np.int32), len(SCATTERING_PX) - 2)
-        last = length_px * SUBSAMPLES - 2
-        samples = np.clip((place_px + 0.5) * SUBSAMPLES - 0.5, 0.0, last + 1.0)
+        last = length_px * SAMPLES_PER_PIXEL - 2
+        samples = np.clip((place_px + 0.5) * SAMPLES_PER_PIXEL - 0.5, 0.0, last + 1.0)
         sample = np.minimum(samples.astype(np.int32), last)
         return cls(
             np.rint(rows).astype(np.int32),
@@ -160,8 +160,9 @@ def _mixed(values: Float32Array, first: Int32Array, beyond: Float32Array) -> Flo
 def defocus_blur_px(projector: View, distance_mm: Float64Array) -> Float64Array:
     """Return the blur's standard deviation at distances along the axis, projector pixels.
 
-    A thin lens images a point as a disc of diameter ``A f |z - z_f| / (z (z_f - f))`` with
-    A = f / N; the deviation of a disc along one axis is a quarter of its diameter.
+    The image of a point by a thin lens is a disc. Its diameter is
+    ``A f |z - z_f| / (z (z_f - f))`` with A = f / N; the deviation of a disc along one axis is a
+    quarter of its diameter.
     """
     focus_mm, f = projector.focus_distance_mm, projector.focal_mm
     z = np.maximum(distance_mm, 2.0 * f)

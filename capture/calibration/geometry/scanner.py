@@ -17,7 +17,7 @@ from capture.arrays import Float64Array
 from capture.calibration.geometry import bundle
 from capture.calibration.geometry.board import Board, CornerObservation
 from capture.calibration.geometry.bundle import BundleError, BundleResult
-from capture.calibration.geometry.bundle_equations import N_CAMERA, step_camera
+from capture.calibration.geometry.bundle_equations import N_CAMERA, Gauge, step_camera
 from capture.calibration.geometry.intrinsics import CameraPose
 
 WINDOW_PITCH = 0.45  # radius of the window around a corner over the distance of neighbors
@@ -156,7 +156,7 @@ def calibrate_scanner(
         pixels = _rescale_pixels(joined.pixels, scale[name])
         sightings[name, pose] = CornerObservation(joined.ids, pixels)
     in_jig = any(pose == 0 for _, pose in sightings)
-    gauge: bundle.Gauge = "board" if in_jig else "cameras"
+    gauge: Gauge = "board" if in_jig else "cameras"
     result = bundle.adjust(sightings, board, {**start, **scaled}, gauge=gauge)
     ranges = {
         (camera, projector): _depth_stderr_mm(result, board, camera, projector)

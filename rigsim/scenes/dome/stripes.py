@@ -46,7 +46,7 @@ AMBIENT_RATE_PER_S: Final = 0.5
 """Full scales per second of a white under the light of a dimmed room; chosen."""
 PROJECTOR_POWER_DEVIATION: Final = 0.001
 """Relative standard deviation of a projector's light between frames; chosen, as of the LEDs."""
-SUBPIXELS: Final = 2
+STRIPE_SUBPIXELS: Final = 2
 PRINT_SAMPLES: Final = 4
 """Samples of the print along each side of a subpixel."""
 SHADOW_OFFSET_MM: Final = 0.05
@@ -101,7 +101,7 @@ class StripedFace:
 
     def see(self, view: View, distortion: Float64Array) -> StripedPoints:
         """Return the points behind a camera's subpixels."""
-        origins, ways = camera_rays(view, subpixels=SUBPIXELS, distortion=distortion)
+        origins, ways = camera_rays(view, subpixels=STRIPE_SUBPIXELS, distortion=distortion)
         at, uv, position, _, _ = trace(self._caster, origins, ways).hit_samples()
         layers = sample(self._texture(view), uv, np.ones(len(at), np.bool_))
         normal = layers[:, -3:].astype(np.float64)
@@ -141,7 +141,7 @@ class StripedBoard:
     def see(self, view: View, distortion: Float64Array) -> StripedPoints:
         """Return the points behind a camera's subpixels."""
         rotation, corner = self._pose()
-        _, ways = camera_rays(view, subpixels=SUBPIXELS, distortion=distortion)
+        _, ways = camera_rays(view, subpixels=STRIPE_SUBPIXELS, distortion=distortion)
         eye = np.asarray(view.position_mm, np.float64)
         away = ways.reshape(-1, 3).astype(np.float64)
         depth = away @ rotation[:, 2]
@@ -159,16 +159,17 @@ class StripedBoard:
     def _mean_reflectance(self, cell: Float64Array, size: tuple[int, int]) -> Float32Array:
         """Return the mean reflectance over each ray's part of a pixel, by its neighbors' places."""
         grid = cell.reshape(*size, 2)
-        down, across = np.gradient(grid, axis=(0, 1))
+        down, across = np.gradient(grid, axis=0), np.gradient(grid, axis=1)
         steps = (np.arange(PRINT_SAMPLES) + 0.5) / PRINT_SAMPLES - 0.5
         rows, columns = self._plate.reflectance.shape
         framed = np.pad(self._plate.reflectance, 1)  # nothing around the board
         total = np.zeros(size)
         for a in steps:
             for b in steps:
-                x, y = np.floor(np.moveaxis(grid + a * down + b * across, -1, 0)) + 1
-                x, y = np.clip(x, 0, columns + 1), np.clip(y, 0, rows + 1)
-                total += framed[y.astype(np.int64), x.astype(np.int64)]
+                place = np.floor(grid + a * down + b * across) + 1
+                x = np.clip(place[..., 0], 0, columns + 1).astype(np.int64)
+                y = np.clip(place[..., 1], 0, rows + 1).astype(np.int64)
+                total += framed[y, x]
         return np.asarray(total.reshape(-1) / PRINT_SAMPLES**2, np.float32)
 
     def is_blocked(self, start: Float64Array, way: Float64Array, length: Float64Array) -> BoolArray:
@@ -382,7 +383,9 @@ def _display_gradient(
 def _image(view: View, pixel: Int64Array, signal: Float64Array) -> Float64Array:
     """Return the mean of subpixels' signals in each pixel, shape (H, W)."""
     total = np.bincount(pixel, signal, minlength=view.height_px * view.width_px)
-    return np.asarray(total.reshape(view.height_px, view.width_px) / SUBPIXELS**2, np.float64)
+    return np.asarray(
+        total.reshape(view.height_px, view.width_px) / STRIPE_SUBPIXELS**2, np.float64
+    )
 
 
 def _unit(vectors: Float64Array) -> Float64Array:
@@ -391,5 +394,5 @@ def _unit(vectors: Float64Array) -> Float64Array:
 
 def _pixel_of(subpixel: Int64Array, view: View) -> Int64Array:
     """Return the pixel of subpixels, both as indices into flat images."""
-    row, column = np.divmod(subpixel, view.width_px * SUBPIXELS)
-    return (row // SUBPIXELS) * view.width_px + column // SUBPIXELS
+    row, column = np.divmod(subpixel, view.width_px * STRIPE_SUBPIXELS)
+    return (row // STRIPE_SUBPIXELS) * view.width_px + column // STRIPE_SUBPIXELS

@@ -35,7 +35,7 @@ from skinrig.benchmarks.stage import BenchmarkStage
 FIRST_SEED: Final = 100
 """The settings were chosen with seeds 1 and 2."""
 SKIN_TYPES: Final = ("I", "III", "V", "II", "IV", "VI")
-STEPS: Final = 6
+PHASE_STEPS: Final = 6
 WIDTH_PX: Final = 320
 VOXEL_PIXELS: Final = 2.5
 SATURATING_FACTOR: Final = 10.0
@@ -48,7 +48,7 @@ WRONG_ANGLE_RAD: Final = 0.005
 class StripeSetting:
     """Setting of one scan."""
 
-    steps: int = STEPS
+    steps: int = PHASE_STEPS
     exposure: float = 1.0
     """Exposure over the default one of the rig."""
     width_px: int = WIDTH_PX
@@ -229,9 +229,10 @@ def measure_stripes(stage: BenchmarkStage) -> None:
             _add_stripes(stage, setting, [scan_person(person, setting) for person in people])
     ranges = [scan_by_range_images(person) for person in people]
     _add(stage, {"source": "range images", "case": "default"}, ranges, {})
-    stage.limits["rms"] = _rms([one.rms_mm for one in usual])
+    rms_mm = _rms([one.rms_mm for one in usual])
+    stage.limits["rms"] = rms_mm
     stage.limits["least"] = stage.limits["most"] = float(np.mean([one.coverage for one in usual]))
-    stage.limits["better"] = _rms([one.rms_mm for one in ranges]) / stage.limits["rms"]
+    stage.limits["better"] = _rms([one.rms_mm for one in ranges]) / rms_mm
     _measure_extremes(stage, people, default, usual)
 
 
@@ -268,7 +269,7 @@ def _add_stripes(
 ) -> None:
     scanner = load_rig("dome").scanner
     bits = 0 if scanner is None else scanner.gray_bits(scanner.projectors[0].width_px)
-    knobs = {
+    knobs: dict[str, str | int | float] = {
         "source": "stripes",
         "case": setting.case,
         "steps": setting.steps,
