@@ -14,8 +14,8 @@ from reconstruction.pipeline.recipes import reconstruct
 from reconstruction.scan.closest_points import ScanSurface
 from reconstruction.scan.repair import TriangleMesh
 from skinrig.calibrating.calibrate import calibrate
-from skinrig.simulating import simulate
 from skinrig.simulating.orders import DomeOrder
+from skinrig.simulating.simulation import simulate
 
 pytestmark = pytest.mark.long
 SMALL = {"width_px": 240, "lights": 14, "views": 3, "seed": 21, "scanner": True}
