@@ -45,7 +45,7 @@ def prepare_scan(run: CaptureRun, boxes: Mapping[str, Any]) -> "StripeScan":
     if run.eyes == "open":
         raise AcquisitionError(
             "flicker: the scanner's stripes flicker, open eyes allow none; nothing was lit: close "
-            "or shield the eyes and give --eyes [SR-CAP-011]"
+            "or shield the eyes and give --eyes"
         )
     scan = StripeScan(run, boxes[SCANNER_BOX])
     for step in run.plan.steps:

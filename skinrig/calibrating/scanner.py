@@ -39,7 +39,7 @@ def calibrate_from_stripes(sessions: TargetSessions, board: Board) -> Calibratio
     if scanner is None or not sessions.frames(STRIPES_KIND):
         raise CalibratingError(
             "sessions: got no frames of kind 'stripes', expected some; capture the board with the "
-            "scanner first (`skinrig simulate dome --target charuco --scanner`) [SR-CAL-001]"
+            "scanner first (`skinrig simulate dome --target charuco --scanner`)"
         )
     cameras: dict[tuple[str, int], CornerObservation] = {}
     projectors: dict[tuple[str, int], list[CornerObservation]] = {}

@@ -183,7 +183,7 @@ def test_both_projectors_lost_stop_capture(make):
 
 def test_open_eyes_are_refused_before_light(make):
     bench = make()
-    with pytest.raises(AcquisitionError, match=r"stripes flicker.*--eyes \[SR-CAP-011\]"):
+    with pytest.raises(AcquisitionError, match=r"stripes flicker.*--eyes"):
         bench.run(eyes="open")
     assert not bench.world.switched
 
