@@ -18,7 +18,7 @@ from skinrig.simulating.orders import DomeOrder
 from skinrig.simulating.simulation import simulate
 
 pytestmark = pytest.mark.long
-SMALL = {"width_px": 240, "lights": 14, "views": 3, "seed": 21, "scanner": True}
+SMALL = {"width_px": 240, "lights": 20, "views": 6, "seed": 21, "scanner": True}
 CREATED = datetime(2026, 11, 21, tzinfo=UTC)
 
 
