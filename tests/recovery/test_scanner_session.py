@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from capture.plan.dome import add_scan, dome_calibration_plan
+from capture.rig import load_rig
 from capture.session import Session
 from model import store
 from reconstruction.pipeline.dome.stripes import decode_scan, has_stripes
@@ -13,7 +15,11 @@ from reconstruction.pipeline.inputs import Inputs
 from reconstruction.pipeline.recipes import reconstruct
 from reconstruction.scan.closest_points import ScanSurface
 from reconstruction.scan.repair import TriangleMesh
+from rigsim.scenes.dome.stripes import scan_board
+from rigsim.scenes.dome.targets import make_target_scene
 from skinrig.calibrating.calibrate import calibrate
+from skinrig.simulating import driving
+from skinrig.simulating.dome import small_dome
 from skinrig.simulating.orders import DomeOrder
 from skinrig.simulating.simulation import simulate
 
@@ -22,13 +28,27 @@ SMALL = {"width_px": 240, "lights": 20, "views": 6, "seed": 21, "scanner": True}
 CREATED = datetime(2026, 11, 21, tzinfo=UTC)
 
 
+def capture_board(out):
+    """Capture six poses of the board with its stripes."""
+    order = DomeOrder(out=out, target="charuco", created=CREATED, **SMALL)
+    size = {name: SMALL[name] for name in ("lights", "views", "width_px")}
+    rig = small_dome(load_rig("dome").with_scanner(), **size)
+    plan = add_scan(dome_calibration_plan(rig, "charuco", poses=6), rig)
+    scene = make_target_scene("charuco", rig, seed=order.seed)
+    scan_board(scene, seed=order.seed)
+    session = driving.open_session(order, plan, rig, {}, scene)
+
+    def prompt(world, text):
+        scene.set_pose(int(text.rpartition(" ")[2]))
+
+    driving.drive_plan(order, session, rig, scene, prompt, eyes="closed")
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     made = tmp_path_factory.mktemp("scanner")
-    board = DomeOrder(out=made / "board", target="charuco", created=CREATED, **SMALL)
-    face = DomeOrder(out=made / "face", subject="IV", created=CREATED, **SMALL)
-    for order in (board, face):
-        simulate(order)
+    capture_board(made / "board")
+    simulate(DomeOrder(out=made / "face", subject="IV", created=CREATED, **SMALL))
     for kind in ("geometry", "scanner"):
         calibrate(kind, [made / "board"], made / "calibration")
     return made
