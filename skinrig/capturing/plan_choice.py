@@ -15,7 +15,7 @@ from capture.plan.gradient import (
     strain_state,
 )
 from capture.plan.probe import PROBE_SITES, ProbeTarget, probe_calibration_plan, probe_plan
-from capture.rig import Rig
+from capture.rig import SCANNER_BOX, Rig
 from skinrig.capturing.sequences import SequenceOrder, sequence_plan
 from skinrig.errors import UsageError, require_choice
 
@@ -175,9 +175,16 @@ def parse_direction_count(angles: Sequence[float] | None) -> int:
 
 
 def needed_boxes(rig: Rig, plan: Plan) -> tuple[str, ...]:
-    """Return the names of the controllers that a plan uses: the caliper only with strain steps."""
-    skin = any(strain_state(step) is not None for step in plan.steps)
-    return tuple(name for name in rig.boxes if skin or name != "caliper")
+    """Return the names of the controllers that a plan uses.
+
+    The caliper is used with strain steps alone, the scanner with steps of stripes alone.
+    """
+    unused = set()
+    if not any(strain_state(step) is not None for step in plan.steps):
+        unused.add("caliper")
+    if not any(step.kind == "stripes" for step in plan.steps):
+        unused.add(SCANNER_BOX)
+    return tuple(name for name in rig.boxes if name not in unused)
 
 
 def write_plan(plan: Plan, file: Path) -> None:

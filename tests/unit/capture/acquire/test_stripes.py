@@ -17,6 +17,7 @@ from capture.session import Session, SubjectRecord, verify
 from rigsim.boxes.faults import Faults
 from rigsim.boxes.scanner import ProjectorLight
 from rigsim.world.world import World
+from skinrig.capturing.plan_choice import needed_boxes
 
 DOME = load_rig("dome")
 RIG = DOME.subset(lights=["L060", "L090"], views=["C00"]).resized(16).with_scanner()
@@ -123,6 +124,11 @@ def test_plan_scans_boards_along_both_axes():
     assert add_scan(mirror, RIG) is mirror or add_scan(mirror, RIG).steps == mirror.steps
     without = DOME.subset(views=["C00"])
     assert add_scan(dome_plan(without), without).steps == dome_plan(without).steps
+
+
+def test_scanner_is_needed_for_stripes_alone():
+    assert needed_boxes(RIG, PLAN) == ("dome", "scanner")
+    assert needed_boxes(RIG, dome_calibration_plan(RIG, "mirror", spheres=1)) == ("dome",)
 
 
 def test_capture_keeps_every_pattern(make):
