@@ -154,7 +154,10 @@ def _surface(inputs: Inputs, dome: CalibratedDome) -> RefinedScan:
     scan = scan_mesh.prepare_scan(mesh, points=points)
     fit = register_mesh(dome, scan.coarse)
     # a calibrated scanner places the face better than the images do, unless the head has moved
-    placed = decoded is not None and decoded.calibrated and not fit.is_significant()
+    # by more than one of their pixels
+    shift_mm = np.linalg.norm(fit.move(scan.points_mm) - scan.points_mm, axis=1)
+    moved = fit.is_significant() and float(np.sqrt(np.mean(shift_mm**2))) > footprint
+    placed = decoded is not None and decoded.calibrated and not moved
     inputs.noted["registration"] = {
         "rotation": fit.rotation.tolist(),
         "translation_mm": fit.translation_mm.tolist(),
