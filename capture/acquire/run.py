@@ -37,7 +37,8 @@ def run_plan(
         The rig that the plan is for.
     boxes, cameras
         Open drivers by name: the controller of the rig ("flash", "dome", "probe" or
-        "gradient_sphere", and "caliper" for stretched skin), and a camera for each view.
+        "gradient_sphere", "caliper" for stretched skin, "scanner" for stripes), and a camera for
+        each view.
     session
         Open for writing.
     operator
@@ -70,7 +71,7 @@ def run_plan(
     kind = find_rig_kind(rig)
     if (box := RIG_KINDS[kind].box) not in boxes:
         raise AcquisitionError(f"controller {box!r}: no port was given; add --port {box}=URL")
-    check_serials(cameras, [(view.name, view.serial) for view in rig.views])
+    check_serials(cameras, [(view.name, view.serial) for view in rig.all_views])
     asked: dict[str, Any] = {
         "eyes": eyes,
         "force_limit_n": force_limit_n,

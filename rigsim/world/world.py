@@ -20,7 +20,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from capture.devices.camera import Exposure
-from capture.rig import Rig, View, load_rig
+from capture.rig import SCANNER_BOX, Rig, View, load_rig
 from rigsim.arrays import UInt16Array
 from rigsim.boxes.controller import Controller
 from rigsim.boxes.device import Wiring
@@ -158,7 +158,7 @@ class World:
             rng=self.rng_for("box", name),
             faults=self.faults,
             on_light=self._light.add,
-            on_trigger=self._trigger,
+            on_trigger=self._trigger_scanner if name == SCANNER_BOX else self._trigger,
             on_grip=self._note_grip,
             skin=self.skin,
             head=self.head,
@@ -247,7 +247,15 @@ class World:
 
     def _trigger(self, now: float, mask: int = -1) -> None:
         """Pulse the camera line; a dome pulses the lines of the mask's bits, in the rig's order."""
-        for number, view in enumerate(self.rig.views):
+        self._release(self.rig.views, now, mask)
+
+    def _trigger_scanner(self, now: float, mask: int) -> None:
+        """Pulse the lines of the scanner's cameras, by the mask's bits."""
+        if self.rig.scanner is not None:
+            self._release(self.rig.scanner.views, now, mask)
+
+    def _release(self, views: Iterable[View], now: float, mask: int) -> None:
+        for number, view in enumerate(views):
             if mask >> number & 1 and view.name in self._cameras:
                 self._cameras[view.name].edge(now)
 

@@ -114,7 +114,7 @@ def _run(
     """Run a plan through the drivers into a new or resumed session."""
     with contextlib.ExitStack() as stack:
         boxes, cameras = _open_devices(stack, rig, plan, order, console)
-        width, _ = next(iter({(c.info.width_px, c.info.height_px) for c in cameras.values()}))
+        width = cameras[rig.views[0].name].info.width_px
         if width != rig.views[0].width_px:
             # a served simulation may run smaller than the rig file's camera
             rig = rig.resized(width) if rig.caliper is None else rig.cropped(width)
@@ -174,7 +174,7 @@ def _open_devices(
         boxes[kind] = open_with_retry(opening, console.progress)
         stack.callback(boxes[kind].close)
     cameras: dict[str, Camera] = {}
-    for view in rig.views:
+    for view in rig.all_views:
         opened = open_with_retry(partial(open_camera, order.cameras[view.name]), console.progress)
         cameras[view.name] = opened
         stack.callback(opened.close)

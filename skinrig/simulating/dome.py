@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from capture.plan import Plan
-from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
+from capture.plan.dome import DomeTarget, add_scan, dome_calibration_plan, dome_plan
 from capture.plan.rows import step_lights
 from capture.rig import Rig, load_rig
 from model.skin import SkinAppearance, SkinMap
@@ -24,6 +24,8 @@ from rigsim.population.population import PopulationError, get_member
 from rigsim.scanner.flaws import encode_binary_ply
 from rigsim.scanner.pods import ScannerSettings, scan_face, wrap_template
 from rigsim.scenes.dome.scene import DomeScene
+from rigsim.scenes.dome.stripes import scan_board
+from rigsim.scenes.dome.stripes import scan_face as scan_face_by_stripes
 from rigsim.scenes.dome.targets import TARGET_POSES, make_target_scene, plate_normals
 from rigsim.subject.head_motion import draw_head_motion, draw_head_position
 from rigsim.subject.perfusion import STATE_NAMES
@@ -67,13 +69,14 @@ def simulate_dome(order: DomeOrder) -> SimulationResult:
     conditions = _conditions(order)
     rig = _rig(order)
     planned = order.plan if order.target is None else None
-    plan = planned or _plan(rig, order.target, order.size)
+    plan = planned or add_scan(_plan(rig, order.target, order.size), rig)
     light = driving.announce_light(plan, rig, order)
     settings = _manifest_settings(order, rig, conditions)
     scene = _scene(rig, order, plan)
     session = driving.open_session(order, plan, rig, settings, scene)
     with driving.release_on_error(session):
-        scan = _attach_scan(session, scene, order) if order.target is None else {}
+        attach = order.target is None and not order.scanner
+        scan = _attach_scan(session, scene, order) if attach else {}
 
     def prompt(world: Any, text: str) -> None:
         # prompts such as "pose 3" and "sphere 1": the operator moves the target there
@@ -114,6 +117,8 @@ def _manifest_settings(
         "plan": "" if order.plan is None else order.plan.to_json(),
         **select_attributes(order, "move", "state", "movement", "wrapped"),
     }
+    if order.scanner:
+        settings["scanner"] = True
     if order.target is None:
         settings |= select_attributes(order, "subsurface", "interreflections")
     if conditions:
@@ -257,6 +262,7 @@ def _rig(order: DomeOrder) -> Rig:
     """Return the dome with the lights, cameras and image size of an order."""
     width_px = order.width_px or WIDTHS_PX[order.size]
     dome = load_rig("dome")
+    dome = dome.with_scanner() if order.scanner else dataclasses.replace(dome, scanner=None)
     if order.plan is None:
         lights, views = LIGHT_COUNTS[order.size], VIEW_COUNTS[order.size]
         return small_dome(
@@ -290,7 +296,9 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
         return DomeScene(rig, make_target("dark"), dome=built, seed=order.noise_seed)
     if order.target is not None:
         seed = order.noise_seed
-        return make_target_scene(order.target, rig, seed=seed, dome=built)  # type: ignore[arg-type]
+        target = make_target_scene(order.target, rig, seed=seed, dome=built)  # type: ignore[arg-type]
+        scan_board(target, seed=order.seed, noise_seed=seed)
+        return target
     conditions = dict(order.conditions)
     if (one := _member(order)) is not None:
         person = one.face(TEXTURE_TEXELS)
@@ -300,7 +308,7 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
         person = subject.face(seed=order.seed, size=TEXTURE_TEXELS, mesh=order.mesh)
     person = person.translate(draw_head_position(order.session_seed))
     motion = draw_head_motion(order.noise_seed) if order.move else None
-    return DomeScene(
+    scene = DomeScene(
         rig,
         person,
         dome=built,
@@ -313,6 +321,8 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
         effects=SceneEffects.from_switches(_skin_light_effects(order)),
         choice=choose_renderer(order.renderer),
     )
+    scan_face_by_stripes(scene, seed=order.seed, noise_seed=order.noise_seed)
+    return scene
 
 
 def _skin_light_effects(order: DomeOrder) -> dict[str, Any]:

@@ -130,7 +130,7 @@ def open_session(
         rig=rig,
         devices={
             **{name: f"rigsim {name} box" for name in rig.boxes},
-            **{view.name: view.serial for view in rig.views},
+            **{view.name: view.serial for view in rig.all_views},
         },
         subject=order.person
         or SubjectRecord(subject_records.pseudonym(order.subject, order.seed), SIMULATED_USES),
@@ -270,7 +270,7 @@ def drive_plan(
         kind: open_box(kind, f"sim://{kind}?world={name}", clock=world.clock, first_seq=1)
         for kind in rig.boxes
     }
-    cameras = {view.name: open_camera(f"sim://{name}/{view.name}") for view in rig.views}
+    cameras = {view.name: open_camera(f"sim://{name}/{view.name}") for view in rig.all_views}
     operator = Operator(
         progress=order.progress or (lambda line: None),
         prompt=lambda text: None if prompt is None else prompt(world, text),

@@ -305,6 +305,9 @@ class DomeOrder(FaceOrder):
     wrapped: bool = False
     """Whether the scan is a template wrapped onto the face, with the same triangles and texture
     coordinates for every expression, so that maps of expressions share one texture."""
+    scanner: bool = False
+    """Whether the scanner's stripes are captured, for a face instead of an attached mesh, for a
+    board to calibrate the scanner."""
     subsurface: bool = False
     """True: lateral scattering in skin is always built; False: only if it changes pixels, see
     `rigsim.needs.effects`."""
@@ -328,6 +331,12 @@ class DomeOrder(FaceOrder):
         if self.plan is not None and (self.lights, self.views) != (None, None):
             raise SimulationOptionsError("lights, views: a plan has its own; remove them")
         self.check_rig_of_plan()
+        if self.scanner and self.wrapped:
+            raise SimulationOptionsError("scanner, wrapped: two kinds of scan; remove one of them")
+        if self.scanner and (self.plan is not None or self.target not in (None, "charuco")):
+            raise SimulationOptionsError(
+                "scanner: an option of the default plan of a face or of target charuco; remove it"
+            )
         if self.target is None:
             return
         if self.state != "neutral":

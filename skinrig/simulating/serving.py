@@ -157,7 +157,7 @@ def _build_served_rig(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
 def _next_step(rig_name: str, rig: Rig, urls: Mapping[str, str], resume: Path | None) -> str:
     """Return the command that captures from a served rig."""
     boxes = " ".join("--port " + shell_quote(f"{name}={urls[name]}") for name in rig.boxes)
-    cameras = " ".join("--camera " + shell_quote(f"{v.name}={urls[v.name]}") for v in rig.views)
+    cameras = " ".join("--camera " + shell_quote(f"{v.name}={urls[v.name]}") for v in rig.all_views)
     more = "" if rig.caliper is None else " --force-limit 2 --eyes closed"
     out = "session" if resume is None else f"{shell_quote(resume)} --resume"
     return f"skinrig capture {shell_quote(rig_name)} {boxes} {cameras}{more} --out {out}"

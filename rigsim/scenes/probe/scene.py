@@ -21,7 +21,7 @@ from model import spectra
 from model.skin import SkinAppearance
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.probe import ActualProbe, build_probe
-from rigsim.boxes.source_shutter import SourceLight
+from rigsim.boxes.contact_probe.source_shutter import SourceLight
 from rigsim.fiber.homogeneous_fit import fit_homogeneous_medium
 from rigsim.fiber.probe_profile import BandProfile, ProfileCache, probe_fibers
 from rigsim.fiber.probe_tissue import HomogeneousTissue, ProbedTissue, TissueError
