@@ -16,14 +16,14 @@ from numpy.typing import ArrayLike
 from model.checks import Checks
 from model.color_table import ColorTable
 from reconstruction.arrays import Float64Array
-from reconstruction.chromophores.inversion import (
+from reconstruction.chromophores.pixel_checks import ChromophoreError, check_colors, is_usable_color
+from reconstruction.chromophores.shading_prior import ShadingPrior
+from reconstruction.chromophores.start import MIN_AXIS_FRACTION
+from reconstruction.chromophores.table_fit.fitting import (
     POPULATION_BLOOD,
     POPULATION_LOG_SD,
     POPULATION_MELANIN,
 )
-from reconstruction.chromophores.pixel_checks import ChromophoreError, check_colors, is_usable_color
-from reconstruction.chromophores.shading_prior import ShadingPrior
-from reconstruction.chromophores.start import MIN_AXIS_FRACTION
 
 LOG_FRACTION_STEP: Final = 0.05
 """Step of the grid in log melanin and in log blood, at most a third of their standard errors."""

@@ -9,7 +9,6 @@ the thickness of the epidermis, the melanin optical depth.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -19,7 +18,6 @@ from scipy import special
 from model.checks import Checks
 from model.color_table import ColorTable
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
-from reconstruction.chromophores import inversion_kernels as kernels
 from reconstruction.chromophores.model_error import add_brightness_variance, model_covariance
 from reconstruction.chromophores.pixel_checks import (
     ChromophoreError,
@@ -33,19 +31,10 @@ from reconstruction.chromophores.start import (
     evaluate_table,
     inverse_table_for,
 )
+from reconstruction.chromophores.table_fit import kernels
+from reconstruction.chromophores.table_fit.fitting import MAX_IDENTIFIABLE_STDERR, fit_colors
 
 Shading = Literal["known"] | ArrayLike | None
-
-MAX_IDENTIFIABLE_STDERR = 1.0
-"""Relative standard error above which a chromophore counts as not identifiable."""
-POPULATION_MELANIN = 0.037
-"""Median melanin of measured spectra of skin (ISSA), as a volume fraction."""
-POPULATION_BLOOD = 0.011
-"""Median blood volume fraction of them."""
-POPULATION_LOG_SD = (1.0, 1.5)
-"""Standard deviations of log melanin and of log blood over people and sites. Types I to VI span
-2.7 in log melanin; published blood volume fractions of skin span 0.002 to 0.07, or 3.6."""
-_TASK_PIXELS = 8192
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +50,8 @@ class ChromophoreMaps:
     """Factor between the table's color and the pixel: fitted when free, else as given, times the
     most probable factor where the model error has a part common to the channels."""
     stderr_melanin: Float32Array
-    """Standard error of `melanin`: Fisher information of noise, model error and unknown optics."""
+    """Standard error of `melanin`: Fisher information of noise, model error and unknown optics.
+    With known shading it has a factor, see `chromophores.table_fit.interval_factors`."""
     stderr_hemoglobin: Float32Array
     """Standard error of `hemoglobin`."""
     residual: Float32Array
@@ -176,9 +166,10 @@ def invert(
     fit; at a relative error of half and above they are rough.
 
     With unknown optics and known shading, priors of both cube roots over people are added, see
-    `POPULATION_LOG_SD`. They move what a color leaves open toward the population: a color of the
-    table at C_m 0.03, C_hd 0.02 comes out 1 and 7 percent off, one of very pale or blood-rich skin
-    (0.01, 0.1) by 33 and 43 percent, up to 1.6 standard errors. Colors of the table come back
+    `chromophores.table_fit.fitting.POPULATION_LOG_SD`. They move what a color leaves open toward
+    the population: a color of the table at C_m 0.03, C_hd 0.02 comes out 1 and 7 percent off, one
+    of very pale or blood-rich skin (0.01, 0.1) by 33 and 43 percent, up to 1.6 standard errors.
+    Colors of the table come back
     exactly with a table built with ``exact_optics=True``.
 
     Maps are float32 for float64 input too: rounding changes them by less than 1e-4 of a standard
@@ -203,77 +194,17 @@ def invert(
     covariance = add_brightness_variance(covariance) if free else covariance
     brightest = np.inf if shading_max is None else shading_max
     Checks(ChromophoreError).within("shading_max", brightest, "(0, inf]")
-    start = inverse_table_for(table, free)
-    maps, masks = _fit(
+    maps, masks = fit_colors(
         np.ascontiguousarray(colors).reshape(-1, 3),
         _variance(variance, shape),
         (free, known, _usable(valid, shape)),
         covariance,
         table,
-        start.axes if free or table.optics_covariance is None else _axes_with_optics(table),
         (np.float32(np.log(brightest)), np.float32(limit)),
     )
     named = dict(zip(kernels.INVERSION_MAPS, maps.reshape(len(maps), *shape), strict=True))
     flags = dict(zip(kernels.INVERSION_MASKS, masks.reshape(len(masks), *shape), strict=True))
     return ChromophoreMaps(**named, **flags, depth_factor=table.constants.melanin_depth_factor)
-
-
-def _fit(
-    rgb: Float32Array,
-    variance: Float32Array,
-    shading: tuple[bool, Float32Array, BoolArray],
-    covariance: Float64Array,
-    table: ColorTable,
-    start_axes: Float32Array,
-    limits: tuple[np.float32, np.float32],
-) -> tuple[Float32Array, BoolArray]:
-    """Fit pixels (n, 3) from a start grid; return maps and masks, see `kernels.fit_pixels`."""
-    maps = np.empty((len(kernels.INVERSION_MAPS), len(rgb)), dtype=np.float32)
-    masks = np.empty((len(kernels.INVERSION_MASKS), len(rgb)), dtype=np.bool_)
-    free, known, usable = shading
-    start = inverse_table_for(table, free)
-    kernels.fit_pixels(
-        rgb,
-        variance,
-        known,
-        usable,
-        free,
-        covariance.astype(np.float32),
-        optics_triangles(table),
-        _axis_prior(table, free),
-        np.ascontiguousarray(table.cells, dtype=np.float32),
-        np.array([table.c_m_max, table.c_hd_max], dtype=np.float32),
-        np.ascontiguousarray(start.projection, dtype=np.float32),
-        start_axes,
-        start.twin_log,
-        limits[0],
-        np.float32(start.side),
-        limits[1],
-        maps,
-        masks,
-        _TASK_PIXELS,
-    )
-    return maps, masks
-
-
-@lru_cache(maxsize=16)
-def _axes_with_optics(table: ColorTable) -> Float32Array:
-    """Return the fit of the start grid's own colors, moved by unknown optics and priors."""
-    axes = inverse_table_for(table, False).axes
-    color, _, _ = evaluate_table(table, *np.moveaxis(axes.reshape(-1, 2).astype(np.float64), 1, 0))
-    one, all_usable = np.ones(1, np.float32), np.ones(1, np.bool_)
-    maps, masks = _fit(
-        np.ascontiguousarray(color, np.float32),
-        np.zeros((1, 3), np.float32),
-        (False, one, all_usable),
-        model_covariance(None, True),
-        table,
-        axes,
-        (np.float32(np.inf), np.float32(MAX_IDENTIFIABLE_STDERR)),
-    )
-    ends = np.array([[table.c_m_max], [table.c_hd_max]])
-    moved = np.cbrt(maps[:2] / ends).astype(np.float32).T.reshape(axes.shape)
-    return np.where(masks[0].reshape(*axes.shape[:2], 1), moved, axes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -371,30 +302,6 @@ def compute_identifiability(
         stderr_hemoglobin=3.0 * np.sqrt(aa / det) / b,
         ambiguous=ambiguous,
     )
-
-
-def _axis_prior(table: ColorTable, free: bool) -> Float32Array:
-    """Return means and precisions of the axes' fractions over people.
-
-    They are zeros for exact optics, and for a free shading: a color then has one pair of
-    chromophores on the light side of the fold, and `posterior` has the priors.
-    """
-    if table.optics_covariance is None or free:
-        return np.zeros(4, dtype=np.float32)
-    ends = np.array([table.c_m_max, table.c_hd_max])
-    mean = np.cbrt(np.array([POPULATION_MELANIN, POPULATION_BLOOD]) / ends)
-    sd = mean * np.array(POPULATION_LOG_SD) / 3.0  # c = c_max a^3, hence da = a d(ln c) / 3
-    return np.concatenate([mean, sd**-2.0]).astype(np.float32)
-
-
-@lru_cache(maxsize=16)
-def optics_triangles(table: ColorTable) -> Float32Array:
-    """Return upper triangles of a table's covariance by unknown optics, (n, n, 6); n = 1: none."""
-    nodes = table.optics_covariance
-    if nodes is None:
-        return np.zeros((1, 1, 6), dtype=np.float32)
-    row, column = np.triu_indices(3)
-    return np.ascontiguousarray(nodes[..., row, column], dtype=np.float32)
 
 
 def _weights(

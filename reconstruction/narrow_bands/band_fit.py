@@ -19,12 +19,12 @@ from model.tissue_optics import SKIN_CONSTANTS
 from model.tissue_optics.band_signals import NUISANCE_SD, BandSignals
 from model.tissue_optics.skin_spectra import typical_skin
 from reconstruction.arrays import BoolArray, Float64Array
-from reconstruction.chromophores.inversion import (
+from reconstruction.chromophores.pixel_checks import ChromophoreError
+from reconstruction.chromophores.table_fit.fitting import (
     POPULATION_BLOOD,
     POPULATION_LOG_SD,
     POPULATION_MELANIN,
 )
-from reconstruction.chromophores.pixel_checks import ChromophoreError
 
 OXYGENATION_SD: Final = float(NUISANCE_SD[0])
 """Standard deviation of oxygenation over people, of its published range."""

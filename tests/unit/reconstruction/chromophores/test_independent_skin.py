@@ -2,7 +2,7 @@
 
 Rationale: an estimator that shares every constant with its simulator covers only that simulator.
 Expected: spectra by Monte Carlo, of Jacques' scattering laws, 0.06 to 0.3 mm of epidermis and
-oxygenation of 0.4 to 0.95, are covered as stated. Tolerance: 50 skins a type and camera leave 7 %
+oxygenation of 0.4 to 0.95, are covered as stated. Tolerance: 400 to 900 skins of a type leave 2 %
 of coverage uncertain; with exact optics the same test must fail.
 """
 
@@ -16,14 +16,14 @@ from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import invert
 from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores.common_optics import CommonOptics
-from reconstruction.chromophores.inversion import (
+from reconstruction.chromophores.posterior import add_optics_errors
+from reconstruction.chromophores.shading_prior import lognormal_prior
+from reconstruction.chromophores.start import evaluate_table
+from reconstruction.chromophores.table_fit.fitting import (
     POPULATION_BLOOD,
     POPULATION_LOG_SD,
     POPULATION_MELANIN,
 )
-from reconstruction.chromophores.posterior import add_optics_errors
-from reconstruction.chromophores.shading_prior import lognormal_prior
-from reconstruction.chromophores.start import evaluate_table
 from skinrig.benchmarks.flash_rig import independent_skin as independent
 
 
@@ -49,9 +49,9 @@ def test_independent_skin_is_valid_and_covered(by_camera, name):
     for found in by_camera:
         one = found[name]
         assert one.valid >= (0.9 if name in ("V", "VI") else 0.95)
-        assert abs(one.bias - 1.0) < 0.25
-        assert 0.5 < one.within_68 < 0.9
-        assert one.within_95 > 0.8
+        assert abs(one.bias - 1.0) < 0.15
+        assert 0.58 < one.within_68 < 0.78
+        assert 0.89 < one.within_95 < 0.99
         assert one.blood_within_68 > 0.4
 
 
@@ -67,6 +67,7 @@ def table():
 
 
 def test_fit_is_stationary_under_covariance_of_color(table, rng):
+    table = replace(table, camera="own")  # its standard errors have no factors
     # plain NumPy: at the minimum of e' W e and the prior, the force is small against its deviation
     c_m, c_hd = rng.uniform(0.01, 0.1, 400), rng.uniform(0.005, 0.03, 400)
     rgb = table.lookup(c_m, c_hd) * np.exp(0.05 * rng.standard_normal((400, 3)))

@@ -5,7 +5,8 @@ from model import color_table
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
-from reconstruction.chromophores.inversion import POPULATION_LOG_SD, compute_identifiability
+from reconstruction.chromophores.inversion import compute_identifiability
+from reconstruction.chromophores.table_fit.fitting import POPULATION_LOG_SD
 from skinrig.evaluating.bounds import chromophore_bounds, relative_bounds
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"

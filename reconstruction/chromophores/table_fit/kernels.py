@@ -110,19 +110,28 @@ def _project(rows, l0, l1, l2):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always", fastmath=FASTMATH_CONTRACT)
-def _guess(axes, y0, y1):  # type: ignore[no-untyped-def]
-    """Interpolate the start grid bilinearly, clamped to it."""
-    last = axes.shape[0] - 1
-    y0 = min(max(y0, _ZERO), np.float32(last))
-    y1 = min(max(y1, _ZERO), np.float32(last))
+def _between_nodes(pairs, y0, y1):  # type: ignore[no-untyped-def]
+    """Interpolate a grid (g, g, 2) bilinearly at fractional indices within it."""
+    last = pairs.shape[0] - 1
     i, j = min(int(y0), last - 1), min(int(y1), last - 1)
     x, y = y0 - np.float32(i), y1 - np.float32(j)
-    n00, n01, n10, n11 = axes[i, j], axes[i, j + 1], axes[i + 1, j], axes[i + 1, j + 1]
+    n00, n01, n10, n11 = pairs[i, j], pairs[i, j + 1], pairs[i + 1, j], pairs[i + 1, j + 1]
     w11 = x * y
     w10, w01 = x - w11, y - w11
     w00 = _ONE - x - w01
-    a = w00 * n00[0] + w01 * n01[0] + w10 * n10[0] + w11 * n11[0]
-    b = w00 * n00[1] + w01 * n01[1] + w10 * n10[1] + w11 * n11[1]
+    return (
+        w00 * n00[0] + w01 * n01[0] + w10 * n10[0] + w11 * n11[0],
+        w00 * n00[1] + w01 * n01[1] + w10 * n10[1] + w11 * n11[1],
+    )
+
+
+@njit(inline="always", fastmath=FASTMATH_CONTRACT)
+def _guess(axes, y0, y1):  # type: ignore[no-untyped-def]
+    """Interpolate the start grid bilinearly, clamped to it."""
+    last = np.float32(axes.shape[0] - 1)
+    y0 = min(max(y0, _ZERO), last)
+    y1 = min(max(y1, _ZERO), last)
+    a, b = _between_nodes(axes, y0, y1)
     return min(max(a, _MIN_AXIS_FRACTION), _ONE), min(max(b, _MIN_AXIS_FRACTION), _ONE)
 
 
@@ -158,6 +167,7 @@ def _bounded(a, b, step_a, step_b, aa, ab, bb, ra, rb):  # type: ignore[no-untyp
         readonly_array_type(float32, 2),  # covariance of the model's relative error (3, 3)
         readonly_array_type(float32, 3),  # covariance by optics on the axes (k, k, 6); k = 1: none
         readonly_array_type(float32, 1),  # prior of axis fractions: means and precisions (4,)
+        readonly_array_type(float32, 3),  # factors of standard errors on the axes (m, m, 2)
         readonly_array_type(float32, 5),  # cells of the color table
         readonly_array_type(float32, 1),  # ends of the axes as volume fractions (2,)
         readonly_array_type(float32, 2),  # projection of log rgb, and offset (2, 4)
@@ -181,6 +191,7 @@ def fit_pixels(  # type: ignore[no-untyped-def]
     model,
     optics,
     prior,
+    factors,
     cells,
     ends,
     projection,
@@ -199,6 +210,7 @@ def fit_pixels(  # type: ignore[no-untyped-def]
     length = np.float32(last)
     grid = twin_log.shape[0]
     has_optics = optics.shape[0] > 1
+    has_factors = factors.shape[0] > 1
     gain_tol = np.float32(GAIN_TOL)
     common_variance = max(min(model[0, 1], model[0, 2], model[1, 2]), _ZERO)
     each_variance = variance.shape[0] > 1
@@ -386,6 +398,11 @@ def fit_pixels(  # type: ignore[no-untyped-def]
             inverse = np.float32(1.0 / det)
             relative_a = _THREE * math.sqrt(bb * inverse) / a
             relative_b = _THREE * math.sqrt(aa * inverse) / b
+            if has_factors:
+                nodes = np.float32(factors.shape[0] - 1)
+                factor_a, factor_b = _between_nodes(factors, a * nodes, b * nodes)
+                relative_a *= factor_a
+                relative_b *= factor_b
             distance = math.sqrt((e0 * e0 + e1 * e1 + e2 * e2) / _THREE)
             maps[0, n] = ends[0] * a * a * a
             maps[1, n] = ends[1] * b * b * b
