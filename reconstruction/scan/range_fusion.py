@@ -98,7 +98,7 @@ def _mean_distance(
         across = (before - way) * cosine
         seen = np.isfinite(across) & (np.abs(across) < band_mm)
         inverse = 1.0 / np.maximum(variance[seen] * cosine[seen] ** 2, 1e-12)
-        # far from a map's surface its distance along the ray is no longer that to the surface
+        # far from a map's surface, the distance along the ray differs from that to the surface
         near = inverse * (1.0 - np.abs(across[seen]) / band_mm)
         total[seen] += near * across[seen]
         weights[seen] += near
