@@ -15,7 +15,7 @@ import numpy as np
 
 from model.tissue_optics.constants import SKIN_CONSTANTS
 from reconstruction.arrays import Float64Array
-from reconstruction.chromophores.inversion import (
+from reconstruction.chromophores.table_fit.fitting import (
     POPULATION_BLOOD,
     POPULATION_LOG_SD,
     POPULATION_MELANIN,
