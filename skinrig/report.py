@@ -2,13 +2,14 @@
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from model import store
 from model.skin import SkinAppearance
 from skinrig.appearances.dynamic import describe_parts
+from skinrig.evaluating.session_agreement import SessionAgreement
 from skinrig.reporting import first_screen, map_images, page, provenance
 from skinrig.reporting import verdict as verdict_section
 from skinrig.reporting.comparison import page as comparison
@@ -40,6 +41,8 @@ class Report:
     checks: tuple[page.Check, ...]
     compared: tuple[str, str] | None
     """Labels of the two runs that are compared; None: the report is on one collection."""
+    sessions: Mapping[str, SessionAgreement] = field(default_factory=dict)
+    """Verdicts on person and state, by the name of the compared maps."""
 
     @property
     def verdict(self) -> str:
@@ -96,7 +99,8 @@ def build_any(
             title, comparison.build_lead(*both, pairs), comparison.build_sections(*both, pairs)
         )
         checks = tuple(both[0].checks + both[1].checks)
-        return Report(html, checks, (both[0].label, both[1].label))
+        verdicts = {p.name: p.agreement for p in pairs if p.agreement is not None}
+        return Report(html, checks, (both[0].label, both[1].label), verdicts)
     checks_of_all: list[page.Check] = []
     found = discover(places)
     body = build_sections(found, checks_of_all)

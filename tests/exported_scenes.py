@@ -11,6 +11,7 @@ import numpy as np
 import OpenEXR
 from scipy import stats
 
+from rigsim.mitsuba.startup import share_kernels
 from rigsim.mitsuba.variant import choose_variant
 
 ROOT = Path(__file__).parents[1]
@@ -27,21 +28,27 @@ if sys.argv[6]:
     sys.path.insert(0, sys.argv[6])
     import rigsim.mitsuba
 scene = mi.load_file(sys.argv[2], light=sys.argv[3], **json.loads(sys.argv[7]))
-runs = [mi.render(scene, sensor=int(sys.argv[4]), spp={SAMPLES}, seed=k) for k in range({RUNS})]
+sensor, count = int(sys.argv[4]), int(sys.argv[8])
+runs = [mi.render(scene, sensor=sensor, spp={SAMPLES}, seed=k) for k in range(count)]
 np.save(sys.argv[5], np.stack([np.array(mi.TensorXf(run).numpy()) for run in runs]))
 ours = {{name.split(".")[0] for name in sys.modules}} & {{"rigsim", "skinrig"}}
 assert bool(ours) == bool(sys.argv[6])
 """
 
 
-def render(folder, light, sensor, file="scene-stock.xml", **parameters):
-    """Return images of `RUNS` seeds by a new process, with plugins unless materials are stock."""
+def render(folder, light, sensor, file="scene-stock.xml", *, is_exact=False, **parameters):
+    """Return images of `RUNS` seeds by a new process, with plugins unless materials are stock.
+
+    The image of an exact integrator, which draws nothing at random, stands for all seeds.
+    """
     out = folder / "images.npy"
     choice = choose_variant("rgb")
     plugins = "" if "stock" in file else str(ROOT)
     arguments = [choice.name, str(folder / file), light, str(sensor), str(out), plugins]
     arguments.append(json.dumps({name: str(value) for name, value in parameters.items()}))
+    arguments.append("1" if is_exact else str(RUNS))
     environment = {"DRJIT_LIBLLVM_PATH": choice.library, "HOME": str(folder.parent)}
+    share_kernels(environment)
     done = subprocess.run(
         [sys.executable, "-I", "-c", RENDER, *arguments],
         env=environment,
@@ -50,7 +57,8 @@ def render(folder, light, sensor, file="scene-stock.xml", **parameters):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    return np.load(out)
+    images = np.load(out)
+    return np.broadcast_to(images, (RUNS, *images.shape[1:]))
 
 
 def sum_blocks(images):

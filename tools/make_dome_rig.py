@@ -95,6 +95,66 @@ spectral_sensitivity = "Nikon 5100 (NPL)"
 full_well_e = 22000.0
 read_noise_e = 9.0
 """
+SCANNER = """
+# Scanner of the face: two projectors and four cameras, after Weyrich et al. 2005, figure 2.
+# It is used with boxes = ["dome", "scanner"].
+[scanner]
+period_px = 32               # 10 mm on the face
+phase_steps = 6
+exposure_s = 0.02
+settle_s = 0.02
+max_show_s = 0.5
+range_mm = [650.0, 1150.0]
+"""
+PROJECTOR = """
+[[scanner.projectors]]
+name = "P{number}"
+model = "skinrig projector"
+serial = "SP-{number:04d}"
+position_mm = {place}
+target_mm = [0.0, 0.0, -40.0]
+up = [0.0, 1.0, 0.0]
+focal_mm = 21.0              # field at the subject: 262 x 419 mm
+pixel_um = 7.637
+width_px = 800
+height_px = 1280
+f_number = 2.4
+illuminant = "LED-B3"
+power_w = 0.4
+cameras = {cameras}
+"""
+SCANNER_CAMERA = """
+[[scanner.views]]
+name = "S{number}"
+camera_model = "skinrig scanner camera"
+serial = "SS-{number:04d}"
+position_mm = {place}
+target_mm = [0.0, 0.0, -40.0]
+up = [0.0, 1.0, 0.0]
+focal_mm = 17.0              # field at the subject: 287 x 359 mm
+pixel_um = 5.3
+width_px = 1024
+height_px = 1280
+f_number = 8.0
+readout_s = 0.02
+bit_depth = 12
+cfa = "MONO"
+black_level = 64
+white_level = 4095
+spectral_sensitivity = "Nikon 5100 (NPL)"
+full_well_e = 10000.0
+read_noise_e = 7.0
+"""
+SCANNER_MM = 900.0
+POD_DEG = (-38.0, 38.0)  # azimuth of a projector
+POD_CAMERAS_DEG = ((-18.0, 8.0), (18.0, -8.0))  # azimuth and elevation from its projector
+
+
+def scanner_place(azimuth_deg: float, elevation_deg: float) -> list[float]:
+    a, e = np.radians([azimuth_deg, elevation_deg])
+    place = SCANNER_MM * np.array([np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)])
+    place[2] -= 40.0  # around the middle of a head
+    return (place.round(1) + 0.0).tolist()
 
 
 def main() -> None:
@@ -103,6 +163,16 @@ def main() -> None:
         print(LIGHT.format(number=number, place=place.tolist()), end="")
     for number, place in enumerate(camera_positions()):
         print(CAMERA.format(number=number, place=place.tolist()), end="")
+    print(SCANNER, end="")
+    count = len(POD_CAMERAS_DEG)
+    for number, azimuth in enumerate(POD_DEG):
+        cameras = [f"S{count * number + k}" for k in range(count)]
+        place, names = scanner_place(azimuth, 0.0), str(cameras).replace("'", '"')
+        print(PROJECTOR.format(number=number, place=place, cameras=names), end="")
+    for number, azimuth in enumerate(POD_DEG):
+        for k, (aside, up) in enumerate(POD_CAMERAS_DEG):
+            place = scanner_place(azimuth + aside, up)
+            print(SCANNER_CAMERA.format(number=count * number + k, place=place), end="")
 
 
 if __name__ == "__main__":

@@ -20,15 +20,13 @@ from typing import Any
 
 import make_dome_maps
 import make_portrait_maps
+import make_reference_images
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from capture.rig import load_rig
 from model import store
 from model.skin import SkinMap
-from rigsim.scenes.reference.patch import draw_patch, predict_patch, render_patch
-from rigsim.subject.person_skin import PersonSkin
 from skinrig.drawing import png
 from skinrig.viewer import faces, page
 
@@ -38,7 +36,6 @@ BROWSER = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshad
 READY_MS = 90_000
 VIEW = "#weights.anger=1&weights.surprise=0.6"
 """Settings of the live page, as its *Copy link* writes them."""
-VOXEL_PX = 32
 HIDE_TIME = "document.getElementById('time').style.visibility = 'hidden'"
 """Run times differ between runs: they stay out of the image."""
 
@@ -150,18 +147,6 @@ def held_out(demo: Path) -> None:
 # screenshots -------------------------------------------------------------------------------------
 
 
-def voxel_skin() -> None:
-    """Draw freckled skin by Mitsuba as voxels and by the fast renderer's equations."""
-    patch = draw_patch(PersonSkin.of_preset("II"), "cheek", field_mm=24.0, voxel_mm=0.375)
-    rig = load_rig("flash")
-    voxels = render_patch(patch, rig, width_px=VOXEL_PX, samples=1024, seed=0).rgb
-    fast = predict_patch(patch, rig, width_px=VOXEL_PX)
-    change = 0.5 + 5.0 * (voxels / fast - 1.0)
-    codes = [png.encode_srgb8(image / fast.max()) for image in (voxels, fast)]
-    codes.append(np.rint(255 * np.clip(change, 0.0, 1.0)).astype(np.uint8))
-    write_row("gallery-voxels.png", [code.repeat(8, axis=0).repeat(8, axis=1) for code in codes])
-
-
 def screenshots(demo: Path) -> None:
     """Photograph the live page and the first screen of the report."""
     chromium = shutil.which("chromium")
@@ -195,7 +180,7 @@ def main(demo: Path) -> None:
     IMAGES.mkdir(exist_ok=True)
     for draw in (chromophores, expression, topography, translucency, held_out):
         draw(demo)
-    voxel_skin()
+    make_reference_images.main()
     make_dome_maps.main(demo)
     make_portrait_maps.main()
     screenshots(demo)

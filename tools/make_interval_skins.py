@@ -12,7 +12,7 @@ import numpy as np
 from make_independent_skins import WAVELENGTH_NM, coefficients, draw_skin, typology_angles
 
 from model.tissue_optics import adding_doubling
-from reconstruction.chromophores.interval_factors import SKINS_FILE
+from reconstruction.chromophores.table_fit.interval_factors import SKINS_FILE
 from rigsim.tissue.skin_layers import ETA, SKIN_ANISOTROPY
 from skinrig.benchmarks.flash_rig.independent_skin import MELANOSOME_550_PER_MM
 

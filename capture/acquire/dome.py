@@ -8,6 +8,7 @@ a whole.
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
 from typing import Any
 
 from capture.acquire.frames import configure_camera, requested_exposure
@@ -19,6 +20,7 @@ from capture.acquire.outcome import (
     require_trigger_line,
     step_limit_error,
 )
+from capture.acquire.stripes import prepare_scan
 from capture.acquire.table_run import TableRun
 from capture.devices.camera import Frame
 from capture.devices.dome import DomeBox, TableRow
@@ -49,14 +51,24 @@ def acquire(run: CaptureRun, boxes: Mapping[str, Any]) -> AcquisitionResult:
     for name, camera in run.cameras.items():
         why = "dome's trigger line, and no other way keeps pace with its lights"
         require_trigger_line(name, camera, why)
-    scan = _Sequences(run, box)
+    sequences = _Sequences(run, box)
+    missing = run.pending_steps()
+    scan = prepare_scan(run, boxes) if any(step.kind == "stripes" for step in missing) else None
     try:
         begin_lit_run(run, box, DOME_LEASE_S)
-        for piece in _split_sequences(run.pending_steps(), int(box.limits.get("max_rows", 1024))):
-            run.operator.stop_if_asked()
-            scan.prepare(piece[0])
-            scan.take(piece)
+        for stripes, group in groupby(missing, key=lambda step: step.kind == "stripes"):
+            steps = list(group)
+            if stripes and scan is not None:
+                sequences.prepare(steps[0])
+                scan.take(steps)
+                continue
+            for piece in _split_sequences(steps, int(box.limits.get("max_rows", 1024))):
+                run.operator.stop_if_asked()
+                sequences.prepare(piece[0])
+                sequences.take(piece)
     finally:
+        if scan is not None:
+            run.tear_down(scan.box)
         run.tear_down(box)
     return run.summarize(box.failed_leds)
 
@@ -110,7 +122,8 @@ def _check_box(plan: Plan, rig: Rig, limits: Mapping[str, Any]) -> None:
             f"{len(rig.views)}; use the rig file of this controller"
         )
     settle_s, overlap_s = float(limits["settle_us"]) / 1e6, float(limits["overlap_us"]) / 1e6
-    for step, row in zip(plan.steps, led_rows(plan.steps, rig), strict=True):
+    lit = [step for step in plan.steps if step.kind != "stripes"]
+    for step, row in zip(lit, led_rows(lit, rig), strict=True):
         check_dwell(step, row.dwell_s, limits)
         if len(row.leds) > int(limits["max_at_once"]):
             what = (

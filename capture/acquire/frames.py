@@ -70,8 +70,12 @@ def encode_step_frame(
     step: Step,
     session: Session,
     light: Mapping[str, Value],
+    color: raw.CameraColor | None = None,
 ) -> bytes:
-    """Encode a frame as our DNG, with its step and its light."""
+    """Encode a frame as our DNG, with its step, its light and the camera's color.
+
+    A raw file with a color matrix of its own keeps it.
+    """
     info = camera.info
     if isinstance(frame.image, bytes):
         # a foreign raw file is encoded again, because its own metadata can name people and places
@@ -88,6 +92,10 @@ def encode_step_frame(
             noise_profile=noise,
             step_id=step.id,
         )
+    if color is not None and picture.pattern != "MONO" and picture.color_matrix is None:
+        picture = replace(
+            picture, color_matrix=color.matrix, color_illuminant="D65", neutral=color.neutral
+        )
     return raw.encode_frame(
         replace(
             picture,
@@ -95,7 +103,6 @@ def encode_step_frame(
             iso=frame.exposure.iso,
             camera_model=info.model,
             camera_serial=frame.serial,
-            color_illuminant="D65",
             f_number=view.f_number,
             focal_mm=view.focal_mm,
             captured_at=None,

@@ -13,6 +13,7 @@ from capture.devices.camera import Camera, CameraError, Frame, Trigger
 from capture.devices.led_box import Eyes
 from capture.devices.port import SYSTEM_CLOCK, Clock, DeviceError
 from capture.plan import Plan, Step, Value
+from capture.raw import CameraColor
 from capture.rig import Rig
 from capture.session import Session
 
@@ -106,7 +107,7 @@ class CaptureRun:
 
     Attributes
     ----------
-    plan, rig, cameras, session, operator, eyes, force_limit_n, all_brackets
+    plan, rig, cameras, session, operator, eyes, force_limit_n, all_brackets, camera_colors
         See `capture.acquire.run.run_plan`.
     steps, frames, stale, retakes : int
         Results so far, see `AcquisitionResult`.
@@ -120,6 +121,7 @@ class CaptureRun:
     eyes: Eyes = "open"
     force_limit_n: float | None = None
     all_brackets: bool = False
+    camera_colors: Mapping[str, CameraColor] = field(default_factory=dict)
     steps: int = 0
     frames: int = 0
     stale: int = 0
@@ -152,7 +154,8 @@ class CaptureRun:
     ) -> bytes:
         """Return a frame of the view ``name`` as our DNG."""
         view, camera = self.rig.view(name), self.cameras[name]
-        return encode_step_frame(frame, view, camera, step, self.session, light)
+        color = self.camera_colors.get(name)
+        return encode_step_frame(frame, view, camera, step, self.session, light, color)
 
     def commit_frames(
         self,

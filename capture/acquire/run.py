@@ -9,6 +9,7 @@ from capture.devices.camera import Camera, check_serials
 from capture.devices.led_box import Eyes
 from capture.plan import Plan
 from capture.plan.rig_kinds import RIG_KINDS, find_rig_kind
+from capture.raw import CameraColor
 from capture.rig import Rig
 from capture.session import Session
 
@@ -24,6 +25,7 @@ def run_plan(
     eyes: Eyes = "open",
     force_limit_n: float | None = None,
     all_brackets: bool = False,
+    camera_colors: Mapping[str, CameraColor] | None = None,
 ) -> AcquisitionResult:
     """Capture the missing steps of a plan.
 
@@ -35,7 +37,8 @@ def run_plan(
         The rig that the plan is for.
     boxes, cameras
         Open drivers by name: the controller of the rig ("flash", "dome", "probe" or
-        "gradient_sphere", and "caliper" for stretched skin), and a camera for each view.
+        "gradient_sphere", "caliper" for stretched skin, "scanner" for stripes), and a camera for
+        each view.
     session
         Open for writing.
     operator
@@ -47,6 +50,8 @@ def run_plan(
         Greatest force of the caliper on the skin, N; it has no default, and nothing moves without.
     all_brackets
         Whether the probe takes all exposures of a series, also those that cannot add information.
+    camera_colors
+        Color of cameras by view, written into their frames; unknown by default.
 
     Returns
     -------
@@ -66,11 +71,12 @@ def run_plan(
     kind = find_rig_kind(rig)
     if (box := RIG_KINDS[kind].box) not in boxes:
         raise AcquisitionError(f"controller {box!r}: no port was given; add --port {box}=URL")
-    check_serials(cameras, [(view.name, view.serial) for view in rig.views])
+    check_serials(cameras, [(view.name, view.serial) for view in rig.all_views])
     asked: dict[str, Any] = {
         "eyes": eyes,
         "force_limit_n": force_limit_n,
         "all_brackets": all_brackets,
+        "camera_colors": camera_colors or {},
     }
     run = CaptureRun(plan, rig, cameras, session, operator or Operator(), **asked)
     acquire: Callable[..., AcquisitionResult] = import_module(f"capture.acquire.{kind}").acquire

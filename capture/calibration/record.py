@@ -33,7 +33,16 @@ def freeze_arrays(
         object.__setattr__(row, name, array)
 
 
-CALIBRATION_KINDS = ("sensor", "color", "polarization", "white", "geometry", "lights", "fiber")
+CALIBRATION_KINDS = (
+    "sensor",
+    "color",
+    "polarization",
+    "white",
+    "geometry",
+    "lights",
+    "fiber",
+    "scanner",
+)
 DEFAULT_VALIDITY_DAYS = 90
 
 Source: TypeAlias = Literal["measured", "simulated"]

@@ -9,8 +9,9 @@ import numpy as np
 from capture.plan.eye_light import eye_irradiance
 from capture.plan.light_order import best_order
 from capture.plan.rows import LedRow
-from capture.plan.steps import Index, Kind, Plan, StepSeries, Value, require_argument
-from capture.rig import LedLimits, Rig
+from capture.plan.steps import Index, Kind, Plan, Step, StepSeries, Value, require_argument
+from capture.rig import SCANNER_BOX, LedLimits, Rig
+from capture.scanner import STRIPE_AXES
 
 DomeTarget = Literal["charuco", "mirror", "white", "dark"]
 
@@ -181,6 +182,48 @@ def dome_calibration_plan(
                 index, at = {"pose": pose, "light": name}, f"W{pose}-{name}"
                 series.expose(at, "white", index, exposures_s[0], light=name, level=level)
     return series.plan()
+
+
+def add_scan(plan: Plan, rig: Rig, *, iso: int = 100) -> Plan:
+    """Return a plan with the stripes of the rig's scanner, where its controller is used.
+
+    A subject is scanned first, along columns; a board in each pose after its own step, along both
+    axes, so that the projectors can be calibrated. Other targets are not scanned.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> dome = load_rig("dome")
+    >>> plan = dome_plan(dome)
+    >>> len(add_scan(plan, dome.with_scanner()).steps) - len(plan.steps), len(plan.steps)
+    (24, 318)
+    """
+    if rig.scanner is None or SCANNER_BOX not in rig.boxes:
+        return plan
+    subject = any(step.kind == "olat" for step in plan.steps)
+    steps: list[Step] = _stripes(rig, STRIPE_AXES[:1], {}, iso) if subject else []
+    for step in plan.steps:
+        steps.append(step)
+        if step.kind == "charuco":
+            steps += _stripes(rig, STRIPE_AXES, step.index, iso)
+    return Plan(plan.rig, tuple(steps), plan.limits)
+
+
+def _stripes(rig: Rig, axes: Sequence[str], index: Index, iso: int) -> list[Step]:
+    """Return the steps of all patterns of a scanner, projector by projector."""
+    if (scanner := rig.scanner) is None:
+        return []
+    prefix = "".join(f"P{value:02d}-" for value in index.values() if isinstance(value, int))
+    steps = []
+    for projector in scanner.projectors:
+        for axis in axes:
+            shown = {"projector": projector.name, "axis": axis}
+            for number in range(scanner.pattern_count(projector, axis)):
+                name = f"{prefix}{projector.name}-{axis[:3]}{number:02d}"
+                taken = {"stripes": number, "exposure_s": scanner.exposure_s, "iso": iso}
+                place = {**index, **shown, "pattern": number}
+                steps.append(Step(name, "stripes", place, {**shown, **taken}, projector.cameras))
+    return steps
 
 
 def _cosine(a: Sequence[float], b: Sequence[float]) -> float:

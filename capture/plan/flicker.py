@@ -188,7 +188,7 @@ def flicker_report(plan: Plan, rig: Rig) -> FlickerReport:
     overlap_s = rig.leds.overlap_s if rig.leds is not None else 0.0
     reports = [
         flicker_of_rows(_insert_analyzer_rotations(piece, rig), weights, overlap_s=overlap_s)
-        for piece in split_passes(plan.steps)
+        for piece in split_passes([step for step in plan.steps if step.kind != "stripes"])
     ]
     seconds = sum(report.seconds for report in reports)
     mean = sum(report.mean_w_m2 * report.seconds for report in reports)

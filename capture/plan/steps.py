@@ -21,11 +21,12 @@ from capture.documents import (
 from capture.former_names import translate_names
 from capture.plan.suction import suction_overhead_s
 from capture.rig import ID_RULE, Rig, is_id
+from capture.scanner import STRIPE_AXES
 
 Value = str | int | float | bool
 Index = Mapping[str, str | int | float]
 FlashKind = Literal["dark", "flat", "chart", "malus", "subject"]
-DomeKind = Literal["olat", "tracking", "charuco", "mirror", "white"]
+DomeKind = Literal["olat", "tracking", "charuco", "mirror", "white", "stripes"]
 Kind = Literal[FlashKind, DomeKind, "gradient", "ball", "fibers", "phantom", "mask"]
 Polarizer = Literal["parallel", "crossed"]
 
@@ -50,6 +51,9 @@ _SETTING_RULES: Mapping[str, tuple[tuple[type, ...], Any, str]] = {
     "dwell_s": ((int, float), lambda v: 0 < v < math.inf, "seconds > 0"),
     "suction_mbar": ((int, float), lambda v: 0 < v < math.inf, "mbar > 0"),
     "fiber": ((int,), lambda v: v >= 0, "a fiber's number >= 0, or none for all"),
+    "projector": ((str,), lambda v: is_id(v), "a projector's name"),
+    "axis": ((str,), lambda v: v in STRIPE_AXES, f"one of {', '.join(STRIPE_AXES)}"),
+    "stripes": ((int,), lambda v: v >= 0, "a pattern's number >= 0"),
     "start_s": ((int, float), lambda v: 0 <= v < math.inf, "seconds >= 0"),
 }
 
@@ -68,7 +72,8 @@ class Step(Document):
         Unique in the plan, usable in a file name.
     kind : str
         Of the flash rig "flat", "chart", "malus" or "subject"; of the dome "olat" (one light at a
-        time), "tracking" (several at once), "charuco", "mirror" or "white"; of the gradient sphere
+        time), "tracking" (several at once), "charuco", "mirror", "white" or "stripes" (a pattern
+        of the scanner); of the gradient sphere
         "gradient" (skin) or "ball" (a ball of black glass); of the fiber probe "fibers" (skin),
         "phantom" (a block of known optics) or "mask" (the same with all fibers covered but one); of
         all "dark".
@@ -78,7 +83,9 @@ class Step(Document):
         ``polarizer`` ("parallel" or "crossed"), ``power`` (0 to 1 of a light's full energy),
         ``exposure_s`` (s), ``iso``; ``analyzer_deg`` (rotator reading, degrees; 0 is parallel, 90
         crossed) takes precedence over ``polarizer``. On the dome ``light`` (its name), or ``leds``
-        (names joined by +), at ``level`` (0 to 1) for ``dwell_s``; in the gradient sphere
+        (names joined by +), at ``level`` (0 to 1) for ``dwell_s``; of the scanner ``projector``
+        (its name), ``axis`` ("columns" or "rows") and ``stripes`` (number of the pattern); in the
+        gradient sphere
         ``pattern`` instead of lights; of the fiber probe ``suction_mbar`` and ``fiber`` (number of
         the only uncovered fiber). In a sequence ``start_s``, s after its beginning. Rigs may
         define further names.
@@ -188,7 +195,7 @@ class Plan(Document):
         """Raise an error when the plan is for another rig, or names views that it lacks."""
         checks = FaultCollector(f"Plan for rig {self.rig!r}", PlanError)
         checks.check("rig", self.rig, self.rig == rig.name, f"the rig's name {rig.name!r}")
-        views = [view.name for view in rig.views]
+        views = [view.name for view in rig.all_views]
         for number, step in enumerate(self.steps):
             for camera in step.cameras:
                 known = camera in views

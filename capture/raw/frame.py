@@ -23,6 +23,16 @@ class RawError(InputError):
     """Raised for a raw file, or the content of one, that cannot be used."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraColor:
+    """Color of a camera under the light of a rig, for programs that develop raw files."""
+
+    matrix: Float64Array
+    """(3, 3) from CIE XYZ of D65 to camera RGB."""
+    neutral: tuple[float, float, float]
+    """Camera RGB of a neutral surface in the light of the rig, largest 1."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RawFrame:
     """Sensor values as read out, with black and white levels and the settings of the exposure."""

@@ -106,7 +106,7 @@ def log_reflectance(wavelength_nm: ArrayLike, skin: ArrayLike) -> Float64Array:
     check.shape("wavelength_nm", nm, ("n",))
     check.shape("skin", properties, ("...", len(SKIN_PARAMETERS)))
     check.within("skin", properties, "[0, inf)")
-    melanin, blood, oxygenation, thickness, amplitude, slope, baseline, eumelanin = (
+    melanin, _, _, thickness, _, _, _, eumelanin = (
         part[..., None] for part in np.moveaxis(properties, -1, 0)
     )
     kinds = [spectra.eumelanin_absorption, spectra.pheomelanin_absorption]
@@ -114,10 +114,7 @@ def log_reflectance(wavelength_nm: ArrayLike, skin: ArrayLike) -> Float64Array:
         eumelanin * kinds[0](at) + (1.0 - eumelanin) * kinds[1](at)
         for at in (nm, np.array([OPTICAL_DEPTH_NM]))
     ]
-    scattering = amplitude * (nm / 500.0) ** -slope
-    without = baseline * spectra.baseline_absorption(nm)
-    oxy, deoxy = blood_absorption(nm, oxygenation=1.0), blood_absorption(nm, oxygenation=0.0)
-    dermis = blood * (oxygenation * oxy + (1.0 - oxygenation) * deoxy) + (1.0 - blood) * without
+    dermis, scattering, without = _dermis(nm, properties)
     fraction = melanin / (thickness * relative[1])
     coordinates = (
         scattering * thickness,
@@ -125,6 +122,52 @@ def log_reflectance(wavelength_nm: ArrayLike, skin: ArrayLike) -> Float64Array:
         dermis / (SKIN_CONSTANTS.dermis_scattering * scattering),
     )
     return _interpolate(np.stack(np.broadcast_arrays(*coordinates)))
+
+
+def log_sigma_tr(wavelength_nm: ArrayLike, skin: ArrayLike) -> Float64Array:
+    """Return the logarithm of the dermis's effective transport coefficient sigma_tr, in 1/mm.
+
+    Parameters
+    ----------
+    wavelength_nm, skin
+        As in `log_reflectance`.
+
+    Returns
+    -------
+    ndarray
+        Shape (..., n): natural logarithm of sqrt(3 sigma_a (sigma_a + sigma_s')).
+
+    Examples
+    --------
+    >>> np.exp(log_sigma_tr([540.0, 650.0], typical_skin(0.1, 0.01))).round(1).tolist()
+    [2.1, 0.6]
+    """
+    nm = np.asarray(wavelength_nm, np.float64)
+    properties = np.asarray(skin, np.float64)
+    check = Checks(TissueError)
+    check.shape("wavelength_nm", nm, ("n",))
+    check.shape("skin", properties, ("...", len(SKIN_PARAMETERS)))
+    check.within("skin", properties, "[0, inf)")
+    absorbed, epidermal, _ = _dermis(nm, properties)
+    scattering = SKIN_CONSTANTS.dermis_scattering * epidermal
+    return np.asarray(0.5 * np.log(3.0 * absorbed * (absorbed + scattering)))
+
+
+def _dermis(
+    nm: Float64Array, properties: Float64Array
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Return absorption of the dermis, scattering of the epidermis, and absorption of neither.
+
+    All in 1/mm, (..., n); the last one is that of skin without melanin and blood.
+    """
+    _, blood, oxygenation, _, amplitude, slope, baseline, _ = (
+        part[..., None] for part in np.moveaxis(properties, -1, 0)
+    )
+    scattering = amplitude * (nm / 500.0) ** -slope
+    without = baseline * spectra.baseline_absorption(nm)
+    oxy, deoxy = blood_absorption(nm, oxygenation=1.0), blood_absorption(nm, oxygenation=0.0)
+    absorbed = blood * (oxygenation * oxy + (1.0 - oxygenation) * deoxy) + (1.0 - blood) * without
+    return absorbed, scattering, without
 
 
 def _interpolate(coordinates: Float64Array) -> Float64Array:

@@ -19,7 +19,7 @@ from reconstruction.arrays import Float64Array
 from reconstruction.chromophores.pixel_checks import ChromophoreError, check_colors, is_usable_color
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MIN_AXIS_FRACTION
-from reconstruction.chromophores.table_fit import (
+from reconstruction.chromophores.table_fit.fitting import (
     POPULATION_BLOOD,
     POPULATION_LOG_SD,
     POPULATION_MELANIN,

@@ -18,7 +18,6 @@ from scipy import special
 from model.checks import Checks
 from model.color_table import ColorTable
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
-from reconstruction.chromophores import inversion_kernels as kernels
 from reconstruction.chromophores.model_error import add_brightness_variance, model_covariance
 from reconstruction.chromophores.pixel_checks import (
     ChromophoreError,
@@ -32,7 +31,8 @@ from reconstruction.chromophores.start import (
     evaluate_table,
     inverse_table_for,
 )
-from reconstruction.chromophores.table_fit import MAX_IDENTIFIABLE_STDERR, fit_colors
+from reconstruction.chromophores.table_fit import kernels
+from reconstruction.chromophores.table_fit.fitting import MAX_IDENTIFIABLE_STDERR, fit_colors
 
 Shading = Literal["known"] | ArrayLike | None
 
@@ -51,7 +51,7 @@ class ChromophoreMaps:
     most probable factor where the model error has a part common to the channels."""
     stderr_melanin: Float32Array
     """Standard error of `melanin`: Fisher information of noise, model error and unknown optics.
-    With known shading it has a factor, see `reconstruction.chromophores.interval_factors`."""
+    With known shading it has a factor, see `chromophores.table_fit.interval_factors`."""
     stderr_hemoglobin: Float32Array
     """Standard error of `hemoglobin`."""
     residual: Float32Array
@@ -166,10 +166,10 @@ def invert(
     fit; at a relative error of half and above they are rough.
 
     With unknown optics and known shading, priors of both cube roots over people are added, see
-    `reconstruction.chromophores.table_fit.POPULATION_LOG_SD`. They move what a color leaves open
-    toward the population: a color of the table at C_m 0.03, C_hd 0.02 comes out 1 and 7 percent
-    off, one of very pale or blood-rich skin (0.01, 0.1) by 33 and 43 percent, up to 1.6 standard
-    errors. Colors of the table come back
+    `chromophores.table_fit.fitting.POPULATION_LOG_SD`. They move what a color leaves open toward
+    the population: a color of the table at C_m 0.03, C_hd 0.02 comes out 1 and 7 percent off, one
+    of very pale or blood-rich skin (0.01, 0.1) by 33 and 43 percent, up to 1.6 standard errors.
+    Colors of the table come back
     exactly with a table built with ``exact_optics=True``.
 
     Maps are float32 for float64 input too: rounding changes them by less than 1e-4 of a standard

@@ -24,7 +24,6 @@ from reconstruction.chromophores import posterior_kernels as ridge
 from reconstruction.chromophores.common_optics import CommonOptics
 from reconstruction.chromophores.face_distribution import FaceDistribution
 from reconstruction.chromophores.inversion import ChromophoreMaps, invert
-from reconstruction.chromophores.inversion_kernels import OUTSIDE_DISTANCE, OUTSIDE_SIGMAS
 from reconstruction.chromophores.model_error import (
     DEFAULT_RELATIVE_NOISE,
     add_brightness_variance,
@@ -33,7 +32,8 @@ from reconstruction.chromophores.model_error import (
 from reconstruction.chromophores.pixel_checks import ChromophoreError, is_usable_color
 from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.chromophores.start import MELANIN_AXIS, MIN_AXIS_FRACTION, equal_melanin_lines
-from reconstruction.chromophores.table_fit import POPULATION_LOG_SD, POPULATION_MELANIN
+from reconstruction.chromophores.table_fit.fitting import POPULATION_LOG_SD, POPULATION_MELANIN
+from reconstruction.chromophores.table_fit.kernels import OUTSIDE_DISTANCE, OUTSIDE_SIGMAS
 
 MIN_RELATIVE_NOISE = 2e-4
 """Minimum relative error of a color; smaller noise is raised to it. It corresponds to some 0.3

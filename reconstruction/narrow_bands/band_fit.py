@@ -20,7 +20,7 @@ from model.tissue_optics.band_signals import NUISANCE_SD, BandSignals
 from model.tissue_optics.skin_spectra import typical_skin
 from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.chromophores.pixel_checks import ChromophoreError
-from reconstruction.chromophores.table_fit import (
+from reconstruction.chromophores.table_fit.fitting import (
     POPULATION_BLOOD,
     POPULATION_LOG_SD,
     POPULATION_MELANIN,

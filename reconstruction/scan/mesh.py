@@ -41,6 +41,8 @@ class RefinedScan:
     """The repaired scan before refinement, with texture coordinates; used for ray casting."""
     report: RepairReport
     """Counts of the repairs."""
+    stderr_mm: Float32Array | None = None
+    """Standard error across the surface at each point, shape (P,); None: not known."""
 
     def transform(self, rotation: Float64Array, translation_mm: Float64Array) -> RefinedScan:
         """Apply a rigid motion ``rotation @ p + translation_mm`` to the surface."""

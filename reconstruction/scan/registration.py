@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from model.checks import Checks
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int64Array
@@ -35,6 +36,8 @@ MIN_SCAN_COSINE: Final = 0.35
 """Least cosine between normal and view of a used point: 70 degrees."""
 ERROR_CELL_MM: Final = 20.0
 """Side of the cubes within which errors are taken as fully correlated."""
+MAX_STILL_CHI_SQUARE: Final = 16.81
+"""99 % quantile of chi-square of six degrees of freedom."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,6 +63,18 @@ class RigidFit:
     def move(self, points_mm: ArrayLike) -> Float64Array:
         """Transform points of the scan to the rig frame."""
         return np.asarray(points_mm, np.float64) @ self.rotation.T + self.translation_mm
+
+    def is_significant(self) -> bool:
+        """Return whether the motion differs from none by more than its standard errors explain.
+
+        The sum of the squared motions over their variances, of six numbers, exceeds its 99 %
+        quantile.
+        """
+        turn = Rotation.from_matrix(self.rotation).as_rotvec()
+        before = (self.center_mm - self.translation_mm) @ self.rotation
+        motion = np.concatenate([turn, self.center_mm - before])
+        ratio = np.square(motion / np.maximum(self.stderr, 1e-12)).sum()
+        return bool(ratio > MAX_STILL_CHI_SQUARE)
 
 
 def register_scan(

@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike
 from capture.rig import Rig, View
 from rigsim.arrays import Float64Array
 
+UNDISTORT_TOL: Final = 1e-14
+"""Largest remaining difference of slopes."""
 UNDISTORT_STEPS: Final = 12
 """Newton steps from image to ray; each doubles the number of correct digits."""
 
@@ -86,9 +88,8 @@ def build_dome(rig: Rig, *, seed: int, tolerances: DomeTolerances | None = None)
     views, distortion, gain = [], {}, {}
     for view in rig.views:
         rng = np.random.default_rng([seed, *view.serial.encode()])
-        views.append(_shifted(view, size, rng))
-        k = np.array([-1.0 + 0.2 * rng.standard_normal(), *rng.standard_normal(3), 0.0])
-        distortion[view.name] = size.distortion * k * [1.0, 1.0, 0.01, 0.01, 0.0]
+        views.append(perturb_view(view, size, rng))
+        distortion[view.name] = draw_distortion(size, rng)
         gain[view.name] = float(np.exp(size.gain * rng.standard_normal()))
     lights, axes = [], []
     for light in rig.lights:
@@ -112,7 +113,14 @@ def build_dome(rig: Rig, *, seed: int, tolerances: DomeTolerances | None = None)
     return ActualDome(rig, built, np.array(axes), distortion, gain)
 
 
-def _shifted(view: View, size: DomeTolerances, rng: np.random.Generator) -> View:
+def draw_distortion(size: DomeTolerances, rng: np.random.Generator) -> Float64Array:
+    """Draw k1, k2, p1, p2, k3 of a lens as built."""
+    k = np.array([-1.0 + 0.2 * rng.standard_normal(), *rng.standard_normal(3), 0.0])
+    return np.asarray(size.distortion * k * [1.0, 1.0, 0.01, 0.01, 0.0])
+
+
+def perturb_view(view: View, size: DomeTolerances, rng: np.random.Generator) -> View:
+    """Return a view as built: position, direction and focal length with manufacturing errors."""
     place = np.array(view.position_mm) + size.camera_mm * rng.standard_normal(3)
     right, up, back = (np.array(axis) for axis in view.axes)
     turn = math.radians(size.camera_deg) * rng.standard_normal(3)
@@ -155,6 +163,8 @@ def undistort(xy: ArrayLike, distortion: ArrayLike) -> Float64Array:
     right, down = np.array([step, 0.0]), np.array([0.0, step])
     for _ in range(UNDISTORT_STEPS):
         miss = distort(found, distortion) - wanted
+        if np.abs(miss).max(initial=0.0) < UNDISTORT_TOL:
+            break
         gx = (distort(found + right, distortion) - distort(found - right, distortion)) / (2 * step)
         gy = (distort(found + down, distortion) - distort(found - down, distortion)) / (2 * step)
         det = gx[..., 0] * gy[..., 1] - gx[..., 1] * gy[..., 0]

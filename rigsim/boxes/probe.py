@@ -29,15 +29,14 @@ from rigsim.boxes.command import (
     parse_decimal,
     parse_token,
 )
-from rigsim.boxes.device import Device, Wiring
-from rigsim.boxes.source_shutter import (
+from rigsim.boxes.contact_probe.source_shutter import (
     COVER_MOVE_S,
     LEVEL_STEPS,
     MIN_OPENING_MS,
     SourceLight,
     SourceShutter,
 )
-from rigsim.boxes.suction_pump import (
+from rigsim.boxes.contact_probe.suction_pump import (
     MAX_PUMPING_S,
     MIN_SUCTION_MBAR,
     MIN_SUCTION_MS,
@@ -45,6 +44,7 @@ from rigsim.boxes.suction_pump import (
     Gauge,
     SuctionPump,
 )
+from rigsim.boxes.device import Device, Wiring
 
 __all__ = ["ProbeUnit", "SourceLight"]
 

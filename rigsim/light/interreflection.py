@@ -233,15 +233,18 @@ class InterreflectionColor:
         subject = skin.subject
         covered = subject.atlas.covered.astype(np.float32)
         factor = r_d / np.maximum(reflectance, np.float32(MIN_REFLECTANCE))
-        layers = np.dstack([covered, subject.melanin, skin.blood_volume_fraction, factor, r_d])
+        fractions = subject.melanin, skin.blood_volume_fraction, subject.thickness_ratio
+        layers = np.dstack([covered, *fractions, factor, r_d])
         coarse = self._bounce.coarsen(np.asarray(layers * covered[..., None], np.float32))
         coarse[:, 1:] /= np.maximum(coarse[:, :1], np.float32(MIN_REFLECTANCE))
-        self._r_d = np.ascontiguousarray(coarse[:, 6:])
+        self._r_d = np.ascontiguousarray(coarse[:, 7:])
         self._weights: Float32Array | None = None
         if bounces.spectral:
             weights = skin.band_weights(bounces.step)
-            spectra = skin.table.spectra(coarse[:, 1], coarse[:, 2])[:, :: bounces.step]
-            cover = coarse[:, 3:6].mean(axis=1, keepdims=True)
+            # patches off the skin have a thickness of 0
+            thickness = np.clip(coarse[:, 3], fractions[2].min(), fractions[2].max())
+            spectra = skin.spectra(coarse[:, 1], coarse[:, 2], thickness)[:, :: bounces.step]
+            cover = coarse[:, 4:7].mean(axis=1, keepdims=True)
             self._spectrum = np.asarray(spectra * cover, np.float32)
             self._channel = np.maximum(self._spectrum @ weights, MIN_REFLECTANCE).astype(np.float32)
             self._weights = np.asarray(weights, np.float32)

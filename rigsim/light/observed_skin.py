@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from model import spectra
-from rigsim.arrays import Float32Array, Float64Array
+from rigsim.arrays import Float32Array, Float64Array, FloatArray
 from rigsim.subject import SimulatedSubject
 from rigsim.tissue.lateral_kernels import SIGMAS_MM, GaussianSum
+from rigsim.tissue.site_thickness import interpolate_thickness
 from rigsim.tissue.skin_color import SkinColor, skin_color
 from rigsim.tissue.skin_table import WAVELENGTH_NM, SkinTable
 
@@ -26,8 +27,10 @@ class ObservedSkin:
 
     @property
     def color(self) -> SkinColor:
-        """Colors of skin of any pigment in the camera's channels."""
-        return skin_color(self.camera, self.illuminant, self.subject.tissue)
+        """Colors of skin of any pigment, with the epidermis's thickness between the regions."""
+        return skin_color(
+            self.camera, self.illuminant, self.subject.tissue.with_thickness_ratio(1.0)
+        )
 
     @property
     def blood_volume_fraction(self) -> Float32Array:
@@ -36,11 +39,65 @@ class ObservedSkin:
 
     def reflectance(self) -> Float32Array:
         """Return the white-balanced reflectance, shape (N, N, 3)."""
-        return self.color.rgb(self.subject.melanin, self.blood_volume_fraction)
+        return self._rgb(self.subject.melanin)
 
     def reflectance_without_melanin(self) -> Float32Array:
         """Return the reflectance of the same skin without melanin, shape (N, N, 3)."""
-        return self.color.rgb(np.zeros_like(self.subject.melanin), self.blood_volume_fraction)
+        return self._rgb(np.zeros_like(self.subject.melanin))
+
+    def _rgb(self, melanin: Float32Array) -> Float32Array:
+        blood = self.blood_volume_fraction
+        found = interpolate_thickness(
+            self.subject.tissue,
+            self.subject.thickness_ratio,
+            lambda tissue: skin_color(self.camera, self.illuminant, tissue).rgb(melanin, blood),
+        )
+        return np.asarray(found, np.float32)
+
+    def fractions_of(self, rgb: Float32Array) -> tuple[Float32Array, Float32Array]:
+        """Return melanin and blood of uniform skin of given colors, each with its own thickness.
+
+        Parameters
+        ----------
+        rgb
+            Reflectance per channel, > 0, shape (N, N, 3); near that of the face.
+
+        Returns
+        -------
+        melanin, blood : ndarray of float32
+            Shape (N, N), see `rigsim.tissue.skin_color.SkinColor.nearest_fractions`.
+
+        Notes
+        -----
+        Colors are converted to those of the thickness between the regions by the ratio of the
+        face's own colors.
+        """
+        melanin, blood = self.subject.melanin, self.blood_volume_fraction
+        even = rgb * (self.color.rgb(melanin, blood) / self.reflectance())
+        return self.color.nearest_fractions(even, melanin, blood)
+
+    def spectra(
+        self, c_m: Float32Array, c_hd: Float32Array, thickness_ratio: Float32Array
+    ) -> FloatArray:
+        """Return spectra of this person's skin at `rigsim.tissue.skin_table.WAVELENGTH_NM`.
+
+        Parameters
+        ----------
+        c_m, c_hd
+            Volume fractions of melanosomes and of blood, shape (n,).
+        thickness_ratio
+            Thickness of the epidermis over that between the regions, shape (n,).
+
+        Returns
+        -------
+        ndarray
+            Diffuse reflectance, shape (n, wavelengths).
+        """
+        return interpolate_thickness(
+            self.subject.tissue,
+            thickness_ratio,
+            lambda tissue: SkinTable.load(tissue).spectra(c_m, c_hd),
+        )
 
     def covered_chromophores(self) -> tuple[Float32Array, Float32Array]:
         """Return melanin and hemoglobin where the texture covers skin, shape (n,) each."""
@@ -53,8 +110,8 @@ class ObservedSkin:
 
     @property
     def table(self) -> SkinTable:
-        """Spectra of this person's skin of any pigment."""
-        return SkinTable.load(self.subject.tissue)
+        """Spectra of this person's skin of any pigment, of the thickness between the regions."""
+        return SkinTable.load(self.subject.tissue.with_thickness_ratio(1.0))
 
     def lateral_kernels(self) -> GaussianSum:
         """Return the lateral profile at the median melanin and hemoglobin, per channel."""

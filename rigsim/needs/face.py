@@ -286,8 +286,8 @@ def _tissue_effects(
 
 def max_reflectance_rgb(skin: ObservedSkin) -> Float64Array:
     """Return the largest white-balanced reflectance of a face's skin in each channel, (3,)."""
-    rgb = skin.color.rgb(*(part[::TEXEL_STEP] for part in skin.covered_chromophores()))
-    return np.asarray(rgb.reshape(-1, 3).max(axis=0), np.float64)
+    rgb = skin.reflectance()[skin.subject.atlas.covered][::TEXEL_STEP]
+    return np.asarray(rgb.max(axis=0), np.float64)
 
 
 def choose_min_bounce_fraction(over_noise: float) -> float:

@@ -1,5 +1,6 @@
 """Select the effects that the fiber probe's images require."""
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -136,9 +137,14 @@ def predict_profiles(rig: Rig, tissue: SkinTissue, properties: TissueProperties)
         rig.views[0].spectral_sensitivity, rig.lights[0].illuminant, SKIN_WAVELENGTHS_NM
     )
     area_mm2 = np.pi * (outer**2 - inner**2)
+    other = SkinTissue(replace(tissue.person, tissue=properties))
     rings = [
         interpolate_rings(
-            tissue.melanin(site), tissue.blood(site, 0.0), properties, SKIN_WAVELENGTHS_NM, edges
+            other.melanin(site),
+            other.blood(site, 0.0),
+            other.person.at(site).tissue,
+            SKIN_WAVELENGTHS_NM,
+            edges,
         )[1:-1:2]
         for site in SITE_NAMES
     ]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import exp
 from typing import Final
 
 import numpy as np
@@ -18,6 +19,7 @@ from rigsim.fiber.probe_tissue import ProbedTissue, SkinTissue
 from rigsim.needs.effects import Effect, EffectSelection, PixelNoise, SceneEffects, decide_effect
 from rigsim.skin_patch.microrelief import MicroSkin, change_patch_tissue
 from rigsim.subject import SimulatedSubject
+from rigsim.subject.thickness import LOG_RATIO_RANGE
 from rigsim.targets import Target
 from rigsim.tissue.skin_layers import (
     DERMIS_SCATTERING_RATIO,
@@ -45,7 +47,7 @@ class TissueRule:
 
 
 TISSUE_RULES: Final = (
-    TissueRule("thickness of the epidermis", "thickness", ("epidermis_mm",)),
+    TissueRule("thickness of the epidermis", "thickness", ("epidermis_mm", "site_contrast")),
     TissueRule("depth of melanin", "melanin_depth", ("basal_melanin_fraction",)),
     TissueRule("oxygenation of blood", "oxygenation", ("oxygenation",)),
     TissueRule(
@@ -59,7 +61,8 @@ TISSUE_RULES: Final = (
         ("epidermal_blood_ratio", "baseline_amplitude", "eumelanin_fraction"),
     ),
 )
-"""One rule per property; each field of `TissueProperties` has one rule."""
+"""One rule per property. Each field of `TissueProperties` has one rule, except for the thickness to
+which melanin refers: skin of another thickness has the same melanin per area."""
 
 
 def select_tissue_effects(
@@ -234,11 +237,19 @@ class SkinSample:
         -----
         The loss beyond a shadow's edge grows with the mean free path of diffuse light in the
         dermis. Two tissues change a pixel by both, color and lateral scattering; the larger counts.
+        Regions of another thickness than the rest are compared, too.
         """
-        own, changed = self.signals(tissue), self.signals(other)
-        shown = np.minimum(level * own / own.max(axis=0), 1.0)
-        by_color = gain * np.abs(changed / own - 1.0) * shown / noise.sigma(shown)
+        contrast = max(tissue.site_contrast, other.site_contrast)
+        by_color = 0.0
+        for step in (0.0, *LOG_RATIO_RANGE) if contrast > 0.0 else (0.0,):
+            own, changed = (
+                self.signals(one.with_thickness_ratio(exp(step * one.site_contrast)))
+                for one in (tissue, other)
+            )
+            shown = np.minimum(level * own / own.max(axis=0), 1.0)
+            change = gain * np.abs(changed / own - 1.0) * shown / noise.sigma(shown)
+            by_color = max(by_color, float(change.max()))
         longer = self.diffuse_path_mm(other) / self.diffuse_path_mm(tissue) - 1.0
         scattered = np.minimum(np.asarray(lost, np.float64) * level, 1.0)
         by_path = np.abs(longer) * scattered / noise.sigma(scattered)
-        return float(max(by_color.max(), by_path.max()))
+        return max(by_color, float(by_path.max()))

@@ -12,10 +12,12 @@ freckles         0 to 1; drawn from the seed if omitted
 oil              factor of the surface fraction covered by oil, 0 to 3
 tissue_model     other properties of the skin: "drawn" from the seed as people vary (default),
                  "typical", or "papers" (the papers' model)
-epidermis_mm     thickness of the epidermis, mm; this and the next ones replace those of the model,
-                 in the ranges of `rigsim.tissue.skin_layers.PROPERTY_RANGES`
-...              basal_melanin_fraction, epidermal_blood_ratio, oxygenation, scattering_per_mm,
-                 rayleigh_fraction, scattering_slope, baseline_amplitude, eumelanin_fraction
+epidermis_mm     thickness of the epidermis, mm, at equal melanin per area; this and the next ones
+                 replace those of the model, in the ranges of
+                 `rigsim.tissue.skin_layers.PROPERTY_RANGES`
+...              site_contrast, basal_melanin_fraction, epidermal_blood_ratio, oxygenation,
+                 scattering_per_mm, rayleigh_fraction, scattering_slope, baseline_amplitude,
+                 eumelanin_fraction
 mesh             file of the face's geometry, .npz or .obj
 melanin_map      texture of melanin, volume fraction of the epidermis, 0.0005 to 0.5
 hemoglobin_map   texture of blood at rest, volume fraction of the dermis, 0 to 0.31
@@ -84,6 +86,7 @@ class SubjectFile(Document):
     """`DRAWN_TISSUE`, or one of `NAMED_TISSUES`."""
     epidermis_mm: float | None = None
     """None: that of the model, as for the next ones."""
+    site_contrast: float | None = None
     basal_melanin_fraction: float | None = None
     epidermal_blood_ratio: float | None = None
     oxygenation: float | None = None

@@ -3,4 +3,4 @@
 from rigsim.render.caster import Caster
 from rigsim.render.rays import GBuffer, camera_rays, g_buffer, trace, visibility
 
-__all__ = ["RAY_OFFSET_MM", "Caster", "GBuffer", "camera_rays", "g_buffer", "trace", "visibility"]
+__all__ = ["Caster", "GBuffer", "camera_rays", "g_buffer", "trace", "visibility"]

@@ -1,7 +1,7 @@
 """Base classes of scenes: views, sensors, exposures, and caches of their light."""
 
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -58,6 +58,22 @@ def full_power_duration_s(light: SwitchedLight, name: str) -> float:
     return light.level * (light.t_off_s - light.t_on_s)
 
 
+class StripeExposures(Protocol):
+    """Exposures of a scanner's cameras."""
+
+    @property
+    def view_names(self) -> frozenset[str]:
+        """Names of the cameras."""
+
+    def forget(self) -> None:
+        """Note that the subject has moved."""
+
+    def exposure(
+        self, view_name: str, *, pops: Sequence[Any], exposure_s: float, seed: int
+    ) -> UInt16Array:
+        """Return the raw DN of a camera, shape (H, W)."""
+
+
 class RigScene:
     """Base class of the scenes of all rigs."""
 
@@ -68,6 +84,8 @@ class RigScene:
     """Shape of the light on a pixel: camera RGB, or () for the one band of a camera."""
     needs: EffectSelection
     """Effects with their verdicts and reasons."""
+    stripes: StripeExposures | None = None
+    """The scanner's cameras with their exposures; None without a scanner."""
 
     @property
     def omitted(self) -> list[tuple[str, str]]:

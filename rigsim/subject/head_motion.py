@@ -30,6 +30,9 @@ SWAY_BAND_HZ: Final = (0.02, 0.4)
 PIVOT_MM: Final = (0.0, 0.0, -70.0)
 """Center of rotation of the head; the translation is that of this point."""
 
+POSITION_DEVIATION_MM: Final = 2.0
+"""Standard deviation of the head's position between sessions, per axis: a chin rest's, chosen."""
+
 TWITCH_DURATION_S: Final = 0.5
 TWITCH_RANGE_MM: Final = (0.8, 2.0)
 TWITCH_RADIUS_MM: Final = 14.0
@@ -169,6 +172,31 @@ def draw_head_motion(
         twitch_mm=float(rng.uniform(*TWITCH_RANGE_MM)) if twitch else 0.0,
         twitch_side=str(rng.choice(["left", "right"])),
     )
+
+
+def draw_head_position(seed: int | None) -> tuple[float, float, float]:
+    """Draw where a subject's head is in one session, relative to the center of the rig.
+
+    Parameters
+    ----------
+    seed
+        Seed of the session, >= 0; None: the center of the rig.
+
+    Returns
+    -------
+    tuple of float
+        Translation along x, y, z, mm, rig frame; at most 2.5 standard deviations per axis.
+
+    Examples
+    --------
+    >>> draw_head_position(None), draw_head_position(1) == draw_head_position(1)
+    ((0.0, 0.0, 0.0), True)
+    """
+    if seed is None:
+        return 0.0, 0.0, 0.0
+    normal = np.random.default_rng([seed, 6]).standard_normal(3)
+    x, y, z = (POSITION_DEVIATION_MM * np.clip(normal, -2.5, 2.5)).tolist()
+    return x, y, z
 
 
 def _rotation_matrix(vector: Float64Array) -> Float64Array:

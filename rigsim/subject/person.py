@@ -25,6 +25,7 @@ from rigsim.subject import (
 )
 from rigsim.subject.head import LANDMARKS_MM, build_head
 from rigsim.subject.perfusion import STATE_NAMES, Perfusion, StateError, draw_perfusion
+from rigsim.subject.thickness import thickness_ratio
 from rigsim.tissue.skin_layers import TYPICAL_SKIN, TissueProperties
 
 PRESET_NAMES: Final = tuple(pigment.MELANIN_PRESETS)
@@ -77,7 +78,8 @@ class SimulatedSubject:
     atlas: Atlas
     """Surface under each texel."""
     melanin: Float32Array
-    """Volume fraction of melanosomes in the epidermis, 0 to 0.5."""
+    """Volume fraction of melanosomes in an epidermis of `TissueProperties.melanin_reference_mm`, 0
+    to 0.5."""
     perfusion: Perfusion
     """Blood by compartment, with its response to the states."""
     roughness: Float32Array
@@ -105,6 +107,11 @@ class SimulatedSubject:
     def size(self) -> int:
         """Texels along each side of the maps."""
         return self.atlas.size
+
+    @property
+    def thickness_ratio(self) -> Float32Array:
+        """Thickness of the epidermis over that between the face's regions, shape (N, N)."""
+        return thickness_ratio(self.perfusion.regions, self.tissue.site_contrast)
 
     def hemoglobin(self, state: str = "neutral") -> Float32Array:
         """Return the blood volume fraction of the dermis in a state, shape (N, N), 0 to 0.32.

@@ -78,7 +78,7 @@ class SkinColor:
         )
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=24)
 def skin_color(camera: str, light: str, tissue: TissueProperties = TYPICAL_SKIN) -> SkinColor:
     """Return the color table of a person's skin for a camera and a light; it is built once.
 

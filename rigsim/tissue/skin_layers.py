@@ -6,7 +6,7 @@ equation with the estimators evaluated on it; only tabulated data are shared.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Final
 
@@ -26,6 +26,8 @@ BASAL_THICKNESS_FRACTION = 1.0 / 3.0  # of the epidermis, with the melanocytes
 BLOOD_G_PER_L, HEMOGLOBIN_G_PER_MOL = 150.0, 64_500.0  # Prahl 1998 (OMLC)
 
 MAX_C_M, MAX_C_HD = 0.5, 0.32  # Jimenez et al. 2010, table 1
+REFERENCE_EPIDERMIS_MM: Final = 0.09
+"""Thickness of the epidermis to which volume fractions of melanosomes refer, mm."""
 REFERENCE_WAVELENGTH_NM: Final = 500.0
 """Wavelength of `TissueProperties.scattering_per_mm`."""
 
@@ -34,9 +36,12 @@ REFERENCE_WAVELENGTH_NM: Final = 500.0
 class TissueProperties:
     """Properties of a person's skin except for the amounts of melanin and blood."""
 
-    epidermis_mm: float = 0.09
-    """Thickness of the epidermis, mm, 0.03 to 0.4. Sandby-Moller et al. 2003,
-    doi:10.1080/00015550310015419: 0.075 on the forearm, 0.097 on the buttock."""
+    epidermis_mm: float = REFERENCE_EPIDERMIS_MM
+    """Thickness of the epidermis between the regions of the face, mm, 0.03 to 0.4. Sandby-Moller et
+    al. 2003, doi:10.1080/00015550310015419: 0.075 on the forearm, 0.097 on the buttock."""
+    site_contrast: float = 0.0
+    """Contrast of the thickness between regions of the face, 0 to 2; 1 is the published one, see
+    `rigsim.subject.thickness`."""
     basal_melanin_fraction: float = BASAL_THICKNESS_FRACTION
     """Fraction of the melanin in the basal third of the epidermis, 1/3 (even) to 0.6."""
     epidermal_blood_ratio: float = 0.0
@@ -57,14 +62,35 @@ class TissueProperties:
     eumelanin_fraction: float = 0.8
     """Fraction of eumelanin; the rest is pheomelanin. Between 0.61 (Donner et al. 2008) and the
     melanosomes of Jacques 2013, 1; measured spectra agree with 0.6 to 0.95 alike."""
+    melanin_reference_mm: float = REFERENCE_EPIDERMIS_MM
+    """Thickness to which volume fractions of melanosomes refer, mm. Skin of another thickness and
+    the same fraction has the same melanin per area."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in PROPERTY_RANGES.items():
             _require_range(name, getattr(self, name), low, high)
+        _require_range("melanin_reference_mm", self.melanin_reference_mm, *_THICKNESS_RANGE_MM)
 
+    def with_thickness_ratio(self, ratio: float) -> "TissueProperties":
+        """Return this skin at a site, with the epidermis thicker by a factor, in its range.
+
+        Examples
+        --------
+        >>> thin = TissueProperties(site_contrast=1.0).with_thickness_ratio(0.9)
+        >>> round(thin.epidermis_mm, 4), thin.site_contrast
+        (0.081, 0.0)
+        """
+        low, high = _THICKNESS_RANGE_MM
+        return replace(
+            self, epidermis_mm=min(max(self.epidermis_mm * ratio, low), high), site_contrast=0.0
+        )
+
+
+_THICKNESS_RANGE_MM: Final = (0.03, 0.4)
 
 PROPERTY_RANGES: Final[Mapping[str, tuple[float, float]]] = {
-    "epidermis_mm": (0.03, 0.4),
+    "epidermis_mm": _THICKNESS_RANGE_MM,
+    "site_contrast": (0.0, 2.0),
     "basal_melanin_fraction": (BASAL_THICKNESS_FRACTION, 0.6),
     "epidermal_blood_ratio": (0.0, 1.0),
     "oxygenation": (0.0, 1.0),
@@ -90,6 +116,7 @@ _DONNER_MIE_PER_MM: Final = 14.74 * REFERENCE_WAVELENGTH_NM**-0.22
 _DONNER_RAYLEIGH_PER_MM: Final = 2.2e11 * REFERENCE_WAVELENGTH_NM**-4.0
 PAPER_SKIN: Final = TissueProperties(
     epidermis_mm=0.25,
+    melanin_reference_mm=0.25,
     epidermal_blood_ratio=0.25,
     eumelanin_fraction=0.61,
     scattering_per_mm=_DONNER_MIE_PER_MM + _DONNER_RAYLEIGH_PER_MM,
@@ -216,11 +243,13 @@ def skin_coefficients(
     whole_blood = blood_per_mm(wavelength, tissue.oxygenation)
     baseline = tissue.baseline_amplitude * baseline_per_mm(wavelength)
     c_he = tissue.epidermal_blood_ratio * blood
+    melanosomes = melanosomes * (tissue.melanin_reference_mm / tissue.epidermis_mm)
     basal = melanosomes * tissue.basal_melanin_fraction / BASAL_THICKNESS_FRACTION
     upper = melanosomes * (1.0 - tissue.basal_melanin_fraction) / (1.0 - BASAL_THICKNESS_FRACTION)
 
     def epidermis(local: Float64Array) -> Float64Array:
-        return local * melanin + c_he * whole_blood + (1.0 - local - c_he) * baseline
+        bloodless = np.maximum(1.0 - local - c_he, 0.0)  # melanin of a thin epidermis may fill it
+        return local * melanin + c_he * whole_blood + bloodless * baseline
 
     return SkinCoefficients(
         upper=epidermis(upper),
@@ -240,7 +269,8 @@ def skin_layer_stack(
     wavelength_nm
         Wavelength in nm, 380 to 780.
     c_m
-        Volume fraction of melanosomes in the epidermis, 0 to 0.5.
+        Volume fraction of melanosomes in an epidermis of `TissueProperties.melanin_reference_mm`,
+        0 to 0.5.
     c_hd
         Volume fraction of blood in the dermis, 0 to 0.32.
     tissue

@@ -36,7 +36,7 @@ NODES_PER_AXIS: Final = 41
 """Nodes of melanin and of blood."""
 RING_EDGES_MM: Final = np.concatenate([[0.0], np.geomspace(0.01, 15.0, 40)])
 """Edges of the rings of lateral profiles, mm."""
-MAX_CACHED_TABLES: Final = 16
+MAX_CACHED_TABLES: Final = 32
 """Number of cached tables; each takes 0.9 MB."""
 
 

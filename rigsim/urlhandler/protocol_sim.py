@@ -18,7 +18,7 @@ from urllib.parse import parse_qsl, urlsplit
 
 from serial.serialutil import PortNotOpenError, SerialBase, SerialException, SerialTimeoutException
 
-from capture.rig import load_rig
+from capture.rig import SCANNER_BOX, load_rig
 from rigsim import world as worlds
 from rigsim.boxes.faults import Faults
 from rigsim.world import World
@@ -60,6 +60,8 @@ def world_from_url(url: str) -> tuple[World, str]:
     except ValueError as exc:
         raise ValueError(f"{url}: {exc}") from exc
     rig = load_rig(BOXES[box].rig if box in BOXES else "flash")
+    if box == SCANNER_BOX:
+        rig = rig.with_scanner()
     made = World(rig, seed=int(seed), clock="real" if clock == "real" else "virtual", faults=faults)
     _with_box(made, box, url).register(name)
     return made, box

@@ -4,12 +4,13 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import replace
 
+from rigsim.boxes.contact_probe.source_shutter import SourceLight
 from rigsim.boxes.flash import FlashPop
 from rigsim.boxes.gradient_sphere import PatternLight
 from rigsim.boxes.led_table import LedPulse
-from rigsim.boxes.source_shutter import SourceLight
+from rigsim.boxes.scanner import ProjectorLight
 
-SwitchedLight = LedPulse | PatternLight | SourceLight
+SwitchedLight = LedPulse | PatternLight | SourceLight | ProjectorLight
 Light = FlashPop | SwitchedLight
 
 
@@ -21,7 +22,7 @@ class LightRecord:
     pops : list of FlashPop
         All pops.
     switched : list of SwitchedLight
-        Intervals of light that have ended; a rig has one kind of controller that switches light.
+        Intervals of light that have ended.
     """
 
     def __init__(self) -> None:

@@ -10,6 +10,7 @@ from rigsim.boxes.dome import DomeUnit
 from rigsim.boxes.flash import FlashUnit
 from rigsim.boxes.gradient_sphere import GradientSphereUnit
 from rigsim.boxes.probe import ProbeUnit
+from rigsim.boxes.scanner import ScannerUnit
 
 
 class BoxKind(NamedTuple):
@@ -26,6 +27,7 @@ BOXES: Final = {
     "gradient_sphere": BoxKind(GradientSphereUnit, "GS-0001", "gradient"),
     "caliper": BoxKind(CaliperUnit, "CA-0001", "gradient"),
     "probe": BoxKind(ProbeUnit, "PR-0001", "probe"),
+    "scanner": BoxKind(ScannerUnit, "SC-0001", "dome"),
 }
 
 

@@ -42,6 +42,7 @@ def serve_world(
     tcp: str = "127.0.0.1:0",
     allow_remote: bool = False,
     seed: int = 0,
+    subject_seed: int | None = None,
     scene: Scene | None = None,
     faults: Faults | None = None,
     shots_made: Mapping[str, int] | None = None,
@@ -60,7 +61,7 @@ def serve_world(
         in the order of the rig, then all cameras one.
     allow_remote
         Permit an address that other machines can reach.
-    seed, scene, faults, shots_made
+    seed, subject_seed, scene, faults, shots_made
         Arguments of the new world, see `World`; without `faults`, bytes take no time beyond that
         of the pty or the network.
     world
@@ -87,7 +88,13 @@ def serve_world(
         rig = rig_name if isinstance(rig_name, Rig) else load_rig(rig_name)
         faults = Faults(baud=0.0) if faults is None else faults
         world = World(
-            rig, seed=seed, clock="real", scene=scene, faults=faults, shots_made=shots_made
+            rig,
+            seed=seed,
+            subject_seed=subject_seed,
+            clock="real",
+            scene=scene,
+            faults=faults,
+            shots_made=shots_made,
         )
     if world.virtual:
         raise ServeError("clock: got a virtual one, expected 'real' for other programs")

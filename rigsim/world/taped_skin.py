@@ -104,7 +104,9 @@ class TapeMechanics:
         return self.stiffness_n * math.expm1(self.stiffening * strain) / self.stiffening
 
 
-def draw_mechanics(seed: int, *, angle_deg: float, stiffness: float = 1.0) -> TapeMechanics:
+def draw_mechanics(
+    seed: int, *, angle_deg: float, stiffness: float = 1.0, tape_seed: int | None = None
+) -> TapeMechanics:
     """Draw the mechanics of a subject's skin and tape along one direction.
 
     Parameters
@@ -115,6 +117,8 @@ def draw_mechanics(seed: int, *, angle_deg: float, stiffness: float = 1.0) -> Ta
         Direction of the jaws, degrees.
     stiffness
         Stiffness of the skin relative to normal, > 0.
+    tape_seed
+        Seed of the tape's bond, which is new in each session; None: `seed`.
 
     Notes
     -----
@@ -132,7 +136,8 @@ def draw_mechanics(seed: int, *, angle_deg: float, stiffness: float = 1.0) -> Ta
     stiffening = subject.uniform(4.0, 6.0)
     anisotropy = subject.uniform(0.1, 0.35)
     along_deg = subject.uniform(0.0, 180.0)
-    tape = np.random.default_rng([seed, 0x7470, round(100.0 * (angle_deg % 180.0))])
+    bond_seed = seed if tape_seed is None else tape_seed
+    tape = np.random.default_rng([bond_seed, 0x7470, round(100.0 * (angle_deg % 180.0))])
     direction = 1.0 + anisotropy * math.cos(math.radians(2.0 * (angle_deg - along_deg)))
     return TapeMechanics(
         stiffness_n=float(stiffness * at_rest_n * direction),
@@ -156,6 +161,8 @@ class TapedSkin:
         The subject, see `draw_mechanics`.
     stiffness
         Stiffness of the skin relative to normal, > 0.
+    tape_seed
+        See `draw_mechanics`.
     mechanics
         The same mechanics along every direction instead of drawn ones.
 
@@ -175,11 +182,13 @@ class TapedSkin:
         *,
         seed: int = 0,
         stiffness: float = 1.0,
+        tape_seed: int | None = None,
         mechanics: TapeMechanics | None = None,
     ) -> None:
         self._caliper = caliper
         self._seed = seed
         self._stiffness = stiffness
+        self._tape_seed = tape_seed
         self._fixed = mechanics
         self._angle_deg = caliper.angles_deg[0]
         self._aperture_mm = caliper.aperture_mm
@@ -193,7 +202,9 @@ class TapedSkin:
     def _mechanics(self, angle_deg: float) -> TapeMechanics:
         if self._fixed is not None:
             return self._fixed
-        return draw_mechanics(self._seed, angle_deg=angle_deg, stiffness=self._stiffness)
+        return draw_mechanics(
+            self._seed, angle_deg=angle_deg, stiffness=self._stiffness, tape_seed=self._tape_seed
+        )
 
     @property
     def force_n(self) -> float:

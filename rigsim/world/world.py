@@ -20,7 +20,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from capture.devices.camera import Exposure
-from capture.rig import Rig, View, load_rig
+from capture.rig import SCANNER_BOX, Rig, View, load_rig
 from rigsim.arrays import UInt16Array
 from rigsim.boxes.controller import Controller
 from rigsim.boxes.device import Wiring
@@ -74,6 +74,8 @@ class World:
         The rig; by default the shipped flash rig.
     seed
         Seeds controllers, faults and sensors: same seed, same bytes.
+    subject_seed
+        Seeds the mechanics of the subject's skin; None: `seed`.
     clock
         ``"virtual"``: time passes when a client waits; ``"real"``: it passes continuously.
     scene
@@ -105,6 +107,7 @@ class World:
         rig: Rig | None = None,
         *,
         seed: int = 0,
+        subject_seed: int | None = None,
         clock: Literal["virtual", "real"] = "virtual",
         scene: Scene | None = None,
         faults: Faults | None = None,
@@ -120,17 +123,20 @@ class World:
         self._light = light = LightRecord()
         self.pops, self.switched = light.pops, light.switched
         self.grips: list[tuple[float, GripState]] = []
+        person = seed if subject_seed is None else subject_seed
         self.skin: TapedSkin | None = None
         if self.rig.caliper is not None:
             stiffness = self.faults.skin_stiff
-            self.skin = TapedSkin(self.rig.caliper, seed=seed, stiffness=stiffness)
+            self.skin = TapedSkin(
+                self.rig.caliper, seed=person, tape_seed=seed, stiffness=stiffness
+            )
             self._note_grip(0.0)
         self.head: ProbeHead | None = None
         if self.rig.probe is not None:
             kept_c, fails_after_s = self.rig.probe.camera_c, self.faults.camera_warms_after
             self.head = ProbeHead(
                 CameraCooler(kept_c, fails_after_s=fails_after_s),
-                seed=seed,
+                seed=person,
                 leak=self.faults.pump_leak,
                 pump_dead=self.faults.pump_dead,
                 lifts_after_s=self.faults.head_lifts_after,
@@ -152,7 +158,7 @@ class World:
             rng=self.rng_for("box", name),
             faults=self.faults,
             on_light=self._light.add,
-            on_trigger=self._trigger,
+            on_trigger=self._trigger_scanner if name == SCANNER_BOX else self._trigger,
             on_grip=self._note_grip,
             skin=self.skin,
             head=self.head,
@@ -241,7 +247,15 @@ class World:
 
     def _trigger(self, now: float, mask: int = -1) -> None:
         """Pulse the camera line; a dome pulses the lines of the mask's bits, in the rig's order."""
-        for number, view in enumerate(self.rig.views):
+        self._release(self.rig.views, now, mask)
+
+    def _trigger_scanner(self, now: float, mask: int) -> None:
+        """Pulse the lines of the scanner's cameras, by the mask's bits."""
+        if self.rig.scanner is not None:
+            self._release(self.rig.scanner.views, now, mask)
+
+    def _release(self, views: Iterable[View], now: float, mask: int) -> None:
+        for number, view in enumerate(views):
             if mask >> number & 1 and view.name in self._cameras:
                 self._cameras[view.name].edge(now)
 

@@ -27,6 +27,8 @@ from skinrig.next_steps import shell_quote
 from skinrig.traits import labels as trait_labels
 
 SCHEMA: Final = "skinrig.analyse-brdf/1"
+SAMPLES_DATA: Final = "simulated BRDF samples with known normals, without images"
+SESSIONS_DATA: Final = "sessions of the light dome"
 N_POINTS_PER_DATASET: Final = 5_000
 N_POINTS_PER_FACE: Final = 2_000
 MAX_TRAINING_POINTS: Final = 5_000
@@ -192,7 +194,9 @@ def analyze_simulated(
         analyze(data, basis, by_label=data.name == "dataset B", method=method, rng=rng)
         for data in sets
     )
-    _write(out, found, basis, spheres=found[1], method=method, source="simulated")
+    _write(
+        out, found, basis, spheres=found[1], method=method, source="simulated", data=SAMPLES_DATA
+    )
     return found
 
 
@@ -265,7 +269,16 @@ def analyze_measured(
     documents = [store.read_document(folder) for folder in folders]
     source = "measured" if any(one.source == "measured" for one in documents) else "simulated"
     agreed = consent.merge_consent(*documents)
-    _write(out, done, materials, spheres=done[-1], method=method, source=source, agreed=agreed)
+    _write(
+        out,
+        done,
+        materials,
+        spheres=done[-1],
+        method=method,
+        source=source,
+        data=SESSIONS_DATA,
+        agreed=agreed,
+    )
     return done
 
 
@@ -317,12 +330,14 @@ def _write(
     spheres: BrdfRankAnalysis,
     method: str,
     source: str,
+    data: str,
     agreed: Sequence[Mapping[str, Any]] = (),
 ) -> None:
     out.mkdir(parents=True, exist_ok=True)
     document = {
         "schema": SCHEMA,
         "source": source,
+        "data": data,
         consent.CONSENT_KEY: [dict(one) for one in agreed],
         "method": method,
         "rule": "plateau: the first rank whose error exceeds the least one by no more than 5 % of "

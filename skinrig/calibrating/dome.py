@@ -22,8 +22,9 @@ from skinrig.calibrating.outcome import (
     TargetSessions,
     number_findings,
 )
+from skinrig.calibrating.scanner import calibrate_from_stripes
 
-DOME_CALIBRATION_KINDS = ("geometry", "lights")
+DOME_CALIBRATION_KINDS = ("geometry", "lights", "scanner")
 LIGHT_TOLERANCE_MM = 5.0
 """Standard deviation of light positions about nominal: a prior that matters only for lights with
 few observed highlights."""
@@ -50,7 +51,7 @@ def dome_targets(square_mm: float, sphere_radius_mm: float) -> DomeTargets:
 def calibrate_dome(
     kind: str, sessions: TargetSessions, targets: DomeTargets | None = None
 ) -> CalibrationResult:
-    """Estimate the calibration "geometry" or "lights" of a dome.
+    """Estimate the calibration "geometry", "lights" or "scanner" of a dome.
 
     Parameters
     ----------
@@ -59,7 +60,8 @@ def calibrate_dome(
     sessions
         For "geometry", sessions of the board; for "lights", of the mirror sphere, the white plate,
         or both. "lights" needs the folder's geometry; "geometry" is compared with the folder's
-        previous one, and cameras that moved are reported.
+        previous one, and cameras that moved are reported. For "scanner", sessions of the board
+        with stripes.
     targets
         Sizes of the targets.
 
@@ -77,7 +79,10 @@ def calibrate_dome(
         raise CalibratingError(
             f"kind {kind!r}: got a session of rig {rigs.pop()!r}, expected one of a dome; name one"
         )
-    return (_geometry if kind == "geometry" else _lights)(sessions, targets or DomeTargets())
+    sizes = targets or DomeTargets()
+    if kind == "scanner":
+        return calibrate_from_stripes(sessions, sizes.board)
+    return (_geometry if kind == "geometry" else _lights)(sessions, sizes)
 
 
 def _frames(

@@ -18,6 +18,7 @@ from capture.plan import Plan
 from capture.rig import Rig
 from capture.session import Session, SubjectRecord
 from skinrig.capturing.addresses import open_box, open_with_retry, require_addresses
+from skinrig.capturing.camera_colors import nominal_camera_colors
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.capturing.plan_choice import needed_boxes, write_plan
 from skinrig.capturing.sequences import sequence_lines
@@ -113,7 +114,7 @@ def _run(
     """Run a plan through the drivers into a new or resumed session."""
     with contextlib.ExitStack() as stack:
         boxes, cameras = _open_devices(stack, rig, plan, order, console)
-        width, _ = next(iter({(c.info.width_px, c.info.height_px) for c in cameras.values()}))
+        width = cameras[rig.views[0].name].info.width_px
         if width != rig.views[0].width_px:
             # a served simulation may run smaller than the rig file's camera
             rig = rig.resized(width) if rig.caliper is None else rig.cropped(width)
@@ -149,6 +150,7 @@ def _run(
                 eyes=order.eyes,
                 force_limit_n=order.force_limit_n,
                 all_brackets=order.all_brackets,
+                camera_colors=nominal_camera_colors(rig),
             )
         session.close()
         omitted = dict(session.omitted_steps())
@@ -172,7 +174,7 @@ def _open_devices(
         boxes[kind] = open_with_retry(opening, console.progress)
         stack.callback(boxes[kind].close)
     cameras: dict[str, Camera] = {}
-    for view in rig.views:
+    for view in rig.all_views:
         opened = open_with_retry(partial(open_camera, order.cameras[view.name]), console.progress)
         cameras[view.name] = opened
         stack.callback(opened.close)

@@ -72,13 +72,13 @@ def require_addresses(
     from capture.devices.camera import CameraUrlError, check_address
 
     missing = [f"--port {name}=URL" for name in needed or rig.boxes if name not in boxes]
-    missing += [f"--camera {v.name}=URL" for v in rig.views if v.name not in cameras]
+    missing += [f"--camera {v.name}=URL" for v in rig.all_views if v.name not in cameras]
     if missing:
         raise UsageError(
             f"the rig {rig.name!r} needs {' '.join(missing)}; --dry-run needs none, and "
             "skinrig serve prints those of a simulation [SR-CAP-033]"
         )
-    for view in rig.views:  # checked before a controller is opened, which switches its light
+    for view in rig.all_views:  # checked before a controller is opened, which switches its light
         try:
             check_address(cameras[view.name])
         except CameraUrlError as error:

@@ -74,10 +74,11 @@ def light_figures(plan: Plan, rig: Rig) -> Mapping[str, float | str]:
         light_s = sum(float(step.settings["dwell_s"]) for step in steps)
         skin = {"state_s": light_s, "duty": scan_duty(steps, rig)}
         break
+    striped = any(step.kind == "stripes" for step in plan.steps)
     return {
         "flashes_per_s": flicker.flashes_per_s,
         "flicker_rms": flicker.rms,
-        "open_eyes": "allowed" if flicker.within(limits) and not skin else "refused",
+        "open_eyes": "refused" if skin or striped or not flicker.within(limits) else "allowed",
         **select_attributes(dose, "led", "led_ws", "limit_ws", "blue_share", "eye_j_m2"),
         **skin,
     }

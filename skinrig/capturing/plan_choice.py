@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from capture.plan import Plan, flash_calibration_plan, flash_plan
-from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
+from capture.plan.dome import DomeTarget, add_scan, dome_calibration_plan, dome_plan
 from capture.plan.gradient import (
     GradientTarget,
     gradient_calibration_plan,
@@ -15,7 +15,7 @@ from capture.plan.gradient import (
     strain_state,
 )
 from capture.plan.probe import PROBE_SITES, ProbeTarget, probe_calibration_plan, probe_plan
-from capture.rig import Rig
+from capture.rig import SCANNER_BOX, Rig
 from skinrig.capturing.sequences import SequenceOrder, sequence_plan
 from skinrig.errors import UsageError, require_choice
 
@@ -64,8 +64,9 @@ class DefaultPlan:
             return gradient_calibration_plan(rig, self._check_target(get_args(GradientTarget)))
         if "dome" in rig.boxes:
             if self.target is None:
-                return dome_plan(rig)
-            return dome_calibration_plan(rig, self._check_target(get_args(DomeTarget)))
+                return add_scan(dome_plan(rig), rig)
+            target = self._check_target(get_args(DomeTarget))
+            return add_scan(dome_calibration_plan(rig, target), rig)
         repeats = self.repeats
         if rig.probe is not None:
             if self.target is None:
@@ -174,9 +175,16 @@ def parse_direction_count(angles: Sequence[float] | None) -> int:
 
 
 def needed_boxes(rig: Rig, plan: Plan) -> tuple[str, ...]:
-    """Return the names of the controllers that a plan uses: the caliper only with strain steps."""
-    skin = any(strain_state(step) is not None for step in plan.steps)
-    return tuple(name for name in rig.boxes if skin or name != "caliper")
+    """Return the names of the controllers that a plan uses.
+
+    The caliper is used with strain steps alone, the scanner with steps of stripes alone.
+    """
+    unused = set()
+    if not any(strain_state(step) is not None for step in plan.steps):
+        unused.add("caliper")
+    if not any(step.kind == "stripes" for step in plan.steps):
+        unused.add(SCANNER_BOX)
+    return tuple(name for name in rig.boxes if name not in unused)
 
 
 def write_plan(plan: Plan, file: Path) -> None:

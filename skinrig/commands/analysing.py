@@ -45,7 +45,8 @@ def analyse_brdf(
     Parameters
     ----------
     appearances
-        APPEARANCE/ folders of dome sessions with basis BRDFs; none: simulated faces.
+        APPEARANCE/ folders of dome sessions with basis BRDFs; none: simulated BRDF samples of
+        faces, without images.
     merl_basis
         Folder of the MERL tables used in the reconstruction; default: built-in materials.
     points
@@ -63,6 +64,7 @@ def analyse_brdf(
     if points is not None and points < 20:
         raise UnusableError(f"--points: got {points}, expected 20 or more; raise it")
     console = Console(json)
+    data = analysing_brdf.SESSIONS_DATA if appearances else analysing_brdf.SAMPLES_DATA
     if appearances:
         each = points or analysing_brdf.N_POINTS_PER_FACE
         given: dict[str, Any] = {"labels": labels, "basis": merl_basis, "method": how, "seed": seed}
@@ -90,8 +92,67 @@ def analyse_brdf(
         if document["points_lost"]:
             lost = document["points_lost"]
             console.print_line(f"{document['name']}: {lost} points without specular reflection")
+    console.print_line(f"data: {data}")
     console.print_line(f"{out}: figure-14.png, figure-15.png, curves.csv, analysis.json")
-    console.print_document("skinrig.analyse-brdf/1", {"out": out, "datasets": documents})
+    console.print_document(
+        "skinrig.analyse-brdf/1", {"out": out, "data": data, "datasets": documents}
+    )
+
+
+@analyse_app.command("lumitexel", cls=Command)
+@command
+def analyse_lumitexel(
+    appearance: Path,
+    session: Path,
+    /,
+    *,
+    out: Out,
+    calibration: Path | None = None,
+    at: list[str] | None = None,
+    seed: int = 0,
+    json: Json = False,
+) -> None:
+    """Draw the BRDF samples of points of a face over the hemisphere of light directions.
+
+    Example: skinrig analyse lumitexel appearance session-dome --calibration calibration --out
+    lumitexels
+
+    Parameters
+    ----------
+    appearance
+        APPEARANCE/ folder of the dome session, with normals.
+    session
+        Its SESSION/ folder.
+    calibration
+        CALIBRATION/ folder; default: the rig's nominal geometry.
+    at
+        Point on the skin, mm, rig frame, such as 0,60,70; repeatable; default: a point with many
+        visible lights and one with many occluded ones.
+    seed
+        Random seed of the chosen points.
+    """
+    from skinrig.analysing import lumitexel
+    from skinrig.rendering.request import parse_triple
+
+    points = []
+    for text in at or ():
+        point = parse_triple(text)
+        if point is None:
+            raise UsageError(f"--at: got {text!r}, expected three numbers, mm: 0,60,70")
+        points.append(point)
+    console = Console(json)
+    found = lumitexel.analyze_lumitexels(
+        out, appearance, session, calibration=calibration, points_mm=tuple(points), seed=seed
+    )
+    for one in found["lumitexels"]:
+        console.print_line(
+            f"point {one['position_mm']} mm: {one['samples_of_the_view']} samples of camera "
+            f"{one['view']}, {one['samples_of_all_views']} of all; "
+            f"{one['occluded_lights']} lights not seen"
+        )
+    console.print_line(f"{out}: {', '.join(lumitexel.OUTPUT_FILES)}")
+    figures = {name: value for name, value in found.items() if name != "schema"}
+    console.print_document("skinrig.analyse-lumitexel/1", {"out": out, **figures})
 
 
 def _plateaus(document: dict[str, Any]) -> list[object]:

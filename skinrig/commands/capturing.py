@@ -234,6 +234,7 @@ class ServeOptions:
     subject: options.Subject = "III"
     scale: options.Scale = "small"
     seed: options.Seed = 0
+    session_seed: options.SessionSeed = None
     renderer: options.Renderer = "mitsuba"
     resume: Path | None = None
     json: options.Json = False
@@ -286,7 +287,16 @@ def _serve(context: typer.Context, common: ServeOptions, site: str | None = None
     """Serve a simulated rig until interrupted."""
     from skinrig.simulating.serving import ServeOrder, serve_rig
 
-    options = ("pty", "tcp", "allow_remote", "subject", "seed", "renderer", "resume")
+    options = (
+        "pty",
+        "tcp",
+        "allow_remote",
+        "subject",
+        "seed",
+        "session_seed",
+        "renderer",
+        "resume",
+    )
     order = ServeOrder(site=site, size=common.scale, **select_attributes(common, *options))
     serve_rig(str(context.info_name), order, Console(common.json))
 

@@ -50,6 +50,20 @@ def choice(*values: str, text: str | None = None, metavar: str | None = None) ->
 
 Json = Annotated[bool, option("Print exactly one JSON document on stdout.", "--json")]
 Seed = Annotated[int, option("Random seed.")]
+DaysAgo = Annotated[
+    int,
+    option(
+        "Day of the session, days before today; LEDs and frame of dome and sphere are those of "
+        "that day."
+    ),
+]
+SessionSeed = Annotated[
+    int | None,
+    option(
+        "Random seed of one session of the same subject and rig: noise, position, motion and "
+        "controllers; default: that of --seed."
+    ),
+]
 Out = Annotated[Path, option("Folder to write.", "--out")]
 
 

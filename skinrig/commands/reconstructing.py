@@ -36,14 +36,14 @@ def calibrate(
     sessions
         SESSION/ folders of the target.
     square_mm
-        Side of the calibration board's squares, mm (dome: geometry).
+        Side of the calibration board's squares, mm (dome: geometry, scanner).
     sphere_mm
         Radius of the mirror sphere, mm (dome: lights).
     phantom
         Certificate of the phantom, JSON (probe: fiber).
     kind
-        Calibration: sensor, color, polarization or white (flash); geometry or lights (dome);
-        sensor, lights or polarization (gradient); fiber (probe).
+        Calibration: sensor, color, polarization or white (flash); geometry, lights or
+        scanner (dome); sensor, lights or polarization (gradient); fiber (probe).
     """
     from capture.former_names import FORMER_NAMES
     from skinrig.calibrating.calibrate import calibrate as make

@@ -53,6 +53,11 @@ class RenderOptions:
     subsurface
         Subsurface scattering: dipole (lateral), local (diffuse albedo without lateral scattering)
         or none (specular reflection only).
+    transport
+        Light transport: direct (light of the lamps alone) or path (also light that skin reflects
+        onto skin, by Monte Carlo).
+    path_samples
+        Directions of paths per element of the skin (--transport path).
     translucency
         sigma_tr of red, green and blue at all texels, 1/mm: 0.3558,0.7932,1.5173; default: the
         map's.
@@ -90,6 +95,8 @@ class RenderOptions:
     shadow_samples: int = 4
     light_radius: float | None = None
     subsurface: Annotated[str, choice("dipole", "local", "none")] = "dipole"
+    transport: Annotated[str, choice("direct", "path")] = "direct"
+    path_samples: int = 64
     translucency: str | None = None
     components: bool = False
     bases: str | None = None
@@ -127,6 +134,7 @@ def render(appearance: list[Path], /, out: Out, asked: RenderOptions, json: Json
         subpixels=parse_subpixels(asked.samples),
         progress=console.progress,
         **select_attributes(asked, "subsurface", "shadow_samples", "exposure", "seed"),
+        **select_attributes(asked, "transport", "path_samples"),
     )
     console.progress(f"read {', '.join(str(path) for path in appearance)}")
     if asked.against is not None and not asked.components:
@@ -153,6 +161,7 @@ def _compare(
             count=asked.photographs,
             progress=console.progress,
             **select_attributes(asked, "subsurface", "ablation", "seed"),
+            **select_attributes(asked, "transport", "path_samples"),
         ),
         **select_attributes(asked, "calibration", "translucency"),
     )

@@ -64,11 +64,15 @@ def report(
         talk.print_line(
             f"compared {' with '.join(done.compared)}; --no-compare reports both in full"
         )
+        for verdict in done.sessions.values():
+            talk.print_line(str(verdict))
     if not piped:
         talk.print_line(f"{out}: {size / 1e6:.2f} MB; open it in a browser")
     missed = sum(not check.passed for check in done.checks)
     figures = {"path": out, "bytes": size, "checks": len(done.checks), "missed": missed}
-    console.print_document("skinrig.report/1", {**figures, "compared": done.compared})
+    sessions = {name: verdict.document() for name, verdict in done.sessions.items()}
+    figures |= {"compared": done.compared, "sessions": sessions}
+    console.print_document("skinrig.report/1", figures)
 
 
 @dataclass(frozen=True, slots=True)

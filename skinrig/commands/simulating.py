@@ -55,6 +55,8 @@ class SimulateOptions:
     out: options.Out
     scale: options.Scale = "small"
     seed: options.Seed = 0
+    session_seed: options.SessionSeed = None
+    days_ago: options.DaysAgo = 0
     plan: Path | None = None
     consent: options.Consent = None
     consent_expires: options.ConsentExpires = None
@@ -75,7 +77,11 @@ class SimulateOptions:
             person = parse_subject(name, self.consent or SIMULATED_USES, self.consent_expires)
         plan = None if self.plan is None else read_plan(self.plan)
         order = {"subject": subject, "plan": plan, "person": person, "progress": console.progress}
-        return order | select_attributes(self, "out", "seed", "resume") | {"size": self.scale}
+        return (
+            order
+            | select_attributes(self, "out", "seed", "session_seed", "days_ago", "resume")
+            | {"size": self.scale}
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +114,23 @@ class SimulatedFaceOptions:
 
         order = {"width_px": self.width, "leave_out": parse_names(self.omit) or ()}
         return order | select_attributes(self, "mesh", "movement", "renderer")
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedScanOptions:
+    """Options of the scan of a simulated face.
+
+    Attributes
+    ----------
+    wrapped
+        Scan with a wrapped template mesh, so that all expressions share one texture layout.
+    scanner
+        Scan with projected stripes instead of an attached mesh; with target charuco, capture them
+        on the board too.
+    """
+
+    wrapped: bool = False
+    scanner: bool = False
 
 
 @simulate_app.command("flash", cls=RigCommand)
@@ -158,13 +181,13 @@ def simulate_flash(
 def simulate_dome(
     common: SimulateOptions,
     face: SimulatedFaceOptions,
+    scan: SimulatedScanOptions,
     subject: Annotated[str, typer.Option(autocompletion=completion.complete_subjects)] = "III",
     target: Annotated[str | None, target_option("dome")] = None,
     lights: int | None = None,
     views: int | None = None,
     move: bool = False,
     state: OneState = None,
-    wrapped: bool = False,
     subsurface: bool = False,
     interreflections: bool = False,
     condition: Annotated[
@@ -186,8 +209,6 @@ def simulate_dome(
         Number of cameras; default 6, at full scale all 16.
     move
         Simulate head motion during the capture.
-    wrapped
-        Scan with a wrapped template mesh, so that all expressions share one texture layout.
     subsurface
         Simulate subsurface scattering even if its effect is not visible.
     interreflections
@@ -211,7 +232,7 @@ def simulate_dome(
         views=views,
         move=move,
         states=tuple(state or ("neutral",)),
-        wrapped=wrapped,
+        **select_attributes(scan, "wrapped", "scanner"),
         subsurface=subsurface,
         interreflections=interreflections,
         conditions=parse_amounts(condition or (), "--condition", default=1.0),

@@ -6,7 +6,7 @@ from model import color_table
 from model.skin import SkinAppearance
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
-from reconstruction.chromophores.table_fit import POPULATION_LOG_SD
+from reconstruction.chromophores.table_fit.fitting import POPULATION_LOG_SD
 from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import Float64Array
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +14,7 @@ import numpy as np
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.pipeline.probe.stages import CHANNEL_NAMES, SUBSURFACE_FILE
 from reconstruction.subsurface import probe_sites, translucency
-from reconstruction.subsurface.translucency import TranslucencyMap
+from reconstruction.subsurface.translucency import TranslucencyMap, TranslucencyPrior
 from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import Float32Array, Float64Array
 
@@ -116,6 +116,35 @@ def map_translucency(
     reconstruction.subsurface.translucency.TranslucencyError
         If no measurement is usable, or the table is invalid.
     """
+    placed = place_sites(probe, position, landmarks=landmarks)
+    found = interpolate_sites(placed.sites, position)
+    return replace(found, left_out=(*placed.left_out, *found.left_out), assumed=placed.assumed)
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedSites:
+    """Sites of a probe on a face, with omitted ones and assumptions as in `PlacedTranslucency`."""
+
+    sites: tuple[ProbeSite, ...]
+    left_out: tuple[tuple[str, str], ...]
+    assumed: tuple[str, ...]
+
+
+def place_sites(
+    probe: SkinAppearance, position: SkinMap, *, landmarks: Path | None = None
+) -> PlacedSites:
+    """Place a probe's sites on the texture of a face.
+
+    Parameters
+    ----------
+    probe, position, landmarks
+        See `map_translucency`.
+
+    Raises
+    ------
+    ProbeSiteError
+        If no measured site has a known position on the scan.
+    """
     measured = _measured(probe)
     height, width = position.values.shape[:2]
     known = intersect_valid(position)
@@ -159,9 +188,44 @@ def map_translucency(
         raise ProbeSiteError(f"sites: got none on the face, expected one or more: {why}")
     how = "of the probe are placed as on a mean face, relative to the tip of the nose"
     assumed = (f"{', '.join(guessed)} {how}",) if guessed else ()
+    return PlacedSites(tuple(sites), tuple(left_out), assumed)
+
+
+def interpolate_sites(
+    sites: Sequence[ProbeSite],
+    position: SkinMap,
+    *,
+    prior: TranslucencyPrior | None = None,
+    expected_mm: Float32Array | None = None,
+) -> PlacedTranslucency:
+    """Interpolate the measurements of sites over the texture of a face.
+
+    Parameters
+    ----------
+    sites
+        Sites on the texture.
+    position
+        Map `position` of the face, mm, in the rig frame.
+    prior
+        Distribution of log(1/sigma_tr), or with `expected_mm` of its deviation from that; None:
+        table 2 of Weyrich et al. 2005.
+    expected_mm
+        (H, W, 3): expected 1/sigma_tr, above 0; the measured deviations from it are interpolated.
+
+    Raises
+    ------
+    reconstruction.subsurface.translucency.TranslucencyError
+        If no measurement is usable.
+    """
+    known = intersect_valid(position)
+    at_mm = position.values.astype(np.float64)
+    if expected_mm is not None:
+        sites = [_relative_to(site, expected_mm[site.texel]) for site in sites]
     chart = _Chart.of(at_mm[known], sites)
-    found_map = _interpolated(chart, sites)
+    found_map = _interpolated(chart, sites, prior)
     spread = chart.interpolate(found_map, at_mm)
+    if expected_mm is not None:
+        spread *= np.tile(expected_mm, 2)
     valid = known & found_map.valid.all(axis=(0, 1)).all()
     return PlacedTranslucency(
         map=SkinMap(
@@ -172,11 +236,19 @@ def map_translucency(
             "1/sigma_tr of red, green and blue light, kriging between measured sites",
         ),
         sites=tuple(sites),
-        left_out=(*left_out, *found_map.omitted),
+        left_out=found_map.omitted,
         conflicts=found_map.conflicts,
-        assumed=assumed,
+        assumed=(),
         p_value=tuple(float(p) for p in found_map.p_value),
     )
+
+
+def _relative_to(site: ProbeSite, expected_mm: Float32Array) -> ProbeSite:
+    """Return a site with sigma_tr over the expected one."""
+    scale = expected_mm.astype(np.float64)
+    parts = np.array(site.sigma_tr_per_mm) * scale, np.array(site.stderr_per_mm) * scale
+    value, stderr = (tuple(part.tolist()) for part in parts)
+    return replace(site, sigma_tr_per_mm=value, stderr_per_mm=stderr)
 
 
 def _measured(probe: SkinAppearance) -> dict[str, tuple[tuple[float, ...], tuple[float, ...]]]:
@@ -275,7 +347,9 @@ class _Chart:
         return np.asarray(upper * (1.0 - p) + lower * p, np.float32)
 
 
-def _interpolated(chart: _Chart, sites: Sequence[ProbeSite]) -> TranslucencyMap:
+def _interpolated(
+    chart: _Chart, sites: Sequence[ProbeSite], prior: TranslucencyPrior | None
+) -> TranslucencyMap:
     at = chart.coordinates(np.array([site.position_mm for site in sites])) / chart.size_mm
     sigma_tr = np.array([site.sigma_tr_per_mm for site in sites])
     good = np.isfinite(sigma_tr)
@@ -286,5 +360,6 @@ def _interpolated(chart: _Chart, sites: Sequence[ProbeSite]) -> TranslucencyMap:
         (GRID_SIDE, GRID_SIDE),
         valid=good,
         names=[site.name for site in sites],
+        prior=prior,
         texture_mm=(float(chart.size_mm[0]), float(chart.size_mm[1])),
     )

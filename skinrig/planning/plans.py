@@ -26,6 +26,7 @@ from skinrig.capturing.plan_choice import read_plan
 from skinrig.console import select_attributes
 from skinrig.errors import UsageError, require_choice
 from skinrig.planning.led_information import LedInformation, format_information
+from skinrig.planning.unmodeled_light import list_unmodeled_effects
 from skinrig.unit_format import format_quantity
 
 SCHEMA = "skinrig.plan-choice/1"
@@ -159,6 +160,7 @@ class PlanChoice:
             **select_attributes(self, "knobs", "seconds", "full_seconds"),
             "saved_seconds": self.full_seconds - self.seconds,
             **select_attributes(self, "left_out", "path", "reasons", "light"),
+            "unmodeled": list_unmodeled_effects(self.rig.name),
             **({"leds": leds} if leds else {}),
         }
 
@@ -399,6 +401,7 @@ def format_choice(choice: PlanChoice) -> list[str]:
         "the whole rig's plan"
     )
     out += [f"omitted: {what} ({why})" for what, why in choice.left_out]
+    out += [f"not modeled: {what} ({why})" for what, why in list_unmodeled_effects(choice.rig.name)]
     out += [
         f"light: {name.replace('_', ' ')} {_format_knob(v)}" for name, v in choice.light.items()
     ]

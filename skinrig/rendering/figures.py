@@ -12,8 +12,10 @@ import numpy as np
 
 from model.skin import SkinAppearance
 from model.skin_reflectance import SkinReflectance
+from rigsim.render import Caster
 from skinrig import consent
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
+from skinrig.console import select_attributes
 from skinrig.drawing import png
 from skinrig.errors import UnusableError, UsageError
 from skinrig.rendering import folder, shadow
@@ -27,6 +29,7 @@ from skinrig.rendering.photographs.held_out import HeldOutPhotographs
 from skinrig.rendering.render import Rendering, Subsurface, render_surface
 from skinrig.rendering.request import read_model
 from skinrig.rendering.shadow import MAX_SIGMA_TR_PER_MM, MIN_SIGMA_TR_PER_MM, ShadowBoundary
+from skinrig.rendering.transport import PATH_SAMPLES, SkinExchange, Transport
 
 RADIANCE_UNIT = (
     "radiance over that of a perfect white Lambertian patch facing a light of intensity 1; "
@@ -44,6 +47,10 @@ class RenderSettings:
     shadow_samples: int = 4
     exposure: float | None = None
     """Factor of the PNGs; None: automatic by skin brightness, equal for all images of a sheet."""
+    transport: Transport = "direct"
+    """"path": with light that skin reflects onto skin."""
+    path_samples: int = PATH_SAMPLES
+    """Directions of paths per element of the skin, for "path"."""
     seed: int = 0
     progress: Callable[[str], None] = field(default=lambda _: None)
 
@@ -101,15 +108,20 @@ class RenderRequest:
 
     def render(self, surface: FittedSurface, interior: Interior | None = None) -> Rendering:
         """Render a model, optionally with its precomputed interior."""
+        effort, caster = self.settings, Caster(surface.mesh)
         return render_surface(
             surface,
             self.camera,
             self.lights,
-            subsurface=self.settings.subsurface,
-            subpixels=self.settings.subpixels,
-            shadow_samples=self.settings.shadow_samples,
+            subsurface=effort.subsurface,
+            subpixels=effort.subpixels,
+            shadow_samples=effort.shadow_samples,
+            caster=caster,
             interior=None if interior is None else interior.with_surface(surface),
-            progress=self.settings.progress,
+            exchange=SkinExchange.for_transport(
+                effort.transport, surface, caster, samples=effort.path_samples, seed=effort.seed
+            ),
+            progress=effort.progress,
         )
 
     def exposure(self, rendering: Rendering) -> float:
@@ -131,7 +143,7 @@ class RenderRequest:
             "unit": RADIANCE_UNIT,
             "view": {**view, "columns": columns, "rows": rows},
             "lights": {name: names.count(name) for name in names},
-            "subsurface": self.settings.subsurface,
+            **select_attributes(self.settings, "subsurface", "transport"),
             "samples": self.settings.subpixels**2,
             "shadow_samples": self.settings.shadow_samples,
             "seed": self.settings.seed,

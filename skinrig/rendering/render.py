@@ -1,7 +1,8 @@
 """Render a fitted skin model: ray tracing, then shading by the fitted maps at the hit points.
 
 Geometry, texture coordinates and shadows come from `rigsim.render`; what a point reflects comes
-from `model.skin_reflectance`, direct light only. Radiance is relative to that of a perfect
+from `model.skin_reflectance`: direct light, and with a `SkinExchange` light that skin reflects onto
+skin. Radiance is relative to that of a perfect
 white Lambertian patch facing a light of intensity 1, at the position and distance where the
 light's intensity is stated (see `skinrig.rendering.lights`)::
 
@@ -30,6 +31,7 @@ from skinrig.rendering.camera import Camera, RenderingError
 from skinrig.rendering.geometry import FittedSurface, SurfacePointSamples
 from skinrig.rendering.interior import Interior, Lighting
 from skinrig.rendering.lights import Light
+from skinrig.rendering.transport import ReturningLight, SkinExchange
 
 Subsurface = Literal["local", "dipole", "none"]
 """Subsurface light leaves at its point of entry, is scattered by the dipole, or is omitted."""
@@ -90,6 +92,7 @@ def render_surface(
     blockers: Mesh | None = None,
     caster: Caster | None = None,
     interior: Interior | None = None,
+    exchange: SkinExchange | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Rendering:
     """Render a fitted model under lights.
@@ -114,6 +117,8 @@ def render_surface(
         Precomputed shadow caster of the mesh.
     interior
         Precomputed interior of the model on the mesh, for "dipole".
+    exchange
+        Paths between parts of the skin, see `skinrig.rendering.transport`; None: direct light only.
     progress
         Called with one line per step.
 
@@ -143,7 +148,8 @@ def render_surface(
     )
     columns, height = camera.image_size
     lighting = Lighting(lamps, shadows, shadow_samples)
-    inside = _subsurface_radiance(surface, subsurface, lighting, interior)
+    returning = None if exchange is None else (exchange, exchange.trace(lighting))
+    inside = _subsurface_radiance(surface, subsurface, lighting, interior, returning)
     film = _PixelAccumulator(height, columns)
     out = met = 0
     band = max(1, BAND_RAYS // (columns * subpixels**2))
@@ -156,7 +162,7 @@ def render_surface(
         index = np.flatnonzero(buffers.mask & facing)
         out, met = out + len(index), met + int(np.count_nonzero(buffers.mask))
         points = _Points.of(surface, buffers, index)
-        shaded = _shade(points, lighting, surface, inside)
+        shaded = _shade(points, lighting, surface, inside, returning)
         film.put(part, subpixels, index, points, shaded)
         if progress is not None and part[1] < height:
             progress(f"render: {100 * part[1] // height} %")
@@ -265,8 +271,16 @@ class _PixelAccumulator:
             mask[rows] = (some & (total(good) == count)).reshape(tall, width)
 
 
+Returning = tuple[SkinExchange, ReturningLight] | None
+"""Paths between parts of the skin and the light on them; None: direct light only."""
+
+
 def _subsurface_radiance(
-    surface: FittedSurface, subsurface: Subsurface, lighting: Lighting, interior: Interior | None
+    surface: FittedSurface,
+    subsurface: Subsurface,
+    lighting: Lighting,
+    interior: Interior | None,
+    returning: Returning,
 ) -> Callable[[_Points, Float64Array], Float64Array]:
     """Return the function from entering to exiting subsurface flux at points."""
     if subsurface == "none":
@@ -275,6 +289,9 @@ def _subsurface_radiance(
         return lambda points, entered: entered * points.rows.r_d
     below = Interior.of(surface) if interior is None else interior
     light = below.compute_entered_flux(lighting)
+    if returning is not None:
+        exchange, from_skin = returning
+        light += exchange.entered_at(from_skin, below.position_mm)
     return lambda points, entered: below.compute_exitant_flux(
         light, points.position_mm, points.rows, entered
     )
@@ -285,6 +302,7 @@ def _shade(
     lighting: Lighting,
     fitted_surface: FittedSurface,
     inside: Callable[[_Points, Float64Array], Float64Array],
+    returning: Returning,
 ) -> _Shaded:
     """Compute the radiance of points towards the camera, summed over lights."""
     count = len(points.uv)
@@ -303,5 +321,9 @@ def _shade(
         at = rows.weights[shown], towards[shown], points.view[shown], normals[shown]
         lobe = lobe_brdf(fitted_surface.model.lobes, *at)
         surface[shown] += np.pi * lobe[:, None] * arriving[shown]
+    if returning is not None:
+        exchange, from_skin = returning
+        entered += exchange.entered_at(from_skin, position)
+        surface += exchange.reflected_at(from_skin, position, faces, rows, points.view)
     leaving = transmittance(cos_view, fitted_surface.model.eta)[:, None]
     return _Shaded(leaving * inside(points, entered), surface, lit & (cos_view > 0.0))

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from capture.plan import Plan
-from capture.plan.dome import DomeTarget, dome_calibration_plan, dome_plan
+from capture.plan.dome import DomeTarget, add_scan, dome_calibration_plan, dome_plan
 from capture.plan.rows import step_lights
 from capture.rig import Rig, load_rig
 from model.skin import SkinAppearance, SkinMap
+from rigsim.as_built.aging import age_dome
 from rigsim.as_built.dome import build_dome
 from rigsim.mitsuba.variant import choose_renderer
 from rigsim.needs.effects import SceneEffects, max_on_time_s
@@ -23,8 +24,10 @@ from rigsim.population.population import PopulationError, get_member
 from rigsim.scanner.flaws import encode_binary_ply
 from rigsim.scanner.pods import ScannerSettings, scan_face, wrap_template
 from rigsim.scenes.dome.scene import DomeScene
+from rigsim.scenes.dome.stripes import scan_board
+from rigsim.scenes.dome.stripes import scan_face as scan_face_by_stripes
 from rigsim.scenes.dome.targets import TARGET_POSES, make_target_scene, plate_normals
-from rigsim.subject.head_motion import draw_head_motion
+from rigsim.subject.head_motion import draw_head_motion, draw_head_position
 from rigsim.subject.perfusion import STATE_NAMES
 from rigsim.targets import make_target
 from skinrig.console import select_attributes
@@ -66,13 +69,14 @@ def simulate_dome(order: DomeOrder) -> SimulationResult:
     conditions = _conditions(order)
     rig = _rig(order)
     planned = order.plan if order.target is None else None
-    plan = planned or _plan(rig, order.target, order.size)
+    plan = planned or add_scan(_plan(rig, order.target, order.size), rig)
     light = driving.announce_light(plan, rig, order)
     settings = _manifest_settings(order, rig, conditions)
     scene = _scene(rig, order, plan)
     session = driving.open_session(order, plan, rig, settings, scene)
     with driving.release_on_error(session):
-        scan = _attach_scan(session, scene, order) if order.target is None else {}
+        attach = order.target is None and not order.scanner
+        scan = _attach_scan(session, scene, order) if attach else {}
 
     def prompt(world: Any, text: str) -> None:
         # prompts such as "pose 3" and "sphere 1": the operator moves the target there
@@ -113,6 +117,8 @@ def _manifest_settings(
         "plan": "" if order.plan is None else order.plan.to_json(),
         **select_attributes(order, "move", "state", "movement", "wrapped"),
     }
+    if order.scanner:
+        settings["scanner"] = True
     if order.target is None:
         settings |= select_attributes(order, "subsurface", "interreflections")
     if conditions:
@@ -256,6 +262,7 @@ def _rig(order: DomeOrder) -> Rig:
     """Return the dome with the lights, cameras and image size of an order."""
     width_px = order.width_px or WIDTHS_PX[order.size]
     dome = load_rig("dome")
+    dome = dome.with_scanner() if order.scanner else dataclasses.replace(dome, scanner=None)
     if order.plan is None:
         lights, views = LIGHT_COUNTS[order.size], VIEW_COUNTS[order.size]
         return small_dome(
@@ -284,11 +291,14 @@ def _plan(rig: Rig, target: str | None, size: str) -> Plan:
 
 
 def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
-    built = build_dome(rig, seed=order.seed)
+    built = age_dome(build_dome(rig, seed=order.seed), order.rig_age, seed=order.seed)
     if order.target == "dark":
-        return DomeScene(rig, make_target("dark"), dome=built, seed=order.seed)
+        return DomeScene(rig, make_target("dark"), dome=built, seed=order.noise_seed)
     if order.target is not None:
-        return make_target_scene(order.target, rig, seed=order.seed, dome=built)  # type: ignore[arg-type]
+        seed = order.noise_seed
+        target = make_target_scene(order.target, rig, seed=seed, dome=built)  # type: ignore[arg-type]
+        scan_board(target, seed=order.seed, noise_seed=seed)
+        return target
     conditions = dict(order.conditions)
     if (one := _member(order)) is not None:
         person = one.face(TEXTURE_TEXELS)
@@ -296,20 +306,23 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
     else:
         subject = subject_file.load_subject(order.subject)
         person = subject.face(seed=order.seed, size=TEXTURE_TEXELS, mesh=order.mesh)
-    motion = draw_head_motion(order.seed) if order.move else None
-    return DomeScene(
+    person = person.translate(draw_head_position(order.session_seed))
+    motion = draw_head_motion(order.noise_seed) if order.move else None
+    scene = DomeScene(
         rig,
         person,
         dome=built,
         motion=motion,
         state=order.state,
         movement=order.movement,
-        seed=order.seed,
+        seed=order.noise_seed,
         conditions=conditions,
         on_s=max_on_time_s(plan),
         effects=SceneEffects.from_switches(_skin_light_effects(order)),
         choice=choose_renderer(order.renderer),
     )
+    scan_face_by_stripes(scene, seed=order.seed, noise_seed=order.noise_seed)
+    return scene
 
 
 def _skin_light_effects(order: DomeOrder) -> dict[str, Any]:
@@ -333,10 +346,10 @@ def _attach_scan(session: Any, scene: Any, order: DomeOrder) -> dict[str, Any]:
     scanner = ScannerSettings(triangles=SCAN_TRIANGLES[order.size])
     mesh = scene.subject.mesh
     if order.wrapped:
-        rng = np.random.default_rng([order.seed, 7, STATE_NAMES.index(order.state)])
+        rng = np.random.default_rng([order.noise_seed, 7, STATE_NAMES.index(order.state)])
         scan = wrap_template(mesh, rng=rng, scanner=scanner)
     else:
-        scan = scan_face(mesh, rng=np.random.default_rng([order.seed, 7]), scanner=scanner)
+        scan = scan_face(mesh, rng=np.random.default_rng([order.noise_seed, 7]), scanner=scanner)
     if SCAN_FILE not in session.attachments():
         kind = "template wrapped onto a scan" if order.wrapped else "scanned mesh"
         session.attach(SCAN_FILE, scan.ply, about={"kind": kind, "unit": "mm"})

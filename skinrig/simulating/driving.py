@@ -19,6 +19,7 @@ from model import store
 from model.skin import SkinAppearance
 from rigsim.world import World
 from skinrig.capturing.addresses import open_box
+from skinrig.capturing.camera_colors import nominal_camera_colors
 from skinrig.capturing.light_safety import light_figures, light_lines
 from skinrig.simulating import subject_records
 from skinrig.simulating.exposure_log import SceneLog
@@ -69,7 +70,17 @@ def manifest_settings(order: SimulationOrder, **rig_settings: Any) -> dict[str, 
         asked["renderer"] = order.renderer
     if order.leave_out:
         asked["leave_out"] = list(order.leave_out)
-    return asked | rig_settings
+    return asked | rig_settings | session_settings(order)
+
+
+def session_settings(order: SimulationOrder) -> dict[str, Any]:
+    """Return the given settings that differ between sessions of one subject."""
+    found: dict[str, Any] = {}
+    if order.session_seed is not None:
+        found["session_seed"] = order.session_seed
+    if order.days_ago:
+        found["days_ago"] = order.days_ago
+    return found
 
 
 @contextmanager
@@ -112,14 +123,14 @@ def open_session(
             )
         return session
     order.out.parent.mkdir(parents=True, exist_ok=True)
-    created = order.created
+    created = order.captured_at
     return Session.create(
         order.out,
         plan=plan,
         rig=rig,
         devices={
             **{name: f"rigsim {name} box" for name in rig.boxes},
-            **{view.name: view.serial for view in rig.views},
+            **{view.name: view.serial for view in rig.all_views},
         },
         subject=order.person
         or SubjectRecord(subject_records.pseudonym(order.subject, order.seed), SIMULATED_USES),
@@ -222,7 +233,7 @@ def drive_plan(
     Parameters
     ----------
     order
-        Order of the simulation, with the world's seed and the progress callback.
+        Order of the simulation, with the world's seeds and the progress callback.
     session, rig
         Session, open for writing, and the nominal rig.
     scene
@@ -246,7 +257,12 @@ def drive_plan(
         Time elapsed on the rig's clock, s.
     """
     world = World(
-        rig, seed=order.seed, clock="virtual", scene=scene, shots_made=count_shots(session)
+        rig,
+        seed=order.noise_seed,
+        subject_seed=order.seed,
+        clock="virtual",
+        scene=scene,
+        shots_made=count_shots(session),
     )
     name = world.register(session.id)
     boxes = {
@@ -254,7 +270,7 @@ def drive_plan(
         kind: open_box(kind, f"sim://{kind}?world={name}", clock=world.clock, first_seq=1)
         for kind in rig.boxes
     }
-    cameras = {view.name: open_camera(f"sim://{name}/{view.name}") for view in rig.views}
+    cameras = {view.name: open_camera(f"sim://{name}/{view.name}") for view in rig.all_views}
     operator = Operator(
         progress=order.progress or (lambda line: None),
         prompt=lambda text: None if prompt is None else prompt(world, text),
@@ -272,6 +288,7 @@ def drive_plan(
             cameras=cameras,
             session=session,
             operator=operator,
+            camera_colors=nominal_camera_colors(rig),
             **run,
         )
         session.close()

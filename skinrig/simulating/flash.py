@@ -12,6 +12,7 @@ from rigsim.needs.effects import SceneEffects
 from rigsim.population import files as subject_file
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.scenes.flash.truth import face_surface
+from rigsim.subject.head_motion import draw_head_position
 from rigsim.subject.perfusion import STATE_NAMES
 from skinrig.capturing.plan_choice import DefaultPlan
 from skinrig.console import select_attributes
@@ -94,14 +95,15 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
 
 
 def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:
-    seed = order.seed
+    seed = order.noise_seed
     powers = [float(step.settings.get("power", 0.0)) for step in plan.steps]
     power = max(powers, default=0.0) or 1.0
     if order.target is not None:
         state = "white" if order.target == "white" else ""
         return {state: FlashScene(rig, targets.make_target(order.target), seed=seed, power=power)}
-    person = subject_file.load_subject(order.subject).face(seed=seed, mesh=order.mesh)
+    person = subject_file.load_subject(order.subject).face(seed=order.seed, mesh=order.mesh)
     person = person.translate(_stance_offset_mm(rig, order.nearer_mm))
+    person = person.translate(draw_head_position(order.session_seed))
     return {
         state: FlashScene(
             rig,

@@ -8,6 +8,7 @@ from capture.plan import Plan
 from capture.plan.gradient import group_by_state, strain_state
 from capture.rig import Rig, load_rig
 from capture.session import Session
+from rigsim.as_built.aging import RigAge, age_sphere
 from rigsim.as_built.sphere import build_sphere
 from rigsim.mitsuba.variant import Renderer, choose_renderer
 from rigsim.needs.effects import SceneEffects, max_on_time_s
@@ -58,6 +59,8 @@ def simulate_gradient(order: GradientOrder) -> SimulationResult:
         site=order.site,
         subject=order.subject,
         seed=order.seed,
+        noise_seed=order.noise_seed,
+        age=order.rig_age,
         plan=plan,
         without=order.scene_switches(),
         renderer=order.renderer,
@@ -83,6 +86,8 @@ def make_scene(
     site: str | None = None,
     subject: str = "III",
     seed: int = 0,
+    noise_seed: int | None = None,
+    age: RigAge | None = None,
     plan: Plan | None = None,
     without: Mapping[str, Any] | None = None,
     renderer: Renderer = "mitsuba",
@@ -96,7 +101,11 @@ def make_scene(
     target : str, optional
         "ball", "flat" or "dark"; a patch of skin by default.
     site, subject, seed
-        Properties of the skin; the seed is also that of the sphere and of the patch's motion.
+        Properties of the skin; the seed is also that of the sphere.
+    noise_seed
+        Seed of the noise, the patch's motion and the place of a target; None: `seed`.
+    age
+        State of the rig on the day of the session; None: as built.
     plan : Plan, optional
         Plan whose caliper angles set the size of the skin; default any angle.
     without
@@ -105,8 +114,11 @@ def make_scene(
         Renderer of the patch; "mitsuba" only where its shadow rays are affordable.
     """
     sphere = build_sphere(rig, seed=seed)
+    if age is not None:
+        sphere = age_sphere(sphere, age, seed=seed)
+    session_seed = seed if noise_seed is None else noise_seed
     if target is not None:
-        return GradientScene(rig, cast(Any, target), sphere=sphere, seed=seed)
+        return GradientScene(rig, cast(Any, target), sphere=sphere, seed=session_seed)
     angles = {float(s.index["angle"]) for s in plan.steps if strain_state(s)} if plan else set()
     size_mm = required_size_mm(
         max(rig.views[0].field_mm),
@@ -122,8 +134,8 @@ def make_scene(
         rig,
         skin,
         sphere=sphere,
-        motion=PatchMotion(seed),
-        seed=seed,
+        motion=PatchMotion(session_seed),
+        seed=session_seed,
         on_s=on_s,
         effects=SceneEffects.from_switches(without or {}),
         choice=choose_renderer(renderer) if renderer == "fast" else None,

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, fields
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, ClassVar, get_args
 
@@ -12,6 +12,7 @@ from capture.plan.dome import DomeTarget
 from capture.plan.gradient import GradientTarget
 from capture.plan.probe import ProbeTarget
 from capture.session import SubjectRecord
+from rigsim.as_built.aging import RigAge, draw_rig_age
 from rigsim.mitsuba.variant import Renderer
 from skinrig.capturing.sequences import SequenceOrder
 from skinrig.errors import UsageError, require_choice
@@ -102,7 +103,13 @@ class SimulationOrder:
     size: str = "small"
     """"small" or "full"; each rig has its own meaning."""
     seed: int = 0
-    """Seed of the subject, the sensor and the controllers."""
+    """Seed of the subject and of the rig as built; without `session_seed` also of the capture."""
+    session_seed: int | None = None
+    """Seed of one capture of the same subject with the same rig: noise, position, motion, scan and
+    controllers. None: `seed`, and the face at the center of the rig."""
+    days_ago: int = 0
+    """Day of the session before today; LEDs and frame of dome and sphere are those of that day, see
+    `rigsim.as_built.aging`."""
     subject: str = "III"
     """Preset of the skin, or a file NAME.toml, see `rigsim.population.files`."""
     target: str | None = None
@@ -115,7 +122,7 @@ class SimulationOrder:
     resume: bool = False
     """Resume an interrupted session; its frames are kept."""
     created: datetime | None = None
-    """Date of the session; None: now."""
+    """Date of the session; None: now, less `days_ago`."""
     person: SubjectRecord | None = None
     """Pseudonym and consent to record; None: consent to :data:`SIMULATED_USES`, or that of the
     resumed session. A record that differs from the resumed session's is refused."""
@@ -132,8 +139,10 @@ class SimulationOrder:
                 )
         require_size(self.size)
         require_choice("renderer", self.renderer, get_args(Renderer), SimulationError)
-        if self.seed < 0:
-            raise SimulationError(f"seed: got {self.seed}, expected 0 or more")
+        for name in ("seed", "session_seed", "days_ago"):
+            number = getattr(self, name)
+            if number is not None and number < 0:
+                raise SimulationError(f"{name}: got {number}, expected 0 or more")
         width_px = getattr(self, "width_px", None)
         if width_px is not None and width_px < MIN_WIDTH_PX:
             raise SimulationError(
@@ -152,6 +161,23 @@ class SimulationOrder:
             raise SimulationOptionsError(
                 "plan: an option of subjects; targets and sequences have their own, so remove it"
             )
+
+    @property
+    def noise_seed(self) -> int:
+        """Seed of everything that differs between two captures of one subject."""
+        return self.seed if self.session_seed is None else self.session_seed
+
+    @property
+    def captured_at(self) -> datetime | None:
+        """Date of the session; None: now."""
+        if self.created is not None or not self.days_ago:
+            return self.created
+        return datetime.now(UTC) - timedelta(days=self.days_ago)
+
+    @property
+    def rig_age(self) -> RigAge:
+        """State of the rig on the day of the session."""
+        return draw_rig_age(self.days_ago, seed=self.seed)
 
     def check_rig_of_plan(self) -> None:
         """Raise for a plan of another rig."""
@@ -279,6 +305,9 @@ class DomeOrder(FaceOrder):
     wrapped: bool = False
     """Whether the scan is a template wrapped onto the face, with the same triangles and texture
     coordinates for every expression, so that maps of expressions share one texture."""
+    scanner: bool = False
+    """Whether the scanner's stripes are captured, for a face instead of an attached mesh, for a
+    board to calibrate the scanner."""
     subsurface: bool = False
     """True: lateral scattering in skin is always built; False: only if it changes pixels, see
     `rigsim.needs.effects`."""
@@ -302,6 +331,12 @@ class DomeOrder(FaceOrder):
         if self.plan is not None and (self.lights, self.views) != (None, None):
             raise SimulationOptionsError("lights, views: a plan has its own; remove them")
         self.check_rig_of_plan()
+        if self.scanner and self.wrapped:
+            raise SimulationOptionsError("scanner, wrapped: two kinds of scan; remove one of them")
+        if self.scanner and (self.plan is not None or self.target not in (None, "charuco")):
+            raise SimulationOptionsError(
+                "scanner: an option of the default plan of a face or of target charuco; remove it"
+            )
         if self.target is None:
             return
         if self.state != "neutral":

@@ -39,7 +39,10 @@ def simulate_probe(order: ProbeOrder) -> SimulationResult:
     )
     photons = TRUTH_PHOTONS[order.size]
     scene = make_scene(
-        rig, order.target, **select_attributes(order, "subject", "seed"), photons=photons
+        rig,
+        order.target,
+        **select_attributes(order, "subject", "seed", "noise_seed"),
+        photons=photons,
     )
     if order.target is None:
         _check_sites(scene.tissue, order.sites or PROBE_SITES, rig)
@@ -68,7 +71,15 @@ def _check_sites(tissue: Any, sites: Sequence[str], rig: Rig) -> None:
             raise SimulationError(str(error)) from error
 
 
-def make_scene(rig: Rig, target: str | None, *, subject: str, seed: int, photons: int) -> Any:
+def make_scene(
+    rig: Rig,
+    target: str | None,
+    *,
+    subject: str,
+    seed: int,
+    photons: int,
+    noise_seed: int | None = None,
+) -> Any:
     """Return the scene of a tissue or a target under the probe's actual fibers.
 
     Parameters
@@ -80,7 +91,9 @@ def make_scene(rig: Rig, target: str | None, *, subject: str, seed: int, photons
     subject : str
         Preset of the skin, or "homogeneous:SIGMA_A,SIGMA_S_PRIME[,G]" in 1/mm.
     seed : int
-        Seed of the subject, the photons and the sensor's noise; the probe is the same for all.
+        Seed of the subject and the photons; the probe is the same for all.
+    noise_seed : int, optional
+        Seed of the sensor's noise; default `seed`.
     photons : int
         Photons per site and angle.
 
@@ -93,7 +106,7 @@ def make_scene(rig: Rig, target: str | None, *, subject: str, seed: int, photons
         tissue = BLOCK if target == "phantom" else subject_file.load_tissue(subject, seed=seed)
     except TissueError as error:
         raise SimulationError(str(error)) from error
-    return ProbeScene(rig, tissue, seed=seed, photons=photons)
+    return ProbeScene(rig, tissue, seed=seed, noise_seed=noise_seed, photons=photons)
 
 
 class HeadLog(SceneLog):

@@ -15,13 +15,14 @@ from model import store
 from rigsim.mitsuba.variant import choose_renderer
 from rigsim.population import files as subject_file
 from rigsim.scenes.flash.course import FlashCourseScene, FlashEvent
+from rigsim.subject.head_motion import draw_head_position
 from rigsim.subject.perfusion import STATE_NAMES
 from rigsim.subject.perfusion_course import EventCourse, PromptedCourse
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.capturing.sequences import SequenceOrder, sequence_lines, sequence_plan
 from skinrig.errors import require_choice
 from skinrig.simulating import subject_records
-from skinrig.simulating.driving import build_result, drive_plan, open_session
+from skinrig.simulating.driving import build_result, drive_plan, open_session, session_settings
 from skinrig.simulating.exposure_log import ExposureLog
 from skinrig.simulating.flash_truth import WIDTHS_PX, build_truth, scale_landmarks, to_superpixels
 from skinrig.simulating.orders import (
@@ -71,6 +72,7 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
         "sequence": sequence.document(),
         "relaxation_s": constant_s,
         "movement": order.movement,
+        **session_settings(order),
     }
     reaction_s = sequence.reaction_s
     if reaction_s is not None and not 0 <= reaction_s < np.inf:
@@ -82,12 +84,15 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
     if sequence.is_prompted:
         own = {"rise_s": constant_s, "fall_s": constant_s, "reaction_s": reaction_s}
         known: dict[str, Any] = {name: v for name, v in own.items() if v is not None}
-        course: EventCourse | PromptedCourse = PromptedCourse(sequence.state, seed=seed, **known)
+        course: EventCourse | PromptedCourse = PromptedCourse(
+            sequence.state, seed=order.noise_seed, **known
+        )
     else:
         course = EventCourse(sequence.state, constant_s)
     texels = TEXTURE_TEXELS_BY_WIDTH[int(width > MAX_COARSE_WIDTH_PX)]
     subject = subject_file.load_subject(order.subject)
     person = subject.face(seed=seed, size=texels, mesh=order.mesh)
+    person = person.translate(draw_head_position(order.session_seed))
     plan = sequence_plan(rig, sequence)
     if order.progress is not None:
         for line in sequence_lines(plan):
@@ -103,7 +108,7 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
         rig,
         person,
         course,
-        seed=seed,
+        seed=order.noise_seed,
         movement=order.movement,
         on_flash=note,
         choice=choose_renderer(order.renderer),

@@ -18,6 +18,7 @@ from rigsim.population import files as subject_file
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.scenes.gradient.reference import NEUTRAL_GRIP
+from rigsim.subject.head_motion import draw_head_position
 from rigsim.world.serve import serve_world
 from rigsim.world.suction import HeadState
 from skinrig.arrays import UInt16Array
@@ -33,6 +34,7 @@ from skinrig.simulating.subject_records import find_unused_subject_keys
 
 if TYPE_CHECKING:
     from rigsim.scenes.probe.scene import ProbeScene
+    from rigsim.subject import SimulatedSubject
 
 GRADIENT_WIDTH_PX = 96
 """Width of the gradient rig's image when served, px."""
@@ -54,6 +56,8 @@ class ServeOrder:
     subject: str = "III"
     size: str = "small"
     seed: int = 0
+    session_seed: int | None = None
+    """Seed of one session of the same subject and rig; None: `seed`."""
     renderer: Renderer = "mitsuba"
     """Renderer of a face's images."""
     site: str | None = None
@@ -66,6 +70,16 @@ class ServeOrder:
         require_size(self.size)
         if not re.fullmatch(r".+:\d+", self.tcp):
             raise UsageError(f"--tcp: got {self.tcp!r}, expected HOST:PORT, such as 127.0.0.1:0")
+
+    @property
+    def noise_seed(self) -> int:
+        """Seed of everything that differs between two sessions of one subject."""
+        return self.seed if self.session_seed is None else self.session_seed
+
+    def face(self) -> SimulatedSubject:
+        """Return the subject's face where it is in the session."""
+        face = subject_file.load_subject(self.subject).face(seed=self.seed)
+        return face.translate(draw_head_position(self.session_seed))
 
 
 def serve_rig(rig_name: str, order: ServeOrder, console: Console) -> None:
@@ -90,7 +104,8 @@ def serve_rig(rig_name: str, order: ServeOrder, console: Console) -> None:
     if order.site is not None and rig.caliper is None:
         raise SimulationOptionsError("site: an option of the gradient rig only; remove it")
     rig, scene = _build_served_rig(rig, order)
-    options = select_attributes(order, "pty", "tcp", "allow_remote", "seed")
+    options = select_attributes(order, "pty", "tcp", "allow_remote")
+    options |= {"seed": order.noise_seed, "subject_seed": order.seed}
     with serve_world(rig, scene=scene, shots_made=made, **options) as served:
         command = _next_step(rig_name, rig, served.addresses, order.resume)
         if console.as_json:
@@ -123,13 +138,16 @@ def _build_served_rig(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
             )
         rig = rig.cropped(GRADIENT_WIDTH_PX)
         scene = gradient.make_scene(
-            rig, site=order.site, subject=subject, seed=seed, renderer=order.renderer
+            rig,
+            subject=subject,
+            seed=seed,
+            **select_attributes(order, "site", "noise_seed", "renderer"),
         )
         # rendered before the first request, so that no client waits for it
         scene.moments(NEUTRAL_GRIP)
         return rig, scene
     if rig.probe is not None:
-        return rig, _probe_scene(rig, rig.probe, subject, seed)
+        return rig, _probe_scene(rig, rig.probe, order)
     dome = "dome" in rig.boxes
     width = (simulating_dome if dome else flash).WIDTHS_PX[order.size]
     rig = rig.resized(width) if width != rig.views[0].width_px else rig
@@ -139,7 +157,7 @@ def _build_served_rig(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
 def _next_step(rig_name: str, rig: Rig, urls: Mapping[str, str], resume: Path | None) -> str:
     """Return the command that captures from a served rig."""
     boxes = " ".join("--port " + shell_quote(f"{name}={urls[name]}") for name in rig.boxes)
-    cameras = " ".join("--camera " + shell_quote(f"{v.name}={urls[v.name]}") for v in rig.views)
+    cameras = " ".join("--camera " + shell_quote(f"{v.name}={urls[v.name]}") for v in rig.all_views)
     more = "" if rig.caliper is None else " --force-limit 2 --eyes closed"
     out = "session" if resume is None else f"{shell_quote(resume)} --resume"
     return f"skinrig capture {shell_quote(rig_name)} {boxes} {cameras}{more} --out {out}"
@@ -159,22 +177,22 @@ def _shots_made(session: Path | None, rig: Rig) -> Mapping[str, int]:
 
 
 def _flash_scene(rig: Rig, order: ServeOrder) -> Any:
-    face = subject_file.load_subject(order.subject).face(seed=order.seed)
-    scene = FlashScene(rig, face, seed=order.seed, choice=choose_renderer(order.renderer))
+    choice = choose_renderer(order.renderer)
+    scene = FlashScene(rig, order.face(), seed=order.noise_seed, choice=choice)
     # rendered before the first request, so that no client waits for it
     scene.radiance("crossed")
     return scene
 
 
 def _dome_scene(rig: Rig, order: ServeOrder) -> Any:
-    face = subject_file.load_subject(order.subject).face(seed=order.seed)
     built, choice = build_dome(rig, seed=order.seed), choose_renderer(order.renderer)
-    return DomeScene(rig, face, dome=built, seed=order.seed, choice=choice)
+    return DomeScene(rig, order.face(), dome=built, seed=order.noise_seed, choice=choice)
 
 
-def _probe_scene(rig: Rig, probe: Probe, subject: str, seed: int) -> Any:
+def _probe_scene(rig: Rig, probe: Probe, order: ServeOrder) -> Any:
+    given = select_attributes(order, "subject", "seed", "noise_seed")
     skin, block = (
-        simulating_probe.make_scene(rig, of, subject=subject, seed=seed, photons=PROBE_PHOTONS)
+        simulating_probe.make_scene(rig, of, photons=PROBE_PHOTONS, **given)
         for of in (None, "phantom")
     )
     # photons of the default sites are traced before the first request: during one, the head is

@@ -25,6 +25,7 @@ HEAVY = {
     "probe-session",
     "reference-dome",
     "reference-probe",
+    "reference-relief",
     "render-dome",
     "render-gradient",
     "render-model",

@@ -9,8 +9,8 @@ from fixtures.box_manuals import PROBE as PROBE_BOX
 
 from capture.devices import wire
 from capture.devices.wire import Code, Request
-from rigsim.boxes.source_shutter import SourceLight
-from rigsim.boxes.suction_pump import MAX_PUMPING_S, PUMP_CONTROL_PERIOD_S
+from rigsim.boxes.contact_probe.source_shutter import SourceLight
+from rigsim.boxes.contact_probe.suction_pump import MAX_PUMPING_S, PUMP_CONTROL_PERIOD_S
 
 PROBE = PROBE_BOX.rig.probe
 

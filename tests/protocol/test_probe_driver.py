@@ -13,7 +13,7 @@ from capture.devices.port import BadAnswer, CommandRefused, Port, PortTimeout, W
 from capture.devices.probe import ProbeBox
 from capture.devices.wire import Code
 from capture.rig import load_rig
-from rigsim.boxes import source_shutter
+from rigsim.boxes.contact_probe import source_shutter
 from rigsim.boxes.faults import Faults
 from rigsim.boxes.probe import ProbeUnit
 from rigsim.world import World

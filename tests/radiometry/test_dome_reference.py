@@ -10,6 +10,7 @@ start, and normals from texels against normals from vertices), fixed beforehand.
 
 import dataclasses
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -76,19 +77,26 @@ def theirs(scene, view, light):
     ]
 
 
-def point(rig, light):
-    return {
-        "type": "point",
-        "position": list(rig.lights[light].position_mm),
-        "intensity": {"type": "rgb", "value": [1.0, 1.0, 1.0]},
-    }
+@pytest.fixture(scope="module")
+def point_images(rig, face):
+    """Mitsuba's images of a view under a light that is a point; each is rendered once."""
+    scene = PlainScene(rig, face, subpixels=1)
+
+    @cache
+    def render(view, light):
+        point = {
+            "type": "point",
+            "position": list(rig.lights[light].position_mm),
+            "intensity": {"type": "rgb", "value": [1.0, 1.0, 1.0]},
+        }
+        return theirs(scene, rig.view(view), point)
+
+    return render
 
 
 @pytest.mark.parametrize(("view", "light"), [("C02", 45), ("C06", 20), ("C02", 100)])
-def test_each_light_of_view_matches_mitsuba_image(rig, face, view, light):
-    scene = PlainScene(rig, face, subpixels=1)
-    runs = theirs(scene, rig.view(view), point(rig, light))
-    worst, limit = worst_z(*ours(rig, face, view, light), runs)
+def test_each_light_of_view_matches_mitsuba_image(rig, face, point_images, view, light):
+    worst, limit = worst_z(*ours(rig, face, view, light), point_images(view, light))
     assert worst < limit
 
 
@@ -105,10 +113,10 @@ class Paler(PlainScene):
 
 
 @pytest.mark.parametrize("scene_class", [Rougher, Paler])
-def test_three_percent_roughness_or_albedo_error_is_detectable(rig, face, scene_class):
-    scene = PlainScene(rig, face, subpixels=1)
-    runs = theirs(scene, rig.view("C02"), point(rig, 45))
-    worst, limit = worst_z(*ours(rig, face, "C02", 45, scene_class), runs)
+def test_three_percent_roughness_or_albedo_error_is_detectable(
+    rig, face, point_images, scene_class
+):
+    worst, limit = worst_z(*ours(rig, face, "C02", 45, scene_class), point_images("C02", 45))
     assert worst > limit
 
 

@@ -1,8 +1,5 @@
 """The gradient rig's Mitsuba scene and its integrator `ledmoments` against independent sums."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -216,40 +213,3 @@ def test_coated_skin_agrees_with_olat(choice):
     np.testing.assert_array_equal(moments[..., 6], 0.5 * moments[..., 0])
     assert (moments[..., 0] > 0.3 * expected.mean(axis=-1)).any()
     assert not moments[..., 3].any()
-
-
-THREAD_SCRIPT = """
-import hashlib
-import sys
-
-import drjit as dr
-from capture.rig import load_rig
-from rigsim.mitsuba.startup import load_mitsuba
-from rigsim.mitsuba.variant import choose_variant
-from rigsim.scenes.gradient.reference import NEUTRAL_GRIP
-from rigsim.scenes.gradient.scene import GradientScene
-from rigsim.skin_patch.microrelief import make_micro_skin
-
-load_mitsuba(choose_variant("rgb"))
-dr.set_thread_count(int(sys.argv[1]))
-rig = load_rig("gradient").cropped(96)
-scene = GradientScene(rig, make_micro_skin("cheek", seed=3, size_mm=1.4))
-light = scene.stokes(NEUTRAL_GRIP)
-print(hashlib.sha256(light.tobytes()).hexdigest(), scene.variant.renderer, float(light.sum()))
-"""
-
-
-@pytest.mark.long
-def test_threads_do_not_change_a_byte():
-    found = set()
-    for threads in (1, 2, 4):
-        run = subprocess.run(
-            [sys.executable, "-c", THREAD_SCRIPT, str(threads)],
-            capture_output=True,
-            text=True,
-            timeout=300,
-        )
-        assert run.returncode == 0, run.stderr
-        found.add(run.stdout)
-    assert len(found) == 1
-    assert found.pop().split()[1] == "mitsuba"

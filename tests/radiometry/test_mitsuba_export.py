@@ -11,6 +11,8 @@ triangles' frames against the rig's frame), fixed beforehand.
 
 import dataclasses
 import json
+import shutil
+from functools import cache
 
 import numpy as np
 import pytest
@@ -69,17 +71,37 @@ def session(tmp_path_factory):
     return Session.open(out)
 
 
-@pytest.fixture
-def scene_folder(session, tmp_path):
-    out = tmp_path / "scene"
+@pytest.fixture(scope="module")
+def exported(session):
+    out = session.path.parent / "scene"
     exporting.export(session.path, out, "mitsuba", use="research")
     return out
 
 
-def render_ours(session, light, sensor, file="scene-stock.xml"):
+@pytest.fixture(scope="module")
+def renders(session, exported):
+    """Images of the exported scenes; each is rendered once."""
+
+    @cache
+    def render_once(file, light, sensor):
+        return render(exported, session.rig.lights[light].name, sensor, file)
+
+    return render_once
+
+
+@pytest.fixture
+def scene_folder(exported, tmp_path):
+    return shutil.copytree(exported, tmp_path / "scene")
+
+
+@pytest.fixture(scope="module")
+def face():
+    return subject_file.load_subject("V").face(seed=SEED, size=512)
+
+
+def render_ours(session, face, light, sensor, file="scene-stock.xml"):
     """Return block sums at the finest grid of rays, and their deviation over three grids."""
     dome = build_dome(session.rig, seed=session.seed)
-    face = subject_file.load_subject("V").face(seed=SEED, size=512)
     view = session.rig.views[sensor].name
     sums = [
         sum_blocks(
@@ -92,15 +114,15 @@ def render_ours(session, light, sensor, file="scene-stock.xml"):
 
 
 @pytest.fixture(scope="module")
-def ours(session):
-    return render_ours(session, 0, 0)
+def ours(session, face):
+    return render_ours(session, face, 0, 0)
 
 
 @pytest.mark.parametrize("file", list(REFERENCES))
 @pytest.mark.parametrize(("light", "sensor"), [(0, 0), (1, 0), (2, 1)])
-def test_mitsuba_renders_the_projects_image(session, scene_folder, file, light, sensor):
-    runs = render(scene_folder, session.rig.lights[light].name, sensor, file)
-    worst, limit = worst_z(render_ours(session, light, sensor, file), runs)
+def test_mitsuba_renders_the_projects_image(session, face, renders, file, light, sensor):
+    runs = renders(file, light, sensor)
+    worst, limit = worst_z(render_ours(session, face, light, sensor, file), runs)
     print(f"{file} {light} {sensor}: {worst:.2f} of {limit:.2f}")
     assert worst < limit
 
@@ -132,18 +154,17 @@ def test_defects_of_the_export_are_detected(session, scene_folder, ours, defect)
 
 
 @pytest.mark.parametrize("file", list(REFERENCES))
-def test_scenes_miss_the_session_by_few_percent(session, scene_folder, file):
+def test_scenes_miss_the_session_by_few_percent(session, face, exported, renders, file):
     """Interreflections, lateral scattering and lens, for stock also vellus hair and discs."""
     dome = build_dome(session.rig, seed=session.seed)
-    face = subject_file.load_subject("V").face(seed=SEED, size=512)
     view = session.rig.views[0].name
     scene = DomeScene(session.rig, face, dome=dome, subpixels=6)
     full = sum_blocks(scene.radiance(view, [0])[0] / dome.gain[view])
-    found = sum_blocks(render(scene_folder, session.rig.lights[0].name, 0, file)).mean(axis=0)
+    found = sum_blocks(renders(file, 0, 0)).mean(axis=0)
     missed = np.sqrt(np.mean((found - full) ** 2)) / full.mean()
     print(f"{file}: {100 * missed:.1f} % of the mean")
     assert 0.001 < missed < 0.1
-    document = json.loads((scene_folder / "mitsuba.json").read_text())
+    document = json.loads((exported / "mitsuba.json").read_text())
     assert ["lateral scattering in skin", "interreflection"] == [
         name for name, _ in document["left_out"][:2]
     ]

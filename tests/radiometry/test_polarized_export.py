@@ -9,6 +9,7 @@ in `test_mitsuba_export`, fixed beforehand.
 
 import dataclasses
 import shutil
+from functools import cache
 
 import numpy as np
 import pytest
@@ -61,22 +62,29 @@ def flash_folder(flash, tmp_path):
     return shutil.copytree(flash[1], tmp_path / "scene")
 
 
-def flash_image(session, subpixels, *, stock):
+@pytest.fixture(scope="module")
+def face():
+    return subject_file.load_subject("V").face(seed=SEED)
+
+
+def skin_layers(session, face):
+    """Return the textures of the face, continued beyond its charts."""
+    rig, view = session.rig, session.rig.views[0]
+    skin = ObservedSkin(face, "neutral", view.spectral_sensitivity, rig.lights[0].illuminant)
+    layers = {"normals": face.normal, "roughness": face.roughness, "hair": face.hair}
+    layers |= {"albedo": inner_albedo(face, skin.reflectance())}
+    return {name: dilate_texture(layer, face.atlas.covered) for name, layer in layers.items()}
+
+
+def flash_image(session, face, layers, subpixels, *, stock):
     """Return both images by the compiled formulas at each hit: S0 of a stock scene, or analyzed."""
     rig, view = session.rig, session.rig.views[0]
-    face = subject_file.load_subject("V").face(seed=SEED)
     films = NO_POLARIZERS if stock else draw_polarizers(rig)
     caster, flashes = Caster(face.mesh, choice=choose_renderer("fast")), flash_lights(rig, films)
     surface = FastSurface(caster, flashes)
     hits = surface.trace(view, subpixels, (0, view.height_px))
-    skin = ObservedSkin(face, "neutral", view.spectral_sensitivity, rig.lights[0].illuminant)
-    layers = {"normals": face.normal, "roughness": face.roughness, "hair": face.hair}
-    layers |= {"albedo": inner_albedo(face, skin.reflectance())}
     everywhere = np.ones(hits.count, np.bool_)
-    seen = {
-        name: sample(dilate_texture(layer, face.atlas.covered), hits.uv, everywhere)
-        for name, layer in layers.items()
-    }
+    seen = {name: sample(layer, hits.uv, everywhere) for name, layer in layers.items()}
     normal = seen["normals"] / np.linalg.norm(seen["normals"], axis=1, keepdims=True)
     entered, shadows = np.zeros(hits.count), []
     for light, weight in zip(rig.lights, flashes.weights, strict=True):
@@ -120,11 +128,11 @@ def white_rgb(session):
 
 
 @pytest.fixture(scope="module")
-def flash_sums(flash):
+def flash_sums(flash, face):
     """Block sums at the finest grid of rays with their deviation, by image and kind of scene."""
-    found = {}
+    found, layers = {}, skin_layers(flash[0], face)
     for kind in ("", "stock-"):
-        grids = [flash_image(flash[0], n, stock=bool(kind)) for n in (6, 7, 8)]
+        grids = [flash_image(flash[0], face, layers, n, stock=bool(kind)) for n in (6, 7, 8)]
         for name in grids[0]:
             sums = [sum_blocks(grid[name]) for grid in grids]
             found[f"scene-{kind}{name}.xml"] = sums[-1], np.std(sums, axis=0, ddof=1)
@@ -135,13 +143,19 @@ FLASH_FILES = [f"scene-{kind}{name}.xml" for kind in ("", "stock-") for name in 
 
 
 def render_polarized(folder, file, light="all"):
-    finest = {} if "stock" in file else {"subpixels": 8}
+    finest = {} if "stock" in file else {"subpixels": 8, "is_exact": True}
     return render(folder, light, 0, file, **finest)
 
 
+@pytest.fixture(scope="module")
+def flash_renders(flash):
+    """Images of the exported scenes; each is rendered once."""
+    return cache(lambda file: render_polarized(flash[1], file))
+
+
 @pytest.mark.parametrize("file", FLASH_FILES)
-def test_flash_scenes_have_the_compiled_image(flash_folder, flash_sums, file):
-    worst, limit = worst_z(flash_sums[file], render_polarized(flash_folder, file))
+def test_flash_scenes_have_the_compiled_image(flash_renders, flash_sums, file):
+    worst, limit = worst_z(flash_sums[file], flash_renders(file))
     print(f"{file}: {worst:.2f} of {limit:.2f}")
     assert worst < limit
 
@@ -173,14 +187,13 @@ def test_defects_of_flash_scenes_are_detected(flash_folder, flash_sums, defect):
     assert worst > limit
 
 
-def test_flash_scenes_miss_the_session_little(flash, flash_folder):
+def test_flash_scenes_miss_the_session_little(flash, face, flash_renders):
     """Interreflection, lateral scattering and lens; stock scenes also polarization."""
-    face = subject_file.load_subject("V").face(seed=SEED)
     scene = FlashScene(flash[0].rig, face, seed=SEED, subpixels=6)
     for name in POLARIZERS:
         full = sum_blocks(scene.radiance(name))
         for file in (f"scene-{name}.xml", f"scene-stock-{name}.xml"):
-            found = sum_blocks(render_polarized(flash_folder, file)).mean(axis=0)
+            found = sum_blocks(flash_renders(file)).mean(axis=0)
             missed = np.sqrt(np.mean((found - full) ** 2)) / full.mean()
             print(f"{file}: {100 * missed:.1f} % of the mean")
             assert 0.001 < missed < 0.1
@@ -197,6 +210,17 @@ def gradient(tmp_path_factory):
 @pytest.fixture
 def gradient_folder(gradient, tmp_path):
     return shutil.copytree(gradient[1], tmp_path / "scene")
+
+
+@pytest.fixture(scope="module")
+def gradient_renders(gradient):
+    """Images of the exported scenes; each is rendered once."""
+
+    @cache
+    def render_once(file, pattern="full"):
+        return render(gradient[1], pattern, 0, file, is_exact="stock" not in file)
+
+    return render_once
 
 
 PLAIN_PATCH = {"lateral": False, "optics": False, "interreflections": False}
@@ -226,20 +250,27 @@ def patch_light(session, subpixels=1, *, stock=False):
     ]
 
 
+@pytest.fixture(scope="module")
+def session_stokes(gradient):
+    return sum(patch_light(gradient[0]))
+
+
 @pytest.mark.parametrize("name", POLARIZERS)
 @pytest.mark.parametrize("pattern", ["full", "x", "-z"])
-def test_gradient_scene_has_the_sessions_image(gradient, gradient_folder, name, pattern):
+def test_gradient_scene_has_the_sessions_image(
+    gradient, gradient_renders, session_stokes, name, pattern
+):
     """Rationale: the plugins render the files, and `ledmoments` the session's own topography.
     Tolerance: 1e-3 of the mean at 99.9 % of pixels; rays at edges of triangles differ."""
     session, _ = gradient
     view, films = session.rig.views[0], draw_polarizers(session.rig)
-    stokes = np.einsum("m,msij->ijs", PATTERN_WEIGHTS[pattern], sum(patch_light(session)))
+    stokes = np.einsum("m,msij->ijs", PATTERN_WEIGHTS[pattern], session_stokes)
     to_camera = -camera_rays(view)[1]
     passes_deg = films.analyzer_axis_deg(view, name, None)
     axes = {"image_right": view.axes[0], "image_up": view.axes[1]}
     leak = {"extinction": films.analyzer_extinction}
     expected = shading.apply_analyzer(stokes, to_camera, passes_deg=passes_deg, **axes, **leak)
-    image = render(gradient_folder, pattern, 0, f"scene-{name}.xml")[0].mean(axis=-1)
+    image = gradient_renders(f"scene-{name}.xml", pattern)[0].mean(axis=-1)
     error = np.abs(image - expected) / expected.mean()
     print(f"{name} {pattern}: {np.quantile(error, 0.999):.1e}, worst {error.max():.1e}")
     assert np.quantile(error, 0.999) < 1e-3
@@ -259,29 +290,33 @@ def patch_sums(gradient):
 
 
 @pytest.mark.parametrize("name", POLARIZERS)
-def test_stock_gradient_scene_has_unpolarized_image(gradient_folder, patch_sums, name):
-    runs = render(gradient_folder, "full", 0, f"scene-stock-{name}.xml")
-    worst, limit = worst_z(patch_sums[name], runs)
+def test_stock_gradient_scene_has_unpolarized_image(gradient_renders, patch_sums, name):
+    worst, limit = worst_z(patch_sums[name], gradient_renders(f"scene-stock-{name}.xml"))
     print(f"{name}: {worst:.2f} of {limit:.2f}")
     assert worst < limit
 
 
-@pytest.mark.parametrize("name", POLARIZERS)
-def test_gradient_scenes_miss_the_sessions_contrast(gradient, gradient_folder, name):
-    """Lateral scattering fills grooves; interreflection, diffraction, for stock polarization."""
+@pytest.fixture(scope="module")
+def patch_scene(gradient):
     session, _ = gradient
-    scene = make_scene(session.rig, subject="V", seed=SEED, plan=session.plan)
-    full = scene.radiance("full", grip=GRIP, analyzer_deg={"parallel": 0.0, "crossed": 90.0}[name])
+    return make_scene(session.rig, subject="V", seed=SEED, plan=session.plan)
+
+
+@pytest.mark.parametrize("name", POLARIZERS)
+def test_gradient_scenes_miss_the_sessions_contrast(gradient_renders, patch_scene, name):
+    """Lateral scattering fills grooves; interreflection, diffraction, for stock polarization."""
+    full = patch_scene.radiance(
+        "full", grip=GRIP, analyzer_deg={"parallel": 0.0, "crossed": 90.0}[name]
+    )
     for file in (f"scene-{name}.xml", f"scene-stock-{name}.xml"):
-        found = render(gradient_folder, "full", 0, file).mean(axis=(0, 3))
+        found = gradient_renders(file).mean(axis=(0, 3))
         missed = np.sqrt(np.mean((found - full) ** 2)) / full.mean()
         print(f"{file}: {100 * missed:.1f} %, mean {100 * (found.mean() / full.mean() - 1):.1f} %")
         assert 0.001 < missed < 0.3
 
 
-def test_swapped_gradient_scenes_are_detected(gradient_folder, patch_sums):
-    runs = render(gradient_folder, "full", 0, "scene-stock-crossed.xml")
-    worst, limit = worst_z(patch_sums["parallel"], runs)
+def test_swapped_gradient_scenes_are_detected(gradient_folder, gradient_renders, patch_sums):
+    worst, limit = worst_z(patch_sums["parallel"], gradient_renders("scene-stock-crossed.xml"))
     assert worst > limit
     change_map("stock_diffuse", lambda m: np.float32(1.02) * m)(gradient_folder)
     worst, limit = worst_z(

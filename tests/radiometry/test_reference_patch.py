@@ -27,20 +27,25 @@ def patch():
     return replace(drawn, melanin=melanin, blood=np.full_like(drawn.blood, 0.01))
 
 
+@pytest.fixture(scope="module")
+def renders(patch):
+    """Images of 4 x 4 pixels with few and with four times as many samples."""
+    rig = load_rig("flash")
+    return [render_patch(patch, rig, width_px=4, samples=n, seed=1) for n in (32, 128)]
+
+
 def darkest_quarter(image):
     """Row and column of the darkest quarter."""
     quarters = image.mean(axis=-1).reshape(2, 2, 2, 2).mean(axis=(1, 3))
     return np.unravel_index(quarters.argmin(), quarters.shape)
 
 
-def test_dark_quarter_is_upper_right_everywhere(patch):
+def test_dark_quarter_is_upper_right_everywhere(patch, renders):
     """Rationale: row 0 is at the top, and x points to the right, as in the flash rig's images."""
-    rig = load_rig("flash")
     melanin, _ = pixel_truth(patch, 4)
-    voxels = render_patch(patch, rig, width_px=4, samples=64, seed=0)
-    fast = predict_patch(patch, rig, width_px=4)
+    fast = predict_patch(patch, load_rig("flash"), width_px=4)
     assert darkest_quarter(-melanin[..., None]) == (0, 1)
-    assert darkest_quarter(voxels.rgb) == (0, 1)
+    assert darkest_quarter(renders[1].rgb) == (0, 1)
     assert darkest_quarter(fast) == (0, 1)
 
 
@@ -49,13 +54,9 @@ def test_width_that_splits_voxels_is_refused(patch):
         pixel_truth(patch, 5)
 
 
-def test_noise_of_patch_falls_with_samples(patch):
+def test_noise_of_patch_falls_with_samples(renders):
     """Tolerance: factor 2 of the expected ratio of 4; variances of 48 values err by 20 %."""
-    rig = load_rig("flash")
-    few, many = (
-        np.mean(render_patch(patch, rig, width_px=4, samples=samples, seed=1).variance)
-        for samples in (32, 128)
-    )
+    few, many = (np.mean(image.variance) for image in renders)
     assert 2.0 < few / many < 8.0
 
 

@@ -65,6 +65,22 @@ def test_white_furnace_returns_all_light():
     assert not reflects(gray, whole, 2048, floor_reflectance=1.0)
 
 
+def test_layers_reflect_the_same_both_ways():
+    """Rationale: reciprocity of light and camera at 0 and 60 degrees, through a smooth boundary."""
+    found = []
+    for light_deg, camera_deg in ((60.0, 0.0), (0.0, 60.0)):
+        scene = describe_flat_layers(GIOVANELLI, light_deg=light_deg)
+        angle = np.radians(camera_deg)
+        place = 5.0 * np.sin(angle), 0.0, 5.0 * np.cos(angle)
+        scene["sensor"]["to_world"] = look_at(place, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+        image = render_voxels(scene, samples=2048, seed=1)[..., -1].ravel()
+        found.append((image.mean(), image.std(ddof=1) / 8.0, np.cos(np.radians(light_deg))))
+    (forth, forth_error, slant), (back, back_error, _) = found
+    assert abs(forth / slant - back) < 4.0 * np.hypot(forth_error / slant, back_error)
+    assert abs(forth - back) > 4.0 * np.hypot(forth_error, back_error)
+    assert back_error < 0.01 * back
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("preset", "samples"), [("I", 24576), ("VI", 49152)])
 def test_skin_layers_match_photon_walk(preset, samples):

@@ -170,6 +170,7 @@ def test_manual_lists_every_dome_controller_command():
         ("gradient_sphere", "Commands of the gradient sphere's box"),
         ("caliper", "Commands of the caliper's box"),
         ("probe", "Commands of the probe's box"),
+        ("scanner", "Commands of the scanner's box"),
     ],
 )
 def test_manual_lists_every_later_rig_controller_command(box_name, heading):
@@ -179,7 +180,8 @@ def test_manual_lists_every_later_rig_controller_command(box_name, heading):
 
     dome = World(load_rig("dome")).box("dome").device.commands()
     shared = dome if box_name == "gradient_sphere" else {}
-    box = World(load_rig(BOXES[box_name].rig)).box(box_name)
+    rig = load_rig(BOXES[box_name].rig)
+    box = World(rig.with_scanner() if box_name == "scanner" else rig).box(box_name)
     expected = {}
     for name, command in box.device.commands().items():
         needs = "bare" if command.bare else "" if name.endswith("?") else "frame"

@@ -1,6 +1,6 @@
 """The chromophore fit in plain NumPy: slow, double precision, and short enough to check by eye.
 
-It minimises the same sum as `reconstruction.chromophores.inversion_kernels`, by Levenberg-Marquardt
+It minimises the same sum as `reconstruction.chromophores.table_fit.kernels`, by Levenberg-Marquardt
 on all pixels at once instead of damped Newton on each, and sums the same probability as
 `reconstruction.chromophores.posterior_kernels`, over a dense plane. Both kernels are tested against
 it.

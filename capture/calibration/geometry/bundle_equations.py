@@ -94,6 +94,9 @@ class BundleResult:
         Corners of each image (view, pose) farther than five sigmas; images without are omitted.
     center_covariance_mm2 : dict of str to ndarray of float64, shape (3, 3)
         Covariance of each camera's center of projection, rig frame.
+    camera_covariance : ndarray of float64, shape (15 C, 15 C)
+        Covariance of the parameters of all C cameras, in the order of their sorted names; see
+        `step_camera`.
     """
 
     cameras: dict[str, CameraPose]
@@ -103,6 +106,7 @@ class BundleResult:
     corners: dict[str, int]
     outliers: dict[tuple[str, int], int]
     center_covariance_mm2: dict[str, Float64Array]
+    camera_covariance: Float64Array
 
 
 class BundleProblem:
@@ -215,7 +219,8 @@ class BundleProblem:
             for key, r in residuals.items()
         }
         outliers = {key: n for key, n in far.items() if n}
-        return BundleResult(found, poses, rms, noise, corners, outliers, centers)
+        joint = covariance[: self.first, : self.first]
+        return BundleResult(found, poses, rms, noise, corners, outliers, centers, joint)
 
     def _inverse(self, H: Float64Array, cameras: Cameras) -> Float64Array:
         """Return the covariance; with a free frame, for a frame fixed by the camera centers."""
@@ -306,25 +311,37 @@ class BundleProblem:
         new_cameras, new_places = dict(cameras), dict(places)
         for i, name in enumerate(() if self.cameras_fixed else self.names):
             d = step[i * N_CAMERA : (i + 1) * N_CAMERA]
-            camera = cameras[name]
-            matrix = camera.matrix.copy()
-            matrix[0, 0] += d[0]
-            matrix[1, 1] += d[1]
-            matrix[:2, 2] += d[2:4]
-            matrix[0, 0], matrix[1, 1] = max(matrix[0, 0], 1.0), max(matrix[1, 1], 1.0)
-            new_cameras[name] = replace(
-                camera,
-                matrix=matrix,
-                distortion=camera.distortion + d[4:9],
-                rotation=_rotate(camera.rotation, d[9:12]),
-                translation_mm=camera.translation_mm + d[12:15],
-            )
+            new_cameras[name] = step_camera(cameras[name], d)
         for j, pose in enumerate(self.poses):
             d = step[self.first + j * N_POSE : self.first + (j + 1) * N_POSE]
             new_places[pose] = BoardPose(
                 _rotate(places[pose].rotation, d[:3]), places[pose].translation_mm + d[3:]
             )
         return new_cameras, new_places
+
+
+def step_camera(camera: CameraPose, change: Float64Array) -> CameraPose:
+    """Return a camera whose parameters have changed.
+
+    Parameters
+    ----------
+    camera : CameraPose
+    change : ndarray of float64, shape (15,)
+        Of fx, fy, cx, cy (px), k1, k2, p1, p2, k3, of a rotation about its own axes (rad), and of
+        `CameraPose.translation_mm`.
+    """
+    matrix = camera.matrix.copy()
+    matrix[0, 0] += change[0]
+    matrix[1, 1] += change[1]
+    matrix[:2, 2] += change[2:4]
+    matrix[0, 0], matrix[1, 1] = max(matrix[0, 0], 1.0), max(matrix[1, 1], 1.0)
+    return replace(
+        camera,
+        matrix=matrix,
+        distortion=camera.distortion + change[4:9],
+        rotation=_rotate(camera.rotation, change[9:12]),
+        translation_mm=camera.translation_mm + change[12:15],
+    )
 
 
 def _derivatives(

@@ -204,9 +204,10 @@ def to_calibration(
     cameras: Mapping[str, CameraPose],
     *,
     reprojection_px: Mapping[str, float] | None = None,
+    kind: str = "geometry",
     **about: Unpack[Origin],
 ) -> Calibration:
-    """Return cameras as a `Calibration` of kind "geometry", keyed by serial.
+    """Return cameras as a `Calibration`, keyed by serial.
 
     Parameters
     ----------
@@ -216,6 +217,8 @@ def to_calibration(
         As the fields of `Calibration`; `valid_until` None: the default validity.
     reprojection_px : mapping of str to float, optional
         RMS reprojection error by the same names.
+    kind : str
+        "geometry", or "scanner" for cameras and projectors of a scanner.
     """
     serials = tuple(camera.serial for camera in cameras.values())
     if len(set(serials)) != len(serials):
@@ -237,7 +240,7 @@ def to_calibration(
         "frame": "x_camera = rotation x_rig + translation_mm; x right, y down, z forward",
         "distortion": "k1 k2 p1 p2 k3 on normalized coordinates",
     }
-    return make_device_calibration("geometry", values, notes, **about)
+    return make_device_calibration(kind, values, notes, **about)
 
 
 def cameras_from_calibration(calibration: Calibration, rig: Rig) -> dict[str, CameraPose]:
@@ -248,13 +251,26 @@ def cameras_from_calibration(calibration: Calibration, rig: Rig) -> dict[str, Ca
     CalibrationMismatch
         If the calibration lacks a camera of the rig.
     """
+    return poses_from_calibration(calibration, {view.name: view.serial for view in rig.views})
+
+
+def poses_from_calibration(
+    calibration: Calibration, serials: Mapping[str, str]
+) -> dict[str, CameraPose]:
+    """Return calibrated cameras or projectors by name, given their serials by name.
+
+    Raises
+    ------
+    CalibrationMismatch
+        If the calibration lacks one of them.
+    """
     poses = {}
-    for view in rig.views:
-        got = partial(calibration.quantity, view.serial)
+    for name, serial in serials.items():
+        got = partial(calibration.quantity, serial)
         matrix, distortion, shift = got("matrix"), got("distortion"), got("translation_mm")
         columns, rows = got("image_size").value
-        poses[view.name] = CameraPose(
-            view.serial,
+        poses[name] = CameraPose(
+            serial,
             matrix.value,
             distortion.value,
             got("rotation").value,

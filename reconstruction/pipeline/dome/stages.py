@@ -3,11 +3,13 @@
 import math
 import tempfile
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from model.checks import Checks
 from model.skin import SkinMap
@@ -30,11 +32,13 @@ from reconstruction.pipeline.dome.lobes import (
 )
 from reconstruction.pipeline.dome.motion import DomeHeadMotion, follow_head
 from reconstruction.pipeline.dome.registration import register_mesh
+from reconstruction.pipeline.dome.stripes import decode_scan, has_stripes
 from reconstruction.pipeline.hold_out import HoldOutError
 from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.skin_tone import maps as tone
 from reconstruction.scan import mesh as scan_mesh
 from reconstruction.scan.mesh import RefinedScan
+from reconstruction.scan.repair import TriangleMesh
 from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates
 from reconstruction.surface.estimates import PointValues
@@ -131,7 +135,8 @@ def _dome(inputs: Inputs) -> CalibratedDome:
 def _surface(inputs: Inputs, dome: CalibratedDome) -> RefinedScan:
     """Clean and refine the scan, and register it to the dome."""
     session = inputs.session
-    if inputs.scan is None and SCAN_FILE not in session.attachments():
+    striped = inputs.scan is None and has_stripes(session)
+    if not striped and inputs.scan is None and SCAN_FILE not in session.attachments():
         raise InputsError(
             f"session {session.id}: got no scan, expected one; add it with "
             "`skinrig import mesh FILE` [SR-REC-006]"
@@ -139,9 +144,20 @@ def _surface(inputs: Inputs, dome: CalibratedDome) -> RefinedScan:
     _require(dome)
     footprint = dome.pixel_mm
     points = int(np.clip(FACE_AREA_MM2 / footprint**2, *POINT_LIMITS))
-    mesh = session.attachment(SCAN_FILE) if inputs.scan is None else inputs.scan
+    decoded = decode_scan(inputs) if striped else None
+    mesh: bytes | TriangleMesh
+    if decoded is not None:
+        mesh = decoded.mesh
+        inputs.noted["scan"] = dict(decoded.record)
+    else:
+        mesh = session.attachment(SCAN_FILE) if inputs.scan is None else inputs.scan
     scan = scan_mesh.prepare_scan(mesh, points=points)
     fit = register_mesh(dome, scan.coarse)
+    # a calibrated scanner places the face better than the images do, unless the head has moved
+    # by more than one of their pixels
+    shift_mm = np.linalg.norm(fit.move(scan.points_mm) - scan.points_mm, axis=1)
+    moved = fit.is_significant() and float(np.sqrt(np.mean(shift_mm**2))) > footprint
+    placed = decoded is not None and decoded.calibrated and not moved
     inputs.noted["registration"] = {
         "rotation": fit.rotation.tolist(),
         "translation_mm": fit.translation_mm.tolist(),
@@ -150,8 +166,14 @@ def _surface(inputs: Inputs, dome: CalibratedDome) -> RefinedScan:
         "converged": fit.converged,
         "points": len(scan.points_mm),
         "pixel_mm": footprint,
+        "applied": not placed,
     }
-    return scan.transform(fit.rotation, fit.translation_mm)
+    if decoded is not None:
+        _, nearest = cKDTree(decoded.mesh.vertices_mm).query(scan.points_mm)
+        moved_mm = 0.0 if placed else float(np.sqrt(np.mean(np.square(fit.stderr[3:]))))
+        stderr = np.hypot(decoded.stderr_mm[nearest], moved_mm)
+        scan = replace(scan, stderr_mm=stderr.astype(np.float32))
+    return scan if placed else scan.transform(fit.rotation, fit.translation_mm)
 
 
 def _require(dome: CalibratedDome) -> None:
@@ -171,7 +193,9 @@ def _texture(surface: RefinedScan) -> Mapping[str, Any]:
     side = 2 ** math.ceil(math.log2(math.sqrt(2.0 * len(surface.points_mm))))
     texture = SurfaceTexture.of(surface, size=int(np.clip(side, *TEXTURE_LIMITS)))
     points = surface.points_mm
-    position = texture.map(points, None, np.ones(len(points), bool), "mm", "rig frame")
+    errors = surface.stderr_mm
+    stderr = None if errors is None else np.repeat(errors[:, None], 3, axis=1)
+    position = texture.map(points, stderr, np.ones(len(points), bool), "mm", "rig frame")
     return {"texture": texture, "position": position, MESH_FILE: texture.wavefront()}
 
 

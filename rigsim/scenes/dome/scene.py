@@ -250,6 +250,8 @@ class DomeScene(FaceScene):
         ndarray of uint16
             Raw DN, shape (H, W).
         """
+        if self.stripes is not None and view_name in self.stripes.view_names:
+            return self.stripes.exposure(view_name, pops=pops, exposure_s=exposure_s, seed=seed)
         view = self._camera(view_name)
 
         def frame(pulse: LedPulse) -> Float32Array:

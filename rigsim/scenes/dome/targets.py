@@ -122,6 +122,8 @@ class TargetScene(RigScene):
         if not 0 <= pose < TARGET_POSES[self.kind]:
             raise SceneError(f"pose: got {pose}, expected 0 to {TARGET_POSES[self.kind] - 1}")
         self.pose = pose
+        if self.stripes is not None:
+            self.stripes.forget()
 
     def exposure(
         self, view_name: str, *, pops: Sequence[LedPulse], exposure_s: float, seed: int
@@ -144,6 +146,8 @@ class TargetScene(RigScene):
         ndarray of uint16
             Raw DN, shape (H, W).
         """
+        if self.stripes is not None and view_name in self.stripes.view_names:
+            return self.stripes.exposure(view_name, pops=pops, exposure_s=exposure_s, seed=seed)
         view = self._camera(view_name)
         rng = np.random.default_rng([self.seed, seed])
         on_s = np.zeros(len(self.rig.lights))

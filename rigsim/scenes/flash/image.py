@@ -151,9 +151,7 @@ class FlashCamera:
         skin = ObservedSkin(subject, state, camera, light)
         even = subject.atlas.covered.astype(np.float32)
         blurred = scatter_through_pigment(skin, glow.reflectance, even, glow.kernels)
-        melanin, blood = skin.color.nearest_fractions(
-            blurred, subject.melanin, skin.blood_volume_fraction
-        )
+        melanin, blood = skin.fractions_of(blurred)
         return {
             "reflectance_blurred": blurred,
             "melanin_blurred": melanin,

@@ -21,7 +21,7 @@ from model import spectra
 from model.skin import SkinAppearance
 from rigsim.arrays import Float32Array, Float64Array, UInt16Array
 from rigsim.as_built.probe import ActualProbe, build_probe
-from rigsim.boxes.source_shutter import SourceLight
+from rigsim.boxes.contact_probe.source_shutter import SourceLight
 from rigsim.fiber.homogeneous_fit import fit_homogeneous_medium
 from rigsim.fiber.probe_profile import BandProfile, ProfileCache, probe_fibers
 from rigsim.fiber.probe_tissue import HomogeneousTissue, ProbedTissue, TissueError
@@ -75,7 +75,9 @@ class ProbeScene(RigScene):
     sensor
         The camera's sensor at `DARK_CURRENT_REFERENCE_C`; None takes the rig's.
     seed
-        Seeds the photons and the variation between exposures.
+        Seeds the photons, and without `noise_seed` the variation between exposures.
+    noise_seed
+        Seeds the variation between exposures of one session; None: `seed`.
     photons
         Photons per site and angle.
     """
@@ -91,11 +93,13 @@ class ProbeScene(RigScene):
         build: ActualProbe | None = None,
         sensor: Sensor | None = None,
         seed: int = 0,
+        noise_seed: int | None = None,
         photons: int = PHOTONS_PER_ANGLE,
     ) -> None:
         if rig.probe is None or len(rig.views) != 1:
             raise SceneError(f"rig {rig.name!r}: expected a contact probe and one view")
-        self.rig, self.tissue, self.seed = rig, tissue, seed
+        self.rig, self.tissue = rig, tissue
+        self.seed = seed if noise_seed is None else noise_seed
         self.build = build_probe(rig, seed=0) if build is None else build
         if len(self.build.gain) != len(rig.probe.fibers):
             raise SceneError(

@@ -118,7 +118,8 @@ def draw_patch(
         )
         height = _block_mean(1e-3 * skin.height_um[::-1].astype(np.float64), count)
         height -= float(height.mean())
-    return SkinPatch(field_mm, voxel_mm, x, melanin, blood, person.tissue, alpha, height)
+    tissue = person.at(site).tissue
+    return SkinPatch(field_mm, voxel_mm, x, melanin, blood, tissue, alpha, height)
 
 
 def render_patch(

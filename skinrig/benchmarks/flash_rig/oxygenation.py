@@ -100,10 +100,8 @@ def draw_people(population: str, leds: Sequence[str], count: int) -> DrawnPeople
     signals = np.empty((len(SKIN_TYPES), count, 3 + len(leds)))
     for i, kind in enumerate(SKIN_TYPES):
         c_m, blood = TYPICAL_FRACTIONS[kind]
-        for k, (tissue, own) in enumerate(zip(tissues, tables, strict=True)):
-            # the type is that of the melanin per area, whatever the thickness
-            fraction = c_m * TYPICAL_SKIN.epidermis_mm / tissue.epidermis_mm
-            parts = [t.spectra(fraction, blood) @ w for t, w in zip(own, weights, strict=True)]
+        for k, own in enumerate(tables):
+            parts = [t.spectra(c_m, blood) @ w for t, w in zip(own, weights, strict=True)]
             signals[i, k] = np.concatenate(parts)
     shading = np.exp(rng.normal(*LOG_SHADING, signals.shape[:2]))
     noise = 1.0 + SIGNAL_NOISE * rng.standard_normal(signals.shape)

@@ -8,6 +8,7 @@ import numpy as np
 
 from capture.calibration.color.colorimetry import delta_e_2000
 from model import skin_tone
+from rigsim.light.observed_skin import ObservedSkin
 from rigsim.population.files import load_subject
 from rigsim.skin_patch.microrelief import CAMERA_BAND_NM
 from rigsim.subject.face_regions import from_mean_head
@@ -19,6 +20,7 @@ from rigsim.tissue.tissue_mc import trace_photons
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.results import ErrorEstimate
 from skinrig.benchmarks.stage import BenchmarkStage
+from skinrig.planning.camera_separability import TYPICAL_CAMERA
 
 COMPARED_SITE: Final = "cheek"
 PROBED_NM: Final = (440.0, 490.0, 540.0, 580.0, 620.0, 650.0)
@@ -85,9 +87,9 @@ def _face(preset: str, *, size: int = 512) -> _SeenSkin:
     near = (np.hypot(away[..., 0], away[..., 1]) < SITE_RADIUS_MM) & (away[..., 2] > -30.0)
     there = near & face.atlas.covered
     c_m, c_hd = face.melanin[there], face.hemoglobin()[there]
-    table = SkinTable.load(face.tissue)
+    skin = ObservedSkin(face, "neutral", TYPICAL_CAMERA, "D55")
     return _SeenSkin(
-        np.asarray(table.spectra(c_m, c_hd).mean(axis=0), np.float64),
+        skin.spectra(c_m, c_hd, face.thickness_ratio[there]).mean(axis=0, dtype=np.float64),
         _sigma_tr(float(c_m.mean()), float(c_hd.mean()), face.tissue),
     )
 

@@ -23,7 +23,7 @@ from capture.rig import Rig, load_rig
 from reconstruction.pipeline.probe.images import Measurement
 from reconstruction.pipeline.probe.profile_fits import MeasuredProfile, fit_profiles, site_values
 from reconstruction.pipeline.probe.stages import CHANNEL_NAMES
-from rigsim.boxes.source_shutter import SourceLight
+from rigsim.boxes.contact_probe.source_shutter import SourceLight
 from rigsim.fiber.homogeneous_fit import fit_homogeneous_medium
 from rigsim.fiber.probe_profile import BandProfile, ProfileCache, probe_fibers
 from rigsim.fiber.probe_tissue import HomogeneousTissue, SkinTissue

@@ -91,7 +91,9 @@ def measure_reference_world(stage: BenchmarkStage) -> None:
             noise = rng.standard_normal(plain.shape) * np.sqrt(voxels.variance)
             images = {"voxels": voxels, "fast": PatchImage(plain + noise, voxels.variance)}
             tissue = person.tissue
-            depth = tissue.epidermis_mm * melanin_per_mm(ABSORPTION_NM, tissue.eumelanin_fraction)
+            depth = tissue.melanin_reference_mm * melanin_per_mm(
+                ABSORPTION_NM, tissue.eumelanin_fraction
+            )
             melanin, blood = pixel_truth(patch, width)
             melanin *= float(depth) / skin_colors[0].constants.melanin_depth_factor
             light = _ramp_shading(skin_colors[1], width)

@@ -11,7 +11,7 @@ from rigsim.population.files import load_subject
 from rigsim.population.population import draw_population
 from rigsim.subject.person_skin import PersonSkin
 from rigsim.subject.pigment import MELANIN_PRESETS
-from rigsim.tissue.skin_table import SkinTable
+from rigsim.tissue.skin_table import WAVELENGTH_NM, interpolate_spectra
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.resampling import mean_error
 from skinrig.benchmarks.stage import BenchmarkStage
@@ -62,6 +62,16 @@ def _distances(people: Sequence[PersonSkin]) -> list[float]:
     return ranks
 
 
+def measure_face(person: PersonSkin) -> Float64Array:
+    """Return the mean spectrum of `FACE_SITES` as a sphere measures it, at `WAVELENGTH_NM`."""
+    sites = [person.at(site) for site in FACE_SITES]
+    spectra = [
+        interpolate_spectra(np.array([s.c_m]), np.array([s.c_hd]), s.tissue, WAVELENGTH_NM)[0]
+        for s in sites
+    ]
+    return np.asarray(np.mean(spectra, axis=0) + skin_tone.sphere_specular())
+
+
 def percentile_ranks(people: Sequence[PersonSkin]) -> Float64Array:
     """Return the percentiles of skin among measured skin of its band of the typology angle.
 
@@ -78,11 +88,7 @@ def percentile_ranks(people: Sequence[PersonSkin]) -> Float64Array:
     measured = skin_tone.measured_skin()
     ranks = []
     for person in people:
-        table = SkinTable.load(person.tissue)
-        sites = [person.at(site) for site in FACE_SITES]
-        spectrum = np.mean([table.spectra(site.c_m, site.c_hd) for site in sites], axis=0)
-        spectrum += skin_tone.sphere_specular()
-        lab = skin_tone.lab_of_spectra(spectrum, table.wavelength_nm)
+        lab = skin_tone.lab_of_spectra(measure_face(person), WAVELENGTH_NM)
         hue, chroma = skin_tone.hue_chroma(lab)
         band = skin_tone.ITA_BANDS[int(skin_tone.ita_band(skin_tone.ita(lab))) - 1]
         values = zip(COLOR_QUANTITIES, (lab[0], chroma, hue), strict=True)

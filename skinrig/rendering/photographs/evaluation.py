@@ -36,9 +36,12 @@ from skinrig.rendering.photographs.errors import (
 from skinrig.rendering.photographs.held_out import HeldOutPhotographs, HeldOutShot
 from skinrig.rendering.render import Rendering, Subsurface, render_surface
 from skinrig.rendering.request import read_model
+from skinrig.rendering.transport import PATH_SAMPLES, SkinExchange, Transport
 
 N_DRAWN_IMAGES: Final = 6
 """Number of photographs drawn with their renderings, at equal steps."""
+DIRECT_LIGHT: Final = "direct light only"
+"""Rendering without light that skin reflects onto skin."""
 MAX_SHOWN_ERROR: Final = 0.2
 """Relative error at the end of the images' color scale."""
 
@@ -49,6 +52,10 @@ class EvaluationSettings:
 
     subsurface: Subsurface = "dipole"
     """Treatment of subsurface light in the full model."""
+    transport: Transport = "direct"
+    """"path": the full model includes light that skin reflects onto skin."""
+    path_samples: int = PATH_SAMPLES
+    """Directions of paths per element of the skin, for "path"."""
     count: int | None = None
     """Number of photographs, selected at equal steps; None: all."""
     ablation: bool = True
@@ -66,12 +73,19 @@ class _Surface:
     caster: Caster
     interior: Interior | None
     photographs: HeldOutPhotographs
+    exchange: SkinExchange | None = None
 
-    def render(self, shot: HeldOutShot, subsurface: Subsurface) -> Rendering:
+    def render(
+        self, shot: HeldOutShot, subsurface: Subsurface, *, direct: bool = False
+    ) -> Rendering:
         shown = self.photographs.camera(shot), self.photographs.light(shot)
-        below = self.interior
         return render_surface(
-            self.surface, *shown, subsurface=subsurface, caster=self.caster, interior=below
+            self.surface,
+            *shown,
+            subsurface=subsurface,
+            caster=self.caster,
+            interior=self.interior,
+            exchange=None if direct else self.exchange,
         )
 
     def render_ablations(
@@ -80,6 +94,8 @@ class _Surface:
         """Yield the renderings with a part removed, from that of the full model."""
         yield "without the surface", made.diffuse
         yield "without light from inside", made.surface
+        if self.exchange is not None:
+            yield DIRECT_LIGHT, self.render(shot, made.subsurface, direct=True).radiance
         if made.subsurface == "dipole":
             yield "light that does not spread", self.render(shot, "local").radiance
         for name, less in fewer.items():
@@ -133,9 +149,15 @@ def evaluate_photographs(
         Interior.of(laid) if settings.subsurface == "dipole" else None,
         photographs,
     )
-    surface = _Surface(laid, *below)
+    paths = {"samples": settings.path_samples, "seed": settings.seed}
+
+    def lay(model: FittedSurface) -> _Surface:
+        exchange = SkinExchange.for_transport(settings.transport, model, below[0], **paths)
+        return _Surface(model, *below, exchange)
+
+    surface = lay(laid)
     fewer = {
-        name: _Surface(FittedSurface.of(less, mesh), *below)
+        name: lay(FittedSurface.of(less, mesh))
         for name, less in (build_ablations(whole, mesh) if settings.ablation else {}).items()
     }
     chosen = photographs.select_shots(settings.count)

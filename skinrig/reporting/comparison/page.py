@@ -33,7 +33,8 @@ def build_lead(a: ComparedRun, b: ComparedRun, found: Sequence[MapsPair]) -> Ite
     disagree = [(pair.name, one) for pair in found for one in pair.differences if one.disagree]
     compared = sum(bool(one.beyond) for pair in found for one in pair.differences)
     same = compared and not any(one.high > 0.0 for pair in found for one in pair.differences)
-    sentences = []
+    verdicts = [pair.agreement for pair in found if pair.agreement is not None]
+    sentences = [str(one) for one in verdicts]
     if rows:
         worse = sum(row.verdict_change == "worse" for row in changed)
         common = sum(row.a is not None and row.b is not None for row in rows)
@@ -51,6 +52,7 @@ def build_lead(a: ComparedRun, b: ComparedRun, found: Sequence[MapsPair]) -> Ite
     if not sentences:
         sentences.append("The runs have neither checks nor maps with uncertainties in common.")
     bad = any(row.verdict_change == "worse" for row in changed)
+    bad = bad or not all(one.same for one in verdicts)
     yield page.Paragraph(" ".join(sentences), f"verdict {'bad' if bad else ''}")
     yield from first_screen.compare_first_screens(
         [(pair.name, pair.a, pair.b) for pair in found], (a.label, b.label)
@@ -113,6 +115,7 @@ def _pair(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Block
             "Both estimates are from the same frames. Differences are due to processing, and the "
             "combined standard uncertainties are too large because both share the noise."
         )
+    yield from _agreement(pair)
     yield page.build_view("compared_maps", maps=sorted(pair.differences, key=_sort_key))
     if pair.refused:
         table = page.build_table(
@@ -123,6 +126,40 @@ def _pair(a: ComparedRun, b: ComparedRun, pair: MapsPair) -> Iterator[page.Block
     yield from _by_band(pair)
     yield from _errors(a, b, pair)
     yield from runs.compare_settings(a, b, pair)
+
+
+def _agreement(pair: MapsPair) -> Iterator[page.Block]:
+    """Yield the table behind the verdict on person and state."""
+    if pair.agreement is None:
+        yield page.build_note(f"No verdict on person and state: {pair.not_agreed}.")
+        return
+    rows = [
+        (
+            one.name,
+            f"{one.change:+.3g} {one.unit if one.unit != '1' else ''}".strip(),
+            one.place,
+            one.sigmas,
+            one.ratio,
+            one.p_value,
+            "yes" if one.changed else "no",
+        )
+        for one in pair.agreement.quantities
+    ]
+    optics = "the same" if pair.agreement.shared_optics else "different"
+    yield page.Heading("Same person, same state?")
+    yield page.build_table(
+        (
+            "quantity",
+            "largest change",
+            "where",
+            "in standard uncertainties",
+            "rms difference over the stated",
+            "p-value",
+            "changed",
+        ),
+        rows,
+        caption=f"Samples are paired {pair.agreement.registered}; camera and light are {optics}",
+    )
 
 
 def _sort_key(difference: MapDifference) -> tuple[float, str]:

@@ -15,6 +15,7 @@ from model import store
 from model.skin import SkinAppearance
 from skinrig.benchmarks import figures as bench_figures
 from skinrig.benchmarks.document import SCHEMA
+from skinrig.evaluating.session_agreement import SessionAgreement, SessionError, compare_sessions
 from skinrig.reporting import folders, page, provenance
 from skinrig.reporting import folders as report_folders
 from skinrig.reporting.comparison import maps as map_comparison
@@ -175,6 +176,10 @@ class MapsPair:
     differences: tuple[MapDifference, ...]
     refused: tuple[tuple[str, str], ...]
     """Maps that cannot be subtracted, and why."""
+    agreement: SessionAgreement | None = None
+    """Verdict on the person and the state; None: of the same frames, or not comparable."""
+    not_agreed: str = ""
+    """Reason for the missing verdict."""
 
 
 def compare_maps_of_runs(a: ComparedRun, b: ComparedRun) -> list[MapsPair]:
@@ -194,8 +199,21 @@ def compare_maps_of_runs(a: ComparedRun, b: ComparedRun) -> list[MapsPair]:
                 differences.append(map_comparison.compare_maps(key, one.maps[key], other.maps[key]))
             except ValueError as error:
                 refused.append((key, str(error)))
-        found.append(MapsPair(name, one, other, tuple(differences), tuple(refused)))
+        agreement, reason = judge_sessions(one, other)
+        found.append(
+            MapsPair(name, one, other, tuple(differences), tuple(refused), agreement, reason)
+        )
     return found
+
+
+def judge_sessions(a: SkinAppearance, b: SkinAppearance) -> tuple[SessionAgreement | None, str]:
+    """Return the verdict on person and state of two sessions, or None with the reason."""
+    if "session" in a.inputs and a.inputs.get("session") == b.inputs.get("session"):
+        return None, "both are of the same frames"
+    try:
+        return compare_sessions(a, b), ""
+    except SessionError as error:
+        return None, str(error)
 
 
 def _apart_mm(a: SkinAppearance, b: SkinAppearance) -> float:

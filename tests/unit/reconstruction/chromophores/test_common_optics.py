@@ -8,7 +8,7 @@ from reconstruction.chromophores.common_optics import estimate_common_optics
 from reconstruction.chromophores.face import estimate_face
 from reconstruction.chromophores.pixel_checks import ChromophoreError
 from reconstruction.chromophores.shading_prior import lognormal_prior
-from reconstruction.chromophores.table_fit import POPULATION_BLOOD, POPULATION_MELANIN
+from reconstruction.chromophores.table_fit.fitting import POPULATION_BLOOD, POPULATION_MELANIN
 
 COMMON_LIGHT = 0.1
 PRIOR = lognormal_prior(0.7, 0.4)

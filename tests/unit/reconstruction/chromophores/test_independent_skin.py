@@ -19,7 +19,7 @@ from reconstruction.chromophores.common_optics import CommonOptics
 from reconstruction.chromophores.posterior import add_optics_errors
 from reconstruction.chromophores.shading_prior import lognormal_prior
 from reconstruction.chromophores.start import evaluate_table
-from reconstruction.chromophores.table_fit import (
+from reconstruction.chromophores.table_fit.fitting import (
     POPULATION_BLOOD,
     POPULATION_LOG_SD,
     POPULATION_MELANIN,

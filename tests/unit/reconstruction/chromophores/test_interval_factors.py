@@ -12,7 +12,8 @@ from scipy import special
 
 from model import color_table, skin_tone
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction.chromophores import interval_factors, invert, table_fit
+from reconstruction.chromophores import invert
+from reconstruction.chromophores.table_fit import fitting, interval_factors
 from skinrig.benchmarks.flash_rig import independent_skin as independent
 
 SKINS_PER_BAND = 800
@@ -92,7 +93,7 @@ def test_invert_without_factors_covers_too_much(table, monkeypatch):
     # the factors are needed: without them, intervals of the lightest skin are too wide
     skins = independent.load_skins()
     rgb = independent.noisy_colors(skins, "Nikon 5100 (NPL)", "D55")
-    monkeypatch.setattr(table_fit, "_interval_factors", lambda table: table_fit._NO_FACTORS)
+    monkeypatch.setattr(fitting, "_interval_factors", lambda table: fitting._NO_FACTORS)
     plain, _ = independent.accuracy_by_type(table, skins, rgb)
     monkeypatch.undo()
     found, _ = independent.accuracy_by_type(table, skins, rgb)
@@ -107,6 +108,6 @@ def test_camera_without_sensitivities_has_no_factors(table):
     one, other = (invert(rgb, each, shading="known") for each in (table, own))
     np.testing.assert_array_equal(one.melanin, other.melanin)
     ratio = one.stderr_melanin / other.stderr_melanin
-    factors = table_fit._interval_factors(table)[..., 0]
+    factors = fitting._interval_factors(table)[..., 0]
     assert ratio[0] < 0.95
     assert 0.999 * factors.min() < ratio.min() < ratio.max() < 1.001 * factors.max()

@@ -55,7 +55,8 @@ def nearly_typical(step):
 
 def test_each_tissue_property_has_one_rule():
     fields = Counter(name for rule in TISSUE_RULES for name in rule.fields)
-    assert fields == Counter(field.name for field in dataclasses.fields(TissueProperties))
+    names = {field.name for field in dataclasses.fields(TissueProperties)}
+    assert fields == Counter(names - {"melanin_reference_mm"})  # a convention, not a property
     assert {rule.switch for rule in TISSUE_RULES} <= {
         field.name for field in dataclasses.fields(SceneEffects)
     }
@@ -102,6 +103,19 @@ def test_dim_light_needs_fewer_properties(flash, face):
     bright, dim = (FlashScene(flash, person, power=power).needs for power in (1.0, 1e-4))
     assert any(bright.builds(name) for name in PROPERTIES)
     assert not any(dim.builds(name) for name in PROPERTIES)
+
+
+def test_thickness_of_sites_alone_is_built(flash, face):
+    person = dataclasses.replace(face, tissue=TissueProperties(site_contrast=1.0))
+    scenes = [
+        FlashScene(flash, person, effects=SceneEffects(thickness=built)) for built in (None, False)
+    ]
+    rule = scenes[0].needs["thickness of the epidermis"]
+    assert rule.verdict == "built"
+    have, lack = (scene.radiance("crossed") for scene in scenes)
+    noise = PixelNoise.of(scenes[0].sensor())
+    change = np.abs(np.minimum(have, 1.0) - np.minimum(lack, 1.0)) / noise.sigma(have)
+    assert 0.1 < change.max() <= rule.over_noise
 
 
 def test_posed_face_changes_tissue_at_rest(flash, face):

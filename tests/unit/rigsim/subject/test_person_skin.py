@@ -12,10 +12,16 @@ from rigsim.subject.face_regions import from_mean_head
 from rigsim.subject.head import LANDMARKS_MM
 from rigsim.subject.perfusion import StateError
 from rigsim.subject.person import make_subject
-from rigsim.subject.person_skin import SITE_NAMES, PersonSkin, PersonSkinError, layers
+from rigsim.subject.person_skin import SITE_NAMES, PersonSkin, PersonSkinError, draw_tissue, layers
 from rigsim.subject.skin_tone import MONK_ITA_DEG, melanin_of_tone, typology_angle_deg
-from rigsim.tissue.skin_layers import PAPER_SKIN
-from rigsim.tissue.skin_table import SkinTable
+from rigsim.tissue.skin_layers import (
+    PAPER_SKIN,
+    TYPICAL_SKIN,
+    TissueProperties,
+    melanin_per_mm,
+    skin_coefficients,
+)
+from rigsim.tissue.skin_table import WAVELENGTH_NM, interpolate_spectra
 
 
 @pytest.mark.parametrize("seed", [0, 3])
@@ -74,11 +80,56 @@ def test_unknown_site_and_preset_are_refused():
 
 def measured_angle(person):
     """Return the typology angle of the mean of three sites as an instrument measures it."""
-    table = SkinTable.load(person.tissue)
     sites = [person.at(site) for site in ("forehead", "cheek", "chin")]
-    spectrum = np.mean([table.spectra(site.c_m, site.c_hd) for site in sites], axis=0)
-    lab = skin_tone.lab_of_spectra(spectrum + skin_tone.sphere_specular(), table.wavelength_nm)
+    spectrum = np.mean(
+        [
+            interpolate_spectra(np.array([s.c_m]), np.array([s.c_hd]), s.tissue, WAVELENGTH_NM)[0]
+            for s in sites
+        ],
+        axis=0,
+    )
+    lab = skin_tone.lab_of_spectra(spectrum + skin_tone.sphere_specular(), WAVELENGTH_NM)
     return float(skin_tone.ita(lab))
+
+
+def test_thickness_differs_between_people_and_sites():
+    people = [load_subject("III").skin(seed=seed) for seed in range(60)]
+    thickness = np.array([[p.at(site).tissue.epidermis_mm for site in SITE_NAMES] for p in people])
+    assert 0.05 < thickness.min() < 0.085
+    assert 0.1 < thickness.max() < 0.125
+    ratio = thickness[:, SITE_NAMES.index("forehead")] / thickness[:, SITE_NAMES.index("cheek")]
+    np.testing.assert_allclose(ratio, 0.21 / 0.195, rtol=0.02)  # of the publication
+    even = PersonSkin.of_preset("III")
+    assert {even.at(site).tissue for site in SITE_NAMES} == {TYPICAL_SKIN}
+
+
+def test_face_has_the_thickness_of_its_sites():
+    face = load_subject("III").face(seed=4, size=128)
+    person = load_subject("III").skin(seed=4)
+    for site, landmark in (("cheek", "cheek left"), ("forehead", "forehead"), ("chin", "chin")):
+        center = from_mean_head(np.array(LANDMARKS_MM[landmark]), face.mesh)
+        away = face.atlas.position_mm - center
+        near = np.hypot(away[..., 0], away[..., 1]) < 8.0
+        there = near & face.atlas.covered & (away[..., 2] > -30.0)
+        found = face.tissue.epidermis_mm * face.thickness_ratio[there].mean()
+        assert found == pytest.approx(person.at(site).tissue.epidermis_mm, rel=0.01)
+
+
+@pytest.mark.parametrize("thickness_mm", [0.05, 0.09, 0.2])
+def test_thickness_keeps_melanin_per_area(thickness_mm):
+    tissue = TissueProperties(epidermis_mm=thickness_mm)
+    one, none = (skin_coefficients(550.0, c_m, 0.01, tissue) for c_m in (0.04, 0.0))
+    depth = thickness_mm * float(one.upper - none.upper)
+    per_mm = float(melanin_per_mm(550.0))
+    replaced = 0.04 * 0.09 * float(none.upper)  # melanosomes replace other absorption
+    assert depth == pytest.approx(0.04 * 0.09 * per_mm - replaced, rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_tone_is_exact_for_any_thickness(seed):
+    tissue = draw_tissue(seed)
+    assert typology_angle_deg(melanin_of_tone("ita:27", tissue), tissue) == pytest.approx(27.0)
+    assert typology_angle_deg(melanin_of_tone("ita:27"), tissue) != pytest.approx(27.0, abs=0.02)
 
 
 @pytest.mark.parametrize("angle", [60.0, 27.0, -40.0])

@@ -10,8 +10,8 @@ from capture.devices.camera import Exposure, Trigger, open_camera
 from capture.devices.port import Port
 from capture.devices.probe import ProbeBox
 from capture.rig import load_rig
+from rigsim.boxes.contact_probe.source_shutter import SourceLight
 from rigsim.boxes.faults import Faults
-from rigsim.boxes.source_shutter import SourceLight
 from rigsim.world.suction import HeadState
 from rigsim.world.world import World
 

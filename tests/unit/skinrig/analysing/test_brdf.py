@@ -180,6 +180,7 @@ def test_measured_faces_are_analyzed_by_label(tmp_path, basis, capsys):
         assert (tmp_path / "out" / name).stat().st_size > 0
     kept = json.loads((tmp_path / "out" / "analysis.json").read_text(encoding="utf-8"))
     assert (kept["source"], kept["consent"]) == ("measured", [agreed])
+    assert kept["data"] == told["data"] == "sessions of the light dome"
     assert main(["report", str(tmp_path / "out"), "--out", str(tmp_path / "report.html")]) == 0
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert ">P7</th>" in page

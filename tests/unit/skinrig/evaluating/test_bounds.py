@@ -6,7 +6,7 @@ from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import model_error, shading_prior
 from reconstruction.chromophores.inversion import compute_identifiability
-from reconstruction.chromophores.table_fit import POPULATION_LOG_SD
+from reconstruction.chromophores.table_fit.fitting import POPULATION_LOG_SD
 from skinrig.evaluating.bounds import chromophore_bounds, relative_bounds
 
 CAMERA, LIGHT = "Nikon 5100 (NPL)", "D55"

@@ -136,6 +136,7 @@ def test_plan_keeps_promised_error_and_reports_omissions(tmp_path, capsys, monke
     assert len(lit) < 150
     assert document["saved_seconds"] > 0
     assert any("lights" in what for what, _ in document["left_out"])
+    assert any("% of the light" in size for _, size in document["unmodeled"])
     assert document["light"]["flashes_per_s"] < 3
     # the inverse question gives the same answer
     assert main(["plan", "dome", "--forecast", str(file), "--width", "320", "--json"]) == 0

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import numpy as np
@@ -133,3 +134,26 @@ def test_a_medium_is_not_counted_as_a_person(tmp_path):
     assert "this report, 2 sessions<" in no_truth_tells
     del appearances["III"]
     assert not list(subsurface.compare_people(appearances, truths))
+
+
+def test_people_are_independent_of_published_table(monkeypatch):
+    sites = [
+        {"site": "cheek", "sigma_tr_per_mm": value, "sigma_tr_stderr": 0.01}
+        for value in (0.5, 0.7, 0.9)
+    ]
+    files = {SUBSURFACE_FILE: json.dumps({"sites": sites}).encode()}
+    appearances = {
+        name: SkinAppearance({}, "simulated", files=files) for name in ("first", "second")
+    }
+
+    def rows(who):
+        html = page.render_fragment(subsurface.compare_people(appearances))
+        return [row for row in html.split("<tr>") if who in row]
+
+    own, published = rows("this report"), rows("published (")
+    table = subsurface.weyrich_2005()
+    other = dataclasses.replace(table, mean_per_mm=2.0 * table.mean_per_mm)
+    monkeypatch.setattr(subsurface, "weyrich_2005", lambda: other)
+    assert len(own) == 3
+    assert rows("this report") == own
+    assert rows("published (") != published

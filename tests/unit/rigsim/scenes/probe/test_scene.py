@@ -12,7 +12,7 @@ from scipy.stats import ncx2
 from capture.rig import load_rig
 from model import spectra
 from rigsim.as_built.probe import SPOT_RADIUS_PX, ProbeBuildError, ProbeTolerances, build_probe
-from rigsim.boxes.source_shutter import SourceLight
+from rigsim.boxes.contact_probe.source_shutter import SourceLight
 from rigsim.fiber.probe_tissue import HomogeneousTissue
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.probe.detector import render_fiber_images

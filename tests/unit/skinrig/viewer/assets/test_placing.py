@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skinrig.viewer.assets.placed_color import place_texels
-from skinrig.viewer.scene import SceneError
+from skinrig.appearances.texel_placement import PlacementError, place_texels
 
 SIZE = 48
 FOCAL_PX, EYE_MM = 900.0, np.array([30.0, 10.0, 500.0])
@@ -87,10 +86,10 @@ def test_too_few_or_flat_landmarks_are_refused(dome, rng):
     position, normal = dome
     covered = np.ones((SIZE, SIZE), bool)
     solid, flat = _landmarks(position, rng, count=5)
-    with pytest.raises(SceneError, match="expected at least"):
+    with pytest.raises(PlacementError, match="expected at least"):
         place_texels(position, normal, covered, landmarks_mm=solid, landmarks_px=flat)
     solid, _ = _landmarks(position, rng)
     level = {name: (x, y, 0.0) for name, (x, y, _) in solid.items()}
     flat = {name: tuple(_pixel(np.array(p)).tolist()) for name, p in level.items()}
-    with pytest.raises(SceneError, match="coplanar"):
+    with pytest.raises(PlacementError, match="coplanar"):
         place_texels(position, normal, covered, landmarks_mm=level, landmarks_px=flat)

@@ -27,7 +27,7 @@ CHANNEL_NOISE: Final = 0.01
 NODES_PER_AXIS: Final = optics_uncertainty.COVARIANCE_NODES
 """Nodes of the factors along each axis of a color table, evenly in the axes' cube roots."""
 FACTOR_CANDIDATES: Final = np.geomspace(0.5, 2.0, 141)
-COVERAGES: Final = (0.6827, 0.95)
+NOMINAL_COVERAGES: Final = (0.6827, 0.95)
 """Nominal coverages that a factor serves."""
 COVERAGE_MARGINS: Final = ((0.08, 0.08), (0.05, 0.03))
 """Weights of coverages below and above nominal: deviations that count alike."""
@@ -89,7 +89,7 @@ def coverage_factor(deviation: Float64Array) -> float:
     """
     worst = np.zeros(FACTOR_CANDIDATES.size)
     size = np.sort(np.abs(deviation))
-    for nominal, (below, above) in zip(COVERAGES, COVERAGE_MARGINS, strict=True):
+    for nominal, (below, above) in zip(NOMINAL_COVERAGES, COVERAGE_MARGINS, strict=True):
         ends = FACTOR_CANDIDATES * special.ndtri(0.5 + 0.5 * nominal)
         excess = np.searchsorted(size, ends) / size.size - nominal
         worst = np.maximum(worst, np.maximum(-excess / below, excess / above))

@@ -7,10 +7,9 @@ import numpy as np
 from model import spectra
 from model.color_table import ColorTable
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
-from reconstruction.chromophores import interval_factors
-from reconstruction.chromophores import inversion_kernels as kernels
 from reconstruction.chromophores.model_error import model_covariance
 from reconstruction.chromophores.start import evaluate_table, inverse_table_for
+from reconstruction.chromophores.table_fit import interval_factors, kernels
 
 MAX_IDENTIFIABLE_STDERR = 1.0
 """Relative standard error above which a chromophore counts as not identifiable."""

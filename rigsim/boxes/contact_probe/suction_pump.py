@@ -14,8 +14,8 @@ import numpy as np
 from capture.devices.wire import Code
 from capture.rig import Probe
 from rigsim.boxes.command import CommandRefused, add_us, ceil_ms, elapsed_us
+from rigsim.boxes.contact_probe.source_shutter import SourceShutter
 from rigsim.boxes.device import Device, SuctionLoad
-from rigsim.boxes.source_shutter import SourceShutter
 
 PUMP_CONTROL_PERIOD_S = 0.05
 """Sampling period of the gauge while the pump runs, s."""

@@ -1,0 +1,1 @@
+"""Fusion: one person's skin from the measurements of several rigs."""

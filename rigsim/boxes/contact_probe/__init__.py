@@ -1,0 +1,1 @@
+"""Parts of the contact probe: light source with shutter and cover, suction pump with gauge."""

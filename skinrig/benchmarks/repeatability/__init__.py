@@ -1,0 +1,1 @@
+"""Measure how well two sessions of one simulated person agree."""

@@ -1,0 +1,74 @@
+"""`skinrig fuse`: one person's maps by several rigs to one appearance."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from skinrig.commands.options import Json, Out, command
+from skinrig.console import Console
+from skinrig.next_steps import shell_quote
+
+
+@command
+def fuse(
+    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION_OR_APPEARANCE")],
+    /,
+    out: Out = Path("double"),
+    without: str | None = None,
+    landmarks: Path | None = None,
+    image_landmarks: Path | None = None,
+    sites: Path | None = None,
+    json: Json = False,
+) -> None:
+    """Fuse one person's maps by flash rig, dome, gradient rig and probe into one appearance.
+
+    Melanin, blood, R_d and sigma_tr are estimated together. All maps are on the dome's texture.
+
+    Example: skinrig fuse session-flash session-dome session-probe --out double
+
+    Parameters
+    ----------
+    sessions
+        SESSION/ folders with their maps next to them, or APPEARANCE/ folders; one per rig.
+    without
+        Rigs to leave out, separated by commas: flash, dome, gradient, probe.
+    landmarks
+        CSV table name,x,y,z in mm of the dome's mesh, or name,x,y in texels of its maps.
+    image_landmarks
+        CSV table name,x,y in pixels of the flash rig's maps.
+    sites
+        CSV table name,x,y of the probe's sites, texels of the dome's maps.
+    """
+    from skinrig.capturing.option_values import parse_names
+    from skinrig.fusing.double import FusionInputs, fuse
+    from skinrig.fusing.summary import summarize
+
+    console = Console(json)
+    given = FusionInputs(
+        tuple(sessions), parse_names(without) or (), landmarks, image_landmarks, sites
+    )
+    found = fuse(given, out=out, progress=console.progress)
+    rows = summarize(found)
+    console.print_table(("map", "median", "68 % interval, %", "common to the face, %"), rows)
+    console.print_table(
+        ("rig", "probability that it is faulty", "p value of its gains"),
+        [(check.rig, round(check.probability, 4), check.p_value) for check in found.checks],
+    )
+    if found.contradiction is not None:
+        console.print_line(f"contradiction: {found.contradiction}")
+    console.print_each("assumed", found.measured.assumed)
+    console.print_omissions(found.measured.left_out)
+    console.print_line(f"{out}: {', '.join(sorted(found.appearance.maps))}")
+    console.print_line(f"next: skinrig report {shell_quote(out)}")
+    console.print_document(
+        "skinrig.fuse/1",
+        {
+            "out": out,
+            "maps": sorted(found.appearance.maps),
+            "rows": rows,
+            "fusion": found.appearance.parameters["fusion"],
+            "contradiction": found.contradiction,
+            "left_out": found.measured.left_out,
+        },
+    )

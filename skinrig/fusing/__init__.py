@@ -1,0 +1,1 @@
+"""Fuse one person's measurements by several rigs: `skinrig fuse`."""

@@ -1,0 +1,164 @@
+"""Signals of one person on one texture, and what the person's skin has in common."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from reconstruction.chromophores.model_error import load_covariance
+from reconstruction.fusion.person import POPULATION_MEAN, PersonSkin, Regions, estimate_person
+from reconstruction.fusion.regions import hide_signals, summarize_regions
+from reconstruction.fusion.signals import FusionError, RigBands, residual_covariance
+from reconstruction.fusion.texels import OffsetModel, RigColors
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
+from skinrig.fitting import probe_sites
+from skinrig.fusing.texel_colors import ColorSource
+
+LOCAL_SHARE: Final = 0.25
+"""Variance over places of a face of what the model leaves unexplained, over that over people.
+
+Residuals of measured spectra are known between people only; a quarter is assumed within a face."""
+SITE_SIGMA_TR_SD: Final = 0.05
+"""Deviation of log sigma_tr between sites of a face that tissue does not explain."""
+SITE_RADIUS_MM: Final = 8.0
+"""Radius around a probe's site whose colors are those of the probed skin."""
+MAX_SAMPLED_TEXELS: Final = 40_000
+"""Texels that the person's common properties are estimated from, evenly over the texture."""
+
+
+@dataclass(slots=True, eq=False)
+class Measurements:
+    """Signals of one person on one texture, ready for the estimators.
+
+    Attributes
+    ----------
+    colors
+        Colors by rig, of H x W texels.
+    shape
+        Rows and columns of the texture.
+    sites
+        Sites of a probe on the texture.
+    position_mm
+        (H W, 3): surface points; None without a mesh.
+    assumed, left_out
+        What was assumed and omitted.
+    """
+
+    colors: tuple[ColorSource, ...]
+    shape: tuple[int, int]
+    sites: tuple[probe_sites.ProbeSite, ...] = ()
+    position_mm: Float32Array | None = None
+    assumed: tuple[str, ...] = ()
+    left_out: tuple[tuple[str, str], ...] = ()
+    probe_bands: RigBands | None = None
+
+    @property
+    def rigs(self) -> tuple[RigBands, ...]:
+        """Bands of all signals: colors first, then the probe."""
+        own = tuple(one.bands for one in self.colors)
+        return own if self.probe_bands is None else (*own, self.probe_bands)
+
+    @property
+    def count(self) -> int:
+        """Number of texels."""
+        return self.shape[0] * self.shape[1]
+
+    def sampled(self) -> BoolArray:
+        """Return evenly chosen texels with a color, at most `MAX_SAMPLED_TEXELS`, (H W,)."""
+        known = np.zeros(self.count, bool)
+        for one in self.colors:
+            known |= one.valid
+        places = np.flatnonzero(known)
+        few = places[:: max(1, -(-places.size // MAX_SAMPLED_TEXELS))]
+        chosen = np.zeros(self.count, bool)
+        chosen[few] = True
+        return chosen
+
+    def errors(self, log_skin: Float64Array) -> OffsetModel:
+        """Return the covariances of the signals' errors for a face of typical melanin and blood.
+
+        Parameters
+        ----------
+        log_skin
+            (2,): log melanin optical depth and log blood.
+        """
+        unexplained = residual_covariance(self.rigs, log_skin)
+        calibration = np.zeros_like(unexplained)
+        simulated = np.zeros_like(unexplained)
+        for k, one in enumerate(self.colors):
+            at = slice(3 * k, 3 * k + 3)
+            calibration[at, at] = one.calibration
+            simulated[at, at] = load_covariance()
+        local = LOCAL_SHARE * unexplained + simulated
+        if self.probe_bands is not None:
+            local[-3:, -3:] = SITE_SIGMA_TR_SD**2 * np.eye(3)
+            calibration[-3:, -3:] = 1e-6 * np.eye(3)
+        return OffsetModel(unexplained, calibration, local)
+
+    def regions(self, errors: OffsetModel) -> Regions:
+        """Return the signals of the whole face and of the probe's sites.
+
+        Parameters
+        ----------
+        errors
+            Covariances of the signals' errors.
+        """
+        chosen = self.sampled()
+        colors = [one.colors(k, chosen) for k, one in enumerate(self.colors)]
+        whole, _ = summarize_regions(colors, np.zeros(int(chosen.sum()), np.intp), errors)
+        parts = [whole]
+        for site in self.sites:
+            if self.position_mm is None:
+                break
+            away = np.linalg.norm(self.position_mm - np.array(site.position_mm), axis=-1)
+            near = away < SITE_RADIUS_MM
+            colors = [one.colors(k, near) for k, one in enumerate(self.colors)]
+            parts.append(_add_sigma_tr(site, colors, errors))
+        return Regions(
+            np.concatenate([part.values for part in parts]),
+            np.concatenate([part.covariance for part in parts]),
+        )
+
+    def estimate_person(
+        self, regions: Regions | None = None, known: Sequence[int] = ()
+    ) -> tuple[PersonSkin, OffsetModel]:
+        """Estimate what the person's skin has in common.
+
+        Parameters
+        ----------
+        regions
+            Signals; None: those of `regions`.
+        known
+            Properties that count as typical, see `reconstruction.fusion.person.estimate_person`.
+        """
+        errors = self.errors(POPULATION_MEAN)
+        given = self.regions(errors) if regions is None else regions
+        first = estimate_person(self.rigs, given, errors.offset_covariance, known=known)
+        # again with the errors of skin of this color
+        errors = self.errors(first.mean)
+        given = self.regions(errors) if regions is None else regions
+        person = estimate_person(
+            self.rigs, given, errors.offset_covariance, start=first, known=known
+        )
+        return person, errors
+
+
+def _add_sigma_tr(
+    site: probe_sites.ProbeSite, colors: Sequence[RigColors], errors: OffsetModel
+) -> Regions:
+    """Return the signals of a site: colors around it, where there are enough, and sigma_tr."""
+    size = len(errors.local)
+    try:
+        labels = np.ones(len(colors[0].valid), np.intp)
+        found, _ = summarize_regions(colors, labels, errors)
+        value, covariance = found.values[0], found.covariance[0]
+    except FusionError:
+        value = np.zeros(size)
+        covariance = hide_signals(errors.local, np.ones(size, bool))
+    sigma_tr, stderr = np.array(site.sigma_tr_per_mm), np.array(site.stderr_per_mm)
+    good = np.isfinite(sigma_tr) & np.isfinite(stderr) & (sigma_tr > 0.0)
+    at = np.arange(size - 3, size)[good]
+    covariance[at, at] = np.square(stderr[good] / sigma_tr[good]) + SITE_SIGMA_TR_SD**2
+    value[at] = np.log(sigma_tr[good])
+    return Regions(value[None], covariance[None])

@@ -1,0 +1,52 @@
+"""Grooves as voxels and in the gradient rig's scene: the same heights, and their contrast."""
+
+import numpy as np
+import pytest
+
+from rigsim.scenes.reference.gradient_relief import draw_grooves, predict_relief
+from rigsim.subject.person_skin import PersonSkin
+from skinrig.benchmarks.simulation.reference_relief import (
+    PIXEL_UM,
+    RELIEF_SITE,
+    compare_contrast,
+    crop_rig,
+)
+
+WIDTH = 24
+
+
+@pytest.fixture(scope="module")
+def images():
+    """Slopes of the voxels' heights toward +x and +y in pixels, and the fast renderer's images."""
+    rig, person = crop_rig(WIDTH), PersonSkin.of_preset("III")
+    patch = draw_grooves(person, RELIEF_SITE, rig)
+    block = round(1e-3 * PIXEL_UM / patch.voxel_mm)
+    first = (len(patch.x_mm) - block * WIDTH) // 2
+    inner = slice(first, first + block * WIDTH)
+    slopes = [
+        np.gradient(patch.height_mm, patch.voxel_mm, axis=axis)[inner, inner]
+        .reshape(WIDTH, block, WIDTH, block)
+        .mean(axis=(1, 3))[::-1]
+        for axis in (1, 0)
+    ]
+    light = {
+        lateral: predict_relief(person, patch, rig, RELIEF_SITE, lateral=lateral)
+        for lateral in (False, True)
+    }
+    return slopes, light
+
+
+def test_fast_image_has_heights_of_voxels(images):
+    """Rationale: skin that rises toward +x turns away from light at +x. Rows swapped fail."""
+    slopes, light = images
+    for slope, image in zip(slopes, light[False][1:3], strict=True):
+        assert np.corrcoef(-slope.ravel(), image.ravel())[0, 1] > 0.8
+        assert np.corrcoef(-slope[::-1].ravel(), image.ravel())[0, 1] < 0.4
+
+
+def test_lateral_scattering_lowers_contrast(images):
+    _, light = images
+    local, scattered = (light[lateral][1] / light[lateral][0].mean() for lateral in (False, True))
+    found = compare_contrast(np.stack([scattered, scattered]), local)
+    assert 0.02 < found.slope < 0.5
+    assert compare_contrast(np.stack([local, local]), local).slope == pytest.approx(1.0)

@@ -1,0 +1,154 @@
+"""`skinrig fuse` on small drawn maps: each rig alone, both together, and refused inputs."""
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from model import store
+from model.skin import SkinAppearance, SkinMap
+from skinrig.cli import app
+from skinrig.fusing.double import FusionInputs, fuse
+from skinrig.fusing.sources import FusionInputError, read_sources
+from skinrig.fusing.texel_colors import LOG_R_D_OVER_REFLECTANCE
+
+SIDE = 24
+REFLECTANCE = np.array([0.36, 0.26, 0.21])
+"""Color of skin of type III in the dome's channels, about."""
+LIGHT = 0.77
+FOCAL_PX, DISTANCE_MM = 300.0, 600.0
+
+
+def positions():
+    """Points of a bulged patch of 96 mm, and its normals."""
+    y, x = np.meshgrid(np.linspace(48, -48, SIDE), np.linspace(-48, 48, SIDE), indexing="ij")
+    z = 40.0 - (x**2 + y**2) / 160.0
+    normals = np.stack([x / 80.0, y / 80.0, np.ones_like(x)], axis=-1)
+    return np.stack([x, y, z], axis=-1), normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+
+def project(points):
+    """Pixels of points in the flash image of 96 x 96 pixels, its camera on the z axis."""
+    scale = FOCAL_PX / (DISTANCE_MM - points[..., 2])
+    return np.stack([47.5 + scale * points[..., 0], 47.5 - scale * points[..., 1]], axis=-1)
+
+
+def write_dome(path, *, gain=(1.0, 1.0, 1.0), seed=0):
+    rng = np.random.default_rng(seed)
+    at, normals = positions()
+    r_d = REFLECTANCE * np.exp(LOG_R_D_OVER_REFLECTANCE) * np.array(gain)
+    r_d = r_d * np.exp(0.03 * rng.standard_normal((SIDE, SIDE, 1))) * np.ones((SIDE, SIDE, 3))
+    maps = {
+        "position": SkinMap(at, "mm"),
+        "normals": SkinMap(normals, "1", np.full_like(normals, 0.01)),
+        "r_d": SkinMap(r_d, "1", 0.03 * r_d),
+    }
+    return store.write(path, SkinAppearance(maps, "simulated", {"kind": "appearance"}, seed=seed))
+
+
+def write_flash(path, seed=1):
+    rng = np.random.default_rng(seed)
+    noise = 1.0 + 0.005 * rng.standard_normal((96, 96, 3))
+    diffuse = LIGHT * REFLECTANCE * noise
+    maps = {"diffuse": SkinMap(diffuse, "1", 0.005 * diffuse)}
+    return store.write(path, SkinAppearance(maps, "simulated", {"kind": "appearance"}, seed=seed))
+
+
+def write_landmarks(folder):
+    """Tables of ten points on the mesh and in the image."""
+    at, _ = positions()
+    picks = at[::5, ::5].reshape(-1, 3)
+    solid = ["name,x,y,z"] + [f"p{k},{x},{y},{z}" for k, (x, y, z) in enumerate(picks)]
+    flat = ["name,x,y"] + [f"p{k},{x},{y}" for k, (x, y) in enumerate(project(picks))]
+    tables = folder / "mesh.csv", folder / "image.csv"
+    for path, rows in zip(tables, (solid, flat), strict=True):
+        path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return tables
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("fuse")
+    write_dome(folder / "dome")
+    write_flash(folder / "flash")
+    write_landmarks(folder)
+    return folder
+
+
+def both(folders, **more):
+    paths = folders / "dome", folders / "flash"
+    return FusionInputs(
+        paths, landmarks=folders / "mesh.csv", image_landmarks=folders / "image.csv", **more
+    )
+
+
+def test_fuse_two_rigs_lowers_r_d_error(folders, tmp_path):
+    found = fuse(both(folders), out=tmp_path / "double").appearance
+    true = REFLECTANCE * np.exp(LOG_R_D_OVER_REFLECTANCE)
+    good = found.maps["r_d"].mask
+    assert good.mean() > 0.5
+    errors = [
+        np.abs(np.log(one.maps["r_d"].values[good] / true)).std()
+        for one in (found, store.read(folders / "dome"))
+    ]
+    assert errors[0] < 0.5 * errors[1]
+    assert found.parameters["fusion"]["maps"]["melanin"] == ["dome", "flash"]
+
+
+def test_fuse_writes_common_and_own_errors(folders, tmp_path):
+    fuse(both(folders), out=tmp_path / "double")
+    maps = store.read(tmp_path / "double").maps
+    good = maps["melanin"].mask
+    own = maps["melanin_texel_stderr"].values[good]
+    assert (maps["melanin"].stderr[good] > own).all()
+    assert np.isfinite(maps["melanin_blood_covariance"].values[good]).all()
+
+
+def test_fuse_dome_alone_keeps_its_texture(folders, tmp_path):
+    found = fuse(FusionInputs((folders / "dome",)), out=tmp_path / "double")
+    assert found.appearance.maps["melanin"].values.shape == (SIDE, SIDE)
+    assert found.checks == ()
+
+
+def test_fuse_flash_alone_uses_its_image(folders, tmp_path):
+    found = fuse(FusionInputs((folders / "flash",)), out=tmp_path / "double")
+    assert found.appearance.maps["melanin"].values.shape == (96, 96)
+    assert "r_d" not in found.appearance.maps
+
+
+def test_fuse_faulty_dome_is_named(folders, tmp_path):
+    write_dome(tmp_path / "dome", gain=(1.3, 1.0, 0.8))
+    given = both(folders)
+    wrong = FusionInputs(
+        (tmp_path / "dome", folders / "flash"),
+        landmarks=given.landmarks,
+        image_landmarks=given.image_landmarks,
+    )
+    assert fuse(given, out=tmp_path / "good").contradiction is None
+    found = fuse(wrong, out=tmp_path / "double").contradiction
+    assert found is not None
+    assert found.startswith("dome: R_d")
+
+
+def test_fuse_without_landmarks_names_the_option(folders, tmp_path):
+    with pytest.raises(FusionInputError, match="--image-landmarks"):
+        fuse(FusionInputs((folders / "dome", folders / "flash")), out=tmp_path / "double")
+    assert not (tmp_path / "double").exists()
+
+
+def test_sources_of_one_rig_twice_raise(folders):
+    with pytest.raises(FusionInputError, match="second dome"):
+        read_sources([folders / "dome", folders / "dome"])
+
+
+def test_command_without_unknown_rig_is_refused(folders, tmp_path):
+    words = ["fuse", str(folders / "dome"), "--without", "probe", "--out", str(tmp_path / "double")]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code != 0
+    assert "--without" in str(result.exception) + result.output
+
+
+def test_command_prints_one_document(folders, tmp_path):
+    words = ["fuse", str(folders / "dome"), "--out", str(tmp_path / "double"), "--json"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    assert '"skinrig.fuse/1"' in result.output
