@@ -176,6 +176,7 @@ NUMBERS = {
     "caliper": _caliper,
     "probe": _probe,
 }
+"""Numbers of each box that has firmware; the dome's surface scanner has none yet."""
 
 
 def limits_header(name: str, rig: Rig, faults: Faults = NO_FAULTS) -> str:
@@ -212,7 +213,7 @@ def limits_header(name: str, rig: Rig, faults: Faults = NO_FAULTS) -> str:
 
 def shipped_headers() -> dict[str, str]:
     """Return the headers of all boxes with the limits of the shipped rigs, by box."""
-    return {name: limits_header(name, load_rig(kind.rig)) for name, kind in BOXES.items()}
+    return {name: limits_header(name, load_rig(BOXES[name].rig)) for name in NUMBERS}
 
 
 def main() -> None:

@@ -21,6 +21,7 @@ from rigsim.boxes.command import (
     CommandHandler,
     CommandRefused,
     PendingReply,
+    add_us,
     build_command_table,
     parse_choice,
     parse_integer,
@@ -252,8 +253,10 @@ class ScannerUnit(Device):
             least = f"expected at least settle_ms {self._scanner.settle_s * 1e3:g}"
             raise CommandRefused(Code.OUT_OF_RANGE, least)
         level = self.faults.weak_leds.get(self.projector, 1.0)
-        light = ProjectorLight(projector.name, self.axis, self.pattern, level, now, now + span_s)
-        show = _Show(token, light, now + self._scanner.settle_s)
+        light = ProjectorLight(
+            projector.name, self.axis, self.pattern, level, now, add_us(now, 1e3 * span_ms)
+        )
+        show = _Show(token, light, add_us(now, 1e6 * self._scanner.settle_s))
         self._show = show
 
         def outcome() -> str | CommandRefused:
