@@ -116,7 +116,7 @@ def skin_of_person(log_skin: ArrayLike, properties_sd: ArrayLike) -> Float64Arra
     --------
     >>> skin = skin_of_person(np.log([0.2, 0.01]), [0, 1.0, 0, 0, 0, 0])
     >>> skin.round(4).tolist()
-    [0.2, 0.01, 0.75, 0.1185, 9.2, 1.421, 1.0, 0.8]
+    [0.2, 0.01, 0.75, 0.1184, 9.2, 1.421, 1.0, 0.8]
     """
     at = np.asarray(log_skin, np.float64)
     check = Checks(FusionError)

@@ -21,7 +21,7 @@ def fuse(
     sites: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Fuse one person's maps by flash rig, dome, gradient rig and probe into one appearance.
+    """Fuse one person's maps by flash rig, dome and probe into one appearance.
 
     Melanin, blood, R_d and sigma_tr are estimated together. All maps are on the dome's texture.
 
@@ -32,7 +32,7 @@ def fuse(
     sessions
         SESSION/ folders with their maps next to them, or APPEARANCE/ folders; one per rig.
     without
-        Rigs to leave out, separated by commas: flash, dome, gradient, probe.
+        Rigs to leave out, separated by commas: flash, dome, probe.
     landmarks
         CSV table name,x,y,z in mm of the dome's mesh, or name,x,y in texels of its maps.
     image_landmarks

@@ -17,7 +17,7 @@ HELP_SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
         "Capture with a rig or its simulation",
         ("plan", "simulate", "capture", "serve", "calibrate", "import", "verify"),
     ),
-    ("Reconstruct and model", ("reconstruct", "fit", "apply", "edit", "analyse")),
+    ("Reconstruct and model", ("reconstruct", "fuse", "fit", "apply", "edit", "analyse")),
     ("Report, render and export", ("report", "view", "render", "export")),
     ("Measure errors and run times", ("bench",)),
 )

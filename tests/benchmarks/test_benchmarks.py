@@ -29,10 +29,13 @@ HEAVY = {
     "render-dome",
     "render-gradient",
     "render-model",
+    "repeatability",
+    "scan-decoding",
     "sphere-lights",
     "template",
     "traits",
     "translucency-people",
+    "transport",
 }
 MIN_POINTS = 4
 

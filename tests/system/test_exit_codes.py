@@ -69,6 +69,8 @@ UNREADABLE = {
     "apply microstructure": ["a --out b"],
     "analyse albedo": ["maps --out a", "--labels l.csv --out a"],
     "analyse brdf": ["--out a --labels l.csv"],
+    "analyse lumitexel": ["a"],
+    "fuse": ["--out a"],
 }
 """What no file could make right."""
 
@@ -147,6 +149,8 @@ UNUSABLE = {
     "apply microstructure": ["none --weights smile=1 --mesh none.obj --out a"],
     "analyse albedo": ["none folder --out a"],
     "analyse brdf": ["none folder --out a"],
+    "analyse lumitexel": ["none none --out a"],
+    "fuse": ["none folder --out a", "folder --out a"],
 }
 """What another name, number or file would make right."""
 

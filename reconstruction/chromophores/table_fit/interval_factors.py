@@ -13,6 +13,7 @@ from importlib import resources
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import special
 
 from model import color_table, skin_tone
@@ -53,9 +54,9 @@ class IntervalSkins:
     """(n,): volume fraction of blood in the dermis."""
 
     @property
-    def band(self) -> Float64Array:
+    def band(self) -> NDArray[np.intp]:
         """Return the index of each skin's band, 0 for the lightest, (n,)."""
-        return skin_tone.ita_band(self.typology_angle_deg) - 1
+        return skin_tone.ita_band(self.typology_angle_deg).astype(np.intp) - 1
 
 
 @lru_cache(maxsize=1)

@@ -176,7 +176,7 @@ def build_cases(
 def measure_transport(stage: BenchmarkStage) -> None:
     """Measure errors of direct light and of paths, over people, lights and samples."""
     people = ("I",) if stage.toy else tuple(SEED_BY_PRESET)
-    lights = ("below",) if stage.toy else tuple(LIGHT_WAYS)
+    lights = tuple(LIGHT_WAYS)[:2] if stage.toy else tuple(LIGHT_WAYS)
     size = {"width_px": 40, "texels": 64, "samples": 64}
     if not stage.toy:
         size = {"width_px": 64, "texels": 128, "samples": 64}
@@ -201,7 +201,7 @@ def measure_transport(stage: BenchmarkStage) -> None:
     timing, images = stage.time(lambda: [c.render(None) for c in cases], repeats=1, memory=None)
     report("direct", 0, timing, images)
     direct_rms, direct_delta = errors(images)
-    for samples in PATH_SAMPLES[:2] if stage.toy else PATH_SAMPLES:
+    for samples in PATH_SAMPLES[:3] if stage.toy else PATH_SAMPLES:
 
         def render_paths(samples: int = samples) -> list[Float64Array]:
             return [c.render(SkinExchange.of(c.surface, c.caster, samples=samples)) for c in cases]

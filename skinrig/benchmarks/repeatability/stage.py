@@ -5,6 +5,8 @@ stated uncertainties per sample. The verdict on person and state is tested on pa
 of two people, and of one person in two states.
 """
 
+from __future__ import annotations
+
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,15 +18,16 @@ import numpy as np
 
 from capture.calibration import store as calibrations
 from model.skin import SkinAppearance
+from skinrig.arrays import Float64Array
 from skinrig.benchmarks.repeatability.sessions import RigDay, RigProtocol, choose_protocol
-from skinrig.benchmarks.resampling import mean_error
+from skinrig.benchmarks.resampling import gaussian_rms
 from skinrig.benchmarks.results import Timing
 from skinrig.benchmarks.stage import BenchmarkStage
 from skinrig.evaluating.session_agreement import SessionError, compare_sessions, region_changes
 
 DAYS_AGO: Final = (30, 0)
 """Days of the two sessions, before today."""
-AGES_DAYS: Final = (30, 90, 365)
+AGES_DAYS: Final = (90, 365)
 """Ages at which calibrations are compared with today's."""
 SKIN_PRESETS: Final = ("I", "II", "III", "IV", "V", "VI")
 PATCH_SITES: Final = ("forehead", "cheek", "nose", "chin", "temple")
@@ -68,6 +71,28 @@ def describe_person(rig: str, number: int) -> dict[str, Any]:
     return {"subject": f"ita:{65 - 9 * (number % 12)}"}
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationDrift:
+    """Change of one kind of calibration between two days."""
+
+    kind: str
+    days: int
+    """Days between them."""
+    sigmas: Float64Array
+    """Change of each quantity with an uncertainty, in combined standard uncertainties."""
+    relative: float
+    """Median relative change of quantities other than 0; 0 without any."""
+
+    @classmethod
+    def between(cls, kind: str, old: RigDay, new: RigDay, *, days: int) -> CalibrationDrift:
+        """Compare the calibrations of two days."""
+        pair = (calibrations.load(day.folder / "calibration", kind) for day in (old, new))
+        moved = calibrations.measure_drift(*pair)
+        sigmas = np.array([one.sigmas for one in moved if one.sigmas is not None])
+        relative = [abs(one.change / one.old) for one in moved if one.old]
+        return cls(kind, days, sigmas, float(np.median(relative)) if relative else 0.0)
+
+
 @dataclass(slots=True)
 class RigTrials:
     """Comparisons of sessions of one rig.
@@ -82,6 +107,8 @@ class RigTrials:
         Pairs of one person judged as changed, and all.
     found, changed
         Changed pairs found, and all: of two people, and of two states.
+    drifts
+        Changes of calibrations between both days.
     """
 
     ratios: dict[str, list[tuple[float, float, float]]] = field(default_factory=dict)
@@ -90,6 +117,7 @@ class RigTrials:
     pairs: int = 0
     found: int = 0
     changed: int = 0
+    drifts: list[CalibrationDrift] = field(default_factory=list)
 
     def judge_same(self, a: SkinAppearance, b: SkinAppearance) -> None:
         """Compare two sessions of one person in one state."""
@@ -134,6 +162,9 @@ def run_trials(
         for k, ago in enumerate(DAYS_AGO)
     ]
     trials = RigTrials()
+    apart = DAYS_AGO[0] - DAYS_AGO[1]
+    for kind, _ in protocol.kinds:
+        trials.drifts.append(CalibrationDrift.between(kind, *days, days=apart))
     before: SkinAppearance | None = None
     for number in numbers:
         person = describe_person(protocol.rig, number)
@@ -150,7 +181,7 @@ def run_trials(
 
 def measure_drifts(
     folder: Path, protocol: RigProtocol, ages_days: Sequence[int]
-) -> Iterator[tuple[str, int, float, float]]:
+) -> Iterator[CalibrationDrift]:
     """Yield the change of each calibration with age.
 
     Parameters
@@ -161,22 +192,12 @@ def measure_drifts(
         How the rig is calibrated.
     ages_days
         Ages of the old calibrations.
-
-    Yields
-    ------
-    kind, age_days, sigmas, relative
-        Kind of calibration, its age, the root mean square change in combined standard
-        uncertainties, and the median relative change.
     """
     today = RigDay.calibrate(protocol, folder / "age-0", days_ago=0, seed=9100)
     for age in ages_days:
         old = RigDay.calibrate(protocol, folder / f"age-{age}", days_ago=age, seed=9100 + age)
         for kind, _ in protocol.kinds:
-            pair = (calibrations.load(day.folder / "calibration", kind) for day in (old, today))
-            moved = calibrations.measure_drift(*pair)
-            sigmas = np.array([one.sigmas for one in moved if one.sigmas is not None])
-            relative = np.array([abs(one.change / one.old) for one in moved if one.old])
-            yield kind, age, float(np.sqrt(np.mean(sigmas**2))), float(np.median(relative))
+            yield CalibrationDrift.between(kind, old, today, days=age)
 
 
 def measure_repeatability(stage: BenchmarkStage) -> Iterator[None]:
@@ -203,16 +224,15 @@ def measure_repeatability(stage: BenchmarkStage) -> Iterator[None]:
                     "common to a region": region,
                 }
                 knobs = {"rig": rig, "quantity": quantity}
-                stage.add(knobs, timing, mean_error(ratios), extra)
+                stage.add(knobs, timing, gaussian_rms(ratios), extra)
             alarms, pairs = alarms + trials.false_alarms, pairs + trials.pairs
             found, changed = found + trials.found, changed + trials.changed
             if rig in ("dome", "gradient"):
-                for kind, age, sigmas, relative in measure_drifts(
-                    Path(name) / "drift", protocol, AGES_DAYS
-                ):
-                    knobs = {"rig": rig, "quantity": f"{kind} calibration, {age} days old"}
-                    extra = {"median relative change, %": 100.0 * relative}
-                    stage.add(knobs, timing, mean_error([sigmas]), extra)
+                trials.drifts += measure_drifts(Path(name) / "drift", protocol, AGES_DAYS)
+            for drift in (one for one in trials.drifts if one.sigmas.size):
+                knobs = {"rig": rig, "quantity": f"{drift.kind} calibration, {drift.days} days old"}
+                extra = {"median relative change, %": 100.0 * drift.relative}
+                stage.add(knobs, timing, gaussian_rms(drift.sigmas), extra)
         yield
     stage.limits["false"] = alarms / max(pairs, 1)
     if changed:
