@@ -198,6 +198,8 @@ def measure(sources: Sources, given: FusionInputs) -> Measurements:
     colors: list[ColorSource] = []
     assumed: list[str] = []
     left_out: list[tuple[str, str]] = []
+    if sources.get("gradient") is not None:
+        left_out.append(("gradient", "normals of a patch are not fused with those of a face"))
     position = None if dome is None else dome.appearance.maps["position"]
     for one in (dome, flash, probe):
         if one is not None and not one.spectra()[2]:
