@@ -30,6 +30,7 @@ _UNARMED: Final = {
     "gradient_sphere": "PATT FULL,10",
     "caliper": "CAL:HOME",
     "probe": "SHUT OPEN,10",
+    "scanner": "TRIG checkup,100",
 }
 """By kind, a command that is refused unless armed."""
 

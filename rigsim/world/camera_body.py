@@ -18,6 +18,7 @@ import numpy as np
 from capture.devices.camera import CameraError, CameraInfo, Exposure, Frame, FrameTimeout, Trigger
 from capture.rig import View
 from rigsim.arrays import UInt16Array
+from rigsim.boxes.command import add_us
 from rigsim.boxes.faults import Faults
 from rigsim.world.light_record import Light
 
@@ -185,7 +186,10 @@ class CameraBody:
             self._open_shutter(now)
 
     def _open_shutter(self, now: float) -> None:
-        shot = _Shot(self._shots, self._seq, now + self.view.shutter_lag_s, self.exposure)
+        lag_s = self.view.shutter_lag_s
+        # on the controllers' clock: else a pop delayed by the lag can be early by a rounding error
+        start_s = add_us(now, 1e6 * lag_s) if lag_s > 0.0 else now
+        shot = _Shot(self._shots, self._seq, start_s, self.exposure)
         self._shots += 1
         self._seq += 1
         self._armed -= 1

@@ -32,6 +32,7 @@ def serve():
 
     def serve(kind="flash", **faults):
         rig = load_rig(BOXES[kind].rig)
+        rig = rig.with_scanner() if kind == "scanner" else rig
         served = serve_world(rig, pty=True, faults=Faults(baud=0.0, **faults))
         port = CheckupPort(served.addresses[kind])
         opened.extend((served, port))
