@@ -104,7 +104,7 @@ def doctor(
 
     With a port it judges the controller there: identity, clock, latency, lease and refusals.
 
-    Examples: skinrig doctor;  skinrig doctor --port /dev/ttyUSB0
+    Example: skinrig doctor --port /dev/ttyUSB0
     """
     console = Console(json)
     findings = check_controller(port) if port else check_installation()
