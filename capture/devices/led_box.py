@@ -63,7 +63,24 @@ class LedStatus(BoxStatus):
     """Whether a person has confirmed that the subject's eyes are closed or shielded."""
 
 
-class LedBox(Box):
+class EyeSafetyBox(Box):
+    """A box whose light depends on the state of the subject's eyes."""
+
+    def set_eyes(self, eyes: Eyes) -> None:
+        """Send the state of the subject's eyes that a person has confirmed."""
+        if eyes not in EYE_STATES:
+            raise ValueError(f"eyes: got {eyes!r}, expected one of {', '.join(EYE_STATES)}")
+        self._port.ask(f"SAFE:EYES {eyes.upper()}")
+
+    def eyes(self) -> str:
+        """Return the confirmed state of the subject's eyes."""
+        payload = self._port.ask("SAFE:EYES?").lower()
+        if payload not in EYE_STATES:
+            raise self._bad_answer("SAFE:EYES?", payload, "OPEN, CLOSED or SHIELDED")
+        return payload
+
+
+class LedBox(EyeSafetyBox):
     """Driver of the commands that controllers with LEDs and a table share.
 
     Attributes
@@ -151,19 +168,6 @@ class LedBox(Box):
     def trigger_cameras(self, token: str) -> float:
         """Release the cameras without light; return the controller's time, in s."""
         return self._token_time("CAM:TRIG", token)
-
-    def set_eyes(self, eyes: Eyes) -> None:
-        """Send the state of the subject's eyes that a person has confirmed."""
-        if eyes not in EYE_STATES:
-            raise ValueError(f"eyes: got {eyes!r}, expected one of {', '.join(EYE_STATES)}")
-        self._port.ask(f"SAFE:EYES {eyes.upper()}")
-
-    def eyes(self) -> str:
-        """Return the confirmed state of the subject's eyes."""
-        payload = self._port.ask("SAFE:EYES?").lower()
-        if payload not in EYE_STATES:
-            raise self._bad_answer("SAFE:EYES?", payload, "OPEN, CLOSED or SHIELDED")
-        return payload
 
     def dose_ws(self, led: int) -> float:
         """Return the energy that an LED has emitted to this subject, Ws."""

@@ -9,8 +9,8 @@ query) while cameras expose.
 
 from typing import ClassVar, Final
 
-from capture.devices.box import Box, BoxStatus, StatusBit, format_decimal
-from capture.devices.led_box import EYE_STATES, Eyes
+from capture.devices.box import BoxStatus, StatusBit, format_decimal
+from capture.devices.led_box import EyeSafetyBox
 from capture.scanner import STRIPE_AXES
 
 _LEASE_POLL_S = 0.1
@@ -29,7 +29,7 @@ class ScannerStatus(BoxStatus):
     """Whether a person has confirmed that the subject's eyes are closed or shielded."""
 
 
-class ScannerBox(Box):
+class ScannerBox(EyeSafetyBox):
     """Driver of the scanner's controller; see `capture.devices.box.Box`.
 
     Keys of ``limits``: ``projectors``, ``cameras``, ``columns`` and ``rows`` (of each projector),
@@ -102,19 +102,6 @@ class ScannerBox(Box):
         self._keep_lease(seconds, _LEASE_POLL_S)
 
     # eyes and dose ----------------------------------------------------------------------------
-
-    def set_eyes(self, eyes: Eyes) -> None:
-        """Send the state of the subject's eyes that a person has confirmed."""
-        if eyes not in EYE_STATES:
-            raise ValueError(f"eyes: got {eyes!r}, expected one of {', '.join(EYE_STATES)}")
-        self._port.ask(f"SAFE:EYES {eyes.upper()}")
-
-    def eyes(self) -> str:
-        """Return the confirmed state of the subject's eyes."""
-        payload = self._port.ask("SAFE:EYES?").lower()
-        if payload not in EYE_STATES:
-            raise self._bad_answer("SAFE:EYES?", payload, "OPEN, CLOSED or SHIELDED")
-        return payload
 
     def dose_ws(self) -> float:
         """Return the light emitted to this subject, Ws."""
