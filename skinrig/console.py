@@ -68,11 +68,14 @@ class Console:
     """
 
     as_json: bool = False
+    quiet: bool = False
+    """Whether only progress is printed: the caller prints its own summary."""
     started_s: float = field(default_factory=time.perf_counter)
 
     def print_line(self, text: str = "") -> None:
         """Print a line of text."""
-        print(text, file=sys.stderr if self.as_json else sys.stdout, flush=True)
+        if not self.quiet:
+            print(text, file=sys.stderr if self.as_json else sys.stdout, flush=True)
 
     def progress(self, text: str) -> None:
         """Print a line of progress with the time since the command's start, s."""

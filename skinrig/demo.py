@@ -1,4 +1,7 @@
-"""Run the demo: simulate, capture, calibrate, reconstruct, measure and report."""
+"""Run the demo: simulate, capture, calibrate, reconstruct, measure and report.
+
+The report is written when the first rig is done, and again after each further rig.
+"""
 
 import json
 import multiprocessing
@@ -6,12 +9,14 @@ import os
 import shutil
 import signal
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from skinrig.atomic_file import write_atomically
 from skinrig.benchmarks.stages import run_stages
 from skinrig.console import Console, to_json_value
 from skinrig.demo_rigs import RIGS, DemoResults, RigDemo
@@ -37,7 +42,14 @@ BENCH_STAGES = (
 )
 """Stages measured at small size, a few per rig, about 1 s each; `skinrig bench` measures all."""
 BENCH_BUDGET_S = 8.0
-RIG_ORDER = ("gradient", "dome", "flash", "probe")
+TYPICAL_SECONDS = {"flash": 60.0, "dome": 85.0, "gradient": 25.0, "probe": 20.0}
+"""Seconds of each rig beside another one on two cores, in the order in which the rigs start.
+
+The flash rig starts first: its maps are in the report while the other rigs run.
+"""
+REPORT_NAME = "report.html"
+RELOAD_S = 10
+"""Seconds after which a browser loads a preliminary report again."""
 SLEEPING_THREADS = {**PASSIVE_WAIT_SETTINGS, "OPENBLAS_NUM_THREADS": "1"}
 """Environment of parallel rigs, unless the user has set it: the rigs share the cores."""
 SecondsByStep = dict[str, float]
@@ -82,33 +94,23 @@ def run_demo(
     began = time.perf_counter()
     asked = [rig for rig in RIGS if rig in rigs]
     at_once = min(len(asked), MAX_JOBS, os.cpu_count() or 1) if jobs is None else jobs
-    order = (out, seed, width_px, console)
-    if at_once > 1:
-        parts = _run_in_processes(asked, order, at_once)
-    else:
-        parts = {rig: _run_rig(rig, *order) for rig in asked}
-    found = DemoResults()
-    shares: SecondsByStep = {}
-    for rig in asked:
-        part, seconds = parts[rig]
-        found.errors += part.errors
-        found.tables += part.tables
-        shares |= seconds
+    parts: _Parts = {}
+    for rig, part in _run_rigs(asked, (out, seed, width_px, console), at_once):
+        parts[rig] = part
+        waiting = [one for one in asked if one not in parts]
+        if waiting:
+            _write_report(out, parts, _sum_up(asked, parts), preliminary=True)
+            console.print_line(
+                f"{rig}: done, {len(parts)} of {len(asked)} rigs, "
+                f"about {_estimate_left_s(parts, waiting, at_once):.0f} s left; "
+                f"the report so far: {out / REPORT_NAME}"
+            )
+    found, shares = _sum_up(asked, parts)
     with _time_step("measure error against run time", shares, console):
-        bench = run_stages(
-            BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=console
-        )
-    spent = DemoResults()
-    title = "Seconds" + (", rigs in parallel" if at_once > 1 else "")
-    spent.add_table(title, ["step", "seconds"], ((n, round(s, 2)) for n, s in shares.items()))
-    document: dict[str, Any] = {"schema": "skinrig.demo/1", "title": "This demo"}
-    document["tables"] = spent.tables + found.tables
-    # run times differ from run to run, so they go to a document of their own, not into the maps
-    (out / "demo.json").write_text(json.dumps(to_json_value(document), indent=1), encoding="utf-8")
+        quiet = replace(console, quiet=True)  # the report shows its tables
+        bench = run_stages(BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=quiet)
     with _time_step("report", shares, console):
-        from skinrig.report import build
-
-        (out / "report.html").write_text(build([out], title="skinrig demo"), encoding="utf-8")
+        _write_report(out, parts, (found, shares), preliminary=False)
     console.print_line("")
     console.print_table(
         ("subject", "map", "error", "unit", "68 % interval covers, %", "masked, %"),
@@ -131,28 +133,78 @@ def run_demo(
         "total_s": total_s,
         "errors": found.errors,
         "bench_passed": bench["passed"],
-        "report": out / "report.html",
+        "report": out / REPORT_NAME,
     }
 
 
 _Order = tuple[Path, int, int | None, Console]
-_Parts = dict[str, tuple[DemoResults, SecondsByStep]]
+_Part = tuple[DemoResults, SecondsByStep]
+_Parts = dict[str, _Part]
 
 
-def _run_in_processes(rigs: Sequence[str], order: _Order, at_once: int) -> _Parts:
+def _sum_up(asked: Sequence[str], parts: _Parts) -> _Part:
+    """Return the results and seconds of the rigs that are done, in the order of the report."""
+    found = DemoResults()
+    shares: SecondsByStep = {}
+    for rig in asked:
+        if rig in parts:
+            found.errors += parts[rig][0].errors
+            found.tables += parts[rig][0].tables
+            shares |= parts[rig][1]
+    return found, shares
+
+
+def _write_report(out: Path, rigs: Iterable[str], results: _Part, *, preliminary: bool) -> None:
+    """Write the demo's document and its report on the rigs that are done."""
+    from skinrig.report import build
+
+    found, shares = results
+    spent = DemoResults()
+    spent.add_table("Seconds", ["step", "seconds"], ((n, round(s, 2)) for n, s in shares.items()))
+    document: dict[str, Any] = {"schema": "skinrig.demo/1", "title": "This demo"}
+    document["tables"] = spent.tables + found.tables
+    # run times differ from run to run, so they go to a document of their own, not into the maps
+    written = out / "demo.json"
+    write_atomically(written, json.dumps(to_json_value(document), indent=1))
+    done = set(rigs)  # the folders of the others are growing
+    paths = [out]
+    title = "skinrig demo"
+    if preliminary:
+        paths = [one for one in sorted(out.iterdir()) if done & set(one.name.split("-"))]
+        paths.append(written)
+        title += f": {', '.join(rig for rig in RIGS if rig in done)}; other rigs follow"
+    html = build(paths, title=title, reload_s=RELOAD_S if preliminary else None)
+    write_atomically(out / REPORT_NAME, html)
+
+
+def _estimate_left_s(parts: _Parts, waiting: Sequence[str], at_once: int) -> float:
+    """Return the time left, s, from typical seconds and this machine's pace so far."""
+    pace = sum(sum(part[1].values()) for part in parts.values())
+    pace /= sum(TYPICAL_SECONDS[rig] for rig in parts)
+    return pace * sum(TYPICAL_SECONDS[rig] for rig in waiting) / at_once
+
+
+def _run_rigs(rigs: Sequence[str], order: _Order, at_once: int) -> Iterator[tuple[str, _Part]]:
+    """Yield each rig with its results when it is done."""
+    first = [rig for rig in TYPICAL_SECONDS if rig in rigs]
+    if at_once > 1:
+        yield from _run_in_processes(first, order, at_once)
+    else:
+        yield from ((rig, _run_rig(rig, *order)) for rig in first)
+
+
+def _run_in_processes(
+    rigs: Sequence[str], order: _Order, at_once: int
+) -> Iterator[tuple[str, _Part]]:
     """Run each rig in its own process; an error in one stops all."""
     pool = ProcessPoolExecutor(
         at_once, mp_context=multiprocessing.get_context("spawn"), initializer=_die_when_interrupted
     )
-    first = sorted(rigs, key=lambda rig: RIG_ORDER.index(rig) if rig in RIG_ORDER else 0)
     try:
         with _environment(SLEEPING_THREADS):  # the pool starts its processes on submission
-            futures = {rig: pool.submit(_run_rig, rig, *order) for rig in first}
-        wait(futures.values(), return_when=FIRST_EXCEPTION)
-        failed = [f for f in futures.values() if f.done() and f.exception() is not None]
-        if failed:
-            failed[0].result()
-        return {rig: futures[rig].result() for rig in rigs}
+            futures = {pool.submit(_run_rig, rig, *order): rig for rig in rigs}
+        for done in as_completed(futures):
+            yield futures[done], done.result()
     except BaseException:
         for process in multiprocessing.active_children():
             process.terminate()

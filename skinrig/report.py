@@ -50,7 +50,9 @@ class Report:
         return verdict_section.format_headline(self.checks)
 
 
-def build(paths: Sequence[str | Path], *, title: str = "skinrig report") -> str:
+def build(
+    paths: Sequence[str | Path], *, title: str = "skinrig report", reload_s: int | None = None
+) -> str:
     """Return a deterministic HTML report of everything at ``paths``.
 
     Parameters
@@ -60,17 +62,23 @@ def build(paths: Sequence[str | Path], *, title: str = "skinrig report") -> str:
         benchmark documents.
     title
         Heading of the page.
+    reload_s
+        Seconds after which a browser loads the page again; None: never.
 
     Raises
     ------
     ReportError
         If a path does not exist, or nothing is found.
     """
-    return build_any(paths, title=title, compare=False).html
+    return build_any(paths, title=title, compare=False, reload_s=reload_s).html
 
 
 def build_any(
-    paths: Sequence[str | Path], *, title: str = "skinrig report", compare: bool | None = None
+    paths: Sequence[str | Path],
+    *,
+    title: str = "skinrig report",
+    compare: bool | None = None,
+    reload_s: int | None = None,
 ) -> Report:
     """Return the report on a collection, or the comparison of two runs.
 
@@ -82,6 +90,8 @@ def build_any(
         Heading of the page.
     compare
         Whether two runs are compared; None: by the rule of `run_comparison.split_sides`.
+    reload_s
+        As for `build`; a comparison is never loaded again.
 
     Raises
     ------
@@ -107,7 +117,7 @@ def build_any(
     lead = verdict_section.section(
         checks_of_all, found.summary(), _list_least_certain(found), _first_screen(found)
     )
-    html = page.render_page(title, lead, body)
+    html = page.render_page(title, lead, body, reload_s=reload_s)
     return Report(html, tuple(checks_of_all), None)
 
 

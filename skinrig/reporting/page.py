@@ -320,7 +320,9 @@ def render_fragment(blocks: Iterable[Block]) -> str:
     return templates.render("reporting/templates/fragment.html", blocks=list(blocks))
 
 
-def render_page(title: str, lead: Iterable[Block], sections: Iterable[Block]) -> str:
+def render_page(
+    title: str, lead: Iterable[Block], sections: Iterable[Block], *, reload_s: int | None = None
+) -> str:
     """Return the whole page; it makes no request and runs no script.
 
     Parameters
@@ -331,6 +333,8 @@ def render_page(title: str, lead: Iterable[Block], sections: Iterable[Block]) ->
         First blocks: verdict and images.
     sections
         Blocks below the contents.
+    reload_s
+        Seconds after which a browser loads the page again; None: never.
     """
     style = PAGE_STYLE + _bars()
     digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
@@ -340,6 +344,7 @@ def render_page(title: str, lead: Iterable[Block], sections: Iterable[Block]) ->
         "reporting/templates/page.html",
         title=title,
         style=style,
+        reload_s=reload_s,
         policy=f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'; "
         "base-uri 'none'; form-action 'none'",
         lead=head,

@@ -54,6 +54,26 @@ def test_only_requested_rigs_run(tmp_path, monkeypatch, without_benchmarks):
         assert ran == expected
 
 
+def test_report_is_written_after_each_rig(tmp_path, monkeypatch, without_benchmarks):
+    """The first has the finished rig alone, and browsers load it again; the last has all."""
+    for rig in ("flash", "dome"):
+        made = tmp_path / "demo" / f"session-{rig}-white"
+        monkeypatch.setitem(RIGS, rig, lambda *_, made=made: made.mkdir())
+    built = []
+
+    def build(paths, *, title, reload_s):
+        built.append(([path.name for path in paths], title, reload_s))
+        return f"report {len(built)}"
+
+    monkeypatch.setattr("skinrig.report.build", build)
+    run_demo(tmp_path / "demo", ["dome", "flash"], console=Console(False), jobs=1)
+    assert built == [
+        (["session-flash-white", "demo.json"], "skinrig demo: flash; other rigs follow", 10),
+        (["demo"], "skinrig demo", None),
+    ]
+    assert (tmp_path / "demo" / "report.html").read_text() == "report 2"
+
+
 def test_error_in_single_parallel_rig_stays_its_own(tmp_path):
     with pytest.raises(SimulationError, match="width"):
         run_demo(tmp_path / "demo", ["flash", "dome"], console=Console(False), width_px=4, jobs=2)
@@ -68,7 +88,7 @@ def test_parallel_rig_threads_sleep_unless_user_sets_policy(own, expected, monke
         monkeypatch.setenv("OPENBLAS_NUM_THREADS", own)
     monkeypatch.setattr(demo, "_run_rig", os.getenv)  # a process says what it was given
     names = ["OMP_WAIT_POLICY", "OPENBLAS_NUM_THREADS"]
-    given = demo._run_in_processes(names, ("not set",), 2)
+    given = dict(demo._run_in_processes(names, ("not set",), 2))
     assert given == {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": expected}
     assert [os.environ.get(name) for name in names] == [None, own]
 
