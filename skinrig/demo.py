@@ -1,4 +1,4 @@
-"""Run the demo: simulate, capture, calibrate, reconstruct, measure and report."""
+"""Run the demo: simulate, capture, calibrate, reconstruct, fuse, measure and report."""
 
 import json
 import multiprocessing
@@ -14,7 +14,7 @@ from typing import Any
 
 from skinrig.benchmarks.stages import run_stages
 from skinrig.console import Console, to_json_value
-from skinrig.demo_rigs import RIGS, DemoResults, RigDemo
+from skinrig.demo_rigs import RIGS, DemoResults, RigDemo, fuse_person
 from skinrig.kernel_cache import PASSIVE_WAIT_SETTINGS
 from skinrig.next_steps import suggest
 from skinrig.unit_format import format_unit
@@ -94,6 +94,9 @@ def run_demo(
         found.errors += part.errors
         found.tables += part.tables
         shares |= seconds
+    if {"flash", "dome"} <= set(asked):
+        run = RigDemo(out, seed, lambda name: _time_step(name, shares, console), width_px, found)
+        fuse_person(run, asked)
     with _time_step("measure error against run time", shares, console):
         bench = run_stages(
             BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=console
