@@ -8,7 +8,7 @@ WORKERS := -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --max
 .PHONY: help setup browser firmware demo test test-long lint docs bench clean
 
 help:
-	@echo "make demo       simulate, capture, calibrate, reconstruct, report (leaves ./demo)"
+	@echo "make demo       simulate, capture, calibrate, reconstruct, fuse, report (leaves ./demo)"
 	@echo "make test       every test but the long ones"
 	@echo "make test-long  the long ones"
 	@echo "make lint       ruff, mypy and the import contracts"

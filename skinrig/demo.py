@@ -1,4 +1,4 @@
-"""Run the demo: simulate, capture, calibrate, reconstruct, measure and report.
+"""Run the demo: simulate, capture, calibrate, reconstruct, fuse, measure and report.
 
 The report is written when the first rig is done, and again after each further rig.
 """
@@ -19,7 +19,7 @@ from typing import Any
 from skinrig.atomic_file import write_atomically
 from skinrig.benchmarks.stages import run_stages
 from skinrig.console import Console, to_json_value
-from skinrig.demo_rigs import RIGS, DemoResults, RigDemo
+from skinrig.demo_rigs import RIGS, DemoResults, RigDemo, fuse_person
 from skinrig.kernel_cache import PASSIVE_WAIT_SETTINGS
 from skinrig.next_steps import suggest
 from skinrig.unit_format import format_unit
@@ -106,6 +106,9 @@ def run_demo(
                 f"the report so far: {out / REPORT_NAME}"
             )
     found, shares = _sum_up(asked, parts)
+    if {"flash", "dome"} <= set(asked):
+        run = RigDemo(out, seed, lambda name: _time_step(name, shares, console), width_px, found)
+        fuse_person(run, asked)
     with _time_step("measure error against run time", shares, console):
         quiet = replace(console, quiet=True)  # the report shows its tables
         bench = run_stages(BENCH_STAGES, budget_s=BENCH_BUDGET_S, toy=True, out=out, console=quiet)

@@ -4,7 +4,7 @@ Each rig runs in its own process, which compiles the kernels it imports. Modules
 rig needs are therefore imported in its function.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,17 +29,16 @@ from skinrig.reporting.map_names import state_title
 from skinrig.simulating.orders import SimulationResult
 from skinrig.simulating.simulation import simulate_session
 
-FLASH_SUBJECTS = ("II", "IV")
-"""Skin types of the flash rig's faces, one light and one dark: errors depend on melanin."""
+SUBJECT = "III"
+"""Skin type of the one person in front of flash rig, dome and probe."""
 FLASH_STATES = ("neutral", "anger")
-"""Expressions of the first face, to which a hemoglobin rig is fitted."""
+"""Expressions of the face, to which a hemoglobin rig is fitted."""
 FLASH_CALIBRATIONS = {"flat": "sensor", "white": "white", "chart": "color", "malus": "polarization"}
 """Calibration by target, in the order of computation."""
 FLASH_WANT = (
     *("melanin", "hemoglobin", "shading", "residual", "diffuse", "image", "specular_image"),
     *("tsumura_melanin", "tsumura_hemoglobin"),
 )
-DOME_SUBJECT = "III"
 DOME_WANT = (
     *("half_vector_normals", "normals", "normals_refined", "r_d", "lobe_residual", "samples"),
     *(f"basis_weight_{lobe}" for lobe in range(4)),
@@ -53,11 +52,14 @@ N_COMPARED_PHOTOGRAPHS = 3
 DOME_WIDTH_PX = 320
 """Default image width of the dome's cameras."""
 
-PROBE_SUBJECT = "III"
 PROBE_MEDIUM = "homogeneous:0.08,1.2"
 """Homogeneous medium with known sigma_tr, 0.55 per mm; for layers it is a definition only."""
 PROBE_WANT = ("profiles", "subsurface", "translucency")
 GRADIENT_SITE = "forehead"
+DOUBLE = "double"
+"""Folder of the person's fused maps."""
+FUSED_SUBJECTS = {"flash": SUBJECT, "dome": SUBJECT, "gradient": GRADIENT_SITE, "probe": SUBJECT}
+"""Names of the fused maps' sessions by rig."""
 GRADIENT_WANT = ("normals", "height", "crossed", "strain", "histograms", "kernels")
 
 
@@ -133,7 +135,7 @@ class RigDemo:
 
 
 def _flash(run: RigDemo) -> None:
-    """Run the flash rig on targets and two faces, up to melanin, blood volume and its changes."""
+    """Run the flash rig on targets and a face, up to melanin, blood volume and its changes."""
     found, width = run.found, run.width_px
     with run.share("flash: capture the calibration targets"):
         for target in FLASH_CALIBRATIONS:
@@ -141,31 +143,27 @@ def _flash(run: RigDemo) -> None:
     with run.share("flash: calibrate"):
         for target, kind in FLASH_CALIBRATIONS.items():
             run.calibrate("flash", kind, target)
-    captures: list[SimulationResult] = []
-    with run.share("flash: capture two faces"):
-        for number, subject in enumerate(FLASH_SUBJECTS):
-            states = FLASH_STATES if number == 0 else ("neutral",)
-            captures.append(
-                run.simulate("flash", subject, subject=subject, width_px=width, states=states)
-            )
+    with run.share("flash: capture a face"):
+        capture = run.simulate(
+            "flash", SUBJECT, subject=SUBJECT, width_px=width, states=FLASH_STATES
+        )
     with run.share("flash: reconstruct melanin and blood"):
-        for capture in captures:
-            name, _, maps, truth = run.reconstruct("flash", capture, FLASH_WANT)
-            for row in flash.compare(maps, truth, rng=np.random.default_rng(0)):
-                if row.band is None and row.against == "blurred":
-                    error = 100 * row.median_relative
-                    found.add(name, row.name, error, "%", row.coverage.fraction, row.masked)
+        name, _, maps, truth = run.reconstruct("flash", capture, FLASH_WANT)
+        for row in flash.compare(maps, truth, rng=np.random.default_rng(0)):
+            if row.band is None and row.against == "blurred":
+                error = 100 * row.median_relative
+                found.add(name, row.name, error, "%", row.coverage.fraction, row.masked)
     with run.share("flash: fit the blood of a moving face"):
-        moving = run.out / f"appearance-flash-moving-{FLASH_SUBJECTS[0]}"
+        moving = run.out / f"appearance-flash-moving-{SUBJECT}"
         calibration = run.out / "calibration-flash"
-        fit_facial_color([captures[0].session], out=moving, calibration=calibration)
+        fit_facial_color([capture.session], out=moving, calibration=calibration)
         _evaluate_states(moving, found)
     found.add_table(
         "Blur by lateral scattering in the skin, 10 to 90 % of an edge, mm",
         ["subject", "red", "green", "blue"],
-        ([c.session.name, *(round(mm, 3) for mm in c.blur_mm)] for c in captures),
+        [[capture.session.name, *(round(mm, 3) for mm in capture.blur_mm)]],
     )
-    found.add_omissions("flash rig", captures[0])
+    found.add_omissions("flash rig", capture)
 
 
 def _evaluate_states(appearance: Path, found: DemoResults) -> None:
@@ -196,11 +194,7 @@ def _dome(run: RigDemo) -> None:
         run.calibrate("dome", "lights", "mirror", "white")
     with run.share("dome: scan and capture a face"):
         capture = run.simulate(
-            "dome",
-            DOME_SUBJECT,
-            subject=DOME_SUBJECT,
-            leave_out=DOME_OMITTED_EFFECTS,
-            width_px=width,
+            "dome", SUBJECT, subject=SUBJECT, leave_out=DOME_OMITTED_EFFECTS, width_px=width
         )
     with run.share("dome: reconstruct normals, albedo and basis BRDFs"):
         name, folder, maps, truth = run.reconstruct("dome", capture, DOME_WANT, DOME_HOLD_OUT)
@@ -268,7 +262,7 @@ def _probe(run: RigDemo) -> None:
     with run.share("probe: capture a medium and three sites of a face"):
         captures = [
             run.simulate("probe", "medium", subject=PROBE_MEDIUM, sites=("cheek",)),
-            run.simulate("probe", PROBE_SUBJECT, subject=PROBE_SUBJECT),
+            run.simulate("probe", SUBJECT, subject=SUBJECT),
         ]
     with run.share("probe: reconstruct sigma_tr and diffuse mean free path"):
         for capture in captures:
@@ -279,6 +273,33 @@ def _probe(run: RigDemo) -> None:
                 what, error = f"sigma_tr, {row.method}", 100 * row.median
                 run.found.add(name, what, error, "%", row.coverage, float(lost))
     run.found.add_omissions("fiber probe", captures[-1])
+
+
+def fuse_person(run: RigDemo, rigs: Sequence[str]) -> None:
+    """Fuse the maps of one person by these rigs, and compare them with the best single rig."""
+    from skinrig.evaluating.fusion import compare_fused
+    from skinrig.fusing.double import FusionInputs, fuse
+
+    folders = {rig: run.out / f"appearance-{rig}-{FUSED_SUBJECTS[rig]}" for rig in rigs}
+    with run.share("fuse the rigs' maps of the person"):
+        double = fuse(FusionInputs(tuple(folders.values())), out=run.out / DOUBLE)
+    with run.share("compare the fused maps with each rig's"):
+        single = {rig: store.read(folders[rig]) for rig in ("flash", "dome")}
+        truths = {
+            rig: store.read(run.out / str(one.parameters["truth"])) for rig, one in single.items()
+        }
+        rows = compare_fused(double.appearance, single, truths, double.measured.placement)
+    position = double.appearance.maps["position"].mask
+    for row in rows:
+        masked = 1.0 - float(double.appearance.maps[row.quantity.split()[0]].mask[position].mean())
+        run.found.add(DOUBLE, row.quantity, 100 * row.fused, "%", row.fused_coverage, masked)
+    run.found.add_table(
+        "Fused person against the best single rig, median error of the logarithm",
+        ["map", "fused, %", "single rig, %", "single rig"],
+        ([r.quantity, 100 * r.fused, 100 * r.single, r.rig] for r in rows),
+    )
+    named = double.contradiction or "none"
+    run.found.add_table("Rig that contradicts the others", ["rig"], [[named]])
 
 
 RIGS: Mapping[str, Callable[[RigDemo], None]] = {

@@ -22,6 +22,7 @@ from skinrig.reporting.sections import (
     chromophore,
     dynamic,
     extremes,
+    fused,
     microrelief,
     sequence,
     session,
@@ -123,9 +124,16 @@ def build_any(
 
 def _first_screen(found: ReportInputs) -> Iterator[page.Block]:
     """Yield the images of the first screen."""
-    appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
+    appearances = _read_appearances(found)
     truths = {name: found.find_truth(appearance) for name, appearance in appearances.items()}
     yield from first_screen.draw_first_screen(appearances, truths)
+
+
+def _read_appearances(found: ReportInputs) -> dict[str, SkinAppearance]:
+    """Return the appearances by name, a fused person first."""
+    appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
+    order = sorted(appearances, key=lambda name: not fused.is_fused(appearances[name]))
+    return {name: appearances[name] for name in order}
 
 
 def _list_least_certain(found: ReportInputs) -> list[str]:
@@ -149,7 +157,7 @@ def evaluate_checks(found: ReportInputs, checks: list[page.Check]) -> None:
     checks
         Checks are added to it.
     """
-    appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
+    appearances = _read_appearances(found)
     sessions = session.read_session_facts(found.sessions)
     for blocks in (
         _maps(found, appearances, checks),
@@ -169,7 +177,7 @@ def build_sections(found: ReportInputs, checks: list[page.Check]) -> list[page.B
     checks
         Checks are added to it.
     """
-    appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
+    appearances = _read_appearances(found)
     sessions = session.read_session_facts(found.sessions)
     return [
         *_maps(found, appearances, checks),
@@ -211,7 +219,11 @@ def _documents(found: ReportInputs, checks: list[page.Check]) -> Iterator[page.B
 
 def _appearance_section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     appearance, truth = subject.appearance, subject.truth
-    yield page.Heading(f"Maps: {subject.name}", level=2)
+    is_fused = fused.is_fused(appearance)
+    kind = "Fused person" if is_fused else "Maps"
+    yield page.Heading(f"{kind}: {subject.name}", level=2)
+    if is_fused:
+        yield from fused.section(appearance)
     images = [
         map_images.draw_color_image(f"{map_title(key)}, linear RGB", appearance.maps[key].values)
         for key in ("image", "specular_image")

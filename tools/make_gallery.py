@@ -93,8 +93,8 @@ def write_row(
 
 def chromophores(demo: Path) -> None:
     """Draw images of a face, and estimate, half-width and ground truth of its chromophores."""
-    found = store.read(demo / "appearance-flash-IV").maps
-    truth = store.read(demo / "truth-flash-IV").maps
+    found = store.read(demo / "appearance-flash-III").maps
+    truth = store.read(demo / "truth-flash-III").maps
     part = face(found["melanin"])
     images = [color(found["image"], 0.5, part), color(found["specular_image"], 0.1, part)]
     write_row("gallery-polarization.png", images)
@@ -111,7 +111,7 @@ def chromophores(demo: Path) -> None:
 
 def expression(demo: Path) -> None:
     """Draw the blood of an angry face, and its change from the neutral face."""
-    found = store.read(demo / "appearance-flash-moving-II").maps
+    found = store.read(demo / "appearance-flash-moving-III").maps
     angry, rest = found["hemoglobin_anger"], found["hemoglobin"]
     part = face(rest)
     row = [scalar(shown, 0.0, 0.1, part) for shown in (rest, angry)]

@@ -21,24 +21,25 @@ def fuse(
     sites: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Fuse one person's maps by flash rig, dome and probe into one appearance.
+    """Fuse one person's maps by flash rig, dome, gradient rig and probe into one appearance.
 
-    Melanin, blood, R_d and sigma_tr are estimated together. All maps are on the dome's texture.
+    Melanin, blood, R_d and sigma_tr are estimated together, on the dome's texture. The gradient
+    rig's patch keeps its pixels and gets the dome's low frequencies.
 
-    Example: skinrig fuse session-flash session-dome session-probe --out double
+    Example: skinrig fuse session-flash session-dome session-gradient session-probe --out double
 
     Parameters
     ----------
     sessions
         SESSION/ folders with their maps next to them, or APPEARANCE/ folders; one per rig.
     without
-        Rigs to leave out, separated by commas: flash, dome, probe.
+        Rigs to leave out, separated by commas: flash, dome, gradient, probe.
     landmarks
         CSV table name,x,y,z in mm of the dome's mesh, or name,x,y in texels of its maps.
     image_landmarks
         CSV table name,x,y in pixels of the flash rig's maps.
     sites
-        CSV table name,x,y of the probe's sites, texels of the dome's maps.
+        CSV table name,x,y of sites of probe and gradient rig, texels of the dome's maps.
     """
     from skinrig.capturing.option_values import parse_names
     from skinrig.fusing.double import FusionInputs, fuse
@@ -53,12 +54,15 @@ def fuse(
     console.print_table(("map", "median", "68 % interval, %", "common to the face, %"), rows)
     console.print_table(
         ("rig", "probability that it is faulty", "p value of its gains"),
-        [(check.rig, round(check.probability, 4), check.p_value) for check in found.checks],
+        [
+            (check.rig, round(check.probability, 4), check.p_value)
+            for check in (*found.checks, *([] if found.patch is None else [found.patch.check]))
+        ],
     )
     if found.contradiction is not None:
         console.print_line(f"contradiction: {found.contradiction}")
-    console.print_each("assumed", found.measured.assumed)
-    console.print_omissions(found.measured.left_out)
+    console.print_each("assumed", found.assumed)
+    console.print_omissions(found.left_out)
     console.print_line(f"{out}: {', '.join(sorted(found.appearance.maps))}")
     console.print_line(f"next: skinrig report {shell_quote(out)}")
     console.print_document(
@@ -69,6 +73,6 @@ def fuse(
             "rows": rows,
             "fusion": found.appearance.parameters["fusion"],
             "contradiction": found.contradiction,
-            "left_out": found.measured.left_out,
+            "left_out": found.left_out,
         },
     )

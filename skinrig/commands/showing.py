@@ -132,7 +132,7 @@ def view(
 
     Example: skinrig view -o page.html
 
-    Example: skinrig view demo/appearance-flash-moving-II -o face.html
+    Example: skinrig view demo/appearance-flash-moving-III -o face.html
 
     Example: skinrig view demo/appearance-dome-III --size-px 1024 --port 0
 

@@ -89,6 +89,28 @@ def fit_microstructure(
         If a folder lacks a map or enough kernels; the message names both.
     """
     dynamic_appearance.check_target(out)
+    fits, part = fit_part(appearances, paper_table=paper_table)
+    dynamic_appearance.add(out, MICROSTRUCTURE, part)
+    return fits
+
+
+def fit_part(
+    appearances: Sequence[Path], *, paper_table: bool
+) -> tuple[dict[str, SiteFit], SkinAppearance]:
+    """Fit the microstructure of sites, without writing it.
+
+    Parameters
+    ----------
+    appearances, paper_table
+        See `fit_microstructure`.
+
+    Returns
+    -------
+    fits
+        By site.
+    part
+        Their reliefs and kernel tables.
+    """
     if not appearances:
         raise MicrostructureFitError("appearances: got none, expected folders of caliper sessions")
     by_site: dict[str, list[tuple[Path, SkinAppearance]]] = {}
@@ -109,8 +131,7 @@ def fit_microstructure(
         },
         left_out=tuple((site, why) for site, fit in fits.items() if fit.kernels == 0),
     )
-    dynamic_appearance.add(out, MICROSTRUCTURE, part)
-    return fits
+    return fits, part
 
 
 def _parse_site(appearance: Path) -> tuple[str, Path]:

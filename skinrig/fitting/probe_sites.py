@@ -161,8 +161,7 @@ def place_sites(
     guessed: list[str] = []
     for name, (sigma_tr, stderr) in measured.items():
         if name in given:
-            column, row = given[name][0] * width, (1.0 - given[name][1]) * height
-            wanted = at_mm[min(int(row), height - 1), min(int(column), width - 1)]
+            wanted = _given_position(given[name], at_mm)
         elif name in SITE_OFFSETS_FROM_NOSE_MM:
             wanted, off_mm = _mean_site_position(name, at_mm[known])
             if off_mm > MAX_SITE_DISTANCE_MM:
@@ -189,6 +188,50 @@ def place_sites(
     how = "of the probe are placed as on a mean face, relative to the tip of the nose"
     assumed = (f"{', '.join(guessed)} {how}",) if guessed else ()
     return PlacedSites(tuple(sites), tuple(left_out), assumed)
+
+
+def locate_site(
+    name: str, position: SkinMap, *, landmarks: Path | None = None
+) -> tuple[Float64Array, bool]:
+    """Return the point of a site on a face, mm, and whether it is that of a mean face.
+
+    Parameters
+    ----------
+    name
+        Name of the site.
+    position, landmarks
+        See `map_translucency`.
+
+    Raises
+    ------
+    ProbeSiteError
+        If the site is unknown, or not on the scan.
+    """
+    at_mm, known = position.values.astype(np.float64), intersect_valid(position)
+    given: dict[str, tuple[float, float]] = {}
+    if landmarks is not None:
+        height, width = at_mm.shape[:2]
+        given = probe_sites.read_landmarks(landmarks, texture_px=(height, width))
+    if name in given:
+        wanted = _given_position(given[name], at_mm)
+        off_mm = float(np.linalg.norm(at_mm[known] - wanted, axis=-1).min()) if known.any() else 1e9
+    elif name in SITE_OFFSETS_FROM_NOSE_MM and known.any():
+        wanted, off_mm = _mean_site_position(name, at_mm[known])
+    else:
+        raise ProbeSiteError(
+            f"site: got {name!r}, expected {', '.join(SITE_OFFSETS_FROM_NOSE_MM)} or one of the "
+            "table of --sites; rename the folder or add it to the table"
+        )
+    if off_mm > MAX_SITE_DISTANCE_MM:
+        raise ProbeSiteError(f"{name}: the scan ends {off_mm:.0f} mm short of the site")
+    return wanted, name not in given
+
+
+def _given_position(place: tuple[float, float], at_mm: Float64Array) -> Float64Array:
+    """Return the point at a place of a texture, in fractions of its width and height."""
+    height, width = at_mm.shape[:2]
+    column, row = place[0] * width, (1.0 - place[1]) * height
+    return at_mm[min(int(row), height - 1), min(int(column), width - 1)]
 
 
 def interpolate_sites(

@@ -1,6 +1,6 @@
 """Fuse one person's maps by several rigs into one appearance: `skinrig fuse`."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -10,9 +10,10 @@ import numpy as np
 from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from model.skin_reflectance import NORMAL_MAPS, TRANSLUCENCY_MAP
-from reconstruction.fusion.consistency import RigCheck, check_rigs, name_faulty_rig
+from reconstruction.fusion.consistency import MIN_PROBABILITY, RigCheck, check_rigs, name_faulty_rig
+from reconstruction.fusion.patch_normals import PatchCheck
 from reconstruction.fusion.person import PersonSkin
-from reconstruction.fusion.signals import PROPERTY_NAMES, RigBands
+from reconstruction.fusion.signals import RigBands
 from reconstruction.fusion.texels import (
     BLOCK_TEXELS,
     OffsetModel,
@@ -23,10 +24,12 @@ from reconstruction.fusion.texels import (
 from reconstruction.subsurface.translucency import TranslucencyPrior
 from skinrig.appearances import face_textures
 from skinrig.appearances.contents import derive_appearance, intersect_valid, list_assumptions
-from skinrig.appearances.texel_placement import place_texels
+from skinrig.appearances.texel_placement import TexelPlacement, place_texels
 from skinrig.arrays import Float32Array, Int64Array
 from skinrig.fitting import probe_sites
+from skinrig.fusing.description import describe_checks, describe_patch, describe_person
 from skinrig.fusing.measurements import SITE_SIGMA_TR_SD, Measurements
+from skinrig.fusing.patches import PATCH_PREFIX, PlacedPatch, place_patch
 from skinrig.fusing.sources import FusionInputError, Source, Sources, read_sources
 from skinrig.fusing.texel_colors import (
     LOG_R_D_OVER_REFLECTANCE,
@@ -43,6 +46,7 @@ QUANTITY_BY_RIG: Final[Mapping[str, str]] = {
     "dome": "R_d",
     "flash": "diffuse light",
     "probe": "sigma_tr",
+    "gradient": "normals",
 }
 """Quantity of a rig in the name of a contradiction."""
 FUSED_MAPS: Final = ("melanin", "melanin_optical_depth", "hemoglobin", "r_d", TRANSLUCENCY_MAP)
@@ -83,12 +87,27 @@ class FusedDouble:
     errors: OffsetModel
     measured: Measurements
     checks: tuple[RigCheck, ...]
+    patch: PlacedPatch | None = None
+
+    @property
+    def assumed(self) -> tuple[str, ...]:
+        """What was assumed."""
+        return (*self.measured.assumed, *(() if self.patch is None else self.patch.assumed))
+
+    @property
+    def left_out(self) -> tuple[tuple[str, str], ...]:
+        """What was omitted, with reasons."""
+        return (*self.measured.left_out, *(() if self.patch is None else self.patch.left_out))
 
     @property
     def contradiction(self) -> str | None:
-        """The rig that contradicts the others, in words; None without a clear one."""
-        named = name_faulty_rig(self.checks)
-        return None if named is None else named.describe(QUANTITY_BY_RIG[named.rig])
+        """The rigs that contradict the others or themselves, in words; None without a clear one."""
+        named: list[RigCheck | PatchCheck] = []
+        if (rig := name_faulty_rig(self.checks)) is not None:
+            named.append(rig)
+        if self.patch is not None and self.patch.check.probability > MIN_PROBABILITY:
+            named.append(self.patch.check)
+        return "; ".join(one.describe(QUANTITY_BY_RIG[one.rig]) for one in named) or None
 
 
 def fuse(
@@ -139,6 +158,10 @@ def fuse_sources(
     report("common properties of the skin")
     person, errors = measured.estimate_person()
     checks = check_rigs(measured.rigs, measured.regions(errors), errors, person)
+    gradient = sources.get("gradient")
+    patch = None
+    if gradient is not None:
+        patch = place_patch(gradient, sources.get("dome"), sites=given.sites)
     base = sources.get("dome") or sources.by_rig["flash"]
     maps = dict(base.appearance.maps)
     carried = [name for name in maps if name not in FUSED_MAPS]
@@ -149,12 +172,22 @@ def fuse_sources(
     provenance |= {name: list(color_rigs) for name in fused}
     if TRANSLUCENCY_MAP in fused:
         provenance[TRANSLUCENCY_MAP] = [rig.rig for rig in measured.rigs]
+    files = dict(base.appearance.files)
+    assumed, left_out = list(measured.assumed), list(measured.left_out)
+    if patch is not None:
+        maps |= patch.maps
+        files |= patch.files
+        rigs = ["gradient"] if patch.fused is None else ["dome", "gradient"]
+        for name in patch.maps:
+            provenance[name] = rigs if name.startswith(PATCH_PREFIX) else ["gradient"]
+        assumed += patch.assumed
+        left_out += patch.left_out
     own = {name: value for name, value in base.appearance.parameters.items() if name != "work"}
-    parameters: dict[str, object] = {
+    parameters: dict[str, Any] = {
         **own,
         "assumed": [
             *(f"{s.rig}: {text}" for s in sources.by_rig.values() for text in _assumed(s)),
-            *measured.assumed,
+            *assumed,
         ],
         "appearances": [one.path.name for one in sources.by_rig.values()],
         FUSION_KEY: {
@@ -164,15 +197,18 @@ def fuse_sources(
             "checks": describe_checks(checks),
         },
     }
+    if patch is not None:
+        parameters["parts"] = patch.parameters
+        parameters[FUSION_KEY]["patch"] = describe_patch(patch)
     appearance = derive_appearance(
         *(one.appearance for one in sources.by_rig.values()),
         maps=maps,
         parameters=parameters,
         inputs={one.rig: one.digest for one in sources.by_rig.values()},
-        left_out=(*base.appearance.left_out, *measured.left_out),
-        files=dict(base.appearance.files),
+        left_out=(*base.appearance.left_out, *left_out),
+        files=files,
     )
-    return FusedDouble(appearance, person, errors, measured, checks)
+    return FusedDouble(appearance, person, errors, measured, checks, patch)
 
 
 def _assumed(source: Source) -> list[str]:
@@ -198,8 +234,7 @@ def measure(sources: Sources, given: FusionInputs) -> Measurements:
     colors: list[ColorSource] = []
     assumed: list[str] = []
     left_out: list[tuple[str, str]] = []
-    if sources.get("gradient") is not None:
-        left_out.append(("gradient", "normals of a patch are not fused with those of a face"))
+    placement: TexelPlacement | None = None
     position = None if dome is None else dome.appearance.maps["position"]
     for one in (dome, flash, probe):
         if one is not None and not one.spectra()[2]:
@@ -209,7 +244,6 @@ def measure(sources: Sources, given: FusionInputs) -> Measurements:
         colors.append(DomeColors.of(dome.appearance, camera, illuminant))
     if flash is not None:
         camera, illuminant, _ = flash.spectra()
-        placement = None
         if dome is not None:
             placement = _place_flash(dome, flash, given)
         colors.append(FlashColors.of(flash.appearance, placement, camera, illuminant))
@@ -233,10 +267,11 @@ def measure(sources: Sources, given: FusionInputs) -> Measurements:
         tuple(assumed),
         tuple(left_out),
         bands,
+        placement,
     )
 
 
-def _place_flash(dome: Source, flash: Source, given: FusionInputs) -> Any:
+def _place_flash(dome: Source, flash: Source, given: FusionInputs) -> TexelPlacement:
     """Return the places of the dome's texels in the flash image."""
     face = face_textures.read(dome.path, given.landmarks)
     if given.image_landmarks is not None:
@@ -371,51 +406,3 @@ def _write_block(
         planes["r_d"][block] = np.concatenate([r_d, r_d * np.sinh(sd)], axis=-1)
     if measured.probe_bands is not None:
         planes["expected"][block] = np.exp(-skin.log_signals[:, -3:])
-
-
-def describe_person(person: PersonSkin, rigs: Sequence[RigBands]) -> dict[str, Any]:
-    """Return what the person's skin has in common, as JSON values.
-
-    Parameters
-    ----------
-    person
-        Estimate.
-    rigs
-        Rigs of the signals.
-    """
-    sd = np.sqrt(np.diag(person.covariance))
-    return {
-        "properties_sd": {
-            name: {"value": float(person.properties_sd[k]), "stderr": float(sd[k])}
-            for k, name in enumerate(PROPERTY_NAMES)
-        },
-        "log_offset": {
-            rig.rig: {
-                "value": person.offset[3 * k : 3 * k + 3].tolist(),
-                "stderr": sd[6 + 3 * k : 9 + 3 * k].tolist(),
-            }
-            for k, rig in enumerate(rigs)
-        },
-        "log_melanin_stderr": float(sd[-2]),
-        "log_blood_stderr": float(sd[-1]),
-    }
-
-
-def describe_checks(checks: Sequence[RigCheck]) -> list[dict[str, Any]]:
-    """Return the agreement of the rigs, as JSON values.
-
-    Parameters
-    ----------
-    checks
-        Of all rigs.
-    """
-    return [
-        {
-            "rig": check.rig,
-            "probability_faulty": check.probability,
-            "log_gain": check.log_gain.tolist(),
-            "stderr": check.stderr.tolist(),
-            "p_value": check.p_value,
-        }
-        for check in checks
-    ]

@@ -11,6 +11,7 @@ from reconstruction.fusion.person import POPULATION_MEAN, PersonSkin, Regions, e
 from reconstruction.fusion.regions import hide_signals, summarize_regions
 from reconstruction.fusion.signals import FusionError, RigBands, residual_covariance
 from reconstruction.fusion.texels import OffsetModel, RigColors
+from skinrig.appearances.texel_placement import TexelPlacement
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.fitting import probe_sites
 from skinrig.fusing.texel_colors import ColorSource
@@ -43,6 +44,10 @@ class Measurements:
         (H W, 3): surface points; None without a mesh.
     assumed, left_out
         What was assumed and omitted.
+    probe_bands
+        Channels of a probe with sites; None without.
+    placement
+        Places of the texels in the flash rig's image; None if it is the texture, or missing.
     """
 
     colors: tuple[ColorSource, ...]
@@ -52,6 +57,7 @@ class Measurements:
     assumed: tuple[str, ...] = ()
     left_out: tuple[tuple[str, str], ...] = ()
     probe_bands: RigBands | None = None
+    placement: TexelPlacement | None = None
 
     @property
     def rigs(self) -> tuple[RigBands, ...]:

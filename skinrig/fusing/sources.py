@@ -1,5 +1,6 @@
 """Find the maps of one person by several rigs, from sessions or appearances."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,6 +44,10 @@ class Source:
         session = self._sibling("session", SESSION_FILE)
         rig = load_rig(self.rig) if session is None else Session.open(session).rig
         return rig.views[0].spectral_sensitivity, rig.lights[0].illuminant, session is not None
+
+    def site(self) -> str:
+        """Return the site of a patch: the last word of the folder's name."""
+        return re.sub(r"[^a-z0-9_]", "_", self.path.resolve().name.rpartition("-")[2].lower())
 
     def truth(self) -> SkinAppearance | None:
         """Return the ground truth next to the maps; None of measured people."""

@@ -19,11 +19,15 @@ from skinrig.unit_format import format_unit
 SMALL_WIDTH_PX = 110
 """Width of half-vector normals, weights, samples and residuals."""
 BACKGROUND_CODE = 0.5
+OWN_PIXELS = ("_", "patch_", "microrelief_")
+"""Prefixes of maps that are not on the texture of the positions."""
 Box = tuple[FloatArray, FloatArray]
 Index = NDArray[np.intp]
 RELATIVE_ERROR_MAPS = ("r_d",)
 """Maps with uncertainties in percent of the estimate."""
 FIRST_MAPS = ("r_d", "normals_refined", "normals", "half_vector_normals")
+SKIN_MAPS = ("melanin", "hemoglobin", "translucency")
+"""Maps of a fused person."""
 
 
 def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
@@ -54,15 +58,15 @@ def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
         known = np.flatnonzero(usable)
         true_view = FrontView.of(true_place.values.reshape(-1, 3)[known].astype(float), box)
     best = next((key for key in FIRST_MAPS[1:] if key in appearance.maps), "")
-    large = {"r_d", best}
+    large = {"r_d", "melanin", "hemoglobin", best}
     shown_truths: set[str] = set()
     # main maps first, then by name
-    keys = [key for key in FIRST_MAPS if key in appearance.maps]
+    keys = [key for key in (*FIRST_MAPS, *SKIN_MAPS) if key in appearance.maps]
     keys += sorted(set(appearance.maps) - set(keys))
     minor = []
     for key in keys:
         skin_map = appearance.maps[key]
-        if key == "position" or key.startswith("_"):
+        if key == "position" or key.startswith(OWN_PIXELS):
             continue
         values = skin_map.values[rows, columns]
         good = skin_map.mask[rows, columns]
@@ -82,7 +86,7 @@ def section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
         if skin_map.stderr is not None:
             stderr = skin_map.stderr[rows, columns]
             figures.append(_stderr_image(key, skin_map, stderr, view, (rows, columns), width))
-        if key in FIRST_MAPS:
+        if key in (*FIRST_MAPS, *SKIN_MAPS):
             yield page.Heading(map_heading(key))
             yield page.Images(figures, small=key not in large)
         else:
@@ -114,7 +118,7 @@ def _shown(
 
 def _title(title: str, key: str) -> str:
     """Return the caption of an image, with its map where several share a heading."""
-    return title if key in FIRST_MAPS else f"{map_title(key)}, {title}"
+    return title if key in (*FIRST_MAPS, *SKIN_MAPS) else f"{map_title(key)}, {title}"
 
 
 def _error(

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from typer.testing import CliRunner
 
 from model import store
@@ -152,3 +153,57 @@ def test_command_prints_one_document(folders, tmp_path):
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0, result.output
     assert '"skinrig.fuse/1"' in result.output
+
+
+def write_gradient(path, *, turned_deg=0.0):
+    """A drawn relief of 64 x 64 pixels, whose normals are turned about the camera's axis."""
+    rng = np.random.default_rng(2)
+    height = ndimage.gaussian_filter(rng.standard_normal((64, 64)), 4.0)
+    down, right = np.gradient(height / height.std())
+    angle = np.radians(turned_deg)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    slopes = np.stack([right, -down], axis=-1) @ turn.T
+    normals = np.concatenate([-slopes, np.ones((64, 64, 1))], axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    maps = {
+        "normals_a000_n0": SkinMap(normals, "1", np.full_like(normals, 0.02)),
+        "height_a000_n0": SkinMap(20.0 * height / height.std(), "um"),
+    }
+    parameters = {"kind": "appearance", "pixel_um": 6.0, "states": ["a000_n0"]}
+    return store.write(path, SkinAppearance(maps, "simulated", parameters, seed=2))
+
+
+def test_fuse_places_gradient_patch_by_table(folders, tmp_path):
+    write_gradient(tmp_path / "gradient-forehead")
+    sites = tmp_path / "sites.csv"
+    sites.write_text("name,x,y\nforehead,12,12\n", encoding="utf-8")
+    paths = folders / "dome", tmp_path / "gradient-forehead"
+    found = fuse(FusionInputs(paths, sites=sites), out=tmp_path / "double")
+    maps = store.read(tmp_path / "double").maps
+    at = maps["patch_position_forehead"].values.reshape(-1, 3)
+    assert np.abs(at.mean(axis=0) - positions()[0][12, 12]).max() < 1e-3
+    mean = maps["patch_normals_forehead"].values.reshape(-1, 3).mean(axis=0)
+    # the patch's mean tilt is the face's there
+    assert np.degrees(np.arccos(mean @ positions()[1][12, 12] / np.linalg.norm(mean))) < 2.0
+    assert found.appearance.parameters["fusion"]["maps"]["patch_normals_forehead"] == [
+        "dome",
+        "gradient",
+    ]
+    assert "microrelief_forehead" in maps
+    assert found.contradiction is None
+
+
+def test_fuse_turned_gradient_normals_are_named(folders, tmp_path):
+    write_gradient(tmp_path / "gradient-forehead", turned_deg=40.0)
+    paths = folders / "dome", tmp_path / "gradient-forehead"
+    found = fuse(FusionInputs(paths), out=tmp_path / "double").contradiction
+    assert found is not None
+    assert found.startswith("gradient: normals turned by 40 degrees")
+
+
+def test_fuse_patch_of_unknown_site_is_left_out(folders, tmp_path):
+    write_gradient(tmp_path / "gradient-elbow")
+    paths = folders / "dome", tmp_path / "gradient-elbow"
+    found = fuse(FusionInputs(paths), out=tmp_path / "double")
+    assert "elbow" in dict(found.left_out)["gradient: normals"]
+    assert "patch_normals_elbow" not in found.appearance.maps

@@ -1,0 +1,58 @@
+"""Report section on a fused person: the rigs behind each map, and their agreement."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from model.skin import SkinAppearance
+from skinrig.fusing.double import FUSION_KEY
+from skinrig.reporting import map_images, page
+from skinrig.reporting.map_names import map_title
+
+
+def is_fused(appearance: SkinAppearance) -> bool:
+    """Return whether `skinrig fuse` wrote an appearance.
+
+    Parameters
+    ----------
+    appearance
+        Any.
+    """
+    return FUSION_KEY in appearance.parameters
+
+
+def section(appearance: SkinAppearance) -> Iterator[page.Block]:
+    """Yield the rigs behind each map and their agreement.
+
+    Parameters
+    ----------
+    appearance
+        Maps of a fused person.
+    """
+    found: Any = appearance.parameters[FUSION_KEY]
+    rigs_by_map: Mapping[str, list[str]] = found["maps"]
+    names: dict[tuple[str, ...], list[str]] = {}
+    for name, rigs in rigs_by_map.items():
+        if not name.startswith("_"):
+            names.setdefault(tuple(rigs), []).append(map_title(name))
+    rows = [[", ".join(rigs), ", ".join(maps)] for rigs, maps in names.items()]
+    yield page.build_table(["rigs", "maps"], rows, caption="Rigs behind each map")
+    if found["checks"]:
+        yield page.build_table(
+            ["rig", "probability that it is faulty", "p value of its gains"],
+            [[one["rig"], one["probability_faulty"], one["p_value"]] for one in found["checks"]],
+            caption="Agreement of the rigs",
+        )
+    for name, one in appearance.maps.items():
+        drawing = map_images.MapDrawing(map_title(name), "°", one.mask)
+        if name.startswith("patch_normals_") and one.stderr is not None:
+            spread = np.degrees(one.stderr[..., 0])
+            reach = map_images.compute_percentile_reach(spread, one.mask, 98)
+            yield page.Heading(map_title(name))
+            yield page.Images(
+                [
+                    drawing.normals("normals of the patch on the face", one.values),
+                    drawing.size("standard uncertainty", spread, reach),
+                ]
+            )
