@@ -68,6 +68,7 @@ void show_pin(const char *pin, double value) {
 
 bool board_start(void) {
   PRESCALE = CLOCK_MHZ - 1u; /* the counter is free-running: no tick can be missed */
+  COUNTER = 0;               /* it ran before: QEMU takes 40 ms to open its terminals */
   for (uint32_t uart = LINE; uart <= PINS; uart += PINS - LINE) {
     REGISTER(uart + UART_BAUD) = CLOCK_MHZ * 1000000u / 115200u;
     REGISTER(uart + UART_CTRL) = uart == LINE ? 1u | 2u | 8u : 1u;
