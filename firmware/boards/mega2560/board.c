@@ -53,7 +53,7 @@ static volatile uint8_t in_head, in_tail;
 static volatile uint16_t out_head, out_tail;
 static volatile char in_ring[RING], out_ring[OUT];
 static volatile int32_t stage_at, stage_target, jaws_at, jaws_target;
-static double jaws_lost_mm;
+static double jaws_ordered_mm;
 
 static uint16_t read_analog(uint8_t channel) {
   ADMUX = (uint8_t)(1u << REFS0 | channel);
@@ -242,13 +242,14 @@ static int32_t jaw_steps(void) {
 /* The steps count from the potentiometer where they were lost, at power-up or in a stall. */
 void board_start_jaws(double target_mm, bool back) {
   (void)target_mm, (void)back;
-  jaws_lost_mm = 0.0;
   double reading_mm = jaws_reading_mm();
-  if (fabs(reading_mm - (double)jaw_steps() * MM_PER_STEP) <= STALL_MM) return;
+  jaws_ordered_mm = (double)jaw_steps() * MM_PER_STEP;
+  if (fabs(reading_mm - jaws_ordered_mm) <= STALL_MM) return;
   int32_t at = (int32_t)(reading_mm / MM_PER_STEP + 0.5);
   cli();
   jaws_at = jaws_target = at;
   sei();
+  jaws_ordered_mm = (double)at * MM_PER_STEP;
 }
 
 bool board_drive_jaws(double distance_mm) {
@@ -256,16 +257,15 @@ bool board_drive_jaws(double distance_mm) {
   cli();
   jaws_target = target;
   sei();
-  double lag = distance_mm - (double)jaw_steps() * MM_PER_STEP;
-  /* within the stepper's own delay the jaws follow */
-  jaws_lost_mm = fabs(lag) < STALL_MM ? lag : 0.0;
+  jaws_ordered_mm = distance_mm;
   return !is_high(PIN_HOME);
 }
 
 void board_read_jaws(double *distance_mm, double *force_n) {
   double steps_mm = (double)jaw_steps() * MM_PER_STEP, reading_mm = jaws_reading_mm();
   bool stalled = fabs(reading_mm - steps_mm) > STALL_MM;
-  *distance_mm = stalled ? reading_mm : steps_mm + jaws_lost_mm;
+  bool follows = fabs(jaws_ordered_mm - steps_mm) <= STALL_MM; /* within the stepper's delay */
+  *distance_mm = stalled ? reading_mm : follows ? jaws_ordered_mm : steps_mm;
   *force_n = (read_analog(0) - 512.0) * (10.0 / 512.0); /* amplifier: -10 to 10 N */
 }
 
