@@ -237,6 +237,9 @@ class ExpressionOptions:
         Target face: APPEARANCE/ folder with hemoglobin and melanin; default: the fitted face.
     landmarks
         CSV table name,x,y: first of the fitted face, then of the target face.
+    color_table
+        Table of skin color, .exr or .csv (`skinrig analyse color-table`); default: linear sRGB
+        under D65.
     """
 
     parts: str | None = None
@@ -246,6 +249,7 @@ class ExpressionOptions:
     gain: float = 1.0
     target_face: Path | None = None
     landmarks: list[Path] | None = None
+    color_table: Path | None = None
 
     def expression(self, weights: Mapping[str, float]) -> ExpressionRequest:
         """Return the options as a request for an expression."""
@@ -258,6 +262,7 @@ class ExpressionOptions:
             emotional=self.emotional,
             gain=self.gain,
             target_face=_read_target_face(self.target_face, self.landmarks or []),
+            color_table=self.color_table,
         )
 
 

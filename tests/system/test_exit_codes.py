@@ -69,6 +69,8 @@ UNREADABLE = {
     "apply microstructure": ["a --out b"],
     "analyse albedo": ["maps --out a", "--labels l.csv --out a"],
     "analyse brdf": ["--out a --labels l.csv"],
+    "analyse blood": ["a"],
+    "analyse color-table": ["--size 8", "file.txt --eumelanin-fraction 0.5 --out t"],
     "analyse lumitexel": ["a"],
     "fuse": ["--out a"],
 }
@@ -149,6 +151,16 @@ UNUSABLE = {
     "apply microstructure": ["none --weights smile=1 --mesh none.obj --out a"],
     "analyse albedo": ["none folder --out a"],
     "analyse brdf": ["none folder --out a"],
+    "analyse blood": ["none --out a", "folder --out a"],
+    "analyse color-table": [
+        "none.exr --out t",
+        "file.txt --out t",
+        "--camera none --out t",
+        "--size 3 --out t",
+        "--eumelanin-fraction 2 --out t",
+        "--epidermal-blood-ratio 1 --out t",
+        "--tissue wax --out t",
+    ],
     "analyse lumitexel": ["none none --out a"],
     "fuse": ["none folder --out a", "folder --out a"],
 }
