@@ -141,7 +141,7 @@ UNUSABLE = {
     "fit traits": ["none folder --labels l.csv --out t"],
     "fit reflectance": ["none --out t"],
     "fit facial-color": ["none --out m"],
-    "fit wrinkles": ["none --out m"],
+    "fit wrinkles": ["none --out m", "folder --method sums --out m"],
     "fit microstructure": ["none --out m"],
     "fit template": ["none --out m.ply"],
     "import photos": ["none --out s", "folder --out s", "file.txt --out s"],
