@@ -326,11 +326,20 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def write_exr(path: str | Path, image: Float32Array) -> None:
-    """Write (H, W) as channel Y or (H, W, 3) as RGB, float32, compressed without loss."""
+def write_exr(
+    path: str | Path, image: Float32Array, *, attributes: Mapping[str, str] | None = None
+) -> None:
+    """Write (H, W) as channel Y or (H, W, 3) as RGB, float32, compressed without loss.
+
+    Texts of `attributes` are written to the header.
+    """
     import OpenEXR
 
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header: dict[str, Any] = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        **(attributes or {}),
+    }
     channel = "Y" if image.ndim == 2 else "RGB"
     pixels = np.ascontiguousarray(image, np.float32)
     with OpenEXR.File(header, {channel: pixels}) as file:
@@ -346,6 +355,17 @@ EXR_MAGIC = b"v/1\x01"
 
 def read_exr(path: str | Path) -> Float32Array:
     """Read an EXR file with channel Y or RGB as float32 (H, W) or (H, W, 3).
+
+    Raises
+    ------
+    StoreError
+        When the file is not an EXR of these channels.
+    """
+    return read_exr_with_attributes(path)[0]
+
+
+def read_exr_with_attributes(path: str | Path) -> tuple[Float32Array, dict[str, str]]:
+    """Read an EXR file like `read_exr`, and the texts of its header.
 
     Raises
     ------
@@ -371,8 +391,9 @@ def read_exr(path: str | Path) -> Float32Array:
                     f"{path}: got channels {sorted(channels)}, expected Y or R, G and B"
                 )
             pixels = np.array(channels[name].pixels, np.float32)
+            texts = {k: v for k, v in file.header().items() if isinstance(v, str)}
     except StoreError:
         raise
     except Exception as error:  # the library raises bare RuntimeErrors of several kinds
         raise StoreError(f"{path}: cannot be read as EXR ({error})") from error
-    return pixels
+    return pixels, texts

@@ -195,14 +195,6 @@ def test_data():
 
 
 @pytest.fixture(scope="session")
-def device_port(request):
-    url = request.config.getoption("--device-port")
-    if url is None:
-        pytest.skip("no --device-port was given")
-    return url
-
-
-@pytest.fixture(scope="session")
 def typical_person(tmp_path_factory):
     """Return a function from a preset to the file of a person whose optics are the model's.
 

@@ -326,6 +326,7 @@ enum code bank_require_within_limits(requested_light *light, struct loads *most)
   heat_until_now();
   light(-1, note_led, NULL);
   for (uint16_t k = 0; k < requested.count; k++) {
+    board_feed_watchdog();
     collect_led(requested.order[k], light);
     if (judged.full) return refuse(CODE_IGNORED, P("too many pulses in a second"));
     TRY(judge_led(requested.order[k], most));

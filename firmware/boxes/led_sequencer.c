@@ -65,6 +65,7 @@ static void take_step(void) {
   kind_next_step(&unit.next);
   if (step.action == PULSE) {
     unit.run_row = step.row;
+    core_update_clock(); /* a frame is found by this time: the release's, not the table's */
     unit.steps[step.row] = core_clock_us();
     board_release_cameras(table[step.row].mask & unit.mask);
     say(P("SEQ:STEP"), step.row);

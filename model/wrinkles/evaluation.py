@@ -3,6 +3,7 @@
 Maps are `wrinkle_base` (n_x/n_z, n_y/n_z, 0), `wrinkle_map` in the same form and
 `wrinkle_mask_<zone>` of the first wrinkle map, `wrinkle_<k>_map` and `wrinkle_<k>_mask_<zone>`
 of others, zones numbered from 0; and the file `wrinkles.json` with names, tables and the clamp.
+A model by differences of normals also has `wrinkle_difference`, which replaces the first map.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 from model.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from model.checks import Checks
 from model.skin import SkinMap
+from model.wrinkles import differences as wrinkle_differences
 from model.wrinkles import partial_derivatives as wrinkles
 from model.wrinkles.expressions import (
     ZONE_SUM_LIMITS,
@@ -34,6 +36,7 @@ from model.wrinkles.partial_derivatives import WrinkleLayer
 
 SCHEMA = "skinrig.wrinkles/1"
 WRINKLE_FILE = "wrinkles.json"
+DIFFERENCE_MAP = "wrinkle_difference"
 DERIVATIVE_FRAME = "tangent space, +X right, +Y up; derivatives n_x/n_z, n_y/n_z"
 NO_ERRORS: Mapping[str, tuple[float, ...]] = MappingProxyType({})
 
@@ -80,6 +83,9 @@ class WrinkleModel:
     weight_stderr : mapping of str to tuple of float
         Standard error of the rows of the first layer's table that were fitted; infinite for a
         weight that was not determined.
+    difference : ndarray, shape (h, w, 3), optional
+        Difference of normals in [0, 1] of the only layer, as in `model.wrinkles.differences`. If
+        given, it is evaluated instead of the layer's derivatives.
     """
 
     base: FloatArray
@@ -88,6 +94,7 @@ class WrinkleModel:
     valid: BoolArray | None = None
     base_stderr: FloatArray | None = None
     weight_stderr: Mapping[str, tuple[float, ...]] = field(default_factory=lambda: NO_ERRORS)
+    difference: FloatArray | None = None
 
     def __post_init__(self) -> None:
         """Raise for shapes that do not fit; set unmeasured values to 0."""
@@ -102,6 +109,11 @@ class WrinkleModel:
         object.__setattr__(self, "base", np.where(valid[..., None], base, base.dtype.type(0)))
         object.__setattr__(self, "valid", valid)
         object.__setattr__(self, "layers", tuple(self.layers))
+        if self.difference is not None:
+            single = len(self.layers) == 1
+            Checks(WrinkleError).require(single, "layers", len(self.layers), "1 with differences")
+            Checks(WrinkleError).shape("difference", np.asarray(self.difference), ("h", "w", 3))
+            Checks(WrinkleError).within("difference", self.difference, "[0, 1]")
         errors = {name: tuple(map(float, row)) for name, row in self.weight_stderr.items()}
         object.__setattr__(self, "weight_stderr", MappingProxyType(errors))
 
@@ -123,7 +135,13 @@ class WrinkleModel:
         assert self.valid is not None  # noqa: S101
         sums = tuple(zone_sums(weights, layer.table) for layer in self.layers)
         held = tuple(clamp_sums(one, self.clamp) for one in sums)
-        normals = wrinkles.combine_layers(self.base, self.layers, weights, clamp=self.clamp)
+        if self.difference is None:
+            normals = wrinkles.combine_layers(self.base, self.layers, weights, clamp=self.clamp)
+        else:
+            masks, table = self.layers[0].masks, self.layers[0].table
+            shown = {"clamp": self.clamp, "table": table}
+            base = wrinkles.decode(self.base)
+            normals = wrinkle_differences.combine(base, self.difference, masks, weights, **shown)
         normals[~self.valid] = 0.0
         parts = [
             float((layer.masks[before != after] > 0).any(axis=0).mean())
@@ -152,6 +170,11 @@ class WrinkleModel:
                     "source": table.source,
                 }
             )
+        if self.difference is not None:
+            # stored without the bias of 0.5
+            signed = (2.0 * self.difference - 1.0).astype(np.float32)
+            note = "difference of tangent-space normals at full strength"
+            maps[DIFFERENCE_MAP] = SkinMap(signed, "1", description=note)
         errors = {
             name: [value if math.isfinite(value) else None for value in row]
             for name, row in self.weight_stderr.items()
@@ -188,6 +211,7 @@ class WrinkleModel:
                 for name, row in given["weight_stderr"].items()
             }
             base = _require_map(maps, "wrinkle_base")
+            signed = maps.get(DIFFERENCE_MAP)
             return cls(
                 base.values[..., :2],
                 layers,
@@ -195,6 +219,7 @@ class WrinkleModel:
                 base.valid,
                 None if base.stderr is None else base.stderr[..., :2],
                 errors,
+                None if signed is None else 0.5 + 0.5 * signed.values,
             )
         except WrinkleError:
             raise

@@ -22,6 +22,12 @@ from reconstruction.arrays import BoolArray, Float64Array, Int64Array
 
 FACE_SITES = ("forehead", "cheek", "nose", "chin", "temple")
 """Sites of the curves."""
+LANDMARK_ALIASES: Mapping[str, str] = {
+    "cheek": "cheek left",
+    "nose": "nose tip",
+    "temple": "temple left",
+}
+"""Landmark that replaces a site's own name in a table without it."""
 TRANSITION_FALSE_ALARM_RATE = 0.05
 """Probability of a detected transition in a cycle without one."""
 MAX_PHASE_FRACTION = 0.25
@@ -177,6 +183,38 @@ def standard_positions(skin: ArrayLike) -> dict[str, tuple[float, float]]:
         name: (float(left + u * (right - left)), float(top + v * (bottom - top)))
         for name, (u, v) in _FACE_POSITIONS.items()
     }
+
+
+def select_sites(table: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    """Select the sites' positions from a table of landmarks, by name or alias.
+
+    Parameters
+    ----------
+    table : mapping of str to (x, y)
+        Landmarks, px.
+
+    Returns
+    -------
+    dict
+        (x, y) of those of :data:`FACE_SITES` that the table has.
+
+    Raises
+    ------
+    CurveError
+        If the table has none.
+
+    Examples
+    --------
+    >>> select_sites({"nose tip": (3.0, 4.0), "ear": (0.0, 0.0)})
+    {'nose': (3.0, 4.0)}
+    """
+    named = {
+        name: name if name in table else LANDMARK_ALIASES.get(name, name) for name in FACE_SITES
+    }
+    found = {name: table[place] for name, place in named.items() if place in table}
+    expected = f"one of {', '.join((*FACE_SITES, *LANDMARK_ALIASES.values()))}"
+    Checks(CurveError).require(found, "names of landmarks", ", ".join(table) or "none", expected)
+    return found
 
 
 @dataclass(frozen=True, slots=True)

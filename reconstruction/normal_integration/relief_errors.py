@@ -11,13 +11,18 @@ from typing import Final
 
 import numpy as np
 
-from reconstruction.arrays import BoolArray, Float32Array, FloatArray
+from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.normal_integration.height_filters import SIGMA_PER_CUTOFF
 
 RELATIVE_HEIGHT_ERROR: Final = 0.07
 """Error of a height over the standard deviation of the relief."""
 RELATIVE_SLOPE_ERROR: Final = 0.055
 """Error of a normal, rad in one direction, over the standard deviation of slopes."""
+DIFFUSE_SCALE_MM: Final = 0.15
+"""Standard deviation of the Gaussian that smooths the surface whose normals diffuse normals are."""
+RELATIVE_DIFFUSE_ERROR: Final = 0.63
+"""Error of a diffuse normal, rad in one direction, over the standard deviation of such normals.
+Set with `DIFFUSE_SCALE_MM` on grooves of six voxel patches (docs/validation/voxel-skin.md)."""
 
 
 def height_stderr(height: FloatArray, stderr: Float32Array, valid: BoolArray) -> Float32Array:
@@ -69,9 +74,39 @@ def normal_stderr(normals: FloatArray, stderr: Float32Array, valid: BoolArray) -
     """
     if not valid.any():
         return stderr
-    across = np.var(normals[valid][:, :2], axis=0, dtype=np.float64)
-    model = RELATIVE_SLOPE_ERROR * float(np.sqrt(across.mean()))
+    model = RELATIVE_SLOPE_ERROR * float(np.sqrt(_slope_variance(normals, valid)))
     return np.where(valid, np.hypot(stderr, np.float32(model)), stderr)
+
+
+def diffuse_normal_stderr(
+    normals: FloatArray, stderr: Float32Array, valid: BoolArray
+) -> Float32Array:
+    """Return standard errors of diffuse normals, of noise and of a relief's grooves together.
+
+    Grooves scatter light sideways, and shadow it, by other amounts than a smoothed surface does.
+    Parameters and result are those of `normal_stderr`. Noise of `stderr` does not count as relief.
+
+    Examples
+    --------
+    >>> normals = np.array([[[0.1, 0.0, 1.0], [-0.1, 0.0, 1.0]]])
+    >>> known = np.ones((1, 2), bool)
+    >>> even = diffuse_normal_stderr(normals, np.zeros((1, 2), np.float32), known)
+    >>> noisy = diffuse_normal_stderr(normals, np.full((1, 2), 0.08, np.float32), known)
+    >>> even.astype(float).round(4).tolist(), noisy.astype(float).round(4).tolist()
+    ([[0.0445, 0.0445]], [[0.08, 0.08]])
+    """
+    if not valid.any():
+        return stderr
+    noise = float(np.square(stderr[valid], dtype=np.float64).mean())
+    relief = max(_slope_variance(normals, valid) - noise, 0.0)
+    model = RELATIVE_DIFFUSE_ERROR * float(np.sqrt(relief))
+    return np.where(valid, np.hypot(stderr, np.float32(model)), stderr)
+
+
+def _slope_variance(normals: FloatArray, valid: BoolArray) -> float:
+    """Return the variance of normals in one direction, mean of both, rad^2."""
+    across: Float64Array = np.var(normals[valid][:, :2], axis=0, dtype=np.float64)
+    return float(across.mean())
 
 
 def expected_height_rms(

@@ -143,9 +143,9 @@ def fit_texels(
     ----------
     weight : ndarray, shape (H, W)
         Sum over expressions of the squared strength (times a pixel's weight).
-    product : ndarray, shape (H, W, 2)
-        Sum over expressions of strength times derivative (times the same weight).
-    noise : ndarray, shape (H, W, 2)
+    product : ndarray, shape (H, W, C)
+        Sum over expressions of strength times value (times the same weight).
+    noise : ndarray, shape (H, W, C)
         Variance of `product`.
     covered : ndarray, shape (H, W)
         Measured fraction of the pixel, 0 or 1.
@@ -165,8 +165,9 @@ def fit_texels(
     coverage = gather_texels(by, bx, covered) / full
     relative = summed / (full * max(float(np.max(weight, initial=0.0)), 1e-300))
     valid = (coverage >= MIN_COVERAGE) & (relative >= MIN_STRENGTH)
-    values = np.zeros((*shape, 2))
-    stderr = np.full((*shape, 2), np.inf)
+    channels = product.shape[2]
+    values = np.zeros((*shape, channels))
+    stderr = np.full((*shape, channels), np.inf)
     if not valid.any():
         return Texels(values, stderr, valid)
     diagonal = A.diagonal()
@@ -176,7 +177,7 @@ def fit_texels(
     matrix = scaling @ A[some][:, some] @ scaling
     matrix = (matrix + RELATIVE_DAMPING * sparse.eye_array(some.size)).tocsr()
     spread = _inverse_diagonal(by) * _inverse_diagonal(bx)
-    for c in (0, 1):
+    for c in range(channels):
         b = gather_texels(by, bx, product[..., c]).ravel()[some]
         first = b / summed.ravel()[some] / root
         solved, _ = cg(matrix, root * b, x0=first, rtol=tolerance, maxiter=500)

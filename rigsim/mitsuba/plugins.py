@@ -1,5 +1,6 @@
 """Register the plugins for Mitsuba's variants."""
 
+from collections.abc import Callable
 from typing import Any, Final
 
 from rigsim.mitsuba.led_array import define_led_array
@@ -28,16 +29,35 @@ def register(mi: Any) -> None:
 
 
 def _register_variant(mi: Any) -> None:
-    if mi.variant() in _REGISTERED_VARIANTS:
+    """Register each plugin, or the reason why it does not work in the active variant."""
+    variant = mi.variant()
+    if variant in _REGISTERED_VARIANTS:
         return
-    _REGISTERED_VARIANTS.add(mi.variant())
-    if not (mi.is_polarized or mi.is_spectral or mi.variant().startswith("scalar")):
-        define_tissue(mi)
-    for add, name, plugin in (
-        (mi.register_bsdf, "skincoat", define_skin_coat(mi)),
-        (mi.register_emitter, "ledarray", define_led_array(mi)),
-        (mi.register_sensor, "rigcamera", define_rig_camera(mi)),
-        (mi.register_integrator, "olat", define_olat(mi)),
-        (mi.register_integrator, "ledmoments", define_led_moments(mi)),
+    _REGISTERED_VARIANTS.add(variant)
+    is_vectorized = not variant.startswith("scalar")
+    is_rgb = is_vectorized and variant.endswith("_rgb")
+    vectorized = "a vectorized one, such as llvm_ad_rgb"
+    for add, name, define, works, expected in (
+        (mi.register_bsdf, "skincoat", define_skin_coat, True, ""),
+        (mi.register_emitter, "ledarray", define_led_array, is_vectorized, vectorized),
+        (mi.register_sensor, "rigcamera", define_rig_camera, is_vectorized, vectorized),
+        (mi.register_integrator, "olat", define_olat, is_rgb, "llvm_ad_rgb"),
+        (mi.register_integrator, "ledmoments", define_led_moments, is_rgb, "llvm_ad_rgb"),
     ):
-        add(name, plugin)
+        add(name, define(mi) if works else _refuse_variant(name, variant, expected))
+    if is_vectorized and not (mi.is_polarized or mi.is_spectral):
+        define_tissue(mi)
+    else:
+        why = _refuse_variant("tissue", variant, "llvm_ad_rgb or llvm_ad_mono")
+        mi.register_integrator("tissue", why)
+
+
+def _refuse_variant(name: str, variant: str, expected: str) -> Callable[[Any], Any]:
+    """Return what raises the error of a plugin that does not work in a variant."""
+
+    def refuse(properties: Any) -> Any:
+        raise ValueError(
+            f"{name}: got the variant {variant}, expected {expected}; call mi.set_variant first"
+        )
+
+    return refuse

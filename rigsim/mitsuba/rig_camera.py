@@ -72,6 +72,8 @@ class _RigCamera:
         mi, dr = self.mi, self.dr
         self.mi.Sensor.__init__(self, properties)
         self.focal_px = float(properties["focal_px"])
+        if not 0.0 < self.focal_px < np.inf:
+            raise ValueError(f"rigcamera, focal_px: got {self.focal_px:g}, expected above 0")
         self.distortion: Mapping[str, float] = {
             name: float(properties.get(name, 0.0)) for name in DISTORTION_NAMES
         }

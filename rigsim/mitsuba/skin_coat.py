@@ -67,6 +67,19 @@ IOR_COLUMN: Final = 9
 FACET_DISTRIBUTIONS: Final = ("beckmann", "ggx")
 """Distributions of the skin's facets; the oil's and a coating's are GGX."""
 
+RANGES: Final = {
+    "r_d": (0.0, MAX_R_D),
+    "alpha": (1e-3, 1.0),
+    "vellus": (0.0, MAX_VELLUS),
+    **{name: (0.0, 1.0) for name in ("oil", "bare", "film", "powder", "oil_smoothing")},
+    **{name: (0.0, 1.0) for name in ("vellus_albedo", "powder_albedo")},
+    "film_alpha": (1e-3, 1.0),
+    "powder_asymmetry": (-0.999, 0.999),
+    **{name: (1.0, 4.0) for name in ("int_ior", "oil_ior")},
+    "film_ior": (1.0, 2.0),
+}
+"""Least and largest values of properties that are numbers."""
+
 MIN_COSINE: Final = 1e-6
 """Cosines of masked lanes are clamped to it, so that their square roots stay real."""
 
@@ -93,6 +106,7 @@ class _SkinCoat:
         self.is_coated = any(name in properties for name in COATING_PARAMETERS)
         defaults = {"alpha": 0.3, "bare": 1.0, "film_alpha": 0.2, "film_ior": 1.4}
         names = SKIN_PARAMETERS + (COATING_PARAMETERS if self.is_coated else ())
+        _check_numbers(properties)
         self.textures = {
             name: properties.get_unbounded_texture(name, defaults.get(name, 0.0)) for name in names
         }
@@ -301,6 +315,14 @@ class _SkinCoat:
             facets.append((ggx, dr.maximum(film_alpha, 0.01)))
         glossy = 0.25
         return [1.0 - glossy, *(glossy * share for share in shares)], facets
+
+
+def _check_numbers(properties: Any) -> None:
+    """Refuse properties that are numbers outside `RANGES`; textures are checked at hits."""
+    for name, (low, high) in RANGES.items():
+        value = properties[name] if name in properties else None
+        if isinstance(value, int | float) and not low <= value <= high:
+            raise ValueError(f"skincoat, {name}: got {value:g}, expected {low:g} to {high:g}")
 
 
 def define_skin_coat(mi: Any) -> Any:

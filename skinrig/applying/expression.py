@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from model import color_table, store
+from model.color_table import ColorTable
+from model.color_table_file import read_color_table
 from model.facial_color import HemoglobinRig
 from model.facial_color import rig as facial_color
 from model.facial_color.document import RIG_DOCUMENT, from_maps_and_document
@@ -19,7 +21,12 @@ from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import ROW_OF_STATE, Clamp
 from reconstruction.facial_color.rig_transfer import transfer_rig
 from skinrig.appearances import dynamic as dynamic_appearance
-from skinrig.appearances.contents import derive_appearance, hash_document, intersect_valid
+from skinrig.appearances.contents import (
+    derive_appearance,
+    hash_document,
+    hash_file,
+    intersect_valid,
+)
 from skinrig.appearances.dynamic import DYNAMIC_PARTS, FACIAL_COLOR, WRINKLES
 from skinrig.capturing.option_values import parse_amounts
 from skinrig.console import select_attributes
@@ -101,6 +108,8 @@ class ExpressionRequest:
         Scale the blood of the whole face by the paper's factors for anger and fear.
     gain
         Additional factor of the blood volume fraction.
+    color_table
+        File of a table of skin color, see `model.color_table_file`; None: linear sRGB under D65.
     """
 
     weights: Mapping[str, float]
@@ -109,6 +118,7 @@ class ExpressionRequest:
     emotional: bool = False
     gain: float = 1.0
     target_face: TargetFace | None = None
+    color_table: Path | None = None
 
 
 def parse_weights(text: str) -> dict[str, float]:
@@ -280,10 +290,10 @@ def _facial_color(
     melanin = maps["melanin"]
     seen = good & intersect_valid(melanin)
     done.maps["melanin"] = melanin
-    note = f"diffuse reflectance as {COLOR_OBSERVER} under {COLOR_ILLUMINANT}, white = 1"
-    done.maps["color"] = SkinMap(
-        skin_reflectance(melanin.values, held, seen), "1", None, seen, note
-    )
+    table, source = _color_table(expression.color_table, done)
+    note = f"diffuse reflectance as {table.camera} under {table.illuminant}, white = 1{source}"
+    color = skin_reflectance(melanin.values, held, seen, table=table)
+    done.maps["color"] = SkinMap(color, "1", None, seen, note)
 
 
 def _transfer_rig(rig: HemoglobinRig, target: TargetFace, done: AppliedExpression) -> HemoglobinRig:
@@ -311,12 +321,25 @@ def _transfer_rig(rig: HemoglobinRig, target: TargetFace, done: AppliedExpressio
     return rig.transfer_to(blood.values, valid=blood.valid, stderr=blood.stderr)
 
 
-def skin_reflectance(melanin: Any, hemoglobin: Any, valid: Any) -> Any:
-    """Return diffuse reflectance of skin in linear sRGB under D65, (H, W, 3); 0 outside."""
-    table = color_table.build(COLOR_OBSERVER, COLOR_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
+def skin_reflectance(
+    melanin: Any, hemoglobin: Any, valid: Any, *, table: ColorTable | None = None
+) -> Any:
+    """Return diffuse reflectance of skin, (H, W, 3), 0 outside; default: sRGB under D65."""
+    if table is None:
+        table = color_table.build(COLOR_OBSERVER, COLOR_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
     color = np.zeros((*valid.shape, 3), np.float32)
     color[valid] = table.lookup(melanin[valid], hemoglobin[valid])
     return color
+
+
+def _color_table(path: Path | None, done: AppliedExpression) -> tuple[ColorTable, str]:
+    """Return the table of a file, with its name for notes; without a file, that of sRGB."""
+    if path is None:
+        made = color_table.build(COLOR_OBSERVER, COLOR_ILLUMINANT, anisotropy=ANISOTROPY_SKIN)
+        return made, ""
+    table = read_color_table(path)
+    done.inputs["color_table"] = hash_file(path)
+    return table, f", by the table {path.name}"
 
 
 def _wrinkles(

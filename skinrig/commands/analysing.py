@@ -155,6 +155,127 @@ def analyse_lumitexel(
     console.print_document("skinrig.analyse-lumitexel/1", {"out": out, **figures})
 
 
+@analyse_app.command("blood", cls=Command)
+@command
+def analyse_blood(
+    appearance: Path,
+    /,
+    *,
+    out: Out,
+    landmarks: Path | None = None,
+    radius: float | None = None,
+    json: Json = False,
+) -> None:
+    """Test how near to Gaussian the blood of five regions of a face is distributed.
+
+    The Anderson-Darling test rejects any real distribution if its sample is large enough. The
+    p-value of all pixels, which neighbors repeat, is thus followed by that of pixels a correlation
+    length apart, and by the number of independent samples that the test would reject.
+
+    Example: skinrig analyse blood appearance-flash --out blood
+
+    Parameters
+    ----------
+    appearance
+        APPEARANCE/ folder of a flash session, with hemoglobin.
+    landmarks
+        CSV table name,x,y, pixels; default: the ground truth's own, else the face's outline.
+    radius
+        Radius of each region, px; default: image width / 32.
+    """
+    from skinrig.analysing import blood
+
+    console = Console(json)
+    found = blood.analyze_blood(out, appearance, landmarks=landmarks, radius_px=radius)
+    console.print_table(
+        ("region", "pixels", "distance", "A2", "p", "independent", "p of these", "rejected from"),
+        (
+            (
+                row["region"],
+                row["pixels"],
+                f"{row['distance']:.3f}",
+                f"{row['statistic']:.2f}",
+                f"{row['p_value']:.2g}",
+                f"{row['independent']:.0f}",
+                "-" if row["spaced_p_value"] is None else f"{row['spaced_p_value']:.2g}",
+                f"{row['rejected_from']:.0f}",
+            )
+            for row in found["regions"]
+        ),
+    )
+    within = found["fraction_of_discs"]
+    console.print_line(
+        f"all discs: {100 * within['within_1_sd']:.1f} % within one deviation (Gaussian: 68.3 %), "
+        f"{100 * within['within_2_sd']:.1f} % within two (95.4 %)"
+    )
+    console.print_line(f"{out}: {', '.join(blood.OUTPUT_FILES)}")
+    figures = {name: value for name, value in found.items() if name != "schema"}
+    console.print_document("skinrig.analyse-blood/1", {"out": out, **figures})
+
+
+@analyse_app.command("color-table", cls=Command)
+@command
+def analyse_color_table(
+    table: Path | None = None,
+    /,
+    *,
+    out: Out,
+    camera: str | None = None,
+    illuminant: str | None = None,
+    tissue: Annotated[str | None, choice("skin", "papers")] = None,
+    size: int | None = None,
+    eumelanin_fraction: float | None = None,
+    epidermal_blood_ratio: float | None = None,
+    json: Json = False,
+) -> None:
+    """Write skin color against melanin and blood as EXR and CSV, on cube-root axes.
+
+    `skinrig apply expression --color-table` reads both files.
+
+    Example: skinrig analyse color-table --tissue papers --out table
+
+    Parameters
+    ----------
+    table
+        A table to check and convert, .exr or .csv; default: build one.
+    camera
+        Observer: linear sRGB (default), or a camera's spectral sensitivities.
+    illuminant
+        Light, such as D55; default D65.
+    tissue
+        Optics: skin (default, as for all rigs) or papers (the papers' model).
+    size
+        Nodes per axis, 8 to 512; default 64.
+    eumelanin_fraction
+        beta_m, 0 to 1; default: the tissue's, 0.8 or 0.61.
+    epidermal_blood_ratio
+        C_he / C_hd, 0 to 0.3125; default: the tissue's, 0 or 0.25.
+    """
+    from skinrig.analysing import color_table
+
+    console = Console(json)
+    given: dict[str, Any] = {
+        "camera": camera,
+        "illuminant": illuminant,
+        "tissue": tissue,
+        "size": size,
+        "eumelanin_fraction": eumelanin_fraction,
+        "epidermal_blood_ratio": epidermal_blood_ratio,
+    }
+    given = {name: value for name, value in given.items() if value is not None}
+    if table is not None and given:
+        name = next(iter(given)).replace("_", "-")
+        raise UsageError(f"--{name}: applies to a table that is built; remove it, or the file")
+    made = color_table.build_table(**given) if table is None else table
+    found = color_table.analyze_table(out, made)
+    console.print_figures({"color table": found}, int, float, str)
+    for name, lost in found["relative_loss"].items():
+        console.print_line(f"{name}: read back within {lost:.1g}")
+    console.print_line(f"{out}: {', '.join(color_table.OUTPUT_FILES)}")
+    figures = {name: value for name, value in found.items() if name != "schema"}
+    console.print_document("skinrig.analyse-color-table/1", {"out": out, **figures})
+
+
 def _plateaus(document: dict[str, Any]) -> list[object]:
     """Return the plateau for 5, 2 and 10 % of the fall in error, and the rank at noise level."""
     by_share, at_noise = document["plateau_by_share"], document["rank_at_noise"]

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
@@ -104,6 +104,7 @@ def fit_wrinkles(
     mask: list[Path] | None = None,
     size_px: int = 256,
     mask_size: int = 64,
+    method: Annotated[str, choice("derivatives", "differences")] = "derivatives",
     seed: int = 0,
     json: Json = False,
 ) -> None:
@@ -121,25 +122,39 @@ def fit_wrinkles(
         Width and height of the wrinkle map, texels.
     mask_size
         Width and height of estimated zone masks, texels.
+    method
+        Combination with the neutral normals: derivatives (two channels) or differences (of
+        normals, three channels).
     seed
         Random seed of the zone estimation.
     """
+    from skinrig.fitting.wrinkles import Method, list_zone_names, summarize_expressions
     from skinrig.fitting.wrinkles import fit_wrinkles as fit
-    from skinrig.fitting.wrinkles import list_zone_names, summarize_expressions
 
     console = Console(json)
-    found = fit(appearances, out=out, masks=mask, size=size_px, mask_size=mask_size, seed=seed)
+    how = require_choice("--method", method, get_args(Method))
+    sizes = {"size": size_px, "mask_size": mask_size}
+    found = fit(appearances, out=out, masks=mask, **sizes, seed=seed, method=how)
     console.print_table(
         ("expression", *list_zone_names(found).values()), summarize_expressions(found)
     )
     console.print_line(
         f"{out}: wrinkles explain {100 * found.fit.explained:.0f} % of normal differences"
     )
+    console.print_line(
+        f"mean angle to the expressions: {found.angle_deg:.3f} degrees by {how}, "
+        f"{found.neutral_angle_deg:.3f} of the neutral face"
+    )
     print_fit(
         console,
         "wrinkles",
         out,
-        {"explained": found.fit.explained, "rows": summarize_expressions(found)},
+        {
+            "explained": found.fit.explained,
+            "method": how,
+            **select_attributes(found, "angle_deg", "neutral_angle_deg", "clamped_fraction"),
+            "rows": summarize_expressions(found),
+        },
     )
 
 
@@ -237,6 +252,9 @@ class ExpressionOptions:
         Target face: APPEARANCE/ folder with hemoglobin and melanin; default: the fitted face.
     landmarks
         CSV table name,x,y: first of the fitted face, then of the target face.
+    color_table
+        Table of skin color, .exr or .csv (`skinrig analyse color-table`); default: linear sRGB
+        under D65.
     """
 
     parts: str | None = None
@@ -246,6 +264,7 @@ class ExpressionOptions:
     gain: float = 1.0
     target_face: Path | None = None
     landmarks: list[Path] | None = None
+    color_table: Path | None = None
 
     def expression(self, weights: Mapping[str, float]) -> ExpressionRequest:
         """Return the options as a request for an expression."""
@@ -258,6 +277,7 @@ class ExpressionOptions:
             emotional=self.emotional,
             gain=self.gain,
             target_face=_read_target_face(self.target_face, self.landmarks or []),
+            color_table=self.color_table,
         )
 
 

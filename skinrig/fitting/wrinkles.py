@@ -1,26 +1,30 @@
 """Fit wrinkle maps to normals of a neutral face and its expressions: `skinrig fit wrinkles`."""
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from model import store
+from model import metrics, store
 from model.skin import SkinAppearance
 from model.wrinkles.evaluation import WRINKLE_FILE as WRINKLE_FILE
+from model.wrinkles.evaluation import WrinkleModel
 from reconstruction.normal_maps import NormalMaps
 from reconstruction.pipeline.dome.stages import MESH_FILE
 from reconstruction.surface.tangent_space import SMOOTHING_MM, tangent_normals
 from reconstruction.wrinkles.fit import WrinkleFit, fit_wrinkle_map
+from reconstruction.wrinkles.normal_differences import fit_difference_map
 from reconstruction.wrinkles.zones import ZoneFit, estimate_amplitudes, fit_zones
 from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.contents import derive_appearance, hash_document, intersect_valid
 from skinrig.appearances.dynamic import WRINKLES
-from skinrig.arrays import BoolArray, Float32Array
+from skinrig.arrays import BoolArray, Float32Array, FloatArray
 from skinrig.console import select_attributes
+
+Method: TypeAlias = Literal["derivatives", "differences"]
 
 STATE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}")
 NORMAL_MAPS = ("normals_refined", "normals")
@@ -40,6 +44,14 @@ class FittedWrinkles:
     fit: WrinkleFit
     zones: ZoneFit | None
     """Fit of the zones; None if masks were given."""
+    model: WrinkleModel
+    """The face with its wrinkles."""
+    angle_deg: float
+    """Mean angle between measured and modeled normals of the expressions."""
+    neutral_angle_deg: float
+    """Mean angle between the normals of the expressions and of the neutral face."""
+    clamped_fraction: float
+    """Fraction of texels of a difference beyond [-1, 1]; 0 for derivatives."""
 
 
 def fit_wrinkles(
@@ -50,6 +62,7 @@ def fit_wrinkles(
     size: int = 256,
     mask_size: int = 64,
     seed: int = 0,
+    method: Method = "derivatives",
 ) -> FittedWrinkles:
     """Fit the wrinkle part of a dynamic appearance and write it to `out`.
 
@@ -67,6 +80,8 @@ def fit_wrinkles(
         Width and height of wrinkle map and masks, texels.
     seed
         Random seed of the zone search.
+    method
+        Combination with the neutral normals: partial derivatives, or differences of normals.
 
     Raises
     ------
@@ -105,7 +120,13 @@ def fit_wrinkles(
     else:
         stack = _read_masks(masks)
     found = fit_wrinkle_map(neutral, measured, stack, size=(min(size, side), min(size, side)))
-    maps, document = found.model().to_maps()
+    model, clamped = found.model(), 0.0
+    if method == "differences":
+        difference = fit_difference_map(found, neutral, measured)
+        model, clamped = replace(model, difference=difference.values), difference.clamped_fraction
+    maps, document = model.to_maps()
+    angle = _mean_angle_deg(measured, lambda state: model.evaluate({state: 1.0}).normals)
+    neutral_angle = _mean_angle_deg(measured, lambda _: neutral.normals)
     why = "texture layout not compared with the others, since the mesh is missing"
     part = derive_appearance(
         *(one for _, one in read.values()),
@@ -115,6 +136,9 @@ def fit_wrinkles(
             "expressions": list(measured),
             "appearances": [folder.name for folder, _ in read.values()],
             **select_attributes(found, "explained", "rounds"),
+            "method": method,
+            "mean_angle_deg": angle,
+            "mean_angle_of_neutral_deg": neutral_angle,
             "zones": "given" if zones is None else "found in the data",
             "rank_one_share": None if zones is None else zones.rank_one_fraction,
             "distinct_zones": None if zones is None else zones.distinct,
@@ -126,7 +150,17 @@ def fit_wrinkles(
         seed=read["neutral"][1].seed,
     )
     dynamic_appearance.add(out, WRINKLES, part)
-    return FittedWrinkles(found, zones)
+    return FittedWrinkles(found, zones, model, angle, neutral_angle, clamped)
+
+
+def _mean_angle_deg(measured: Mapping[str, NormalMaps], show: Callable[[str], FloatArray]) -> float:
+    """Return the mean angle between normals of the expressions and those shown, degrees."""
+    angles = []
+    for state, one in measured.items():
+        shown = show(state)
+        good = one.valid & np.isfinite(shown).all(axis=2) & (shown != 0).any(axis=2)
+        angles.append(metrics.angular_error_rad(one.normals[good], shown[good]))
+    return float(np.degrees(np.mean(np.concatenate(angles)))) if angles else 0.0
 
 
 def _parse_state(appearance: Path) -> tuple[str, Path]:

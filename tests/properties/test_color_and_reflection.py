@@ -413,11 +413,9 @@ def test_topography_model_errors_only_widen_and_scale(seed, scale):
     normals = rng.standard_normal((6, 5, 3))
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     angles = rng.uniform(0.01, 1.0, (6, 5)).astype(np.float32)
-    wider = relief_errors.normal_stderr(normals, angles, valid)
-    assert np.all(wider >= angles)
-    np.testing.assert_array_equal(
-        relief_errors.normal_stderr(normals, angles, valid & False), angles
-    )
+    for with_relief in (relief_errors.normal_stderr, relief_errors.diffuse_normal_stderr):
+        assert np.all(with_relief(normals, angles, valid) >= angles)
+        np.testing.assert_array_equal(with_relief(normals, angles, valid & False), angles)
 
 
 @CHEAP

@@ -138,7 +138,7 @@ def test_skin_of_reflectance_one_gains_no_light(mi):
 
 
 def test_a_parameter_above_its_range_is_refused(mi):
-    scene = load_description(mi, ball({"r_d": 2.0}))
+    scene = load_description(mi, ball({"r_d": {"type": "rgb", "value": [2.0] * 3}}))
     with pytest.raises(ValueError, match=r"skincoat: got r_d above 1\.25"):
         mi.load_dict({"type": "olat"}).trace(scene, scene.sensors()[0])
 
@@ -311,6 +311,28 @@ def test_a_scene_without_lights_is_refused(mi):
     scene = load_description(mi, {k: v for k, v in ball().items() if k != "leds"})
     with pytest.raises(ValueError, match="without lights"):
         mi.load_dict({"type": "olat"}).render(scene)
+
+
+@pytest.mark.parametrize(
+    ("variant", "plugin"),
+    [
+        ("scalar_rgb", {"type": "ledarray"}),
+        ("scalar_rgb", {"type": "rigcamera"}),
+        ("llvm_ad_mono", {"type": "olat"}),
+        ("llvm_ad_spectral", {"type": "ledmoments"}),
+        ("llvm_ad_spectral", {"type": "tissue"}),
+    ],
+)
+def test_plugin_in_wrong_variant_is_refused(mi, variant, plugin):
+    mi.set_variant(variant)
+    with pytest.raises(RuntimeError, match=f"got the variant {variant}, expected a? ?[vl]"):
+        mi.load_dict(plugin)
+
+
+@pytest.mark.parametrize(("name", "value"), [("alpha", -1.0), ("int_ior", 0.5), ("oil", 2)])
+def test_skincoat_outside_ranges_is_refused(mi, name, value):
+    with pytest.raises(RuntimeError, match=f"skincoat, {name}: got {value:g}, expected"):
+        mi.load_dict({"type": "skincoat", name: value})
 
 
 PLAIN_SCRIPT = """

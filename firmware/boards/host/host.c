@@ -64,6 +64,7 @@ static void ask(void (*handle)(char *, uint16_t), char *line, uint16_t size) {
 void host_query(char *line, uint16_t size) { ask(core_handle_bare_line, line, size); }
 void host_hello(char *line, uint16_t size) { ask(core_handle_framed_line, line, size); }
 
+void board_feed_watchdog(void) {}
 int64_t board_now_us(void) { return core_now(); }
 void board_send(const char *data, uint16_t size) { board.send(data, size); }
 uint16_t board_random_epoch(void) { return board.random_epoch(); }

@@ -9,6 +9,7 @@
 #include <avr/interrupt.h>
 #include <avr/io.h>
 #include <avr/wdt.h>
+#include <math.h>
 #include <util/delay.h>
 
 /* PORTA: outputs of lights, cameras and valves */
@@ -31,7 +32,7 @@
 #define PIN_POP_FAULT 2 /* PL2, D47: low reports a missing ignition */
 #define PIN_HOME 3      /* PL3, D46: home mark, low is seen */
 #define PIN_BLADES_OPEN 4 /* PL4, D45: blades' sensor, low is open */
-/* analog: A0 force, A1 gauge, A2 temperature; level: OC4A (PH3, D6), suction OC4B (PH4, D7) */
+/* analog: A0 force, A1 gauge, A2 temperature, A3 jaws' distance; level: OC4A (PH3, D6), suction OC4B (PH4, D7) */
 
 #define PULSE_US 100
 #define STEPS_PER_S 2000
@@ -39,14 +40,30 @@
 #define MM_PER_STEP 0.0025
 #define STALL_MM 0.05
 #define RING 128 /* bytes received and not read */
-#define OUT 512  /* bytes to be sent */
+#define OUT 1032 /* bytes to be sent: the longest answer, so that sending never waits */
 
-static volatile uint32_t overflows __attribute__((section(".noinit")));
+#define MM_PER_READING 0.02 /* the jaws' potentiometer: 20.48 mm over 1024 readings */
+#define UNPOWERED __attribute__((section(".noinit")))
+#define KEPT_MARK 0x5AFE2560u
+
+static volatile uint32_t overflows UNPOWERED;
+static uint32_t kept_mark UNPOWERED; /* the memory holds what it held before the reset */
+static uint8_t reset_cause UNPOWERED;
 static volatile uint8_t in_head, in_tail;
 static volatile uint16_t out_head, out_tail;
 static volatile char in_ring[RING], out_ring[OUT];
 static volatile int32_t stage_at, stage_target, jaws_at, jaws_target;
-static double jaws_lost_mm;
+static double jaws_ordered_mm;
+
+static uint16_t read_analog(uint8_t channel) {
+  ADMUX = (uint8_t)(1u << REFS0 | channel);
+  ADCSRA |= 1u << ADSC;
+  while (ADCSRA & 1u << ADSC) {
+  }
+  return ADC;
+}
+
+static double jaws_reading_mm(void) { return read_analog(3) * MM_PER_READING; }
 
 static void set_pin(volatile uint8_t *port, uint8_t pin, bool high) {
   uint8_t before = SREG;
@@ -63,16 +80,24 @@ static void pulse(uint8_t pin) {
 
 static bool is_high(uint8_t pin) { return (PINL >> pin & 1) != 0; }
 
-bool board_start(void) {
-  bool cold = (MCUSR & (1u << PORF | 1u << BORF)) != 0;
+/* Before memory is set up: dark, vented and free; after a watchdog's reset it runs on with 16 ms. */
+__attribute__((naked, used, section(".init3"))) void board_go_dark(void);
+void board_go_dark(void) {
+  PORTA = 0;
+  DDRA = 0xFF;
+  reset_cause = MCUSR;
   MCUSR = 0;
   wdt_enable(WDTO_120MS);
-  PORTA = 0; /* dark, vented and free before the pins drive */
-  DDRA = 0xFF;
+}
+
+bool board_start(void) {
+  /* a boot loader may have cleared the cause: then the mark decides */
+  bool cold = (reset_cause & (1u << PORF | 1u << BORF)) != 0 || kept_mark != KEPT_MARK;
+  kept_mark = 0;
   DDRC = 1u << PIN_STEP | 1u << PIN_DIRECTION | 1u << PIN_JAW_STEP | 1u << PIN_JAW_DIRECTION;
   PORTL = 0xFF;
   DDRH = 1u << 3 | 1u << 4;
-  if (cold) overflows = 0;
+  overflows = cold ? 0 : overflows + 1u; /* the timer begins at zero: never backwards */
   TCCR1B = 1u << CS11; /* 2 MHz */
   TIMSK1 = 1u << TOIE1;
   OCR3A = (uint16_t)(F_CPU / 8u / STEPS_PER_S - 1u);
@@ -85,6 +110,7 @@ bool board_start(void) {
   UCSR0A = 1u << U2X0;
   UBRR0 = 16; /* 115 200 Bd within 2.1 % */
   UCSR0B = 1u << RXEN0 | 1u << TXEN0 | 1u << RXCIE0;
+  jaws_at = jaws_target = (int32_t)(jaws_reading_mm() / MM_PER_STEP + 0.5);
   sei();
   return cold;
 }
@@ -169,7 +195,11 @@ uint16_t board_random_epoch(void) {
   return (uint16_t)(count * 40503u + 0x9E37u);
 }
 
-void board_feed_watchdog(void) { wdt_reset(); }
+void board_feed_watchdog(void) {
+  kept_mark = KEPT_MARK;
+  wdt_reset();
+}
+
 bool board_stop_is_open(void) { return is_high(PIN_STOP); }
 
 /* lights and cameras ---------------------------------------------------------------------- */
@@ -202,14 +232,6 @@ void board_turn(int32_t position) {
 
 /* caliper --------------------------------------------------------------------------------- */
 
-static uint16_t read_analog(uint8_t channel) {
-  ADMUX = (uint8_t)(1u << REFS0 | channel);
-  ADCSRA |= 1u << ADSC;
-  while (ADCSRA & 1u << ADSC) {
-  }
-  return ADC;
-}
-
 static int32_t jaw_steps(void) {
   cli();
   int32_t at = jaws_at;
@@ -217,21 +239,33 @@ static int32_t jaw_steps(void) {
   return at;
 }
 
-void board_start_jaws(double target_mm, bool back) { (void)target_mm, (void)back; }
+/* The steps count from the potentiometer where they were lost, at power-up or in a stall. */
+void board_start_jaws(double target_mm, bool back) {
+  (void)target_mm, (void)back;
+  double reading_mm = jaws_reading_mm();
+  jaws_ordered_mm = (double)jaw_steps() * MM_PER_STEP;
+  if (fabs(reading_mm - jaws_ordered_mm) <= STALL_MM) return;
+  int32_t at = (int32_t)(reading_mm / MM_PER_STEP + 0.5);
+  cli();
+  jaws_at = jaws_target = at;
+  sei();
+  jaws_ordered_mm = (double)at * MM_PER_STEP;
+}
 
 bool board_drive_jaws(double distance_mm) {
   int32_t target = (int32_t)(distance_mm / MM_PER_STEP + 0.5);
   cli();
   jaws_target = target;
   sei();
-  double lag = distance_mm - (double)jaw_steps() * MM_PER_STEP;
-  /* within the stepper's own delay the jaws follow */
-  jaws_lost_mm = lag < STALL_MM && lag > -STALL_MM ? lag : 0.0;
+  jaws_ordered_mm = distance_mm;
   return !is_high(PIN_HOME);
 }
 
 void board_read_jaws(double *distance_mm, double *force_n) {
-  *distance_mm = (double)jaw_steps() * MM_PER_STEP + jaws_lost_mm;
+  double steps_mm = (double)jaw_steps() * MM_PER_STEP, reading_mm = jaws_reading_mm();
+  bool stalled = fabs(reading_mm - steps_mm) > STALL_MM;
+  bool follows = fabs(jaws_ordered_mm - steps_mm) <= STALL_MM; /* within the stepper's delay */
+  *distance_mm = stalled ? reading_mm : follows ? jaws_ordered_mm : steps_mm;
   *force_n = (read_analog(0) - 512.0) * (10.0 / 512.0); /* amplifier: -10 to 10 N */
 }
 

@@ -14,7 +14,6 @@ import numpy as np
 
 from capture.plan.phases import phase_grid
 from capture.session import FrameRecord, Session
-from model.checks import Checks
 from model.skin import SkinMap
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array
 from reconstruction.chromophores import model_error
@@ -34,8 +33,6 @@ MAP_NAMES = (*flash_stages.MAP_NAMES, CURVES_NAME)
 FILE_NAMES = (CURVES_FILE,)
 RADIUS_FRACTION = 0.02
 """Radius of a site's disc over the map's width: 5 mm of a face that fills the image."""
-LANDMARK_ALIASES = {"cheek": "cheek left", "nose": "nose tip", "temple": "temple left"}
-"""Landmark that replaces a site's own name in a table without it."""
 MAX_STILL_MOTION_PX = 0.1
 """Median displacement of the face below which it has not moved."""
 BLOOD_CURVE_STDERR = 0.07
@@ -133,13 +130,11 @@ def _places(
         outline = "places: by the face's outline; give a table of landmarks for exact positions"
         inputs.assumed.append(outline)
         return perfusion_curves.standard_positions(skin)
-    table, names = landmark_table.read_landmark_table(inputs.landmarks), perfusion_curves.FACE_SITES
-    named = {name: name if name in table else LANDMARK_ALIASES.get(name, name) for name in names}
-    found = {name: table[place] for name, place in named.items() if place in table}
-    got = ", ".join(table) or "nothing"
-    expected = f"one of {', '.join((*names, *LANDMARK_ALIASES.values()))}"
-    Checks(InputsError).require(found, f"names in {inputs.landmarks}", got, expected)
-    return found
+    table = landmark_table.read_landmark_table(inputs.landmarks)
+    try:
+        return perfusion_curves.select_sites(table)
+    except perfusion_curves.CurveError as error:
+        raise InputsError(f"{inputs.landmarks}: {error}") from error
 
 
 def _align_to_rest(

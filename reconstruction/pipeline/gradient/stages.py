@@ -40,7 +40,7 @@ from reconstruction.pipeline.gradient.strain_kernels import (
 from reconstruction.pipeline.inputs import Inputs
 from reconstruction.pipeline.sensor_noise import ElectronNoise
 
-STAGE_REVISION = 8
+STAGE_REVISION = 9
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = ("normals", "height", "diffuse_normals", "crossed", "strain", "histograms", "kernels")
@@ -267,7 +267,8 @@ def _normals(rig: GradientRig, state: SkinState, _facets: Roughness) -> Mapping[
     # the height map, so these pixels take the filtered normal
     normals = np.where(sharp.valid[..., None], sharp.normals, smooth.normals)
     known = (sharp.valid | smooth.valid) & skin
-    shown = _normal_map(smooth, skin, "of the surface's reflection", relief=True)
+    grooves = relief_errors.normal_stderr
+    shown = _normal_map(smooth, skin, "of the surface's reflection", grooves)
     restored = restore_normals(normals, lens=rig.lens, valid=known)
     return {
         f"normals_{state.name}": shown,
@@ -278,16 +279,24 @@ def _normals(rig: GradientRig, state: SkinState, _facets: Roughness) -> Mapping[
 def _diffuse(rig: GradientRig) -> SkinMap:
     patterns = rig.images.of(rig.images.neutral)
     found = _patterns_normals(rig, patterns, "diffuse", smoothing=DIFFUSE_SMOOTH_PX)
-    what = "of subsurface-scattered light, which spreads over tenths of a millimeter"
-    return _normal_map(found, skin_mask(patterns.crossed()), what)
+    what = (
+        "of subsurface-scattered light: those of the surface smoothed by a Gaussian of "
+        f"{relief_errors.DIFFUSE_SCALE_MM:g} mm"
+    )
+    grooves = relief_errors.diffuse_normal_stderr
+    return _normal_map(found, skin_mask(patterns.crossed()), what, grooves)
 
 
-def _normal_map(found: NormalMaps, skin: BoolArray, what: str, *, relief: bool = False) -> SkinMap:
+def _normal_map(
+    found: NormalMaps,
+    skin: BoolArray,
+    what: str,
+    with_relief: Callable[[FloatArray, Float32Array, BoolArray], Float32Array],
+) -> SkinMap:
     valid = found.valid & skin
     # standard error per tangential axis, as in the other normal maps
     stderr = np.where(valid, found.stderr_rad / math.sqrt(2.0), np.pi).astype(np.float32)
-    if relief:
-        stderr = relief_errors.normal_stderr(found.normals, stderr, valid)
+    stderr = with_relief(found.normals, stderr, valid)
     return SkinMap(
         np.asarray(found.normals, np.float32),
         MAP_UNITS["normals"],

@@ -1,0 +1,31 @@
+"""Run the tests of hardware on a given port, or on the images that `make firmware` has built."""
+
+import contextlib
+
+import pytest
+from fixtures.compiled.targets import TARGETS, start_target
+
+
+def pytest_generate_tests(metafunc):
+    if "device_port" not in metafunc.fixturenames:
+        return
+    url = metafunc.config.getoption("--device-port")
+    only = getattr(metafunc.module, "BOX", None)
+    pairs = [(board, box) for board, (boxes, _) in TARGETS.items() for box in boxes]
+    images = [
+        pytest.param(pair, id="-".join(pair), marks=pytest.mark.long)
+        for pair in pairs
+        if only is None or pair[1] in only
+    ]
+    given = [url] if url else images
+    metafunc.parametrize("device_port", given, indirect=True, scope="module")
+
+
+@pytest.fixture(scope="module")
+def device_port(request):
+    """URL of the box: given on the command line, or of an image that runs meanwhile."""
+    if isinstance(request.param, str):
+        yield request.param
+        return
+    with contextlib.closing(start_target(*request.param)) as target:
+        yield target.url
