@@ -29,7 +29,10 @@ browser: .venv/.ready
 firmware:
 	@tools/setup_firmware.sh
 
-demo: .venv/.ready
+.venv/.demo: pyproject.toml constraints.txt tools/setup_environment.sh
+	@tools/setup_environment.sh demo
+
+demo: .venv/.demo
 	@$(SKINRIG) demo --out demo
 
 lint: .venv/.ready

@@ -14,7 +14,7 @@ PHOTOGRAPH_SUFFIXES: Final = tuple(
     ".dng .nef .cr2 .cr3 .arw .raf .orf .rw2 .tif .tiff .jpg .jpeg".split()
 )
 REPORT_HEAD: Final = b"content=\"default-src 'none'; img-src data:; style-src 'sha256-"
-"""Start of the content security policy of a report; the policy of a live page allows a script."""
+"""Start of the content security policy of a report; that of a live page names its script first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ def _document(path: Path) -> dict[str, Any] | None:
 
 
 def _is_report(path: Path) -> bool:
-    """Return whether an HTML file is a report: its security policy allows no script."""
+    """Return whether an HTML file is a report, by the start of its security policy."""
     try:
         with path.open("rb") as stream:
             head = stream.read(1000)

@@ -1,11 +1,12 @@
 """Compile the kernels that the demo calls into numba's per-module cache, in parallel.
 
-``tools/compiled_kernels.csv`` lists them with their argument types; a kernel that was not compiled
+``tools/compiled_kernels.csv`` lists them with their argument types and the first rig of the demo
+that calls them; a kernel that was not compiled
 here is compiled on its first call. Kernels with an explicit signature are compiled when their
 module is imported. Kernels that a cached function builds for an element type are listed under that
 function's name. Lines that no longer match the code are skipped.
 
-Usage: python tools/compile_kernels.py [--processes N]
+Usage: python tools/compile_kernels.py [--processes N] [--rig RIG]
        python tools/compile_kernels.py --record   (runs the demo, 3 minutes, and lists its kernels)
 """
 
@@ -19,10 +20,12 @@ import re
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numba import config, types
@@ -30,6 +33,8 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.errors import NumbaError
 
 LIST = Path(__file__).with_name("compiled_kernels.csv")
+ORDER = ("flash", "dome", "gradient", "probe")
+"""Rigs in the order in which the demo starts them."""
 PACKAGES = ("capture", "model", "reconstruction", "rigsim", "skinrig")
 _NAMES = {name: getattr(types, name) for name in dir(types)} | {"bool": types.boolean}
 
@@ -76,22 +81,27 @@ def _named(function: Any, given: Any) -> tuple[str, str]:
     return (name if name in kernels or not kernels else kernels[0]), str(given)
 
 
-def listed() -> list[list[tuple[str, str, str]]]:
-    """Return module, function and types by module, the slowest to compile first."""
+def listed(rig: str | None = None) -> list[list[tuple[str, str, str]]]:
+    """Return module, function and types by module, the slowest to compile first.
+
+    With the name of a rig, return the kernels that the demo's rigs up to this one call.
+    """
     seconds: dict[str, float] = {}
     kernels: dict[str, list[tuple[str, str, str]]] = {}
     with LIST.open(encoding="utf-8", newline="") as stream:
         for row in csv.DictReader(stream):
+            if rig is not None and ORDER.index(row["rig"]) > ORDER.index(rig):
+                continue
             module = row["module"]
             seconds[module] = seconds.get(module, 0.0) + float(row["seconds"])
             kernels.setdefault(module, []).append((module, row["function"], row["types"]))
     return [kernels[module] for module in sorted(seconds, key=lambda name: -seconds[name])]
 
 
-def compile_all(processes: int) -> int:
-    """Compile all listed kernels and return how many lines do not match the code."""
+def compile_all(processes: int, rig: str | None = None) -> int:
+    """Compile the kernels of `listed` and return how many lines do not match the code."""
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        return sum(pool.map(compile_module, listed()))
+        return sum(pool.map(compile_module, listed(rig)))
 
 
 def record() -> None:
@@ -102,7 +112,8 @@ def record() -> None:
     class Recorder(event.Listener):  # type: ignore[misc]
         def __init__(self) -> None:
             self.began: list[float] = []
-            self.found: list[tuple[Any, float, Any]] = []
+            self.found: list[tuple[str, Any, float, Any]] = []
+            self.rig = ORDER[0]  # what the demo compiles on import, its first rig waits for
 
         def on_start(self, _: Any) -> None:
             self.began.append(time.thread_time())
@@ -112,20 +123,27 @@ def record() -> None:
             function = getattr(event.data["dispatcher"], "py_func", None)
             module = getattr(function, "__module__", "") or ""
             if not self.began and module.split(".")[0] in PACKAGES:
-                self.found.append((function, seconds, event.data["args"]))
+                self.found.append((self.rig, function, seconds, event.data["args"]))
 
     recorder = Recorder()
     with event.install_listener("numba:compile", recorder), tempfile.TemporaryDirectory() as out:
         from skinrig.console import Console  # imported here: some kernels are compiled on import
         from skinrig.demo import run_demo
-        from skinrig.demo_rigs import RIGS
+        from skinrig.demo_rigs import RIGS, RigDemo
 
-        run_demo(Path(out) / "demo", list(RIGS), console=Console(False), jobs=1)
+        def run_recorded(run: RigDemo, rig: str, run_rig: Callable[[RigDemo], None]) -> None:
+            recorder.rig = rig
+            run_rig(run)
+
+        recorded = {rig: partial(run_recorded, rig=rig, run_rig=RIGS[rig]) for rig in ORDER}
+        cast(dict[str, Callable[[RigDemo], None]], RIGS).update(recorded)
+        run_demo(Path(out) / "demo", list(ORDER), console=Console(False), jobs=1)
     rows = []
-    for function, seconds, given in recorder.found:  # all modules are fully imported by now
+    for rig, function, seconds, given in recorder.found:  # all modules are fully imported by now
         name, kinds = _named(function, given)
         rows.append(
             {
+                "rig": rig,
                 "module": function.__module__,
                 "function": name,
                 "seconds": f"{seconds:.1f}",
@@ -150,7 +168,7 @@ def write(rows: list[dict[str, Any]]) -> None:
     rows.sort(key=lambda row: (row["module"], row["function"], row["types"]))
     with LIST.open("w", encoding="utf-8", newline="") as stream:
         table = csv.DictWriter(
-            stream, ["module", "function", "seconds", "types"], lineterminator="\n"
+            stream, ["rig", "module", "function", "seconds", "types"], lineterminator="\n"
         )
         table.writeheader()
         table.writerows(rows)
@@ -160,12 +178,13 @@ def main() -> None:
     """Compile the listed kernels, or record the list, as the command line asks."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 4))
+    parser.add_argument("--rig", choices=ORDER, help="kernels up to this rig of the demo alone")
     parser.add_argument("--record", action="store_true")
     given = parser.parse_args()
     if given.record:
         record()
         return
-    missing = compile_all(given.processes)
+    missing = compile_all(given.processes, given.rig)
     if missing:
         text = f"compile_kernels: kernels to compile when first called: {missing}"
         print(text, file=sys.stderr)

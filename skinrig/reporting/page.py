@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -22,6 +20,7 @@ from skinrig.unit_format import format_quantity, format_unit
 Row = TypeVar("Row")
 
 PAGE_STYLE = resources.files("skinrig").joinpath("data/report.css").read_text(encoding="utf-8")
+PAGE_SCRIPT = resources.files("skinrig").joinpath("data/report.js").read_text(encoding="utf-8")
 MAX_UNBROKEN_CHARS = 22
 """Characters up to which the text of a cell is kept on one line."""
 BAR_STOPS = 17
@@ -323,7 +322,7 @@ def render_fragment(blocks: Iterable[Block]) -> str:
 def render_page(
     title: str, lead: Iterable[Block], sections: Iterable[Block], *, reload_s: int | None = None
 ) -> str:
-    """Return the whole page; it makes no request and runs no script.
+    """Return the whole page; it makes no request, and its one script enlarges images.
 
     Parameters
     ----------
@@ -337,7 +336,6 @@ def render_page(
         Seconds after which a browser loads the page again; None: never.
     """
     style = PAGE_STYLE + _bars()
-    digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode("ascii")
     taken = {"content", "contents"}
     head, body = _parts(lead, taken), _parts(sections, taken)
     return templates.render(
@@ -345,8 +343,10 @@ def render_page(
         title=title,
         style=style,
         reload_s=reload_s,
-        policy=f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'; "
-        "base-uri 'none'; form-action 'none'",
+        script=PAGE_SCRIPT,
+        masked_gray=png.INVALID_GRAY,
+        policy=f"default-src 'none'; img-src data:; style-src '{templates.hash_inline(style)}'; "
+        f"script-src '{templates.hash_inline(PAGE_SCRIPT)}'; base-uri 'none'; form-action 'none'",
         lead=head,
         body=body,
         titled=[part for part in head + body if part.anchor],

@@ -1,7 +1,5 @@
 """Pack scene, shaders and scripts into one HTML page without network requests."""
 
-import base64
-import hashlib
 import json
 import re
 from importlib import resources
@@ -78,8 +76,9 @@ def render(packed: PackedScene, *, connect: bool = False) -> str:
     code = build_script().replace("</", "<\\/")
     source = "'self'" if connect else "'none'"
     policy = (
-        f"default-src 'none'; script-src '{_hash(code)}'; style-src '{_hash(style)}'; "
-        f"img-src data: blob:; connect-src {source}; base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; script-src '{templates.hash_inline(code)}'; "
+        f"style-src '{templates.hash_inline(style)}'; img-src data: blob:; "
+        f"connect-src {source}; base-uri 'none'; form-action 'none'"
     )
     return templates.render(
         "viewer/page.html",
@@ -125,10 +124,6 @@ def write(scene: ViewerScene, out: Path) -> dict[str, Any]:
 def _bare(text: str) -> str:
     """Strip comment lines and indentation from a script."""
     return re.sub(r"^[ \t]+", "", re.sub(r"^[ \t]*//.*\n", "", text, flags=re.M), flags=re.M)
-
-
-def _hash(text: str) -> str:
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode()
 
 
 def _files(folder: str, ending: str) -> list[Traversable]:

@@ -1,6 +1,7 @@
 """The report in a browser: no request, nothing refused, accessible in both color schemes."""
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -126,6 +127,32 @@ def test_first_screen_shows_images_below_the_verdict(browser, pages, width):
         assert all(right <= width and alt > 20 for _, right, alt in places)
         assert page.locator(".first .bar").count() >= 2
         context.close()
+
+
+def test_enlarged_image_reads_values_of_map(browser, pages):
+    """Rationale: values come from colors alone; the map rises from 0.02 to 0.12 row by row.
+
+    Tolerance: a 64th of the scale: 128 colors, noise of 0.002, and 17 colors of the bar.
+    """
+    context, page, problems = opened(browser, pages[0])
+    page.locator(".maps .enlarge").filter(has=page.locator("img")).first.press("Enter")
+    dialog = page.locator("dialog[open]")
+    assert dialog.get_by_role("combobox").count() == 2
+    stage = dialog.locator(".stage").bounding_box()
+    expected = 0.02 + 0.1 * np.array([0.1, 0.9])
+    found = []
+    for part in (0.1, 0.9):
+        page.mouse.move(stage["x"] + 0.5 * stage["width"], stage["y"] + part * stage["height"])
+        text = dialog.locator("output").text_content()
+        found.append(float(re.search(r"ground truth: ≈ ([0-9.]+)", text)[1]))
+    np.testing.assert_allclose(found, expected, atol=0.1 / 64)
+    before = dialog.locator(".stage").screenshot()
+    dialog.get_by_role("slider").fill("100")
+    assert dialog.locator(".stage").screenshot() != before
+    page.keyboard.press("Escape")
+    page.locator("dialog").wait_for(state="detached")
+    assert problems == []
+    context.close()
 
 
 def test_policy_refuses_foreign_content(browser, pages, tmp_path):

@@ -1,0 +1,122 @@
+// Opens an image of the report in full size, with a second image of its group and the values
+// under the pointer. Values are read from the colors of the page's own images and color bars.
+"use strict";
+(() => {
+  const MASKED_GRAY = Number(document.currentScript.dataset.maskedGray);
+  const FOREIGN_COLOR = 400; // squared distance in 8-bit sRGB beyond which a color is not of the bar
+
+  const make = (tag, attributes = {}, ...children) => {
+    const element = document.createElement(tag);
+    for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+    element.append(...children);
+    return element;
+  };
+
+  // 17 colors from low to high, as the style sheet draws them
+  const readStops = (bar) =>
+    [...getComputedStyle(bar).backgroundImage.matchAll(/rgb\((\d+), (\d+), (\d+)\)/g)].map((found) =>
+      found.slice(1).map(Number),
+    );
+
+  // position of a color on a ramp, from 0 to 1, and its squared distance to the ramp
+  const locate = (color, stops) => {
+    let best = { distance: Infinity, at: 0 };
+    for (let i = 0; i + 1 < stops.length; i++) {
+      const step = stops[i + 1].map((end, k) => end - stops[i][k]);
+      const length = step.reduce((sum, x) => sum + x * x, 0);
+      const along = step.reduce((sum, x, k) => sum + x * (color[k] - stops[i][k]), 0);
+      const t = Math.min(1, Math.max(0, along / length));
+      const distance = step.reduce((sum, x, k) => sum + (color[k] - stops[i][k] - t * x) ** 2, 0);
+      if (distance < best.distance) best = { distance, at: (i + t) / (stops.length - 1) };
+    }
+    return best;
+  };
+
+  const isMasked = (color) => color.every((value) => value === MASKED_GRAY);
+
+  // what one image shows: its title, its pixels, and how a color becomes a value
+  const describe = (image) => {
+    const figure = image.closest("figure");
+    const scale = figure.querySelector(".scale .bar") || image.closest(".quantity")?.querySelector(".scale .bar");
+    const texts = scale ? [...scale.parentElement.children].map((part) => part.textContent) : [];
+    const [low, high, unit] = [Number.parseFloat(texts[0]), Number.parseFloat(texts[2]), texts[3] || ""];
+    const stops = scale ? readStops(scale) : [];
+    const canvas = make("canvas");
+    [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+    const context = canvas.getContext("2d", { willReadFrequently: true });
+    context.drawImage(image, 0, 0);
+    const read = (x, y) => {
+      const color = [...context.getImageData(x, y, 1, 1).data].slice(0, 3);
+      if (isMasked(color)) return "masked";
+      if (/x, y, z as red, green, blue/.test(image.alt))
+        return `x, y, z ≈ ${color.map((value) => (value / 127.5 - 1).toFixed(2)).join(", ")}`;
+      if (stops.length < 2) return `red, green, blue ${color.join(", ")} of 255, sRGB`;
+      const { at, distance } = locate(color, stops);
+      if (distance > FOREIGN_COLOR) return "no value";
+      return `≈ ${(low + at * (high - low)).toPrecision(3)} ${unit}`.trim();
+    };
+    return { image, scale, read, title: figure.querySelector("figcaption").textContent };
+  };
+
+  const open = (chosen) => {
+    const group = [...chosen.closest(".maps, .pair").querySelectorAll("img")].map(describe);
+    const names = group.map((one) => one.title);
+    const first = group.findIndex((one) => one.image === chosen);
+    const select = (label, index) => {
+      const field = make("select", { "aria-label": label });
+      names.forEach((name, i) => field.append(make("option", { value: i }, name)));
+      field.value = index;
+      return field;
+    };
+    const left = select("left image", first);
+    const right = select("right image", group.length > 1 ? (first + 1) % group.length : first);
+    const divider = make("input", { type: "range", min: 0, max: 100, value: group.length > 1 ? 50 : 100, "aria-label": "divider" });
+    const values = make("output");
+    const bar = make("div");
+    const stage = make("div", { class: "stage" });
+    const close = make("button", { type: "button" }, "Close");
+    const dialog = make("dialog", { class: "enlarged", "aria-label": names[first] });
+    const controls = make("div", { class: "controls" }, left);
+    if (group.length > 1) controls.append(divider, right);
+    controls.append(close);
+    dialog.append(controls, stage, bar, values);
+
+    const shown = () => [group[left.value], group[right.value]];
+    const draw = () => {
+      const [a, b] = shown();
+      stage.replaceChildren(
+        make("img", { src: b.image.src, alt: b.image.alt }),
+        make("img", { src: a.image.src, alt: a.image.alt, class: "over" }),
+      );
+      stage.style.setProperty("--divider", `${divider.value}%`);
+      stage.style.setProperty("--aspect", a.image.naturalWidth / a.image.naturalHeight);
+      bar.replaceChildren(...(a.scale ? [a.scale.parentElement.cloneNode(true)] : []));
+      values.textContent = "Move the pointer over the image for its values.";
+    };
+    stage.addEventListener("pointermove", (event) => {
+      const box = stage.getBoundingClientRect();
+      const [u, v] = [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
+      const said = [...new Set(shown())].map(({ image, read, title }) => {
+        const [w, h] = [image.naturalWidth, image.naturalHeight];
+        const [x, y] = [Math.min(w - 1, Math.floor(u * w)), Math.min(h - 1, Math.floor(v * h))];
+        return `${title}: ${x < 0 || y < 0 ? "" : read(x, y)}`;
+      });
+      values.textContent = said.join("; ");
+    });
+    for (const field of [left, right]) field.addEventListener("change", draw);
+    divider.addEventListener("input", () => stage.style.setProperty("--divider", `${divider.value}%`));
+    close.addEventListener("click", () => dialog.close());
+    dialog.addEventListener("close", () => dialog.remove());
+    document.body.append(dialog);
+    draw();
+    dialog.showModal();
+  };
+
+  for (const image of document.querySelectorAll(".maps img, .pair img")) {
+    const title = image.closest("figure").querySelector("figcaption").textContent;
+    const button = make("button", { type: "button", class: "enlarge", "aria-label": `Enlarge: ${title}. ${image.alt}` });
+    image.replaceWith(button);
+    button.append(image);
+    button.addEventListener("click", () => open(image));
+  }
+})();
