@@ -167,8 +167,24 @@ needs_extra = pytest.mark.skipif(
 )
 
 
+def is_newer_than_sources(built):
+    """Tell whether `make docs` made the site from the present manuals and docstrings."""
+    if not built.is_file():
+        return False
+    packages = ("capture", "model", "reconstruction", "rigsim", "skinrig")
+    sources = [
+        ROOT / "mkdocs.yml",
+        *(path for path in DOCS.rglob("*") if path.is_file()),
+        *(path for name in packages for path in (ROOT / name).rglob("*.py")),
+    ]
+    return built.stat().st_mtime > max(path.stat().st_mtime for path in sources)
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
+    """Return the folder of the site: that of `make docs`, or one built for these tests."""
+    if is_newer_than_sources(ROOT / "site" / "index.html"):
+        return ROOT / "site"
     out = tmp_path_factory.mktemp("site")
     build = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(out)],
