@@ -67,7 +67,7 @@ IOR_COLUMN: Final = 9
 FACET_DISTRIBUTIONS: Final = ("beckmann", "ggx")
 """Distributions of the skin's facets; the oil's and a coating's are GGX."""
 
-RANGES: Final = {
+NUMBER_RANGES: Final = {
     "r_d": (0.0, MAX_R_D),
     "alpha": (1e-3, 1.0),
     "vellus": (0.0, MAX_VELLUS),
@@ -318,8 +318,8 @@ class _SkinCoat:
 
 
 def _check_numbers(properties: Any) -> None:
-    """Refuse properties that are numbers outside `RANGES`; textures are checked at hits."""
-    for name, (low, high) in RANGES.items():
+    """Refuse properties that are numbers outside `NUMBER_RANGES`; textures are checked at hits."""
+    for name, (low, high) in NUMBER_RANGES.items():
         value = properties[name] if name in properties else None
         if isinstance(value, int | float) and not low <= value <= high:
             raise ValueError(f"skincoat, {name}: got {value:g}, expected {low:g} to {high:g}")

@@ -67,7 +67,7 @@ FRONT_LIGHT: Final = 24
 MIN_LIT_LEVEL: Final = 0.02
 """Least light of a pixel that counts, of the brightest."""
 WHITE_DN: Final = 50_000.0
-BOARD: Final = Board.of(("charuco", 7, 5, "4X4_50"), square_mm=36.0)
+DOME_BOARD: Final = Board.of(("charuco", 7, 5, "4X4_50"), square_mm=36.0)
 """The dome's board."""
 
 
@@ -313,10 +313,8 @@ def _shift(kind: str, sharp: Float64Array, blurred: Float64Array) -> float:
             for part in (sharp.sum(axis=0), blurred.sum(axis=0))
         )
         return float(np.sqrt(np.square(after - before).mean()))
-    found = [
-        find_board(np.moveaxis(np.uint16(WHITE_DN * np.clip(part, 0.0, 1.0)), 0, -1), BOARD)
-        for part in (sharp, blurred)
-    ]
+    levels = (WHITE_DN * np.clip(np.stack([sharp, blurred]), 0.0, 1.0)).astype(np.uint16)
+    found = [find_board(np.moveaxis(part, 0, -1), DOME_BOARD) for part in levels]
     if found[0] is None or found[1] is None:
         return math.nan
     pixels = [dict(zip(one.ids.tolist(), one.pixels, strict=True)) for one in found if one]
