@@ -279,6 +279,39 @@ def analyse_profile(
     console.print_document("skinrig.analyse-profile/1", {"out": out, **figures})
 
 
+@analyse_app.command("parameterization", cls=Command)
+@command
+def analyse_parameterization(source: Path, /, *, out: Out, json: Json = False) -> None:
+    """Measure how the texture coordinates of a mesh distort areas and angles.
+
+    Example: skinrig analyse parameterization appearance-dome --out distortion
+
+    Parameters
+    ----------
+    source
+        Mesh with texture coordinates (.obj, .ply, .npz), or APPEARANCE/ folder of a dome session.
+    """
+    from skinrig.analysing import parameterization
+
+    console = Console(json)
+    found = parameterization.analyze_parameterization(out, source)
+    console.print_table(
+        ("of the skin's area", "5 %", "50 %", "95 %"),
+        (
+            ("area per texel over its median", *_rounded(found["area_over_median"])),
+            ("larger over smaller stretch", *_rounded(found["angle_ratio"])),
+        ),
+    )
+    console.print_line(f"standard deviation of the logarithm of area: {found['log_area_sd']:.3f}")
+    console.print_line(f"{out}: {parameterization.OUTPUT_FILE}")
+    figures = {name: value for name, value in found.items() if name != "schema"}
+    console.print_document("skinrig.analyse-parameterization/1", {"out": out, **figures})
+
+
+def _rounded(values: dict[str, float]) -> list[str]:
+    return [f"{value:.3f}" for value in values.values()]
+
+
 @analyse_app.command("color-table", cls=Command)
 @command
 def analyse_color_table(

@@ -70,6 +70,7 @@ UNREADABLE = {
     "analyse albedo": ["maps --out a", "--labels l.csv --out a"],
     "analyse brdf": ["--out a --labels l.csv"],
     "analyse blood": ["a"],
+    "analyse parameterization": ["a"],
     "analyse profile": ["a", "--stretch 1,b --out p"],
     "analyse color-table": ["--size 8", "file.txt --eumelanin-fraction 0.5 --out t"],
     "analyse lumitexel": ["a"],
@@ -158,6 +159,7 @@ UNUSABLE = {
     "analyse albedo": ["none folder --out a"],
     "analyse brdf": ["none folder --out a"],
     "analyse blood": ["none --out a", "folder --out a"],
+    "analyse parameterization": ["none --out p", "file.txt --out p", "folder --out p"],
     "analyse profile": [
         "none --out p",
         "file.txt --out p",
