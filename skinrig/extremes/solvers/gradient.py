@@ -1,6 +1,9 @@
 """Extremes of normals from gradient patterns on a mirror-like surface under an even sphere."""
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from reconstruction.gradient_normals import from_patterns
 from reconstruction.normal_maps import NormalMaps
@@ -18,10 +21,10 @@ AXES = ("x", "y", "z")
 
 def _images(
     real: InputPrecision, normals: Float64Array, scale: float = 1.0
-) -> dict[tuple[str, str], object]:
+) -> dict[tuple[str, str], NDArray[Any]]:
     """Return images of specular reflection alone: the mirror direction's gradients, both signs."""
     mirror = 2.0 * normals[..., 2:] * normals - np.array([0.0, 0.0, 1.0])
-    images: dict[tuple[str, str], object] = {}
+    images: dict[tuple[str, str], NDArray[Any]] = {}
     for polarizer, gain in (("parallel", 1.0), ("crossed", 0.0)):
         images["full", polarizer] = real(gain * scale * np.ones(normals.shape[:2]))
         for k, axis in enumerate(AXES):
