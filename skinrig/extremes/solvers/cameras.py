@@ -17,7 +17,7 @@ from skinrig.extremes.inputs import InputPrecision
 from skinrig.viewer.assets import gaussian_profiles
 from skinrig.viewer.scene import SceneError
 
-BOARD = Board.of(("charuco", 7, 5, "4X4_50"), square_mm=36.0)
+CHARUCO_BOARD = Board.of(("charuco", 7, 5, "4X4_50"), square_mm=36.0)
 N_CORNERS = 24
 N_POSES = 5
 
@@ -31,15 +31,15 @@ def _cameras(*names: str) -> dict[str, CameraPose]:
 def _corners(real: InputPrecision, cameras: Mapping[str, CameraPose], noise_px: float) -> Corners:
     """Return corners of a board in random poses near the origin, the first in the jig."""
     rng = np.random.default_rng(0)
-    places = [BoardPose.to_jig_pose(BOARD)]
-    middle = np.array([*np.array(BOARD.size_mm) / 2, 0.0])
+    places = [BoardPose.to_jig_pose(CHARUCO_BOARD)]
+    middle = np.array([*np.array(CHARUCO_BOARD.size_mm) / 2, 0.0])
     for _ in range(1, N_POSES):
         rotation = cv2.Rodrigues(rng.uniform(-0.7, 0.7, 3))[0] @ places[0].rotation
         places.append(BoardPose(rotation, rng.uniform(-15, 15, 3) - rotation @ middle))
     found: Corners = {}
     for name, camera in cameras.items():
         for pose, place in enumerate(places):
-            pixels = camera.project(place.to_rig(BOARD.points_mm))
+            pixels = camera.project(place.to_rig(CHARUCO_BOARD.points_mm))
             pixels = pixels + noise_px * rng.standard_normal(pixels.shape)
             observed: Float64Array = np.asarray(real(pixels), np.float64)
             found[name, pose] = CornerObservation(np.arange(N_CORNERS), observed)
@@ -53,7 +53,7 @@ def _largest_shift(found: bundle.BundleResult, true: Mapping[str, CameraPose]) -
 
 def _exact_corners(real: InputPrecision) -> str:
     cameras = _cameras("C06", "C07", "C08")
-    found = bundle.adjust(_corners(real, cameras, 0.0), BOARD, cameras)
+    found = bundle.adjust(_corners(real, cameras, 0.0), CHARUCO_BOARD, cameras)
     return expect_within(_largest_shift(found, cameras), 0.0, 0.05, label="shift, mm")
 
 
@@ -68,7 +68,7 @@ def _distant_start(real: InputPrecision) -> str:
         )
         for name, camera in cameras.items()
     }
-    found = bundle.adjust(_corners(real, cameras, 0.05), BOARD, start)
+    found = bundle.adjust(_corners(real, cameras, 0.05), CHARUCO_BOARD, start)
     return expect_within(max(found.rms_px.values()), 0.0, 0.1, label="RMS, px")
 
 
@@ -77,7 +77,7 @@ def _wrong_corners(real: InputPrecision) -> str:
     seen = _corners(real, cameras, 0.05)
     for observation in seen.values():
         observation.pixels[3] += 500.0
-    found = bundle.adjust(seen, BOARD, cameras)
+    found = bundle.adjust(seen, CHARUCO_BOARD, cameras)
     expect_within(_largest_shift(found, cameras), 0.0, 1.5, label="shift, mm")
     return f"{sum(found.outliers.values())} of {len(seen)} wrong corners left out"
 
@@ -87,7 +87,9 @@ def _no_common_board(real: InputPrecision) -> str:
     seen = _corners(real, cameras, 0.05)
     apart = {k: one for k, one in seen.items() if (k[0] in ("C05", "C06")) == (k[1] < 2)}
     return expect_error(
-        lambda: bundle.adjust(apart, BOARD, cameras), bundle.BundleError, "share no board pose"
+        lambda: bundle.adjust(apart, CHARUCO_BOARD, cameras),
+        bundle.BundleError,
+        "share no board pose",
     )
 
 

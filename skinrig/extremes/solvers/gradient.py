@@ -16,7 +16,7 @@ from skinrig.extremes.expectations import (
 )
 from skinrig.extremes.inputs import InputPrecision
 
-AXES = ("x", "y", "z")
+PATTERN_AXES = ("x", "y", "z")
 
 
 def _images(
@@ -27,7 +27,7 @@ def _images(
     images: dict[tuple[str, str], NDArray[Any]] = {}
     for polarizer, gain in (("parallel", 1.0), ("crossed", 0.0)):
         images["full", polarizer] = real(gain * scale * np.ones(normals.shape[:2]))
-        for k, axis in enumerate(AXES):
+        for k, axis in enumerate(PATTERN_AXES):
             for name, sign in ((axis, 1.0), (f"-{axis}", -1.0)):
                 shown = 0.5 * (1.0 + sign * mirror[..., k])
                 images[name, polarizer] = real(gain * scale * shown)

@@ -79,7 +79,7 @@ def _few_points(real: InputPrecision) -> str:
     )
 
 
-NOISE = CameraNoise(4.0, 7.0, 64.0, 4095.0, "RGGB", "nominal")
+CAMERA_NOISE = CameraNoise(4.0, 7.0, 64.0, 4095.0, "RGGB", "nominal")
 BRACKETS_S = (0.01, 0.1, 1.0)
 FRAME_SHAPE = (32, 32)
 
@@ -87,7 +87,7 @@ FRAME_SHAPE = (32, 32)
 def _darks() -> DarkModel:
     rng = np.random.default_rng(1)
     frames = [np.rint(64.0 + rng.normal(0.0, 1.75, FRAME_SHAPE)).astype(np.uint16) for _ in "abcd"]
-    return measure_darks(frames, (0.01, 0.01, 1.0, 1.0), noise=NOISE)
+    return measure_darks(frames, (0.01, 0.01, 1.0, 1.0), noise=CAMERA_NOISE)
 
 
 def _merge(electrons_per_s: float, factors: Sequence[float] = (1.0, 1.0, 1.0)) -> MergedSeries:
@@ -97,7 +97,7 @@ def _merge(electrons_per_s: float, factors: Sequence[float] = (1.0, 1.0, 1.0)) -
         light = rng.poisson(min(electrons_per_s * exposure_s * factor, 1e6), FRAME_SHAPE)
         values = 64.0 + (light + rng.normal(0.0, 7.0, FRAME_SHAPE)) / 4.0
         frames.append(np.clip(np.rint(values), 0, 4095).astype(np.uint16))
-    return merge_series(frames, BRACKETS_S, darks=_darks(), noise=NOISE)
+    return merge_series(frames, BRACKETS_S, darks=_darks(), noise=CAMERA_NOISE)
 
 
 def _saturated_fibers(_: InputPrecision) -> str:
@@ -112,7 +112,7 @@ def _dark_fibers(_: InputPrecision) -> str:
 
 def _one_electron(_: InputPrecision) -> str:
     found = _merge(1.0)
-    off = found.rate.mean() * NOISE.span_dn * NOISE.gain_e_per_dn
+    off = found.rate.mean() * CAMERA_NOISE.span_dn * CAMERA_NOISE.gain_e_per_dn
     return "electrons per second " + expect_near(off, 1.0, absolute=1.0)
 
 
