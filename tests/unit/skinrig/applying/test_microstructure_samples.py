@@ -18,6 +18,7 @@ def relief():
     return samples.SampleRelief.simulated(0, size_mm=1.6)
 
 
+@pytest.mark.long
 def test_sphere_sample_orders_roughness_by_shape(relief, tmp_path):
     found = samples.draw_sample("sphere", tmp_path, relief, size_px=512)
     variance = {(one["relief"], one["shape"]): one["slope_variances"] for one in found["of"]}
@@ -35,6 +36,7 @@ def test_paper_block_has_25392_tetrahedra():
     assert 6 * int(np.prod(samples.BLOCK_DIVISIONS)) == 25_392
 
 
+@pytest.mark.long
 def test_patch_sample_writes_pushed_maps(relief, tmp_path):
     pytest.importorskip("skfem")
     found = samples.draw_sample("patch", tmp_path, relief, size_px=512, divisions=(7, 7, 2))
