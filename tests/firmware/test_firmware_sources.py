@@ -34,12 +34,8 @@ def test_limits_header_is_current(name):
     assert shipped == made, "run python tools/make_firmware_limits.py"
 
 
-WITHOUT_FIRMWARE = {"scanner"}
-"""A projector's controller is part of the projector; docs/how-to/build-hardware.md says so."""
-
-
-def test_every_other_box_has_firmware():
-    assert SOURCES.keys() == BOXES.keys() - WITHOUT_FIRMWARE
+def test_every_box_has_firmware():
+    assert SOURCES.keys() == BOXES.keys()
 
 
 def test_board_header_and_code_stay_small():
