@@ -62,6 +62,10 @@ us_t core_deadline(void);
 void core_handle_framed_line(char *line, uint16_t size); /* a line without its newline */
 void core_handle_bare_line(char *line, uint16_t size);
 
+#ifdef FIRMWARE_HOST
+void core_ask(void (*handle)(char *, uint16_t), char *line, uint16_t size);
+#endif
+
 /* For boxes. */
 us_t core_now(void);
 us_t core_clock_us(void); /* since power-up */
