@@ -21,7 +21,7 @@ static STATE struct {
   enum axis axis;
   uint16_t pattern;
   enum eyes eyes;
-  bool lit, released, darkened, stop_seen;
+  bool lit, released, darkened;
   us_t start, answer_at, end;
   uint8_t shown; /* projector of the light, or of the last one */
   char token[49];
@@ -59,7 +59,6 @@ void box_reset(bool power_up) {
   if (power_up) {
     memset(&unit, 0, sizeof unit);
     unit.answer_at = core_now();
-    unit.stop_seen = board_stop_is_open();
   }
   show_pattern();
 }
@@ -98,10 +97,7 @@ static void release(void) {
 }
 
 void box_advance(void) {
-  if (board_stop_is_open() && !unit.stop_seen) {
-    unit.stop_seen = true;
-    box_go_dark();
-  }
+  if (core_stop_opens()) box_go_dark();
   while (box_deadline() <= core_now()) {
     if (unit.released)
       end_light();

@@ -77,6 +77,8 @@ struct text *reason(void);
 struct text *event_start(flash_text name);
 void event_end(void);
 enum code refuse_open_stop(void);
+bool core_stop_opens(void); /* true once for each opening of the emergency stop */
+bool core_lease_is_over(us_t now);
 /* A number from low to high (nano-units) as a multiple of 10^-digits, halves rounded up. */
 enum code parse_number(const char *text, int64_t low, int64_t high, flash_text unit,
                        uint8_t digits, int64_t *value);
