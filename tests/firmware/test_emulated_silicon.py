@@ -25,7 +25,7 @@ HOLD_S = 0.25
 """Time in which the head is held, s."""
 CYCLES_SLACK_S = 2e-3
 DARK_SLACK_S = 0.010
-JUDGED_ROWS = 60
+JUDGED_ROWS = 140
 BUSY_SLACK_S = 0.1
 
 
@@ -77,7 +77,10 @@ def lit(request):
     board, box = request.param
     pin, texts = LIT[box]
     target = start_target(board, box, counted=True)
-    with contextlib.closing(target), CheckupPort(target.url, timeout_s=0.5) as port:
+    with contextlib.closing(target):
+        with CheckupPort(target.url, timeout_s=0.5) as port:
+            port.hello()  # at the start, a request may be lost
+        port = CheckupPort(target.url, timeout_s=5.0)  # a repeated one would renew the lease
         port.hello()
         port.ask(f"SYST:WDOG {round(1e3 * LEASE_S)}")
         port.ask("SYST:ARM")
@@ -97,11 +100,13 @@ def test_killed_host_leaves_darkness_within_lease(lit):
     dark_s = next(e.t_s for e in target.of_pin(light, 0.0) if e.t_s > lit_s)
     # the lease counts from the command, which the light follows
     slack_s = BUSY_SLACK_S if target.board.startswith("posix") else DARK_SLACK_S
-    assert dark_s - lit_s < LEASE_S + slack_s
+    # an answer that waits renews the lease when it is given
+    answered_s = {"scanner": 0.02}.get(target.box, 0.0)
+    assert dark_s - lit_s < answered_s + LEASE_S + slack_s
 
 
 def test_dome_steps_release_cameras_once_a_row():
-    target = start_target("mps2-an500", "dome")
+    target = start_target("mps2-an500", "dome", counted=True)
     with contextlib.closing(target), CheckupPort(target.url, timeout_s=0.5) as port:
         port.hello()
         rows = 12
@@ -110,14 +115,15 @@ def test_dome_steps_release_cameras_once_a_row():
         port.ask("SYST:ARM")
         port.ask(f"SEQ:ARM {rows}")
         port.ask("TRIG t1")
-        port.listen(0.04 * rows + 0.2)
+        target.wait_for(lambda: len(target.of_pin("camera")) >= rows)
+        port.listen(0.2)
         assert port.ask("SEQ:POS?") == f"DONE,{rows - 1},{rows},t1"
         cameras = target.of_pin("camera")
         assert len(cameras) == rows
         for led in range(rows):
             on, off = target.of_pin(f"led{led}", 1.0), target.of_pin(f"led{led}", 0.0)
             assert (len(on), len(off)) == (1, 1)
-            assert 0.035 < off[0].t_s - on[0].t_s < 0.04 + BUSY_SLACK_S
+            assert 0.035 < off[0].t_s - on[0].t_s < 0.04 + DARK_SLACK_S
 
 
 def lit_spans_s(target, pin):
