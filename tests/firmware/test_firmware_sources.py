@@ -12,7 +12,7 @@ from fixtures.product_code import ROOT, text_of
 from rigsim.world.rig_boxes import BOXES
 
 MAX_BOARD_FUNCTIONS = 20
-MAX_LINES = 5000
+MAX_LINES = 5600
 QUICK_LINES = 2000
 LONG_LINES = int(os.environ.get("FIRMWARE_FUZZ_LINES", "12000"))
 SANITIZED = """
