@@ -23,7 +23,12 @@ from reconstruction.fusion.texels import (
 )
 from reconstruction.subsurface.translucency import TranslucencyPrior
 from skinrig.appearances import face_textures
-from skinrig.appearances.contents import derive_appearance, intersect_valid, list_assumptions
+from skinrig.appearances.contents import (
+    FUSION_KEY,
+    derive_appearance,
+    intersect_valid,
+    list_assumptions,
+)
 from skinrig.appearances.texel_placement import TexelPlacement, place_texels
 from skinrig.arrays import Float32Array, Int64Array
 from skinrig.fitting import probe_sites
@@ -38,8 +43,6 @@ from skinrig.fusing.texel_colors import (
     FlashColors,
 )
 
-FUSION_KEY: Final = "fusion"
-"""Key in `parameters` of the person's common properties and of each map's rigs."""
 OWN_SUFFIX: Final = "_texel_stderr"
 """Suffix of maps of standard errors without those common to the face."""
 QUANTITY_BY_RIG: Final[Mapping[str, str]] = {
@@ -316,7 +319,7 @@ def _fused_maps(
             ("blood", 3),
             ("covariance", 1),
             ("misfit", 1),
-            ("r_d", 6),
+            ("r_d", 9),
             ("expected", 3),
         )
     }
@@ -350,9 +353,10 @@ def _fused_maps(
         "fusion_misfit": one_map("misfit", 0, None, "1", "chi-squared over degrees of freedom"),
     }
     if base.rig == "dome":
-        r_d = planes["r_d"].reshape(height, width, 6)
+        r_d, good = planes["r_d"].reshape(height, width, 9), valid.reshape(height, width)
         what = "fused, camera RGB over that of a perfect white"
-        maps["r_d"] = SkinMap(r_d[..., :3], "1", r_d[..., 3:], valid.reshape(height, width), what)
+        maps["r_d"] = SkinMap(r_d[..., :3], "1", r_d[..., 3:6], good, what)
+        maps[f"r_d{OWN_SUFFIX}"] = SkinMap(r_d[..., 6:], "1", None, good, apart)
     p_value: list[float] = []
     if measured.probe_bands is not None:
         usual = measured.errors(person.mean).unexplained
@@ -363,7 +367,9 @@ def _fused_maps(
         prior = TranslucencyPrior(
             np.zeros(3), np.sqrt(np.diag(usual)[-3:]), np.full(3, SITE_SIGMA_TR_SD)
         )
-        expected = np.maximum(planes["expected"].reshape(height, width, 3), 1e-3)
+        # a site may be at a texel without colors
+        planes["expected"][~valid] = np.median(planes["expected"][valid], axis=0)
+        expected = planes["expected"].reshape(height, width, 3)
         found = probe_sites.interpolate_sites(
             measured.sites, place, prior=prior, expected_mm=expected
         )
@@ -402,7 +408,8 @@ def _write_block(
     planes["misfit"][block, 0] = skin.misfit
     if measured.rigs[0].rig == "dome":
         r_d = np.exp(skin.log_signals[:, :3] + LOG_R_D_OVER_REFLECTANCE)
-        sd = np.sqrt(skin.signal_variance[:, :3] + skin.signal_common[:, :3])
-        planes["r_d"][block] = np.concatenate([r_d, r_d * np.sinh(sd)], axis=-1)
+        own, common = skin.signal_variance[:, :3], skin.signal_common[:, :3]
+        sd = np.sinh(np.sqrt(np.concatenate([own + common, own], axis=-1)))
+        planes["r_d"][block] = np.concatenate([r_d, np.tile(r_d, 2) * sd], axis=-1)
     if measured.probe_bands is not None:
         planes["expected"][block] = np.exp(-skin.log_signals[:, -3:])

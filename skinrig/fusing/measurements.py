@@ -22,8 +22,6 @@ LOCAL_SHARE: Final = 0.25
 Residuals of measured spectra are known between people only; a quarter is assumed within a face."""
 SITE_SIGMA_TR_SD: Final = 0.05
 """Deviation of log sigma_tr between sites of a face that tissue does not explain."""
-SITE_RADIUS_MM: Final = 8.0
-"""Radius around a probe's site whose colors are those of the probed skin."""
 MAX_SAMPLED_TEXELS: Final = 40_000
 """Texels that the person's common properties are estimated from, evenly over the texture."""
 
@@ -118,9 +116,10 @@ class Measurements:
             if self.position_mm is None:
                 break
             away = np.linalg.norm(self.position_mm - np.array(site.position_mm), axis=-1)
-            near = away < SITE_RADIUS_MM
+            near = away < probe_sites.SITE_RADIUS_MM
             colors = [one.colors(k, near) for k, one in enumerate(self.colors)]
-            parts.append(_add_sigma_tr(site, colors, errors))
+            value, stderr = np.array(site.sigma_tr_per_mm), np.array(site.stderr_per_mm)
+            parts.append(summarize_site(value, stderr, colors, errors))
         return Regions(
             np.concatenate([part.values for part in parts]),
             np.concatenate([part.covariance for part in parts]),
@@ -150,19 +149,32 @@ class Measurements:
         return person, errors
 
 
-def _add_sigma_tr(
-    site: probe_sites.ProbeSite, colors: Sequence[RigColors], errors: OffsetModel
+def summarize_site(
+    sigma_tr_per_mm: Float64Array,
+    stderr_per_mm: Float64Array,
+    colors: Sequence[RigColors],
+    errors: OffsetModel,
 ) -> Regions:
-    """Return the signals of a site: colors around it, where there are enough, and sigma_tr."""
+    """Return the signals of a probe's site: colors around it, where there are enough, and sigma_tr.
+
+    Parameters
+    ----------
+    sigma_tr_per_mm, stderr_per_mm
+        (3,): of the probe; channels that are not finite and positive are not known.
+    colors
+        Colors of the texels around the site.
+    errors
+        Covariances of the signals' errors; the probe's signals are the last.
+    """
     size = len(errors.local)
     try:
-        labels = np.ones(len(colors[0].valid), np.intp)
+        labels = np.ones(len(colors[0].valid), np.intp) if colors else np.zeros(0, np.intp)
         found, _ = summarize_regions(colors, labels, errors)
         value, covariance = found.values[0], found.covariance[0]
     except FusionError:
         value = np.zeros(size)
         covariance = hide_signals(errors.local, np.ones(size, bool))
-    sigma_tr, stderr = np.array(site.sigma_tr_per_mm), np.array(site.stderr_per_mm)
+    sigma_tr, stderr = np.asarray(sigma_tr_per_mm), np.asarray(stderr_per_mm)
     good = np.isfinite(sigma_tr) & np.isfinite(stderr) & (sigma_tr > 0.0)
     at = np.arange(size - 3, size)[good]
     covariance[at, at] = np.square(stderr[good] / sigma_tr[good]) + SITE_SIGMA_TR_SD**2
