@@ -14,7 +14,7 @@ from reconstruction.fusion.texels import OffsetModel, RigColors
 from skinrig.appearances.texel_placement import TexelPlacement
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.fitting import probe_sites
-from skinrig.fusing.texel_colors import ColorSource
+from skinrig.fusing.texel_colors import ColorSource, Texels
 
 LOCAL_SHARE: Final = 0.25
 """Variance over places of a face of what the model leaves unexplained, over that over people.
@@ -46,6 +46,8 @@ class Measurements:
         Channels of a probe with sites; None without.
     placement
         Places of the texels in the flash rig's image; None if it is the texture, or missing.
+    independent
+        Whether all errors count as independent: covariances are left out.
     """
 
     colors: tuple[ColorSource, ...]
@@ -56,6 +58,7 @@ class Measurements:
     left_out: tuple[tuple[str, str], ...] = ()
     probe_bands: RigBands | None = None
     placement: TexelPlacement | None = None
+    independent: bool = False
 
     @property
     def rigs(self) -> tuple[RigBands, ...]:
@@ -79,6 +82,11 @@ class Measurements:
         chosen[few] = True
         return chosen
 
+    def texel_colors(self, texels: Texels) -> list[RigColors]:
+        """Return the colors of some texels by all rigs, numbered row by row."""
+        found = [one.colors(k, texels) for k, one in enumerate(self.colors)]
+        return [one.without_covariance() for one in found] if self.independent else found
+
     def errors(self, log_skin: Float64Array) -> OffsetModel:
         """Return the covariances of the signals' errors for a face of typical melanin and blood.
 
@@ -98,7 +106,8 @@ class Measurements:
         if self.probe_bands is not None:
             local[-3:, -3:] = SITE_SIGMA_TR_SD**2 * np.eye(3)
             calibration[-3:, -3:] = 1e-6 * np.eye(3)
-        return OffsetModel(unexplained, calibration, local)
+        found = OffsetModel(unexplained, calibration, local)
+        return found.without_covariance() if self.independent else found
 
     def regions(self, errors: OffsetModel) -> Regions:
         """Return the signals of the whole face and of the probe's sites.
@@ -109,7 +118,7 @@ class Measurements:
             Covariances of the signals' errors.
         """
         chosen = self.sampled()
-        colors = [one.colors(k, chosen) for k, one in enumerate(self.colors)]
+        colors = self.texel_colors(chosen)
         whole, _ = summarize_regions(colors, np.zeros(int(chosen.sum()), np.intp), errors)
         parts = [whole]
         for site in self.sites:
@@ -117,7 +126,7 @@ class Measurements:
                 break
             away = np.linalg.norm(self.position_mm - np.array(site.position_mm), axis=-1)
             near = away < probe_sites.SITE_RADIUS_MM
-            colors = [one.colors(k, near) for k, one in enumerate(self.colors)]
+            colors = self.texel_colors(near)
             value, stderr = np.array(site.sigma_tr_per_mm), np.array(site.stderr_per_mm)
             parts.append(summarize_site(value, stderr, colors, errors))
         return Regions(

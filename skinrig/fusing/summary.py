@@ -4,7 +4,8 @@ from typing import Final
 
 import numpy as np
 
-from skinrig.fusing.double import FUSED_MAPS, OWN_SUFFIX, FusedDouble
+from skinrig.fusing.double import FusedDouble
+from skinrig.fusing.maps import FUSED_MAPS, OWN_SUFFIX
 
 SummaryRow = tuple[str, float, float, float | None]
 """Map, median, median relative standard error in %, and its part common to the face in %."""
