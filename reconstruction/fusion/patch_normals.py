@@ -317,8 +317,9 @@ def _measure_rotation(patch: PatchNormals) -> tuple[float, float]:
     weight = np.maximum(_blur(patch.valid.astype(np.float64), SMOOTH_PX), 1e-9)
     slopes = patch.slopes * patch.valid[..., None]
     p, q = (_blur(slopes[..., k], SMOOTH_PX) / weight for k in range(2))
-    by_x, by_y = (lambda v: np.gradient(v, axis=1)), (lambda v: -np.gradient(v, axis=0))
-    curl, divergence = by_x(q) - by_y(p), by_x(p) + by_y(q)
+    # rows run down, y up
+    curl = np.gradient(q, axis=1) + np.gradient(p, axis=0)
+    divergence = np.gradient(p, axis=1) - np.gradient(q, axis=0)
     margin = int(np.ceil(2.0 * SMOOTH_PX))
     inner = ndimage.binary_erosion(patch.valid, iterations=margin)
     sums = []

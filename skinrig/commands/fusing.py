@@ -59,10 +59,7 @@ def fuse(
     console.print_table(("map", "median", "68 % interval, %", "common to the face, %"), rows)
     console.print_table(
         ("rig", "probability that it is faulty", "p value of its gains"),
-        [
-            (check.rig, round(check.probability, 4), check.p_value)
-            for check in (*found.checks, *([] if found.patch is None else [found.patch.check]))
-        ],
+        [(one.rig, round(one.probability, 4), one.p_value) for one in found.all_checks],
     )
     cost = []
     if given.without:

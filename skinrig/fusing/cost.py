@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from model.skin import SkinAppearance
-from skinrig.arrays import Float64Array, FloatArray
+from model.skin import SkinAppearance, SkinMap
+from skinrig.arrays import Float64Array
 from skinrig.fusing.maps import FUSED_MAPS
 
 CostRow = tuple[str, float | None, float | None, float | None]
@@ -24,39 +24,38 @@ def compare_without(whole: SkinAppearance, part: SkinAppearance) -> list[CostRow
     """
     rows: list[CostRow] = []
     for name in FUSED_MAPS:
-        maps = [one.maps.get(name) for one in (whole, part)]
-        found = [None if one is None else _flat(one.values, one.stderr) for one in maps]
-        if found[0] is None and found[1] is None:
+        one, other = whole.maps.get(name), part.maps.get(name)
+        shown = one or other
+        if shown is None:
             continue
-        valid = [None if one is None else one.mask.reshape(-1) for one in maps]
-        first = next(pair for pair in found if pair is not None)
-        channels = first[0].shape[1]
+        channels = 1 if shown.values.ndim == 2 else shown.values.shape[2]
         for c in range(channels):
-            widths: list[float | None] = []
-            for pair, good in zip(found, valid, strict=True):
-                if pair is None or good is None or not good.any():
-                    widths.append(None)
-                    continue
-                values, stderr = pair
-                widths.append(100.0 * float(np.median(stderr[good, c] / values[good, c])))
-            change = None
-            if (
-                found[0] is not None
-                and found[1] is not None
-                and len(found[0][0]) == len(found[1][0])
-            ):
-                both = np.logical_and(*valid)
-                if both.any():
-                    off = np.abs(found[1][0] - found[0][0])[both, c] / found[0][1][both, c]
-                    change = float(np.median(off))
             label = name if channels == 1 else f"{name} {_CHANNELS[c]}"
-            rows.append((label, widths[0], widths[1], change))
+            rows.append((label, _width(one, c), _width(other, c), _change(one, other, c)))
     return rows
 
 
-def _flat(values: FloatArray, stderr: FloatArray | None) -> tuple[Float64Array, Float64Array]:
-    """Return values and standard errors of a map by texel and channel."""
-    height, width = values.shape[:2]
-    flat = values.reshape(height * width, -1).astype(np.float64)
-    error = np.ones_like(flat) if stderr is None else stderr.reshape(flat.shape).astype(np.float64)
-    return flat, error
+def _width(one: SkinMap | None, channel: int) -> float | None:
+    """Return the median half-width of a map's 68 % intervals, in % of its values."""
+    if one is None or not one.mask.any():
+        return None
+    values, stderr = _flat(one, channel)
+    return 100.0 * float(np.median(stderr[one.mask] / values[one.mask]))
+
+
+def _change(one: SkinMap | None, other: SkinMap | None, channel: int) -> float | None:
+    """Return the median difference of two maps, in standard errors of the first."""
+    if one is None or other is None or one.mask.shape != other.mask.shape:
+        return None
+    both = one.mask & other.mask
+    if not both.any():
+        return None
+    (values, stderr), (others, _) = _flat(one, channel), _flat(other, channel)
+    return float(np.median(np.abs(others - values)[both] / stderr[both]))
+
+
+def _flat(one: SkinMap, channel: int) -> tuple[Float64Array, Float64Array]:
+    """Return values and standard errors of a channel, (H, W)."""
+    pair = one.values, np.ones_like(one.values) if one.stderr is None else one.stderr
+    values, stderr = (v if v.ndim == 2 else v[..., channel] for v in pair)
+    return values.astype(np.float64), stderr.astype(np.float64)

@@ -1,5 +1,6 @@
 """Fuse one person's maps by several rigs into one appearance: `skinrig fuse`."""
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +37,8 @@ QUANTITY_BY_RIG: Final[Mapping[str, str]] = {
     "gradient": "normals",
 }
 """Quantity of a rig in the name of a contradiction."""
+FUSION_FILE: Final = "fusion.json"
+"""Common properties, rigs behind each map and agreement of the rigs, as in `parameters`."""
 ALBEDO_MAP: Final = "r_d"
 COVARIANCE: Final = "covariance"
 MAP_RIGS: Final[Mapping[str, str]] = {
@@ -82,6 +85,11 @@ class FusedDouble:
     measured: Measurements
     checks: tuple[RigCheck, ...]
     patch: PlacedPatch | None = None
+
+    @property
+    def all_checks(self) -> tuple[RigCheck | PatchCheck, ...]:
+        """Agreement of the rigs, and of the patch with a surface."""
+        return (*self.checks, *(() if self.patch is None else (self.patch.check,)))
 
     @property
     def assumed(self) -> tuple[str, ...]:
@@ -202,6 +210,8 @@ def fuse_sources(
     if patch is not None:
         parameters["parts"] = patch.parameters
         parameters[FUSION_KEY]["patch"] = describe_patch(patch)
+    # exports carry files, not parameters
+    files[FUSION_FILE] = json.dumps(parameters[FUSION_KEY], indent=1).encode()
     appearance = derive_appearance(
         *(one.appearance for one in sources.by_rig.values()),
         maps=maps,
