@@ -216,11 +216,17 @@ def fuse_sources(
         *(one.appearance for one in sources.by_rig.values()),
         maps=maps,
         parameters=parameters,
-        inputs={one.rig: one.digest for one in sources.by_rig.values()},
+        inputs=_session_input(base) | {one.rig: one.digest for one in sources.by_rig.values()},
         left_out=(*base.appearance.left_out, *left_out),
         files=files,
     )
     return FusedDouble(appearance, person, errors, measured, checks, patch)
+
+
+def _session_input(base: Source) -> dict[str, str]:
+    """Return the hash of the session of the mesh, whose held-out photographs stay held out."""
+    found = base.appearance.inputs.get("session")
+    return {} if found is None else {"session": found}
 
 
 def _assumed(source: Source) -> list[str]:
