@@ -29,13 +29,13 @@ from skinrig.fusing.measurements import Measurements
 from skinrig.fusing.texel_colors import Texels
 
 _DEPTH_FACTOR = SKIN_CONSTANTS.melanin_depth_factor
-SEED = 400
-TEXELS = 800
+PERSON_SEED = 400
+FACE_TEXELS = 800
 
 
 @cache
-def _face(texels: int = TEXELS) -> DrawnFace:
-    return draw_face("III", SEED, texels=texels)
+def _face(texels: int = FACE_TEXELS) -> DrawnFace:
+    return draw_face("III", PERSON_SEED, texels=texels)
 
 
 def _colors(real: InputPrecision, face: DrawnFace) -> list[RigColors]:
@@ -62,8 +62,8 @@ def _expect_covered(face: DrawnFace, found: TexelSkin, chosen: BoolArray) -> str
 
 def _no_overlap(real: InputPrecision) -> str:
     face = _face()
-    left = np.arange(TEXELS) < TEXELS // 2
-    none = np.arange(TEXELS) % 10 == 0
+    left = np.arange(FACE_TEXELS) < FACE_TEXELS // 2
+    none = np.arange(FACE_TEXELS) % 10 == 0
     dome, flash = _colors(real, face)
     colors = [replace(dome, valid=left & ~none), replace(flash, valid=~left & ~none)]
     found = _estimate(face, colors)
@@ -81,7 +81,7 @@ def _contradiction(real: InputPrecision) -> str:
         replace(dome, log_rgb=dome.log_rgb + balance),
         replace(flash, log_rgb=flash.log_rgb - balance),
     ]
-    regions, _ = summarize_regions(colors, np.zeros(TEXELS, np.intp), face.errors)
+    regions, _ = summarize_regions(colors, np.zeros(FACE_TEXELS, np.intp), face.errors)
     person = face.estimate_person(regions)
     named = name_faulty_rig(check_rigs(RIGS, regions, face.errors, person))
     if named is None or named.rig not in ("dome", "flash"):
@@ -92,7 +92,7 @@ def _contradiction(real: InputPrecision) -> str:
 def _single_frame(real: InputPrecision) -> str:
     face = _face()
     dome, flash = _colors(real, face)
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(PERSON_SEED)
     noisy = dome.log_rgb + 0.9 * rng.standard_normal(dome.log_rgb.shape)
     wide = dome.covariance + 0.9**2 * np.eye(3)
     alone = _estimate(face, [flash])
@@ -158,12 +158,12 @@ def _large_texture(real: InputPrecision) -> str:
 
 def _no_color(real: InputPrecision) -> str:
     face = _face()
-    colors = [replace(c, valid=np.zeros(TEXELS, bool)) for c in _colors(real, face)]
+    colors = [replace(c, valid=np.zeros(FACE_TEXELS, bool)) for c in _colors(real, face)]
     return expect_error(lambda: _estimate(face, colors), FusionError, "region")
 
 
 def _turned_normals(real: InputPrecision) -> str:
-    patch = draw_patch(np.random.default_rng(SEED), rotation_deg=90.0)
+    patch = draw_patch(np.random.default_rng(PERSON_SEED), rotation_deg=90.0)
     check = check_patch(replace(patch, normals=real(patch.normals)))
     expect_within(check.probability, 0.9, 1.0, label="probability")
     return expect_within(abs(np.degrees(check.rotation_rad)), 85.0, 90.0, label="degrees")

@@ -40,7 +40,7 @@ QUANTITY_BY_RIG: Final[Mapping[str, str]] = {
 FUSION_FILE: Final = "fusion.json"
 """Common properties, rigs behind each map and agreement of the rigs, as in `parameters`."""
 ALBEDO_MAP: Final = "r_d"
-COVARIANCE: Final = "covariance"
+COVARIANCE_NAME: Final = "covariance"
 MAP_RIGS: Final[Mapping[str, str]] = {
     "diffuse": "flash",
     "sigma_tr": "probe",
@@ -160,7 +160,7 @@ def fuse_sources(
         If no colors are left.
     """
     report = progress or (lambda _step: None)
-    kept = [name for name in given.without if name not in (ALBEDO_MAP, COVARIANCE)]
+    kept = [name for name in given.without if name not in (ALBEDO_MAP, COVARIANCE_NAME)]
     sources = sources.without([MAP_RIGS.get(name, name) for name in kept])
     report("place texels")
     measured = measure(sources, given)
@@ -288,7 +288,7 @@ def measure(sources: Sources, given: FusionInputs) -> Measurements:
         tuple(left_out),
         bands,
         placement,
-        COVARIANCE in given.without,
+        COVARIANCE_NAME in given.without,
     )
 
 

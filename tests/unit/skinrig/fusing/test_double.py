@@ -107,7 +107,7 @@ def test_fuse_writes_common_and_own_errors(folders, tmp_path):
     assert np.isfinite(maps["melanin_blood_covariance"].values[good]).all()
 
 
-def test_fuse_without_r_d_keeps_mesh_and_misses_level(folders, tmp_path):
+def test_fuse_without_albedo_keeps_mesh(folders, tmp_path):
     found = fuse(both(folders, without=("r_d",)), out=tmp_path / "double").appearance
     assert "r_d" not in found.maps
     assert found.maps["melanin"].values.shape == (SIDE, SIDE)
