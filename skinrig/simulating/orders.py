@@ -315,6 +315,8 @@ class DomeOrder(FaceOrder):
     """True: interreflection of skin is always built; False: only if it changes pixels."""
     conditions: Mapping[str, float] = field(default_factory=dict)
     """Conditions of the face with their amounts, see `rigsim.population.conditions`."""
+    texels: int = 512
+    """Texels per side of the face's simulated maps."""
 
     @property
     def state(self) -> str:
