@@ -3,7 +3,7 @@
     python tools/judge_epidermal_scattering.py [--skins 900]
 
 The skins follow the laws of ``tools/make_independent_skins.py`` by adding-doubling, with seeds of
-their own that set nothing; light is known, noise is 0.5 %. The first rows have the laws of Jacques
+their own; light is known, noise is 0.5 %. The first rows have the laws of Jacques
 2013 for the dermis and 1 or 2 times their scattering in the epidermis. The last rows have one law:
 the 5th or 95th percentile of the laws' amplitudes at 500 nm, with their mean exponent, in both
 layers. Printed per type I to VI: median bias, coverage of 68 and 95 % intervals, valid fraction.
