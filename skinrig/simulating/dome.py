@@ -35,6 +35,7 @@ from skinrig.errors import require_choice
 from skinrig.evaluating.reflection_truth import TEST_FILE, make_test
 from skinrig.simulating import driving
 from skinrig.simulating.orders import (
+    FACE_TEXELS,
     DomeOrder,
     SimulationError,
     SimulationOptionsError,
@@ -117,6 +118,8 @@ def _manifest_settings(
     }
     if order.scanner:
         settings["scanner"] = True
+    if order.texels != FACE_TEXELS:
+        settings["texels"] = order.texels
     if order.target is None:
         settings |= select_attributes(order, "subsurface", "interreflections")
     if conditions:
