@@ -23,7 +23,6 @@ SIMULATED_USES = ("research", "publication")
 """Default consent scope of simulated subjects."""
 MIN_WIDTH_PX = 16
 FACE_TEXELS = 512
-"""Texels per side of a face's maps in front of the dome."""
 _COUNT_OPTIONS = {"width_px": "width", "lights": "lights", "views": "views"}
 """Fields that count something, and their names in messages."""
 
