@@ -75,7 +75,7 @@ NUMBER_RANGES: Final = {
     **dict.fromkeys(("vellus_albedo", "powder_albedo"), (0.0, 1.0)),
     "film_alpha": (1e-3, 1.0),
     "powder_asymmetry": (-0.999, 0.999),
-    **dict.fromkeys(("int_ior", "oil_ior"), (1.0, 4.0)),
+    **dict.fromkeys(("int_ior", "oil_ior"), (1.0, 1e9)),  # 1e6 makes a mirror
     "film_ior": (1.0, 2.0),
 }
 """Least and largest values of properties that are numbers."""
