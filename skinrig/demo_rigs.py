@@ -29,7 +29,7 @@ from skinrig.reporting.map_names import state_title
 from skinrig.simulating.orders import SimulationResult
 from skinrig.simulating.simulation import simulate_session
 
-SUBJECT = "III"
+DEMO_SUBJECT = "III"
 """Skin type of the one person in front of flash rig, dome and probe."""
 FLASH_STATES = ("neutral", "anger")
 """Expressions of the face, to which a hemoglobin rig is fitted."""
@@ -56,9 +56,14 @@ PROBE_MEDIUM = "homogeneous:0.08,1.2"
 """Homogeneous medium with known sigma_tr, 0.55 per mm; for layers it is a definition only."""
 PROBE_WANT = ("profiles", "subsurface", "translucency")
 GRADIENT_SITE = "forehead"
-DOUBLE = "double"
+DOUBLE_FOLDER = "double"
 """Folder of the person's fused maps."""
-FUSED_SUBJECTS = {"flash": SUBJECT, "dome": SUBJECT, "gradient": GRADIENT_SITE, "probe": SUBJECT}
+FUSED_SUBJECTS = {
+    "flash": DEMO_SUBJECT,
+    "dome": DEMO_SUBJECT,
+    "gradient": GRADIENT_SITE,
+    "probe": DEMO_SUBJECT,
+}
 """Names of the fused maps' sessions by rig."""
 GRADIENT_WANT = ("normals", "height", "crossed", "strain", "histograms", "kernels")
 
@@ -145,7 +150,7 @@ def _flash(run: RigDemo) -> None:
             run.calibrate("flash", kind, target)
     with run.share("flash: capture a face"):
         capture = run.simulate(
-            "flash", SUBJECT, subject=SUBJECT, width_px=width, states=FLASH_STATES
+            "flash", DEMO_SUBJECT, subject=DEMO_SUBJECT, width_px=width, states=FLASH_STATES
         )
     with run.share("flash: reconstruct melanin and blood"):
         name, _, maps, truth = run.reconstruct("flash", capture, FLASH_WANT)
@@ -154,7 +159,7 @@ def _flash(run: RigDemo) -> None:
                 error = 100 * row.median_relative
                 found.add(name, row.name, error, "%", row.coverage.fraction, row.masked)
     with run.share("flash: fit the blood of a moving face"):
-        moving = run.out / f"appearance-flash-moving-{SUBJECT}"
+        moving = run.out / f"appearance-flash-moving-{DEMO_SUBJECT}"
         calibration = run.out / "calibration-flash"
         fit_facial_color([capture.session], out=moving, calibration=calibration)
         _evaluate_states(moving, found)
@@ -194,7 +199,11 @@ def _dome(run: RigDemo) -> None:
         run.calibrate("dome", "lights", "mirror", "white")
     with run.share("dome: scan and capture a face"):
         capture = run.simulate(
-            "dome", SUBJECT, subject=SUBJECT, leave_out=DOME_OMITTED_EFFECTS, width_px=width
+            "dome",
+            DEMO_SUBJECT,
+            subject=DEMO_SUBJECT,
+            leave_out=DOME_OMITTED_EFFECTS,
+            width_px=width,
         )
     with run.share("dome: reconstruct normals, albedo and basis BRDFs"):
         name, folder, maps, truth = run.reconstruct("dome", capture, DOME_WANT, DOME_HOLD_OUT)
@@ -262,7 +271,7 @@ def _probe(run: RigDemo) -> None:
     with run.share("probe: capture a medium and three sites of a face"):
         captures = [
             run.simulate("probe", "medium", subject=PROBE_MEDIUM, sites=("cheek",)),
-            run.simulate("probe", SUBJECT, subject=SUBJECT),
+            run.simulate("probe", DEMO_SUBJECT, subject=DEMO_SUBJECT),
         ]
     with run.share("probe: reconstruct sigma_tr and diffuse mean free path"):
         for capture in captures:
@@ -282,7 +291,7 @@ def fuse_person(run: RigDemo, rigs: Sequence[str]) -> None:
 
     folders = {rig: run.out / f"appearance-{rig}-{FUSED_SUBJECTS[rig]}" for rig in rigs}
     with run.share("fuse the rigs' maps of the person"):
-        double = fuse(FusionInputs(tuple(folders.values())), out=run.out / DOUBLE)
+        double = fuse(FusionInputs(tuple(folders.values())), out=run.out / DOUBLE_FOLDER)
     with run.share("compare the fused maps with each rig's"):
         single = {rig: store.read(folders[rig]) for rig in ("flash", "dome")}
         truths = {
@@ -292,7 +301,7 @@ def fuse_person(run: RigDemo, rigs: Sequence[str]) -> None:
     position = double.appearance.maps["position"].mask
     for row in rows:
         masked = 1.0 - float(double.appearance.maps[row.quantity.split()[0]].mask[position].mean())
-        run.found.add(DOUBLE, row.quantity, 100 * row.fused, "%", row.fused_coverage, masked)
+        run.found.add(DOUBLE_FOLDER, row.quantity, 100 * row.fused, "%", row.fused_coverage, masked)
     run.found.add_table(
         "Fused person against the best single rig, median error of the logarithm",
         ["map", "fused, %", "single rig, %", "single rig"],

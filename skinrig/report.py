@@ -8,6 +8,7 @@ from typing import Any
 
 from model import store
 from model.skin import SkinAppearance
+from skinrig.appearances.contents import is_fused
 from skinrig.appearances.dynamic import describe_parts
 from skinrig.evaluating.session_agreement import SessionAgreement
 from skinrig.reporting import first_screen, map_images, page, provenance
@@ -132,7 +133,7 @@ def _first_screen(found: ReportInputs) -> Iterator[page.Block]:
 def _read_appearances(found: ReportInputs) -> dict[str, SkinAppearance]:
     """Return the appearances by name, a fused person first."""
     appearances = {name: store.read(folder) for name, folder in found.appearances.items()}
-    order = sorted(appearances, key=lambda name: not fused.is_fused(appearances[name]))
+    order = sorted(appearances, key=lambda name: not is_fused(appearances[name]))
     return {name: appearances[name] for name in order}
 
 
@@ -219,10 +220,9 @@ def _documents(found: ReportInputs, checks: list[page.Check]) -> Iterator[page.B
 
 def _appearance_section(subject: page.ReportedAppearance) -> Iterator[page.Block]:
     appearance, truth = subject.appearance, subject.truth
-    is_fused = fused.is_fused(appearance)
-    kind = "Fused person" if is_fused else "Maps"
+    kind = "Fused person" if is_fused(appearance) else "Maps"
     yield page.Heading(f"{kind}: {subject.name}", level=2)
-    if is_fused:
+    if is_fused(appearance):
         yield from fused.section(appearance)
     images = [
         map_images.draw_color_image(f"{map_title(key)}, linear RGB", appearance.maps[key].values)

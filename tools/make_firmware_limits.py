@@ -169,14 +169,41 @@ def _probe(box: Controller) -> list[str]:
     ]
 
 
+def _scanner(box: Controller) -> list[str]:
+    unit = box.device
+    scanner = unit._scanner
+    projectors, views = scanner.projectors, scanner.views
+    counts = {
+        axis: [scanner.pattern_count(projector, axis) for projector in projectors]
+        for axis in ("columns", "rows")
+    }
+    masks = [
+        sum(1 << number for number, view in enumerate(views) if view.name in projector.cameras)
+        for projector in projectors
+    ]
+    return [
+        _define("PROJECTORS", len(projectors)),
+        _define("CAMERAS", len(views)),
+        _define("SETTLE_US", _us(scanner.settle_s)),
+        _define("MAX_SHOW_US", _us(scanner.max_show_s)),
+        _define("DOSE_NANO_WS", round(1e9 * unit._dose_limit_ws)),
+        _define("DOSE_WS", repr(float(unit._dose_limit_ws))),
+        _array("uint16_t", "COLUMN_PATTERNS", counts["columns"]),
+        _array("uint16_t", "ROW_PATTERNS", counts["rows"]),
+        _array("uint32_t", "RELEASED_CAMERAS", masks),
+        _array("double", "PROJECTOR_W", [projector.power_w for projector in projectors]),
+    ]
+
+
 NUMBERS = {
     "flash": _flash,
     "dome": _leds,
     "gradient_sphere": _gradient_sphere,
     "caliper": _caliper,
     "probe": _probe,
+    "scanner": _scanner,
 }
-"""Numbers of each box that has firmware; the dome's surface scanner has none yet."""
+"""Numbers of each box."""
 
 
 def limits_header(name: str, rig: Rig, faults: Faults = NO_FAULTS) -> str:

@@ -27,7 +27,9 @@ from PIL import Image
 
 from model import store
 from model.skin import SkinMap
+from skinrig.appearances.front_view import FrontView
 from skinrig.drawing import png
+from skinrig.rendering.photographs.evaluation import EvaluationSettings, evaluate_folders
 from skinrig.viewer import faces, page
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs/images"
@@ -36,6 +38,13 @@ BROWSER = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshad
 READY_MS = 90_000
 VIEW = "#weights.anger=1&weights.surprise=0.6"
 """Settings of the live page, as its *Copy link* writes them."""
+FUSED_PANELS = (
+    ("melanin", 0.0, 0.06),
+    ("hemoglobin", 0.0, 0.03),
+    ("r_d", 0.0, 0.8),
+    ("translucency", 0.8, 1.2),
+)
+"""Maps of the fused person with the ends of their scales; of the mean free path, mm, green."""
 HIDE_TIME = "document.getElementById('time').style.visibility = 'hidden'"
 """Run times differ between runs: they stay out of the image."""
 
@@ -144,6 +153,33 @@ def held_out(demo: Path) -> None:
     write("gallery-held-out.png", Image.open(demo / "pictures-dome-III" / HELD_OUT))
 
 
+def fused_person(demo: Path) -> None:
+    """Draw a fused person: rendering beside a held-out photograph, and its maps from the front."""
+    pictures = demo / "pictures-double"
+    if not (pictures / HELD_OUT).is_file():
+        settings = EvaluationSettings(count=3, seed=0)
+        folders = demo / "double", demo / "session-dome-III", pictures
+        evaluate_folders(*folders, settings, calibration=demo / "calibration-dome")
+    above = Image.open(pictures / HELD_OUT).convert("RGB")
+    found = store.read(demo / "double").maps
+    place = found["position"]
+    points = place.values[place.mask].astype(np.float64)
+    view = FrontView.of(points, (points.min(axis=0), points.max(axis=0)))
+    panels = []
+    for name, low, high in FUSED_PANELS:
+        values, good = found[name].values[place.mask], found[name].mask[place.mask]
+        chosen = values if name == "r_d" or values.ndim == 1 else values[:, 1]
+        image, seen = view.rasterize(chosen, valid=good)
+        shown = SkinMap(image, "1", valid=seen)
+        panels.append(color(shown, high) if name == "r_d" else scalar(shown, low, high))
+    row = Image.fromarray(np.concatenate(panels, axis=1))
+    row = row.resize((above.width, round(row.height * above.width / row.width)))
+    both = Image.new("RGB", (above.width, above.height + row.height), "white")
+    both.paste(above, (0, 0))
+    both.paste(row, (0, above.height))
+    write("gallery-fused.png", both)
+
+
 # screenshots -------------------------------------------------------------------------------------
 
 
@@ -178,7 +214,7 @@ def main(demo: Path) -> None:
     """Make all images."""
     began = time.perf_counter()
     IMAGES.mkdir(exist_ok=True)
-    for draw in (chromophores, expression, topography, translucency, held_out):
+    for draw in (chromophores, expression, topography, translucency, held_out, fused_person):
         draw(demo)
     make_reference_images.main()
     make_dome_maps.main(demo)

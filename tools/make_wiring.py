@@ -24,7 +24,7 @@ USED = {
 }
 ANALOG = {
     "flash": ("D6: power of the pops",),
-    "caliper": ("A0: force",),
+    "caliper": ("A0: force", "A3: distance"),
     "probe": ("A1: gauge", "A2: temperature", "D6: level of the LED", "D7: suction"),
 }
 DOME = (

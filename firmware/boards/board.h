@@ -21,10 +21,13 @@ void board_release_cameras(uint32_t mask);            /* pulse the lines of the 
 
 /* Lights, and the one stage that a box turns. */
 bool board_set_led(uint16_t led, double level);       /* 0 to 1; false: it draws no current.
-                                                         Modeling lamps are LED 0. */
+                                                         Modeling lamps are LED 0,
+                                                         projectors their number. */
 bool board_pop(double power, uint16_t center_nm, uint16_t width_nm); /* false: did not ignite */
 void board_turn(int32_t position);                    /* analyzer, ring: 0.001 degrees; cover:
-                                                         fiber, -1 for all */
+                                                         fiber, -1 for all; displays: 10000 times
+                                                         the projector, plus 1000 and the number of
+                                                         columns' stripes, or 2000 and of rows' */
 
 /* Caliper. */
 void board_start_jaws(double target_mm, bool back);   /* motor on; back: return, after a trip */

@@ -23,7 +23,7 @@ static KEPT struct {
 } kept;
 
 static STATE struct {
-  bool homed, moving, homing, back, barred, turning, stop_seen;
+  bool homed, moving, homing, back, barred, turning;
   int8_t barred_direction;
   int32_t limit_mn; /* 0: none */
   double barred_mm, last_force_n;
@@ -56,7 +56,6 @@ void box_reset(bool power_up) {
   memcpy(report, unit.report, sizeof report);
   memset(&unit, 0, sizeof unit);
   if (!power_up) memcpy(unit.report, report, sizeof report);
-  unit.stop_seen = board_stop_is_open();
 }
 
 /* moves ----------------------------------------------------------------------------------- */
@@ -197,10 +196,7 @@ static void control(void) {
 }
 
 void box_advance(void) {
-  if (board_stop_is_open() && !unit.stop_seen) {
-    unit.stop_seen = true;
-    release(P("INTERLOCK"), false);
-  }
+  if (core_stop_opens()) release(P("INTERLOCK"), false);
   while (box_deadline() <= core_now()) {
     if (unit.turning && unit.turned_at <= core_now()) {
       unit.turning = false;

@@ -107,7 +107,7 @@ double guard_flashes_per_s(requested_light *past, requested_light *light) {
   uint16_t places[2] = {0, 0};
   double most = 0.0;
   for (uint32_t k = 0; k < samples; k++) {
-    board_feed_watchdog(); /* a long table takes longer to judge than the watchdog waits */
+    bank_keep_ends();
     double value = seen(k, start_s, places);
     if (value > most) most = value;
   }
@@ -118,6 +118,7 @@ double guard_flashes_per_s(requested_light *past, requested_light *light) {
   int8_t direction = 0;
   turns.first = turns.count = turns.most = 0;
   for (uint32_t k = 0; k < samples; k++) {
+    bank_keep_ends();
     double value = seen(k, start_s, places);
     if (value < low) low = value;
     if (value > high) high = value;
@@ -182,7 +183,7 @@ double guard_rms(requested_light *light) {
      pulse's coefficient is (exp(-i w off) - exp(-i w on)) / (-i w span) */
   for (uint32_t order = (uint32_t)ceil(3.0 * span); order <= (uint32_t)(65.0 * span); order++) {
     double omega = TWO_PI * order / span, real = 0.0, imaginary = 0.0;
-    board_feed_watchdog();
+    bank_keep_ends();
     for (uint16_t k = 0; k < interval.count; k++) {
       double off = omega * seconds_of(interval.off[k] - start);
       double on = omega * seconds_of(interval.on[k] - start);

@@ -150,6 +150,7 @@ static void pop(void) {
 }
 
 void box_advance(void) {
+  if (core_stop_opens()) box_go_dark();
   us_t due = box_deadline();
   if (due <= core_now()) {
     bool lamp_ends = lamp_out_at() <= core_now();

@@ -52,6 +52,8 @@ double bank_dose_ws(uint16_t led);
 void bank_new_subject(void);
 us_t bank_deadline(void);
 bool bank_advance(void); /* false: a driver has tripped, LED:HOT was said */
+/* Put out what is due, while a long judgment lets no time pass for the core. */
+void bank_keep_ends(void);
 bool bank_switch_on(uint16_t led, double level, us_t end); /* false: it draws no current */
 void bank_switch_off(uint16_t led);
 void bank_all_off(void);

@@ -93,6 +93,15 @@ bool bank_advance(void) {
   return cool;
 }
 
+void bank_keep_ends(void) {
+  us_t now = board_now_us();
+  board_feed_watchdog();
+  for (uint16_t k = 0; k < bank.count; k++) {
+    uint16_t led = bank.order[k];
+    if (bank.end[led] <= now || core_lease_is_over(now)) board_set_led(led, 0.0);
+  }
+}
+
 /* switching ------------------------------------------------------------------------------- */
 
 bool bank_switch_on(uint16_t led, double level, us_t end) {
@@ -326,7 +335,7 @@ enum code bank_require_within_limits(requested_light *light, struct loads *most)
   heat_until_now();
   light(-1, note_led, NULL);
   for (uint16_t k = 0; k < requested.count; k++) {
-    board_feed_watchdog();
+    bank_keep_ends();
     collect_led(requested.order[k], light);
     if (judged.full) return refuse(CODE_IGNORED, P("too many pulses in a second"));
     TRY(judge_led(requested.order[k], most));

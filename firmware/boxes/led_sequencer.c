@@ -79,6 +79,7 @@ static void take_step(void) {
 }
 
 void box_advance(void) {
+  if (core_stop_opens()) box_go_dark();
   while (box_deadline() <= core_now()) {
     advance_bank();
     while (unit.run == RUN && unit.start + unit.next.at <= core_now()) take_step();

@@ -38,7 +38,7 @@ static STATE struct {
   uint32_t last_number; /* 0: none */
   flash_text last_end, shut_by;
   /* suction */
-  bool pumping, held, placed, stop_seen;
+  bool pumping, held, placed;
   us_t pump_start, pump_end;
   uint32_t ticks;
   int32_t wanted_ubar;
@@ -260,17 +260,13 @@ void box_reset(bool power_up) {
     memset(&unit, 0, sizeof unit);
     unit.answer_at = core_now();
   }
-  unit.stop_seen = board_stop_is_open();
   move_cover(ALL_FIBERS);
 }
 
 us_t box_deadline(void) { return sooner(shutter_deadline(), pump_deadline()); }
 
 void box_advance(void) {
-  if (board_stop_is_open() && !unit.stop_seen) {
-    unit.stop_seen = true;
-    release_head(P("INTERLOCK"));
-  }
+  if (core_stop_opens()) release_head(P("INTERLOCK"));
   do {
     advance_shutter();
     advance_pump();

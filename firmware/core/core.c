@@ -39,11 +39,11 @@ struct error {
   char reason[ERROR_BYTES];
 };
 
-static STATE struct {
+static STATE struct core {
   us_t now, powered_at, lease_end;
   char line[LINE_BYTES];
   uint16_t line_used;
-  bool discarding, armed, tripped, pending;
+  bool discarding, armed, tripped, pending, stop_seen;
   uint16_t boot, lease_ms;
   uint32_t events;
   struct request under_way;
@@ -79,6 +79,16 @@ static const FLASH struct command COMMANDS[] = {BOX_COMMANDS(X)};
 #define COMMAND_COUNT (sizeof COMMANDS / sizeof COMMANDS[0])
 
 static const FLASH char CAPABILITIES[] = BOX_CAPABILITIES;
+
+#ifdef FIRMWARE_HOST
+/* A bare query, or a refused frame, leaves no trace: not in the log of errors either. */
+void core_ask(void (*handle)(char *, uint16_t), char *line, uint16_t size) {
+  static struct core before;
+  before = core;
+  handle(line, size);
+  core = before;
+}
+#endif
 
 us_t core_now(void) { return core.now; }
 void core_update_clock(void) {
@@ -128,6 +138,14 @@ enum code refuse(enum code code, flash_text detail) {
 enum code refuse_open_stop(void) {
   return board_stop_is_open() ? refuse(CODE_INTERLOCK, P("")) : CODE_OK;
 }
+
+bool core_stop_opens(void) {
+  bool before = core.stop_seen;
+  core.stop_seen = board_stop_is_open();
+  return core.stop_seen && !before;
+}
+
+bool core_lease_is_over(us_t now) { return now >= core.lease_end; }
 
 static enum code refuse_range(int64_t low, int64_t high, uint8_t digits) {
   refuse(CODE_OUT_OF_RANGE, P("expected "));
@@ -258,6 +276,7 @@ void core_power_up(us_t now, bool cold) {
   core.lease_end = NEVER;
   text_start(&core.event, core.event_data, EVENT_BYTES);
   text_start(&core.reason, core.reason_data, ERROR_BYTES);
+  core.stop_seen = board_stop_is_open();
   if (cold) box_build();
   do core.boot = board_random_epoch();
   while (core.boot == 0 || core.boot == before);

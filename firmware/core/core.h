@@ -62,6 +62,10 @@ us_t core_deadline(void);
 void core_handle_framed_line(char *line, uint16_t size); /* a line without its newline */
 void core_handle_bare_line(char *line, uint16_t size);
 
+#ifdef FIRMWARE_HOST
+void core_ask(void (*handle)(char *, uint16_t), char *line, uint16_t size);
+#endif
+
 /* For boxes. */
 us_t core_now(void);
 us_t core_clock_us(void); /* since power-up */
@@ -73,6 +77,8 @@ struct text *reason(void);
 struct text *event_start(flash_text name);
 void event_end(void);
 enum code refuse_open_stop(void);
+bool core_stop_opens(void); /* true once for each opening of the emergency stop */
+bool core_lease_is_over(us_t now);
 /* A number from low to high (nano-units) as a multiple of 10^-digits, halves rounded up. */
 enum code parse_number(const char *text, int64_t low, int64_t high, flash_text unit,
                        uint8_t digits, int64_t *value);

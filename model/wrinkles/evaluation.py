@@ -138,10 +138,15 @@ class WrinkleModel:
         if self.difference is None:
             normals = wrinkles.combine_layers(self.base, self.layers, weights, clamp=self.clamp)
         else:
-            masks, table = self.layers[0].masks, self.layers[0].table
-            shown = {"clamp": self.clamp, "table": table}
-            base = wrinkles.decode(self.base)
-            normals = wrinkle_differences.combine(base, self.difference, masks, weights, **shown)
+            (layer,) = self.layers
+            normals = wrinkle_differences.combine(
+                wrinkles.decode(self.base),
+                self.difference,
+                layer.masks,
+                weights,
+                clamp=self.clamp,
+                table=layer.table,
+            )
         normals[~self.valid] = 0.0
         parts = [
             float((layer.masks[before != after] > 0).any(axis=0).mean())

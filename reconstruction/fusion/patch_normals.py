@@ -33,7 +33,7 @@ FREE_TILT_SD_RAD: Final = float(np.radians(20.0))
 """Standard deviation of the tilt of a faulty patch, per axis."""
 SMOOTH_PX: Final = 3.0
 """Blur of slopes before they are differentiated, as pixels have noise of their own."""
-BLOCKS: Final = 4
+BLOCKS_PER_SIDE: Final = 4
 """Blocks along each axis whose scatter gives the standard error of the rotation."""
 
 
@@ -317,13 +317,14 @@ def _measure_rotation(patch: PatchNormals) -> tuple[float, float]:
     weight = np.maximum(_blur(patch.valid.astype(np.float64), SMOOTH_PX), 1e-9)
     slopes = patch.slopes * patch.valid[..., None]
     p, q = (_blur(slopes[..., k], SMOOTH_PX) / weight for k in range(2))
-    by_x, by_y = (lambda v: np.gradient(v, axis=1)), (lambda v: -np.gradient(v, axis=0))
-    curl, divergence = by_x(q) - by_y(p), by_x(p) + by_y(q)
+    # rows run down, y up
+    curl = np.gradient(q, axis=1) + np.gradient(p, axis=0)
+    divergence = np.gradient(p, axis=1) - np.gradient(q, axis=0)
     margin = int(np.ceil(2.0 * SMOOTH_PX))
     inner = ndimage.binary_erosion(patch.valid, iterations=margin)
     sums = []
-    for rows in np.array_split(np.arange(inner.shape[0]), BLOCKS):
-        for columns in np.array_split(np.arange(inner.shape[1]), BLOCKS):
+    for rows in np.array_split(np.arange(inner.shape[0]), BLOCKS_PER_SIDE):
+        for columns in np.array_split(np.arange(inner.shape[1]), BLOCKS_PER_SIDE):
             at = np.ix_(rows, columns)
             c, d = curl[at][inner[at]], divergence[at][inner[at]]
             # curl and divergence are sin t and cos t times one field: the double angle is theirs

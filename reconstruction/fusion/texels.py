@@ -75,6 +75,11 @@ class RigColors:
         parts = self.log_rgb[chosen], self.covariance[chosen], self.valid[chosen]
         return RigColors(self.rig, *parts, self.brightness_variance)
 
+    def without_covariance(self) -> "RigColors":
+        """Return the same colors, whose channels' errors count as independent."""
+        own = np.einsum("ncc->nc", self.covariance) + self.brightness_variance
+        return RigColors(self.rig, self.log_rgb, own[..., None] * np.eye(3), self.valid)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TexelSkin:
@@ -134,6 +139,11 @@ class OffsetModel:
     def offset_covariance(self) -> Float64Array:
         """Prior covariance of a person's offsets."""
         return self.unexplained + self.calibration
+
+    def without_covariance(self) -> "OffsetModel":
+        """Return the same variances, without covariances."""
+        parts = self.unexplained, self.calibration, self.local
+        return OffsetModel(*(np.diag(np.diag(part)) for part in parts))
 
 
 def estimate_texels(

@@ -64,7 +64,7 @@ def fit_moments(y, noise, gain, read, noise_source, dark, out):  # type: ignore[
             if noise_source == 2:
                 # signals of the previous fit: weights from the samples' own noise would be biased
                 base = max(out[C_0, p], 0.0) if turn else top
-                floor = 1e-6 * (read + gain * top) if top > 0.0 else max(read, 1e-12)
+                floor = 1e-6 * (read + gain * top) if top > 0.0 else max(read, 1e-30)
                 for k in range(8):
                     signal = base
                     if k == DARK:

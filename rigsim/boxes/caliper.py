@@ -72,19 +72,21 @@ class _Move:
     tripped_s: float = math.inf  # time when the force met its limit; then the jaws return
     reading_mm: float = 0.0  # at that time
     force_n: float = 0.0
+    arrives_s: float = 0.0
+    next_s: float = 0.0  # time of the next sample
+
+    def __post_init__(self) -> None:
+        self.schedule()
 
     @property
     def direction(self) -> int:
         return 1 if self.to_mm > self.from_mm else -1
 
-    @property
-    def arrives_s(self) -> float:
+    def schedule(self) -> None:
+        """Compute the times of arrival and of the next sample after a change."""
         span_us = 1e6 * (abs(self.to_mm - self.from_mm) / self.speed_mm_per_s)
-        return add_us(self.start_s, span_us)
-
-    @property
-    def next_s(self) -> float:
-        return min(add_us(self.start_s, (self.ticks + 1) * _PERIOD_US), self.arrives_s)
+        self.arrives_s = add_us(self.start_s, span_us)
+        self.next_s = min(add_us(self.start_s, (self.ticks + 1) * _PERIOD_US), self.arrives_s)
 
     def driven_to_mm(self, now: float) -> float:
         if now >= self.arrives_s:
@@ -232,6 +234,7 @@ class CaliperUnit(Device):
         self._load.move(self.aperture_mm)
         self._on_change(now)
         move.ticks += 1
+        move.schedule()
         limit_n, force_n = self.limit_n or 0.0, self.measured_force_n
         before_n, self._last_force_n = self._last_force_n, force_n
         lost = abs(driven_mm - self.aperture_mm) > STALL_LAG_MM
@@ -268,6 +271,7 @@ class CaliperUnit(Device):
         )
         move.to_mm, move.from_mm = move.from_mm, self.aperture_mm
         move.start_s, move.ticks, move.stalls_at_mm = now, 0, None
+        move.schedule()
 
     def _lose_steps(self, move: _Move, now: float) -> None:
         """End a move whose motor has lost steps: only the home mark restores the position."""
@@ -345,6 +349,7 @@ class CaliperUnit(Device):
             end_mm = self._ends_mm[0] if self.aperture_mm > home_mm else self._ends_mm[1]
             beyond_mm = math.copysign(2.0 * STALL_LAG_MM, end_mm - home_mm)
             self._move.to_mm, self._move.stalls_at_mm = end_mm + beyond_mm, end_mm
+            self._move.schedule()
         return answer
 
     def _step(self, arguments: str, now: float) -> str:

@@ -1,6 +1,7 @@
 """Model the LEDs and their driver: switching, heat, duty and dose (sans-I/O)."""
 
 import math
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 
@@ -8,7 +9,7 @@ import numpy as np
 
 from capture.devices.wire import Code
 from capture.rig import LedLimits, Rig
-from rigsim.boxes.command import CommandRefused, add_us, elapsed_s, elapsed_us
+from rigsim.boxes.command import CommandRefused, add_us, elapsed_s, whole_us
 from rigsim.boxes.faults import Faults
 from rigsim.boxes.led_table import LedPulse
 
@@ -16,6 +17,30 @@ TRIP_RESET_FRACTION = 0.5
 """Temperature below which a hot LED may be lit again, relative to the trip temperature."""
 HEAT_TOLERANCE = 1e-6
 """Error of a temperature that a controller computes in single precision."""
+
+
+class _LightGiven:
+    """Light of one LED's intervals given until a time, in level times s; times in us."""
+
+    def __init__(self, on: Sequence[int], off: Sequence[int], level: Sequence[float]) -> None:
+        steps = [*zip(on, level, strict=True), *((t, -v) for t, v in zip(off, level, strict=True))]
+        steps.sort(key=lambda step: step[0])
+        self._times, self._given = [steps[0][0]], [0.0]
+        rate, given = steps[0][1], 0.0
+        for time, change in steps[1:]:
+            given += rate * ((time - self._times[-1]) / 1e6)
+            rate += change
+            self._times.append(time)
+            self._given.append(given)
+
+    def until(self, at: int) -> float:
+        """Return the light given until a time."""
+        times, given = self._times, self._given
+        if at <= times[0] or at >= times[-1]:
+            return given[0] if at <= times[0] else given[-1]
+        place = bisect_right(times, at) - 1
+        slope = (given[place + 1] - given[place]) / (times[place + 1] - times[place])
+        return slope * (at - times[place]) + given[place]
 
 
 class LedBank:
@@ -189,19 +214,21 @@ class LedBank:
             past.append(LedPulse(led, self._lit[led][0], self._lit[led][1], now))
         pulses = [*past, *new]
         # whole microseconds: equal windows have equal means, whatever the time of day
-        window_us = round(1e6 * window)
-        on = np.array([elapsed_us(now, pulse.t_on_s) for pulse in pulses])
-        off = np.array([elapsed_us(now, pulse.t_off_s) for pulse in pulses])
-        level = np.array([pulse.level for pulse in pulses])
-        times = np.concatenate([on, off])
-        order = np.argsort(times, kind="stable")
-        times, rate = times[order], np.cumsum(np.concatenate([level, -level])[order])
-        given = np.concatenate([[0.0], np.cumsum(rate[:-1] * (np.diff(times) / 1e6))])
+        window_us, now_us = round(1e6 * window), whole_us(now)
+        on = [whole_us(pulse.t_on_s) - now_us for pulse in pulses]
+        off = [whole_us(pulse.t_off_s) - now_us for pulse in pulses]
+        light = _LightGiven(on, off, [pulse.level for pulse in pulses])
         # the mean is greatest where light ends, or where a window's far edge leaves darkness
-        ends = np.concatenate([off[len(past) :], on + window_us, off[: len(past)] + window_us])
-        ends = ends[(ends > on[len(past) :].min()) & (ends <= off[len(past) :].max())]
-        mean = np.interp(ends, times, given) - np.interp(ends - window_us, times, given)
-        return float(mean.max()) / window
+        first, last, old = min(on[len(past) :]), max(off[len(past) :]), len(past)
+        ends = [*off[old:], *(t + window_us for t in on), *(t + window_us for t in off[:old])]
+        return (
+            max(
+                light.until(end) - light.until(end - window_us)
+                for end in ends
+                if first < end <= last
+            )
+            / window
+        )
 
     def _heat_after(self, led: int, new: Sequence[LedPulse], now: float) -> float:
         """Return the highest temperature that an LED will reach."""

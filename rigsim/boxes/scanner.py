@@ -23,9 +23,10 @@ from rigsim.boxes.command import (
     PendingReply,
     add_us,
     build_command_table,
+    elapsed_us,
     parse_choice,
+    parse_decimal,
     parse_integer,
-    parse_number,
     parse_token,
 )
 from rigsim.boxes.device import Device, Wiring
@@ -86,6 +87,7 @@ class ScannerUnit(Device):
         self.count = 0
         self.dose_ws = 0.0
         self._show: _Show | None = None
+        self._answer_s = 0.0
         self.reset(0.0, power_up=True)
 
     # settings ---------------------------------------------------------------------------------
@@ -98,6 +100,7 @@ class ScannerUnit(Device):
         self.eyes = "OPEN"
         if power_up:
             self.last_report = ""
+            self._answer_s = 0.0
 
     def capabilities(self) -> Mapping[str, Any]:
         """Return limits and counts; the names include the units."""
@@ -199,7 +202,7 @@ class ScannerUnit(Device):
         self._show = None
         light = _cut(show.light, now)
         power_w = self._scanner.projectors[self._number(show)].power_w
-        self.dose_ws += power_w * (light.t_off_s - light.t_on_s)
+        self.dose_ws += power_w * (elapsed_us(light.t_on_s, light.t_off_s) / 1e6)
         if light.t_off_s > light.t_on_s and light.level > 0.0:
             self._on_light(light)
 
@@ -210,12 +213,14 @@ class ScannerUnit(Device):
         words = {axis: word for word, axis in AXES_BY_WORD.items()}
         return f"{words[axis]},{pattern}" if axis else "FULL"
 
-    def _require_dark(self) -> None:
-        CommandRefused.raise_if(self.lit, Code.IGNORED, "a pattern is shown")
+    def _require_dark(self, now: float) -> None:
+        # also until a release that was prevented has been answered
+        shown = self.lit or now < self._answer_s
+        CommandRefused.raise_if(shown, Code.IGNORED, "a pattern is shown")
 
     def _select_projector(self, arguments: str, now: float) -> None:
         number = parse_integer(arguments, 0, len(self._scanner.projectors) - 1)
-        self._require_dark()
+        self._require_dark(now)
         self.projector = number
 
     def _select_pattern(self, arguments: str, now: float) -> None:
@@ -229,22 +234,23 @@ class ScannerUnit(Device):
             projector = self._scanner.projectors[self.projector]
             last = self._scanner.pattern_count(projector, axis) - 1
             pattern = parse_integer(number, 0, last)
-        self._require_dark()
+        self._require_dark(now)
         self.axis, self.pattern = axis, pattern
 
     def _trigger(self, arguments: str, now: float) -> PendingReply:
         token, comma, length = arguments.partition(",")
         token = parse_token(token)
         CommandRefused.raise_if(not comma, Code.SYNTAX, "expected TOKEN,MS")
-        span_ms = parse_number(length, MIN_SHOW_MS, self._scanner.max_show_s * 1e3, "ms")
+        most_ms = self._scanner.max_show_s * 1e3
+        span_us = parse_decimal(length, MIN_SHOW_MS, most_ms, "ms", digits=3)
         self._require_closed_stop()
-        self._require_dark()
+        self._require_dark(now)
         CommandRefused.raise_if(self.eyes == "OPEN", Code.FLICKER)
         dead = self.projector in self.faults.dead_leds
         why = f"the lamp of projector {self.projector} draws no current"
         CommandRefused.raise_if(dead, Code.HARDWARE, why)
         projector = self._scanner.projectors[self.projector]
-        span_s = span_ms / 1e3
+        span_s = span_us / 1e6
         dose_ws = self.dose_ws + projector.power_w * span_s
         if dose_ws > self._dose_limit_ws:
             text = f"{dose_ws:.3f} of {self._dose_limit_ws:g} Ws"
@@ -254,10 +260,10 @@ class ScannerUnit(Device):
             raise CommandRefused(Code.OUT_OF_RANGE, least)
         level = self.faults.weak_leds.get(self.projector, 1.0)
         light = ProjectorLight(
-            projector.name, self.axis, self.pattern, level, now, add_us(now, 1e3 * span_ms)
+            projector.name, self.axis, self.pattern, level, now, add_us(now, span_us)
         )
         show = _Show(token, light, add_us(now, 1e6 * self._scanner.settle_s))
-        self._show = show
+        self._show, self._answer_s = show, show.release_s
 
         def outcome() -> str | CommandRefused:
             return show.outcome or CommandRefused(Code.HARDWARE, "the cameras were not released")
@@ -265,7 +271,7 @@ class ScannerUnit(Device):
         return PendingReply(show.release_s, outcome)
 
     def _trigger_all(self, arguments: str, now: float) -> str:
-        self._require_dark()
+        self._require_dark(now)
         token = parse_token(arguments)
         self._on_trigger(now, (1 << len(self._scanner.views)) - 1)
         return f"{token},{self.clock_us(now)}"
@@ -277,7 +283,7 @@ class ScannerUnit(Device):
 
     def _new_subject(self, arguments: str, now: float) -> None:
         parse_token(arguments)
-        self._require_dark()
+        self._require_dark(now)
         self.dose_ws = 0.0
         self.eyes = "OPEN"
 

@@ -67,15 +67,15 @@ IOR_COLUMN: Final = 9
 FACET_DISTRIBUTIONS: Final = ("beckmann", "ggx")
 """Distributions of the skin's facets; the oil's and a coating's are GGX."""
 
-RANGES: Final = {
+NUMBER_RANGES: Final = {
     "r_d": (0.0, MAX_R_D),
     "alpha": (1e-3, 1.0),
     "vellus": (0.0, MAX_VELLUS),
-    **{name: (0.0, 1.0) for name in ("oil", "bare", "film", "powder", "oil_smoothing")},
-    **{name: (0.0, 1.0) for name in ("vellus_albedo", "powder_albedo")},
+    **dict.fromkeys(("oil", "bare", "film", "powder", "oil_smoothing"), (0.0, 1.0)),
+    **dict.fromkeys(("vellus_albedo", "powder_albedo"), (0.0, 1.0)),
     "film_alpha": (1e-3, 1.0),
     "powder_asymmetry": (-0.999, 0.999),
-    **{name: (1.0, 4.0) for name in ("int_ior", "oil_ior")},
+    **dict.fromkeys(("int_ior", "oil_ior"), (1.0, 4.0)),
     "film_ior": (1.0, 2.0),
 }
 """Least and largest values of properties that are numbers."""
@@ -318,8 +318,8 @@ class _SkinCoat:
 
 
 def _check_numbers(properties: Any) -> None:
-    """Refuse properties that are numbers outside `RANGES`; textures are checked at hits."""
-    for name, (low, high) in RANGES.items():
+    """Refuse properties that are numbers outside `NUMBER_RANGES`; textures are checked at hits."""
+    for name, (low, high) in NUMBER_RANGES.items():
         value = properties[name] if name in properties else None
         if isinstance(value, int | float) and not low <= value <= high:
             raise ValueError(f"skincoat, {name}: got {value:g}, expected {low:g} to {high:g}")

@@ -16,6 +16,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from glob import glob
 from pathlib import Path
 from typing import Final, Literal
@@ -232,7 +233,16 @@ def choose_renderer(renderer: Renderer) -> VariantChoice:
     """
     if renderer == "fast":
         return VariantChoice(_SCALAR_VARIANTS["rgb"], "requested", "")
-    return choose_variant("rgb")
+    choice = choose_variant("rgb")
+    if not choice.is_vectorized:
+        _warn_of_fast(choice.why)
+    return choice
+
+
+@cache
+def _warn_of_fast(why: str) -> None:
+    """Warn once that compiled loops make the images, as Mitsuba's scenes need LLVM."""
+    logger.warning("renderer: fast instead of mitsuba, which needs LLVM: %s", why)
 
 
 def choose_variant(

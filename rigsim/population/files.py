@@ -5,11 +5,14 @@ A file is TOML; every key is optional, and unknown keys are errors:
 ================ ==================================================================================
 schema           "skinrig.subject/1"
 preset           pigment, "I" to "VI", "palest" or "darkest"; "III"
+member           "P01" to "P87" of the simulated population, with own head, seed and conditions;
+                 of the other keys it takes melanin, blood, freckles, oil and beard
 melanin          volume fraction of melanosomes around which skin varies, 0.001 to 0.45; replaces it
 tone             "ita:DEGREES" or "monk:N": the melanin of a skin of that tone
 blood            factor of all blood, 0.1 to 4
 freckles         0 to 1; drawn from the seed if omitted
 oil              factor of the surface fraction covered by oil, 0 to 3
+beard            stubble of a member, 0 to 1; its own if omitted
 tissue_model     other properties of the skin: "drawn" from the seed as people vary (default),
                  "typical", or "papers" (the papers' model)
 epidermis_mm     thickness of the epidermis, mm, at equal melanin per area; this and the next ones
@@ -42,7 +45,7 @@ import numpy as np
 from capture.documents import Document, Fault, FaultCollector, parse_document, read_toml
 from rigsim.fiber.probe_tissue import ProbedTissue, SkinTissue, TissueError, parse_tissue
 from rigsim.geometry.mesh import Mesh, MeshError, load_mesh
-from rigsim.population.population import PopulationError, get_member
+from rigsim.population.population import Member, PopulationError, get_member
 from rigsim.population.textures import MAP_RANGES, SubjectFileError, load_texture, resample_texture
 from rigsim.skin_patch.microrelief import MicroSkin, make_micro_skin
 from rigsim.subject import PRESET_NAMES, SimulatedSubject, make_subject, pigment
@@ -61,6 +64,7 @@ NAMED_TISSUES: Final[Mapping[str, TissueProperties]] = {
 }
 """Named properties of skin that do not vary."""
 _FILE_KEYS: Final = ("mesh", *MAP_RANGES)
+_MEMBER_KEYS: Final = ("schema", "member", "melanin", "blood", "freckles", "oil", "beard")
 _UNUSED_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
     "gradient": ("oil", *_FILE_KEYS),
     "probe": ("oil", *_FILE_KEYS),
@@ -74,14 +78,18 @@ class SubjectFile(Document):
 
     schema: str = SCHEMA
     preset: str = "III"
+    member: str | None = None
+    """Name of a member of the population; None: the person is drawn from the seed."""
     melanin: float | None = None
-    """None: that of the tone or the preset."""
+    """None: that of the tone, the preset or the member."""
     tone: str | None = None
     """A text of `rigsim.subject.skin_tone`; None: that of the preset."""
     blood: float = 1.0
     freckles: float | None = None
     """None: drawn."""
     oil: float = 1.0
+    beard: float | None = None
+    """None: that of the member."""
     tissue_model: str = DRAWN_TISSUE
     """`DRAWN_TISSUE`, or one of `NAMED_TISSUES`."""
     epidermis_mm: float | None = None
@@ -116,11 +124,13 @@ class SubjectFile(Document):
             ("blood", 0.1, 4.0),
             ("freckles", 0.0, 1.0),
             ("oil", 0.0, 3.0),
+            ("beard", 0.0, 1.0),
             *((name, *ends) for name, ends in PROPERTY_RANGES.items()),
         ):
             value = getattr(self, name)
             good = value is None or low <= value <= high
             checks.check(name, value, good, f"{low:g} to {high:g}")
+        self._check_member(checks)
         if self.tone is not None:
             try:
                 melanin_of_tone(self.tone)
@@ -141,6 +151,29 @@ class SubjectFile(Document):
                 "no blood together with it",
             )
         checks.close()
+
+    def _check_member(self, checks: FaultCollector) -> None:
+        """Check that a member exists, and that no other key describes the same person."""
+        if self.member is None:
+            checks.check("beard", self.beard, self.beard is None, "a member together with it")
+            return
+        own = [f for f in dataclasses.fields(self) if f.name not in _MEMBER_KEYS]
+        others = ", ".join(f.name for f in own if getattr(self, f.name) != f.default)
+        checks.check("member", self.member, not others, f"no {others} together with it")
+        try:
+            self.person()
+        except PopulationError as error:
+            raise SubjectFileError(str(error)) from error
+
+    def person(self) -> Member | None:
+        """Return the member with the file's changes; None without a member."""
+        if self.member is None:
+            return None
+        own, names = get_member(self.member), ("melanin", "freckles", "beard")
+        given: Any = {k: v for k in names if (v := getattr(self, k)) is not None}
+        return dataclasses.replace(
+            own, blood=self.blood * own.blood, oil=self.oil * own.oil, **given
+        )
 
     def melanosome_fraction(self, *, seed: int) -> float:
         """Return the volume fraction of melanosomes around which the skin varies."""
@@ -178,10 +211,10 @@ class SubjectFile(Document):
         rigsim.subject.SubjectError, rigsim.geometry.mesh.MeshError
             See `rigsim.subject.make_subject`.
         """
-        if mesh is not None and self.mesh is not None:
-            raise SubjectFileError(
-                f"mesh: the subject's file sets {self.mesh}; omit the other mesh"
-            )
+        if mesh is not None and (own := self.mesh or self.member) is not None:
+            raise SubjectFileError(f"mesh: the subject's file sets {own}; omit the other mesh")
+        if (member := self.person()) is not None:
+            return member.face(size)
         fraction = self.melanosome_fraction(seed=seed)
         found = make_subject(
             pigment.nearest_preset(fraction),
@@ -232,6 +265,8 @@ class SubjectFile(Document):
 
     def skin(self, *, seed: int) -> PersonSkin:
         """Return the skin that every rig simulates."""
+        if (member := self.person()) is not None:
+            return member.skin
         return PersonSkin(
             self.melanosome_fraction(seed=seed),
             self.blood,

@@ -235,7 +235,7 @@ def analyze_blood(
         found.append(
             describe_distribution(name, np.where(good, blood[box], 0.0).astype(np.float64), good)
         )
-    document = {
+    document: dict[str, Any] = {
         "schema": "skinrig.blood-distribution/1",
         "source": read.source,
         consent.CONSENT_KEY: consent.merge_consent(read),
@@ -245,7 +245,7 @@ def analyze_blood(
         "fraction_of_discs": _share_of_discs(blood, valid, radius),
         "regions": [one.document() for one in found],
     }
-    contents = (
+    contents: tuple[str | bytes, ...] = (
         _draw(np.where(valid, blood, np.nan), places, found, radius),
         _table(document["regions"]),
         json.dumps(document, indent=1),

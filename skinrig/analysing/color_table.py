@@ -18,7 +18,7 @@ from model import color_table, spectra
 from model.color_table import ColorTable
 from model.color_table_file import read_color_table, write_color_table
 from model.tissue_optics.constants import PAPER_CONSTANTS, SKIN_CONSTANTS, TissueConstants
-from model.tissue_optics.layers import ANISOTROPY_SKIN
+from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX
 from skinrig.analysing.brdf_space_figures import encode_figure, new_figure
 from skinrig.arrays import Float64Array
 from skinrig.atomic_file import write_atomically
@@ -71,7 +71,7 @@ def build_table(
         raise UnusableError(
             f"--eumelanin-fraction: got {eumelanin_fraction:g}, expected 0 to 1; change it"
         )
-    most = MAX_EPIDERMAL_BLOOD / color_table.C_HD_MAX
+    most = MAX_EPIDERMAL_BLOOD / C_HD_MAX
     if epidermal_blood_ratio is not None:
         if not 0.0 <= epidermal_blood_ratio <= most:
             raise UnusableError(

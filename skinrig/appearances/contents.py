@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -12,6 +12,14 @@ from model import store
 from model.skin import SkinAppearance, SkinMap
 from skinrig import consent
 from skinrig.arrays import BoolArray
+
+FUSION_KEY: Final = "fusion"
+"""Key in `parameters` of a fused person: common properties and each map's rigs."""
+
+
+def is_fused(appearance: SkinAppearance) -> bool:
+    """Return whether `skinrig fuse` wrote an appearance."""
+    return FUSION_KEY in appearance.parameters
 
 
 def intersect_valid(*maps: SkinMap) -> BoolArray:

@@ -9,7 +9,7 @@ from typing import Any
 
 from model import store
 from model.skin import SkinAppearance
-from skinrig.appearances.contents import list_versions
+from skinrig.appearances.contents import is_fused, list_versions
 
 DYNAMIC_KIND = "dynamic"
 FACIAL_COLOR, WRINKLES, MICROSTRUCTURE = "facial_color", "wrinkles", "microstructure"
@@ -88,7 +88,7 @@ def add(out: Path, name: str, part: SkinAppearance) -> SkinAppearance:
 def read(
     path: Path, *, parts: Sequence[str] = DYNAMIC_PARTS
 ) -> tuple[SkinAppearance, dict[str, Any]]:
-    """Read a dynamic appearance and the documents of its parts.
+    """Read a dynamic appearance, or a fused person, and the documents of its parts.
 
     Parameters
     ----------
@@ -103,7 +103,8 @@ def read(
         If it has none of them.
     """
     appearance = store.read(path)
-    found = describe_parts(appearance) if appearance.parameters.get("kind") == DYNAMIC_KIND else {}
+    has_parts = appearance.parameters.get("kind") == DYNAMIC_KIND or is_fused(appearance)
+    found = describe_parts(appearance) if has_parts else {}
     if not set(parts) & set(found):
         commands = " or ".join(f"`{FIT_COMMANDS[name]}`" for name in parts)
         raise DynamicAppearanceError(

@@ -121,10 +121,13 @@ class AppliedMicrostructure:
     height : ndarray of float32, shape (H, W)
         Relief in the unit of the neutral relief; a memory map if `out` was given.
     report : MicrostructureReport
+    strain : MeshStrain
+        Strain at the mesh's vertices.
     """
 
     height: Float32Array
     report: MicrostructureReport
+    strain: MeshStrain
 
 
 def apply_microstructure(
@@ -234,7 +237,7 @@ def apply_microstructure(
         **pose.shares(),
         **pose.compute_vertex_figures(),
     )
-    return AppliedMicrostructure(journal.target, report)
+    return AppliedMicrostructure(journal.target, report, found)
 
 
 def convolve_by_strain(
@@ -244,6 +247,24 @@ def convolve_by_strain(
     field = rasterize(found, faces, uv, (height.shape[0], height.shape[1]))
     s, t = line_kernels(field, table)
     return convolve(height, s.axis, t.axis, s.alpha, s.sigma_px, t.alpha, t.sigma_px), field
+
+
+def strain_image(field: TextureStrain) -> Float32Array:
+    """Return r_s, r_t and the angle of axis s from +x towards +y, rad, (H, W, 3).
+
+    Examples
+    --------
+    >>> one = np.ones((1, 1), bool)
+    >>> axes = np.array([[[[0.0, -1.0], [1.0, 0.0]]]], np.float32)  # s points up
+    >>> stretch = np.array([[[1.2, 0.9]]], np.float32)
+    >>> strain_image(TextureStrain(stretch, axes, stretch, one, one)).round(3).tolist()
+    [[[1.2000000476837158, 0.8999999761581421, 1.5709999799728394]]]
+    """
+    x, y = field.axes[..., 0, 0], -field.axes[..., 0, 1]
+    angle = np.arctan2(y, x)
+    angle = np.where(angle > 0.5 * np.pi + 1e-6, angle - np.pi, angle)  # an axis has no sign
+    angle = np.where(angle <= -0.5 * np.pi, angle + np.pi, angle)
+    return np.concatenate([field.stretch, angle[..., None]], axis=-1).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,7 @@ from model.displacement_synthesis import growth as displacement_synthesis
 from model.displacement_synthesis.sources import level_patch
 from model.displacement_synthesis.volume_noise import VolumeNoise
 from model.microstructure import KernelTable
-from model.microstructure.strain_fields import KernelRegions
+from model.microstructure.strain_fields import KernelRegions, rasterize
 from model.skin import SkinAppearance, SkinMap
 from rigsim.geometry.atlas import dilate_texture, unwrap
 from rigsim.geometry.mesh import build_mesh
@@ -26,7 +26,7 @@ from rigsim.subject.perfusion import STATE_NAMES
 from skinrig.appearances.contents import hash_file
 from skinrig.appearances.dynamic import MICROSTRUCTURE
 from skinrig.applying.expression import AppliedExpression, ApplyError
-from skinrig.applying.microstructure import apply_microstructure
+from skinrig.applying.microstructure import apply_microstructure, strain_image
 from skinrig.arrays import Float32Array, Float64Array
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.blend_shapes.meshes import BlendShapeMesh
@@ -53,6 +53,8 @@ ROWS_PER_NOISE_BAND: Final = 256
 SECONDS_KEYS: Final = ("strain_s", "convolution_s")
 RELIEF_SOURCES: Final = ("patches", "noise")
 Extrapolation = Literal["hold", "formula"]
+STRAIN_SIDE_PX: Final = 1024
+STRAIN_NOTE: Final = "stretch ratios r_s and r_t, angle of axis s from +x towards +y, rad"
 EXTRAPOLATION_MODES: Final[tuple[Extrapolation, ...]] = get_args(Extrapolation)
 MAX_EXR_SIDE_PX: Final = 8192
 """Maximum side of EXR maps; larger maps are written as .npy files next to the folder."""
@@ -178,6 +180,9 @@ class ReliefEvaluator:
         ):
             shown = np.array(height[::step, ::step]) if asked.exceeds_exr else np.asarray(height)
             done.maps[name] = SkinMap(shown, "um", None, None, note + more)
+        side = min(asked.size_px, STRAIN_SIDE_PX)
+        field = rasterize(moved.strain, self.mesh.faces, self.mesh.uv, (side, side))
+        done.maps["strain"] = SkinMap(strain_image(field), "1", None, field.covered, STRAIN_NOTE)
         figures = asdict(moved.report)
         seconds = {f"{key[:-2]}_seconds": figures.pop(key) for key in SECONDS_KEYS}
         done.figures[MICROSTRUCTURE] = {
@@ -200,7 +205,9 @@ class ReliefEvaluator:
     ) -> Any:
         """Return the neutral relief on the mesh's texture, um: grown patches or noise."""
         asked = self.request
-        patches = {name: [_patch(name, appearance, entry)] for name, entry in sites.items()}
+        patches = {
+            name: [level_site_patch(name, appearance, entry)] for name, entry in sites.items()
+        }
         pixels_um = [float(entry["pixel_um"]) for entry in sites.values()]
         if max(pixels_um) > (1.0 + PIXEL_SIZE_TOL) * min(pixels_um):
             raise ApplyError(
@@ -264,7 +271,16 @@ def _with_states(
     return (BlendShapeMesh(mesh.vertices_mm, mesh.uv, mesh.faces, {**mesh.shapes, **made}), own)
 
 
-def _patch(site: str, appearance: SkinAppearance, entry: Mapping[str, Any]) -> Float32Array:
+def level_site_patch(
+    site: str, appearance: SkinAppearance, entry: Mapping[str, Any]
+) -> Float32Array:
+    """Return the relief of a fitted site without its bulge, um.
+
+    Raises
+    ------
+    ApplyError
+        For a patch smaller than `MIN_PATCH_PX`.
+    """
     relief = appearance.maps[str(entry["map"])]
     if min(relief.values.shape) < MIN_PATCH_PX:
         raise ApplyError(

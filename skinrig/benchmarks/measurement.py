@@ -2,7 +2,7 @@
 
 import time
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any, TypeVar
 
 import numpy as np
@@ -11,6 +11,7 @@ from skinrig.benchmarks import resident_memory
 from skinrig.benchmarks.results import Timing
 
 Made = TypeVar("Made")
+Key = TypeVar("Key", bound=Hashable)
 
 LIMIT_CORES = 2
 """Cores that limits in seconds assume; processor time excludes other programs on them."""
@@ -105,6 +106,26 @@ def measure_processor_seconds(call: Callable[[], object], repeats: int = 1) -> f
     True
     """
     return measure_processor_time(call, repeats)[0]
+
+
+def measure_processor_seconds_in_turn(
+    calls: Mapping[Key, Callable[[], object]], repeats: int
+) -> dict[Key, float]:
+    """Return the least processor time of each call, s, of repeats that alternate between them.
+
+    Other programs then slow all calls alike.
+
+    Examples
+    --------
+    >>> found = measure_processor_seconds_in_turn({"a": list, "b": lambda: sum(range(10**5))}, 3)
+    >>> found["a"] < found["b"]
+    True
+    """
+    least = dict.fromkeys(calls, float("inf"))
+    for _ in range(repeats):
+        for name, call in calls.items():
+            least[name] = min(least[name], measure_processor_seconds(call))
+    return least
 
 
 def measure_once(call: Callable[[], Made]) -> tuple[Timing, Made]:

@@ -213,6 +213,105 @@ def analyse_blood(
     console.print_document("skinrig.analyse-blood/1", {"out": out, **figures})
 
 
+@analyse_app.command("profile", cls=Command)
+@command
+def analyse_profile(
+    profile: Path | None = None,
+    /,
+    *,
+    out: Out,
+    length: float = 3.0,
+    stretch: str = "0.8,1.35",
+    seed: int = 0,
+    json: Json = False,
+) -> None:
+    """Measure the surface length of a skin profile under stretch, with and without kernels.
+
+    Example: skinrig analyse profile forearm.csv --stretch 0.8,1.35 --out profile
+
+    Parameters
+    ----------
+    profile
+        CSV table position_um,height_um at equal steps; default: a simulated forehead.
+    length
+        Length of the simulated profile, mm.
+    stretch
+        Stretch ratios, separated by commas.
+    seed
+        Random seed of the simulated skin.
+    """
+    from skinrig.analysing import profile as analysing_profile
+    from skinrig.capturing.option_values import parse_floats
+
+    console = Console(json)
+    ratios = parse_floats(stretch, "--stretch") or analysing_profile.PAPER_STRETCHES
+    if profile is None:
+        heights, spacing_um = analysing_profile.simulate_profile(length, seed)
+    else:
+        heights, spacing_um = analysing_profile.read_profile(profile)
+    source = f"simulated forehead, seed {seed}" if profile is None else str(profile)
+    found = analysing_profile.analyze_profile(
+        out, heights, spacing_um, source=source, stretches=ratios
+    )
+    console.print_table(
+        (
+            "stretch",
+            "length, unchanged",
+            "alpha",
+            "sigma, um",
+            "length, kernel",
+            "alpha that keeps",
+        ),
+        (
+            (
+                row["stretch"],
+                f"{row['unchanged_ratio']:.3f}",
+                f"{row['table_alpha']:.2f}",
+                f"{row['table_sigma_um']:.1f}",
+                f"{row['table_ratio']:.3f}",
+                f"{row['preserving_alpha']:.2f} (length {row['preserving_ratio']:.3f})",
+            )
+            for row in found["stretches"]
+        ),
+    )
+    console.print_line(f"{out}: {', '.join(analysing_profile.OUTPUT_FILES)}")
+    figures = {name: value for name, value in found.items() if name != "schema"}
+    console.print_document("skinrig.analyse-profile/1", {"out": out, **figures})
+
+
+@analyse_app.command("parameterization", cls=Command)
+@command
+def analyse_parameterization(source: Path, /, *, out: Out, json: Json = False) -> None:
+    """Measure how the texture coordinates of a mesh distort areas and angles.
+
+    Example: skinrig analyse parameterization appearance-dome --out distortion
+
+    Parameters
+    ----------
+    source
+        Mesh with texture coordinates (.obj, .ply, .npz), or APPEARANCE/ folder of a dome session.
+    """
+    from skinrig.analysing import parameterization
+
+    console = Console(json)
+    found = parameterization.analyze_parameterization(out, source)
+    console.print_table(
+        ("of the skin's area", "5 %", "50 %", "95 %"),
+        (
+            ("area per texel over its median", *_rounded(found["area_over_median"])),
+            ("larger over smaller stretch", *_rounded(found["angle_ratio"])),
+        ),
+    )
+    console.print_line(f"standard deviation of the logarithm of area: {found['log_area_sd']:.3f}")
+    console.print_line(f"{out}: {parameterization.OUTPUT_FILE}")
+    figures = {name: value for name, value in found.items() if name != "schema"}
+    console.print_document("skinrig.analyse-parameterization/1", {"out": out, **figures})
+
+
+def _rounded(values: dict[str, float]) -> list[str]:
+    return [f"{value:.3f}" for value in values.values()]
+
+
 @analyse_app.command("color-table", cls=Command)
 @command
 def analyse_color_table(

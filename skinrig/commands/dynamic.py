@@ -199,7 +199,8 @@ class ReliefOptions:
     Attributes
     ----------
     size_px
-        Width and height of the displacement map, pixels.
+        Width and height of the displacement map, pixels; default 4096, of samples 2048 (sphere) or
+        1000 (patch).
     relief_site
         Site whose microrelief covers the whole mesh; default: each fitted site its own region.
     synthesize
@@ -210,7 +211,7 @@ class ReliefOptions:
         Random seed of the synthesized relief.
     """
 
-    size_px: int = 4096
+    size_px: int | None = None
     relief_site: str | None = None
     synthesize: Annotated[str, choice("patches", "noise")] = "patches"
     extrapolate: Annotated[str, choice("hold", "formula")] = "hold"
@@ -228,8 +229,9 @@ class ReliefOptions:
         """Return the options as a request."""
         from skinrig.applying.relief import ReliefRequest
 
-        given = select_attributes(self, "size_px", "extrapolate", "seed")
-        return ReliefRequest(site=self.relief_site, source=self.synthesize, **given)
+        given = select_attributes(self, "extrapolate", "seed")
+        size_px = 4096 if self.size_px is None else self.size_px
+        return ReliefRequest(size_px, site=self.relief_site, source=self.synthesize, **given)
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,10 +329,12 @@ def apply_expression(
 @apply_app.command("microstructure", cls=Command)
 @command
 def apply_microstructure(
-    appearance: Path,
+    appearance: Path | None = None,
     /,
-    mesh: Path,
-    weights: str,
+    *,
+    mesh: Path | None = None,
+    weights: str | None = None,
+    on: Annotated[str | None, choice("sphere", "patch")] = None,
     out: NewMaps,
     moving: ReliefOptions,
     json: Json = False,
@@ -339,19 +343,33 @@ def apply_microstructure(
 
     Example: skinrig apply microstructure moving --mesh head.npz --weights smile=1 --out relief
 
+    Example: skinrig apply microstructure --on patch --out pushed
+
     Parameters
     ----------
     appearance
-        Folder written by `skinrig fit`.
+        Folder written by `skinrig fit`; with --on, default: a simulated forehead.
     mesh
         Mesh with blend shapes: .npz, OBJ or glTF.
     weights
         Weights of blend shapes or expressions: jawOpen=0.5,smile=1.
+    on
+        Draw a sample instead of a mesh: sphere (shrunk, grown, squashed) or patch (a block of
+        tetrahedra pushed by a probe, with subsurface scattering).
     """
     from skinrig.appearances.dynamic import MICROSTRUCTURE
     from skinrig.applying import expression as applying
 
     console = Console(json)
+    if on is not None:
+        if mesh is not None or weights is not None:
+            raise UsageError("--mesh, --weights: not of a sample; remove them, or --on")
+        _draw_sample(on, appearance, out, moving, console)
+        return
+    if appearance is None or mesh is None or weights is None:
+        raise UsageError(
+            "appearance, --mesh, --weights: got not all three, expected them or --on; add them"
+        )
     given = applying.ExpressionRequest(applying.parse_weights(weights))
     relief = moving.relief(mesh, given.weights, out, console)
     parts = (MICROSTRUCTURE,)
@@ -359,6 +377,26 @@ def apply_microstructure(
         appearance, given, out=out, parts=parts, relief=relief, progress=console.progress
     )
     _report(console, out, done)
+
+
+def _draw_sample(
+    kind: str, appearance: Path | None, out: Path, moving: ReliefOptions, console: Console
+) -> None:
+    """Draw a deformed sphere or patch, and print its figures."""
+    from skinrig.applying import microstructure_samples as samples
+
+    relief = (
+        samples.SampleRelief.simulated(moving.seed)
+        if appearance is None
+        else samples.SampleRelief.fitted(appearance, moving.relief_site)
+    )
+    found = samples.draw_sample(
+        kind, out, relief, size_px=moving.size_px, seed=moving.seed, progress=console.progress
+    )
+    console.print_figures({kind: found}, int, float, str)
+    console.print_line(f"{out}: {', '.join(found['files'])}, sample.json")
+    figures = {name: value for name, value in found.items() if name != "schema"}
+    console.print_document("skinrig.apply-sample/1", {"out": out, **figures})
 
 
 def _read_target_face(folder: Path | None, landmarks: list[Path]) -> TargetFace | None:
@@ -400,49 +438,3 @@ def _report(console: Console, out: Path, done: AppliedExpression) -> None:
 def print_fit(console: Console, model: str, out: Path, found: Mapping[str, Any]) -> None:
     """Print the JSON document of a fit."""
     console.print_document("skinrig.fit/1", {"model": model, "out": out, **found})
-
-
-@fit_app.command("reflectance", cls=Command)
-@command
-def fit_reflectance(
-    dome: Path,
-    probe: Path | None = None,
-    /,
-    *,
-    out: NewMaps,
-    landmarks: Annotated[Path | None, typer.Option("--landmarks", "--sites")] = None,
-    json: Json = False,
-) -> None:
-    """Combine basis BRDFs, albedo, normals and translucency of a subject into one model.
-
-    Example: skinrig fit reflectance appearance-dome appearance-probe --out model
-
-    Parameters
-    ----------
-    dome
-        Maps of a dome session: normals, r_d, basis BRDF weights.
-    probe
-        Maps of a fiber probe session of the same subject; default: dome maps only.
-    landmarks
-        CSV table name,x,y of the probe's sites, texels of the dome's maps.
-    """
-    from skinrig.fitting.reflectance import fit_reflectance as fit
-    from skinrig.fitting.reflectance import summarize_medians
-
-    console = Console(json)
-    found = fit(dome, probe, out=out, landmarks=landmarks)
-    rows = summarize_medians(found)
-    console.print_table(("median over valid texels", "red", "green", "blue"), rows)
-    for site in found.placed.sites if found.placed is not None else ():
-        console.print_line(f"{site.name}: texel row {site.texel[0]}, column {site.texel[1]}")
-    console.print_each("assumed", found.assumed)
-    console.print_omissions(found.left_out)
-    valid = float(found.model.valid.mean())
-    console.print_line(f"{out}: reflectance model, {100 * valid:.0f} % of its texels valid")
-    console.print_line(f"next: skinrig render {shell_quote(out)} --light 1,1,2 --out picture")
-    print_fit(
-        console,
-        "reflectance",
-        out,
-        select_attributes(found, "assumed", "left_out") | {"rows": rows},
-    )

@@ -1,5 +1,6 @@
 """`skinrig fuse`: one person's maps by several rigs to one appearance."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -33,7 +34,9 @@ def fuse(
     sessions
         SESSION/ folders with their maps next to them, or APPEARANCE/ folders; one per rig.
     without
-        Rigs to leave out, separated by commas: flash, dome, gradient, probe.
+        What to leave out, separated by commas: rigs (flash, dome, gradient, probe), their maps
+        (diffuse, r_d, normals, sigma_tr), or covariance. Its cost is printed: the maps are also
+        estimated with it.
     landmarks
         CSV table name,x,y,z in mm of the dome's mesh, or name,x,y in texels of its maps.
     image_landmarks
@@ -42,7 +45,9 @@ def fuse(
         CSV table name,x,y of sites of probe and gradient rig, texels of the dome's maps.
     """
     from skinrig.capturing.option_values import parse_names
-    from skinrig.fusing.double import FusionInputs, fuse
+    from skinrig.fusing.cost import compare_without
+    from skinrig.fusing.double import FusionInputs, fuse, fuse_sources
+    from skinrig.fusing.sources import read_sources
     from skinrig.fusing.summary import summarize
 
     console = Console(json)
@@ -54,11 +59,15 @@ def fuse(
     console.print_table(("map", "median", "68 % interval, %", "common to the face, %"), rows)
     console.print_table(
         ("rig", "probability that it is faulty", "p value of its gains"),
-        [
-            (check.rig, round(check.probability, 4), check.p_value)
-            for check in (*found.checks, *([] if found.patch is None else [found.patch.check]))
-        ],
+        [(one.rig, round(one.probability, 4), one.p_value) for one in found.all_checks],
     )
+    cost = []
+    if given.without:
+        console.progress("once more, with what was left out")
+        whole = fuse_sources(read_sources(given.paths), replace(given, without=()))
+        cost = compare_without(whole.appearance, found.appearance)
+        head = ("map", "68 % interval with all, %", "without, %", "change, standard errors")
+        console.print_table(head, cost)
     if found.contradiction is not None:
         console.print_line(f"contradiction: {found.contradiction}")
     console.print_each("assumed", found.assumed)
@@ -71,6 +80,7 @@ def fuse(
             "out": out,
             "maps": sorted(found.appearance.maps),
             "rows": rows,
+            "cost": cost,
             "fusion": found.appearance.parameters["fusion"],
             "contradiction": found.contradiction,
             "left_out": found.left_out,

@@ -9,7 +9,7 @@ import typer
 
 from skinrig.commands import completion
 from skinrig.commands.dynamic import print_fit
-from skinrig.commands.options import Json, MeshFile, Out, choice, command
+from skinrig.commands.options import Json, MeshFile, NewMaps, Out, choice, command
 from skinrig.commands.renamed_options import replace_former_values
 from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import UnusableError
@@ -277,3 +277,48 @@ def fit_template(
         "--out appearance"
     )
     print_fit(console, "template", out, figures)
+
+
+@command
+def fit_reflectance(
+    dome: Path,
+    probe: Path | None = None,
+    /,
+    *,
+    out: NewMaps,
+    landmarks: Annotated[Path | None, typer.Option("--landmarks", "--sites")] = None,
+    json: Json = False,
+) -> None:
+    """Combine basis BRDFs, albedo, normals and translucency of a subject into one model.
+
+    Example: skinrig fit reflectance appearance-dome appearance-probe --out model
+
+    Parameters
+    ----------
+    dome
+        Maps of a dome session: normals, r_d, basis BRDF weights.
+    probe
+        Maps of a fiber probe session of the same subject; default: dome maps only.
+    landmarks
+        CSV table name,x,y of the probe's sites, texels of the dome's maps.
+    """
+    from skinrig.fitting.reflectance import fit_reflectance as fit
+    from skinrig.fitting.reflectance import summarize_medians
+
+    console = Console(json)
+    found = fit(dome, probe, out=out, landmarks=landmarks)
+    rows = summarize_medians(found)
+    console.print_table(("median over valid texels", "red", "green", "blue"), rows)
+    for site in found.placed.sites if found.placed is not None else ():
+        console.print_line(f"{site.name}: texel row {site.texel[0]}, column {site.texel[1]}")
+    console.print_each("assumed", found.assumed)
+    console.print_omissions(found.left_out)
+    valid = float(found.model.valid.mean())
+    console.print_line(f"{out}: reflectance model, {100 * valid:.0f} % of its texels valid")
+    console.print_line(f"next: skinrig render {shell_quote(out)} --light 1,1,2 --out picture")
+    print_fit(
+        console,
+        "reflectance",
+        out,
+        select_attributes(found, "assumed", "left_out") | {"rows": rows},
+    )

@@ -19,9 +19,10 @@ from skinrig.extremes.inputs import InputPrecision
 
 SCHEMA = "skinrig.extremes.cases/1"
 
-CASES_TABLE = resources.files("skinrig").joinpath("data/extremes.csv")
-"""Stage, name, extreme, danger and expectation of each case, with module and function of its trial.
-`one_precision` is the reason why one run counts for both, where inputs have a fixed precision."""
+CASE_TABLES = ("extremes.csv", "extremes_solvers.csv")
+"""Files below skinrig/data. Stage, name, extreme, danger and expectation of each case, with module
+and function of its trial. `one_precision` is the reason why one run counts for both, where inputs
+have a fixed precision."""
 
 INPUT_PRECISIONS: Mapping[str, InputPrecision] = {
     "float32": InputPrecision(np.float32),
@@ -53,13 +54,14 @@ class CaseResult:
 
 
 def read_cases() -> tuple[Case, ...]:
-    """Read every case from the table, in the table's order."""
-    rows = csv.DictReader(CASES_TABLE.read_text(encoding="utf-8").splitlines())
-    return tuple(_case(**row) for row in rows)
+    """Read every case from the tables, in their order."""
+    folder = resources.files("skinrig").joinpath("data")
+    texts = [folder.joinpath(name).read_text(encoding="utf-8") for name in CASE_TABLES]
+    return tuple(_case(**row) for text in texts for row in csv.DictReader(text.splitlines()))
 
 
 def _case(*, run: str, **words: str) -> Case:
-    module, function = run.split(".")
+    module, _, function = run.rpartition(".")
     return Case(run=getattr(import_module(f"skinrig.extremes.{module}"), function), **words)
 
 

@@ -16,7 +16,7 @@ from reconstruction.pipeline.probe.stages import CHANNEL_NAMES, SUBSURFACE_FILE
 from reconstruction.subsurface import probe_sites, translucency
 from reconstruction.subsurface.translucency import TranslucencyMap, TranslucencyPrior
 from skinrig.appearances.contents import intersect_valid
-from skinrig.arrays import Float32Array, Float64Array
+from skinrig.arrays import BoolArray, Float32Array, Float64Array
 
 SITE_OFFSETS_FROM_NOSE_MM: Final[Mapping[str, tuple[float, float]]] = {
     "forehead": (0.0, 76.0),
@@ -33,6 +33,8 @@ GRID_SIDE: Final = 256
 """Side of the grid on which translucency is interpolated before it is resampled to the texture."""
 MAX_SITE_DISTANCE_MM: Final = 15.0
 """Maximum distance of a site from the nearest texel of the scan."""
+SITE_RADIUS_MM: Final = 8.0
+"""Radius around a probe's site whose skin is that of the probe."""
 HEAD_RADIUS_RANGE_MM: Final = (40.0, 200.0)
 """Range of fitted girth radii that count as a head; other shapes are measured along x and y."""
 
@@ -263,7 +265,10 @@ def interpolate_sites(
     known = intersect_valid(position)
     at_mm = position.values.astype(np.float64)
     if expected_mm is not None:
-        sites = [_relative_to(site, expected_mm[site.texel]) for site in sites]
+        sites = [
+            _relative_to(site, np.median(expected_mm[known & _is_near(site, at_mm)], axis=0))
+            for site in sites
+        ]
     chart = _Chart.of(at_mm[known], sites)
     found_map = _interpolated(chart, sites, prior)
     spread = chart.interpolate(found_map, at_mm)
@@ -284,6 +289,13 @@ def interpolate_sites(
         assumed=(),
         p_value=tuple(float(p) for p in found_map.p_value),
     )
+
+
+def _is_near(site: ProbeSite, at_mm: Float64Array) -> BoolArray:
+    """Return the texels within `SITE_RADIUS_MM` of a site, at least its own, (H, W)."""
+    near = np.linalg.norm(at_mm - np.array(site.position_mm), axis=-1) < SITE_RADIUS_MM
+    near[site.texel] = True
+    return np.asarray(near)
 
 
 def _relative_to(site: ProbeSite, expected_mm: Float32Array) -> ProbeSite:

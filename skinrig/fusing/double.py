@@ -1,47 +1,35 @@
 """Fuse one person's maps by several rigs into one appearance: `skinrig fuse`."""
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 from model import store
-from model.skin import MAP_UNITS, SkinAppearance, SkinMap
+from model.skin import SkinAppearance
 from model.skin_reflectance import NORMAL_MAPS, TRANSLUCENCY_MAP
 from reconstruction.fusion.consistency import MIN_PROBABILITY, RigCheck, check_rigs, name_faulty_rig
 from reconstruction.fusion.patch_normals import PatchCheck
 from reconstruction.fusion.person import PersonSkin
 from reconstruction.fusion.signals import RigBands
-from reconstruction.fusion.texels import (
-    BLOCK_TEXELS,
-    OffsetModel,
-    TexelSkin,
-    estimate_texels,
-    melanin_depth_factor,
-)
-from reconstruction.subsurface.translucency import TranslucencyPrior
+from reconstruction.fusion.texels import OffsetModel
 from skinrig.appearances import face_textures
-from skinrig.appearances.contents import derive_appearance, intersect_valid, list_assumptions
+from skinrig.appearances.contents import (
+    FUSION_KEY,
+    derive_appearance,
+    intersect_valid,
+    list_assumptions,
+)
 from skinrig.appearances.texel_placement import TexelPlacement, place_texels
-from skinrig.arrays import Float32Array, Int64Array
 from skinrig.fitting import probe_sites
 from skinrig.fusing.description import describe_checks, describe_patch, describe_person
-from skinrig.fusing.measurements import SITE_SIGMA_TR_SD, Measurements
+from skinrig.fusing.maps import FUSED_MAPS, estimate_maps
+from skinrig.fusing.measurements import Measurements
 from skinrig.fusing.patches import PATCH_PREFIX, PlacedPatch, place_patch
 from skinrig.fusing.sources import FusionInputError, Source, Sources, read_sources
-from skinrig.fusing.texel_colors import (
-    LOG_R_D_OVER_REFLECTANCE,
-    ColorSource,
-    DomeColors,
-    FlashColors,
-)
+from skinrig.fusing.texel_colors import ColorSource, DomeColors, FlashColors
 
-FUSION_KEY: Final = "fusion"
-"""Key in `parameters` of the person's common properties and of each map's rigs."""
-OWN_SUFFIX: Final = "_texel_stderr"
-"""Suffix of maps of standard errors without those common to the face."""
 QUANTITY_BY_RIG: Final[Mapping[str, str]] = {
     "dome": "R_d",
     "flash": "diffuse light",
@@ -49,8 +37,16 @@ QUANTITY_BY_RIG: Final[Mapping[str, str]] = {
     "gradient": "normals",
 }
 """Quantity of a rig in the name of a contradiction."""
-FUSED_MAPS: Final = ("melanin", "melanin_optical_depth", "hemoglobin", "r_d", TRANSLUCENCY_MAP)
-"""Maps that the fusion estimates; all others are carried over."""
+FUSION_FILE: Final = "fusion.json"
+"""Common properties, rigs behind each map and agreement of the rigs, as in `parameters`."""
+ALBEDO_MAP: Final = "r_d"
+COVARIANCE_NAME: Final = "covariance"
+MAP_RIGS: Final[Mapping[str, str]] = {
+    "diffuse": "flash",
+    "sigma_tr": "probe",
+    "normals": "gradient",
+}
+"""Rigs that give one map to the fusion; the dome's `r_d` can be left out alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +58,8 @@ class FusionInputs:
     paths
         Sessions with their maps next to them, or appearances, one per rig.
     without
-        Rigs to leave out.
+        Rigs, maps of `MAP_RIGS` or "covariance" to leave out. Without `r_d` the dome's mesh and
+        normals stay.
     landmarks
         Table ``name,x,y,z`` in mm of the dome's mesh, or ``name,x,y`` in texels of its maps.
     image_landmarks
@@ -88,6 +85,11 @@ class FusedDouble:
     measured: Measurements
     checks: tuple[RigCheck, ...]
     patch: PlacedPatch | None = None
+
+    @property
+    def all_checks(self) -> tuple[RigCheck | PatchCheck, ...]:
+        """Agreement of the rigs, and of the patch with a surface."""
+        return (*self.checks, *(() if self.patch is None else (self.patch.check,)))
 
     @property
     def assumed(self) -> tuple[str, ...]:
@@ -130,7 +132,7 @@ def fuse(
         If folders cannot be fused; the message names them.
     """
     store.require_free(out)
-    sources = read_sources(given.paths).without(given.without)
+    sources = read_sources(given.paths)
     if any(one.path.resolve() == out.resolve() for one in sources.by_rig.values()):
         raise FusionInputError(f"{out}: is one of the inputs; name another --out")
     found = fuse_sources(sources, given, progress=progress)
@@ -148,11 +150,18 @@ def fuse_sources(
     sources
         Maps by rig.
     given
-        Landmarks and sites.
+        Landmarks and sites, and what is left out.
     progress
         As of `fuse`.
+
+    Raises
+    ------
+    FusionInputError
+        If no colors are left.
     """
     report = progress or (lambda _step: None)
+    kept = [name for name in given.without if name not in (ALBEDO_MAP, COVARIANCE_NAME)]
+    sources = sources.without([MAP_RIGS.get(name, name) for name in kept])
     report("place texels")
     measured = measure(sources, given)
     report("common properties of the skin")
@@ -165,7 +174,8 @@ def fuse_sources(
     base = sources.get("dome") or sources.by_rig["flash"]
     maps = dict(base.appearance.maps)
     carried = [name for name in maps if name not in FUSED_MAPS]
-    fused, p_value = _fused_maps(measured, person, errors, base, report)
+    position = base.appearance.maps.get("position")
+    fused, p_value = estimate_maps(measured, person, errors, position=position, progress=report)
     maps = {name: maps[name] for name in carried} | fused
     color_rigs = [rig.rig for rig in measured.rigs if rig.kind == "reflectance"]
     provenance = {name: [base.rig] for name in carried}
@@ -200,15 +210,23 @@ def fuse_sources(
     if patch is not None:
         parameters["parts"] = patch.parameters
         parameters[FUSION_KEY]["patch"] = describe_patch(patch)
+    # exports carry files, not parameters
+    files[FUSION_FILE] = json.dumps(parameters[FUSION_KEY], indent=1).encode()
     appearance = derive_appearance(
         *(one.appearance for one in sources.by_rig.values()),
         maps=maps,
         parameters=parameters,
-        inputs={one.rig: one.digest for one in sources.by_rig.values()},
+        inputs=_session_input(base) | {one.rig: one.digest for one in sources.by_rig.values()},
         left_out=(*base.appearance.left_out, *left_out),
         files=files,
     )
     return FusedDouble(appearance, person, errors, measured, checks, patch)
+
+
+def _session_input(base: Source) -> dict[str, str]:
+    """Return the hash of the session of the mesh, whose held-out photographs stay held out."""
+    found = base.appearance.inputs.get("session")
+    return {} if found is None else {"session": found}
 
 
 def _assumed(source: Source) -> list[str]:
@@ -239,7 +257,7 @@ def measure(sources: Sources, given: FusionInputs) -> Measurements:
     for one in (dome, flash, probe):
         if one is not None and not one.spectra()[2]:
             assumed.append(f"{one.rig}: camera and light are those of the rig file")
-    if dome is not None:
+    if dome is not None and ALBEDO_MAP not in given.without:
         camera, illuminant, _ = dome.spectra()
         colors.append(DomeColors.of(dome.appearance, camera, illuminant))
     if flash is not None:
@@ -247,6 +265,8 @@ def measure(sources: Sources, given: FusionInputs) -> Measurements:
         if dome is not None:
             placement = _place_flash(dome, flash, given)
         colors.append(FlashColors.of(flash.appearance, placement, camera, illuminant))
+    if not colors:
+        raise FusionInputError("--without: got r_d of the only rig with colors; leave out another")
     sites: tuple[probe_sites.ProbeSite, ...] = ()
     bands = None
     if probe is not None and position is None:
@@ -268,6 +288,7 @@ def measure(sources: Sources, given: FusionInputs) -> Measurements:
         tuple(left_out),
         bands,
         placement,
+        COVARIANCE_NAME in given.without,
     )
 
 
@@ -297,112 +318,3 @@ def _place_flash(dome: Source, flash: Source, given: FusionInputs) -> TexelPlace
         landmarks_mm=face.landmarks,
         landmarks_px=pixels,
     )
-
-
-def _fused_maps(
-    measured: Measurements,
-    person: PersonSkin,
-    errors: OffsetModel,
-    base: Source,
-    report: Callable[[str], None],
-) -> tuple[dict[str, SkinMap], list[float]]:
-    """Estimate all texels block by block, and write the maps."""
-    height, width = measured.shape
-    planes = {
-        name: np.zeros((measured.count, channels), np.float32)
-        for name, channels in (
-            ("melanin", 3),
-            ("depth", 2),
-            ("blood", 3),
-            ("covariance", 1),
-            ("misfit", 1),
-            ("r_d", 6),
-            ("expected", 3),
-        )
-    }
-    valid = np.zeros(measured.count, bool)
-    factor = melanin_depth_factor(person.properties_sd)
-    known = np.flatnonzero(np.logical_or.reduce([one.valid for one in measured.colors]))
-    for start in range(0, known.size, BLOCK_TEXELS):
-        report(f"texels: {100 * start // known.size} %")
-        block = known[start : start + BLOCK_TEXELS]
-        colors = [one.colors(k, block) for k, one in enumerate(measured.colors)]
-        for _, skin in estimate_texels(person, colors, errors):
-            _write_block(planes, block, skin, factor, measured)
-            valid[block] = skin.valid
-
-    def one_map(plane: str, column: int, error: int | None, unit: str, what: str) -> SkinMap:
-        values = planes[plane].reshape(height, width, -1)
-        stderr = None if error is None else values[..., error]
-        return SkinMap(values[..., column], unit, stderr, valid.reshape(height, width), what)
-
-    thickness = "for an epidermis of 0.09 mm"
-    apart = "standard error by errors of the texel alone"
-    maps = {
-        "melanin": one_map("melanin", 0, 1, MAP_UNITS["melanin"], f"fused, {thickness}"),
-        f"melanin{OWN_SUFFIX}": one_map("melanin", 2, None, MAP_UNITS["melanin"], apart),
-        "melanin_optical_depth": one_map("depth", 0, 1, "1", "fused, at 550 nm"),
-        "hemoglobin": one_map("blood", 0, 1, MAP_UNITS["hemoglobin"], "fused"),
-        f"hemoglobin{OWN_SUFFIX}": one_map("blood", 2, None, MAP_UNITS["hemoglobin"], apart),
-        "melanin_blood_covariance": one_map(
-            "covariance", 0, None, "1", "covariance of log melanin optical depth and log blood"
-        ),
-        "fusion_misfit": one_map("misfit", 0, None, "1", "chi-squared over degrees of freedom"),
-    }
-    if base.rig == "dome":
-        r_d = planes["r_d"].reshape(height, width, 6)
-        what = "fused, camera RGB over that of a perfect white"
-        maps["r_d"] = SkinMap(r_d[..., :3], "1", r_d[..., 3:], valid.reshape(height, width), what)
-    p_value: list[float] = []
-    if measured.probe_bands is not None:
-        usual = measured.errors(person.mean).unexplained
-        at_mm = base.appearance.maps["position"]
-        place = SkinMap(
-            at_mm.values, "mm", valid=intersect_valid(at_mm) & valid.reshape(height, width)
-        )
-        prior = TranslucencyPrior(
-            np.zeros(3), np.sqrt(np.diag(usual)[-3:]), np.full(3, SITE_SIGMA_TR_SD)
-        )
-        expected = np.maximum(planes["expected"].reshape(height, width, 3), 1e-3)
-        found = probe_sites.interpolate_sites(
-            measured.sites, place, prior=prior, expected_mm=expected
-        )
-        maps[TRANSLUCENCY_MAP] = found.map
-        p_value = list(found.p_value)
-    return maps, p_value
-
-
-def _write_block(
-    planes: Mapping[str, Float32Array],
-    block: Int64Array,
-    skin: TexelSkin,
-    factor: float,
-    measured: Measurements,
-) -> None:
-    """Write the estimates of a block into the planes of the maps."""
-    depth, blood = np.exp(skin.log_skin).T
-    melanin = depth / factor
-    own = np.sqrt(np.einsum("naa->na", skin.covariance))
-    both = skin.covariance + skin.common
-    total = np.sqrt(np.einsum("naa->na", both))
-    # half-widths of 68 % intervals of lognormal quantities
-    planes["melanin"][block] = np.stack(
-        [
-            melanin,
-            melanin * np.sinh(np.sqrt(skin.log_melanin_variance)),
-            melanin * np.sinh(own[:, 0]),
-        ],
-        axis=-1,
-    )
-    planes["depth"][block] = np.stack([depth, depth * np.sinh(total[:, 0])], axis=-1)
-    planes["blood"][block] = np.stack(
-        [blood, blood * np.sinh(total[:, 1]), blood * np.sinh(own[:, 1])], axis=-1
-    )
-    planes["covariance"][block, 0] = both[:, 0, 1]
-    planes["misfit"][block, 0] = skin.misfit
-    if measured.rigs[0].rig == "dome":
-        r_d = np.exp(skin.log_signals[:, :3] + LOG_R_D_OVER_REFLECTANCE)
-        sd = np.sqrt(skin.signal_variance[:, :3] + skin.signal_common[:, :3])
-        planes["r_d"][block] = np.concatenate([r_d, r_d * np.sinh(sd)], axis=-1)
-    if measured.probe_bands is not None:
-        planes["expected"][block] = np.exp(-skin.log_signals[:, -3:])

@@ -14,7 +14,7 @@ from reconstruction.fusion.texels import OffsetModel, RigColors
 from skinrig.appearances.texel_placement import TexelPlacement
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.fitting import probe_sites
-from skinrig.fusing.texel_colors import ColorSource
+from skinrig.fusing.texel_colors import ColorSource, Texels
 
 LOCAL_SHARE: Final = 0.25
 """Variance over places of a face of what the model leaves unexplained, over that over people.
@@ -22,8 +22,6 @@ LOCAL_SHARE: Final = 0.25
 Residuals of measured spectra are known between people only; a quarter is assumed within a face."""
 SITE_SIGMA_TR_SD: Final = 0.05
 """Deviation of log sigma_tr between sites of a face that tissue does not explain."""
-SITE_RADIUS_MM: Final = 8.0
-"""Radius around a probe's site whose colors are those of the probed skin."""
 MAX_SAMPLED_TEXELS: Final = 40_000
 """Texels that the person's common properties are estimated from, evenly over the texture."""
 
@@ -48,6 +46,8 @@ class Measurements:
         Channels of a probe with sites; None without.
     placement
         Places of the texels in the flash rig's image; None if it is the texture, or missing.
+    independent
+        Whether all errors count as independent: covariances are left out.
     """
 
     colors: tuple[ColorSource, ...]
@@ -58,6 +58,7 @@ class Measurements:
     left_out: tuple[tuple[str, str], ...] = ()
     probe_bands: RigBands | None = None
     placement: TexelPlacement | None = None
+    independent: bool = False
 
     @property
     def rigs(self) -> tuple[RigBands, ...]:
@@ -81,6 +82,11 @@ class Measurements:
         chosen[few] = True
         return chosen
 
+    def texel_colors(self, texels: Texels) -> list[RigColors]:
+        """Return the colors of some texels by all rigs, numbered row by row."""
+        found = [one.colors(k, texels) for k, one in enumerate(self.colors)]
+        return [one.without_covariance() for one in found] if self.independent else found
+
     def errors(self, log_skin: Float64Array) -> OffsetModel:
         """Return the covariances of the signals' errors for a face of typical melanin and blood.
 
@@ -100,7 +106,8 @@ class Measurements:
         if self.probe_bands is not None:
             local[-3:, -3:] = SITE_SIGMA_TR_SD**2 * np.eye(3)
             calibration[-3:, -3:] = 1e-6 * np.eye(3)
-        return OffsetModel(unexplained, calibration, local)
+        found = OffsetModel(unexplained, calibration, local)
+        return found.without_covariance() if self.independent else found
 
     def regions(self, errors: OffsetModel) -> Regions:
         """Return the signals of the whole face and of the probe's sites.
@@ -111,16 +118,17 @@ class Measurements:
             Covariances of the signals' errors.
         """
         chosen = self.sampled()
-        colors = [one.colors(k, chosen) for k, one in enumerate(self.colors)]
+        colors = self.texel_colors(chosen)
         whole, _ = summarize_regions(colors, np.zeros(int(chosen.sum()), np.intp), errors)
         parts = [whole]
         for site in self.sites:
             if self.position_mm is None:
                 break
             away = np.linalg.norm(self.position_mm - np.array(site.position_mm), axis=-1)
-            near = away < SITE_RADIUS_MM
-            colors = [one.colors(k, near) for k, one in enumerate(self.colors)]
-            parts.append(_add_sigma_tr(site, colors, errors))
+            near = away < probe_sites.SITE_RADIUS_MM
+            colors = self.texel_colors(near)
+            value, stderr = np.array(site.sigma_tr_per_mm), np.array(site.stderr_per_mm)
+            parts.append(summarize_site(value, stderr, colors, errors))
         return Regions(
             np.concatenate([part.values for part in parts]),
             np.concatenate([part.covariance for part in parts]),
@@ -150,19 +158,32 @@ class Measurements:
         return person, errors
 
 
-def _add_sigma_tr(
-    site: probe_sites.ProbeSite, colors: Sequence[RigColors], errors: OffsetModel
+def summarize_site(
+    sigma_tr_per_mm: Float64Array,
+    stderr_per_mm: Float64Array,
+    colors: Sequence[RigColors],
+    errors: OffsetModel,
 ) -> Regions:
-    """Return the signals of a site: colors around it, where there are enough, and sigma_tr."""
+    """Return the signals of a probe's site: colors around it, where there are enough, and sigma_tr.
+
+    Parameters
+    ----------
+    sigma_tr_per_mm, stderr_per_mm
+        (3,): of the probe; channels that are not finite and positive are not known.
+    colors
+        Colors of the texels around the site.
+    errors
+        Covariances of the signals' errors; the probe's signals are the last.
+    """
     size = len(errors.local)
     try:
-        labels = np.ones(len(colors[0].valid), np.intp)
+        labels = np.ones(len(colors[0].valid), np.intp) if colors else np.zeros(0, np.intp)
         found, _ = summarize_regions(colors, labels, errors)
         value, covariance = found.values[0], found.covariance[0]
     except FusionError:
         value = np.zeros(size)
         covariance = hide_signals(errors.local, np.ones(size, bool))
-    sigma_tr, stderr = np.array(site.sigma_tr_per_mm), np.array(site.stderr_per_mm)
+    sigma_tr, stderr = np.asarray(sigma_tr_per_mm), np.asarray(stderr_per_mm)
     good = np.isfinite(sigma_tr) & np.isfinite(stderr) & (sigma_tr > 0.0)
     at = np.arange(size - 3, size)[good]
     covariance[at, at] = np.square(stderr[good] / sigma_tr[good]) + SITE_SIGMA_TR_SD**2

@@ -102,7 +102,8 @@ def place_patch(gradient: Source, dome: Source | None, *, sites: Path | None) ->
         left_out.append(("gradient: microstructure", str(error).partition("; ")[0]))
         if height in appearance.maps:
             maps[f"microrelief_{site}"] = appearance.maps[height]
-    fused, assumed = None, ()
+    fused: FusedPatch | None = None
+    assumed: tuple[str, ...] = ()
     if dome is None:
         left_out.append(
             ("gradient: normals", "a patch is placed on a dome's mesh, which is missing")
@@ -115,14 +116,16 @@ def place_patch(gradient: Source, dome: Source | None, *, sites: Path | None) ->
     if fused is not None:
         spread = np.sqrt(np.einsum("hwaa->hw", fused.covariance) / 2.0)
         what = "fused, rig frame: low frequencies by the dome, high by the gradient rig"
-        three = np.repeat(spread[..., None], 3, axis=-1)
-        pairs = fused.covariance[..., [0, 0, 1], [0, 1, 1]]
+        three = np.repeat(spread[..., None], 3, axis=-1).astype(np.float32)
+        pairs = fused.covariance[..., [0, 0, 1], [0, 1, 1]].astype(np.float32)
+        normals_map = fused.normals.astype(np.float32)
+        points = fused.position_mm.astype(np.float32)
         maps |= {
-            f"{PATCH_PREFIX}normals_{site}": SkinMap(fused.normals, "1", three, fused.valid, what),
+            f"{PATCH_PREFIX}normals_{site}": SkinMap(normals_map, "1", three, fused.valid, what),
             f"{PATCH_PREFIX}normals_covariance_{site}": SkinMap(
                 pairs, "1", None, fused.valid, "rad^2: to the right; of both; up"
             ),
-            f"{PATCH_PREFIX}position_{site}": SkinMap(fused.position_mm, "mm", None, fused.valid),
+            f"{PATCH_PREFIX}position_{site}": SkinMap(points, "mm", None, fused.valid),
         }
     return PlacedPatch(
         site, maps, files, parameters, fused, check_patch(patch), assumed, tuple(left_out)

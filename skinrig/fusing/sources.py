@@ -11,7 +11,7 @@ from capture.session import Session
 from model import store
 from model.skin import SkinAppearance
 from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
-from skinrig.appearances.contents import hash_document
+from skinrig.appearances.contents import FUSION_KEY, hash_document
 from skinrig.errors import UsageError
 
 RIG_NAMES: Final = ("flash", "dome", "gradient", "probe")
@@ -89,8 +89,8 @@ class Sources:
         for name in rigs:
             if name not in self.by_rig:
                 raise FusionInputError(
-                    f"--without: got {name!r}, expected one of {', '.join(self.by_rig)}; "
-                    "name a rig whose maps are given"
+                    f"--without: got {name!r}, expected one of {', '.join(self.by_rig)}, their "
+                    "maps r_d, diffuse, sigma_tr, normals, or covariance; name a given one"
                 )
         return Sources({name: one for name, one in self.by_rig.items() if name not in rigs})
 
@@ -138,7 +138,8 @@ def _find_maps(path: Path) -> Path:
     for entry in near:
         document = store.read_document(entry)
         own = document.parameters.get("session") == path.resolve().name
-        if own and document.parameters.get("kind") == "appearance":
+        is_own = own and document.parameters.get("kind") == "appearance"
+        if is_own and FUSION_KEY not in document.parameters:
             return entry
     raise UsageError(
         f"{path}: got a session without maps next to it, expected an appearance; run "

@@ -4,7 +4,8 @@ from typing import Final
 
 import numpy as np
 
-from skinrig.fusing.double import FUSED_MAPS, OWN_SUFFIX, FusedDouble
+from skinrig.fusing.double import FusedDouble
+from skinrig.fusing.maps import FUSED_MAPS, OWN_SUFFIX
 
 SummaryRow = tuple[str, float, float, float | None]
 """Map, median, median relative standard error in %, and its part common to the face in %."""
@@ -31,7 +32,8 @@ def summarize(found: FusedDouble) -> list[SummaryRow]:
         for k, value in enumerate(np.median(values, axis=0)):
             common = None
             if name + OWN_SUFFIX in maps:
-                own = float(np.median(maps[name + OWN_SUFFIX].values[good] / values[:, 0]))
+                apart = maps[name + OWN_SUFFIX].values[good].reshape(values.shape)
+                own = float(np.median(apart[:, k] / values[:, k]))
                 common = 100.0 * float(np.sqrt(max(relative[k] ** 2 - own**2, 0.0)))
             label = name if values.shape[1] == 1 else f"{name} {_CHANNELS[k]}"
             rows.append((label, float(value), 100.0 * float(relative[k]), common))

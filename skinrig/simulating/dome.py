@@ -35,6 +35,7 @@ from skinrig.errors import require_choice
 from skinrig.evaluating.reflection_truth import TEST_FILE, make_test
 from skinrig.simulating import driving
 from skinrig.simulating.orders import (
+    FACE_TEXELS,
     DomeOrder,
     SimulationError,
     SimulationOptionsError,
@@ -45,8 +46,6 @@ from skinrig.simulating.orders import (
 if TYPE_CHECKING:
     from rigsim.population.population import Member
 
-TEXTURE_TEXELS = 512
-"""Texels per side of a face's maps."""
 WIDTHS_PX = {"small": 320, "full": 1300}
 LIGHT_COUNTS = {"small": 48, "full": None}
 VIEW_COUNTS = {"small": 6, "full": None}
@@ -119,6 +118,8 @@ def _manifest_settings(
     }
     if order.scanner:
         settings["scanner"] = True
+    if order.texels != FACE_TEXELS:
+        settings["texels"] = order.texels
     if order.target is None:
         settings |= select_attributes(order, "subsurface", "interreflections")
     if conditions:
@@ -301,11 +302,13 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
         return target
     conditions = dict(order.conditions)
     if (one := _member(order)) is not None:
-        person = one.face(TEXTURE_TEXELS)
+        person = one.face(order.texels)
         conditions = dict(one.applied) | conditions
     else:
         subject = subject_file.load_subject(order.subject)
-        person = subject.face(seed=order.seed, size=TEXTURE_TEXELS, mesh=order.mesh)
+        if (member := subject.person()) is not None:
+            conditions = dict(member.applied) | conditions
+        person = subject.face(seed=order.seed, size=order.texels, mesh=order.mesh)
     person = person.translate(draw_head_position(order.session_seed))
     motion = draw_head_motion(order.noise_seed) if order.move else None
     scene = DomeScene(

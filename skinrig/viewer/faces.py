@@ -16,6 +16,7 @@ from rigsim.geometry.mesh import Mesh, build_mesh, center_face
 from rigsim.subject import SimulatedSubject, make_subject
 from skinrig import consent
 from skinrig.appearances import dynamic as dynamic_appearance
+from skinrig.appearances.contents import is_fused
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.rendering.geometry import read_own_mesh
 from skinrig.viewer.assets import facial_color as facial_color_assets
@@ -219,10 +220,13 @@ def _read(paths: Sequence[Path]) -> tuple[dict[str, Path], dict[str, SkinAppeara
     appearances: dict[str, SkinAppearance] = {}
     for path in paths:
         appearance = store.read(path)
-        kind = detect_kind(path, appearance)
-        if kind in folders:
-            raise SceneError(f"{path}: {folders[kind]} is of the same kind ({kind}); show one")
-        appearances[kind], folders[kind] = appearance, path
+        kinds = [detect_kind(path, appearance)]
+        if is_fused(appearance) and dynamic_appearance.describe_parts(appearance):
+            kinds.append("dynamic")  # the microstructure of a fused person
+        for kind in kinds:
+            if kind in folders:
+                raise SceneError(f"{path}: {folders[kind]} is of the same kind ({kind}); show one")
+            appearances[kind], folders[kind] = appearance, path
     return folders, appearances
 
 
@@ -278,7 +282,7 @@ def detect_kind(path: Path, appearance: SkinAppearance) -> str:
     SceneError
         If it has nothing to display on a face.
     """
-    if dynamic_appearance.describe_parts(appearance):
+    if dynamic_appearance.describe_parts(appearance) and not is_fused(appearance):
         return "dynamic"
     if skin_reflectance.BASIS_FILE in appearance.files and "reflectance_model" in (
         appearance.parameters

@@ -32,7 +32,10 @@ EMULATED_ONLY = {
 
 
 def pytest_generate_tests(metafunc):
-    files = ("test_wire_faults.py", "test_wire_capture.py", "test_stateful_boxes.py")
+    files = (
+        *("test_wire_faults.py", "test_wire_capture.py", "test_stateful_boxes.py"),
+        *("test_caliper_faults.py", "test_probe_faults.py"),
+    )
     on_both_sides(metafunc, long=files)  # the compiled side is marked pytest.mark.long
 
 

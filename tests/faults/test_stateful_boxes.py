@@ -7,7 +7,7 @@ cases test the test.
 from collections import deque
 
 import pytest
-from fixtures.hosts import caliper, dome, flash, probe
+from fixtures.hosts import caliper, dome, flash, gradient_sphere, probe, scanner
 from fixtures.noisy_host import explore
 from hypothesis import Phase
 
@@ -16,8 +16,10 @@ from rigsim.world import World
 HOSTS = {
     "flash": (flash, flash.NoisyFlash, 30),
     "dome": (dome, dome.NoisyDome, 20),
+    "gradient_sphere": (gradient_sphere, gradient_sphere.NoisySphere, 15),
     "caliper": (caliper, caliper.NoisyCaliper, 15),
     "probe": (probe, probe.NoisyProbe, 15),
+    "scanner": (scanner, scanner.NoisyScanner, 15),
 }
 """Module, state machine, and steps of an example."""
 LEFT_OUT = [

@@ -108,7 +108,7 @@ def rises(target, pin):
 
 
 @pytest.mark.parametrize("board", ["posix", "mega2560", "mps2-an385"])
-def test_flash_session_is_one_edge_and_pop_a_shot(capture, board):
+def test_flash_session_pops_once_a_shot(capture, board):
     rig = load_rig("flash").resized(16)
     rig = dataclasses.replace(rig, views=(dataclasses.replace(rig.views[0], readout_s=0.05),))
     plan = flash_plan(rig, states=("neutral",), repeats=2, power=0.25, darks=2)
@@ -121,7 +121,7 @@ def test_flash_session_is_one_edge_and_pop_a_shot(capture, board):
     assert lit >= 4
 
 
-def test_dome_session_is_one_edge_and_pulse_a_row(capture):
+def test_dome_session_pulses_once_a_row(capture):
     rig = load_rig("dome").resized(16)
     whole = dome_plan(rig, exposures_s=(0.02,), tracking_interval=50, order=range(len(rig.lights)))
     few = [view.name for view in rig.views[:CAMERAS]]
@@ -149,7 +149,7 @@ def test_dome_session_is_one_edge_and_pulse_a_row(capture):
     assert Counter(lit) == expected
 
 
-def test_probe_session_is_one_edge_and_opening_an_exposure(capture):
+def test_probe_session_opens_once_an_exposure(capture):
     rig = load_rig("probe")
     plan = probe_plan(rig, sites=["cheek"], brackets=4, max_exposure_s=0.4, step_ev=2.0, darks=1)
     scene = Photometer(rig, weight=lambda led: 1000.0)

@@ -13,6 +13,7 @@ QUIET = {
     "gradient_sphere": ("SEQ:DEF 0,X:90:500:30000:1", "SEQ:CRC?", "1,A68E"),
     "caliper": ("CAL:FORC:LIM 1.5", "CAL:FORC:LIM?", "1.5"),
     "probe": ("DOSE:NEW checkup", "DOSE?", "0.000000"),
+    "scanner": ("PAT COL,3", "PAT?", "COL,3"),
 }
 """By kind: a setting that neither lights nor moves, its query, and the answer."""
 

@@ -1,11 +1,14 @@
 """Properties of the signals of several rigs and of the skin that they determine."""
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.tissue_optics import skin_spectra
-from reconstruction.fusion import consistency, person, regions, signals, texels
+from reconstruction.fusion import consistency, patch_normals, person, regions, signals, texels
+from skinrig.benchmarks.fusion import people
 
 FEW = settings(derandomize=True, deadline=None, database=None)
 RIGS = (
@@ -69,3 +72,24 @@ def test_depth_factor_rises_with_eumelanin(properties):
     more = properties + 0.1 * (np.arange(6) == 5)
     assert texels.melanin_depth_factor(more) >= texels.melanin_depth_factor(properties)
     assert texels.eumelanin_slope() > 0.0
+
+
+@settings(FEW, max_examples=10)
+@given(st.floats(-80.0, 80.0), st.floats(-0.2, 0.2))
+def test_rotation_of_patch_adds_to_its_estimate(degrees, tilt):
+    drawn = people.draw_patch(np.random.default_rng(3))
+    angle = np.radians(degrees)
+    cos, sin = np.cos(angle), np.sin(angle)
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    turned = replace(drawn, normals=drawn.normals @ turn.T)
+    found = [patch_normals.check_patch(one).rotation_rad for one in (drawn, turned)]
+    off = (found[1] - found[0] - angle + np.pi / 2) % np.pi - np.pi / 2
+    assert abs(off) < 1e-6
+    flat = patch_normals.SurfaceFrame(np.zeros(3), np.eye(3), np.zeros((2, 2)), np.eye(2))
+    normals = patch_normals.fuse_patch(turned, flat, cutoff_um=4e3).normals
+    assert np.allclose(np.linalg.norm(normals, axis=-1), 1.0)
+    # the frame's tilt is the only one: a patch seen askew has the same detail about it
+    slopes = turned.slopes + np.array([tilt, 0.0])
+    askew = np.concatenate([-slopes, np.ones((*slopes.shape[:2], 1))], axis=-1)
+    again = patch_normals.fuse_patch(replace(turned, normals=askew), flat, cutoff_um=4e3).normals
+    assert np.allclose(normals, again, atol=1e-6)

@@ -5,12 +5,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model import microstructure, wrinkles
+from model import color_table_file, microstructure, wrinkles
+from model.color_table import ColorTable
 from model.displacement_synthesis import sources as synthesis_sources
 from model.microstructure import mesh_strain, strain_fields
 from model.microstructure.map_windows import MapWindow
 from model.wrinkles import expressions as wrinkle_expressions
 from model.wrinkles import storage as wrinkle_storage
+from reconstruction.facial_color import perfusion_curves
 from reconstruction.gradient_normals import channels as gradient_channels
 from reconstruction.gradient_normals import patterns as gradient_patterns
 from reconstruction.gradient_normals.channels import PatternSamples
@@ -284,3 +286,19 @@ def test_kernel_direction_dependence_is_unit_invariant(seed, unit, bad):
         told[k][3] = bad
         with pytest.raises(kernel_table.KernelTableFitError, match="finite"):
             kernel_table.estimate_direction_dependence(table, *told)
+
+
+@FEW
+@given(seed=SEED, size=st.integers(8, 20), scale=st.floats(1e-6, 1e6))
+def test_stored_color_table_keeps_positive_colors(tmp_path_factory, seed, size, scale):
+    rgb = scale * np.random.default_rng(seed).uniform(0.01, 1.0, (size, size, 3))
+    path = tmp_path_factory.mktemp("table") / "t.csv"
+    color_table_file.write_color_table(path, ColorTable("camera", "light", rgb))
+    np.testing.assert_array_equal(color_table_file.read_color_table(path).rgb, rgb)
+
+
+@CHEAP
+@given(x=st.floats(-1e6, 1e6), names=st.sets(st.sampled_from(("nose", "chin", "ear")), min_size=2))
+def test_selected_sites_are_those_of_the_table(x, names):
+    found = perfusion_curves.select_sites(dict.fromkeys(names, (x, 1.0)))
+    assert found == dict.fromkeys(names - {"ear"}, (x, 1.0))

@@ -48,7 +48,7 @@ def pytest_generate_tests(metafunc):
         quick=("test_box_manuals.py", "test_flash_box.py"),
         long=(
             *("test_box_fuzz.py", "test_boxes_side_by_side.py", "test_flash_sequence.py"),
-            *(f"test_{kind}_box.py" for kind in ("dome", "gradient_sphere", "caliper", "probe")),
+            *(f"test_{kind}_box.py" for kind in BOXES if kind != "flash"),
             *(f"test_{kind}_driver.py" for kind in BOXES),
         ),
     )

@@ -78,11 +78,14 @@ def test_lease_ends_light(bench):
 
 def test_dose_is_limited_per_subject(bench):
     bench.say(READY)
-    bench.unit.dose_ws = 49.99
-    assert bench.code("TRIG a1,45") == Code.LIGHT_DOSE
+    for number in range(250):  # 0.1996 Ws each, of 50
+        show(bench, f"a{number}", 499)
+        bench.wait(0.5)
+    assert float(bench.ask("DOSE?")) == pytest.approx(49.9, abs=1e-5)
+    assert bench.code("TRIG b1,251") == Code.LIGHT_DOSE
     bench.say(("DOSE:NEW next", "SAFE:EYES CLOSED"))
     show(bench)
-    assert bench.ask("TRIG:COUN?") == "1"
+    assert bench.ask("TRIG:COUN?") == "251"
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """The demo as a newcomer runs it: rigs by name, a folder that is its own, a report at the end."""
 
+import json
 import multiprocessing
 import os
 
@@ -12,6 +13,7 @@ from skinrig.console import Console
 from skinrig.demo import RIGS, DemoError, run_demo
 from skinrig.simulating import dome
 from skinrig.simulating.orders import SimulationError
+from skinrig.viewer.faces import build_scene
 
 
 @pytest.fixture
@@ -39,7 +41,7 @@ def test_folder_not_from_demo_is_left_unchanged(tmp_path):
     assert list(tmp_path.iterdir()) == [kept]
 
 
-def test_only_requested_rigs_run(tmp_path, monkeypatch, without_benchmarks):
+def test_only_requested_rigs_run(tmp_path, capsys, monkeypatch, without_benchmarks):
     ran = []
     for rig in list(RIGS):
         monkeypatch.setitem(RIGS, rig, lambda *_, rig=rig: ran.append(rig))
@@ -97,7 +99,7 @@ def test_parallel_rig_threads_sleep_unless_user_sets_policy(own, expected, monke
 
 @pytest.mark.long
 @pytest.mark.timeout(600)
-def test_dome_and_flash_end_with_fused_person(tmp_path, monkeypatch, without_benchmarks):
+def test_dome_and_flash_end_with_fused_person(tmp_path, capsys, monkeypatch, without_benchmarks):
     monkeypatch.setattr("skinrig.demo_rigs.DOME_WIDTH_PX", 200)
     # fewer lights and cameras than the demo's own: how accurate a dome is, other tests say
     monkeypatch.setitem(dome.LIGHT_COUNTS, "small", 32)
@@ -125,3 +127,18 @@ def test_dome_and_flash_end_with_fused_person(tmp_path, monkeypatch, without_ben
     }
     # again into the same folder: it is the demo's own and made anew
     assert (out / ".skinrig-demo").is_file()
+
+    sessions = [str(out / f"session-{rig}-III") for rig in ("flash", "dome")]
+    given = ["fuse", *sessions, "--without", "covariance", "--out", str(out / "again"), "--json"]
+    capsys.readouterr()
+    assert main(given) == 0
+    fused = json.loads(capsys.readouterr().out)
+    cost = {row[0]: row[1:] for row in fused["cost"]}
+    assert cost["melanin"][2] > 0.0
+    assert fused["contradiction"] is None
+    assert main(["export", str(out / "double"), "--to", "maps", "--out", str(out / "maps")]) == 0
+    assert (out / "maps/files/fusion.json").is_file()
+    assert (out / "maps/exr/hemoglobin.exr").is_file()
+    scene = build_scene([out / "double"], size=128)
+    assert not {"chromophores of this face"} & dict(scene.left_out).keys()
+    assert scene.textures["chromophores"].values.shape[0] == 128

@@ -2,8 +2,6 @@
  *
  * All state of the core lies in one section, so that one library serves many boxes in turn.
  */
-#include <string.h>
-
 #include "boards/board.h"
 #include "core/core.h"
 
@@ -53,16 +51,12 @@ void host_power_up(int64_t now, bool cold) { core_power_up(now, cold); }
 void host_announce(int64_t now) { core_announce(now); }
 void host_feed(const char *data, uint16_t size, int64_t now) { core_feed(data, size, now); }
 void host_advance(int64_t now) { core_advance(now); }
-/* Ask without a trace, even from within a call of the board. */
-static void ask(void (*handle)(char *, uint16_t), char *line, uint16_t size) {
-  static char before[1u << 20];
-  memcpy(before, host_state(), host_state_size());
-  handle(line, size);
-  memcpy(host_state(), before, host_state_size());
+void host_query(char *line, uint16_t size) {
+  core_ask(core_handle_bare_line, line, size);
 }
-
-void host_query(char *line, uint16_t size) { ask(core_handle_bare_line, line, size); }
-void host_hello(char *line, uint16_t size) { ask(core_handle_framed_line, line, size); }
+void host_hello(char *line, uint16_t size) {
+  core_ask(core_handle_framed_line, line, size);
+}
 
 void board_feed_watchdog(void) {}
 int64_t board_now_us(void) { return core_now(); }

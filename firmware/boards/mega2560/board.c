@@ -36,6 +36,7 @@
 
 #define PULSE_US 100
 #define STEPS_PER_S 2000
+#define DRIVER_US 2 /* set-up of a direction, and length of a step */
 #define MDEG_PER_STEP 225
 #define MM_PER_STEP 0.0025
 #define STALL_MM 0.05
@@ -131,8 +132,10 @@ static void step_towards(volatile int32_t *at, int32_t target, uint8_t step, uin
   if (*at == target) return;
   bool up = target > *at;
   set_pin(&PORTC, direction, up);
+  _delay_us(DRIVER_US);
   set_pin(&PORTC, step, true);
   *at += up ? 1 : -1;
+  _delay_us(DRIVER_US);
   set_pin(&PORTC, step, false);
 }
 
@@ -151,8 +154,18 @@ ISR(USART0_RX_vect) {
   in_head = next;
 }
 
+static uint16_t sent_until(void) {
+  uint8_t before = SREG;
+  cli();
+  uint16_t tail = out_tail;
+  SREG = before;
+  return tail;
+}
+
+/* No byte is taken while an answer might have to wait: a lamp's end must not wait with it. */
 bool board_read(char *byte) {
-  if (in_tail == in_head) return false;
+  uint16_t waiting = (uint16_t)((out_head + OUT - sent_until()) % OUT);
+  if (in_tail == in_head || waiting > OUT / 4u) return false;
   *byte = in_ring[in_tail];
   in_tail = (uint8_t)((in_tail + 1u) % RING);
   return true;
@@ -165,14 +178,6 @@ ISR(USART0_UDRE_vect) {
   }
   UDR0 = (uint8_t)out_ring[out_tail];
   out_tail = (uint16_t)((out_tail + 1u) % OUT);
-}
-
-static uint16_t sent_until(void) {
-  uint8_t before = SREG;
-  cli();
-  uint16_t tail = out_tail;
-  SREG = before;
-  return tail;
 }
 
 void board_send(const char *data, uint16_t size) {

@@ -1,20 +1,25 @@
-/* The board `posix`: a process on a pseudo-terminal, with ideal hardware at its pins.
+/* The board `posix`: a process on a pseudo-terminal or a TCP port, with ideal hardware at its pins.
  *
- * It prints the terminal's name, and then each change of a pin: microseconds, pin, value.
+ * With FIRMWARE_TCP=PORT in the environment it listens on this machine, on a free port if that is 0;
+ * one host at a time. It prints its URL, and then each change of a pin: microseconds, pin, value.
  */
 #define _XOPEN_SOURCE 600
 #include "boards/board.h"
 #include "boards/ideal.h"
 
+#include <arpa/inet.h>
 #include <fcntl.h>
+#include <netinet/tcp.h>
 #include <poll.h>
+#include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <sys/socket.h>
 #include <termios.h>
 #include <time.h>
 #include <unistd.h>
 
-static int terminal;
+static int line = -1, listener = -1; /* of a host; -1: none */
 
 void show_pin(const char *pin, double value) {
   char data[64];
@@ -34,31 +39,69 @@ int64_t board_now_us(void) {
   return now - start;
 }
 
-bool board_start(void) {
+static void listen_on(const char *port) {
+  struct sockaddr_in place = {.sin_family = AF_INET, .sin_port = htons((uint16_t)atoi(port))};
+  socklen_t size = sizeof place;
+  int on = 1;
+  place.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+  listener = socket(AF_INET, SOCK_STREAM, 0);
+  if (listener < 0) exit(1);
+  setsockopt(listener, SOL_SOCKET, SO_REUSEADDR, &on, sizeof on);
+  if (bind(listener, (struct sockaddr *)&place, size) || listen(listener, 1) ||
+      getsockname(listener, (struct sockaddr *)&place, &size))
+    exit(1);
+  printf("socket://127.0.0.1:%u\n", ntohs(place.sin_port));
+}
+
+static void accept_host(void) {
+  int on = 1;
+  line = accept(listener, NULL, NULL);
+  if (line >= 0) setsockopt(line, IPPROTO_TCP, TCP_NODELAY, &on, sizeof on);
+}
+
+static void open_terminal(void) {
   struct termios raw;
-  terminal = posix_openpt(O_RDWR | O_NOCTTY);
-  if (terminal < 0 || grantpt(terminal) || unlockpt(terminal)) exit(1);
-  const char *name = ptsname(terminal);
+  line = posix_openpt(O_RDWR | O_NOCTTY);
+  if (line < 0 || grantpt(line) || unlockpt(line)) exit(1);
+  const char *name = ptsname(line);
   int other = open(name, O_RDWR | O_NOCTTY); /* kept open: a host that leaves is no error */
   if (other < 0 || tcgetattr(other, &raw)) exit(1);
   raw.c_iflag = raw.c_oflag = raw.c_lflag = 0;
   raw.c_cflag |= CS8;
   tcsetattr(other, TCSANOW, &raw);
-  fcntl(terminal, F_SETFL, O_NONBLOCK);
+  fcntl(line, F_SETFL, O_NONBLOCK);
   printf("%s\n", name);
+}
+
+bool board_start(void) {
+  const char *port = getenv("FIRMWARE_TCP");
+  signal(SIGPIPE, SIG_IGN);
+  if (port)
+    listen_on(port);
+  else
+    open_terminal();
   fflush(stdout);
   return true;
 }
 
 bool board_read(char *byte) {
-  struct pollfd wait = {terminal, POLLIN, 0};
+  struct pollfd wait = {line < 0 ? listener : line, POLLIN, 0};
   if (poll(&wait, 1, 1) <= 0) return false;
-  return read(terminal, byte, 1) == 1;
+  if (line < 0) {
+    accept_host();
+    return false;
+  }
+  if (read(line, byte, 1) == 1) return true;
+  if (listener >= 0) { /* the host has left */
+    close(line);
+    line = -1;
+  }
+  return false;
 }
 
 void board_send(const char *data, uint16_t size) {
   while (size) {
-    ssize_t sent = write(terminal, data, size);
+    ssize_t sent = line < 0 ? -1 : write(line, data, size);
     if (sent <= 0) return; /* nobody reads: lost, as on a real line */
     data += sent;
     size = (uint16_t)(size - sent);

@@ -22,6 +22,9 @@ POPULATION_LOG_SD = (1.0, 1.5)
 2.7 in log melanin; published blood volume fractions of skin span 0.002 to 0.07, or 3.6."""
 _TASK_PIXELS = 8192
 _NO_FACTORS = np.ones((1, 1, 2), np.float32)
+_NO_SLOPES = np.zeros((1, 1, 3), np.float32)
+_SLOPE_HEIGHTS = (-0.05, 0.05)
+"""Heights over the table's surface in log RGB between which the start grid's slopes are taken."""
 _NO_LIMITS = np.float32(np.inf), np.float32(MAX_IDENTIFIABLE_STDERR)
 
 
@@ -50,10 +53,10 @@ def fit_colors(
         chromophore.
     """
     if shading[0] or table.optics_covariance is None:
-        axes = inverse_table_for(table, shading[0]).axes
-        return _fit(rgb, variance, shading, covariance, table, axes, _NO_FACTORS, limits)
-    axes, factors = _axes_with_optics(table), _interval_factors(table)
-    return _fit(rgb, variance, shading, covariance, table, axes, factors, limits)
+        start = inverse_table_for(table, shading[0]).axes, _NO_SLOPES
+        return _fit(rgb, variance, shading, covariance, table, start, _NO_FACTORS, limits)
+    start, factors = _start_with_optics(table), _interval_factors(table)
+    return _fit(rgb, variance, shading, covariance, table, start, factors, limits)
 
 
 def _fit(
@@ -62,11 +65,11 @@ def _fit(
     shading: tuple[bool, Float32Array, BoolArray],
     covariance: Float64Array,
     table: ColorTable,
-    start_axes: Float32Array,
+    start_grid: tuple[Float32Array, Float32Array],
     factors: Float32Array,
     limits: tuple[np.float32, np.float32],
 ) -> tuple[Float32Array, BoolArray]:
-    """Fit pixels from a start grid (g, g, 2), with factors of standard errors (k, k, 2)."""
+    """Fit pixels from a start grid, see `_start_with_optics`, with factors of errors (k, k, 2)."""
     maps = np.empty((len(kernels.INVERSION_MAPS), len(rgb)), dtype=np.float32)
     masks = np.empty((len(kernels.INVERSION_MASKS), len(rgb)), dtype=np.bool_)
     free, known, usable = shading
@@ -84,7 +87,8 @@ def _fit(
         np.ascontiguousarray(table.cells, dtype=np.float32),
         np.array([table.c_m_max, table.c_hd_max], dtype=np.float32),
         np.ascontiguousarray(start.projection, dtype=np.float32),
-        start_axes,
+        *start_grid,
+        np.ascontiguousarray(start.normal, dtype=np.float32),
         start.twin_log,
         limits[0],
         np.float32(start.side),
@@ -97,10 +101,38 @@ def _fit(
 
 
 @lru_cache(maxsize=16)
-def _axes_with_optics(table: ColorTable) -> Float32Array:
-    """Return the fit of the start grid's own colors, moved by unknown optics and priors."""
-    axes = inverse_table_for(table, False).axes
+def _start_with_optics(table: ColorTable) -> tuple[Float32Array, Float32Array]:
+    """Return the start grid as unknown optics and priors move it, and its slopes.
+
+    Returns
+    -------
+    axes : ndarray, shape (g, g, 2)
+        Fit of the grid's own colors.
+    slopes : ndarray, shape (g, g, 3)
+        Height of the table's surface along the grid's normal in log RGB, and the change of both
+        fractions per unit of height. Without them, colors off the surface would start far from
+        their fit.
+    """
+    start = inverse_table_for(table, False)
+    axes, shape = start.axes, start.axes.shape[:2]
     color, _, _ = evaluate_table(table, *np.moveaxis(axes.reshape(-1, 2).astype(np.float64), 1, 0))
+    moved, sides = axes, []
+    for height in (0.0, *_SLOPE_HEIGHTS):
+        found, good = _fit_axes(table, color * np.exp(height * start.normal), axes)
+        if height:
+            sides.append(np.where(good, found, np.nan))
+        else:
+            moved = np.where(good, found, axes)
+    change = (sides[1] - sides[0]) / (_SLOPE_HEIGHTS[1] - _SLOPE_HEIGHTS[0])
+    level = (np.log(color) @ start.normal).reshape(*shape, 1)
+    slopes = np.concatenate([level, np.nan_to_num(change)], axis=-1)
+    return moved, np.ascontiguousarray(slopes, np.float32)
+
+
+def _fit_axes(
+    table: ColorTable, color: Float64Array, axes: Float32Array
+) -> tuple[Float32Array, BoolArray]:
+    """Fit the colors of a grid (g, g, 2) without noise; return its axes and which are valid."""
     one, all_usable = np.ones(1, np.float32), np.ones(1, np.bool_)
     maps, masks = _fit(
         np.ascontiguousarray(color, np.float32),
@@ -108,13 +140,13 @@ def _axes_with_optics(table: ColorTable) -> Float32Array:
         (False, one, all_usable),
         model_covariance(None, True),
         table,
-        axes,
+        (axes, _NO_SLOPES),
         _NO_FACTORS,
         _NO_LIMITS,
     )
     ends = np.array([[table.c_m_max], [table.c_hd_max]])
-    moved = np.cbrt(maps[:2] / ends).astype(np.float32).T.reshape(axes.shape)
-    return np.where(masks[0].reshape(*axes.shape[:2], 1), moved, axes)
+    found = np.cbrt(maps[:2] / ends).astype(np.float32).T.reshape(axes.shape)
+    return found, masks[0].reshape(*axes.shape[:2], 1)
 
 
 @lru_cache(maxsize=16)
@@ -139,7 +171,7 @@ def _interval_factors(table: ColorTable) -> Float32Array:
         (False, one, all_usable),
         model_covariance(0.0, False),
         table,
-        _axes_with_optics(table),
+        _start_with_optics(table),
         _NO_FACTORS,
         _NO_LIMITS,
     )

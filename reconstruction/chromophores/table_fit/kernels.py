@@ -27,7 +27,7 @@ NOISY_STEP_TOL = 3e-2
 """Step, relative to the value, that is the last one where the remaining misfit exceeds the gain."""
 CONVERGED_STEP = 2e-2
 """Step, relative to the value, up to which the last one counts as converged."""
-REWEIGHT_STEP = 0.02
+REWEIGHT_STEP = 0.012
 """Fraction of an axis from the weights' position above which the weights are computed again."""
 MAX_REWEIGHTS = 8
 """Maximum number of times that the weights are computed again."""
@@ -126,12 +126,20 @@ def _between_nodes(pairs, y0, y1):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always", fastmath=FASTMATH_CONTRACT)
-def _guess(axes, y0, y1):  # type: ignore[no-untyped-def]
-    """Interpolate the start grid bilinearly, clamped to it."""
+def _guess(axes, slopes, y0, y1, height):  # type: ignore[no-untyped-def]
+    """Interpolate the start grid bilinearly, clamped to it.
+
+    A color at another height than the surface moves the guess by the grid's slopes, if it has any.
+    """
     last = np.float32(axes.shape[0] - 1)
     y0 = min(max(y0, _ZERO), last)
     y1 = min(max(y1, _ZERO), last)
     a, b = _between_nodes(axes, y0, y1)
+    if slopes.shape[0] > 1:
+        node = slopes[int(y0 + _HALF), int(y1 + _HALF)]
+        above = height - node[0]
+        a += node[1] * above
+        b += node[2] * above
     return min(max(a, _MIN_AXIS_FRACTION), _ONE), min(max(b, _MIN_AXIS_FRACTION), _ONE)
 
 
@@ -172,6 +180,8 @@ def _bounded(a, b, step_a, step_b, aa, ab, bb, ra, rb):  # type: ignore[no-untyp
         readonly_array_type(float32, 1),  # ends of the axes as volume fractions (2,)
         readonly_array_type(float32, 2),  # projection of log rgb, and offset (2, 4)
         readonly_array_type(float32, 3),  # start grid on it (g, g, 2)
+        readonly_array_type(float32, 3),  # its heights and slopes (g, g, 3); g = 1: none
+        readonly_array_type(float32, 1),  # direction of the height in log rgb (3,)
         readonly_array_type(float32, 2),  # mean log color of second solutions (g, g)
         float32,  # largest plausible log shading
         float32,  # sign of the surface's side on which light skin lies
@@ -196,6 +206,8 @@ def fit_pixels(  # type: ignore[no-untyped-def]
     ends,
     projection,
     start_axes,
+    start_slopes,
+    normal,
     twin_log,
     log_shading_max,
     light_side,
@@ -249,7 +261,8 @@ def fit_pixels(  # type: ignore[no-untyped-def]
                 d0, d1, d2 = d0 * unshaded, d1 * unshaded, d2 * unshaded
             l0, l1, l2 = math.log(d0), math.log(d1), math.log(d2)
             y0, y1 = _project(projection, l0, l1, l2)
-            a, b = _guess(start_axes, y0, y1)
+            height = normal[0] * l0 + normal[1] * l1 + normal[2] * l2
+            a, b = _guess(start_axes, start_slopes, y0, y1, height)
             noise = v0, v1, v2
             w = color_weights(noise, model, optics, a, b, free)
             a_of_weights, b_of_weights = a, b

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib import resources
 from pathlib import Path
 from typing import Final
@@ -26,7 +27,7 @@ from model.tissue_optics import uncertainty as optics_uncertainty
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction import chromophores
 from skinrig.arrays import BoolArray, Float64Array
-from skinrig.benchmarks.measurement import measure_processor_seconds
+from skinrig.benchmarks.measurement import measure_processor_seconds_in_turn
 from skinrig.benchmarks.resampling import median_error
 from skinrig.benchmarks.stage import BenchmarkStage
 
@@ -40,6 +41,8 @@ MEASURED_CAMERAS: Final = (
     ("Sigma SDMerill (NPL)", "LED-B3"),
 )
 CHANNEL_NOISE: Final = 0.005
+TIMED_REPEATS: Final = 7
+"""Timed calls with each table, in turn."""
 MELANOSOME_550_PER_MM: Final = 6.6e10 * 550.0**-3.33
 """Absorption of the simulated skins' melanosomes at 550 nm, 1/mm."""
 MIN_REFLECTANCE: Final = 0.003
@@ -165,7 +168,7 @@ def measure_independent_skin(stage: BenchmarkStage) -> None:
         rgb = noisy_colors(skins, camera, illuminant)
         image = rgb[np.arange(side * side) % len(rgb)].reshape(side, side, 3).astype(np.float32)
         variance = np.square(CHANNEL_NOISE * image)
-        seconds: dict[tuple[str, bool], float] = {}
+        calls: dict[tuple[str, bool], Callable[[], object]] = {}
         for exact in (True, False):
             for size in sizes:
                 table = color_table.build(
@@ -192,13 +195,11 @@ def measure_independent_skin(stage: BenchmarkStage) -> None:
                     )
                 if size == sizes[-1]:
                     for shading, known in (("known", 1.0), ("free", None)):
-                        # processor time: other programs do not change the ratio
-                        seconds[shading, exact] = measure_processor_seconds(
-                            lambda: chromophores.invert(
-                                image, table, shading=known, variance=variance
-                            ),
-                            3,
+                        calls[shading, exact] = partial(
+                            chromophores.invert, image, table, shading=known, variance=variance
                         )
+        # processor time, in turn: other programs do not change the ratio
+        seconds = measure_processor_seconds_in_turn(calls, TIMED_REPEATS)
         for shading in ("known", "free"):
             with_optics, without = (seconds[shading, exact] for exact in (False, True))
             stage.limits["time", side, shading, camera] = with_optics / without

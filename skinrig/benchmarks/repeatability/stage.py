@@ -30,7 +30,7 @@ DAYS_AGO: Final = (30, 0)
 AGES_DAYS: Final = (90, 365)
 """Ages at which calibrations are compared with today's."""
 SKIN_PRESETS: Final = ("I", "II", "III", "IV", "V", "VI")
-PATCH_SITES: Final = ("forehead", "cheek", "nose", "chin", "temple")
+PATCH_SITES: Final = ("forehead", "cheek", "chin")
 CHANGED_STATE: Final = "exercise"
 """State with blood in the whole face."""
 FIRST_PERSON: Final = 104

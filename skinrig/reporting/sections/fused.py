@@ -6,20 +6,9 @@ from typing import Any
 import numpy as np
 
 from model.skin import SkinAppearance
-from skinrig.fusing.double import FUSION_KEY
+from skinrig.appearances.contents import FUSION_KEY
 from skinrig.reporting import map_images, page
 from skinrig.reporting.map_names import map_title
-
-
-def is_fused(appearance: SkinAppearance) -> bool:
-    """Return whether `skinrig fuse` wrote an appearance.
-
-    Parameters
-    ----------
-    appearance
-        Any.
-    """
-    return FUSION_KEY in appearance.parameters
 
 
 def section(appearance: SkinAppearance) -> Iterator[page.Block]:

@@ -1,7 +1,7 @@
 """Build the assets of Jimenez 2010: chromophores, hemoglobin rig, skin color table, albedo."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,7 +14,7 @@ from model import color_table, spectra
 from model.facial_color import HemoglobinRig
 from model.facial_color.rig import GLOBAL_GAINS
 from model.facial_color.state_maps import NEUTRAL
-from model.skin import SkinAppearance
+from model.skin import SkinAppearance, SkinMap
 from model.tissue_optics.layers import ANISOTROPY_SKIN, C_HD_MAX, C_M_MAX
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.perfusion import STATE_NAMES
@@ -140,6 +140,7 @@ FINEST_STEP_WORDS: Final = 8
 """Quantization step of the finest octave for chromophores of 2048 texels per side and more; detail
 below 0.2 mm is noise."""
 ALBEDO_MAP: Final = "r_d"
+CHROMOPHORE_MAPS: Final = ("melanin", "hemoglobin")
 
 
 def build_assets(source: SceneSource) -> Assets:
@@ -172,9 +173,10 @@ def build_assets(source: SceneSource) -> Assets:
         facts["albedo_color"] = seen.provenance
         if not seen.known:
             left_out["colors of this face"] = seen.provenance
-        left_out["chromophores of this face"] = (
-            "the dome measures color only; expressions scale it by the ratio of simulated blood"
-        )
+        if _measured_chromophores(source) is None:
+            left_out["chromophores of this face"] = (
+                "the dome measures color only; expressions scale it by the ratio of simulated blood"
+            )
     return {
         "textures": textures,
         # 11 bits are finer than linear interpolation between the nodes, and pack twice as small
@@ -190,9 +192,24 @@ def _face(source: SceneSource, *, measured: bool) -> FaceColor:
     subject, dynamic = source.subject, source.appearances.get("dynamic")
     if dynamic is not None and FACIAL_COLOR in describe_parts(dynamic):
         return place_facial_color(source)
-    return simulate_chromophores(
+    found = simulate_chromophores(
         subject, FineSkin(subject, subject.size) if measured else source.skin
     )
+    fused = _measured_chromophores(source)
+    if fused is None:
+        return found
+    maps = [downsample(fill_holes(one.values, one.mask), source.size) for one in fused]
+    facts = {"source": source.fitted[0].source}
+    return replace(found, melanin=maps[0], hemoglobin=maps[1], facts=facts)
+
+
+def _measured_chromophores(source: SceneSource) -> tuple[SkinMap, SkinMap] | None:
+    """Return melanin and blood on the albedo's texture, of a fused person; None without them."""
+    for appearance in source.fitted:
+        maps = [appearance.maps.get(name) for name in CHROMOPHORE_MAPS]
+        if ALBEDO_MAP in appearance.maps and maps[0] is not None and maps[1] is not None:
+            return maps[0], maps[1]
+    return None
 
 
 def simulate_chromophores(person: SimulatedSubject, skin: FineSkin) -> FaceColor:

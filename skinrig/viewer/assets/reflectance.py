@@ -18,6 +18,7 @@ from model.skin_reflectance import TRANSLUCENCY_MAP
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from model.traits import storage as trait_storage
 from reconstruction.surface import texture_fill
+from skinrig.appearances.contents import FUSION_KEY
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.editing import surface_mixtures
 from skinrig.viewer.assets import gaussian_profiles
@@ -306,7 +307,9 @@ def _diffusion_of(source: SceneSource) -> tuple[GaussianProfile, Float32Array | 
     off = (logs - mean.astype(np.float32)).mean(axis=-1, keepdims=True)
     widths = np.exp(fill_texels(off, known, TRANSLUCENCY_PX)[..., 0])
     record: Any = appearance.parameters.get("reflectance_model")
-    if isinstance(record, dict) and record.get("translucency") == "measured":
+    fused: Any = appearance.parameters.get(FUSION_KEY, {"maps": {}})
+    by_probe = "probe" in fused["maps"].get(TRANSLUCENCY_MAP, ())
+    if by_probe or (isinstance(record, dict) and record.get("translucency") == "measured"):
         origin = "a fiber probe on this face"
     even = float(np.ptp(widths)) < 1e-3
     return gaussian_profiles.fit_gaussians(r_d, np.exp(-mean)), None if even else widths, origin

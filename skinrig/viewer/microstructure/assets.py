@@ -17,6 +17,7 @@ from model.microstructure.mesh_strain import strain
 from model.skin import SkinAppearance
 from rigsim.geometry.mesh import Mesh
 from rigsim.skin_patch.microrelief import make_micro_skin
+from skinrig.appearances.contents import is_fused
 from skinrig.appearances.dynamic import MICROSTRUCTURE, describe_parts
 from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.viewer.microstructure import relief_growth
@@ -110,16 +111,23 @@ MAX_REACH_PX: Final = 64
 def build_assets(source: SceneSource) -> Assets:
     """Build the microstructure of a scene, or the reason for its omission.
 
-    A fitted relief precedes a simulated one; simulated relief on a captured face is reported.
+    A fitted relief precedes a simulated one; simulated relief on a captured face is reported. That
+    of a fused person comes without a choice, so that one too fine for the page is replaced.
     """
     dynamic = source.appearances.get("dynamic")
     relief = None if dynamic is None else read_fitted_relief(dynamic)
+    unusable = ""
     if relief is not None:
-        return build_relief_assets(relief, source.mesh, seed=source.seed)
+        try:
+            return build_relief_assets(relief, source.mesh, seed=source.seed)
+        except SceneError as error:
+            if dynamic is None or not is_fused(dynamic):
+                raise
+            unusable = f"; the measured relief is not displayed: {error}"
     made = build_relief_assets(simulate_relief(source.seed), source.mesh, seed=source.seed)
     if source.kind in ("dynamic", "dome", "model"):
-        reason = "simulated, with the published kernels of a forehead; "
-        reason += "`skinrig fit microstructure` adds measured ones"
+        reason = "simulated, with the published kernels of a forehead"
+        reason += unusable or "; `skinrig fit microstructure` adds measured ones"
         made["left_out"] = (("microstructure of this face", reason),)
     return made
 

@@ -18,7 +18,8 @@ from reconstruction.chromophores import posterior as chromophore_posterior
 from reconstruction.chromophores.common_optics import CommonOptics
 from reconstruction.chromophores.posterior import add_optics_errors
 from reconstruction.chromophores.shading_prior import lognormal_prior
-from reconstruction.chromophores.start import evaluate_table
+from reconstruction.chromophores.start import evaluate_table, inverse_table_for
+from reconstruction.chromophores.table_fit import fitting
 from reconstruction.chromophores.table_fit.fitting import (
     POPULATION_BLOOD,
     POPULATION_LOG_SD,
@@ -90,6 +91,36 @@ def test_fit_is_stationary_under_covariance_of_color(table, rng):
     assert np.quantile(sigmas[inside], 0.95) < 0.25
     stderr = 3.0 * np.sqrt(np.linalg.inv(fisher)[:, 0, 0]) / a * found.melanin
     np.testing.assert_allclose(found.stderr_melanin[inside], stderr[inside], rtol=0.1)
+
+
+def test_start_grid_slopes_shorten_the_fit_alone(table, monkeypatch):
+    rng = np.random.default_rng(31)
+    c_m, c_hd = rng.uniform(0.01, 0.1, 600), rng.uniform(0.005, 0.03, 600)
+    rgb = table.lookup(c_m, c_hd) * np.exp(0.04 * rng.standard_normal((600, 3)))
+
+    axes, slopes = fitting._start_with_optics(table)
+
+    def fit(slopes):
+        monkeypatch.setattr(fitting, "_start_with_optics", lambda _: (axes, slopes))
+        found = invert(rgb, table, shading="known", variance=(0.005 * rgb) ** 2)
+        monkeypatch.undo()
+        return found
+
+    started, plain = fit(slopes), fit(fitting._NO_SLOPES)
+    both = started.valid & plain.valid
+    assert both.mean() > 0.98
+    shift = np.abs(started.melanin - plain.melanin)[both] / plain.stderr_melanin[both]
+    assert np.quantile(shift, 0.95) < 0.1
+    # the guess itself: without slopes it is several times as far from the fit
+    start = inverse_table_for(table, False)
+    at = np.log(rgb) @ start.projection[:, :3].T + start.projection[:, 3]
+    node = np.clip(np.rint(at).astype(int), 0, len(axes) - 1)
+    flat, slope = axes[node[:, 0], node[:, 1]], slopes[node[:, 0], node[:, 1]]
+    above = (np.log(rgb) @ start.normal - slope[:, 0])[:, None]
+    reached = np.cbrt(plain.melanin / table.c_m_max)
+    off_flat = np.abs(flat[:, 0] - reached)
+    off_sloped = np.abs((flat + slope[:, 1:] * above)[:, 0] - reached)
+    assert np.median(off_sloped[both]) < 0.4 * np.median(off_flat[both])
 
 
 def test_interval_is_symmetric_in_cube_root(table):

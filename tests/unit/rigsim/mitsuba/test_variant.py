@@ -101,3 +101,14 @@ def test_environment_requests_scalar_variant_or_is_refused():
         variant.choose_variant("rgb", environment={"SKINRIG_MITSUBA": "fast"})
     with pytest.raises(ValueError, match="kind: got 'rbg'"):
         variant.choose_variant("rbg")  # type: ignore[arg-type]
+
+
+def test_missing_llvm_is_reported_once(monkeypatch, caplog):
+    monkeypatch.setenv("SKINRIG_MITSUBA", "scalar")
+    variant._warn_of_fast.cache_clear()
+    assert [variant.choose_renderer("mitsuba").renderer for _ in range(2)] == ["fast"] * 2
+    assert caplog.messages == [
+        "renderer: fast instead of mitsuba, which needs LLVM: requested by SKINRIG_MITSUBA=scalar"
+    ]
+    variant.choose_renderer("fast")
+    assert len(caplog.messages) == 1

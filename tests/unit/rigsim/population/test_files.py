@@ -10,6 +10,7 @@ from model.store import write_exr
 from rigsim.fiber.probe_tissue import SkinTissue, TissueError
 from rigsim.population import files as subject_file
 from rigsim.population.files import load_subject, read_subject_file, record_subject
+from rigsim.population.population import get_member
 from rigsim.population.textures import SubjectFileError, resample_texture
 from rigsim.subject import pigment
 from rigsim.subject.perfusion import STATE_NAMES
@@ -276,3 +277,27 @@ def test_tone_in_file_replaces_melanin(person):
         read_subject_file(person('tone = "ita:40"\nmelanin = 0.03'))
     with pytest.raises(SubjectFileError, match="expected monk:1 to monk:10"):
         read_subject_file(person('tone = "monk:11"'))
+
+
+def test_member_in_file_keeps_all_but_changes(person):
+    own = get_member("P12")
+    changed = read_subject_file(person('member = "P12"\nmelanin = 0.06\nblood = 1.5\n')).person()
+    assert changed == dataclasses.replace(own, melanin=0.06, blood=1.5 * own.blood)
+    same = load_subject(person('member = "P12"\n', "same"))
+    np.testing.assert_array_equal(same.face(seed=9, size=64).melanin, own.face(64).melanin)
+    assert same.skin(seed=9) == own.skin
+    assert read_subject_file(person("", "nobody")).person() is None
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('member = "P99"\n', "P99"),
+        ('member = "P12"\ntone = "ita:20"\n', "no tone together with it"),
+        ("beard = 0.5\n", "a member together with it"),
+        ('member = "P12"\nmelanin = 0.4\n', "melanin of P12"),
+    ],
+)
+def test_unusable_member_in_file_is_refused(person, text, said):
+    with pytest.raises(SubjectFileError, match=said):
+        read_subject_file(person(text))

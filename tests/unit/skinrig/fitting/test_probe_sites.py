@@ -7,7 +7,7 @@ import pytest
 
 from model.skin import SkinAppearance, SkinMap
 from reconstruction.subsurface.probe_sites import SITE_UV
-from reconstruction.subsurface.translucency import TranslucencyError
+from reconstruction.subsurface.translucency import TranslucencyError, TranslucencyPrior
 from rigsim.subject.head import build_head
 from skinrig.fitting import probe_sites
 from skinrig.fitting.probe_sites import ProbeSiteError
@@ -141,3 +141,22 @@ def test_simulated_head_sites_are_found_within_a_centimeter(seed):
         # below the chin skin faces down: places one behind the other are one height
         axes = [0, 1] if site.name == "chin" else [0, 1, 2]
         assert np.linalg.norm((np.array(site.position_mm) - true)[axes]) < 10.0
+
+
+def test_interpolated_site_ignores_expectation_of_its_texel():
+    """A texel without colors has no expectation of its own; its neighbors count."""
+    y, x = np.mgrid[0:24, 0:24]
+    at = np.stack([4.0 * x, -4.0 * y, np.zeros((24, 24))], axis=-1)
+    sites = [
+        probe_sites.ProbeSite("a", (1.0,) * 3, (0.05,) * 3, (6, 6), tuple(at[6, 6])),
+        probe_sites.ProbeSite("b", (1.0,) * 3, (0.05,) * 3, (18, 18), tuple(at[18, 18])),
+    ]
+    expected = np.ones((24, 24, 3), np.float32)
+    expected[6, 6] = 1e-3
+    prior = TranslucencyPrior(np.zeros(3), np.full(3, 0.3), np.full(3, 0.05))
+    found = probe_sites.interpolate_sites(
+        sites, SkinMap(at, "mm"), prior=prior, expected_mm=expected
+    )
+    others = np.ones((24, 24), bool)
+    others[6, 6] = False
+    assert np.abs(found.map.values[others] - 1.0).max() < 0.1

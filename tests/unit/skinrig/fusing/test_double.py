@@ -7,10 +7,12 @@ from typer.testing import CliRunner
 
 from model import store
 from model.skin import SkinAppearance, SkinMap
+from reconstruction.surface.errors import interior_error
 from skinrig.cli import app
+from skinrig.fusing.cost import compare_without
 from skinrig.fusing.double import FusionInputs, fuse
 from skinrig.fusing.sources import FusionInputError, read_sources
-from skinrig.fusing.texel_colors import LOG_R_D_OVER_REFLECTANCE
+from skinrig.fusing.texel_colors import LOG_R_D_OVER_REFLECTANCE, DomeColors
 
 SIDE = 24
 REFLECTANCE = np.array([0.36, 0.26, 0.21])
@@ -41,7 +43,8 @@ def write_dome(path, *, gain=(1.0, 1.0, 1.0), seed=0):
     maps = {
         "position": SkinMap(at, "mm"),
         "normals": SkinMap(normals, "1", np.full_like(normals, 0.01)),
-        "r_d": SkinMap(r_d, "1", 0.03 * r_d),
+        # noise of 3 % and the dome's error by light from inside the skin
+        "r_d": SkinMap(r_d, "1", np.hypot(0.03 * r_d, interior_error(r_d))),
     }
     return store.write(path, SkinAppearance(maps, "simulated", {"kind": "appearance"}, seed=seed))
 
@@ -102,6 +105,46 @@ def test_fuse_writes_common_and_own_errors(folders, tmp_path):
     own = maps["melanin_texel_stderr"].values[good]
     assert (maps["melanin"].stderr[good] > own).all()
     assert np.isfinite(maps["melanin_blood_covariance"].values[good]).all()
+
+
+def test_fuse_without_albedo_keeps_mesh(folders, tmp_path):
+    found = fuse(both(folders, without=("r_d",)), out=tmp_path / "double").appearance
+    assert "r_d" not in found.maps
+    assert found.maps["melanin"].values.shape == (SIDE, SIDE)
+    whole = fuse(both(folders), out=tmp_path / "whole").appearance
+    rows = {row[0]: row for row in compare_without(whole, found)}
+    _, full, less, change = rows["melanin"]
+    assert less > full
+    assert change > 0.0
+    assert rows["r_d red"][2] is None
+
+
+def test_fuse_without_covariance_is_less_exact(folders, tmp_path):
+    maps = [
+        fuse(both(folders, without=left), out=tmp_path / f"double{len(left)}").appearance.maps
+        for left in ((), ("covariance",))
+    ]
+    width = [float(np.median(one["melanin"].stderr[one["melanin"].mask])) for one in maps]
+    assert width[1] > width[0]
+
+
+def test_fuse_without_only_colors_is_refused(folders, tmp_path):
+    with pytest.raises(FusionInputError, match="only rig with colors"):
+        fuse(FusionInputs((folders / "dome",), without=("r_d",)), out=tmp_path / "double")
+
+
+def test_dome_common_gain_grows_on_dark_skin(folders):
+    dome = store.read(folders / "dome")
+    dark = SkinMap(0.2 * dome.maps["r_d"].values, "1", 0.1 * dome.maps["r_d"].values)
+    made = [
+        DomeColors.of(
+            SkinAppearance({**dome.maps, "r_d": one}, "simulated"), "Nikon 5100 (NPL)", "D65"
+        )
+        for one in (dome.maps["r_d"], dark)
+    ]
+    light_sd, dark_sd = (float(np.sqrt(one.calibration[0, 1])) for one in made)
+    assert 0.02 < light_sd < 0.04
+    assert dark_sd > 3.0 * light_sd
 
 
 def test_fuse_dome_alone_keeps_its_texture(folders, tmp_path):

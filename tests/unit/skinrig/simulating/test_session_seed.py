@@ -17,7 +17,9 @@ TEXELS = 64
 
 
 def order(**options):
-    return DomeOrder(out=Path("session"), width_px=64, lights=2, views=1, seed=3, **options)
+    return DomeOrder(
+        out=Path("session"), width_px=64, lights=2, views=1, seed=3, texels=TEXELS, **options
+    )
 
 
 def scene(**options):
@@ -25,8 +27,7 @@ def scene(**options):
     return dome._scene(dome._rig(asked), asked, dome._plan(dome._rig(asked), None, "small"))
 
 
-def test_session_seed_keeps_person_and_rig(monkeypatch):
-    monkeypatch.setattr(dome, "TEXTURE_TEXELS", TEXELS)
+def test_session_seed_keeps_person_and_rig():
     first, second = scene(session_seed=1), scene(session_seed=2)
     assert np.array_equal(first.subject.melanin, second.subject.melanin)
     assert first.rig.lights == second.rig.lights
@@ -37,8 +38,7 @@ def test_session_seed_keeps_person_and_rig(monkeypatch):
     assert (first.seed, second.seed) == (1, 2)
 
 
-def test_seed_without_session_seed_centers_the_face(monkeypatch):
-    monkeypatch.setattr(dome, "TEXTURE_TEXELS", TEXELS)
+def test_seed_without_session_seed_centers_the_face():
     plain = scene()
     assert plain.subject.offset_mm == (0.0, 0.0, 0.0)
     assert plain.seed == 3

@@ -1,0 +1,1 @@
+"""Extreme cases of iterative solvers: what is reached, how, and why a search stops."""
