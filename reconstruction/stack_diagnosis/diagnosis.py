@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,6 +26,8 @@ from reconstruction.stack_diagnosis.shading_space import (
 MIN_FRAMES = 6
 """Fewer images leave no redundancy to find a wrong one."""
 MIN_POINTS = 30
+MIN_LEVEL, MAX_LEVEL = 1e-3, 2.0
+"""Bright samples outside this range are in another unit than the white level."""
 MAX_SIDE_PX = 160
 """Images are reduced to this size: faults of lights are in all pixels."""
 MIN_SINGULAR_RATIO = 0.01
@@ -37,6 +40,8 @@ MIRROR_COSINE = 0.85
 MIN_MATTE, MAX_MATTE_ERROR = 0.25, 0.25
 """Shading of the samples that show near lights, and their largest error."""
 STORED_WRONG = ("empty image", "dead light", "padded image")
+OF_ANY_LIGHT = ("repeated image", "repeated images", "full-bright image")
+"""Faults that are found without the list."""
 MOVED = ("moved image", "mirrored image")
 CLIPPED, CURVE, FOREIGN = "clipped images", "transfer curve", "foreign list"
 AMBIENT, DRIFT = "ambient light", "exposure drift"
@@ -83,9 +88,10 @@ def diagnose_stack(
     *,
     usable: BoolArray | None = None,
     inside: BoolArray | None = None,
+    near: bool = False,
     rng: np.random.Generator,
 ) -> Diagnosis:
-    """Find faults of images of one object under N listed far lights.
+    """Find faults of images of one object under N listed lights.
 
     Parameters
     ----------
@@ -97,6 +103,9 @@ def diagnose_stack(
         (N, H, W), False for saturated samples; None: all are usable.
     inside
         (H, W), the object; None: all pixels.
+    near
+        Whether the lights are near: their directions then differ from pixel to pixel, and faults
+        of the list are not looked for.
     rng
         Draws points and sets of lights.
 
@@ -110,7 +119,13 @@ def diagnose_stack(
     checks.require(len(whole) >= MIN_FRAMES, "gray", f"{len(whole)} images", f"{MIN_FRAMES}")
     listed = unit_vectors(np.asarray(light_directions, np.float64))
     checks.shape("light_directions", listed, (len(whole), 3))
-    good = np.ones(whole.shape, bool) if usable is None else np.asarray(usable, bool)
+    finite = np.isfinite(whole)
+    good = finite if usable is None else np.asarray(usable, bool) & finite
+    whole = np.where(finite, whole, 0.0)
+    level = float(np.quantile(whole[good], 0.999)) if good.any() else 0.0
+    checks.require(level > 0.0, "gray", "no light in any image", "positive samples")
+    if not MIN_LEVEL < level < MAX_LEVEL:  # not over the white level: any unit
+        whole = whole / level
     mask = np.ones(whole.shape[1:], bool) if inside is None else np.asarray(inside, bool)
     stored = [*frame_faults.find_unlit(whole, mask), *frame_faults.find_clipped(good, mask)]
     out = np.zeros(len(whole), bool)
@@ -131,8 +146,17 @@ def diagnose_stack(
         again = _diagnose_light(linear, listed, out.copy(), rng)
         others = (one for one in again.findings if one.fault != CURVE)
         found = replace(again, findings=(curve, *others))
+    if near:
+        order = np.arange(len(out), dtype=np.intp)
+        kept = tuple(one for one in found.findings if one.fault in OF_ANY_LIGHT)
+        found = replace(found, findings=kept, order=order, left_out=_named_in(kept, len(out)) | out)
     every = sorted((*stored, *found.findings), key=lambda one: -one.strength)
     return replace(found, findings=tuple(every))
+
+
+def _named_in(findings: Iterable[Finding], count: int) -> BoolArray:
+    """Return which of the images findings name."""
+    return np.isin(np.arange(count), [number for one in findings for number in one.frames])
 
 
 def _diagnose_light(
@@ -180,7 +204,7 @@ def _diagnose_light(
     used = np.flatnonzero(~out)
     view = replace(stack, gray=stack.gray / strength[:, None, None])
     once = np.array([number for number in kept if number not in repeated], np.intp)
-    of_images = _find_in_images(view, rows, used, once, rng)
+    of_images = _find_in_images(view, rows, directions, used, once, rng)
     ambient = any(one.fault == AMBIENT for one in of_images)  # it changes strengths with tilt
     findings += [one for one in lights if not (ambient and one.fault == DRIFT)]
     moved = {number for one in of_images if one.fault in MOVED for number in one.frames}
@@ -193,6 +217,7 @@ def _diagnose_light(
 def _find_in_images(
     stack: _Stack,
     rows: Float64Array,
+    directions: Float64Array,
     used: NDArray[np.intp],
     kept: NDArray[np.intp],
     rng: np.random.Generator,
@@ -204,7 +229,9 @@ def _find_in_images(
     stack
         Images over the strength of their light.
     rows
-        (N, 3), directions in the order of the images.
+        (N, 3), listed directions in the order of the images.
+    directions
+        (N, 3), as the images show them.
     used, kept
         Images for the normals, and images that may have moved.
     """
@@ -216,8 +243,9 @@ def _find_in_images(
     shading = np.maximum(np.einsum("hwi,ni->nhw", normals, rows), 0.0)
     findings = list(axis_faults.find_axes(normals, valid))
     findings += light_faults.find_ambient(stack.gray[used], valid, normals, albedo, rows[used])
+    relit = np.maximum(np.einsum("hwi,ni->nhw", normals, directions[kept]), 0.0)
     moved = frame_faults.find_moved(
-        stack.gray[kept], stack.usable[kept], valid, albedo * shading[kept]
+        stack.gray[kept], stack.usable[kept], valid, albedo * shading[kept], albedo * relit
     )
     findings += [_renumbered(one, kept) for one in moved]
     height, width = mask.shape

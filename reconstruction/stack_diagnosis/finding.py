@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,8 +22,6 @@ class Finding:
         The measured quantity, and the value from which it counts as a fault.
     remedy
         What the user does.
-    cost_deg
-        Median change of the normals by the fault, degrees; None where it was not computed.
     order
         Row of the list for each image, if the finding proposes another order.
     """
@@ -33,10 +32,20 @@ class Finding:
     measured: float
     limit: float
     remedy: str
-    cost_deg: float | None = None
     order: tuple[int, ...] | None = None
 
     @property
     def strength(self) -> float:
         """The measured quantity over its limit, at least 1; larger is more certain."""
         return self.measured / self.limit
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the finding with numbers of images from 1, as they are written."""
+        return {
+            "fault": self.fault,
+            "images": [number + 1 for number in self.frames],
+            "evidence": self.evidence,
+            "measured": self.measured,
+            "limit": self.limit,
+            "remedy": self.remedy,
+        }

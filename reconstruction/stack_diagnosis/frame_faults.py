@@ -126,7 +126,11 @@ def find_repeated(samples: Float64Array) -> Iterator[Finding]:
 
 
 def find_moved(
-    gray: Float64Array, usable: BoolArray, inside: BoolArray, predicted: Float64Array
+    gray: Float64Array,
+    usable: BoolArray,
+    inside: BoolArray,
+    predicted: Float64Array,
+    relit: Float64Array,
 ) -> Iterator[Finding]:
     """Yield images that are mirrored, or shifted against what the other images predict.
 
@@ -138,15 +142,18 @@ def find_moved(
         (H, W), the object.
     predicted
         (N, H, W), the matte shading of each light by normals and albedo of all images.
+    relit
+        The same for the directions that the images show: an image that it explains has a wrong
+        light, and has not moved.
     """
-    for number, (image, shading) in enumerate(zip(gray, predicted, strict=True)):
+    for number, (image, shading, other) in enumerate(zip(gray, predicted, relit, strict=True)):
         good = inside & usable[number] & (shading > 0.0)
         if np.count_nonzero(good) < 100:
             continue
         mirrored = max(
             _correlation(image[:, ::-1], shading, good), _correlation(image[::-1], shading, good)
         )
-        straight = _correlation(image, shading, good)
+        straight = max(_correlation(image, one, good) for one in (shading, other))
         if mirrored > straight + 0.1 and mirrored > MIN_IMAGE_CORRELATION:
             yield Finding(
                 "mirrored image", (number,),
@@ -155,7 +162,7 @@ def find_moved(
                 mirrored - straight, 0.1, "mirror the image back",
             )  # fmt: skip
             continue
-        shift, sigma = _shift_px(image, shading, good)
+        shift, sigma = _shift_px(image, shading, other, good)
         size = float(np.hypot(*shift))
         if size > max(MIN_SHIFT_PX, MIN_SHIFT_SIGMAS * sigma):
             yield Finding(
@@ -172,12 +179,13 @@ def _correlation(image: Float64Array, shading: Float64Array, good: BoolArray) ->
 
 
 def _shift_px(
-    image: Float64Array, shading: Float64Array, good: BoolArray
+    image: Float64Array, shading: Float64Array, other: Float64Array, good: BoolArray
 ) -> tuple[Float64Array, float]:
     """Return the shift (x, y) of an image against its shading, px, and its standard error.
 
     The start is no shift, or the phase correlation of both gradients, whichever ends nearer. A
-    shift that does not explain the difference of the two is none.
+    shift that does not explain the difference of the two is none; nor is one where another light
+    explains it.
     """
     import cv2
 
@@ -189,7 +197,7 @@ def _shift_px(
         starts.append(coarse)
     tries = [_refine_shift(image, shading, good, start) for start in starts]
     shift, sigma, rest = min(tries, key=lambda one: one[2])
-    before = _difference(image, shading, good)[1]
+    before = min(_difference(image, one, good)[1] for one in (shading, other))
     return (shift, sigma) if rest < MAX_REST_AFTER_SHIFT * before else (np.zeros(2), sigma)
 
 
@@ -209,7 +217,7 @@ def _refine_shift(
     """Return shift, standard error and remaining difference after Gauss-Newton steps."""
     import cv2
 
-    down, across = np.gradient(shading)
+    down, across = (np.asarray(one, np.float64) for one in np.gradient(shading))
     size = image.shape[::-1]
     sigma = rest = np.inf
     for step in range(N_SHIFT_STEPS):
@@ -222,6 +230,7 @@ def _refine_shift(
         kept = good & (np.abs(difference) < N_TRIMMED * rest)
         rows = -np.stack([across[kept], down[kept]], axis=1)
         normal = rows.T @ rows + 1e-12 * np.eye(2)
-        shift = shift + np.clip(np.linalg.solve(normal, rows.T @ difference[kept]), -3.0, 3.0)
+        by = np.linalg.solve(normal, rows.T @ difference[kept])
+        shift = np.asarray(shift + np.clip(by, -3.0, 3.0), np.float64)
         sigma = float(rest * np.sqrt(np.linalg.inv(normal).trace()))
     return shift, sigma, float(rest)
