@@ -98,6 +98,7 @@ def demo(
 
 for command in (
     capturing.verify,
+    importing.diagnose,
     reconstructing.calibrate,
     reconstructing.reconstruct,
     fusing.fuse,

@@ -17,12 +17,13 @@ from model.skin import MAP_UNITS, SkinMap
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.normal_maps import NormalMaps, PhotometricStereoError
-from reconstruction.photometric_stereo import estimate_normals, light_check
+from reconstruction.photometric_stereo import estimate_normals
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.masked_map import masked_map
+from reconstruction.stack_diagnosis import Diagnosis, diagnose_stack
 
-STAGE_REVISION = 2
+STAGE_REVISION = 3
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = ("normals", "albedo", "residual")
@@ -30,8 +31,8 @@ MAP_NAMES = ("normals", "albedo", "residual")
 
 MEMORY_BYTES = 2**30
 """Stacks above this size are stored in a file, not in memory."""
-MAX_STRENGTH_DEVIATION = 0.2
-"""Relative deviation of a light's strength from the median above which it is reported."""
+MIN_KEPT_IMAGES = 4
+"""Images without which none is left out."""
 OUTLIER_SIGMAS = 4.0
 
 
@@ -130,56 +131,65 @@ def _stack(session: Session) -> LightStack:
 
 
 def _lights(inputs: Inputs, stack: LightStack) -> StackLights:
-    """Check the list's lights against the shading; use another order if only that one agrees."""
-    session = inputs.session
-    listed = session.manifest.extra["light_list"]
-    if not isinstance(listed, dict):
-        got = f"got a light list of type {type(listed).__name__}, expected a table"
-        raise InputsError(f"{session.path}: {got}; import the images with their light list again")
-    vectors = np.array(
-        [session.rig.light(str(r.index["light"])).position_mm for r in stack.records], np.float64
-    )
-    unit = unit_vectors(vectors)
-    near = bool(listed.get("near", False))
-    scale = float(listed.get("mm_per_px") or 1.0)
+    """Diagnose the images; use the order that the pixels show, without images that are wrong."""
+    vectors, near, scale = _listed_lights(inputs.session, stack)
     alive = np.ones(len(vectors), bool)
     try:
-        found = light_check.check_lights(
-            stack.gray, unit, valid=stack.usable & stack.inside, rng=np.random.default_rng(0)
-        )
+        found = _diagnose(stack, vectors, near=near)
     except PhotometricStereoError as error:
         inputs.assumed.append(f"the lights belong to their images ({error})")
         return StackLights(vectors, near, scale, alive)
-    best = f"{100 * min(found.misfit.values()):.1f} %"
-    as_listed = f"{100 * found.misfit['as listed']:.1f} %"
-    if found.order == "unknown":
-        inputs.assumed.append(
-            "the light list is right, though no order of it explains the shading"
-            f" (misfit {as_listed}): the object is glossy, or the list is of other lights"
+    inputs.assumed += [f"{one.fault}: {one.evidence}; {one.remedy}" for one in found.findings]
+    inputs.noted["diagnosis"] = [one.to_json() for one in found.findings]
+    if np.count_nonzero(~found.left_out) >= MIN_KEPT_IMAGES:
+        alive = ~found.left_out
+    return StackLights(vectors[found.order], near, scale, alive)
+
+
+def _listed_lights(session: Session, stack: LightStack) -> tuple[Float64Array, bool, float]:
+    """Return the list's vectors (N, 3), whether they are positions, and the size of a pixel, mm."""
+    listed = session.manifest.extra.get("light_list")
+    if not isinstance(listed, dict):
+        raise InputsError(
+            f"{session.path}: got no light list, expected a session of images under listed lights; "
+            "import the images with their list by `skinrig import lp`"
         )
-    elif found.order != "as listed":
-        vectors = vectors[found.permutation]
-        inputs.assumed.append(
-            f"the light list is {found.order}: the shading's misfit is {as_listed} as listed and"
-            f" {best} in that order, which was used"
-        )
-    alive = ~found.dead
-    for number in np.flatnonzero(found.dead):
-        inputs.assumed.append(f"light {number + 1} of the list gave no light and is omitted")
-    off = np.flatnonzero(alive & (np.abs(found.strength - 1) > MAX_STRENGTH_DEVIATION))
-    if off.size and found.order != "unknown":
-        worst = off[np.argmax(np.abs(found.strength[off] - 1))]
-        inputs.assumed.append(
-            f"lights are of one strength, though {off.size} differ by more than "
-            f"{MAX_STRENGTH_DEVIATION:.0%}, most"
-            f" light {worst + 1} with {found.strength[worst]:.2f} of the median"
-        )
-    inputs.noted["light_check"] = {
-        "order": found.order,
-        "misfit": {name: round(value, 5) for name, value in found.misfit.items()},
-        "dead": [int(k) for k in np.flatnonzero(found.dead)],
-    }
-    return StackLights(vectors, near, scale, alive)
+    vectors = np.array(
+        [session.rig.light(str(r.index["light"])).position_mm for r in stack.records], np.float64
+    )
+    return vectors, bool(listed.get("near", False)), float(listed.get("mm_per_px") or 1.0)
+
+
+def _diagnose(stack: LightStack, vectors: Float64Array, *, near: bool) -> Diagnosis:
+    return diagnose_stack(
+        stack.gray,
+        unit_vectors(vectors),
+        usable=stack.usable,
+        inside=stack.inside,
+        near=near,
+        rng=np.random.default_rng(0),
+    )
+
+
+def diagnose_session(path: str | Path) -> Diagnosis:
+    """Diagnose the images of a session with a light list.
+
+    Parameters
+    ----------
+    path
+        The SESSION/ folder.
+
+    Raises
+    ------
+    InputsError
+        If the session has no light list, or fewer than three images.
+    PhotometricStereoError
+        If its images cannot be judged: too few, or without light.
+    """
+    session = Session.open(path)
+    stack = _stack(session)
+    vectors, near, _ = _listed_lights(session, stack)
+    return _diagnose(stack, vectors, near=near)
 
 
 def _points_mm(shape: tuple[int, int], mm_per_px: float) -> Float64Array:

@@ -15,7 +15,7 @@ HELP_SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
     ("Start here", ("demo", "doctor")),
     (
         "Capture with a rig or its simulation",
-        ("plan", "simulate", "capture", "serve", "calibrate", "import", "verify"),
+        ("plan", "simulate", "capture", "serve", "calibrate", "import", "diagnose", "verify"),
     ),
     ("Reconstruct and model", ("reconstruct", "fuse", "fit", "apply", "edit", "analyse")),
     ("Report, render and export", ("report", "view", "render", "export")),

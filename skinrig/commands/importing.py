@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from skinrig import errors
 from skinrig.commands.help import Command, Subcommands
 from skinrig.commands.options import Consent, ConsentExpires, Json, Out, choice, command
 from skinrig.console import Console, format_count, select_attributes
@@ -167,10 +168,60 @@ def import_lp(
     console.print_line(
         f"{done.path}: {format_count(done.frames, 'picture')}, lights of {done.lights}"
     )
-    console.print_line(
-        f"next: skinrig reconstruct {shell_quote(out)} --maps normals,albedo --out appearance"
-    )
+    console.print_line(f"next: skinrig diagnose {shell_quote(out)}")
     console.print_document(
         "skinrig.import/1",
         select_attributes(done, "path", "frames", "lights", "encoding", "mask", "assumed"),
     )
+
+
+@command
+def diagnose(session: Path, /, json: Json = False) -> None:
+    """Find what is wrong with images under listed lights; exit code 1 if anything is.
+
+    The images themselves show it: light lists in another order, swapped or wrong lights, flipped
+    axes, a wrong transfer curve, ambient light, near lights, drift, and empty, repeated, moved or
+    clipped images. `reconstruct` uses the order and leaves out the images that this command names.
+
+    Example: skinrig diagnose session-rti
+
+    Parameters
+    ----------
+    session
+        Session of `skinrig import lp`.
+    """
+    from reconstruction.pipeline.light_stack import diagnose_session
+
+    console = Console(json)
+    console.progress("read the images and compare them with their light list")
+    found = diagnose_session(session)
+    rows = [
+        (
+            one.fault,
+            ", ".join(str(number + 1) for number in one.frames) or "all",
+            one.strength,
+            one.evidence,
+            one.remedy,
+        )
+        for one in found.findings
+    ]
+    if rows:
+        head = ("fault", "images", "over its limit", "evidence", "remedy")
+        console.print_table(head, rows)
+    else:
+        console.print_line(f"{session}: no fault was found in {len(found.order)} images")
+    after = f"reconstruct {shell_quote(session)} --maps normals,albedo --out appearance"
+    console.print_line(f"next: skinrig {after}")
+    console.print_document(
+        "skinrig.diagnosis/1",
+        {
+            "session": session,
+            "findings": [one.to_json() for one in found.findings],
+            "order": [int(number) + 1 for number in found.order],
+            "left_out": [int(number) + 1 for number in found.left_out.nonzero()[0]],
+            "directions": found.directions,
+            "strength": found.strength,
+        },
+    )
+    if rows:
+        raise typer.Exit(errors.EXIT_LIMIT_MISSED)

@@ -12,8 +12,7 @@ from reconstruction.gradient_normals import channels as gradient_channels
 from reconstruction.gradient_normals.noise import SensorNoise
 from reconstruction.normal_integration import discontinuities as discontinuity_integration
 from reconstruction.normal_integration import lens_restoration
-from reconstruction.normal_maps import PhotometricStereoError
-from reconstruction.photometric_stereo import estimate_normals, light_check
+from reconstruction.photometric_stereo import estimate_normals
 from reconstruction.registration import dense_flow
 from reconstruction.surface import errors as surface_errors
 from reconstruction.wrinkles import texels as wrinkle_texels
@@ -115,36 +114,6 @@ def test_waves_are_filtered_linearly_and_all_preserve_image(seed, sides, factor)
     np.testing.assert_allclose(
         lens_restoration.filter_by_transfer(values, np.ones_like(transfer)), values, atol=1e-12
     )
-
-
-# lists of lights
-
-
-@FEW
-@given(
-    seed=SEED,
-    lights=st.integers(4, 12),
-    gain=st.sampled_from([1e-30, 1e-3, 1.0, 1e30]),
-    dead=st.integers(0, 1),
-    bad=NO_NUMBER,
-)
-def test_sorted_list_is_recognized_in_any_unit(seed, lights, gain, dead, bad):
-    rng = np.random.default_rng(seed)
-    ways = unit_normals(rng, (lights,), 0.5)
-    normals = unit_normals(rng, (120,), 0.3)
-    seen = gain * np.maximum(ways @ normals.T, 0.0) * rng.uniform(0.5, 1.0, 120)
-    seen[0, :2] = bad
-    seen[lights - dead :] = 0.0
-    if lights - dead < 4:
-        with pytest.raises(PhotometricStereoError, match="at least 4"):
-            light_check.check_lights(seen, ways, rng=rng)
-        return
-    found = light_check.check_lights(seen, ways, rng=rng)
-    assert found.order == "as listed"
-    assert found.dead.sum() == dead
-    assert np.isfinite(found.strength).all()
-    np.testing.assert_allclose(found.strength[~found.dead], 1.0, atol=0.05)
-    assert set(found.permutation.tolist()) == set(range(lights))
 
 
 # pictures that are laid over each other

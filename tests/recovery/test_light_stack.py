@@ -68,8 +68,9 @@ def test_reversed_light_list_is_reported_and_corrected(tmp_path, capsys):
     images, lights, n, inside = ball()
     write(tmp_path / "f", images, lights[::-1], inside)
     found = made(tmp_path, tmp_path / "f", capsys)
-    assert found.parameters["light_check"]["order"] == "reversed"
-    assert any("light list is reversed" in text for text in found.parameters["assumed"])
+    (one,) = found.parameters["diagnosis"]
+    assert one["fault"] == "order of lights"
+    assert any("if the list is reversed" in text for text in found.parameters["assumed"])
     assert error_deg(found, n, inside).mean() < 0.5
 
 
@@ -78,7 +79,8 @@ def test_dead_light_is_reported_and_omitted(tmp_path, capsys):
     images[4] = 0.0
     write(tmp_path / "f", images, lights, inside)
     found = made(tmp_path, tmp_path / "f", capsys)
-    assert any("light 5 of the list gave no light" in t for t in found.parameters["assumed"])
+    (one,) = found.parameters["diagnosis"]
+    assert (one["fault"], one["images"]) == ("empty image", [5])
     assert error_deg(found, n, inside).mean() < 0.5
 
 

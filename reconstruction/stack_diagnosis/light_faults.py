@@ -1,0 +1,217 @@
+"""Find what is wrong with the light itself: curve, ambient light, near lights, drift, strengths."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from reconstruction.arrays import BoolArray, Float64Array
+from reconstruction.stack_diagnosis.finding import Finding
+from reconstruction.stack_diagnosis.shading_space import compare_directions, fit_shading_space
+
+MIN_CURVE_AGREEING = 0.6
+"""Fraction of lights that must agree with the list for a curve to be judged."""
+MIN_TREND_LIGHTS = 6
+MIN_CURVE_MISFIT = 0.02
+"""Misfit to equal lights from which another curve is considered."""
+CURVE_RATIO = 0.6
+"""Ratio of misfits below which another curve is reported."""
+MAX_AMBIENT = 0.03
+"""Light in attached shadows over the albedo."""
+SHADOW_COSINE = -0.15
+"""Shading below which a point is turned away from a light."""
+MIN_NEAR_COEFFICIENT, MIN_NEAR_SIGMAS = 0.15, 6.0
+"""Twice half a width of the object over the distance of the lights, and its certainty."""
+STRENGTH_RANGE = (0.75, 1.35)
+MIN_DRIFT, MIN_DRIFT_SIGMAS = 0.05, 6.0
+
+
+def decode_srgb(values: Float64Array) -> Float64Array:
+    """Return the light of sRGB values from 0 to 1 (IEC 61966-2-1)."""
+    low = values / 12.92
+    return np.where(values <= 0.04045, low, ((np.maximum(values, 0.0) + 0.055) / 1.055) ** 2.4)
+
+
+def encode_srgb(light: Float64Array) -> Float64Array:
+    """Return the sRGB values of light from 0 to 1 (IEC 61966-2-1)."""
+    light = np.maximum(light, 0.0)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+CURVES: dict[str, Callable[[Float64Array], Float64Array]] = {
+    "sRGB values that were read as linear": decode_srgb,
+    "values of gamma 2.2 that were read as linear": lambda v: np.maximum(v, 0.0) ** 2.2,
+    "values of gamma 1.8 that were read as linear": lambda v: np.maximum(v, 0.0) ** 1.8,
+    "linear values that were decoded as sRGB": encode_srgb,
+    "linear values that were decoded by gamma 2.2": lambda v: np.maximum(v, 0.0) ** (1 / 2.2),
+}
+"""What the values are, with the function that makes them linear."""
+
+
+def find_curve(
+    samples: Float64Array, usable: BoolArray, directions: Float64Array, rng: np.random.Generator
+) -> Iterator[Finding]:
+    """Yield the transfer curve under which lights of one strength fit clearly better.
+
+    Parameters
+    ----------
+    samples
+        (N, P), as read, over the white level.
+    usable
+        (N, P).
+    directions
+        (N, 3), of the lights in the order of the images.
+    rng
+        Draws sets of lights.
+    """
+    listed = _misfit(samples, usable, directions, rng, with_trend=True)
+    if listed < MIN_CURVE_MISFIT:
+        return
+    found = {
+        name: _misfit(decode(samples), usable, directions, rng, with_trend=False)
+        for name, decode in CURVES.items()
+    }
+    best = min(found, key=lambda name: found[name])
+    if found[best] < CURVE_RATIO * listed:
+        yield Finding(
+            "transfer curve", (),
+            f"equal lights fit to {found[best]:.1%} if these are {best}, else to {listed:.1%}",
+            listed / found[best], 1.0 / CURVE_RATIO,
+            f"import again with the right encoding: these are {best}",
+        )  # fmt: skip
+
+
+def _misfit(
+    samples: Float64Array,
+    usable: BoolArray,
+    directions: Float64Array,
+    rng: np.random.Generator,
+    *,
+    with_trend: bool,
+) -> float:
+    """Return how well equal lights fit the list; 1 where most lights are elsewhere."""
+    lights = fit_shading_space(samples, usable).lights
+    found = compare_directions(lights, directions, rng, draws=150)
+    if found.agrees.mean() < MIN_CURVE_AGREEING:
+        return 1.0
+    if not with_trend:
+        return found.misfit
+    slope, _, _ = fit_trend(found.strength, found.agrees)
+    trend = np.exp(slope * np.linspace(-0.5, 0.5, len(lights)))
+    straight = compare_directions(lights / trend[:, None], directions, rng, draws=150)
+    return min(found.misfit, straight.misfit)
+
+
+def find_ambient(
+    gray: Float64Array, inside: BoolArray, normals: Float64Array, albedo: Float64Array,
+    directions: Float64Array,
+) -> Iterator[Finding]:  # fmt: skip
+    """Yield light where the surface is turned away from the lamp: ambient light, black level.
+
+    Parameters
+    ----------
+    gray
+        (N, H, W).
+    inside
+        (H, W), where `normals`, (H, W, 3), and `albedo`, (H, W), are valid.
+    directions
+        (N, 3).
+    """
+    cosine = np.einsum("hwi,ni->nhw", normals, directions)
+    turned = (cosine < SHADOW_COSINE) & inside
+    if np.count_nonzero(turned) < 50:
+        return
+    ratio = (gray / np.maximum(albedo, 1e-9))[turned]
+    level = float(np.median(ratio))
+    if level > MAX_AMBIENT:
+        yield Finding(
+            "ambient light", (),
+            f"points turned away from the lamp still have {level:.1%} of the light",
+            level, MAX_AMBIENT,
+            "subtract an image without lamps, or the black level",
+        )  # fmt: skip
+
+
+def find_near(
+    samples: Float64Array, weights: Float64Array, directions: Float64Array,
+    places: Float64Array,
+) -> Iterator[Finding]:  # fmt: skip
+    """Yield that lights are near: images are brighter towards their lamp.
+
+    A lamp at the distance D gives a point x of the object ``1 + 2 x . l / D`` of the light of the
+    middle. This is quadratic in the direction l, and normals and albedo cannot take it up.
+
+    Parameters
+    ----------
+    samples, weights
+        (N, P).
+    directions
+        (N, 3).
+    places
+        (P, 2), x to the right and y up, over half the object's width.
+    """
+    inner = np.einsum("np,ni,nj->pij", weights, directions, directions) + 1e-9 * np.eye(3)
+    matte = np.linalg.solve(
+        inner, np.einsum("np,np,ni->pi", weights, samples, directions)[..., None]
+    )
+    shading = np.maximum(directions @ matte[..., 0].T, 0.0)
+    tilt = shading * (directions[:, :2] @ places.T)
+    own = np.linalg.solve(inner, np.einsum("np,np,ni->pi", weights, tilt, directions)[..., None])
+    tilt = tilt - directions @ own[..., 0].T
+    residual = samples - directions @ matte[..., 0].T
+    above = np.sum(weights * residual * tilt, axis=1)
+    below = np.sum(weights * tilt**2, axis=1)
+    coefficient = float(above.sum() / max(below.sum(), 1e-30))
+    error = float(np.sqrt(np.sum((above - coefficient * below) ** 2)) / max(below.sum(), 1e-30))
+    limit = max(MIN_NEAR_COEFFICIENT, MIN_NEAR_SIGMAS * error)
+    if coefficient > limit:
+        yield Finding(
+            "near lights", (),
+            f"images are brighter towards their lamp, as from {2.0 / coefficient:.0f} half widths "
+            "of the object",
+            coefficient, limit,
+            "give the positions of the lights and the size of a pixel (--mm-per-px)",
+        )  # fmt: skip
+
+
+def find_strengths(strength: Float64Array, right: BoolArray) -> Iterator[Finding]:
+    """Yield a drift of the exposure, and single dim or bright lights."""
+    kept = right & (strength > 0.0)
+    if np.count_nonzero(kept) < MIN_TREND_LIGHTS:
+        return
+    slope, error, rest = fit_trend(strength, kept)
+    limit = max(MIN_DRIFT, MIN_DRIFT_SIGMAS * error)
+    drifts = abs(slope) > limit
+    if drifts:
+        yield Finding(
+            "exposure drift", (),
+            f"light changes by {np.expm1(slope):+.0%} from the first image to the last",
+            abs(slope), limit, "give each image's exposure, or correct the images by this trend",
+        )  # fmt: skip
+    # without the trend where there is one
+    level = np.exp(rest) if drifts else strength[kept] / np.median(strength[kept])
+    for number, value in zip(np.flatnonzero(kept), level, strict=True):
+        if not STRENGTH_RANGE[0] <= value <= STRENGTH_RANGE[1]:
+            yield Finding(
+                "unequal light", (int(number),),
+                f"light of image {number + 1} has {value:.2f} of the median strength",
+                abs(float(np.log(value))), float(-np.log(STRENGTH_RANGE[0])),
+                "give the strengths of the lights, or replace the lamp",
+            )  # fmt: skip
+
+
+def fit_trend(strength: Float64Array, kept: BoolArray) -> tuple[float, float, Float64Array]:
+    """Return slope of the logarithm over all images, its standard error, and the rest.
+
+    The median of the slopes of all pairs (Theil 1950; Sen 1968): one dim light does not tilt it.
+    """
+    place = np.flatnonzero(kept)
+    log = np.log(np.maximum(strength[place], 1e-9))
+    x = place / max(len(strength) - 1, 1) - 0.5
+    i, j = np.triu_indices(len(x), 1)
+    slope = float(np.median((log[j] - log[i]) / (x[j] - x[i])))
+    rest = log - slope * x
+    rest = rest - np.median(rest)
+    spread = 1.4826 * float(np.median(np.abs(rest))) + 1e-4
+    return slope, spread / float(np.sqrt(np.sum((x - x.mean()) ** 2))), rest
