@@ -43,7 +43,7 @@ BENCH_STAGES = (
 """Stages measured at small size, a few per rig, about 1 s each; `skinrig bench` measures all."""
 BENCH_BUDGET_S = 8.0
 TYPICAL_SECONDS = {"flash": 45.0, "dome": 110.0, "gradient": 60.0, "probe": 30.0}
-"""Seconds of each rig beside another one on two cores, in the order in which the rigs start.
+"""Seconds of each rig while another one runs, on two cores, in the order in which the rigs start.
 
 They lie between those with and without compiled kernels. The flash rig starts first: its maps are
 in the report while the other rigs run.

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -224,6 +224,8 @@ def _appearance_section(subject: page.ReportedAppearance) -> Iterator[page.Block
     yield page.Heading(f"{kind}: {subject.name}", level=2)
     if is_fused(appearance):
         yield from fused.section(appearance)
+        appearance = fused.without_copies(appearance)
+        subject = replace(subject, appearance=appearance)
     images = [
         map_images.draw_color_image(f"{map_title(key)}, linear RGB", appearance.maps[key].values)
         for key in ("image", "specular_image")

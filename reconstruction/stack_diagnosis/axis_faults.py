@@ -115,7 +115,7 @@ def _outline(valid: BoolArray) -> tuple[BoolArray, Float64Array] | None:
     out = -np.stack([across, -down], axis=-1)
     length = np.linalg.norm(out, axis=-1, keepdims=True)
     out = out / np.maximum(length, 1e-9)
-    # where the image cuts the object there is no outline
+    # an object that the image cuts has no outline there
     margin = max(int(0.05 * min(height, width)), 1)
     near[:margin] = near[-margin:] = False
     near[:, :margin] = near[:, -margin:] = False

@@ -42,7 +42,7 @@ MIN_MATTE, MAX_MATTE_ERROR = 0.25, 0.25
 STORED_WRONG = ("empty image", "dead light", "padded image")
 OF_ANY_LIGHT = ("repeated image", "repeated images", "full-bright image")
 """Faults that are found without the list."""
-MOVED = ("moved image", "mirrored image")
+MOVED_FAULTS = ("moved image", "mirrored image")
 CLIPPED, CURVE, FOREIGN = "clipped images", "transfer curve", "foreign list"
 AMBIENT, DRIFT = "ambient light", "exposure drift"
 SWAPPED, WRONG = "swapped lights", "wrong light"
@@ -57,7 +57,7 @@ class Diagnosis:
     findings
         Faults; empty where none was found.
     order
-        (N,), row of the list for each image, as the pixels say.
+        (N,), row of the list for each image, as the pixels show.
     left_out
         (N,), images that no map should use.
     directions
@@ -139,9 +139,8 @@ def diagnose_stack(
     found = _diagnose_light(stack, listed, out.copy(), rng)
     curve = next((one for one in found.findings if one.fault == CURVE), None)
     if curve is not None:  # what else was found may follow from the wrong curve
-        decode = next(
-            light_faults.CURVES[name] for name in light_faults.CURVES if name in curve.remedy
-        )
+        curves = light_faults.CURVES_BY_NAME
+        decode = next(curves[name] for name in curves if name in curve.remedy)
         linear = replace(stack, gray=decode(stack.gray))
         again = _diagnose_light(linear, listed, out.copy(), rng)
         others = (one for one in again.findings if one.fault != CURVE)
@@ -180,7 +179,7 @@ def _diagnose_light(
         out[[number for one in full for number in one.frames]] = True
         found = _diagnose_light(stack, listed, out, rng)
         return replace(found, findings=(*full, *found.findings))
-    findings = [_renumbered(one, kept) for one in frame_faults.find_repeated(samples)]
+    findings = [_renumbered(one, kept) for one in frame_faults.find_repeated(samples, listed[kept])]
     repeated = {number for one in findings for number in one.frames}
     space = fit_shading_space(samples, clear)
     if space.singular_ratio < MIN_SINGULAR_RATIO:
@@ -207,7 +206,7 @@ def _diagnose_light(
     of_images = _find_in_images(view, rows, directions, used, once, rng)
     ambient = any(one.fault == AMBIENT for one in of_images)  # it changes strengths with tilt
     findings += [one for one in lights if not (ambient and one.fault == DRIFT)]
-    moved = {number for one in of_images if one.fault in MOVED for number in one.frames}
+    moved = {number for one in of_images if one.fault in MOVED_FAULTS for number in one.frames}
     explained = (moved | repeated) - swapped
     findings += of_images + [one for one in suspects if not explained & set(one.frames)]
     out[list(moved)] = True

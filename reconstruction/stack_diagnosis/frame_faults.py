@@ -13,11 +13,15 @@ MIN_BRIGHTNESS = 0.05
 """Bright samples of an image over the median image's, below which it shows no light."""
 MIN_PADDED_FRACTION = 0.03
 """Fraction of an image's rows or columns with one and the same value that counts as padding."""
+MIN_EDGE_BRIGHTNESS = 0.3
+"""Light of the line next to padding over that of the typical image."""
 MAX_CLIPPED_FRACTION = 0.02
 """Fraction of the samples of the object that may be saturated."""
 BRIGHT_QUANTILE, MIN_FULL_BRIGHT = 0.8, 2.0
 MAX_REPEAT_DIFFERENCE = 0.25
 """Difference of two images over the typical difference of an image to its most similar one."""
+MIN_REPEAT_ANGLE_DEG = 2.0
+"""Angle between listed lights up to which images may be equal."""
 MIN_SHIFT_PX = 0.7
 MIN_SHIFT_SIGMAS = 6.0
 MIN_IMAGE_CORRELATION = 0.5
@@ -61,18 +65,27 @@ def find_unlit(gray: Float64Array, inside: BoolArray) -> Iterator[Finding]:
 def _constant_lines(
     image: Float64Array, typical: Float64Array, inside: BoolArray, axis: int
 ) -> float:
-    """Return the fraction of lines through the object that have one value, other images not."""
-    shown = np.where(inside, image, np.nan)
+    """Return the fraction of lines through the object that have one value, other images not.
+
+    The line next to them is as bright as usual: an attached shadow grows dark by degrees.
+    """
     crossed = inside.sum(axis=axis) >= 8
     if not crossed.any():
         return 0.0
-    with np.errstate(all="ignore"):
-        low, high = (np.where(inside, image, fill) for fill in (np.inf, -np.inf))
-        level = low.min(axis=axis)
-        flat = level == high.max(axis=axis)
-        flat &= level < 0.5 * np.where(inside, typical, -np.inf).max(axis=axis)
-        other = np.where(inside, typical, -np.inf).max(axis=axis) > 0.05 * np.nanmax(shown)
-    return float(np.count_nonzero(flat & crossed & other) / np.count_nonzero(crossed))
+    low = np.where(inside, image, np.inf).min(axis=axis)
+    high = np.where(inside, image, -np.inf).max(axis=axis)
+    brightest = np.where(inside, typical, 0.0).max(axis=axis)
+    flat = crossed & (low == high) & (low < 0.5 * brightest) & (brightest > 0.05 * typical.max())
+    usual = np.where(inside, image, 0.0).sum(axis=axis) > MIN_EDGE_BRIGHTNESS * np.where(
+        inside, typical, 0.0
+    ).sum(axis=axis)
+    lines = np.flatnonzero(flat)
+    neighbors = np.concatenate([lines - 1, lines + 1])
+    neighbors = neighbors[(neighbors >= 0) & (neighbors < len(flat))]
+    edge = neighbors[crossed[neighbors] & ~flat[neighbors]]
+    if not edge.size or not usual[edge].any():
+        return 0.0
+    return float(lines.size / np.count_nonzero(crossed))
 
 
 def find_full_bright(samples: Float64Array) -> Iterator[Finding]:
@@ -103,8 +116,16 @@ def find_clipped(usable: BoolArray, inside: BoolArray) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def find_repeated(samples: Float64Array) -> Iterator[Finding]:
-    """Yield pairs of images that differ far less than other images do, samples (N, P)."""
+def find_repeated(samples: Float64Array, directions: Float64Array) -> Iterator[Finding]:
+    """Yield pairs of images that differ far less than others do whose lights are as far apart.
+
+    Parameters
+    ----------
+    samples
+        (N, P).
+    directions
+        (N, 3), listed unit vectors.
+    """
     n = len(samples)
     unit = samples / np.maximum(np.linalg.norm(samples, axis=1, keepdims=True), 1e-12)
     apart = np.sqrt(np.maximum(2.0 - 2.0 * unit @ unit.T, 0.0)) + 10.0 * np.eye(n)
@@ -115,7 +136,11 @@ def find_repeated(samples: Float64Array) -> Iterator[Finding]:
             "import one image per light",
         )  # fmt: skip
         return
-    for i, j in np.argwhere(np.triu(apart < MAX_REPEAT_DIFFERENCE * typical)):
+    angle = np.degrees(np.arccos(np.clip(directions @ directions.T, -1.0, 1.0)))
+    per_degree = apart / np.maximum(angle, 1e-3)
+    alike = (apart < MAX_REPEAT_DIFFERENCE * typical) & (angle > MIN_REPEAT_ANGLE_DEG)
+    alike &= per_degree < MAX_REPEAT_DIFFERENCE * np.median(per_degree[angle > 0.0])
+    for i, j in np.argwhere(np.triu(alike)):
         yield Finding(
             "repeated image", (int(i), int(j)),
             f"images {i + 1} and {j + 1} differ by {apart[i, j] / typical:.1%} of a typical "
@@ -183,9 +208,8 @@ def _shift_px(
 ) -> tuple[Float64Array, float]:
     """Return the shift (x, y) of an image against its shading, px, and its standard error.
 
-    The start is no shift, or the phase correlation of both gradients, whichever ends nearer. A
-    shift that does not explain the difference of the two is none; nor is one where another light
-    explains it.
+    The search starts without a shift, and at the phase correlation of both gradients. A shift that
+    does not explain the difference of the two is none; nor is one where another light explains it.
     """
     import cv2
 

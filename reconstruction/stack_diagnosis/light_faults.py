@@ -27,23 +27,23 @@ STRENGTH_RANGE = (0.75, 1.35)
 MIN_DRIFT, MIN_DRIFT_SIGMAS = 0.05, 6.0
 
 
-def decode_srgb(values: Float64Array) -> Float64Array:
+def _decode_srgb(values: Float64Array) -> Float64Array:
     """Return the light of sRGB values from 0 to 1 (IEC 61966-2-1)."""
     low = values / 12.92
     return np.where(values <= 0.04045, low, ((np.maximum(values, 0.0) + 0.055) / 1.055) ** 2.4)
 
 
-def encode_srgb(light: Float64Array) -> Float64Array:
+def _encode_srgb(light: Float64Array) -> Float64Array:
     """Return the sRGB values of light from 0 to 1 (IEC 61966-2-1)."""
     light = np.maximum(light, 0.0)
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
-CURVES: dict[str, Callable[[Float64Array], Float64Array]] = {
-    "sRGB values that were read as linear": decode_srgb,
+CURVES_BY_NAME: dict[str, Callable[[Float64Array], Float64Array]] = {
+    "sRGB values that were read as linear": _decode_srgb,
     "values of gamma 2.2 that were read as linear": lambda v: np.maximum(v, 0.0) ** 2.2,
     "values of gamma 1.8 that were read as linear": lambda v: np.maximum(v, 0.0) ** 1.8,
-    "linear values that were decoded as sRGB": encode_srgb,
+    "linear values that were decoded as sRGB": _encode_srgb,
     "linear values that were decoded by gamma 2.2": lambda v: np.maximum(v, 0.0) ** (1 / 2.2),
 }
 """What the values are, with the function that makes them linear."""
@@ -70,7 +70,7 @@ def find_curve(
         return
     found = {
         name: _misfit(decode(samples), usable, directions, rng, with_trend=False)
-        for name, decode in CURVES.items()
+        for name, decode in CURVES_BY_NAME.items()
     }
     best = min(found, key=lambda name: found[name])
     if found[best] < CURVE_RATIO * listed:

@@ -1,4 +1,4 @@
-"""Say how a list of lights is wrong: its order, exchanged lights, single wrong directions."""
+"""Find how a list of lights is wrong: its order, exchanged lights, single wrong directions."""
 
 from __future__ import annotations
 

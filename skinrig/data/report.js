@@ -96,12 +96,12 @@
     stage.addEventListener("pointermove", (event) => {
       const box = stage.getBoundingClientRect();
       const [u, v] = [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
-      const said = [...new Set(shown())].map(({ image, read, title }) => {
+      const texts = [...new Set(shown())].map(({ image, read, title }) => {
         const [w, h] = [image.naturalWidth, image.naturalHeight];
         const [x, y] = [Math.min(w - 1, Math.floor(u * w)), Math.min(h - 1, Math.floor(v * h))];
         return `${title}: ${x < 0 || y < 0 ? "" : read(x, y)}`;
       });
-      values.textContent = said.join("; ");
+      values.textContent = texts.join("; ");
     });
     for (const field of [left, right]) field.addEventListener("change", draw);
     divider.addEventListener("input", () => stage.style.setProperty("--divider", `${divider.value}%`));

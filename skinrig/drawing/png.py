@@ -66,6 +66,16 @@ def to_data_url(file: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(file).decode("ascii")
 
 
+def to_webp_url(file: bytes) -> str:
+    """Encode an image file without loss as WebP, a fifth smaller than PNG, in a ``data:`` URL."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    image = Image.open(io.BytesIO(file)).convert("RGB")
+    image.save(out, "WEBP", lossless=True, quality=50, method=4)
+    return "data:image/webp;base64," + base64.b64encode(out.getvalue()).decode("ascii")
+
+
 def encode_jpeg_url(image: UInt8Array, *, quality: int = 88) -> str:
     """Encode an image, (H, W, 3), as a JPEG file in a ``data:`` URL, for small previews."""
     import cv2

@@ -69,7 +69,7 @@ class MapDrawing:
         bar = page.ColorScale(
             png.SCALE_CLASSES[scale], format_number(low), format_number(high), self.unit
         )
-        return _build_image(title, png.to_data_url(data), alt, small.shape, bar)
+        return _build_image(title, png.to_webp_url(data), alt, small.shape, bar)
 
     def size(self, title: str, values: FloatArray, reach: float) -> page.Image:
         """Return an image of values from 0 on, such as sizes of errors and uncertainties."""
@@ -137,7 +137,7 @@ def draw_plain_image(title: str, image: UInt8Array, *, alt: str = "") -> page.Im
 
 
 def _address(image: UInt8Array, lossy: bool = False) -> str:
-    return png.encode_jpeg_url(image) if lossy else png.to_data_url(png.encode(image))
+    return png.encode_jpeg_url(image) if lossy else png.to_webp_url(png.encode(image))
 
 
 def _build_image(

@@ -1,6 +1,7 @@
 """Report section on a fused person: the rigs behind each map, and their agreement."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,21 @@ from model.skin import SkinAppearance
 from skinrig.appearances.contents import FUSION_KEY
 from skinrig.reporting import map_images, page
 from skinrig.reporting.map_names import map_title
+
+DRAWN_OF_ONE_RIG = ("position", "normals_refined", "translucency")
+"""Maps of a single rig that are drawn all the same."""
+
+
+def without_copies(appearance: SkinAppearance) -> SkinAppearance:
+    """Return a fused person without maps that one rig's section draws as well."""
+    found: Any = appearance.parameters[FUSION_KEY]
+    copies = {
+        name
+        for name, rigs in found["maps"].items()
+        if len(rigs) == 1 and name not in DRAWN_OF_ONE_RIG and not name.startswith("patch_")
+    }
+    maps = {name: one for name, one in appearance.maps.items() if name not in copies}
+    return replace(appearance, maps=maps)
 
 
 def section(appearance: SkinAppearance) -> Iterator[page.Block]:
