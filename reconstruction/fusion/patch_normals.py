@@ -229,7 +229,10 @@ def fuse_patch(patch: PatchNormals, frame: SurfaceFrame, *, cutoff_um: float) ->
 
 
 def _blur(values: Float64Array, sigma_px: float) -> Float64Array:
-    return np.asarray(ndimage.gaussian_filter(values, sigma_px, mode="constant"), np.float64)
+    """Filter by a Gaussian up to a common factor; it ends where the image does."""
+    radius = min(int(4.0 * sigma_px + 0.5), max(values.shape))
+    blurred = ndimage.gaussian_filter(values, sigma_px, mode="constant", radius=radius)
+    return np.asarray(blurred, np.float64)
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,6 +58,7 @@ def people(tmp_path_factory):
     return made
 
 
+@pytest.mark.long
 def test_maps_recover_oxygenation_of_two_people(people, calibrations, tmp_path):
     """Expected: within two standard errors, and 0.6 of the difference between them.
 

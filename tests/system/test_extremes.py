@@ -17,6 +17,7 @@ HEAVY = {
     *("forehead at the ends of the paper's table", "residual of 5e-3 against 1e-6"),
     *("layer 20 times stiffer than its tissue", "scan 14 mm away", "search of two steps"),
     *("points 100 000 px away", "collapsed image", "incompressible tissue"),
+    *("mirror up to 80 degrees", "scan of a ball", "texture of 8192 texels"),
     *("half of a face", "coarse scan", "scan turned by 90 degrees", "scan 100 m away"),
 }
 

@@ -63,6 +63,7 @@ def killed(here, capsys, monkeypatch):
     return argv
 
 
+@pytest.mark.long
 def test_session_is_not_resumed_with_changed_subject_file(here, capsys, killed):
     (here / "ann.toml").write_text(FILE.format(melanin=0.03), encoding="utf-8")
     assert main([*killed, "--resume", "--camera-offset-mm", "5", "--seed", "1"]) == 3
@@ -117,6 +118,7 @@ def test_effects_invisible_to_rig_are_reported_before_work(here, capsys, monkeyp
         assert "the same command" not in said
 
 
+@pytest.mark.long
 def test_forecast_uses_skin_from_subject_file(here, capsys):
     found = []
     for melanin in (0.01, 0.2):

@@ -63,6 +63,7 @@ def test_brightness_corrects_level_of_unknown_optics(table, typical):
     assert abs(by_brightness) < max(0.5 * abs(by_color), 0.015)
 
 
+@pytest.mark.long
 def test_light_far_from_the_reference_is_within_interval(table):
     """Face positions and optics are drawn as assumed, so the coverage is nominal."""
     covered = []

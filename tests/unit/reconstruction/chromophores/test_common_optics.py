@@ -33,6 +33,7 @@ def draw_face(table, rng, *, pixels=60):
     return rgb.astype(np.float32), np.log(melanin), np.log(blood)
 
 
+@pytest.mark.long
 def test_intervals_of_drawn_faces_cover_nominally(table, rng):
     """Over 300 faces the count within one standard error is binomial about 68 %.
 
