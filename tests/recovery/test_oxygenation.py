@@ -29,6 +29,9 @@ eumelanin_fraction = 0.72
 """
 
 
+pytestmark = pytest.mark.long
+
+
 @pytest.fixture(scope="module")
 def calibrations(tmp_path_factory):
     """White references with and without LEDs."""
@@ -58,7 +61,6 @@ def people(tmp_path_factory):
     return made
 
 
-@pytest.mark.long
 def test_maps_recover_oxygenation_of_two_people(people, calibrations, tmp_path):
     """Expected: within two standard errors, and 0.6 of the difference between them.
 
