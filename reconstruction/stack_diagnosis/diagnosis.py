@@ -35,9 +35,7 @@ MIN_SINGULAR_RATIO = 0.01
 MIN_STRENGTH = 1e-3
 MAX_CLIPPED = 0.3
 """Fraction of saturated samples above which nothing else is judged."""
-MIRROR_COSINE = 0.85
-"""Cosine between normal and half vector above which a sample may hold a highlight."""
-MIN_MATTE, MAX_MATTE_ERROR = 0.25, 0.25
+MIN_MATTE, MAX_MATTE_ERROR = 0.15, 0.25
 """Shading of the samples that show near lights, and their largest error."""
 STORED_WRONG = ("empty image", "dead light", "padded image")
 OF_ANY_LIGHT = ("repeated image", "repeated images", "full-bright image")
@@ -184,7 +182,7 @@ def _diagnose_light(
     space = fit_shading_space(samples, clear)
     if space.singular_ratio < MIN_SINGULAR_RATIO:
         return replace(nothing, findings=tuple(findings))
-    placed, agreement, wrong = find_order(space.lights, listed[kept], rng)
+    placed, agreement, wrong = find_order(space, samples, clear, listed[kept], rng)
     suspects = [_renumbered(one, kept) for one in wrong]
     order[kept] = kept[placed]
     directions[kept] = agreement.directions
@@ -255,10 +253,10 @@ def _find_in_images(
     at = (slice(None), places[:, 0], places[:, 1])
     scaled = stack.gray[used][at] / np.maximum(albedo[at[1:]], 1e-9)
     matte = shading[used][at]
-    half_vectors = unit_vectors(rows[used] + (0.0, 0.0, 1.0))
-    glossy = half_vectors @ normals[at[1:]].T > MIRROR_COSINE
-    lit = (matte > MIN_MATTE) & (np.abs(scaled - matte) < MAX_MATTE_ERROR) & ~glossy
-    findings += light_faults.find_near(scaled, lit.astype(np.float64), rows[used], xy)
+    mirror_cosine = unit_vectors(rows[used] + (0.0, 0.0, 1.0)) @ normals[at[1:]].T
+    lit = (matte > MIN_MATTE) & (np.abs(scaled - matte) < MAX_MATTE_ERROR)
+    weights = lit.astype(np.float64)
+    findings += light_faults.find_near(scaled, weights, mirror_cosine, rows[used], xy)
     return findings
 
 

@@ -21,6 +21,11 @@ MAX_AMBIENT = 0.03
 """Light in attached shadows over the albedo."""
 SHADOW_COSINE = -0.15
 """Shading below which a point is turned away from a light."""
+MIRROR_COSINES = (0.85, 0.65)
+"""Samples with larger cosines may hold a highlight; the second limit leaves out wide lobes too."""
+MIN_KEPT_FRACTION = 0.9
+"""Of the coefficient, which highlights lose between the two limits and near lights do not."""
+MIN_NEAR_LIGHTS, MIN_NEAR_POINTS = 6, 50
 MIN_NEAR_COEFFICIENT, MIN_NEAR_SIGMAS = 0.15, 6.0
 """Twice half a width of the object over the distance of the lights, and its certainty."""
 STRENGTH_RANGE = (0.75, 1.35)
@@ -134,45 +139,63 @@ def find_ambient(
 
 
 def find_near(
-    samples: Float64Array, weights: Float64Array, directions: Float64Array,
-    places: Float64Array,
+    samples: Float64Array, weights: Float64Array, mirror_cosine: Float64Array,
+    directions: Float64Array, places: Float64Array,
 ) -> Iterator[Finding]:  # fmt: skip
     """Yield that lights are near: images are brighter towards their lamp.
 
     A lamp at the distance D gives a point x of the object ``1 + 2 x . l / D`` of the light of the
-    middle. This is quadratic in the direction l, and normals and albedo cannot take it up.
+    middle. This is quadratic in the direction l, and normals and albedo cannot take it up. So are
+    the highlights of a convex object, whose share falls the further samples are from mirroring.
 
     Parameters
     ----------
     samples, weights
         (N, P).
+    mirror_cosine
+        (N, P), between normal and half vector.
     directions
         (N, 3).
     places
         (P, 2), x to the right and y up, over half the object's width.
     """
-    inner = np.einsum("np,ni,nj->pij", weights, directions, directions) + 1e-9 * np.eye(3)
-    matte = np.linalg.solve(
-        inner, np.einsum("np,np,ni->pi", weights, samples, directions)[..., None]
+    wide, error = _fit_near(
+        samples, weights * (mirror_cosine < MIRROR_COSINES[0]), directions, places
     )
-    shading = np.maximum(directions @ matte[..., 0].T, 0.0)
-    tilt = shading * (directions[:, :2] @ places.T)
-    own = np.linalg.solve(inner, np.einsum("np,np,ni->pi", weights, tilt, directions)[..., None])
-    tilt = tilt - directions @ own[..., 0].T
-    residual = samples - directions @ matte[..., 0].T
-    above = np.sum(weights * residual * tilt, axis=1)
-    below = np.sum(weights * tilt**2, axis=1)
-    coefficient = float(above.sum() / max(below.sum(), 1e-30))
-    error = float(np.sqrt(np.sum((above - coefficient * below) ** 2)) / max(below.sum(), 1e-30))
+    far, _ = _fit_near(samples, weights * (mirror_cosine < MIRROR_COSINES[1]), directions, places)
     limit = max(MIN_NEAR_COEFFICIENT, MIN_NEAR_SIGMAS * error)
-    if coefficient > limit:
+    if wide > limit and far > MIN_KEPT_FRACTION * wide:
         yield Finding(
             "near lights", (),
-            f"images are brighter towards their lamp, as from {2.0 / coefficient:.0f} half widths "
-            "of the object",
-            coefficient, limit,
+            f"images are brighter towards their lamp, as from {2.0 / wide:.0f} half widths of the "
+            "object",
+            wide, limit,
             "give the positions of the lights and the size of a pixel (--mm-per-px)",
         )  # fmt: skip
+
+
+def _fit_near(
+    samples: Float64Array, weights: Float64Array, directions: Float64Array, places: Float64Array
+) -> tuple[float, float]:
+    """Return the coefficient of `find_near` and its standard error over the lights."""
+    kept = weights.sum(axis=0) >= MIN_NEAR_LIGHTS
+    if np.count_nonzero(kept) < MIN_NEAR_POINTS:
+        return 0.0, 0.0
+    samples, weights, places = samples[:, kept], weights[:, kept], places[kept]
+    inner = np.einsum("np,ni,nj->pij", weights, directions, directions) + 1e-9 * np.eye(3)
+
+    def fit(values: Float64Array) -> Float64Array:
+        right = np.einsum("np,np,ni->pi", weights, values, directions)
+        return np.asarray(directions @ np.linalg.solve(inner, right[..., None])[..., 0].T)
+
+    matte = fit(samples)
+    tilt = np.maximum(matte, 0.0) * (directions[:, :2] @ places.T)
+    tilt = tilt - fit(tilt)
+    above = np.sum(weights * (samples - matte) * tilt, axis=1)
+    below = np.sum(weights * tilt**2, axis=1)
+    whole = max(float(below.sum()), 1e-30)
+    coefficient = float(above.sum()) / whole
+    return coefficient, float(np.sqrt(np.sum((above - coefficient * below) ** 2))) / whole
 
 
 def find_strengths(strength: Float64Array, right: BoolArray) -> Iterator[Finding]:

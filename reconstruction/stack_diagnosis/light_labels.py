@@ -5,12 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from reconstruction.arrays import Float64Array
+from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.stack_diagnosis.finding import Finding
-from reconstruction.stack_diagnosis.shading_space import Agreement, compare_directions
+from reconstruction.stack_diagnosis.shading_space import (
+    Agreement,
+    ShadingSpace,
+    compare_directions,
+    compare_residuals,
+)
 
 MIN_AGREEING_FRACTION = 0.6
 """Of the lights as listed; below it other orders are tried."""
+MIN_RESIDUAL_RATIO = 3.0
+"""Residual under the listed light over that under the estimated one that shows a wrong light."""
 GOOD_SCORE_DEG = 1.5
 """Mean angle up to which no other order is tried: some orders are nearly rotations of the list."""
 SCORE_RATIO = 0.5
@@ -18,19 +25,26 @@ SCORE_RATIO = 0.5
 
 
 def find_order(
-    lights: Float64Array, directions: Float64Array, rng: np.random.Generator
+    space: ShadingSpace,
+    samples: Float64Array,
+    usable: BoolArray,
+    directions: Float64Array,
+    rng: np.random.Generator,
 ) -> tuple[NDArray[np.intp], Agreement, list[Finding]]:
     """Return the row of the list for each image, how it agrees, and what is wrong with the list.
 
     Parameters
     ----------
-    lights
-        (N, 3), of a `ShadingSpace`.
+    space
+        Of the samples.
+    samples, usable
+        (N, P), and which of them are usable.
     directions
         (N, 3), unit vectors as listed.
     rng
         Draws sets of lights.
     """
+    lights = space.lights
     order = np.arange(len(lights), dtype=np.intp)
     agreement = compare_directions(lights, directions, rng)
     findings: list[Finding] = []
@@ -58,7 +72,9 @@ def find_order(
             )
         )  # fmt: skip
         return order, agreement, findings
-    findings += _explain_wrong(order, agreement, directions)
+    ratio = compare_residuals(space, samples, usable, directions[order], agreement)
+    wrong = np.flatnonzero(~agreement.agrees & (ratio > MIN_RESIDUAL_RATIO))
+    findings += _explain_wrong(wrong.tolist(), order, agreement, directions)
     for one in findings:
         if one.order is not None:
             order = np.array(one.order, np.intp)
@@ -105,10 +121,9 @@ def list_orders(count: int) -> dict[str, NDArray[np.intp]]:
 
 
 def _explain_wrong(
-    order: NDArray[np.intp], agreement: Agreement, directions: Float64Array
+    wrong: list[int], order: NDArray[np.intp], agreement: Agreement, directions: Float64Array
 ) -> list[Finding]:
     """Explain the lights that disagree: exchanged in pairs, repeated, or in another direction."""
-    wrong = np.flatnonzero(~agreement.agrees).tolist()
     cosine = np.clip(agreement.directions @ directions.T, -1.0, 1.0)
     apart = np.degrees(np.arccos(cosine))  # of image i from row j
     mutual = [

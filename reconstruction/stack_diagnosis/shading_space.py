@@ -28,6 +28,9 @@ N_FRAMES_PER_DRAW = 4
 MIN_ANGLE_DEG = 6.0
 """Least angle between an estimated and a listed direction that calls the listed one wrong."""
 MAX_COUNTED_DEG = 15.0
+MAX_CONDITION = 1e6
+MIN_RESIDUAL = 2e-3
+"""Residual, over a bright sample, below which lights fit equally well."""
 SPREAD_FACTOR = 4.0
 """The limit is at least this many robust deviations of the angles that agree."""
 
@@ -209,3 +212,52 @@ def _misfit_equal(lights: Float64Array, directions: Float64Array) -> float:
 def _angles_deg(vectors: Float64Array, unit: Float64Array) -> Float64Array:
     cosine = np.sum(unit_vectors(vectors, min_length=1e-12) * unit, axis=-1)
     return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def compare_residuals(
+    space: ShadingSpace,
+    samples: Float64Array,
+    usable: BoolArray,
+    listed: Float64Array,
+    agreement: Agreement,
+) -> Float64Array:
+    """Return each image's residual under its listed light over that under its estimated light.
+
+    An image whose residual hardly falls has another fault than a wrong light: its light cannot be
+    estimated from it.
+
+    Parameters
+    ----------
+    space
+        Of these samples.
+    samples, usable
+        (N, P).
+    listed
+        (N, 3), unit vectors in the order of the images.
+    agreement
+        Of the space with the list.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        1 where both lights fit alike.
+    """
+    right = agreement.agrees
+    scaled_directions = listed[right] * agreement.strength[right, None]
+    found = np.linalg.lstsq(space.lights[right], scaled_directions, rcond=None)[0]
+    if not right.any() or np.linalg.cond(found) > MAX_CONDITION:
+        return np.ones(len(listed))
+    expected = listed @ np.linalg.inv(found)
+    bright = np.quantile(np.where(usable, samples, 0.0), BRIGHT_QUANTILE, axis=0)
+    scaled = samples / np.where(bright > 0.0, bright, 1.0)
+    lit = usable & (scaled > SHADOW_FRACTION) & (scaled < HIGHLIGHT_FACTOR)
+    ratio = np.ones(len(listed))
+    for number in np.flatnonzero(lit.sum(axis=1) > N_FRAMES_PER_DRAW):
+        values, points = scaled[number, lit[number]], space.points[lit[number]]
+        rest = []
+        for light in (expected[number], space.lights[number]):
+            shading = points @ light
+            gain = np.median(values * shading) / max(float(np.median(shading**2)), 1e-12)
+            rest.append(float(np.median(np.abs(values - gain * shading))))
+        ratio[number] = rest[0] / max(rest[1], MIN_RESIDUAL)
+    return ratio

@@ -61,8 +61,10 @@ def test_shading_space_gives_directions_up_to_linear_map(seed, lights):
     assert space.misfit < 0.01
     agreement = shading_space.compare_directions(space.lights, directions, rng)
     assert agreement.agrees.all()
-    order, _, findings = light_labels.find_order(space.lights, directions, rng)
+    order, _, findings = light_labels.find_order(space, samples, clear, directions, rng)
     assert (order.tolist(), findings) == (list(range(lights)), [])
+    ratio = shading_space.compare_residuals(space, samples, clear, directions, agreement)
+    assert ratio.max() < 3.0
     for one in light_labels.list_orders(lights).values():
         assert sorted(one.tolist()) == list(range(lights))
 
@@ -85,7 +87,9 @@ def test_checks_of_sound_images_find_nothing(seed, lights):
     assert not list(light_faults.find_ambient(images, inside, normals, albedo, directions))
     assert not list(light_faults.find_strengths(strength, np.ones(lights, bool)))
     lit = np.asarray(shading[:, inside] > 0.25, float)
-    assert not list(light_faults.find_near(samples, lit, directions, normals[inside][:, :2]))
+    half = unit_vectors(directions + np.array([0.0, 0.0, 1.0])) @ normals[inside].T
+    places = normals[inside][:, :2]
+    assert not list(light_faults.find_near(samples, lit, half, directions, places))
     assert not list(light_faults.find_curve(samples, usable[:, inside], directions, rng))
     assert not list(axis_faults.find_axes(normals, inside))
     slope, error, rest = light_faults.fit_trend(strength, np.ones(lights, bool))
