@@ -112,25 +112,26 @@ def diagnose_stack(
     PhotometricStereoError
         For fewer than 6 images, or an object without light.
     """
-    whole = np.asarray(gray, np.float64)
+    images = np.asanyarray(gray)  # may lie in a file, larger than memory
     checks = Checks(PhotometricStereoError)
-    checks.require(len(whole) >= MIN_FRAMES, "gray", f"{len(whole)} images", f"{MIN_FRAMES}")
+    checks.require(len(images) >= MIN_FRAMES, "gray", f"{len(images)} images", f"{MIN_FRAMES}")
     listed = unit_vectors(np.asarray(light_directions, np.float64))
-    checks.shape("light_directions", listed, (len(whole), 3))
-    finite = np.isfinite(whole)
-    good = finite if usable is None else np.asarray(usable, bool) & finite
-    whole = np.where(finite, whole, 0.0)
-    level = float(np.quantile(whole[good], 0.999)) if good.any() else 0.0
+    checks.shape("light_directions", listed, (len(images), 3))
+    mask = np.ones(images.shape[1:], bool) if inside is None else np.asarray(inside, bool)
+    stack, unusable = _reduce(images, usable, mask)
+    checks.require(stack.inside.any(), "inside", "no pixels", "an object of some pixels")
+    level = float(np.quantile(stack.gray[stack.usable], 0.999)) if stack.usable.any() else 0.0
     checks.require(level > 0.0, "gray", "no light in any image", "positive samples")
     if not MIN_LEVEL < level < MAX_LEVEL:  # not over the white level: any unit
-        whole = whole / level
-    mask = np.ones(whole.shape[1:], bool) if inside is None else np.asarray(inside, bool)
-    stored = [*frame_faults.find_unlit(whole, mask), *frame_faults.find_clipped(good, mask)]
-    out = np.zeros(len(whole), bool)
+        stack = replace(stack, gray=stack.gray / level)
+    stored = [
+        *frame_faults.find_unlit(stack.gray, stack.inside),
+        *frame_faults.find_clipped(unusable),
+    ]
+    out = np.zeros(len(images), bool)
     for one in stored:
         if one.fault in STORED_WRONG:
             out[list(one.frames)] = True
-    stack = _reduce(whole, good, mask)
     if any(one.fault == CLIPPED and one.measured > MAX_CLIPPED for one in stored):
         order = np.arange(len(out), dtype=np.intp)  # too few samples are left to judge the light
         return Diagnosis(tuple(stored), order, out, listed, np.ones(len(out)))
@@ -147,7 +148,7 @@ def diagnose_stack(
         order = np.arange(len(out), dtype=np.intp)
         kept = tuple(one for one in found.findings if one.fault in OF_ANY_LIGHT)
         found = replace(found, findings=kept, order=order, left_out=_named_in(kept, len(out)) | out)
-    every = sorted((*stored, *found.findings), key=lambda one: -one.strength)
+    every = sorted((*stored, *found.findings), key=lambda one: -one.ratio_to_limit)
     return replace(found, findings=tuple(every))
 
 
@@ -268,19 +269,26 @@ def _renumbered(one: Finding, numbers: NDArray[np.intp]) -> Finding:
     return replace(one, frames=tuple(int(numbers[k]) for k in one.frames), order=order)
 
 
-def _reduce(gray: Float64Array, usable: BoolArray, inside: BoolArray) -> _Stack:
-    """Average blocks of pixels; a block is usable where all of its samples are."""
+def _reduce(
+    gray: NDArray[Any], usable: BoolArray | None, inside: BoolArray
+) -> tuple[_Stack, Float64Array]:
+    """Average blocks of pixels, image by image, and return each image's unusable fraction.
+
+    A block is usable where all of its samples are.
+    """
     height, width = inside.shape
     step = max(1, int(np.ceil(max(height, width) / MAX_SIDE_PX)))
     h, w = height // step, width // step
 
     def blocks(values: NDArray[Any]) -> NDArray[Any]:
-        part = values[..., : h * step, : w * step]
-        return part.reshape(*part.shape[:-2], h, step, w, step)
+        return values[: h * step, : w * step].reshape(h, step, w, step)
 
-    axes = (-3, -1)
-    return _Stack(
-        blocks(gray).mean(axis=axes),
-        np.asarray(blocks(usable).all(axis=axes)),
-        np.asarray(blocks(inside).all(axis=axes)),
-    )
+    means, good, unusable = np.zeros((len(gray), h, w)), np.zeros((len(gray), h, w), bool), []
+    for number, image in enumerate(gray):
+        finite = np.isfinite(image)
+        kept = finite if usable is None else finite & usable[number]
+        means[number] = blocks(np.where(finite, image, 0.0)).mean(axis=(1, 3), dtype=np.float64)
+        good[number] = blocks(kept).all(axis=(1, 3))
+        unusable.append(1.0 - float(kept[inside].mean()) if inside.any() else 1.0)
+    whole = np.asarray(blocks(inside).all(axis=(1, 3)))
+    return _Stack(means, good, whole), np.array(unusable)

@@ -35,7 +35,7 @@ class Finding:
     order: tuple[int, ...] | None = None
 
     @property
-    def strength(self) -> float:
+    def ratio_to_limit(self) -> float:
         """The measured quantity over its limit, at least 1; larger is more certain."""
         return self.measured / self.limit
 

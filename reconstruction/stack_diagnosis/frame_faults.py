@@ -101,12 +101,17 @@ def find_full_bright(samples: Float64Array) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def find_clipped(usable: BoolArray, inside: BoolArray) -> Iterator[Finding]:
-    """Yield the clipping of all images; single ones are named when others are not clipped."""
-    fraction = 1.0 - usable[:, inside].mean(axis=1)
+def find_clipped(fraction: Float64Array) -> Iterator[Finding]:
+    """Yield the clipping of all images; single ones are named when others are not clipped.
+
+    Parameters
+    ----------
+    fraction
+        (N,), of each image's samples of the object, that are saturated.
+    """
     worst = np.flatnonzero(fraction > MAX_CLIPPED_FRACTION)
     if worst.size:
-        frames = () if worst.size > len(usable) // 2 else tuple(int(k) for k in worst)
+        frames = () if worst.size > len(fraction) // 2 else tuple(int(k) for k in worst)
         yield Finding(
             "clipped images", frames,
             f"up to {fraction.max():.0%} of an image's samples are saturated, in {worst.size} "

@@ -199,7 +199,7 @@ def diagnose(session: Path, /, json: Json = False) -> None:
         (
             one.fault,
             ", ".join(str(number + 1) for number in one.frames) or "all",
-            one.strength,
+            one.ratio_to_limit,
             one.evidence,
             one.remedy,
         )

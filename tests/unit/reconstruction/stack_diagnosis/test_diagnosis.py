@@ -1,5 +1,7 @@
 """Faults of images under listed lights are named with the right images; sound sets have none."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from fixtures.faulty_stacks import FAULTS, make
@@ -26,7 +28,7 @@ def test_fault_is_found_with_its_images(fault):
     found = diagnose(stack)
     named = {(one.fault, one.frames) for one in found.findings}
     assert (FAULTS[fault], stack.frames) in named, named
-    assert all(one.strength >= 1.0 for one in found.findings)
+    assert all(one.ratio_to_limit >= 1.0 for one in found.findings)
     if fault in NAMED_ALONE:
         assert len(named) == 1, named
 
@@ -90,6 +92,27 @@ def test_near_lists_are_not_judged_by_one_direction():
 def test_unusable_stack_is_refused(images, lights, message):
     with pytest.raises(PhotometricStereoError, match=message):
         diagnose_stack(images, lights, rng=np.random.default_rng(0))
+
+
+def test_empty_object_is_refused():
+    with pytest.raises(PhotometricStereoError, match="inside: got no pixels"):
+        diagnose_stack(
+            np.ones((8, 8, 8)),
+            np.ones((8, 3)),
+            inside=np.zeros((8, 8), bool),
+            rng=np.random.default_rng(0),
+        )
+
+
+def test_large_stacks_are_read_image_by_image():
+    """Rationale: a stack may lie in a file. Expected: far less memory than one copy of it."""
+    stack = make("", 310, side=64, count=12)
+    images = stack.images.repeat(16, axis=1).repeat(16, axis=2)
+    tracemalloc.start()
+    diagnose_stack(images, stack.lights, rng=np.random.default_rng(0))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 0.6 * images.nbytes
 
 
 @pytest.mark.long
