@@ -19,6 +19,7 @@ NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
     "metahuman": "read delta_maps.json: layout and encoding of the deltas",
     "mitsuba": "read README.txt: how to load the scene, and where it differs from the session",
     "stokes": "read stokes.json: axis, channels, and components not measured",
+    "zarr": "in Python: xarray.open_zarr('DIR/session.zarr', group='KIND', consolidated=False)",
     "lp": "skinrig import lp DIR --out SESSION reads the folder back",
 }
 """Next step after an export, by format."""
@@ -26,7 +27,7 @@ NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
 
 FORMATS: Final = (
     *("maps", "mtlx", "gltf", "usd", "spectral", "metahuman", "merl", "rgl"),
-    *("mhl", "frames", "event-model", "lp", "stokes", "mitsuba"),
+    *("mhl", "frames", "event-model", "lp", "stokes", "zarr", "mitsuba"),
 )
 """Formats of appearances, then of sessions; the writers are imported with the chosen one."""
 
@@ -136,7 +137,7 @@ def export(
         APPEARANCE/ or SESSION/ folder.
     to
         Format. Appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. Session: mhl,
-        frames, lp, stokes, event-model, mitsuba (simulated dome, flash, gradient).
+        frames, lp, stokes, event-model, zarr, mitsuba (simulated dome, flash, gradient).
     use
         Purpose of the copy, such as research, which the subjects' consent must include; required
         for measured data.

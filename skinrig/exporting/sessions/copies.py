@@ -145,7 +145,7 @@ def _descriptor(
 ) -> dict[str, Any]:
     view = session.rig.view(record.camera)
     keys: dict[str, dict[str, Any]] = {
-        key: {"source": f"skinrig:{key}", "dtype": _dtype(value), "shape": [], **_unit(key)}
+        key: {"source": f"skinrig:{key}", "dtype": _dtype(value), "shape": [], **_units(key)}
         for key, value in data.items()
     }
     keys[f"{record.camera}_image"] = {
@@ -175,5 +175,17 @@ def _dtype(value: Value) -> str:
     return "number" if isinstance(value, float) else "string"
 
 
-def _unit(key: str) -> dict[str, str]:
-    return next(({"units": unit} for end, unit in _UNIT_SUFFIXES.items() if key.endswith(end)), {})
+def _units(key: str) -> dict[str, str]:
+    unit = name_unit(key)
+    return {} if unit is None else {"units": unit}
+
+
+def name_unit(key: str) -> str | None:
+    """Return the unit that the suffix of a setting's name states; None without.
+
+    Examples
+    --------
+    >>> name_unit("actual_exposure_s"), name_unit("light")
+    ('s', None)
+    """
+    return next((unit for end, unit in _UNIT_SUFFIXES.items() if key.endswith(end)), None)
