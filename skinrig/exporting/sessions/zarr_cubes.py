@@ -17,6 +17,7 @@ import numpy as np
 
 from capture.plan import Step, Value
 from capture.session import FrameRecord, Session
+from skinrig.console import format_count
 from skinrig.errors import MissingExtra
 from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.sessions.copies import name_unit
@@ -126,7 +127,13 @@ def write(session: Session, out: Path, delivery: ExportSettings) -> list[tuple[s
         _write_cube(root.create_group(cube.name), cube, session)
     kept = "remains in the session; `skinrig export --to mhl` copies it"
     left_out = [(name, kept) for name in session.attachments()]
-    return left_out + [(step, reason) for step, reason in session.omitted_steps().items()]
+    steps: dict[str, list[str]] = {}
+    for step, reason in session.omitted_steps().items():
+        steps.setdefault(reason, []).append(step)
+    return left_out + [
+        (f"{format_count(len(ids), 'step')} from {ids[0]} on", reason)
+        for reason, ids in steps.items()
+    ]
 
 
 def arrange_steps(session: Session) -> Iterator[StepCube]:

@@ -21,7 +21,9 @@ FLASH = load_rig("flash").resized(16)
 DOME = load_rig("dome").resized(20)
 
 
-def write_session(folder, rig, plan, *, white=16383, left_out=(), attempts=1, shape=(10, 16)):
+def write_session(
+    folder, rig, plan, *, white=16383, left_out=(), omitted=(), attempts=1, shape=(10, 16)
+):
     """Write a session with frames of seeded noise; return its folder."""
     random = np.random.default_rng(7)
     with Session.create(
@@ -32,6 +34,8 @@ def write_session(folder, rig, plan, *, white=16383, left_out=(), attempts=1, sh
         subject=SubjectRecord("P042", ("research",), None),
         source="measured",
     ) as made:
+        if omitted:
+            made.omit_steps(omitted, reason="light failed", t_host_s=99.0)
         for step, camera in made.pending_frames():
             if step.id in left_out:
                 continue
@@ -155,6 +159,15 @@ def test_frame_with_fill_value_is_refused(tmp_path, monkeypatch):
     with pytest.raises(ExportError, match="got the value 65535"):
         export(source, tmp_path / "out", "zarr", use="research")
     assert not (tmp_path / "out").exists()
+
+
+def test_omitted_steps_grouped_by_reason(tmp_path):
+    source = write_session(tmp_path / "s", DOME, plan_dome(), omitted=("O00", "O21"))
+    done = export(source, tmp_path / "out", "zarr", use="research")
+    assert done.left_out[1:] == (("2 steps from O00 on", "light failed"),)
+    found = open_group(tmp_path / "out", "olat")
+    assert found.planned.all()
+    assert found.taken.sum() == 2 * 4
 
 
 def test_export_memory_independent_of_frames(tmp_path):
