@@ -160,7 +160,7 @@ def _sum_up(asked: Sequence[str], parts: _Parts) -> _Part:
 
 def _write_report(out: Path, rigs: Iterable[str], results: _Part, *, preliminary: bool) -> None:
     """Write the demo's document and its report on the rigs that are done."""
-    from skinrig.report import build
+    from skinrig.reporting.report import build
 
     found, shares = results
     spent = DemoResults()

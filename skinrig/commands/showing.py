@@ -45,7 +45,7 @@ def report(
         Compare two runs side by side; default: if PATHS are exactly two of one kind.
     """
     from skinrig.atomic_file import write_atomically
-    from skinrig.report import build_any
+    from skinrig.reporting.report import build_any
 
     piped = str(out) == STDOUT_MARK
     if piped and json:

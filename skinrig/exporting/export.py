@@ -31,7 +31,7 @@ SESSION_FORMATS: Final[Mapping[str, str]] = {
     "event-model": "sessions.copies.write_events",
     "lp": "sessions.light_lists.write",
     "stokes": "sessions.spectral.write_stokes",
-    "zarr": "sessions.zarr_cubes.write",
+    "zarr": "sessions.zarr_store.write",
     "mitsuba": "mitsuba.scene.write",
 }
 """Writer of each format of a session: all files, the DNG files alone, or other descriptions."""

@@ -9,7 +9,7 @@ import pytest
 
 from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
-from skinrig import report
+from skinrig.reporting import report
 
 WIDTHS = (1250, 400)
 

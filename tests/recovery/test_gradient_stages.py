@@ -15,7 +15,7 @@ from reconstruction.pipeline import recipes as pipeline
 from reconstruction.pipeline.gradient.images import GradientImages
 from reconstruction.pipeline.inputs import InputsError
 from skinrig.evaluating import microrelief as evaluation
-from skinrig.report import build
+from skinrig.reporting.report import build
 from skinrig.simulating.simulation import simulate_session
 
 pytestmark = [pytest.mark.long, pytest.mark.render]

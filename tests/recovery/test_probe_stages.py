@@ -11,7 +11,7 @@ from reconstruction.pipeline.inputs import InputsError
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.cli import main
 from skinrig.evaluating import subsurface as evaluation
-from skinrig.report import build
+from skinrig.reporting.report import build
 from skinrig.simulating.orders import truth_folder
 from skinrig.simulating.simulation import simulate_session
 

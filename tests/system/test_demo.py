@@ -45,7 +45,7 @@ def test_only_requested_rigs_run(tmp_path, capsys, monkeypatch, without_benchmar
     ran = []
     for rig in list(RIGS):
         monkeypatch.setitem(RIGS, rig, lambda *_, rig=rig: ran.append(rig))
-    monkeypatch.setattr("skinrig.report.build", lambda *_, **__: "<html></html>")
+    monkeypatch.setattr("skinrig.reporting.report.build", lambda *_, **__: "<html></html>")
     monkeypatch.setattr("skinrig.demo.fuse_person", lambda _, rigs: ran.append(f"fuse {rigs}"))
     for asked, expected in (
         (["dome"], ["dome"]),
@@ -68,7 +68,7 @@ def test_report_is_written_after_each_rig(tmp_path, monkeypatch, without_benchma
         built.append(([path.name for path in paths], title, reload_s))
         return f"report {len(built)}"
 
-    monkeypatch.setattr("skinrig.report.build", build)
+    monkeypatch.setattr("skinrig.reporting.report.build", build)
     monkeypatch.setattr("skinrig.demo.fuse_person", lambda *_: None)
     run_demo(tmp_path / "demo", ["dome", "flash"], console=Console(False), jobs=1)
     assert built == [

@@ -9,7 +9,7 @@ import pytest
 from skinrig.cli import main
 from skinrig.extremes import cases as extremes
 from skinrig.extremes import expectations
-from skinrig.report import build
+from skinrig.reporting.report import build
 
 CASES = extremes.read_cases()
 HEAVY = {

@@ -11,7 +11,7 @@ from capture.calibration import store as calibrations
 from capture.calibration.record import Calibration, Quantity
 from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
-from skinrig import report
+from skinrig.reporting import report
 
 
 def write_run(folder, *, captured="2026-03-10", valid_until=date(2026, 6, 1), worst=0.3):

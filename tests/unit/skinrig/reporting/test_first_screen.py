@@ -10,8 +10,7 @@ import pytest
 from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from reconstruction.pipeline.probe.stages import CHANNEL_NAMES, PROFILE_FILE
-from skinrig import report
-from skinrig.reporting import first_screen, page, verdict
+from skinrig.reporting import first_screen, page, report, verdict
 from skinrig.reporting.sections.chromophore import draw_panels
 
 SHAPE = (40, 50)

@@ -15,9 +15,8 @@ from PIL import Image
 
 from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
-from skinrig import report
 from skinrig.drawing import figures, png, svg
-from skinrig.reporting import map_images, page, verdict
+from skinrig.reporting import map_images, page, report, verdict
 
 
 class Outline(HTMLParser):

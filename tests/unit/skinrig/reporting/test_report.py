@@ -7,10 +7,9 @@ import pytest
 from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
-from skinrig import report
 from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.results import Limit, Point, StageBenchmark, Timing
-from skinrig.reporting import page
+from skinrig.reporting import page, report
 from skinrig.reporting.folders import discover
 from skinrig.reporting.sections import subsurface
 from skinrig.reporting.sections.chromophore import draw_panels

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from model import store
-from skinrig import report
 from skinrig.drawing import png
+from skinrig.reporting import report
 from skinrig.reporting.comparison import images as image_comparison
 from skinrig.reporting.comparison import runs as run_comparison
 

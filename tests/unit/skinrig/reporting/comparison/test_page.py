@@ -8,13 +8,13 @@ import pytest
 
 from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
-from skinrig import report
 from skinrig.benchmarks.document import to_document
 from skinrig.benchmarks.results import Limit, Point, StageBenchmark, Timing
-from skinrig.report import ReportError
+from skinrig.reporting import report
 from skinrig.reporting.comparison import maps as map_comparison
 from skinrig.reporting.comparison import runs as run_comparison
 from skinrig.reporting.comparison.maps import CHANCE_FRACTIONS, compare_maps
+from skinrig.reporting.report import ReportError
 
 SIDE = 200
 PIXELS = SIDE * SIDE

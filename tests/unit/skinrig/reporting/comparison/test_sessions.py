@@ -7,8 +7,8 @@ import pytest
 
 from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
-from skinrig import report
 from skinrig.cli import main
+from skinrig.reporting import report
 
 SIDE = 24
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from skinrig.drawing import png
-from skinrig.report import ReportError, build
 from skinrig.reporting import page
+from skinrig.reporting.report import ReportError, build
 from skinrig.reporting.sections import images as pictures
 
 

@@ -12,8 +12,8 @@ from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from model.wrinkles.evaluation import WRINKLE_FILE as WRINKLE_FILE
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.partial_derivatives import WrinkleLayer
-from skinrig import report
 from skinrig.appearances import dynamic
+from skinrig.reporting import report
 
 SIDE = 40
 

@@ -1,0 +1,1 @@
+"""Run skinrig from Python and notebooks: functions, and results that notebooks display."""
