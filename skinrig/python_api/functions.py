@@ -16,7 +16,7 @@ from skinrig.python_api.results import (
     CalibrationFolder,
     ChosenPlan,
     DiagnosedSession,
-    Displayed,
+    NotebookResult,
     ExportedFolder,
     FittedModel,
     HtmlPage,
@@ -27,7 +27,7 @@ from skinrig.python_api.results import (
 if TYPE_CHECKING:
     import xarray
 
-FolderLike: TypeAlias = str | Path | Displayed
+FolderLike: TypeAlias = str | Path | NotebookResult
 FIT_KINDS: Final = (
     "facial_color",
     "wrinkles",
@@ -47,7 +47,7 @@ def to_path(folder: FolderLike) -> Path:
     >>> to_path("session").as_posix(), to_path(SessionFolder(Path("session"))).as_posix()
     ('session', 'session')
     """
-    return folder.path if isinstance(folder, Displayed) else Path(folder)
+    return folder.path if isinstance(folder, NotebookResult) else Path(folder)
 
 
 def simulate(
@@ -125,7 +125,7 @@ def load_session(
     from capture.session import Session
     from skinrig.errors import UsageError
 
-    if not isinstance(source, (str, Path, Displayed)):
+    if not isinstance(source, (str, Path, NotebookResult)):
         from skinrig.python_api.xarrays import write_stack_session
 
         if out is None:
@@ -165,7 +165,7 @@ def calibrate(
     from skinrig.calibrating.calibrate import calibrate as save_calibration
 
     saved = save_calibration(kind, [to_path(one) for one in _listed(sessions)], Path(out))
-    return CalibrationFolder(saved.path, saved)
+    return CalibrationFolder(Path(out), saved)
 
 
 def reconstruct(
@@ -300,7 +300,7 @@ def fit(
         One of `FIT_KINDS`.
     sources
         SESSION/ folders (facial_color), maps (wrinkles, microstructure, traits), maps of the dome
-        and of the probe (reflectance), or a scanned mesh (template). "NAME=FOLDER" names a state or
+        and of the probe (reflectance), or a scanned mesh (template). "NAME=FOLDER" gives a state or
         a site.
     out
         New folder or file of the model.
@@ -393,4 +393,4 @@ def view(
 
 def _listed(given: FolderLike | Sequence[FolderLike]) -> Sequence[FolderLike]:
     """Return one folder or several as a sequence."""
-    return [given] if isinstance(given, (str, Path, Displayed)) else given
+    return [given] if isinstance(given, (str, Path, NotebookResult)) else given

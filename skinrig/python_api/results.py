@@ -26,7 +26,7 @@ LIVE_HEIGHT_PX: Final = 720
 
 
 @dataclass(frozen=True)
-class Displayed:
+class NotebookResult:
     """A result with a page of blocks that a notebook displays.
 
     Attributes
@@ -61,7 +61,7 @@ def embed_blocks(title: str, blocks: Iterable[Block]) -> str:
 
 
 @dataclass(frozen=True)
-class SessionFolder(Displayed):
+class SessionFolder(NotebookResult):
     """A session on disk.
 
     Attributes
@@ -135,7 +135,7 @@ def draw_frame(session: Session, record: FrameRecord) -> Image:
 
 
 @dataclass(frozen=True)
-class CalibrationFolder(Displayed):
+class CalibrationFolder(NotebookResult):
     """A calibration on disk.
 
     Attributes
@@ -157,7 +157,7 @@ class CalibrationFolder(Displayed):
 
 
 @dataclass(frozen=True)
-class MapsFolder(Displayed):
+class MapsFolder(NotebookResult):
     """Maps on disk: an appearance.
 
     Attributes
@@ -216,7 +216,7 @@ class MapsFolder(Displayed):
 
 
 @dataclass(frozen=True)
-class DiagnosedSession(Displayed):
+class DiagnosedSession(NotebookResult):
     """What the images of a session show about their light list.
 
     Attributes
@@ -251,7 +251,7 @@ class DiagnosedSession(Displayed):
 
 
 @dataclass(frozen=True)
-class ChosenPlan(Displayed):
+class ChosenPlan(NotebookResult):
     """A plan with its forecast.
 
     Attributes
@@ -273,7 +273,7 @@ class ChosenPlan(Displayed):
 
 
 @dataclass(frozen=True)
-class HtmlPage(Displayed):
+class HtmlPage(NotebookResult):
     """A page on disk that a browser opens.
 
     Attributes
@@ -291,7 +291,7 @@ class HtmlPage(Displayed):
 
 
 @dataclass(frozen=True)
-class FittedModel(Displayed):
+class FittedModel(NotebookResult):
     """A fitted model on disk.
 
     Attributes
@@ -315,7 +315,7 @@ class FittedModel(Displayed):
 
 
 @dataclass(frozen=True)
-class ExportedFolder(Displayed):
+class ExportedFolder(NotebookResult):
     """An exported folder.
 
     Attributes
