@@ -16,11 +16,11 @@ from skinrig.python_api.results import (
     CalibrationFolder,
     ChosenPlan,
     DiagnosedSession,
-    NotebookResult,
     ExportedFolder,
     FittedModel,
     HtmlPage,
     MapsFolder,
+    NotebookResult,
     SessionFolder,
 )
 

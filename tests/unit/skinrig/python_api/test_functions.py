@@ -10,6 +10,7 @@ import pytest
 
 import skinrig
 from skinrig.errors import UnusableError, UsageError
+from skinrig.python_api.functions import FIT_KINDS
 from skinrig.python_api.progress import show_progress
 
 xarray = pytest.importorskip("xarray")
@@ -149,3 +150,17 @@ def test_import_loads_no_numerical_library():
     code = "import sys, skinrig; print([m for m in ('numpy', 'numba', 'cv2') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("kind", FIT_KINDS)
+def test_every_fit_kind_has_a_function(kind, tmp_path):
+    with pytest.raises((ValueError, OSError, TypeError)) as found:
+        skinrig.fit(kind, tmp_path / "missing", tmp_path / "model")
+    assert found.type is not TypeError or "labels" in str(found.value)  # traits need a table
+
+
+@pytest.mark.long
+def test_view_writes_page_of_head(tmp_path):
+    page = skinrig.view(out=tmp_path / "page.html", size=64)
+    assert page.path.stat().st_size > 100_000
+    assert "<html" in displayed(page)
