@@ -93,7 +93,7 @@ class Faults:
     interlock: bool = False
     """The emergency-stop line is open."""
     interlock_after: Seconds = math.inf
-    """The emergency stop of a caliper or a probe opens at this time after power-up, s."""
+    """The emergency stop opens at this time after power-up, s."""
     jaw_stall: Probability = 0.0
     """Probability that the motor of a caliper stalls in a move."""
     home_missed: bool = False

@@ -164,9 +164,9 @@ class LedSequencer(Device, Generic[RowT]):
     # time -------------------------------------------------------------------------------------
 
     def deadline(self) -> float:
-        """Return when the sequence or an LED will next change, in s; inf for never."""
+        """Return when the sequence, an LED or the stop will next change, in s; inf for never."""
         run = self._run
-        due = self.bank.deadline()
+        due = min(self._stop_changes_at_s(), self.bank.deadline())
         if run is not None and run.pending:
             due = min(due, run.next_s)
         return due
@@ -174,6 +174,7 @@ class LedSequencer(Device, Generic[RowT]):
     def advance(self, now: float) -> None:
         """Advance time to `now`, in s."""
         while (due := self.deadline()) <= now:
+            self._follow_stop(due)
             self._advance_bank(due)
             run = self._run
             while run is not None and run.pending and run.next_s <= due:

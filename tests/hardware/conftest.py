@@ -4,6 +4,9 @@ import contextlib
 
 import pytest
 from fixtures.compiled.targets import TARGETS, start_target
+from fixtures.quick_close import quick_close
+
+__all__ = ["quick_close"]
 
 
 def pytest_generate_tests(metafunc):
