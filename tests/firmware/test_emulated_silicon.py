@@ -29,7 +29,7 @@ HOLD_S = 0.25
 """Time in which the head is held, s."""
 CYCLES_SLACK_S = 2e-3
 DARK_SLACK_S = 0.010
-JUDGED_ROWS = 140
+JUDGED_ROWS = 480
 BUSY_SLACK_S = 0.1
 
 
@@ -196,20 +196,49 @@ def test_stop_frees_skin_each_time_it_opens():
             assert port.ask("CAL:ATT?") == "0"
 
 
-def test_light_ends_in_time_beneath_a_long_judgment():
+@pytest.fixture
+def judged():
+    """A dome with a long table, armed, and the frames of a burst that asks for its judgment."""
     target = start_target("mps2-an500", "dome", counted=True)
     with contextlib.closing(target), CheckupPort(target.url, timeout_s=2.0) as port:
         port.hello()
         port.ask("SAFE:EYES CLOSED")
-        for first in range(0, JUDGED_ROWS, 10):
-            rows = ";".join(f"{led}:200:83333:1" for led in range(first, first + 10))
+        for first in range(0, JUDGED_ROWS, 40):
+            rows = ";".join(f"{led % 150}:200:83333:1" for led in range(first, first + 40))
             port.ask(f"SEQ:DEF {first},{rows}")
+        port.ask("SYST:WDOG 5000")
         port.ask("SYST:ARM")
         port.ask("LED:ON 149,100,200")
-        asked_s = int(port.ask("SYST:PING?")) / 1e6
-        port.ask(f"SEQ:ARM {JUDGED_ROWS}")
-        judged_s = int(port.ask("SYST:PING?")) / 1e6 - asked_s
-        target.wait_for(lambda: lit_spans_s(target, "led149"))
-        assert lit_spans_s(target, "led149")[0] == pytest.approx(0.1, abs=DARK_SLACK_S)
 
-        assert judged_s > 0.2  # without care the LED would have been lit for this long
+        def ask_at_once(*texts):
+            """Send `SEQ:ARM` and texts in one burst; return the answers by text, in order."""
+            texts = (f"SEQ:ARM {JUDGED_ROWS}", *texts)
+            asked = dict(enumerate(texts, 900))
+            frames = [wire.encode(wire.Request(k, port.boot, text)) for k, text in asked.items()]
+            lines = port.exchange_raw(b"".join([*frames, frames[0]]), 1.0)
+            while len(lines) < len(texts):
+                lines += port.exchange_raw(b"", 10.0)
+            replies = [wire.decode(line) for line in lines]
+            return {asked[reply.seq]: reply for reply in replies if isinstance(reply, wire.Reply)}
+
+        yield target, port, ask_at_once
+
+
+def test_long_judgment_is_answered_last_and_once(judged):
+    target, port, ask_at_once = judged
+    began, refused, late = (*(answers := ask_at_once("SYST:PING?", "SEQ:CLE")).values(),)
+    assert list(answers) == ["SYST:PING?", "SEQ:CLE", f"SEQ:ARM {JUDGED_ROWS}"]
+    assert (refused.code, late.code) == (Code.IGNORED, Code.OK)
+    judged_s = (int(port.ask("SYST:PING?")) - int(began.payload)) / 1e6
+    assert port.listen(0.1) == []  # the retry is not answered again
+    assert int(port.ask("STAT?")) & 32
+    target.wait_for(lambda: lit_spans_s(target, "led149"))
+    assert lit_spans_s(target, "led149")[0] == pytest.approx(0.1, abs=DARK_SLACK_S)
+    assert judged_s > 0.2  # without care the LED would have been lit for this long
+
+
+def test_safe_ends_a_long_judgment(judged):
+    _, port, ask_at_once = judged
+    done, late = ask_at_once("SAFE").values()
+    assert (done.code, late.code) == (Code.OK, Code.HARDWARE)
+    assert not int(port.ask("STAT?")) & 32 + 1
