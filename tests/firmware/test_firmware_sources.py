@@ -34,6 +34,12 @@ def test_limits_header_is_current(name):
     assert shipped == made, "run python tools/make_firmware_limits.py"
 
 
+def test_build_guide_and_drawings_are_current(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "tools")
+    for path, text in load_tool("make_wiring").make_files().items():
+        assert text_of(path) == text, "run python tools/make_wiring.py"
+
+
 def test_every_box_has_firmware():
     assert SOURCES.keys() == BOXES.keys()
 
