@@ -73,6 +73,7 @@ def test_firmware_answers_as_emulated_box_byte_for_byte(name):
 @each_box
 def test_firmware_answers_as_emulated_box_long_run(name):
     found, sent = spread_differences(name, lines=LONG_LINES, seed=12)
+    print(f"{name}: {sent} lines, {len(found)} differences")
     assert (found, sent) == ([], LONG_LINES)
 
 
