@@ -1,4 +1,4 @@
-"""How deep the stack of each image gets: memory that no call has touched keeps its paint.
+"""Depth of each image's stack, from the paint that its memory keeps where no call has touched it.
 
 Run with `-rP` to see the figures, which docs/validation/firmware.md lists.
 """
