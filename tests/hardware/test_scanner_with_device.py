@@ -5,7 +5,7 @@ It shows stripes for some hundredths of a second. Nobody looks into the projecto
 
 import pytest
 
-from capture.devices.port import CommandRefused, Port
+from capture.devices.port import CommandRefused
 from capture.devices.scanner import ScannerBox
 from capture.devices.wire import Code
 
@@ -13,14 +13,8 @@ BOX = ("scanner",)
 
 
 @pytest.fixture
-def box(device_port):
-    with Port(device_port) as port:
-        if port.hello().kind not in BOX:
-            pytest.skip("another box than the scanner")
-    with ScannerBox(Port(device_port)) as box:
-        box.reset()
-        yield box
-        box.dark()
+def box(attach):
+    return attach(ScannerBox)
 
 
 def test_scanner_shows_nothing_at_open_eyes(box):
