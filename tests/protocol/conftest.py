@@ -39,6 +39,9 @@ EMULATED_ONLY = {
     "test_analyzer_that_never_arrives_is_abandoned": "holds the emulated analyzer",
     "test_a_caliper_that_never_arrives_is_given_up": "holds the emulated jaws",
     "test_a_cover_that_never_arrives_is_given_up": "holds the emulated cover",
+    "test_slow_judgment_is_awaited_with_retries": "delays the emulated judgment",
+    "test_slow_judgment_is_answered_late_and_once": "delays the emulated judgment",
+    "test_dark_ends_a_slow_judgment": "delays the emulated judgment",
     "test_charge_falls_by_power_recovers_within_recycle_time": "reads the emulated capacitor",
 }
 """Tests that exchange parts of the emulation, with what they exchange."""
