@@ -113,7 +113,7 @@ def test_killed_host_leaves_darkness_within_lease(dark):
     slack_s = BUSY_SLACK_S if target.board == "posix" else DARK_SLACK_S
     # an answer that waits renews the lease when it is given
     answered_s = {"scanner": 0.02}.get(target.box, 0.0)
-    assert LEASE_S - DARK_SLACK_S < dark_s - lit_s < answered_s + LEASE_S + slack_s
+    assert LEASE_S - slack_s < dark_s - lit_s < answered_s + LEASE_S + slack_s
 
 
 def test_stop_puts_light_out_for_good(dark):
@@ -143,8 +143,7 @@ def test_dome_steps_release_cameras_once_a_row():
         port.ask("SYST:ARM")
         port.ask(f"SEQ:ARM {rows}")
         port.ask("TRIG t1")
-        target.wait_for(lambda: len(target.of_pin("camera")) >= rows)
-        port.listen(0.2)
+        target.wait_for(lambda: target.of_pin(f"led{rows - 1}", 0.0))
         assert port.ask("SEQ:POS?") == f"DONE,{rows - 1},{rows},t1"
         cameras = target.of_pin("camera")
         assert len(cameras) == rows
