@@ -6,7 +6,7 @@ checks are the tests of hardware, of firmware under emulators, and of ``skinrig 
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Final
 
@@ -33,6 +33,51 @@ _UNARMED: Final = {
     "scanner": "TRIG checkup,100",
 }
 """By kind, a command that is refused unless armed."""
+_REFUSED_ARMED: Final = {
+    "flash": {
+        "FLAS:POW 0": Code.OUT_OF_RANGE,
+        "FLAS:POL:ANG 180.1": Code.OUT_OF_RANGE,
+        "FLAS:SYNC 50001": Code.OUT_OF_RANGE,
+        "FLAS:LED 590": Code.SYNTAX,
+        "FLAS:LAMP ON,501": Code.OUT_OF_RANGE,
+        "FLAS:FIRE check up": Code.SYNTAX,
+    },
+    "dome": {
+        "SEQ:DEF 0,3:500:1999:1": Code.OUT_OF_RANGE,
+        "SAFE:EYES SHUT": Code.SYNTAX,
+        "LED:ON 0,501": Code.OUT_OF_RANGE,
+        "TRIG checkup": Code.NOT_ARMED,
+    },
+    "gradient_sphere": {
+        "SEQ:DEF 0,X:181:1000:30000:1": Code.OUT_OF_RANGE,
+        "SAFE:EYES SHUT": Code.SYNTAX,
+        "PATT FULL,501": Code.OUT_OF_RANGE,
+        "TRIG checkup": Code.NOT_ARMED,
+    },
+    "caliper": {
+        "CAL:FORC:LIM 0": Code.OUT_OF_RANGE,
+        "CAL:FORC:LIM 10.1": Code.OUT_OF_RANGE,
+        "CAL:STEP:ABS 1.5": Code.SYNTAX,
+        "CAL:ANG 181": Code.OUT_OF_RANGE,
+    },
+    "probe": {
+        "HEAD:SITE checkup,360": Code.OUT_OF_RANGE,
+        "LED 1001": Code.OUT_OF_RANGE,
+        "SHUT OPEN,0.5": Code.OUT_OF_RANGE,
+        "PUMP ON,99,60": Code.OUT_OF_RANGE,
+        "PUMP ON,5000,60": Code.IGNORED,
+    },
+    "scanner": {
+        "PROJ 99": Code.OUT_OF_RANGE,
+        "PAT COL,999": Code.OUT_OF_RANGE,
+        "SAFE:EYES SHUT": Code.SYNTAX,
+        "TRIG checkup": Code.SYNTAX,
+        "TRIG checkup,100": Code.FLICKER,
+    },
+}
+"""By kind, what an armed controller refuses after `SAFE`, at open eyes."""
+_EYES: Final = ("dome", "gradient_sphere", "scanner")
+_QUEUED_ERRORS = 16
 
 
 class CheckupPort(Port):
@@ -151,7 +196,7 @@ def _code(port: Port, text: str) -> int:
 
 
 def check_refusals(port: CheckupPort) -> str:
-    """Send what must be refused, framed, damaged, foreign, repeated and bare."""
+    """Send what must be refused: out of range, unarmed, damaged, foreign, repeated and bare."""
     kind = port.hello().kind
     port.ask("SAFE")
     port.ask("*CLS")
@@ -165,9 +210,20 @@ def check_refusals(port: CheckupPort) -> str:
         "SYST:CAP:PART? 999": {Code.OUT_OF_RANGE},
     }
     for text, codes in expected.items():
-        got = _code(port, text)
-        names = " or ".join(str(int(code)) for code in sorted(codes))
-        CheckupFault.raise_unless(got in codes, text, got, names)
+        _require_refusal(port, text, codes)
+    if kind in _EYES:
+        port.ask("SAFE:EYES OPEN")
+    port.ask("SYST:ARM")
+    for text, code in _REFUSED_ARMED[kind].items():
+        _require_refusal(port, text, {code})
+    port.ask("SAFE")
+    for _ in range(_QUEUED_ERRORS + 1):
+        _code(port, "CHECKUP:NONE?")
+    errors = [port.ask("SYST:ERR?") for _ in range(_QUEUED_ERRORS)]
+    overflow = int(Code.QUEUE_OVERFLOW)
+    CheckupFault.raise_unless(
+        errors[-1].startswith(f"{overflow},"), "error queue", errors[-1], overflow
+    )
     frame = wire.encode(Request(7, port.boot, "SYST:PING?"))
     damaged = frame.replace(b"PING", b"PONG")
     foreign = wire.encode(Request(8, port.boot ^ 1 or 2, "SYST:PING?"))
@@ -183,7 +239,7 @@ def check_refusals(port: CheckupPort) -> str:
     unframed = queued.startswith(f"{int(Code.UNFRAMED)},")
     CheckupFault.raise_unless(unframed, "bare SYST:ARM", queued, "203 in the error queue")
     CheckupFault.raise_unless(port.ask("SYST:ARM?") == "0", "armed", "1", "0")
-    return f"{len(expected) + 5} refused as specified"
+    return f"{len(expected) + len(_REFUSED_ARMED[kind]) + 6} refused as specified"
 
 
 def check_retries(port: CheckupPort) -> str:
@@ -206,6 +262,7 @@ def check_lease(port: CheckupPort) -> str:
     CheckupFault.raise_unless("WDOG:TRIP" in events, "events", events, "WDOG:TRIP")
     CheckupFault.raise_unless(port.ask("SYST:ARM?") == "0", "armed", "1", "0")
     CheckupFault.raise_unless(bool(int(port.ask("STAT?")) & 2), "STAT?", "no bit 2", "bit 2")
+    _require_refusal(port, _UNARMED[port.hello().kind], {Code.WATCHDOG_TRIPPED})
     port.ask("SYST:ARM")
     port.ask("SAFE")
     CheckupFault.raise_unless(port.ask("SYST:ARM?") == "0", "armed after SAFE", "1", "0")
@@ -247,6 +304,12 @@ def judge_controller(port: CheckupPort) -> list[CheckupResult]:
             results.append(CheckupResult(what, str(fault), fine=False))
     port.ask("SAFE")
     return results
+
+
+def _require_refusal(port: Port, text: str, codes: Collection[Code]) -> None:
+    got = _code(port, text)
+    names = " or ".join(str(int(code)) for code in sorted(codes))
+    CheckupFault.raise_unless(got in codes, text, got, names)
 
 
 def _require_frame(

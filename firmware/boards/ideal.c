@@ -20,7 +20,6 @@ void format_pin(struct text *text, const char *pin, double value) {
   put_char(text, '\n');
 }
 
-bool board_stop_is_open(void) { return false; }
 void board_release_cameras(uint32_t mask) { show_pin("camera", (double)mask); }
 
 bool board_set_led(uint16_t led, double level) {

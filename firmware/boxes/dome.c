@@ -211,7 +211,6 @@ COMMAND(do_led_on) {
   int64_t span = LED_DEFAULT_US;
   uint32_t level = LEVEL_STEPS;
   struct loads loads;
-  double flashes, rms;
   TRY(refuse_running());
   char *length = cut(arguments, ',');
   char *steps = length ? cut(length, ',') : NULL;
@@ -233,7 +232,7 @@ COMMAND(do_led_on) {
   unit.level = (double)level / LEVEL_STEPS;
   unit.end = core_now() + span;
   TRY(bank_require_within_limits(single_light, &loads));
-  TRY(require_flicker_limits(single_light, &flashes, &rms));
+  TRY(require_flicker_limits(single_light));
   disarm_sequence();
   for (uint8_t k = 0; k < unit.count; k++) bank_switch_on(unit.leds[k], unit.level, unit.end);
   return CODE_OK;

@@ -115,7 +115,6 @@ COMMAND(do_patt) {
   int64_t span = LED_DEFAULT_US;
   uint32_t level = LEVEL_STEPS;
   struct loads loads;
-  double flashes, rms;
   TRY(refuse_running());
   char *length = cut(arguments, ',');
   char *steps = length ? cut(length, ',') : NULL;
@@ -134,7 +133,7 @@ COMMAND(do_patt) {
   unit.level = (double)level / LEVEL_STEPS;
   unit.end = core_now() + span;
   TRY(bank_require_within_limits(single_light, &loads));
-  TRY(require_flicker_limits(single_light, &flashes, &rms));
+  TRY(require_flicker_limits(single_light));
   disarm_sequence();
   memset(unit.failed, 0, sizeof unit.failed);
   start_pattern(unit.pattern, unit.level, unit.end);

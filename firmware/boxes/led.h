@@ -62,16 +62,18 @@ void bank_visit_since(us_t start, visit_pulse *visit, void *context);
 enum code bank_require_within_limits(requested_light *light, struct loads *most);
 
 /* eyes */
-double guard_flashes_per_s(requested_light *past, requested_light *light);
-double guard_rms(requested_light *light);
-bool guard_is_full(void); /* the last light had too many changes to be judged */
+void guard_start(requested_light *past, requested_light *light);
+bool guard_continue(void); /* judge a part, of some ms at most; true: more are left */
+double guard_flashes_per_s(void); /* half the reversals in the worst second */
+double guard_rms(void);           /* of the 3 to 65 Hz part, over the mean */
+bool guard_is_full(void);         /* the light had too many changes to be judged */
 
 /* sequencer */
 extern struct row table[MAX_ROWS];
 uint16_t sequencer_rows(void);
 enum code refuse_running(void);
 void disarm_sequence(void);
-enum code require_flicker_limits(requested_light *light, double *flashes, double *rms);
+enum code require_flicker_limits(requested_light *light);
 bool sequencer_is_lit(void);
 uint16_t sequencer_status(void);
 void sequencer_reset(bool power_up);

@@ -5,6 +5,8 @@
 #include "boxes/led.h"
 
 #define FLICKER_HISTORY_US 1000000
+#define JUDGE_US 1000
+#define JUDGE_MAX_US 1900000 /* the host gives up after 2 s */
 #define ALL_CAMERAS ((uint32_t)((UINT64_C(1) << CAMERAS) - 1u))
 
 enum eyes { EYES_OPEN, EYES_CLOSED, EYES_SHIELDED };
@@ -17,7 +19,10 @@ static STATE struct {
   int32_t run_row;
   uint32_t mask;
   enum eyes eyes;
-  bool armed;
+  bool armed, judging, darkened;
+  bool late; /* the judgment took too long */
+  us_t asked_at, judged_at;
+  struct loads loads;
   enum run run;
   us_t start;
   struct step next;
@@ -36,7 +41,11 @@ static void forget_steps(void) {
 void sequencer_reset(bool power_up) {
   (void)power_up;
   box_go_dark();
+  us_t judged_at = unit.judged_at; /* an answer may still be due */
+  bool darkened = unit.darkened;
   memset(&unit, 0, sizeof unit);
+  unit.judged_at = judged_at;
+  unit.darkened = darkened;
   unit.mask = ALL_CAMERAS;
   forget_steps();
 }
@@ -78,8 +87,18 @@ static void take_step(void) {
   }
 }
 
+/* Judge for a while: a long table takes many calls, and the box answers between them. */
+static void judge(void) {
+  us_t until = board_now_us() + JUDGE_US;
+  while (unit.judging && board_now_us() < until) unit.judging = guard_continue();
+  unit.late = unit.judging && core_now() - unit.asked_at > JUDGE_MAX_US;
+  if (unit.late) unit.judging = false;
+  unit.judged_at = core_now();
+}
+
 void box_advance(void) {
   if (core_stop_opens()) box_go_dark();
+  if (unit.judging) judge();
   while (box_deadline() <= core_now()) {
     advance_bank();
     while (unit.run == RUN && unit.start + unit.next.at <= core_now()) take_step();
@@ -90,6 +109,11 @@ void box_advance(void) {
 void box_go_dark(void) {
   bank_all_off();
   unit.armed = false;
+  if (unit.judging) {
+    unit.judging = false;
+    unit.darkened = true;
+    unit.judged_at = core_now();
+  }
   if (unit.run == RUN) {
     unit.run = STOP;
     say(P("SEQ:STOP"), unit.run_row);
@@ -102,16 +126,10 @@ uint16_t sequencer_status(void) {
                     bank_has_tripped() << 7 | safe << 9);
 }
 
-us_t box_pending_due(void) { return NEVER; }
-
-enum code box_pending_outcome(struct text *answer) {
-  (void)answer;
-  return CODE_OK;
-}
-
 /* table ----------------------------------------------------------------------------------- */
 
 enum code refuse_running(void) {
+  if (unit.judging) return refuse(CODE_IGNORED, P("a table is being judged"));
   return unit.run == RUN ? refuse(CODE_IGNORED, P("a sequence is running")) : CODE_OK;
 }
 
@@ -222,46 +240,67 @@ static void past_light(int32_t only, visit_pulse *visit, void *context) {
   bank_visit_since(core_now() - FLICKER_HISTORY_US, visit_past, &visit);
 }
 
-enum code require_flicker_limits(requested_light *light, double *flashes, double *rms) {
-  *flashes = guard_flashes_per_s(past_light, light);
-  *rms = guard_rms(light);
+static enum code require_no_flicker(void) {
+  double flashes = guard_flashes_per_s(), rms = guard_rms();
   if (guard_is_full()) return refuse(CODE_IGNORED, P("too many changes of light"));
   if (unit.eyes != EYES_OPEN) return CODE_OK;
-  if (*flashes >= MAX_FLASHES_PER_S) {
+  if (flashes >= MAX_FLASHES_PER_S) {
     refuse(CODE_FLICKER, P(""));
     put_flash(reason(), P("; "));
-    put_real(reason(), *flashes, 1);
+    put_real(reason(), flashes, 1);
     put_flash(reason(), P(" flashes per s at open eyes"));
     return CODE_FLICKER;
   }
-  if (*rms > MAX_FLICKER_RMS) {
+  if (rms > MAX_FLICKER_RMS) {
     refuse(CODE_FLICKER, P("rms "));
-    put_real(reason(), *rms, 2);
+    put_real(reason(), rms, 2);
     put_flash(reason(), P(" of 3 to 65 Hz at open eyes"));
     return CODE_FLICKER;
   }
   return CODE_OK;
 }
 
-COMMAND(do_seq_arm) {
-  uint32_t rows;
-  struct loads loads;
-  double flashes, rms;
-  TRY(refuse_running());
-  TRY(parse_integer(arguments, 1, MAX_ROWS, &rows));
-  if (rows != unit.rows) return refuse_above(P("the table has "), unit.rows, P(" rows"));
-  TRY(refuse_open_stop());
-  TRY(kind_require_ready());
-  TRY(bank_require_within_limits(table_light, &loads));
-  TRY(require_flicker_limits(table_light, &flashes, &rms));
+enum code require_flicker_limits(requested_light *light) {
+  guard_start(past_light, light);
+  while (guard_continue()) {
+  }
+  return require_no_flicker();
+}
+
+static enum code conclude_judgment(struct text *answer) {
+  TRY(require_no_flicker());
   unit.armed = true;
-  put_real(answer, flashes, 2);
-  const double values[] = {rms, loads.duty, loads.heat, loads.dose_ws};
+  put_real(answer, guard_flashes_per_s(), 2);
+  const double values[] = {guard_rms(), unit.loads.duty, unit.loads.heat, unit.loads.dose_ws};
   for (uint8_t k = 0; k < 4; k++) {
     put_char(answer, ',');
     put_real(answer, values[k], 4);
   }
   return CODE_OK;
+}
+
+us_t box_pending_due(void) { return unit.judging ? NEVER : unit.judged_at; }
+
+enum code box_pending_outcome(struct text *answer) {
+  if (unit.darkened) return refuse(CODE_HARDWARE, P("made dark before the table was judged"));
+  if (unit.late) return refuse(CODE_IGNORED, P("the table takes too long to judge"));
+  return conclude_judgment(answer);
+}
+
+COMMAND(do_seq_arm) {
+  uint32_t rows;
+  TRY(refuse_running());
+  TRY(parse_integer(arguments, 1, MAX_ROWS, &rows));
+  if (rows != unit.rows) return refuse_above(P("the table has "), unit.rows, P(" rows"));
+  TRY(refuse_open_stop());
+  TRY(kind_require_ready());
+  TRY(bank_require_within_limits(table_light, &unit.loads));
+  guard_start(past_light, table_light);
+  unit.darkened = unit.late = false;
+  unit.judging = true;
+  unit.asked_at = core_now();
+  judge();
+  return unit.judging ? CODE_PENDING : conclude_judgment(answer);
 }
 
 COMMAND(do_trig) {

@@ -187,7 +187,7 @@ class CaliperUnit(Device):
 
     def deadline(self) -> float:
         """Return the time of the next sample of a move or other change of its own, in s."""
-        due = self._stop_opens_s()
+        due = self._stop_changes_at_s()
         if self._move is not None:
             due = min(due, self._move.next_s)
         if self._turning is not None:
@@ -197,9 +197,7 @@ class CaliperUnit(Device):
     def advance(self, now: float) -> None:
         """Advance time to `now`, in s."""
         while (due := self.deadline()) <= now:
-            if self._stop_opens_s() <= due:
-                self.interlock = True
-                self._release(due, "INTERLOCK")
+            self._follow_stop(due)
             if self._turning is not None and self._turning[0] <= due:
                 self.angle_deg, self._turning = self._turning[1], None
                 self._load.turn(self.angle_deg)
@@ -210,6 +208,9 @@ class CaliperUnit(Device):
     def go_dark(self, now: float) -> None:
         """Release the skin and stop all motion."""
         self._release(now, "DARK")
+
+    def _make_dark_at_stop(self, now: float) -> None:
+        self._release(now, "INTERLOCK")
 
     def is_busy(self, now: float) -> bool:
         """Return whether the jaws or the ring move."""

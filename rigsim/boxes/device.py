@@ -102,6 +102,9 @@ class Device(ABC):
         self.rig, self.faults, self._rng = wiring.rig, wiring.faults, wiring.rng
         self._on_light, self._on_trigger = wiring.on_light, wiring.on_trigger
         self.interlock = self.faults.interlock
+        opens_s = on_clock(self.faults.interlock_after)
+        self.stop_changes_s = [] if self.interlock or opens_s == math.inf else [opens_s]
+        """World times at which the emergency stop opens and closes in turn; past ones are gone."""
         self._powered_at = 0.0
         self._events: list[tuple[str, str]] = []
 
@@ -171,6 +174,17 @@ class Device(ABC):
     def _require_closed_stop(self) -> None:
         CommandRefused.raise_if(self.interlock, Code.INTERLOCK)
 
-    def _stop_opens_s(self) -> float:
-        """Return when the emergency stop will open, s; inf where it is open."""
-        return math.inf if self.interlock else on_clock(self.faults.interlock_after)
+    def _stop_changes_at_s(self) -> float:
+        """Return when the emergency stop opens or closes next, s; inf for never."""
+        return self.stop_changes_s[0] if self.stop_changes_s else math.inf
+
+    def _follow_stop(self, now: float) -> None:
+        """Open or close the emergency stop if that is due; it makes dark each time it opens."""
+        if self._stop_changes_at_s() <= now:
+            self.stop_changes_s.pop(0)
+            self.interlock = not self.interlock
+            if self.interlock:
+                self._make_dark_at_stop(now)
+
+    def _make_dark_at_stop(self, now: float) -> None:
+        self.go_dark(now)

@@ -90,10 +90,12 @@ class Faults:
     """Probability that the tube does not ignite."""
     slow_charge: float = 1.0
     """Charging time of the capacitor relative to normal."""
+    slow_judgment: Seconds = 0.0
+    """Time that a controller of LEDs takes to judge a table, s; the answer comes afterwards."""
     interlock: bool = False
     """The emergency-stop line is open."""
     interlock_after: Seconds = math.inf
-    """The emergency stop of a caliper or a probe opens at this time after power-up, s."""
+    """The emergency stop opens at this time after power-up, s."""
     jaw_stall: Probability = 0.0
     """Probability that the motor of a caliper stalls in a move."""
     home_missed: bool = False

@@ -186,9 +186,9 @@ class FlashUnit(Device):
     # time -------------------------------------------------------------------------------------
 
     def deadline(self) -> float:
-        """Return the time of the next pop or timed lamp-off, in s; inf for never."""
+        """Return the time of the next change of its own, in s; inf for never."""
         pop = math.inf if self._coming is None else self._coming[0]
-        return min(pop, self._lamp_out())
+        return min(self._stop_changes_at_s(), pop, self._lamp_out())
 
     def _lamp_out(self) -> float:
         if not self._lamp.lit:
@@ -200,6 +200,7 @@ class FlashUnit(Device):
     def advance(self, now: float) -> None:
         """Advance time to `now`, in s."""
         while (due := self.deadline()) <= now:
+            self._follow_stop(due)
             lamp_ends = self._lamp_out() <= due
             self._heat_until(due)
             if self._coming is not None and self._coming[0] <= due:

@@ -18,6 +18,7 @@ from rigsim.boxes.command import (
     Command,
     CommandHandler,
     CommandRefused,
+    PendingReply,
     add_us,
     build_command_table,
     parse_choice,
@@ -82,6 +83,8 @@ class LedSequencer(Device, Generic[RowT]):
         self._limits = self.bank.limits
         self._guard = EyeFlickerMonitor(rig.lights)
         self._run: SequenceRun[RowT] | None = None
+        # a table is being judged until it is answered, also when it was made dark meanwhile
+        self._judging = self._darkened = False
         # tokens and times of all sequences since the controller was built
         self.runs: list[tuple[str, float]] = []
 
@@ -112,6 +115,7 @@ class LedSequencer(Device, Generic[RowT]):
         self.mask = (1 << self._cameras) - 1
         self.eyes = "OPEN"
         self._sequence_armed = False
+        self._judging &= not power_up
         self._run = None
         self._steps: dict[int, int] = {}
 
@@ -164,9 +168,9 @@ class LedSequencer(Device, Generic[RowT]):
     # time -------------------------------------------------------------------------------------
 
     def deadline(self) -> float:
-        """Return when the sequence or an LED will next change, in s; inf for never."""
+        """Return when the sequence, an LED or the stop will next change, in s; inf for never."""
         run = self._run
-        due = self.bank.deadline()
+        due = min(self._stop_changes_at_s(), self.bank.deadline())
         if run is not None and run.pending:
             due = min(due, run.next_s)
         return due
@@ -174,6 +178,7 @@ class LedSequencer(Device, Generic[RowT]):
     def advance(self, now: float) -> None:
         """Advance time to `now`, in s."""
         while (due := self.deadline()) <= now:
+            self._follow_stop(due)
             self._advance_bank(due)
             run = self._run
             while run is not None and run.pending and run.next_s <= due:
@@ -203,6 +208,7 @@ class LedSequencer(Device, Generic[RowT]):
         """Switch off every LED and stop the sequence."""
         self.bank.all_off(now)
         self._sequence_armed = False
+        self._darkened = self._judging
         run = self._run
         if run is not None and run.pending:
             run.pending.clear()
@@ -220,8 +226,8 @@ class LedSequencer(Device, Generic[RowT]):
         return self._run is not None and self._run.state == "RUN"
 
     def is_busy(self, now: float) -> bool:
-        """Return whether a sequence is stepping."""
-        return self.is_running
+        """Return whether a sequence is stepping or a table is being judged."""
+        return self.is_running or self._judging
 
     def states(self, now: float) -> dict[int, bool]:
         """Return bits 16 running, 32 sequence armed, 64 lit, 128 hot, 512 eyes safe."""
@@ -231,6 +237,7 @@ class LedSequencer(Device, Generic[RowT]):
     # sequence ---------------------------------------------------------------------------------
 
     def _require_still(self) -> None:
+        CommandRefused.raise_if(self._judging, Code.IGNORED, "a table is being judged")
         CommandRefused.raise_if(self.is_running, Code.IGNORED, "a sequence is running")
 
     def _clear_table(self, _: str, now: float) -> None:
@@ -255,7 +262,7 @@ class LedSequencer(Device, Generic[RowT]):
         self.table[first : first + len(rows)] = rows
         self._sequence_armed = False
 
-    def _arm_sequence(self, arguments: str, now: float) -> str:
+    def _arm_sequence(self, arguments: str, now: float) -> str | PendingReply:
         self._require_still()
         rows = parse_integer(arguments, 1, self._limits.max_rows)
         if rows != len(self.table):
@@ -263,22 +270,43 @@ class LedSequencer(Device, Generic[RowT]):
         self._require_closed_stop()
         wanted = self._pulses_from_table(self.table, now)
         duty, heat, dose_ws = self.bank.require_within_limits(wanted, now)
-        flashes, rms = self._require_flicker_limits(wanted, now)
-        self._sequence_armed = True
-        return f"{flashes:.2f},{rms:.4f},{duty:.4f},{heat:.4f},{dose_ws:.4f}"
+        flicker = self._flicker(wanted, now)
+
+        def conclude() -> str:
+            flashes, rms = self._require_no_flicker(*flicker)
+            self._sequence_armed = True
+            return f"{flashes:.2f},{rms:.4f},{duty:.4f},{heat:.4f},{dose_ws:.4f}"
+
+        if self.faults.slow_judgment == 0.0:
+            return conclude()
+        self._judging, self._darkened = True, False
+        due_s = add_us(now, 1e6 * self.faults.slow_judgment)
+        return PendingReply(due_s, lambda: self._end_judgment(conclude))
+
+    def _end_judgment(self, conclude: Callable[[], str]) -> str | CommandRefused:
+        self._judging = False
+        if self._darkened:
+            return CommandRefused(Code.HARDWARE, "made dark before the table was judged")
+        try:
+            return conclude()
+        except CommandRefused as refused:
+            return refused
 
     def _require_flicker_limits(
         self, wanted: Sequence[LedPulse], now: float
     ) -> tuple[float, float]:
-        """Return flashes per second and rms of the request, or refuse it for open eyes.
+        """Return flashes per second and rms of the request, or refuse it for open eyes."""
+        return self._require_no_flicker(*self._flicker(wanted, now))
 
-        Flashes are counted together with those of the last second.
-        """
-        limits = self._limits
+    def _flicker(self, wanted: Sequence[LedPulse], now: float) -> tuple[float, float]:
+        """Return flashes per second, with those of the last second, and rms of the request."""
         past = [
             pulse for pulse in self.bank.pulses_since(now - FLICKER_HISTORY_S) if pulse.t_on_s < now
         ]
-        flashes, rms = self._guard.flashes_per_s([*past, *wanted]), self._guard.rms(wanted)
+        return self._guard.flashes_per_s([*past, *wanted]), self._guard.rms(wanted)
+
+    def _require_no_flicker(self, flashes: float, rms: float) -> tuple[float, float]:
+        limits = self._limits
         if self.eyes == "OPEN":
             if flashes >= limits.max_flashes_per_s:
                 raise CommandRefused(Code.FLICKER, f"{flashes:.1f} flashes per s at open eyes")

@@ -138,20 +138,21 @@ class ProbeUnit(Device):
 
     def deadline(self) -> float:
         """Return the time of the next change of its own, in s."""
-        return min(self._stop_opens_s(), self.shutter.deadline(), self.pump.deadline())
+        return min(self._stop_changes_at_s(), self.shutter.deadline(), self.pump.deadline())
 
     def advance(self, now: float) -> None:
         """Advance time to `now`, in s."""
         while (due := self.deadline()) <= now:
-            if self._stop_opens_s() <= due:
-                self.interlock = True
-                self._release_head(due, "INTERLOCK")
+            self._follow_stop(due)
             self.shutter.advance(due)
             self.pump.advance(due)
 
     def go_dark(self, now: float) -> None:
         """Close the shutter, switch off the LED, vent, and clear the head's site."""
         self._release_head(now, "DARK")
+
+    def _make_dark_at_stop(self, now: float) -> None:
+        self._release_head(now, "INTERLOCK")
 
     def light_now(self, now: float) -> list[SourceLight]:
         """Return the light that has not ended, as emitted so far."""

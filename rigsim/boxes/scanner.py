@@ -145,7 +145,7 @@ class ScannerUnit(Device):
 
     def deadline(self) -> float:
         """Return the time of the cameras' release or the light's end, in s; inf for never."""
-        due = self._stop_opens_s()
+        due = self._stop_changes_at_s()
         if self._show is not None:
             waits = self._show.outcome is None
             due = min(due, self._show.release_s if waits else self._show.light.t_off_s)
@@ -154,9 +154,7 @@ class ScannerUnit(Device):
     def advance(self, now: float) -> None:
         """Advance time to `now`, in s."""
         while (due := self.deadline()) <= now:
-            if self._stop_opens_s() <= due:
-                self.interlock = True
-                self.go_dark(due)
+            self._follow_stop(due)
             show = self._show
             if show is None:
                 continue

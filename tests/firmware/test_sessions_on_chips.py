@@ -44,6 +44,8 @@ BLACK = 60
 CAMERAS = 3
 MAX_RETAKES = 15
 """Rows of 157 that a busy machine may spoil: their cameras' release comes late in QEMU."""
+MAX_LEAK = 0.02
+"""Light of the next row in a frame that was released late, relative to its own."""
 
 
 class Photometer:
@@ -131,17 +133,19 @@ def test_dome_session_pulses_once_a_row(capture):
     boards = {"dome": "mps2-an500"}
     targets, done, frames = capture(rig, plan, boards, Photometer(rig), eyes="closed")
     assert len(frames) == CAMERAS * len(plan.steps)
-    runs = {}
+    runs, leaked = {}, 0
     for record, levels in frames:
         (row,) = led_rows([record.step], rig)
         light = sum(10.0 * (1 + led) * row.level for led in row.leds)
-        assert levels == [BLACK + round(light)], record.step_id
+        assert levels == [pytest.approx(BLACK + light, abs=1 + MAX_LEAK * light)], record.step_id
+        leaked += abs(levels[0] - BLACK - light) > 1
         runs[record.step_id] = record.actual["tries"], row.leds
     # one edge a row, on the lines of its cameras, and one pulse a light; rows that the host's load
     # spoiled were run again
     edges = [edge.value for edge in rises(targets["dome"], "camera")]
     assert edges == [2**CAMERAS - 1] * (len(plan.steps) + done.retakes)
     assert done.retakes <= MAX_RETAKES
+    assert leaked <= MAX_RETAKES
     lit = [edge.pin for edge in targets["dome"].edges if edge.pin[:3] == "led" and edge.value]
     expected = Counter()
     for tries, leds in runs.values():
@@ -157,7 +161,7 @@ def test_probe_session_opens_once_an_exposure(capture):
     for record, levels in frames:
         # the line pulses for 0.1 ms, so that the shortest exposure ends after the light
         lit = 1000 * (record.kind != "dark")
-        assert levels == [pytest.approx(BLACK + lit, rel=0.03 * (lit > 0))], record.step_id
+        assert levels == [pytest.approx(BLACK + lit, rel=0.05 * (lit > 0))], record.step_id
     lit = sum(record.kind != "dark" for record, _ in frames)
     edges = [len(rises(targets["probe"], pin)) for pin in ("shutter", "camera", "suction")]
     assert edges == [lit, len(frames), 1]

@@ -4,6 +4,11 @@ import contextlib
 
 import pytest
 from fixtures.compiled.targets import TARGETS, start_target
+from fixtures.quick_close import quick_close
+
+from capture.devices.port import Port
+
+__all__ = ["quick_close"]
 
 
 def pytest_generate_tests(metafunc):
@@ -29,3 +34,20 @@ def device_port(request):
         return
     with contextlib.closing(start_target(*request.param)) as target:
         yield target.url
+
+
+@pytest.fixture
+def attach(device_port):
+    """Return a function that opens a box, reset and dark at the end, or skips for another kind."""
+    with contextlib.ExitStack() as parts:
+
+        def attach(driver):
+            with Port(device_port) as port:
+                if port.hello().kind != driver.kind:
+                    pytest.skip(f"another box than the {driver.kind}")
+            box = parts.enter_context(driver(Port(device_port)))
+            parts.callback(box.dark)
+            box.reset()
+            return box
+
+        yield attach

@@ -6,7 +6,7 @@ The jaws move, with nothing between them.
 import pytest
 
 from capture.devices.caliper import CaliperBox
-from capture.devices.port import CommandRefused, Port
+from capture.devices.port import CommandRefused
 from capture.devices.wire import Code
 
 BOX = ("caliper",)
@@ -15,15 +15,10 @@ POSITION_MM = 0.02
 
 
 @pytest.fixture
-def box(device_port):
-    with Port(device_port) as port:
-        if port.hello().kind not in BOX:
-            pytest.skip("another box than the caliper")
-    with CaliperBox(Port(device_port)) as box:
-        box.reset()
-        box.set_lease(5.0)
-        yield box
-        box.dark()
+def box(attach):
+    box = attach(CaliperBox)
+    box.set_lease(5.0)
+    return box
 
 
 def test_caliper_moves_nothing_unless_armed_and_limited(box):

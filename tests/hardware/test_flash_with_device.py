@@ -6,20 +6,15 @@ It flashes at the lowest power. Nobody looks into the lights while this runs.
 import pytest
 
 from capture.devices.flash import FlashBox
-from capture.devices.port import CommandRefused, Port
+from capture.devices.port import CommandRefused
 from capture.devices.wire import Code
 
 BOX = ("flash",)
 
 
 @pytest.fixture
-def box(device_port):
-    with Port(device_port) as port:
-        if port.hello().kind not in BOX:
-            pytest.skip("another box than the flash")
-    with FlashBox(Port(device_port)) as box:
-        box.reset()
-        yield box
+def box(attach):
+    return attach(FlashBox)
 
 
 def test_controller_reports_its_limits(box):

@@ -5,7 +5,7 @@ The head is on a flat plate. It sucks for a second and lights up for some hundre
 
 import pytest
 
-from capture.devices.port import CommandRefused, Port
+from capture.devices.port import CommandRefused
 from capture.devices.probe import ProbeBox
 from capture.devices.wire import Code
 
@@ -14,15 +14,10 @@ SUCTION_MBAR = 40.0
 
 
 @pytest.fixture
-def box(device_port):
-    with Port(device_port) as port:
-        if port.hello().kind not in BOX:
-            pytest.skip("another box than the probe")
-    with ProbeBox(Port(device_port)) as box:
-        box.reset()
-        box.set_lease(5.0)
-        yield box
-        box.dark()
+def box(attach):
+    box = attach(ProbeBox)
+    box.set_lease(5.0)
+    return box
 
 
 def test_probe_lights_nothing_unless_head_is_held(box):

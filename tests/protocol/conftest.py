@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import serial
 from fixtures.compiled.sides import choose_side, on_both_sides
+from fixtures.quick_close import quick_close
 from serial import rfc2217
 
 from capture.devices.camera import open_camera
@@ -22,6 +23,7 @@ from rigsim.world import World
 from rigsim.world.rig_boxes import BOXES
 from rigsim.world.serve import serve_world
 
+__all__ = ["quick_close"]
 NAMES = (f"protocol-{number}" for number in itertools.count())
 
 EMULATED_ONLY = {
@@ -37,6 +39,9 @@ EMULATED_ONLY = {
     "test_analyzer_that_never_arrives_is_abandoned": "holds the emulated analyzer",
     "test_a_caliper_that_never_arrives_is_given_up": "holds the emulated jaws",
     "test_a_cover_that_never_arrives_is_given_up": "holds the emulated cover",
+    "test_slow_judgment_is_awaited_with_retries": "delays the emulated judgment",
+    "test_slow_judgment_is_answered_late_and_once": "delays the emulated judgment",
+    "test_dark_ends_a_slow_judgment": "delays the emulated judgment",
     "test_charge_falls_by_power_recovers_within_recycle_time": "reads the emulated capacitor",
 }
 """Tests that exchange parts of the emulation, with what they exchange."""
@@ -76,14 +81,6 @@ def quick_rig():
     rig = load_rig("flash").resized(16)
     view = dataclasses.replace(rig.views[0], readout_s=0.05)
     return dataclasses.replace(rig, views=(view,), polarizer_move_s=0.1)
-
-
-@pytest.fixture(autouse=True)
-def quick_close(monkeypatch):
-    """Skip the 0.3 s that pyserial sleeps after closing a socket."""
-    monkeypatch.setattr(
-        "serial.urlhandler.protocol_socket.time", SimpleNamespace(sleep=lambda seconds: None)
-    )
 
 
 @pytest.fixture

@@ -7,7 +7,18 @@ from fixtures.box_manuals import ANY, BOXES, SHARED_ANSWERS, SHARED_REFUSALS
 
 from capture.devices import wire
 from capture.devices.wire import Code
+from rigsim.boxes.command import on_clock
 
+IN_OPERATION = {
+    "flash": ("SYST:ARM", "FLAS:LAMP ON,500"),
+    "dome": ("SYST:ARM", "SAFE:EYES CLOSED", "LED:ON 3,400,300"),
+    "gradient_sphere": ("SYST:ARM", "SAFE:EYES CLOSED", "PATT X,400,300"),
+    "caliper": (*BOXES["caliper"].ready, "CAL:ATT"),
+    "probe": ("SYST:ARM", "HEAD:SITE cheek,0", "PUMP ON,5000,60"),
+    "scanner": ("SYST:ARM", "SAFE:EYES CLOSED", "TRIG a1,500"),
+}
+"""By box, what lights, sucks or holds for longer than until the emergency stop has closed again."""
+STOP_S = 0.2
 HARMLESS = ("SAFE", "ABOR", "*CLS")
 """What every box obeys without a frame."""
 ROWS = [
@@ -167,3 +178,22 @@ def test_data_dictionary_parts_join_into_whole_short_lines(manual):
 def test_manuals_list_common_commands_only_once():
     for manual in BOXES.values():
         assert not SHARED_ANSWERS.keys() & manual.answers.keys()
+
+
+@each_box
+def test_stop_in_operation_ends_it_for_good(manual):
+    bench = manual.bench()
+    *before, act = IN_OPERATION[manual.name]
+    bench.say(before)
+    bench.raw(bench.frame(act))
+    bench.silence(0.1)
+    assert not manual.idle(bench.unit)
+    opens_s = on_clock(bench.now + 0.05)
+    bench.unit.stop_changes_s = [opens_s, on_clock(opens_s + STOP_S)]
+    bench.silence(0.1)
+    assert manual.idle(bench.unit)
+    assert int(bench.ask("STAT?")) & 256
+    assert bench.code(act) == Code.INTERLOCK
+    bench.silence(STOP_S)
+    assert not int(bench.ask("STAT?")) & 256
+    assert manual.idle(bench.unit)

@@ -397,6 +397,41 @@ def test_the_emergency_stop_is_reported_and_nothing_lights():
     assert bench.code("SEQ:ARM 2") == Code.INTERLOCK
 
 
+def judged_slowly():
+    """A dome that judges a table for 0.5 s, and the frame that asked it to."""
+    bench = DOME.bench(slow_judgment=0.5)
+    bench.say(("SYST:ARM", "SAFE:EYES CLOSED"))
+    bench.load(rows_of(behind(2)))
+    frame = bench.frame("SEQ:ARM 2")
+    assert bench.raw(frame) == b""
+    return bench, frame
+
+
+def test_slow_judgment_is_answered_late_and_once():
+    bench, frame = judged_slowly()
+    assert bench.ask("*OPC?") == "0"
+    for text in ("SEQ:CLE", "SEQ:ARM 2", "LED:ON 3,50", "TRIG a1"):
+        assert bench.code(text) == Code.IGNORED
+    bench.now += 0.2
+    assert bench.raw(frame) == b""
+    bench.now += 0.3
+    late = wire.decode(bench.box.advance(bench.now).rstrip())
+    assert late.code == Code.OK
+    assert bench.raw(frame).rstrip() == wire.encode(late).rstrip()
+    assert bench.ask("*OPC?") == "1"
+    assert bench.ask("SEQ:POS?").startswith("READY")
+
+
+@pytest.mark.parametrize("text", ["SAFE", "*RST"])
+def test_dark_ends_a_slow_judgment(text):
+    bench, _ = judged_slowly()
+    bench.ask(text)
+    bench.now += 0.5
+    assert wire.decode(bench.box.advance(bench.now).rstrip()).code == Code.HARDWARE
+    assert bench.ask("*OPC?") == "1"
+    assert bench.ask("SEQ:POS?").startswith("IDLE")
+
+
 def test_retried_trigger_runs_table_once(bench):
     bench.ask("SYST:ARM")
     bench.load(rows_of(behind(2)))

@@ -175,6 +175,22 @@ def test_a_dead_led_is_named():
     world.unregister()
 
 
+def test_slow_judgment_is_awaited_with_retries():
+    world = World(RIG, seed=5, faults=Faults(slow_judgment=1.7))
+    name = world.register(next(NAMES))
+    port = Port(f"sim://dome?world={name}", clock=world.clock)
+    with DomeBox(port) as box:
+        box.load(rows(UNSEEN[:8]))
+        box.arm()
+        asked_s = world.now
+        assert box.arm_sequence(8).duty == pytest.approx(0.03, abs=1e-3)
+        assert world.now - asked_s == pytest.approx(1.7, abs=0.05)
+        assert port.statistics.retries >= 5
+        assert box.position().state == "READY"
+        assert box.is_armed()
+    world.unregister()
+
+
 def test_flash_controller_is_not_accepted_as_dome():
     world = World(seed=5)
     name = world.register(next(NAMES))

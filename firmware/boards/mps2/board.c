@@ -1,7 +1,9 @@
 /* The board `mps2`: Arm's MPS2 with a Cortex-M3 (AN385) or a Cortex-M7 (AN500), as in QEMU.
  *
- * UART 0 is the line. QEMU has no pins: UART 1 names each change of one: microseconds, pin, value.
- * The hardware behind the pins is ideal. An epoch is loaded into memory before the start.
+ * UART 0 is the line. QEMU has no pins: UART 1 names each change of one: microseconds, pin, value,
+ * and takes S and s, which open and close the emergency stop. The hardware behind the pins is ideal.
+ * An epoch is loaded into memory before the start, and whether the processor may sleep: the clock of
+ * an emulator that counts instructions jumps when the processor sleeps and its host is late.
  */
 #include "boards/board.h"
 #include "boards/ideal.h"
@@ -29,6 +31,7 @@
 #define IRQ_TIMER (1u << 8)
 #define CPACR REGISTER(0xE000ED88u)
 #define EPOCH REGISTER(0x203FFFF0u)
+#define AWAKE REGISTER(0x203FFFF4u) /* never sleep */
 #define STARTS REGISTER(0x203FFFE0u) /* zero at power-up, kept by a reset */
 #define WATCHDOG_LOAD REGISTER(0x40008000u)
 #define WATCHDOG_CTRL REGISTER(0x40008008u)
@@ -75,7 +78,7 @@ bool board_start(void) {
   PRESCALE = CLOCK_MHZ - 1u; /* the counter is free-running: no tick can be missed */
   for (uint32_t uart = LINE; uart <= PINS; uart += PINS - LINE) {
     REGISTER(uart + UART_BAUD) = CLOCK_MHZ * 1000000u / 115200u;
-    REGISTER(uart + UART_CTRL) = uart == LINE ? 1u | 2u | 8u : 1u;
+    REGISTER(uart + UART_CTRL) = uart == LINE ? 1u | 2u | 8u : 1u | 2u;
   }
   TIMER_RELOAD = TIMER_VALUE = CLOCK_MHZ * 1000u; /* wakes the processor each millisecond */
   TIMER_CTRL = 1u | 8u;
@@ -100,7 +103,7 @@ int64_t board_now_us(void) {
 /* Without a byte, sleep until one or the next millisecond. */
 bool board_read(char *byte) {
   if (!(REGISTER(LINE + UART_STATE) & STATE_IN_FULL)) {
-    __asm volatile("wfi");
+    if (!AWAKE) __asm volatile("wfi");
     TIMER_CLEAR = 1u;
     REGISTER(LINE + UART_CLEAR) = 2u;
     NVIC_CLEAR = IRQ_LINE | IRQ_TIMER;
@@ -112,6 +115,15 @@ bool board_read(char *byte) {
 
 void board_send(const char *data, uint16_t size) {
   while (size--) put_byte(LINE, *data++);
+}
+
+bool board_stop_is_open(void) {
+  static bool open;
+  while (REGISTER(PINS + UART_STATE) & STATE_IN_FULL) {
+    uint32_t command = REGISTER(PINS + UART_DATA);
+    if (command == 'S' || command == 's') open = command == 'S';
+  }
+  return open;
 }
 
 uint16_t board_random_epoch(void) { return (uint16_t)(EPOCH + STARTS++); }

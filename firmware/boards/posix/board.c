@@ -2,6 +2,7 @@
  *
  * With FIRMWARE_TCP=PORT in the environment it listens on this machine, on a free port if that is 0;
  * one host at a time. It prints its URL, and then each change of a pin: microseconds, pin, value.
+ * S and s on the standard input open and close the emergency stop.
  */
 #define _XOPEN_SOURCE 600
 #include "boards/board.h"
@@ -114,6 +115,15 @@ uint16_t board_random_epoch(void) {
   if (source < 0 || read(source, &epoch, 2) != 2) exit(1);
   close(source);
   return epoch;
+}
+
+bool board_stop_is_open(void) {
+  static bool open;
+  struct pollfd wait = {STDIN_FILENO, POLLIN, 0};
+  char command;
+  while (poll(&wait, 1, 0) > 0 && read(STDIN_FILENO, &command, 1) == 1)
+    if (command == 'S' || command == 's') open = command == 'S';
+  return open;
 }
 
 void board_feed_watchdog(void) {}

@@ -255,6 +255,16 @@ def test_lost_controller_ends_dark_keeps_captured_frames(make):
     check_frames(bench)
 
 
+def test_emergency_stop_ends_capture_dark(make):
+    bench = make(interlock_after=3.0)
+    with pytest.raises(CommandRefused, match="Interlock open"):
+        bench.run()
+    assert not bench.unit.lit
+    assert not bench.world.box("dome").armed
+    assert len(bench.session.frames()) > 0
+    check_frames(bench)
+
+
 def test_subject_dose_starts_with_session_and_continues_resumed(make):
     bench = make()
     bench.unit.bank._dose_ws[:] = 7.0

@@ -70,6 +70,14 @@ def obey_bare_lines(monkeypatch):
     )
 
 
+def light_longer(monkeypatch):
+    monkeypatch.setattr("rigsim.boxes.flash.LAMP_RANGE_MS", (1.0, 900.0))
+
+
+def queue_more_errors(monkeypatch):
+    monkeypatch.setattr("rigsim.boxes.controller.MAX_QUEUED_ERRORS", 20)
+
+
 def run_fast(monkeypatch):
     original = Controller._own_commands
 
@@ -90,6 +98,8 @@ def run_fast(monkeypatch):
         (forget_lease, "lease"),
         (forget_answers, "retries"),
         (obey_bare_lines, "refusals"),
+        (light_longer, "refusals"),
+        (queue_more_errors, "refusals"),
         (run_fast, "clock"),
     ],
 )
