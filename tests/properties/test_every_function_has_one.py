@@ -130,7 +130,7 @@ def named_by_tests():
 
 @lru_cache(maxsize=1)
 def named_in_bodies():
-    """What each function's body names, by its name; by "" what classes, private ones and stages do."""
+    """What each function's body names, by its name; by "" those of classes and private ones."""
     found = {"": set()}
     for module, tree in product_modules():
         own = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
