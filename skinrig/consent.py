@@ -12,6 +12,10 @@ CONSENT_KEY = "consent"
 """Key in an appearance's parameters: the consent of each measured session's subject."""
 
 
+THING = "none"
+"""Subject of a session of a thing."""
+
+
 class HasProvenance(Protocol):
     """An object with provenance: an appearance, its document or a library of traits."""
 
@@ -32,7 +36,8 @@ def parse_subject(
     Parameters
     ----------
     pseudonym
-        Pseudonym, never a name.
+        Pseudonym, never a name; `THING` for a thing, which has every use unless ``scopes`` limits
+        it.
     scopes
         Permitted uses; each text may list several, separated by commas.
     expires
@@ -47,7 +52,11 @@ def parse_subject(
     --------
     >>> parse_subject("P042", ["research,teaching", "publication"], date(2031, 1, 1)).consent_scope
     ('research', 'teaching', 'publication')
+    >>> parse_subject(THING, None, None).consent_scope
+    ('any',)
     """
+    if pseudonym == THING and scopes is None:
+        scopes = [ANY_USE]
     words = [word.strip() for text in scopes or () for word in text.split(",")]
     day = expires.date() if isinstance(expires, datetime) else expires
     return SubjectRecord(pseudonym, tuple(dict.fromkeys(filter(None, words))), day)

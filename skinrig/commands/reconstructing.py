@@ -146,9 +146,10 @@ def reconstruct(
     check_rank(rank, merl_basis)
     wants = [name.strip() for name in maps.split(",") if name.strip()]
     wants = replace_former_values(wants, FORMER_MAP_NAMES)
-    made = []
+    made, beside = [], []
     for session, folder in zip(sessions, assign_output_folders(sessions, out), strict=True):
         truth = find_comparison_truth(session, state)
+        beside += [truth] if truth else []
         if len(sessions) > 1:
             console.print_line(f"{session}:")
         done = pipeline.reconstruct(
@@ -163,12 +164,14 @@ def reconstruct(
             dome=DomeOptions(scan, merl_basis, hold_out, rank),
         )
         console.print_each("assumed", done.assumed)
-        console.print_line(f"run: {', '.join(done.ran) or 'nothing'}")
-        console.print_line(f"reused: {', '.join(done.reused) or 'nothing'}")
+        for what, names in (("run", done.ran), ("reused", done.reused)):
+            if names:
+                console.print_line(f"{what}: {', '.join(names)}")
         console.print_each("omitted", (f"{what} ({why})" for what, why in done.omitted))
         written = select_attributes(done, "ran", "reused", "assumed", "work")
         made.append({"path": folder, **written, "left_out": done.omitted})
-    console.print_line(f"next: skinrig report {shell_quote(out)}")
+    shown = [out, *beside, *([calibration] if calibration else [])]
+    console.print_line(f"next: skinrig report {' '.join(map(shell_quote, shown))}")
     console.print_document(
         "skinrig.reconstruct/1", made[0] if len(made) == 1 else {"path": out, "appearances": made}
     )
