@@ -125,7 +125,7 @@ def test_missing_calibration_is_not_named():
     assert commands()[0] == "skinrig reconstruct session-a --maps normals,r_d --out appearance"
 
 
-def test_calibration_beside_flash_session_is_named():
+def test_calibration_of_flash_session_is_named():
     Path("calibration").mkdir()
     told = suggest_after_session("flash", "session-a", None)
     assert "--calibration calibration" in told

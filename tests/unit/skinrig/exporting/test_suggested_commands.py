@@ -1,4 +1,4 @@
-"""What a plain `skinrig` suggests for a folder's maps runs to its end."""
+"""Commands suggested for a folder of maps run to their end."""
 
 import shlex
 from pathlib import Path
