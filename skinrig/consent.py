@@ -12,6 +12,10 @@ CONSENT_KEY = "consent"
 """Key in an appearance's parameters: the consent of each measured session's subject."""
 
 
+THING_SUBJECT = "none"
+"""Subject of a session of a thing."""
+
+
 class HasProvenance(Protocol):
     """An object with provenance: an appearance, its document or a library of traits."""
 
@@ -25,31 +29,49 @@ class HasProvenance(Protocol):
 
 
 def parse_subject(
-    pseudonym: str, scopes: Sequence[str] | None, expires: datetime | date | None
+    pseudonym: str,
+    scopes: Sequence[str] | None,
+    expires: datetime | date | None,
+    *,
+    today: date | None = None,
 ) -> SubjectRecord:
     """Return the subject record of the options.
 
     Parameters
     ----------
     pseudonym
-        Pseudonym, never a name.
+        Pseudonym, never a name; `THING_SUBJECT` for a thing, which has every use unless ``scopes``
+        limits it.
     scopes
         Permitted uses; each text may list several, separated by commas.
     expires
         Last day of the consent; None: unlimited.
+    today
+        Date of the check; None: the current date, UTC.
 
     Raises
     ------
+    skinrig.errors.UsageError
+        For a consent that has ended.
     SessionError
         For a full name, or an invalid scope.
 
     Examples
     --------
-    >>> parse_subject("P042", ["research,teaching", "publication"], date(2031, 1, 1)).consent_scope
+    >>> ends, today = date(2031, 1, 1), date(2026, 1, 1)
+    >>> uses = ["research,teaching", "publication"]
+    >>> parse_subject("P042", uses, ends, today=today).consent_scope
     ('research', 'teaching', 'publication')
+    >>> parse_subject(THING_SUBJECT, None, None).consent_scope
+    ('any',)
     """
+    if pseudonym == THING_SUBJECT and scopes is None:
+        scopes = [ANY_USE]
     words = [word.strip() for text in scopes or () for word in text.split(",")]
     day = expires.date() if isinstance(expires, datetime) else expires
+    now = today or datetime.now(UTC).date()
+    if day is not None and day < now:
+        raise UsageError(f"--consent-expires: got {day}, expected {now} or later; correct the day")
     return SubjectRecord(pseudonym, tuple(dict.fromkeys(filter(None, words))), day)
 
 

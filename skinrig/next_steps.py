@@ -30,8 +30,6 @@ DEFAULT_WANTS: Final[Mapping[str, str]] = {
     "photographs": "melanin,hemoglobin",
 }
 """Maps usually reconstructed from a session of skin, by rig."""
-UNCALIBRATED_RIGS: Final = ("flash", "photographs")
-"""Rigs whose maps need no calibration; without one, nominal values are listed as assumed."""
 OPEN_COMMAND: Final = {"darwin": "open", "win32": "start"}.get(sys.platform, "xdg-open")
 DEMO_FOLDER: Final = "demo"
 MAX_STEPS: Final = 4
@@ -84,7 +82,7 @@ def suggest_after_session(
     if target == "sequence":
         return f"skinrig reconstruct {place} --maps perfusion_curves --out appearance"
     if not target:
-        calibrated = rig in DEFAULT_WANTS and rig not in UNCALIBRATED_RIGS
+        calibrated = rig in CALIBRATION_BY_TARGET and Path(calibration).is_dir()
         needs = f" --calibration {store}" if calibrated else ""
         want = DEFAULT_WANTS.get(rig, DEFAULT_WANTS["photographs"])
         return f"skinrig reconstruct {place} --maps {want}{needs} --out appearance"
@@ -130,11 +128,14 @@ def suggest(found: Workspace, folder: Path) -> tuple[Step, ...]:
         if rig not in CALIBRATION_BY_TARGET:
             command += _state_option(document)
         steps.append(Step(command, "maps with standard uncertainties"))
-    if found.appearances:
-        seen = shell_quote(_most_complete(found.appearances, ("facial_color.json", "mesh.obj")))
+    viewable = {p: d for p, d in found.appearances.items() if _is_viewable(d)}
+    if viewable:
+        seen = shell_quote(_most_complete(viewable, ("facial_color.json", "mesh.obj")))
         steps.append(Step(f"skinrig view {seen}", "an interactive page of the face, with lights"))
-        given = _most_complete(found.appearances, ("mesh.obj",))
-        measured = found.appearances[given].get("source") == "measured"
+    permitted = {p: d for p, d in found.appearances.items() if _permits_research(d)}
+    if permitted:
+        given = _most_complete(permitted, ("mesh.obj",))
+        measured = permitted[given].get("source") == "measured"
         use = " --use research" if measured else ""
         command = f"skinrig export {shell_quote(given)} --to maps{use} --out export"
         steps.append(Step(command, "files for other programs"))
@@ -203,6 +204,31 @@ def _state_option(session: Mapping[str, Any]) -> str:
         if step.get("kind") == "subject" and colored & set(step.get("cameras", ()))
     ]
     return "" if not states or "neutral" in states else f" --state {shell_quote(states[0])}"
+
+
+def _is_viewable(appearance: Mapping[str, Any]) -> bool:
+    """Return whether `skinrig view` shows an appearance: a moving face, a model, or a dome's."""
+    parameters, files = appearance.get("parameters", {}), appearance.get("files", {})
+    if "mesh.obj" in files and "r_d" in appearance.get("maps", {}):
+        return True
+    is_model = "brdf_basis.npz" in files and "reflectance_model" in parameters
+    return is_model or ("fusion" not in parameters and bool(parameters.get("parts")))
+
+
+def _permits_research(appearance: Mapping[str, Any]) -> bool:
+    """Return whether the subjects of an appearance have agreed to its export for research."""
+    if appearance.get("source") != "measured":
+        return True
+    from capture.session import ConsentError
+    from model.skin import SkinAppearance
+    from skinrig.consent import require_consent
+
+    try:
+        parameters = appearance.get("parameters", {})
+        require_consent(SkinAppearance({}, "measured", parameters), "research", folder="")
+    except ConsentError:
+        return False
+    return True
 
 
 def _is_grayscale(session: Mapping[str, Any]) -> bool:

@@ -43,7 +43,8 @@ def read_error_texts(root: Path, packages: Iterable[str]) -> list[ErrorText]:
         ErrorText(code, template, path.relative_to(root).as_posix())
         for package in packages
         for path in sorted((root / package).rglob("*.py"))
-        for code, template in error_texts_of(ast.parse(path.read_text("utf-8")))
+        if CODE.search(text := path.read_text("utf-8"))
+        for code, template in error_texts_of(ast.parse(text))
     ]
     return sorted(found, key=lambda one: (one.code, one.path))
 

@@ -14,6 +14,7 @@ from capture.plan.steps import (
     StepSeries,
     Value,
     require_argument,
+    require_repeats,
 )
 from capture.rig import Rig
 
@@ -80,7 +81,7 @@ def flash_plan(
     >>> [s.index["state"] for s in plan.steps[::2]]
     ['neutral', 'anger', 'neutral', 'anger']
     """
-    require_argument(repeats >= 1, "repeats", repeats, ">= 1")
+    require_repeats(repeats)
     require_argument(darks >= 0, "darks", darks, ">= 0")
     require_argument(0 < power <= 1, "power", power, "0 < power <= 1")
     series = _Series(rig, exposure_s=exposure_s, iso=iso)

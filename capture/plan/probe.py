@@ -10,7 +10,16 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 from typing import Literal, get_args
 
-from capture.plan.steps import Index, Kind, Plan, Step, StepSeries, int_if_whole, require_argument
+from capture.plan.steps import (
+    Index,
+    Kind,
+    Plan,
+    Step,
+    StepSeries,
+    int_if_whole,
+    require_argument,
+    require_repeats,
+)
 from capture.plan.suction import HeadPlacement, step_placement
 from capture.rig import Probe, Rig, is_id
 
@@ -112,7 +121,7 @@ def probe_plan(
     require_argument(
         len(set(chosen)) == len(chosen) > 0, "sites", chosen, "at least one, none twice"
     )
-    require_argument(repeats >= 1, "repeats", repeats, ">= 1")
+    require_repeats(repeats)
     require_argument(1 <= angles <= 360, "angles", angles, "1 to 360")
     series = _Series(
         rig, brackets=brackets, longest_s=max_exposure_s, step_ev=step_ev, level=level, iso=iso
@@ -167,7 +176,7 @@ def probe_calibration_plan(
     """
     targets = get_args(ProbeTarget)
     require_argument(target in targets, "target", target, f"one of {', '.join(targets)}")
-    require_argument(repeats >= 1, "repeats", repeats, ">= 1")
+    require_repeats(repeats)
     require_argument(
         darks >= (1 if target == "dark" else 0), "darks", darks, ">= 0, of the dark >= 1"
     )

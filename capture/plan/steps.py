@@ -294,6 +294,15 @@ def int_if_whole(angle_deg: float) -> int | float:
     return int(angle_deg) if float(angle_deg).is_integer() else float(angle_deg)
 
 
+MAX_REPEATS = 1000
+"""Most repeats of a plan: a face is held still for minutes, not for days."""
+
+
+def require_repeats(repeats: int) -> None:
+    """Raise for a number of repeats that no plan has."""
+    require_argument(1 <= repeats <= MAX_REPEATS, "repeats", repeats, f"1 to {MAX_REPEATS}")
+
+
 def require_argument(condition: bool, name: str, got: object, expected: str) -> None:
     """Raise `PlanError` when an argument of a plan generator is not as expected."""
     if not condition:

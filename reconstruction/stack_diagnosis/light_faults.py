@@ -182,10 +182,11 @@ def _fit_near(
     if np.count_nonzero(kept) < MIN_NEAR_POINTS:
         return 0.0, 0.0
     samples, weights, places = samples[:, kept], weights[:, kept], places[kept]
-    inner = np.einsum("np,ni,nj->pij", weights, directions, directions) + 1e-9 * np.eye(3)
+    products = (directions[:, :, None] * directions[:, None, :]).reshape(len(directions), -1)
+    inner = (weights.T @ products).reshape(-1, 3, 3) + 1e-9 * np.eye(3)
 
     def fit(values: Float64Array) -> Float64Array:
-        right = np.einsum("np,np,ni->pi", weights, values, directions)
+        right = (weights * values).T @ directions
         return np.asarray(directions @ np.linalg.solve(inner, right[..., None])[..., 0].T)
 
     matte = fit(samples)

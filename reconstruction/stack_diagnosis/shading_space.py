@@ -146,7 +146,8 @@ def _ridge(rows: Float64Array) -> Float64Array:
 
 def _solve(weights: Float64Array, values: Float64Array, rows: Float64Array) -> Float64Array:
     """Return x (M, 3) of the weighted least squares ``values ~ x @ rows.T``, row by row."""
-    normal = np.einsum("mk,ki,kj->mij", weights, rows, rows) + _ridge(rows)
+    products = (rows[:, :, None] * rows[:, None, :]).reshape(len(rows), -1)
+    normal = (weights @ products).reshape(-1, 3, 3) + _ridge(rows)
     right = (weights * values) @ rows
     return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0])
 

@@ -42,7 +42,7 @@ def import_photos(
     target
         Photographed target, a color chart in the light of the photographs; default: a subject.
     subject
-        Pseudonym of the subject.
+        Pseudonym of the subject; none: a thing, which needs no consent.
     """
     from capture.importers import import_photos as bring_in
     from capture.rig import load_rig
@@ -133,6 +133,9 @@ def import_lp(
     mask: Path | None = None,
     encoding: Annotated[str, choice("auto", "sRGB", "linear")] = "auto",
     mm_per_px: float | None = None,
+    subject: str = "unnamed",
+    consent: Consent = None,
+    consent_expires: ConsentExpires = None,
     json: Json = False,
 ) -> None:
     """Convert images of one object under many lights, with their light list, to a session.
@@ -152,10 +155,14 @@ def import_lp(
         Transfer function of 8-bit and PNG values: auto, sRGB or linear.
     mm_per_px
         Pixel size on the object, mm; the light list then gives positions in mm.
+    subject
+        Pseudonym of the subject; none: a thing, which needs no consent.
     """
     from capture.importers import import_light_list
+    from skinrig.consent import parse_subject
 
     console = Console(json)
+    person = parse_subject(subject, consent, consent_expires)
     done = import_light_list(
         directory,
         out=out,
@@ -163,6 +170,7 @@ def import_lp(
         mask=mask,
         encoding=encoding,  # type: ignore[arg-type]
         mm_per_px=mm_per_px,
+        subject=person,
     )
     console.print_each("assumed", done.assumed)
     console.print_line(

@@ -52,7 +52,10 @@ def calibrate(
     console = Console(json)
     (kind,) = replace_former_values([kind], FORMER_NAMES)
     done = make(kind, sessions, out, targets=dome_targets(square_mm, sphere_mm), phantom=phantom)
-    console.print_table(("quantity", "value"), done.summary)
+    rows = [(*name.split(" ", 1)[::-1], value) for name, value in done.summary]
+    console.print_table(
+        ("quantity", "of", "value"), [(name.replace("_", " "), *rest) for name, *rest in rows]
+    )
     console.print_each("found", done.findings)
     for change in done.drift:
         if change.change and (change.sigmas is None or abs(change.sigmas) > 2):
@@ -146,9 +149,10 @@ def reconstruct(
     check_rank(rank, merl_basis)
     wants = [name.strip() for name in maps.split(",") if name.strip()]
     wants = replace_former_values(wants, FORMER_MAP_NAMES)
-    made = []
+    made, truths = [], []
     for session, folder in zip(sessions, assign_output_folders(sessions, out), strict=True):
         truth = find_comparison_truth(session, state)
+        truths += [truth] if truth else []
         if len(sessions) > 1:
             console.print_line(f"{session}:")
         done = pipeline.reconstruct(
@@ -163,12 +167,14 @@ def reconstruct(
             dome=DomeOptions(scan, merl_basis, hold_out, rank),
         )
         console.print_each("assumed", done.assumed)
-        console.print_line(f"run: {', '.join(done.ran) or 'nothing'}")
-        console.print_line(f"reused: {', '.join(done.reused) or 'nothing'}")
+        for outcome, names in (("run", done.ran), ("reused", done.reused)):
+            if names:
+                console.print_line(f"{outcome}: {', '.join(names)}")
         console.print_each("omitted", (f"{what} ({why})" for what, why in done.omitted))
         written = select_attributes(done, "ran", "reused", "assumed", "work")
         made.append({"path": folder, **written, "left_out": done.omitted})
-    console.print_line(f"next: skinrig report {shell_quote(out)}")
+    shown = [out, *truths, *([calibration] if calibration else [])]
+    console.print_line(f"next: skinrig report {' '.join(map(shell_quote, shown))}")
     console.print_document(
         "skinrig.reconstruct/1", made[0] if len(made) == 1 else {"path": out, "appearances": made}
     )

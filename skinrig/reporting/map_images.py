@@ -85,7 +85,7 @@ class MapDrawing:
         every = np.ones(normals.shape[:2], bool)
         mask = shrink(every if self.valid is None else self.valid, self.width).astype(bool)
         codes = np.rint(255.0 * np.clip(0.5 + 0.5 * np.nan_to_num(small), 0.0, 1.0))
-        image = codes.astype(np.uint8)
+        image = codes.astype(np.uint8) & np.uint8(0xFE)  # 128 steps, as in a color scale
         image[~mask] = png.INVALID_GRAY
         alt = f"{self.of or 'normals'}, {title}: x, y, z as red, green, blue"
         if mask.any():

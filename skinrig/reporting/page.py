@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -21,6 +22,7 @@ Row = TypeVar("Row")
 
 PAGE_STYLE = resources.files("skinrig").joinpath("data/report.css").read_text(encoding="utf-8")
 PAGE_SCRIPT = resources.files("skinrig").joinpath("data/report.js").read_text(encoding="utf-8")
+_IMAGE = re.compile(r'<img [^>]*src="(data:[^"]+)">')
 MAX_UNBROKEN_CHARS = 22
 """Characters up to which the text of a cell is kept on one line."""
 BAR_STOPS = 17
@@ -338,7 +340,7 @@ def render_page(
     style = PAGE_STYLE + _bars()
     taken = {"content", "contents"}
     head, body = _parts(lead, taken), _parts(sections, taken)
-    return templates.render(
+    page = templates.render(
         "reporting/templates/page.html",
         title=title,
         style=style,
@@ -351,6 +353,40 @@ def render_page(
         body=body,
         titled=[part for part in head + body if part.anchor],
     )
+    return link_repeated_images(page)
+
+
+def link_repeated_images(page: str, *, least_bytes: int = 5000) -> str:
+    r"""Replace each image that is on the page already by a link to it.
+
+    Parameters
+    ----------
+    page
+        HTML; an image is ``<img ... src="data:...">``.
+    least_bytes
+        Smaller images are repeated.
+
+    Examples
+    --------
+    >>> one, other = '<img alt="a" src="data:x">', '<img alt="c" src="data:y">'
+    >>> print(link_repeated_images(one + other + one, least_bytes=6).replace("><", ">\n<"))
+    <img id="image-1" alt="a" src="data:x">
+    <img alt="c" src="data:y">
+    <a href="#image-1">shown above</a>
+    """
+    counts = Counter(_IMAGE.findall(page))
+    numbers: dict[str, int] = {}
+
+    def replace(found: re.Match[str]) -> str:
+        address = found[1]
+        if address in numbers:
+            return f'<a href="#image-{numbers[address]}">shown above</a>'
+        if counts[address] == 1 or len(address) < least_bytes:
+            return found[0]
+        numbers[address] = len(numbers) + 1
+        return found[0].replace("<img", f'<img id="image-{numbers[address]}"', 1)
+
+    return _IMAGE.sub(replace, page)
 
 
 def _parts(blocks: Iterable[Block], taken: set[str]) -> list[Part]:

@@ -35,13 +35,13 @@ from skinrig.errors import require_choice
 from skinrig.evaluating.reflection_truth import TEST_FILE, make_test
 from skinrig.simulating import driving
 from skinrig.simulating.orders import (
-    FACE_TEXELS,
     DomeOrder,
     SimulationError,
     SimulationOptionsError,
     SimulationResult,
     truth_folder,
 )
+from skinrig.simulating.subject_records import FACE_TEXELS, choose_face_texels
 
 if TYPE_CHECKING:
     from rigsim.population.population import Member
@@ -118,13 +118,17 @@ def _manifest_settings(
     }
     if order.scanner:
         settings["scanner"] = True
-    if order.texels != FACE_TEXELS:
-        settings["texels"] = order.texels
     if order.target is None:
+        if (texels := _texels(order, rig)) != FACE_TEXELS:
+            settings["texels"] = texels
         settings |= select_attributes(order, "subsurface", "interreflections")
     if conditions:
         settings["conditions"] = conditions
     return driving.manifest_settings(order, **settings)
+
+
+def _texels(order: DomeOrder, rig: Rig) -> int:
+    return order.texels or choose_face_texels(rig.views[0].width_px)
 
 
 def _conditions(order: DomeOrder) -> dict[str, float]:
@@ -300,15 +304,15 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
         target = make_target_scene(order.target, rig, seed=seed, dome=built)  # type: ignore[arg-type]
         scan_board(target, seed=order.seed, noise_seed=seed)
         return target
-    conditions = dict(order.conditions)
+    conditions, texels = dict(order.conditions), _texels(order, rig)
     if (one := _member(order)) is not None:
-        person = one.face(order.texels)
+        person = one.face(texels)
         conditions = dict(one.applied) | conditions
     else:
         subject = subject_file.load_subject(order.subject)
         if (member := subject.person()) is not None:
             conditions = dict(member.applied) | conditions
-        person = subject.face(seed=order.seed, size=order.texels, mesh=order.mesh)
+        person = subject.face(seed=order.seed, size=texels, mesh=order.mesh)
     person = person.translate(draw_head_position(order.session_seed))
     motion = draw_head_motion(order.noise_seed) if order.move else None
     scene = DomeScene(

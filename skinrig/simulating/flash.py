@@ -59,6 +59,9 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
             *(["bands"] if order.bands else []),
         ),
     )
+    texels = subject_records.choose_face_texels(width)
+    if target is None and texels != subject_records.FACE_TEXELS:
+        settings["texels"] = texels
     # plan and scenes are built first, so that an error leaves no session folder
     details = select_attributes(order, "target", "states", "repeats", "bands")
     plan = order.plan or DefaultPlan(**details).of(rig)
@@ -101,7 +104,9 @@ def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:
     if order.target is not None:
         state = "white" if order.target == "white" else ""
         return {state: FlashScene(rig, targets.make_target(order.target), seed=seed, power=power)}
-    person = subject_file.load_subject(order.subject).face(seed=order.seed, mesh=order.mesh)
+    subject = subject_file.load_subject(order.subject)
+    texels = subject_records.choose_face_texels(rig.views[0].width_px)
+    person = subject.face(seed=order.seed, size=texels, mesh=order.mesh)
     person = person.translate(_stance_offset_mm(rig, order.nearer_mm))
     person = person.translate(draw_head_position(order.session_seed))
     return {

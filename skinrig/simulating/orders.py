@@ -22,7 +22,6 @@ PICTURE_SIZES = ("small", "full")
 SIMULATED_USES = ("research", "publication")
 """Default consent scope of simulated subjects."""
 MIN_WIDTH_PX = 16
-FACE_TEXELS = 512
 _COUNT_OPTIONS = {"width_px": "width", "lights": "lights", "views": "views"}
 """Fields that count something, and their names in messages."""
 
@@ -316,8 +315,8 @@ class DomeOrder(FaceOrder):
     """True: interreflection of skin is always built; False: only if it changes pixels."""
     conditions: Mapping[str, float] = field(default_factory=dict)
     """Conditions of the face with their amounts, see `rigsim.population.conditions`."""
-    texels: int = FACE_TEXELS
-    """Texels per side of the face's simulated maps."""
+    texels: int | None = None
+    """Texels per side of the face's simulated maps; None: `subject_records.choose_face_texels`."""
 
     @property
     def state(self) -> str:

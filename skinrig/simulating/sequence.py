@@ -47,10 +47,6 @@ COURSE_LANDMARKS = {
 """The five positions of Jimenez et al. 2010, figure 7, with their landmarks."""
 DISC_RADIUS_FRACTION = 0.02
 """Radius of the disc at a position, as a fraction of the image width."""
-TEXTURE_TEXELS_BY_WIDTH = (256, 512)
-"""Texels per side of the face's texture: for images up to `MAX_COARSE_WIDTH_PX` wide, and for
-wider ones."""
-MAX_COARSE_WIDTH_PX = 384
 INTERRUPTION_S = 10.0
 """Duration of a simulated interruption on the host's clock, s."""
 
@@ -89,8 +85,8 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
         )
     else:
         course = EventCourse(sequence.state, constant_s)
-    texels = TEXTURE_TEXELS_BY_WIDTH[int(width > MAX_COARSE_WIDTH_PX)]
     subject = subject_file.load_subject(order.subject)
+    texels = subject_records.choose_face_texels(width)
     person = subject.face(seed=seed, size=texels, mesh=order.mesh)
     person = person.translate(draw_head_position(order.session_seed))
     plan = sequence_plan(rig, sequence)

@@ -9,6 +9,18 @@ from rigsim.population import files as subject_file
 SUBJECT_FILE_SUFFIX = ".toml"
 """Suffix of a subject file, see `rigsim.population.files`."""
 
+FACE_TEXELS = 512
+"""Texels per side of the face's simulated maps: about 0.5 mm each."""
+COARSE_FACE_TEXELS = 256
+MAX_COARSE_WIDTH_PX = 256
+"""Up to this width a pixel of the flash rig and the dome is 1 mm or more on the face: as much as a
+texel of `COARSE_FACE_TEXELS`."""
+
+
+def choose_face_texels(width_px: int) -> int:
+    """Return the texels per side of a simulated face's maps for images of a width."""
+    return COARSE_FACE_TEXELS if width_px <= MAX_COARSE_WIDTH_PX else FACE_TEXELS
+
 
 def pseudonym(subject: str, seed: int) -> str:
     """Return the pseudonym of a simulated subject.

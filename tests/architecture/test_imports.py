@@ -29,6 +29,7 @@ HEAVY = (
     "trimesh",
 )
 QUICK_S = 0.3
+QUICK_HELP_S = 0.5
 RUNS = 5
 """The quickest of so many starts is judged: what else runs on the machine only adds to one."""
 
@@ -107,6 +108,13 @@ def test_version_is_printed_within_third_of_second():
     Starting with NumPy takes 0.25 s or more, and with SciPy or a renderer a second.
     """
     assert least_start_s(["--version"]) < QUICK_S
+
+
+@pytest.mark.skipif(not COMMAND.exists(), reason="the command is not installed beside Python")
+@pytest.mark.parametrize("command", ["", "simulate flash", "reconstruct", "report", "view"])
+def test_help_is_printed_within_half_second(command):
+    """Tolerance: the requirement; a quiet core takes .2 to .3 s."""
+    assert least_start_s([*command.split(), "--help"], runs=2) < QUICK_HELP_S
 
 
 @pytest.mark.skipif(not COMMAND.exists(), reason="the command is not installed beside Python")

@@ -7,7 +7,7 @@ tests/recovery and tests/system. The names are read from the sources: nothing is
 """
 
 import ast
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import pytest
 from fixtures.product_code import ROOT, modules, tree_of
@@ -56,6 +56,7 @@ def defined_at(name):
     return name
 
 
+@cache
 def modules_of(tree):
     """Local name to module, or to function where one is imported by itself."""
     names = {}
@@ -127,20 +128,26 @@ def named_by_tests():
     return set().union(*(names_used(tree, modules_of(tree)) for tree in trees))
 
 
-def called_by(functions):
-    """What the bodies of `functions` name, and those of classes, private ones and stages."""
-    found = set()
+@lru_cache(maxsize=1)
+def named_in_bodies():
+    """What each function's body names, by its name; by "" those of classes and private ones."""
+    found = {"": set()}
     for module, tree in product_modules():
-        names = modules_of(tree)
         own = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
-        names |= {name: f"{module}.{name}" for name in own}
+        names = modules_of(tree) | {name: f"{module}.{name}" for name in own}
         for node in tree.body:
             inner = isinstance(node, ast.ClassDef) or f"{module}.".startswith(STAGES)
             if inner or getattr(node, "name", "").startswith("_"):
-                found |= names_used(node, names)
-            elif isinstance(node, ast.FunctionDef) and f"{module}.{node.name}" in functions:
-                found |= names_used(node, names)
+                found[""] |= names_used(node, names)
+            elif isinstance(node, ast.FunctionDef):
+                found[f"{module}.{node.name}"] = names_used(node, names)
     return found
+
+
+def called_by(functions):
+    """What the bodies of `functions` name, and those of classes, private ones and stages."""
+    named = named_in_bodies()
+    return named[""].union(*(named[name] for name in functions & named.keys()))
 
 
 def unjudged(public, known):

@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 from fixtures.striped_scenes import CAMERA, CODE, OTHER, PROJECTOR, columns_of, hit_plane, shine
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -42,6 +43,7 @@ def test_column_depends_on_neither_albedo_nor_ambient_light(seed, gain, ambient)
     np.testing.assert_allclose(found.position_px[found.valid], column[found.valid], atol=1e-6)
 
 
+@pytest.mark.long
 @given(SEEDS)
 @settings(max_examples=8, deadline=None)
 def test_points_move_with_all_devices(seed):
@@ -67,6 +69,7 @@ def test_points_move_with_all_devices(seed):
         np.testing.assert_allclose(after.cosine[both], before.cosine[both], atol=1e-3)
 
 
+@pytest.mark.long
 @given(st.permutations([0, 1]), st.floats(2.0, 4.0))
 @settings(max_examples=6, deadline=None)
 def test_fused_surface_depends_on_no_order(order, voxel_mm):

@@ -34,6 +34,7 @@ def test_led_has_its_center_and_width(center, width):
     assert weights.sum() == pytest.approx(1.0)
 
 
+@pytest.mark.long
 @FEW
 @given(depth=st.floats(0.01, 3.0), more=st.floats(1.05, 3.0), blood=st.floats(0.001, 0.1))
 def test_more_pigment_darkens_every_wavelength(depth, more, blood):
@@ -53,6 +54,7 @@ def test_darker_skin_has_smaller_typology_angle(low, slope, darker):
     assert dark < light
 
 
+@pytest.mark.long
 @FEW
 @given(
     melanin=st.floats(0.005, 0.2),

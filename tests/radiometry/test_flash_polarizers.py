@@ -58,6 +58,7 @@ def test_image_blocks_match_path_tracer_within_noise(name):
     assert block_deviation(1.02 * ours, seeds) > 1.0  # two percent more light is noticed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["parallel", "crossed"])
 def test_own_scene_matches_path_tracer(name):
     """Rationale: the same `skincoat` and `ledarray`, with leaky polarizers, in a stock integrator

@@ -65,6 +65,7 @@ def test_mitsuba_moments_match_shadow_rays(skin, pixels, reference):
     np.testing.assert_allclose(found[:, [0, 3]].mean(0), reference[:, [0, 3]].mean(0), rtol=1e-3)
 
 
+@pytest.mark.long
 def test_mitsuba_error_falls_with_samples(skin, pixels, reference):
     """With the reference's own samples only rounding and penumbras of nearly no size are left."""
     errors = [

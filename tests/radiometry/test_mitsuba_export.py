@@ -26,6 +26,7 @@ from rigsim.population import files as subject_file
 from rigsim.scenes.dome.scene import DomeScene
 from skinrig.exporting import export as exporting
 from skinrig.simulating.simulation import simulate_session
+from skinrig.simulating.subject_records import COARSE_FACE_TEXELS
 
 pytestmark = [pytest.mark.render, pytest.mark.long]
 
@@ -96,7 +97,7 @@ def scene_folder(exported, tmp_path):
 
 @pytest.fixture(scope="module")
 def face():
-    return subject_file.load_subject("V").face(seed=SEED, size=512)
+    return subject_file.load_subject("V").face(seed=SEED, size=COARSE_FACE_TEXELS)
 
 
 def render_ours(session, face, light, sensor, file="scene-stock.xml"):

@@ -262,6 +262,7 @@ BLOCKER = {"type": "sphere", "radius": 25.0, "center": [40.0, 20.0, 110.0]}
 SEVERAL = {"blocker": BLOCKER | {"bsdf": {"type": "diffuse"}}}
 
 
+@pytest.mark.long
 def test_sum_over_lights_is_the_path_tracers(mi):
     """Rationale: light, shadow and two BSDFs. Tolerance: 3 standard errors of 32 runs in 98 % of
     the pixels inside the surfaces, where 99.5 % are expected (Student's t)."""

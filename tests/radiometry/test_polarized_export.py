@@ -36,6 +36,7 @@ from rigsim.world.taped_skin import GripState
 from skinrig.exporting import export as exporting
 from skinrig.simulating.gradient import make_scene
 from skinrig.simulating.simulation import simulate_session
+from skinrig.simulating.subject_records import COARSE_FACE_TEXELS
 
 pytestmark = [pytest.mark.render, pytest.mark.long]
 
@@ -64,7 +65,7 @@ def flash_folder(flash, tmp_path):
 
 @pytest.fixture(scope="module")
 def face():
-    return subject_file.load_subject("V").face(seed=SEED)
+    return subject_file.load_subject("V").face(seed=SEED, size=COARSE_FACE_TEXELS)
 
 
 def skin_layers(session, face):

@@ -55,6 +55,7 @@ def run():
     )
 
 
+@pytest.mark.long
 def test_walk_agrees_with_simulators_photons(run):
     """Tolerance: chi-squared of six fibers; 15 % more absorption exceeds it."""
     mean = run.even_per_mm2.mean(axis=0)

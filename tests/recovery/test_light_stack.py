@@ -84,6 +84,7 @@ def test_dead_light_is_reported_and_omitted(tmp_path, capsys):
     assert error_deg(found, n, inside).mean() < 0.5
 
 
+@pytest.mark.long
 def test_the_real_buddha_agrees_with_its_reference(tmp_path, capsys, test_data):
     found = made(tmp_path, test_data / "photometric_stereo" / "buddha", capsys)
     reference = np.load(test_data / "photometric_stereo" / "buddha" / "buddha_ref.npz")["normals"]

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from skinrig.cli import main
+from skinrig.simulating import flash_truth
 
 ROOT = Path(__file__).parents[2]
 
@@ -37,6 +38,8 @@ def simulated(tmp_path_factory):
 @each_tutorial
 def test_tutorial_runs_to_its_end(page, tmp_path, simulated, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    # half as wide as its default: how accurate maps of more pixels are, other tests say
+    monkeypatch.setitem(flash_truth.WIDTHS_PX, "small", 384)
     lines = commands(page)
     assert lines
     for words in lines:

@@ -29,11 +29,11 @@ def session(path, rig="flash", kinds=("dark", "subject"), target=""):
     (path / "session.json").write_text(json.dumps(document))
 
 
-def appearance(path, session="", kind="appearance", files=()):
+def appearance(path, session="", kind="appearance", files=(), maps=("melanin", "r_d"), **more):
     path.mkdir()
     document = {
-        "parameters": {"kind": kind, "session": session},
-        "maps": {"melanin": {}},
+        "parameters": {"kind": kind, "session": session, **more},
+        "maps": {name: {} for name in maps},
         "files": dict.fromkeys(files, ""),
     }
     (path / "appearance.json").write_text(json.dumps(document))
@@ -79,8 +79,17 @@ def test_target_is_not_reconstructed_as_skin():
 
 def test_session_with_maps_is_viewed_next():
     session(Path("session-a"))
-    appearance(Path("appearance"), "session-a")
+    appearance(Path("appearance"), "session-a", files=("mesh.obj",))
     assert [command.split()[1] for command in commands()] == ["report", "view", "export"]
+
+
+@pytest.mark.parametrize(
+    "other", [{"files": ()}, {"files": ("mesh.obj",), "maps": ("melanin",)}, {"fusion": {}}]
+)
+def test_maps_without_face_are_not_viewed(other):
+    """Maps of flash rig, gradient rig, probe and photographs: `skinrig view` refuses them."""
+    appearance(Path("appearance"), "session-a", **other)
+    assert [command.split()[1] for command in commands()] == ["report", "export"]
 
 
 def test_whole_face_is_viewed_before_patch_never_truth():
@@ -92,16 +101,34 @@ def test_whole_face_is_viewed_before_patch_never_truth():
 
 def test_dynamic_face_is_viewed_and_mesh_face_exported():
     appearance(Path("a-face"), files=("mesh.obj",))
-    appearance(Path("b-moving"), kind="dynamic", files=("facial_color.json",))
+    parts = {"facial_color": {}}
+    appearance(Path("b-moving"), kind="dynamic", files=("facial_color.json",), parts=parts)
     assert "skinrig view b-moving" in commands()
     assert "skinrig export a-face --to maps --out export" in commands()
 
 
-def test_the_export_of_measured_maps_names_a_use():
-    appearance(Path("a-face"))
+@pytest.mark.parametrize(
+    ("scope", "offered"),
+    [(["research"], True), (["any"], True), (["teaching"], False), ([], False)],
+)
+def test_export_of_measured_maps_is_offered_within_consent(scope, offered):
+    record = {"pseudonym": "P1", "consent_scope": scope, "consent_expires": None}
+    appearance(Path("a-face"), consent=[record])
     document = json.loads(Path("a-face/appearance.json").read_text()) | {"source": "measured"}
     Path("a-face/appearance.json").write_text(json.dumps(document))
-    assert "skinrig export a-face --to maps --use research --out export" in commands()
+    told = "skinrig export a-face --to maps --use research --out export" in commands()
+    assert told is offered
+
+
+def test_missing_calibration_is_not_named():
+    session(Path("session-a"), "dome", ("dark", "olat"))
+    assert commands()[0] == "skinrig reconstruct session-a --maps normals,r_d --out appearance"
+
+
+def test_calibration_of_flash_session_is_named():
+    Path("calibration").mkdir()
+    told = suggest_after_session("flash", "session-a", None)
+    assert "--calibration calibration" in told
 
 
 def test_a_demo_below_is_found():

@@ -306,6 +306,7 @@ def test_the_expected_cosine_is_the_cosine_on_average(rng):
     assert abs(gap.mean()) < 3 * gap.std() / np.sqrt(40) + 0.01
 
 
+@pytest.mark.long
 def test_shuffled_labels_give_p_values_that_are_even(rng):
     samples, _, _ = population(rng, people=24, shift=0.0)
     ps = []

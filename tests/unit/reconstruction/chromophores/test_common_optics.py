@@ -67,6 +67,7 @@ def test_intervals_of_drawn_faces_cover_nominally(table, rng):
     assert (narrow / faces < 0.60 - sampling).all()
 
 
+@pytest.mark.long
 def test_known_light_separates_optics_from_pigment(table, rng):
     """Melanin of 100 faces errs less than where color alone estimates it."""
     errors = {True: [], False: []}

@@ -32,6 +32,7 @@ def fitted(probability):
     return fit_distribution(probability, (MELANIN, BLOOD), (MELANIN_ENDS, BLOOD_ENDS))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("spread", [0.1, 0.3])
 def test_means_and_deviations_are_recovered_under_pixel_errors(spread, rng):
     count = 3000

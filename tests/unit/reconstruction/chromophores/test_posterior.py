@@ -45,6 +45,7 @@ def seen(table, c_m, c_hd, shading, rng, noise=NOISE):
     return clean * (1.0 + noise * rng.standard_normal(clean.shape))
 
 
+@pytest.mark.long
 def test_kernel_sum_matches_plain_numpy_over_dense_plane(table, prior, rng):
     c_m, c_hd, shading = skin(rng, 10, prior)
     # down to skin whose blood nobody can see, and up to where melanin has two solutions

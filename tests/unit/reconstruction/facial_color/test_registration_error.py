@@ -109,6 +109,7 @@ def test_tracked_light_leaves_stated_brightness_covariance(rng):
     assert denied > 1.5 * seen
 
 
+@pytest.mark.long
 def test_shifted_image_differences_match_stated_covariance(rng):
     """Shifts drawn with the stated error; brightness once, colors `SCALE` times; 25 % for the
     bend of the texture between pixels and for 200 shifts."""

@@ -377,6 +377,7 @@ def test_mismatched_registration_error_is_refused(table, prior, rng):
             )
 
 
+@pytest.mark.long
 def test_face_pixels_constrain_common_melanin_but_keep_moles(table, prior, rng):
     """Truth: type V, 9 % melanin with 15 % scatter, in light drawn from the prior, two states.
 

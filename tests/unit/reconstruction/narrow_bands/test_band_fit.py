@@ -37,6 +37,7 @@ def fit(table, signals, **changed):
     )
 
 
+@pytest.mark.long
 def test_leds_recover_oxygenation_of_monte_carlo_people(table):
     """Expected: RMS error below the prior's standard deviation by the factor of the intervals."""
     people = draw_people("published", LEDS, PEOPLE)

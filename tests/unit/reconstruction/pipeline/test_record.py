@@ -70,6 +70,7 @@ def test_changed_setting_reruns_dependents_and_reports_reason():
     assert done(entries)["frames"] == "reused"
 
 
+@pytest.mark.long
 @pytest.mark.render
 def test_repeated_request_reads_no_frame_and_writes_nothing(tmp_path, monkeypatch):
     from capture.session import Session

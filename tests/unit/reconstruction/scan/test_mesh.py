@@ -229,6 +229,7 @@ def test_refinement_reports_missing_requirements():
         refine_mesh(unwrap_mesh(cap()), points=10**9)
 
 
+@pytest.mark.long
 def test_flawed_head_scan_becomes_manifold_near_truth():
     from rigsim.scanner.pods import ScannerSettings, scan_face
     from rigsim.subject.head import build_head

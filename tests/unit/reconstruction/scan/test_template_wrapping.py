@@ -48,6 +48,7 @@ def test_wrapped_template_is_on_scan_unfolded(wrapped):
     np.testing.assert_array_equal(wrapped.mesh.faces, template.mesh.faces)
 
 
+@pytest.mark.long
 def test_vertices_without_scan_are_extrapolated():
     template = load_default_template()
     scan, _ = scanned(keep=lambda centers: centers[:, 0] > -5.0)
@@ -74,6 +75,7 @@ def test_pose_without_search_needs_near_frame():
         estimate_pose(load_default_template(), ScanSurface(scan), search=False)
 
 
+@pytest.mark.long
 def test_sphere_is_refused():
     ball = trimesh.creation.icosphere(3, 95.0)
     scan = TriangleMesh(np.asarray(ball.vertices, float), np.asarray(ball.faces, np.int64))

@@ -198,6 +198,7 @@ def coverage(fit, sigma_tr):
     return np.mean((low <= sigma_tr) & (sigma_tr <= high))
 
 
+@pytest.mark.long
 def test_interval_coverage_matches_nominal(rng):
     """68 % within 60...76 %; a false alarm is rarer than 1e-3 (groups of ten share a medium)."""
     sigma_tr, readings, variance = draws_of_everything(rng)

@@ -65,6 +65,7 @@ def test_layers_contain_requested_melanin_and_blood():
     assert optics.stacks[index].layers[0].thickness_mm == skin.epidermis_mm("cheek")
 
 
+@pytest.mark.long
 def test_profile_under_suction_uses_reduced_blood():
     """Reweighted paths against photons of the layers themselves."""
     skin = SkinTissue(PersonSkin.of_preset("II", seed=4))

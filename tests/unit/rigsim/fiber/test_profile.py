@@ -63,6 +63,7 @@ def exit_profile(stack, radii_mm, *, core_mm, source_core_mm, photons, seed):
 FORWARD = LayerStack((Layer(inf, 0.1, 7.5, 0.85, 1.4),))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("stack", "twin", "agree"), [(RED, RED, True), (LAYERED, LAYERED, True), (RED, FORWARD, False)]
 )

@@ -92,6 +92,7 @@ def face():
     return make_subject("III", seed=0, size=192)
 
 
+@pytest.mark.long
 def test_wrinkles_shade_moved_face_equally_in_both_renderers(face):
     rig = small_dome(load_rig("dome"), lights=4, views=1, width_px=64)
     view = rig.views[0].name

@@ -189,6 +189,7 @@ def grazing(rig, angle_deg=88.0):
     return dataclasses.replace(rig, lights=(dataclasses.replace(light, position_mm=place),))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("power", [1.0, 0.02])
 def test_effect_sizes_are_bounds_under_grazing_light(flash, faces, power):
     """What faces the light is 29 times as bright as the plate, and beyond full scale."""
@@ -209,6 +210,7 @@ def test_effect_sizes_are_bounds_under_grazing_light(flash, faces, power):
     assert told["interreflections"] < 40.0 * max(told["spectral"], 0.02)
 
 
+@pytest.mark.long
 def test_lens_effect_follows_highlight_brighter_than_dark_skin(flash, faces):
     """A bound on highlights: above what is found anywhere, though a few times at most."""
     for rig in (flash, grazing(flash, 60.0)):
@@ -223,6 +225,7 @@ def test_lens_effect_follows_highlight_brighter_than_dark_skin(flash, faces):
         assert shown.max() < peak
 
 
+@pytest.mark.long
 def test_fewer_wavelengths_change_pixels_below_stated_bound(flash, faces):
     """Of light from skin to skin, whose share is told as a bound, between any two of its skins."""
     face = faces["II"]

@@ -127,6 +127,7 @@ def patterned(buffers: GBuffer) -> np.ndarray:
     return np.where(buffers.mask, light, 0.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("f_number", [2.0, 1.4])
 def test_defocused_face_matches_rays_through_whole_pupil(rig, caster, f_number):
     """RMS over the face, and where blur shows, against 40 x 16 rays a pixel.

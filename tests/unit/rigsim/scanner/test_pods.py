@@ -53,6 +53,7 @@ def clean_surface(scan):
     return mesh, heights(mesh.vertices, mesh.vertex_normals)
 
 
+@pytest.mark.long
 def test_same_seed_gives_same_bytes_another_seed_others():
     scanner = ScannerSettings(triangles=12_000, resolution_mm=2.0)
     again = scan_face(HEAD, rng=np.random.default_rng(0), scanner=scanner)

@@ -20,6 +20,7 @@ def test_facets_of_every_site_tilt_11_to_20deg(site: str, seed: int) -> None:
     assert 11.0 <= np.degrees(np.arctan(np.hypot(x, y))).mean() <= 20.0
 
 
+@pytest.mark.long
 def test_sites_differ_in_depth_and_direction() -> None:
     deep, across = {}, {}
     for site in SITE_NAMES:

@@ -165,6 +165,7 @@ def test_member_has_one_skin_in_all_rigs():
         load_tissue("P88", seed=0)
 
 
+@pytest.mark.long
 def test_population_looks_like_measured_skin():
     angles = np.array([measured_angle(member.skin) for member in draw_population()])
     assert 25.0 < np.median(angles) < 50.0

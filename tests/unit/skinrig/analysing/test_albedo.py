@@ -16,6 +16,7 @@ def lab(tmp_path_factory, dome_faces):
     return folder, *dome_faces.population(folder, count=4)
 
 
+@pytest.mark.long
 def test_groups_differ_in_histograms_as_generated(lab, capsys):
     folder, paths, labels = lab
     out = folder / "analysis"

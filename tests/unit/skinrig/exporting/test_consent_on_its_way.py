@@ -16,6 +16,7 @@ from skinrig.appearances.dynamic import describe_parts
 from skinrig.cli import main
 from skinrig.editing import edit as editing
 from skinrig.editing.spots import SpotRequest
+from skinrig.errors import UsageError
 from skinrig.exporting.export import export
 from skinrig.fitting.microstructure import fit_microstructure
 from skinrig.fitting.reflectance import fit_reflectance
@@ -50,6 +51,13 @@ def refused_beyond(folder, tmp_path, to):
     export(folder, tmp_path / "out", to=to, use="research", today=DAY)
     told = next((tmp_path / "out").glob("*.json"))
     assert json.loads(told.read_text())[consent.CONSENT_KEY] == [NARROW]
+
+
+def test_ended_consent_is_refused_at_the_capture():
+    today = date(2026, 1, 2)
+    assert consent.parse_subject("P042", ["research"], today, today=today).consent_expires == today
+    with pytest.raises(UsageError, match=r"got 2026-01-01, expected 2026-01-02 or later"):
+        consent.parse_subject("P042", ["research"], DAY, today=today)
 
 
 def test_a_fitted_reflectance_leaves_within_the_consent_alone(dome, tmp_path):

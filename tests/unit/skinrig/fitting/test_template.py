@@ -36,6 +36,7 @@ def seamed(tmp_path):
     return write_mesh(tmp_path / "own.ply", corners, faces, uv)
 
 
+@pytest.mark.long
 def test_written_file_has_template_layout_and_uncertainties(scan, tmp_path, capsys):
     out = tmp_path / "wrapped.ply"
     assert main(["fit", "template", str(scan), "--out", str(out), "--steps", "2", "--json"]) == 0
@@ -50,6 +51,7 @@ def test_written_file_has_template_layout_and_uncertainties(scan, tmp_path, caps
     assert figures["rms_mm"] < 0.3
 
 
+@pytest.mark.long
 def test_seams_of_own_template_stay_closed(scan, seamed, tmp_path):
     out = tmp_path / "wrapped.ply"
     fitting.fit_template(fitting.TemplateFiles(scan, seamed), out=out, steps=2)

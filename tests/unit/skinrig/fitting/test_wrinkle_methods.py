@@ -40,6 +40,7 @@ def fit(folders, method, out, capsys):
     return json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.long
 def test_both_methods_reduce_angle_to_expressions(face, folders, tmp_path, capsys):
     found = {
         method: fit(folders, method, tmp_path / method, capsys)

@@ -110,6 +110,7 @@ def test_median_of_offset_errors_matches_draws(rng):
     assert dome._median_magnitude(offset, sigma) == pytest.approx(np.median(drawn), rel=0.01)
 
 
+@pytest.mark.long
 def test_plan_keeps_promised_error_and_reports_omissions(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(dome_observation, "FACE_POINTS", 300)
     file = tmp_path / "plan.json"

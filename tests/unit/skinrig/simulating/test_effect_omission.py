@@ -20,6 +20,7 @@ def test_every_name_is_an_effect_that_scenes_take(rig):
         assert list(asked.values()).count(False) == 1
 
 
+@pytest.mark.long
 def test_omitted_flash_effects_are_reported_by_name(tmp_path):
     rig = load_rig("flash").resized(48)
     asked = {"width_px": 48, "plan": flash_plan(rig), "leave_out": ("subsurface", "optics")}

@@ -79,6 +79,7 @@ def test_missing_light_and_too_few_spots_are_distinguished(rng, fiber_camera, fa
         find(camera, light)
 
 
+@pytest.mark.long
 def test_merging_spots_are_resolved_by_single_uncovered_frames(rng, fiber_camera):
     nominal = fiber_camera(rng, shift=(0, 0), turn_rad=0, jitter_px=0).places
     places = nominal.copy()

@@ -173,6 +173,7 @@ def test_bundle_derivatives_are_those_of_projection(rng):
         np.testing.assert_allclose(derivative, found, rtol=1e-4, atol=1e-4 * np.abs(found).max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gauge", ["board", "cameras"])
 def test_a_bundle_finds_cameras_within_their_errors(rng, gauge):
     """Chi-square of the centres over several rigs; false alarm 1e-3 on each side."""

@@ -32,6 +32,7 @@ def both(rig: Rig, subject, *, films=FILMS, **kwargs) -> list[FlashScene]:
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("state", ["neutral", "smile"])
 def test_renderers_agree_on_a_face(rig, face, state):
     """Rationale: two ray tracers, two codes of the optics. Tolerances: float32 and 16-bit normals

@@ -119,6 +119,7 @@ def test_images_and_landmarks_follow_moved_face_truth(rig, places):
             )
 
 
+@pytest.mark.long
 def test_lens_blurs_face_out_of_focus(rig, face):
     """The lens stays focused on the tile's place: slopes of the picture lose energy with depth."""
     view = rig.views[0]

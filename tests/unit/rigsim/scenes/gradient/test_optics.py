@@ -109,6 +109,7 @@ def test_invalid_lens_is_refused(lens):
         )
 
 
+@pytest.mark.long
 def test_slope_transfer_matches_lens_and_pixel_mtf(lens):
     """The whole chain is linear in small slopes, so it is the OTF; tolerance 0.02."""
     periods = [60.0, 30.0, 20.0]

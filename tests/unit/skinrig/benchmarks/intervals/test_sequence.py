@@ -33,6 +33,7 @@ def trials(rng, **more):
     ]
 
 
+@pytest.mark.long
 def test_time_constants_in_noise_have_stated_coverage(rng):
     """300 fits: 4 sigma of a coverage of 68 % is 11 points, of 95 % 5."""
     made = trials(rng, noise=4e-4)
@@ -40,6 +41,7 @@ def test_time_constants_in_noise_have_stated_coverage(rng):
     assert abs(pool_trials(made, level=95).inside_fraction - 0.95) < 0.05
 
 
+@pytest.mark.long
 def test_intervals_half_as_wide_are_found_out(rng):
     made = trials(rng, noise=4e-4, too_sure=2.0)
     assert pool_trials(made, level=68, confidence=0.999).verdict == "missed"
