@@ -22,6 +22,8 @@ PICTURE_SIZES = ("small", "full")
 SIMULATED_USES = ("research", "publication")
 """Default consent scope of simulated subjects."""
 MIN_WIDTH_PX = 16
+MAX_PATCH_PX = 32
+"""Largest width of a patch of voxel skin, px."""
 FACE_TEXELS = 512
 _COUNT_OPTIONS = {"width_px": "width", "lights": "lights", "views": "views"}
 """Fields that count something, and their names in messages."""
@@ -79,6 +81,22 @@ def truth_folder(session: Path) -> Path:
     return session.with_name(f"truth-{session.name.removeprefix('session-')}")
 
 
+def refuse_reference(rig: str, why: str) -> None:
+    """Raise if a rig has no sessions of voxel skin.
+
+    Parameters
+    ----------
+    rig
+        Name of the rig.
+    why
+        Reason and what to do; empty: the rig has such sessions.
+    """
+    if why:
+        raise SimulationError(
+            f"renderer: got reference, expected mitsuba or fast for the {rig} rig, because {why}"
+        )
+
+
 SURFACE_FILE = "surface.npz"
 """Surface of a scene in the ground truth of the flash and the gradient rig, for renderers."""
 
@@ -98,6 +116,8 @@ class SimulationOrder:
     rig: ClassVar[str]
     targets: ClassVar[tuple[str, ...]]
     """Targets that can replace the subject."""
+    reference_refusal: ClassVar[str] = ""
+    """Reason why the rig has no sessions of voxel skin; empty: it has."""
 
     out: Path
     """The session's folder ``session-NAME``; the ground truth goes to ``truth-NAME`` next to it."""
@@ -140,6 +160,8 @@ class SimulationOrder:
                 )
         require_size(self.size)
         require_choice("renderer", self.renderer, get_args(Renderer), SimulationError)
+        if self.renderer == "reference":
+            refuse_reference(self.rig, self.reference_refusal)
         for name in ("seed", "session_seed", "days_ago"):
             number = getattr(self, name)
             if number is not None and number < 0:
@@ -243,6 +265,9 @@ class FlashOrder(FaceOrder):
     rig: ClassVar[str] = "flash"
     targets: ClassVar[tuple[str, ...]] = ("white", "chart", "flat", "dark", "malus")
 
+    site: str | None = None
+    """Site of the patch of voxel skin (renderer reference only); None: cheek."""
+
     repeats: int = 1
     """Image pairs per expression."""
     nearer_mm: float = 0.0
@@ -273,6 +298,7 @@ class FlashOrder(FaceOrder):
                 f"{self.exclusive_subject}; remove it"
             )
         SimulationOrder.check(self)
+        self._check_patch()
         if self.bands and (self.plan is not None or self.target not in (None, "white")):
             raise SimulationOptionsError(
                 "bands: an option of the default plan of a subject or of target white; a plan has "
@@ -282,6 +308,21 @@ class FlashOrder(FaceOrder):
             self.refuse_options(self.rig, "target", "repeats", "states", "bands")
         elif self.relaxation_s is not None:
             raise SimulationOptionsError("relaxation: an option of sequences; remove it")
+
+    def _check_patch(self) -> None:
+        """Raise for options that a patch of voxel skin lacks, or that only it has."""
+        if self.renderer != "reference":
+            self.refuse_options("flash (renderer mitsuba or fast)", "site")
+            return
+        names = ("mesh", "states", "nearer_mm", "bands", "sequence", "leave_out", "plan")
+        self.refuse_options("flash (renderer reference)", *names)
+        width_px = self.width_px or MIN_WIDTH_PX
+        if width_px > MAX_PATCH_PX or width_px % 2:
+            raise SimulationError(
+                f"width: got {width_px}, expected an even number up to {MAX_PATCH_PX} pixels for "
+                f"renderer reference, whose time grows with the pixels: {MIN_WIDTH_PX} take "
+                "a minute of processor time at small scale; lower it"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -296,6 +337,10 @@ class DomeOrder(FaceOrder):
 
     rig: ClassVar[str] = "dome"
     targets: ClassVar[tuple[str, ...]] = get_args(DomeTarget)
+    reference_refusal: ClassVar[str] = (
+        "its stages need the scan of a face, and a face as voxels takes 11 days; run "
+        "skinrig bench --stage reference-dome, which has patches through the same stages"
+    )
 
     lights: int | None = None
     """Number of evenly distributed lights; None: that of ``size``."""
@@ -366,6 +411,10 @@ class GradientOrder(SimulationOrder):
 
     rig: ClassVar[str] = "gradient"
     targets: ClassVar[tuple[str, ...]] = get_args(GradientTarget)
+    reference_refusal: ClassVar[str] = (
+        "its heights come from the surface's reflection, which voxels lack; run skinrig bench "
+        "--stage reference-gradient or reference-relief, which have diffuse normals of patches"
+    )
 
     width_px: int | None = None
     """Width of the image, px, instead of that of ``size``."""
