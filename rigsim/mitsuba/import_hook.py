@@ -13,13 +13,13 @@ from typing import Final
 
 from rigsim.mitsuba.plugins import register
 
-MITSUBA: Final = "mitsuba"
+MITSUBA_MODULE: Final = "mitsuba"
 
 
 def register_on_import() -> None:
     """Register the plugins now where Mitsuba is imported already, otherwise at its import."""
-    if MITSUBA in sys.modules:
-        register(sys.modules[MITSUBA])
+    if MITSUBA_MODULE in sys.modules:
+        register(sys.modules[MITSUBA_MODULE])
     else:
         sys.meta_path.insert(0, _RegisteringFinder())
 
@@ -30,7 +30,7 @@ class _RegisteringLoader(SourceFileLoader):
     def exec_module(self, module: ModuleType) -> None:
         super().exec_module(module)
         # Mitsuba replaces its module during the import
-        register(sys.modules[MITSUBA])
+        register(sys.modules[MITSUBA_MODULE])
 
 
 class _RegisteringFinder(MetaPathFinder):
@@ -39,7 +39,7 @@ class _RegisteringFinder(MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        if fullname != MITSUBA:
+        if fullname != MITSUBA_MODULE:
             return None
         spec = PathFinder.find_spec(fullname, path, target)
         if spec is not None and isinstance(spec.loader, SourceFileLoader):

@@ -40,6 +40,7 @@ from skinrig.simulating.sequence import simulate_sequence
 
 def simulate_flash(order: FlashOrder) -> SimulationResult:
     """Simulate a capture with the flash rig; see `simulation.simulate`."""
+    reference.check_flash_order(order)
     if order.sequence is not None:
         return simulate_sequence(order, order.sequence)
     target, states = order.target, order.states

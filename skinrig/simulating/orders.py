@@ -22,8 +22,6 @@ PICTURE_SIZES = ("small", "full")
 SIMULATED_USES = ("research", "publication")
 """Default consent scope of simulated subjects."""
 MIN_WIDTH_PX = 16
-MAX_PATCH_PX = 32
-"""Largest width of a patch of voxel skin, px."""
 FACE_TEXELS = 512
 _COUNT_OPTIONS = {"width_px": "width", "lights": "lights", "views": "views"}
 """Fields that count something, and their names in messages."""
@@ -81,22 +79,6 @@ def truth_folder(session: Path) -> Path:
     return session.with_name(f"truth-{session.name.removeprefix('session-')}")
 
 
-def refuse_reference(rig: str, why: str) -> None:
-    """Raise if a rig has no sessions of voxel skin.
-
-    Parameters
-    ----------
-    rig
-        Name of the rig.
-    why
-        Reason and what to do; empty: the rig has such sessions.
-    """
-    if why:
-        raise SimulationError(
-            f"renderer: got reference, expected mitsuba or fast for the {rig} rig, because {why}"
-        )
-
-
 SURFACE_FILE = "surface.npz"
 """Surface of a scene in the ground truth of the flash and the gradient rig, for renderers."""
 
@@ -116,8 +98,6 @@ class SimulationOrder:
     rig: ClassVar[str]
     targets: ClassVar[tuple[str, ...]]
     """Targets that can replace the subject."""
-    reference_refusal: ClassVar[str] = ""
-    """Reason why the rig has no sessions of voxel skin; empty: it has."""
 
     out: Path
     """The session's folder ``session-NAME``; the ground truth goes to ``truth-NAME`` next to it."""
@@ -129,8 +109,7 @@ class SimulationOrder:
     """Seed of one capture of the same subject with the same rig: noise, position, motion, scan and
     controllers. None: `seed`, and the face at the center of the rig."""
     days_ago: int = 0
-    """Day of the session before today; LEDs and frame of dome and sphere are those of that day, see
-    `rigsim.as_built.aging`."""
+    """Days before today of the session; LEDs and frames age, see `rigsim.as_built.aging`."""
     subject: str = "III"
     """Preset of the skin, or a file NAME.toml, see `rigsim.population.files`."""
     target: str | None = None
@@ -160,8 +139,6 @@ class SimulationOrder:
                 )
         require_size(self.size)
         require_choice("renderer", self.renderer, get_args(Renderer), SimulationError)
-        if self.renderer == "reference":
-            refuse_reference(self.rig, self.reference_refusal)
         for name in ("seed", "session_seed", "days_ago"):
             number = getattr(self, name)
             if number is not None and number < 0:
@@ -265,9 +242,6 @@ class FlashOrder(FaceOrder):
     rig: ClassVar[str] = "flash"
     targets: ClassVar[tuple[str, ...]] = ("white", "chart", "flat", "dark", "malus")
 
-    site: str | None = None
-    """Site of the patch of voxel skin (renderer reference only); None: cheek."""
-
     repeats: int = 1
     """Image pairs per expression."""
     nearer_mm: float = 0.0
@@ -278,8 +252,9 @@ class FlashOrder(FaceOrder):
     sequence: SequenceOrder | None = None
     """Sequence in time instead of ``states``."""
     relaxation_s: float | None = None
-    """Time constant of the sequence's blood volume fraction, s; None: that of the expression, see
-    `rigsim.subject.perfusion_course`."""
+    """Time constant of the sequence's blood volume fraction, s; None: that of the expression."""
+    site: str | None = None
+    """Site of the patch of voxel skin (renderer "reference"); None: cheek."""
 
     @property
     def exclusive_subject(self) -> str | None:
@@ -298,7 +273,6 @@ class FlashOrder(FaceOrder):
                 f"{self.exclusive_subject}; remove it"
             )
         SimulationOrder.check(self)
-        self._check_patch()
         if self.bands and (self.plan is not None or self.target not in (None, "white")):
             raise SimulationOptionsError(
                 "bands: an option of the default plan of a subject or of target white; a plan has "
@@ -308,21 +282,6 @@ class FlashOrder(FaceOrder):
             self.refuse_options(self.rig, "target", "repeats", "states", "bands")
         elif self.relaxation_s is not None:
             raise SimulationOptionsError("relaxation: an option of sequences; remove it")
-
-    def _check_patch(self) -> None:
-        """Raise for options that a patch of voxel skin lacks, or that only it has."""
-        if self.renderer != "reference":
-            self.refuse_options("flash (renderer mitsuba or fast)", "site")
-            return
-        names = ("mesh", "states", "nearer_mm", "bands", "sequence", "leave_out", "plan")
-        self.refuse_options("flash (renderer reference)", *names)
-        width_px = self.width_px or MIN_WIDTH_PX
-        if width_px > MAX_PATCH_PX or width_px % 2:
-            raise SimulationError(
-                f"width: got {width_px}, expected an even number up to {MAX_PATCH_PX} pixels for "
-                f"renderer reference, whose time grows with the pixels: {MIN_WIDTH_PX} take "
-                "a minute of processor time at small scale; lower it"
-            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -337,10 +296,6 @@ class DomeOrder(FaceOrder):
 
     rig: ClassVar[str] = "dome"
     targets: ClassVar[tuple[str, ...]] = get_args(DomeTarget)
-    reference_refusal: ClassVar[str] = (
-        "its stages need the scan of a face, and a face as voxels takes 11 days; run "
-        "skinrig bench --stage reference-dome, which has patches through the same stages"
-    )
 
     lights: int | None = None
     """Number of evenly distributed lights; None: that of ``size``."""
@@ -411,10 +366,6 @@ class GradientOrder(SimulationOrder):
 
     rig: ClassVar[str] = "gradient"
     targets: ClassVar[tuple[str, ...]] = get_args(GradientTarget)
-    reference_refusal: ClassVar[str] = (
-        "its heights come from the surface's reflection, which voxels lack; run skinrig bench "
-        "--stage reference-gradient or reference-relief, which have diffuse normals of patches"
-    )
 
     width_px: int | None = None
     """Width of the image, px, instead of that of ``size``."""

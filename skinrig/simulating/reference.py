@@ -15,8 +15,18 @@ from rigsim.scenes.reference.probe_session import VoxelProbeScene
 from rigsim.subject.person_skin import ABDOMEN_SITE, SITE_NAMES
 from skinrig.errors import require_choice
 from skinrig.simulating.driving import encode_arrays
-from skinrig.simulating.orders import SimulationError
+from skinrig.simulating.orders import MIN_WIDTH_PX, FlashOrder, SimulationError
 
+REFUSALS: Final = {
+    "dome": "its stages need the scan of a face, and a face as voxels takes 11 days; run "
+    "skinrig bench --stage reference-dome, which has patches through the same stages",
+    "gradient": "its heights come from the surface's reflection, which voxels lack; run "
+    "skinrig bench --stage reference-gradient or reference-relief, which have diffuse normals of "
+    "patches",
+}
+"""Reasons why a rig has no sessions of voxel skin, by its name."""
+MAX_PATCH_PX: Final = 32
+"""Largest width of a patch, px."""
 VOXEL_FILE: Final = "voxels.npz"
 """Voxels of a patch in the ground truth of the flash rig."""
 FACE_SITE_NAMES: Final = tuple(name for name in SITE_NAMES if name != ABDOMEN_SITE)
@@ -29,6 +39,30 @@ PATCH_SECONDS_PER_SAMPLE: Final = 4e-4
 """Processor seconds per pixel and sample, all wavelengths (two cores, type III)."""
 PROBE_SECONDS_PER_PHOTON: Final = 8e-4
 """Processor seconds per photon at each wavelength, all wavelengths (two cores, type III)."""
+
+
+def refuse_reference(rig: str) -> None:
+    """Raise `SimulationError` for a rig that has no sessions of voxel skin."""
+    if why := REFUSALS.get(rig):
+        raise SimulationError(
+            f"renderer: got reference, expected mitsuba or fast for the {rig} rig, because {why}"
+        )
+
+
+def check_flash_order(order: FlashOrder) -> None:
+    """Raise `SimulationError` for options that a patch lacks, or that a face lacks."""
+    if order.renderer != "reference":
+        order.refuse_options("flash (renderer mitsuba or fast)", "site")
+        return
+    names = ("mesh", "states", "nearer_mm", "bands", "sequence", "leave_out", "plan")
+    order.refuse_options("flash (renderer reference)", *names)
+    width_px = order.width_px or MIN_WIDTH_PX
+    if width_px > MAX_PATCH_PX or width_px % 2:
+        raise SimulationError(
+            f"width: got {width_px}, expected an even number up to {MAX_PATCH_PX} pixels for "
+            f"renderer reference, whose time grows with the pixels: {MIN_WIDTH_PX} take a minute "
+            "of processor time at small scale; lower it"
+        )
 
 
 def make_patch_scene(

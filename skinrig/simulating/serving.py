@@ -31,11 +31,8 @@ from skinrig.simulating import flash, gradient, reference
 from skinrig.simulating import probe as simulating_probe
 from skinrig.simulating.orders import (
     MIN_WIDTH_PX,
-    DomeOrder,
-    GradientOrder,
     SimulationError,
     SimulationOptionsError,
-    refuse_reference,
     require_size,
 )
 from skinrig.simulating.resumption import count_shots
@@ -141,7 +138,7 @@ def _build_served_rig(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
     find_unused_subject_keys(subject, kind, _report)
     if kind == "gradient":
         if order.renderer == "reference":
-            refuse_reference("gradient", GradientOrder.reference_refusal)
+            reference.refuse_reference("gradient")
         if order.size != "small":
             raise SimulationError(
                 f"size: got {order.size!r}, expected small: larger pictures take longer to make "
@@ -162,7 +159,7 @@ def _build_served_rig(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
     dome = "dome" in rig.boxes
     if order.renderer == "reference":
         if dome:
-            refuse_reference("dome", DomeOrder.reference_refusal)
+            reference.refuse_reference("dome")
         return _reference_flash(rig, order)
     width = (simulating_dome if dome else flash).WIDTHS_PX[order.size]
     rig = rig.resized(width) if width != rig.views[0].width_px else rig
