@@ -17,7 +17,7 @@ from skinrig.errors import require_choice
 from skinrig.simulating.driving import encode_arrays
 from skinrig.simulating.orders import MIN_WIDTH_PX, FlashOrder, SimulationError
 
-REFUSALS: Final = {
+REFUSAL_REASONS: Final = {
     "dome": "its stages need the scan of a face, and a face as voxels takes 11 days; run "
     "skinrig bench --stage reference-dome, which has patches through the same stages",
     "gradient": "its heights come from the surface's reflection, which voxels lack; run "
@@ -43,7 +43,7 @@ PROBE_SECONDS_PER_PHOTON: Final = 8e-4
 
 def refuse_reference(rig: str) -> None:
     """Raise `SimulationError` for a rig that has no sessions of voxel skin."""
-    if why := REFUSALS.get(rig):
+    if why := REFUSAL_REASONS.get(rig):
         raise SimulationError(
             f"renderer: got reference, expected mitsuba or fast for the {rig} rig, because {why}"
         )
