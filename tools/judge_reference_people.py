@@ -20,6 +20,7 @@ from make_independent_skins import coefficients, draw_skin
 
 from capture.rig import load_rig
 from model import spectra
+from reconstruction.chromophores.shading_prior import LOG_SHADING_SOFTNESS
 from reconstruction.pipeline.flash.stages import load_skin_colors
 from rigsim.scenes.reference.flat_layers import describe_flat_layers, render_voxels
 from rigsim.scenes.reference.patch import SMOOTH_ROUGHNESS, PatchImage, fast_shading
@@ -75,12 +76,18 @@ def main(seed: int, count: int) -> None:
         shape = (WIDTH_PX, WIDTH_PX, 3)
         rgb = color * (1.0 + IMAGE_NOISE * rng.standard_normal(shape))
         image = PatchImage(rgb, np.broadcast_to((IMAGE_NOISE * color) ** 2, shape))
-        truths = (
+        truths = [
             np.full(shape[:2], part)
             for part in (depth / colors[0].constants.melanin_depth_factor, skin["c_hd"])
-        )
-        for key, one in estimate_patch(image, fast_shading(rig), light, colors, *truths).items():
-            found[key].append(one)
+        ]
+        # a face off the white reference's position has other light than the reference
+        step = np.random.default_rng([seed, number]).standard_normal()
+        off = light * math.exp(LOG_SHADING_SOFTNESS * step)
+        for place, lit in (("", light), (", off the position", off)):
+            given = image, fast_shading(rig), lit, colors, *truths
+            for (shading, name), one in estimate_patch(*given).items():
+                if shading == "free" or not place:
+                    found[shading + place, name].append(one)
         print(number, np.round(color, 3), file=sys.stderr, flush=True)
     print(f"noise of a color, %: {100 * float(np.mean(noises)):.2f}")
     for (shading, name), people in found.items():

@@ -168,7 +168,8 @@ def _accuracy(
 ) -> PersonAccuracy:
     """Return the accuracy with 68 and 95 % intervals between two ends each."""
     if not valid.any():
-        return PersonAccuracy(*[float("nan")] * 4, 0.0)
+        unknown = float("nan")
+        return PersonAccuracy(unknown, unknown, unknown, unknown, 0.0)
     ratio = value[valid] / truth[valid]
     inside, wide = ((low <= truth) & (truth <= high) for low, high in ends)
     return PersonAccuracy(
