@@ -3,18 +3,16 @@
 BSDF `skincoat`, emitter `ledarray`, sensor `rigcamera`, integrators `olat` and `tissue`::
 
     import mitsuba as mi
+    import rigsim.mitsuba            # registers them, for variants that are set before and later
     mi.set_variant("llvm_ad_rgb")
-    import rigsim.mitsuba            # registers them, also for variants that are set later
     scene = mi.load_file("scene.xml")
 
-A script that imports this package before Mitsuba calls `register` itself.
+The order of these two imports is free.
 """
 
-import sys
-
+from rigsim.mitsuba.import_hook import register_on_import
 from rigsim.mitsuba.plugins import register
 
 __all__ = ["register"]
 
-if "mitsuba" in sys.modules:
-    register(sys.modules["mitsuba"])
+register_on_import()

@@ -6,7 +6,6 @@ from collections.abc import MutableMapping
 from functools import cache
 from typing import Any, Final
 
-from rigsim.mitsuba.plugins import register
 from rigsim.mitsuba.render_error import RenderError
 from rigsim.mitsuba.variant import VariantChoice, user_cache_dir
 
@@ -52,7 +51,6 @@ def _import_mitsuba(library: str) -> Any:
         raise RenderError(f"Mitsuba cannot be imported: {error}; reinstall mitsuba") from error
     dr.set_thread_count(thread_count())
     mi.set_log_level(mi.LogLevel.Error)
-    register(mi)
     return mi
 
 

@@ -21,6 +21,8 @@ from glob import glob
 from pathlib import Path
 from typing import Final, Literal
 
+from rigsim.mitsuba.render_error import RenderError
+
 logger = logging.getLogger(__name__)
 
 Kind = Literal["rgb", "mono", "mono_polarized", "spectral", "spectral_polarized"]
@@ -85,8 +87,9 @@ class LibraryCheck:
     """Version when usable, otherwise the reason in words."""
 
 
-Renderer = Literal["mitsuba", "fast"]
-"""Renderers of a session's images: Mitsuba's scenes, or compiled loops with Embree's rays."""
+Renderer = Literal["mitsuba", "fast", "reference"]
+"""Renderers of a session's images: Mitsuba's scenes, compiled loops with Embree's rays, or voxels
+of a patch of skin by Mitsuba."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,6 +229,11 @@ def probe_library(path: Path, *, timeout_s: float = PROBE_TIMEOUT_S) -> LibraryC
 def choose_renderer(renderer: Renderer) -> VariantChoice:
     """Return the variant of a renderer: "mitsuba" needs LLVM, otherwise its reason is in `why`.
 
+    Raises
+    ------
+    RenderError
+        "reference" without LLVM.
+
     Examples
     --------
     >>> choose_renderer("fast").renderer
@@ -235,6 +243,10 @@ def choose_renderer(renderer: Renderer) -> VariantChoice:
         return VariantChoice(_SCALAR_VARIANTS["rgb"], "requested", "")
     choice = choose_variant("rgb")
     if not choice.is_vectorized:
+        if renderer == "reference":
+            raise RenderError(
+                f"renderer: reference needs LLVM, got {choice.why}; install LLVM or use fast"
+            )
         _warn_of_fast(choice.why)
     return choice
 

@@ -117,7 +117,13 @@ Subject = Annotated[
 Scale = Annotated[str, choice("small", "full")]
 Renderer = Annotated[
     str,
-    choice("mitsuba", "fast", text="Renderer: scenes of Mitsuba, or compiled loops without it."),
+    choice(
+        "mitsuba",
+        "fast",
+        "reference",
+        text="Renderer: scenes of Mitsuba, compiled loops without it, or a patch of voxel skin "
+        "(flash, probe).",
+    ),
 ]
 Width = Annotated[int | None, option("Image width, pixels; default: that of the scale.")]
 Resume = Annotated[bool, option("Continue an interrupted session.", "--resume")]

@@ -146,6 +146,12 @@ def simulate_flash(
     camera_offset_mm: float = 0.0,
     relaxation: float | None = None,
     bands: options.Bands = None,
+    site: Annotated[
+        str | None,
+        options.choice(
+            "forehead", "cheek", "chin", text="Site of renderer reference; default: cheek."
+        ),
+    ] = None,
 ) -> None:
     """Simulate the flash rig: expressions of a face, a time sequence, or a target.
 
@@ -172,6 +178,7 @@ def simulate_flash(
         sequence=sequence.order(),
         relaxation_s=relaxation,
         bands=parse_bands(bands) if bands else (),
+        site=site,
     )
     _simulate(order, console, "sequence" if order.sequence is not None else target)
 
@@ -290,6 +297,7 @@ def simulate_probe(
     repeats: options.Placements = 1,
     angles: options.Directions = None,
     all_brackets: options.AllBrackets = False,
+    renderer: options.Renderer = "mitsuba",
 ) -> None:
     """Simulate the fiber probe: tissue at several sites, or a target.
 
@@ -313,6 +321,7 @@ def simulate_probe(
         repeats=repeats,
         angles=parse_floats(angles, "--angles"),
         all_brackets=all_brackets,
+        renderer=cast(Any, renderer),
     )
     _simulate(order, console, target)
 

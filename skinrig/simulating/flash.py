@@ -12,12 +12,13 @@ from rigsim.needs.effects import SceneEffects
 from rigsim.population import files as subject_file
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.scenes.flash.truth import face_surface
+from rigsim.scenes.reference.flash_session import VoxelFlashScene, crop_to_patch, make_patch_sensor
 from rigsim.subject.head_motion import draw_head_position
 from rigsim.subject.perfusion import STATE_NAMES
 from skinrig.capturing.plan_choice import DefaultPlan
 from skinrig.console import select_attributes
 from skinrig.errors import require_choice
-from skinrig.simulating import subject_records
+from skinrig.simulating import reference, subject_records
 from skinrig.simulating.driving import (
     build_result,
     drive_plan,
@@ -27,6 +28,7 @@ from skinrig.simulating.driving import (
 )
 from skinrig.simulating.flash_truth import WIDTHS_PX, _stance_offset_mm, build_truth
 from skinrig.simulating.orders import (
+    MIN_WIDTH_PX,
     SURFACE_FILE,
     FlashOrder,
     SimulationError,
@@ -38,14 +40,19 @@ from skinrig.simulating.sequence import simulate_sequence
 
 def simulate_flash(order: FlashOrder) -> SimulationResult:
     """Simulate a capture with the flash rig; see `simulation.simulate`."""
+    reference.check_flash_order(order)
     if order.sequence is not None:
         return simulate_sequence(order, order.sequence)
     target, states = order.target, order.states
     for state in states if target is None else ():
         require_choice("state", state, STATE_NAMES, SimulationError)
-    width = order.width_px or WIDTHS_PX[order.size]
     rig = load_rig("flash")
-    rig = rig.resized(width) if width != rig.views[0].width_px else rig
+    is_patch = order.renderer == "reference"
+    width = order.width_px or (MIN_WIDTH_PX if is_patch else WIDTHS_PX[order.size])
+    if is_patch:
+        rig = crop_to_patch(rig, width)
+    elif width != rig.views[0].width_px:
+        rig = rig.resized(width)
     settings = manifest_settings(
         order,
         width_px=width,
@@ -57,6 +64,7 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
             "movement",
             *(["nearer_mm"] if order.nearer_mm else []),
             *(["bands"] if order.bands else []),
+            *(["size", "site"] if is_patch else []),
         ),
     )
     texels = subject_records.choose_face_texels(width)
@@ -88,11 +96,15 @@ def simulate_flash(order: FlashOrder) -> SimulationResult:
             parameters=about,
             with_oxygenation=has_leds,
         )
-        if state == states[0]:
+        if isinstance(scene, VoxelFlashScene):
+            appearance = reference.add_voxels(scene, appearance)
+        elif state == states[0]:
             surface = face_surface(scene.subject, state, rig, scene.white_rgb())
             files = {SURFACE_FILE: encode_arrays(surface)}
             appearance = dataclasses.replace(appearance, files=files)
         store.write(folder, appearance)
+    if is_patch:
+        return build_result(order, session, first, rig_seconds, truth)
     blur_mm = tuple(float(width) for width in first.resolution_mm())
     return build_result(order, session, first, rig_seconds, truth, blur_mm=blur_mm)
 
@@ -103,7 +115,14 @@ def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:
     power = max(powers, default=0.0) or 1.0
     if order.target is not None:
         state = "white" if order.target == "white" else ""
-        return {state: FlashScene(rig, targets.make_target(order.target), seed=seed, power=power)}
+        target = targets.make_target(order.target)
+        sensor = make_patch_sensor(rig) if order.renderer == "reference" else None
+        return {state: FlashScene(rig, target, seed=seed, power=power, sensor=sensor)}
+    if order.renderer == "reference":
+        given = select_attributes(
+            order, "subject", "site", "seed", "noise_seed", "size", "progress"
+        )
+        return {"neutral": reference.make_patch_scene(rig, **given)}
     subject = subject_file.load_subject(order.subject)
     texels = subject_records.choose_face_texels(rig.views[0].width_px)
     person = subject.face(seed=order.seed, size=texels, mesh=order.mesh)

@@ -37,8 +37,12 @@ def _stance_offset_mm(rig: Rig, nearer_mm: float) -> tuple[float, float, float]:
 
 
 def _nearer_mm(scene: Any) -> float:
-    """Return how much nearer, mm, a scene's face is to its first camera than the reference."""
-    return float(np.dot(scene.subject.offset_mm, scene.rig.views[0].axes[2]))
+    """Return how much nearer, mm, a scene's face is to its first camera than the reference.
+
+    A patch of voxel skin is in the reference's position.
+    """
+    offset_mm = getattr(scene.subject, "offset_mm", (0.0, 0.0, 0.0))
+    return float(np.dot(offset_mm, scene.rig.views[0].axes[2]))
 
 
 def to_superpixels(values: NDArray[Any], mask: BoolArray | None = None) -> NDArray[Any]:

@@ -108,8 +108,7 @@ class SimulationOrder:
     """Seed of one capture of the same subject with the same rig: noise, position, motion, scan and
     controllers. None: `seed`, and the face at the center of the rig."""
     days_ago: int = 0
-    """Day of the session before today; LEDs and frame of dome and sphere are those of that day, see
-    `rigsim.as_built.aging`."""
+    """Days before today of the session; LEDs and frames age, see `rigsim.as_built.aging`."""
     subject: str = "III"
     """Preset of the skin, or a file NAME.toml, see `rigsim.population.files`."""
     target: str | None = None
@@ -252,8 +251,9 @@ class FlashOrder(FaceOrder):
     sequence: SequenceOrder | None = None
     """Sequence in time instead of ``states``."""
     relaxation_s: float | None = None
-    """Time constant of the sequence's blood volume fraction, s; None: that of the expression, see
-    `rigsim.subject.perfusion_course`."""
+    """Time constant of the sequence's blood volume fraction, s; None: that of the expression."""
+    site: str | None = None
+    """Site of the patch of voxel skin (renderer "reference"); None: cheek."""
 
     @property
     def exclusive_subject(self) -> str | None:

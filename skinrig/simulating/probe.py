@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from capture.plan import Plan
 from capture.plan.probe import PHANTOM_SITE, PROBE_SITES, group_by_series
 from capture.plan.suction import HeadPlacement
 from capture.rig import Rig, load_rig
@@ -14,7 +15,7 @@ from rigsim.scenes.probe.scene import ProbePlacement, ProbeScene
 from rigsim.scenes.probe.scene import probe_truth as ground_truth
 from skinrig.capturing.plan_choice import DefaultPlan, parse_direction_count
 from skinrig.console import select_attributes
-from skinrig.simulating import driving
+from skinrig.simulating import driving, reference
 from skinrig.simulating.exposure_log import SceneLog
 from skinrig.simulating.orders import ProbeOrder, SimulationError, SimulationResult, truth_folder
 
@@ -37,13 +38,7 @@ def simulate_probe(order: ProbeOrder) -> SimulationResult:
         angles=parse_direction_count(order.angles),
         **select_attributes(order, "size", "repeats", "all_brackets"),
     )
-    photons = TRUTH_PHOTONS[order.size]
-    scene = make_scene(
-        rig,
-        order.target,
-        **select_attributes(order, "subject", "seed", "noise_seed"),
-        photons=photons,
-    )
+    scene = _build_scene(rig, plan, order)
     if order.target is None:
         _check_sites(scene.tissue, order.sites or PROBE_SITES, rig)
     light = driving.announce_light(plan, rig, order)
@@ -59,6 +54,16 @@ def simulate_probe(order: ProbeOrder) -> SimulationResult:
         driving.write_truth(truth, order, session, appearance, subject=order.subject)
     log.remove()
     return driving.build_result(order, session, scene, rig_seconds, truth, light=light)
+
+
+def _build_scene(rig: Rig, plan: Plan, order: ProbeOrder) -> Any:
+    given = select_attributes(order, "subject", "seed", "noise_seed")
+    if order.renderer != "reference" or order.target is not None:
+        return make_scene(rig, order.target, photons=TRUTH_PHOTONS[order.size], **given)
+    places = {(head.site, head.angle_deg) for head, _ in group_by_series(plan)}
+    return reference.make_probe_scene(
+        rig, places=places, **given, **select_attributes(order, "size", "progress")
+    )
 
 
 def _check_sites(tissue: Any, sites: Sequence[str], rig: Rig) -> None:

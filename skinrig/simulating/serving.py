@@ -18,6 +18,7 @@ from rigsim.population import files as subject_file
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.scenes.gradient.reference import NEUTRAL_GRIP
+from rigsim.scenes.reference.flash_session import crop_to_patch
 from rigsim.subject.head_motion import draw_head_position
 from rigsim.world.serve import serve_world
 from rigsim.world.suction import HeadState
@@ -26,9 +27,14 @@ from skinrig.console import Console, select_attributes
 from skinrig.errors import EXIT_INTERRUPTED, UsageError
 from skinrig.next_steps import shell_quote
 from skinrig.simulating import dome as simulating_dome
-from skinrig.simulating import flash, gradient
+from skinrig.simulating import flash, gradient, reference
 from skinrig.simulating import probe as simulating_probe
-from skinrig.simulating.orders import SimulationError, SimulationOptionsError, require_size
+from skinrig.simulating.orders import (
+    MIN_WIDTH_PX,
+    SimulationError,
+    SimulationOptionsError,
+    require_size,
+)
 from skinrig.simulating.resumption import count_shots
 from skinrig.simulating.subject_records import find_unused_subject_keys
 
@@ -129,8 +135,10 @@ def _build_served_rig(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
     subject, seed = order.subject, order.seed
     # a rig file may have any name, so the kind of the rig follows from its parts
     kind = "gradient" if "gradient_sphere" in rig.boxes else "probe" if rig.probe else "other"
-    find_unused_subject_keys(subject, kind, lambda text: print(text, file=sys.stderr))
+    find_unused_subject_keys(subject, kind, _report)
     if kind == "gradient":
+        if order.renderer == "reference":
+            reference.refuse_reference("gradient")
         if order.size != "small":
             raise SimulationError(
                 f"size: got {order.size!r}, expected small: larger pictures take longer to make "
@@ -149,6 +157,10 @@ def _build_served_rig(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
     if rig.probe is not None:
         return rig, _probe_scene(rig, rig.probe, order)
     dome = "dome" in rig.boxes
+    if order.renderer == "reference":
+        if dome:
+            reference.refuse_reference("dome")
+        return _reference_flash(rig, order)
     width = (simulating_dome if dome else flash).WIDTHS_PX[order.size]
     rig = rig.resized(width) if width != rig.views[0].width_px else rig
     return rig, (_dome_scene if dome else _flash_scene)(rig, order)
@@ -184,6 +196,17 @@ def _flash_scene(rig: Rig, order: ServeOrder) -> Any:
     return scene
 
 
+def _report(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+def _reference_flash(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
+    """Return the cropped rig and its patch of voxel skin, rendered before the first request."""
+    rig = crop_to_patch(rig, MIN_WIDTH_PX)
+    given = select_attributes(order, "subject", "seed", "noise_seed", "size")
+    return rig, reference.make_patch_scene(rig, site=None, progress=_report, **given)
+
+
 def _dome_scene(rig: Rig, order: ServeOrder) -> Any:
     built, choice = build_dome(rig, seed=order.seed), choose_renderer(order.renderer)
     return DomeScene(rig, order.face(), dome=built, seed=order.noise_seed, choice=choice)
@@ -191,10 +214,17 @@ def _dome_scene(rig: Rig, order: ServeOrder) -> Any:
 
 def _probe_scene(rig: Rig, probe: Probe, order: ServeOrder) -> Any:
     given = select_attributes(order, "subject", "seed", "noise_seed")
-    skin, block = (
-        simulating_probe.make_scene(rig, of, photons=PROBE_PHOTONS, **given)
-        for of in (None, "phantom")
-    )
+    block = simulating_probe.make_scene(rig, "phantom", photons=PROBE_PHOTONS, **given)
+    skin: ProbeScene
+    if order.renderer == "reference":
+        given |= {
+            "size": order.size,
+            "places": [(site, 0.0) for site in PROBE_SITES],
+            "progress": _report,
+        }
+        skin = reference.make_probe_scene(rig, **given)
+    else:
+        skin = simulating_probe.make_scene(rig, None, photons=PROBE_PHOTONS, **given)
     # photons of the default sites are traced before the first request: during one, the head is
     # under suction, and the controller waits for its host for a few seconds only
     for site in (*PROBE_SITES, PHANTOM_SITE):

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from skinrig.simulating.orders import SimulationOrder, SimulationResult, order_for
+from skinrig.simulating.reference import refuse_reference
 
 
 def simulate(order: SimulationOrder) -> SimulationResult:
@@ -20,6 +21,8 @@ def simulate(order: SimulationOrder) -> SimulationResult:
     SimulationError
         For an order that the rig cannot simulate.
     """
+    if order.renderer == "reference":
+        refuse_reference(order.rig)
     # one module per rig, imported on use, so that a run loads only its own rig
     rig = importlib.import_module(f"skinrig.simulating.{order.rig}")
     done: SimulationResult = getattr(rig, f"simulate_{order.rig}")(order)

@@ -337,19 +337,36 @@ def test_skincoat_outside_ranges_is_refused(mi, name, value):
 
 
 PLAIN_SCRIPT = """
-import mitsuba as mi
-mi.set_variant("scalar_rgb")
-import rigsim.mitsuba
-print(mi.load_dict({"type": "skincoat", "oil": 0.2}))
-mi.set_variant("llvm_ad_mono")
-print(mi.load_dict({"type": "skincoat", "oil": 0.2}))
+{imports}
+for variant in ("scalar_rgb", "llvm_ad_mono_polarized", "llvm_ad_rgb"):
+    mi.set_variant(variant)
+    print(mi.load_dict({{"type": "skincoat", "oil": 0.2}}))
+print(mi.load_dict({{"type": "tissue"}}).aov_names())
 """
 
+IMPORT_ORDERS = {
+    "package first": """
+import sys
+import rigsim.mitsuba
+assert "mitsuba" not in sys.modules
+import mitsuba as mi""",
+    "Mitsuba first": """
+import mitsuba as mi
+import rigsim.mitsuba""",
+    "after a variant": """
+import mitsuba as mi
+mi.set_variant("scalar_rgb")
+import rigsim.mitsuba""",
+}
 
-def test_plugins_work_in_any_script(mi):
-    """The active variant when the package is imported, and one that is set later."""
+
+@pytest.mark.parametrize("order", IMPORT_ORDERS)
+def test_plugins_work_in_any_script(mi, order):
+    """The package before and after Mitsuba, with variants of each kind."""
+    script = PLAIN_SCRIPT.format(imports=IMPORT_ORDERS[order])
     run = subprocess.run(
-        [sys.executable, "-c", PLAIN_SCRIPT], capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=120
     )
     assert run.returncode == 0, run.stderr
-    assert run.stdout.count("SkinCoat[r_d, alpha, oil, vellus, bare]") == 2
+    assert run.stdout.count("SkinCoat[r_d, alpha, oil, vellus, bare]") == 3
+    assert run.stdout.splitlines()[-1].startswith("['subsurface.")

@@ -18,9 +18,10 @@ from rigsim.arrays import Float32Array, Float64Array
 from rigsim.as_built.probe import SPOT_RADIUS_PX, ActualProbe
 from rigsim.mitsuba.scene_radiance import perspective, radiance
 
-SAMPLES_PER_PIXEL: Final = 32
+SAMPLES_PER_PIXEL: Final = 64
 """Samples per pixel, multi-jittered: after the lens, 0.2 % of error of a pixel (rms), and 0.003 px
-of a spot's position."""
+of a spot's position. Mitsuba rounds them up to a grid, and adds other counts than powers of two in
+the order of its threads: 64 is a grid of 8 x 8."""
 RADIAL_TEXELS, ANGULAR_TEXELS = 32, 128
 """Texels of a fiber end's light, in polar coordinates."""
 BLUR_SIGMAS: Final = 5.0

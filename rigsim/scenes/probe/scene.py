@@ -25,7 +25,7 @@ from rigsim.boxes.contact_probe.source_shutter import SourceLight
 from rigsim.fiber.homogeneous_fit import fit_homogeneous_medium
 from rigsim.fiber.probe_profile import BandProfile, ProfileCache, probe_fibers
 from rigsim.fiber.probe_tissue import HomogeneousTissue, ProbedTissue, TissueError
-from rigsim.mitsuba.variant import choose_variant
+from rigsim.mitsuba.variant import Renderer, choose_variant
 from rigsim.needs.effects import PixelNoise
 from rigsim.needs.probe import equivalent_pixels, select_probe_effects
 from rigsim.needs.tissue import select_probed_tissue
@@ -82,7 +82,7 @@ class ProbeScene(RigScene):
         Photons per site and angle.
     """
 
-    renderer: Final = "mitsuba"
+    renderer: Renderer = "mitsuba"
     """Renderer of the detector's image, with any variant."""
 
     def __init__(

@@ -27,6 +27,9 @@ MAX_VIEW_DEG: Final = 80.0
 N_VIEWS: Final = 48
 """Rendered cameras per light, even over zenith angle and azimuth."""
 VIEW_DISTANCE_MM: Final = 2.0
+FACET_ROUGHNESS: Final = 0.35
+FACET_OIL_FRACTION: Final = 0.08
+"""Surface of a cheek: Beckmann roughness and fraction below oil."""
 N_QUADRATURE: Final = 32
 MIN_SAMPLES: Final = 4
 """Samples per camera at the wavelength to which the rig's cameras are least sensitive."""

@@ -1,5 +1,6 @@
 """A patch of a person's face as voxels, before the flash rig's camera and lights."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import atan, degrees, hypot
 from typing import Any, Final
@@ -123,7 +124,13 @@ def draw_patch(
 
 
 def render_patch(
-    patch: SkinPatch, rig: Rig, *, width_px: int, samples: int, seed: int
+    patch: SkinPatch,
+    rig: Rig,
+    *,
+    width_px: int,
+    samples: int,
+    seed: int,
+    progress: Callable[[str], None] | None = None,
 ) -> PatchImage:
     """Render the patch before the flash rig, one band of the spectrum after the other.
 
@@ -139,6 +146,8 @@ def render_patch(
         Samples per pixel at the wavelength to which the camera is most sensitive.
     seed
         Seed of the sampler, >= 0.
+    progress
+        Called with a line per wavelength.
 
     Returns
     -------
@@ -152,6 +161,8 @@ def render_patch(
     white = _render_white(patch, rig, width_px)[..., None]
     rgb = np.zeros((2, width_px, width_px, 3))
     for band, wavelength_nm in enumerate(WAVELENGTH_NM):
+        if progress is not None:
+            progress(f"voxels: {wavelength_nm:g} nm, {band + 1} of {len(WAVELENGTH_NM)} bands")
         scene = describe_patch(patch, rig, float(wavelength_nm), width_px=width_px)
         spp = max(round(0.5 * samples * float(importance[band])), MIN_SAMPLES)
         for half in range(2):

@@ -27,6 +27,8 @@ from rigsim.light.led_light import lobe_exponent, white_intensity
 from rigsim.light.surface_brdf import evaluate_brdf
 from rigsim.population.files import load_subject
 from rigsim.scenes.reference.directions import (
+    FACET_OIL_FRACTION,
+    FACET_ROUGHNESS,
     DirectionalReflectance,
     facet_reflection,
     normal_reflectance,
@@ -50,9 +52,6 @@ TILT_DEG: Final = (0.0, 20.0, 40.0)
 """Angles between the patch's normal and the direction in which the subject looks."""
 SCAN_ERROR_DEG: Final = 2.0
 """Angle between the normals of scan and patch."""
-CHEEK_ROUGHNESS: Final = 0.35
-CHEEK_OIL_FRACTION: Final = 0.08
-"""Surface of a cheek: Beckmann roughness and fraction below oil."""
 SIDE_POINTS: Final = 4
 POINT_SPACING_PX: Final = 2.0
 """Distance of points in pixels of the merged images, so that their noise is independent."""
@@ -274,11 +273,11 @@ def estimate_patch(
     rng = np.random.default_rng(seed)
     normal = _tilt(np.array([0.0, 0.0, 1.0]), tilt_deg, rng)
     scan_normal = _tilt(normal, SCAN_ERROR_DEG, rng)
-    packed = np.array([*truth, CHEEK_ROUGHNESS, CHEEK_OIL_FRACTION, 0.0, 1.0])
+    packed = np.array([*truth, FACET_ROUGHNESS, FACET_OIL_FRACTION, 0.0, 1.0])
 
     def reflect_voxels(light: Float64Array, camera: Float64Array) -> Float64Array:
         facets = facet_reflection(
-            normal, light, camera, roughness=CHEEK_ROUGHNESS, oil=CHEEK_OIL_FRACTION
+            normal, light, camera, roughness=FACET_ROUGHNESS, oil=FACET_OIL_FRACTION
         )
         return below.evaluate(normal, light, camera) + facets[:, None]
 

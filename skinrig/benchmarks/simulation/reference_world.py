@@ -28,6 +28,7 @@ from rigsim.scenes.reference.patch import (
 )
 from rigsim.tissue.skin_layers import melanin_per_mm
 from skinrig.arrays import Float64Array
+from skinrig.benchmarks.intervals.flash import FACTOR_95
 from skinrig.benchmarks.measurement import measure_processor_time
 from skinrig.benchmarks.resampling import mean_error
 from skinrig.benchmarks.results import Timing
@@ -39,6 +40,7 @@ FACE_SITE: Final = "cheek"
 FIELD_MM: Final = 16.0
 VOXEL_MM: Final = 0.25
 INTERVAL_PROBABILITY: Final = 0.683
+WIDE_PROBABILITY: Final = 0.95
 ABSORPTION_NM: Final = 550.0
 
 ShadingMode = Literal["known", "free"]
@@ -55,6 +57,8 @@ class PersonAccuracy:
     """Median ratio of estimate to ground truth."""
     coverage: float
     """Fraction of 68 % intervals that contain the ground truth."""
+    wide_coverage: float
+    """The same of 95 % intervals."""
     valid: float
     """Fraction of valid pixels."""
 
@@ -96,9 +100,9 @@ def measure_reference_world(stage: BenchmarkStage) -> None:
             )
             melanin, blood = pixel_truth(patch, width)
             melanin *= float(depth) / skin_colors[0].constants.melanin_depth_factor
-            light = _ramp_shading(skin_colors[1], width)
+            light = ramp_shading(skin_colors[1], width)
             for name, image in images.items():
-                for key, one in _estimate(
+                for key, one in estimate_patch(
                     image, fast_shading(rig), light, skin_colors, melanin, blood
                 ).items():
                     found[name, *key].append(one)
@@ -107,7 +111,7 @@ def measure_reference_world(stage: BenchmarkStage) -> None:
     stage.limits["color"] = 100.0 * float(ratio.max())
 
 
-def _ramp_shading(prior: ShadingPrior, width: int) -> Float64Array:
+def ramp_shading(prior: ShadingPrior, width: int) -> Float64Array:
     """Return light that changes over the image by the central part of a face's, shape (H, W)."""
     below = np.cumsum(prior.density) * prior.step
     quantiles = np.linspace(
@@ -117,7 +121,7 @@ def _ramp_shading(prior: ShadingPrior, width: int) -> Float64Array:
     return np.repeat(column[:, None], width, axis=1)
 
 
-def _estimate(
+def estimate_patch(
     image: PatchImage,
     shading: float,
     light: Float64Array,
@@ -146,30 +150,33 @@ def _estimate(
         ("hemoglobin", blood),
     )
     for name, truth in truths:
-        low, high = known.interval(name, INTERVAL_PROBABILITY)
-        out["known", name] = _accuracy(getattr(known, name), low, high, truth, known.valid)
+        ends = [known.interval(name, p) for p in (INTERVAL_PROBABILITY, WIDE_PROBABILITY)]
+        out["known", name] = _accuracy(getattr(known, name), ends, truth, known.valid)
         middle, half = (
             np.asarray(getattr(free, part), np.float64) for part in (name, f"stderr_{name}")
         )
-        out["free", name] = _accuracy(middle, middle - half, middle + half, truth, free.valid)
+        ends = [(middle - k * half, middle + k * half) for k in (1.0, FACTOR_95)]
+        out["free", name] = _accuracy(middle, ends, truth, free.valid)
     return out
 
 
 def _accuracy(
     value: Float64Array,
-    low: Float64Array,
-    high: Float64Array,
+    ends: list[tuple[Float64Array, Float64Array]],
     truth: Float64Array,
     valid: np.ndarray,
 ) -> PersonAccuracy:
+    """Return the accuracy with 68 and 95 % intervals between two ends each."""
     if not valid.any():
-        return PersonAccuracy(float("nan"), float("nan"), float("nan"), 0.0)
+        unknown = float("nan")
+        return PersonAccuracy(unknown, unknown, unknown, unknown, 0.0)
     ratio = value[valid] / truth[valid]
-    inside = (low <= truth) & (truth <= high)
+    inside, wide = ((low <= truth) & (truth <= high) for low, high in ends)
     return PersonAccuracy(
         100.0 * float(np.median(np.abs(ratio - 1.0))),
         float(np.median(ratio)),
         float(inside[valid].mean()),
+        float(wide[valid].mean()),
         float(valid.mean()),
     )
 
@@ -187,6 +194,9 @@ def _add_results(
         extra: dict[str, float] = {
             "noise, %": round(noise_percent, 2),
             "coverage of 68 % intervals": round(coverage, 3),
+            "coverage of 95 % intervals": round(
+                float(np.mean([one.wide_coverage for one in people])), 3
+            ),
             "median ratio to the truth": round(float(np.mean([one.bias for one in people])), 3),
             "lowest ratio of a person": round(min(one.bias for one in people), 3),
             "highest ratio of a person": round(max(one.bias for one in people), 3),

@@ -29,7 +29,7 @@ def read_surface(truth: SkinAppearance, session: Path) -> dict[str, NDArray[np.g
     if SURFACE_FILE not in truth.files:
         raise ExportError(
             f"{session}: its ground truth has no {SURFACE_FILE}, expected the surface of a scene; "
-            "an older version or a sequence has none: simulate again [SR-EXP-010]"
+            "an older version, a sequence or voxels have none: simulate a face [SR-EXP-010]"
         )
     with np.load(io.BytesIO(truth.files[SURFACE_FILE])) as arrays:
         return dict(arrays)

@@ -50,10 +50,14 @@ THREADED = (
     SCENE
     + """
 import hashlib
+import numba
+from rigsim.as_built.probe import build_probe
+from rigsim.mitsuba.variant import choose_renderer
 from rigsim.scenes.dome.scene import DomeScene
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.scenes.gradient.reference import NEUTRAL_GRIP
 from rigsim.scenes.gradient.scene import GradientScene
+from rigsim.scenes.probe.detector import render_fiber_images
 from rigsim.scenes.reference.flat_layers import describe_flat_layers, render_voxels
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.subject import make_subject
@@ -63,14 +67,23 @@ small = load_rig("dome").resized(96).subset(views=["C02"])
 layers = LayerStack((Layer(0.1, 1.0, 9.0, 0.8, 1.4),))
 patch = make_micro_skin("cheek", seed=3, size_mm=1.2)
 def render_all(seed=0):
-    flash = FlashScene(load_rig("flash").resized(48), person)
-    gradient = GradientScene(load_rig("gradient").cropped(64), patch)
-    assert {flash.variant.renderer, gradient.variant.renderer} == {"mitsuba"}
+    sessions = []
+    for renderer in ("mitsuba", "fast"):
+        choice = choose_renderer(renderer)
+        flash = FlashScene(load_rig("flash").resized(48), person, choice=choice)
+        gradient = GradientScene(load_rig("gradient").cropped(64), patch, choice=choice)
+        assert {flash.variant.renderer, gradient.variant.renderer} == {renderer}
+        sessions += [
+            DomeScene(small, person, choice=choice).radiance("C02", [3, 70]),
+            flash.radiance("parallel"),
+            flash.radiance("crossed"),
+            gradient.stokes(NEUTRAL_GRIP),
+        ]
+    probe = load_rig("probe")
+    render_fiber_images.cache_clear()
+    sessions.append(render_fiber_images(build_probe(probe, seed=0), probe.views[0]))
     return [
-        DomeScene(small, person).radiance("C02", [3, 70]),
-        flash.radiance("parallel"),
-        flash.radiance("crossed"),
-        gradient.stokes(NEUTRAL_GRIP),
+        *sessions,
         *render(seed),
         render_voxels(describe_flat_layers(layers), samples=16, seed=seed),
     ]
@@ -81,6 +94,7 @@ found = []
 for count in (1, 2, 4):
     dr.set_thread_count(count)
     assert dr.thread_count() == count
+    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
     found.append(digest(render_all()))
 print(json.dumps([found, digest(render_all(seed=1))]))
 """
@@ -128,11 +142,11 @@ def test_second_process_compiles_nothing(tmp_path):
 @pytest.mark.render
 @pytest.mark.long
 def test_images_do_not_depend_on_threads():
-    """Images of dome, flash and gradient sessions, `olat`, `path` and `tissue`."""
-    found, other_seed = run(THREADED)
+    """Images of sessions of all rigs by both renderers, `olat`, `path` and `tissue`."""
+    found, other_seed = run(THREADED, NUMBA_NUM_THREADS="4")
     assert found[1:] == found[:1] * 2
     unchanged = [a == b for a, b in zip(found[0], other_seed, strict=True)]
-    assert unchanged == [True] * 5 + [False] * 4
+    assert unchanged == [True] * 10 + [False] * 4
 
 
 @pytest.mark.render

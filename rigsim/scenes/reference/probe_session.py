@@ -1,0 +1,119 @@
+"""Voxels of a person's skin below the fiber probe, as a scene of sessions."""
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from capture.rig import Rig
+from rigsim.fiber.probe_profile import BandProfile, ProfileCache
+from rigsim.fiber.probe_tissue import SkinTissue, TissueError
+from rigsim.mitsuba.variant import Renderer
+from rigsim.needs.effects import Effect, EffectSelection
+from rigsim.scenes.probe.scene import ProbeScene
+from rigsim.scenes.reference.placed_paths import HeadPlace
+from rigsim.scenes.reference.probe_skin import read_person
+from rigsim.subject.person_skin import PersonSkinError
+
+PHOTONS_PER_LAID_PATH: Final = 100
+UNIFORM_EFFECT: Final = "hair, pores and veins under the head"
+"""Effect of layered tissue of which voxels have a part."""
+
+
+class VoxelProfiles(ProfileCache):
+    """Readings of voxels of a person's skin, see `rigsim.scenes.reference.probe_skin`.
+
+    Parameters
+    ----------
+    rig, tissue, photons, seed
+        As for `ProfileCache`; photons are those at each wavelength.
+    progress
+        Called with a line per traced place.
+    """
+
+    tissue: SkinTissue
+
+    def __init__(
+        self,
+        rig: Rig,
+        tissue: SkinTissue,
+        *,
+        photons: int,
+        seed: int,
+        progress: Callable[[str], None] | None = None,
+    ) -> None:
+        super().__init__(rig, tissue, photons=photons, seed=seed)
+        self._progress = progress
+
+    def profile(self, site: str, angle_deg: float = 0.0, suction_mbar: float = 0.0) -> BandProfile:
+        """Return the fibers' reflectance at a site, under the probe's nominal suction.
+
+        Parameters
+        ----------
+        site, angle_deg
+            As for `ProfileCache.profile`.
+        suction_mbar
+            Ignored.
+
+        Raises
+        ------
+        TissueError
+            The person's face has no such site.
+        """
+        del suction_mbar
+        return self._profiles.get((site, angle_deg), lambda: self._read(site, angle_deg))
+
+    def _read(self, site: str, angle_deg: float) -> BandProfile:
+        if self._progress is not None:
+            self._progress(f"voxels: {site}, {angle_deg:g} degrees")
+        try:
+            found = read_person(
+                self.tissue.person,
+                site,
+                self.rig,
+                (HeadPlace(angle_deg=angle_deg),),
+                photons=self.photons,
+                laid_paths=max(self.photons // PHOTONS_PER_LAID_PATH, 1),
+                seed=self.seed,
+            )
+        except PersonSkinError as error:
+            raise TissueError(str(error)) from error
+        value = found.reflectance_per_mm2[0]
+        stderr = np.hypot(
+            found.ratio[0] * found.even_stderr, found.even_per_mm2 * found.ratio_stderr[0]
+        )
+        return BandProfile(value, stderr)
+
+
+class VoxelProbeScene(ProbeScene):
+    """A person's skin as voxels under the probe.
+
+    Parameters
+    ----------
+    rig, seed, noise_seed, photons
+        As for `ProbeScene`; photons are those at each wavelength.
+    tissue
+        The person's skin.
+    progress
+        Called with a line per traced place.
+    """
+
+    renderer: Renderer = "reference"
+    """Renderer of the detector's image and of the skin."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        tissue: SkinTissue,
+        *,
+        photons: int,
+        seed: int = 0,
+        noise_seed: int | None = None,
+        progress: Callable[[str], None] | None = None,
+    ) -> None:
+        super().__init__(rig, tissue, seed=seed, noise_seed=noise_seed, photons=photons)
+        self.profiles = VoxelProfiles(rig, tissue, photons=photons, seed=seed, progress=progress)
+        rest = [effect for effect in self.needs if effect.name != UNIFORM_EFFECT]
+        uneven = Effect("pigment and blood that vary below the head", "built", "those of the face")
+        hair = Effect(UNIFORM_EFFECT, "unmodeled", "voxels have pigment and blood alone")
+        self.needs = EffectSelection((*rest, uneven, hair))

@@ -1,0 +1,168 @@
+"""Build scenes of voxel skin for sessions: `--renderer reference` of flash rig and probe."""
+
+import dataclasses
+from collections.abc import Callable, Collection
+from typing import Any, Final
+
+from capture.rig import Rig
+from model.skin import SkinAppearance
+from rigsim.fiber.probe_tissue import SkinTissue
+from rigsim.mitsuba.render_error import RenderError
+from rigsim.mitsuba.variant import choose_renderer
+from rigsim.population import files as subject_file
+from rigsim.scenes.reference.flash_session import VoxelFlashScene, render_skin
+from rigsim.scenes.reference.probe_session import VoxelProbeScene
+from rigsim.subject.person_skin import ABDOMEN_SITE, SITE_NAMES
+from skinrig.errors import require_choice
+from skinrig.simulating.driving import encode_arrays
+from skinrig.simulating.orders import MIN_WIDTH_PX, FlashOrder, SimulationError
+
+REFUSAL_REASONS: Final = {
+    "dome": "its stages need the scan of a face, and a face as voxels takes 11 days; run "
+    "skinrig bench --stage reference-dome, which has patches through the same stages",
+    "gradient": "its heights come from the surface's reflection, which voxels lack; run "
+    "skinrig bench --stage reference-gradient or reference-relief, which have diffuse normals of "
+    "patches",
+}
+"""Reasons why a rig has no sessions of voxel skin, by its name."""
+MAX_PATCH_PX: Final = 32
+"""Largest width of a patch, px."""
+VOXEL_FILE: Final = "voxels.npz"
+"""Voxels of a patch in the ground truth of the flash rig."""
+FACE_SITE_NAMES: Final = tuple(name for name in SITE_NAMES if name != ABDOMEN_SITE)
+DEFAULT_SITE: Final = "cheek"
+PATCH_SAMPLES: Final = {"small": 512, "full": 2048}
+"""Samples per pixel at the most sensitive wavelength; 512 leave 2.5 % of noise."""
+PATCH_PHOTONS: Final = {"small": 10_000, "full": 40_000}
+"""Photons per site, direction and wavelength below the probe."""
+PATCH_SECONDS_PER_SAMPLE: Final = 4e-4
+"""Processor seconds per pixel and sample, all wavelengths (two cores, type III)."""
+PROBE_SECONDS_PER_PHOTON: Final = 8e-4
+"""Processor seconds per photon at each wavelength, all wavelengths (two cores, type III)."""
+
+
+def refuse_reference(rig: str) -> None:
+    """Raise `SimulationError` for a rig that has no sessions of voxel skin."""
+    if why := REFUSAL_REASONS.get(rig):
+        raise SimulationError(
+            f"renderer: got reference, expected mitsuba or fast for the {rig} rig, because {why}"
+        )
+
+
+def check_flash_order(order: FlashOrder) -> None:
+    """Raise `SimulationError` for options that a patch lacks, or that a face lacks."""
+    if order.renderer != "reference":
+        order.refuse_options("flash (renderer mitsuba or fast)", "site")
+        return
+    names = ("mesh", "states", "nearer_mm", "bands", "sequence", "leave_out", "plan")
+    order.refuse_options("flash (renderer reference)", *names)
+    width_px = order.width_px or MIN_WIDTH_PX
+    if width_px > MAX_PATCH_PX or width_px % 2:
+        raise SimulationError(
+            f"width: got {width_px}, expected an even number up to {MAX_PATCH_PX} pixels for "
+            f"renderer reference, whose time grows with the pixels: {MIN_WIDTH_PX} take a minute "
+            "of processor time at small scale; lower it"
+        )
+
+
+def make_patch_scene(
+    rig: Rig,
+    *,
+    subject: str,
+    site: str | None,
+    seed: int,
+    noise_seed: int,
+    size: str,
+    progress: Callable[[str], None] | None,
+) -> VoxelFlashScene:
+    """Render a patch of a subject's skin before the flash rig.
+
+    Parameters
+    ----------
+    rig
+        Result of `rigsim.scenes.reference.flash_session.crop_to_patch`.
+    subject
+        Preset of the skin, or a file.
+    site
+        Site of the face; None: `DEFAULT_SITE`.
+    seed, noise_seed
+        Seeds of subject and of one session.
+    size
+        "small" or "full": samples per pixel.
+    progress
+        Called with the expected time, and with a line per wavelength.
+    """
+    try:
+        choose_renderer("reference")
+    except RenderError as error:
+        raise SimulationError(str(error)) from error
+    samples = PATCH_SAMPLES[size]
+    pixels = rig.views[0].width_px * rig.views[0].height_px
+    _announce(progress, PATCH_SECONDS_PER_SAMPLE * samples * pixels)
+    person = subject_file.load_subject(subject).skin(seed=seed)
+    skin = render_skin(
+        rig, person, site or DEFAULT_SITE, samples=samples, seed=seed, progress=progress
+    )
+    return VoxelFlashScene(rig, skin, seed=noise_seed)
+
+
+def add_voxels(scene: VoxelFlashScene, truth: SkinAppearance) -> SkinAppearance:
+    """Return the ground truth of a patch with its voxels as parameters and file."""
+    about, maps = scene.describe_voxels()
+    return dataclasses.replace(
+        truth,
+        parameters={**truth.parameters, "voxels": dict(about)},
+        files={VOXEL_FILE: encode_arrays(maps)},
+    )
+
+
+def make_probe_scene(
+    rig: Rig,
+    *,
+    subject: str,
+    seed: int,
+    noise_seed: int | None,
+    size: str,
+    places: Collection[tuple[str, float]],
+    progress: Callable[[str], None] | None,
+) -> VoxelProbeScene:
+    """Return the scene of a subject's skin as voxels under the probe.
+
+    Parameters
+    ----------
+    rig
+        The probe.
+    subject
+        Preset of the skin, or a file.
+    seed, noise_seed
+        Seeds of subject and photons, and of one session.
+    size
+        "small" or "full": photons.
+    places
+        Sites with directions of the head, degrees.
+    progress
+        Called with the expected time, and with a line per traced place.
+
+    Raises
+    ------
+    SimulationError
+        The subject is not a person, or a site is not on the face.
+    """
+    tissue: Any = subject_file.load_tissue(subject, seed=seed)
+    if not isinstance(tissue, SkinTissue):
+        raise SimulationError(
+            f"subject: got {subject!r}, expected a person for renderer reference; a medium has "
+            "no voxels, so remove the renderer"
+        )
+    for site, _ in places:
+        require_choice("site", site, FACE_SITE_NAMES, SimulationError)
+    photons = PATCH_PHOTONS[size]
+    _announce(progress, PROBE_SECONDS_PER_PHOTON * photons * len(places))
+    return VoxelProbeScene(
+        rig, tissue, photons=photons, seed=seed, noise_seed=noise_seed, progress=progress
+    )
+
+
+def _announce(progress: Callable[[str], None] | None, seconds: float) -> None:
+    if progress is not None:
+        progress(f"voxels: about {max(round(seconds, -1), 10.0):.0f} s of processor time")

@@ -1,0 +1,131 @@
+"""Sessions of voxel skin: `--renderer reference` of flash rig and probe, and its refusals."""
+
+import json
+
+import numpy as np
+import pytest
+
+from capture.session import Session
+from model import store
+from reconstruction.pipeline import recipes as pipeline
+from rigsim.mitsuba.variant import choose_variant
+from skinrig.calibrating.calibrate import calibrate
+from skinrig.simulating import reference
+from skinrig.simulating.orders import SimulationError
+from skinrig.simulating.serving import ServeOrder, serve_rig
+from skinrig.simulating.simulation import simulate_session
+
+needs_llvm = pytest.mark.skipif(
+    not choose_variant("rgb").is_vectorized, reason="voxels need a vectorized variant"
+)
+SUBJECT = {"subject": "II", "seed": 5, "renderer": "reference"}
+
+
+@pytest.fixture(scope="module")
+def flash_session(tmp_path_factory):
+    """A patch with few samples, and the lines of its progress."""
+    folder, lines = tmp_path_factory.mktemp("flash"), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(reference.PATCH_SAMPLES, "small", 16)
+        done = simulate_session(
+            "flash", folder / "session-flash", progress=lines.append, site="chin", **SUBJECT
+        )
+    return done, lines
+
+
+@needs_llvm
+@pytest.mark.render
+@pytest.mark.long
+def test_flash_patch_states_time_renderer_and_voxels(flash_session):
+    done, lines = flash_session
+    assert lines[0].endswith("s of processor time")
+    extra = Session.open(done.session).manifest.extra
+    assert extra["renderer"]["name"] == "reference"
+    assert "noise is" in extra["renderer"]["why"]
+    assert extra["simulation"]["site"] == "chin"
+    truth = store.read(done.truth)
+    assert truth.maps["melanin"].values.shape == (8, 8)
+    voxels = truth.parameters["voxels"]
+    assert voxels["tissue"]["epidermis_mm"] > 0.0
+    with np.load(done.truth / reference.VOXEL_FILE) as held:
+        inner = np.abs(held["x_mm"]) < 32 * voxels["voxel_mm"]
+        mean = held["melanin"][np.ix_(inner, inner)].mean()
+        np.testing.assert_allclose(truth.maps["melanin"].values.mean(), mean, rtol=1e-5)
+
+
+@needs_llvm
+@pytest.mark.render
+@pytest.mark.long
+def test_flash_patch_is_calibrated_and_reconstructed(flash_session, tmp_path):
+    """Rationale: the light that polarizers separate is that of the voxels, which are known.
+
+    Tolerance: 2 % of the mean over 256 pixels, whose noise is 13 % each, shared by both sides; a
+    white reference or an analyzer that is wrong by a few percent fails.
+    """
+    done, _ = flash_session
+    for target, kind in (("flat", "sensor"), ("white", "white"), ("malus", "polarization")):
+        session = tmp_path / f"session-{target}"
+        simulate_session("flash", session, target=target, renderer="reference")
+        calibrate(kind, [session], tmp_path / "calibration")
+    pipeline.reconstruct(
+        done.session,
+        want=("diffuse", "specular", "melanin"),
+        out=tmp_path / "maps",
+        calibration=tmp_path / "calibration",
+    )
+    found = store.read(tmp_path / "maps")
+    with np.load(done.truth / reference.VOXEL_FILE) as held:
+        true = held["rgb"].mean(axis=(0, 1))
+    diffuse = found.maps["diffuse"].values.mean(axis=(0, 1))
+    np.testing.assert_allclose(diffuse, true, rtol=0.02)
+    assert found.maps["specular"].values.mean() > 0.02
+    assert found.maps["melanin"].valid.mean() > 0.9
+
+
+@pytest.mark.long
+def test_probe_voxels_are_the_truth_of_their_session(tmp_path, monkeypatch):
+    monkeypatch.setitem(reference.PATCH_PHOTONS, "small", 1000)
+    done = simulate_session("probe", tmp_path / "session-probe", sites=("cheek",), **SUBJECT)
+    flat = simulate_session(
+        "probe", tmp_path / "session-flat", subject="II", seed=5, sites=("cheek",)
+    )
+    voxels, layers = (
+        json.loads((one.truth / "appearance.json").read_text())["parameters"]["profiles"][0]
+        for one in (done, flat)
+    )
+    ratio = np.divide(*(np.array(one["reflectance_per_mm2"])[:10] for one in (voxels, layers)))
+    # the mean skin is the same; pigment and blood around the site are not
+    assert 0.6 < ratio.min() < 0.98
+    assert ratio.max() < 1.5
+    built = [one for one in done.effects if one["name"].startswith("pigment and blood that vary")]
+    assert built[0]["verdict"] == "built"
+
+
+@pytest.mark.parametrize(
+    ("rig", "options", "told"),
+    [
+        ("dome", {}, "expected mitsuba or fast for the dome rig, because .* 11 days"),
+        ("gradient", {}, "expected mitsuba or fast for the gradient rig"),
+        ("flash", {"width_px": 64}, "width: got 64, expected an even number up to 32"),
+        ("flash", {"states": ("anger",)}, "states: not an option"),
+        ("flash", {"renderer": "fast", "site": "chin"}, "site: not an option"),
+        ("probe", {"sites": ("abdomen",)}, "site: got 'abdomen', expected one of forehead"),
+        ("probe", {"subject": "homogeneous:0.1,1"}, "expected a person"),
+    ],
+)
+def test_reference_is_refused_before_folder_creation(tmp_path, rig, options, told):
+    with pytest.raises(SimulationError, match=told):
+        simulate_session(rig, tmp_path / "session", **SUBJECT | options)
+    assert not (tmp_path / "session").exists()
+
+
+def test_reference_without_llvm_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv("SKINRIG_MITSUBA", "scalar")
+    with pytest.raises(SimulationError, match="reference needs LLVM"):
+        simulate_session("flash", tmp_path / "session", **SUBJECT)
+
+
+@pytest.mark.parametrize("rig", ["dome", "gradient"])
+def test_served_rig_without_voxels_is_refused(rig):
+    with pytest.raises(SimulationError, match=f"mitsuba or fast for the {rig} rig"):
+        serve_rig(rig, ServeOrder(renderer="reference"), None)
