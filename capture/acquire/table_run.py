@@ -262,6 +262,8 @@ class TableRun:
         for row in range(len(self._steps)):  # query the times whose reports were lost on the line
             if row not in times and (time_s := self._box.step_time(row)) is not None:
                 times[row] = time_s
+        if position.state != "DONE":  # the light of its last row was cut short
+            times.pop(position.row, None)
         return times
 
     def rows(self, first: int, last: int) -> Iterator[tuple[int, dict[str, Frame]]]:

@@ -303,7 +303,7 @@ def _serve(context: typer.Context, common: ServeOptions, site: str | None = None
 
 @command
 def verify(session: Path, /, json: options.Json = False) -> None:
-    """Check the digests of all files of a session; exit code 3 if one is damaged.
+    """Check the digests of all files of a session; exit code 3 if one is damaged or missing.
 
     Example: skinrig verify session
 
@@ -318,11 +318,13 @@ def verify(session: Path, /, json: options.Json = False) -> None:
     found = check(session)
     console.print_each("warning", found.warnings)
     console.print_each("damaged", found.problems)
+    state = "sound" if found.ok else "DAMAGED" if found.complete else "INCOMPLETE"
     console.print_line(
-        f"{session}: {'sound' if found.ok else 'DAMAGED'}, {format_count(found.frames, 'frame')}, "
-        f"{found.bytes / 1e6:.1f} MB"
+        f"{session}: {state}, {format_count(found.frames, 'frame')}, {found.bytes / 1e6:.1f} MB"
     )
-    figures = select_attributes(found, "ok", "problems", "warnings", "frames", "bytes")
+    figures = select_attributes(
+        *(found, "ok", "complete", "problems", "warnings", "frames", "bytes")
+    )
     console.print_document("skinrig.verify/1", figures)
     if not found.ok:
         raise typer.Exit(errors.EXIT_BAD_INPUT)

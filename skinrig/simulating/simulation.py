@@ -4,7 +4,7 @@ import importlib
 from pathlib import Path
 from typing import Any
 
-from skinrig.simulating.orders import SimulationOrder, SimulationResult, order_for
+from skinrig.simulating.orders import SessionComplete, SimulationOrder, SimulationResult, order_for
 
 
 def simulate(order: SimulationOrder) -> SimulationResult:
@@ -22,7 +22,10 @@ def simulate(order: SimulationOrder) -> SimulationResult:
     """
     # one module per rig, imported on use, so that a run loads only its own rig
     rig = importlib.import_module(f"skinrig.simulating.{order.rig}")
-    done: SimulationResult = getattr(rig, f"simulate_{order.rig}")(order)
+    try:
+        done: SimulationResult = getattr(rig, f"simulate_{order.rig}")(order)
+    except SessionComplete as complete:
+        return complete.result
     return done
 
 
