@@ -115,7 +115,21 @@ def save(calibration: Calibration, directory: str | Path) -> Path:
         The JSON file.
     """
     folder = Path(directory)
+    fresh = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
+    before = set(folder.iterdir())
+    try:
+        return _write(calibration, folder)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            for made in set(folder.glob(f"{calibration.kind}-*.exr")) - before:
+                made.unlink()
+            if fresh:
+                folder.rmdir()
+        raise
+
+
+def _write(calibration: Calibration, folder: Path) -> Path:
     maps = {
         name: _write_map(folder, f"{calibration.kind}-{name}", image)
         for name, image in sorted(calibration.maps.items())
@@ -303,6 +317,13 @@ def _write_map(folder: Path, stem: str, image: Float32Array) -> dict[str, Any]:
     try:
         OpenEXR.File(header, channels).write(str(part))
         os.replace(part, path)
+    except RuntimeError as error:  # the library's error for a full disk
+        with contextlib.suppress(OSError):
+            part.unlink()
+        raise CalibrationError(
+            f"{path}: cannot be written ({error}); free space, or name another disk, then run the "
+            "command again [SR-CLI-003]"
+        ) from error
     except BaseException:
         with contextlib.suppress(OSError):
             part.unlink()

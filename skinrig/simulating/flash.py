@@ -101,8 +101,9 @@ def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:
     if order.target is not None:
         state = "white" if order.target == "white" else ""
         return {state: FlashScene(rig, targets.make_target(order.target), seed=seed, power=power)}
+    offset_mm = _stance_offset_mm(rig, order.nearer_mm)  # refuses, before the face is made
     person = subject_file.load_subject(order.subject).face(seed=order.seed, mesh=order.mesh)
-    person = person.translate(_stance_offset_mm(rig, order.nearer_mm))
+    person = person.translate(offset_mm)
     person = person.translate(draw_head_position(order.session_seed))
     return {
         state: FlashScene(
