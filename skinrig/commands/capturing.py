@@ -218,11 +218,10 @@ class ServeOptions:
     pty
         Serve each controller on a pseudo terminal.
     tcp
-        Address of cameras and, without --pty, of controllers; port 0: any free port.
+        Address of cameras and, without --pty, of controllers, on this machine only; port 0: any
+        free port.
     scale
         Scale of the simulation: small (fast) or full (the complete rig); gradient: small only.
-    allow_remote
-        Accept connections from other machines.
     resume
         Interrupted session captured from an earlier server with this rig and seed; new shots
         continue its noise sequence and differ from those on disk.
@@ -230,7 +229,6 @@ class ServeOptions:
 
     pty: bool = False
     tcp: str = "127.0.0.1:0"
-    allow_remote: bool = False
     subject: options.Subject = "III"
     scale: options.Scale = "small"
     seed: options.Seed = 0
@@ -287,16 +285,7 @@ def _serve(context: typer.Context, common: ServeOptions, site: str | None = None
     """Serve a simulated rig until interrupted."""
     from skinrig.simulating.serving import ServeOrder, serve_rig
 
-    options = (
-        "pty",
-        "tcp",
-        "allow_remote",
-        "subject",
-        "seed",
-        "session_seed",
-        "renderer",
-        "resume",
-    )
+    options = ("pty", "tcp", "subject", "seed", "session_seed", "renderer", "resume")
     order = ServeOrder(site=site, size=common.scale, **select_attributes(common, *options))
     serve_rig(str(context.info_name), order, Console(common.json))
 
