@@ -7,6 +7,7 @@ same folder, named by their digest. Numbers are keyed by the serial of their cam
 
 import contextlib
 import hashlib
+import io
 import json
 import math
 import os
@@ -341,7 +342,11 @@ def _read_map(folder: Path, name: str, entry: _MapFile) -> Float32Array:
     if not path.is_file():
         raise CalibrationDamaged(f"{path}: missing, map {name!r} needs it; calibrate again")
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as stream:
+        # the library prints what it cannot read, on stdout, and goes on
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            OpenEXR.File(str(path), separate_channels=True) as stream,
+        ):
             channels = stream.channels()
             count = entry.shape[2] if len(entry.shape) == 3 else 1
             planes = [np.array(channels[f"c{i}"].pixels, dtype=np.float32) for i in range(count)]
