@@ -17,7 +17,7 @@ import numpy as np
 
 from model import store
 from model.arrays import Float64Array
-from model.checked_files import decode_json
+from model.checks.files import decode_json
 from model.color_table import ColorTable, ColorTableError
 from model.tissue_optics.constants import TissueConstants, TissueError
 

@@ -19,8 +19,8 @@ from model import fresnel, translucency_population
 from model.arrays import BoolArray, Float32Array, Float64Array
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
-from model.checked_files import read_arrays
 from model.checks import Checks
+from model.checks.files import read_arrays
 from model.dipole.maps import DipoleMaps
 from model.skin import SkinAppearance, SkinMap
 

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
 from model.arrays import Float32Array
-from model.checked_files import decode_json, require_plausible_size
 from model.checks import Checks
+from model.checks.files import decode_json, require_plausible_size
 from model.skin import SkinAppearance, SkinMap
 
 SCHEMA = "skinrig.appearance/2"

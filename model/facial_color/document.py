@@ -7,8 +7,8 @@ from typing import Any, Final
 import numpy as np
 
 from model.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from model.checked_files import decode_json
 from model.checks import Checks
+from model.checks.files import decode_json
 from model.facial_color.rig import HemoglobinRig
 from model.facial_color.state_maps import NEUTRAL, FacialColorError, StateMaps
 from model.skin import MAP_UNITS, SkinMap

@@ -27,8 +27,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array
-from model.checked_files import decode_json
 from model.checks import Checks
+from model.checks.files import decode_json
 from model.microstructure.convolution_kernels import TRUNCATE_SIGMAS
 
 Line: TypeAlias = tuple[float, float]

@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array, FloatArray
-from model.checked_files import read_arrays
 from model.checks import Checks
+from model.checks.files import read_arrays
 from model.texture_statistics import steerable_pyramid
 from model.texture_statistics.bins import OPPONENT_AXES, make_bin_edges, principal_axes
 from model.texture_statistics.histograms import HISTOGRAM_BINS

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Float64Array
-from model.checked_files import decode_json, read_arrays
 from model.checks import Checks
+from model.checks.files import decode_json, read_arrays
 from model.traits import feasible_sets, reduced_spaces
 from model.traits.space import TraitSpace
 from model.traits.vectors import Confidence, TraitError, TraitVector

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from model.arrays import BoolArray, Float32Array, Float64Array, FloatArray
-from model.checked_files import decode_json
 from model.checks import Checks
+from model.checks.files import decode_json
 from model.skin import SkinMap
 from model.wrinkles import differences as wrinkle_differences
 from model.wrinkles import partial_derivatives as wrinkles

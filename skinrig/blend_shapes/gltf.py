@@ -22,7 +22,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from model.checked_files import decode_json
+from model.checks.files import decode_json
 from rigsim.geometry.mesh import MeshFileError
 from skinrig.arrays import Float64Array
 from skinrig.blend_shapes.obj import MeshArrays

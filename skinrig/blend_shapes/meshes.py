@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from model.checked_files import read_arrays
+from model.checks.files import read_arrays
 from rigsim.geometry.mesh import MeshError, MeshFileError, check_triangles
 from skinrig.arrays import Float32Array, Float64Array, Int32Array
 from skinrig.blend_shapes import gltf as blend_shape_gltf

@@ -112,8 +112,8 @@ def _run(
     rig: Rig, plan: Plan, out: Path, order: CaptureOrder, console: Console
 ) -> Mapping[str, Any]:
     """Run a plan through the drivers into a new or resumed session."""
-    if order.resume and (done := Session.open(out)).complete:
-        return _describe_complete(done, console)
+    if order.resume and (opened := Session.open(out)).complete:
+        return _describe_complete(opened, console)
     with contextlib.ExitStack() as stack:
         boxes, cameras = _open_devices(stack, rig, plan, order, console)
         width = cameras[rig.views[0].name].info.width_px

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type
 
 import typer
 
+from skinrig.atomic_file import require_writable
 from skinrig.commands import completion
 from skinrig.errors import UnusableError, UsageError, require_choice
-from skinrig.output_place import require_writable
 
 if TYPE_CHECKING:
     from skinrig.capturing.sequences import SequenceOrder

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
-from model.checked_files import read_arrays
+from model.checks.files import read_arrays
 from model.skin import SkinAppearance, SkinMap
 from model.skin_reflectance import BASIS_FILE, WEIGHT_PREFIX
 from skinrig.appearances.contents import intersect_valid

@@ -25,13 +25,12 @@ from skinrig.simulating import subject_records
 from skinrig.simulating.exposure_log import SceneLog
 from skinrig.simulating.orders import (
     SIMULATED_USES,
-    SessionComplete,
     SimulationError,
     SimulationOrder,
     SimulationResult,
     truth_folder,
 )
-from skinrig.simulating.resumption import count_shots, list_refusals
+from skinrig.simulating.resumption import SessionComplete, count_shots, list_refusals
 
 Log = TypeVar("Log", bound=SceneLog)
 
@@ -106,7 +105,7 @@ def open_logged_session(
     session = open_session(order, plan, rig, settings, scene)
     with release_on_error(session):
         truth = truth_folder(order.out)
-        require_unfinished(order, session, scene, kind.path_beside(truth))
+        require_unfinished(order, session, scene, kind.path_of(truth))
         return session, kind(scene, truth, resume=order.resume, session=session)
 
 

@@ -63,20 +63,6 @@ class SimulationResult:
         return {one.name: getattr(self, one.name) for one in fields(self)}
 
 
-class SessionComplete(Exception):
-    """Raised when a resumed simulation lacks neither frames nor ground truth.
-
-    Attributes
-    ----------
-    result : SimulationResult
-        Result of the simulation.
-    """
-
-    def __init__(self, result: SimulationResult) -> None:
-        super().__init__(result)
-        self.result = result
-
-
 def require_size(size: str) -> None:
     """Raise unless a size is "small" or "full"."""
     require_choice("size", size, PICTURE_SIZES, SimulationError)

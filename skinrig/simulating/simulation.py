@@ -4,7 +4,8 @@ import importlib
 from pathlib import Path
 from typing import Any
 
-from skinrig.simulating.orders import SessionComplete, SimulationOrder, SimulationResult, order_for
+from skinrig.simulating.orders import SimulationOrder, SimulationResult, order_for
+from skinrig.simulating.resumption import SessionComplete
 
 
 def simulate(order: SimulationOrder) -> SimulationResult:

@@ -10,7 +10,7 @@ from typing import Any, Final, get_args
 
 import numpy as np
 
-from model.checked_files import read_arrays
+from model.checks.files import read_arrays
 from model.texture_statistics.space import TextureError, TextureSpace
 from model.traits import TraitSpace
 from model.traits import storage as trait_storage

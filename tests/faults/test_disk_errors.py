@@ -133,7 +133,7 @@ def finish(path, acknowledged):
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_struck_session_resumes_or_starts_anew(tmp_path, fault):
+def test_session_resumes_or_restarts_after_disk_fault(tmp_path, fault):
     struck = Counter()
     while True:
         path, acknowledged = tmp_path / f"s{struck.total()}", set()

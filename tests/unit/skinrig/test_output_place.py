@@ -5,9 +5,9 @@ from collections import namedtuple
 
 import pytest
 
+from skinrig.atomic_file import MIN_FREE_BYTES, require_writable
 from skinrig.cli import main
 from skinrig.errors import UnusableError
-from skinrig.output_place import MIN_FREE_BYTES, require_writable
 
 Usage = namedtuple("Usage", "total used free")
 COMMANDS = [
