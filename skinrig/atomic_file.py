@@ -45,12 +45,12 @@ def require_writable(path: str | Path, *, option: str = "--out") -> None:
     except OSError as error:
         raise UnusableError(
             f"{option}: {target}: {parent} cannot be written to ({error.strerror}); nothing was "
-            "computed: name another folder [SR-CLI-002]"
+            "computed: name another folder"
         ) from error
     if free < MIN_FREE_BYTES:
         raise UnusableError(
             f"{option}: {target}: got {free} bytes free, expected at least {MIN_FREE_BYTES}; "
-            "nothing was computed: free space, or name another disk [SR-CLI-003]"
+            "nothing was computed: free space, or name another disk"
         )
 
 

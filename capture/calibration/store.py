@@ -323,7 +323,7 @@ def _write_map(folder: Path, stem: str, image: Float32Array) -> dict[str, Any]:
             part.unlink()
         raise CalibrationError(
             f"{path}: cannot be written ({error}); free space, or name another disk, then run the "
-            "command again [SR-CLI-003]"
+            "command again"
         ) from error
     except BaseException:
         with contextlib.suppress(OSError):
