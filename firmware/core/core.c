@@ -527,7 +527,7 @@ static bool is_repeated(const struct request *request, bool behind) {
 }
 
 void core_handle_framed_line(char *line, uint16_t size) {
-  struct frame frame;
+  struct frame frame = {0};
   struct text reply;
   if (!decode(line, size, &frame)) {
     start_event(&reply, P("NAK 204"));
