@@ -17,6 +17,7 @@ import numpy as np
 
 from model import store
 from model.arrays import Float64Array
+from model.checks.files import decode_json
 from model.color_table import ColorTable, ColorTableError
 from model.tissue_optics.constants import TissueConstants, TissueError
 
@@ -159,7 +160,7 @@ def _table(path: Path, nodes: Float64Array, text: str | None) -> ColorTable:
     if text is None:
         return ColorTable(UNKNOWN_ORIGIN, UNKNOWN_ORIGIN, nodes)
     try:
-        found: dict[str, Any] = json.loads(text)
+        found: dict[str, Any] = decode_json(text)
         if found.pop("schema") != SCHEMA:
             raise ValueError("another schema")
         constants = TissueConstants(**found.pop("constants"))

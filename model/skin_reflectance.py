@@ -10,8 +10,6 @@ References
 Weyrich et al. 2006, doi:10.1145/1141911.1141987, sections 3 and 9 (the dome of 2005).
 """
 
-import io
-import zipfile
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +20,7 @@ from model.arrays import BoolArray, Float32Array, Float64Array
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
 from model.checks import Checks
+from model.checks.files import read_arrays
 from model.dipole.maps import DipoleMaps
 from model.skin import SkinAppearance, SkinMap
 
@@ -214,13 +213,13 @@ def load_basis(appearance: SkinAppearance) -> BrdfBasis:
             f"files: got no {BASIS_FILE}; `skinrig reconstruct --maps {WEIGHT_PREFIX}0` makes it"
         )
     try:
-        with np.load(io.BytesIO(appearance.files[BASIS_FILE]), allow_pickle=False) as stored:
-            table, radius = stored["table"], float(stored["light_radius_rad"])
+        stored = read_arrays(appearance.files[BASIS_FILE])
+        table, radius = stored["table"], float(stored["light_radius_rad"])
     except KeyError as error:
         raise SkinReflectanceError(
             f"{BASIS_FILE}: {error.args[0]}; an older version made it: reconstruct the maps again"
         ) from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, TypeError) as error:
         raise SkinReflectanceError(f"{BASIS_FILE}: cannot be read: {error}") from error
     if table.ndim != 4 or not table.shape[-1]:
         raise SkinReflectanceError(

@@ -5,12 +5,15 @@ folder is written completely or not at all. TRUTH/ folders have the same format.
 """
 
 import hashlib
+import io
 import json
+import math
 import os
 import re
 import shutil
 import uuid
 from collections.abc import Mapping
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
 from model.arrays import Float32Array
 from model.checks import Checks
+from model.checks.files import decode_json, require_plausible_size
 from model.skin import SkinAppearance, SkinMap
 
 SCHEMA = "skinrig.appearance/2"
@@ -196,7 +200,7 @@ def read_document(folder: Path) -> _Document:
             "`skinrig reconstruct` makes one [SR-REC-005]"
         ) from error
     try:
-        loaded = json.loads(raw)
+        loaded = decode_json(raw)
     except ValueError as error:
         raise StoreError(f"{path}: is not JSON ({error}); the folder is damaged") from error
     version = loaded.get("schema") if isinstance(loaded, dict) else None
@@ -383,7 +387,14 @@ def read_exr_with_attributes(path: str | Path) -> tuple[Float32Array, dict[str, 
     if magic != EXR_MAGIC:
         raise StoreError(f"{path}: begins with {magic!r}, expected an OpenEXR image")
     try:
-        with OpenEXR.File(str(path)) as file:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            low, high = file.header()["dataWindow"]
+            count = math.prod(int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
+            require_plausible_size(4 * count, Path(path).stat().st_size)
+        # the library prints what it cannot read, on stdout, and goes on
+        with redirect_stdout(io.StringIO()) as printed, OpenEXR.File(str(path)) as file:
+            if printed.getvalue():
+                raise ValueError(printed.getvalue().strip())
             channels = file.channels()
             name = "RGB" if "RGB" in channels else "Y"
             if name not in channels:

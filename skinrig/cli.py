@@ -29,7 +29,7 @@ from skinrig.commands import (
 )
 from skinrig.commands.help import Command, Commands
 from skinrig.commands.options import Json, Out, Seed, option
-from skinrig.console import Console
+from skinrig.console import Console, EscapingFormatter, escape_controls
 from skinrig.next_steps import format_welcome
 
 app = typer.Typer(
@@ -62,7 +62,9 @@ def _root(
 ) -> None:
     level = logging.INFO if verbose else logging.WARNING
     form = "%(levelname)s %(name)s: %(message)s"
-    logging.basicConfig(stream=sys.stderr, level=level, format=form)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(EscapingFormatter(form))
+    logging.basicConfig(handlers=[handler], level=level)
     if context.invoked_subcommand is None:
         from importlib.metadata import version as version_of
 
@@ -162,7 +164,7 @@ def _report_failure(
             else str(format_message())
         )
     if print_message:
-        print(f"skinrig: {message}", file=sys.stderr)
+        print(f"skinrig: {escape_controls(message)}", file=sys.stderr)
     # still one document only: a command prints its own last, after all that can fail
     Console("--json" in arguments).print_document(
         "skinrig.error/1",

@@ -1,7 +1,9 @@
 """Print results of commands on stdout, progress on stderr, and one document with --json."""
 
 import json
+import logging
 import math
+import re
 import sys
 import time
 from collections.abc import Iterable, Mapping
@@ -32,6 +34,26 @@ def to_json_value(value: Any) -> Any:
     return str(value)
 
 
+_CONTROL_CHARACTERS = re.compile(
+    "[\x00-\x06\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
+)
+
+
+def escape_controls(text: str) -> str:
+    r"""Replace characters that command a terminal by their escapes; bell, tab and newline are kept.
+
+    Names and notes of other people's sessions may contain them.
+
+    Examples
+    --------
+    >>> escape_controls("a\x1b[2Jb")
+    'a\\x1b[2Jb'
+    """
+    return _CONTROL_CHARACTERS.sub(
+        lambda found: found[0].encode("unicode_escape").decode("ascii"), text
+    )
+
+
 def select_attributes(source: object, *names: str) -> dict[str, Any]:
     """Return attributes of an object, keyed by name.
 
@@ -60,6 +82,14 @@ def _cell(value: object) -> str:
     return "–" if math.isnan(value) else f"{value:.4g}"
 
 
+class EscapingFormatter(logging.Formatter):
+    """Formatter of log records whose control characters are escaped."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return a record as text for a terminal."""
+        return escape_controls(super().format(record))
+
+
 @dataclass(slots=True)
 class Console:
     """Output streams of a command.
@@ -75,12 +105,13 @@ class Console:
     def print_line(self, text: str = "") -> None:
         """Print a line of text."""
         if not self.quiet:
-            print(text, file=sys.stderr if self.as_json else sys.stdout, flush=True)
+            stream = sys.stderr if self.as_json else sys.stdout
+            print(escape_controls(text), file=stream, flush=True)
 
     def progress(self, text: str) -> None:
         """Print a line of progress with the time since the command's start, s."""
         seconds = time.perf_counter() - self.started_s
-        print(f"[{seconds:6.1f} s] {text}", file=sys.stderr, flush=True)
+        print(f"[{seconds:6.1f} s] {escape_controls(text)}", file=sys.stderr, flush=True)
 
     def print_table(self, head: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
         """Print a table with aligned columns; NaN is printed as a dash."""

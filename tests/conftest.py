@@ -2,7 +2,9 @@
 
 import csv
 import gc
+import ipaddress
 import os
+import socket
 import sys
 from collections import Counter
 from functools import cache
@@ -28,6 +30,30 @@ hypothesis.settings.load_profile("alike")
 
 
 ROOT = Path(__file__).parents[1]
+
+
+def require_loopback(address):
+    """Fail a test that connects to, or listens for, anything beyond this machine."""
+    if isinstance(address, tuple) and address[0] != "localhost":
+        host = str(address[0]) or "0.0.0.0"
+        if not ipaddress.ip_address(host.partition("%")[0]).is_loopback:
+            pytest.fail(f"network: got {address}, expected an address of this machine")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def loopback_sockets():
+    """Block sockets beyond this machine: no command needs a network at run time."""
+    with pytest.MonkeyPatch.context() as patched:
+        for name in ("connect", "connect_ex", "bind"):
+            honest = getattr(socket.socket, name)
+
+            def checked(self, address, honest=honest):
+                require_loopback(address)
+                return honest(self, address)
+
+            patched.setattr(socket.socket, name, checked)
+        yield
+
 
 pytest_runtest_protocol = real_time.pytest_runtest_protocol
 

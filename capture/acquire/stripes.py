@@ -18,7 +18,7 @@ from capture.acquire.outcome import (
 )
 from capture.devices.camera import Frame, FrameRefused, FrameTimeout, Trigger
 from capture.devices.port import CommandRefused
-from capture.devices.scanner import ScannerBox
+from capture.devices.scanner import ScannerBox, ShownPattern
 from capture.devices.wire import Code
 from capture.plan import Step
 from capture.rig import SCANNER_BOX
@@ -152,13 +152,18 @@ class StripeScan:
         run, want = self._run, requested_exposure(step)
         chosen = run.step_cameras(step)
         armed_s = arm_cameras(chosen, want, dict.fromkeys(chosen, Trigger.EDGE))
-        self.box.select_projector(self._numbers[str(step.settings["projector"])])
-        self.box.select_pattern(str(step.settings["axis"]), int(step.settings["stripes"]))
+        projector = self._numbers[str(step.settings["projector"])]
+        axis, pattern = str(step.settings["axis"]), int(step.settings["stripes"])
+        self.box.select_projector(projector)
+        self.box.select_pattern(axis, pattern)
         self._shown += 1
         # armed for this pattern only: a readout may last longer than any lease
         self.box.arm()
         token = f"{run.operator.run_id}.{self._shown}.{attempt}"
         t_box_s = self.box.trigger(token, self._show_s(step))
+        wanted = ShownPattern(token, t_box_s, projector, axis, pattern)
+        if (shown := self.box.last_shown()) != wanted:
+            raise FrameRefused(f"step {step.id}: the controller showed {shown}, expected {wanted}")
         timeouts_s = {name: frame_timeout_s(step, run.rig.view(name)) for name in chosen}
         frames, stale = collect_frames(chosen, want, armed_s, timeouts_s)
         run.stale += stale

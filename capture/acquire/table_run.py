@@ -222,12 +222,8 @@ class TableRun:
         keep_alive()
         for camera in self._cameras.values():
             camera.arm(len(steps), Trigger.EDGE)
-        box.trigger(token)
-        self.times_s = self._listen(poll_s, keep_alive)
-        box.dark()
-        for row in range(len(steps)):  # query the times whose reports were lost on the line
-            if row not in self.times_s and (time_s := box.step_time(row)) is not None:
-                self.times_s[row] = time_s
+        began_s = box.trigger(token)
+        self.times_s = self._listen(token, began_s, poll_s, keep_alive)
         self._streams = {
             name: FrameStream(
                 name,
@@ -242,20 +238,33 @@ class TableRun:
             for name, camera in self._cameras.items()
         }
 
-    def _listen(self, poll_s: float, keep_alive: Callable[[], object]) -> dict[int, float]:
+    def _listen(
+        self, token: str, began_s: float, poll_s: float, keep_alive: Callable[[], object]
+    ) -> dict[int, float]:
         """Renew the leases until the table has ended; return when its rows released the cameras."""
         times: dict[int, float] = {}
         while True:
-            times.update(self._box.listen(poll_s))
+            reported = self._box.listen(poll_s)
+            times.update((row, time_s) for row, time_s in reported.items() if time_s >= began_s)
             keep_alive()
             position = self._box.position()
             if position.state != "RUN":
-                if position.state != "DONE":
-                    log.warning("the %s stopped after row %d", self._what[0], position.row)
-                return times
+                break
             step = self._steps[max(position.row, 0)]
             count = f"{position.row + 1}/{len(self._steps)}"
             self._run.operator.progress(f"{count} {step.id} {step.kind}")
+        if position.state != "DONE":
+            log.warning("the %s stopped after row %d", self._what[0], position.row)
+        self._box.dark()
+        if (position.token, position.rows) != (token, len(self._steps)):
+            log.warning("the controller ran %s, expected %s", position, token)
+            return {}
+        for row in range(len(self._steps)):  # query the times whose reports were lost on the line
+            if row not in times and (time_s := self._box.step_time(row)) is not None:
+                times[row] = time_s
+        if position.state != "DONE":  # the light of its last row was cut short
+            times.pop(position.row, None)
+        return times
 
     def rows(self, first: int, last: int) -> Iterator[tuple[int, dict[str, Frame]]]:
         """Yield the rows before ``last`` with a frame of every camera, with the frames."""

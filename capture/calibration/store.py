@@ -7,6 +7,7 @@ same folder, named by their digest. Numbers are keyed by the serial of their cam
 
 import contextlib
 import hashlib
+import io
 import json
 import math
 import os
@@ -115,7 +116,21 @@ def save(calibration: Calibration, directory: str | Path) -> Path:
         The JSON file.
     """
     folder = Path(directory)
+    fresh = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
+    before = set(folder.iterdir())
+    try:
+        return _write(calibration, folder)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            for made in set(folder.glob(f"{calibration.kind}-*.exr")) - before:
+                made.unlink()
+            if fresh:
+                folder.rmdir()
+        raise
+
+
+def _write(calibration: Calibration, folder: Path) -> Path:
     maps = {
         name: _write_map(folder, f"{calibration.kind}-{name}", image)
         for name, image in sorted(calibration.maps.items())
@@ -303,6 +318,13 @@ def _write_map(folder: Path, stem: str, image: Float32Array) -> dict[str, Any]:
     try:
         OpenEXR.File(header, channels).write(str(part))
         os.replace(part, path)
+    except RuntimeError as error:  # the library's error for a full disk
+        with contextlib.suppress(OSError):
+            part.unlink()
+        raise CalibrationError(
+            f"{path}: cannot be written ({error}); free space, or name another disk, then run the "
+            "command again"
+        ) from error
     except BaseException:
         with contextlib.suppress(OSError):
             part.unlink()
@@ -320,7 +342,11 @@ def _read_map(folder: Path, name: str, entry: _MapFile) -> Float32Array:
     if not path.is_file():
         raise CalibrationDamaged(f"{path}: missing, map {name!r} needs it; calibrate again")
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as stream:
+        # the library prints what it cannot read, on stdout, and goes on
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            OpenEXR.File(str(path), separate_channels=True) as stream,
+        ):
             channels = stream.channels()
             count = entry.shape[2] if len(entry.shape) == 3 else 1
             planes = [np.array(channels[f"c{i}"].pixels, dtype=np.float32) for i in range(count)]

@@ -7,14 +7,14 @@ checks are the tests of hardware, of firmware under emulators, and of ``skinrig 
 import statistics
 import time
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from capture.devices import wire
 from capture.devices.port import CommandRefused, DeviceError, Port
 from capture.devices.wire import Code, Event, Reply, Request
 
-PROTOCOL_MINOR = 1
+PROTOCOL_MINOR = 2
 """Revision of the protocol's text that this host follows; see `protocol_minor`."""
 LEASE_RANGE_MS = (300, 5000)
 MAX_CLOCK_ERROR = 0.01
@@ -78,6 +78,8 @@ _REFUSED_ARMED: Final = {
 """By kind, what an armed controller refuses after `SAFE`, at open eyes."""
 _EYES: Final = ("dome", "gradient_sphere", "scanner")
 _QUEUED_ERRORS = 16
+MAX_NUMBERS_KEPT = 1000
+"""More requests than any controller keeps answers of."""
 
 
 class CheckupPort(Port):
@@ -93,6 +95,11 @@ class CheckupPort(Port):
             while not lines and self.clock.monotonic() < end_s:
                 lines += self._splitter.feed(self._serial.read(max(1, self._serial.in_waiting)))
         return lines
+
+    def make_request(self, text: str) -> Request:
+        """Return a request with the next number, to be sent by `exchange_raw`."""
+        seq, self._seq = self._seq, wire.next_seq(self._seq)
+        return Request(seq, self.boot, text)
 
 
 class CheckupFault(Exception):
@@ -224,11 +231,10 @@ def check_refusals(port: CheckupPort) -> str:
     CheckupFault.raise_unless(
         errors[-1].startswith(f"{overflow},"), "error queue", errors[-1], overflow
     )
-    frame = wire.encode(Request(7, port.boot, "SYST:PING?"))
-    damaged = frame.replace(b"PING", b"PONG")
-    foreign = wire.encode(Request(8, port.boot ^ 1 or 2, "SYST:PING?"))
-    reused = wire.encode(Request(9, port.boot, "SYST:WDOG?"))
-    other = wire.encode(Request(9, port.boot, "SYST:ARM?"))
+    damaged = wire.encode(port.make_request("SYST:PING?")).replace(b"PING", b"PONG")
+    foreign = wire.encode(replace(port.make_request("SYST:PING?"), boot=port.boot ^ 1 or 2))
+    request = port.make_request("SYST:WDOG?")
+    reused, other = wire.encode(request), wire.encode(replace(request, text="SYST:ARM?"))
     _require_frame(port, damaged, lambda f: isinstance(f, Event) and f.name == "NAK", "NAK 204")
     _require_code(port, foreign, Code.BOOT_CHANGED)
     _require_code(port, reused, Code.OK)
@@ -244,12 +250,17 @@ def check_refusals(port: CheckupPort) -> str:
 
 def check_retries(port: CheckupPort) -> str:
     """Send one frame twice: the answer is the same, and the clock in it has not moved."""
-    frame = wire.encode(Request(11, port.boot, "SYST:PING?"))
+    request = port.make_request("SYST:PING?")
+    frame = wire.encode(request)
     answers = [port.exchange_raw(frame, SLACK_S) for _ in range(2)]
     CheckupFault.raise_unless(
         answers[0] == answers[1] != [], "retry", answers[1], f"the first answer, {answers[0]}"
     )
-    return "a repeated frame gets its first answer"
+    if protocol_minor(port.capabilities()) < 2:
+        return "a repeated frame gets its first answer"
+    behind = replace(request, seq=(request.seq - MAX_NUMBERS_KEPT) % (wire.MAX_SEQ + 1))
+    _require_code(port, wire.encode(behind), Code.SEQ_REUSED)
+    return "a repeated frame gets its first answer, an old one is refused"
 
 
 def check_lease(port: CheckupPort) -> str:

@@ -106,7 +106,7 @@ class LinkStatistics:
     naks: int = 0
     """Damaged frames reported by the controller."""
     stale: int = 0
-    """Answers to earlier requests, dropped."""
+    """Answers to earlier requests and events that came before, dropped."""
     bad_lines: int = 0
     """Lines that were not frames, dropped."""
     lost_events: int = 0
@@ -425,9 +425,13 @@ class Port:
                 "command with --resume [SR-CAP-005]"
             )
         if isinstance(frame, Event):
-            if self._next_event is not None and frame.number > self._next_event:
-                self.statistics.lost_events += frame.number - self._next_event
-            self._next_event = frame.number + 1
+            if self._next_event is not None:
+                if wire.is_behind(frame.number, self._next_event):
+                    self.statistics.stale += 1
+                    return None
+                lost = (frame.number - self._next_event) % (wire.MAX_SEQ + 1)
+                self.statistics.lost_events += lost
+            self._next_event = wire.next_seq(frame.number)
             if frame.name != "NAK":
                 self.events.append(frame)
         return frame

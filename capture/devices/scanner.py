@@ -7,9 +7,10 @@ controller that receives nothing during its lease goes dark: renew it (`ScannerB
 query) while cameras expose.
 """
 
+from dataclasses import dataclass
 from typing import ClassVar, Final
 
-from capture.devices.box import BoxStatus, StatusBit, format_decimal
+from capture.devices.box import BoxStatus, StatusBit, format_decimal, parse_whole_number
 from capture.devices.led_box import EyeSafetyBox
 from capture.scanner import STRIPE_AXES
 
@@ -27,6 +28,22 @@ class ScannerStatus(BoxStatus):
     """Whether a pattern is shown."""
     eyes_safe = StatusBit(9)
     """Whether a person has confirmed that the subject's eyes are closed or shielded."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShownPattern:
+    """Report of a release by the controller."""
+
+    token: str
+    """Token given with the command."""
+    t_box_s: float
+    """Time of the release on the controller's clock, s since power-up."""
+    projector: int
+    """Number of the projector, from 0."""
+    axis: str
+    """"columns" or "rows"; empty: full white."""
+    pattern: int
+    """Number of the pattern, from 0; 0 for full white."""
 
 
 class ScannerBox(EyeSafetyBox):
@@ -89,6 +106,10 @@ class ScannerBox(EyeSafetyBox):
             raise self._bad_answer("TRIG", payload, "token,us")
         return int(t_us) / 1e6
 
+    def last_shown(self) -> ShownPattern | None:
+        """Return the last pattern shown with a release, None when there was none since power-up."""
+        return self._read_or_none("TRIG:LAST?", _shown_pattern, "token,us,projector,pattern")
+
     def shown_patterns(self) -> int:
         """Return the number of patterns shown since manufacture."""
         return self._count("TRIG:COUN?", "a number", shown="TRIG:COUN?")
@@ -110,6 +131,18 @@ class ScannerBox(EyeSafetyBox):
     def new_subject(self, pseudonym: str) -> None:
         """Restart the dose counter and clear the state of the eyes."""
         self._port.ask(f"DOSE:NEW {pseudonym}")
+
+
+def _shown_pattern(payload: str) -> ShownPattern:
+    token, t_us, projector, *pattern = payload.split(",")
+    if pattern == ["FULL"]:
+        axis, number = "", 0
+    else:
+        word, digits = pattern
+        axis = {word: axis for axis, word in _WORDS.items()}[word]
+        number = parse_whole_number(digits)
+    time_s = parse_whole_number(t_us) / 1e6
+    return ShownPattern(token, time_s, parse_whole_number(projector), axis, number)
 
 
 DRIVER: Final = ScannerBox

@@ -243,6 +243,17 @@ def next_seq(seq: int) -> int:
     return 0 if seq == MAX_SEQ else seq + 1
 
 
+def is_behind(number: int, latest: int) -> bool:
+    """Return whether a counter of 32 bits is behind the latest one: an old line, come again.
+
+    Examples
+    --------
+    >>> is_behind(7, 8), is_behind(8, 8), is_behind(0, 2**32 - 1)
+    (True, False, False)
+    """
+    return (number - latest) % (MAX_SEQ + 1) > MAX_SEQ // 2
+
+
 class LineSplitter:
     r"""Split a byte stream into lines and drop a line that is too long, up to the next newline.
 

@@ -1,5 +1,7 @@
 """Read a photograph of any format as a raw frame of linear values without its metadata."""
 
+import contextlib
+import io
 import struct
 import zlib
 from collections.abc import Sequence
@@ -19,6 +21,8 @@ Encoding = Literal["raw", "linear", "sRGB"]
 MAX_IMAGE_BYTES = 2**30
 MAX_IMAGE_PIXELS = 2**26  # four raw cells each: the largest frame a session takes
 MAX_IMAGE_SIDE_PX = 32_767
+MAX_EXR_EXPANSION = 1100
+"""Pixels per stored byte; the largest ratio of deflate is 1032 (RFC 1951)."""
 WHITE_DN = 65_535
 FLOAT_BLACK_DN = 1_024  # room for the negative values of floating-point images
 FLOAT_HEADROOM = 1.02  # floating-point images do not saturate, so their maximum stays below white
@@ -395,7 +399,15 @@ def _exr(file: Path, where: str) -> Photo:
             low, high = header.header()["dataWindow"]
             width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
         _check_size(width, height, where)
-        with OpenEXR.File(str(file), separate_channels=True) as stream:
+        if width * height > MAX_EXR_EXPANSION * file.stat().st_size:
+            raise ValueError(f"declares {width} x {height} pixels, more than it can store")
+        # the library prints what it cannot read, on stdout, and goes on
+        with (
+            contextlib.redirect_stdout(io.StringIO()) as printed,
+            OpenEXR.File(str(file), separate_channels=True) as stream,
+        ):
+            if printed.getvalue():
+                raise ValueError(printed.getvalue().strip())
             channels = {name: np.array(c.pixels) for name, c in stream.channels().items()}
     except InputError:
         raise

@@ -11,7 +11,7 @@ from capture.session.errors import (
 )
 from capture.session.journal import AttachmentLine, FrameLine
 from capture.session.manifest import SCHEMA, CalibrationRef, Manifest, SubjectRecord
-from capture.session.reopening import reopen_copy
+from capture.session.reopening import reopen_copy, resume_unless_complete
 from capture.session.store import Session
 from capture.session.verification import VerifyReport, verify
 from capture.session.view import FrameRecord
@@ -34,5 +34,6 @@ __all__ = [
     "SubjectRecord",
     "VerifyReport",
     "reopen_copy",
+    "resume_unless_complete",
     "verify",
 ]

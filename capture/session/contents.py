@@ -22,6 +22,7 @@ MANIFEST_FILE, JOURNAL_FILE = "session.json", "journal.jsonl"
 FRAMES_FOLDER, ORPHANS_FOLDER, ATTACHMENTS_FOLDER = "frames", "orphans", "attachments"
 MAX_MANIFEST_BYTES = 2**26
 MAX_JOURNAL_BYTES = 2**30
+MAX_UNLISTED_FILES = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +149,32 @@ def list_files(path: Path) -> list[str]:
     """Return the paths in the folders of frames and attachments, sorted, inside the session."""
     folders = [folder for folder in (FRAMES_FOLDER, ATTACHMENTS_FOLDER) if (path / folder).is_dir()]
     return sorted(f"{folder}/{name}" for folder in folders for name in os.listdir(path / folder))
+
+
+def unlisted_files(path: Path, contents: SessionContents) -> list[str]:
+    """Return the files of frames and attachments without a line in the journal, sorted."""
+    known = {line.file for line in contents.file_lines}
+    return [file for file in list_files(path) if file not in known]
+
+
+def find_lost_lines(path: Path, unlisted: list[str]) -> SessionDamage | None:
+    """Return the error of an open session whose journal has lost lines, None when it has not.
+
+    One process writes one file after the other under its name, and a line after each: an
+    interruption leaves at most `MAX_UNLISTED_FILES` without one.
+    """
+    files = [file for file in unlisted if not file.endswith(".part")]
+    if len(files) <= MAX_UNLISTED_FILES:
+        return None
+    journal = path / JOURNAL_FILE
+    got = f"{len(files)} files without a line, first {files[0]}"
+    return SessionDamage(
+        "is incomplete: lines are lost",
+        where=str(journal),
+        faults=[Fault("journal", got, f"at most {MAX_UNLISTED_FILES}, after an interruption")],
+        advice=f"Restore {JOURNAL_FILE} from a copy; without one, capture a new session.",
+        code="SR-SES-014",
+    )
 
 
 def _require_folder(folder: Path) -> None:

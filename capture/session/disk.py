@@ -20,12 +20,15 @@ class Disk:
     """Operations of the real disk; each method is one operation of a power-cut model."""
 
     def make_dir(self, path: Path) -> None:
-        """Make a directory whose parent exists."""
-        os.mkdir(path)
+        """Make a directory whose parent exists; its owner alone may enter it."""
+        os.mkdir(path, 0o700)
 
     def create(self, path: Path) -> int:
-        """Create a new file for writing and return its descriptor; an existing one is an error."""
-        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        """Create a new file for writing and return its descriptor; an existing one is an error.
+
+        Its owner alone may read it: a session may show a face.
+        """
+        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
 
     def open_append(self, path: Path) -> int:
         """Open an existing file for appending; a symbolic link is an error."""

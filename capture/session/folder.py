@@ -12,7 +12,9 @@ from capture.session.contents import (
     MANIFEST_FILE,
     ORPHANS_FOLDER,
     SessionContents,
+    find_lost_lines,
     list_files,
+    unlisted_files,
 )
 from capture.session.disk import Disk
 from capture.session.errors import SessionDamage, SessionDiskError, SessionError
@@ -120,6 +122,9 @@ def move_orphans(disk: Disk, path: Path, contents: SessionContents) -> None:
     """Move files without a line to ``orphans/``; a missing committed file is an error."""
     lines = {line.file: line for line in contents.file_lines}
     present = list_files(path)
+    orphans = unlisted_files(path, contents)
+    if (lost := find_lost_lines(path, orphans)) is not None:
+        raise lost
     for line in lines.values():
         size = (path / line.file).lstat().st_size if line.file in present else None
         if size != line.bytes:
@@ -129,7 +134,6 @@ def move_orphans(disk: Disk, path: Path, contents: SessionContents) -> None:
             raise SessionDamage(
                 "a committed file is gone", where=str(path), faults=faults, advice=advice
             )
-    orphans = [file for file in present if file not in lines]
     if not orphans:
         return
     taken = set(os.listdir(path / ORPHANS_FOLDER))

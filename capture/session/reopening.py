@@ -1,4 +1,4 @@
-"""Copy a closed session, which is never modified, into one that is open for additions."""
+"""Resume a session that may be complete, and copy a closed one into one open for additions."""
 
 from pathlib import Path
 
@@ -19,6 +19,20 @@ from capture.session.folder import DiskErrors, require_free, write_manifest, wri
 from capture.session.journal import CloseLine
 from capture.session.store import Session
 from capture.session.view import check_file
+
+
+def resume_unless_complete(path: str | Path) -> Session:
+    """Open a session for writing, or only for reading when it is closed and lacks nothing.
+
+    A capture that was killed between its last frame and its exit is such a session.
+
+    Raises
+    ------
+    SessionError
+        See `Session.resume`.
+    """
+    opened = Session.open(path)
+    return opened if opened.complete else Session.resume(path)
 
 
 def reopen_copy(

@@ -180,24 +180,23 @@ class Session(SessionView):
         read_undamaged_contents(place)
         with DiskErrors(place):
             descriptor = disk.open_append(place / JOURNAL_FILE)
-        try:
-            if not disk.lock(descriptor):
-                what, advice = "another process is writing this session", "Wait for its end."
-                raise SessionLocked(what, where=str(place), advice=advice, code="SR-SES-003")
-            contents = read_undamaged_contents(place)  # again, under the lock
-            if contents.walk.closed:
-                what = "the session is closed"
-                advice = "Start a new session; a closed one is never modified."
-                raise SessionError(what, where=str(place), advice=advice, code="SR-SES-002")
-            with DiskErrors(place):
+            try:
+                if not disk.lock(descriptor):
+                    what, advice = "another process is writing this session", "Wait for its end."
+                    raise SessionLocked(what, where=str(place), advice=advice, code="SR-SES-003")
+                contents = read_undamaged_contents(place)  # again, under the lock
+                if contents.walk.closed:
+                    what = "the session is closed"
+                    advice = "Start a new session; a closed one is never modified."
+                    raise SessionError(what, where=str(place), advice=advice, code="SR-SES-002")
                 if contents.walk.torn:
                     _log.warning("%s: cut %d torn bytes", place / JOURNAL_FILE, contents.walk.torn)
                     disk.truncate(descriptor, contents.walk.end)
                     disk.fdatasync(descriptor)
                 move_orphans(disk, place, contents)
-        except BaseException:
-            disk.close(descriptor)
-            raise
+            except BaseException:
+                disk.close(descriptor)
+                raise
         return cls(place, contents, disk=disk, descriptor=descriptor)
 
     def commit(

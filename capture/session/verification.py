@@ -12,8 +12,9 @@ from capture.session.contents import (
     MANIFEST_FILE,
     ORPHANS_FOLDER,
     SessionContents,
-    list_files,
+    find_lost_lines,
     read_contents,
+    unlisted_files,
 )
 from capture.session.errors import NotASession, SessionError
 from capture.session.journal import FrameLine
@@ -37,6 +38,8 @@ class VerifyReport:
     """Number of committed frames whose files are intact."""
     bytes: int
     """Bytes of those frames and of the intact attachments."""
+    complete: bool = True
+    """Whether the journal has a line for each file but one that an interruption may leave."""
 
 
 def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
@@ -83,22 +86,17 @@ def verify(path: str | Path, *, today: date | None = None) -> VerifyReport:
             frames += isinstance(line, FrameLine)
         except SessionError as exc:
             problems.append(str(exc))
-    strays = problems if contents.walk.closed else warnings
-    damaged_journal = contents.walk.damage is not None
-    strays.extend(_stray_files(place, contents) if not damaged_journal else [])
+    unlisted = unlisted_files(place, contents) if contents.walk.damage is None else []
+    lost = None if contents.walk.closed else find_lost_lines(place, unlisted)
+    if lost is None:
+        advice = "it was never acknowledged; resuming sets it aside"
+        strays = problems if contents.walk.closed else warnings
+        strays.extend(f"{place / file}: no line in the journal; {advice}" for file in unlisted)
+    else:
+        problems.append(str(lost))
     warnings.extend(_state(place, contents))
     warnings.extend(_consent(contents, today or datetime.now(UTC).date()))
-    return VerifyReport(not problems, tuple(problems), tuple(warnings), frames, size)
-
-
-def _stray_files(place: Path, contents: SessionContents) -> list[str]:
-    known = {line.file for line in contents.file_lines}
-    advice = "it was never acknowledged; resuming sets it aside"
-    return [
-        f"{place / file}: no line in the journal; {advice}"
-        for file in list_files(place)
-        if file not in known
-    ]
+    return VerifyReport(not problems, tuple(problems), tuple(warnings), frames, size, lost is None)
 
 
 def _state(place: Path, contents: SessionContents) -> list[str]:

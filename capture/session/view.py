@@ -273,6 +273,11 @@ class SessionView:
         return self._close_line is not None
 
     @property
+    def complete(self) -> bool:
+        """Whether the session is closed and lacks no frame of its plan but omitted ones."""
+        return self.closed and not self.pending_frames()
+
+    @property
     def content_hash(self) -> str:
         """``sha256:`` hash that covers manifest, journal and, through it, every frame."""
         return self._head if self._head.startswith("sha256:") else f"sha256:{self._head}"

@@ -9,6 +9,7 @@
 #define LINE_BYTES 1024u
 #define KEPT_ANSWERS 8u
 #define KEPT_BYTES 160u
+#define HELLOS 8u
 #define ERRORS 16u
 #ifdef __AVR__
 #define ERROR_BYTES 72u
@@ -49,6 +50,9 @@ static STATE struct core {
   struct request under_way;
   struct kept_answer kept[KEPT_ANSWERS];
   uint8_t kept_next;
+  uint32_t latest_seq, hellos[HELLOS];
+  uint8_t hellos_next, hellos_count;
+  bool heard; /* latest_seq is valid */
   struct error errors[ERRORS];
   uint8_t errors_first, errors_count;
   char event_data[EVENT_BYTES];
@@ -485,8 +489,24 @@ static void send_refusal(uint32_t seq, enum code code) {
   send_sealed(&frame);
 }
 
-/* Return whether a request was answered, or is being executed, before. */
-static bool is_repeated(const struct request *request) {
+static void refuse_reused(uint32_t seq) {
+  send_refusal(seq, CODE_SEQ_REUSED);
+  record_error(CODE_SEQ_REUSED, core.reason_data);
+}
+
+/* A host begins; an old hello again changes nothing. */
+static void note_hello(uint32_t seq) {
+  for (uint8_t k = 0; k < core.hellos_count; k++)
+    if (core.hellos[k] == seq) return;
+  core.hellos[core.hellos_next] = seq;
+  core.hellos_next = (uint8_t)((core.hellos_next + 1u) % HELLOS);
+  if (core.hellos_count < HELLOS) core.hellos_count++;
+  core.latest_seq = seq;
+  core.heard = true;
+}
+
+/* Return whether a request was answered, is being executed, or is an old one, come again. */
+static bool is_repeated(const struct request *request, bool behind) {
   for (uint8_t k = 0; k <= KEPT_ANSWERS; k++) {
     bool last = k == KEPT_ANSWERS;
     if (last && !core.pending) break;
@@ -499,15 +519,15 @@ static bool is_repeated(const struct request *request) {
       board_send(kept->data, kept->size);
       return true;
     }
-    send_refusal(request->seq, CODE_SEQ_REUSED);
-    record_error(CODE_SEQ_REUSED, core.reason_data);
+    refuse_reused(request->seq);
     return true;
   }
-  return false;
+  if (behind) refuse_reused(request->seq);
+  return behind;
 }
 
 void core_handle_framed_line(char *line, uint16_t size) {
-  struct frame frame;
+  struct frame frame = {0};
   struct text reply;
   if (!decode(line, size, &frame)) {
     start_event(&reply, P("NAK 204"));
@@ -516,6 +536,7 @@ void core_handle_framed_line(char *line, uint16_t size) {
   }
   if (frame.mark != '@') return; /* the box's own output, returned by an echoing line */
   if (frame.boot == 0 && strcmp(frame.text, "SYST:HELLO?") == 0) {
+    note_hello(frame.number);
     start_reply(&reply, frame.number);
     execute(frame.text, &reply, true);
     send_sealed(&reply);
@@ -525,9 +546,15 @@ void core_handle_framed_line(char *line, uint16_t size) {
     send_refusal(frame.number, CODE_BOOT_CHANGED);
     return;
   }
-  renew_lease();
+  uint32_t ahead = frame.number - core.latest_seq; /* modulo 2^32 */
+  bool behind = core.heard && ahead > 0x7FFFFFFFu;
+  if (!behind && (ahead > 0 || !core.heard)) {
+    renew_lease();
+    core.latest_seq = frame.number;
+    core.heard = true;
+  }
   struct request request = {frame.number, hash32(frame.text), (uint16_t)strlen(frame.text)};
-  if (is_repeated(&request)) return;
+  if (is_repeated(&request, behind)) return;
   start_reply(&reply, request.seq);
   enum code code = execute(frame.text, &reply, true);
   if (code == CODE_PENDING) {

@@ -8,6 +8,7 @@ import numpy as np
 
 from model.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from model.checks import Checks
+from model.checks.files import decode_json
 from model.facial_color.rig import HemoglobinRig
 from model.facial_color.state_maps import NEUTRAL, FacialColorError, StateMaps
 from model.skin import MAP_UNITS, SkinMap
@@ -68,7 +69,7 @@ def from_maps_and_document(maps: Mapping[str, SkinMap], document: bytes) -> Hemo
         For a map or key that is missing, unknown, of another schema or of another shape; names it.
     """
     try:
-        loaded = json.loads(document)
+        loaded = decode_json(document)
     except ValueError as error:
         raise FacialColorError(f"{RIG_DOCUMENT}: is not JSON ({error})") from error
     version = loaded.get("schema") if isinstance(loaded, dict) else None

@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array
 from model.checks import Checks
+from model.checks.files import decode_json
 from model.microstructure.convolution_kernels import TRUNCATE_SIGMAS
 
 Line: TypeAlias = tuple[float, float]
@@ -185,8 +186,8 @@ class KernelTable:
             For text that is not a table, unknown or missing keys, or an inconsistent table.
         """
         try:
-            given: Any = json.loads(text)
-        except json.JSONDecodeError as error:
+            given: Any = decode_json(text)
+        except ValueError as error:
             raise KernelTableError(f"table: got text that is not JSON: {error}") from error
         if not isinstance(given, dict) or given.get("schema") != TABLE_SCHEMA:
             got = given.get("schema") if isinstance(given, dict) else type(given).__name__
@@ -199,7 +200,7 @@ class KernelTable:
             return cls(**given)
         except KernelTableError:
             raise
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise KernelTableError(f"table: got values of a wrong kind: {error}") from error
 
 

@@ -17,7 +17,6 @@ Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 10.2.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from numpy.typing import ArrayLike
 
 from model.arrays import BoolArray, Float64Array, FloatArray
 from model.checks import Checks
+from model.checks.files import read_arrays
 from model.texture_statistics import steerable_pyramid
 from model.texture_statistics.bins import OPPONENT_AXES, make_bin_edges, principal_axes
 from model.texture_statistics.histograms import HISTOGRAM_BINS
@@ -270,10 +270,10 @@ class TextureSpace:
     def load(cls, path: str | Path) -> TextureSpace:
         """Read a file of `save`; raise TextureError for any other file."""
         try:
-            with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as stored:
-                mean, axes, edges = (stored[name] for name in ("mean", "axes", "edges"))
-                levels, orientations, images = (int(n) for n in stored["counts"])
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            stored = read_arrays(path)
+            mean, axes, edges = (stored[name] for name in ("mean", "axes", "edges"))
+            levels, orientations, images = (int(n) for n in stored["counts"])
+        except (OSError, KeyError, ValueError, TypeError) as error:
             raise TextureError(f"{path}: got no texture space ({error})") from error
         return cls(mean, axes, edges, levels, orientations, images)
 

@@ -6,7 +6,6 @@ measured while writing and stored in the document.
 
 import io
 import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from model.arrays import Float64Array
 from model.checks import Checks
+from model.checks.files import decode_json, read_arrays
 from model.traits import feasible_sets, reduced_spaces
 from model.traits.space import TraitSpace
 from model.traits.vectors import Confidence, TraitError, TraitVector
@@ -156,11 +156,10 @@ def from_bytes(content: bytes) -> TraitLibrary:
         For bytes that do not contain any, or another version's.
     """
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-        document = json.loads(arrays["document"].tobytes())
+        arrays = read_arrays(content)
+        document = decode_json(arrays["document"].tobytes())
         schema = document["schema"]
-    except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except (KeyError, ValueError, TypeError) as error:
         raise TraitFileError(
             "got no trait spaces, expected a file of `skinrig fit traits`"
         ) from error

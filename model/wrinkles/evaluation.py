@@ -19,6 +19,7 @@ import numpy as np
 
 from model.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from model.checks import Checks
+from model.checks.files import decode_json
 from model.skin import SkinMap
 from model.wrinkles import differences as wrinkle_differences
 from model.wrinkles import partial_derivatives as wrinkles
@@ -203,7 +204,7 @@ class WrinkleModel:
             For a document of another kind, or a missing map.
         """
         try:
-            given: Any = json.loads(document)
+            given: Any = decode_json(document)
         except ValueError as error:
             raise WrinkleError(f"{WRINKLE_FILE}: got text that is not JSON: {error}") from error
         schema = given.get("schema") if isinstance(given, dict) else type(given).__name__

@@ -29,9 +29,10 @@ from rigsim.boxes.command import (
 from rigsim.boxes.device import Device
 
 FIRMWARE_VERSION = "1.0"
-PROTOCOL_MINOR = 1
+PROTOCOL_MINOR = 2
 """Revision of the protocol's text; a controller without it in its limits is of revision 0."""
 MAX_CACHED_REPLIES = 8
+MAX_REMEMBERED_HELLOS = 8
 MAX_KEPT_ANSWER_BYTES = 160
 """Longest answer that is kept, newline included; only the limits are longer, and are made again."""
 MAX_QUEUED_ERRORS = 16
@@ -85,6 +86,8 @@ class Controller:
         self._errors: deque[tuple[int, str]] = deque()
         self._replies: deque[tuple[int, str, bytes]] = deque(maxlen=MAX_CACHED_REPLIES)
         self._under_way: tuple[Request, PendingReply] | None = None
+        self._hellos: deque[int] = deque(maxlen=MAX_REMEMBERED_HELLOS)
+        self._latest_seq: int | None = None
         self._events = 0
         self._lease_ms = DEFAULT_LEASE_MS
         self._lease_end = math.inf
@@ -150,11 +153,18 @@ class Controller:
         if not isinstance(frame, Request):
             return b""  # the controller's own output, returned by an echoing line
         if frame.boot == wire.UNKNOWN_BOOT and frame.text == "SYST:HELLO?":
+            if frame.seq not in self._hellos:  # a host begins; an old hello again changes nothing
+                self._hellos.append(frame.seq)
+                self._latest_seq = frame.seq
             return wire.encode(Reply(frame.seq, self.boot, Code.OK, self._hello()))
         if self._foreign_epoch(frame.boot):
             refused = CommandRefused(Code.BOOT_CHANGED)
             return wire.encode(Reply(frame.seq, self.boot, refused.code, refused.reason))
-        self._renew_lease(now)
+        latest = self._latest_seq
+        behind = latest is not None and wire.is_behind(frame.seq, latest)
+        if frame.seq != latest and not behind:
+            self._renew_lease(now)
+            self._latest_seq = frame.seq
         answers = list(self._replies)
         if self._under_way is not None:
             request = self._under_way[0]
@@ -166,9 +176,10 @@ class Controller:
                     break
                 return answer
             if seq == frame.seq:
-                refused = CommandRefused(Code.SEQ_REUSED)
-                self._record_error(refused)
-                return wire.encode(Reply(frame.seq, self.boot, refused.code, refused.reason))
+                return self._refuse_reused(frame)
+        else:
+            if behind:
+                return self._refuse_reused(frame)
         try:
             outcome = self._execute(frame.text, now)
         except CommandRefused as refused:
@@ -178,6 +189,11 @@ class Controller:
             self._renew_lease(now)
             return b""
         return self._answer(frame, outcome, now)
+
+    def _refuse_reused(self, request: Request) -> bytes:
+        refused = CommandRefused(Code.SEQ_REUSED)
+        self._record_error(refused)
+        return wire.encode(Reply(request.seq, self.boot, refused.code, refused.reason))
 
     def _answer(self, request: Request, outcome: str | CommandRefused, now: float) -> bytes:
         if isinstance(outcome, CommandRefused):

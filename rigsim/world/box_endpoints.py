@@ -16,6 +16,13 @@ from rigsim.world.world import World
 log = logging.getLogger(__name__)
 
 CHUNK_BYTES = 4096
+MAX_LEAVING = 16
+"""Largest number of refused clients whose own end is awaited."""
+BROWSER_STARTS = (
+    *(b"GET ", b"POST ", b"PUT ", b"HEAD ", b"OPTIONS ", b"DELETE ", b"PATCH ", b"CONNECT "),
+    *(b"TRACE ", b"PRI ", b"\x16\x03"),
+)
+"""First bytes of HTTP and TLS: a page in a browser must not command a controller."""
 
 
 class BoxEndpoint(ABC):
@@ -136,7 +143,8 @@ class TcpEndpoint(BoxEndpoint):
         self._listener = socket.create_server((host, port), backlog=4)
         self._listener.setblocking(False)
         self._client: socket.socket | None = None
-        self._leaving: set[socket.socket] = set()
+        self._heard = False
+        self._leaving: dict[socket.socket, None] = {}
         self._unwritten = b""
         self.address = f"socket://{host}:{self._listener.getsockname()[1]}"
 
@@ -167,7 +175,7 @@ class TcpEndpoint(BoxEndpoint):
             return
         client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._client = client
+        self._client, self._heard = client, False
         self._selector.register(client, selectors.EVENT_READ, self._readable)
 
     def _readable(self) -> None:
@@ -175,8 +183,9 @@ class TcpEndpoint(BoxEndpoint):
             return
         try:
             data = self._client.recv(CHUNK_BYTES)
-            if not data:
+            if not data or (not self._heard and data.startswith(BROWSER_STARTS)):
                 raise ConnectionResetError
+            self._heard = True
             self._send(data)
         except BlockingIOError:
             return
@@ -209,15 +218,15 @@ class TcpEndpoint(BoxEndpoint):
         """Shut a connection down and wait for the client's own end: closing at once is a reset."""
 
         def drain() -> None:
+            if client not in self._leaving:
+                return  # ended by a later one
             with contextlib.suppress(BlockingIOError):
                 try:
                     over = not client.recv(CHUNK_BYTES)
                 except ConnectionError:
                     over = True
                 if over:
-                    self._leaving.discard(client)
-                    self._selector.unregister(client)
-                    client.close()
+                    self._end(client)
 
         try:
             client.setblocking(False)
@@ -225,8 +234,15 @@ class TcpEndpoint(BoxEndpoint):
         except OSError:
             client.close()
             return
-        self._leaving.add(client)
+        while len(self._leaving) >= MAX_LEAVING:
+            self._end(next(iter(self._leaving)))
+        self._leaving[client] = None
         self._selector.register(client, selectors.EVENT_READ, drain)
+
+    def _end(self, client: socket.socket) -> None:
+        del self._leaving[client]
+        self._selector.unregister(client)
+        client.close()
 
     def stop(self) -> None:
         """Stop serving; a second call is allowed."""

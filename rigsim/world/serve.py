@@ -3,14 +3,12 @@
 One thread moves the controllers' bytes and advances the world's time. Each camera connection has a
 thread of its own, because computing pixels takes time and no lamp may wait for it. Controllers,
 lines and faults are those behind ``sim://``, so that a client in any language observes the same as
-a driver. Every client that reaches a port can fire the lights: ports listen on this machine only,
-unless remote access is permitted.
+a driver. Every client that reaches a port can fire the lights: ports listen on this machine only.
 """
 
 from __future__ import annotations
 
 import ipaddress
-import logging
 import os
 import selectors
 import threading
@@ -23,8 +21,6 @@ from rigsim.boxes.faults import Faults
 from rigsim.world.box_endpoints import BoxEndpoint, PtyEndpoint, TcpEndpoint
 from rigsim.world.camera_service import CameraService
 from rigsim.world.world import Scene, World
-
-log = logging.getLogger(__name__)
 
 MAX_IDLE_S = 0.5
 """Longest sleep of the thread that serves the controllers, s."""
@@ -40,7 +36,6 @@ def serve_world(
     *,
     pty: bool = False,
     tcp: str = "127.0.0.1:0",
-    allow_remote: bool = False,
     seed: int = 0,
     subject_seed: int | None = None,
     scene: Scene | None = None,
@@ -59,8 +54,6 @@ def serve_world(
     tcp
         ``HOST:PORT``; port 0 takes free ones. Otherwise the controllers get ports upwards from it,
         in the order of the rig, then all cameras one.
-    allow_remote
-        Permit an address that other machines can reach.
     seed, subject_seed, scene, faults, shots_made
         Arguments of the new world, see `World`; without `faults`, bytes take no time beyond that
         of the pty or the network.
@@ -75,8 +68,7 @@ def serve_world(
     Raises
     ------
     ServeError
-        When the address is in use, is malformed, or is reachable from elsewhere without
-        `allow_remote`.
+        When the address is in use, is malformed, or is reachable from elsewhere.
 
     Examples
     --------
@@ -98,10 +90,10 @@ def serve_world(
         )
     if world.virtual:
         raise ServeError("clock: got a virtual one, expected 'real' for other programs")
-    return ServedWorld(world, pty=pty, host_port=_host_port(tcp, allow_remote))
+    return ServedWorld(world, pty=pty, host_port=_host_port(tcp))
 
 
-def _host_port(text: str, allow_remote: bool) -> tuple[str, int]:
+def _host_port(text: str) -> tuple[str, int]:
     host, colon, port = text.rpartition(":")
     if not (colon and host and port.isdecimal() and int(port) < 65_536):
         raise ServeError(f"tcp: got {text!r}, expected HOST:PORT, e.g. 127.0.0.1:0")
@@ -109,14 +101,12 @@ def _host_port(text: str, allow_remote: bool) -> tuple[str, int]:
         local = host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         local = False
-    if not local and not allow_remote:
+    if not local:
         raise ServeError(
             f"tcp: got {host!r}, expected an address of this machine only, such as 127.0.0.1. "
-            "Any client of the port can fire the lights; permit it with allow_remote "
-            "(--allow-remote)"
+            "Any client of the port can fire the lights; from another machine use a tunnel, "
+            "ssh -L PORT:127.0.0.1:PORT THIS_MACHINE"
         )
-    if not local:
-        log.warning("%s: other machines can reach the controllers and fire the lights", text)
     return host, int(port)
 
 

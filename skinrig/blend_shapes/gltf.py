@@ -14,7 +14,6 @@ glTF 2.0 specification, ISO/IEC 12113:2022.
 
 import base64
 import binascii
-import json
 import struct
 from pathlib import Path
 from typing import Any, Final
@@ -23,6 +22,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from model.checks.files import decode_json
 from rigsim.geometry.mesh import MeshFileError
 from skinrig.arrays import Float64Array
 from skinrig.blend_shapes.obj import MeshArrays
@@ -44,6 +44,8 @@ COMPRESSION_EXTENSIONS: Final = (
     "KHR_meshopt_compression",
 )
 TRIANGLES_MODE: Final = 4
+MAX_ZERO_ROWS: Final = 2**22
+"""Maximum length of an accessor without a buffer, which only sparse values fill."""
 MAX_NODE_DEPTH: Final = 1000
 """Maximum depth of a mesh in the scene graph; a deeper one is assumed to be cyclic."""
 
@@ -60,8 +62,8 @@ class _Gltf:
             raise self.build_error(f"cannot be read: {error.strerror}") from error
         text = self._unpacked(data) if path.suffix.lower() == ".glb" else data
         try:
-            document = json.loads(text)
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+            document = decode_json(text)
+        except ValueError as error:
             raise self.build_error(f"not JSON: {error}") from error
         if not isinstance(document, dict):
             raise self.build_error("got no JSON object")
@@ -113,7 +115,8 @@ class _Gltf:
                     raise self.build_error(f"buffer {number}: its data URI is damaged") from error
             else:
                 file = self.path.parent / unquote(uri)
-                if ".." in Path(unquote(uri)).parts or Path(unquote(uri)).is_absolute():
+                here = self.path.parent.resolve()
+                if not file.resolve().is_relative_to(here):  # also by a link
                     raise self.build_error(
                         f"buffer {number}: got {uri!r}, expected a file next to it"
                     )
@@ -156,6 +159,11 @@ class _Gltf:
         if "bufferView" in entry:
             values = self._rows(entry, count, component, width)
         else:
+            if not 0 <= count <= MAX_ZERO_ROWS:
+                raise self.build_error(
+                    f"accessor {number}: got {count} rows without data, expected at most "
+                    f"{MAX_ZERO_ROWS}"
+                )
             values = np.zeros((count, width), COMPONENT_DTYPES[component])
         if "sparse" in entry:
             sparse = entry["sparse"]
@@ -193,7 +201,10 @@ def read(path: Path) -> MeshArrays:
         return _read(gltf)
     except MeshFileError:
         raise
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+    except (
+        *(KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError),
+        *(MemoryError, RecursionError),
+    ) as error:
         raise gltf.build_error(
             f"an entry is missing or of a wrong type ({error!r}); export it again"
         ) from error

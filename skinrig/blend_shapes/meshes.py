@@ -1,7 +1,6 @@
 """Load and check meshes with blend shapes: .npz, OBJ and glTF files."""
 
 import difflib
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from model.checks.files import read_arrays
 from rigsim.geometry.mesh import MeshError, MeshFileError, check_triangles
 from skinrig.arrays import Float32Array, Float64Array, Int32Array
 from skinrig.blend_shapes import gltf as blend_shape_gltf
@@ -114,15 +114,11 @@ def load(path: Path | str) -> BlendShapeMesh:
 
 def _read_npz(path: Path) -> blend_shape_obj.MeshArrays:
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            missing = [key for key in NPZ_KEYS if key not in archive]
-            if missing:
-                raise MeshFileError(f"{path}: {', '.join(missing)} missing; export it again")
-            arrays = {key: archive[key] for key in NPZ_KEYS}
-    except MeshFileError:
-        raise
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        arrays = read_arrays(path)
+    except (OSError, ValueError) as error:
         raise MeshFileError(f"{path}: not a readable .npz: {error}") from error
+    if missing := [key for key in NPZ_KEYS if key not in arrays]:
+        raise MeshFileError(f"{path}: {', '.join(missing)} missing; export it again")
     names = arrays["shape_names"]
     if names.ndim != 1 or names.dtype.kind != "U":
         raise MeshFileError(

@@ -16,7 +16,7 @@ from capture.devices.camera import Camera, open_camera
 from capture.devices.led_box import Eyes
 from capture.plan import Plan
 from capture.rig import Rig
-from capture.session import Session, SubjectRecord
+from capture.session import Session, SessionDiskError, SubjectRecord
 from skinrig.capturing.addresses import open_box, open_with_retry, require_addresses
 from skinrig.capturing.camera_colors import nominal_camera_colors
 from skinrig.capturing.light_safety import light_figures, light_lines
@@ -112,6 +112,8 @@ def _run(
     rig: Rig, plan: Plan, out: Path, order: CaptureOrder, console: Console
 ) -> Mapping[str, Any]:
     """Run a plan through the drivers into a new or resumed session."""
+    if order.resume and (opened := Session.open(out)).complete:
+        return _describe_complete(opened, console)
     with contextlib.ExitStack() as stack:
         boxes, cameras = _open_devices(stack, rig, plan, order, console)
         width = cameras[rig.views[0].name].info.width_px
@@ -132,7 +134,7 @@ def _run(
                 subject=order.subject,
                 source="simulated" if maker.upper().startswith("RIGSIM") else "measured",
             )
-            stack.enter_context(_discard_unused_session(session, fresh, console))
+            stack.enter_context(discard_unused_session(session, fresh, console))
         stack.callback(session.release)
         with _stop_on_signal() as stopped:
             done = run_plan(
@@ -162,6 +164,21 @@ def _run(
     figures = {"session": out, "captured": done.frames, "retakes": done.retakes}
     figures |= {"stale_frames": done.stale, "steps": len(plan.steps)}
     return figures | {"dead_lights": done.dead_lights, "left_out": omitted}
+
+
+def _describe_complete(session: Session, console: Console) -> Mapping[str, Any]:
+    """Report a session that lacks nothing; no device is opened."""
+    frames = len(session.frames())
+    console.print_line(f"{session.path}: complete, {frames} frames; nothing is left to capture")
+    console.print_line(f"next: skinrig verify {shell_quote(session.path)}")
+    figures: dict[str, Any] = {
+        "session": session.path,
+        "captured": 0,
+        "retakes": 0,
+        "stale_frames": 0,
+    }
+    figures |= {"steps": len(session.plan.steps), "dead_lights": ()}
+    return figures | {"left_out": dict(session.omitted_steps())}
 
 
 def _open_devices(
@@ -201,12 +218,18 @@ def signal_subject(progress: Callable[[str], None], instruction: str) -> None:
 
 
 @contextlib.contextmanager
-def _discard_unused_session(session: Session, fresh: bool, console: Console) -> Iterator[None]:
-    """Remove a new session if a device fails before its first frame."""
+def discard_unused_session(session: Session, fresh: bool, console: Console) -> Iterator[None]:
+    """Remove a new session if a device fails before its first frame.
+
+    After an error of the disk it is kept: it can be resumed, and may contain what was not
+    acknowledged.
+    """
     try:
         yield
+    except SessionDiskError:
+        raise
     except Exception:
-        if not session.frames():
+        if not session.frames() and not session.attachments():
             session.release()
             remove_unused(session.path, with_folder=fresh)
             console.progress(f"{session.path}: removed, because no frame was recorded")
@@ -218,10 +241,10 @@ def remove_unused(path: Path, *, with_folder: bool) -> None:
 
     The manifest is removed first: a folder without it is not a session, even if the rest fails.
     """
-    for name in ("session.json", "journal.jsonl"):
-        (path / name).unlink()
     # rmdir fails on a folder that holds foreign files: those and their folder are kept
     with contextlib.suppress(OSError):
+        for name in ("session.json", "journal.jsonl"):
+            (path / name).unlink()
         for part in (path / "frames").glob("*.part"):
             part.unlink()
         (path / "frames").rmdir()

@@ -218,11 +218,10 @@ class ServeOptions:
     pty
         Serve each controller on a pseudo terminal.
     tcp
-        Address of cameras and, without --pty, of controllers; port 0: any free port.
+        Address of cameras and, without --pty, of controllers, on this machine only; port 0: any
+        free port.
     scale
         Scale of the simulation: small (fast) or full (the complete rig); gradient: small only.
-    allow_remote
-        Accept connections from other machines.
     resume
         Interrupted session captured from an earlier server with this rig and seed; new shots
         continue its noise sequence and differ from those on disk.
@@ -230,7 +229,6 @@ class ServeOptions:
 
     pty: bool = False
     tcp: str = "127.0.0.1:0"
-    allow_remote: bool = False
     subject: options.Subject = "III"
     scale: options.Scale = "small"
     seed: options.Seed = 0
@@ -287,23 +285,14 @@ def _serve(context: typer.Context, common: ServeOptions, site: str | None = None
     """Serve a simulated rig until interrupted."""
     from skinrig.simulating.serving import ServeOrder, serve_rig
 
-    options = (
-        "pty",
-        "tcp",
-        "allow_remote",
-        "subject",
-        "seed",
-        "session_seed",
-        "renderer",
-        "resume",
-    )
+    options = ("pty", "tcp", "subject", "seed", "session_seed", "renderer", "resume")
     order = ServeOrder(site=site, size=common.scale, **select_attributes(common, *options))
     serve_rig(str(context.info_name), order, Console(common.json))
 
 
 @command
 def verify(session: Path, /, json: options.Json = False) -> None:
-    """Check the digests of all files of a session; exit code 3 if one is damaged.
+    """Check the digests of all files of a session; exit code 3 if one is damaged or missing.
 
     Example: skinrig verify session
 
@@ -318,11 +307,13 @@ def verify(session: Path, /, json: options.Json = False) -> None:
     found = check(session)
     console.print_each("warning", found.warnings)
     console.print_each("damaged", found.problems)
+    state = "sound" if found.ok else "DAMAGED" if found.complete else "INCOMPLETE"
     console.print_line(
-        f"{session}: {'sound' if found.ok else 'DAMAGED'}, {format_count(found.frames, 'frame')}, "
-        f"{found.bytes / 1e6:.1f} MB"
+        f"{session}: {state}, {format_count(found.frames, 'frame')}, {found.bytes / 1e6:.1f} MB"
     )
-    figures = select_attributes(found, "ok", "problems", "warnings", "frames", "bytes")
+    figures = select_attributes(
+        *(found, "ok", "complete", "problems", "warnings", "frames", "bytes")
+    )
     console.print_document("skinrig.verify/1", figures)
     if not found.ok:
         raise typer.Exit(errors.EXIT_BAD_INPUT)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type
 
 import typer
 
+from skinrig.atomic_file import require_writable
 from skinrig.commands import completion
 from skinrig.errors import UnusableError, UsageError, require_choice
 
@@ -64,7 +65,16 @@ SessionSeed = Annotated[
         "controllers; default: that of --seed."
     ),
 ]
-Out = Annotated[Path, option("Folder to write.", "--out")]
+
+
+def _check_output_place(context: typer.Context, out: Path | None) -> Path | None:
+    """Refuse a place that cannot be written to, before the computation starts."""
+    if out is not None and not context.resilient_parsing:
+        require_writable(out)
+    return out
+
+
+Out = Annotated[Path, option("Folder to write.", "--out", callback=_check_output_place)]
 
 
 def _check_output_folder(context: typer.Context, out: Path) -> Path:
@@ -72,6 +82,7 @@ def _check_output_folder(context: typer.Context, out: Path) -> Path:
     if not context.resilient_parsing:
         from model.store import require_free
 
+        require_writable(out)
         require_free(out)
     return out
 
@@ -88,6 +99,8 @@ def check_output_file(context: typer.Context, out: Path | None) -> Path | None:
         raise UnusableError(
             f"--out: {out} is a folder, expected a file to write; name a file [SR-CLI-011]"
         )
+    if str(out) != STDOUT_MARK:
+        _check_output_place(context, out)
     return out
 
 

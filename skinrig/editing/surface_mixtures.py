@@ -2,7 +2,6 @@
 
 import dataclasses
 import io
-import zipfile
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from model.brdf import tables as brdf_tables
 from model.brdf.tables import BrdfBasis
+from model.checks.files import read_arrays
 from model.skin import SkinAppearance, SkinMap
 from model.skin_reflectance import BASIS_FILE, WEIGHT_PREFIX
 from skinrig.appearances.contents import intersect_valid
@@ -95,12 +95,11 @@ def read(appearance: SkinAppearance) -> SurfaceMixtures:
             f" {WEIGHT_PREFIX}0`"
         )
     try:
-        with np.load(io.BytesIO(appearance.files[BASIS_FILE]), allow_pickle=False) as file:
-            stored = {name: file[name] for name in file.files}
+        stored = read_arrays(appearance.files[BASIS_FILE])
         mix = np.asarray(stored["mix"], np.float64)
         names = tuple(str(name) for name in stored["materials"])
         stored["light_radius_rad"], stored["table"]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise SurfaceMixtureError(
             f"{BASIS_FILE}: not readable ({error}); reconstruct the session again"
         ) from error

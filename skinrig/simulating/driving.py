@@ -14,7 +14,7 @@ from capture.acquire import Operator, run_plan
 from capture.devices.camera import open_camera
 from capture.plan import Plan
 from capture.rig import Rig
-from capture.session import Session, SubjectRecord
+from capture.session import Session, SubjectRecord, resume_unless_complete
 from model import store
 from model.skin import SkinAppearance
 from rigsim.world import World
@@ -30,7 +30,7 @@ from skinrig.simulating.orders import (
     SimulationResult,
     truth_folder,
 )
-from skinrig.simulating.resumption import count_shots, list_refusals
+from skinrig.simulating.resumption import SessionComplete, count_shots, list_refusals
 
 Log = TypeVar("Log", bound=SceneLog)
 
@@ -104,7 +104,21 @@ def open_logged_session(
     """Open the session of an order and the log that wraps its scene."""
     session = open_session(order, plan, rig, settings, scene)
     with release_on_error(session):
-        return session, kind(scene, truth_folder(order.out), resume=order.resume, session=session)
+        truth = truth_folder(order.out)
+        require_unfinished(order, session, scene, kind.path_of(truth))
+        return session, kind(scene, truth, resume=order.resume, session=session)
+
+
+def require_unfinished(
+    order: SimulationOrder, session: Session, scene: Any, log_path: Path
+) -> None:
+    """Raise `SessionComplete` when the ground truth was written and its log removed.
+
+    The ground truth cannot be written again without the log.
+    """
+    truth = truth_folder(order.out)
+    if session.closed and truth.is_dir() and not log_path.exists():
+        raise SessionComplete(build_result(order, session, scene, 0.0, truth))
 
 
 def open_session(
@@ -112,7 +126,7 @@ def open_session(
 ) -> Session:
     """Create the session of an order, or resume it if its settings are the same."""
     if order.resume:
-        session = Session.resume(order.out)
+        session = resume_unless_complete(order.out)
         lines = list_refusals(session, settings, order.seed, order.person)
         if lines:
             session.release()
@@ -256,6 +270,10 @@ def drive_plan(
     float
         Time elapsed on the rig's clock, s.
     """
+    if session.closed:  # resumed after its last frame
+        if order.progress is not None:
+            order.progress("complete: nothing is left to capture")
+        return 0.0
     world = World(
         rig,
         seed=order.noise_seed,

@@ -77,7 +77,7 @@ class SceneLog(ExposureLog):
     """Frames that have no ground truth without the log, for messages."""
 
     def __init__(self, scene: Any, truth: Path, *, resume: bool, session: Session) -> None:
-        super().__init__(truth.with_name(f".{truth.name}.{self.suffix}.jsonl"), resume=resume)
+        super().__init__(self.path_of(truth), resume=resume)
         self._scene = scene
         entries = self.read()
         if not entries and any(session.frames(kind) for kind in self.kinds):
@@ -86,6 +86,11 @@ class SceneLog(ExposureLog):
                 "simulate a new session"
             )
         self._run = 1 + max((int(entry["run"]) for entry in entries), default=0)
+
+    @classmethod
+    def path_of(cls, truth: Path) -> Path:
+        """Return the path of the log of a ground truth's folder."""
+        return truth.with_name(f".{truth.name}.{cls.suffix}.jsonl")
 
     @property
     def run_id(self) -> str:

@@ -123,10 +123,11 @@ def _scenes(rig: Rig, order: FlashOrder, plan: Plan) -> dict[str, Any]:
             order, "subject", "site", "seed", "noise_seed", "size", "progress"
         )
         return {"neutral": reference.make_patch_scene(rig, **given)}
+    offset_mm = _stance_offset_mm(rig, order.nearer_mm)  # refuses, before the face is made
     subject = subject_file.load_subject(order.subject)
     texels = subject_records.choose_face_texels(rig.views[0].width_px)
     person = subject.face(seed=order.seed, size=texels, mesh=order.mesh)
-    person = person.translate(_stance_offset_mm(rig, order.nearer_mm))
+    person = person.translate(offset_mm)
     person = person.translate(draw_head_position(order.session_seed))
     return {
         state: FlashScene(

@@ -5,6 +5,22 @@ from collections.abc import Mapping
 from typing import Any
 
 from capture.session import Session, SubjectRecord
+from skinrig.simulating.orders import SimulationResult
+
+
+class SessionComplete(Exception):
+    """Raised when a resumed simulation lacks neither frames nor ground truth.
+
+    Attributes
+    ----------
+    result : SimulationResult
+        Result of the simulation.
+    """
+
+    def __init__(self, result: SimulationResult) -> None:
+        super().__init__(result)
+        self.result = result
+
 
 _MAX_SHOWN_CHARACTERS = 60
 """Maximum number of characters of a value in a message."""

@@ -22,7 +22,13 @@ from skinrig.arrays import BoolArray, Float64Array
 from skinrig.capturing.sequences import SequenceOrder, sequence_lines, sequence_plan
 from skinrig.errors import require_choice
 from skinrig.simulating import subject_records
-from skinrig.simulating.driving import build_result, drive_plan, open_session, session_settings
+from skinrig.simulating.driving import (
+    build_result,
+    drive_plan,
+    open_session,
+    require_unfinished,
+    session_settings,
+)
 from skinrig.simulating.exposure_log import ExposureLog
 from skinrig.simulating.flash_truth import WIDTHS_PX, build_truth, scale_landmarks, to_superpixels
 from skinrig.simulating.orders import (
@@ -110,7 +116,9 @@ def simulate_sequence(order: FlashOrder, sequence: SequenceOrder) -> SimulationR
         choice=choose_renderer(order.renderer),
     )
     session = open_session(order, plan, rig, asked, scene)
-    log = ExposureLog(truth.with_name(f"{truth.name}.flashes.jsonl"), resume=order.resume)
+    log_path = truth.with_name(f"{truth.name}.flashes.jsonl")
+    require_unfinished(order, session, scene, log_path)
+    log = ExposureLog(log_path, resume=order.resume)
     before_s = _event_s(session)
     begun_s = time.time() if before_s is None else _last_s(session) + INTERRUPTION_S
     if before_s is not None and not sequence.is_prompted:

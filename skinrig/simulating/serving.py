@@ -57,8 +57,6 @@ class ServeOrder:
     """Serve controllers on pseudo terminals; cameras always use TCP."""
     tcp: str = "127.0.0.1:0"
     """HOST:PORT; port 0 chooses a free one."""
-    allow_remote: bool = False
-    """Allow an address that other machines can reach."""
     subject: str = "III"
     size: str = "small"
     seed: int = 0
@@ -110,7 +108,7 @@ def serve_rig(rig_name: str, order: ServeOrder, console: Console) -> None:
     if order.site is not None and rig.caliper is None:
         raise SimulationOptionsError("site: an option of the gradient rig only; remove it")
     rig, scene = _build_served_rig(rig, order)
-    options = select_attributes(order, "pty", "tcp", "allow_remote")
+    options = select_attributes(order, "pty", "tcp")
     options |= {"seed": order.noise_seed, "subject_seed": order.seed}
     with serve_world(rig, scene=scene, shots_made=made, **options) as served:
         command = _next_step(rig_name, rig, served.addresses, order.resume)

@@ -6,6 +6,7 @@ from typing import Any
 
 from skinrig.simulating.orders import SimulationOrder, SimulationResult, order_for
 from skinrig.simulating.reference import refuse_reference
+from skinrig.simulating.resumption import SessionComplete
 
 
 def simulate(order: SimulationOrder) -> SimulationResult:
@@ -25,7 +26,10 @@ def simulate(order: SimulationOrder) -> SimulationResult:
         refuse_reference(order.rig)
     # one module per rig, imported on use, so that a run loads only its own rig
     rig = importlib.import_module(f"skinrig.simulating.{order.rig}")
-    done: SimulationResult = getattr(rig, f"simulate_{order.rig}")(order)
+    try:
+        done: SimulationResult = getattr(rig, f"simulate_{order.rig}")(order)
+    except SessionComplete as complete:
+        return complete.result
     return done
 
 

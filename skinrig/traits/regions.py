@@ -10,6 +10,7 @@ from typing import Any, Final, get_args
 
 import numpy as np
 
+from model.checks.files import read_arrays
 from model.texture_statistics.space import TextureError, TextureSpace
 from model.traits import TraitSpace
 from model.traits import storage as trait_storage
@@ -117,11 +118,11 @@ def _texture(library: TraitLibrary) -> TextureSpace:
             "albedo traits need their texture space; learn the library again"
         )
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-            mean, axes, edges = (stored[name] for name in ("mean", "axes", "edges"))
-            levels, orientations, images = (int(n) for n in stored["counts"])
+        stored = read_arrays(content)
+        mean, axes, edges = (stored[name] for name in ("mean", "axes", "edges"))
+        levels, orientations, images = (int(n) for n in stored["counts"])
         return TextureSpace(mean, axes, edges, levels, orientations, images)
-    except (OSError, KeyError, ValueError, EOFError, TextureError) as error:
+    except (KeyError, ValueError, TypeError, TextureError) as error:
         raise UnusableError(
             f"{TEXTURE_SPACE_FILE}: cannot be read: {error}; learn the library again"
         ) from error

@@ -88,6 +88,55 @@ def test_a_number_with_another_text_is_refused(bench):
     assert bench.unit.power == 1.0
 
 
+def test_old_line_does_nothing_whatever_its_number(bench):
+    hello = bench.frame("SYST:HELLO?", boot=0)
+    bench.raw(hello)
+    old = [bench.frame("SYST:ARM"), bench.frame("FLAS:POW 0.5"), bench.frame("FLAS:FIRE a1")]
+    for line in old:
+        bench.raw(line)
+    for _ in range(2 * MAX_CACHED_REPLIES):
+        bench.wait(0.2)
+    bench.say(["FLAS:POW 1", "SAFE"])
+    for line in [hello, *old, hello, *reversed(old)]:
+        answer = wire.decode(bench.raw(line).rstrip())
+        assert answer.code == (Code.OK if line == hello else Code.SEQ_REUSED)
+    assert (bench.unit.power, bench.unit.count, bench.box.armed) == (1.0, 1, False)
+    bench.ask("SYST:ARM")
+
+
+def test_number_counts_on_after_two_to_the_32(bench):
+    bench.seq = wire.MAX_SEQ - 1
+    bench.ask("SYST:ARM")
+    bench.seq = -1
+    assert bench.code("SYST:PING?") == Code.OK
+    assert bench.reply("FLAS:POW 0.5", seq=wire.MAX_SEQ - 9).code == Code.SEQ_REUSED
+
+
+def test_hello_of_another_host_begins_its_numbers(bench):
+    bench.seq = 2**31
+    bench.ask("SYST:ARM")
+    assert bench.reply("SYST:PING?", seq=5).code == Code.SEQ_REUSED
+    assert bench.reply("SYST:HELLO?", seq=4, boot=0).code == Code.OK
+    assert bench.reply("SYST:PING?", seq=5).code == Code.OK
+
+
+def test_repeated_lines_do_not_renew_the_lease(bench):
+    old = bench.frame("SYST:PING?")
+    bench.raw(old)
+    for _ in range(2 * MAX_CACHED_REPLIES):
+        bench.ask("SYST:PING?")
+    arm = bench.frame("SYST:ARM")
+    bench.raw(arm)
+    armed_s = bench.now
+    for number in range(1, 6):
+        bench.now = armed_s + 0.199 * number
+        bench.raw(arm if number % 2 else old)
+    assert bench.box.armed
+    bench.now = armed_s + 1.0
+    bench.raw(arm)
+    assert not bench.box.armed
+
+
 def test_a_refusal_is_repeated_too(bench):
     frame = bench.frame("FLAS:FIRE a1")
     first = bench.raw(frame)

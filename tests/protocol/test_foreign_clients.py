@@ -2,6 +2,7 @@
 
 import contextlib
 import shutil
+import socket
 import subprocess
 
 import pytest
@@ -11,6 +12,7 @@ from fixtures.box_manuals import ANY, BOXES, FLASH
 from capture.devices.flash import FlashBox
 from capture.devices.port import Port, PortBusy
 from rigsim.world import World
+from rigsim.world.box_endpoints import MAX_LEAVING
 from rigsim.world.serve import ServeError, serve_world
 
 UNFRAMED = '203,"Unframed command"'
@@ -139,14 +141,40 @@ def test_served_addresses_name_controllers_first(rig):
 
 
 @pytest.mark.parametrize("tcp", ["0.0.0.0:0", "192.0.2.1:5000", "example.org:1"])
-def test_an_address_that_others_reach_must_be_permitted(rig, tcp):
-    with pytest.raises(ServeError, match="fire the lights"):
+def test_an_address_that_others_reach_is_refused(rig, tcp):
+    with pytest.raises(ServeError, match="ssh -L"):
         serve_world(rig, tcp=tcp)
 
 
-def test_a_permitted_address_is_warned_about(rig, caplog):
-    with serve_world(rig, tcp="0.0.0.0:0", allow_remote=True):
-        assert "other machines" in caplog.text
+BROWSER_REQUEST = b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n*IDN?\nSYST:ARM?\n"
+
+
+@contextlib.contextmanager
+def served_flash(rig):
+    """Serve a flash; yield its URL, its host and port, and the service."""
+    with serve_world(rig) as served:
+        host, _, port = served.addresses["flash"].removeprefix("socket://").partition(":")
+        yield served.addresses["flash"], (host, int(port)), served
+
+
+@pytest.mark.parametrize("start", [BROWSER_REQUEST, b"\x16\x03\x01\x02\x00*IDN?\n"])
+def test_request_of_a_browser_gets_no_answer(rig, start):
+    with served_flash(rig) as (url, address, _):
+        with socket.create_connection(address, timeout=5.0) as browser:
+            browser.sendall(start)
+            assert browser.recv(100) == b""
+        with FlashBox(Port(url)) as box:
+            assert box.errors() == []
+
+
+def test_clients_that_never_leave_are_bounded(rig):
+    with served_flash(rig) as (url, address, served), contextlib.ExitStack() as held:
+        box = held.enter_context(FlashBox(Port(url)))
+        for _ in range(3 * MAX_LEAVING):
+            client = held.enter_context(socket.create_connection(address, timeout=5.0))
+            assert client.recv(1) == b""
+        assert len(served._ends[0]._leaving) <= MAX_LEAVING
+        assert box.count() == 0
 
 
 @pytest.mark.parametrize("tcp", ["127.0.0.1", ":5", "127.0.0.1:x", "127.0.0.1:99999"])

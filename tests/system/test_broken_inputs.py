@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from capture import raw
+from capture.session import Session, SessionDamage
 from model.facial_color import FacialColorError
 from reconstruction.pipeline.flash import facial_color as facial_color_fit
 from skinrig.cli import main
@@ -220,6 +221,24 @@ def test_session_without_neutral_state_is_refused_before_images(tmp_path, capsys
     assert "states of sessions: got white, expected 'neutral'" in err
     assert "repeat" not in err
     assert not out.exists()
+
+
+def journal_keeps_two_lines(session):
+    path = session / "journal.jsonl"
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:2]))
+
+
+@pytest.mark.parametrize("damage", [journal_is_empty, journal_keeps_two_lines])
+def test_session_whose_journal_lost_lines_is_incomplete(session, damage, capsys):
+    frames = len(list((session / "frames").iterdir()))
+    damage(session)
+    assert main(["verify", str(session)]) == 3
+    out, err = capsys.readouterr()
+    assert "INCOMPLETE" in out
+    assert "Restore journal.jsonl from a copy" in out + err
+    with pytest.raises(SessionDamage, match="lines are lost"):
+        Session.resume(session)
+    assert len(list((session / "frames").iterdir())) == frames
 
 
 def test_a_sound_session_passes(session, capsys):

@@ -177,17 +177,20 @@ def test_simulation_resumed_mid_series_has_complete_truth(tmp_path, monkeypatch)
     assert runs == {"forehead": "sim1", "cheek": "sim2"}
     sites = [p["site"] for p in store.read(tmp_path / "truth-probe").parameters["profiles"]]
     assert sites == ["forehead", "cheek"]
+    assert main([*words, "--resume"]) == errors.EXIT_DONE  # complete, its log is removed
 
 
 @pytest.mark.usefixtures("small")
-def test_next_command_is_printed_closed_session_not_continued(capsys, tmp_path):
+def test_next_command_is_printed_complete_session_not_continued(capsys, tmp_path):
     out = tmp_path / "session-dark"
     words = simulate(out, "--target", "dark")
     assert main(words) == errors.EXIT_DONE
     printed = capsys.readouterr()
     assert f"next: skinrig verify {out}" in printed.out + printed.err
-    assert main([*words, "--resume"]) != errors.EXIT_DONE
-    assert "closed" in capsys.readouterr().err
+    before = Session.open(out).content_hash
+    assert main([*words, "--resume"]) == errors.EXIT_DONE
+    assert "complete: nothing is left" in capsys.readouterr().err
+    assert Session.open(out).content_hash == before
 
 
 HOST = """

@@ -17,6 +17,10 @@ SHUTTER_PRESS_TIMEOUT_S = 60.0
 """Time in which a person has to press a shutter, s."""
 MAX_TOKEN_CHARS = 48
 """Maximum length of a token that a controller accepts."""
+STOP_READING_DEG: Mapping[str, float] = {"parallel": 0.0, "crossed": 90.0}
+MAX_POWER_ROUNDING = 1e-8
+MAX_READING_ROUNDING_DEG = 1e-3
+"""Digits of the controller's report."""
 
 
 class ShotTiming:
@@ -99,10 +103,7 @@ def _expose(
         box.arm()
         report = box.fire(token)
         box.dark()
-        if report.led != (wanted := step_led(step)):
-            raise FrameRefused(
-                f"light: got {report.led or 'the flash tube'}, expected {wanted or 'the tube'}"
-            )
+        check_report(step, token, report)
     elif Trigger.EDGE in triggers.values():
         box.trigger_cameras(token)
     timeouts_s = {name: frame_timeout_s(step, run.rig.view(name)) for name in chosen}
@@ -118,6 +119,34 @@ def _expose(
     frames, stale = collect_frames(chosen, want, armed_s, timeouts_s)
     run.stale += stale
     return report, frames
+
+
+def check_report(step: Step, token: str, report: FlashReport) -> None:
+    """Refuse a flash whose report by the controller differs from what the step requests.
+
+    Raises
+    ------
+    FrameRefused
+        When token, LED, power, polarizer or analyzer reading differ.
+    """
+    power, led = flash_power(step), step_led(step) or "the flash tube"
+    lit = report.led or "the flash tube"
+    stop = str(step.settings["polarizer"])
+    at_stop = "analyzer_deg" not in step.settings
+    reading_deg = STOP_READING_DEG[stop] if at_stop else float(step.settings["analyzer_deg"])
+    checks = (
+        ("token", report.token, token, report.token == token),
+        ("light", lit, led, lit == led),
+        ("power", report.power, power, abs(report.power - power) <= MAX_POWER_ROUNDING),
+        ("polarizer", report.polarizer, stop, report.polarizer == stop or not at_stop),
+        (
+            *("analyzer_deg", report.analyzer_deg, reading_deg),
+            abs(report.analyzer_deg - reading_deg) <= MAX_READING_ROUNDING_DEG,
+        ),
+    )
+    for name, got, wanted, same in checks:
+        if not same:
+            raise FrameRefused(f"flash of step {step.id}: {name} {got}, expected {wanted}")
 
 
 def _choose_trigger(name: str, camera: Camera, lit: bool) -> Trigger:

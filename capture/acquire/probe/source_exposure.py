@@ -104,6 +104,10 @@ def _light_s(step: Step, box: ProbeBox, opening: ShutterOpening) -> float:
     open_s = last.t_shut_s - last.t_open_s
     if abs(open_s - seconds) > MAX_SHUTTER_DEVIATION * seconds + SHUTTER_MARGIN_S:
         raise ShutterFault(f"the shutter was open for {open_s:g} s, expected {seconds:g} s")
+    level, steps = box.level(), int(box.limits["level_steps"])
+    if round(steps * level) != round(steps * (wanted := float(step.settings["level"]))):
+        recover_shutter(box, step)
+        raise ShutterFault(f"the source was at level {level:g}, expected {wanted:g}")
     return open_s
 
 

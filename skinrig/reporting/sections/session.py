@@ -70,6 +70,9 @@ VERDICT_WORDS = {
 SESSION_FILE = "session.json"
 
 
+_EFFECT_KEYS = {"name", "verdict", "reason"}
+
+
 def read_effects(session: Path) -> list[Mapping[str, Any]]:
     """Return the effects that a session's manifest holds; none where it was measured.
 
@@ -83,7 +86,7 @@ def read_effects(session: Path) -> list[Mapping[str, Any]]:
         return []
     document = json.loads(manifest.read_text(encoding="utf-8"))
     found = document.get("extra", {}).get("effects", [])
-    return [entry for entry in found if isinstance(entry, dict)]
+    return [entry for entry in found if isinstance(entry, dict) and _EFFECT_KEYS <= entry.keys()]
 
 
 def list_omissions(sessions: Sequence[Path]) -> Iterator[page.Block]:

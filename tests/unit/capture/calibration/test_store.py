@@ -1,7 +1,10 @@
+import errno
 import json
+from dataclasses import replace
 from datetime import date
 
 import numpy as np
+import OpenEXR
 import pytest
 
 from capture.calibration import store
@@ -195,3 +198,28 @@ def test_not_a_number_never_enters_a_calibration():
         Quantity([1.0, np.nan])
     with pytest.raises(ValueError, match="stderr"):
         Quantity([1.0, 2.0], [0.1])
+
+
+@pytest.mark.parametrize("before", [False, True])
+@pytest.mark.parametrize("failing", ["image", "document"])
+def test_full_disk_leaves_nothing_half_written(calibration, tmp_path, monkeypatch, failing, before):
+    folder = tmp_path / "calibration"
+    if before:
+        store.save(calibration, folder)
+    kept = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    changed = replace(calibration, maps={"shading": calibration.maps["shading"] + 1})
+
+    def full(*arguments):
+        raise error
+
+    error: Exception
+    if failing == "image":
+        error = RuntimeError("Failed to write pixel data. No space left on device.")
+        monkeypatch.setattr(OpenEXR.File, "write", full)
+    else:
+        error = OSError(errno.ENOSPC, "No space left on device")
+        monkeypatch.setattr(store, "_write_atomically", full)
+    with pytest.raises((store.CalibrationError, OSError), match="No space left"):
+        store.save(changed, folder)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == kept
+    assert folder.exists() == before

@@ -1,0 +1,135 @@
+"""Decode JSON texts and NumPy archives of strangers: limits first, one error.
+
+A file may declare more than it contains. Nothing is allocated before the declared size has been
+compared with the stored one, and pickled objects are never loaded.
+"""
+
+import io
+import json
+import math
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_EXPANSION = 1100
+"""Largest ratio of unpacked to packed bytes; that of deflate is 1032 (RFC 1951)."""
+MIN_UNPACKED_BYTES = 2**20
+"""Unpacked size that any file may have."""
+
+
+def decode_json(text: str | bytes) -> Any:
+    """Decode JSON without NaN, infinities and doubled keys.
+
+    Raises
+    ------
+    ValueError
+        For any other text, and for one that is nested too deeply.
+
+    Examples
+    --------
+    >>> decode_json('{"a": [1, 2]}')
+    {'a': [1, 2]}
+    >>> decode_json('{"a": 1, "a": 2}')
+    Traceback (most recent call last):
+        ...
+    ValueError: key 'a' is twice in one object
+    """
+
+    def refuse_constant(name: str) -> NoReturn:
+        raise ValueError(f"got {name}, expected a finite number")
+
+    def refuse_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        table: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in table:
+                raise ValueError(f"key {key!r} is twice in one object")
+            table[key] = value
+        return table
+
+    try:
+        decoded = text.decode("utf-8") if isinstance(text, bytes) else text
+        return json.loads(decoded, parse_constant=refuse_constant, object_pairs_hook=refuse_doubles)
+    except RecursionError as error:
+        raise ValueError("is nested too deeply") from error
+
+
+def require_plausible_size(unpacked_bytes: int, packed_bytes: int) -> None:
+    """Raise ValueError when data declare more bytes than their packed form can store."""
+    limit = MAX_EXPANSION * packed_bytes + MIN_UNPACKED_BYTES
+    if not 0 <= unpacked_bytes <= limit:
+        raise ValueError(
+            f"declares {unpacked_bytes} bytes, {packed_bytes} stored bytes hold at most {limit}"
+        )
+
+
+def read_arrays(source: str | Path | bytes) -> dict[str, NDArray[Any]]:
+    """Read all arrays of an .npz archive.
+
+    Parameters
+    ----------
+    source
+        Path of the archive, or its content.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Arrays by name.
+
+    Raises
+    ------
+    ValueError
+        For a damaged archive, pickled objects, a name twice, or sizes that do not fit.
+    OSError
+        When the file cannot be read.
+
+    Examples
+    --------
+    >>> content = io.BytesIO()
+    >>> np.savez_compressed(content, a=np.arange(3))
+    >>> read_arrays(content.getvalue())["a"].tolist()
+    [0, 1, 2]
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else source) as found:
+            entries = found.infolist()
+            names = [entry.filename.removesuffix(".npy") for entry in entries]
+            if len(set(names)) != len(names):
+                raise ValueError("an array is twice in it")
+            packed = sum(entry.compress_size for entry in entries)
+            require_plausible_size(sum(entry.file_size for entry in entries), packed)
+            return {
+                name: _read_array(found, entry) for name, entry in zip(names, entries, strict=True)
+            }
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        raise ValueError(f"is not a readable archive: {error}") from error
+    except (MemoryError, OverflowError, SyntaxError, TypeError, KeyError) as error:
+        raise ValueError(f"has an unreadable array: {error!r}") from error
+
+
+def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
+    with archive.open(entry) as stream:
+        version = np.lib.format.read_magic(stream)
+        if version == (1, 0):
+            shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+        elif version == (2, 0):
+            shape, fortran, dtype = np.lib.format.read_array_header_2_0(stream)
+        else:
+            raise ValueError(f"{entry.filename}: got version {version}, expected 1.0 or 2.0")
+        if dtype.hasobject:
+            raise ValueError(f"{entry.filename}: contains pickled objects")
+        if any(length < 0 for length in shape):
+            raise ValueError(f"{entry.filename}: got shape {shape}")
+        wanted = math.prod(shape) * dtype.itemsize
+        if wanted > entry.file_size:
+            raise ValueError(
+                f"{entry.filename}: declares {wanted} bytes, its file has {entry.file_size}"
+            )
+        data = stream.read()
+    if len(data) != wanted:
+        raise ValueError(f"{entry.filename}: got {len(data)} bytes, expected {wanted}")
+    flat = np.frombuffer(data, dtype).copy()
+    return flat.reshape(shape, order="F" if fortran else "C")

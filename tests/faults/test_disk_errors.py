@@ -1,0 +1,159 @@
+"""A fault at each operation of the disk: the session resumes or starts anew, and loses nothing."""
+
+import contextlib
+import errno
+import os
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from capture import raw
+from capture.plan import Plan, Step
+from capture.rig import load_rig
+from capture.session import Disk, Session, SessionDiskError, SubjectRecord, verify
+from skinrig.capturing.acquisition import discard_unused_session
+from skinrig.console import Console
+
+RIG = load_rig("flash").resized(16)
+FRAMES = 3
+PLAN = Plan("flash", tuple(Step(f"S{n:03d}", "subject", {}, {}, ("cam",)) for n in range(FRAMES)))
+SCAN = b"ply: a scan"
+OPERATIONS = (
+    *("make_dir", "create", "open_append", "write", "fsync", "fdatasync", "truncate"),
+    *("rename", "remove", "fsync_dir", "lock"),
+)
+FAULTS = ("ENOSPC", "EIO", "EINTR", "EDQUOT", "short write", "kill", "kill in write", "kill after")
+
+
+class Killed(BaseException):
+    """The process ends: nothing after it runs."""
+
+
+class FaultyDisk(Disk):
+    """The real disk, on which one operation fails; a killed process does nothing afterwards."""
+
+    def __init__(self, strike, fault):
+        self.strike, self.fault = strike, fault
+        self.count, self.struck, self.dead = 0, "", False
+        self.descriptors = set()
+
+    def create(self, path):
+        descriptor = super().create(path)
+        self.descriptors.add(descriptor)
+        return descriptor
+
+    def open_append(self, path):
+        descriptor = super().open_append(path)
+        self.descriptors.add(descriptor)
+        return descriptor
+
+    def close(self, descriptor):
+        self.descriptors.discard(descriptor)
+        super().close(descriptor)
+
+    def end(self):
+        """Close what a killed process leaves open."""
+        for descriptor in list(self.descriptors):
+            self.close(descriptor)
+
+    def run(self, name, operation, arguments):
+        if self.dead:
+            raise Killed
+        self.count += 1
+        if self.count != self.strike:
+            return operation(*arguments)
+        self.struck, fault = name, self.fault
+        if name == "write" and fault in ("short write", "kill in write", "ENOSPC"):
+            descriptor, data = arguments
+            operation(descriptor, data[: len(data) // 2])
+        elif fault == "kill after":
+            operation(*arguments)
+        if fault.startswith("kill"):
+            self.dead = True
+            raise Killed
+        number = errno.ENOSPC if fault == "short write" else getattr(errno, fault)
+        raise OSError(number, os.strerror(number))
+
+
+def faulty(name):
+    operation = getattr(FaultyDisk, name)
+    return lambda self, *arguments: self.run(name, operation.__get__(self), arguments)
+
+
+for _name in OPERATIONS:
+    setattr(FaultyDisk, _name, faulty(_name))
+
+
+def create(path, disk):
+    words = {"devices": {}, "subject": SubjectRecord("P1"), "source": "simulated"}
+    return Session.create(path, plan=PLAN, rig=RIG, session_id="disk", disk=disk, **words)
+
+
+def capture(path, disk, acknowledged, *, resume):
+    """Capture what is missing, as the command does; note what was acknowledged."""
+    fresh = not path.exists()
+    session = Session.resume(path, disk=disk) if resume else create(path, disk)
+    unused = discard_unused_session(session, fresh, Console(True))
+    with contextlib.nullcontext() if resume else unused:
+        for step, _ in session.pending_frames():
+            values = np.full((10, 16), 600 + int(step.id[1:]), np.uint16)
+            words = {"pattern": "RGGB", "black": 512, "white": 16383}
+            blob = raw.encode_dng(values, **words, step_id=step.id, session_id=session.id)
+            session.commit(step.id, "cam", blob, settings={}, actual={}, t_host_s=0.0)
+            acknowledged.add(step.id)
+            if not session.attachments():
+                session.attach("scan.ply", SCAN)
+                acknowledged.add("scan.ply")
+        session.close()
+
+
+def strike(path, number, fault, acknowledged, *, resume=False):
+    """Capture on a disk whose operation ``number`` fails; return its name, empty for none."""
+    disk = FaultyDisk(number, fault)
+    with contextlib.suppress(SessionDiskError, Killed):
+        capture(path, disk, acknowledged, resume=resume)
+    disk.end()
+    return disk.struck
+
+
+def finish(path, acknowledged):
+    """Go on as the operator would: resume what is a session, else start anew."""
+    if not (path / "session.json").exists():
+        assert not acknowledged
+        capture(path, Disk(), acknowledged, resume=False)
+    elif not Session.open(path).complete:
+        capture(path, Disk(), acknowledged, resume=True)
+    session = Session.open(path)
+    assert session.complete
+    assert acknowledged <= {*session.attachments(), *(r.step_id for r in session.frames())}
+    for record in session.frames():
+        assert set(np.unique(session.read(record).cfa)) == {600 + int(record.step_id[1:])}
+    assert verify(path).ok
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_session_resumes_or_restarts_after_disk_fault(tmp_path, fault):
+    struck = Counter()
+    while True:
+        path, acknowledged = tmp_path / f"s{struck.total()}", set()
+        name = strike(path, struck.total() + 1, fault, acknowledged)
+        if not name:
+            break
+        struck[name] += 1
+        finish(path, acknowledged)
+    print(f"{fault}: {struck.total()} operations: {dict(struck)}")
+    assert struck.total() >= 30
+    assert {"create", "write", "fsync", "fdatasync", "rename", "fsync_dir"} <= set(struck)
+
+
+@pytest.mark.parametrize("fault", ["ENOSPC", "kill"])
+def test_fault_while_resuming_loses_nothing(tmp_path, fault):
+    resumed = Counter()
+    for first in range(12, 40, 5):
+        for second in range(1, 12, 2):
+            path, acknowledged = tmp_path / f"s{first}-{second}", set()
+            strike(path, first, fault, acknowledged)
+            resumed[strike(path, second, fault, acknowledged, resume=True)] += 1
+            finish(path, acknowledged)
+    assert {"open_append", "rename", "write"} <= set(resumed)
