@@ -13,7 +13,6 @@ from model.translucency_population import CHANNEL_NAMES, SITE_OF_LABEL, weyrich_
 from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from rigsim.fiber.probe_tissue import phantom_certificate
 from rigsim.population.population import Member
-from skinrig.arrays import Float64Array
 from skinrig.benchmarks.intervals.trials import reconstruct_maps, resimulate
 from skinrig.benchmarks.people import PeopleValues, choose_members
 from skinrig.benchmarks.results import Timing
@@ -63,45 +62,21 @@ def probe_people(folder: Path, members: Sequence[Member]) -> PeopleValues:
     members
         Members of the population.
     """
-    calibrate_probe(folder)
-    values = np.array([probe_person(folder, one, seed=row) for row, one in enumerate(members)])
-    flat = values.reshape(len(members), 3, -1)
-    return PeopleValues(tuple(members), flat[:, 0], flat[:, 1], flat[:, 2])
-
-
-def calibrate_probe(folder: Path) -> None:
-    """Simulate the block and calibrate the probe into FOLDER/calibration."""
     phantom, paper = folder / "session-phantom", folder / "block.json"
     simulate_session("probe", phantom, target="phantom", seed=1)
     paper.write_text(json.dumps(dict(phantom_certificate())), encoding="utf-8")
     calibrate("fiber", [phantom], folder / "calibration", phantom=paper)
-
-
-def probe_person(folder: Path, member: Member, *, seed: int) -> Float64Array:
-    """Simulate and fit a person's session with a calibrated probe.
-
-    Parameters
-    ----------
-    folder
-        Folder of `calibrate_probe`.
-    member
-        Member of the population.
-    seed
-        Seed of the session.
-
-    Returns
-    -------
-    ndarray of float64
-        Estimate, stated standard error and ground truth of sigma_tr, 1/mm, shape
-        (3, sites, channels); NaN where the session gives none.
-    """
-    values = np.full((3, len(PROBED_SITES), len(CHANNEL_NAMES)), np.nan)
-    done = resimulate("probe", folder, subject=member.name, seed=seed, sites=PROBED_SITES)
-    fits, known = reconstruct_maps(folder, done, ["subsurface"])
-    document = evaluation.read_document(fits, SUBSURFACE_FILE)
-    for one in [] if document is None else evaluation.site_measurements(member.name, document):
-        site = PROBED_SITES.index(one.site)
-        values[0, site], values[1, site] = one.sigma_tr_per_mm, one.stderr_per_mm
-    for entry in evaluation.true_profiles(known).values():
-        values[2, PROBED_SITES.index(str(entry["site"]))] = entry["sigma_tr_per_mm"]
-    return values
+    shape = (len(members), len(PROBED_SITES), len(CHANNEL_NAMES))
+    estimated, stderr, true = np.full((3, *shape), np.nan)
+    for row, member in enumerate(members):
+        done = resimulate("probe", folder, subject=member.name, seed=row, sites=PROBED_SITES)
+        fits, known = reconstruct_maps(folder, done, ["subsurface"])
+        document = evaluation.read_document(fits, SUBSURFACE_FILE)
+        for one in [] if document is None else evaluation.site_measurements(member.name, document):
+            at = row, PROBED_SITES.index(one.site)
+            estimated[at], stderr[at] = one.sigma_tr_per_mm, one.stderr_per_mm
+        for entry in evaluation.true_profiles(known).values():
+            true[row, PROBED_SITES.index(str(entry["site"]))] = entry["sigma_tr_per_mm"]
+    return PeopleValues(
+        tuple(members), *(v.reshape(len(members), -1) for v in (estimated, stderr, true))
+    )
