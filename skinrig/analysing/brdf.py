@@ -3,7 +3,7 @@
 import csv
 import dataclasses
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -16,8 +16,9 @@ from model.brdf.tables import BrdfBasis
 from reconstruction.brdf_basis import space as brdf_space
 from reconstruction.brdf_basis.space import SpaceCurve
 from skinrig import consent
-from skinrig.analysing import brdf_space_datasets, brdf_space_figures
+from skinrig.analysing import brdf_space_figures
 from skinrig.analysing.brdf_space_datasets import Dataset
+from skinrig.analysing.population_sessions import load_population_sessions
 from skinrig.appearances.face_textures import find_valid_texels
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.editing import surface_mixtures
@@ -27,9 +28,7 @@ from skinrig.next_steps import shell_quote
 from skinrig.traits import labels as trait_labels
 
 SCHEMA: Final = "skinrig.analyse-brdf/1"
-SAMPLES_DATA: Final = "simulated BRDF samples with known normals, without images"
 SESSIONS_DATA: Final = "sessions of the light dome"
-N_POINTS_PER_DATASET: Final = 5_000
 N_POINTS_PER_FACE: Final = 2_000
 MAX_TRAINING_POINTS: Final = 5_000
 """Maximum number of points from which common mixtures are factored."""
@@ -160,44 +159,50 @@ def analyze(
 def analyze_simulated(
     out: Path,
     *,
-    points: int = N_POINTS_PER_DATASET,
     points_each: int = N_POINTS_PER_FACE,
     method: brdf_space.Method = "shares",
     seed: int = 0,
-    progress: Callable[[str], None] | None = None,
 ) -> tuple[BrdfRankAnalysis, ...]:
     """Analyze one simulated person, dataset A and dataset B, and write the figures.
+
+    All three come from packaged sessions of the simulated dome, see
+    `skinrig.analysing.population_sessions`.
 
     Parameters
     ----------
     out
         Folder for ``figure-14.png``, ``figure-15.png``, ``curves.csv``, ``analysis.json``.
-    points
-        Points of the one person, and of all conditions of dataset A in total.
     points_each
-        Points per person of the 87 of dataset B.
+        Maximum number of points per person and condition.
     method
         See `reconstruction.brdf_basis.space.compute_error_curve`.
     seed
-        Seed of points, noise and factorizations.
-    progress
-        Called with one line per face.
+        Seed of points and factorizations.
     """
     basis = brdf_tables.default_basis()
     rng = np.random.default_rng([seed, 70])
-    sets = (
-        brdf_space_datasets.sample_one_person(points, rng=rng),
-        brdf_space_datasets.build_dataset_a(points, progress=progress, rng=rng),
-        brdf_space_datasets.build_dataset_b(points_each, progress=progress, rng=rng),
+    sessions = load_population_sessions()
+    dataset_a, dataset_b = (
+        _sample(data, points_each, rng) for data in (sessions.conditions, sessions.people)
     )
-    found = tuple(
-        analyze(data, basis, by_label=data.name == "dataset B", method=method, rng=rng)
-        for data in sets
+    bare = dataset_a.label == dataset_a.labels.index("normal")
+    alone = np.zeros(np.count_nonzero(bare), np.int64)
+    one = Dataset("one person", dataset_a.weights[bare], alone, ("normal",), np.nan, 0)
+    how: dict[str, Any] = {"method": method, "rng": rng}
+    found = (
+        _analyze_face(one, basis, sessions.lobes, **how),
+        analyze(dataset_a, basis, by_label=False, **how),
+        analyze(dataset_b, basis, by_label=True, **how),
     )
-    _write(
-        out, found, basis, spheres=found[1], method=method, source="simulated", data=SAMPLES_DATA
-    )
+    _write(out, found, basis, spheres=found[1], method=method, source="simulated")
     return found
+
+
+def _sample(data: Dataset, count: int, rng: np.random.Generator) -> Dataset:
+    """Return at most `count` random points of each label."""
+    order = rng.permutation(len(data.label))
+    at = np.concatenate([order[data.label[order] == k][:count] for k in range(len(data.labels))])
+    return dataclasses.replace(data, weights=data.weights[at], label=data.label[at])
 
 
 def analyze_measured(
@@ -248,7 +253,7 @@ def analyze_measured(
     table = None if labels is None else trait_labels.read(labels, names)
     materials = brdf_tables.default_basis() if basis is None else brdf_tables.load(basis)
     rng = np.random.default_rng([seed, 71])
-    found = [_read_weights(folder, materials, points_each, rng) for folder in folders]
+    found = [read_weights(folder, materials, points_each, rng) for folder in folders]
     sets = [
         Dataset(name, shares, np.zeros(len(shares), np.int64), (name,), np.nan, lost)
         for name, (shares, lost, _) in zip(names, found, strict=True)
@@ -269,16 +274,7 @@ def analyze_measured(
     documents = [store.read_document(folder) for folder in folders]
     source = "measured" if any(one.source == "measured" for one in documents) else "simulated"
     agreed = consent.merge_consent(*documents)
-    _write(
-        out,
-        done,
-        materials,
-        spheres=done[-1],
-        method=method,
-        source=source,
-        data=SESSIONS_DATA,
-        agreed=agreed,
-    )
+    _write(out, done, materials, spheres=done[-1], method=method, source=source, agreed=agreed)
     return done
 
 
@@ -294,10 +290,34 @@ def _analyze_face(
     return dataclasses.replace(one, curve=curve)
 
 
-def _read_weights(
+def read_weights(
     folder: Path, materials: BrdfBasis, count: int, rng: np.random.Generator
 ) -> tuple[Float64Array, int, int]:
-    """Return material weights at random texels, the count of invalid ones, and of the lobes."""
+    """Return material weights at random texels, the count of invalid ones, and of the lobes.
+
+    Parameters
+    ----------
+    folder
+        APPEARANCE/ folder of a dome session with lobes.
+    materials
+        Basis BRDFs of the fit, K materials.
+    count
+        Number of texels.
+    rng
+        Generator of the texels.
+
+    Returns
+    -------
+    weights : ndarray of float64, shape (P, K)
+    invalid : int
+        Texels without specular reflection; P is smaller by these.
+    lobes : int
+
+    Raises
+    ------
+    AnalysisError
+        If the folder has no lobes, or lobes of other materials.
+    """
     appearance = store.read(folder)
     try:
         lobes = surface_mixtures.read(appearance)
@@ -330,14 +350,13 @@ def _write(
     spheres: BrdfRankAnalysis,
     method: str,
     source: str,
-    data: str,
     agreed: Sequence[Mapping[str, Any]] = (),
 ) -> None:
     out.mkdir(parents=True, exist_ok=True)
     document = {
         "schema": SCHEMA,
         "source": source,
-        "data": data,
+        "data": SESSIONS_DATA,
         consent.CONSENT_KEY: [dict(one) for one in agreed],
         "method": method,
         "rule": "plateau: the first rank whose error exceeds the least one by no more than 5 % of "

@@ -45,13 +45,13 @@ def analyse_brdf(
     Parameters
     ----------
     appearances
-        APPEARANCE/ folders of dome sessions with basis BRDFs; none: simulated BRDF samples of
-        faces, without images.
+        APPEARANCE/ folders of dome sessions with basis BRDFs; none: packaged estimates from
+        simulated sessions of people.
     merl_basis
         Folder of the MERL tables used in the reconstruction; default: built-in materials.
     points
-        Texels per measured face, default 2000. Simulated faces: points per condition of the single
-        subject, default 5000, and 0.4 times as many for each of the 87 subjects.
+        Texels per face, default 2000. Packaged sessions have up to 300 of the single subject in
+        each condition and up to 60 of each person.
     method
         Space in which basis BRDFs are compared: shares (material weights) or brdf (reflectance).
     seed
@@ -64,9 +64,8 @@ def analyse_brdf(
     if points is not None and points < 20:
         raise UnusableError(f"--points: got {points}, expected 20 or more; raise it")
     console = Console(json)
-    data = analysing_brdf.SESSIONS_DATA if appearances else analysing_brdf.SAMPLES_DATA
+    each = points or analysing_brdf.N_POINTS_PER_FACE
     if appearances:
-        each = points or analysing_brdf.N_POINTS_PER_FACE
         given: dict[str, Any] = {"labels": labels, "basis": merl_basis, "method": how, "seed": seed}
         found = analysing_brdf.analyze_measured(out, appearances, points_each=each, **given)
     elif labels is not None or merl_basis is not None:
@@ -74,11 +73,7 @@ def analyse_brdf(
             "--labels, --merl-basis: apply to measured faces only; name APPEARANCE/ folders"
         )
     else:
-        some = points or analysing_brdf.N_POINTS_PER_DATASET
-        each = max(1, round(0.4 * some))
-        found = analysing_brdf.analyze_simulated(
-            out, points=some, points_each=each, method=how, seed=seed, progress=console.progress
-        )
+        found = analysing_brdf.analyze_simulated(out, points_each=each, method=how, seed=seed)
     documents = [one.document() for one in found]
     console.print_table(
         ("data set", "needed", "by 2 %", "by 10 %", "to noise", "error", "held out", "noise"),
@@ -92,10 +87,11 @@ def analyse_brdf(
         if document["points_lost"]:
             lost = document["points_lost"]
             console.print_line(f"{document['name']}: {lost} points without specular reflection")
-    console.print_line(f"data: {data}")
+    console.print_line(f"data: {analysing_brdf.SESSIONS_DATA}")
     console.print_line(f"{out}: figure-14.png, figure-15.png, curves.csv, analysis.json")
     console.print_document(
-        "skinrig.analyse-brdf/1", {"out": out, "data": data, "datasets": documents}
+        "skinrig.analyse-brdf/1",
+        {"out": out, "data": analysing_brdf.SESSIONS_DATA, "datasets": documents},
     )
 
 

@@ -59,7 +59,7 @@ LED_POWER_DEVIATION: Final = 0.001
 """Relative standard deviation of an LED's energy between pulses."""
 
 MAX_CACHED_FRAMES: Final = 16
-FRAME_CACHE_BYTES: Final = 2**28
+FRAME_CACHE_BYTES: Final = 2**29
 """Cached frames, the larger of both limits, so that a second exposure costs nothing."""
 
 

@@ -106,18 +106,48 @@ def capture_people(
     PeopleValues
         `QUANTITY_NAMES` of each region of `REGION_LANDMARKS`, quantities running fastest.
     """
-    shown = dict.fromkeys(("charuco", "mirror", "white"), size)
-    kinds = (("geometry", ("charuco",)), ("lights", ("mirror", "white")))
-    calibrate_simulated("dome", folder, shown, kinds, seed=DOME_SEED)
+    calibrate_dome(folder, size)
     rows = []
     for member in members:
-        kept: Any = {"subject": member.name, "leave_out": OMITTED_EFFECTS, **size}
-        done = resimulate("dome", folder, seed=DOME_SEED, **kept)
-        want = ("normals_refined", "r_d", *weight_names(N_BASIS_BRDFS))
-        found, truth = reconstruct_maps(folder, done, want, dome=DomeOptions(rank=N_BASIS_BRDFS))
+        found, truth = capture_face(folder, size, subject=member.name)
         rows.append((*estimate_regions(found, truth), true_regions(truth)))
     values = np.array(rows).reshape(len(members), 3, -1)
     return PeopleValues(tuple(members), values[:, 0], values[:, 1], values[:, 2])
+
+
+def calibrate_dome(folder: Path, size: Mapping[str, int]) -> None:
+    """Simulate the targets of a dome and calibrate it into FOLDER/calibration.
+
+    Parameters
+    ----------
+    folder
+        Empty folder.
+    size
+        Lights, cameras and image width of the dome.
+    """
+    shown = dict.fromkeys(("charuco", "mirror", "white"), size)
+    kinds = (("geometry", ("charuco",)), ("lights", ("mirror", "white")))
+    calibrate_simulated("dome", folder, shown, kinds, seed=DOME_SEED)
+
+
+def capture_face(
+    folder: Path, size: Mapping[str, int], **subject: Any
+) -> tuple[SkinAppearance, SkinAppearance]:
+    """Simulate and reconstruct a face in a calibrated dome; return its maps and the ground truth.
+
+    Parameters
+    ----------
+    folder
+        Folder of `calibrate_dome`.
+    size
+        Lights, cameras and image width of the dome.
+    subject
+        Further fields of the dome's order, such as the subject and its conditions.
+    """
+    kept: Any = {"leave_out": OMITTED_EFFECTS, **size, **subject}
+    done = resimulate("dome", folder, seed=DOME_SEED, **kept)
+    want = ("normals_refined", "r_d", *weight_names(N_BASIS_BRDFS))
+    return reconstruct_maps(folder, done, want, dome=DomeOptions(rank=N_BASIS_BRDFS))
 
 
 def estimate_regions(
