@@ -331,10 +331,10 @@ static void finish_reply(struct text *frame, uint32_t seq, enum code code) {
   }
 }
 
-static void answer(const struct request *request, struct text *frame, enum code code) {
+static void answer(const struct request *request, struct text *frame, enum code code, bool renew) {
   finish_reply(frame, request->seq, code);
   if (code != CODE_OK) record_error(code, core.reason_data);
-  renew_lease();
+  if (renew) renew_lease();
   keep_and_send(request, frame);
 }
 
@@ -348,7 +348,7 @@ void core_advance(us_t now) {
       struct text frame;
       core.pending = false;
       start_reply(&frame, core.under_way.seq);
-      answer(&core.under_way, &frame, box_pending_outcome(&frame));
+      answer(&core.under_way, &frame, box_pending_outcome(&frame), true);
     }
     if (due >= core.lease_end) {
       disarm();
@@ -514,7 +514,10 @@ static bool is_repeated(const struct request *request, bool behind) {
     const struct request *before = last ? &core.under_way : &kept->request;
     if (before->length == 0 || before->seq != request->seq) continue;
     if (before->hash == request->hash && before->length == request->length) {
-      if (last) return true; /* answered when it is complete */
+      if (last) { /* answered when it is complete; its host still waits */
+        renew_lease();
+        return true;
+      }
       if (kept->size > KEPT_BYTES) return false;
       board_send(kept->data, kept->size);
       return true;
@@ -548,7 +551,8 @@ void core_handle_framed_line(char *line, uint16_t size) {
   }
   uint32_t ahead = frame.number - core.latest_seq; /* modulo 2^32 */
   bool behind = core.heard && ahead > 0x7FFFFFFFu;
-  if (!behind && (ahead > 0 || !core.heard)) {
+  bool is_new = !behind && (ahead > 0 || !core.heard);
+  if (is_new) {
     renew_lease();
     core.latest_seq = frame.number;
     core.heard = true;
@@ -563,7 +567,7 @@ void core_handle_framed_line(char *line, uint16_t size) {
     renew_lease();
     return;
   }
-  answer(&request, &reply, code);
+  answer(&request, &reply, code, is_new);
 }
 
 static void handle_line(char *line, uint16_t size) {

@@ -162,7 +162,8 @@ class Controller:
             return wire.encode(Reply(frame.seq, self.boot, refused.code, refused.reason))
         latest = self._latest_seq
         behind = latest is not None and wire.is_behind(frame.seq, latest)
-        if frame.seq != latest and not behind:
+        is_new = frame.seq != latest and not behind
+        if is_new:
             self._renew_lease(now)
             self._latest_seq = frame.seq
         answers = list(self._replies)
@@ -172,6 +173,8 @@ class Controller:
             answers.append((request.seq, request.text, b""))
         for seq, text, answer in answers:
             if self._same_request(seq, text, frame):
+                if not answer:
+                    self._renew_lease(now)  # its host still waits
                 if len(answer) > MAX_KEPT_ANSWER_BYTES:
                     break
                 return answer
@@ -183,25 +186,28 @@ class Controller:
         try:
             outcome = self._execute(frame.text, now)
         except CommandRefused as refused:
-            return self._answer(frame, refused, now)
+            return self._answer(frame, refused, now, renew=is_new)
         if isinstance(outcome, PendingReply):
             self._under_way = (frame, outcome)
             self._renew_lease(now)
             return b""
-        return self._answer(frame, outcome, now)
+        return self._answer(frame, outcome, now, renew=is_new)
 
     def _refuse_reused(self, request: Request) -> bytes:
         refused = CommandRefused(Code.SEQ_REUSED)
         self._record_error(refused)
         return wire.encode(Reply(request.seq, self.boot, refused.code, refused.reason))
 
-    def _answer(self, request: Request, outcome: str | CommandRefused, now: float) -> bytes:
+    def _answer(
+        self, request: Request, outcome: str | CommandRefused, now: float, *, renew: bool = True
+    ) -> bytes:
         if isinstance(outcome, CommandRefused):
             self._record_error(outcome)
             reply = Reply(request.seq, self.boot, outcome.code, outcome.reason)
         else:
             reply = Reply(request.seq, self.boot, Code.OK, outcome)
-        self._renew_lease(now)
+        if renew:
+            self._renew_lease(now)
         answer = wire.encode(reply)
         self._replies.append((request.seq, request.text, answer))
         return answer

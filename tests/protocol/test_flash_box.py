@@ -137,6 +137,19 @@ def test_repeated_lines_do_not_renew_the_lease(bench):
     assert not bench.box.armed
 
 
+def test_repeated_long_answer_does_not_renew_lease(bench):
+    bench.ask("SYST:ARM")
+    asked_s = bench.now
+    long = bench.frame("SYST:CAP?")
+    first = bench.raw(long)
+    for number in range(1, 6):
+        bench.now = asked_s + 0.199 * number
+        assert bench.raw(long) == first  # too long to be kept, so made anew
+    bench.now = asked_s + 1.0
+    bench.raw(long)
+    assert not bench.box.armed
+
+
 def test_a_refusal_is_repeated_too(bench):
     frame = bench.frame("FLAS:FIRE a1")
     first = bench.raw(frame)
