@@ -77,7 +77,7 @@ def test_rig_help_lists_its_own_options_only(verb, capsys):
         assert main([verb, rig, "--help"]) == 0
         shown[rig] = set(re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, re.MULTILINE))
     owners = {
-        "--site": {"gradient"},
+        "--site": {"flash", "gradient"} if verb == "simulate" else {"gradient"},
         "--sites": {"probe"},
         "--state": {"flash"} if verb == "capture" else {"flash", "dome"},
         "--sequence": {"flash"},

@@ -7,9 +7,9 @@ import pytest
 from capture.plan import flash_plan
 from capture.rig import load_rig
 from capture.session import Session, SubjectRecord
-from skinrig import report
 from skinrig.cli import main
 from skinrig.console import Console
+from skinrig.reporting import report
 
 RIG = load_rig("flash").resized(16)
 HOSTILE = "</script></style>--><hostile onload=1>\"'<hostile a=`x`>${1}&lt;\x1b[2J\x9b31m\u202e"

@@ -11,7 +11,7 @@ from capture.session import ConsentError, Session, SubjectRecord
 from model import store
 from model.skin import SkinAppearance, SkinMap
 from model.traits.storage import load
-from skinrig import consent, report
+from skinrig import consent
 from skinrig.appearances.dynamic import describe_parts
 from skinrig.cli import main
 from skinrig.editing import edit as editing
@@ -21,7 +21,7 @@ from skinrig.exporting.export import export
 from skinrig.fitting.microstructure import fit_microstructure
 from skinrig.fitting.reflectance import fit_reflectance
 from skinrig.fitting.wrinkles import fit_wrinkles
-from skinrig.reporting import provenance
+from skinrig.reporting import provenance, report
 
 WIDTH_PX = 192
 DAY = date(2026, 1, 1)
