@@ -13,7 +13,6 @@ import errno
 import json
 import logging
 import os
-import secrets
 import threading
 import time
 from collections import deque
@@ -35,6 +34,7 @@ from capture.devices.errors import (
     PortUrlError,
     WrongDevice,
 )
+from capture.devices.first_number import draw_first_number
 from capture.devices.port_url import load_url_handler, opening_advice
 from capture.devices.wire import Code, Event, Reply, Request
 
@@ -149,9 +149,9 @@ class Port:
     retries
         Number of repetitions.
     first_seq
-        First sequence number. By default random, so that a controller never takes a new run's
-        request for a retry of the last run's; give it only for byte-identical replays on a fresh
-        controller.
+        First sequence number. By default milliseconds since 1970, so that the numbers of an
+        earlier host are behind and its lines, come again, do nothing; give it only for
+        byte-identical replays on a fresh controller.
     baudrate
         Bits per second, for real serial lines.
 
@@ -185,7 +185,7 @@ class Port:
         self._timeout_s = timeout_s
         self._retries = retries
         self._baudrate = baudrate
-        self._seq = secrets.randbelow(wire.MAX_SEQ + 1) if first_seq is None else first_seq
+        self._seq = draw_first_number() if first_seq is None else first_seq
         self._splitter = wire.LineSplitter()
         self._lines: deque[bytes] = deque()
         self._next_event: int | None = None

@@ -331,10 +331,15 @@ static void finish_reply(struct text *frame, uint32_t seq, enum code code) {
   }
 }
 
-static void answer(const struct request *request, struct text *frame, enum code code, bool renew) {
+/* Answer a request; one that is not new neither renews the lease nor takes a kept answer's place. */
+static void answer(const struct request *request, struct text *frame, enum code code, bool is_new) {
   finish_reply(frame, request->seq, code);
   if (code != CODE_OK) record_error(code, core.reason_data);
-  if (renew) renew_lease();
+  if (!is_new) {
+    send_sealed(frame);
+    return;
+  }
+  renew_lease();
   keep_and_send(request, frame);
 }
 
@@ -366,28 +371,42 @@ void core_advance(us_t now) {
 
 /* lines ---------------------------------------------------------------------------------- */
 
+static const FLASH struct command *find_command(const char *name) {
+  for (uint8_t k = 0; k < COMMAND_COUNT; k++)
+    if (equals_word(name, COMMANDS[k].name)) return &COMMANDS[k];
+  return NULL;
+}
+
+/* Return whether a command makes dark or safe, whoever sends it. */
+static bool makes_safe(char *text) {
+  char *arguments = cut(text, ' ');
+  const FLASH struct command *command = find_command(text);
+  bool safe = command && (command->needs & BARE ||
+                          (*command->harmless &&
+                           equals_word(arguments ? arguments : "", command->harmless)));
+  if (arguments) arguments[-1] = ' ';
+  return safe;
+}
+
 static enum code execute(char *text, struct text *payload, bool framed) {
   char *arguments = cut(text, ' ');
   if (!arguments) arguments = text + strlen(text);
-  for (uint8_t k = 0; k < COMMAND_COUNT; k++) {
-    const FLASH struct command *command = &COMMANDS[k];
-    if (!equals_word(text, command->name)) continue;
-    bool harmless = *command->harmless && equals_word(arguments, command->harmless);
-    bool query = text[0] && text[strlen(text) - 1] == '?';
-    if (!framed && !query && !(command->needs & BARE) && !harmless)
-      return refuse(CODE_UNFRAMED, P(""));
-    if (!*arguments != !*command->arguments) {
-      refuse(CODE_SYNTAX, P("expected "));
-      put_flash(&core.reason, command->name);
-      if (*command->arguments) put_char(&core.reason, ' ');
-      put_flash(&core.reason, command->arguments);
-      return CODE_SYNTAX;
-    }
-    if (command->needs & ARMED && !core.armed && !harmless)
-      return refuse(core.tripped ? CODE_WATCHDOG_TRIPPED : CODE_NOT_ARMED, P(""));
-    return command->run(arguments, payload);
+  const FLASH struct command *command = find_command(text);
+  if (!command) return refuse(CODE_UNDEFINED_HEADER, P(""));
+  bool harmless = *command->harmless && equals_word(arguments, command->harmless);
+  bool query = text[0] && text[strlen(text) - 1] == '?';
+  if (!framed && !query && !(command->needs & BARE) && !harmless)
+    return refuse(CODE_UNFRAMED, P(""));
+  if (!*arguments != !*command->arguments) {
+    refuse(CODE_SYNTAX, P("expected "));
+    put_flash(&core.reason, command->name);
+    if (*command->arguments) put_char(&core.reason, ' ');
+    put_flash(&core.reason, command->arguments);
+    return CODE_SYNTAX;
   }
-  return refuse(CODE_UNDEFINED_HEADER, P(""));
+  if (command->needs & ARMED && !core.armed && !harmless)
+    return refuse(core.tripped ? CODE_WATCHDOG_TRIPPED : CODE_NOT_ARMED, P(""));
+  return command->run(arguments, payload);
 }
 
 static bool is_space(char c) { return c == ' ' || (c >= 9 && c <= 13) || (c >= 28 && c <= 31); }
@@ -505,8 +524,9 @@ static void note_hello(uint32_t seq) {
   core.heard = true;
 }
 
-/* Return whether a request was answered, is being executed, or is an old one, come again. */
-static bool is_repeated(const struct request *request, bool behind) {
+/* Return whether a request is not to be executed: it was answered, is being executed, or comes
+   with a used number. What makes safe is executed whatever its number. */
+static bool is_repeated(const struct request *request, bool *is_new, bool safe) {
   for (uint8_t k = 0; k <= KEPT_ANSWERS; k++) {
     bool last = k == KEPT_ANSWERS;
     if (last && !core.pending) break;
@@ -522,11 +542,11 @@ static bool is_repeated(const struct request *request, bool behind) {
       board_send(kept->data, kept->size);
       return true;
     }
-    refuse_reused(request->seq);
-    return true;
+    *is_new = false; /* the number of another request */
   }
-  if (behind) refuse_reused(request->seq);
-  return behind;
+  if (*is_new || safe) return false;
+  refuse_reused(request->seq);
+  return true;
 }
 
 void core_handle_framed_line(char *line, uint16_t size) {
@@ -558,7 +578,7 @@ void core_handle_framed_line(char *line, uint16_t size) {
     core.heard = true;
   }
   struct request request = {frame.number, hash32(frame.text), (uint16_t)strlen(frame.text)};
-  if (is_repeated(&request, behind)) return;
+  if (is_repeated(&request, &is_new, makes_safe(frame.text))) return;
   start_reply(&reply, request.seq);
   enum code code = execute(frame.text, &reply, true);
   if (code == CODE_PENDING) {

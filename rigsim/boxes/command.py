@@ -56,14 +56,19 @@ class CommandRefused(Exception):
             raise cls(code, detail)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class PendingReply:
-    """A command in progress: it is answered when it is complete."""
+    """A command in progress: it is answered when it is complete, or when it is ended early."""
 
     at_s: float
     """Time of the answer on the world's clock, s."""
     outcome: Callable[[], str | CommandRefused]
     """Payload of the answer, or the refusal; evaluated at that time."""
+
+    def end(self, now: float, code: Code, reason: str) -> None:
+        """Have the command refused at `now`, in s, before it is complete."""
+        self.at_s, refused = min(self.at_s, now), CommandRefused(code, reason)
+        self.outcome = lambda: refused
 
 
 CommandHandler: TypeAlias = Callable[[str, float], str | PendingReply | None]

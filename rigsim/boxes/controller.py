@@ -117,8 +117,7 @@ class Controller:
                 output += f"{self.device.model} {FIRMWARE_VERSION} ready\n".encode()
                 output += self._event("BOOT", "POWER")
             if self._under_way is not None and due >= self._under_way[1].at_s:
-                (request, later), self._under_way = self._under_way, None
-                output += self._answer(request, later.outcome(), due)
+                output += self._conclude(due)
             if due >= self._lease_end:
                 self._disarm(due)
                 self.tripped = True
@@ -179,19 +178,27 @@ class Controller:
                     break
                 return answer
             if seq == frame.seq:
-                return self._refuse_reused(frame)
+                is_new = False
         else:
-            if behind:
+            if not is_new and not self._is_permitted_bare(frame.text):
                 return self._refuse_reused(frame)
         try:
             outcome = self._execute(frame.text, now)
         except CommandRefused as refused:
-            return self._answer(frame, refused, now, renew=is_new)
+            return self._answer(frame, refused, now, is_new=is_new)
         if isinstance(outcome, PendingReply):
+            ended = self._conclude(now)  # what was made dark just before, if anything
             self._under_way = (frame, outcome)
             self._renew_lease(now)
+            return ended
+        return self._answer(frame, outcome, now, is_new=is_new)
+
+    def _conclude(self, now: float) -> bytes:
+        """Answer the command under way; nothing without one."""
+        if self._under_way is None:
             return b""
-        return self._answer(frame, outcome, now, renew=is_new)
+        (request, later), self._under_way = self._under_way, None
+        return self._answer(request, later.outcome(), now)
 
     def _refuse_reused(self, request: Request) -> bytes:
         refused = CommandRefused(Code.SEQ_REUSED)
@@ -199,33 +206,37 @@ class Controller:
         return wire.encode(Reply(request.seq, self.boot, refused.code, refused.reason))
 
     def _answer(
-        self, request: Request, outcome: str | CommandRefused, now: float, *, renew: bool = True
+        self, request: Request, outcome: str | CommandRefused, now: float, *, is_new: bool = True
     ) -> bytes:
         if isinstance(outcome, CommandRefused):
             self._record_error(outcome)
             reply = Reply(request.seq, self.boot, outcome.code, outcome.reason)
         else:
             reply = Reply(request.seq, self.boot, Code.OK, outcome)
-        if renew:
-            self._renew_lease(now)
         answer = wire.encode(reply)
-        self._replies.append((request.seq, request.text, answer))
+        if is_new:
+            self._renew_lease(now)
+            self._replies.append((request.seq, request.text, answer))
         return answer
 
     def _handle_bare_line(self, line: bytes, now: float) -> bytes:
         text = line.decode("ascii", errors="replace").strip()
-        header, _, arguments = text.partition(" ")
-        header = header.upper()
-        command = self.commands.get(header)
+        header = text.partition(" ")[0].upper()
         try:
-            if command is not None:
-                dark = command.bare or arguments.upper() in command.harmless
-                CommandRefused.raise_if(not (header.endswith("?") or dark), Code.UNFRAMED)
+            if header in self.commands:
+                permitted = header.endswith("?") or self._is_permitted_bare(text)
+                CommandRefused.raise_if(not permitted, Code.UNFRAMED)
             payload = self._execute(text, now)
         except CommandRefused as refused:
             self._record_error(refused)
             return b""
         return f"{payload}\n".encode() if header.endswith("?") else b""
+
+    def _is_permitted_bare(self, text: str) -> bool:
+        """Return whether a command makes dark or safe, whoever sends it."""
+        header, _, arguments = text.partition(" ")
+        command = self.commands.get(header.upper())
+        return command is not None and (command.bare or arguments.upper() in command.harmless)
 
     def _execute(self, text: str, now: float) -> str | PendingReply:
         header, _, arguments = text.partition(" ")

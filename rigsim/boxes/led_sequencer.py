@@ -83,8 +83,7 @@ class LedSequencer(Device, Generic[RowT]):
         self._limits = self.bank.limits
         self._guard = EyeFlickerMonitor(rig.lights)
         self._run: SequenceRun[RowT] | None = None
-        # a table is being judged until it is answered, also when it was made dark meanwhile
-        self._judging = self._darkened = False
+        self._judgment: PendingReply | None = None
         # tokens and times of all sequences since the controller was built
         self.runs: list[tuple[str, float]] = []
 
@@ -115,7 +114,6 @@ class LedSequencer(Device, Generic[RowT]):
         self.mask = (1 << self._cameras) - 1
         self.eyes = "OPEN"
         self._sequence_armed = False
-        self._judging &= not power_up
         self._run = None
         self._steps: dict[int, int] = {}
 
@@ -208,7 +206,9 @@ class LedSequencer(Device, Generic[RowT]):
         """Switch off every LED and stop the sequence."""
         self.bank.all_off(now)
         self._sequence_armed = False
-        self._darkened = self._judging
+        if self._judgment is not None:
+            self._judgment.end(now, Code.HARDWARE, "made dark before the table was judged")
+            self._judgment = None
         run = self._run
         if run is not None and run.pending:
             run.pending.clear()
@@ -227,7 +227,7 @@ class LedSequencer(Device, Generic[RowT]):
 
     def is_busy(self, now: float) -> bool:
         """Return whether a sequence is stepping or a table is being judged."""
-        return self.is_running or self._judging
+        return self.is_running or self._judgment is not None
 
     def states(self, now: float) -> dict[int, bool]:
         """Return bits 16 running, 32 sequence armed, 64 lit, 128 hot, 512 eyes safe."""
@@ -237,7 +237,7 @@ class LedSequencer(Device, Generic[RowT]):
     # sequence ---------------------------------------------------------------------------------
 
     def _require_still(self) -> None:
-        CommandRefused.raise_if(self._judging, Code.IGNORED, "a table is being judged")
+        CommandRefused.raise_if(self._judgment is not None, Code.IGNORED, "a table is being judged")
         CommandRefused.raise_if(self.is_running, Code.IGNORED, "a sequence is running")
 
     def _clear_table(self, _: str, now: float) -> None:
@@ -279,14 +279,12 @@ class LedSequencer(Device, Generic[RowT]):
 
         if self.faults.slow_judgment == 0.0:
             return conclude()
-        self._judging, self._darkened = True, False
         due_s = add_us(now, 1e6 * self.faults.slow_judgment)
-        return PendingReply(due_s, lambda: self._end_judgment(conclude))
+        self._judgment = PendingReply(due_s, lambda: self._end_judgment(conclude))
+        return self._judgment
 
     def _end_judgment(self, conclude: Callable[[], str]) -> str | CommandRefused:
-        self._judging = False
-        if self._darkened:
-            return CommandRefused(Code.HARDWARE, "made dark before the table was judged")
+        self._judgment = None
         try:
             return conclude()
         except CommandRefused as refused:

@@ -426,9 +426,11 @@ def test_slow_judgment_is_answered_late_and_once():
 def test_dark_ends_a_slow_judgment(text):
     bench, _ = judged_slowly()
     bench.ask(text)
-    bench.now += 0.5
     assert wire.decode(bench.box.advance(bench.now).rstrip()).code == Code.HARDWARE
     assert bench.ask("*OPC?") == "1"
+    assert bench.code("SEQ:CLE") == Code.OK
+    bench.now += 0.5
+    assert bench.box.advance(bench.now) == b""
     assert bench.ask("SEQ:POS?").startswith("IDLE")
 
 

@@ -137,6 +137,36 @@ def test_repeated_lines_do_not_renew_the_lease(bench):
     assert not bench.box.armed
 
 
+def test_safe_acts_whatever_its_number(bench):
+    bench.seq = 500
+    bench.ask("SYST:ARM")
+    bench.ask("FLAS:LAMP ON,500")
+    assert bench.reply("FLAS:LAMP ON,400", seq=3).code == Code.SEQ_REUSED
+    assert bench.reply("SAFE", seq=3).code == Code.OK
+    assert not bench.box.armed
+    bench.ask("SYST:ARM")
+    assert bench.reply("SAFE", seq=bench.seq - 1).code == Code.OK
+    assert not bench.box.armed
+
+
+def test_number_of_hello_is_used_up(bench):
+    assert bench.reply("SYST:HELLO?", seq=2**31 + 5, boot=0).code == Code.OK
+    assert bench.reply("SYST:ARM", seq=2**31 + 5).code == Code.SEQ_REUSED
+    assert not bench.box.armed
+
+
+def test_answer_made_anew_displaces_no_kept_answer(bench):
+    long = bench.frame("SYST:CAP?")
+    bench.raw(long)
+    ping = bench.frame("SYST:PING?")
+    first = bench.raw(ping)
+    for _ in range(2 * MAX_CACHED_REPLIES):
+        bench.now += 0.01
+        bench.raw(long)
+    bench.now += 0.01
+    assert bench.raw(ping) == first  # of the time before
+
+
 def test_repeated_long_answer_does_not_renew_lease(bench):
     bench.ask("SYST:ARM")
     asked_s = bench.now
