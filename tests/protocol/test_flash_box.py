@@ -155,7 +155,7 @@ def test_number_of_hello_is_used_up(bench):
     assert not bench.box.armed
 
 
-def test_answer_made_anew_displaces_no_kept_answer(bench):
+def test_long_answer_displaces_no_kept_answer(bench):
     long = bench.frame("SYST:CAP?")
     bench.raw(long)
     ping = bench.frame("SYST:PING?")
