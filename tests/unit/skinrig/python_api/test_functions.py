@@ -118,6 +118,7 @@ def test_plan_writes_file_with_forecast(tmp_path):
         (lambda one: one.rename(light="lamp"), "without light"),
         (lambda one: one.drop_vars("direction_y"), "without direction_y"),
         (lambda one: one - 1.0, "minimum -1"),
+        (lambda one: one.where(one < one.max(), np.inf), "infinite values, expected finite"),
     ],
 )
 def test_unusable_array_is_refused(tmp_path, change, message):
