@@ -37,7 +37,15 @@ def decode_json(text: str | bytes) -> Any:
     Traceback (most recent call last):
         ...
     ValueError: key 'a' is twice in one object
+    >>> decode_json('{"a": 1e999}')
+    Traceback (most recent call last):
+        ...
+    ValueError: got 1e999, expected a finite number
     """
+
+    def parse_finite(digits: str) -> float:
+        value = float(digits)
+        return value if math.isfinite(value) else refuse_constant(digits)
 
     def refuse_constant(name: str) -> NoReturn:
         raise ValueError(f"got {name}, expected a finite number")
@@ -52,7 +60,12 @@ def decode_json(text: str | bytes) -> Any:
 
     try:
         decoded = text.decode("utf-8") if isinstance(text, bytes) else text
-        return json.loads(decoded, parse_constant=refuse_constant, object_pairs_hook=refuse_doubles)
+        return json.loads(
+            decoded,
+            parse_float=parse_finite,
+            parse_constant=refuse_constant,
+            object_pairs_hook=refuse_doubles,
+        )
     except RecursionError as error:
         raise ValueError("is nested too deeply") from error
 
