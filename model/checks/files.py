@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 MAX_EXPANSION = 1100
 """Largest ratio of unpacked to packed bytes; that of deflate is 1032 (RFC 1951)."""
+PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Compressions that numpy writes, and for which `MAX_EXPANSION` holds."""
 MIN_UNPACKED_BYTES = 2**20
 """Unpacked size that any file may have."""
 
@@ -95,7 +97,8 @@ def read_arrays(source: str | Path | bytes) -> dict[str, NDArray[Any]]:
     Raises
     ------
     ValueError
-        For a damaged archive, pickled objects, a name twice, or sizes that do not fit.
+        For a damaged archive, a compression that numpy does not write, pickled objects, a name
+        twice, or sizes that do not fit.
     OSError
         When the file cannot be read.
 
@@ -112,6 +115,12 @@ def read_arrays(source: str | Path | bytes) -> dict[str, NDArray[Any]]:
             names = [entry.filename.removesuffix(".npy") for entry in entries]
             if len(set(names)) != len(names):
                 raise ValueError("an array is twice in it")
+            for entry in entries:
+                if entry.compress_type not in PACKINGS:
+                    raise ValueError(
+                        f"{entry.filename}: got compression {entry.compress_type}, expected none "
+                        "or deflate; write it with numpy"
+                    )
             packed = sum(entry.compress_size for entry in entries)
             require_plausible_size(sum(entry.file_size for entry in entries), packed)
             return {
