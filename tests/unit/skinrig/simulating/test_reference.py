@@ -1,14 +1,18 @@
 """Sessions of voxel skin: `--renderer reference` of flash rig and probe, and its refusals."""
 
-import json
-
 import numpy as np
 import pytest
 
+from capture.rig import load_rig
 from capture.session import Session
 from model import store
 from reconstruction.pipeline import recipes as pipeline
+from rigsim.boxes.flash import FlashPop
 from rigsim.mitsuba.variant import choose_variant
+from rigsim.scenes.exposing import SceneError
+from rigsim.scenes.reference.flash_session import RenderedSkin, VoxelFlashScene, crop_to_patch
+from rigsim.scenes.reference.patch import PatchImage, draw_patch
+from rigsim.subject.person_skin import PersonSkin
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.simulating import reference
 from skinrig.simulating.orders import SimulationError
@@ -18,6 +22,7 @@ from skinrig.simulating.simulation import simulate_session
 needs_llvm = pytest.mark.skipif(
     not choose_variant("rgb").is_vectorized, reason="voxels need a vectorized variant"
 )
+ONES = np.ones((28, 3))
 SUBJECT = {"subject": "II", "seed": 5, "renderer": "reference"}
 
 
@@ -82,23 +87,18 @@ def test_flash_patch_is_calibrated_and_reconstructed(flash_session, tmp_path):
     assert found.maps["melanin"].valid.mean() > 0.9
 
 
-@pytest.mark.long
-def test_probe_voxels_are_the_truth_of_their_session(tmp_path, monkeypatch):
-    monkeypatch.setitem(reference.PATCH_PHOTONS, "small", 1000)
-    done = simulate_session("probe", tmp_path / "session-probe", sites=("cheek",), **SUBJECT)
-    flat = simulate_session(
-        "probe", tmp_path / "session-flat", subject="II", seed=5, sites=("cheek",)
-    )
-    voxels, layers = (
-        json.loads((one.truth / "appearance.json").read_text())["parameters"]["profiles"][0]
-        for one in (done, flat)
-    )
-    ratio = np.divide(*(np.array(one["reflectance_per_mm2"])[:10] for one in (voxels, layers)))
-    # the mean skin is the same; pigment and blood around the site are not
-    assert 0.6 < ratio.min() < 0.98
-    assert ratio.max() < 1.5
-    built = [one for one in done.effects if one["name"].startswith("pigment and blood that vary")]
-    assert built[0]["verdict"] == "built"
+@needs_llvm
+def test_patch_under_led_is_refused():
+    """A scene that fell back to its white reference would record wrong frames."""
+    rig = crop_to_patch(load_rig("flash"), 4)
+    person = PersonSkin.of_preset("II")
+    patch = draw_patch(person, "cheek", field_mm=4.0, voxel_mm=0.25)
+    skin = RenderedSkin(patch, PatchImage(np.full((4, 4, 3), 0.5), np.full((4, 4, 3), 1e-4)))
+    scene = VoxelFlashScene(rig, skin)
+    assert scene.under("") is scene
+    pop = FlashPop("1", 0.0, 1.0, "crossed", 0.0, "LED-550-20")
+    with pytest.raises(SceneError, match="got LED-550-20, expected the tube"):
+        scene.exposure("cam", pops=[pop], exposure_s=0.01, seed=0)
 
 
 @pytest.mark.parametrize(
