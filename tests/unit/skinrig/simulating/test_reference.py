@@ -88,6 +88,22 @@ def test_flash_patch_is_calibrated_and_reconstructed(flash_session, tmp_path):
 
 
 @needs_llvm
+@pytest.mark.render
+@pytest.mark.long
+def test_patch_noise_follows_session_seed(monkeypatch):
+    monkeypatch.setitem(reference.PATCH_SAMPLES, "small", 2)
+    rig = crop_to_patch(load_rig("flash"), 2)
+    given = {"subject": "II", "site": None, "seed": 5, "size": "small", "progress": None}
+    first, second, again = (
+        reference.make_patch_scene(rig, noise_seed=noise_seed, **given).skin
+        for noise_seed in (1, 2, 1)
+    )
+    np.testing.assert_array_equal(first.patch.melanin, second.patch.melanin)
+    np.testing.assert_array_equal(first.image.rgb, again.image.rgb)
+    assert (first.image.rgb != second.image.rgb).all()
+
+
+@needs_llvm
 def test_patch_under_led_is_refused():
     """A scene that fell back to its white reference would record wrong frames."""
     rig = crop_to_patch(load_rig("flash"), 4)
