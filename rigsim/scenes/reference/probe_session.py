@@ -9,15 +9,34 @@ from capture.rig import Rig
 from rigsim.fiber.probe_profile import BandProfile, ProfileCache
 from rigsim.fiber.probe_tissue import SkinTissue, TissueError
 from rigsim.mitsuba.variant import Renderer
-from rigsim.needs.effects import Effect, EffectSelection
+from rigsim.needs.effects import Effect, EffectSelection, omitted_effects
+from rigsim.needs.face import BAND_EFFECT, POLARIZATION_EFFECT
+from rigsim.needs.probe import (
+    COLOR_EFFECT,
+    CROSSTALK_EFFECT,
+    DARK_CURRENT_EFFECT,
+    LAYERS_EFFECT,
+    TRANSPORT_EFFECT,
+    WINGS_EFFECT,
+)
+from rigsim.needs.tissue import TISSUE_RULES
 from rigsim.scenes.probe.scene import ProbeScene
 from rigsim.scenes.reference.placed_paths import HeadPlace
 from rigsim.scenes.reference.probe_skin import read_person
 from rigsim.subject.person_skin import PersonSkinError
 
 PHOTONS_PER_LAID_PATH: Final = 100
-UNIFORM_EFFECT: Final = "hair, pores and veins under the head"
-"""Effect of layered tissue of which voxels have a part."""
+PROBE_EFFECTS: Final = (
+    POLARIZATION_EFFECT,
+    BAND_EFFECT,
+    TRANSPORT_EFFECT,
+    CROSSTALK_EFFECT,
+    WINGS_EFFECT,
+    DARK_CURRENT_EFFECT,
+    COLOR_EFFECT,
+)
+"""Effects of the probe that hold for any tissue of several bands."""
+UNEVEN_EFFECT: Final = "pigment and blood that vary below the head"
 
 
 class VoxelProfiles(ProfileCache):
@@ -113,7 +132,12 @@ class VoxelProbeScene(ProbeScene):
     ) -> None:
         super().__init__(rig, tissue, seed=seed, noise_seed=noise_seed, photons=photons)
         self.profiles = VoxelProfiles(rig, tissue, photons=photons, seed=seed, progress=progress)
-        rest = [effect for effect in self.needs if effect.name != UNIFORM_EFFECT]
-        uneven = Effect("pigment and blood that vary below the head", "built", "those of the face")
-        hair = Effect(UNIFORM_EFFECT, "unmodeled", "voxels have pigment and blood alone")
-        self.needs = EffectSelection((*rest, uneven, hair))
+        self.needs = EffectSelection(
+            (
+                *(self.needs[name] for name in PROBE_EFFECTS),
+                *(Effect(rule.name, "built", "voxels have the person's") for rule in TISSUE_RULES),
+                Effect(LAYERS_EFFECT, "built", "epidermis above dermis, thinned by suction"),
+                Effect(UNEVEN_EFFECT, "built", "those of the face"),
+                *omitted_effects("probe", "probe_voxels"),
+            )
+        )

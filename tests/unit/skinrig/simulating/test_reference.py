@@ -1,5 +1,7 @@
 """Sessions of voxel skin: `--renderer reference` of flash rig and probe, and its refusals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,11 +11,14 @@ from model import store
 from reconstruction.pipeline import recipes as pipeline
 from rigsim.boxes.flash import FlashPop
 from rigsim.mitsuba.variant import choose_variant
+from rigsim.needs.tissue import TISSUE_RULES
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.reference.flash_session import RenderedSkin, VoxelFlashScene, crop_to_patch
 from rigsim.scenes.reference.patch import PatchImage, draw_patch
+from rigsim.scenes.reference.probe_session import UNEVEN_EFFECT
 from rigsim.subject.person_skin import PersonSkin
 from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating.subsurface import compare_profiles
 from skinrig.simulating import reference
 from skinrig.simulating.orders import SimulationError
 from skinrig.simulating.serving import ServeOrder, serve_rig
@@ -115,6 +120,38 @@ def test_patch_under_led_is_refused():
     pop = FlashPop("1", 0.0, 1.0, "crossed", 0.0, "LED-550-20")
     with pytest.raises(SceneError, match="got LED-550-20, expected the tube"):
         scene.exposure("cam", pops=[pop], exposure_s=0.01, seed=0)
+
+
+@pytest.mark.long
+def test_probe_session_measures_its_voxels(tmp_path, monkeypatch):
+    """Rationale: the fibers' light is that of the voxels below the head, which differ by site.
+
+    Tolerance: errors of the phantom and of the photons are common to neighboring fibers, so more
+    than 68 % of fibers may be within one standard error; 84 of each site are judged.
+    """
+    monkeypatch.setitem(reference.PATCH_PHOTONS, "small", 1000)
+    simulate_session("probe", tmp_path / "session-phantom", target="phantom")
+    calibrate("fiber", [tmp_path / "session-phantom"], tmp_path / "calibration")
+    sites = {"cheek": "forehead", "forehead": "cheek"}
+    done = simulate_session("probe", tmp_path / "session", sites=tuple(sites), **SUBJECT)
+    pipeline.reconstruct(
+        done.session,
+        want=("profiles",),
+        out=tmp_path / "maps",
+        calibration=tmp_path / "calibration",
+    )
+    found, truth = store.read(tmp_path / "maps"), store.read(done.truth)
+    rows = compare_profiles(found, truth)
+    assert len(rows) == 6
+    assert min(row.coverage for row in rows) > 0.68
+    assert max(row.median for row in rows) < 0.02
+    exchanged = [one | {"site": sites[one["site"]]} for one in truth.parameters["profiles"]]
+    swapped = replace(truth, parameters={**truth.parameters, "profiles": exchanged})
+    assert max(row.coverage for row in compare_profiles(found, swapped)) < 0.5
+    verdicts = {one["name"]: one["verdict"] for one in done.effects}
+    assert verdicts[UNEVEN_EFFECT] == "built"
+    assert {verdicts[rule.name] for rule in TISSUE_RULES} == {"built"}
+    assert verdicts["suction other than nominal"] == "unmodeled"
 
 
 @pytest.mark.parametrize(
