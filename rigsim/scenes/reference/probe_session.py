@@ -1,6 +1,6 @@
 """Voxels of a person's skin below the fiber probe, as a scene of sessions."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Final
 
 import numpy as np
@@ -63,6 +63,24 @@ class VoxelProfiles(ProfileCache):
     ) -> None:
         super().__init__(rig, tissue, photons=photons, seed=seed)
         self._progress = progress
+        self._allowed: frozenset[tuple[str, float]] | None = None
+
+    def trace_only(self, places: Collection[tuple[str, float]]) -> None:
+        """Trace places now, and refuse all others from now on.
+
+        Parameters
+        ----------
+        places
+            Sites with directions of the head, degrees.
+
+        Raises
+        ------
+        TissueError
+            The person's face has no such site.
+        """
+        for site, angle_deg in places:
+            self.profile(site, angle_deg)
+        self._allowed = frozenset(places)
 
     def profile(self, site: str, angle_deg: float = 0.0, suction_mbar: float = 0.0) -> BandProfile:
         """Return the fibers' reflectance at a site, under the probe's nominal suction.
@@ -77,9 +95,15 @@ class VoxelProfiles(ProfileCache):
         Raises
         ------
         TissueError
-            The person's face has no such site.
+            The person's face has no such site, or `trace_only` has excluded the place.
         """
         del suction_mbar
+        if self._allowed is not None and (site, angle_deg) not in self._allowed:
+            known = ", ".join(f"{name} at {turn:g} degrees" for name, turn in sorted(self._allowed))
+            raise TissueError(
+                f"place: got {site} at {angle_deg:g} degrees, expected one whose voxels were "
+                f"traced before the first request: {known}; place the head there"
+            )
         return self._profiles.get((site, angle_deg), lambda: self._read(site, angle_deg))
 
     def _read(self, site: str, angle_deg: float) -> BandProfile:
@@ -117,6 +141,7 @@ class VoxelProbeScene(ProbeScene):
         Called with a line per traced place.
     """
 
+    profiles: VoxelProfiles
     renderer: Renderer = "reference"
     """Renderer of the detector's image and of the skin."""
 

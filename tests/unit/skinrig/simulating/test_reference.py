@@ -10,6 +10,7 @@ from capture.session import Session
 from model import store
 from reconstruction.pipeline import recipes as pipeline
 from rigsim.boxes.flash import FlashPop
+from rigsim.fiber.probe_profile import BandProfile
 from rigsim.mitsuba.variant import choose_variant
 from rigsim.needs.tissue import TISSUE_RULES
 from rigsim.scenes.exposing import SceneError
@@ -17,6 +18,7 @@ from rigsim.scenes.reference.flash_session import RenderedSkin, VoxelFlashScene,
 from rigsim.scenes.reference.patch import PatchImage, draw_patch
 from rigsim.scenes.reference.probe_session import UNEVEN_EFFECT
 from rigsim.subject.person_skin import PersonSkin
+from rigsim.world.suction import HeadState
 from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating.subsurface import compare_profiles
 from skinrig.simulating import reference
@@ -152,6 +154,24 @@ def test_probe_session_measures_its_voxels(tmp_path, monkeypatch):
     assert verdicts[UNEVEN_EFFECT] == "built"
     assert {verdicts[rule.name] for rule in TISSUE_RULES} == {"built"}
     assert verdicts["suction other than nominal"] == "unmodeled"
+
+
+def test_probe_place_that_was_not_traced_is_refused(monkeypatch):
+    rig = load_rig("probe")
+    scene = reference.make_probe_scene(
+        rig, subject="II", seed=5, noise_seed=None, size="small", places=(), progress=None
+    )
+    traced = []
+    monkeypatch.setattr(
+        scene.profiles, "_read", lambda *place: traced.append(place) or BandProfile(ONES, ONES)
+    )
+    scene.profiles.trace_only([("cheek", 0.0)])
+    head = HeadState("cheek", 0.0, True, 100.0, 5.0)
+    assert scene.fiber_radiance(head).min() > 0.0
+    for other in (replace(head, site="chin"), replace(head, angle_deg=45.0)):
+        with pytest.raises(SceneError, match="expected one whose voxels were traced before"):
+            scene.fiber_radiance(other)
+    assert traced == [("cheek", 0.0)]
 
 
 @pytest.mark.parametrize(
