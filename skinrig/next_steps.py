@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from capture.former_names import FORMER_KINDS
 from skinrig.workspace import Workspace, read_document, scan
 
 CALIBRATION_BY_TARGET: Final[Mapping[str, Mapping[str, str]]] = {
@@ -208,6 +207,8 @@ def format_welcome(folder: Path, version: str) -> str:
 
 def _has_calibration(folder: Path, rig: str) -> bool:
     """Return whether a folder has a calibration of a rig, of a kind that its targets yield."""
+    from capture.former_names import FORMER_KINDS
+
     kinds = set(CALIBRATION_BY_TARGET.get(rig, {}).values())
     files = (folder / f"{name}.json" for kind in kinds for name in (kind, FORMER_KINDS.get(kind)))
     documents = (read_document(file) or {} for file in files)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 MAX_EXPANSION = 1100
 """Largest ratio of unpacked to packed bytes; that of deflate is 1032 (RFC 1951)."""
-PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+READABLE_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compressions that numpy writes, and for which `MAX_EXPANSION` holds."""
 MIN_UNPACKED_BYTES = 2**20
 """Unpacked size that any file may have."""
@@ -116,7 +116,7 @@ def read_arrays(source: str | Path | bytes) -> dict[str, NDArray[Any]]:
             if len(set(names)) != len(names):
                 raise ValueError("an array is twice in it")
             for entry in entries:
-                if entry.compress_type not in PACKINGS:
+                if entry.compress_type not in READABLE_COMPRESSIONS:
                     raise ValueError(
                         f"{entry.filename}: got compression {entry.compress_type}, expected none "
                         "or deflate; write it with numpy"
