@@ -18,8 +18,8 @@ about as much."""
 def require_writable(path: str | Path, *, option: str = "--out") -> None:
     """Raise an error unless an output can be made at a path that need not exist.
 
-    A folder is made for a moment in the nearest folder that exists, because permissions alone do
-    not decide.
+    A folder is made for a moment in the nearest folder that exists, and in an output folder that
+    exists, because permissions alone do not decide.
 
     Parameters
     ----------
@@ -38,13 +38,15 @@ def require_writable(path: str | Path, *, option: str = "--out") -> None:
     >>> require_writable(Path(tempfile.gettempdir()) / "a" / "b")
     """
     target = Path(path).absolute()
-    parent = next(folder for folder in target.parents if os.path.lexists(folder))
+    tried = next(folder for folder in target.parents if os.path.lexists(folder))
     try:
-        with tempfile.TemporaryDirectory(prefix=".skinrig-", dir=parent):
-            free = shutil.disk_usage(parent).free
+        free = _try_folder(tried)
+        if target.is_dir():  # it is written into, or replaced from its parent
+            tried = target
+            free = min(free, _try_folder(tried))
     except OSError as error:
         raise UnusableError(
-            f"{option}: {target}: {parent} cannot be written to ({error.strerror}); nothing was "
+            f"{option}: {target}: {tried} cannot be written to ({error.strerror}); nothing was "
             "computed: name another folder"
         ) from error
     if free < MIN_FREE_BYTES:
@@ -52,6 +54,12 @@ def require_writable(path: str | Path, *, option: str = "--out") -> None:
             f"{option}: {target}: got {free} bytes free, expected at least {MIN_FREE_BYTES}; "
             "nothing was computed: free space, or name another disk"
         )
+
+
+def _try_folder(folder: Path) -> int:
+    """Return the free bytes of a folder after a folder was made in it."""
+    with tempfile.TemporaryDirectory(prefix=".skinrig-", dir=folder):
+        return shutil.disk_usage(folder).free
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:

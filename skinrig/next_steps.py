@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from skinrig.workspace import Workspace, scan
+from skinrig.workspace import Workspace, read_document, scan
 
 CALIBRATION_BY_TARGET: Final[Mapping[str, Mapping[str, str]]] = {
     "flash": {
@@ -56,7 +56,13 @@ def shell_quote(path: str | Path) -> str:
 
 
 def suggest_after_session(
-    rig: str, session: str | Path, target: str | None, *, calibration: str | Path = "calibration"
+    rig: str,
+    session: str | Path,
+    target: str | None,
+    *,
+    calibration: str | Path = "calibration",
+    phantom: str | Path | None = None,
+    source: str = "simulated",
 ) -> str:
     """Return the most likely next command after a session.
 
@@ -69,7 +75,11 @@ def suggest_after_session(
     target
         Calibration target of the session; "sequence" for a time sequence, None for skin.
     calibration
-        CALIBRATION/ folder for the command.
+        CALIBRATION/ folder for the command; one without a calibration of this rig is not named.
+    phantom
+        SESSION/ folder of a phantom, which calibrates a probe; None: there is none.
+    source
+        "measured" or "simulated": how a probe's phantom is captured.
 
     Examples
     --------
@@ -77,12 +87,19 @@ def suggest_after_session(
     'skinrig reconstruct session-flash --maps melanin,hemoglobin --out appearance'
     >>> suggest_after_session("probe", "session-phantom", "phantom")
     'skinrig calibrate fiber session-phantom --out calibration'
+    >>> suggest_after_session("probe", "session", None, calibration="missing")
+    'skinrig simulate probe --target phantom --out session-phantom'
     """
     place, store = shell_quote(session), shell_quote(calibration)
     if target == "sequence":
         return f"skinrig reconstruct {place} --maps perfusion_curves --out appearance"
     if not target:
-        calibrated = rig in CALIBRATION_BY_TARGET and Path(calibration).is_dir()
+        calibrated = _has_calibration(Path(calibration), rig)
+        if rig == "probe" and not calibrated:  # its reconstruction requires calibrated fibers
+            if phantom is not None:
+                return suggest_after_session(rig, phantom, "phantom", calibration=calibration)
+            made = "capture" if source == "measured" else "simulate"
+            return f"skinrig {made} probe --target phantom --out session-phantom"
         needs = f" --calibration {store}" if calibrated else ""
         want = DEFAULT_WANTS.get(rig, DEFAULT_WANTS["photographs"])
         return f"skinrig reconstruct {place} --maps {want}{needs} --out appearance"
@@ -122,12 +139,22 @@ def suggest(found: Workspace, folder: Path) -> tuple[Step, ...]:
     if fresh:
         path, document = fresh[0]
         rig = document.get("rig", {}).get("name", "")
-        where = next((c for c in found.calibrations if rig in c.name), None)
-        where = where or next(iter(found.calibrations), Path("calibration"))
-        command = suggest_after_session(rig, path, None, calibration=where)
+        stores = [folder for folder in found.calibrations if _has_calibration(folder, rig)]
+        stores.sort(key=lambda folder: rig not in folder.name)
+        phantoms = (p for p, d in found.sessions.items() if _target(d) == "phantom")
+        command = suggest_after_session(
+            rig,
+            path,
+            None,
+            calibration=next(iter(stores), folder / "calibration"),
+            phantom=next(phantoms, None),
+            source=str(document.get("source", "simulated")),
+        )
         if rig not in CALIBRATION_BY_TARGET:
             command += _state_option(document)
-        steps.append(Step(command, "maps with standard uncertainties"))
+        maps = command.startswith("skinrig reconstruct")
+        why = "maps with standard uncertainties" if maps else "the calibration that its maps need"
+        steps.append(Step(command, why))
     viewable = {p: d for p, d in found.appearances.items() if _is_viewable(d)}
     if viewable:
         seen = shell_quote(_most_complete(viewable, ("facial_color.json", "mesh.obj")))
@@ -176,6 +203,16 @@ def format_welcome(folder: Path, version: str) -> str:
     lines += [f"  {step.command.ljust(width)}  {step.why}".rstrip() for step in steps]
     lines += ["", "All commands: skinrig --help; one of them: skinrig report --help"]
     return "\n".join(lines)
+
+
+def _has_calibration(folder: Path, rig: str) -> bool:
+    """Return whether a folder has a calibration of a rig, of a kind that its targets yield."""
+    from capture.former_names import FORMER_KINDS
+
+    kinds = set(CALIBRATION_BY_TARGET.get(rig, {}).values())
+    files = (folder / f"{name}.json" for kind in kinds for name in (kind, FORMER_KINDS.get(kind)))
+    documents = (read_document(file) or {} for file in files)
+    return any(document.get("rig") == rig for document in documents)
 
 
 def _target(session: Mapping[str, Any]) -> str:

@@ -57,9 +57,9 @@ def scan(folder: Path) -> Workspace:
     except OSError:
         return Workspace()
     for entry in entries:
-        if (document := _document(entry / "session.json")) is not None:
+        if (document := read_document(entry / "session.json")) is not None:
             sessions[entry] = document
-        elif (document := _document(entry / "appearance.json")) is not None:
+        elif (document := read_document(entry / "appearance.json")) is not None:
             if document.get("parameters", {}).get("kind") == "truth":
                 truths.append(entry)
             else:
@@ -73,7 +73,8 @@ def scan(folder: Path) -> Workspace:
     )
 
 
-def _document(path: Path) -> dict[str, Any] | None:
+def read_document(path: Path) -> dict[str, Any] | None:
+    """Return the object of a JSON file; None if it is unreadable or not an object."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -114,6 +114,8 @@ class CameraInfo:
         Levels, DN; black for each position of the color filter array.
     triggers
         Triggers that it supports.
+    pixel_um
+        Side of a pixel, um; None: not reported.
     """
 
     serial: str
@@ -124,6 +126,7 @@ class CameraInfo:
     black: tuple[float, ...]
     white: int
     triggers: tuple[Trigger, ...]
+    pixel_um: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

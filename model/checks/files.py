@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 MAX_EXPANSION = 1100
 """Largest ratio of unpacked to packed bytes; that of deflate is 1032 (RFC 1951)."""
+READABLE_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Compressions that numpy writes, and for which `MAX_EXPANSION` holds."""
 MIN_UNPACKED_BYTES = 2**20
 """Unpacked size that any file may have."""
 
@@ -37,7 +39,15 @@ def decode_json(text: str | bytes) -> Any:
     Traceback (most recent call last):
         ...
     ValueError: key 'a' is twice in one object
+    >>> decode_json('{"a": 1e999}')
+    Traceback (most recent call last):
+        ...
+    ValueError: got 1e999, expected a finite number
     """
+
+    def parse_finite(digits: str) -> float:
+        value = float(digits)
+        return value if math.isfinite(value) else refuse_constant(digits)
 
     def refuse_constant(name: str) -> NoReturn:
         raise ValueError(f"got {name}, expected a finite number")
@@ -52,7 +62,12 @@ def decode_json(text: str | bytes) -> Any:
 
     try:
         decoded = text.decode("utf-8") if isinstance(text, bytes) else text
-        return json.loads(decoded, parse_constant=refuse_constant, object_pairs_hook=refuse_doubles)
+        return json.loads(
+            decoded,
+            parse_float=parse_finite,
+            parse_constant=refuse_constant,
+            object_pairs_hook=refuse_doubles,
+        )
     except RecursionError as error:
         raise ValueError("is nested too deeply") from error
 
@@ -82,7 +97,8 @@ def read_arrays(source: str | Path | bytes) -> dict[str, NDArray[Any]]:
     Raises
     ------
     ValueError
-        For a damaged archive, pickled objects, a name twice, or sizes that do not fit.
+        For a damaged archive, a compression that numpy does not write, pickled objects, a name
+        twice, or sizes that do not fit.
     OSError
         When the file cannot be read.
 
@@ -99,6 +115,12 @@ def read_arrays(source: str | Path | bytes) -> dict[str, NDArray[Any]]:
             names = [entry.filename.removesuffix(".npy") for entry in entries]
             if len(set(names)) != len(names):
                 raise ValueError("an array is twice in it")
+            for entry in entries:
+                if entry.compress_type not in READABLE_COMPRESSIONS:
+                    raise ValueError(
+                        f"{entry.filename}: got compression {entry.compress_type}, expected none "
+                        "or deflate; write it with numpy"
+                    )
             packed = sum(entry.compress_size for entry in entries)
             require_plausible_size(sum(entry.file_size for entry in entries), packed)
             return {

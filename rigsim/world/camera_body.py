@@ -111,6 +111,7 @@ class CameraBody:
             black=(float(view.black_level),) * (1 if view.cfa == "MONO" else 4),
             white=view.white_level,
             triggers=(Trigger.SOFTWARE, Trigger.EDGE),
+            pixel_um=view.pixel_um,
         )
         self.exposure = Exposure(0.01, 100)
         self.missed_edges = 0

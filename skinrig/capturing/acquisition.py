@@ -12,7 +12,7 @@ from typing import Any
 
 from capture.acquire import Operator, run_plan
 from capture.devices.box import Box
-from capture.devices.camera import Camera, open_camera
+from capture.devices.camera import Camera, CameraInfo, open_camera
 from capture.devices.led_box import Eyes
 from capture.plan import Plan
 from capture.rig import Rig
@@ -116,10 +116,7 @@ def _run(
         return _describe_complete(opened, console)
     with contextlib.ExitStack() as stack:
         boxes, cameras = _open_devices(stack, rig, plan, order, console)
-        width = cameras[rig.views[0].name].info.width_px
-        if width != rig.views[0].width_px:
-            # a served simulation may run smaller than the rig file's camera
-            rig = rig.resized(width) if rig.caliper is None else rig.cropped(width)
+        rig = match_camera(rig, cameras[rig.views[0].name].info)
         if order.resume:
             session = Session.resume(out)
             plan = session.plan
@@ -164,6 +161,42 @@ def _run(
     figures = {"session": out, "captured": done.frames, "retakes": done.retakes}
     figures |= {"stale_frames": done.stale, "steps": len(plan.steps)}
     return figures | {"dead_lights": done.dead_lights, "left_out": omitted}
+
+
+def match_camera(rig: Rig, info: CameraInfo) -> Rig:
+    """Return the rig with the images of its first camera, which a simulation may serve smaller.
+
+    Pixels of another size are those of `Rig.resized`; fewer pixels of one size are those of
+    `Rig.cropped`. A camera that does not report the size of its pixels shows the rig's whole
+    field, except in front of a caliper.
+
+    Parameters
+    ----------
+    rig
+        Rig of the rig file.
+    info
+        Properties of its first camera.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> rig = load_rig("flash")
+    >>> served = rig.resized(260).cropped(16)
+    >>> view = served.views[0]
+    >>> info = CameraInfo("A1", "sim", 16, 16, "RGGB", (0.0,), 4095, (), view.pixel_um)
+    >>> match_camera(rig, info) == served
+    True
+    """
+    view = rig.views[0]
+    width_px = info.width_px
+    if info.pixel_um is None:
+        if width_px == view.width_px:
+            return rig
+        return rig.resized(width_px) if rig.caliper is None else rig.cropped(width_px)
+    if not math.isclose(info.pixel_um, view.pixel_um):
+        rig = rig.resized(round(view.width_px * view.pixel_um / info.pixel_um))
+    view = rig.views[0]
+    return rig if width_px == view.width_px else rig.cropped(width_px)
 
 
 def _describe_complete(session: Session, console: Console) -> Mapping[str, Any]:

@@ -5,6 +5,8 @@
   const MASKED_GRAY = Number(document.currentScript.dataset.maskedGray);
   const FOREIGN_COLOR = 400; // squared distance in 8-bit sRGB beyond which a color is not of the bar
 
+  const IMAGES = 'img, a[href^="#image-"]';
+
   const make = (tag, attributes = {}, ...children) => {
     const element = document.createElement(tag);
     for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
@@ -34,10 +36,12 @@
 
   const isMasked = (color) => color.every((value) => value === MASKED_GRAY);
 
-  // what one image shows: its title, its pixels, and how a color becomes a value
-  const describe = (image) => {
-    const figure = image.closest("figure");
-    const scale = figure.querySelector(".scale .bar") || image.closest(".quantity")?.querySelector(".scale .bar");
+  // what one figure shows: its title, its pixels, and how a color becomes a value; a link
+  // replaces an image that is on the page already
+  const describe = (part) => {
+    const figure = part.closest("figure");
+    const image = part.matches("a") ? document.querySelector(part.getAttribute("href")) : part;
+    const scale = figure.querySelector(".scale .bar") || part.closest(".quantity")?.querySelector(".scale .bar");
     const texts = scale ? [...scale.parentElement.children].map((part) => part.textContent) : [];
     const [low, high, unit] = [Number.parseFloat(texts[0]), Number.parseFloat(texts[2]), texts[3] || ""];
     const stops = scale ? readStops(scale) : [];
@@ -55,13 +59,13 @@
       if (distance > FOREIGN_COLOR) return "no value";
       return `≈ ${(low + at * (high - low)).toPrecision(3)} ${unit}`.trim();
     };
-    return { image, scale, read, title: figure.querySelector("figcaption").textContent };
+    return { part, image, scale, read, title: figure.querySelector("figcaption").textContent };
   };
 
   const open = (chosen) => {
-    const group = [...chosen.closest(".maps, .pair").querySelectorAll("img")].map(describe);
+    const group = [...chosen.closest(".maps, .pair").querySelectorAll(IMAGES)].map(describe);
     const names = group.map((one) => one.title);
-    const first = group.findIndex((one) => one.image === chosen);
+    const first = group.findIndex((one) => one.part === chosen);
     const select = (label, index) => {
       const field = make("select", { "aria-label": label });
       names.forEach((name, i) => field.append(make("option", { value: i }, name)));

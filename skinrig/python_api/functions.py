@@ -97,7 +97,7 @@ def load_session(
     out: str | Path | None = None,
     *,
     subject: str = "unnamed",
-    consent: Sequence[str] = (),
+    consent: str | Sequence[str] | None = None,
 ) -> SessionFolder:
     """Open a session, or write one from an array of images under one light each.
 
@@ -111,9 +111,10 @@ def load_session(
     out
         New SESSION/ folder of an array; None for a folder.
     subject
-        Pseudonym of the subject of an array, never a name.
+        Pseudonym of the subject of an array, never a name; "none" for a thing.
     consent
-        Uses that the subject has agreed to, such as "research"; without one nothing is exported.
+        Uses that the subject has agreed to, such as "research" or "research,teaching"; None:
+        every use of a thing and none of a person, of whom nothing is then exported.
 
     Raises
     ------
@@ -132,7 +133,7 @@ def load_session(
             raise UsageError("out: got none with an array of images; name a new folder")
         from skinrig.consent import parse_subject
 
-        person = parse_subject(subject, consent, None)
+        person = parse_subject(subject, [consent] if isinstance(consent, str) else consent, None)
         return SessionFolder(write_stack_session(source, Path(out), person))
     if out is not None:
         raise UsageError("out: applies to arrays of images, not to a folder; remove it")
@@ -144,7 +145,13 @@ def load_session(
 
 
 def calibrate(
-    kind: str, sessions: FolderLike | Sequence[FolderLike], out: str | Path = "calibration"
+    kind: str,
+    sessions: FolderLike | Sequence[FolderLike],
+    out: str | Path = "calibration",
+    *,
+    square_mm: float = 36.0,
+    sphere_mm: float = 50.0,
+    phantom: str | Path | None = None,
 ) -> CalibrationFolder:
     """Estimate one kind of calibration from sessions of targets, and save it.
 
@@ -156,6 +163,12 @@ def calibrate(
         One or more SESSION/ folders of the target.
     out
         CALIBRATION/ folder; other kinds in it are kept.
+    square_mm
+        Side of the calibration board's squares, mm (dome: geometry, scanner).
+    sphere_mm
+        Radius of the mirror sphere, mm (dome: lights).
+    phantom
+        Certificate of the phantom, JSON (probe: fiber); None: that of the simulated one.
 
     Raises
     ------
@@ -163,8 +176,10 @@ def calibrate(
         If the sessions lack what the kind requires.
     """
     from skinrig.calibrating.calibrate import calibrate as save_calibration
+    from skinrig.calibrating.dome import dome_targets
 
-    saved = save_calibration(kind, [to_path(one) for one in _listed(sessions)], Path(out))
+    paths, targets = [to_path(one) for one in _listed(sessions)], dome_targets(square_mm, sphere_mm)
+    saved = save_calibration(kind, paths, Path(out), targets=targets, phantom=phantom)
     return CalibrationFolder(Path(out), saved)
 
 
@@ -176,6 +191,11 @@ def reconstruct(
     calibration: FolderLike | None = None,
     state: str = "neutral",
     progress: bool = True,
+    scan: str | Path | None = None,
+    merl_basis: str | Path | None = None,
+    rank: int | None = None,
+    hold_out: str | None = None,
+    landmarks: str | Path | None = None,
 ) -> MapsFolder:
     """Compute maps of a session; stages that are up to date are reused.
 
@@ -193,6 +213,16 @@ def reconstruct(
         Expression or condition.
     progress
         Whether a progress bar is shown.
+    scan
+        Face mesh, PLY in mm; None: the session's own scan (dome).
+    merl_basis
+        Folder of MERL tables as basis BRDFs; None: the generated ones (dome).
+    rank
+        Number of basis BRDFs; None: 4 (dome).
+    hold_out
+        Lights and views that no fit uses, such as "lights=L007,views=C03" (dome).
+    landmarks
+        CSV table name,x,y of the sites on the translucency map, pixels (probe).
 
     Raises
     ------
@@ -200,6 +230,7 @@ def reconstruct(
         If a map is unknown, or the session lacks what it requires.
     """
     from reconstruction.pipeline import recipes
+    from reconstruction.pipeline.inputs import DomeOptions
     from skinrig.appearances.state_truth import find_comparison_truth
 
     wanted = maps.split(",") if isinstance(maps, str) else maps
@@ -212,6 +243,8 @@ def reconstruct(
             out=target,
             calibration=None if calibration is None else to_path(calibration),
             state=state,
+            landmarks=landmarks,
+            dome=DomeOptions(scan, merl_basis, hold_out, rank),
             progress=report_line,
             truth=truth.name if truth else "",
         )
@@ -266,7 +299,12 @@ def plan(rig: str, goals: str = "", *, out: str | Path = "plan.json", **options:
     return ChosenPlan(Path(out), choice)
 
 
-def report(paths: FolderLike | Sequence[FolderLike], out: str | Path = "report.html") -> HtmlPage:
+def report(
+    paths: FolderLike | Sequence[FolderLike],
+    out: str | Path = "report.html",
+    *,
+    compare: bool | None = None,
+) -> HtmlPage:
     """Write a self-contained HTML report on results and their errors against ground truth.
 
     Parameters
@@ -275,6 +313,8 @@ def report(paths: FolderLike | Sequence[FolderLike], out: str | Path = "report.h
         Folders or files written by skinrig; two of one kind are compared.
     out
         HTML file; an existing one is replaced.
+    compare
+        Whether two runs are compared; None: if there are two of one kind.
 
     Raises
     ------
@@ -284,7 +324,7 @@ def report(paths: FolderLike | Sequence[FolderLike], out: str | Path = "report.h
     from skinrig.atomic_file import write_atomically
     from skinrig.reporting.report import build_any
 
-    done = build_any([to_path(one) for one in _listed(paths)])
+    done = build_any([to_path(one) for one in _listed(paths)], compare=compare)
     write_atomically(Path(out), done.html)
     return HtmlPage(Path(out), done.verdict)
 

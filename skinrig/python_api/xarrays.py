@@ -135,7 +135,7 @@ def write_stack_session(images: xarray.DataArray, out: Path, subject: SubjectRec
     Raises
     ------
     UsageError
-        If a dimension or a coordinate is missing, or a value is negative.
+        If a dimension or a coordinate is missing, or a value is negative or infinite.
     capture.session.SessionError
         If the folder exists.
     """
@@ -152,7 +152,13 @@ def write_stack_session(images: xarray.DataArray, out: Path, subject: SubjectRec
             f"{', '.join(DIRECTION_NAMES)} along light"
         )
     order = [*STACK_AXES, *(axis for axis in images.dims if axis not in STACK_AXES)]
-    values = np.nan_to_num(np.asarray(images.transpose(*order).values, np.float64))
+    given = np.asarray(images.transpose(*order).values, np.float64)
+    values = np.where(np.isnan(given), 0.0, given)
+    if infinite := int(np.isinf(values).sum()):
+        raise UsageError(
+            f"images: got {infinite} infinite values, expected finite ones, or NaN where nothing "
+            "was recorded; replace them"
+        )
     if values.ndim > 4 or (values.ndim == 4 and values.shape[3] != 3) or values.min(initial=0) < 0:
         raise UsageError(
             f"images: got shape {values.shape} and minimum {values.min(initial=0):g}, expected "

@@ -86,7 +86,7 @@ def make_patch_scene(
     site
         Site of the face; None: `DEFAULT_SITE`.
     seed, noise_seed
-        Seeds of subject and of one session.
+        Seeds of subject, and of one session, whose repeats share the renderer's noise.
     size
         "small" or "full": samples per pixel.
     progress
@@ -101,7 +101,7 @@ def make_patch_scene(
     _announce(progress, PATCH_SECONDS_PER_SAMPLE * samples * pixels)
     person = subject_file.load_subject(subject).skin(seed=seed)
     skin = render_skin(
-        rig, person, site or DEFAULT_SITE, samples=samples, seed=seed, progress=progress
+        rig, person, site or DEFAULT_SITE, samples=samples, seed=noise_seed, progress=progress
     )
     return VoxelFlashScene(rig, skin, seed=noise_seed)
 

@@ -215,12 +215,12 @@ def _probe_scene(rig: Rig, probe: Probe, order: ServeOrder) -> Any:
     block = simulating_probe.make_scene(rig, "phantom", photons=PROBE_PHOTONS, **given)
     skin: ProbeScene
     if order.renderer == "reference":
-        given |= {
-            "size": order.size,
-            "places": [(site, 0.0) for site in PROBE_SITES],
-            "progress": _report,
-        }
-        skin = reference.make_probe_scene(rig, **given)
+        places = [(site, 0.0) for site in PROBE_SITES]
+        given |= {"size": order.size, "places": places, "progress": _report}
+        voxels = reference.make_probe_scene(rig, **given)
+        # voxels of another place take longer than the controller waits for its host
+        voxels.profiles.trace_only(places)
+        skin = voxels
     else:
         skin = simulating_probe.make_scene(rig, None, photons=PROBE_PHOTONS, **given)
     # photons of the default sites are traced before the first request: during one, the head is

@@ -1,15 +1,20 @@
 """The report in a browser: no request, nothing refused, accessible in both color schemes."""
 
+import base64
+import io
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import PIL.Image
 import pytest
 
 from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig.reporting import report
+from skinrig.reporting.page import Image, Images, render_page
 
 WIDTHS = (1250, 400)
 
@@ -151,6 +156,29 @@ def test_enlarged_image_reads_values_of_map(browser, pages):
     assert dialog.locator(".stage").screenshot() != before
     page.keyboard.press("Escape")
     page.locator("dialog").wait_for(state="detached")
+    assert problems == []
+    context.close()
+
+
+def test_linked_image_is_compared_with_its_partner(browser, tmp_path):
+    """A repeated image is a link; its group still compares two images."""
+    rng, shown = np.random.default_rng(12345), []
+    for title in ("first", "second"):
+        stream = io.BytesIO()
+        PIL.Image.fromarray(rng.integers(0, 255, (64, 64, 3), np.uint8)).save(stream, "png")
+        address = f"data:image/png;base64,{base64.b64encode(stream.getvalue()).decode()}"
+        shown.append(Image(title, address, "random colors"))
+    first, second = shown
+    groups = [Images((first,)), Images((second, replace(first, title="repeated")))]
+    path = tmp_path / "page.html"
+    path.write_text(render_page("linked", [], groups), encoding="utf-8")
+    assert path.read_text(encoding="utf-8").count("shown above") == 1
+    context, page, problems = opened(browser, path)
+    page.locator(".maps .enlarge").last.press("Enter")
+    dialog = page.locator("dialog[open]")
+    assert dialog.get_by_role("combobox").count() == 2
+    sources = dialog.locator(".stage img").evaluate_all("all => all.map(one => one.src)")
+    assert sources == [first.address, second.address]
     assert problems == []
     context.close()
 

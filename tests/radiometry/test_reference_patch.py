@@ -29,9 +29,9 @@ def patch():
 
 @pytest.fixture(scope="module")
 def renders(patch):
-    """Images of 4 x 4 pixels with few and with four times as many samples."""
+    """Images of 4 x 4 pixels with few and with 16 times as many samples."""
     rig = load_rig("flash")
-    return [render_patch(patch, rig, width_px=4, samples=n, seed=1) for n in (32, 128)]
+    return [render_patch(patch, rig, width_px=4, samples=n, seed=1) for n in (32, 512)]
 
 
 def darkest_quarter(image):
@@ -55,9 +55,11 @@ def test_width_that_splits_voxels_is_refused(patch):
 
 
 def test_noise_of_patch_falls_with_samples(renders):
-    """Tolerance: factor 2 of the expected ratio of 4; variances of 48 values err by 20 %."""
+    """Tolerance: factor 4 of the expected ratio of 16; channels share bands, so that the variance
+    of 16 pixels errs by a third, and the ratio's logarithm by .5.
+    """
     few, many = (np.mean(image.variance) for image in renders)
-    assert 2.0 < few / many < 8.0
+    assert 4.0 < few / many < 64.0
 
 
 @pytest.mark.long

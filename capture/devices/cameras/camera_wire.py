@@ -20,6 +20,7 @@ blob of a frame is uint16, little endian, row by row (``"shape": [H, W]``), or a
 """
 
 import json
+import math
 import zlib
 from collections.abc import Mapping
 from typing import Any
@@ -88,6 +89,9 @@ def info_to_json(info: CameraInfo) -> dict[str, Any]:
 def info_from_json(table: Mapping[str, Any]) -> CameraInfo:
     """Return the properties of a camera; raise `BadMessage` when a field is missing."""
     try:
+        pixel_um = None if table.get("pixel_um") is None else float(table["pixel_um"])
+        if pixel_um is not None and not 0.0 < pixel_um < math.inf:
+            raise ValueError(f"pixel_um: got {pixel_um}, expected more than 0")
         return CameraInfo(
             serial=str(table["serial"]),
             model=str(table["model"]),
@@ -97,6 +101,7 @@ def info_from_json(table: Mapping[str, Any]) -> CameraInfo:
             black=tuple(float(level) for level in table["black"]),
             white=int(table["white"]),
             triggers=tuple(Trigger(name) for name in table["triggers"]),
+            pixel_um=pixel_um,
         )
     except (KeyError, TypeError, ValueError) as exc:
         raise BadMessage(f"info: {exc!r}") from exc

@@ -21,6 +21,7 @@ from rigsim.mitsuba.variant import Renderer, choose_renderer
 from rigsim.needs import face
 from rigsim.needs.effects import Effect, EffectSelection, omitted_effects
 from rigsim.render import camera_rays
+from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.flash.image import WHITE_SCALE, FlashImage
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.scenes.reference.directions import FACET_OIL_FRACTION, FACET_ROUGHNESS, facet_reflection
@@ -152,6 +153,21 @@ class VoxelFlashScene(FlashScene):
         view = self._camera(view_name)
         melanin, blood = pixel_truth(self.skin.patch, view.width_px)
         return {"melanin": melanin, "hemoglobin": blood, "mask": np.ones(melanin.shape, bool)}
+
+    def under(self, led: str) -> FlashScene:
+        """Return the scene itself; voxels are rendered before the tubes alone.
+
+        Raises
+        ------
+        SceneError
+            For an LED.
+        """
+        if led:
+            raise SceneError(
+                f"light: got {led}, expected the tube, because voxels are rendered before it "
+                "alone; capture without --bands, or use renderer mitsuba"
+            )
+        return self
 
     def landmarks_px(self, view_name: str | None = None) -> dict[str, tuple[float, float]]:
         """Return the positions of named skin points; plane skin has none."""

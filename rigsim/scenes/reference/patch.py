@@ -166,7 +166,9 @@ def render_patch(
         scene = describe_patch(patch, rig, float(wavelength_nm), width_px=width_px)
         spp = max(round(0.5 * samples * float(importance[band])), MIN_SAMPLES)
         for half in range(2):
-            image = render_voxels(scene, samples=spp, seed=2 * (band + 1000 * seed) + half)
+            state = np.random.SeedSequence([seed, band, half]).generate_state(1)
+            # 30 bits: Dr.Jit takes 31, and the parts of an image add to the seed
+            image = render_voxels(scene, samples=spp, seed=int(state[0]) >> 2)
             rgb[half] += weights[band] * image[..., 1:2] / white
     # two values alone do not give a variance: the relative one is that of all pixels
     mean = rgb.mean(axis=0)

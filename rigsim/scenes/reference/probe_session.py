@@ -1,6 +1,6 @@
 """Voxels of a person's skin below the fiber probe, as a scene of sessions."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Final
 
 import numpy as np
@@ -9,15 +9,34 @@ from capture.rig import Rig
 from rigsim.fiber.probe_profile import BandProfile, ProfileCache
 from rigsim.fiber.probe_tissue import SkinTissue, TissueError
 from rigsim.mitsuba.variant import Renderer
-from rigsim.needs.effects import Effect, EffectSelection
+from rigsim.needs.effects import Effect, EffectSelection, omitted_effects
+from rigsim.needs.face import BAND_EFFECT, POLARIZATION_EFFECT
+from rigsim.needs.probe import (
+    COLOR_EFFECT,
+    CROSSTALK_EFFECT,
+    DARK_CURRENT_EFFECT,
+    LAYERS_EFFECT,
+    TRANSPORT_EFFECT,
+    WINGS_EFFECT,
+)
+from rigsim.needs.tissue import TISSUE_RULES
 from rigsim.scenes.probe.scene import ProbeScene
 from rigsim.scenes.reference.placed_paths import HeadPlace
 from rigsim.scenes.reference.probe_skin import read_person
 from rigsim.subject.person_skin import PersonSkinError
 
 PHOTONS_PER_LAID_PATH: Final = 100
-UNIFORM_EFFECT: Final = "hair, pores and veins under the head"
-"""Effect of layered tissue of which voxels have a part."""
+PROBE_EFFECTS: Final = (
+    POLARIZATION_EFFECT,
+    BAND_EFFECT,
+    TRANSPORT_EFFECT,
+    CROSSTALK_EFFECT,
+    WINGS_EFFECT,
+    DARK_CURRENT_EFFECT,
+    COLOR_EFFECT,
+)
+"""Effects of the probe that hold for any tissue of several bands."""
+UNEVEN_EFFECT: Final = "pigment and blood that vary below the head"
 
 
 class VoxelProfiles(ProfileCache):
@@ -44,6 +63,24 @@ class VoxelProfiles(ProfileCache):
     ) -> None:
         super().__init__(rig, tissue, photons=photons, seed=seed)
         self._progress = progress
+        self._allowed: frozenset[tuple[str, float]] | None = None
+
+    def trace_only(self, places: Collection[tuple[str, float]]) -> None:
+        """Trace places now, and refuse all others from now on.
+
+        Parameters
+        ----------
+        places
+            Sites with directions of the head, degrees.
+
+        Raises
+        ------
+        TissueError
+            The person's face has no such site.
+        """
+        for site, angle_deg in places:
+            self.profile(site, angle_deg)
+        self._allowed = frozenset(places)
 
     def profile(self, site: str, angle_deg: float = 0.0, suction_mbar: float = 0.0) -> BandProfile:
         """Return the fibers' reflectance at a site, under the probe's nominal suction.
@@ -58,9 +95,15 @@ class VoxelProfiles(ProfileCache):
         Raises
         ------
         TissueError
-            The person's face has no such site.
+            The person's face has no such site, or `trace_only` has excluded the place.
         """
         del suction_mbar
+        if self._allowed is not None and (site, angle_deg) not in self._allowed:
+            known = ", ".join(f"{name} at {turn:g} degrees" for name, turn in sorted(self._allowed))
+            raise TissueError(
+                f"place: got {site} at {angle_deg:g} degrees, expected one whose voxels were "
+                f"traced before the first request: {known}; place the head there"
+            )
         return self._profiles.get((site, angle_deg), lambda: self._read(site, angle_deg))
 
     def _read(self, site: str, angle_deg: float) -> BandProfile:
@@ -98,6 +141,7 @@ class VoxelProbeScene(ProbeScene):
         Called with a line per traced place.
     """
 
+    profiles: VoxelProfiles
     renderer: Renderer = "reference"
     """Renderer of the detector's image and of the skin."""
 
@@ -113,7 +157,12 @@ class VoxelProbeScene(ProbeScene):
     ) -> None:
         super().__init__(rig, tissue, seed=seed, noise_seed=noise_seed, photons=photons)
         self.profiles = VoxelProfiles(rig, tissue, photons=photons, seed=seed, progress=progress)
-        rest = [effect for effect in self.needs if effect.name != UNIFORM_EFFECT]
-        uneven = Effect("pigment and blood that vary below the head", "built", "those of the face")
-        hair = Effect(UNIFORM_EFFECT, "unmodeled", "voxels have pigment and blood alone")
-        self.needs = EffectSelection((*rest, uneven, hair))
+        self.needs = EffectSelection(
+            (
+                *(self.needs[name] for name in PROBE_EFFECTS),
+                *(Effect(rule.name, "built", "voxels have the person's") for rule in TISSUE_RULES),
+                Effect(LAYERS_EFFECT, "built", "epidermis above dermis, thinned by suction"),
+                Effect(UNEVEN_EFFECT, "built", "those of the face"),
+                *omitted_effects("probe", "probe_voxels"),
+            )
+        )

@@ -29,6 +29,12 @@ def session(path, rig="flash", kinds=("dark", "subject"), target=""):
     (path / "session.json").write_text(json.dumps(document))
 
 
+def calibration(path, rig, *kinds):
+    path.mkdir()
+    for kind in kinds:
+        (path / f"{kind}.json").write_text(json.dumps({"kind": kind, "rig": rig}))
+
+
 def appearance(path, session="", kind="appearance", files=(), maps=("melanin", "r_d"), **more):
     path.mkdir()
     document = {
@@ -63,8 +69,9 @@ def test_photographs_are_imported():
 
 def test_skin_session_is_reconstructed_with_own_calibration():
     session(Path("session-a"), "dome", ("dark", "olat"))
-    Path("calibration-dome").mkdir()
-    Path("calibration-flash").mkdir()
+    calibration(Path("calibration-a"), "gradient", "lights")
+    calibration(Path("calibration-dome"), "dome", "geometry", "lights")
+    calibration(Path("calibration-flash"), "flash", "white")
     assert commands()[0] == (
         "skinrig reconstruct session-a --maps normals,r_d --calibration calibration-dome "
         "--out appearance"
@@ -125,10 +132,35 @@ def test_missing_calibration_is_not_named():
     assert commands()[0] == "skinrig reconstruct session-a --maps normals,r_d --out appearance"
 
 
+def test_calibration_of_another_rig_is_not_named():
+    session(Path("session-a"), "dome", ("dark", "olat"))
+    calibration(Path("calibration-flash"), "flash", "white")
+    calibration(Path("calibration-gradient"), "gradient", "lights")
+    Path("calibration-dome").mkdir()
+    assert "--calibration" not in commands()[0]
+
+
 def test_calibration_of_flash_session_is_named():
-    Path("calibration").mkdir()
+    calibration(Path("calibration"), "flash", "white")
     told = suggest_after_session("flash", "session-a", None)
     assert "--calibration calibration" in told
+
+
+def test_probe_is_calibrated_before_reconstruction():
+    session(Path("session-skin"), "probe", ("dark", "place"))
+    calibration(Path("calibration-flash"), "flash", "white")
+    assert commands()[0] == "skinrig simulate probe --target phantom --out session-phantom"
+    session(Path("session-phantom"), "probe", target="phantom")
+    assert commands()[0] == "skinrig calibrate fiber session-phantom --out calibration"
+    calibration(Path("calibration"), "probe", "fibre")  # of an older version
+    told = commands()[0]
+    assert told.startswith("skinrig reconstruct session-skin --maps profiles")
+    assert "--calibration calibration" in told
+
+
+def test_measured_probe_is_offered_capture_of_phantom():
+    told = suggest_after_session("probe", "session-skin", None, source="measured")
+    assert told == "skinrig capture probe --target phantom --out session-phantom"
 
 
 def test_a_demo_below_is_found():

@@ -1,6 +1,8 @@
 """An output that cannot be written is refused before the work for it begins."""
 
+import errno
 import shutil
+import tempfile
 from collections import namedtuple
 
 import pytest
@@ -39,6 +41,22 @@ def test_place_below_file_is_refused(tmp_path):
     (tmp_path / "a").write_text("x")
     with pytest.raises(UnusableError, match="cannot be written to"):
         require_writable(tmp_path / "a" / "b")
+
+
+def test_existing_folder_itself_is_tried(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    out.mkdir()
+    make = tempfile.TemporaryDirectory
+
+    def refuse_out(*, prefix, dir):
+        if dir == out:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return make(prefix=prefix, dir=dir)
+
+    monkeypatch.setattr(tempfile, "TemporaryDirectory", refuse_out)
+    with pytest.raises(UnusableError, match=r"out cannot be written to \(Permission"):
+        require_writable(out)
+    require_writable(tmp_path / "other")
 
 
 def test_check_leaves_nothing_behind(tmp_path):

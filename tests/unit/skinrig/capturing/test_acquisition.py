@@ -1,15 +1,18 @@
 """Captures as they begin and end on the command line, on worlds without pixels."""
 
+import contextlib
 import dataclasses
 
 import pytest
 
-from capture.devices.camera import CameraBusy, CameraError
+from capture.devices.camera import CameraBusy, CameraError, open_camera
 from capture.devices.port import PortBusy
 from capture.plan import Plan, flash_plan
 from capture.rig import load_rig
 from capture.session import Session
 from rigsim.boxes.faults import Faults
+from rigsim.scenes.reference.flash_session import crop_to_patch
+from rigsim.world.serve import serve_world
 from rigsim.world.world import World
 from skinrig.capturing import acquisition, addresses
 from skinrig.cli import main
@@ -43,6 +46,26 @@ def test_dry_run_plan_file_is_captured_unchanged(tmp_path, sim, capsys):
     out = tmp_path / "s"
     assert main(["capture", "flash", "--plan", str(file), "--out", str(out), *sim("w1")]) == 0
     assert Session.open(out).plan.steps == flash_plan(load_rig("flash")).steps
+
+
+def test_cropped_camera_keeps_its_pixels_size(tmp_path, sim):
+    """Server of a patch of voxels: 16 mm on 16 pixels; the whole field would be 260.7 mm."""
+    served = crop_to_patch(load_rig("flash"), 16)
+    argv = ["capture", "flash", "--out", str(tmp_path / "s"), *sim("w9", served)]
+    assert main(argv) == 0
+    assert Session.open(tmp_path / "s").rig == served
+
+
+@pytest.mark.parametrize("served", [crop_to_patch(load_rig("flash"), 16), RIG])
+def test_rig_matches_served_camera(served):
+    with (
+        serve_world(served) as service,
+        contextlib.closing(open_camera(service.addresses["cam"])) as camera,
+    ):
+        info = camera.info
+    assert acquisition.match_camera(load_rig("flash"), info) == served
+    unreported = dataclasses.replace(info, pixel_um=None)
+    assert acquisition.match_camera(load_rig("flash"), unreported) == RIG
 
 
 def test_session_records_subject_consent_and_expiry(tmp_path, sim):

@@ -4,14 +4,18 @@ import html
 import json
 import subprocess
 import sys
+from importlib import import_module
+from inspect import signature
 
 import numpy as np
 import pytest
 
 import skinrig
+from capture.session import Session
 from skinrig.errors import UnusableError, UsageError
 from skinrig.python_api.functions import FIT_KINDS
 from skinrig.python_api.progress import show_progress
+from skinrig.reporting.folders import ReportError
 
 xarray = pytest.importorskip("xarray")
 pytest.importorskip("tqdm")
@@ -106,6 +110,7 @@ def test_export_and_report_refer_files(stack, tmp_path):
     assert "files" in displayed(sent)
 
 
+@pytest.mark.long
 def test_plan_writes_file_with_forecast(tmp_path):
     chosen = skinrig.plan("probe", "sigma_tr<=6%", out=tmp_path / "plan.json")
     assert json.loads(chosen.path.read_text())["rig"] == "probe"
@@ -118,6 +123,7 @@ def test_plan_writes_file_with_forecast(tmp_path):
         (lambda one: one.rename(light="lamp"), "without light"),
         (lambda one: one.drop_vars("direction_y"), "without direction_y"),
         (lambda one: one - 1.0, "minimum -1"),
+        (lambda one: one.where(one < one.max(), np.inf), "infinite values, expected finite"),
     ],
 )
 def test_unusable_array_is_refused(tmp_path, change, message):
@@ -125,6 +131,44 @@ def test_unusable_array_is_refused(tmp_path, change, message):
     with pytest.raises(UsageError, match=message):
         skinrig.load_session(change(images), tmp_path / "session")
     assert not (tmp_path / "session").exists()
+
+
+@pytest.mark.parametrize(
+    ("subject", "consent", "scopes"),
+    [
+        ("none", None, ("any",)),
+        ("P042", None, ()),
+        ("P042", "research,teaching", ("research", "teaching")),
+        ("P042", ["research"], ("research",)),
+    ],
+)
+def test_consent_of_array_is_recorded(tmp_path, subject, consent, scopes):
+    images, _, _ = render_dome()
+    written = skinrig.load_session(images, tmp_path / "s", subject=subject, consent=consent)
+    assert Session.open(written.path).subject.consent_scope == scopes
+
+
+@pytest.mark.parametrize(
+    ("function", "command"),
+    [
+        ("reconstruct", "reconstructing.reconstruct"),
+        ("calibrate", "reconstructing.calibrate"),
+        ("report", "showing.report"),
+    ],
+)
+def test_function_has_options_of_its_command(function, command):
+    module, name = command.split(".")
+    asked = signature(getattr(import_module(f"skinrig.commands.{module}"), name)).parameters
+    given = signature(getattr(skinrig, function)).parameters
+    assert set(asked) - set(given) <= {"json", "sessions"}
+
+
+def test_options_reach_the_work(stack, tmp_path):
+    with pytest.raises(ValueError, match="rank"):
+        skinrig.reconstruct(stack[0], "normals", tmp_path / "maps", progress=False, rank=5)
+    maps = skinrig.reconstruct(stack[0], "normals", tmp_path / "maps", progress=False)
+    with pytest.raises(ReportError, match="compare"):
+        skinrig.report(maps, tmp_path / "page.html", compare=True)
 
 
 def test_missing_or_superfluous_folder_is_refused(stack, tmp_path):

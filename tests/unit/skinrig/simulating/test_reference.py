@@ -1,15 +1,26 @@
 """Sessions of voxel skin: `--renderer reference` of flash rig and probe, and its refusals."""
 
-import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from capture.rig import load_rig
 from capture.session import Session
 from model import store
 from reconstruction.pipeline import recipes as pipeline
+from rigsim.boxes.flash import FlashPop
+from rigsim.fiber.probe_profile import BandProfile
 from rigsim.mitsuba.variant import choose_variant
+from rigsim.needs.tissue import TISSUE_RULES
+from rigsim.scenes.exposing import SceneError
+from rigsim.scenes.reference.flash_session import RenderedSkin, VoxelFlashScene, crop_to_patch
+from rigsim.scenes.reference.patch import PatchImage, draw_patch
+from rigsim.scenes.reference.probe_session import UNEVEN_EFFECT
+from rigsim.subject.person_skin import PersonSkin
+from rigsim.world.suction import HeadState
 from skinrig.calibrating.calibrate import calibrate
+from skinrig.evaluating.subsurface import compare_profiles
 from skinrig.simulating import reference
 from skinrig.simulating.orders import SimulationError
 from skinrig.simulating.serving import ServeOrder, serve_rig
@@ -18,6 +29,7 @@ from skinrig.simulating.simulation import simulate_session
 needs_llvm = pytest.mark.skipif(
     not choose_variant("rgb").is_vectorized, reason="voxels need a vectorized variant"
 )
+ONES = np.ones((28, 3))
 SUBJECT = {"subject": "II", "seed": 5, "renderer": "reference"}
 
 
@@ -82,23 +94,84 @@ def test_flash_patch_is_calibrated_and_reconstructed(flash_session, tmp_path):
     assert found.maps["melanin"].valid.mean() > 0.9
 
 
+@needs_llvm
+@pytest.mark.render
 @pytest.mark.long
-def test_probe_voxels_are_the_truth_of_their_session(tmp_path, monkeypatch):
+def test_patch_noise_follows_session_seed(monkeypatch):
+    monkeypatch.setitem(reference.PATCH_SAMPLES, "small", 2)
+    rig = crop_to_patch(load_rig("flash"), 2)
+    given = {"subject": "II", "site": None, "seed": 5, "size": "small", "progress": None}
+    first, second, again = (
+        reference.make_patch_scene(rig, noise_seed=noise_seed, **given).skin
+        for noise_seed in (1, 2, 1)
+    )
+    np.testing.assert_array_equal(first.patch.melanin, second.patch.melanin)
+    np.testing.assert_array_equal(first.image.rgb, again.image.rgb)
+    assert (first.image.rgb != second.image.rgb).all()
+
+
+@needs_llvm
+def test_patch_under_led_is_refused():
+    """A scene that fell back to its white reference would record wrong frames."""
+    rig = crop_to_patch(load_rig("flash"), 4)
+    person = PersonSkin.of_preset("II")
+    patch = draw_patch(person, "cheek", field_mm=4.0, voxel_mm=0.25)
+    skin = RenderedSkin(patch, PatchImage(np.full((4, 4, 3), 0.5), np.full((4, 4, 3), 1e-4)))
+    scene = VoxelFlashScene(rig, skin)
+    assert scene.under("") is scene
+    pop = FlashPop("1", 0.0, 1.0, "crossed", 0.0, "LED-550-20")
+    with pytest.raises(SceneError, match="got LED-550-20, expected the tube"):
+        scene.exposure("cam", pops=[pop], exposure_s=0.01, seed=0)
+
+
+@pytest.mark.long
+def test_probe_session_measures_its_voxels(tmp_path, monkeypatch):
+    """Rationale: the fibers' light is that of the voxels below the head, which differ by site.
+
+    Tolerance: errors of the phantom and of the photons are common to neighboring fibers, so more
+    than 68 % of fibers may be within one standard error; 84 of each site are judged.
+    """
     monkeypatch.setitem(reference.PATCH_PHOTONS, "small", 1000)
-    done = simulate_session("probe", tmp_path / "session-probe", sites=("cheek",), **SUBJECT)
-    flat = simulate_session(
-        "probe", tmp_path / "session-flat", subject="II", seed=5, sites=("cheek",)
+    simulate_session("probe", tmp_path / "session-phantom", target="phantom")
+    calibrate("fiber", [tmp_path / "session-phantom"], tmp_path / "calibration")
+    sites = {"cheek": "forehead", "forehead": "cheek"}
+    done = simulate_session("probe", tmp_path / "session", sites=tuple(sites), **SUBJECT)
+    pipeline.reconstruct(
+        done.session,
+        want=("profiles",),
+        out=tmp_path / "maps",
+        calibration=tmp_path / "calibration",
     )
-    voxels, layers = (
-        json.loads((one.truth / "appearance.json").read_text())["parameters"]["profiles"][0]
-        for one in (done, flat)
+    found, truth = store.read(tmp_path / "maps"), store.read(done.truth)
+    rows = compare_profiles(found, truth)
+    assert len(rows) == 6
+    assert min(row.coverage for row in rows) > 0.68
+    assert max(row.median for row in rows) < 0.02
+    exchanged = [one | {"site": sites[one["site"]]} for one in truth.parameters["profiles"]]
+    swapped = replace(truth, parameters={**truth.parameters, "profiles": exchanged})
+    assert max(row.coverage for row in compare_profiles(found, swapped)) < 0.5
+    verdicts = {one["name"]: one["verdict"] for one in done.effects}
+    assert verdicts[UNEVEN_EFFECT] == "built"
+    assert {verdicts[rule.name] for rule in TISSUE_RULES} == {"built"}
+    assert verdicts["suction other than nominal"] == "unmodeled"
+
+
+def test_probe_place_that_was_not_traced_is_refused(monkeypatch):
+    rig = load_rig("probe")
+    scene = reference.make_probe_scene(
+        rig, subject="II", seed=5, noise_seed=None, size="small", places=(), progress=None
     )
-    ratio = np.divide(*(np.array(one["reflectance_per_mm2"])[:10] for one in (voxels, layers)))
-    # the mean skin is the same; pigment and blood around the site are not
-    assert 0.6 < ratio.min() < 0.98
-    assert ratio.max() < 1.5
-    built = [one for one in done.effects if one["name"].startswith("pigment and blood that vary")]
-    assert built[0]["verdict"] == "built"
+    traced = []
+    monkeypatch.setattr(
+        scene.profiles, "_read", lambda *place: traced.append(place) or BandProfile(ONES, ONES)
+    )
+    scene.profiles.trace_only([("cheek", 0.0)])
+    head = HeadState("cheek", 0.0, True, 100.0, 5.0)
+    assert scene.fiber_radiance(head).min() > 0.0
+    for other in (replace(head, site="chin"), replace(head, angle_deg=45.0)):
+        with pytest.raises(SceneError, match="expected one whose voxels were traced before"):
+            scene.fiber_radiance(other)
+    assert traced == [("cheek", 0.0)]
 
 
 @pytest.mark.parametrize(
