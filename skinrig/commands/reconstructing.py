@@ -52,10 +52,8 @@ def calibrate(
     console = Console(json)
     (kind,) = replace_former_values([kind], FORMER_NAMES)
     done = make(kind, sessions, out, targets=dome_targets(square_mm, sphere_mm), phantom=phantom)
-    rows = [(*name.split(" ", 1)[::-1], value) for name, value in done.summary]
-    console.print_table(
-        ("quantity", "of", "value"), [(name.replace("_", " "), *rest) for name, *rest in rows]
-    )
+    rows = [(name.replace("_", " "), value) for name, value in done.summary]
+    console.print_table(("quantity", "value"), rows)
     console.print_each("found", done.findings)
     for change in done.drift:
         if change.change and (change.sigmas is None or abs(change.sigmas) > 2):

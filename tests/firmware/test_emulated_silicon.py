@@ -171,7 +171,7 @@ def test_lamp_ends_in_time_beneath_long_answers(mega_flash):
     target, port = mega_flash
     port.ask("SYST:ARM")
     port.ask("FLAS:LAMP ON,200")
-    asked = b"".join(wire.encode(wire.Request(900 + k, port.boot, "SYST:CAP?")) for k in range(9))
+    asked = b"".join(wire.encode(port.make_request("SYST:CAP?")) for _ in range(9))
     port.exchange_raw(asked, 0.5)
     target.wait_for(lambda: lit_spans_s(target, "A3"))
     assert lit_spans_s(target, "A3") == [pytest.approx(0.2, abs=DARK_SLACK_S)]
@@ -212,8 +212,9 @@ def judged():
         def ask_at_once(*texts):
             """Send `SEQ:ARM` and texts in one burst; return the answers by text, in order."""
             texts = (f"SEQ:ARM {JUDGED_ROWS}", *texts)
-            asked = dict(enumerate(texts, 900))
-            frames = [wire.encode(wire.Request(k, port.boot, text)) for k, text in asked.items()]
+            requests = [port.make_request(text) for text in texts]
+            asked = {request.seq: request.text for request in requests}
+            frames = [wire.encode(request) for request in requests]
             lines = port.exchange_raw(b"".join([*frames, frames[0]]), 1.0)
             while len(lines) < len(texts):
                 lines += port.exchange_raw(b"", 10.0)

@@ -10,7 +10,7 @@ from fixtures.compiled.targets import run_mega2560, run_qemu, start_target
 
 from capture.devices.checkup import CheckupPort
 from capture.devices.port import BoxRebooted
-from capture.devices.wire import Request, encode
+from capture.devices.wire import encode
 
 # pyserial leaves ports to the collector
 pytestmark = [
@@ -65,7 +65,7 @@ def hang(port, query):
 
 
 def port_frame(port, text):
-    return encode(Request(9999, port.boot, text))
+    return encode(port.make_request(text))
 
 
 def wait_for_hello(port):

@@ -59,8 +59,10 @@ LED_POWER_DEVIATION: Final = 0.001
 """Relative standard deviation of an LED's energy between pulses."""
 
 MAX_CACHED_FRAMES: Final = 16
+"""Cached frames of any size: one light of all cameras, so that a second exposure costs nothing."""
 FRAME_CACHE_BYTES: Final = 2**29
-"""Cached frames, the larger of both limits, so that a second exposure costs nothing."""
+SMALL_FRAME_BYTES: Final = 2**22
+"""Frames up to this size fill the cache, so that a small session's second pass costs nothing."""
 
 
 class DomeScene(FaceScene):
@@ -152,7 +154,10 @@ class DomeScene(FaceScene):
         self._rows = DomeRows(dome, self.subject, self._caster, motion, how)
         # a capture returns to each light in its next pass
         self._frames: LruCache[tuple[str, int, float], Float32Array] = LruCache(
-            lambda frame: max(MAX_CACHED_FRAMES, FRAME_CACHE_BYTES // frame.nbytes)
+            lambda frame: max(
+                MAX_CACHED_FRAMES,
+                FRAME_CACHE_BYTES // frame.nbytes if frame.nbytes <= SMALL_FRAME_BYTES else 0,
+            )
         )
 
     @property
