@@ -189,7 +189,7 @@ def capture(tmp_path, monkeypatch, kind, seed, *, share=0.08):
         ("dome", 1, 20),
         ("gradient_sphere", 1, 15),
         pytest.param("flash", 20, 250, marks=pytest.mark.long),
-        pytest.param("dome", 10, 300, marks=pytest.mark.long),
+        pytest.param("dome", 10, 250, marks=pytest.mark.long),
         pytest.param("gradient_sphere", 10, 200, marks=pytest.mark.long),
     ],
 )
