@@ -310,7 +310,7 @@ static void keep_and_send(const struct request *request, struct text *frame) {
   struct kept_answer *kept = &core.kept[core.kept_next];
   core.kept_next = (uint8_t)((core.kept_next + 1u) % KEPT_ANSWERS);
   kept->request = *request;
-  kept->size = frame->used; /* one that is longer than KEPT_BYTES is made anew */
+  kept->size = frame->used; /* one that is longer than KEPT_BYTES is made again */
   if (frame->used <= KEPT_BYTES) memcpy(kept->data, frame->data, frame->used);
 }
 

@@ -1,4 +1,4 @@
-"""A fault at each operation of the disk: the session resumes or starts anew, and loses nothing."""
+"""A fault at each operation of the disk: the session resumes or starts again, and loses nothing."""
 
 import contextlib
 import errno
@@ -118,7 +118,7 @@ def strike(path, number, fault, acknowledged, *, resume=False):
 
 
 def finish(path, acknowledged):
-    """Go on as the operator would: resume what is a session, else start anew."""
+    """Go on as the operator would: resume what is a session, else start a new one."""
     if not (path / "session.json").exists():
         assert not acknowledged
         capture(path, Disk(), acknowledged, resume=False)

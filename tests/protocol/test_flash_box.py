@@ -174,7 +174,7 @@ def test_repeated_long_answer_does_not_renew_lease(bench):
     first = bench.raw(long)
     for number in range(1, 6):
         bench.now = asked_s + 0.199 * number
-        assert bench.raw(long) == first  # too long to be kept, so made anew
+        assert bench.raw(long) == first  # too long to be kept, so made again
     bench.now = asked_s + 1.0
     bench.raw(long)
     assert not bench.box.armed

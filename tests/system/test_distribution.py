@@ -66,7 +66,7 @@ def test_unpacked_wheel_starts_without_checkout(wheel, tmp_path):
         )
         assert done.returncode == 0, done.stderr[-2000:]
     where = "import skinrig; print(skinrig.__file__)"
-    told = subprocess.check_output(
+    imported_from = subprocess.check_output(
         [sys.executable, "-P", "-c", where], cwd=tmp_path, env=environment, text=True
     )
-    assert str(tmp_path) in told
+    assert str(tmp_path) in imported_from

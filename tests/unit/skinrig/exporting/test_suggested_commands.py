@@ -18,7 +18,7 @@ def test_suggested_commands_run_to_their_end(patch, tmp_path, monkeypatch, capsy
     consent = [parse_subject("none", None, None).to_json()]
     made = patch.face(source="measured", parameters={"consent": consent})
     store.write(tmp_path / "appearance", made)
-    told = [step.command for step in suggest(scan(Path()), Path())]
-    assert [command.split()[1] for command in told] == ["report", "view", "export"]
-    for command in told:
+    suggested = [step.command for step in suggest(scan(Path()), Path())]
+    assert [command.split()[1] for command in suggested] == ["report", "view", "export"]
+    for command in suggested:
         assert main(shlex.split(command)[1:]) == 0, (command, capsys.readouterr().err)

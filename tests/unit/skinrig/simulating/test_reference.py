@@ -175,7 +175,7 @@ def test_probe_place_that_was_not_traced_is_refused(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("rig", "options", "told"),
+    ("rig", "options", "message"),
     [
         ("dome", {}, "expected mitsuba or fast for the dome rig, because .* 11 days"),
         ("gradient", {}, "expected mitsuba or fast for the gradient rig"),
@@ -186,8 +186,8 @@ def test_probe_place_that_was_not_traced_is_refused(monkeypatch):
         ("probe", {"subject": "homogeneous:0.1,1"}, "expected a person"),
     ],
 )
-def test_reference_is_refused_before_folder_creation(tmp_path, rig, options, told):
-    with pytest.raises(SimulationError, match=told):
+def test_reference_is_refused_before_folder_creation(tmp_path, rig, options, message):
+    with pytest.raises(SimulationError, match=message):
         simulate_session(rig, tmp_path / "session", **SUBJECT | options)
     assert not (tmp_path / "session").exists()
 
