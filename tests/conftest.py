@@ -157,6 +157,7 @@ def pytest_terminal_summary(terminalreporter, config):
         terminalreporter.write_line(
             f"{wanting} tests skipped for want of test data (SKINRIG_TEST_DATA)"
         )
+    real_time.pytest_terminal_summary(terminalreporter)
     if config.getoption("record_durations"):
         seconds = {path: spent for path, spent in recorded_durations_s().items() if path.is_file()}
         measured = Counter()

@@ -1,4 +1,4 @@
-"""Tests on a real line are done again where the machine stood still, and only there."""
+"""Tests on a real line run again where the machine stood still, and once more without a stall."""
 
 import os
 import subprocess
@@ -35,6 +35,7 @@ def test_of_a_lease(bench):
         ("tcp", True, 3, True),
         ("pty", True, 1, True),
         ("tcp", True, 6, False),  # not for ever
+        ("tcp", False, 2, True),
         ("sim", True, 2, False),  # virtual time does not run on
     ],
 )
@@ -42,6 +43,8 @@ def test_failure_during_machine_stall_is_retried(line, stands_still, passes_at, 
     run = trial(tmp_path, line=line, stands_still=stands_still, passes_at=passes_at)
     assert run.returncode == (0 if passed else 1), run.stdout
     assert ("1 passed" if passed else "1 failed") in run.stdout
+    repeated = f"{passes_at} attempts on a real line"
+    assert (repeated in run.stdout) is (passed and passes_at > 1)
 
 
 def test_failure_reports_duration_of_machine_stall(tmp_path):
