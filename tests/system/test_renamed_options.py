@@ -150,7 +150,7 @@ def test_former_names_are_hidden_from_help(path, former, capsys):
         ("analyse brdf", "--method", get_args(Method)),
         ("export", "--unit", METERS_PER_UNIT),
         ("import mesh", "--unit", MM_PER_UNIT),
-        ("import lp", "--encoding", get_args(Encoding)),
+        ("import olat", "--encoding", get_args(Encoding)),
     ],
 )
 def test_closed_set_in_help_is_the_accepted_one(path, option, values):
