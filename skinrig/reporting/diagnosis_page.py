@@ -38,7 +38,9 @@ def build_diagnosis_page(name: str, found: DiagnosedStack) -> str:
     """
     findings = found.diagnosis.findings
     count = len(found.gray)
-    verdict = f"{len(findings)} faults in {count} images" if findings else f"no fault in {count}"
+    verdict = (
+        f"{len(findings)} faults in {count} images" if findings else f"no fault in {count} images"
+    )
     lead: list[page.Block] = [page.Paragraph(f"{verdict}.")]
     rows = [
         (one.fault, _list_images(one), one.ratio_to_limit, one.evidence, one.remedy)
@@ -77,14 +79,17 @@ def _draw_image(found: DiagnosedStack, number: int) -> list[page.Image]:
     small = shrink(np.asarray(found.gray[number]), IMAGE_WIDTH_PX)
     shown = draw_plain_image(f"image {number + 1}", _encode(small / level))
     listed = _encode(_shade_ball(found.listed[number]))
-    own = _encode(_shade_ball(found.diagnosis.directions[number]))
-    return [
+    which = f"of image {number + 1}"
+    images = [
         shown,
-        draw_plain_image(
-            "light of the list", listed, alt=f"ball lit as listed, image {number + 1}"
-        ),
-        draw_plain_image("light in the image", own, alt=f"ball lit as image {number + 1} is"),
+        draw_plain_image("light of the list", listed, alt=f"ball under the listed light {which}"),
     ]
+    direction = found.diagnosis.directions[number]
+    if direction @ found.listed[number] < np.cos(np.radians(MIN_SHOWN_ANGLE_DEG)):
+        own = _encode(_shade_ball(direction))
+        alt = f"ball under the light {which}"
+        images.append(draw_plain_image("light in the image", own, alt=alt))
+    return images
 
 
 def _encode(linear: NDArray[np.floating]) -> NDArray[np.uint8]:

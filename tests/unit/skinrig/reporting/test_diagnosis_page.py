@@ -21,7 +21,8 @@ def test_page_shows_named_images_and_both_lights():
     for number in stack.frames:
         assert f"ball under the listed light of image {number + 1}" in page
         assert f"ball under the light of image {number + 1}" in page
-    assert page.count("ball under the light of image") == len(stack.frames)
+    others = set(range(len(stack.images))) - set(stack.frames)
+    assert not any(f'ball under the light of image {number + 1}"' in page for number in others)
 
 
 def test_page_without_faults_names_number_of_images():
@@ -31,4 +32,4 @@ def test_page_without_faults_names_number_of_images():
     )
     sound = type(found)((), found.order, found.left_out, found.directions, found.strength)
     images = DiagnosedStack(sound, stack.images, unit_vectors(stack.lights))
-    assert f"no fault in {len(stack.images)}" in build_diagnosis_page("s", images)
+    assert f"no fault in {len(stack.images)} images" in build_diagnosis_page("s", images)
