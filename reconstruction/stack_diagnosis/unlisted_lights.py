@@ -170,7 +170,7 @@ def _fit_points(
     n, (height, width) = len(gray), gray.shape[1:]
     scaled = _over_bright_sample(gray).reshape(n, -1).T
     lit = usable.reshape(n, -1).T & (scaled > SHADOW_FRACTION) & (scaled < HIGHLIGHT_FACTOR)
-    weights = lit.astype(np.float64)
+    weights: FloatArray = lit.astype(np.float64)
     products = (lights[:, :, None] * lights[:, None, :]).reshape(n, -1)
     ridge = 1e-9 * np.mean(lights**2) * np.eye(3)
     points = np.zeros((len(scaled), 3))

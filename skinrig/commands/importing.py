@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from skinrig import errors
-from skinrig.commands.help import Command, Subcommands
+from skinrig.commands.help import Command, ImportCommands
 from skinrig.commands.options import (
     Consent,
     ConsentExpires,
@@ -20,7 +20,7 @@ from skinrig.console import Console, format_count, select_attributes
 from skinrig.next_steps import shell_quote
 
 import_app = typer.Typer(
-    cls=Subcommands, help="Import data of other devices.", no_args_is_help=True
+    cls=ImportCommands, help="Import data of other devices.", no_args_is_help=True
 )
 
 
@@ -131,7 +131,6 @@ def import_mesh(
     )
 
 
-@import_app.command("lp", cls=Command, hidden=True)
 @import_app.command("olat", cls=Command)
 @command
 def import_olat(

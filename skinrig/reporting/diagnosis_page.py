@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,8 +77,8 @@ def _step(count: int) -> int:
 def _draw_image(found: DiagnosedStack, number: int) -> list[page.Image]:
     """Return an image, the ball under its listed light, and one under another light it shows."""
     level = float(np.quantile(found.gray, 0.999)) or 1.0
-    small = shrink(np.asarray(found.gray[number]), IMAGE_WIDTH_PX)
-    shown = draw_plain_image(f"image {number + 1}", _encode(small / level))
+    small = shrink(np.asarray(found.gray[number]) / level, IMAGE_WIDTH_PX)
+    shown = draw_plain_image(f"image {number + 1}", _encode(small))
     listed = _encode(_shade_ball(found.listed[number]))
     which = f"of image {number + 1}"
     images = [
@@ -92,7 +93,7 @@ def _draw_image(found: DiagnosedStack, number: int) -> list[page.Image]:
     return images
 
 
-def _encode(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
+def _encode(linear: NDArray[Any]) -> NDArray[np.uint8]:
     return np.asarray(np.rint(255.0 * np.sqrt(np.clip(linear, 0.0, 1.0))), np.uint8)
 
 

@@ -142,7 +142,7 @@ def test_folder_without_list_gives_normals(tmp_path, capsys):
     write(tmp_path / "f", stack, np.ones((len(stack), 3)), inside)
     (tmp_path / "f" / "a.lp").unlink()
     argv = ["import", "olat", str(tmp_path / "f"), "--out", str(tmp_path / "s")]
-    assert main(argv) == 2
+    assert main(argv) == 3
     assert "use --lights estimate" in capsys.readouterr().err
     assert main([*argv, "--lights", "estimate"]) == 0
     shown = capsys.readouterr().out

@@ -160,3 +160,10 @@ def test_closed_set_in_help_is_the_accepted_one(path, option, values):
 
 def test_formats_in_help_are_those_of_writers():
     assert (*APPEARANCE_FORMATS, *SESSION_FORMATS) == FORMATS
+
+
+def test_former_import_command_works_with_notice(tmp_path, capsys):
+    assert main(["import", "lp", str(tmp_path / "none"), "--out", str(tmp_path / "s")]) == 3
+    assert "import lp is now import olat" in capsys.readouterr().err
+    assert main(["import", "--help"]) == 0
+    assert " lp " not in capsys.readouterr().out
