@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from fixtures.faulty_stacks import SHAPES, dome, render
 
 from reconstruction.normal_maps import PhotometricStereoError
-from reconstruction.stack_diagnosis.unlisted_lights import HOLLOW, estimate_lights
+from reconstruction.stack_diagnosis.unlisted_lights import HOLLOW_FACTORS, estimate_lights
 
 COUNTS = (12, 24, 40)
 SIDE_PX, MAX_TILT_DEG, STRENGTH_SPREAD = 96, 60.0, 0.03
@@ -45,7 +45,7 @@ def judge(count: int, seeds: range) -> str:
                 refused += 1
                 continue
             as_found, hollow = (
-                mean_angle_deg(found.directions * sign, lights) for sign in (1.0, HOLLOW)
+                mean_angle_deg(found.directions * sign, lights) for sign in (1.0, HOLLOW_FACTORS)
             )
             right += as_found < hollow
             errors.append(min(as_found, hollow))

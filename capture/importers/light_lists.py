@@ -14,7 +14,13 @@ import numpy as np
 from capture.arrays import BoolArray, Float32Array, Float64Array
 from capture.documents import Fault
 from capture.importers.images import read_photo
-from capture.importers.light_tables import LightListError, parse_vector, read_light_table, read_text
+from capture.importers.light_tables import (
+    LightListError,
+    UnequalCountError,
+    parse_vector,
+    read_light_table,
+    read_text,
+)
 from capture.raw import RawFrame
 
 Kind = Literal["lp", "list", "chrome ball", "images"]
@@ -128,7 +134,7 @@ def find_images(directory: Path) -> tuple[Path, ...]:
     Raises
     ------
     LightListError
-        When there is no such folder, or several subfolders have images.
+        When the folder is missing, or several subfolders have images.
     """
     if not directory.is_dir():
         raise LightListError(
@@ -326,7 +332,7 @@ def _from_text(path: Path, directory: Path, pictures: tuple[Path, ...]) -> Light
 
 def _require_one_each(path: Path, pictures: tuple[Path, ...], vectors: Float64Array) -> None:
     if len(pictures) != len(vectors):
-        raise LightListError(
+        raise UnequalCountError(
             "does not fit the images",
             where=str(path),
             faults=[Fault("lights", str(len(vectors)), f"{len(pictures)}, one per image")],

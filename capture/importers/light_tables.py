@@ -21,6 +21,10 @@ class LightListError(InputError):
     """Raised for a light list, or a folder of images with one, that cannot be imported."""
 
 
+class UnequalCountError(LightListError):
+    """Raised for a list that has more or fewer rows than there are images."""
+
+
 def read_bytes(path: Path) -> bytes:
     """Return the content of a list; refuse what no list is as large as."""
     try:

@@ -49,7 +49,7 @@ MIN_TILT_DEG = 5.0
 """Lower median angles are the limit in which all strengths are equal whatever the lights."""
 START_HEIGHTS = (0.3, 1.0, 3.0)
 """Of the lights over their distance from the axis, from which the fit starts."""
-HOLLOW = np.array([-1.0, -1.0, 1.0])
+HOLLOW_FACTORS = np.array([-1.0, -1.0, 1.0])
 """Factors on normals and lights that leave all shading as it is."""
 DARK_FRACTION = 0.06
 """Of a point's bright sample: darker samples that face the light are in a cast shadow."""
@@ -144,7 +144,7 @@ def estimate_lights(
         lights, normals = lights * (1.0, 1.0, -1.0), normals * (1.0, 1.0, -1.0)
     sign, evidence = _compare_with_hollow(stack, normals, lights, good)
     if evidence < 0.0:
-        lights = lights * HOLLOW
+        lights = lights * HOLLOW_FACTORS
     strength = np.linalg.norm(lights, axis=1)
     stderr_deg = np.degrees(error_rad)
     tilt_deg = float(np.degrees(np.median(np.arccos(lights[:, 2] / strength))))
@@ -173,7 +173,7 @@ def _fit_points(
     weights: FloatArray = lit.astype(np.float64)
     products = (lights[:, :, None] * lights[:, None, :]).reshape(n, -1)
     ridge = 1e-9 * np.mean(lights**2) * np.eye(3)
-    points = np.zeros((len(scaled), 3))
+    points: FloatArray = np.zeros((len(scaled), 3))
     for _ in range(8):
         normal = (weights @ products).reshape(-1, 3, 3) + ridge
         points = np.linalg.solve(normal, ((weights * scaled) @ lights)[..., None])[..., 0]
@@ -276,7 +276,8 @@ def _compare_with_hollow(
     """Return what speaks for the object, and how much; negative: for its hollow twin."""
     dark = (_over_bright_sample(stack.gray) < DARK_FRACTION) & good & stack.usable
     explained = [
-        _explained_shadows(dark, normals * sign, lights * sign, good) for sign in (1.0, HOLLOW)
+        _explained_shadows(dark, normals * sign, lights * sign, good)
+        for sign in (1.0, HOLLOW_FACTORS)
     ]
     evidence = explained[0] - explained[1]
     if abs(evidence) >= MIN_SHADOW_EVIDENCE:

@@ -216,7 +216,7 @@ def diagnose(
     session
         Session of `skinrig import olat`.
     out
-        HTML file that shows the images in question beside balls under their lights.
+        HTML file that shows the images in question, with balls under their lights.
     """
     from reconstruction.pipeline.light_stack import diagnose_images
 

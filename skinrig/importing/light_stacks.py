@@ -18,10 +18,10 @@ from capture.importers.light_lists import (
     read_mask,
     to_gray,
 )
-from capture.importers.light_tables import LightListError
+from capture.importers.light_tables import LightListError, UnequalCountError
 from model.arrays import BoolArray, Float64Array
 
-ESTIMATE: Final = "estimate"
+ESTIMATE_LIGHTS: Final = "estimate"
 """Value of ``--lights`` under which the images themselves show their lights."""
 LINEAR_MISFIT_RATIO = 0.8
 """As for listed lights: values count as linear when they fit clearly better so."""
@@ -70,14 +70,12 @@ def find_lights(
     PhotometricStereoError
         When no list exists and the images do not determine their lights.
     """
-    if lights == ESTIMATE:
+    if lights == ESTIMATE_LIGHTS:
         return _estimate_list(directory, mask, encoding)
     source = Path(lights) if lights else None
     try:
         return FoundLights(find_light_list(directory, lights=source), encoding)
-    except LightListError as error:
-        if error.code != "SR-IMP-007":
-            raise
+    except UnequalCountError as error:
         return _without_special(directory, source, mask, encoding, error)
 
 

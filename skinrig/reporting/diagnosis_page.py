@@ -27,8 +27,8 @@ BALL_RADIUS = 0.92
 def build_diagnosis_page(name: str, found: DiagnosedStack) -> str:
     """Return the page as HTML.
 
-    Each image in question stands next to a matte ball under the light that the list gives it. If
-    the image itself shows another light, a second ball is lit by that.
+    Each image in question has a matte ball under the light that the list gives it. If the image
+    itself shows another light, a second ball is lit by that.
 
     Parameters
     ----------

@@ -5,7 +5,7 @@ import pytest
 from fixtures.faulty_stacks import dome, render
 
 from reconstruction.normal_maps import PhotometricStereoError
-from reconstruction.stack_diagnosis.unlisted_lights import HOLLOW, estimate_lights
+from reconstruction.stack_diagnosis.unlisted_lights import HOLLOW_FACTORS, estimate_lights
 
 
 def angle_deg(found, lights):
@@ -36,7 +36,7 @@ def test_directions_are_found_without_list(shape, count, seed, sign):
     assert found.sign == sign
     assert found.sign_evidence > 0.1
     # the test can fail: the hollow twin explains all shading and is far off
-    assert angle_deg(found.directions * HOLLOW, lights).mean() > 45.0
+    assert angle_deg(found.directions * HOLLOW_FACTORS, lights).mean() > 45.0
 
 
 def test_stated_error_grows_with_unequal_lights():
