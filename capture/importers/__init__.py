@@ -2,7 +2,7 @@
 
 from capture.importers.image_stacks import ImageStackImport, import_light_list
 from capture.importers.images import Photo, PhotoError, read_photo
-from capture.importers.light_lists import LightListError
+from capture.importers.light_tables import LightListError
 from capture.importers.photos import PhotoImport, import_photos
 
 __all__ = [

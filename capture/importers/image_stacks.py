@@ -1,6 +1,6 @@
 """Import images of one object under many lights into a closed SESSION/."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,7 +22,8 @@ from capture.importers.imported_session import (
     make_placeholder_rig,
     make_placeholder_view,
 )
-from capture.importers.light_lists import LightList, LightListError
+from capture.importers.light_lists import LightList
+from capture.importers.light_tables import LightListError
 from capture.plan import Plan, Step, Value
 from capture.rig import Rig
 from capture.session import Session, SubjectRecord
@@ -55,11 +56,12 @@ def import_light_list(
     directory: str | Path,
     *,
     out: str | Path,
-    lights: str | Path | None = None,
+    lights: str | Path | LightList | None = None,
     mask: str | Path | None = None,
     encoding: Encoding = "auto",
     mm_per_px: float | None = None,
     subject: SubjectRecord | None = None,
+    assumed: Sequence[str] = (),
     now: Callable[[], datetime] | None = None,
 ) -> ImageStackImport:
     """Import images of one object under many lights into a closed session; all, or none.
@@ -70,7 +72,7 @@ def import_light_list(
         Folder of the images, in any format that `read_photo` reads; see `light_lists.find`.
     out : str or Path
         The new SESSION/ folder.
-    lights : str or Path, optional
+    lights : str, Path or LightList, optional
         Light list or folder of a chrome ball; default: found in the folder.
     mask : str or Path, optional
         Image that is bright where the object is; default the folder's own ``*mask*``.
@@ -82,6 +84,8 @@ def import_light_list(
         center, and the lights are near.
     subject : Subject, optional
         Subject of the images; default an unnamed one.
+    assumed : sequence of str
+        What the caller assumed about images and lights; stored with the import's own assumptions.
     now : callable, optional
         Clock, returns a time with its zone.
 
@@ -99,7 +103,11 @@ def import_light_list(
     clock = now or (lambda: datetime.now(UTC))
     if encoding not in ("auto", "sRGB", "linear"):
         raise LightListError.at("cannot be read so", "encoding", encoding, "auto, sRGB or linear")
-    found = light_lists.find_light_list(Path(directory), lights=Path(lights) if lights else None)
+    if isinstance(lights, LightList):
+        found = lights
+    else:
+        source = Path(lights) if lights else None
+        found = light_lists.find_light_list(Path(directory), lights=source)
     if len(found.images) < 3:
         raise LightListError(
             "has too few images",
@@ -117,17 +125,19 @@ def import_light_list(
         encoding == "linear" or (encoding == "auto" and _is_linear_despite_encoding(sampled, found))
     )
     shown = "linear" if as_linear else first.encoding
-    assumed = _list_assumptions(found, notes, near=near, as_linear=as_linear, encoding=encoding)
+    every = _list_assumptions(found, notes, near=near, as_linear=as_linear, encoding=encoding)
+    every = [*assumed, *every]
     rig = _rig(found, first.frame, near=near)
     steps = _steps(found)
     extra = {
-        "assumed": assumed,
+        "assumed": every,
         "light_list": {
             "kind": found.kind,
             "near": near,
             "mm_per_px": mm_per_px,
             "encoding": shown,
             "intensity": None if found.intensity is None else found.intensity.tolist(),
+            "stderr_deg": None if found.stderr_deg is None else found.stderr_deg.tolist(),
         },
         "photographs": [
             {"step": step.id, "sha256": hash_file(file), "encoding": shown}
@@ -143,7 +153,7 @@ def import_light_list(
         for step, file in zip(steps, found.images, strict=True):
             _commit(session, step, file, clock, as_linear=as_linear)
     listed, masked = f"{found.file} ({found.kind})", where_mask.name if where_mask else ""
-    return ImageStackImport(str(target), len(steps), listed, shown, masked, assumed)
+    return ImageStackImport(str(target), len(steps), listed, shown, masked, every)
 
 
 def _pixel_shape(frame: raw.RawFrame) -> tuple[int, int]:
@@ -152,12 +162,12 @@ def _pixel_shape(frame: raw.RawFrame) -> tuple[int, int]:
     return (height, width) if frame.pattern == "MONO" else (height // 2, width // 2)
 
 
-def _encode_srgb(linear: FloatArray) -> FloatArray:
+def encode_srgb(linear: FloatArray) -> FloatArray:
     """Encode linear light in [0, 1] as display values, IEC 61966-2-1.
 
     Examples
     --------
-    >>> _encode_srgb(np.array([0.0, 0.214041, 1.0])).round(5).tolist()
+    >>> encode_srgb(np.array([0.0, 0.214041, 1.0])).round(5).tolist()
     [0.0, 0.5, 1.0]
     """
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
@@ -201,7 +211,7 @@ def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, d
 def _is_linear_despite_encoding(samples: Float64Array, found: LightList) -> bool:
     """Return whether the stored values fit the shading model better than their decoded light."""
     decoded = np.clip(samples, 0.0, 1.0)
-    codes = np.asarray(_encode_srgb(decoded))
+    codes = np.asarray(encode_srgb(decoded))
     return _misfit(codes, found.directions) < LINEAR_MISFIT_RATIO * _misfit(
         decoded, found.directions
     )
@@ -231,6 +241,8 @@ def _list_assumptions(
         texts.append("the lights are far away: only their directions count")
         if not found.has_unit_vectors:
             texts.append("the list's rows are positions; give mm_per_px to use them as such")
+    if found.kind == "images":
+        return texts
     if found.intensity is None:
         texts.append("all lights are of one strength, over the exposure where files state it")
     if found.kind != "lp":
@@ -275,7 +287,7 @@ def _commit(
     frame = read_photo(file).frame
     if as_linear:
         share = np.arange(frame.white + 1) / frame.white
-        undone = np.rint(frame.white * _encode_srgb(share)).astype(np.uint16)
+        undone = np.rint(frame.white * encode_srgb(share)).astype(np.uint16)
         frame = replace(frame, cfa=undone[np.minimum(frame.cfa, frame.white)])
     settings: dict[str, Value] = dict(step.settings)
     if frame.exposure_s is not None:

@@ -1,9 +1,8 @@
-"""Read light lists in use in the field: .lp, lights.txt, light_directions.txt, chrome balls.
+"""Read light lists in use in the field: .lp, text, JSON and NumPy files, chrome balls.
 
 Directions are towards the lights: x right, y up, z towards the camera, as .lp files have them.
 """
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,23 +12,35 @@ from typing import Literal
 import numpy as np
 
 from capture.arrays import BoolArray, Float32Array, Float64Array
-from capture.documents import Fault, InputError
+from capture.documents import Fault
 from capture.importers.images import read_photo
+from capture.importers.light_tables import (
+    LightListError,
+    UnequalCountError,
+    parse_vector,
+    read_light_table,
+    read_text,
+)
 from capture.raw import RawFrame
 
-Kind = Literal["lp", "list", "chrome ball"]
+Kind = Literal["lp", "list", "chrome ball", "images"]
 
 IMAGE_SUFFIXES = frozenset(
     ".png .jpg .jpeg .tif .tiff .exr .dng .nef .cr2 .cr3 .arw .orf .rw2 .raf .pef .srw .kdc".split()
 )
 BALL_FOLDER_NAMES = ("chrome", "ball", "sphere", "mirror")
+LIST_NAMES = tuple(
+    f"{stem}.{suffix}"
+    for suffix in ("txt", "json", "npy")
+    for stem in (
+        *("light_directions", "lights", "light_positions"),
+        *("light_dirs", "light_dir", "light_pos", "directions"),
+    )
+)
+"""Names of lists without names of images, the first that exists counts."""
 MAX_LIGHTS = 10_000
 UNIT_LENGTH_RANGE = (0.98, 1.02)
 """Range of lengths in which the rows of a list count as rounded unit vectors."""
-
-
-class LightListError(InputError):
-    """Raised for a light list, or a folder of images with one, that cannot be imported."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +55,8 @@ class LightList:
     """Name of the file or folder of the list."""
     intensity: Float64Array | None = None
     """(N, 3), relative strength per channel, where the folder gives it."""
+    stderr_deg: Float64Array | None = None
+    """(N,), standard error of directions that were estimated from the images."""
 
     @property
     def directions(self) -> Float64Array:
@@ -69,7 +82,9 @@ def natural_sort_key(name: str) -> tuple[tuple[int, int | str], ...]:
     return tuple((0, int(part)) if part.isdigit() else (1, part) for part in parts if part)
 
 
-def find_light_list(directory: Path, *, lights: Path | None = None) -> LightList:
+def find_light_list(
+    directory: Path, *, lights: Path | None = None, images: Sequence[Path] | None = None
+) -> LightList:
     """Find the images of a folder and the lights under which they were taken.
 
     Parameters
@@ -77,8 +92,10 @@ def find_light_list(directory: Path, *, lights: Path | None = None) -> LightList
     directory : Path
         The folder of the images, or one above it that contains a single such folder.
     lights : Path, optional
-        A .lp file, a text file of directions, or a folder of a chrome ball; default: the one found
-        in the folder or next to it, in that order.
+        A .lp file, a text, JSON or NumPy file of directions, or a folder of a chrome ball; default:
+        the one found in the folder or next to it, in that order.
+    images : sequence of Path, optional
+        Images to which a list without names belongs, in its order; default: all of the folder.
 
     Returns
     -------
@@ -101,12 +118,32 @@ def find_light_list(directory: Path, *, lights: Path | None = None) -> LightList
         source = _source(directory)
     if not source.exists():
         raise LightListError("light list not found", where=str(source))
+    pictures = _images_in(directory) if images is None else tuple(images)
     if source.is_dir():
-        pictures = _images_in(directory)
         return LightList(pictures, _from_ball(source, len(pictures)), "chrome ball", source.name)
     if source.suffix.lower() == ".lp":
         return _from_lp(source, directory)
-    return _from_text(source, directory)
+    if source.suffix.lower() in (".json", ".npy"):
+        return _from_table(source, directory, pictures)
+    return _from_text(source, directory, pictures)
+
+
+def find_images(directory: Path) -> tuple[Path, ...]:
+    """Return the images of a folder, or of its only subfolder with images, in natural order.
+
+    Raises
+    ------
+    LightListError
+        When the folder is missing, or several subfolders have images.
+    """
+    if not directory.is_dir():
+        raise LightListError(
+            "folder not found",
+            where=str(directory),
+            advice="Name a folder of images.",
+            code="SR-IMP-005",
+        )
+    return _images_in(_folder(directory))
 
 
 def _images_in(directory: Path) -> tuple[Path, ...]:
@@ -116,7 +153,7 @@ def _images_in(directory: Path) -> tuple[Path, ...]:
     """
     listed = directory / "filenames.txt"
     if listed.is_file():
-        names = [line.strip() for line in _text(listed).splitlines() if line.strip()]
+        names = [line.strip() for line in read_text(listed).splitlines() if line.strip()]
         return tuple(_find_image_file(name, directory, listed) for name in names)
     files = (f for f in directory.iterdir() if f.is_file() and not f.name.startswith("."))
     images = (f for f in files if f.suffix.lower() in IMAGE_SUFFIXES and not _is_mask(f))
@@ -202,7 +239,8 @@ def _source(directory: Path) -> Path:
                 faults=[Fault("*.lp", ", ".join(f.name for f in lists), "one")],
                 advice="Name one with --lights.",
             )
-        for candidate in (*lists, folder / "light_directions.txt", folder / "lights.txt"):
+        named = (folder / name for name in LIST_NAMES)
+        for candidate in (*lists, *named):
             if candidate.is_file():
                 return candidate
     for folder in (directory, directory.parent):
@@ -212,38 +250,15 @@ def _source(directory: Path) -> Path:
     raise LightListError(
         "has no light list",
         where=str(directory),
-        faults=[Fault("lights", "none", "*.lp, lights.txt, light_directions.txt or chrome/")],
-        advice="Put one next to the images, or name it with --lights.",
+        faults=[Fault("lights", "none", "*.lp, lights.txt, light_directions.json or chrome/")],
+        advice="Put one next to the images, name it with --lights, or use --lights estimate.",
         code="SR-IMP-006",
     )
 
 
-def _text(path: Path) -> str:
-    try:
-        data = path.read_bytes()
-    except OSError as exc:
-        raise LightListError(f"cannot be read: {exc.strerror}", where=str(path)) from exc
-    if len(data) > 2**24 or b"\0" in data:
-        raise LightListError("is not a light list", where=str(path))
-    return data.decode("utf-8-sig", "replace")
-
-
-def _vector(words: Sequence[str], where: str) -> list[float]:
-    try:
-        vector = [float(word.replace(",", ".") if "." not in word else word) for word in words]
-    except ValueError:
-        vector = []
-    if len(vector) != 3 or not all(map(math.isfinite, vector)) or not any(vector):
-        got = " ".join(words)[:60] or "nothing"
-        raise LightListError(
-            "is not a light list", where=where, faults=[Fault("light", got, "three numbers x y z")]
-        )
-    return vector
-
-
 def _from_lp(path: Path, directory: Path) -> LightList:
     """Read an .lp file: a count, then a file name and x y z in each line."""
-    lines = [line.strip() for line in _text(path).splitlines() if line.strip()]
+    lines = [line.strip() for line in read_text(path).splitlines() if line.strip()]
     count = int(lines[0]) if lines and re.fullmatch(r"\d+", lines[0]) else None
     rows = lines[1:] if count is not None else lines
     if not rows or (count is not None and count != len(rows)) or len(rows) > MAX_LIGHTS:
@@ -255,7 +270,7 @@ def _from_lp(path: Path, directory: Path) -> LightList:
     for number, row in enumerate(rows, start=1 if count is None else 2):
         words = row.split()
         where = f"{path}, line {number}"
-        vectors.append(_vector(words[-3:], where))
+        vectors.append(parse_vector(words[-3:], where))
         pictures.append(_find_image_file(" ".join(words[:-3]), directory, path))
     if len(set(pictures)) < len(pictures):
         raise LightListError("contains an image twice", where=str(path))
@@ -285,9 +300,9 @@ def _find_image_file(name: str, directory: Path, source: Path) -> Path:
     )
 
 
-def _from_text(path: Path, directory: Path) -> LightList:
-    """Read rows x y z, with or without a count, for the images in their natural order."""
-    rows = [line.split() for line in _text(path).splitlines() if line.split()]
+def _from_text(path: Path, directory: Path, pictures: tuple[Path, ...]) -> LightList:
+    """Read rows x y z, with or without a count, for these images."""
+    rows = [line.split() for line in read_text(path).splitlines() if line.split()]
     count = None
     if rows and len(rows[0]) == 1 and rows[0][0].isdigit():
         count, rows = int(rows[0][0]), rows[1:]
@@ -297,22 +312,14 @@ def _from_text(path: Path, directory: Path) -> LightList:
             where=str(path),
             faults=[Fault("lines", str(len(rows)), f"{count}, as in its first line")],
         )
-    vectors = np.array([_vector(row, f"{path}, light {k + 1}") for k, row in enumerate(rows)])
-    pictures = _images_in(directory)
-    if len(pictures) != len(rows):
-        raise LightListError(
-            "does not fit the images",
-            where=str(path),
-            faults=[Fault("lights", str(len(rows)), f"{len(pictures)}, one per image")],
-            advice="Move images that do not belong to the series away, or name the mask *mask*.",
-            code="SR-IMP-007",
-        )
+    vectors = np.array([parse_vector(row, f"{path}, light {k + 1}") for k, row in enumerate(rows)])
+    _require_one_each(path, pictures, vectors)
     strengths = directory / "light_intensities.txt"
     intensity = None
     if strengths.is_file():
-        lines = [line.split() for line in _text(strengths).splitlines() if line.split()]
+        lines = [line.split() for line in read_text(strengths).splitlines() if line.split()]
         intensity = np.array(
-            [_vector(row, f"{strengths}, light {k}") for k, row in enumerate(lines)]
+            [parse_vector(row, f"{strengths}, light {k}") for k, row in enumerate(lines)]
         )
         if intensity.shape != vectors.shape or (intensity <= 0).any():
             raise LightListError(
@@ -321,6 +328,29 @@ def _from_text(path: Path, directory: Path) -> LightList:
                 faults=[Fault("rows", str(len(lines)), f"{len(rows)} of numbers > 0")],
             )
     return LightList(pictures, vectors, "list", path.name, intensity)
+
+
+def _require_one_each(path: Path, pictures: tuple[Path, ...], vectors: Float64Array) -> None:
+    if len(pictures) != len(vectors):
+        raise UnequalCountError(
+            "does not fit the images",
+            where=str(path),
+            faults=[Fault("lights", str(len(vectors)), f"{len(pictures)}, one per image")],
+            advice="Move images that do not belong to the series away, or name the mask *mask*.",
+            code="SR-IMP-007",
+        )
+
+
+def _from_table(path: Path, directory: Path, pictures: tuple[Path, ...]) -> LightList:
+    """Read vectors from JSON or NumPy, with names of images where the file has them."""
+    names, vectors = read_light_table(path)
+    if names:
+        pictures = tuple(_find_image_file(name, directory, path) for name in names)
+        if len(set(pictures)) < len(pictures):
+            raise LightListError("contains an image twice", where=str(path))
+        return LightList(pictures, vectors, "lp", path.name)
+    _require_one_each(path, pictures, vectors)
+    return LightList(pictures, vectors, "list", path.name)
 
 
 def _from_ball(folder: Path, count: int) -> Float64Array:

@@ -23,7 +23,7 @@ from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.masked_map import masked_map
 from reconstruction.stack_diagnosis import Diagnosis, diagnose_stack
 
-STAGE_REVISION = 3
+STAGE_REVISION = 4
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = ("normals", "albedo", "residual")
@@ -62,6 +62,8 @@ class StackLights:
     near: bool
     mm_per_px: float
     alive: BoolArray
+    stderr_rad: float
+    """Standard error of the directions, where they were estimated from the images; else 0."""
 
 
 def graph(inputs: Inputs) -> list[stages.PipelineStage]:
@@ -133,17 +135,19 @@ def _stack(session: Session) -> LightStack:
 def _lights(inputs: Inputs, stack: LightStack) -> StackLights:
     """Diagnose the images; use the order that the pixels show, without images that are wrong."""
     vectors, near, scale = _listed_lights(inputs.session, stack)
+    given = inputs.session.manifest.extra["light_list"].get("stderr_deg")
+    stderr_rad = 0.0 if given is None else float(np.radians(np.median(given)))
     alive = np.ones(len(vectors), bool)
     try:
         found = _diagnose(stack, vectors, near=near)
     except PhotometricStereoError as error:
         inputs.assumed.append(f"the lights belong to their images ({error})")
-        return StackLights(vectors, near, scale, alive)
+        return StackLights(vectors, near, scale, alive, stderr_rad)
     inputs.assumed += [f"{one.fault}: {one.evidence}; {one.remedy}" for one in found.findings]
     inputs.noted["diagnosis"] = [one.to_json() for one in found.findings]
     if np.count_nonzero(~found.left_out) >= MIN_KEPT_IMAGES:
         alive = ~found.left_out
-    return StackLights(vectors[found.order], near, scale, alive)
+    return StackLights(vectors[found.order], near, scale, alive, stderr_rad)
 
 
 def _listed_lights(session: Session, stack: LightStack) -> tuple[Float64Array, bool, float]:
@@ -152,7 +156,7 @@ def _listed_lights(session: Session, stack: LightStack) -> tuple[Float64Array, b
     if not isinstance(listed, dict):
         raise InputsError(
             f"{session.path}: got no light list, expected a session of images under listed lights; "
-            "import the images with their list by `skinrig import lp`"
+            "import the images with their list by `skinrig import olat`"
         )
     vectors = np.array(
         [session.rig.light(str(r.index["light"])).position_mm for r in stack.records], np.float64
@@ -171,8 +175,27 @@ def _diagnose(stack: LightStack, vectors: Float64Array, *, near: bool) -> Diagno
     )
 
 
-def diagnose_session(path: str | Path) -> Diagnosis:
-    """Diagnose the images of a session with a light list.
+@dataclass(frozen=True, slots=True)
+class DiagnosedStack:
+    """Images of a session with what is wrong with them.
+
+    Attributes
+    ----------
+    diagnosis
+        Of the images.
+    gray
+        (N, H, W), over exposure and strength of the light.
+    listed
+        (N, 3), unit vectors of the list, in the order of the images.
+    """
+
+    diagnosis: Diagnosis
+    gray: Float32Array
+    listed: Float64Array
+
+
+def diagnose_images(path: str | Path) -> DiagnosedStack:
+    """Diagnose the images of a session with a light list, and return them, too.
 
     Parameters
     ----------
@@ -189,7 +212,12 @@ def diagnose_session(path: str | Path) -> Diagnosis:
     session = Session.open(path)
     stack = _stack(session)
     vectors, near, _ = _listed_lights(session, stack)
-    return _diagnose(stack, vectors, near=near)
+    return DiagnosedStack(_diagnose(stack, vectors, near=near), stack.gray, unit_vectors(vectors))
+
+
+def diagnose_session(path: str | Path) -> Diagnosis:
+    """Diagnose the images of a session; see `diagnose_images`."""
+    return diagnose_images(path).diagnosis
 
 
 def _points_mm(shape: tuple[int, int], mm_per_px: float) -> Float64Array:
@@ -236,7 +264,8 @@ def _normals(inputs: Inputs, stack: LightStack, lights: StackLights) -> Mapping[
     valid = best.valid
     n = np.where(valid[..., None], best.normals, 0.0)
     # the angle's error is isotropic across the normal: half its variance per tangential axis
-    each = best.stderr_rad[..., None] / np.sqrt(2.0) * np.sqrt(np.maximum(1.0 - n**2, 0.0))
+    stderr_rad = np.hypot(best.stderr_rad, lights.stderr_rad)
+    each = stderr_rad[..., None] / np.sqrt(2.0) * np.sqrt(np.maximum(1.0 - n**2, 0.0))
     relative = best.residual / np.where(valid, best.albedo, 1.0)
     frame = "image frame: x right, y up, z towards the camera"
     misfit = "root mean square misfit over albedo"

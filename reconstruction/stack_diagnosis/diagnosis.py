@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from reconstruction.photometric_stereo import estimate_normals
 from reconstruction.stack_diagnosis import axis_faults, frame_faults, light_faults
 from reconstruction.stack_diagnosis.finding import Finding
 from reconstruction.stack_diagnosis.light_labels import find_order
+from reconstruction.stack_diagnosis.reduced_stack import ReducedStack, reduce_stack
 from reconstruction.stack_diagnosis.shading_space import (
     MAX_POINTS,
     choose_points,
@@ -28,8 +28,6 @@ MIN_FRAMES = 6
 MIN_POINTS = 30
 MIN_LEVEL, MAX_LEVEL = 1e-3, 2.0
 """Bright samples outside this range are in another unit than the white level."""
-MAX_SIDE_PX = 160
-"""Images are reduced to this size: faults of lights are in all pixels."""
 MIN_SINGULAR_RATIO = 0.01
 """Ratio of extreme singular values of the light vectors below which all images are alike."""
 MIN_STRENGTH = 1e-3
@@ -71,15 +69,6 @@ class Diagnosis:
     strength: Float64Array
 
 
-@dataclass(frozen=True, slots=True)
-class _Stack:
-    """Reduced images (N, H, W), which samples are usable, and the object (H, W)."""
-
-    gray: Float64Array
-    usable: BoolArray
-    inside: BoolArray
-
-
 def diagnose_stack(
     gray: FloatArray,
     light_directions: FloatArray,
@@ -118,7 +107,7 @@ def diagnose_stack(
     listed = unit_vectors(np.asarray(light_directions, np.float64))
     checks.shape("light_directions", listed, (len(images), 3))
     mask = np.ones(images.shape[1:], bool) if inside is None else np.asarray(inside, bool)
-    stack, unusable = _reduce(images, usable, mask)
+    stack, unusable = reduce_stack(images, usable, mask)
     checks.require(stack.inside.any(), "inside", "no pixels", "an object of some pixels")
     level = float(np.quantile(stack.gray[stack.usable], 0.999)) if stack.usable.any() else 0.0
     checks.require(level > 0.0, "gray", "no light in any image", "positive samples")
@@ -158,7 +147,7 @@ def _named_in(findings: Iterable[Finding], count: int) -> BoolArray:
 
 
 def _diagnose_light(
-    stack: _Stack, listed: Float64Array, out: BoolArray, rng: np.random.Generator
+    stack: ReducedStack, listed: Float64Array, out: BoolArray, rng: np.random.Generator
 ) -> Diagnosis:
     """Find faults of the list, of the light and of single images among those not left out."""
     kept = np.flatnonzero(~out)
@@ -213,7 +202,7 @@ def _diagnose_light(
 
 
 def _find_in_images(
-    stack: _Stack,
+    stack: ReducedStack,
     rows: Float64Array,
     directions: Float64Array,
     used: NDArray[np.intp],
@@ -267,28 +256,3 @@ def _renumbered(one: Finding, numbers: NDArray[np.intp]) -> Finding:
     if one.order is not None and len(one.order) == len(numbers):
         order = tuple(int(numbers[k]) for k in one.order)
     return replace(one, frames=tuple(int(numbers[k]) for k in one.frames), order=order)
-
-
-def _reduce(
-    gray: NDArray[Any], usable: BoolArray | None, inside: BoolArray
-) -> tuple[_Stack, Float64Array]:
-    """Average blocks of pixels, image by image, and return each image's unusable fraction.
-
-    A block is usable where all of its samples are.
-    """
-    height, width = inside.shape
-    step = max(1, int(np.ceil(max(height, width) / MAX_SIDE_PX)))
-    h, w = height // step, width // step
-
-    def blocks(values: NDArray[Any]) -> NDArray[Any]:
-        return values[: h * step, : w * step].reshape(h, step, w, step)
-
-    means, good, unusable = np.zeros((len(gray), h, w)), np.zeros((len(gray), h, w), bool), []
-    for number, image in enumerate(gray):
-        finite = np.isfinite(image)
-        kept = finite if usable is None else finite & usable[number]
-        means[number] = blocks(np.where(finite, image, 0.0)).mean(axis=(1, 3), dtype=np.float64)
-        good[number] = blocks(kept).all(axis=(1, 3))
-        unusable.append(1.0 - float(kept[inside].mean()) if inside.any() else 1.0)
-    whole = np.asarray(blocks(inside).all(axis=(1, 3)))
-    return _Stack(means, good, whole), np.array(unusable)

@@ -41,9 +41,10 @@ def find_unlit(gray: Float64Array, inside: BoolArray) -> Iterator[Finding]:
     for number in np.flatnonzero(relative < MIN_BRIGHTNESS):
         empty = np.ptp(gray[number]) == 0.0
         fault = "empty image" if empty else "dead light"
-        what = "has one value everywhere" if empty else f"has {relative[number]:.1%} of the light"
+        light = f"has {relative[number]:.1%} of the light of the median image"
+        what = "has one value everywhere" if empty else light
         yield Finding(
-            fault, (int(number),), f"image {number + 1} {what} of the median image",
+            fault, (int(number),), f"image {number + 1} {what}",
             1.0 - float(relative[number]), 1.0 - MIN_BRIGHTNESS,
             "take the image again, or leave its row of the list out",
         )  # fmt: skip

@@ -20,7 +20,7 @@ NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
     "mitsuba": "read README.txt: how to load the scene, and where it differs from the session",
     "stokes": "read stokes.json: axis, channels, and components not measured",
     "zarr": "in Python: xarray.open_zarr('DIR/session.zarr', group='KIND', consolidated=False)",
-    "lp": "skinrig import lp DIR --out SESSION reads the folder back",
+    "lp": "skinrig import olat DIR --out SESSION reads the folder back",
 }
 """Next step after an export, by format."""
 

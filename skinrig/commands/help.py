@@ -24,6 +24,8 @@ HELP_SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
 OTHER_SECTION: Final = "More"
 
 
+FORMER_IMPORT_NAMES: Final = {"lp": "olat"}
+
 _TYPE_LABELS: Final = (
     (re.compile(r"<list\[(\w+)\]>"), r"<\1>"),
     (re.compile("<%Y-%m-%d>"), "<date>"),
@@ -127,6 +129,19 @@ class Subcommands(TyperGroup):
             formatter.write_dl(
                 [(name, summarize_command(one)) for name, one in found if one is not None]
             )
+
+
+class ImportCommands(Subcommands):
+    """Commands of `skinrig import`; a former name works with a notice on stderr."""
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return the command of this name, or of its present name."""
+        present = FORMER_IMPORT_NAMES.get(cmd_name)
+        if present is None:
+            return super().get_command(ctx, cmd_name)
+        if not ctx.resilient_parsing:
+            print(format_notice(f"import {cmd_name}", f"import {present}"), file=sys.stderr)
+        return super().get_command(ctx, present)
 
 
 class RigCommand(Command):

@@ -6,13 +6,21 @@ from typing import Annotated
 import typer
 
 from skinrig import errors
-from skinrig.commands.help import Command, Subcommands
-from skinrig.commands.options import Consent, ConsentExpires, Json, Out, choice, command
+from skinrig.commands.help import Command, ImportCommands
+from skinrig.commands.options import (
+    Consent,
+    ConsentExpires,
+    Json,
+    Out,
+    check_output_page,
+    choice,
+    command,
+)
 from skinrig.console import Console, format_count, select_attributes
 from skinrig.next_steps import shell_quote
 
 import_app = typer.Typer(
-    cls=Subcommands, help="Import data of other devices.", no_args_is_help=True
+    cls=ImportCommands, help="Import data of other devices.", no_args_is_help=True
 )
 
 
@@ -123,13 +131,13 @@ def import_mesh(
     )
 
 
-@import_app.command("lp", cls=Command)
+@import_app.command("olat", cls=Command)
 @command
-def import_lp(
+def import_olat(
     directory: Path,
     /,
     out: Out,
-    lights: Path | None = None,
+    lights: str | None = None,
     mask: Path | None = None,
     encoding: Annotated[str, choice("auto", "sRGB", "linear")] = "auto",
     mm_per_px: float | None = None,
@@ -138,17 +146,17 @@ def import_lp(
     consent_expires: ConsentExpires = None,
     json: Json = False,
 ) -> None:
-    """Convert images of one object under many lights, with their light list, to a session.
+    """Convert images of one object, one light at a time, to a session.
 
-    Example: skinrig import lp rti-folder --out session-rti
+    Example: skinrig import olat rti-folder --out session-rti
 
     Parameters
     ----------
     directory
         Folder of images, one per light.
     lights
-        Light list: .lp file, list of directions, or folder of a chrome ball's images; default:
-        found in the folder.
+        Light list: .lp, text, JSON or NumPy file, or folder of a chrome ball's images; estimate:
+        from the images alone; default: found in the folder.
     mask
         Image whose bright pixels are the object; default: the folder's *mask* file, else all.
     encoding
@@ -160,17 +168,20 @@ def import_lp(
     """
     from capture.importers import import_light_list
     from skinrig.consent import parse_subject
+    from skinrig.importing.light_stacks import find_lights
 
     console = Console(json)
     person = parse_subject(subject, consent, consent_expires)
+    found = find_lights(directory, lights=lights, mask=mask, encoding=encoding)  # type: ignore[arg-type]
     done = import_light_list(
         directory,
         out=out,
-        lights=lights,
+        lights=found.lights,
         mask=mask,
-        encoding=encoding,  # type: ignore[arg-type]
+        encoding=found.encoding,
         mm_per_px=mm_per_px,
         subject=person,
+        assumed=found.assumed,
     )
     console.print_each("assumed", done.assumed)
     console.print_line(
@@ -184,25 +195,35 @@ def import_lp(
 
 
 @command
-def diagnose(session: Path, /, json: Json = False) -> None:
+def diagnose(
+    session: Path,
+    /,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", callback=check_output_page, show_default=False)
+    ] = None,
+    json: Json = False,
+) -> None:
     """Find what is wrong with images under listed lights; exit code 1 if anything is.
 
     The images themselves show it: light lists in another order, swapped or wrong lights, flipped
     axes, a wrong transfer curve, ambient light, near lights, drift, and empty, repeated, moved or
     clipped images. `reconstruct` uses the order and leaves out the images that this command names.
 
-    Example: skinrig diagnose session-rti
+    Example: skinrig diagnose session-rti --out diagnosis.html
 
     Parameters
     ----------
     session
-        Session of `skinrig import lp`.
+        Session of `skinrig import olat`.
+    out
+        HTML file that shows the images in question, with balls under their lights.
     """
-    from reconstruction.pipeline.light_stack import diagnose_session
+    from reconstruction.pipeline.light_stack import diagnose_images
 
     console = Console(json)
     console.progress("read the images and compare them with their light list")
-    found = diagnose_session(session)
+    stack = diagnose_images(session)
+    found = stack.diagnosis
     rows = [
         (
             one.fault,
@@ -218,11 +239,18 @@ def diagnose(session: Path, /, json: Json = False) -> None:
         console.print_table(head, rows)
     else:
         console.print_line(f"{session}: no fault was found in {len(found.order)} images")
+    if out is not None:
+        from skinrig.atomic_file import write_atomically
+        from skinrig.reporting.diagnosis_page import build_diagnosis_page
+
+        write_atomically(out, build_diagnosis_page(str(session), stack))
+        console.print_line(f"{out}: open it in a browser")
     after = f"reconstruct {shell_quote(session)} --maps normals,albedo --out appearance"
     console.print_line(f"next: skinrig {after}")
     console.print_document(
         "skinrig.diagnosis/1",
         {
+            "page": out,
             "session": session,
             "findings": [one.to_json() for one in found.findings],
             "order": [int(number) + 1 for number in found.order],

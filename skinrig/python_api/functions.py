@@ -259,7 +259,7 @@ def diagnose(session: FolderLike) -> DiagnosedSession:
     Parameters
     ----------
     session
-        Session of `load_session` from an array, or of `skinrig import lp`.
+        Session of `load_session` from an array, or of `skinrig import olat`.
 
     Raises
     ------

@@ -6,12 +6,16 @@ from hypothesis import strategies as st
 
 from model.vectors import unit_vectors
 from reconstruction import stack_diagnosis
+from reconstruction.normal_maps import PhotometricStereoError
 from reconstruction.stack_diagnosis import (
     axis_faults,
     frame_faults,
     light_faults,
     light_labels,
+    reduced_stack,
     shading_space,
+    special_images,
+    unlisted_lights,
 )
 
 FEW = settings(derandomize=True, deadline=None, max_examples=8, database=None)
@@ -96,3 +100,35 @@ def test_checks_of_sound_images_find_nothing(seed, lights):
     assert abs(slope) < 0.1
     assert error > 0.0
     assert abs(np.median(rest)) < 1e-9
+
+
+@FEW
+@given(seed=SEED, lights=st.integers(10, 20), gain=st.sampled_from([1e-12, 1.0, 1e12]))
+def test_unlisted_lights_follow_their_images(seed, lights, gain):
+    rng = np.random.default_rng(seed)
+    images, inside, _, directions = matte_ball(rng, lights, side=32)
+    order = rng.permutation(lights)
+    try:
+        found, again = (
+            unlisted_lights.estimate_lights(one, inside=inside, rng=np.random.default_rng(0))
+            for one in (images, gain * images[order])
+        )
+    except PhotometricStereoError:  # few lights near the axis leave the directions open
+        return
+    np.testing.assert_allclose(again.directions, found.directions[order], atol=0.02)
+    np.testing.assert_allclose(again.stderr_deg, found.stderr_deg[order], atol=1.0)
+    angle = np.degrees(np.arccos(np.clip((found.directions * directions).sum(1), -1, 1)))
+    assert angle.mean() < 3.0 + 3.0 * np.median(found.stderr_deg)
+
+
+@FEW
+@given(seed=SEED, lights=st.integers(8, 20), level=st.floats(0.2, 0.9))
+def test_special_images_are_found_in_any_unit(seed, lights, level):
+    rng = np.random.default_rng(seed)
+    images, inside, _, _ = matte_ball(rng, lights)
+    full = level * images.sum(axis=0) / images.sum(axis=0).max()
+    stack = 1e6 * np.concatenate([images, [full, 0.0 * full]])
+    reduced, unusable = reduced_stack.reduce_stack(stack, None, inside)
+    assert not unusable.any()
+    named = special_images.find_special_images(reduced.gray, reduced.inside)
+    assert {lights: "full-bright", lights + 1: "dark"}.items() <= named.items()

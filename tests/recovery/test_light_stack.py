@@ -1,5 +1,7 @@
 """Pictures with a light list, from the folder to normals, by the command line's own functions."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -40,7 +42,7 @@ def write(folder, images, lights, inside):
 
 
 def made(tmp_path, folder, capsys):
-    assert main(["import", "lp", str(folder), "--out", str(tmp_path / "s")]) == 0
+    assert main(["import", "olat", str(folder), "--out", str(tmp_path / "s")]) == 0
     argv = ["reconstruct", str(tmp_path / "s"), "--maps", "normals,albedo", "--out"]
     assert main([*argv, str(tmp_path / "a")]) == 0
     capsys.readouterr()
@@ -127,6 +129,38 @@ def test_real_buddha_normals_without_options_match_reference(test_data):
 def test_stack_unsuitable_for_melanin_is_refused(tmp_path, capsys):
     images, lights, _, inside = ball()
     write(tmp_path / "f", images, lights, inside)
-    assert main(["import", "lp", str(tmp_path / "f"), "--out", str(tmp_path / "s")]) == 0
+    assert main(["import", "olat", str(tmp_path / "f"), "--out", str(tmp_path / "s")]) == 0
     with pytest.raises(ValueError, match="melanin"):
         pipeline.reconstruct(tmp_path / "s", want=["melanin"], out=tmp_path / "a")
+
+
+def test_folder_without_list_gives_normals(tmp_path, capsys):
+    """Lights, a dark and a full-bright image are found from pixels; errors state the lights'."""
+    images, _, n, inside = ball(count=20, side=80)
+    full = np.minimum(images.sum(axis=0) / 4.0, 1.0)
+    stack = np.concatenate([[full], images[:7], [0.01 * images[0]], images[7:]])
+    write(tmp_path / "f", stack, np.ones((len(stack), 3)), inside)
+    (tmp_path / "f" / "a.lp").unlink()
+    argv = ["import", "olat", str(tmp_path / "f"), "--out", str(tmp_path / "s")]
+    assert main(argv) == 3
+    assert "use --lights estimate" in capsys.readouterr().err
+    assert main([*argv, "--lights", "estimate"]) == 0
+    shown = capsys.readouterr().out
+    assert "00.tif is full-bright" in shown
+    assert "08.tif is dark" in shown
+    argv = ["reconstruct", str(tmp_path / "s"), "--maps", "normals", "--out"]
+    assert main([*argv, str(tmp_path / "a")]) == 0
+    appearance = store.read(tmp_path / "a")
+    assert error_deg(appearance, n, inside).mean() < 2.0
+    stated = appearance.maps["normals"].stderr[inside & appearance.maps["normals"].valid]
+    assert np.degrees(np.sqrt((stated**2).sum(axis=-1))).mean() > 0.3
+
+
+def test_full_bright_images_beyond_list_are_set_aside(tmp_path, capsys):
+    images, lights, n, inside = ball()
+    full = np.minimum(images.sum(axis=0) / 4.0, 1.0)
+    write(tmp_path / "f", [full, *images], np.ones((len(images) + 1, 3)), inside)
+    (tmp_path / "f" / "a.lp").unlink()
+    (tmp_path / "f" / "light_dirs.json").write_text(json.dumps({"lights": lights.tolist()}))
+    found = made(tmp_path, tmp_path / "f", capsys)
+    assert error_deg(found, n, inside).mean() < 0.5

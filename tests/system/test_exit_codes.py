@@ -64,7 +64,7 @@ UNREADABLE = {
     "fit microstructure": ["a"],
     "fit template": ["s"],
     "import photos": ["d"],
-    "import lp": ["d"],
+    "import olat": ["d"],
     "import mesh": ["m.obj"],
     "apply expression": ["moving --weights smile --out a"],
     "apply microstructure": ["a --out b", "--on patch --weights smile=1 --out b"],
@@ -149,7 +149,7 @@ UNUSABLE = {
     "fit microstructure": ["none --out m"],
     "fit template": ["none --out m.ply"],
     "import photos": ["none --out s", "folder --out s", "file.txt --out s"],
-    "import lp": ["none --out s", "folder --out s"],
+    "import olat": ["none --out s", "folder --out s"],
     "import mesh": ["none --session none", "file.txt --session folder"],
     "apply expression": ["none --weights smile=1 --out a"],
     "apply microstructure": [

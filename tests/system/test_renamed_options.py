@@ -150,7 +150,7 @@ def test_former_names_are_hidden_from_help(path, former, capsys):
         ("analyse brdf", "--method", get_args(Method)),
         ("export", "--unit", METERS_PER_UNIT),
         ("import mesh", "--unit", MM_PER_UNIT),
-        ("import lp", "--encoding", get_args(Encoding)),
+        ("import olat", "--encoding", get_args(Encoding)),
     ],
 )
 def test_closed_set_in_help_is_the_accepted_one(path, option, values):
@@ -160,3 +160,10 @@ def test_closed_set_in_help_is_the_accepted_one(path, option, values):
 
 def test_formats_in_help_are_those_of_writers():
     assert (*APPEARANCE_FORMATS, *SESSION_FORMATS) == FORMATS
+
+
+def test_former_import_command_works_with_notice(tmp_path, capsys):
+    assert main(["import", "lp", str(tmp_path / "none"), "--out", str(tmp_path / "s")]) == 3
+    assert "import lp is now import olat" in capsys.readouterr().err
+    assert main(["import", "--help"]) == 0
+    assert " lp " not in capsys.readouterr().out

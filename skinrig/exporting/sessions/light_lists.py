@@ -58,7 +58,7 @@ def write(session: Session, folder: Path, delivery: ExportSettings) -> list[tupl
         kinds = ", ".join(sorted({step.kind for step in session.plan.steps}))
         raise ExportError(
             f"{session.path}: got {kinds}, expected images of one light each; give a session of "
-            "the dome or of `skinrig import lp`"
+            "the dome or of `skinrig import olat`"
         )
     inputs = Inputs.of(session, delivery.calibration, state="neutral", on_date=None)
     images = DomeImages(session)
@@ -108,7 +108,7 @@ def write(session: Session, folder: Path, delivery: ExportSettings) -> list[tupl
         "clipped_share": clipped,
         "camera": images.views[view],
         "mm_per_px": dome.pixel_mm,
-        "near_lights": f"{POSITIONS_FILE}: mm around the rig's origin; `skinrig import lp DIR "
+        "near_lights": f"{POSITIONS_FILE}: mm around the rig's origin; `skinrig import olat DIR "
         f"--lights DIR/{POSITIONS_FILE} --mm-per-px {dome.pixel_mm:.6g}`",
     }
     write_session_document(folder / DOCUMENT_FILE, inputs, document, left_out)

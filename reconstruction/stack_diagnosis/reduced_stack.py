@@ -1,0 +1,48 @@
+"""Images under many lights, reduced to a size at which faults of lights still show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reconstruction.arrays import BoolArray, Float64Array
+
+MAX_SIDE_PX = 160
+"""Images are reduced to this size: faults of lights are in all pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReducedStack:
+    """Reduced images (N, H, W), which samples are usable, and the object (H, W)."""
+
+    gray: Float64Array
+    usable: BoolArray
+    inside: BoolArray
+
+
+def reduce_stack(
+    gray: NDArray[Any], usable: BoolArray | None, inside: BoolArray
+) -> tuple[ReducedStack, Float64Array]:
+    """Average blocks of pixels, image by image, and return each image's unusable fraction.
+
+    A block is usable where all of its samples are.
+    """
+    height, width = inside.shape
+    step = max(1, int(np.ceil(max(height, width) / MAX_SIDE_PX)))
+    h, w = height // step, width // step
+
+    def blocks(values: NDArray[Any]) -> NDArray[Any]:
+        return values[: h * step, : w * step].reshape(h, step, w, step)
+
+    means, good, unusable = np.zeros((len(gray), h, w)), np.zeros((len(gray), h, w), bool), []
+    for number, image in enumerate(gray):
+        finite = np.isfinite(image)
+        kept = finite if usable is None else finite & usable[number]
+        means[number] = blocks(np.where(finite, image, 0.0)).mean(axis=(1, 3), dtype=np.float64)
+        good[number] = blocks(kept).all(axis=(1, 3))
+        unusable.append(1.0 - float(kept[inside].mean()) if inside.any() else 1.0)
+    whole = np.asarray(blocks(inside).all(axis=(1, 3)))
+    return ReducedStack(means, good, whole), np.array(unusable)

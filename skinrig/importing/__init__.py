@@ -1,0 +1,1 @@
+"""Prepare data of other devices for import."""

@@ -1,0 +1,62 @@
+"""Lists of lights as JSON and NumPy files."""
+
+import json
+
+import numpy as np
+import pytest
+
+from capture.importers.light_tables import LightListError, read_light_table
+
+VECTORS = [[0.0, 0.6, 0.8], [1.0, 0.0, 0.0]]
+
+
+@pytest.mark.parametrize(
+    ("document", "names"),
+    [
+        (VECTORS, []),
+        ({"lights": VECTORS}, []),
+        ({"a.png": VECTORS[0], "b.png": VECTORS[1]}, ["a.png", "b.png"]),
+        (
+            {"frames": [{"file_path": f"{n}.png", "light_dir": v} for n, v in enumerate(VECTORS)]},
+            ["0.png", "1.png"],
+        ),
+        ([{"position": v, "power": 2} for v in VECTORS], []),
+    ],
+)
+def test_json_forms_give_the_same_vectors(document, names, tmp_path):
+    file = tmp_path / "lights.json"
+    file.write_text(json.dumps(document))
+    found, vectors = read_light_table(file)
+    assert found == names
+    np.testing.assert_array_equal(vectors, VECTORS)
+
+
+def test_numpy_array_gives_its_rows(tmp_path):
+    np.save(tmp_path / "lights.npy", VECTORS)
+    assert read_light_table(tmp_path / "lights.npy")[1].tolist() == VECTORS
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"[]",
+        b"3",
+        b'{"lights": 4}',
+        b"[[1, 2]]",
+        b"[[1, 2, NaN]]",
+        b'[{"name": "a.png"}]',
+        b"{",
+        b"[[0, 0, 0]]",
+    ],
+)
+def test_other_documents_are_refused(content, tmp_path):
+    file = tmp_path / "lights.json"
+    file.write_bytes(content)
+    with pytest.raises(LightListError, match=r"lights\.json"):
+        read_light_table(file)
+
+
+def test_pickled_arrays_are_refused(tmp_path):
+    np.save(tmp_path / "lights.npy", np.array([{"a": 1}], object), allow_pickle=True)
+    with pytest.raises(LightListError, match="not a NumPy array"):
+        read_light_table(tmp_path / "lights.npy")

@@ -1,0 +1,71 @@
+"""Lights without a list: directions, their errors, and what the images leave undetermined."""
+
+import numpy as np
+import pytest
+from fixtures.faulty_stacks import dome, render
+
+from reconstruction.normal_maps import PhotometricStereoError
+from reconstruction.stack_diagnosis.unlisted_lights import HOLLOW_FACTORS, estimate_lights
+
+
+def angle_deg(found, lights):
+    return np.degrees(np.arccos(np.clip((found * lights).sum(axis=1), -1.0, 1.0)))
+
+
+def photograph(shape, lights, seed, *, spread=0.03, gloss=0.3, side=80):
+    rng = np.random.default_rng(seed)
+    gains = rng.lognormal(0.0, spread, len(lights))
+    return render(shape, lights, rng, side=side, gloss=gloss, noise=0.01, gains=gains)
+
+
+@pytest.mark.parametrize(
+    ("shape", "count", "seed", "sign"),
+    [
+        ("head", 24, 11, "cast shadows"),
+        ("relief", 24, 12, "cast shadows"),
+        ("ball", 12, 13, "outline"),
+    ],
+)
+def test_directions_are_found_without_list(shape, count, seed, sign):
+    lights = dome(count, np.random.default_rng(seed), 60)
+    images, inside = photograph(shape, lights, seed)
+    found = estimate_lights(images, inside=inside, rng=np.random.default_rng(0))
+    error = angle_deg(found.directions, lights)
+    assert error.mean() < 2.5
+    assert error.mean() < 3.0 * np.median(found.stderr_deg)
+    assert found.sign == sign
+    assert found.sign_evidence > 0.1
+    # the test can fail: the hollow twin explains all shading and is far off
+    assert angle_deg(found.directions * HOLLOW_FACTORS, lights).mean() > 45.0
+
+
+def test_stated_error_grows_with_unequal_lights():
+    lights = dome(24, np.random.default_rng(3), 60)
+    stated, error = [], []
+    for spread in (0.02, 0.15):
+        images, inside = photograph("head", lights, 3, spread=spread)
+        found = estimate_lights(images, inside=inside, rng=np.random.default_rng(0))
+        stated.append(float(np.median(found.stderr_deg)))
+        error.append(float(angle_deg(found.directions, lights).mean()))
+    assert stated[1] > 3.0 * stated[0]
+    assert error[1] < 3.0 * stated[1]
+
+
+def test_one_ring_of_lights_is_refused():
+    phi = 2.0 * np.pi * np.arange(16) / 16.0
+    ring = np.stack([0.7 * np.cos(phi), 0.7 * np.sin(phi), np.full(16, np.sqrt(0.51))], axis=1)
+    images, inside = photograph("head", ring, 5)
+    with pytest.raises(PhotometricStereoError, match="give a list of the lights"):
+        estimate_lights(images, inside=inside, rng=np.random.default_rng(0))
+
+
+def test_flat_object_is_refused():
+    rng = np.random.default_rng(6)
+    level = dome(24, rng, 60)[:, 2, None, None] * np.ones((1, 40, 40))
+    with pytest.raises(PhotometricStereoError, match="from a curved object"):
+        estimate_lights(0.5 * level + 0.001 * rng.normal(size=level.shape), rng=rng)
+
+
+def test_too_few_images_are_refused():
+    with pytest.raises(PhotometricStereoError, match="got 7 images, expected 8"):
+        estimate_lights(np.ones((7, 40, 40)), rng=np.random.default_rng(0))

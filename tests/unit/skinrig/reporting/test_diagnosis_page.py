@@ -1,0 +1,35 @@
+"""The page of a diagnosis shows the images in question and their lights."""
+
+import numpy as np
+from fixtures.faulty_stacks import make
+
+from model.vectors import unit_vectors
+from reconstruction.pipeline.light_stack import DiagnosedStack
+from reconstruction.stack_diagnosis import diagnose_stack
+from skinrig.reporting.diagnosis_page import build_diagnosis_page
+
+
+def test_page_shows_named_images_and_both_lights():
+    stack = make("two swapped", 3)
+    found = diagnose_stack(
+        stack.images, stack.lights, inside=stack.inside, rng=np.random.default_rng(0)
+    )
+    page = build_diagnosis_page(
+        "a/s", DiagnosedStack(found, stack.images, unit_vectors(stack.lights))
+    )
+    assert "swapped lights" in page
+    for number in stack.frames:
+        assert f"ball under the listed light of image {number + 1}" in page
+        assert f"ball under the light of image {number + 1}" in page
+    others = set(range(len(stack.images))) - set(stack.frames)
+    assert not any(f'ball under the light of image {number + 1}"' in page for number in others)
+
+
+def test_page_without_faults_names_number_of_images():
+    stack = make("two swapped", 3)
+    found = diagnose_stack(
+        stack.images, stack.lights, inside=stack.inside, rng=np.random.default_rng(0)
+    )
+    sound = type(found)((), found.order, found.left_out, found.directions, found.strength)
+    images = DiagnosedStack(sound, stack.images, unit_vectors(stack.lights))
+    assert f"no fault in {len(stack.images)} images" in build_diagnosis_page("s", images)
