@@ -17,12 +17,14 @@ import dataclasses
 import sys
 import time
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from model.brdf import tables as brdf_tables
 from model.traits.storage import load_packaged_traits
+from reconstruction.correspondence.common_parameterization import CommonFrame
 from rigsim.population.conditions import CONDITION_NAMES
 from rigsim.population.population import draw_population, get_member
 from skinrig.analysing.brdf import read_weights
@@ -32,15 +34,25 @@ from skinrig.analysing.population_sessions import (
     PopulationSessions,
     load_population_sessions,
 )
+from skinrig.appearances import face_textures
 from skinrig.benchmarks.dome import people as dome
 from skinrig.benchmarks.people import PeopleValues
-from skinrig.traits.truth import lobe_changes
+from skinrig.fitting.traits import sample_albedo
+from skinrig.traits.truth import CommonFaces, lobe_changes
 
 TARGET = Path(__file__).resolve().parents[1] / "skinrig" / SESSIONS_FILE
 SEED = 0
 DOME = {"lights": 36, "views": 4, "width_px": 320}
 POINTS, CONDITION_POINTS = 60, 300
 """Points of a person, and of the one person under a condition."""
+COMMON = {"size": 256, "common": 192}
+"""Texels per side of a face and of the common map of R_d."""
+
+
+@cache
+def common_frame() -> CommonFrame:
+    """Return the common map of the population's heads."""
+    return CommonFaces.of(draw_population(), **COMMON).frame
 
 
 def keep(path: Path, make: Callable[[], dict[str, np.ndarray]]) -> None:
@@ -60,7 +72,14 @@ def capture(folder: Path, name: str, points: int, **worn: object) -> dict[str, n
     basis = brdf_tables.default_basis()
     weights, lost, _ = read_weights(folder / "maps", basis, points, rng)
     regions = np.stack([*dome.estimate_regions(found, truth), dome.true_regions(truth)])
-    return {"weights": weights, "lost": np.array(lost), "regions": regions}
+    albedo = sample_albedo(face_textures.read(folder / "maps"), common_frame())
+    return {
+        "weights": weights,
+        "lost": np.array(lost),
+        "regions": regions,
+        "r_d": albedo.r_d.astype(np.float16),
+        "valid": albedo.valid,
+    }
 
 
 def run(work: Path, people: int) -> None:
