@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 import sys
 import time
 from collections.abc import Callable
@@ -32,6 +33,7 @@ from skinrig.analysing.brdf_space_datasets import DATASET_A_MEMBER
 from skinrig.analysing.population_sessions import (
     SESSIONS_FILE,
     PopulationSessions,
+    encode_r_d,
     load_population_sessions,
 )
 from skinrig.appearances import face_textures
@@ -111,6 +113,11 @@ def collect(work: Path) -> None:
         "lobes": np.array(dome.N_BASIS_BRDFS),
         "condition_names": np.array(list(worn)),
     }
+    mapped = {name: one for name, one in faces.items() if "r_d" in one}
+    stored["mapped"] = np.array(list(mapped))
+    stored["r_d"] = np.array([encode_r_d(one["r_d"], one["valid"]) for one in mapped.values()])
+    half = dataclasses.replace(common_frame(), size=COMMON["common"] // 2)
+    stored["frame"] = np.array(json.dumps(half.to_document()))
     for key, sessions in (("people", faces), ("conditions", worn)):
         weights = [one["weights"] for one in sessions.values()]
         stored[f"{key}_weights"] = np.concatenate(weights).astype(np.float16)
