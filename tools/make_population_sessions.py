@@ -6,7 +6,7 @@ One member under each of seven conditions, then members of the simulated populat
 simulator of the light dome with sensor noise, through its calibration and through the
 reconstruction. One calibration serves all. WORK keeps the estimates of each session, so that an
 interrupted run continues; ``--people 0`` only collects them. People are captured in a random order:
-those of an unfinished run are a random sample. A session takes 32 to 49 s of processor time.
+those of an unfinished run are a random sample. A session takes 38 to 56 s of processor time.
 ``--table`` prints the tables of the validation pages from the stored file and runs nothing.
 """
 
