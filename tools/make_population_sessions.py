@@ -6,7 +6,7 @@ One member under each of seven conditions, then members of the simulated populat
 simulator of the light dome with sensor noise, through its calibration and through the
 reconstruction. One calibration serves all. WORK keeps the estimates of each session, so that an
 interrupted run continues; ``--people 0`` only collects them. People are captured in a random order:
-those of an unfinished run are a random sample. A session takes 32 to 49 s of processor time.
+those of an unfinished run are a random sample. A session takes 38 to 56 s of processor time.
 ``--table`` prints the tables of the validation pages from the stored file and runs nothing.
 """
 
@@ -14,15 +14,18 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 import sys
 import time
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from model.brdf import tables as brdf_tables
 from model.traits.storage import load_packaged_traits
+from reconstruction.correspondence.common_parameterization import CommonFrame
 from rigsim.population.conditions import CONDITION_NAMES
 from rigsim.population.population import draw_population, get_member
 from skinrig.analysing.brdf import read_weights
@@ -30,17 +33,28 @@ from skinrig.analysing.brdf_space_datasets import DATASET_A_MEMBER
 from skinrig.analysing.population_sessions import (
     SESSIONS_FILE,
     PopulationSessions,
+    encode_r_d,
     load_population_sessions,
 )
+from skinrig.appearances import face_textures
 from skinrig.benchmarks.dome import people as dome
 from skinrig.benchmarks.people import PeopleValues
-from skinrig.traits.truth import lobe_changes
+from skinrig.fitting.traits import sample_albedo
+from skinrig.traits.truth import CommonFaces, lobe_changes
 
 TARGET = Path(__file__).resolve().parents[1] / "skinrig" / SESSIONS_FILE
 SEED = 0
 DOME = {"lights": 36, "views": 4, "width_px": 320}
 POINTS, CONDITION_POINTS = 60, 300
 """Points of a person, and of the one person under a condition."""
+COMMON = {"size": 256, "common": 192}
+"""Texels per side of a face and of the common map of R_d."""
+
+
+@cache
+def common_frame() -> CommonFrame:
+    """Return the common map of the population's heads."""
+    return CommonFaces.of(draw_population(), **COMMON).frame
 
 
 def keep(path: Path, make: Callable[[], dict[str, np.ndarray]]) -> None:
@@ -60,7 +74,14 @@ def capture(folder: Path, name: str, points: int, **worn: object) -> dict[str, n
     basis = brdf_tables.default_basis()
     weights, lost, _ = read_weights(folder / "maps", basis, points, rng)
     regions = np.stack([*dome.estimate_regions(found, truth), dome.true_regions(truth)])
-    return {"weights": weights, "lost": np.array(lost), "regions": regions}
+    albedo = sample_albedo(face_textures.read(folder / "maps"), common_frame())
+    return {
+        "weights": weights,
+        "lost": np.array(lost),
+        "regions": regions,
+        "r_d": albedo.r_d.astype(np.float16),
+        "valid": albedo.valid,
+    }
 
 
 def run(work: Path, people: int) -> None:
@@ -92,6 +113,11 @@ def collect(work: Path) -> None:
         "lobes": np.array(dome.N_BASIS_BRDFS),
         "condition_names": np.array(list(worn)),
     }
+    mapped = {name: one for name, one in faces.items() if "r_d" in one}
+    stored["mapped"] = np.array(list(mapped))
+    stored["r_d"] = np.array([encode_r_d(one["r_d"], one["valid"]) for one in mapped.values()])
+    half = dataclasses.replace(common_frame(), size=COMMON["common"] // 2)
+    stored["frame"] = np.array(json.dumps(half.to_document()))
     for key, sessions in (("people", faces), ("conditions", worn)):
         weights = [one["weights"] for one in sessions.values()]
         stored[f"{key}_weights"] = np.concatenate(weights).astype(np.float16)

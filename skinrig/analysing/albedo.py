@@ -19,9 +19,10 @@ from model.texture_statistics.histograms import GroupHistograms
 from model.texture_statistics.space import TextureSpace
 from reconstruction.correspondence import common_regions
 from reconstruction.correspondence.common_parameterization import CommonFrame
-from rigsim.population.population import draw_population
+from rigsim.population.population import get_member
 from skinrig import consent
 from skinrig.analysing.brdf_space_figures import encode_figure, new_figure
+from skinrig.analysing.population_sessions import load_population_sessions
 from skinrig.appearances import face_textures
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.fitting import traits
@@ -29,7 +30,7 @@ from skinrig.fitting.traits import TraitFitError
 from skinrig.traits import albedo_vectors
 from skinrig.traits import labels as trait_labels
 from skinrig.traits.albedo_vectors import AlbedoSample
-from skinrig.traits.truth import ALBEDO_NOISE, CommonFaces, label_members
+from skinrig.traits.truth import label_members
 
 HISTOGRAM_BINS: Final = 128
 ALL_GROUPS: Final = "all"
@@ -146,38 +147,26 @@ def analyze_measured(
     return _write(out, found)
 
 
-def analyze_simulated(
-    out: Path,
-    *,
-    people: int = 87,
-    size: int = 192,
-    seed: int = 0,
-    progress: Callable[[str], None] | None = None,
-) -> AlbedoAnalysis:
-    """Analyze the simulated population of table 1; other parameters as in `analyze_measured`.
+def analyze_simulated(out: Path, *, people: int | None = None, seed: int = 0) -> AlbedoAnalysis:
+    """Analyze members of the simulated population, each from a session of the simulated dome.
+
+    Their maps are packaged, see `skinrig.analysing.population_sessions`.
 
     Parameters
     ----------
+    out
+        Folder for `OUTPUT_FILES`.
     people
-        Number of people, at least 2, sampled at random from the 87.
-    size
-        Texels per side of a face's texture.
+        Number of people, at least 2, sampled at random from the captured; None: all.
     seed
         Seed of the sample.
     """
-    report = progress or (lambda text: None)
-    everybody = draw_population(seed=seed)
-    if not 2 <= people <= len(everybody):
-        raise TraitFitError(f"people: got {people}, expected 2 to {len(everybody)}")
-    chosen = np.random.default_rng([seed, 1]).permutation(len(everybody))[:people]
-    some = [everybody[k] for k in sorted(chosen)]
-    faces = CommonFaces.of(some, size=size, common=128)
-    samples = []
-    for k, person in enumerate(some):
-        if k % 10 == 0:
-            report(f"face {k} of {len(some)}")
-        rng = np.random.default_rng([seed, 2, k])
-        samples.append(faces.albedo(person, noise=ALBEDO_NOISE, rng=rng))
+    sessions = load_population_sessions()
+    count = len(sessions.mapped) if people is None else people
+    if not 2 <= count <= len(sessions.mapped):
+        raise TraitFitError(f"people: got {count}, expected 2 to {len(sessions.mapped)}")
+    chosen = sorted(np.random.default_rng([seed, 1]).permutation(len(sessions.mapped))[:count])
+    some = [get_member(sessions.mapped[k]) for k in chosen]
     known = sorted({label for person in some for label in person.labels})
     binary = {
         name: flags
@@ -186,7 +175,7 @@ def analyze_simulated(
     }
     groups = {ALL_GROUPS: np.ones(len(some), np.bool_)} | binary
     names = tuple(person.name for person in some)
-    return _write(out, analyze(samples, names, groups, faces.frame))
+    return _write(out, analyze([sessions.r_d[k] for k in chosen], names, groups, sessions.frame))
 
 
 def add_complement_groups(binary: Mapping[str, BoolArray]) -> dict[str, BoolArray]:

@@ -188,7 +188,7 @@ def analyse_albedo(
     out: Out,
     labels: Labels = None,
     landmarks: LandmarkFolder = None,
-    people: int = 87,
+    people: int | None = None,
     size_px: CommonSize = None,
     seed: Seed = 0,
     json: Json = False,
@@ -200,9 +200,10 @@ def analyse_albedo(
     Parameters
     ----------
     appearances
-        APPEARANCE/ folders of dome sessions, one per face; none: simulated faces.
+        APPEARANCE/ folders of dome sessions, one per face; none: packaged sessions of simulated
+        faces.
     people
-        Number of simulated faces, at most 87.
+        Number of simulated faces. Default: all.
     """
     from skinrig.analysing import albedo as analysing_albedo
 
@@ -221,9 +222,7 @@ def analyse_albedo(
             "--labels, --landmarks: apply to measured faces only; name APPEARANCE/ folders"
         )
     else:
-        found = analysing_albedo.analyze_simulated(
-            out, people=people, seed=seed, progress=console.progress
-        )
+        found = analysing_albedo.analyze_simulated(out, people=people, seed=seed)
     document = found.document()
     console.print_table(
         ("group", "faces", "R_d red", "green", "blue"),

@@ -3,6 +3,7 @@
 from functools import lru_cache
 
 import numpy as np
+from scipy import ndimage
 
 from model import spectra
 from model.color_table import ColorTable
@@ -179,8 +180,11 @@ def _interval_factors(table: ColorTable) -> Float32Array:
     root = np.cbrt(maps[:2].astype(np.float64).T)
     error = root - np.cbrt(np.stack([melanin, skins.hemoglobin], axis=-1))
     stderr = maps[3:5].T / (3.0 * np.square(root))
-    centers, factors = interval_factors.fit_band_factors(error / stderr, skins, masks[0])
     angle = interval_factors.node_typology_angles(table)
+    ends = np.cbrt([table.c_m_max, table.c_hd_max])
+    nodes = (interval_factors.NODES_PER_AXIS - 1) * root / ends
+    estimated = ndimage.map_coordinates(angle, nodes.T, order=1, mode="nearest")
+    centers, factors = interval_factors.fit_band_factors(error / stderr, skins, masks[0], estimated)
     found = interval_factors.interpolate_factors(angle, centers, factors)
     return np.ascontiguousarray(found, np.float32)
 

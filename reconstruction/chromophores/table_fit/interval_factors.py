@@ -34,7 +34,7 @@ COVERAGE_MARGINS: Final = ((0.08, 0.08), (0.05, 0.03))
 """Weights of coverages below and above nominal: deviations that count alike."""
 MIN_BAND_SKINS: Final = 50
 """Number of skins with an estimate below which a band's factor is 1."""
-FACTOR_TURNS: Final = 3
+FACTOR_TURNS: Final = 4
 """Turns of the fit, as skins lie between the centers of the bands."""
 
 
@@ -98,9 +98,9 @@ def coverage_factor(deviation: Float64Array) -> float:
 
 
 def fit_band_factors(
-    deviation: Float64Array, skins: IntervalSkins, valid: BoolArray
+    deviation: Float64Array, skins: IntervalSkins, valid: BoolArray, angle_deg: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the typology angle of each band's center, degrees, and the factors there.
+    """Return the typology angle of each band's estimates, degrees, and the factors there.
 
     Parameters
     ----------
@@ -110,6 +110,9 @@ def fit_band_factors(
         The n skins.
     valid
         (n,): skins with an estimate.
+    angle_deg
+        (n,): typology angles of the model's skin with the estimated chromophores, degrees. Factors
+        depend on them, as the skins' own are unknown; light skin of type I has smaller ones.
 
     Returns
     -------
@@ -118,12 +121,11 @@ def fit_band_factors(
     ndarray, shape (bands, k)
         Factors; between the angles they are interpolated linearly.
     """
-    angle, band = skins.typology_angle_deg, skins.band
-    bands = range(len(skin_tone.ITA_BANDS))
-    centers = np.array([np.median(angle[band == k]) for k in bands])
+    bands, band = range(len(skin_tone.ITA_BANDS)), skins.band
+    centers = np.array([np.median(angle_deg[band == k]) for k in bands])
     factors = np.ones((centers.size, deviation.shape[1]))
     for _ in range(FACTOR_TURNS):
-        left = deviation / interpolate_factors(angle, centers, factors)
+        left = deviation / interpolate_factors(angle_deg, centers, factors)
         for k in bands:
             chosen = left[valid & (band == k)]
             if len(chosen) >= MIN_BAND_SKINS:

@@ -221,10 +221,11 @@ def true_regions(truth: SkinAppearance) -> Float64Array:
         ) -> Float64Array:
             heights = zip(light[:, 2], view[:, 2], strict=True)
             through = np.array([surface_brdf.boundary_transmittance(*pair) for pair in heights])
-            lobes = [
-                surface_brdf.evaluate_brdf(one, SURFACE_NORMAL, light, view)[1] for one in packed
-            ]
-            return np.asarray(np.mean(lobes, axis=0) - floor / np.pi * through)
+            each = np.repeat(packed, len(light), axis=0)
+            pairs = (np.tile(directions, (len(packed), 1)) for directions in (light, view))
+            lobes = surface_brdf.evaluate_brdf(each, SURFACE_NORMAL, *pairs)[1]
+            mean = lobes.reshape(len(packed), -1).mean(axis=0)
+            return np.asarray(mean - floor / np.pi * through)
 
         values[r] = (
             specular_reflectance(reflect),

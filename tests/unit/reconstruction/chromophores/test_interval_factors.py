@@ -49,7 +49,7 @@ def test_band_factors_follow_errors_of_bands(skins):
     error = np.tile(normal_quantiles(SKINS_PER_BAND), 6) * scale
     every = np.ones(error.size, np.bool_)
     centers, factors = interval_factors.fit_band_factors(
-        np.stack([error, error[::-1]], axis=-1), skins, every
+        np.stack([error, error[::-1]], axis=-1), skins, every, skins.typology_angle_deg
     )
     assert (np.diff(centers) < 0.0).all()
     np.testing.assert_allclose(factors[:, 0], scale[::SKINS_PER_BAND], rtol=0.03)
@@ -59,9 +59,22 @@ def test_band_factors_follow_errors_of_bands(skins):
 def test_band_without_estimates_has_factor_one(skins):
     error = 1.5 * np.tile(normal_quantiles(SKINS_PER_BAND), 6)[:, None]
     valid = skins.band != 2
-    _, factors = interval_factors.fit_band_factors(error, skins, valid)
+    _, factors = interval_factors.fit_band_factors(error, skins, valid, skins.typology_angle_deg)
     assert factors[2, 0] == 1.0
     assert (factors[[0, 1, 3, 4, 5], 0] > 1.4).all()
+
+
+def test_band_factors_follow_angle_of_estimates(skins):
+    # type I is estimated at 68 degrees: a factor at 60 would not be the one that is applied
+    error = np.tile(normal_quantiles(SKINS_PER_BAND), 6)[:, None]
+    error[skins.band == 0] *= 0.8
+    angle = np.where(skins.band == 0, 68.0, skins.typology_angle_deg)
+    centers, factors = interval_factors.fit_band_factors(
+        error, skins, np.ones(angle.size, np.bool_), angle
+    )
+    assert centers[0] == 68.0
+    assert factors[0, 0] == pytest.approx(0.8, abs=0.03)
+    assert factors[1, 0] == pytest.approx(1.0, abs=0.03)
 
 
 def test_interpolated_factors_are_constant_beyond_centers():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from skinrig.analysing import albedo as analysing_albedo
+from skinrig.analysing.population_sessions import load_population_sessions
 from skinrig.cli import main
 
 
@@ -45,10 +46,11 @@ def test_groups_differ_in_histograms_as_generated(lab, capsys):
 
 
 @pytest.mark.parametrize("people", ["1", "88"])
-def test_more_people_than_there_are_are_refused(people, tmp_path, capsys):
+def test_more_people_than_were_captured_are_refused(people, tmp_path, capsys):
     argv = ["analyse", "albedo", "--people", people, "--out", str(tmp_path / "out")]
     assert main(argv) == 3
-    assert f"people: got {people}, expected 2 to 87" in capsys.readouterr().err
+    most = len(load_population_sessions().mapped)
+    assert f"people: got {people}, expected 2 to {most}" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -59,9 +61,8 @@ def test_labels_without_faces_are_refused(lab, capsys):
     assert "name APPEARANCE/ folders" in capsys.readouterr().err
 
 
-@pytest.mark.long
-def test_simulated_population_is_darker_where_stated(tmp_path):
-    found = analysing_albedo.analyze_simulated(tmp_path / "out", people=6, size=96)
-    told = found.document()
-    assert told["groups"]["all"] == 6
-    assert found.explained["face"].size == 5
+def test_analysis_without_faces_uses_sessions(tmp_path):
+    found = analysing_albedo.analyze_simulated(tmp_path / "out", people=3)
+    assert set(found.names) < set(load_population_sessions().mapped)
+    assert found.document()["groups"]["all"] == 3
+    assert found.explained["face"].size == 2

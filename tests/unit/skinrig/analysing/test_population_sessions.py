@@ -10,7 +10,12 @@ from rigsim.population.conditions import CONDITION_NAMES
 from rigsim.population.population import draw_population, get_member
 from skinrig.analysing import brdf as analysing_brdf
 from skinrig.analysing.brdf_space_datasets import DATASET_A_MEMBER
-from skinrig.analysing.population_sessions import load_population_sessions
+from skinrig.analysing.population_sessions import (
+    R_D_RANGE,
+    decode_r_d,
+    encode_r_d,
+    load_population_sessions,
+)
 from skinrig.benchmarks.dome import people as dome
 from skinrig.benchmarks.people import PeopleValues
 from skinrig.traits.truth import lobe_changes
@@ -54,6 +59,26 @@ def test_change_of_surface_is_that_of_its_condition():
         assert change.cosine(mean[k] - mean[0], basis) > 0.93
     lotion = mean[data.labels.index("lotion")] - mean[0]
     assert changes["cold"].cosine(lotion, basis) < 0.0
+
+
+def test_albedo_maps_are_those_of_their_people():
+    at = [SESSIONS.captured.index(name) for name in SESSIONS.mapped]
+    true = np.log(SESSIONS.regions[at, 2, :, 2:]).mean(axis=1)
+    found = np.array([np.log(one.r_d[one.valid]).mean(axis=0) for one in SESSIONS.r_d])
+    assert np.std(found - true, axis=0).max() < 0.05
+    assert np.std(np.roll(found, 1, axis=0) - true, axis=0).min() > 0.1
+
+
+def test_encoded_albedo_keeps_valid_pixels_within_a_step():
+    rng = np.random.default_rng(3)
+    r_d = np.repeat(np.repeat(rng.uniform(0.02, 1.0, (8, 8, 3)), 2, axis=0), 2, axis=1)
+    valid = rng.random((16, 16)) < 0.4
+    found = decode_r_d(encode_r_d(r_d.astype(np.float32), valid))
+    np.testing.assert_array_equal(found.valid, valid.reshape(8, 2, 8, 2).any(axis=(1, 3)))
+    step = np.log(R_D_RANGE[1] / R_D_RANGE[0]) / 254.0
+    error = np.log(found.r_d[found.valid] / r_d[::2, ::2][found.valid])
+    assert np.abs(error).max() < 0.501 * step
+    assert np.abs(error).max() > 0.3 * step
 
 
 def test_analysis_without_faces_uses_sessions(tmp_path):
