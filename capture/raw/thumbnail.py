@@ -18,7 +18,7 @@ MIN_BLOCK_PX: Final = 8
 """Side of the block of photosites for a thumbnail's pixel: the file grows by 2.4 % at most."""
 MIN_FRAME_PX: Final = 64
 """Smaller frames have no thumbnail."""
-GAMMA: Final = 2.2
+DISPLAY_GAMMA: Final = 2.2
 """Exponent of a display's transfer function."""
 
 
@@ -55,5 +55,5 @@ def draw_thumbnail(frame: RawFrame) -> UInt8Array | None:
         values = frame.cfa[row::block, column::block][:rows, :columns]
         black = frame.black[place]
         share = (values - np.float32(black)) / np.float32((frame.white - black) * balance)
-        channels.append(np.clip(share, 0.0, 1.0) ** np.float32(1.0 / GAMMA))
+        channels.append(np.clip(share, 0.0, 1.0) ** np.float32(1.0 / DISPLAY_GAMMA))
     return (255.0 * np.stack(channels, axis=-1) + 0.5).astype(np.uint8)
