@@ -102,6 +102,8 @@ class Framing:
             notes.append(f"each pixel is the mean of {factor} x {factor}")
             if noise is not None:
                 noise = noise[0] / factor**2, noise[1] / factor**2
+        if cfa is frame.cfa:
+            return photo
         if min(cfa.shape) < MIN_SIDE_PX * scale:
             left_over = f"{cfa.shape[1] // scale} x {cfa.shape[0] // scale} px"
             least = f"sides of {MIN_SIDE_PX} px or more"
