@@ -11,6 +11,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -245,8 +246,18 @@ def load_rig(name_or_path: str | Path) -> Rig:
                 advice="Name a rig, or the path of a rig file.",
                 code="SR-PLN-006",
             )
-        path = shipped / f"{text}.toml"
+        return _read_packaged_rig(shipped / f"{text}.toml")
+    return _read_rig(path)
+
+
+def _read_rig(path: Path) -> Rig:
     return rig_from_json(read_toml(path, error=RigError), where=str(path))
+
+
+@cache
+def _read_packaged_rig(path: Path) -> Rig:
+    """Read a rig file of the package once per process: a rig is immutable."""
+    return _read_rig(path)
 
 
 MAX_LISTED_NAMES = 40

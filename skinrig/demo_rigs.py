@@ -54,7 +54,8 @@ DOME_WIDTH_PX = 320
 
 PROBE_MEDIUM = "homogeneous:0.08,1.2"
 """Homogeneous medium with known sigma_tr, 0.55 per mm; for layers it is a definition only."""
-PROBE_WANT = ("profiles", "subsurface", "translucency")
+MEDIUM_WANT = ("profiles", "subsurface")
+PROBE_WANT = (*MEDIUM_WANT, "translucency")
 GRADIENT_SITE = "forehead"
 DOUBLE_FOLDER = "double"
 """Folder of the person's fused maps."""
@@ -274,8 +275,9 @@ def _probe(run: RigDemo) -> None:
             run.simulate("probe", DEMO_SUBJECT, subject=DEMO_SUBJECT),
         ]
     with run.share("probe: reconstruct sigma_tr and diffuse mean free path"):
-        for capture in captures:
-            name, _, maps, truth = run.reconstruct("probe", capture, PROBE_WANT)
+        # a medium is the same everywhere: a map over a face would show the face's places alone
+        for capture, want in zip(captures, (MEDIUM_WANT, PROBE_WANT), strict=True):
+            name, _, maps, truth = run.reconstruct("probe", capture, want)
             fits = subsurface.compare_fits(maps, truth)
             for row in subsurface.summarize_methods(fits):
                 lost = np.mean([not fit.valid for fit in fits if fit.method == row.method])

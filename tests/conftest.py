@@ -20,6 +20,7 @@ import hypothesis
 import numpy as np
 import pytest
 import real_time
+from _pytest.doctest import DoctestModule
 from fixtures.stale_kernels import remove_stale_kernels
 
 # Tests draw the same examples in each run, as slowly as a busy machine likes; nothing is kept
@@ -82,7 +83,22 @@ def pytest_xdist_auto_num_workers():
     return (os.cpu_count() or 1) + 1
 
 
+class ExamplesAlone:
+    """Leave modules without an example to those that import them: most have none.
+
+    A plugin, since a conftest.py is asked about the files of its own folder alone.
+    """
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_collect_file(self, file_path):
+        collectors = yield
+        if file_path.suffix != ".py" or b">>>" in file_path.read_bytes():
+            return collectors
+        return [one for one in collectors if not isinstance(one, DoctestModule)]
+
+
 def pytest_configure(config):
+    config.pluginmanager.register(ExamplesAlone())
     if not hasattr(config, "workerinput"):  # before any process of several compiles
         remove_stale_kernels()
 

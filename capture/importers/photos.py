@@ -10,6 +10,7 @@ from pathlib import Path
 
 from capture import raw
 from capture.documents import Fault, InputError
+from capture.importers.framing import Framing
 from capture.importers.images import Encoding, Photo, PhotoError, read_photo
 from capture.importers.imported_session import (
     DISTANCE_MM,
@@ -82,6 +83,7 @@ def import_photos(
     illuminant: str | None = None,
     kind: Kind = "subject",
     subject: SubjectRecord | None = None,
+    framing: Framing | None = None,
     now: Callable[[], datetime] | None = None,
 ) -> PhotoImport:
     """Import photographs into a closed session; all of them, or none.
@@ -110,6 +112,8 @@ def import_photos(
         Content of the photographs.
     subject : Subject, optional
         Person in the photographs; default an unnamed one who agreed to nothing beyond the capture.
+    framing : Framing, optional
+        Part and width of the photographs to import; default: all of them.
     now : callable, optional
         Clock, returns a time with its zone.
 
@@ -126,7 +130,8 @@ def import_photos(
     """
     clock = now or (lambda: datetime.now(UTC))
     files, ignored = _files(Path(directory))
-    entries = _inspect(files)
+    framing = framing or Framing()
+    entries = _inspect(files, framing)
     light = illuminant or ("D65" if any(e.encoding != "raw" for e in entries) else "D55")
     used, views = _rig(entries, rig, camera_serial, sensitivity, light)
     steps = _steps(entries, views, kind)
@@ -137,7 +142,7 @@ def import_photos(
     target = Path(out)
     with create_imported_session(target, plan, used, subject, extra, clock) as session:
         for step, entry in steps:
-            _commit(session, step, entry, clock)
+            _commit(session, step, entry, framing, clock)
     states = tuple(dict.fromkeys(str(step.index["state"]) for step, _ in steps))
     color = {str(step.index["state"]) for step, entry in steps if entry.view.cfa != "MONO"}
     colored = tuple(state for state in states if state in color)
@@ -172,12 +177,12 @@ def _files(directory: Path) -> tuple[list[Path], list[str]]:
     return files, ignored
 
 
-def _inspect(files: Sequence[Path]) -> list[_Entry]:
+def _inspect(files: Sequence[Path], framing: Framing) -> list[_Entry]:
     """Decode every file once, so that a bad one is found before anything is written."""
     entries, faults = [], []
     for file in files:
         try:
-            photo = read_photo(file)
+            photo = framing.apply(read_photo(file), where=str(file))
         except InputError as exc:
             found = "; ".join(f"{fault.path}: {fault.got}" for fault in exc.faults)
             reason = f"one that {exc.what}" + (f" ({found})" if found else "")
@@ -312,10 +317,12 @@ def _assumptions(
     return texts
 
 
-def _commit(session: Session, step: Step, entry: _Entry, clock: Callable[[], datetime]) -> None:
+def _commit(
+    session: Session, step: Step, entry: _Entry, framing: Framing, clock: Callable[[], datetime]
+) -> None:
     (view,) = step.cameras
     frame = replace(
-        read_photo(entry.file).frame,
+        framing.apply(read_photo(entry.file), where=str(entry.file)).frame,
         camera_serial=session.rig.view(view).serial,
         step_id=step.id,
         session_id=session.id,

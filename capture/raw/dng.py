@@ -18,9 +18,10 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import xxhash
 
-from capture.arrays import UInt16Array
+from capture.arrays import UInt8Array, UInt16Array
 from capture.documents import Fault, canonical_json, read_json
 from capture.raw.frame import ILLUMINANT_CODES, MAX_PIXELS, RawError, RawFrame
+from capture.raw.thumbnail import draw_thumbnail
 from capture.raw.tiff import (
     ASCII,
     BYTE,
@@ -124,16 +125,27 @@ def encode_dng(
 def encode_frame(frame: RawFrame) -> bytes:
     """Encode a frame unchanged as a DNG; see `encode_dng`."""
     pixels = np.ascontiguousarray(frame.cfa, dtype="<u2").tobytes()
-    exif = _exif_entries(frame)
+    small = draw_thumbnail(frame)
+    xmp = _xmp(frame, pixels)
+
+    def lay_out(exif_at: int, small_at: int, pixels_at: int) -> tuple[bytes, bytes, bytes]:
+        """Encode the directories for their places: main, EXIF, thumbnail with its pixels."""
+        exif = encode_directory(_exif_entries(frame), exif_at)
+        if small is None:
+            return encode_directory(_main_entries(frame, xmp, exif_at, pixels_at), 8), exif, b""
+        link = encode_entry(330, LONG, [small_at])
+        main = encode_directory([*_main_entries(frame, xmp, exif_at, pixels_at), link], 8)
+        size = len(encode_directory(_thumbnail_entries(small, 0), 0))
+        tags = encode_directory(_thumbnail_entries(small, small_at + size), small_at)
+        return main, exif, tags + small.tobytes()
+
     # lay out once with zero offsets to compute the sizes, then with the true ones
-    main = encode_directory(_main_entries(frame, pixels, 0, 0), 8)
-    exif_at = 8 + len(main)
-    pixels_at = (
-        -(-(exif_at + len(encode_directory(exif, exif_at))) // _ALIGNMENT_BYTES) * _ALIGNMENT_BYTES
-    )
-    main = encode_directory(_main_entries(frame, pixels, exif_at, pixels_at), 8)
-    head = struct.pack("<2sHI", b"II", 42, 8) + main + encode_directory(exif, exif_at)
-    return head.ljust(pixels_at, b"\0") + pixels
+    main, exif, preview = map(len, lay_out(0, 0, 0))
+    small_at = 8 + main + exif + exif % 2
+    pixels_at = -(-(small_at + preview) // _ALIGNMENT_BYTES) * _ALIGNMENT_BYTES
+    parts = lay_out(8 + main, small_at, pixels_at)
+    head = struct.pack("<2sHI", b"II", 42, 8) + parts[0] + parts[1]
+    return (head.ljust(small_at, b"\0") + parts[2]).ljust(pixels_at, b"\0") + pixels
 
 
 def write_dng(path: str | Path, cfa: UInt16Array, **description: Any) -> None:
@@ -214,7 +226,24 @@ def _error(what: str, where: str, path: str, got: str, expected: str) -> RawErro
     return RawError(what, where=where, faults=[Fault(path, got, expected)], advice=_DNG_ADVICE)
 
 
-def _main_entries(frame: RawFrame, pixels: bytes, exif_at: int, pixels_at: int) -> list[Entry]:
+def _thumbnail_entries(small: UInt8Array, pixels_at: int) -> list[Entry]:
+    height, width, _ = small.shape
+    return [
+        encode_entry(254, LONG, [1]),  # a reduced image of another one in the file
+        encode_entry(256, LONG, [width]),
+        encode_entry(257, LONG, [height]),
+        encode_entry(258, SHORT, [8, 8, 8]),
+        encode_entry(259, SHORT, [1]),
+        encode_entry(262, SHORT, [2]),
+        encode_entry(273, LONG, [pixels_at]),
+        encode_entry(277, SHORT, [3]),
+        encode_entry(278, LONG, [height]),
+        encode_entry(279, LONG, [small.size]),
+        encode_entry(284, SHORT, [1]),
+    ]
+
+
+def _main_entries(frame: RawFrame, xmp: bytes, exif_at: int, pixels_at: int) -> list[Entry]:
     height, width = frame.cfa.shape
     mono = frame.pattern == "MONO"
     side = 1 if mono else 2
@@ -233,10 +262,10 @@ def _main_entries(frame: RawFrame, pixels: bytes, exif_at: int, pixels_at: int) 
         encode_entry(274, SHORT, [1]),
         encode_entry(277, SHORT, [1]),
         encode_entry(278, LONG, [height]),
-        encode_entry(279, LONG, [len(pixels)]),
+        encode_entry(279, LONG, [frame.cfa.size * 2]),
         encode_entry(284, SHORT, [1]),
         encode_entry(305, ASCII, SOFTWARE_NAME),
-        encode_entry(700, BYTE, _xmp(frame, pixels)),
+        encode_entry(700, BYTE, xmp),
         encode_entry(34665, LONG, [exif_at]),
         encode_entry(50706, BYTE, [1, 4, 0, 0]),
         encode_entry(50707, BYTE, [1, 3, 0, 0]),

@@ -7,7 +7,7 @@ from functools import cache
 from importlib import resources
 from typing import Any
 
-from skinrig.benchmarks.measurement import Made, measure_and_keep
+from skinrig.benchmarks.measurement import Made, measure_and_keep, measure_once
 from skinrig.benchmarks.results import ErrorEstimate, Knob, Limit, Point, StageBenchmark, Timing
 from skinrig.evaluating.skin_bands import MELANIN_BANDS, MelaninBand
 
@@ -31,6 +31,8 @@ class BenchmarkStage:
     name: str
     toy: bool = False
     """Whether sizes are small; limits are then not evaluated and may be missing."""
+    smoke: bool = False
+    """Whether to call each function once only, as a check that it runs."""
     points: list[Point] = field(default_factory=list)
     """Measured settings, in the order of the report."""
     limits: LimitValues = field(default_factory=dict)
@@ -54,10 +56,12 @@ class BenchmarkStage:
         call
             Takes no argument.
         repeats
-            Warm calls; None: three, at small size one.
+            Warm calls; None: three, at small size one. A smoke run has a single call instead.
         memory
             As in `skinrig.benchmarks.measurement.measure`.
         """
+        if self.smoke:
+            return measure_once(call)
         warm = (1 if self.toy else 3) if repeats is None else repeats
         return measure_and_keep(call, repeats=warm, memory=memory)
 

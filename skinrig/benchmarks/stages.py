@@ -30,10 +30,10 @@ class BenchError(ValueError):
     """Stage name that the table of stages does not contain."""
 
 
-def _iterate_results(name: str, *, toy: bool) -> Iterator[StageBenchmark]:
+def _iterate_results(name: str, *, toy: bool, smoke: bool = False) -> Iterator[StageBenchmark]:
     """Yield the stage's results: a long stage after each of its parts, any stage at its end."""
     module, function = STAGES[name].rsplit(".", 1)
-    stage = BenchmarkStage(name, toy=toy)
+    stage = BenchmarkStage(name, toy=toy, smoke=smoke)
     run = getattr(import_module(f"skinrig.benchmarks.{module}"), function)
     for _ in run(stage) or ():
         yield stage.to_benchmark()
@@ -53,7 +53,8 @@ def run_stages(
     budget_s
         Time budget in seconds; a stage that would begin after its end is omitted and listed.
     toy
-        Whether to measure small sizes only, which checks that the benchmark runs.
+        Whether to measure small sizes only, with a single call of each function, which checks that
+        the benchmark runs.
     out
         Folder for ``bench.json``; None writes nothing.
     console
@@ -130,7 +131,7 @@ class _Run:
             return
         self.console.progress(f"bench {name}, {size} size")
         try:
-            for made in _iterate_results(name, toy=size == "small"):
+            for made in _iterate_results(name, toy=size == "small", smoke=self.toy):
                 if name in self.to_do:
                     self._take(name, made, size)
                     self.save()

@@ -32,6 +32,8 @@ def import_photos(
     out: Out,
     rig: str | None = None,
     target: Annotated[str | None, choice("chart")] = None,
+    crop: str | None = None,
+    width: int | None = None,
     subject: str = "unnamed",
     consent: Consent = None,
     consent_expires: ConsentExpires = None,
@@ -49,10 +51,15 @@ def import_photos(
         Rig whose camera took the photographs, so that its calibrations apply; default: none.
     target
         Photographed target, a color chart in the light of the photographs; default: a subject.
+    crop
+        Part of each photograph, X,Y,WIDTH,HEIGHT in pixels from the upper left; default: all.
+    width
+        Largest width of the imported images, pixels: wider ones are averaged by whole factors.
     subject
         Pseudonym of the subject; none: a thing, which needs no consent.
     """
     from capture.importers import import_photos as bring_in
+    from capture.importers.framing import Framing
     from capture.rig import load_rig
     from skinrig.consent import parse_subject
 
@@ -64,6 +71,7 @@ def import_photos(
         rig=None if rig is None else load_rig(rig),
         kind="chart" if target else "subject",
         subject=person,
+        framing=Framing.parse(crop, width),
     )
     console.print_each("assumed", done.assumed)
     console.print_each("ignored", done.ignored)

@@ -1,6 +1,6 @@
 """Export sessions and appearances: choice of format, consent check and sealed folder."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import date, datetime
 from importlib import import_module
 from pathlib import Path
@@ -10,6 +10,7 @@ from capture.session import Session, verify
 from model import store
 from model.skin import SkinAppearance
 from skinrig import consent
+from skinrig.appearances.dynamic import describe_parts
 from skinrig.errors import UsageError, require_choice
 from skinrig.exporting.options import ExportError, ExportSettings
 from skinrig.exporting.sealing import ExportResult, export_sealed
@@ -110,16 +111,40 @@ def export(
     else:
         held = _appearance(source, use, today)
         if to in SURFACE_FORMATS and not any(name in held.maps for name in _DOME_MAPS):
-            others = ", ".join(name for name in APPEARANCE_FORMATS if name not in SURFACE_FORMATS)
+            others = ", ".join(_list_usable_formats(held))
             raise ExportError(
                 f"--to: got {to!r}, which requires a dome's maps (position, normals, r_d, basis "
-                f"BRDFs), but {source} has {', '.join(held.maps) or 'none'}; choose {others} "
+                f"BRDFs), but {source} has {_list_names(list(held.maps))}; choose {others} "
                 "[SR-EXP-004]"
             )
         if order.target_face is not None:
             _appearance(order.target_face, use, today)  # its maps are exported, too
     write = load_writer(to)
     return export_sealed(Path(out), lambda part: write(held, part, order), now)
+
+
+MAX_LISTED_MAPS = 6
+"""Maximum number of maps in a message."""
+
+
+def _list_names(names: Sequence[str]) -> str:
+    """List the first names, and count the rest.
+
+    Examples
+    --------
+    >>> _list_names(["melanin"]), _list_names([f"m{n}" for n in range(40)])
+    ('melanin', 'm0, m1, m2, m3, m4, m5 and 34 more')
+    """
+    more = len(names) - MAX_LISTED_MAPS
+    listed = ", ".join(names[:MAX_LISTED_MAPS]) or "none"
+    return f"{listed} and {more} more" if more > 0 else listed
+
+
+def _list_usable_formats(appearance: SkinAppearance) -> list[str]:
+    """Return the formats that do not require a surface and can hold what the appearance has."""
+    spectral = {"melanin", "hemoglobin"} <= set(appearance.maps)
+    fitted = bool(describe_parts(appearance))
+    return ["maps"] + ["spectral"] * spectral + ["metahuman"] * fitted
 
 
 def _appearance(path: str | Path, use: str | None, today: date | None) -> SkinAppearance:

@@ -229,7 +229,7 @@ def _appearance_section(subject: page.ReportedAppearance) -> Iterator[page.Block
     images = [
         map_images.draw_color_image(f"{map_title(key)}, linear RGB", appearance.maps[key].values)
         for key in ("image", "specular_image")
-        if key in appearance.maps
+        if key in appearance.maps and appearance.maps[key].values.any()
     ]
     if images:
         yield page.Images(images)

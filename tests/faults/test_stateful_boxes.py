@@ -32,7 +32,7 @@ LEFT_OUT = [
 @pytest.mark.parametrize("box", HOSTS)
 def test_controller_obeys_rules_on_noisy_line(box):
     _, host, steps = HOSTS[box]
-    explore(host, 40 if box == "flash" else 25, steps=steps)
+    explore(host, 15, steps=steps)
 
 
 @pytest.mark.long
@@ -40,7 +40,7 @@ def test_controller_obeys_rules_on_noisy_line(box):
 @pytest.mark.parametrize("box", HOSTS)
 def test_controller_obeys_rules_on_noisy_line_long_run(box):
     _, host, steps = HOSTS[box]
-    explore(host, 600 if box == "flash" else 500, steps=steps)
+    explore(host, 250, steps=steps)
 
 
 @pytest.mark.parametrize(("box", "leave_out", "caught_by"), LEFT_OUT)

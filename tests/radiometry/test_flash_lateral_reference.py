@@ -30,7 +30,7 @@ def test_uniform_patch_reflectance_matches_table(wavelength_nm, c_m, c_hd):
         np.full((side, side), c_hd),
         pixel_mm=0.2,
         wavelength_nm=wavelength_nm,
-        photons=64_000,
+        photons=24_000,
         rng=np.random.default_rng(12345),
     )
     table = SkinTable.load()

@@ -31,7 +31,7 @@ def patch():
 def renders(patch):
     """Images of 4 x 4 pixels with few and with 16 times as many samples."""
     rig = load_rig("flash")
-    return [render_patch(patch, rig, width_px=4, samples=n, seed=1) for n in (32, 512)]
+    return [render_patch(patch, rig, width_px=4, samples=n, seed=1) for n in (8, 128)]
 
 
 def darkest_quarter(image):

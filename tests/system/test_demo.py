@@ -84,17 +84,15 @@ def test_error_in_single_parallel_rig_stays_its_own(tmp_path):
     assert not multiprocessing.active_children()
 
 
-@pytest.mark.parametrize(("own", "expected"), [(None, "1"), ("3", "3")])
-def test_parallel_rig_threads_sleep_unless_user_sets_policy(own, expected, monkeypatch):
+def test_parallel_rig_threads_sleep_unless_user_sets_policy(monkeypatch):
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
-    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
-    if own is not None:
-        monkeypatch.setenv("OPENBLAS_NUM_THREADS", own)
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "3")
     monkeypatch.setattr(demo, "_run_rig", os.getenv)  # a process says what it was given
     names = ["OMP_WAIT_POLICY", "OPENBLAS_NUM_THREADS"]
-    given = dict(demo._run_in_processes(names, ("not set",), 2))
-    assert given == {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": expected}
-    assert [os.environ.get(name) for name in names] == [None, own]
+    given = dict(demo._run_in_processes(names, ("not set",), 1))
+    assert given == {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "3"}
+    assert [os.environ.get(name) for name in names] == [None, "3"]
+    assert demo.SLEEPING_THREADS["OPENBLAS_NUM_THREADS"] == "1"
 
 
 @pytest.mark.long

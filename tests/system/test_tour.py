@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from skinrig.cli import main
-from skinrig.simulating import flash_truth
+from skinrig.simulating import dome, flash_truth
 
 ROOT = Path(__file__).parents[2]
 
@@ -38,8 +38,9 @@ def simulated(tmp_path_factory):
 @each_tutorial
 def test_tutorial_runs_to_its_end(page, tmp_path, simulated, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    # half as wide as its default: how accurate maps of more pixels are, other tests say
-    monkeypatch.setitem(flash_truth.WIDTHS_PX, "small", 384)
+    # smaller than their defaults: how accurate maps of more pixels and lights are, other tests say
+    monkeypatch.setitem(flash_truth.WIDTHS_PX, "small", 256)
+    monkeypatch.setitem(dome.LIGHT_COUNTS, "small", 24)
     lines = commands(page)
     assert lines
     for words in lines:

@@ -32,7 +32,7 @@ DOME_PX = 100
 GRADIENT_PX = 128
 N_DOME_LIGHTS = 3
 N_PEOPLE = 20
-N_TOY_PEOPLE = 2
+N_TOY_PEOPLE = 1
 
 
 def measure_omissions(stage: BenchmarkStage) -> None:

@@ -52,7 +52,7 @@ def encode(cfa, pattern, **changes):
 
 @pytest.fixture
 def dng(tmp_path, cfa):
-    def write(pattern="RGGB", **changes):
+    def write(pattern="RGGB", cfa=cfa, **changes):
         file = tmp_path / "frame.dng"
         file.write_bytes(encode(cfa, pattern, **changes))
         return file
@@ -92,6 +92,38 @@ def test_adobe_sdk_reads_every_bit_and_settings(dng, cfa, pattern):
     if pattern != "MONO":
         assert frame.get_bayer_pattern() == pattern
         np.testing.assert_allclose(frame.get_white_balance(), (0.5, 1.0, 0.625))
+
+
+@pytest.mark.parametrize("pattern", [*BAYER, "MONO"])
+def test_libraw_extracts_thumbnail_of_every_pattern(dng, pattern):
+    """A red surface with a darker lower right quarter, in light whose neutral is (.5, 1, .625)."""
+    levels = {"R": 0.4, "G": 0.1, "B": 0.05}
+    if pattern == "MONO":
+        cell = np.full((2, 2), 0.4)
+    else:
+        cell = np.reshape([levels[c] for c in pattern], (2, 2))
+    share = np.tile(cell, (48, 64))
+    share[48:, 64:] /= 4.0
+    file = dng(pattern, cfa=np.round(256 + share * 3000).astype(np.uint16), black=256.0, white=3256)
+    with rawpy.imread(str(file)) as frame:
+        found = frame.extract_thumb().data / 255.0
+    assert found.shape == (12, 16, 3)
+    wanted = (0.4, 0.4, 0.4) if pattern == "MONO" else (0.8, 0.1, 0.08)
+    np.testing.assert_allclose(found[3, 4] ** 2.2, wanted, atol=0.01)
+    np.testing.assert_allclose(found[9, 12] ** 2.2, np.divide(wanted, 4.0), atol=0.005)
+    np.testing.assert_array_equal(found[9, 4], found[3, 4])
+
+
+def test_thumbnail_grows_file_by_few_percent(dng, cfa):
+    plain = cfa[:63, :].nbytes
+    assert dng("MONO", cfa=cfa[:63]).stat().st_size - plain < 2000
+    with (
+        rawpy.imread(str(dng("MONO", cfa=cfa[:63]))) as frame,
+        pytest.raises(rawpy.LibRawNoThumbnailError),
+    ):
+        frame.extract_thumb()
+    large = np.zeros((2000, 3000), np.uint16)
+    assert dng(cfa=large).stat().st_size < 1.006 * large.nbytes
 
 
 @pytest.mark.parametrize("pattern", [*BAYER, "MONO"])

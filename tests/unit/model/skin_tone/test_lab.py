@@ -1,4 +1,3 @@
-import colour
 import numpy as np
 import pytest
 
@@ -9,6 +8,8 @@ SKIN = np.array([[0.62, 0.45, 0.37], [0.35, 0.2, 0.13], [0.05, 0.03, 0.02], [1.0
 
 
 def test_lab_equals_colour_science():
+    import colour  # takes two seconds, that each process would wait for
+
     xyz = SKIN @ np.linalg.inv(spectra.XYZ_TO_LINEAR_SRGB).T
     white = np.linalg.inv(spectra.XYZ_TO_LINEAR_SRGB).sum(axis=1)
     expected = colour.XYZ_to_Lab(xyz / white[1], colour.XYZ_to_xy(white))
@@ -16,6 +17,8 @@ def test_lab_equals_colour_science():
 
 
 def test_lab_of_spectra_equals_colour_science():
+    import colour  # takes two seconds, that each process would wait for
+
     wavelength = spectra.WAVELENGTH_NM
     reflectance = 0.05 + 0.5 / (1.0 + np.exp(-(wavelength - 590.0) / 40.0))
     table = colour.SpectralDistribution(reflectance, wavelength).align(

@@ -91,7 +91,7 @@ def test_face_kernel_sum_matches_plain_numpy(table, prior, rng):
                 np.testing.assert_allclose(reach, slow[:, i, 1], rtol=0.12)
 
 
-@pytest.mark.parametrize("melanin", [0.01, 0.05, 0.09, 0.18])
+@pytest.mark.parametrize("melanin", [0.01, 0.09])
 def test_shade_is_not_taken_for_darker_skin(melanin, table, prior, rng):
     """The dimmest fifth is held as the rest is, and errs less than by its pixels alone.
 

@@ -257,7 +257,7 @@ def with_step(rng, *, constant_s, step, noise=2e-4, gap=0.01):
     return curve + noise * rng.standard_normal(PHASE.size)
 
 
-@pytest.mark.parametrize("constant_s", [1.0, 2.0, 4.0])
+@pytest.mark.parametrize("constant_s", [1.0, 4.0])
 def test_pose_offset_in_samples_is_not_quick_blood(constant_s):
     """Steps are drawn from their prior: intervals hold the truth, and plain fits do not."""
     rng = np.random.default_rng(11)

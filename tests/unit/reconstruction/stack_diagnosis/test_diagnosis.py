@@ -119,18 +119,17 @@ def test_large_stacks_are_read_image_by_image():
 def test_detection_and_false_alarms_over_seeds():
     """Rationale: seeds 400 on set no threshold.
 
-    Expected: 98 % of faults found, 95 % with the right images, 1 false alarm in 30 sound sets at
-    most. Tolerance: of 144 faults three may be missed.
+    Expected: all faults but one found, all but two with the right images, 1 false alarm in 15
+    sound sets at most. `tools/judge_diagnosis.py` counts over more seeds.
     """
     found = named = total = 0
     for number, fault in enumerate(FAULTS):
-        for seed in range(400 + 3 * number, 403 + 3 * number):
-            stack = make(fault, seed, side=64)
-            faults = {(one.fault, one.frames) for one in diagnose(stack).findings}
-            total += 1
-            found += FAULTS[fault] in {one for one, _ in faults}
-            named += (FAULTS[fault], stack.frames) in faults
-    alarms = sum(bool(diagnose(make("", seed, side=64)).findings) for seed in range(700, 730))
-    assert found >= 0.98 * total, (found, total)
-    assert named >= 0.95 * total, (named, total)
+        stack = make(fault, 400 + 3 * number, side=64)
+        faults = {(one.fault, one.frames) for one in diagnose(stack).findings}
+        total += 1
+        found += FAULTS[fault] in {one for one, _ in faults}
+        named += (FAULTS[fault], stack.frames) in faults
+    alarms = sum(bool(diagnose(make("", seed, side=64)).findings) for seed in range(700, 715))
+    assert found >= total - 1, (found, total)
+    assert named >= total - 2, (named, total)
     assert alarms <= 1

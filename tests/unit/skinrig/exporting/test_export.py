@@ -46,10 +46,24 @@ def test_photograph_maps_are_refused_for_surface_formats(tmp_path, to):
     values, valid = np.full((4, 4), 0.02, np.float32), np.ones((4, 4), bool)
     flat = SkinMap(values, MAP_UNITS["melanin"], valid=valid)
     maps = store.write(tmp_path / "flash", SkinAppearance({"melanin": flat}, "simulated"))
-    with pytest.raises(ExportError, match="has melanin; choose maps, spectral, metahuman"):
+    with pytest.raises(ExportError, match=r"has melanin; choose maps \["):
         exporting.export(maps, tmp_path / "out", to=to)
     assert not (tmp_path / "out").exists()
     assert exporting.export(maps, tmp_path / "out", to="maps").files > 1
+
+
+def test_refused_format_error_lists_formats_that_work(tmp_path):
+    values, valid = np.full((4, 4), 0.02, np.float32), np.ones((4, 4), bool)
+    chromophores = ("melanin", "hemoglobin")
+    held = {name: SkinMap(values, MAP_UNITS[name], valid=valid) for name in chromophores}
+    held |= {f"height_{n}": SkinMap(values, "1", valid=valid) for n in range(30)}
+    maps = store.write(tmp_path / "flash", SkinAppearance(held, "simulated"))
+    with pytest.raises(ExportError, match=r"and 26 more; choose (.*) \[SR-EXP-004\]") as error:
+        exporting.export(maps, tmp_path / "out", to="gltf")
+    offered = str(error.value).partition("; choose ")[2].partition(" [")[0].split(", ")
+    assert offered == ["maps", "spectral"]
+    for to in offered:
+        assert exporting.export(maps, tmp_path / to, to=to).files > 1
 
 
 def test_simulated_data_needs_no_consent(face_folder, tmp_path):

@@ -82,6 +82,18 @@ def test_maps_without_truth_are_reported_with_stderr(folder):
     assert "estimate − ground truth" not in html
 
 
+@pytest.mark.parametrize("light", [0.0, 0.2])
+def test_specular_image_without_light_is_not_drawn(tmp_path, light):
+    maps = {
+        "image": SkinMap(np.full((8, 8, 3), 0.4), "1"),
+        "specular_image": SkinMap(np.full((8, 8, 3), light), "1"),
+    }
+    store.write(tmp_path / "photograph", SkinAppearance(maps, "simulated"))
+    html = report.build([tmp_path])
+    assert "captured image, linear RGB" in html
+    assert ("specular image, linear RGB" in html) == (light > 0.0)
+
+
 def test_empty_folder_is_refused_with_remedy(tmp_path):
     with pytest.raises(report.ReportError, match="skinrig demo"):
         report.build([tmp_path])
