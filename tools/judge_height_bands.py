@@ -1,20 +1,28 @@
-"""Compare estimated heights of the gradient rig with ground truth by band of periods.
+"""Compare heights, and variances of normals, of the gradient rig with ground truth.
 
     python tools/judge_height_bands.py APPEARANCE TRUTH
 
 Each row is a strain step; each column a band of periods, um: root mean square of the error over
-that of the true height within the band, and the band's part of the height's variance.
+that of the true height within the band, and the band's part of the height's variance; then the
+coverage of the height's 68 and 95 % intervals. A second table has the variances along and across
+the jaws over those of the patch's own true topography, less 1: of the height map, and of
+`histograms.json`, which corrects them for occlusion and noise.
 """
 
 import sys
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from model import store
+from model.skin import SkinAppearance, SkinMap
+from reconstruction.normal_histogram.statistics import measure_normals
 from reconstruction.normal_integration.height_filters import high_pass
+from reconstruction.pipeline.gradient.stages import HISTOGRAM_FILE
 from skinrig.appearances.contents import intersect_valid
+from skinrig.evaluating.subsurface import read_document
 
 PERIODS_UM = (1000, 500, 250, 160, 110, 80, 60, 45, 35, 25)
 PIXEL_UM = 6.0
@@ -24,9 +32,11 @@ CUTOFF_UM = 1000.0
 
 def main(appearance: Path, truth: Path) -> None:
     """Print the table of one session."""
-    maps, true_maps = store.read(appearance).maps, store.read(truth).maps
+    estimated = store.read(appearance)
+    maps, true_maps = estimated.maps, store.read(truth).maps
     bands = list(pairwise(PERIODS_UM))
-    print(" | ".join(["step", *(f"{long} to {short}" for long, short in bands)]))
+    header = [*(f"{long} to {short}" for long, short in bands), "coverage of 68 %", "of 95 %"]
+    print(" | ".join(["step", *header]))
     for name in sorted(name for name in maps if name.startswith("height_")):
         valid = intersect_valid(maps[name]) & intersect_valid(true_maps[name])
         given, true = (np.where(valid, one[name].values, 0.0) for one in (maps, true_maps))
@@ -43,7 +53,36 @@ def main(appearance: Path, truth: Path) -> None:
             band = (period <= longest) & (period > shortest)
             error = np.sqrt(off[band].sum() / signal[band].sum())
             cells.append(f"{100 * error:.1f} % ({100 * signal[band].sum() / signal.sum():.1f} %)")
+        error = (given - true)[valid]
+        stderr = np.asarray(maps[name].stderr)[valid]
+        away = np.abs(error - error.mean()) / stderr  # normals do not determine the mean
+        cells += [f"{100 * np.mean(away <= sigmas):.0f} %" for sigmas in (1.0, 1.96)]
         print(" | ".join([name.removeprefix("height_"), *cells]))
+    _print_variances(estimated, true_maps)
+
+
+def _print_variances(estimated: SkinAppearance, true_maps: Mapping[str, SkinMap]) -> None:
+    """Print the variances of normals over those of the true topography, less 1."""
+    document = read_document(estimated, HISTOGRAM_FILE)
+    if document is None:
+        return
+    print("step | height map, along, across | corrected, along, across")
+    for state in document["states"]:
+        given, true = (maps[f"height_{state['name']}"] for maps in (estimated.maps, true_maps))
+        valid = intersect_valid(given) & intersect_valid(true)
+        relief = np.where(valid, true.values, 0.0).astype(float)
+        relief = high_pass(relief, pixel=PIXEL_UM, cutoff=CUTOFF_UM, valid=valid)
+        angle_rad = np.radians(state["angle_deg"])
+        of_truth = measure_normals(relief, pixel=PIXEL_UM, valid=valid, angle_rad=angle_rad)
+        ratios = state["occlusion_ratio_s"], state["occlusion_ratio_t"]
+        corrected = state["variance_s"], state["variance_t"]
+        noise = state["noise_variance"]
+        measured = [v / ratio + noise for v, ratio in zip(corrected, ratios, strict=True)]
+        cells = []
+        for along, across in (measured, corrected):
+            parts = along / of_truth.variance_x - 1.0, across / of_truth.variance_y - 1.0
+            cells.append(", ".join(f"{100 * part:+.1f} %" for part in parts))
+        print(" | ".join([state["name"], *cells]))
 
 
 if __name__ == "__main__":

@@ -9,10 +9,15 @@ extremes of sigma_tr^2::
 Any (l, u, v) is an ellipse, and none is singular at the circle, u = v = 0.
 """
 
+import logging
+
 import numpy as np
 
+from model.solver_outcome import UNKNOWN_CONDITION, SolverOutcome
 from reconstruction.anisotropy.direction_harmonics import AXIAL_COLUMNS, ODD_COLUMNS, HarmonicFit
 from reconstruction.arrays import BoolArray, Float64Array
+
+_log = logging.getLogger(__name__)
 
 N_MEAN_DIRECTIONS = 360
 """Directions over which sigma_tr is averaged; exact to rounding up to ratios of 25."""
@@ -128,6 +133,14 @@ def fit_ellipses(
         active = active[np.abs(step).max(axis=1) > ELLIPSE_STEP_TOL]
         if not active.size:
             break
+    else:
+        found = SolverOutcome(
+            MAX_ELLIPSE_ITERATIONS,
+            float(np.abs(step).max() / ELLIPSE_STEP_TOL),
+            UNKNOWN_CONDITION,
+            "limit",
+        )
+        found.warn_unless_converged(f"{active.size} of {count} diffusion ellipses", _log)
     # ones on the diagonal of parameters not fitted keep the matrix regular
     rows = np.concatenate([np.sqrt(w)[..., None] * jacobian, eye * ~free[:, None, :]], axis=1)
     triangle = np.linalg.inv(np.linalg.qr(rows, mode="r"))

@@ -15,6 +15,7 @@ shift to that side. Blood at the lower end is undetermined by color, because all
 some: then any value has the same probability.
 """
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +26,10 @@ from scipy.optimize import minimize
 from scipy.special import ndtr
 
 from model.checks import FINITE_RANGE, Checks
+from model.solver_outcome import outcome_from_scipy
 from reconstruction.arrays import Float32Array, Float64Array, FloatArray
+
+_log = logging.getLogger(__name__)
 
 MIN_CONTAMINATION: Final = 0.01
 """Minimum fraction of the skin that is outside the distribution, as for the light
@@ -183,6 +187,9 @@ def fit_distribution(
         method="L-BFGS-B",
         bounds=np.stack([low, high], axis=1),
         options={"maxiter": _MAX_ROUNDS, "ftol": 1e-7, "gtol": 1e-5},
+    )
+    outcome_from_scipy(found, float(np.abs(found.jac).max())).warn_unless_converged(
+        "distribution of the face's chromophores", _log
     )
     return FaceDistribution(*search.distributions(found.x))
 

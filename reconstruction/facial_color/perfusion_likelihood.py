@@ -9,14 +9,18 @@ over all other parameters, exceeds its minimum by at most Fisher's F quantile.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import optimize, stats
 
+from model.solver_outcome import outcome_from_scipy
 from reconstruction.arrays import Float64Array
 from reconstruction.facial_color.perfusion_samples import CurveSamples
+
+_log = logging.getLogger(__name__)
 
 Interval = tuple[float, float]
 Shape = Callable[[Float64Array, Float64Array], Float64Array]
@@ -258,6 +262,7 @@ def _refined(
             bounds=around(logs, start[1]),
             method="bounded",
         )
+        outcome = outcome_from_scipy(found, float(found.fun))
         point, height = (float(delays[0]), float(found.x)), float(found.fun)
     else:
         bounds = [around(delays, start[0]), around(logs, start[1])]
@@ -268,7 +273,9 @@ def _refined(
             bounds=bounds,
             options={"xatol": 1e-5, "fatol": 1e-9},
         )
+        outcome = outcome_from_scipy(simplex, float(simplex.fun))
         point, height = (float(simplex.x[0]), float(simplex.x[1])), float(simplex.fun)
+    outcome.warn_unless_converged("course of blood", _log)
     if height < at_start:
         return (*point, height)
     return float(start[0]), float(start[1]), at_start

@@ -186,7 +186,7 @@ def _cached(
     length = np.linalg.norm(places, axis=1, keepdims=True)
     places = places * np.minimum(1.0, 1.38 / np.maximum(length, 1e-9))
     normals = normal_from_disc(places) @ frame
-    see = _diffuse_sums(lights, frame, eta) if matte else _specular_sums(lights, frame, alpha, eta)
+    see = _diffuse_sums(lights, frame, eta) if matte else specular_sums(lights, frame, alpha, eta)
     layers = np.empty((len(places), TABLE_LAYERS + (FIELD_LAYERS if near else 0)))
     for start in range(0, len(places), 2048):
         part = slice(start, start + 2048)
@@ -204,7 +204,7 @@ def _cached(
         if alpha_stderr > 0.0:
             step_a = 0.02 * alpha
             before, after = (
-                seen(np.zeros(3), _specular_sums(lights, frame, a, eta))[:, :2]
+                seen(np.zeros(3), specular_sums(lights, frame, a, eta))[:, :2]
                 for a in (alpha - step_a, alpha + step_a)
             )
             move = (after - before) / (2.0 * step_a) * alpha_stderr
@@ -242,7 +242,23 @@ def _white(lights: SphereLights, frame: Float64Array) -> float:
     return float(np.sum(lights.intensities * facing) / np.pi)
 
 
-def _specular_sums(lights: SphereLights, frame: Float64Array, alpha: float, eta: float) -> Sums:
+def specular_sums(lights: SphereLights, frame: Float64Array, alpha: float, eta: float) -> Sums:
+    """Return a function of each light's part of a rough surface's reflection.
+
+    Parameters
+    ----------
+    lights
+        The sphere.
+    frame : ndarray, shape (3, 3)
+        Rows: right, up and the view, in the rig frame.
+    alpha, eta : float
+        GGX roughness and refractive index, not checked here.
+
+    Returns
+    -------
+    function of normals (P, 3) and a position (3,), mm, that returns an array (P, L)
+        Parallel less crossed light over that of a white diffuser that faces the view.
+    """
     view = frame[2]
     mirrored = facet_reflectance(lights, view, eta) * (1.0 - lights.leakage)
     # the analyzer halves the white diffuser's light but not the polarized reflection's

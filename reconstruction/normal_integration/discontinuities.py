@@ -8,6 +8,7 @@ of a pixel and direction sum to one, so that a jump removes at most one of its t
 A jump all around a closed contour leaves no trace in normals, so its height cannot be recovered.
 """
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from numba import njit, prange
 from numpy.typing import ArrayLike
 
 from model.checks import Checks
+from model.solver_outcome import SolverOutcome
 from reconstruction.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from reconstruction.normal_integration import slope_fields
 from reconstruction.normal_integration.integration import label_parts, to_height
@@ -25,6 +27,8 @@ from reconstruction.normal_integration.weighted_poisson import (
     solve_poisson,
 )
 from reconstruction.normal_maps import NormalMaps
+
+_log = logging.getLogger(__name__)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -127,10 +131,8 @@ class DiscontinuousHeight:
         neighbor is one less it. Far from 1/2 at a jump.
     energy : float
         The paper's objective at the last round's weights, px^2.
-    rounds : int
-        Number of rounds.
-    converged : bool
-        Whether the energy stopped changing.
+    outcome : SolverOutcome
+        Of the rounds; its residual is the last relative change of `energy`.
     """
 
     height: FloatArray
@@ -139,8 +141,7 @@ class DiscontinuousHeight:
     right: Float32Array
     below: Float32Array
     energy: float
-    rounds: int
-    converged: bool
+    outcome: SolverOutcome
 
 
 def integrate_with_discontinuities(
@@ -182,7 +183,7 @@ def integrate_with_discontinuities(
     >>> import numpy as np
     >>> flat = np.broadcast_to([0.0, 0.0, 1.0], (8, 8, 3))
     >>> found = integrate_with_discontinuities(flat)
-    >>> float(np.ptp(found.height)), found.converged
+    >>> float(np.ptp(found.height)), found.outcome.converged
     (0.0, True)
     """
     Checks(IntegrationError).within("pixel", pixel, "(0, inf)")
@@ -194,21 +195,22 @@ def integrate_with_discontinuities(
     ax, ay, dx, dy = slope_fields.edges(slopes, order=2)
     ex, ey = (ax > 0).astype(np.float32), (ay > 0).astype(np.float32)
     x = np.zeros(dx.shape)
-    solve_poisson(MultigridHierarchy(ax, ay), dx, dy, x, tolerance=1e-2)
+    condition = solve_poisson(MultigridHierarchy(ax, ay), dx, dy, x, tolerance=1e-2).condition
     wx, wy = np.zeros_like(ax), np.zeros_like(ax)
     by_row = np.zeros(ax.shape[0])
-    before, settled, done = np.inf, False, 0
+    before, change, done = np.inf, np.inf, 0
     while True:
         _side_weights(x, ex, ey, slopes.facing, float(chosen.sharpness), wx, wy)
         _one_sided(slopes.gx, slopes.gy, ux, uy, wx, wy, ex, ey, x, ax, ay, dx, dy, by_row)
         energy = float(by_row.sum())
-        settled = abs(before - energy) <= chosen.stop * before if before < np.inf else energy == 0.0
-        if settled or done >= chosen.rounds:
+        change = abs(before - energy) / before if 0.0 < before < np.inf else energy
+        if change <= chosen.stop or done >= chosen.rounds:
             break
-        solve_poisson(
+        solved = solve_poisson(
             MultigridHierarchy(ax, ay), dx, dy, x, tolerance=1e-6, iterations=chosen.inner
         )
         before, done = energy, done + 1
+        condition = solved.condition
     part = label_parts(slopes.valid)
     kind = np.asarray(normals.normals if isinstance(normals, NormalMaps) else normals).dtype
     height = to_height(x[1:-1, 1:-1], part, pixel=pixel, camera=camera)
@@ -219,8 +221,9 @@ def integrate_with_discontinuities(
         wx[1:-1, 1:-1].copy(),
         wy[1:-1, 1:-1].copy(),
         energy,
-        done,
-        settled,
+        SolverOutcome(
+            done, change, condition, "tolerance" if change <= chosen.stop else "limit"
+        ).warn_unless_converged("bilateral integration", _log),
     )
 
 

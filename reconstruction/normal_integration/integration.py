@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 
 from model.checks import Checks
+from model.solver_outcome import SolverOutcome
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray, Int32Array
 from reconstruction.normal_integration import slope_fields
 from reconstruction.normal_integration.height_filters import denoise_slopes
 from reconstruction.normal_integration.slope_fields import Perspective, SlopeField
 from reconstruction.normal_integration.weighted_poisson import (
-    Convergence,
     IntegrationError,
     MultigridHierarchy,
     solve_poisson,
@@ -70,13 +70,14 @@ class HeightMap:
         Pixels of the mask whose normal faces the camera.
     part : ndarray of int32, shape (H, W)
         Number of the connected part (by rows and columns, not diagonally), from 1; 0 outside.
-    convergence : Convergence
+    convergence : SolverOutcome
+        See `solve_poisson`.
     """
 
     height: FloatArray
     valid: BoolArray
     part: Int32Array
-    convergence: Convergence
+    convergence: SolverOutcome
 
 
 def integrate(
@@ -233,7 +234,7 @@ def integrate_map(
         )
     Checks(IntegrationError).choice("method", method, ("auto", "multigrid", "dct"))
     if plain and method != "multigrid":
-        relief, convergence = _by_cosines(slopes, chosen), Convergence(0, 0.0, True)
+        relief, convergence = _by_cosines(slopes, chosen), SolverOutcome(0, 0.0, 1.0, "tolerance")
     else:
         relief, convergence = _by_multigrid(slopes, chosen)
     part = label_parts(slopes.valid)
@@ -246,7 +247,7 @@ def integrate_map(
 
 def _by_multigrid(
     slopes: SlopeField, settings: IntegrationSettings
-) -> tuple[Float64Array, Convergence]:
+) -> tuple[Float64Array, SolverOutcome]:
     ax, ay, dx, dy = slope_fields.edges(slopes, order=settings.order)
     x = np.zeros(dx.shape)
     convergence = solve_poisson(

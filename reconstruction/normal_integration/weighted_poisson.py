@@ -5,11 +5,14 @@ equations are solved by conjugate gradients with a multigrid cycle as preconditi
 matrix. See `multigrid_kernels` for the multigrid.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numba import get_num_threads, set_num_threads
+from scipy.linalg import eigvalsh_tridiagonal
 
+from model.solver_outcome import UNKNOWN_CONDITION, SolverOutcome, StopReason
 from reconstruction.arrays import Float32Array, Float64Array
 from reconstruction.normal_integration import multigrid_coarsening as coarsening
 from reconstruction.normal_integration import multigrid_kernels as kernels
@@ -25,18 +28,6 @@ _RESIDUAL_REDUCTION = 1e-4
 
 class IntegrationError(ValueError):
     """Normals, masks or settings that no height can be computed from."""
-
-
-@dataclass(frozen=True, slots=True)
-class Convergence:
-    """Iterations and residual of a solution."""
-
-    iterations: int
-    """Number of conjugate gradient iterations."""
-    residual: float
-    """Norm of the normal equations' residual over that of their right side, in float64."""
-    converged: bool
-    """Whether `residual` is at most the tolerance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +124,7 @@ def solve_poisson(
     *,
     tolerance: float = 1e-5,
     iterations: int = 200,
-) -> Convergence:
+) -> SolverOutcome:
     """Solve for x in place, starting from its values.
 
     Parameters
@@ -153,21 +144,30 @@ def solve_poisson(
 
     Returns
     -------
-    Convergence
+    SolverOutcome
+        Its residual is the norm of the normal equations' residual over that of their right side, in
+        float64; its condition that of the preconditioned equations, by the Lanczos coefficients of
+        the last conjugate gradients.
     """
     ax, ay = hierarchy.ax, hierarchy.ay
     r, z, p, q = (np.zeros(ax.shape, np.float32) for _ in range(4))
     pair, sums = np.zeros((2, ax.shape[0])), np.zeros(ax.shape[0])
     done, energy, found = 0, 0.0, np.inf
+    condition = UNKNOWN_CONDITION
     while True:
         kernels.residual(ax, ay, dx, dy, x, r, pair)
         norm, given = (float(np.sqrt(total)) for total in pair.sum(axis=1))
         before, found = found, norm / given if given > 0.0 else 0.0
         if found <= tolerance or done >= iterations or not found < 0.5 * before:
-            return Convergence(done, found, found <= tolerance)
+            stop: StopReason = "limit" if done >= iterations else "stalled"
+            return SolverOutcome(
+                done, found, condition, "tolerance" if found <= tolerance else stop
+            )
         # r is rounded to float32: constants in it from rounding must stay small against r
         goal = max(0.9 * tolerance * given, _RESIDUAL_REDUCTION * norm)
         left, rz = norm, 0.0
+        lengths: list[float] = []
+        ratios: list[float] = []
         while done < iterations:
             hierarchy.cycle(r, z)
             kernels.inner(r, z, sums)
@@ -178,7 +178,8 @@ def solve_poisson(
             )
             if not rz > 0.0 or (left <= goal and enough):
                 break
-            kernels.direction(z, p, np.float32(rz / old if old > 0.0 else 0.0), ax, ay, q, sums)
+            ratio = rz / old if old > 0.0 else 0.0
+            kernels.direction(z, p, np.float32(ratio), ax, ay, q, sums)
             p, q = q, p
             curvature = float(sums.sum())
             if not curvature > 0.0:
@@ -186,3 +187,21 @@ def solve_poisson(
             kernels.advance(p, rz / curvature, ax, ay, x, r, sums)
             left = float(np.sqrt(sums.sum()))
             done += 1
+            lengths.append(rz / curvature)
+            ratios.append(ratio)
+        if lengths:
+            condition = _lanczos_condition(np.array(lengths), np.array(ratios))
+
+
+def _lanczos_condition(lengths: Float64Array, ratios: Float64Array) -> float:
+    """Return the condition number from the steps of conjugate gradients (Saad 2003, section 6.7).
+
+    Parameters
+    ----------
+    lengths, ratios : ndarray, shape (K,)
+        Length of each step, and its part of the direction before it; the first ratio is 0.
+    """
+    diagonal = 1.0 / lengths
+    diagonal[1:] += ratios[1:] / lengths[:-1]
+    values = eigvalsh_tridiagonal(diagonal, np.sqrt(ratios[1:]) / lengths[:-1])
+    return float(values[-1] / values[0]) if values[0] > 0.0 else math.inf

@@ -5,6 +5,7 @@ motion per frame is fitted to all cameras' tracks together. Large residuals are 
 and a frame with many of them is not usable.
 """
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -13,8 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.checks import Checks
+from model.solver_outcome import UNKNOWN_CONDITION, SolverOutcome, estimate_condition
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from reconstruction.registration import tracking as registration
+
+_log = logging.getLogger(__name__)
+NO_STEPS = SolverOutcome(0, 0.0, UNKNOWN_CONDITION, "tolerance")
 
 MIN_TRACK_COSINE = 0.4
 """Cosine between normal and view below which a point is not tracked."""
@@ -222,6 +227,8 @@ def estimate(
             found.append(_Pose(np.zeros(6), np.zeros(6), np.zeros(total)))
             continue
         found.append(_pose(pictures, cameras, points, chosen, evened, iterations))
+    worst = max((pose.outcome for pose in found), key=lambda outcome: outcome.residual)
+    worst.warn_unless_converged("head motion", _log)
     return _evaluate_frames(
         found, np.concatenate([points[rows] for rows in chosen]), times, reference
     )
@@ -235,6 +242,7 @@ class _Pose:
     stderr: Float64Array
     residual_px: Float64Array
     """Length of each track's residual, infinite for a lost track."""
+    outcome: SolverOutcome = NO_STEPS
 
 
 def _checked(
@@ -291,13 +299,13 @@ def _pose(
     left = np.full(found.size, np.inf)
     if np.count_nonzero(found) < MIN_TRACKS:
         return _Pose(np.zeros(6), np.full(6, np.inf), left)
-    motion, settled = np.zeros(6), False
+    motion, residual, condition = np.zeros(6), np.inf, np.nan
     for step in range(iterations + 1):
         r, J = _residuals(seen, motion)
         length = np.linalg.norm(r, axis=1)
         scale = max(float(np.median(length)) / _RAYLEIGH_MEDIAN, 1e-6)
         u2 = (length / (TRACK_TUKEY_SIGMAS * scale)) ** 2
-        if settled or step == iterations:
+        if residual < 1.0 or step == iterations:
             break
         w = np.maximum(1.0 - u2, 0.0) ** 2
         A = np.einsum("n,nki,nkj->ij", w, J, J)
@@ -305,12 +313,13 @@ def _pose(
         A = A / np.outer(size, size) + 1e-9 * np.eye(6)
         move = np.linalg.solve(A, np.einsum("n,nki,nk->i", w, J, r) / size) / size
         motion = motion + move
-        settled = bool(np.abs(move[:3]).max() < 1e-8 and np.abs(move[3:]).max() < 1e-6)
+        residual = float(np.abs(move / np.repeat([1e-8, 1e-6], 3)).max())
+        condition = estimate_condition(A)
     stderr = _stderr(r, J, u2, _blocks(seen))
-    if not np.isfinite(stderr).all():
-        motion = np.zeros(6)
+    motion = motion if np.isfinite(stderr).all() else np.zeros(6)
     left[found] = length
-    return _Pose(motion, stderr, left)
+    outcome = SolverOutcome(step, residual, condition, "tolerance" if residual < 1.0 else "limit")
+    return _Pose(motion, stderr, left, outcome)
 
 
 def _worst_part(points: Float64Array, length: Float64Array) -> float:

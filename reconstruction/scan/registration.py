@@ -7,6 +7,7 @@ Rotating the scan rotates its normals, so rotation follows from thousands of nor
 follows from the curvature at nose, eyes and mouth. Texture, landmarks or a true mesh are not used.
 """
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -17,6 +18,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from model.checks import Checks
+from model.solver_outcome import SolverOutcome, estimate_condition
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int64Array
 from reconstruction.lumitexels import LightSources, SampledSurface, compute_visibility
 from reconstruction.lumitexels.ray_casting import RayCaster
@@ -27,6 +29,8 @@ from reconstruction.scan.rough_normals import (
     ScanRegistrationError,
     estimate_rough_normals,
 )
+
+_log = logging.getLogger(__name__)
 
 MAX_IMAGE_WIDTH_PX: Final = 320
 """Width down to which larger images are binned 2 x 2."""
@@ -42,6 +46,9 @@ NOD_BIAS_RAD: Final = 0.0018
 Light from below is weaker and returns from chin and chest, so that photographs turn all normals of
 a head alike. Set on two dome sessions (types III and V) and four rendered heads: rotations about x
 erred by -2.1, -2.7, -0.7, -1.5, -1.9 and -0.9 mrad, of which their scatter states 1.0."""
+TURN_TOL_RAD: Final = 1e-4
+SHIFT_TOL_MM: Final = 1e-2
+"""Steps below which a registration ends."""
 MAX_STILL_CHI_SQUARE: Final = 16.81
 """99 % quantile of chi-square of six degrees of freedom."""
 
@@ -64,7 +71,8 @@ class RigidFit:
     """Median angle between the scan's normals and the photographs'."""
     samples: int
     """Number of pairs of point and view used."""
-    converged: bool
+    outcome: SolverOutcome
+    """Of the steps at all blurs; the residual is the last step's size over its tolerance."""
 
     def move(self, points_mm: ArrayLike) -> Float64Array:
         """Transform points of the scan to the rig frame."""
@@ -126,7 +134,7 @@ def register_scan(
     shift = np.zeros(3) if start is None else np.asarray(start[1], np.float64)
     middle = p.mean(axis=0)
     system = _System(np.zeros((6, 6)), np.zeros(6), np.zeros((0, 6)), np.zeros(0), 0)
-    converged = False
+    iterations, residual = 0, np.inf
     at_blur: list[tuple[Float64Array, Float64Array]] = []
     for blur in blurs_px:
         maps = [_blurred(view, blur) for view in evidence]
@@ -143,8 +151,13 @@ def register_scan(
             turn = small @ turn
             shift = small @ (shift - center) + center + step[3:]
             # bilinear maps have kinks between which steps of this size oscillate
-            converged = bool(np.linalg.norm(step[:3]) < 1e-4 and np.linalg.norm(step[3:]) < 1e-2)
-            if converged:
+            iterations += 1
+            residual = float(
+                max(
+                    np.linalg.norm(step[:3]) / TURN_TOL_RAD, np.linalg.norm(step[3:]) / SHIFT_TOL_MM
+                )
+            )
+            if residual < 1.0:
                 break
         at_blur.append((turn, turn @ middle + shift))
     stderr = _clustered(system, p)
@@ -158,8 +171,14 @@ def register_scan(
         sizes = [np.linalg.norm(v) / np.sqrt(3) for v in (vector, center_last - center_before)]
         stderr = np.hypot(stderr, np.repeat(sizes, 3))
     angle = np.degrees(2.0 * np.arcsin(np.clip(0.5 * np.median(system.size), 0.0, 1.0)))
+    outcome = SolverOutcome(
+        iterations,
+        residual,
+        estimate_condition(system.matrix),
+        "tolerance" if residual < 1.0 else "limit",
+    ).warn_unless_converged("registration of the scan", _log)
     return RigidFit(
-        turn, shift, turn @ middle + shift, stderr, float(angle), system.samples, converged
+        turn, shift, turn @ middle + shift, stderr, float(angle), system.samples, outcome
     )
 
 

@@ -14,6 +14,8 @@ doi:10.1016/0262-8856(92)90066-C.
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -23,12 +25,15 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from model.checks import Checks
+from model.solver_outcome import UNKNOWN_CONDITION, SolverOutcome
 from reconstruction.arrays import BoolArray, Float64Array
 from reconstruction.scan.closest_points import ScanSurface, closest_barycentric
 from reconstruction.scan.face_template import FaceTemplate, vertex_areas_mm2
 from reconstruction.scan.repair import ScanMeshError, TriangleMesh
 from reconstruction.scan.surface_stiffness import SurfaceStiffness, surface_stiffness
 from reconstruction.scan.template_pose import TemplatePose, estimate_pose
+
+_log = logging.getLogger(__name__)
 
 LENGTH_RANGE_MM: Final = (5.0, 100.0)
 """Smoothing lengths of the last and of the first step."""
@@ -328,6 +333,10 @@ class _System:
             z = self._factor.solve(r)
             rz, before = float(np.sum(r * z)), rz
             p = z + (rz / before) * p
+        else:
+            SolverOutcome(
+                SOLVER_STEPS, math.sqrt(rz / target), UNKNOWN_CONDITION, "limit"
+            ).warn_unless_converged("equations of the template", _log)
         return x
 
 

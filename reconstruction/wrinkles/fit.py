@@ -12,6 +12,7 @@ Jimenez, Echevarria, Oat, Gutierrez 2011, Practical and Realistic Facial Wrinkle
 GPU Pro 2, chapter 1. ISBN 978-1-56881-718-7
 """
 
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from numpy.typing import ArrayLike
 
 from model import texture_resampling as resampling
 from model.checks import Checks
+from model.solver_outcome import UNKNOWN_CONDITION, SolverOutcome, StopReason
 from model.wrinkles import Masks, WrinkleError, WrinkleLayer, mask_stack
 from model.wrinkles.evaluation import WrinkleModel
 from model.wrinkles.expressions import JIMENEZ2011_TABLE, ZONE_SUM_LIMITS, Clamp, ExpressionTable
@@ -41,6 +43,8 @@ from reconstruction.wrinkles.weights import (
     build_equations,
     fit_zone_weights,
 )
+
+_log = logging.getLogger(__name__)
 
 Measured: TypeAlias = ArrayLike | NormalMaps | Derivatives
 
@@ -65,10 +69,9 @@ class WrinkleFit:
         Derivatives of the neutral face.
     explained : float
         1 - |misfit|^2 / |differences|^2 with the table's weights, all expressions together.
-    rounds : int
-        Alternations of map and weights; 0 where the weights were given.
-    converged : bool
-        The last round increased `explained` by at most `MISFIT_TOL`.
+    outcome : SolverOutcome
+        Of the alternations of map and weights, 0 where the weights were given; its residual is the
+        last round's gain of `explained`, its tolerance `MISFIT_TOL`.
     clamp : {"unit", "signed"}
         Range of the weights.
     """
@@ -77,8 +80,7 @@ class WrinkleFit:
     expressions: Mapping[str, ZoneWeights]
     base: Derivatives
     explained: float
-    rounds: int
-    converged: bool
+    outcome: SolverOutcome
     clamp: Clamp
 
     def model(self) -> WrinkleModel:
@@ -165,13 +167,13 @@ def fit_wrinkle_map(
         raise WrinkleError(f"zones: got {len(names)} names, expected {len(stack)}; {hint}")
     base = measure_derivatives(neutral)
     data = differences(base, expressions)
-    rounds, settled = 0, True
+    outcome = SolverOutcome(0, 0.0, UNKNOWN_CONDITION, "tolerance")
     if table is not None:
         rows = {name: table.row(name) for name in data}
         for name, row in rows.items():
             Checks(WrinkleError).shape(f"table[{name!r}]", row, (len(stack),))
     else:
-        rows, rounds, settled = _alternate(stack, data, base, size, clamp)
+        rows, outcome = _alternate(stack, data, base, size, clamp)
     texels = _solve_map(stack, rows, data, size)
     wrinkle = _read(texels.values, base.valid.shape)
     found = {
@@ -192,7 +194,7 @@ def fit_wrinkle_map(
         texels.valid,
     )
     return WrinkleFit(
-        layer, found, base, 1.0 - misfit / total if total > 0 else 0.0, rounds, settled, clamp
+        layer, found, base, 1.0 - misfit / total if total > 0 else 0.0, outcome, clamp
     )
 
 
@@ -202,32 +204,34 @@ def _alternate(
     base: Derivatives,
     size: tuple[int, int],
     clamp: Clamp,
-) -> tuple[dict[str, Float64Array], int, bool]:
-    """Alternate map and weights; return weights, number of rounds, and whether they converged.
+) -> tuple[dict[str, Float64Array], SolverOutcome]:
+    """Alternate map and weights; return the weights and how the rounds ended.
 
     Weights hardly depend on fine detail: they are estimated at a resolution of two pixels per texel
     of map or masks.
     """
     rows = _initial_weights(masks, data, base)
     if len(data) == 1:
-        return rows, 0, True  # all weights are 1
+        # all weights are 1
+        return rows, SolverOutcome(0, 0.0, UNKNOWN_CONDITION, "tolerance")
     shape = base.valid.shape
     rough = min(size[0], COARSE_SIDE), min(size[1], COARSE_SIDE)
     texels = max(rough[0], masks.shape[1]), max(rough[1], masks.shape[2])
     small = min(2 * texels[0], shape[0]), min(2 * texels[1], shape[1])
     data = {name: _reduced(one, small) for name, one in data.items()}
     bounds = (0.0 if clamp == "unit" else -math.inf, math.inf)
-    left = math.inf
-    for rounds in range(1, FIT_ROUNDS + 1):
+    left, gain, rounds = math.inf, math.inf, 0
+    while gain > MISFIT_TOL and rounds < FIT_ROUNDS:
+        rounds += 1
         equations = _equations(masks, _solve_map(masks, rows, data, rough, tolerance=1e-7), data)
         free = {name: one.solve_bounded(bounds) for name, one in equations.items()}
         rows = _limited(free)
         misfit = sum(equations[name].misfit(row) for name, row in free.items())
         total = sum(one.total for one in equations.values())
-        if left - misfit <= MISFIT_TOL * total:
-            return rows, rounds, True
-        left = misfit
-    return rows, FIT_ROUNDS, False
+        gain, left = (left - misfit) / max(total, 1e-300), misfit
+    stop: StopReason = "tolerance" if gain <= MISFIT_TOL else "limit"
+    outcome = SolverOutcome(rounds, gain, UNKNOWN_CONDITION, stop)
+    return rows, outcome.warn_unless_converged("wrinkle map and weights", _log)
 
 
 def _reduced(difference: Difference, shape: tuple[int, int]) -> Difference:

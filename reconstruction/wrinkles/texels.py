@@ -5,6 +5,7 @@ solve the normal equations of that interpolation, a matrix of nine neighbors. Wi
 strengths of 1 the result is the least-squares low-pass of the map at its resolution.
 """
 
+import logging
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -17,9 +18,12 @@ from scipy.sparse.linalg import cg
 from model import texture_resampling as resampling
 from model import wrinkles
 from model.checks import Checks
+from model.solver_outcome import UNKNOWN_CONDITION, SolverOutcome
 from model.wrinkles import WrinkleError
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.normal_maps import NormalMaps
+
+_log = logging.getLogger(__name__)
 
 MAX_DERIVATIVE = 4.0
 """Derivatives beyond this, slopes of 76 degrees, are measured in too oblique views to be used."""
@@ -28,6 +32,7 @@ MIN_COVERAGE = 0.1
 MIN_STRENGTH = 1e-3
 """Sum of squared strengths, relative to the largest, below which a texel is not determined."""
 SOLVER_TOL = 1e-12
+MAX_CG_STEPS = 500
 RELATIVE_DAMPING = 1e-10
 MIN_DIAGONAL = 1e-9
 """Diagonal of the normal matrix, relative to the largest, below which a texel stays at 0."""
@@ -180,7 +185,13 @@ def fit_texels(
     for c in range(channels):
         b = gather_texels(by, bx, product[..., c]).ravel()[some]
         first = b / summed.ravel()[some] / root
-        solved, _ = cg(matrix, root * b, x0=first, rtol=tolerance, maxiter=500)
+        solved, steps = cg(matrix, root * b, x0=first, rtol=tolerance, maxiter=MAX_CG_STEPS)
+        if steps > 0:
+            size = max(float(np.linalg.norm(root * b)), 1e-300)
+            residual = float(np.linalg.norm(root * b - matrix @ solved)) / size
+            SolverOutcome(steps, residual, UNKNOWN_CONDITION, "limit").warn_unless_converged(
+                "texels of a map", _log
+            )
         plane = np.zeros(summed.size)
         plane[some] = root * solved
         values[..., c] = np.where(valid, plane.reshape(shape), 0.0)

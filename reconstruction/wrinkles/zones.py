@@ -12,6 +12,7 @@ Jimenez, Echevarria, Oat, Gutierrez 2011, Practical and Realistic Facial Wrinkle
 GPU Pro 2, chapter 1 (zones of figure 1.3, which an artist drew). ISBN 978-1-56881-718-7
 """
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -19,12 +20,15 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 from scipy.ndimage import distance_transform_edt
 
+from model.solver_outcome import UNKNOWN_CONDITION, SolverOutcome
 from model.texture_resampling import averaging_matrix
 from model.vectors import project_to_simplex
 from model.wrinkles import Masks, WrinkleError, mask_stack
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.wrinkles.fit import Measured, differences
 from reconstruction.wrinkles.texels import measure_derivatives
+
+_log = logging.getLogger(__name__)
 
 MIN_SIGNAL = 3.0
 """Minimum energy of a texel's pattern over its scatter by the standard errors: their variance over
@@ -187,8 +191,13 @@ def fit_zones(
         before = weights
         weights = _weights_of(masks, target, strength)
         masks = _on_simplex_fit(masks, prior, target, weights, trust)
-        if np.abs(weights - before).max() < 1e-5:
+        change = float(np.abs(weights - before).max())
+        if change < 1e-5:
             break
+    else:
+        SolverOutcome(ZONE_ROUNDS, change, UNKNOWN_CONDITION, "limit").warn_unless_converged(
+            "zones of wrinkles", _log
+        )
     left = (strength[:, None] * (target - masks @ weights) ** 2).sum()
     whole = (strength[:, None] * target**2).sum()
     squares = strength / np.maximum(amplitudes.rank_one_fraction.ravel(), 1e-12)

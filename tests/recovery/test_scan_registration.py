@@ -75,7 +75,7 @@ def test_a_motion_is_found_again_from_perfect_normals(head, maps, axis, degrees,
     fit = register_scan(
         points[::3], (head.normals @ turn)[::3], maps, visible=visible(head, maps)[:, ::3]
     )
-    assert fit.converged
+    assert fit.outcome.converged
     assert angle_deg(fit.rotation @ turn.T) < 0.1
     assert np.abs(fit.move(points) - head.vertices_mm).max() < 0.35
     assert fit.residual_deg < 3.0

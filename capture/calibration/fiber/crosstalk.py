@@ -1,5 +1,6 @@
 """Cross-talk of fibers: fraction of every other fiber's light in each spot, and stray light."""
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -10,6 +11,8 @@ from numpy.typing import NDArray
 from capture.arrays import Float64Array
 from capture.calibration.fiber.readings import FiberReadings
 from capture.calibration.record import CalibrationError, freeze_arrays
+
+_log = logging.getLogger(__name__)
 
 DISTANCE_EDGES: Final = (1, 2, 3, 4, 6, 9, 14, 21)
 """First distance, in fibers, of each group of pairs with similar cross-talk."""
@@ -206,6 +209,8 @@ def measure_crosstalk(masks: Mapping[int, FiberReadings], phantom: FiberReadings
         offset_variance = np.where(known, 1.0 / np.where(known, total, 1.0), 0.0)
         if (np.abs(offset - before) <= 1e-3 * np.sqrt(offset_variance)).all():
             break
+    else:
+        _log.warning("cross-talk: not converged after %d iterations", MAX_CROSSTALK_ITERATIONS)
     np.fill_diagonal(matrix, 1.0)
     np.fill_diagonal(variance, 0.0)
     leak, leak_stderr, offset, offset_stderr, common = _separate_stray_light(
@@ -248,6 +253,8 @@ def _separate_stray_light(
         level = found[1:]
         if abs(leak - before) <= 1e-3 * leak:
             break
+    else:
+        _log.warning("leak of covers: not converged after %d iterations", MAX_CROSSTALK_ITERATIONS)
     rest = steady - leak * source
     doubt = variance + source**2 * (leak_variance + (COVER_TRANSMITTANCE_SCATTER * leak) ** 2)
     stray = np.tile(level, (count, 1))

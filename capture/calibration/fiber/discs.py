@@ -1,5 +1,6 @@
 """Find candidate spots in a raw mosaic and fit blurred discs to them."""
 
+import logging
 from typing import Any, Final
 
 import numpy as np
@@ -10,6 +11,8 @@ from scipy.special import erfc
 
 from capture.arrays import Float64Array
 from capture.calibration.fiber.merge import MergedSeries, color_masks
+
+_log = logging.getLogger(__name__)
 
 GrayImage = tuple[Float64Array, Float64Array]
 """Sum of a cell's colors at every pixel, full scales per second, and its variance, (H, W)."""
@@ -26,6 +29,7 @@ MIN_SPOT_CONTRAST: Final = 0.3
 """Smallest height of a spot above the light around it, relative."""
 BORDER_PITCH: Final = 0.2
 """Border of the image without a search for spots, in distances of neighbors."""
+MAX_DISC_EVALUATIONS: Final = 30
 MAX_CENTER_STDERR_PITCH: Final = 0.04
 """Largest standard error of a valid position, pixels."""
 SPOT_SCATTER: Final = 0.03
@@ -132,7 +136,11 @@ def fit_disc(
         [position[0] + 0.5 * pitch, position[1] + 0.5 * pitch, 0.7 * pitch, 0.3 * pitch]
     )
     begin = np.clip(begin, low + 1e-6, high - 1e-6)
-    done = least_squares(misfit, begin, bounds=(low, high), x_scale=[1, 1, 1, 0.5], max_nfev=30)
+    done = least_squares(
+        misfit, begin, bounds=(low, high), x_scale=[1, 1, 1, 0.5], max_nfev=MAX_DISC_EVALUATIONS
+    )
+    if done.status == 0:
+        _log.warning("disc of a fiber: not converged after %d evaluations", MAX_DISC_EVALUATIONS)
     amplitude = _solve_colors(done.x, px, py, data / sigma, sigma, parts, stiff)[2]
     at_bound = bool(((done.x <= low + 1e-3) | (done.x >= high - 1e-3))[:2].any())
     if at_bound or amplitude.max() <= 0:

@@ -6,6 +6,7 @@ lights together determine the ball's position much better than one light's posit
 spot then gives the direction of its own light.
 """
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,8 @@ from capture.calibration.lights.reflection import (
 )
 from capture.calibration.record import CalibrationError, freeze_arrays
 from capture.calibration.robust import HUBER_SIGMAS, mad_sigma
+
+_log = logging.getLogger(__name__)
 
 SPOT_DETECTION_SIGMAS = 7.0  # of the smoothed image: none of 4 million pixels of noise reaches it
 SPOT_BLUR_MM = 0.012
@@ -366,6 +369,8 @@ def _refine(
             gate_px = np.clip(6 * scatter_mm * np.abs(moved).max(), 6.0, SPOT_GATE_MM / pixel_mm)
         if step >= 4 and float(change @ normal @ change) < 1e-6:
             break
+    else:
+        _log.warning("place of the ball: not converged after %d steps", N_BALL_STEPS)
     in_field = _inside(seen.pixels, camera, margin_px)
     if in_field[shows].sum() < MIN_LIGHT_FRACTION * shows.sum():
         raise BallError(

@@ -9,6 +9,7 @@ skin, in each direction, which differs from that of the glass.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,8 @@ from numpy.typing import ArrayLike
 from capture.arrays import BoolArray, Float64Array
 from capture.calibration.polarization import PolarizationError
 from capture.calibration.polarization.polarized_reflection import FacetReflection
+
+_log = logging.getLogger(__name__)
 
 MAX_ANALYZER_ZERO_DEG = 30  # of the analyzer, searched
 TYPICAL_LEAK = 3e-4  # of a polarizer, extinction 1e3 to 1e4
@@ -332,6 +335,13 @@ class _PolarizerProblem:
             now = self._objective(self.strength, self.turn, self.shared)
             if settled and gain < POLARIZER_STEP_TOL:
                 break
+        else:
+            _log.warning(
+                "axes of polarizers: not converged after %d steps, last gain %.2g of %.2g",
+                MAX_POLARIZER_STEPS,
+                gain,
+                now,
+            )
         return self
 
     def solve_all_modes(self) -> _PolarizerProblem:

@@ -8,6 +8,7 @@ plate. Before that, the shading of each light is compared with that of all light
 dark frames determine the position of a light.
 """
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -19,6 +20,8 @@ from capture.calibration.geometry import CameraPose
 from capture.calibration.lights.light_list import CameraResponse, LightTable
 from capture.calibration.lights.white_plate import PlateSamples, WhitePlate
 from capture.calibration.record import CalibrationError
+
+_log = logging.getLogger(__name__)
 
 # parameters of a light (intensities, exponent, tilt), of a camera, of a pose or a part
 N_LIGHT, N_RESPONSE, N_TILT = 6, 5, 2
@@ -291,6 +294,12 @@ class _Fit:
             numbers = numbers + step
             if np.abs(step).max() < 1e-8:
                 break
+        else:
+            _log.warning(
+                "lights by a plate: not converged after %d steps, last step %.2g",
+                N_LIGHT_FIT_STEPS,
+                np.abs(step).max(),
+            )
         errors = np.sqrt(np.clip(np.diag(covariance), 0, None))
         table, seen = self._table(numbers, errors)
         silent = [name for name, ok in zip(table.names, seen, strict=True) if not ok]

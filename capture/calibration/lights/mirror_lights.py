@@ -6,6 +6,7 @@ correct the spheres' centers within the errors of their outlines.
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ from capture.calibration.geometry import CameraPose
 from capture.calibration.lights.mirror_sphere import MirrorSphereError, SpherePosition, contour
 from capture.calibration.lights.reflection import reflect, reflection_pixels, reflection_points
 from capture.calibration.robust import huber_weights, mad_sigma
+
+_log = logging.getLogger(__name__)
 
 MIN_RIM_DISTANCE_PX = 1.5  # highlights closer to the outline are ignored
 HIGHLIGHT_NOISE_SIGMAS = 8.0  # above the median in the sphere
@@ -356,6 +359,12 @@ class _Scene:
             centers += step[base:].reshape(-1, 3)
             if step @ H @ step < MIRROR_STEP_TOL:
                 break
+        else:
+            _log.warning(
+                "positions of lights: not converged after %d steps, last step %.2g standard errors",
+                MAX_MIRROR_STEPS,
+                np.sqrt(step @ H @ step),
+            )
         inverse = np.linalg.inv(H)
         covariance = np.zeros((len(start), 3, 3))
         for k, light in enumerate(lights):

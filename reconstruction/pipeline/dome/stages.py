@@ -163,7 +163,7 @@ def _surface(inputs: Inputs, dome: CalibratedDome) -> RefinedScan:
         "translation_mm": fit.translation_mm.tolist(),
         "stderr_rad_mm": fit.stderr.tolist(),
         "residual_deg": fit.residual_deg,
-        "converged": fit.converged,
+        "converged": fit.outcome.converged,
         "points": len(scan.points_mm),
         "pixel_mm": footprint,
         "applied": not placed,

@@ -1,6 +1,7 @@
 """Stages of the gradient sphere: patterns to normals, heights, strain, histograms and kernels."""
 
 import dataclasses
+import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,7 +19,9 @@ from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.gradient_normals import Roughness, estimate_roughness, from_patterns
 from reconstruction.gradient_normals.estimation import Smoothing
+from reconstruction.gradient_normals.occlusion import estimate_occlusion_ratios
 from reconstruction.gradient_normals.sphere_lights import SphereLights
+from reconstruction.normal_histogram.relief_slopes import slopes
 from reconstruction.normal_histogram.statistics import NormalStatistics
 from reconstruction.normal_integration import HeightMap, integrate_map, relief_errors
 from reconstruction.normal_integration.height_filters import high_pass
@@ -40,7 +43,9 @@ from reconstruction.pipeline.gradient.strain_kernels import (
 from reconstruction.pipeline.inputs import Inputs
 from reconstruction.pipeline.sensor_noise import ElectronNoise
 
-STAGE_REVISION = 9
+_log = logging.getLogger(__name__)
+
+STAGE_REVISION = 10
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = ("normals", "height", "diffuse_normals", "crossed", "strain", "histograms", "kernels")
@@ -114,13 +119,16 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     stage = inputs.stage_maker(STAGE_REVISION)
     neutral = rig.images.neutral.name
     heights = " ".join(f"height_{state.name}" for state in rig.images.states)
+    noises = " ".join(f"_slope_noise_{state.name}" for state in rig.images.states)
     diffuse, counted = f"diffuse_normals_{neutral}", f"{HISTOGRAM_FILE} _histograms"
     kernels = partial(_kernels, inputs, rig)
     made = [
         stage("strain", "", f"_strains {STRAIN_FILE}", partial(_strain, inputs, rig)),
         stage("facets", "", "_facets", partial(_facets, inputs, rig)),
         stage(f"diffuse normals {neutral}", "", diffuse, partial(_diffuse, rig)),
-        stage("histograms", f"_strains {heights}", counted, partial(_histograms, rig)),
+        stage(
+            "histograms", f"_strains _facets {heights} {noises}", counted, partial(_histograms, rig)
+        ),
         stage("kernels", f"_strains _histograms {heights}", KERNEL_FILE, kernels),
     ]
     for state in rig.images.states:
@@ -129,7 +137,7 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
         made += [
             stage(f"crossed {name}", "", f"crossed_{name}", partial(_crossed, rig, state)),
             stage(f"normals {name}", "_facets", f"normals_{name} {restored}", normals),
-            stage(f"height {name}", restored, f"height_{name}", height),
+            stage(f"height {name}", restored, f"height_{name} _slope_noise_{name}", height),
         ]
     return made
 
@@ -306,8 +314,11 @@ def _normal_map(
     )
 
 
-def _height(rig: GradientRig, state: SkinState, **made: Any) -> SkinMap:
-    """Integrate the deblurred slopes; remove wavelengths above `CUTOFF_UM`."""
+def _height(rig: GradientRig, state: SkinState, **made: Any) -> Mapping[str, Any]:
+    """Integrate the deblurred slopes; remove wavelengths above `CUTOFF_UM`.
+
+    Also returns the variance of one slope's noise in the map.
+    """
     restored: RestoredNormals
     valid: BoolArray
     restored, valid, stderr_rad = made[f"_restored_{state.name}"]
@@ -326,38 +337,66 @@ def _height(rig: GradientRig, state: SkinState, **made: Any) -> SkinMap:
         return dataclasses.replace(found, height=height)
 
     found = relief(restored.normals, valid)
-    by_noise = _height_stderr(restored, found.valid, relief)
+    found.convergence.warn_unless_converged(f"height of {state.name}", _log)
+    by_noise, slope_noise = _height_noise(restored, found.valid, relief, rig.pixel_um)
     stderr = relief_errors.height_stderr(found.height, by_noise, found.valid)
     what = (
         "height towards the camera, the lens's blur removed as far as noise allows, without "
         f"wavelengths above {CUTOFF_UM / 1e3:g} mm"
     )
-    return SkinMap(found.height.astype(np.float32), "um", stderr, found.valid, what)
+    return {
+        f"height_{state.name}": SkinMap(
+            found.height.astype(np.float32), "um", stderr, found.valid, what
+        ),
+        f"_slope_noise_{state.name}": slope_noise,
+    }
 
 
-def _height_stderr(
+def _height_noise(
     restored: RestoredNormals,
     valid: BoolArray,
     relief: Callable[[FloatArray, BoolArray], HeightMap],
-) -> Float32Array:
-    """Estimate a height's standard error by integrating random noise fields in the same way."""
+    pixel_um: float,
+) -> tuple[Float32Array, float]:
+    """Return a height's standard error, and its slopes' noise variance.
+
+    Random noise fields are integrated in the same way.
+    """
     rng = np.random.default_rng(0)
-    total = np.zeros(valid.shape)
+    total, of_slopes = np.zeros(valid.shape), 0.0
     for _ in range(STDERR_SAMPLES):
         x, y = restored.sample_noise(rng)
         field = np.stack([-x, -y, np.ones_like(x)], axis=-1)
-        total += relief(field, valid).height.astype(np.float64) ** 2
+        height = relief(field, valid).height.astype(np.float64)
+        total += height**2
+        slope_x, slope_y, known = slopes(height, pixel=pixel_um, valid=valid)
+        of_slopes += 0.5 * float(np.mean(slope_x[known] ** 2 + slope_y[known] ** 2))
     # noise is nearly stationary, so its variance is smooth except at borders
     weight = ndimage.gaussian_filter(valid.astype(float), STDERR_SIGMA_PX)
     even = ndimage.gaussian_filter(total, STDERR_SIGMA_PX) / np.maximum(weight, 1e-3)
-    return np.where(valid, np.sqrt(even / STDERR_SAMPLES), np.inf).astype(np.float32)
+    stderr = np.where(valid, np.sqrt(even / STDERR_SAMPLES), np.inf).astype(np.float32)
+    return stderr, of_slopes / STDERR_SAMPLES
 
 
 def _histograms(
-    rig: GradientRig, _strains: list[StateStrain], **heights: SkinMap
+    rig: GradientRig, _strains: list[StateStrain], _facets: Roughness, **made: Any
 ) -> Mapping[str, Any]:
-    found = count_normals(_strains, _by_state(heights), pixel_um=rig.pixel_um)
-    document = histogram_document(_strains, found)
+    by_state = _by_state(made)
+    noise = _by_state(made, "_slope_noise_")
+    found = count_normals(_strains, by_state, pixel_um=rig.pixel_um)
+    occlusion = {
+        each.state.name: estimate_occlusion_ratios(
+            by_state[each.state.name].values,
+            by_state[each.state.name].mask,
+            pixel_um=rig.pixel_um,
+            lights=rig.lights,
+            alpha=_facets.alpha,
+            angle_rad=each.state.angle_rad,
+        )
+        for each in _strains
+        if each.state.name in found
+    }
+    document = histogram_document(_strains, found, occlusion, noise)
     return {"_histograms": found, HISTOGRAM_FILE: stages.serialize_document(document)}
 
 
@@ -375,5 +414,5 @@ def _kernels(
     return stages.serialize_document(document)
 
 
-def _by_state(heights: Mapping[str, SkinMap]) -> dict[str, SkinMap]:
-    return {name.removeprefix("height_"): height for name, height in heights.items()}
+def _by_state(made: Mapping[str, Any], kind: str = "height_") -> dict[str, Any]:
+    return {name.removeprefix(kind): one for name, one in made.items() if name.startswith(kind)}

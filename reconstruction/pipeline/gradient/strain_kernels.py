@@ -10,6 +10,7 @@ from scipy import ndimage
 from model.microstructure import KernelTableError
 from model.skin import SkinMap
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, Int64Array
+from reconstruction.gradient_normals.occlusion import OcclusionRatios
 from reconstruction.kernel_fit import fit_kernel
 from reconstruction.kernel_fit.fit import ALPHA_GRID, SIGMAS_UM
 from reconstruction.kernel_fit.outcome import KernelFit
@@ -37,10 +38,10 @@ MAX_FULL_GRID_PX = 1_000_000
 grid."""
 COARSE_GRID_STEP = 3
 HIDDEN_VARIANCE_RATIO = 0.1
-"""Fraction of a variance that images hide: slopes that reflect no light back, and those longer than
-a leveled patch. Root mean square over both axes of six patches of 0.8 mm at rest, at r = 0.8 and at
-1.19 (seeds 0 to 5). It is a bias, not scatter: states and patches share it, and its size cannot be
-estimated from the images (the lens's transfer is compensated before)."""
+"""Relative error of a variance that the corrections for occlusion and noise leave: detail that the
+lens removes, and slopes longer than a leveled patch. Root mean square over both axes of six patches
+of 0.8 mm without the corrections (seeds 0 to 5). It is a bias, not scatter: states and patches
+share it, and its size cannot be estimated from the images."""
 
 
 def count_normals(
@@ -74,13 +75,30 @@ def count_normals(
 
 
 def histogram_document(
-    strains: Sequence[StateStrain], found: Mapping[str, NormalStatistics]
+    strains: Sequence[StateStrain],
+    found: Mapping[str, NormalStatistics],
+    occlusion: Mapping[str, OcclusionRatios] | None = None,
+    slope_noise: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """Return the histograms as a document.
 
-    Standard errors of its variances include the variation between patches of the same skin and
-    size, and `HIDDEN_VARIANCE_RATIO`. The surface topography is that of the height maps.
+    Its variances are those of the height maps less their noise, times the ratios of `occlusion`;
+    the histograms are those of the height maps. Standard errors of the variances include the
+    variation between patches of the same skin and size, and `HIDDEN_VARIANCE_RATIO`.
+
+    Parameters
+    ----------
+    strains
+        Of every state.
+    found
+        Statistics by the name of the state.
+    occlusion
+        Ratios by the name of the state; None: all 1.
+    slope_noise
+        Variance of one slope's noise by the name of the state; None: all 0.
     """
+    ratios, noises = occlusion or {}, slope_noise or {}
+    open_sky = OcclusionRatios(1.0, 1.0, 1.0)
     of_samples = "samples outside effective_samples samples_per_bucket aliased"
 
     def hidden(stderr: float, variance: float) -> float:
@@ -95,13 +113,18 @@ def histogram_document(
                 "angle_deg": each.state.angle_deg,
                 "counts": one.histogram,
                 **select_attributes(one, of_samples),
-                "variance_s": one.variance_x,
-                "variance_s_stderr": hidden(one.stderr_x, one.variance_x),
-                "variance_t": one.variance_y,
-                "variance_t_stderr": hidden(one.stderr_y, one.variance_y),
+                "variance_s": ratio.along * max(one.variance_x - noise, 0.0),
+                "variance_s_stderr": ratio.along * hidden(one.stderr_x, one.variance_x),
+                "variance_t": ratio.across * max(one.variance_y - noise, 0.0),
+                "variance_t_stderr": ratio.across * hidden(one.stderr_y, one.variance_y),
+                "occlusion_ratio_s": ratio.along,
+                "occlusion_ratio_t": ratio.across,
+                "noise_variance": noise,
             }
             for each in strains
             if (one := found.get(each.state.name)) is not None
+            and (ratio := ratios.get(each.state.name, open_sky)) is not None
+            and (noise := noises.get(each.state.name, 0.0)) is not None
         ],
     }
 

@@ -55,12 +55,12 @@ def _register(
 
 def _scan_in_place(real: InputPrecision) -> str:
     fit, gap = _register(real, np.eye(3), (0.0, 0.0, 0.0))
-    return f"converged {fit.converged}, distance, mm " + expect_within(gap, 0.0, 1.5)
+    return f"converged {fit.outcome.converged}, distance, mm " + expect_within(gap, 0.0, 1.5)
 
 
 def _far_scan(real: InputPrecision) -> str:
     fit, gap = _register(real, np.eye(3), (10.0, -8.0, 6.0))
-    return f"converged {fit.converged}, distance, mm " + expect_within(gap, 0.0, 2.0)
+    return f"converged {fit.outcome.converged}, distance, mm " + expect_within(gap, 0.0, 2.0)
 
 
 def _lost_scan(real: InputPrecision) -> str:

@@ -10,6 +10,7 @@ d'Eon et al. 2007, doi:10.2312/EGWR/EGSR07/147-157, section 4 (sums of Gaussians
 Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 9 (albedo and translucency to a dipole).
 """
 
+import logging
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -19,8 +20,11 @@ from scipy.optimize import minimize, nnls
 from scipy.special import erf
 
 from model import dipole, fresnel
+from model.solver_outcome import outcome_from_scipy
 from skinrig.arrays import Float64Array
 from skinrig.viewer.scene import SceneError
+
+_log = logging.getLogger(__name__)
 
 N_GAUSSIANS: Final = 4
 """Number of Gaussians, two passes each; edge error 0.1 % (three: 0.4 %; six: 0.01 %)."""
@@ -111,6 +115,7 @@ def fit_gaussians(
         (minimize(off, s, method="Nelder-Mead", options={"xatol": 1e-3}) for s in starts),
         key=lambda one: float(one.fun),
     )
+    outcome_from_scipy(best, float(best.fun)).warn_unless_converged("profile's Gaussians", _log)
     found = variances(best.x)
     weights = _weights(_edges(found, at), lines)
     used = weights.max(axis=1) > 1e-6

@@ -64,8 +64,8 @@ def test_the_objective_is_that_of_the_paper():
         normals, settings=BilateralSettings(sharpness=3.0, rounds=4, stop=0.0)
     )
     assert found.energy == pytest.approx(plain_objective(found.height, normals, 3.0), rel=1e-5)
-    assert found.rounds == 4
-    assert not found.converged
+    assert found.outcome.iterations == 4
+    assert found.outcome.stop == "limit"
 
 
 def test_weights_within_unit_interval_open_at_jump():
@@ -88,7 +88,7 @@ def test_smooth_surface_is_unchanged_to_first_order():
     truth, normals, _ = flap(64, 0.0)
     found = integrate_with_discontinuities(normals)
     assert rms(found.height, truth) < 0.02 * np.std(truth)
-    assert found.converged
+    assert found.outcome.converged
 
 
 def test_masks_and_parts_are_kept():

@@ -318,7 +318,7 @@ def test_with_known_weights_the_map_comes_back(face):
 
 def test_map_and_weights_together_show_every_expression(face, fitted):
     states, fit = fitted
-    assert fit.converged
+    assert fit.outcome.converged
     model = fit.model()
     for name, normals in states.items():
         got = model.evaluate({name: 1.0}).normals

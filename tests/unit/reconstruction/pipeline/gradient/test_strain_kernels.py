@@ -8,6 +8,7 @@ from scipy import ndimage
 
 from capture.plan.gradient import state_name
 from model.skin import SkinMap
+from reconstruction.gradient_normals.occlusion import OcclusionRatios
 from reconstruction.normal_histogram.blocks import (
     BLOCKS_PER_SIDE,
     assign_blocks,
@@ -125,6 +126,19 @@ def test_variance_errors_include_detail_hidden_in_images(fitted):
             assert row[f"variance_{axis}_stderr"] ** 2 == pytest.approx(
                 scatter**2 + (HIDDEN_VARIANCE_RATIO * value) ** 2
             )
+
+
+def test_variances_lose_noise_and_regain_hidden_slopes(fitted):
+    strains, counted, _, _ = fitted
+    plain = histogram_document(strains, counted)["states"]
+    names = [row["name"] for row in plain]
+    ratios = dict.fromkeys(names, OcclusionRatios(1.2, 1.1, 0.9))
+    corrected = histogram_document(strains, counted, ratios, dict.fromkeys(names, 1e-3))["states"]
+    for before, after in zip(plain, corrected, strict=True):
+        assert after["variance_s"] == pytest.approx(1.2 * (before["variance_s"] - 1e-3))
+        assert after["variance_t"] == pytest.approx(1.1 * (before["variance_t"] - 1e-3))
+        assert after["variance_s_stderr"] == pytest.approx(1.2 * before["variance_s_stderr"])
+        np.testing.assert_array_equal(after["counts"], before["counts"])
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 35.0, 90.0])

@@ -1,0 +1,94 @@
+"""Each iterative solver reports how it ended, or a listed reason makes a report superfluous."""
+
+import ast
+import re
+
+import pytest
+from fixtures.product_code import PACKAGES, ROOT, modules, text_of
+
+SCIPY_SEARCHES = {
+    *("least_squares", "minimize", "minimize_scalar", "curve_fit", "fsolve", "root"),
+    *("cg", "lsmr", "lsqr", "gmres", "linprog", "NMF", "FastICA", "solve_poisson"),
+}
+LIMIT_NAME = re.compile(r"(?i)(steps|rounds|iterations)$")
+REPORTS = re.compile(r"SolverOutcome\(|outcome_from_scipy\(|_log\.warning\(|Error\(|Convergence\(")
+
+NEED_NO_REPORT = {
+    "capture/calibration/fiber/spot_photometry.py": "spots that do not converge are NaN",
+    "model/dipole/profile.py": "bisection between bounds ends within its steps",
+    "model/texture_statistics/description.py": "returns the distance after each iteration",
+    "reconstruction/chromophores/ridge_kernels.py": "a pixel's unfinished step has no parabola",
+    "reconstruction/chromophores/start.py": "a linear program of four unknowns",
+    "reconstruction/chromophores/table_fit/kernels.py": "a pixel's last step is in its error",
+    "reconstruction/correspondence/landmark_field.py": "a scalar search between two bounds",
+    "reconstruction/diffuse_albedo/kernels.py": "a pixel's weights, with a fixed number of steps",
+    "reconstruction/facial_color/shared_melanin_kernels.py": "a pixel's bracketed root",
+    "reconstruction/gradient_normals/moment_kernels.py": "two rounds of noise, not a search",
+    "reconstruction/photometric_stereo/kernels.py": "a pixel's residual is in its error",
+    "reconstruction/registration/strain.py": "a fixed number of rounds of tracking",
+    "reconstruction/stack_diagnosis/frame_faults.py": "a fixed number of steps, with its residual",
+    "reconstruction/subsurface/levenberg_marquardt.py": "returns each fit's state by its number",
+    "reconstruction/tsumura.py": "scikit-learn warns",
+    "rigsim/as_built/dome.py": "the simulator's lens has an inverse",
+    "rigsim/geometry/atlas.py": "fills a border of some texels, not a search",
+    "rigsim/fiber/homogeneous_fit.py": "the misfit is in its result",
+}
+"""Iterative modules that neither hold an outcome, nor warn or raise, with the reason."""
+
+
+def describe_iterations(source):
+    """Return the solvers of a module's text: SciPy's, and loops that end early or at a limit."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call):
+            name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+            if name in SCIPY_SEARCHES:
+                found.add(name)
+            continue
+        bounded = isinstance(node, ast.For | ast.While)
+        if not bounded:
+            continue
+        head = node.iter if isinstance(node, ast.For) else node.test
+        named = [n for n in ast.walk(head) if isinstance(n, ast.Name | ast.Attribute)]
+        names = [getattr(n, "id", getattr(n, "attr", "")) for n in named]
+        ranged = isinstance(node, ast.While) or "range" in names
+        ends = isinstance(node, ast.While) or any(
+            isinstance(n, ast.Break | ast.Return) for n in ast.walk(node)
+        )
+        limits = [name for name in names if LIMIT_NAME.search(name)]
+        if ranged and ends and limits:
+            found.add(limits[0])
+    return found
+
+
+def iterative_modules():
+    """Return path, text and solvers of each module of the packages that iterates."""
+    for path in modules(*PACKAGES):
+        if {"benchmarks", "extremes"} & set(path.parts):
+            continue
+        if found := describe_iterations(text_of(path)):
+            yield path.relative_to(ROOT).as_posix(), text_of(path), found
+
+
+def test_every_iterative_solver_reports_its_end():
+    found = list(iterative_modules())
+    assert len(found) > 30
+    silent = {path for path, text, _ in found if not REPORTS.search(text)}
+    assert sorted(silent - set(NEED_NO_REPORT)) == []
+
+
+def test_reasons_are_of_modules_that_iterate():
+    assert sorted(set(NEED_NO_REPORT) - {path for path, _, _ in iterative_modules()}) == []
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("for _ in range(MAX_STEPS):\n    if done:\n        break\n", {"MAX_STEPS"}),
+        ("while gain > 1 and rounds < MAX_ROUNDS:\n    rounds += 1\n", {"rounds"}),
+        ("optimize.minimize(cost, start)\n", {"minimize"}),
+        ("for row in range(height):\n    break\n", set()),
+    ],
+)
+def test_solver_scan_finds_loops_and_searches(source, found):
+    assert describe_iterations(source) == found

@@ -1,0 +1,85 @@
+"""Variance of slopes that grooves hide from gradient light."""
+
+import math
+
+import numpy as np
+import pytest
+
+from reconstruction.gradient_normals import GradientError, SphereLights
+from reconstruction.gradient_normals.occlusion import (
+    HORIZON_DIRECTIONS,
+    estimate_occlusion_ratios,
+    find_horizons,
+)
+
+PIXEL_UM = 6.0
+
+
+def even_sphere(count=200):
+    """Return directions of an even sphere of lights (a Fibonacci spiral)."""
+    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    turn = math.pi * (1.0 + math.sqrt(5.0)) * np.arange(count)
+    across = np.sqrt(1.0 - z**2)
+    return SphereLights(np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=-1))
+
+
+def grooves(depth_um, side=96, period_px=24):
+    """Return grooves that run along the rows' axis, sinusoidal along x."""
+    wave = 0.5 * depth_um * np.cos(2.0 * np.pi * np.arange(side) / period_px)
+    return np.tile(wave, (side, 1))
+
+
+def ratios(relief, **settings):
+    valid = np.ones(relief.shape, bool)
+    return estimate_occlusion_ratios(
+        relief, valid, pixel_um=PIXEL_UM, lights=even_sphere(), alpha=0.25, **settings
+    )
+
+
+def test_horizons_of_a_step_follow_its_height():
+    """A wall of height h at distance d hides what is below h / d; behind it nothing is hidden."""
+    relief = np.zeros((41, 41))
+    relief[:, 31:] = 12.0  # 9 pixels from the first one
+    found = find_horizons(relief, [20, 20], [22, 38], pixel=PIXEL_UM)
+    assert found[0, 0] == pytest.approx(12.0 / (9 * PIXEL_UM))
+    assert found[0, HORIZON_DIRECTIONS // 2] == 0.0
+    assert found[1].max() < 1e-12
+
+
+def test_horizons_turn_counterclockwise_from_the_right():
+    relief = np.zeros((41, 41))
+    relief[:10] = 50.0  # a wall at the top of the image
+    (found,) = find_horizons(relief, [20], [20], pixel=PIXEL_UM)
+    assert found[HORIZON_DIRECTIONS // 4] == found.max() > 0.5
+    assert found[HORIZON_DIRECTIONS // 2 :].max() < 1e-12
+
+
+def test_flat_relief_hides_nothing():
+    found = ratios(np.zeros((32, 32)))
+    assert (found.along, found.across) == (1.0, 1.0)
+
+
+def test_deeper_grooves_hide_more_of_their_variance():
+    found = [ratios(grooves(depth)) for depth in (10.0, 30.0, 60.0)]
+    along = [one.along for one in found]
+    assert (np.diff(along) > 0.0).all()
+    assert along[-1] > 1.05
+    assert np.all(np.diff([one.visible_fraction for one in found]) < 0.0)
+    assert [one.across for one in found] == [1.0, 1.0, 1.0]
+
+
+def test_ratios_turn_with_the_jaws():
+    along = ratios(grooves(60.0))
+    across = ratios(grooves(60.0), angle_rad=math.pi / 2)
+    assert across.across == pytest.approx(along.along, rel=1e-9)
+
+
+def test_mask_without_inner_pixels_is_refused():
+    with pytest.raises(GradientError, match="valid"):
+        estimate_occlusion_ratios(
+            np.zeros((8, 8)),
+            np.zeros((8, 8), bool),
+            pixel_um=PIXEL_UM,
+            lights=even_sphere(),
+            alpha=0.25,
+        )
