@@ -1,4 +1,4 @@
-"""Build scenes of voxel skin for sessions: `--renderer reference` of flash rig and probe."""
+"""Build scenes of voxel skin for sessions: `--renderer reference` of flash rig, dome and probe."""
 
 import dataclasses
 from collections.abc import Callable, Collection
@@ -10,19 +10,20 @@ from rigsim.fiber.probe_tissue import SkinTissue
 from rigsim.mitsuba.render_error import RenderError
 from rigsim.mitsuba.variant import choose_renderer
 from rigsim.population import files as subject_file
+from rigsim.scenes.reference.dome_session import VoxelDomeScene, render_directions_of_views
+from rigsim.scenes.reference.face_skin import N_PIGMENTS
 from rigsim.scenes.reference.flash_session import VoxelFlashScene, render_skin
 from rigsim.scenes.reference.probe_session import VoxelProbeScene
+from rigsim.subject import SimulatedSubject
 from rigsim.subject.person_skin import ABDOMEN_SITE, SITE_NAMES
 from skinrig.errors import require_choice
 from skinrig.simulating.driving import encode_arrays
-from skinrig.simulating.orders import MIN_WIDTH_PX, FlashOrder, SimulationError
+from skinrig.simulating.orders import MIN_WIDTH_PX, DomeOrder, FlashOrder, SimulationError
 
 REFUSAL_REASONS: Final = {
-    "dome": "its stages need the scan of a face, and a face as voxels takes 11 days; run "
-    "skinrig bench --stage reference-dome, which has patches through the same stages",
     "gradient": "its heights come from the surface's reflection, which voxels lack; run "
     "skinrig bench --stage reference-gradient or reference-relief, which have diffuse normals of "
-    "patches",
+    "patches"
 }
 """Reasons why a rig has no sessions of voxel skin, by its name."""
 MAX_PATCH_PX: Final = 32
@@ -33,6 +34,10 @@ FACE_SITE_NAMES: Final = tuple(name for name in SITE_NAMES if name != ABDOMEN_SI
 DEFAULT_SITE: Final = "cheek"
 PATCH_SAMPLES: Final = {"small": 512, "full": 2048}
 """Samples per pixel at the most sensitive wavelength; 512 leave 2.5 % of noise."""
+DIRECTION_SAMPLES: Final = {"small": 256, "full": 2048}
+"""Samples per camera, light and pigment of a face at the most sensitive wavelength."""
+PIGMENT_SECONDS: Final = {"small": 15.0, "full": 60.0}
+"""Processor seconds per pigment of a face (two cores, type III)."""
 PATCH_PHOTONS: Final = {"small": 10_000, "full": 40_000}
 """Photons per site, direction and wavelength below the probe."""
 PATCH_SECONDS_PER_SAMPLE: Final = 4e-4
@@ -65,6 +70,53 @@ def check_flash_order(order: FlashOrder) -> None:
         )
 
 
+def check_dome_order(order: DomeOrder) -> None:
+    """Raise `SimulationError` for options that a face of voxel skin lacks."""
+    if order.renderer != "reference" or order.target is not None:
+        return
+    names = ("move", "subsurface", "interreflections", "leave_out")
+    order.refuse_options("dome (renderer reference)", *names)
+    if order.state != "neutral":
+        raise SimulationError(
+            f"state: got {order.state!r}, expected neutral for renderer reference; remove it"
+        )
+
+
+def make_dome_scene(
+    rig: Rig,
+    face: SimulatedSubject,
+    *,
+    noise_seed: int,
+    size: str,
+    progress: Callable[[str], None] | None,
+    **scene: Any,
+) -> VoxelDomeScene:
+    """Render the voxels of a face's pigments, and return the face in the dome.
+
+    Parameters
+    ----------
+    rig
+        The nominal dome.
+    face
+        The face at its position.
+    noise_seed
+        Seed of the session.
+    size
+        "small" or "full": samples per pigment.
+    progress
+        Called with the expected time, and with a line per pigment.
+    scene
+        Further arguments of `VoxelDomeScene`.
+    """
+    _require_llvm()
+    cameras = len({view.spectral_sensitivity for view in rig.views})
+    _announce(progress, PIGMENT_SECONDS[size] * N_PIGMENTS * cameras)
+    directions = render_directions_of_views(
+        rig, face, samples=DIRECTION_SAMPLES[size], seed=noise_seed, progress=progress
+    )
+    return VoxelDomeScene(rig, face, directions, seed=noise_seed, **scene)
+
+
 def make_patch_scene(
     rig: Rig,
     *,
@@ -92,10 +144,7 @@ def make_patch_scene(
     progress
         Called with the expected time, and with a line per wavelength.
     """
-    try:
-        choose_renderer("reference")
-    except RenderError as error:
-        raise SimulationError(str(error)) from error
+    _require_llvm()
     samples = PATCH_SAMPLES[size]
     pixels = rig.views[0].width_px * rig.views[0].height_px
     _announce(progress, PATCH_SECONDS_PER_SAMPLE * samples * pixels)
@@ -161,6 +210,13 @@ def make_probe_scene(
     return VoxelProbeScene(
         rig, tissue, photons=photons, seed=seed, noise_seed=noise_seed, progress=progress
     )
+
+
+def _require_llvm() -> None:
+    try:
+        choose_renderer("reference")
+    except RenderError as error:
+        raise SimulationError(str(error)) from error
 
 
 def _announce(progress: Callable[[str], None] | None, seconds: float) -> None:

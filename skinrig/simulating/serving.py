@@ -155,9 +155,7 @@ def _build_served_rig(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
     if rig.probe is not None:
         return rig, _probe_scene(rig, rig.probe, order)
     dome = "dome" in rig.boxes
-    if order.renderer == "reference":
-        if dome:
-            reference.refuse_reference("dome")
+    if order.renderer == "reference" and not dome:
         return _reference_flash(rig, order)
     width = (simulating_dome if dome else flash).WIDTHS_PX[order.size]
     rig = rig.resized(width) if width != rig.views[0].width_px else rig
@@ -206,7 +204,11 @@ def _reference_flash(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
 
 
 def _dome_scene(rig: Rig, order: ServeOrder) -> Any:
-    built, choice = build_dome(rig, seed=order.seed), choose_renderer(order.renderer)
+    built = build_dome(rig, seed=order.seed)
+    if order.renderer == "reference":
+        given = select_attributes(order, "noise_seed", "size")
+        return reference.make_dome_scene(rig, order.face(), dome=built, progress=_report, **given)
+    choice = choose_renderer(order.renderer)
     return DomeScene(rig, order.face(), dome=built, seed=order.noise_seed, choice=choice)
 
 
