@@ -1,4 +1,4 @@
-"""Build scenes of voxel skin for sessions: `--renderer reference` of flash rig, dome and probe."""
+"""Build scenes of voxel skin for sessions: `--renderer reference` of all rigs."""
 
 import dataclasses
 from collections.abc import Callable, Collection
@@ -6,6 +6,7 @@ from typing import Any, Final
 
 from capture.rig import Rig
 from model.skin import SkinAppearance
+from rigsim.as_built.sphere import ActualSphere
 from rigsim.fiber.probe_tissue import SkinTissue
 from rigsim.mitsuba.render_error import RenderError
 from rigsim.mitsuba.variant import choose_renderer
@@ -13,19 +14,20 @@ from rigsim.population import files as subject_file
 from rigsim.scenes.reference.dome_session import VoxelDomeScene, render_directions_of_views
 from rigsim.scenes.reference.face_skin import N_PIGMENTS
 from rigsim.scenes.reference.flash_session import VoxelFlashScene, render_skin
+from rigsim.scenes.reference.gradient_session import COARSE_PX, VoxelGradientScene, render_grooves
 from rigsim.scenes.reference.probe_session import VoxelProbeScene
 from rigsim.subject import SimulatedSubject
 from rigsim.subject.person_skin import ABDOMEN_SITE, SITE_NAMES
 from skinrig.errors import require_choice
 from skinrig.simulating.driving import encode_arrays
-from skinrig.simulating.orders import MIN_WIDTH_PX, DomeOrder, FlashOrder, SimulationError
+from skinrig.simulating.orders import (
+    MIN_WIDTH_PX,
+    DomeOrder,
+    FlashOrder,
+    GradientOrder,
+    SimulationError,
+)
 
-REFUSAL_REASONS: Final = {
-    "gradient": "its heights come from the surface's reflection, which voxels lack; run "
-    "skinrig bench --stage reference-gradient or reference-relief, which have diffuse normals of "
-    "patches"
-}
-"""Reasons why a rig has no sessions of voxel skin, by its name."""
 MAX_PATCH_PX: Final = 32
 """Largest width of a patch, px."""
 VOXEL_FILE: Final = "voxels.npz"
@@ -34,6 +36,12 @@ FACE_SITE_NAMES: Final = tuple(name for name in SITE_NAMES if name != ABDOMEN_SI
 DEFAULT_SITE: Final = "cheek"
 PATCH_SAMPLES: Final = {"small": 512, "full": 2048}
 """Samples per pixel at the most sensitive wavelength; 512 leave 2.5 % of noise."""
+MAX_GROOVES_PX: Final = 512
+"""Largest width of the gradient rig's image, px."""
+GROOVE_SAMPLES: Final = {"small": 1024, "full": 4096}
+"""Samples per 8 x 8 pixels of grooves, for each three patterns and each of three wavelengths."""
+GROOVE_SECONDS_PER_SAMPLE: Final = 2e-4
+"""Processor seconds per 8 x 8 pixels and sample, all patterns and wavelengths (type III)."""
 DIRECTION_SAMPLES: Final = {"small": 256, "full": 2048}
 """Samples per camera, light and pigment of a face at the most sensitive wavelength."""
 PIGMENT_SECONDS: Final = {"small": 15.0, "full": 60.0}
@@ -44,14 +52,6 @@ PATCH_SECONDS_PER_SAMPLE: Final = 4e-4
 """Processor seconds per pixel and sample, all wavelengths (two cores, type III)."""
 PROBE_SECONDS_PER_PHOTON: Final = 8e-4
 """Processor seconds per photon at each wavelength, all wavelengths (two cores, type III)."""
-
-
-def refuse_reference(rig: str) -> None:
-    """Raise `SimulationError` for a rig that has no sessions of voxel skin."""
-    if why := REFUSAL_REASONS.get(rig):
-        raise SimulationError(
-            f"renderer: got reference, expected mitsuba or fast for the {rig} rig, because {why}"
-        )
 
 
 def check_flash_order(order: FlashOrder) -> None:
@@ -115,6 +115,65 @@ def make_dome_scene(
         rig, face, samples=DIRECTION_SAMPLES[size], seed=noise_seed, progress=progress
     )
     return VoxelDomeScene(rig, face, directions, seed=noise_seed, **scene)
+
+
+def check_gradient_order(order: GradientOrder) -> GradientOrder:
+    """Return the order of skin at rest; raise `SimulationError` for options that voxels lack."""
+    if order.renderer != "reference" or order.target is not None:
+        return order
+    order.refuse_options("gradient (renderer reference)", "plan", "leave_out")
+    if order.steps not in (None, (0, 0)):
+        first, last = order.steps
+        raise SimulationError(
+            f"steps: got {first}..{last}, expected 0..0 for renderer reference, whose skin is at "
+            "rest; remove it"
+        )
+    if (order.width_px or 0) > MAX_GROOVES_PX:
+        raise SimulationError(
+            f"width: got {order.width_px}, expected at most {MAX_GROOVES_PX} pixels for renderer "
+            "reference, whose time grows with the pixels; lower it"
+        )
+    return dataclasses.replace(order, steps=(0, 0))
+
+
+def make_gradient_scene(
+    rig: Rig,
+    sphere: ActualSphere,
+    *,
+    subject: str,
+    site: str,
+    seed: int,
+    noise_seed: int,
+    size: str,
+    on_s: float | None,
+    progress: Callable[[str], None] | None,
+) -> VoxelGradientScene:
+    """Render grooves of a subject's skin as voxels, and return them in the gradient rig.
+
+    Parameters
+    ----------
+    rig, sphere
+        The rig with its cropped camera, and its actual LEDs.
+    subject, site
+        Preset of the skin, or a file; site of the skin.
+    seed, noise_seed
+        Seeds of subject, and of one session.
+    size
+        "small" or "full": samples.
+    on_s
+        Longest exposure of the plan, s.
+    progress
+        Called with the expected time, and with a line per wavelength.
+    """
+    _require_llvm()
+    samples = GROOVE_SAMPLES[size]
+    blocks = (rig.views[0].width_px / COARSE_PX) ** 2
+    _announce(progress, GROOVE_SECONDS_PER_SAMPLE * samples * blocks)
+    person = subject_file.load_subject(subject).skin(seed=seed)
+    grooves = render_grooves(
+        rig, sphere, person, site, samples=samples, seed=noise_seed, progress=progress
+    )
+    return VoxelGradientScene(rig, grooves, sphere=sphere, seed=noise_seed, on_s=on_s)
 
 
 def make_patch_scene(
