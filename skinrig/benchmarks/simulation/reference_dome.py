@@ -269,8 +269,8 @@ def estimate_patch(
         Seeds the tilt's direction, the scan's error and the noise.
     """
     rng = np.random.default_rng(seed)
-    normal = _tilt(np.array([0.0, 0.0, 1.0]), tilt_deg, rng)
-    scan_normal = _tilt(normal, SCAN_ERROR_DEG, rng)
+    normal = tilt_vector(np.array([0.0, 0.0, 1.0]), tilt_deg, rng)
+    scan_normal = tilt_vector(normal, SCAN_ERROR_DEG, rng)
     packed = np.array([*truth, FACET_ROUGHNESS, FACET_OIL_FRACTION, 0.0, 1.0])
 
     facets = SkinFacets(FACET_ROUGHNESS, FACET_OIL_FRACTION)
@@ -297,7 +297,7 @@ def estimate_patch(
     return PatchEstimate(error, stderr, float(valid.mean()))
 
 
-def _tilt(normal: Float64Array, degrees: float, rng: np.random.Generator) -> Float64Array:
+def tilt_vector(normal: Float64Array, degrees: float, rng: np.random.Generator) -> Float64Array:
     """Tilt a unit vector by an angle into a random direction."""
     side = np.cross(normal, unit_vectors(rng.standard_normal(3)))
     angle = np.radians(degrees)
