@@ -16,7 +16,11 @@ from capture.rig import Rig
 from model import metrics
 from rigsim.light.surface_brdf import evaluate_brdf
 from rigsim.population.files import load_subject
-from rigsim.scenes.reference.directions import DirectionalReflectance, normal_reflectance, render_directions
+from rigsim.scenes.reference.directions import (
+    DirectionalReflectance,
+    normal_reflectance,
+    render_directions,
+)
 from rigsim.scenes.reference.facets import FACET_OIL_FRACTION, FACET_ROUGHNESS, SkinFacets
 from skinrig.arrays import Float64Array
 from skinrig.benchmarks.simulation import reference_dome as dome
@@ -37,9 +41,7 @@ def main() -> None:
         skin = load_subject(preset).skin(seed=seed).at(dome.FACE_SITE)
         below = render_directions(skin, *colors, samples=SAMPLES, seed=seed)
         truth = normal_reflectance(skin, *colors)
-        stages = dome.estimate_patch(
-            rig, "voxels", below, truth, tilt_deg=TILT_DEG, seed=[seed, 0]
-        )
+        stages = dome.estimate_patch(rig, "voxels", below, truth, tilt_deg=TILT_DEG, seed=[seed, 0])
         angle = float(np.degrees(np.median(stages.error[dome.NORMAL_QUANTITY])))
         errors = [100.0 * float(stages.error[name].mean()) for name in dome.CHANNEL_NAMES]
         print(f"{preset:4}  stages  {angle:15.2f}  " + "; ".join(f"{e:+.1f}" for e in errors))

@@ -15,6 +15,7 @@ from rigsim.scenes.reference import gradient_session
 from rigsim.scenes.reference.gradient_session import RenderedGrooves, VoxelGradientScene
 from rigsim.skin_patch.microrelief import make_micro_skin
 from rigsim.world.taped_skin import GripState
+from skinrig.reporting.sections import session as session_section
 from skinrig.simulating import reference
 from skinrig.simulating.simulation import simulate_session
 
@@ -71,6 +72,8 @@ def test_gradient_session_states_renderer_and_noise(tmp_path, monkeypatch):
     renderer = Session.open(done.session).manifest.extra["renderer"]
     assert renderer["name"] == "reference"
     assert "% per 8 pixels" in renderer["why"]
+    facts = session_section.read_session_facts([done.session])
+    assert "simulated (reference)" in facts["session"].cells
     verdicts = {one["name"]: one["verdict"] for one in done.effects}
     assert verdicts["lateral scattering in skin"] == "built"
     assert verdicts["noise of the voxels"] == "unmodeled"
