@@ -213,5 +213,7 @@ class VoxelGradientScene(GradientScene):
         return f"voxels by the integrator tissue; its noise is {noise:.1f} % per {COARSE_PX} pixels"
 
 
-UNEVEN_EFFECTS: Final = frozenset({face.PIGMENT_EFFECT})
-"""Effects that skin of even pigment lacks."""
+UNEVEN_EFFECTS: Final = frozenset(
+    {face.PIGMENT_EFFECT, "a lateral kernel that varies over the patch"}
+)
+"""Effects of the rig's scenes that voxels of even pigment lack."""
