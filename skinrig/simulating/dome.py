@@ -322,7 +322,7 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
                 f"subject: got conditions {', '.join(conditions)}, expected none for renderer "
                 "reference; name another subject"
             )
-        given = {"noise_seed": order.noise_seed, "size": order.size, "progress": order.progress}
+        given: dict[str, Any] = select_attributes(order, "noise_seed", "size", "progress")
         voxels = reference.make_dome_scene(rig, person, dome=built, on_s=on_s, **given)
         scan_face_by_stripes(voxels, seed=order.seed, noise_seed=order.noise_seed)
         return voxels

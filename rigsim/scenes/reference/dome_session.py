@@ -121,7 +121,8 @@ class VoxelDomeScene(DomeScene):
         if len(lit):
             rgb[:, lit] = self._reflected(view, hits, lamp, lit).T
         gain = np.float32(np.pi * self.dome.gain.get(view.name, 1.0))
-        return olat.sum_rows(hits, *rgb, gain * self.intensity(light, view_name=view.name))
+        color = gain * self.intensity(light, view_name=view.name)
+        return olat.sum_rows(hits, rgb[0], rgb[1], rgb[2], color)
 
     def _reflected(
         self, view: View, hits: Hits, lamp: Lamp, rows: np.ndarray[tuple[int], np.dtype[np.intp]]
