@@ -33,7 +33,7 @@ def radiance(
     samples
         Samples per pixel, at least 1.
     seed
-        Seed of the sampler.
+        Seed of the sampler, >= 0; those that differ by a multiple of `N_SEEDS` are equal.
 
     Returns
     -------
@@ -52,7 +52,7 @@ def radiance(
     parts = []
     for k, part in enumerate(_powers_of_two(samples)):
         try:
-            film = mi.render(scene, spp=part, seed=seed + k * PART_SEED_STEP)
+            film = mi.render(scene, spp=part, seed=(seed + k * PART_SEED_STEP) % N_SEEDS)
         except RuntimeError as error:
             raise _find_cause(error) from None
         parts.append(part * np.asarray(mi.TensorXf(film).numpy(), np.float64))
@@ -63,6 +63,8 @@ def radiance(
     return image
 
 
+N_SEEDS: Final = 1 << 31
+"""Seeds that Dr.Jit takes: it reads them as signed 32 bits."""
 PART_SEED_STEP: Final = 1 << 24
 """Distance between the seeds of an image's parts; callers count seeds by ones."""
 

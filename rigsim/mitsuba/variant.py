@@ -132,15 +132,20 @@ def find_llvm_libraries(environment: Mapping[str, str] | None = None) -> tuple[P
     named = environment.get("DRJIT_LIBLLVM_PATH", "")
     if named:
         found[Path(named).resolve()] = None
+    found.update(dict.fromkeys(_list_installed_libraries(_LLVM_FOLDERS)))
+    return tuple(found)
+
+
+@cache
+def _list_installed_libraries(folders: tuple[str, ...]) -> tuple[Path, ...]:
+    """Return the libraries in folders, newest version first; a search takes 40 ms."""
     candidates = {
         Path(name).resolve()
-        for folder in _LLVM_FOLDERS
+        for folder in folders
         for pattern in ("libLLVM.so*", "libLLVM-[0-9]*.so*", "libLLVM*.dylib")
         for name in glob(f"{folder}/{pattern}")
     }
-    for path in sorted(candidates, key=lambda path: (-major_version(path), str(path))):
-        found[path] = None
-    return tuple(found)
+    return tuple(sorted(candidates, key=lambda path: (-major_version(path), str(path))))
 
 
 def major_version(path: Path) -> int:

@@ -134,8 +134,7 @@ Renderer = Annotated[
         "mitsuba",
         "fast",
         "reference",
-        text="Renderer: scenes of Mitsuba, compiled loops without it, or a patch of voxel skin "
-        "(flash, probe).",
+        text="Renderer: scenes of Mitsuba, compiled loops without it, or voxel skin.",
     ),
 ]
 Width = Annotated[int | None, option("Image width, pixels; default: that of the scale.")]

@@ -33,7 +33,7 @@ from rigsim.targets import make_target
 from skinrig.console import select_attributes
 from skinrig.errors import require_choice
 from skinrig.evaluating.reflection_truth import TEST_FILE, make_test
-from skinrig.simulating import driving
+from skinrig.simulating import driving, reference
 from skinrig.simulating.orders import (
     DomeOrder,
     SimulationError,
@@ -66,6 +66,7 @@ def simulate_dome(order: DomeOrder) -> SimulationResult:
     """Simulate a capture with the dome; see `simulation.simulate`."""
     require_choice("state", order.state, STATE_NAMES, SimulationError)
     conditions = _conditions(order)
+    reference.check_dome_order(order)
     rig = _rig(order)
     planned = order.plan if order.target is None else None
     plan = planned or add_scan(_plan(rig, order.target, order.size), rig)
@@ -314,6 +315,17 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
             conditions = dict(member.applied) | conditions
         person = subject.face(seed=order.seed, size=texels, mesh=order.mesh)
     person = person.translate(draw_head_position(order.session_seed))
+    on_s = max_on_time_s(plan)
+    if order.renderer == "reference":
+        if conditions:
+            raise SimulationError(
+                f"subject: got conditions {', '.join(conditions)}, expected none for renderer "
+                "reference; name another subject"
+            )
+        given: dict[str, Any] = select_attributes(order, "noise_seed", "size", "progress")
+        voxels = reference.make_dome_scene(rig, person, dome=built, on_s=on_s, **given)
+        scan_face_by_stripes(voxels, seed=order.seed, noise_seed=order.noise_seed)
+        return voxels
     motion = draw_head_motion(order.noise_seed) if order.move else None
     scene = DomeScene(
         rig,
@@ -324,7 +336,7 @@ def _scene(rig: Rig, order: DomeOrder, plan: Plan) -> Any:
         movement=order.movement,
         seed=order.noise_seed,
         conditions=conditions,
-        on_s=max_on_time_s(plan),
+        on_s=on_s,
         effects=SceneEffects.from_switches(_skin_light_effects(order)),
         choice=choose_renderer(order.renderer),
     )

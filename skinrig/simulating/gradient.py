@@ -1,7 +1,7 @@
 """Simulate captures with the gradient sphere: skin in a caliper, or a target, with the truth."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, cast
 
 from capture.plan import Plan
@@ -21,7 +21,7 @@ from rigsim.skin_patch.stretch import required_size_mm
 from rigsim.world.taped_skin import GripState
 from skinrig.capturing.plan_choice import DefaultPlan
 from skinrig.console import select_attributes
-from skinrig.simulating import driving
+from skinrig.simulating import driving, reference
 from skinrig.simulating.exposure_log import SceneLog
 from skinrig.simulating.orders import SURFACE_FILE, GradientOrder, SimulationResult, truth_folder
 
@@ -38,6 +38,7 @@ MAX_SHIFT_MM = 0.3
 
 def simulate_gradient(order: GradientOrder) -> SimulationResult:
     """Simulate a capture with the gradient sphere; see `simulation.simulate`."""
+    order = reference.check_gradient_order(order)
     # the 12 mm ball needs the whole sensor at every size
     width_px = WIDTHS_PX["full" if order.target == "ball" else order.size]
     rig = load_rig("gradient").cropped(order.width_px or width_px)
@@ -64,6 +65,8 @@ def simulate_gradient(order: GradientOrder) -> SimulationResult:
         plan=plan,
         without=order.scene_switches(),
         renderer=order.renderer,
+        size=order.size,
+        progress=order.progress,
     )
     session, log = driving.open_logged_session(order, plan, rig, asked, scene, GripLog)
     rig_seconds = driving.drive_plan(
@@ -91,6 +94,8 @@ def make_scene(
     plan: Plan | None = None,
     without: Mapping[str, Any] | None = None,
     renderer: Renderer = "mitsuba",
+    size: str = "small",
+    progress: Callable[[str], None] | None = None,
 ) -> Any:
     """Return the scene of a target or a patch of skin in the sphere, with its actual LEDs.
 
@@ -112,6 +117,8 @@ def make_scene(
         Omitted effects of the skin, see `skinrig.simulating.effect_omission`.
     renderer
         Renderer of the patch; "mitsuba" only where its shadow rays are affordable.
+    size, progress
+        Samples of voxels, and what is called with lines on them (renderer "reference").
     """
     sphere = build_sphere(rig, seed=seed)
     if age is not None:
@@ -119,6 +126,19 @@ def make_scene(
     session_seed = seed if noise_seed is None else noise_seed
     if target is not None:
         return GradientScene(rig, cast(Any, target), sphere=sphere, seed=session_seed)
+    on_s = None if plan is None else max_on_time_s(plan)
+    if renderer == "reference":
+        return reference.make_gradient_scene(
+            rig,
+            sphere,
+            subject=subject,
+            site=site or DEFAULT_SITE,
+            seed=seed,
+            noise_seed=session_seed,
+            size=size,
+            on_s=on_s,
+            progress=progress,
+        )
     angles = {float(s.index["angle"]) for s in plan.steps if strain_state(s)} if plan else set()
     size_mm = required_size_mm(
         max(rig.views[0].field_mm),
@@ -129,7 +149,6 @@ def make_scene(
     skin = subject_file.load_subject(subject).patch(
         site or DEFAULT_SITE, seed=seed, size_mm=size_mm
     )
-    on_s = None if plan is None else max_on_time_s(plan)
     return GradientScene(
         rig,
         skin,

@@ -111,7 +111,7 @@ def serve_rig(rig_name: str, order: ServeOrder, console: Console) -> None:
     options = select_attributes(order, "pty", "tcp")
     options |= {"seed": order.noise_seed, "subject_seed": order.seed}
     with serve_world(rig, scene=scene, shots_made=made, **options) as served:
-        command = _next_step(rig_name, rig, served.addresses, order.resume)
+        command = _next_step(rig_name, rig, served.addresses, order)
         if console.as_json:
             addresses = {"addresses": dict(served.addresses), "next": command}
             console.print_document("skinrig.serve/1", addresses)
@@ -135,8 +135,6 @@ def _build_served_rig(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
     kind = "gradient" if "gradient_sphere" in rig.boxes else "probe" if rig.probe else "other"
     find_unused_subject_keys(subject, kind, _report)
     if kind == "gradient":
-        if order.renderer == "reference":
-            reference.refuse_reference("gradient")
         if order.size != "small":
             raise SimulationError(
                 f"size: got {order.size!r}, expected small: larger pictures take longer to make "
@@ -147,6 +145,7 @@ def _build_served_rig(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
             rig,
             subject=subject,
             seed=seed,
+            progress=_report,
             **select_attributes(order, "site", "noise_seed", "renderer"),
         )
         # rendered before the first request, so that no client waits for it
@@ -155,20 +154,21 @@ def _build_served_rig(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
     if rig.probe is not None:
         return rig, _probe_scene(rig, rig.probe, order)
     dome = "dome" in rig.boxes
-    if order.renderer == "reference":
-        if dome:
-            reference.refuse_reference("dome")
+    if order.renderer == "reference" and not dome:
         return _reference_flash(rig, order)
     width = (simulating_dome if dome else flash).WIDTHS_PX[order.size]
     rig = rig.resized(width) if width != rig.views[0].width_px else rig
     return rig, (_dome_scene if dome else _flash_scene)(rig, order)
 
 
-def _next_step(rig_name: str, rig: Rig, urls: Mapping[str, str], resume: Path | None) -> str:
+def _next_step(rig_name: str, rig: Rig, urls: Mapping[str, str], order: ServeOrder) -> str:
     """Return the command that captures from a served rig."""
     boxes = " ".join("--port " + shell_quote(f"{name}={urls[name]}") for name in rig.boxes)
     cameras = " ".join("--camera " + shell_quote(f"{v.name}={urls[v.name]}") for v in rig.all_views)
     more = "" if rig.caliper is None else " --force-limit 2 --eyes closed"
+    if rig.caliper is not None and order.renderer == "reference":
+        more += " --steps 0..0"  # voxels are at rest
+    resume = order.resume
     out = "session" if resume is None else f"{shell_quote(resume)} --resume"
     return f"skinrig capture {shell_quote(rig_name)} {boxes} {cameras}{more} --out {out}"
 
@@ -206,7 +206,11 @@ def _reference_flash(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
 
 
 def _dome_scene(rig: Rig, order: ServeOrder) -> Any:
-    built, choice = build_dome(rig, seed=order.seed), choose_renderer(order.renderer)
+    built = build_dome(rig, seed=order.seed)
+    if order.renderer == "reference":
+        given = select_attributes(order, "noise_seed", "size")
+        return reference.make_dome_scene(rig, order.face(), dome=built, progress=_report, **given)
+    choice = choose_renderer(order.renderer)
     return DomeScene(rig, order.face(), dome=built, seed=order.noise_seed, choice=choice)
 
 

@@ -14,10 +14,10 @@ from rigsim.population.files import load_subject
 from rigsim.scenes.reference import directions
 from rigsim.scenes.reference.directions import (
     DirectionalReflectance,
-    facet_reflection,
     normal_reflectance,
     render_directions,
 )
+from rigsim.scenes.reference.facets import SkinFacets
 from rigsim.scenes.reference.plane import render_plane
 from skinrig.benchmarks.simulation.reference_dome import (
     NORMAL_QUANTITY,
@@ -94,9 +94,9 @@ def test_mitsuba_facets_equal_closed_form():
     light, camera = light[lit], camera[lit]
     packed = [0.0, 0.0, 0.0, 0.3, 0.1, 0.0, 1.0]
     expected = evaluate_brdf(packed, normal, light, camera)[1]
-    found = facet_reflection(normal, light, camera, roughness=0.3, oil=0.1)
+    found = SkinFacets(0.3, 0.1).evaluate(normal, light, camera)
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-6)
-    wider = facet_reflection(normal, light, camera, roughness=0.35, oil=0.1)
+    wider = SkinFacets(0.35, 0.1).evaluate(normal, light, camera)
     assert np.abs(wider / expected - 1.0).max() > 0.1
 
 

@@ -20,7 +20,7 @@ WIDTH = 24
 def images():
     """Patch, rig, slopes of the heights toward +x and +y, and the fast renderer's images."""
     rig, person = crop_rig(WIDTH), PersonSkin.of_preset("III")
-    patch = draw_grooves(person, RELIEF_SITE, rig)
+    patch = draw_grooves(person, RELIEF_SITE, max(rig.views[0].field_mm))
     block = round(1e-3 * PIXEL_UM / patch.voxel_mm)
     first = (len(patch.x_mm) - block * WIDTH) // 2
     inner = slice(first, first + block * WIDTH)

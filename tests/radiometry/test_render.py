@@ -154,6 +154,27 @@ def test_rays_never_slip_between_closed_surface_triangles(choice, view):
     assert not ((around == 8) & ~fine.mask).any()
 
 
+def test_radiance_of_large_seeds_differs_by_seed():
+    """Dr.Jit takes 31 bits; three samples add the distance of an image's parts to a seed."""
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1},
+        "sensor": {
+            "type": "orthographic",
+            "film": {"type": "hdrfilm", "width": 2, "height": 2, "rfilter": {"type": "box"}},
+        },
+        "light": {"type": "sphere", "center": [1.0, 0.0, 1.0], "emitter": {"type": "area"}},
+        "plate": {"type": "rectangle", "to_world": np.diag([9.0, 9.0, -1.0, 1.0])},
+    }
+    scene["plate"]["to_world"][2, 3] = 3.0
+    first, same, other = (
+        scene_radiance.radiance(scene, kind="rgb", samples=3, seed=seed)
+        for seed in (2**31 - 1, 2**32 - 1, 2**40)
+    )
+    np.testing.assert_array_equal(first, same)
+    assert (first != other).any()
+
+
 def test_white_plate_under_constant_light_renders_albedo():
     """Mitsuba itself, by a described scene: radiance = albedo times the sky's radiance."""
     image = scene_radiance.radiance(

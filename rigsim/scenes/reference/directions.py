@@ -10,10 +10,7 @@ from numpy.typing import ArrayLike
 from model import spectra
 from rigsim import shading
 from rigsim.arrays import Float64Array
-from rigsim.light.surface_brdf import ETA_OIL, OIL_SMOOTHING
-from rigsim.mitsuba.scene_radiance import load_description, look_at, rough_metal
-from rigsim.mitsuba.startup import load_mitsuba
-from rigsim.mitsuba.variant import choose_variant
+from rigsim.mitsuba.scene_radiance import look_at
 from rigsim.scenes.reference.flat_layers import describe_flat_layers, render_voxels
 from rigsim.subject.person_skin import SiteSkin
 from rigsim.tissue.skin_layers import ETA, skin_layer_stack
@@ -27,9 +24,6 @@ MAX_VIEW_DEG: Final = 80.0
 N_VIEWS: Final = 48
 """Rendered cameras per light, even over zenith angle and azimuth."""
 VIEW_DISTANCE_MM: Final = 2.0
-FACET_ROUGHNESS: Final = 0.35
-FACET_OIL_FRACTION: Final = 0.08
-"""Surface of a cheek: Beckmann roughness and fraction below oil."""
 N_QUADRATURE: Final = 32
 MIN_SAMPLES: Final = 4
 """Samples per camera at the wavelength to which the rig's cameras are least sensitive."""
@@ -41,33 +35,40 @@ class DirectionalReflectance:
     """Light from below even skin: pi f_r over the boundary's transmittances, by direction."""
 
     coefficients: Float64Array
-    """Of `_terms`, shape (terms, 3), white-balanced camera RGB."""
+    """Of `_terms`, shape (terms, C): white-balanced camera RGB of one skin or of several."""
     chi2: Float64Array
-    """Mean square misfit of the fit to the rendered values in units of their noise, shape (3,)."""
+    """Mean square misfit of the fit to the rendered values in units of their noise, shape (C,)."""
     noise: Float64Array
-    """Relative noise of a rendered value, shape (3,)."""
+    """Relative noise of a rendered value, shape (C,)."""
 
     def evaluate(
         self, normal: ArrayLike, to_light: ArrayLike, to_camera: ArrayLike
     ) -> Float64Array:
-        """Return f_r in 1/sr without the surface's own reflection, shape (..., 3).
+        """Return f_r in 1/sr without the surface's own reflection, shape (..., C).
 
         Parameters
         ----------
         normal, to_light, to_camera
-            Unit vectors away from the skin, shape (..., 3), broadcast together; light and camera
-            are within `MAX_VIEW_DEG` of the normal, beyond which the fit is extrapolated.
+            Unit vectors away from the skin, shape (..., 3), broadcast together. The fit is that of
+            `MAX_VIEW_DEG` beyond this angle to the normal; transmittances are exact.
         """
         n, light, camera = (np.asarray(way, np.float64) for way in (normal, to_light, to_camera))
         cos_l, cos_v = np.sum(n * light, axis=-1), np.sum(n * camera, axis=-1)
         between = np.sum(light * camera, axis=-1)
         passed = _transmittance(cos_l) * _transmittance(cos_v)
         scale = np.where((cos_l > 0.0) & (cos_v > 0.0), passed / pi, 0.0)
-        found = _terms(cos_l, cos_v, between) @ self.coefficients
-        return np.asarray(scale[..., None] * found, np.float64)
+        least = cos(np.radians(MAX_VIEW_DEG))
+        found = _terms(np.maximum(cos_l, least), np.maximum(cos_v, least), between)
+        return np.asarray(scale[..., None] * (found @ self.coefficients), np.float64)
+
+    @property
+    def fit_noise(self) -> float:
+        """Relative noise of the fit by the renderer's noise, mean over directions and channels."""
+        free = len(self.coefficients) / (len(LIGHT_DEG) * N_VIEWS)
+        return float(np.sqrt(free * np.square(self.noise).mean()))
 
     def beam_reflectance(self) -> Float64Array:
-        """Return R_d that a beam along the normal has by the light into all directions, (3,)."""
+        """Return R_d that a beam along the normal has by the light into all directions, (C,)."""
         nodes, weights = np.polynomial.legendre.leggauss(N_QUADRATURE)
         cosine = 0.5 * (nodes + 1.0)
         up = np.array([0.0, 0.0, 1.0])
@@ -145,56 +146,6 @@ def normal_reflectance(skin: SiteSkin, camera: str, illuminant: str) -> Float64A
     c_m, c_hd = np.array([skin.c_m]), np.array([skin.c_hd])
     walked = interpolate_spectra(c_m, c_hd, skin.tissue, WAVELENGTH_NM)[0] @ weights
     return np.asarray(shading.interior_scale(ETA) * walked, np.float64)
-
-
-def facet_reflection(
-    normal: ArrayLike, to_light: ArrayLike, to_camera: ArrayLike, *, roughness: float, oil: float
-) -> Float64Array:
-    """Return f_r in 1/sr of the surface by Mitsuba's own rough facets, shape (n,).
-
-    Parameters
-    ----------
-    normal
-        Unit vector, shape (3,).
-    to_light, to_camera
-        Unit vectors away from the skin, shape (n, 3).
-    roughness
-        Beckmann roughness of the skin; oil has GGX facets of half of it.
-    oil
-        Fraction of the surface below oil, 0 to 1.
-
-    Examples
-    --------
-    >>> up = np.array([[0.0, 0.0, 1.0]])
-    >>> bool(facet_reflection(up[0], up, up, roughness=0.3, oil=0.1)[0] > 0.0)
-    True
-    """
-    mi = load_mitsuba(choose_variant("mono"))
-    material = load_description(
-        mi,
-        {
-            "type": "blendbsdf",
-            "weight": oil,
-            "skin": rough_metal("beckmann", ETA, roughness),
-            "oil": rough_metal("ggx", ETA_OIL, OIL_SMOOTHING * roughness),
-        },
-    )
-    frame = mi.Frame3f(mi.Vector3f(*(float(x) for x in np.asarray(normal))))
-    light, camera = (
-        frame.to_local(mi.Vector3f(*np.asarray(way, np.float32).T.copy()))
-        for way in (to_light, to_camera)
-    )
-    point = _zeros(mi.SurfaceInteraction3f, len(np.asarray(to_light)))
-    point.wi = camera
-    found = np.asarray(material.eval(mi.BSDFContext(), point, light)[0], np.float64)
-    cosine = np.maximum(np.asarray(light.z, np.float64), 1e-6)
-    return np.asarray(np.where(cosine > 1e-6, found / cosine, 0.0), np.float64)
-
-
-def _zeros(kind: Any, count: int) -> Any:
-    import drjit
-
-    return drjit.zeros(kind, count)
 
 
 def _cameras() -> tuple[dict[str, Any], Float64Array]:

@@ -24,7 +24,7 @@ from rigsim.render import camera_rays
 from rigsim.scenes.exposing import SceneError
 from rigsim.scenes.flash.image import WHITE_SCALE, FlashImage
 from rigsim.scenes.flash.scene import FlashScene
-from rigsim.scenes.reference.directions import FACET_OIL_FRACTION, FACET_ROUGHNESS, facet_reflection
+from rigsim.scenes.reference.facets import FACET_OIL_FRACTION, FACET_ROUGHNESS, SkinFacets
 from rigsim.scenes.reference.patch import (
     PatchImage,
     SkinPatch,
@@ -219,12 +219,8 @@ class VoxelFlashScene(FlashScene):
 
 def _reflect(to_light: Float32Array, to_camera: Float64Array) -> Float64Array:
     """Return f_r of the facets of a plane across +z in 1/sr, shape (H, W)."""
-    found = facet_reflection(
-        (0.0, 0.0, 1.0),
-        to_light.reshape(-1, 3),
-        to_camera.reshape(-1, 3),
-        roughness=FACET_ROUGHNESS,
-        oil=FACET_OIL_FRACTION,
+    found = SkinFacets(FACET_ROUGHNESS, FACET_OIL_FRACTION).evaluate(
+        (0.0, 0.0, 1.0), to_light.reshape(-1, 3), to_camera.reshape(-1, 3)
     )
     return found.reshape(to_light.shape[:-1])
 

@@ -31,25 +31,22 @@ RELIEF_ROUGHNESS: Final = 0.3
 images at 0.05 have 20 times the noise. Light that facets reflect onto each other is lost, 10 %."""
 
 
-def draw_grooves(person: PersonSkin, site: str, rig: Rig) -> SkinPatch:
-    """Return skin with the relief of a site and even pigment, in the field of the rig's camera.
+def draw_grooves(person: PersonSkin, site: str, field_mm: float) -> SkinPatch:
+    """Return skin with the relief of a site and even pigment.
 
     Parameters
     ----------
     person, site
         As for `rigsim.subject.person_skin.skin_maps`.
-    rig
-        The gradient rig, cropped to the field.
+    field_mm
+        Side of the camera's field, mm.
 
     Examples
     --------
-    >>> from capture.rig import load_rig
-    >>> rig = load_rig("gradient").cropped(8)
-    >>> skin = draw_grooves(PersonSkin.of_preset("III"), "forehead", rig)
+    >>> skin = draw_grooves(PersonSkin.of_preset("III"), "forehead", 0.1)
     >>> skin.height_mm.shape == skin.melanin.shape, float(skin.melanin.std()) < 1e-6
     (True, True)
     """
-    field_mm = float(max(rig.views[0].field_mm))
     drawn = draw_patch(
         person,
         site,
@@ -72,10 +69,12 @@ def predict_relief(
 
     Parameters
     ----------
-    person, site, rig
+    person, site
         As for `draw_grooves`.
     patch
         Its result.
+    rig
+        The gradient rig, cropped to the field.
     lateral
         Whether light scatters laterally.
 

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from capture.rig import Rig
+from model import spectra
 from rigsim import shading
 from rigsim.arrays import Float64Array
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, ActualSphere, diffuser_radiance
@@ -19,6 +20,9 @@ from rigsim.mitsuba.scene_radiance import look_at, radiance
 from rigsim.scenes.reference.patch import SkinPatch, describe_patch
 from rigsim.tissue.skin_layers import ETA
 
+BAND_EDGES_NM: Final = (400.0, 500.0, 580.0, 700.0)
+BAND_NODES_NM: Final = (460.0, 540.0, 620.0)
+"""Wavelengths that represent the light between `BAND_EDGES_NM`."""
 PATTERN_TRIPLES: Final = (("full", "x", "y"), ("full", "z", "-z"))
 """Patterns that are rendered together."""
 NO_EXTINCTION: Final = 1.0 + 1e-9
@@ -198,6 +202,23 @@ def predict_moments(
     inner = albedo * shading.interior_scale(ETA) / np.pi
     white = diffuser_radiance(sphere, np.zeros(1), np.zeros(1), extinction=NO_EXTINCTION)[0, 0]
     return np.asarray(float(leaves[0, 0]) * inner * total / white)
+
+
+def weigh_bands(rig: Rig) -> Float64Array:
+    """Return the parts of the gradient camera's band between `BAND_EDGES_NM`, of sum 1.
+
+    Examples
+    --------
+    >>> from capture.rig import load_rig
+    >>> weigh_bands(load_rig("gradient")).shape
+    (3,)
+    """
+    wavelengths = np.arange(BAND_EDGES_NM[0] + 5.0, BAND_EDGES_NM[-1], 10.0)
+    each = spectra.band_weights(
+        rig.views[0].spectral_sensitivity, rig.lights[0].illuminant, wavelengths
+    ).mean(axis=1)
+    parts = np.histogram(wavelengths, BAND_EDGES_NM, weights=each)[0]
+    return np.asarray(parts / parts.sum(), np.float64)
 
 
 def _white(sphere: ActualSphere) -> float:

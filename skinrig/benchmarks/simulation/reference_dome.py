@@ -27,13 +27,11 @@ from rigsim.light.led_light import lobe_exponent, white_intensity
 from rigsim.light.surface_brdf import evaluate_brdf
 from rigsim.population.files import load_subject
 from rigsim.scenes.reference.directions import (
-    FACET_OIL_FRACTION,
-    FACET_ROUGHNESS,
     DirectionalReflectance,
-    facet_reflection,
     normal_reflectance,
     render_directions,
 )
+from rigsim.scenes.reference.facets import FACET_OIL_FRACTION, FACET_ROUGHNESS, SkinFacets
 from rigsim.scenes.reference.plane import Reflection, render_plane
 from rigsim.sensor import expose_sensor, make_sensor
 from skinrig.arrays import Float64Array
@@ -271,15 +269,15 @@ def estimate_patch(
         Seeds the tilt's direction, the scan's error and the noise.
     """
     rng = np.random.default_rng(seed)
-    normal = _tilt(np.array([0.0, 0.0, 1.0]), tilt_deg, rng)
-    scan_normal = _tilt(normal, SCAN_ERROR_DEG, rng)
+    normal = tilt_vector(np.array([0.0, 0.0, 1.0]), tilt_deg, rng)
+    scan_normal = tilt_vector(normal, SCAN_ERROR_DEG, rng)
     packed = np.array([*truth, FACET_ROUGHNESS, FACET_OIL_FRACTION, 0.0, 1.0])
 
+    facets = SkinFacets(FACET_ROUGHNESS, FACET_OIL_FRACTION)
+
     def reflect_voxels(light: Float64Array, camera: Float64Array) -> Float64Array:
-        facets = facet_reflection(
-            normal, light, camera, roughness=FACET_ROUGHNESS, oil=FACET_OIL_FRACTION
-        )
-        return below.evaluate(normal, light, camera) + facets[:, None]
+        on_surface = facets.evaluate(normal, light, camera)
+        return below.evaluate(normal, light, camera) + on_surface[:, None]
 
     def reflect_model(light: Float64Array, camera: Float64Array) -> Float64Array:
         return evaluate_brdf(packed, normal, light, camera)[0].astype(np.float64)
@@ -299,7 +297,7 @@ def estimate_patch(
     return PatchEstimate(error, stderr, float(valid.mean()))
 
 
-def _tilt(normal: Float64Array, degrees: float, rng: np.random.Generator) -> Float64Array:
+def tilt_vector(normal: Float64Array, degrees: float, rng: np.random.Generator) -> Float64Array:
     """Tilt a unit vector by an angle into a random direction."""
     side = np.cross(normal, unit_vectors(rng.standard_normal(3)))
     angle = np.radians(degrees)

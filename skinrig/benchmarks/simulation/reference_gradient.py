@@ -11,7 +11,6 @@ from typing import Final
 import numpy as np
 
 from capture.rig import Rig, load_rig
-from model import spectra
 from model.metrics import angular_error_rad
 from model.vectors import unit_vectors
 from reconstruction.gradient_normals import SensorNoise, SphereLights, from_patterns
@@ -19,7 +18,13 @@ from reconstruction.normal_maps import NormalMaps
 from reconstruction.pipeline.gradient.stages import DIFFUSE_SMOOTH_PX
 from rigsim.as_built.sphere import PATTERN_WEIGHTS, ActualSphere, nominal_sphere
 from rigsim.scenes.gradient.scene import GRADIENT_METER_RATE_PER_S
-from rigsim.scenes.reference.gradient_skin import predict_moments, render_moments, turn_skin
+from rigsim.scenes.reference.gradient_skin import (
+    BAND_NODES_NM,
+    predict_moments,
+    render_moments,
+    turn_skin,
+    weigh_bands,
+)
 from rigsim.scenes.reference.patch import SkinPatch, draw_patch
 from rigsim.subject.person_skin import PersonSkin, draw_tissue
 from rigsim.tissue.skin_layers import skin_layer_stack
@@ -37,9 +42,6 @@ LIT_PRESETS: Final = ("I", "III", "V", "VI")
 LIT_SITE: Final = "cheek"
 LIT_FIELD_MM: Final = 4.0
 LIT_VOXEL_MM: Final = 0.25
-BAND_EDGES_NM: Final = (400.0, 500.0, 580.0, 700.0)
-BAND_NODES_NM: Final = (460.0, 540.0, 620.0)
-"""Wavelengths that represent the light between `BAND_EDGES_NM`."""
 TILTS_DEG: Final = (0.0, 25.0, 45.0)
 N_DRAWS: Final = 256
 NOISE_PX: Final = 24
@@ -104,7 +106,7 @@ def light_person(
     sphere = nominal_sphere(rig)
     moments, covariance, fast = np.zeros(4), np.zeros((4, 4)), np.zeros(4)
     albedo = 0.0
-    for k, (wavelength_nm, weight) in enumerate(zip(BAND_NODES_NM, _weights(rig), strict=True)):
+    for k, (wavelength_nm, weight) in enumerate(zip(BAND_NODES_NM, weigh_bands(rig), strict=True)):
         image = render_moments(
             patch,
             rig,
@@ -121,16 +123,6 @@ def light_person(
         fast += weight * predict_moments(r_d, rig, sphere, turn)
         albedo += weight * r_d
     return LitSkin(moments, covariance, fast, turn[2], albedo)
-
-
-def _weights(rig: Rig) -> Float64Array:
-    """Return the parts of the camera's band between `BAND_EDGES_NM`, of sum 1."""
-    wavelengths = np.arange(BAND_EDGES_NM[0] + 5.0, BAND_EDGES_NM[-1], 10.0)
-    each = spectra.band_weights(
-        rig.views[0].spectral_sensitivity, rig.lights[0].illuminant, wavelengths
-    ).mean(axis=1)
-    parts = np.histogram(wavelengths, BAND_EDGES_NM, weights=each)[0]
-    return np.asarray(parts / parts.sum(), np.float64)
 
 
 def _field_reflectance(patch: SkinPatch, wavelength_nm: float, seed: int) -> float:

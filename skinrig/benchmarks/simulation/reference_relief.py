@@ -212,7 +212,7 @@ def measure_reference_relief(stage: BenchmarkStage) -> None:
     slopes, local, normals = [], [], []
     for number, preset in enumerate(presets):
         person = PersonSkin.of_preset(preset, seed=FIRST_SEED + number)
-        patch = draw_grooves(person, RELIEF_SITE, rig)
+        patch = draw_grooves(person, RELIEF_SITE, max(rig.views[0].field_mm))
         spent_s, voxels = measure_processor_time(
             lambda: _render_halves(patch, rig, width_px=width, samples=samples, seed=2 * number)
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
@@ -88,6 +89,10 @@ def _on_skin(preset: str, width: int, fine: int) -> ErrorEstimate:
 
 
 REFERENCE_RAYS = 144
+DIRECT_LIGHT = SceneEffects(lateral=False, interreflections=False)
+"""Light between points of the skin is left out: both renderers take it from the same textures."""
+WAY_NAMES: Mapping[Renderer, str] = {"mitsuba": "olat", "fast": "fast"}
+"""Name of a point's way for each renderer of faces."""
 
 
 def measure_flash(stage: BenchmarkStage) -> None:
@@ -103,7 +108,7 @@ def measure_flash(stage: BenchmarkStage) -> None:
     worse = partial(_larger_error, truth=truth)
     for subpixels, _ in efforts:
         stage.measure(
-            {"way": "olat", "subpixels": subpixels},
+            {"scene": "sphere", "way": "olat", "subpixels": subpixels},
             lambda: flash_scenes.render_by_olat(sphere, view, subpixels=subpixels),
             worse,
             repeats=3,
@@ -113,7 +118,7 @@ def measure_flash(stage: BenchmarkStage) -> None:
     for _, samples in efforts:
         image = partial(flash_scenes.render_polarized_with_mitsuba, rig, view, samples=samples)
         stage.measure(
-            {"way": "volpath", "samples": samples},
+            {"scene": "sphere", "way": "volpath", "samples": samples},
             lambda: {
                 name: image(name, seed=k) for k, name in enumerate(flash_scenes.ANALYZER_AXIS_DEG)
             },
@@ -121,6 +126,7 @@ def measure_flash(stage: BenchmarkStage) -> None:
             repeats=3,
             memory=None,
         )
+    _add_face_curves(stage)
     over_fast, difference = _olat_over_fast(64 if stage.toy else 384)
     stage.limits = {"difference": difference}
     if not stage.toy:
@@ -131,13 +137,40 @@ def measure_flash(stage: BenchmarkStage) -> None:
         stage.limits["over_fast"] = over_fast
 
 
-def _olat_over_fast(width_px: int) -> tuple[float, float]:
-    """Compare both renderers of the flash rig: processor time, and relative difference of means.
+def _add_face_curves(stage: BenchmarkStage) -> None:
+    """Add both images of a face by `olat` and by the renderer without LLVM, green channel.
 
-    Light between points of the skin is left out: both take it from the same textures.
+    The reference is `olat` with more rays, so that errors of the fast way include its shadows,
+    which have the resolution of the face's texture.
     """
+    rig, face = load_rig("flash").resized(64 if stage.toy else 256), make_subject("III")
+    kept = []  # scenes of a way share the light on the surface, as long as one lives
+
+    def render(way: Renderer, subpixels: int) -> tuple[float, dict[str, Float32Array]]:
+        scene = FlashScene(
+            rig, face, effects=DIRECT_LIGHT, choice=choose_renderer(way), subpixels=subpixels
+        )
+        kept.append(scene)
+        seconds, images = measure_processor_time(
+            lambda: {name: scene.radiance(name)[..., 1] for name in flash_scenes.ANALYZER_AXIS_DEG}
+        )
+        return seconds, images
+
+    _, truth = render("mitsuba", 4 if stage.toy else 8)
+    for way, name in WAY_NAMES.items():
+        render(way, 1)  # compiles the kernels
+        for subpixels in (1, 2) if stage.toy else (1, 2, 3, 4):
+            runs = [render(way, subpixels) for _ in range(1 if stage.toy else 3)]
+            timing = Timing.single(
+                min(seconds for seconds, _ in runs), no_memory_reason=NO_MEMORY_REASON
+            )
+            knobs: Knobs = {"scene": "face", "way": name, "subpixels": subpixels}
+            stage.add(knobs, timing, _larger_error(runs[0][1], truth))
+
+
+def _olat_over_fast(width_px: int) -> tuple[float, float]:
+    """Compare both renderers of the flash rig: processor time, and relative difference of means."""
     rig, face = load_rig("flash").resized(width_px), make_subject("III")
-    effects = SceneEffects(lateral=False, interreflections=False)
     scalar = choose_variant("rgb", environment={"SKINRIG_MITSUBA": "scalar"})
     ways = {"olat": choose_variant("rgb"), "fast": scalar}
     spent: dict[str, list[float]] = {way: [] for way in ways}
@@ -145,7 +178,7 @@ def _olat_over_fast(width_px: int) -> tuple[float, float]:
     scenes = []  # those of a way share the light on the surface, as long as one lives
     for _ in range(6):  # the first compiles
         for way, choice in ways.items():
-            scene = FlashScene(rig, face, effects=effects, choice=choice)
+            scene = FlashScene(rig, face, effects=DIRECT_LIGHT, choice=choice)
             scenes.append(scene)
             seconds, images = measure_processor_time(
                 lambda: [scene.radiance(name) for name in flash_scenes.ANALYZER_AXIS_DEG]

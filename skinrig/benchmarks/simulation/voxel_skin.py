@@ -36,7 +36,7 @@ def measure_voxel_skin(stage: BenchmarkStage) -> None:
     render = partial(_render_pixels, skin)
     reference = RenderedReflectance(render("tissue", 256 if stage.toy else 16384, seed=99))
     cost = {}
-    efforts = (16, 64) if stage.toy else (64, 256, 1024, 4096)
+    efforts = (16, 64) if stage.toy else (4, 16, 64, 256, 1024, 4096)
     ways: tuple[VoxelIntegrator, ...] = ("tissue", "volpath")
     for way in ways:
         render(way, 1, seed=0)  # compiles the kernel

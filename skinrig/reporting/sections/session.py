@@ -18,6 +18,8 @@ class SessionFacts:
     rig: str
     day: date
     source: str
+    renderer: str
+    """Renderer of simulated images; empty for measured ones."""
     seed: int | None
     frames: int
     megabytes: float
@@ -26,7 +28,8 @@ class SessionFacts:
     def cells(self) -> tuple[object, ...]:
         """Row of the table."""
         seed = "" if self.seed is None else self.seed
-        return self.rig, self.day.isoformat(), self.source, seed, self.frames, self.megabytes
+        source = f"{self.source} ({self.renderer})" if self.renderer else self.source
+        return self.rig, self.day.isoformat(), source, seed, self.frames, self.megabytes
 
 
 def read_session_facts(folders: Sequence[Path]) -> dict[str, SessionFacts]:
@@ -35,10 +38,12 @@ def read_session_facts(folders: Sequence[Path]) -> dict[str, SessionFacts]:
     for folder in folders:
         document = json.loads((folder / "session.json").read_text(encoding="utf-8"))
         frames = list((folder / "frames").glob("*"))
+        renderer = document.get("extra", {}).get("renderer", {})
         found[folder.name] = SessionFacts(
             rig=str(document["plan"]["rig"]),
             day=datetime.fromisoformat(document["created_at"]).date(),
             source=str(document["source"]),
+            renderer=str(renderer.get("name", "")) if isinstance(renderer, dict) else "",
             seed=document.get("seed"),
             frames=len(frames),
             megabytes=sum(frame.stat().st_size for frame in frames) / 1e6,

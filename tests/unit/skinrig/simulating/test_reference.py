@@ -1,4 +1,4 @@
-"""Sessions of voxel skin: `--renderer reference` of flash rig and probe, and its refusals."""
+"""Sessions of voxel skin: `--renderer reference` of flash rig and probe, and all refusals."""
 
 from dataclasses import replace
 
@@ -23,7 +23,6 @@ from skinrig.calibrating.calibrate import calibrate
 from skinrig.evaluating.subsurface import compare_profiles
 from skinrig.simulating import reference
 from skinrig.simulating.orders import SimulationError
-from skinrig.simulating.serving import ServeOrder, serve_rig
 from skinrig.simulating.simulation import simulate_session
 
 needs_llvm = pytest.mark.skipif(
@@ -177,8 +176,11 @@ def test_probe_place_that_was_not_traced_is_refused(monkeypatch):
 @pytest.mark.parametrize(
     ("rig", "options", "message"),
     [
-        ("dome", {}, "expected mitsuba or fast for the dome rig, because .* 11 days"),
-        ("gradient", {}, "expected mitsuba or fast for the gradient rig"),
+        ("dome", {"states": ("anger",)}, "state: got 'anger', expected neutral"),
+        ("dome", {"move": True}, "move: not an option of the dome"),
+        ("dome", {"conditions": {"lotion": 1.0}}, "got conditions lotion, expected none"),
+        ("gradient", {"steps": (-1, 1)}, r"steps: got -1..1, expected 0..0"),
+        ("gradient", {"width_px": 1024}, "width: got 1024, expected at most 512"),
         ("flash", {"width_px": 64}, "width: got 64, expected an even number up to 32"),
         ("flash", {"states": ("anger",)}, "states: not an option"),
         ("flash", {"renderer": "fast", "site": "chin"}, "site: not an option"),
@@ -196,9 +198,3 @@ def test_reference_without_llvm_is_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("SKINRIG_MITSUBA", "scalar")
     with pytest.raises(SimulationError, match="reference needs LLVM"):
         simulate_session("flash", tmp_path / "session", **SUBJECT)
-
-
-@pytest.mark.parametrize("rig", ["dome", "gradient"])
-def test_served_rig_without_voxels_is_refused(rig):
-    with pytest.raises(SimulationError, match=f"mitsuba or fast for the {rig} rig"):
-        serve_rig(rig, ServeOrder(renderer="reference"), None)
