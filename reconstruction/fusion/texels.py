@@ -32,6 +32,10 @@ TEXEL_ITERATIONS: Final = 5
 """Gauss-Newton steps of a texel."""
 TAIL_DEGREES: Final = 6.0
 """Degrees of freedom of the t distribution of a rig's errors at a texel, as its tails are heavy."""
+STEIN_DEGREES: Final = 1.0
+"""Chi-squared of a rig's residual at a texel above which part of it is the place's own skin.
+
+Three channels less two: James and Stein 1961."""
 MAX_STEP: Final = 1.0
 """Longest step in log melanin and log blood."""
 RANGE_MARGIN: Final = 0.02
@@ -303,12 +307,20 @@ def _estimate_signals(
     count, size = values.shape
     # what a signal's residual states of the place's own skin
     gains = np.zeros((count, size, size))
+    own_variance = np.tile(errors.local, (count, 1, 1))
     kept = errors.unexplained @ np.linalg.inv(errors.offset_covariance)
     estimate = values + kept @ person.offset
-    for one, weight, y in zip(colors, solved.weights, solved.seen, strict=True):
+    for one, full, y in zip(colors, solved.stated, solved.seen, strict=True):
         at = table.columns(one.rig)
-        gains[:, at, at] = errors.local[at, at] @ weight
-        estimate[:, at] += np.einsum("ncd,nd->nc", gains[:, at, at], y - values[:, at])
+        local = errors.local[at, at]
+        off = y - values[:, at]
+        far = np.einsum("nc,ncd,nd->n", off, full, off)
+        # skin unlike the face's, such as a nevus, keeps its measured color
+        left = np.minimum(1.0, STEIN_DEGREES / np.maximum(far, 1e-9))[:, None, None]
+        gains[:, at, at] = np.eye(3) - left * (np.eye(3) - local @ full)
+        estimate[:, at] += np.einsum("ncd,nd->nc", gains[:, at, at], off)
+        noise = one.covariance + one.brightness_variance
+        own_variance[:, at, at] = np.where(full[:, :1, :1] > 0.0, gains[:, at, at] @ noise, local)
     whole = np.eye(size) - gains
     moved = slopes @ by_common
     moved[..., :N_PROPERTIES] += by_property
@@ -316,7 +328,7 @@ def _estimate_signals(
     moved[..., person.offset_columns] += kept - gains
     slopes_left = whole @ slopes
     own = np.einsum("nsa,nab,nsb->ns", slopes_left, covariance, slopes_left)
-    own += np.einsum("nst,ts->ns", whole, errors.local)
+    own += np.einsum("nss->ns", own_variance)
     left = np.diag(errors.unexplained - kept @ errors.unexplained)
     common = np.einsum("nsp,pq,nsq->ns", moved, person.covariance, moved) + left
     return estimate, own, common
