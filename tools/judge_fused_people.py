@@ -75,8 +75,6 @@ def capture(folder: Path, subject: str, seed: int) -> None:
         omitted = {"leave_out": DOME_OMITTED_EFFECTS} if rig == "dome" else {}
         done = run.simulate(rig, subject, subject=subject, **size, **omitted)
         run.reconstruct(rig, done, want)
-        for images in folder.glob(f"session-{rig}-*"):
-            shutil.rmtree(images / "frames", ignore_errors=True)
         print(f"{folder.name} {rig}: {time.process_time() - begun:.0f} s", file=sys.stderr)
 
 

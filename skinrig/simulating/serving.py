@@ -215,6 +215,9 @@ def _dome_scene(rig: Rig, order: ServeOrder) -> Any:
     scene = DomeScene(rig, order.face(), dome=built, seed=order.noise_seed, choice=choice)
     if SCANNER_BOX in rig.boxes:
         scan_face(scene, seed=order.seed, noise_seed=order.noise_seed)
+    if scene.stripes is not None:
+        # traced before the first request, so that no client waits for it
+        scene.stripes.trace()
     return scene
 
 
