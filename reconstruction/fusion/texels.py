@@ -32,11 +32,11 @@ TEXEL_ITERATIONS: Final = 5
 """Gauss-Newton steps of a texel."""
 TAIL_DEGREES: Final = 6.0
 """Degrees of freedom of the t distribution of a rig's errors at a texel, as its tails are heavy."""
-OWN_SKIN_CHI2: Final = 3.0
+OWN_SKIN_CHI2: Final = 2.0
 """Chi-squared of a rig's residual at a texel above which part of it is the place's own skin.
 
-It is the mean by the stated errors of three channels. The part grows with chi-squared as that of
-the estimate of James and Stein 1961, which starts at 1: it keeps more noise of usual skin."""
+The part grows with chi-squared as in the estimate of James and Stein 1961, which starts at 1. Lower
+values keep nevi and more noise, see docs/validation/fusion.md."""
 MAX_STEP: Final = 1.0
 """Longest step in log melanin and log blood."""
 RANGE_MARGIN: Final = 0.02

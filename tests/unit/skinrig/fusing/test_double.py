@@ -99,7 +99,7 @@ def test_fuse_two_rigs_lowers_r_d_error(folders, tmp_path):
         np.abs(np.log(one.maps["r_d"].values[good] / true)).std()
         for one in (found, store.read(folders / "dome"))
     ]
-    assert errors[0] < 0.55 * errors[1]
+    assert errors[0] < 0.65 * errors[1]
     assert found.parameters["fusion"]["maps"]["melanin"] == ["dome", "flash"]
 
 
