@@ -137,7 +137,7 @@ def capture_dome(
     from skinrig.capturing.option_values import parse_eye_state
 
     order = common.order(eyes=parse_eye_state(eyes))
-    _capture(context, common, order, target, scanner=scanner)
+    _capture(context, common, order, target, scanner)
 
 
 @capture_app.command("gradient", cls=RigCommand)
@@ -200,8 +200,8 @@ def _capture(
     common: CaptureOptions,
     order: CaptureOrder,
     target: str | None,
-    *,
     scanner: bool = False,
+    /,
     **chosen: Any,
 ) -> None:
     """Capture with the rig's own plan or the plan of a file."""
