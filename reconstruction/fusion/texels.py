@@ -32,6 +32,11 @@ TEXEL_ITERATIONS: Final = 5
 """Gauss-Newton steps of a texel."""
 TAIL_DEGREES: Final = 6.0
 """Degrees of freedom of the t distribution of a rig's errors at a texel, as its tails are heavy."""
+OWN_SKIN_CHI2: Final = 2.0
+"""Chi-squared of a rig's residual at a texel above which part of it is the place's own skin.
+
+The part grows with chi-squared as in the estimate of James and Stein 1961, which starts at 1. Lower
+values keep nevi and more noise, see docs/validation/fusion.md."""
 MAX_STEP: Final = 1.0
 """Longest step in log melanin and log blood."""
 RANGE_MARGIN: Final = 0.02
@@ -56,6 +61,9 @@ class RigColors:
         (N,) bool.
     brightness_variance
         Variance of the unknown log light on a place, common to the channels; 0 for a known light.
+    unresolved
+        Fraction of the texels' variances by detail of the skin finer than the rig's pixels. No
+        other rig's color of the texel removes it from the estimated signal.
     """
 
     rig: int
@@ -63,6 +71,7 @@ class RigColors:
     covariance: Float64Array
     valid: BoolArray
     brightness_variance: float = 0.0
+    unresolved: float = 0.0
 
     def part(self, chosen: slice | BoolArray) -> "RigColors":
         """Return the colors of some texels.
@@ -73,12 +82,15 @@ class RigColors:
             Texels.
         """
         parts = self.log_rgb[chosen], self.covariance[chosen], self.valid[chosen]
-        return RigColors(self.rig, *parts, self.brightness_variance)
+        return RigColors(self.rig, *parts, self.brightness_variance, self.unresolved)
 
     def without_covariance(self) -> "RigColors":
         """Return the same colors, whose channels' errors count as independent."""
         own = np.einsum("ncc->nc", self.covariance) + self.brightness_variance
-        return RigColors(self.rig, self.log_rgb, own[..., None] * np.eye(3), self.valid)
+        independent = own[..., None] * np.eye(3)
+        return RigColors(
+            self.rig, self.log_rgb, independent, self.valid, unresolved=self.unresolved
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -303,12 +315,20 @@ def _estimate_signals(
     count, size = values.shape
     # what a signal's residual states of the place's own skin
     gains = np.zeros((count, size, size))
+    own_variance = np.tile(errors.local, (count, 1, 1))
     kept = errors.unexplained @ np.linalg.inv(errors.offset_covariance)
     estimate = values + kept @ person.offset
-    for one, weight, y in zip(colors, solved.weights, solved.seen, strict=True):
+    for one, full, y in zip(colors, solved.stated, solved.seen, strict=True):
         at = table.columns(one.rig)
-        gains[:, at, at] = errors.local[at, at] @ weight
-        estimate[:, at] += np.einsum("ncd,nd->nc", gains[:, at, at], y - values[:, at])
+        local = errors.local[at, at]
+        off = y - values[:, at]
+        far = np.einsum("nc,ncd,nd->n", off, full, off)
+        # skin unlike the face's, such as a nevus, keeps its measured color
+        left = np.minimum(1.0, OWN_SKIN_CHI2 / np.maximum(far, 1e-9))[:, None, None]
+        gains[:, at, at] = np.eye(3) - left * (np.eye(3) - local @ full)
+        estimate[:, at] += np.einsum("ncd,nd->nc", gains[:, at, at], off)
+        noise = one.covariance + one.brightness_variance
+        own_variance[:, at, at] = np.where(full[:, :1, :1] > 0.0, gains[:, at, at] @ noise, local)
     whole = np.eye(size) - gains
     moved = slopes @ by_common
     moved[..., :N_PROPERTIES] += by_property
@@ -316,7 +336,10 @@ def _estimate_signals(
     moved[..., person.offset_columns] += kept - gains
     slopes_left = whole @ slopes
     own = np.einsum("nsa,nab,nsb->ns", slopes_left, covariance, slopes_left)
-    own += np.einsum("nst,ts->ns", whole, errors.local)
+    own += np.einsum("nss->ns", own_variance)
+    for one in colors:
+        detail = np.einsum("ncc->nc", one.covariance) * one.valid[:, None]
+        own[:, table.columns(one.rig)] += one.unresolved * detail
     left = np.diag(errors.unexplained - kept @ errors.unexplained)
     common = np.einsum("nsp,pq,nsq->ns", moved, person.covariance, moved) + left
     return estimate, own, common

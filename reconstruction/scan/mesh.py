@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from model.checks import Checks
 from reconstruction.arrays import Float32Array, Float64Array, Int32Array, Int64Array
@@ -23,6 +24,11 @@ from reconstruction.scan.repair import (
 FACE_BOX_MM: Final = ((-100.0, -108.0, -105.0), (100.0, 150.0, 60.0))
 """Box around a face in the rig frame; the neck below the chin and clothes are outside."""
 MAX_POINTS: Final = 4_000_000
+UNWRAP_SMOOTHINGS: Final = 3
+"""Smoothing steps before the unwrapping.
+
+On four simulated scans of faces, 3 leave 6 to 13 charts, none 17 to 247. Texels then have 0.8 to
+1.2 times their median size."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,12 +120,29 @@ def prepare_scan(scan: bytes | TriangleMesh, *, points: int = 500_000) -> Refine
     return refine_mesh(mesh, points=points, report=report)
 
 
-def unwrap_mesh(mesh: TriangleMesh) -> TriangleMesh:
-    """Unwrap a surface with little stretch, into charts that fill the unit square (xatlas)."""
+def unwrap_mesh(mesh: TriangleMesh, *, smoothings: int = UNWRAP_SMOOTHINGS) -> TriangleMesh:
+    """Unwrap a surface with little stretch, into charts that fill the unit square (xatlas).
+
+    Charts follow a smoothed copy: on the noise of a scan, xatlas cuts single triangles out of the
+    charts, which leaves holes in every map. The surface keeps its vertices.
+
+    Parameters
+    ----------
+    mesh
+        Any surface.
+    smoothings
+        Times that each vertex of the copy, but for those of its rim, moves to the middle between
+        itself and the mean of its neighbors.
+
+    Raises
+    ------
+    ScanMeshError
+        If xatlas drops triangles.
+    """
     import xatlas
 
     _, index, uv = xatlas.parametrize(
-        np.ascontiguousarray(mesh.vertices_mm, np.float32),
+        np.ascontiguousarray(_smooth_vertices(mesh, smoothings), np.float32),
         np.ascontiguousarray(mesh.faces, np.uint32),
     )
     if len(index) != len(mesh.faces):
@@ -128,6 +151,21 @@ def unwrap_mesh(mesh: TriangleMesh) -> TriangleMesh:
             "decimate the scan and try again"
         )
     return TriangleMesh(mesh.vertices_mm, mesh.faces, np.asarray(uv, np.float64)[index])
+
+
+def _smooth_vertices(mesh: TriangleMesh, count: int) -> Float64Array:
+    """Return vertices (V, 3) after `count` smoothing steps."""
+    start, end = directed_edges(np.concatenate([mesh.faces, mesh.faces[:, ::-1]])).T
+    near = csr_array(
+        (np.ones(len(start)), (start, end)), shape=(len(mesh.vertices_mm), len(mesh.vertices_mm))
+    )
+    near.data[:] = 1.0
+    total = np.maximum(np.asarray(near.sum(axis=1)), 1.0)[:, None]
+    inner = ~np.isin(np.arange(len(total)), boundary_edges(mesh.faces))[:, None]
+    vertices = np.asarray(mesh.vertices_mm, np.float64)
+    for _ in range(count):
+        vertices = np.where(inner, 0.5 * (vertices + near @ vertices / total), vertices)
+    return vertices
 
 
 def refine_mesh(

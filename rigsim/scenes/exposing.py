@@ -65,6 +65,9 @@ class StripeExposures(Protocol):
     def view_names(self) -> frozenset[str]:
         """Names of the cameras."""
 
+    def trace(self) -> None:
+        """Trace what the cameras see, before the first exposure."""
+
     def forget(self) -> None:
         """Note that the subject has moved."""
 

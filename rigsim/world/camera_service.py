@@ -42,7 +42,9 @@ class CameraService:
         service = self
         self.world = world
         self._holders: dict[str, socket.socket] = {}
-        self._waits: dict[str, threading.Lock] = {v.name: threading.Lock() for v in world.rig.views}
+        self._waits: dict[str, threading.Lock] = {
+            v.name: threading.Lock() for v in world.rig.all_views
+        }
         self._lock = threading.Lock()
         self._connections: set[socket.socket] = set()
 
@@ -57,7 +59,7 @@ class CameraService:
         self._server = Server((host, port), Handler)
         real_port = self._server.server_address[1]
         self.addresses = {
-            view.name: f"tcp://{host}:{real_port}/{view.name}" for view in world.rig.views
+            view.name: f"tcp://{host}:{real_port}/{view.name}" for view in world.rig.all_views
         }
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(0.05,), name="rigsim-cameras", daemon=True

@@ -120,6 +120,7 @@ def capture_dome(
     common: CaptureOptions,
     target: Annotated[str | None, target_option("dome")] = None,
     eyes: Eyes = "open",
+    scanner: bool = False,
 ) -> None:
     """Capture with a dome: a face under one light at a time (OLAT), or a target.
 
@@ -130,10 +131,13 @@ def capture_dome(
     eyes
         Subject's eyes, as confirmed by the operator; flicker above its limit requires closed or
         shielded.
+    scanner
+        Scan the face, or the board of target charuco, with the rig's scanner of stripes.
     """
     from skinrig.capturing.option_values import parse_eye_state
 
-    _capture(context, common, common.order(eyes=parse_eye_state(eyes)), target)
+    order = common.order(eyes=parse_eye_state(eyes))
+    _capture(context, common, order, target, scanner)
 
 
 @capture_app.command("gradient", cls=RigCommand)
@@ -196,6 +200,8 @@ def _capture(
     common: CaptureOptions,
     order: CaptureOrder,
     target: str | None,
+    scanner: bool = False,
+    /,
     **chosen: Any,
 ) -> None:
     """Capture with the rig's own plan or the plan of a file."""
@@ -205,6 +211,7 @@ def _capture(
 
     console = Console(common.json)
     rig = load_rig(str(context.info_name))
+    rig = rig.with_scanner() if scanner else rig
     plan = choose_plan(rig, common.plan, target, **chosen)
     console.print_document("skinrig.capture/1", capture_session(rig, plan, order, console))
 
@@ -253,12 +260,17 @@ def serve_flash(context: typer.Context, common: ServeOptions) -> None:
 
 @serve_app.command("dome", cls=RigCommand)
 @command
-def serve_dome(context: typer.Context, common: ServeOptions) -> None:
+def serve_dome(context: typer.Context, common: ServeOptions, scanner: bool = False) -> None:
     """Serve a simulated dome with all its lights and cameras; the first lines are the addresses.
 
     Example: skinrig serve dome --subject II
+
+    Parameters
+    ----------
+    scanner
+        Serve the scanner's controller and cameras, too.
     """
-    _serve(context, common)
+    _serve(context, common, scanner=scanner)
 
 
 @serve_app.command("gradient", cls=RigCommand)
@@ -281,12 +293,16 @@ def serve_probe(context: typer.Context, common: ServeOptions) -> None:
     _serve(context, common)
 
 
-def _serve(context: typer.Context, common: ServeOptions, site: str | None = None) -> None:
+def _serve(
+    context: typer.Context, common: ServeOptions, site: str | None = None, scanner: bool = False
+) -> None:
     """Serve a simulated rig until interrupted."""
     from skinrig.simulating.serving import ServeOrder, serve_rig
 
     options = ("pty", "tcp", "subject", "seed", "session_seed", "renderer", "resume")
-    order = ServeOrder(site=site, size=common.scale, **select_attributes(common, *options))
+    order = ServeOrder(
+        site=site, scanner=scanner, size=common.scale, **select_attributes(common, *options)
+    )
     serve_rig(str(context.info_name), order, Console(common.json))
 
 

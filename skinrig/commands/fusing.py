@@ -25,16 +25,18 @@ def fuse(
     """Fuse one person's maps by flash rig, dome, gradient rig and probe into one appearance.
 
     Melanin, blood, R_d and sigma_tr are estimated together, on the dome's texture. The gradient
-    rig's patch keeps its pixels and gets the dome's low frequencies.
+    rig's patch keeps its pixels and gets the dome's low frequencies. Wrinkles that `skinrig fit
+    wrinkles` fitted to the dome's expressions are carried along.
 
     Example: skinrig fuse session-flash session-dome session-gradient session-probe --out double
 
     Parameters
     ----------
     sessions
-        SESSION/ folders with their maps next to them, or APPEARANCE/ folders; one per rig.
+        SESSION/ folders with their maps next to them, or APPEARANCE/ folders; one per rig, and one
+        with fitted wrinkles.
     without
-        What to leave out, separated by commas: rigs (flash, dome, gradient, probe), their maps
+        What to leave out, separated by commas: rigs (flash, dome, gradient, probe), wrinkles, maps
         (diffuse, r_d, normals, sigma_tr), or covariance. Its cost is printed: the maps are also
         estimated with it.
     landmarks

@@ -27,6 +27,8 @@ Banded = tuple[str, str, str, int, float, float, float]
 """Map, unit, band, points, masked %, median and 95th percentile of the absolute error."""
 MIN_POINTS = 20
 """Minimum number of points of a reported band."""
+MIN_BAND_FRACTION = 0.002
+"""Minimum fraction of the points in a reported band; fewer are nevi that pixels do not resolve."""
 
 # An error with independent Gaussian components of equal standard deviation s in two directions has
 # Rayleigh-distributed length: P(length < r) = 1 - exp(-r^2 / 2 s^2) = 0.6827 at r = RAYLEIGH_68 s.
@@ -214,7 +216,8 @@ def errors_by_band(appearance: SkinAppearance, truth: SkinAppearance) -> list[Ba
         for band in skin_bands.TYPOLOGY_NAMES:
             own = error[bands == band]
             finite = own[np.isfinite(own)]
-            if len(own) < MIN_POINTS or not len(finite):
+            few = len(own) < max(MIN_POINTS, MIN_BAND_FRACTION * len(error))
+            if few or not len(finite):
                 continue
             unit = "%" if key == "r_d" else "°"
             masked = 100.0 * (1.0 - len(finite) / len(own))

@@ -21,6 +21,7 @@ from skinrig.appearances.contents import (
     intersect_valid,
     list_assumptions,
 )
+from skinrig.appearances.dynamic import WRINKLES
 from skinrig.appearances.texel_placement import TexelPlacement, place_texels
 from skinrig.fitting import probe_sites
 from skinrig.fusing.description import describe_checks, describe_patch, describe_person
@@ -29,6 +30,7 @@ from skinrig.fusing.measurements import Measurements
 from skinrig.fusing.patches import PATCH_PREFIX, PlacedPatch, place_patch
 from skinrig.fusing.sources import FusionInputError, Source, Sources, read_sources
 from skinrig.fusing.texel_colors import ColorSource, DomeColors, FlashColors
+from skinrig.fusing.wrinkles import carry_wrinkles
 
 QUANTITY_BY_RIG: Final[Mapping[str, str]] = {
     "dome": "R_d",
@@ -192,6 +194,13 @@ def fuse_sources(
             provenance[name] = rigs if name.startswith(PATCH_PREFIX) else ["gradient"]
         assumed += patch.assumed
         left_out += patch.left_out
+    parts = {} if patch is None else dict(patch.parameters)
+    if (moving := sources.get(WRINKLES)) is not None:
+        wrinkles = carry_wrinkles(moving, sources.get("dome"))
+        maps |= wrinkles.maps
+        files |= wrinkles.files
+        provenance |= {name: ["dome"] for name in wrinkles.maps}
+        parts[WRINKLES] = wrinkles.document
     own = {name: value for name, value in base.appearance.parameters.items() if name != "work"}
     parameters: dict[str, Any] = {
         **own,
@@ -207,8 +216,9 @@ def fuse_sources(
             "checks": describe_checks(checks),
         },
     }
+    if parts:
+        parameters["parts"] = parts
     if patch is not None:
-        parameters["parts"] = patch.parameters
         parameters[FUSION_KEY]["patch"] = describe_patch(patch)
     # exports carry files, not parameters
     files[FUSION_FILE] = json.dumps(parameters[FUSION_KEY], indent=1).encode()

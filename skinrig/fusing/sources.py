@@ -12,10 +12,11 @@ from model import store
 from model.skin import SkinAppearance
 from reconstruction.pipeline.probe.stages import SUBSURFACE_FILE
 from skinrig.appearances.contents import FUSION_KEY, hash_document
+from skinrig.appearances.dynamic import DYNAMIC_KIND, WRINKLES, describe_parts
 from skinrig.errors import UsageError
 
-RIG_NAMES: Final = ("flash", "dome", "gradient", "probe")
-"""Rigs whose maps can be fused, in the order of the table of inputs."""
+RIG_NAMES: Final = ("flash", "dome", "gradient", "probe", WRINKLES)
+"""Rigs whose maps can be fused, in the order of the table of inputs; the dome's wrinkles last."""
 SESSION_FILE: Final = "session.json"
 
 
@@ -150,6 +151,8 @@ def _find_maps(path: Path) -> Path:
 def _recognize(path: Path, appearance: SkinAppearance) -> str:
     """Return the rig of an appearance by its maps and files."""
     maps, files = appearance.maps, appearance.files
+    if appearance.parameters.get("kind") == DYNAMIC_KIND and WRINKLES in describe_parts(appearance):
+        return WRINKLES
     if "r_d" in maps and "position" in maps:
         return "dome"
     if "diffuse" in maps:
@@ -160,6 +163,6 @@ def _recognize(path: Path, appearance: SkinAppearance) -> str:
         return "gradient"
     raise FusionInputError(
         f"{path}: got maps {', '.join(sorted(maps)) or 'none'}, expected r_d with position "
-        f"(dome), diffuse (flash), {SUBSURFACE_FILE} (probe) or normals of the neutral step "
-        "(gradient); reconstruct them first"
+        f"(dome), diffuse (flash), {SUBSURFACE_FILE} (probe), normals of the neutral step "
+        "(gradient) or fitted wrinkles; reconstruct or fit them first"
     )

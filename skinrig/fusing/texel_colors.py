@@ -18,11 +18,16 @@ from skinrig.arrays import BoolArray, Float64Array, FloatArray, Int64Array
 
 BRIGHTNESS_SHARE: Final = 0.5
 """Fraction of the variance of the dome's calibration error that its channels share."""
-SHARED_GAIN_ERROR: Final = 0.012
+SHARED_GAIN_ERROR: Final = 0.005
 """Relative error of R_d that all texels of a face share, common to the channels.
 
-Pixels average over relief and borders of shadow everywhere. Set on two simulated people at 2.1 mm
-per pixel, types III and V, whose R_d was 0.8 and 0.9 % too low."""
+Pixels average over relief and borders of shadow everywhere. It adds to `SHARED_R_D_ERROR`, which
+has most of it: both together are 0.9 %. R_d of three simulated people at 2.1 mm per pixel, types
+III, V and VI, was off by 0.5 to 1.3 %."""
+UNRESOLVED_FRACTION: Final = 0.35
+"""Fraction of the variance of R_d at a texel by detail finer than the dome's pixels.
+
+Set on the same people: their fused R_d scattered by more than stated by this part."""
 FLASH_CHANNEL_ERROR: Final = 0.003
 """Relative standard error of a channel of the flash rig's white reference over the others."""
 PLACED_LIGHT_SD: Final = 1.0
@@ -119,7 +124,8 @@ class DomeColors:
         common = relative.min(axis=-1, keepdims=True)
         covariance = (relative - common)[..., None] * np.eye(3) + common[..., None]
         covariance = covariance + 1e-8 * np.eye(3)
-        return RigColors(rig, np.log(values) - LOG_R_D_OVER_REFLECTANCE, covariance, good)
+        log_rgb = np.log(values) - LOG_R_D_OVER_REFLECTANCE
+        return RigColors(rig, log_rgb, covariance, good, unresolved=UNRESOLVED_FRACTION)
 
 
 def _interior_variance(r_d: FloatArray) -> Float64Array:

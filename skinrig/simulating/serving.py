@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from capture.plan.probe import PHANTOM_SITE, PROBE_SITES
-from capture.rig import Probe, Rig, load_rig
+from capture.rig import SCANNER_BOX, Probe, Rig, load_rig
 from capture.session import Session
 from rigsim.as_built.dome import build_dome
 from rigsim.mitsuba.variant import Renderer, choose_renderer
 from rigsim.population import files as subject_file
 from rigsim.scenes.dome.scene import DomeScene
+from rigsim.scenes.dome.stripes import scan_face
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.scenes.gradient.reference import NEUTRAL_GRIP
 from rigsim.scenes.reference.flash_session import crop_to_patch
@@ -66,6 +67,8 @@ class ServeOrder:
     """Renderer of a face's images."""
     site: str | None = None
     """Site of the skin (gradient rig only)."""
+    scanner: bool = False
+    """Serve the dome's scanner, too."""
     resume: Path | None = None
     """Session with frames of an earlier server of the same seed. The number of the shot seeds the
     noise, and counting continues after those frames. None: from 0."""
@@ -107,7 +110,7 @@ def serve_rig(rig_name: str, order: ServeOrder, console: Console) -> None:
     made = _shots_made(order.resume, rig)
     if order.site is not None and rig.caliper is None:
         raise SimulationOptionsError("site: an option of the gradient rig only; remove it")
-    rig, scene = _build_served_rig(rig, order)
+    rig, scene = _build_served_rig(rig.with_scanner() if order.scanner else rig, order)
     options = select_attributes(order, "pty", "tcp")
     options |= {"seed": order.noise_seed, "subject_seed": order.seed}
     with serve_world(rig, scene=scene, shots_made=made, **options) as served:
@@ -168,6 +171,8 @@ def _next_step(rig_name: str, rig: Rig, urls: Mapping[str, str], order: ServeOrd
     more = "" if rig.caliper is None else " --force-limit 2 --eyes closed"
     if rig.caliper is not None and order.renderer == "reference":
         more += " --steps 0..0"  # voxels are at rest
+    if SCANNER_BOX in rig.boxes:
+        more += " --scanner --eyes closed"
     resume = order.resume
     out = "session" if resume is None else f"{shell_quote(resume)} --resume"
     return f"skinrig capture {shell_quote(rig_name)} {boxes} {cameras}{more} --out {out}"
@@ -208,10 +213,21 @@ def _reference_flash(rig: Rig, order: ServeOrder) -> tuple[Rig, Any]:
 def _dome_scene(rig: Rig, order: ServeOrder) -> Any:
     built = build_dome(rig, seed=order.seed)
     if order.renderer == "reference":
+        if SCANNER_BOX in rig.boxes:
+            raise SimulationError(
+                "renderer: got 'reference' with a scanner, expected mitsuba or fast; voxel skin "
+                "has no stripes"
+            )
         given = select_attributes(order, "noise_seed", "size")
         return reference.make_dome_scene(rig, order.face(), dome=built, progress=_report, **given)
     choice = choose_renderer(order.renderer)
-    return DomeScene(rig, order.face(), dome=built, seed=order.noise_seed, choice=choice)
+    scene = DomeScene(rig, order.face(), dome=built, seed=order.noise_seed, choice=choice)
+    if SCANNER_BOX in rig.boxes:
+        scan_face(scene, seed=order.seed, noise_seed=order.noise_seed)
+    if scene.stripes is not None:
+        # traced before the first request, so that no client waits for it
+        scene.stripes.trace()
+    return scene
 
 
 def _probe_scene(rig: Rig, probe: Probe, order: ServeOrder) -> Any:

@@ -5,12 +5,14 @@ import contextlib
 import pytest
 
 from capture.devices.caliper import CaliperBox
+from capture.devices.camera import open_camera
 from capture.devices.gradient_sphere import GradientSphereBox
 from capture.devices.port import Port, PortBusy, WrongDevice
 from capture.rig import load_rig
 from rigsim.world.serve import ServeError, serve_world
 from skinrig.capturing.addresses import parse_addresses, require_addresses
 from skinrig.errors import UsageError
+from skinrig.simulating.serving import _next_step
 
 RIG = load_rig("gradient").cropped(16)
 
@@ -85,3 +87,15 @@ def test_ports_are_consecutive_in_rig_order():
             assert [int(url.rpartition(":")[2]) for url in urls] == [base, base + 1, base + 2]
             return
     raise AssertionError("five times in a row a port was taken")
+
+
+def test_dome_serves_scanner_with_its_cameras():
+    """The printed command captures with the scanner, whose cameras answer like the dome's."""
+    rig = load_rig("dome").with_scanner()
+    with serve_world(rig) as served:
+        assert {"dome", "scanner", "S0", "S3", rig.views[0].name} <= served.addresses.keys()
+        with contextlib.closing(open_camera(served.addresses["S3"])) as camera:
+            assert camera.info.width_px == rig.view("S3").width_px
+        command = _next_step("dome", rig, served.addresses, None)
+    assert f"--port scanner={served.addresses['scanner']}" in command
+    assert command.endswith("--scanner --eyes closed --out session")

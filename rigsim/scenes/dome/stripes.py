@@ -219,6 +219,13 @@ class StripeScene:
         """Names of the scanner's cameras."""
         return frozenset(self.scanner.views)
 
+    def trace(self) -> None:
+        """Trace all cameras' points now, so that no client of a served scanner waits for them."""
+        for projector in self.scanner.nominal.projectors:
+            for view_name in projector.cameras:
+                self._ambient(view_name)
+                self._lit_points(view_name, projector.name)
+
     def forget(self) -> None:
         """Trace the surface again, which has moved."""
         self._seen.clear()
