@@ -53,7 +53,7 @@ MIN_STRENGTH_SPREAD = 0.005
 """Of the logarithm: no lights are more alike."""
 MIN_INFORMATION = 1e-9
 """Of a parameter of the bas-relief map, where the strengths do not depend on it."""
-PROFILE_FACTORS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
+PROFILE_FACTORS = (0.25, 0.35, 0.5, 0.7, 0.85, 1.2, 1.4, 2.0, 2.8, 4.0)
 """Of the factor on z, at which fits are compared with the best."""
 MIN_TILT_DEG = 5.0
 """Lower median angles are the limit in which all strengths are equal whatever the lights."""
