@@ -13,7 +13,7 @@ from capture import raw
 from capture.arrays import Float64Array, FloatArray
 from capture.documents import Fault
 from capture.importers import light_lists
-from capture.importers.images import Photo, PhotoError, read_photo
+from capture.importers.images import Photo, PhotoError, find_common_white, read_photo, restate_white
 from capture.importers.imported_session import (
     DISTANCE_MM,
     create_imported_session,
@@ -117,6 +117,10 @@ def import_light_list(
             code="SR-IMP-009",
         )
     near = mm_per_px is not None
+    if near and found.kind == "images":
+        raise LightListError.at(
+            "has no positions", "mm_per_px", str(mm_per_px), "none with estimated directions"
+        )
     if mm_per_px is not None and not 0 < mm_per_px < 1e3:
         raise LightListError.at("has no such scale", "mm_per_px", str(mm_per_px), "0 < mm < 1000")
     where_mask = Path(mask) if mask else light_lists.find_mask(found.images[0].parent)
@@ -151,7 +155,8 @@ def import_light_list(
         if where_mask is not None:
             session.attach("mask.png", _mask_png(where_mask, first.frame))
         for step, file in zip(steps, found.images, strict=True):
-            _commit(session, step, file, clock, as_linear=as_linear)
+            frame = read_photo(file, white_value=first.white_value).frame
+            _commit(session, step, frame, clock, as_linear=as_linear)
     listed, masked = f"{found.file} ({found.kind})", where_mask.name if where_mask else ""
     return ImageStackImport(str(target), len(steps), listed, shown, masked, every)
 
@@ -176,6 +181,7 @@ def encode_srgb(linear: FloatArray) -> FloatArray:
 def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, dict[str, None]]:
     """Read every image once; return samples (N, P) over white, the first photo, and its notes."""
     rows, notes, faults = [], {}, []
+    whites: list[float | None] = []
     first: Photo | None = None
     chosen: NDArray[np.intp] | None = None
     for file in found.images:
@@ -195,8 +201,10 @@ def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, d
             expected = f"{first.encoding} {wanted[1]} x {wanted[0]} {first.frame.pattern}"
             faults.append(Fault(file.name, got, expected))
             continue
-        gray = light_lists.to_gray(frame).reshape(-1)[chosen]
-        rows.append(gray.astype(np.float64) / frame.white)
+        whites.append(photo.white_value)
+        (black, *_), white = frame.black, frame.white
+        gray = light_lists.to_gray(frame).reshape(-1)[chosen].astype(np.float64)
+        rows.append((gray - black) / (white - black))
     if faults or first is None:
         raise PhotoError(
             "images differ",
@@ -205,7 +213,13 @@ def _sample(found: LightList, mask: Path | None) -> tuple[Float64Array, Photo, d
             advice="Use images of one camera and one setting.",
             code="SR-IMP-010",
         )
-    return np.array(rows), first, notes
+    samples = np.array(rows)
+    white_value = find_common_white(whites)
+    if white_value is not None:
+        samples *= np.array([1.0 if w is None else w / white_value for w in whites])[:, None]
+        first = replace(first, white_value=white_value)
+        notes = dict.fromkeys(restate_white(list(notes), white_value))
+    return samples, first, notes
 
 
 def _is_linear_despite_encoding(samples: Float64Array, found: LightList) -> bool:
@@ -282,9 +296,13 @@ def _mask_png(path: Path, frame: raw.RawFrame) -> bytes:
 
 
 def _commit(
-    session: Session, step: Step, file: Path, clock: Callable[[], datetime], *, as_linear: bool
+    session: Session,
+    step: Step,
+    frame: raw.RawFrame,
+    clock: Callable[[], datetime],
+    *,
+    as_linear: bool,
 ) -> None:
-    frame = read_photo(file).frame
     if as_linear:
         share = np.arange(frame.white + 1) / frame.white
         undone = np.rint(frame.white * encode_srgb(share)).astype(np.uint16)

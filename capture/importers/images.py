@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import re
 import struct
 import zlib
 from collections.abc import Sequence
@@ -57,15 +58,21 @@ class Photo:
     """
     notes: tuple[str, ...] = ()
     """Assumptions and losses, one sentence each."""
+    white_value: float | None = None
+    """Value of a floating-point file that is stored as white, 0 for a black one; None: the file
+    contains integers."""
 
 
-def read_photo(path: str | Path) -> Photo:
+def read_photo(path: str | Path, *, white_value: float | None = None) -> Photo:
     """Read a RAW, TIFF, OpenEXR, PNG or JPEG file; its content decides, not its name.
 
     Parameters
     ----------
     path : str or Path
         The file.
+    white_value : float, optional
+        Value of floating-point files that is stored as white, so that several files keep their
+        ratios; default: a little above the file's own maximum.
 
     Returns
     -------
@@ -86,9 +93,9 @@ def read_photo(path: str | Path) -> Photo:
     if head.startswith(_PNG_MAGIC):
         return _display(file, where, *_check_png(file.read_bytes(), where))
     if head.startswith(_EXR_MAGIC):
-        return _exr(file, where)
+        return _exr(file, where, white_value)
     if head.startswith(_TIFF_MAGICS) and file.suffix.lower() in _TIFF_SUFFIXES:
-        return _tiff(file, where)
+        return _tiff(file, where, white_value)
     return _raw(file, where)
 
 
@@ -310,24 +317,47 @@ def _check_jpeg(data: bytes, where: str) -> tuple[str, list[str]]:
     return "JPEG", list(dict.fromkeys(notes))
 
 
-def _linear(pixels: NDArray[Any], where: str, notes: list[str]) -> Photo:
-    """Store linear integers unchanged, and floating-point values on a scale of their own."""
+def _linear(pixels: NDArray[Any], notes: list[str], white_value: float | None) -> Photo:
+    """Store linear integers unchanged, and floating-point values over a white value."""
     if pixels.dtype == np.uint16:
         return Photo(_frame(pixels, 0), "linear", (*notes, NOISE_NOTE))
     values = pixels.astype(np.float64)
     known = np.isfinite(values)
     top = float(values[known].max(initial=0.0))
-    if not top > 0:
-        raise _error("is black", where, "largest value", f"{top:g}", "a value above 0")
-    scale = (WHITE_DN - FLOAT_BLACK_DN) / (FLOAT_HEADROOM * top)
+    white = max(FLOAT_HEADROOM * top, 0.0) if white_value is None else white_value
+    scale = (WHITE_DN - FLOAT_BLACK_DN) / white if white > 0.0 else 0.0
     dn = np.rint(FLOAT_BLACK_DN + scale * np.where(known, values, 0.0))
-    notes = [*notes, f"values were divided by {FLOAT_HEADROOM * top:.6g} to fit the range"]
+    notes = [*notes, f"values were divided by {white:.6g} to fit the range"]
     if (dn < 0).any():
         notes.append(f"{int((dn < 0).sum())} values far below zero were raised to the lowest level")
     if not known.all():
         notes.append(f"{int((~known).sum())} values that are not numbers count as saturated")
     stored = np.where(known, np.clip(dn, 0, WHITE_DN - 1), WHITE_DN).astype(np.uint16)
-    return Photo(_frame(stored, FLOAT_BLACK_DN), "linear", (*notes, NOISE_NOTE))
+    return Photo(_frame(stored, FLOAT_BLACK_DN), "linear", (*notes, NOISE_NOTE), white)
+
+
+def find_common_white(values: Sequence[float | None]) -> float | None:
+    """Return the white value under which several files keep their ratios; None: all integers.
+
+    Examples
+    --------
+    >>> find_common_white([None, 2.0, 0.0, 3.0])
+    3.0
+    """
+    given = [value for value in values if value is not None]
+    return max(given) if given else None
+
+
+def restate_white(notes: Sequence[str], white_value: float) -> tuple[str, ...]:
+    """Return a photograph's notes with another white value.
+
+    Examples
+    --------
+    >>> restate_white(["values were divided by 3 to fit the range", "a"], 5.0)
+    ('values were divided by 5 to fit the range', 'a')
+    """
+    pattern = r"^values were divided by \S+ to"
+    return tuple(re.sub(pattern, f"values were divided by {white_value:.6g} to", n) for n in notes)
 
 
 def _channels(pixels: NDArray[Any], where: str, notes: list[str]) -> NDArray[Any]:
@@ -343,7 +373,7 @@ def _channels(pixels: NDArray[Any], where: str, notes: list[str]) -> NDArray[Any
     return squeezed
 
 
-def _tiff(file: Path, where: str) -> Photo:
+def _tiff(file: Path, where: str, white_value: float | None) -> Photo:
     import tifffile
 
     notes: list[str] = []
@@ -386,11 +416,11 @@ def _tiff(file: Path, where: str) -> Photo:
     if pixels.dtype == np.uint8:
         return _from_display(pixels, where, notes)
     if pixels.dtype == np.uint16 or np.issubdtype(pixels.dtype, np.floating):
-        return _linear(pixels, where, [*notes, "the TIFF's values count as linear light"])
+        return _linear(pixels, [*notes, "the TIFF's values count as linear light"], white_value)
     raise _error("has an unknown depth", where, "samples", str(pixels.dtype), "8, 16 bit or float")
 
 
-def _exr(file: Path, where: str) -> Photo:
+def _exr(file: Path, where: str, white_value: float | None) -> Photo:
     import OpenEXR
 
     notes: list[str] = []
@@ -422,4 +452,5 @@ def _exr(file: Path, where: str) -> Photo:
     planes = [channels[name].astype(np.float32) for name in names]
     if any(plane.shape != (height, width) for plane in planes):
         raise _error("contains no image", where, "channels", "different sizes", "one size")
-    return _linear(planes[0] if len(planes) == 1 else np.stack(planes, axis=-1), where, notes)
+    pixels = planes[0] if len(planes) == 1 else np.stack(planes, axis=-1)
+    return _linear(pixels, notes, white_value)

@@ -314,20 +314,25 @@ def _from_text(path: Path, directory: Path, pictures: tuple[Path, ...]) -> Light
         )
     vectors = np.array([parse_vector(row, f"{path}, light {k + 1}") for k, row in enumerate(rows)])
     _require_one_each(path, pictures, vectors)
+    return LightList(pictures, vectors, "list", path.name, read_intensities(directory, len(rows)))
+
+
+def read_intensities(directory: Path, count: int) -> Float64Array | None:
+    """Read the strengths (N, 3) of a folder's ``light_intensities.txt``; None without one."""
     strengths = directory / "light_intensities.txt"
-    intensity = None
-    if strengths.is_file():
-        lines = [line.split() for line in read_text(strengths).splitlines() if line.split()]
-        intensity = np.array(
-            [parse_vector(row, f"{strengths}, light {k}") for k, row in enumerate(lines)]
+    if not strengths.is_file():
+        return None
+    lines = [line.split() for line in read_text(strengths).splitlines() if line.split()]
+    intensity = np.array(
+        [parse_vector(row, f"{strengths}, light {k + 1}") for k, row in enumerate(lines)]
+    )
+    if intensity.shape != (count, 3) or (intensity <= 0).any():
+        raise LightListError(
+            "does not fit the lights",
+            where=str(strengths),
+            faults=[Fault("rows", str(len(lines)), f"{count} of numbers > 0")],
         )
-        if intensity.shape != vectors.shape or (intensity <= 0).any():
-            raise LightListError(
-                "does not fit the lights",
-                where=str(strengths),
-                faults=[Fault("rows", str(len(lines)), f"{len(rows)} of numbers > 0")],
-            )
-    return LightList(pictures, vectors, "list", path.name, intensity)
+    return intensity
 
 
 def _require_one_each(path: Path, pictures: tuple[Path, ...], vectors: Float64Array) -> None:
@@ -350,7 +355,8 @@ def _from_table(path: Path, directory: Path, pictures: tuple[Path, ...]) -> Ligh
             raise LightListError("contains an image twice", where=str(path))
         return LightList(pictures, vectors, "lp", path.name)
     _require_one_each(path, pictures, vectors)
-    return LightList(pictures, vectors, "list", path.name)
+    intensity = read_intensities(directory, len(vectors))
+    return LightList(pictures, vectors, "list", path.name, intensity)
 
 
 def _from_ball(folder: Path, count: int) -> Float64Array:

@@ -82,8 +82,8 @@ def read_light_table(path: Path) -> tuple[list[str], Float64Array]:
     rows: Any
     if path.suffix.lower() == ".npy":
         try:
-            rows = np.load(io.BytesIO(data), allow_pickle=False).tolist()
-        except (ValueError, EOFError, MemoryError) as exc:
+            rows = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False).tolist()
+        except (ValueError, EOFError, MemoryError, OverflowError) as exc:
             raise LightListError("is not a NumPy array", where=str(path)) from exc
     else:
         rows = read_json(data, where=str(path), error=LightListError)
@@ -107,12 +107,20 @@ def read_light_table(path: Path) -> tuple[list[str], Float64Array]:
         )
         for number, (_, row) in enumerate(entries, start=1)
     ]
-    return (names if len(names) == len(vectors) else []), np.array(vectors)
+    if 0 < len(names) < len(vectors):
+        raise LightListError(
+            "names only some images",
+            where=str(path),
+            faults=[Fault("names", f"{len(names)} of {len(vectors)}", "all or none")],
+        )
+    return names, np.array(vectors)
 
 
 def _split_entry(row: Any) -> tuple[str | None, Any]:
     """Return the name of an image, None without one, and the vector of an entry."""
     if not isinstance(row, Mapping):
         return None, row
-    name = next((str(row[key]) for key in NAME_KEYS if isinstance(row.get(key), str)), None)
+    texts = (row[key] for key in NAME_KEYS if isinstance(row.get(key), str))
+    # a lamp can have a name, too: only that of a file has a suffix
+    name = next((text for text in texts if Path(text).suffix), None)
     return name, next((row[key] for key in VECTOR_KEYS if key in row), None)

@@ -11,7 +11,14 @@ from pathlib import Path
 from capture import raw
 from capture.documents import Fault, InputError
 from capture.importers.framing import Framing
-from capture.importers.images import Encoding, Photo, PhotoError, read_photo
+from capture.importers.images import (
+    Encoding,
+    Photo,
+    PhotoError,
+    find_common_white,
+    read_photo,
+    restate_white,
+)
 from capture.importers.imported_session import (
     DISTANCE_MM,
     create_imported_session,
@@ -64,6 +71,7 @@ class _Entry:
     exposure_s: float | None
     iso: int | None
     notes: tuple[str, ...]
+    white_value: float | None
 
     @property
     def camera(self) -> tuple[object, ...]:
@@ -131,6 +139,13 @@ def import_photos(
     clock = now or (lambda: datetime.now(UTC))
     files, ignored = _files(Path(directory))
     framing = framing or Framing()
+    if rig is not None and framing != Framing():
+        raise PhotoError(
+            "cannot be imported so",
+            where=str(directory),
+            faults=[Fault("crop or width", "one together with a rig", "whole photographs")],
+            advice="Leave the rig out, or crop and width.",
+        )
     entries = _inspect(files, framing)
     light = illuminant or ("D65" if any(e.encoding != "raw" for e in entries) else "D55")
     used, views = _rig(entries, rig, camera_serial, sensitivity, light)
@@ -182,13 +197,15 @@ def _inspect(files: Sequence[Path], framing: Framing) -> list[_Entry]:
     entries, faults = [], []
     for file in files:
         try:
-            photo = framing.apply(read_photo(file), where=str(file))
+            photo = read_photo(file)
+            if photo.white_value == 0.0:
+                raise PhotoError("is black", where=str(file))
         except InputError as exc:
             found = "; ".join(f"{fault.path}: {fault.got}" for fault in exc.faults)
             reason = f"one that {exc.what}" + (f" ({found})" if found else "")
             faults.append(Fault(file.name, reason, "a photograph"))
             continue
-        entries.append(_entry(file, photo))
+        entries.append(_entry(file, framing.apply(photo, where=str(file))))
     if faults:
         raise PhotoError(
             f"{len(faults)} of {len(files)} files cannot be imported",
@@ -197,14 +214,29 @@ def _inspect(files: Sequence[Path], framing: Framing) -> list[_Entry]:
             advice="Repair these files or move them away; nothing was written.",
             code="SR-IMP-013",
         )
-    return entries
+    white_value = find_common_white([entry.white_value for entry in entries])
+    if white_value is None:
+        return entries
+    return [
+        entry
+        if entry.white_value is None
+        else replace(entry, white_value=white_value, notes=restate_white(entry.notes, white_value))
+        for entry in entries
+    ]
 
 
 def _entry(file: Path, photo: Photo) -> _Entry:
     frame = photo.frame
     view = make_placeholder_view(frame, analyzer_axis_deg=0.0)
     return _Entry(
-        file, hash_file(file), photo.encoding, view, frame.exposure_s, frame.iso, photo.notes
+        file,
+        hash_file(file),
+        photo.encoding,
+        view,
+        frame.exposure_s,
+        frame.iso,
+        photo.notes,
+        photo.white_value,
     )
 
 
@@ -322,7 +354,9 @@ def _commit(
 ) -> None:
     (view,) = step.cameras
     frame = replace(
-        framing.apply(read_photo(entry.file), where=str(entry.file)).frame,
+        framing.apply(
+            read_photo(entry.file, white_value=entry.white_value), where=str(entry.file)
+        ).frame,
         camera_serial=session.rig.view(view).serial,
         step_id=step.id,
         session_id=session.id,

@@ -9,6 +9,7 @@ except for one sign: a hollow surface under opposite lights has the same images,
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -17,8 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, gaussian_filter, map_coordinates
 from scipy.optimize import least_squares
+from threadpoolctl import threadpool_limits
 
 from model.checks import Checks
+from model.solver_outcome import outcome_from_scipy
 from model.vectors import unit_vectors
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray
 from reconstruction.normal_integration.integration import integrate_map
@@ -32,9 +35,14 @@ from reconstruction.stack_diagnosis.shading_space import (
     fit_shading_space,
 )
 
+_LOG = logging.getLogger(__name__)
+
 MIN_FRAMES = 8
 """Equal strengths leave N - 4 residuals, from which the error is estimated."""
 MIN_POINTS = 200
+MIN_LIT_SAMPLES = 5
+MAX_POINT_MISFIT = 0.05
+"""Median residual of a pixel's lit samples, over its bright sample, of a matte point."""
 MIN_SINGULAR_RATIO = 0.03
 """Ratio of extreme singular values of the light vectors below which the third is noise."""
 SMOOTHING_PX = 1.0
@@ -43,7 +51,9 @@ SOFT_STRENGTH = 0.05
 """Deviation from equal strength up to which a light counts fully."""
 MIN_STRENGTH_SPREAD = 0.005
 """Of the logarithm: no lights are more alike."""
-PROFILE_FACTORS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
+MIN_INFORMATION = 1e-9
+"""Of a parameter of the bas-relief map, where the strengths do not depend on it."""
+PROFILE_FACTORS = (0.25, 0.35, 0.5, 0.7, 0.85, 1.2, 1.4, 2.0, 2.8, 4.0)
 """Of the factor on z, at which fits are compared with the best."""
 MIN_TILT_DEG = 5.0
 """Lower median angles are the limit in which all strengths are equal whatever the lights."""
@@ -124,6 +134,12 @@ def estimate_lights(
     checks.require(len(images) >= MIN_FRAMES, "gray", f"{len(images)} images", f"{MIN_FRAMES}")
     mask = np.ones(images.shape[1:], bool) if inside is None else np.asarray(inside, bool)
     stack, _ = reduce_stack(images, usable, mask)
+    with threadpool_limits(1):  # sums of one order, so that bytes do not depend on threads
+        return _estimate(stack, checks, rng)
+
+
+def _estimate(stack: ReducedStack, checks: Checks, rng: np.random.Generator) -> UnlistedLights:
+    """Estimate the lights of reduced images; see `estimate_lights`."""
     samples, clear = choose_points(stack.gray, stack.usable, stack.inside, rng)
     got = f"{samples.shape[1]} bright points"
     checks.require(samples.shape[1] >= MIN_POINTS, "gray", got, f"{MIN_POINTS}; check mask")
@@ -135,7 +151,7 @@ def estimate_lights(
     field, good = _fit_points(stack.gray, stack.usable & stack.inside, space.lights)
     xy = space.lights @ _make_integrable(field, good)
     # most lights are before the object: a height common to all of them is near the truth
-    height = space.lights @ np.linalg.lstsq(space.lights, np.ones(len(images)), rcond=None)[0]
+    height = space.lights @ np.linalg.lstsq(space.lights, np.ones(len(stack.gray)), rcond=None)[0]
     lights, error_rad = _equalize_strengths(np.concatenate([xy, height[:, None]], axis=1))
     # a light is n . l: normals transform by the inverse transpose of the lights' map
     to_lights = np.linalg.lstsq(space.lights, lights, rcond=None)[0]
@@ -179,7 +195,9 @@ def _fit_points(
         points = np.linalg.solve(normal, ((weights * scaled) @ lights)[..., None])[..., 0]
         rest = np.abs(scaled - points @ lights.T)
         weights = lit / np.maximum(rest, 0.01)
-    good = (lit.sum(axis=1) >= 5) & (np.median(np.where(lit, rest, 0.0), axis=1) < 0.05)
+    good = lit.sum(axis=1) >= MIN_LIT_SAMPLES
+    misfit = np.nanmedian(np.where(lit[good], rest[good], np.nan), axis=1)
+    good[good] = misfit < MAX_POINT_MISFIT
     field = unit_vectors(points, min_length=1e-12)
     return field.reshape(height, width, 3), good.reshape(height, width)
 
@@ -241,6 +259,7 @@ def _equalize_strengths(lights: Float64Array) -> tuple[Float64Array, Float64Arra
     unit = unit_vectors(found, min_length=1e-12)
     variance = max(2.0 * float(best.cost) / (len(lights) - 4), MIN_STRENGTH_SPREAD**2)
     error = _linear_error(found, lights, np.sqrt(variance))
+    outcome_from_scipy(best, float(best.optimality)).warn_unless_converged("lights", _LOG)
     for factor in PROFILE_FACTORS:
         c = factor * best.x[2]
         one = fit(
@@ -249,7 +268,8 @@ def _equalize_strengths(lights: Float64Array) -> tuple[Float64Array, Float64Arra
         if 2.0 * (one.cost - best.cost) < 4.0 * variance:  # within two standard errors
             other = unit_vectors(mapped(one.x[0], one.x[1], c), min_length=1e-12)
             angle = np.arccos(np.clip(np.sum(unit * other, axis=1), -1.0, 1.0))
-            error = np.maximum(error, 0.5 * angle)
+            open_ended = factor in (PROFILE_FACTORS[0], PROFILE_FACTORS[-1])
+            error = np.maximum(error, np.inf if open_ended else 0.5 * angle)
     return found, error
 
 
@@ -259,7 +279,9 @@ def _linear_error(found: Float64Array, lights: Float64Array, sigma: float) -> Fl
     unit = found / strength[:, None]
     by_height = unit[:, 2:] * lights / strength[:, None]  # of the log strength, by a, b and c
     rows = np.concatenate([by_height, -np.ones((len(lights), 1))], axis=1)
-    covariance = sigma**2 * np.linalg.pinv(rows.T @ rows, rcond=1e-12)[:3, :3]
+    # what no strength depends on stays open: its variance is then large, not left out
+    information = rows.T @ rows + MIN_INFORMATION * np.eye(4)
+    covariance = sigma**2 * np.linalg.inv(information)[:3, :3]
     height_error = np.sqrt(np.maximum(np.einsum("nk,kl,nl->n", lights, covariance, lights), 0.0))
     return np.asarray(height_error * np.hypot(unit[:, 0], unit[:, 1]) / strength)
 
@@ -290,6 +312,8 @@ def _explained_shadows(
 ) -> float:
     """Return the overlap of dark samples with shadows that the surface casts, over their union."""
     height = integrate_map(normals, valid=good)
+    if not height.convergence.converged:
+        return 0.0
     heights = np.where(height.valid, height.height, -np.inf).astype(np.float64)
     floor = float(heights[height.valid].min()) if height.valid.any() else 0.0
     heights = np.maximum(heights, floor - 1.0)

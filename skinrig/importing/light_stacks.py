@@ -3,29 +3,34 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from capture.documents import Fault
+from capture.documents import Fault, InputError
 from capture.importers.image_stacks import Encoding, encode_srgb
-from capture.importers.images import read_photo
+from capture.importers.images import find_common_white, read_photo
 from capture.importers.light_lists import (
     LightList,
     find_images,
     find_light_list,
     find_mask,
+    read_intensities,
     read_mask,
     to_gray,
 )
 from capture.importers.light_tables import LightListError, UnequalCountError
 from model.arrays import BoolArray, Float64Array
 
+if TYPE_CHECKING:
+    from reconstruction.stack_diagnosis.reduced_stack import ReducedStack
+
 ESTIMATE_LIGHTS: Final = "estimate"
 """Value of ``--lights`` under which the images themselves show their lights."""
 LINEAR_MISFIT_RATIO = 0.8
 """As for listed lights: values count as linear when they fit clearly better so."""
 MIN_SIGN_EVIDENCE = 0.1
+MIN_OBJECT_PX = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +95,11 @@ def _without_special(
     from reconstruction.stack_diagnosis.special_images import find_special_images
 
     files = find_images(directory)
-    special = find_special_images(*_read_reduced(files, mask, encoding))
+    try:
+        stack = _read_reduced(files, mask, encoding)
+    except InputError:  # files that do not fit together are not what the user has to mend first
+        raise error from None
+    special = find_special_images(stack.gray, stack.inside, usable=stack.usable)
     kept = [file for number, file in enumerate(files) if number not in special]
     try:
         found = find_light_list(directory, lights=source, images=kept)
@@ -117,71 +126,108 @@ def _set_aside(files: Sequence[Path], special: dict[int, str]) -> tuple[str, ...
 
 def _estimate_list(directory: Path, mask: Path | None, encoding: Encoding) -> FoundLights:
     """Estimate the directions from the images; the encoding is the one that fits better."""
-    from reconstruction.stack_diagnosis.shading_space import choose_points, fit_shading_space
+    from reconstruction.stack_diagnosis.reduced_stack import ReducedStack
     from reconstruction.stack_diagnosis.special_images import find_special_images
-    from reconstruction.stack_diagnosis.unlisted_lights import estimate_lights
+    from reconstruction.stack_diagnosis.unlisted_lights import MIN_FRAMES, estimate_lights
 
     files = find_images(directory)
-    gray, inside = _read_reduced(files, mask, encoding)
-    special = find_special_images(gray, inside)
+    whole = _read_reduced(files, mask, encoding)
+    special = find_special_images(whole.gray, whole.inside, usable=whole.usable)
     kept = [number for number in range(len(files)) if number not in special]
-    gray = gray[kept]
-    if encoding == "auto" and _is_encoded(files[0]):
-        misfit = {}
-        for name, values in (("sRGB", gray), ("linear", encode_srgb(np.clip(gray, 0.0, 1.0)))):
-            chosen = choose_points(
-                np.asarray(values), np.ones(gray.shape, bool), inside, np.random.default_rng(0)
-            )
-            misfit[name] = fit_shading_space(*chosen).misfit
-        if misfit["linear"] < LINEAR_MISFIT_RATIO * misfit["sRGB"]:
-            encoding, gray = "linear", np.asarray(encode_srgb(np.clip(gray, 0.0, 1.0)))
-        else:
-            encoding = "sRGB"
-    found = estimate_lights(gray, inside=inside, rng=np.random.default_rng(0))
+    if len(kept) < MIN_FRAMES:
+        raise LightListError.at(
+            "cannot show its lights",
+            "images under one light",
+            str(len(kept)),
+            f"{MIN_FRAMES} or more",
+            where=directory,
+        )
+    gray = whole.gray[kept]
+    intensity = read_intensities(files[0].parent, len(kept))
+    if intensity is not None:
+        gray = gray / (intensity.mean(axis=1) / intensity.mean())[:, None, None]
+    stack = ReducedStack(gray, whole.usable[kept], whole.inside)
+    if encoding == "auto" and read_photo(files[0]).encoding == "sRGB":
+        encoding, stack = _choose_encoding(stack)
+    found = estimate_lights(
+        stack.gray, usable=stack.usable, inside=stack.inside, rng=np.random.default_rng(0)
+    )
     assumed = [
         *_set_aside(files, special),
-        "all lights are of about one strength: their directions then follow from the images, with "
-        f"a standard error of {np.median(found.stderr_deg):.1f} degrees",
+        "all lights are of about one strength, over what the files state: their directions then "
+        f"follow from the images, with a standard error of {np.median(found.stderr_deg):.1f} "
+        "degrees",
     ]
     if found.sign_evidence < MIN_SIGN_EVIDENCE:
         assumed.append("the object is not hollow: a hollow one under opposite lights looks alike")
     pictures = tuple(files[number] for number in kept)
-    listed = LightList(pictures, found.directions, "images", directory.name)
-    listed = replace(listed, stderr_deg=found.stderr_deg)
-    return FoundLights(listed, encoding, tuple(assumed))
+    listed = LightList(pictures, found.directions, "images", directory.name, intensity)
+    return FoundLights(replace(listed, stderr_deg=found.stderr_deg), encoding, tuple(assumed))
 
 
-def _is_encoded(file: Path) -> bool:
-    return read_photo(file).encoding == "sRGB"
+def _choose_encoding(stack: "ReducedStack") -> "tuple[Encoding, ReducedStack]":
+    """Return the encoding under which three images predict the others better, and its light."""
+    from reconstruction.stack_diagnosis.shading_space import choose_points, fit_shading_space
+
+    linear = replace(stack, gray=np.asarray(encode_srgb(np.clip(stack.gray, 0.0, 1.0))))
+    decoded, as_stored = (
+        fit_shading_space(
+            *choose_points(one.gray, one.usable, one.inside, np.random.default_rng(0))
+        ).misfit
+        for one in (stack, linear)
+    )
+    if as_stored < LINEAR_MISFIT_RATIO * decoded:
+        return "linear", linear
+    return "sRGB", stack
 
 
-def _read_reduced(
-    files: Sequence[Path], mask: Path | None, encoding: Encoding
-) -> tuple[Float64Array, BoolArray]:
-    """Return gray images (N, h, w), reduced one by one, over the white level, and the object."""
-    from reconstruction.stack_diagnosis.reduced_stack import reduce_stack
+def _read_reduced(files: Sequence[Path], mask: Path | None, encoding: Encoding) -> "ReducedStack":
+    """Return gray images over white and exposure, reduced one by one, without saturated samples."""
+    from reconstruction.stack_diagnosis.reduced_stack import ReducedStack, reduce_stack
 
-    if not files:
-        raise LightListError("has no images", where="folder")
     where_mask = mask or find_mask(files[0].parent)
     images: list[Float64Array] = []
+    usable: list[BoolArray] = []
+    whites: list[float | None] = []
+    exposures: list[float] = []
+    shape: tuple[int, ...] = ()
     inside = np.ones((1, 1), bool)
     for file in files:
         photo = read_photo(file)
-        gray = to_gray(photo.frame) / np.float32(photo.frame.white)
+        frame = photo.frame
+        black = float(np.mean(frame.black))
+        gray = (to_gray(frame).astype(np.float64) - black) / (frame.white - black)
         if encoding == "linear" and photo.encoding == "sRGB":
-            gray = encode_srgb(np.clip(gray, 0.0, 1.0)).astype(np.float32)
-        whole = np.ones(gray.shape, bool)
+            gray = np.asarray(encode_srgb(np.clip(gray, 0.0, 1.0)))
+        if shape and gray.shape != shape:
+            got, expected = (f"{size[1]} x {size[0]}" for size in (gray.shape, shape))
+            raise LightListError.at("images differ", file.name, got, expected, where=file.parent)
+        shape = gray.shape
+        clear = frame.cfa < frame.white
+        if frame.pattern != "MONO":
+            clear = clear[::2, ::2] & clear[::2, 1::2] & clear[1::2, ::2] & clear[1::2, 1::2]
+        whole = np.ones(shape, bool)
         if where_mask is not None:
-            whole = read_mask(where_mask, gray.shape)
-        reduced, _ = reduce_stack(gray[None], None, whole)
-        if images and reduced.gray.shape[1:] != images[0].shape:
-            got, expected = (
-                f"{shape[1]} x {shape[0]}" for shape in (reduced.gray.shape[1:], images[0].shape)
-            )
-            raise LightListError.at(
-                "images differ", file.name, f"reduced {got}", expected, where=file.parent
-            )
+            whole = read_mask(where_mask, (shape[0], shape[1]))
+        reduced, _ = reduce_stack(gray[None], clear[None], whole)
         images.append(reduced.gray[0])
+        usable.append(reduced.usable[0])
+        whites.append(photo.white_value)
+        exposures.append((frame.exposure_s or 0.0) * (frame.iso or 100.0))
         inside = reduced.inside
-    return np.array(images), inside
+    if not inside.any():
+        raise LightListError.at(
+            "does not fit the images",
+            "mask",
+            "an object thinner than a block of pixels",
+            f"one of {MIN_OBJECT_PX} pixels across or more",
+            where=str(where_mask),
+        )
+    found = np.array(images)
+    white_value = find_common_white(whites)
+    if white_value:
+        factors = [1.0 if white is None else white / white_value for white in whites]
+        found *= np.array(factors)[:, None, None]
+    if all(exposure > 0.0 for exposure in exposures):
+        found *= (np.median(exposures) / np.array(exposures))[:, None, None]
+    return ReducedStack(found, np.array(usable), inside)

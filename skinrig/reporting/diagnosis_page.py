@@ -58,12 +58,14 @@ def _list_images(one: Finding) -> str:
 
 
 def _sections(found: DiagnosedStack) -> Iterator[page.Block]:
+    step = max(1, max(found.gray.shape[1:]) // IMAGE_WIDTH_PX)  # the stack may lie in a file
+    level = float(np.quantile(found.gray[:, ::step, ::step], 0.999)) or 1.0
     for one in found.diagnosis.findings:
         yield page.Heading(one.fault, 2)
         yield page.Paragraph(f"{one.evidence}. Remedy: {one.remedy}.")
         numbers = list(one.frames) or list(range(0, len(found.gray), _step(len(found.gray))))
         for number in numbers[:MAX_SHOWN]:
-            yield page.Images(_draw_image(found, number))
+            yield page.Images(_draw_image(found, number, level))
         left = len(numbers) - MAX_SHOWN
         if left > 0 and one.frames:
             yield page.build_note(f"{left} more images have this fault.")
@@ -74,9 +76,8 @@ def _step(count: int) -> int:
     return max(1, -(-count // MAX_SHOWN))
 
 
-def _draw_image(found: DiagnosedStack, number: int) -> list[page.Image]:
+def _draw_image(found: DiagnosedStack, number: int, level: float) -> list[page.Image]:
     """Return an image, the ball under its listed light, and one under another light it shows."""
-    level = float(np.quantile(found.gray, 0.999)) or 1.0
     small = shrink(np.asarray(found.gray[number]) / level, IMAGE_WIDTH_PX)
     shown = draw_plain_image(f"image {number + 1}", _encode(small))
     listed = _encode(_shade_ball(found.listed[number]))

@@ -113,7 +113,9 @@ def test_unlisted_lights_follow_their_images(seed, lights, gain):
             unlisted_lights.estimate_lights(one, inside=inside, rng=np.random.default_rng(0))
             for one in (images, gain * images[order])
         )
-    except PhotometricStereoError:  # few lights near the axis leave the directions open
+    except PhotometricStereoError:
+        # lights near the axis leave the directions open, others do not
+        assert np.median(directions[:, 2]) > 0.8
         return
     np.testing.assert_allclose(again.directions, found.directions[order], atol=0.02)
     np.testing.assert_allclose(again.stderr_deg, found.stderr_deg[order], atol=1.0)

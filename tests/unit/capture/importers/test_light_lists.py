@@ -1,8 +1,11 @@
 """Foreign pictures with their light lists become sessions, or an error that names the line."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
+import tifffile
 
 from capture.documents import InputError
 from capture.importers import LightListError, import_light_list, light_lists
@@ -185,3 +188,34 @@ def test_chrome_ball_substitutes_for_light_list(test_data):
     angle = np.degrees(np.arccos(np.clip((listed.directions * ball.directions).sum(1), -1, 1)))
     assert ball.kind == "chrome ball"
     assert angle.mean() < 3.5
+
+
+def test_float_images_keep_their_ratios(tmp_path):
+    """Each file has another maximum, and one is black; one white value serves all."""
+    lights = directions(6)
+    images, _, _ = sphere(lights)
+    images *= np.array([1.0, 0.2, 3.0, 0.5, 0.0, 1.0])[:, None, None]
+    folder = tmp_path / "f"
+    folder.mkdir()
+    for number, image in enumerate(images.astype(np.float32)):
+        tifffile.imwrite(folder / f"{number}.tif", image)
+    (folder / "lights.txt").write_text("\n".join(" ".join(map(str, row)) for row in lights))
+    done = import_light_list(folder, out=tmp_path / "s")
+    session = Session.open(done.path)
+    frames = [session.read(record) for record in session.frames("olat")]
+    values = np.array([frame.cfa.astype(float) - frame.black[0] for frame in frames])
+    np.testing.assert_allclose(values / values.max(), images / images.max(), atol=2e-4)
+    assert sum("values were divided by" in text for text in done.assumed) == 1
+
+
+def test_intensities_apply_to_lists_of_every_form(tmp_path):
+    lights = directions(6)
+    images, _, _ = sphere(lights)
+    write(tmp_path / "f", images)
+    rows = np.arange(1.0, 19.0).reshape(6, 3)
+    (tmp_path / "f" / "light_intensities.txt").write_text(
+        "\n".join(" ".join(map(str, row)) for row in rows)
+    )
+    (tmp_path / "f" / "lights.json").write_text(json.dumps(lights.tolist()))
+    found = light_lists.find_light_list(tmp_path / "f")
+    np.testing.assert_array_equal(found.intensity, rows)

@@ -21,6 +21,7 @@ VECTORS = [[0.0, 0.6, 0.8], [1.0, 0.0, 0.0]]
             ["0.png", "1.png"],
         ),
         ([{"position": v, "power": 2} for v in VECTORS], []),
+        ([{"name": f"L0{n}", "position": v} for n, v in enumerate(VECTORS)], []),
     ],
 )
 def test_json_forms_give_the_same_vectors(document, names, tmp_path):
@@ -45,6 +46,7 @@ def test_numpy_array_gives_its_rows(tmp_path):
         b"[[1, 2]]",
         b"[[1, 2, NaN]]",
         b'[{"name": "a.png"}]',
+        b'[{"name": "a.png", "dir": [0, 0, 1]}, {"dir": [0, 0, 1]}]',
         b"{",
         b"[[0, 0, 0]]",
     ],
@@ -58,5 +60,12 @@ def test_other_documents_are_refused(content, tmp_path):
 
 def test_pickled_arrays_are_refused(tmp_path):
     np.save(tmp_path / "lights.npy", np.array([{"a": 1}], object), allow_pickle=True)
+    with pytest.raises(LightListError, match="not a NumPy array"):
+        read_light_table(tmp_path / "lights.npy")
+
+
+def test_archive_of_arrays_is_refused(tmp_path):
+    np.savez(tmp_path / "a.npz", VECTORS)
+    (tmp_path / "a.npz").rename(tmp_path / "lights.npy")
     with pytest.raises(LightListError, match="not a NumPy array"):
         read_light_table(tmp_path / "lights.npy")

@@ -5,7 +5,12 @@ import pytest
 from fixtures.faulty_stacks import dome, render
 
 from reconstruction.normal_maps import PhotometricStereoError
-from reconstruction.stack_diagnosis.unlisted_lights import HOLLOW_FACTORS, estimate_lights
+from reconstruction.stack_diagnosis.unlisted_lights import (
+    HOLLOW_FACTORS,
+    MAX_STDERR_DEG,
+    _equalize_strengths,
+    estimate_lights,
+)
 
 
 def angle_deg(found, lights):
@@ -51,12 +56,27 @@ def test_stated_error_grows_with_unequal_lights():
     assert error[1] < 3.0 * stated[1]
 
 
+def ring(height, count=16):
+    phi = 2.0 * np.pi * np.arange(count) / count
+    across = np.sqrt(1.0 - height**2)
+    return np.stack([across * np.cos(phi), across * np.sin(phi), np.full(count, height)], axis=1)
+
+
 def test_one_ring_of_lights_is_refused():
-    phi = 2.0 * np.pi * np.arange(16) / 16.0
-    ring = np.stack([0.7 * np.cos(phi), 0.7 * np.sin(phi), np.full(16, np.sqrt(0.51))], axis=1)
-    images, inside = photograph("head", ring, 5)
+    images, inside = photograph("head", ring(np.sqrt(0.51)), 5)
     with pytest.raises(PhotometricStereoError, match="give a list of the lights"):
         estimate_lights(images, inside=inside, rng=np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("height", [0.3, 0.71, 0.9])
+@pytest.mark.parametrize("spread", [0.0, 0.03])
+def test_ring_leaves_directions_open(height, spread):
+    """Whatever the noise of the strengths, no fit of a ring states a small error and is wrong."""
+    lights = ring(height) * np.random.default_rng(4).lognormal(0.0, spread, 16)[:, None]
+    found, error_rad = _equalize_strengths(lights * (1.0, 1.0, 0.8))
+    unit = found / np.linalg.norm(found, axis=1, keepdims=True)
+    wrong = np.median(angle_deg(unit, ring(height)))
+    assert np.median(np.degrees(error_rad)) > min(MAX_STDERR_DEG, wrong / 3.0)
 
 
 def test_flat_object_is_refused():
