@@ -74,7 +74,7 @@ def test_ratios_turn_with_the_jaws():
     assert across.across == pytest.approx(along.along, rel=1e-9)
 
 
-def test_ratios_of_wide_map_are_those_of_small_one():
+def test_wide_map_has_ratios_of_small_one():
     """512 inner columns are a multiple of the period: even steps would sample one phase.
 
     Tolerance: 8192 of the pixels are sampled, and borders of the small map hide nothing.

@@ -50,7 +50,10 @@ def test_histograms_correct_counted_pixels_only(rng):
 def test_height_noise_without_pixels_is_zero(rng):
     shape = (20, 20)
     restored = SimpleNamespace(sample_noise=lambda rng: rng.standard_normal((2, *shape)))
-    relief = lambda field, valid: SimpleNamespace(height=np.zeros(shape))  # noqa: E731
+
+    def relief(field, valid):
+        return SimpleNamespace(height=np.zeros(shape))
+
     stderr, noise = stages._height_noise(restored, np.zeros(shape, bool), relief, PIXEL_UM)
     assert np.isinf(stderr).all()
     assert not noise.any()
