@@ -227,7 +227,7 @@ def analyse_albedo(
             "folders"
         )
     elif people is None and seed is not None:
-        raise UsageError("--seed: selects from all simulated faces; add --people or omit it")
+        raise UsageError("--seed: has no effect without --people; add it or omit --seed")
     else:
         found = analysing_albedo.analyze_simulated(out, people=people, seed=seed or 0)
     document = found.document()

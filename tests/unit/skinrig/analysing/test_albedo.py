@@ -67,7 +67,7 @@ def test_labels_without_faces_are_refused(lab, capsys):
         (["--size-px", "96"], "--size-px: apply to measured faces only"),
         (["folder", "--people", "3"], "--people, --seed: apply to simulated faces only"),
         (["folder", "--seed", "0"], "--people, --seed: apply to simulated faces only"),
-        (["--seed", "0"], "--seed: selects from all simulated faces"),
+        (["--seed", "0"], "--seed: has no effect without --people"),
     ],
 )
 def test_options_without_effect_are_refused(options, expected, tmp_path, capsys):
