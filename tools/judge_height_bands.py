@@ -76,8 +76,8 @@ def _print_variances(estimated: SkinAppearance, true_maps: Mapping[str, SkinMap]
         of_truth = measure_normals(relief, pixel=PIXEL_UM, valid=valid, angle_rad=angle_rad)
         ratios = state["occlusion_ratio_s"], state["occlusion_ratio_t"]
         corrected = state["variance_s"], state["variance_t"]
-        noise = state["noise_variance"]
-        measured = [v / ratio + noise for v, ratio in zip(corrected, ratios, strict=True)]
+        noise = state["noise_variance_s"], state["noise_variance_t"]
+        measured = [v / ratio + n for v, ratio, n in zip(corrected, ratios, noise, strict=True)]
         cells = []
         for along, across in (measured, corrected):
             parts = along / of_truth.variance_x - 1.0, across / of_truth.variance_y - 1.0

@@ -93,8 +93,10 @@ class Framing:
             rows, columns = ((scale * low) // side * side for low in (top, left))
             bottom, right = (scale * n // side * side for n in (down, across))
             cfa = cfa[rows : rows + bottom, columns : columns + right]
-            notes.append(f"cropped to {across} x {down} pixels at {left}, {top}")
             height, width = (length // scale for length in cfa.shape)
+            # whole cells of a raw file's mosaic
+            place = f"{columns // scale}, {rows // scale}"
+            notes.append(f"cropped to {width} x {height} pixels at {place}")
         factor = 1 if self.max_width_px is None else -(-width // self.max_width_px)
         noise = frame.noise_profile
         if factor > 1:

@@ -58,17 +58,17 @@ class OcclusionRatios:
 
 
 def find_horizons(
-    height: FloatArray, rows: ArrayLike, columns: ArrayLike, *, pixel: float
+    height: FloatArray, rows: ArrayLike, columns: ArrayLike, *, pixel_um: float
 ) -> Float64Array:
     """Return the tangent of the horizon's elevation around some pixels of a relief.
 
     Parameters
     ----------
     height : ndarray, shape (H, W)
-        Finite, any unit; row 0 is the top. Beyond the border it stays as at the border.
+        Finite, um; row 0 is the top. Beyond the border it stays as at the border.
     rows, columns : array_like of int, shape (P,)
-    pixel : float
-        Side of a pixel, unit of the height.
+    pixel_um : float
+        Side of a pixel.
 
     Returns
     -------
@@ -77,16 +77,16 @@ def find_horizons(
 
     Examples
     --------
-    A wall of height 2 that begins two pixels to the right of the first pixel:
+    A wall of 2 um that begins two pixels to the right of the first pixel:
 
     >>> relief = np.where(np.arange(9) < 6, 0.0, 2.0) * np.ones((9, 1))
-    >>> float(find_horizons(relief, [4], [4], pixel=1.0)[0, 0])
+    >>> float(find_horizons(relief, [4], [4], pixel_um=1.0)[0, 0])
     1.0
     """
     Checks(GradientError).within("height", height)
-    Checks(GradientError).within("pixel", pixel, "(0, inf)")
+    Checks(GradientError).within("pixel_um", pixel_um, "(0, inf)")
     row, column = np.asarray(rows, np.float64), np.asarray(columns, np.float64)
-    count = max(1, math.ceil(math.log(max(HORIZON_REACH_UM / pixel, 1.0), HORIZON_STEP_RATIO)))
+    count = max(1, math.ceil(math.log(max(HORIZON_REACH_UM / pixel_um, 1.0), HORIZON_STEP_RATIO)))
     steps = np.unique(np.round(HORIZON_STEP_RATIO ** np.arange(count + 1)))
     here = height[row.astype(int), column.astype(int)]
     found = np.zeros((row.size, HORIZON_DIRECTIONS))
@@ -95,7 +95,7 @@ def find_horizons(
         for step in steps:
             there = [row - step * math.sin(angle), column + step * math.cos(angle)]
             there_height = ndimage.map_coordinates(height, there, order=1, mode="nearest")
-            found[:, k] = np.maximum(found[:, k], (there_height - here) / (step * pixel))
+            found[:, k] = np.maximum(found[:, k], (there_height - here) / (step * pixel_um))
     return found
 
 
@@ -107,6 +107,7 @@ def estimate_occlusion_ratios(
     lights: SphereLights,
     alpha: float,
     angle_rad: float = 0.0,
+    counted: ArrayLike | None = None,
     eta: float = ETA_SKIN,
 ) -> OcclusionRatios:
     """Estimate by which factor occlusion lowers the variances of a relief's normals.
@@ -123,6 +124,8 @@ def estimate_occlusion_ratios(
         GGX roughness of the facets within a pixel.
     angle_rad : float
         Axis of the jaws, counterclockwise from +x.
+    counted : array_like of bool, shape (H, W), optional
+        Pixels whose normals have the variances; those that are not cast shadows only. None: all.
     eta : float
         Refractive index of the surface.
 
@@ -134,22 +137,28 @@ def estimate_occlusion_ratios(
     Raises
     ------
     GradientError
-        Without a valid pixel, and for shapes and numbers out of range.
+        Without two such pixels, and for shapes and numbers out of range.
     """
     mask = np.asarray(valid, bool)
     Checks(GradientError).shape("height", height, mask.shape)
     relief = np.where(mask, height, 0.0).astype(np.float64)
-    inner = np.flatnonzero(ndimage.binary_erosion(mask))
-    if inner.size < 2:
+    inside = ndimage.binary_erosion(mask)
+    if counted is not None:
+        Checks(GradientError).mask("counted", np.asarray(counted), mask.shape)
+        inside &= np.asarray(counted)
+    picked = np.flatnonzero(inside)
+    if picked.size < 2:
         raise GradientError("valid: got fewer than 2 pixels with neighbors; check the mask")
-    picked = inner[:: max(1, -(-inner.size // MAX_SAMPLES))]
+    if picked.size > MAX_SAMPLES:  # even steps would alias with the map's width
+        chance = np.random.default_rng(0)
+        picked = np.sort(chance.choice(picked, MAX_SAMPLES, replace=False))
     rows, columns = np.unravel_index(picked, mask.shape)
     slope_y, slope_x = np.gradient(relief, pixel_um)
     normals = np.stack(
         [-slope_x.ravel()[picked], slope_y.ravel()[picked], np.ones(picked.size)], axis=-1
     )
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    horizon = np.arctan(find_horizons(relief, rows, columns, pixel=pixel_um))
+    horizon = np.arctan(find_horizons(relief, rows, columns, pixel_um=pixel_um))
     way = lights.directions
     elevation = np.arctan2(way[:, 2], np.hypot(way[:, 0], way[:, 1]))
     turn = np.arctan2(way[:, 1], way[:, 0]) / (2.0 * math.pi) * HORIZON_DIRECTIONS

@@ -190,7 +190,7 @@ def analyse_albedo(
     landmarks: LandmarkFolder = None,
     people: int | None = None,
     size_px: CommonSize = None,
-    seed: Seed = 0,
+    seed: Annotated[int | None, option("Random seed of --people; default: 0.")] = None,
     json: Json = False,
 ) -> None:
     """Average color histograms of groups of faces and compute their principal components.
@@ -209,6 +209,10 @@ def analyse_albedo(
 
     console = Console(json)
     if appearances:
+        if people is not None or seed is not None:
+            raise UsageError(
+                "--people, --seed: apply to simulated faces only; omit them or the folders"
+            )
         found = analysing_albedo.analyze_measured(
             out,
             appearances,
@@ -217,12 +221,15 @@ def analyse_albedo(
             size=size_px,
             progress=console.progress,
         )
-    elif labels is not None or landmarks is not None:
+    elif (labels, landmarks, size_px) != (None, None, None):
         raise UsageError(
-            "--labels, --landmarks: apply to measured faces only; name APPEARANCE/ folders"
+            "--labels, --landmarks, --size-px: apply to measured faces only; name APPEARANCE/ "
+            "folders"
         )
+    elif people is None and seed is not None:
+        raise UsageError("--seed: has no effect without --people; add it or omit --seed")
     else:
-        found = analysing_albedo.analyze_simulated(out, people=people, seed=seed)
+        found = analysing_albedo.analyze_simulated(out, people=people, seed=seed or 0)
     document = found.document()
     console.print_table(
         ("group", "faces", "R_d red", "green", "blue"),

@@ -84,6 +84,22 @@ def test_angular_fit_recovers_smooth_law_and_rejects_peak():
     assert directions._fit(terms, peak + noise).chi2.min() > 3.0
 
 
+def test_fit_beyond_steepest_view_keeps_azimuth():
+    """Expected: below the least angle of the fit only transmittances change, also off the plane.
+
+    Rationale: a frontal camera has no azimuth, so that its light's is 0 / 0 and without effect.
+    """
+    coefficients = np.random.default_rng(5).uniform(0.5, 1.5, (11, 3))
+    interior = DirectionalReflectance(coefficients, np.ones(3), np.zeros(3))
+    zenith = np.radians([75.0, 80.0, 89.0])
+    light = np.column_stack([np.sin(zenith), 0.0 * zenith, np.cos(zenith)])
+    passed = lambertian(np.ones(3)).evaluate
+    for camera in (UP, np.array([0.3, 0.5, np.sqrt(0.66)])):
+        less, least, beyond = interior.evaluate(UP, light, camera) / passed(UP, light, camera)
+        np.testing.assert_allclose(beyond, least, rtol=1e-9)
+        assert np.abs(less / least - 1.0).max() > 1e-3
+
+
 @render
 @needs_vectors
 def test_mitsuba_facets_equal_closed_form():

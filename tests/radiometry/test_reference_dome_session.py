@@ -11,6 +11,7 @@ from model import store
 from rigsim.mitsuba.variant import choose_variant
 from rigsim.needs.effects import SceneEffects
 from rigsim.scenes.dome.scene import DomeScene
+from rigsim.scenes.reference import dome_session
 from rigsim.scenes.reference.directions import DirectionalReflectance
 from rigsim.scenes.reference.dome_session import VoxelDomeScene
 from rigsim.scenes.reference.face_skin import FaceDirections
@@ -75,6 +76,24 @@ def test_lambertian_voxels_have_light_of_session(dome, face):
     assert np.all(ratio[1] > 1.02)
     bright = expected > 0.2 * expected.max()
     assert np.percentile(np.abs(images[0][bright] / expected[bright] - 1.0), 90) < 0.03
+
+
+@pytest.mark.long
+def test_blocks_of_rows_have_light_of_whole_image(dome, face, monkeypatch):
+    view = dome.views[0]
+    scene = VoxelDomeScene(dome, face, {view.spectral_sensitivity: lambertian()})
+    whole, rows = scene.radiance(view.name), []
+    reflected = VoxelDomeScene._reflected
+
+    def reflect(*given):
+        rows.append(len(given[-1]))
+        return reflected(*given)
+
+    monkeypatch.setattr(dome_session, "BLOCK_ROWS", 100)
+    monkeypatch.setattr(VoxelDomeScene, "_reflected", reflect)
+    scene = VoxelDomeScene(dome, face, {view.spectral_sensitivity: lambertian()})
+    np.testing.assert_array_equal(scene.radiance(view.name), whole)
+    assert max(rows) == 100
 
 
 @pytest.mark.long

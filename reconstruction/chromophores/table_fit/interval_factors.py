@@ -21,6 +21,7 @@ from model.color_table import ColorTable
 from model.fresnel import ETA_SKIN, normal_reflectance
 from model.tissue_optics import uncertainty as optics_uncertainty
 from reconstruction.arrays import BoolArray, Float64Array
+from reconstruction.chromophores.pixel_checks import ChromophoreError
 
 SKINS_FILE = "data/interval_skins.npz"
 CHANNEL_NOISE: Final = 0.01
@@ -117,17 +118,36 @@ def fit_band_factors(
     Returns
     -------
     ndarray, shape (bands,)
-        Angles, decreasing.
+        Angles, decreasing: medians of the estimates, of the skins themselves where there are fewer
+        than `MIN_BAND_SKINS`.
     ndarray, shape (bands, k)
         Factors; between the angles they are interpolated linearly.
+
+    Raises
+    ------
+    ChromophoreError
+        If the angles do not decrease from band to band: no factor belongs to an angle then.
     """
     bands, band = range(len(skin_tone.ITA_BANDS)), skins.band
-    centers = np.array([np.median(angle_deg[band == k]) for k in bands])
+    within = [valid & (band == k) for k in bands]
+    centers = np.array(
+        [
+            np.median(angle_deg[chosen])
+            if np.count_nonzero(chosen) >= MIN_BAND_SKINS
+            else np.median(skins.typology_angle_deg[band == k])
+            for k, chosen in enumerate(within)
+        ]
+    )
+    if not (np.diff(centers) < 0.0).all():
+        raise ChromophoreError(
+            f"typology angles of the bands: got {centers.round(1).tolist()} degrees, expected "
+            "decreasing ones; check the camera's and the light's spectra"
+        )
     factors = np.ones((centers.size, deviation.shape[1]))
     for _ in range(FACTOR_TURNS):
         left = deviation / interpolate_factors(angle_deg, centers, factors)
         for k in bands:
-            chosen = left[valid & (band == k)]
+            chosen = left[within[k]]
             if len(chosen) >= MIN_BAND_SKINS:
                 factors[k] *= [coverage_factor(column) for column in chosen.T]
     return centers, factors

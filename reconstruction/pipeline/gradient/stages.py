@@ -36,16 +36,18 @@ from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.gradient.images import GradientImages, SkinState, StatePatterns
 from reconstruction.pipeline.gradient.skin_strain import StateStrain, measure_states, skin_mask
 from reconstruction.pipeline.gradient.strain_kernels import (
+    common_skin,
     count_normals,
     fit_kernels,
     histogram_document,
+    noise_variances,
 )
 from reconstruction.pipeline.inputs import Inputs
 from reconstruction.pipeline.sensor_noise import ElectronNoise
 
 _log = logging.getLogger(__name__)
 
-STAGE_REVISION = 10
+STAGE_REVISION = 11
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = ("normals", "height", "diffuse_normals", "crossed", "strain", "histograms", "kernels")
@@ -317,7 +319,7 @@ def _normal_map(
 def _height(rig: GradientRig, state: SkinState, **made: Any) -> Mapping[str, Any]:
     """Integrate the deblurred slopes; remove wavelengths above `CUTOFF_UM`.
 
-    Also returns the variance of one slope's noise in the map.
+    Also returns the variance of one slope's noise per pixel.
     """
     restored: RestoredNormals
     valid: BoolArray
@@ -357,25 +359,25 @@ def _height_noise(
     valid: BoolArray,
     relief: Callable[[FloatArray, BoolArray], HeightMap],
     pixel_um: float,
-) -> tuple[Float32Array, float]:
-    """Return a height's standard error, and its slopes' noise variance.
+) -> tuple[Float32Array, Float32Array]:
+    """Return a height's standard error, and the noise variance of one slope, each (H, W).
 
-    Random noise fields are integrated in the same way.
+    Random noise fields are integrated in the same way. A pixel without slopes has variance 0.
     """
     rng = np.random.default_rng(0)
-    total, of_slopes = np.zeros(valid.shape), 0.0
+    total, of_slopes = np.zeros(valid.shape), np.zeros(valid.shape)
     for _ in range(STDERR_SAMPLES):
         x, y = restored.sample_noise(rng)
         field = np.stack([-x, -y, np.ones_like(x)], axis=-1)
         height = relief(field, valid).height.astype(np.float64)
         total += height**2
-        slope_x, slope_y, known = slopes(height, pixel=pixel_um, valid=valid)
-        of_slopes += 0.5 * float(np.mean(slope_x[known] ** 2 + slope_y[known] ** 2))
+        slope_x, slope_y, _ = slopes(height, pixel=pixel_um, valid=valid)
+        of_slopes += 0.5 * (slope_x**2 + slope_y**2)
     # noise is nearly stationary, so its variance is smooth except at borders
     weight = ndimage.gaussian_filter(valid.astype(float), STDERR_SIGMA_PX)
     even = ndimage.gaussian_filter(total, STDERR_SIGMA_PX) / np.maximum(weight, 1e-3)
     stderr = np.where(valid, np.sqrt(even / STDERR_SAMPLES), np.inf).astype(np.float32)
-    return stderr, of_slopes / STDERR_SAMPLES
+    return stderr, (of_slopes / STDERR_SAMPLES).astype(np.float32)
 
 
 def _histograms(
@@ -384,19 +386,22 @@ def _histograms(
     by_state = _by_state(made)
     noise = _by_state(made, "_slope_noise_")
     found = count_normals(_strains, by_state, pixel_um=rig.pixel_um)
-    occlusion = {
-        each.state.name: estimate_occlusion_ratios(
-            by_state[each.state.name].values,
-            by_state[each.state.name].mask,
-            pixel_um=rig.pixel_um,
-            lights=rig.lights,
-            alpha=_facets.alpha,
-            angle_rad=each.state.angle_rad,
-        )
-        for each in _strains
-        if each.state.name in found
-    }
-    document = histogram_document(_strains, found, occlusion, noise)
+    occlusion, by_noise = {}, {}
+    for each in _strains:
+        name, height = each.state.name, by_state[each.state.name]
+        if name in found:
+            counted = common_skin(each, _strains[0], by_state)
+            axis = {"pixel_um": rig.pixel_um, "angle_rad": each.state.angle_rad}
+            by_noise[name] = noise_variances(height.values, noise[name], valid=counted, **axis)
+            occlusion[name] = estimate_occlusion_ratios(
+                height.values,
+                height.mask,
+                lights=rig.lights,
+                alpha=_facets.alpha,
+                counted=counted,
+                **axis,
+            )
+    document = histogram_document(_strains, found, occlusion, by_noise)
     return {"_histograms": found, HISTOGRAM_FILE: stages.serialize_document(document)}
 
 

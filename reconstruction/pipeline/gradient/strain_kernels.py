@@ -24,6 +24,7 @@ from reconstruction.normal_histogram.blocks import (
     block_grid_shape,
     count_block_normals,
 )
+from reconstruction.normal_histogram.relief_slopes import rotate_components, slopes
 from reconstruction.normal_histogram.statistics import NormalStatistics, measure_normals
 from reconstruction.pipeline.gradient.skin_strain import StateStrain
 from reconstruction.pipeline.graph import select_attributes
@@ -38,10 +39,10 @@ MAX_FULL_GRID_PX = 1_000_000
 grid."""
 COARSE_GRID_STEP = 3
 HIDDEN_VARIANCE_RATIO = 0.1
-"""Relative error of a variance that the corrections for occlusion and noise leave: detail that the
-lens removes, and slopes longer than a leveled patch. Root mean square over both axes of six patches
-of 0.8 mm without the corrections (seeds 0 to 5). It is a bias, not scatter: states and patches
-share it, and its size cannot be estimated from the images."""
+"""Upper bound of a variance's relative error by detail that the lens removes, slopes longer than a
+leveled patch, and occlusion. Root mean square over both axes of six patches of 0.8 mm (seeds 0 to
+5), without the corrections for occlusion and noise; what these leave was not measured. It is a
+bias, not scatter: states and patches share it, and the images do not determine its size."""
 
 
 def count_normals(
@@ -66,7 +67,7 @@ def count_normals(
     found: dict[str, NormalStatistics] = {}
     for each in strains:
         height = heights[each.state.name]
-        both = height.mask & _common(each, strains[0], heights, there=True)
+        both = common_skin(each, strains[0], heights)
         if np.count_nonzero(both) >= MIN_SAMPLES:
             found[each.state.name] = measure_normals(
                 height.values, pixel=pixel_um, valid=both, angle_rad=each.state.angle_rad
@@ -74,11 +75,59 @@ def count_normals(
     return found
 
 
+def noise_variances(
+    height: Float32Array,
+    slope_noise: Float32Array,
+    *,
+    pixel_um: float,
+    valid: BoolArray,
+    angle_rad: float,
+) -> tuple[float, float]:
+    """Return the variances of the normals' components that noise of the slopes adds.
+
+    Parameters
+    ----------
+    height
+        (H, W), um.
+    slope_noise
+        (H, W): variance of one slope's noise, that of the other is equal and independent.
+    pixel_um
+        Size of a pixel.
+    valid
+        (H, W): pixels whose normals are counted.
+    angle_rad
+        Axis of the jaws, counterclockwise from +x.
+
+    Returns
+    -------
+    float, float
+        Along and across the jaws, to first order in the noise: the normal -p w with
+        w = (1 + p^2 + q^2)^-1/2 has the derivatives -(1 + q^2) w^3 and p q w^3. 0 without a slope.
+
+    Examples
+    --------
+    A plane of slope 1 along x:
+
+    >>> plane, noise = np.arange(9.0) * np.ones((9, 1)), np.full((9, 9), 0.01)
+    >>> valid = np.ones((9, 9), bool)
+    >>> found = noise_variances(plane, noise, pixel_um=1.0, valid=valid, angle_rad=0.0)
+    >>> [round(one, 5) for one in found]
+    [0.00125, 0.005]
+    """
+    p, q, known = slopes(height, pixel=pixel_um, valid=valid)
+    if not known.any():
+        return 0.0, 0.0
+    p, q = (one[known] ** 2 for one in rotate_components(p, q, angle_rad))
+    added = slope_noise[known] / (1.0 + p + q) ** 3
+    along, across = (np.mean(added * ((1.0 + one) ** 2 + p * q)) for one in (q, p))
+    return float(along), float(across)
+
+
 def histogram_document(
     strains: Sequence[StateStrain],
     found: Mapping[str, NormalStatistics],
     occlusion: Mapping[str, OcclusionRatios] | None = None,
-    slope_noise: Mapping[str, float] | None = None,
+    noise: Mapping[str, tuple[float, float]] | None = None,
 ) -> dict[str, Any]:
     """Return the histograms as a document.
 
@@ -94,10 +143,11 @@ def histogram_document(
         Statistics by the name of the state.
     occlusion
         Ratios by the name of the state; None: all 1.
-    slope_noise
-        Variance of one slope's noise by the name of the state; None: all 0.
+    noise
+        Variances by noise along and across the jaws by the name of the state, see
+        `noise_variances`; None: all 0.
     """
-    ratios, noises = occlusion or {}, slope_noise or {}
+    ratios, noises = occlusion or {}, noise or {}
     open_sky = OcclusionRatios(1.0, 1.0, 1.0)
     of_samples = "samples outside effective_samples samples_per_bucket aliased"
 
@@ -113,41 +163,54 @@ def histogram_document(
                 "angle_deg": each.state.angle_deg,
                 "counts": one.histogram,
                 **select_attributes(one, of_samples),
-                "variance_s": ratio.along * max(one.variance_x - noise, 0.0),
+                "variance_s": ratio.along * max(one.variance_x - by_noise[0], 0.0),
                 "variance_s_stderr": ratio.along * hidden(one.stderr_x, one.variance_x),
-                "variance_t": ratio.across * max(one.variance_y - noise, 0.0),
+                "variance_t": ratio.across * max(one.variance_y - by_noise[1], 0.0),
                 "variance_t_stderr": ratio.across * hidden(one.stderr_y, one.variance_y),
                 "occlusion_ratio_s": ratio.along,
                 "occlusion_ratio_t": ratio.across,
-                "noise_variance": noise,
+                "noise_variance_s": by_noise[0],
+                "noise_variance_t": by_noise[1],
             }
             for each in strains
             if (one := found.get(each.state.name)) is not None
             and (ratio := ratios.get(each.state.name, open_sky)) is not None
-            and (noise := noises.get(each.state.name, 0.0)) is not None
+            and (by_noise := noises.get(each.state.name, (0.0, 0.0))) is not None
         ],
     }
 
 
-def _common(
-    each: StateStrain, neutral: StateStrain, heights: Mapping[str, SkinMap], *, there: bool
+def common_skin(
+    each: StateStrain, neutral: StateStrain, heights: Mapping[str, SkinMap], *, there: bool = True
 ) -> BoolArray:
-    """Return the pixels whose skin is visible in both the state and the neutral one.
+    """Return the valid pixels whose skin is visible in both the state and the neutral one.
 
     Parameters
     ----------
+    each, neutral
+        The states.
+    heights
+        By the name of the state, um.
     there
         True: pixels of the state; False: pixels of the neutral one.
+
+    Returns
+    -------
+    ndarray of bool, shape (H, W)
+        All valid pixels of a state whose strain is unknown.
     """
-    both = [heights[one.state.name] for one in (neutral, each)]
-    shape = both[0].values.shape[:2]
+    other, own = (heights[one.state.name].mask for one in (neutral, each))
+    if not there:
+        other, own = own, other
+    shape = own.shape
     if not each.usable:
-        return np.ones(shape, bool)
-    seen = both[0 if there else 1].mask.astype(np.uint8)
+        return own
+    seen = other.astype(np.uint8)
     affine = each.strain.affine_px((shape[0], shape[1]))
     # a pixel of the state is common where its inverse-mapped position is valid in the neutral map
     back = affine if not there else _inverse(affine)
-    return ndimage.map_coordinates(seen, _moved(back, shape), order=0, cval=0) > 0
+    common = ndimage.map_coordinates(seen, _moved(back, shape), order=0, cval=0) > 0
+    return np.asarray(own & common)
 
 
 def _moved(affine: Float64Array, shape: tuple[int, ...]) -> list[Float64Array]:
@@ -252,12 +315,12 @@ def fit_kernels(
     fits = []
     for number, each in enumerate(todo):
         report_progress(number / len(todo))
-        seen = height.mask & _common(each, neutral, heights, there=False)
+        seen = common_skin(each, neutral, heights, there=False)
         turned, inside = _along_x(height.values, seen, each.state.angle_rad)
         if np.count_nonzero(inside) < MIN_SAMPLES:
             continue
         target, strained = statistics[each.state.name], heights[each.state.name]
-        there = strained.mask & _common(each, neutral, heights, there=True)
+        there = common_skin(each, neutral, heights)
         every = 1 if np.count_nonzero(inside) >= MAX_FULL_GRID_PX else COARSE_GRID_STEP
         fit = fit_kernel(
             turned,

@@ -49,8 +49,9 @@ class DirectionalReflectance:
         Parameters
         ----------
         normal, to_light, to_camera
-            Unit vectors away from the skin, shape (..., 3), broadcast together. The fit is that of
-            `MAX_VIEW_DEG` beyond this angle to the normal; transmittances are exact.
+            Unit vectors away from the skin, shape (..., 3), broadcast together. Beyond
+            `MAX_VIEW_DEG` to the normal the fit is that of this angle and the same azimuth;
+            transmittances are exact.
         """
         n, light, camera = (np.asarray(way, np.float64) for way in (normal, to_light, to_camera))
         cos_l, cos_v = np.sum(n * light, axis=-1), np.sum(n * camera, axis=-1)
@@ -58,7 +59,11 @@ class DirectionalReflectance:
         passed = _transmittance(cos_l) * _transmittance(cos_v)
         scale = np.where((cos_l > 0.0) & (cos_v > 0.0), passed / pi, 0.0)
         least = cos(np.radians(MAX_VIEW_DEG))
-        found = _terms(np.maximum(cos_l, least), np.maximum(cos_v, least), between)
+        held_l, held_v = np.maximum(cos_l, least), np.maximum(cos_v, least)
+        # squared sine at most `MAX_VIEW_DEG` over the true one, exactly 1 below
+        ratio = [(1.0 - least**2) / (1.0 - np.clip(c, 0.0, least) ** 2) for c in (cos_l, cos_v)]
+        across = (between - cos_l * cos_v) * np.sqrt(ratio[0] * ratio[1])
+        found = _terms(held_l, held_v, across + held_l * held_v)
         return np.asarray(scale[..., None] * (found @ self.coefficients), np.float64)
 
     @property

@@ -59,7 +59,9 @@ def test_crop_selects_pixels_of_developed_image(tmp_path, rng):
 
 def test_crop_of_raw_photograph_keeps_its_pattern(rng):
     photo = noisy_mosaic(rng, (64, 96))
-    part = Framing.parse("31,15,32,32", None).apply(photo, where="a").frame
+    framed = Framing.parse("31,15,33,32", None).apply(photo, where="a")
+    part = framed.frame
+    assert framed.notes == ("cropped to 32 x 32 pixels at 30, 14",)
     np.testing.assert_array_equal(part.cfa, photo.frame.cfa[14:46, 30:62])
     assert part.pattern == "GRBG"
 

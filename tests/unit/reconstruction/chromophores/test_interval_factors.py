@@ -13,6 +13,7 @@ from scipy import special
 from model import color_table, skin_tone
 from model.tissue_optics.layers import ANISOTROPY_SKIN
 from reconstruction.chromophores import invert
+from reconstruction.chromophores.pixel_checks import ChromophoreError
 from reconstruction.chromophores.table_fit import fitting, interval_factors
 from skinrig.benchmarks.flash_rig import independent_skin as independent
 
@@ -62,6 +63,25 @@ def test_band_without_estimates_has_factor_one(skins):
     _, factors = interval_factors.fit_band_factors(error, skins, valid, skins.typology_angle_deg)
     assert factors[2, 0] == 1.0
     assert (factors[[0, 1, 3, 4, 5], 0] > 1.4).all()
+
+
+def test_skins_without_estimate_have_no_center(skins):
+    # their angles are those of failed fits
+    error = np.tile(normal_quantiles(SKINS_PER_BAND), 6)[:, None]
+    valid = np.ones(error.size, np.bool_)
+    valid[SKINS_PER_BAND // 4 : SKINS_PER_BAND] = False
+    valid[skins.band == 3] = False
+    angle = np.where(valid, skins.typology_angle_deg - 1.0, np.nan)
+    centers, _ = interval_factors.fit_band_factors(error, skins, valid, angle)
+    assert centers.tolist() == [59.0, 47.0, 33.0, 19.0, -11.0, -46.0]
+
+
+def test_bands_out_of_order_are_refused(skins):
+    every = np.ones(skins.band.size, np.bool_)
+    with pytest.raises(ChromophoreError, match="expected decreasing"):
+        interval_factors.fit_band_factors(
+            np.ones((every.size, 1)), skins, every, -skins.typology_angle_deg
+        )
 
 
 def test_band_factors_follow_angle_of_estimates(skins):

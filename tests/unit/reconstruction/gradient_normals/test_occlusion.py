@@ -40,7 +40,7 @@ def test_horizons_of_a_step_follow_its_height():
     """A wall of height h at distance d hides what is below h / d; behind it nothing is hidden."""
     relief = np.zeros((41, 41))
     relief[:, 31:] = 12.0  # 9 pixels from the first one
-    found = find_horizons(relief, [20, 20], [22, 38], pixel=PIXEL_UM)
+    found = find_horizons(relief, [20, 20], [22, 38], pixel_um=PIXEL_UM)
     assert found[0, 0] == pytest.approx(12.0 / (9 * PIXEL_UM))
     assert found[0, HORIZON_DIRECTIONS // 2] == 0.0
     assert found[1].max() < 1e-12
@@ -49,7 +49,7 @@ def test_horizons_of_a_step_follow_its_height():
 def test_horizons_turn_counterclockwise_from_the_right():
     relief = np.zeros((41, 41))
     relief[:10] = 50.0  # a wall at the top of the image
-    (found,) = find_horizons(relief, [20], [20], pixel=PIXEL_UM)
+    (found,) = find_horizons(relief, [20], [20], pixel_um=PIXEL_UM)
     assert found[HORIZON_DIRECTIONS // 4] == found.max() > 0.5
     assert found[HORIZON_DIRECTIONS // 2 :].max() < 1e-12
 
@@ -72,6 +72,31 @@ def test_ratios_turn_with_the_jaws():
     along = ratios(grooves(60.0))
     across = ratios(grooves(60.0), angle_rad=math.pi / 2)
     assert across.across == pytest.approx(along.along, rel=1e-9)
+
+
+def test_wide_map_has_ratios_of_small_one():
+    """512 inner columns are a multiple of the period: even steps would sample one phase.
+
+    Tolerance: 8192 of the pixels are sampled, and borders of the small map hide nothing.
+    """
+    wide, small = (
+        ratios(grooves(60.0, side=side, period_px=32)).along for side in (514, 2 + 2 * 32)
+    )
+    assert small > 1.05
+    assert wide - 1.0 == pytest.approx(small - 1.0, rel=0.15)
+
+
+def test_uncounted_pixels_cast_shadows_only():
+    relief = grooves(60.0)
+    left = np.arange(96) < 48
+    flat = np.where(left, relief, relief[:, 47:48])
+    counted = np.broadcast_to(left, relief.shape)
+    whole, half = ratios(relief), ratios(flat, counted=counted)
+    assert half.along == pytest.approx(whole.along, rel=0.03)
+    assert ratios(flat).along == pytest.approx(half.along, rel=0.03)
+    walls = np.where(left, 0.0, relief)
+    assert ratios(walls).along > 1.05
+    assert ratios(walls, counted=counted & (np.arange(96) < 47)).along == 1.0
 
 
 def test_mask_without_inner_pixels_is_refused():

@@ -61,6 +61,21 @@ def test_labels_without_faces_are_refused(lab, capsys):
     assert "name APPEARANCE/ folders" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--size-px", "96"], "--size-px: apply to measured faces only"),
+        (["folder", "--people", "3"], "--people, --seed: apply to simulated faces only"),
+        (["folder", "--seed", "0"], "--people, --seed: apply to simulated faces only"),
+        (["--seed", "0"], "--seed: has no effect without --people"),
+    ],
+)
+def test_options_without_effect_are_refused(options, expected, tmp_path, capsys):
+    assert main(["analyse", "albedo", *options, "--out", str(tmp_path / "out")]) == 2
+    assert expected in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+
+
 def test_analysis_without_faces_uses_sessions(tmp_path):
     found = analysing_albedo.analyze_simulated(tmp_path / "out", people=3)
     assert set(found.names) < set(load_population_sessions().mapped)
