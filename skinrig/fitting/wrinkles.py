@@ -22,7 +22,6 @@ from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.contents import derive_appearance, hash_document, intersect_valid
 from skinrig.appearances.dynamic import WRINKLES
 from skinrig.arrays import BoolArray, Float32Array, FloatArray
-from skinrig.console import select_attributes
 
 Method: TypeAlias = Literal["derivatives", "differences"]
 
@@ -135,7 +134,8 @@ def fit_wrinkles(
         parameters={
             "expressions": list(measured),
             "appearances": [folder.name for folder, _ in read.values()],
-            **select_attributes(found, "explained", "rounds"),
+            "explained": found.explained,
+            "rounds": found.outcome.iterations,
             "method": method,
             "mean_angle_deg": angle,
             "mean_angle_of_neutral_deg": neutral_angle,
