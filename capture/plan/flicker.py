@@ -193,8 +193,8 @@ def flicker_report(plan: Plan, rig: Rig) -> FlickerReport:
     seconds = sum(report.seconds for report in reports)
     mean = sum(report.mean_w_m2 * report.seconds for report in reports)
     return FlickerReport(
-        max(report.flashes_per_s for report in reports),
-        max(report.rms for report in reports),
+        max((report.flashes_per_s for report in reports), default=0.0),
+        max((report.rms for report in reports), default=0.0),
         seconds,
         mean / seconds if seconds else 0.0,
     )

@@ -15,7 +15,10 @@ from capture.raw.frame import RawFrame
 MAX_SIDE_PX: Final = 160
 """Longer side of a thumbnail at most, pixels, as in EXIF."""
 MIN_BLOCK_PX: Final = 8
-"""Side of the block of photosites for a thumbnail's pixel: the file grows by 2.4 % at most."""
+"""Side of the block of photosites for a thumbnail's pixel.
+
+A thumbnail's 3 bytes per block are 2.4 % of the photosites' 128; its directory is extra.
+"""
 MIN_FRAME_PX: Final = 64
 """Smaller frames have no thumbnail."""
 DISPLAY_GAMMA: Final = 2.2
@@ -28,7 +31,8 @@ def draw_thumbnail(frame: RawFrame) -> UInt8Array | None:
     Parameters
     ----------
     frame
-        The frame, at least `MIN_FRAME_PX` wide and high; a smaller one has no thumbnail.
+        The frame, at least `MIN_FRAME_PX` and one block wide and high; a smaller or longer one
+        has no thumbnail.
 
     Returns
     -------
@@ -47,6 +51,8 @@ def draw_thumbnail(frame: RawFrame) -> UInt8Array | None:
         return None
     block = max(MIN_BLOCK_PX, 2 * -(-max(height, width) // (2 * MAX_SIDE_PX)))
     rows, columns = height // block, width // block
+    if 0 in (rows, columns):
+        return None
     neutral = frame.neutral or (1.0, 1.0, 1.0)
     channels = []
     for color, balance in zip("RGB", neutral, strict=True):

@@ -15,7 +15,6 @@ References
 Weyrich et al. 2006, doi:10.1145/1141911.1141987, section 7.
 """
 
-import logging
 import warnings
 from dataclasses import dataclass
 from typing import Literal
@@ -27,12 +26,9 @@ from sklearn.exceptions import ConvergenceWarning
 
 from model.brdf.tables import BrdfBasis
 from model.checks import Checks
-from model.solver_outcome import UNKNOWN_CONDITION, SolverOutcome, StopReason
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array
 from reconstruction.brdf_basis.nnls_kernels import fit_points
 from reconstruction.lumitexels import boundary_kernels
-
-_log = logging.getLogger(__name__)
 
 MIN_SAMPLE_COSINE = 0.1
 """Least cosine of light and view of a used sample."""
@@ -306,14 +302,9 @@ def reduce(
 
 def _factor(model: NMF, data: Float64Array) -> tuple[Float64Array, Float64Array]:
     with warnings.catch_warnings():
-        # scikit-learn's warning is replaced by the outcome's
+        # A factorization stopped early is valid but slightly worse; its error includes that
         warnings.simplefilter("ignore", ConvergenceWarning)
         found = model.fit_transform(data)
-    size = max(float(np.linalg.norm(data)), 1e-300)
-    stop: StopReason = "limit" if model.n_iter_ >= model.max_iter else "tolerance"
-    SolverOutcome(
-        model.n_iter_, float(model.reconstruction_err_) / size, UNKNOWN_CONDITION, stop
-    ).warn_unless_converged("factorization into basis BRDFs", _log)
     return found, np.asarray(model.components_)
 
 

@@ -10,6 +10,7 @@ over all other parameters, exceeds its minimum by at most Fisher's F quantile.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -30,6 +31,8 @@ _SLOPE_NODES = np.array([0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.
 """Time since the start of a change at which a sample is placed, in time constants."""
 _MIN_DELAY_STEPS = 3.0
 """Time constants below this many delay steps get delays of their own."""
+_SIMPLEX_FATOL = 1e-9
+"""Spread of the square sums of a simplex at which the search ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,7 +265,7 @@ def _refined(
             bounds=around(logs, start[1]),
             method="bounded",
         )
-        outcome = outcome_from_scipy(found, float(found.fun))
+        outcome = outcome_from_scipy(found, math.nan)  # SciPy keeps the bracket's width
         point, height = (float(delays[0]), float(found.x)), float(found.fun)
     else:
         bounds = [around(delays, start[0]), around(logs, start[1])]
@@ -271,9 +274,10 @@ def _refined(
             start,
             method="Nelder-Mead",
             bounds=bounds,
-            options={"xatol": 1e-5, "fatol": 1e-9},
+            options={"xatol": 1e-5, "fatol": _SIMPLEX_FATOL},
         )
-        outcome = outcome_from_scipy(simplex, float(simplex.fun))
+        spread = float(np.ptp(simplex.final_simplex[1])) / _SIMPLEX_FATOL
+        outcome = outcome_from_scipy(simplex, spread)
         point, height = (float(simplex.x[0]), float(simplex.x[1])), float(simplex.fun)
     outcome.warn_unless_converged("course of blood", _log)
     if height < at_start:

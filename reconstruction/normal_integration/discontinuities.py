@@ -203,7 +203,8 @@ def integrate_with_discontinuities(
         _side_weights(x, ex, ey, slopes.facing, float(chosen.sharpness), wx, wy)
         _one_sided(slopes.gx, slopes.gy, ux, uy, wx, wy, ex, ey, x, ax, ay, dx, dy, by_row)
         energy = float(by_row.sum())
-        change = abs(before - energy) / before if 0.0 < before < np.inf else energy
+        first = 0.0 if energy == 0.0 else np.inf
+        change = abs(before - energy) / before if 0.0 < before < np.inf else first
         if change <= chosen.stop or done >= chosen.rounds:
             break
         solved = solve_poisson(

@@ -39,6 +39,10 @@ MAX_PART_RESIDUAL_RATIO = 2.5
 to the frame's own residuals: an expression exceeds both."""
 BLOCK_PX = 32
 """Side of the parts of an image within which errors of tracks are correlated."""
+SMALL_MOVE = np.repeat([1e-8, 1e-6], 3)
+"""Step at which the search ends: rotations in rad, translations in mm."""
+MAX_LAST_MOVE_SIGMAS = 0.1
+"""Last step, in standard errors, from which a usable frame's motion is reported as unfinished."""
 _DIFFERENCE_MM = 0.01
 _MIN_RESIDUAL_PX = 1e-6
 _RAYLEIGH_MEDIAN = (
@@ -227,11 +231,13 @@ def estimate(
             found.append(_Pose(np.zeros(6), np.zeros(6), np.zeros(total)))
             continue
         found.append(_pose(pictures, cameras, points, chosen, evened, iterations))
-    worst = max((pose.outcome for pose in found), key=lambda outcome: outcome.residual)
-    worst.warn_unless_converged("head motion", _log)
-    return _evaluate_frames(
+    motion = _evaluate_frames(
         found, np.concatenate([points[rows] for rows in chosen]), times, reference
     )
+    used = [pose.outcome for pose, usable in zip(found, motion.usable, strict=True) if usable]
+    worst = max(used, key=lambda outcome: outcome.residual)
+    worst.warn_unless_converged("head motion", _log)
+    return motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,6 +249,7 @@ class _Pose:
     residual_px: Float64Array
     """Length of each track's residual, infinite for a lost track."""
     outcome: SolverOutcome = NO_STEPS
+    """Its residual is the last step over its standard error."""
 
 
 def _checked(
@@ -299,13 +306,13 @@ def _pose(
     left = np.full(found.size, np.inf)
     if np.count_nonzero(found) < MIN_TRACKS:
         return _Pose(np.zeros(6), np.full(6, np.inf), left)
-    motion, residual, condition = np.zeros(6), np.inf, np.nan
+    motion, move, condition = np.zeros(6), np.full(6, np.inf), np.nan
     for step in range(iterations + 1):
         r, J = _residuals(seen, motion)
         length = np.linalg.norm(r, axis=1)
         scale = max(float(np.median(length)) / _RAYLEIGH_MEDIAN, 1e-6)
         u2 = (length / (TRACK_TUKEY_SIGMAS * scale)) ** 2
-        if residual < 1.0 or step == iterations:
+        if (np.abs(move) < SMALL_MOVE).all() or step == iterations:
             break
         w = np.maximum(1.0 - u2, 0.0) ** 2
         A = np.einsum("n,nki,nkj->ij", w, J, J)
@@ -313,12 +320,15 @@ def _pose(
         A = A / np.outer(size, size) + 1e-9 * np.eye(6)
         move = np.linalg.solve(A, np.einsum("n,nki,nk->i", w, J, r) / size) / size
         motion = motion + move
-        residual = float(np.abs(move / np.repeat([1e-8, 1e-6], 3)).max())
         condition = estimate_condition(A)
     stderr = _stderr(r, J, u2, _blocks(seen))
+    least = SMALL_MOVE / MAX_LAST_MOVE_SIGMAS
+    residual = float(np.max(np.abs(move) / np.maximum(stderr, least)))
     motion = motion if np.isfinite(stderr).all() else np.zeros(6)
     left[found] = length
-    outcome = SolverOutcome(step, residual, condition, "tolerance" if residual < 1.0 else "limit")
+    outcome = SolverOutcome(
+        step, residual, condition, "tolerance" if residual < MAX_LAST_MOVE_SIGMAS else "limit"
+    )
     return _Pose(motion, stderr, left, outcome)
 
 

@@ -49,6 +49,8 @@ erred by -2.1, -2.7, -0.7, -1.5, -1.9 and -0.9 mrad, of which their scatter stat
 TURN_TOL_RAD: Final = 1e-4
 SHIFT_TOL_MM: Final = 1e-2
 """Steps below which a registration ends."""
+OSCILLATION_TOLS: Final = 10.0
+"""Last step, in these tolerances, up to which an unfinished registration gives no warning."""
 MAX_STILL_CHI_SQUARE: Final = 16.81
 """99 % quantile of chi-square of six degrees of freedom."""
 
@@ -134,7 +136,7 @@ def register_scan(
     shift = np.zeros(3) if start is None else np.asarray(start[1], np.float64)
     middle = p.mean(axis=0)
     system = _System(np.zeros((6, 6)), np.zeros(6), np.zeros((0, 6)), np.zeros(0), 0)
-    iterations, residual = 0, np.inf
+    iterations, residual, step = 0, np.inf, np.zeros(6)
     at_blur: list[tuple[Float64Array, Float64Array]] = []
     for blur in blurs_px:
         maps = [_blurred(view, blur) for view in evidence]
@@ -176,7 +178,11 @@ def register_scan(
         residual,
         estimate_condition(system.matrix),
         "tolerance" if residual < 1.0 else "limit",
-    ).warn_unless_converged("registration of the scan", _log)
+    )
+    # a fit that oscillates by less than its error is good
+    level = np.maximum(stderr, OSCILLATION_TOLS * np.repeat([TURN_TOL_RAD, SHIFT_TOL_MM], 3))
+    if (np.abs(step) > level).any():
+        outcome.warn_unless_converged("registration of the scan", _log)
     return RigidFit(
         turn, shift, turn @ middle + shift, stderr, float(angle), system.samples, outcome
     )

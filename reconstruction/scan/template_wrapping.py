@@ -333,10 +333,11 @@ class _System:
             z = self._factor.solve(r)
             rz, before = float(np.sum(r * z)), rz
             p = z + (rz / before) * p
-        else:
-            SolverOutcome(
-                SOLVER_STEPS, math.sqrt(rz / target), UNKNOWN_CONDITION, "limit"
-            ).warn_unless_converged("equations of the template", _log)
+        if not rz <= target:
+            ratio = math.sqrt(rz / target) if target > 0.0 else math.inf
+            SolverOutcome(SOLVER_STEPS, ratio, UNKNOWN_CONDITION, "limit").warn_unless_converged(
+                "equations of the template", _log
+            )
         return x
 
 

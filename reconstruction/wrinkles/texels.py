@@ -182,22 +182,24 @@ def fit_texels(
     matrix = scaling @ A[some][:, some] @ scaling
     matrix = (matrix + RELATIVE_DAMPING * sparse.eye_array(some.size)).tocsr()
     spread = _inverse_diagonal(by) * _inverse_diagonal(bx)
+    size = float(np.abs(matrix).sum(axis=1).max())
+    unfinished = SolverOutcome(0, 0.0, UNKNOWN_CONDITION, "tolerance")
     for c in range(channels):
         b = gather_texels(by, bx, product[..., c]).ravel()[some]
         first = b / summed.ravel()[some] / root
         solved, steps = cg(matrix, root * b, x0=first, rtol=tolerance, maxiter=MAX_CG_STEPS)
-        if steps > 0:
-            size = max(float(np.linalg.norm(root * b)), 1e-300)
-            residual = float(np.linalg.norm(root * b - matrix @ solved)) / size
-            SolverOutcome(steps, residual, UNKNOWN_CONDITION, "limit").warn_unless_converged(
-                "texels of a map", _log
-            )
+        # the backward error, relative to the data and the texels
+        scale = float(np.linalg.norm(root * b)) + size * float(np.linalg.norm(solved))
+        residual = float(np.linalg.norm(root * b - matrix @ solved)) / max(scale, 1e-300)
+        if steps > 0 and residual > max(100.0 * tolerance, unfinished.residual):
+            unfinished = SolverOutcome(steps, residual, UNKNOWN_CONDITION, "limit")
         plane = np.zeros(summed.size)
         plane[some] = root * solved
         values[..., c] = np.where(valid, plane.reshape(shape), 0.0)
         scatter = gather_texels(by, bx, noise[..., c])
         variance = np.divide(scatter, summed**2, out=np.zeros_like(scatter), where=valid)
         stderr[..., c] = np.where(valid, np.sqrt(spread * variance), np.inf)
+    unfinished.warn_unless_converged("texels of a map", _log)
     return Texels(values, stderr, valid)
 
 

@@ -12,7 +12,7 @@ from capture.rig import load_rig
 from rigsim.world.serve import ServeError, serve_world
 from skinrig.capturing.addresses import parse_addresses, require_addresses
 from skinrig.errors import UsageError
-from skinrig.simulating.serving import _next_step
+from skinrig.simulating.serving import ServeOrder, _next_step
 
 RIG = load_rig("gradient").cropped(16)
 
@@ -96,6 +96,6 @@ def test_dome_serves_scanner_with_its_cameras():
         assert {"dome", "scanner", "S0", "S3", rig.views[0].name} <= served.addresses.keys()
         with contextlib.closing(open_camera(served.addresses["S3"])) as camera:
             assert camera.info.width_px == rig.view("S3").width_px
-        command = _next_step("dome", rig, served.addresses, None)
+        command = _next_step("dome", rig, served.addresses, ServeOrder())
     assert f"--port scanner={served.addresses['scanner']}" in command
     assert command.endswith("--scanner --eyes closed --out session")

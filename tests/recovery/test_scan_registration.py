@@ -7,6 +7,7 @@ from capture.calibration.geometry import CameraPose
 from capture.calibration.lights import LightTable
 from capture.rig import load_rig
 from reconstruction.lumitexels.ray_casting import RayCaster
+from reconstruction.scan import registration
 from reconstruction.scan.mesh import FACE_BOX_MM, load_ply
 from reconstruction.scan.registration import align_scan, register_scan
 from reconstruction.scan.repair import crop, repair_mesh
@@ -79,6 +80,21 @@ def test_a_motion_is_found_again_from_perfect_normals(head, maps, axis, degrees,
     assert angle_deg(fit.rotation @ turn.T) < 0.1
     assert np.abs(fit.move(points) - head.vertices_mm).max() < 0.35
     assert fit.residual_deg < 3.0
+
+
+@pytest.mark.parametrize(("tolerance", "steps", "warnings"), [(1e-4, 12, 0), (1.0, 1, 1)])
+def test_only_step_beyond_its_error_warns(
+    head, maps, monkeypatch, caplog, tolerance, steps, warnings
+):
+    """With a small tolerance the steps do not end, but are far below the standard errors."""
+    monkeypatch.setattr(registration, "TURN_TOL_RAD", tolerance * registration.TURN_TOL_RAD)
+    monkeypatch.setattr(registration, "SHIFT_TOL_MM", tolerance * registration.SHIFT_TOL_MM)
+    monkeypatch.setattr(registration, "MAX_BLUR_STEPS", steps)
+    points = head.vertices_mm[::3] - np.array([5.0, 0.0, 0.0])
+    seen = visible(head, maps)[:, ::3]
+    fit = register_scan(points, head.normals[::3], maps, visible=seen, blurs_px=(3.0, 1.5))
+    assert not fit.outcome.converged
+    assert len(caplog.records) == warnings
 
 
 def test_views_of_another_head_give_a_larger_residual(head, maps):

@@ -1,6 +1,7 @@
 """Find candidate spots in a raw mosaic and fit blurred discs to them."""
 
 import logging
+from collections.abc import Iterable
 from typing import Any, Final
 
 import numpy as np
@@ -16,9 +17,9 @@ _log = logging.getLogger(__name__)
 
 GrayImage = tuple[Float64Array, Float64Array]
 """Sum of a cell's colors at every pixel, full scales per second, and its variance, (H, W)."""
-DiscFit = tuple[Float64Array, Float64Array, float]
-"""x, y, radius, edge in pixels, their standard errors, and the radius of a disc with the area above
-half maximum.
+DiscFit = tuple[Float64Array, Float64Array, float, bool]
+"""x, y, radius, edge in pixels, their standard errors, the radius of a disc with the area above
+half maximum, and whether the fit converged.
 """
 
 SEARCH_BLUR_PITCH: Final = 0.12
@@ -139,8 +140,6 @@ def fit_disc(
     done = least_squares(
         misfit, begin, bounds=(low, high), x_scale=[1, 1, 1, 0.5], max_nfev=MAX_DISC_EVALUATIONS
     )
-    if done.status == 0:
-        _log.warning("disc of a fiber: not converged after %d evaluations", MAX_DISC_EVALUATIONS)
     amplitude = _solve_colors(done.x, px, py, data / sigma, sigma, parts, stiff)[2]
     at_bound = bool(((done.x <= low + 1e-3) | (done.x >= high - 1e-3))[:2].any())
     if at_bound or amplitude.max() <= 0:
@@ -148,7 +147,7 @@ def fit_disc(
     error = _standard_errors(done, len(data) - 4 - 5 * len(colors))
     if error is None or error[:2].max() > MAX_CENTER_STDERR_PITCH * pitch:
         return None
-    return done.x, error, start_radius
+    return done.x, error, start_radius, done.status != 0
 
 
 def _solve_colors(
@@ -191,6 +190,17 @@ def _standard_errors(done: Any, freedom: int) -> Float64Array | None:
         return None
     error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return error if np.isfinite(error).all() else None
+
+
+def warn_of_unfinished_fits(fits: Iterable[DiscFit]) -> None:
+    """Log one warning with the number of fits that did not converge, if any."""
+    unfinished = sum(not fit[3] for fit in fits)
+    if unfinished:
+        _log.warning(
+            "discs of fibers: %d not converged after %d evaluations",
+            unfinished,
+            MAX_DISC_EVALUATIONS,
+        )
 
 
 def drop_duplicate_fits(fits: list[DiscFit], min_distance: float) -> list[DiscFit]:

@@ -15,6 +15,7 @@ from capture.calibration.fiber.discs import (
     find_candidates,
     fit_disc,
     gray_image,
+    warn_of_unfinished_fits,
 )
 from capture.calibration.fiber.merge import MergedSeries
 from capture.calibration.record import CalibrationError, freeze_arrays
@@ -110,14 +111,17 @@ class FiberSpots:
         """
         image = gray_image(merged, pattern)
         pitch = _pitch(self.center_px)
+        used: list[DiscFit] = []
         away, errors = [], []
         for i in np.flatnonzero(self.found & ~self.overlapping):
             fit = fit_disc(merged, image, pattern, self.center_px[i], pitch)
             if fit is not None and np.hypot(*(fit[0][:2] - self.center_px[i])) < 0.5 * pitch:
+                used.append(fit)
                 away.append(fit[0][:2] - self.center_px[i])
                 errors.append(max(float(fit[1][:2].max()), 0.02))
         if len(away) < 3:
             return self, np.zeros(2)
+        warn_of_unfinished_fits(used)
         weight = 1.0 / np.array(errors) ** 2
         shift = (weight[:, None] * np.array(away)).sum(axis=0) / weight.sum()
         return replace(self, center_px=self.center_px + shift), shift
@@ -200,6 +204,7 @@ def find_fiber_spots(
         for k, (i, j) in between.items()
     ]
     _consult_masks(best, masks or {}, model, names, pattern, pitch, findings)
+    warn_of_unfinished_fits(fit for fit in best if fit is not None)
     return _table(best, model, nominal, names, findings)
 
 

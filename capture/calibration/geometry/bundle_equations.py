@@ -45,6 +45,10 @@ class BundleError(CalibrationError):
     """Raised for corners that do not connect the cameras; the message names what is missing."""
 
 
+class BundleDiverged(BundleError):
+    """Raised when the steps of a bundle adjustment do not end."""
+
+
 @dataclass(frozen=True, slots=True)
 class LensPrior:
     """Standard deviations of a lens about its nominal values; 0 holds a parameter fixed.
@@ -173,7 +177,7 @@ class BundleProblem:
             if cost - new < COST_TOL * max(cost, 1e-300):
                 break
         else:
-            raise BundleError(
+            raise BundleDiverged(
                 f"bundle adjustment: not converged after {MAX_BUNDLE_STEPS} steps; show more "
                 "poses of the board, tilted more"
             )

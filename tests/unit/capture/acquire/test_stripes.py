@@ -1,6 +1,7 @@
 """Stripes captured through the real drivers: resumed, retaken, and without a lost projector."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from capture.session import Session, SubjectRecord, verify
 from rigsim.boxes.faults import Faults
 from rigsim.boxes.scanner import ProjectorLight
 from rigsim.world.world import World
+from skinrig.capturing.light_safety import light_figures
 from skinrig.capturing.plan_choice import needed_boxes
 
 DOME = load_rig("dome")
@@ -146,6 +148,16 @@ def test_capture_keeps_every_pattern(make):
     assert not bench.world.box("scanner").armed
     bench.session.close()
     assert verify(bench.folder).ok
+
+
+def test_plan_of_stripes_alone_is_captured(make):
+    """Its lights are the projectors', so that the LEDs do not flicker."""
+    plan = replace(PLAN, steps=tuple(STRIPES[:2]))
+    figures = light_figures(plan, RIG)
+    assert (figures["flashes_per_s"], figures["open_eyes"]) == (0.0, "refused")
+    bench = make(plan=plan)
+    bench.run()
+    assert len(bench.session.frames("stripes")) == 2 * len(STRIPES[0].cameras)
 
 
 def test_lost_frames_are_retaken(make):

@@ -12,6 +12,7 @@ from scipy import stats
 
 from capture import raw
 from capture.raw import RawError, RawFrame
+from capture.raw.thumbnail import draw_thumbnail
 
 BAYER = ("RGGB", "BGGR", "GRBG", "GBRG")
 MATRIX = np.array([[0.7123, -0.1019, -0.0547], [-0.4321, 1.2345678, 0.2109], [-0.1, 0.23, 0.61]])
@@ -124,6 +125,18 @@ def test_thumbnail_grows_file_by_few_percent(dng, cfa):
         frame.extract_thumb()
     large = np.zeros((2000, 3000), np.uint16)
     assert dng(cfa=large).stat().st_size < 1.006 * large.nbytes
+
+
+def test_very_long_frame_has_no_thumbnail(dng):
+    """A block of 76 photosites is wider than the 64 of the frame."""
+    long = np.zeros((64, 12000), np.uint16)
+    frame = RawFrame(cfa=long, pattern="MONO", black=(100.0,), white=1100)
+    assert draw_thumbnail(frame) is None
+    with (
+        rawpy.imread(str(dng("MONO", cfa=long))) as frame,
+        pytest.raises(rawpy.LibRawNoThumbnailError),
+    ):
+        frame.extract_thumb()
 
 
 @pytest.mark.parametrize("pattern", [*BAYER, "MONO"])

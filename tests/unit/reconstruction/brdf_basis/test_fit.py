@@ -5,10 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.optimize import nnls
+from sklearn.decomposition import NMF
 
 from model import fresnel
 from model.brdf import tables as brdf_tables
 from reconstruction import brdf_basis
+from reconstruction.brdf_basis.fit import _factor
 from skinrig.benchmarks.dome import brdf_truth
 
 
@@ -234,6 +236,15 @@ def test_four_face_mixtures_fit_nearly_like_all_materials(face, basis):
     again = brdf_basis.fit_weights(s, basis.mix_materials(mix))
     assert again.weights.shape == (len(face.f), 4)
     assert np.median(again.residual / full.residual) < 1.1
+
+
+def test_early_end_of_factorization_is_silent(caplog, rng):
+    """It is valid, and the error that `reduce` returns includes it."""
+    model = NMF(4, init="nndsvda", max_iter=2, tol=1e-3, random_state=0)
+    found, mix = _factor(model, rng.exponential(size=(40, 59)))
+    assert model.n_iter_ == model.max_iter
+    assert (found.shape, mix.shape) == ((40, 4), (4, 59))
+    assert caplog.records == []
 
 
 def test_excessive_ranks_and_empty_weights_have_clear_outcomes():

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from model.solver_outcome import outcome_from_scipy
+from reconstruction.facial_color import perfusion_likelihood
 from reconstruction.facial_color.perfusion_curves import CurveError
 from reconstruction.facial_color.perfusion_fit import fit_course, fit_cycle, square_levels
 from reconstruction.facial_color.perfusion_samples import CurveSamples, PoseStep
@@ -349,3 +351,25 @@ def test_prior_as_sample_covariance_gives_same_squares():
 def test_steps_mismatching_samples_are_refused(pose, named):
     with pytest.raises(CurveError, match=named):
         fit_cycle(PHASE, relaxing(PHASE, 2.0), cycle_s=CYCLE_S, pose=pose)
+
+
+def test_residual_of_search_is_spread_over_tolerance(monkeypatch):
+    """A square sum of a million at the minimum does not matter to the search."""
+    outcomes = []
+
+    def record(found, residual, **more):
+        outcomes.append(outcome_from_scipy(found, residual, **more))
+        return outcomes[-1]
+
+    monkeypatch.setattr(perfusion_likelihood, "outcome_from_scipy", record)
+    grid = np.linspace(0.0, 1.0, 11)
+    point = perfusion_likelihood._refined(
+        lambda delay, log: 1e6 + (delay - 0.52) ** 2 + (log - 0.48) ** 2,
+        np.array([0.5, 0.5]),
+        grid,
+        grid,
+        np.inf,
+    )
+    assert point == pytest.approx((0.52, 0.48, 1e6), abs=1e-3)
+    assert [outcome.converged for outcome in outcomes] == [True]
+    assert 0.0 <= outcomes[0].residual <= 1.0

@@ -91,6 +91,17 @@ def test_smooth_surface_is_unchanged_to_first_order():
     assert found.outcome.converged
 
 
+def test_gentle_slopes_are_iterated_like_steep_ones():
+    """The relative stop does not end the search at the first, coarse solution."""
+    truth, normals, _ = flap(64, 0.0)
+    normals = normals / normals[..., 2:]
+    gentle = integrate_with_discontinuities(normals * [1e-3, 1e-3, 1.0])  # slopes of 1e-4
+    assert gentle.outcome.iterations >= 1
+    assert gentle.outcome.stop == "tolerance"
+    steep = integrate_with_discontinuities(normals)
+    assert rms(gentle.height, 1e-3 * truth) < 1.1e-3 * rms(steep.height, truth)
+
+
 def test_masks_and_parts_are_kept():
     _, normals, _ = flap(48, 1.0)
     valid = np.ones((48, 48), bool)

@@ -109,12 +109,13 @@ def errors_mm(found, motions):
 
 
 @pytest.mark.parametrize("most_mm", [0.3, 3.0])
-def test_drifting_head_is_tracked_within_fraction_of_pixel(most_mm, rng):
+def test_drifting_head_is_tracked_within_fraction_of_pixel(most_mm, rng, caplog):
     motions = drift(rng, 5, most_mm, most_mm / 3)
     points, normals = ball_points()
     found = head_motion.estimate(capture(rng, motions), CAMERAS, points, normals, np.arange(5.0))
     # a pixel is 1.2 mm at the ball; some 250 tracks of 0.1 px
     assert found.usable.all()
+    assert caplog.records == []
     assert errors_mm(found, motions).max() < 0.06
     assert np.array_equal(found.rotation_rad[0], np.zeros(3))
     moved = found.displacement_mm(points)
@@ -143,7 +144,7 @@ def test_standard_errors_have_the_size_of_the_errors(rng):
     assert 0.5 < ratio < 2.5
 
 
-def test_twitch_is_not_head_motion_and_frame_unusable(rng):
+def test_twitch_is_not_head_motion_and_frame_unusable(rng, caplog):
     motions = drift(rng, 7, 1.0, 0.3)
     twitches = [0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 0.0]
     points, normals = ball_points()
@@ -151,6 +152,7 @@ def test_twitch_is_not_head_motion_and_frame_unusable(rng):
         capture(rng, motions, twitches), CAMERAS, points, normals, np.arange(7.0)
     )
     assert found.usable.tolist() == [True, True, True, False, True, True, True]
+    assert caplog.records == []  # an unusable frame's search needs no warning
     assert found.is_covered([0.5, 2.5, 3.5, 4.5, 4.0, 9.0]).tolist() == [
         True,
         False,
@@ -182,6 +184,13 @@ def test_matrices_take_points_to_where_they_were():
     np.testing.assert_allclose(
         half @ [10.0, 0, 0, 1], [10 * np.cos(0.1) + 1, 10 * np.sin(0.1), 0, 1]
     )
+
+
+def test_unfinished_search_of_usable_frame_warns_once(rng, caplog):
+    points, normals = ball_points()
+    frames = capture(rng, drift(rng, 3, 3.0, 1.0))
+    head_motion.estimate(frames, CAMERAS, points, normals, np.arange(3.0), iterations=1)
+    assert ["head motion" in record.getMessage() for record in caplog.records] == [True]
 
 
 def test_black_frame_is_unusable_and_gives_no_nan(rng):

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy import sparse
 from scipy.spatial.transform import Rotation
 
+from reconstruction.scan import template_wrapping
 from reconstruction.scan.closest_points import ScanSurface
 from reconstruction.scan.face_template import FaceTemplate, load_default_template
 from reconstruction.scan.repair import ScanMeshError, TriangleMesh, boundary_edges
@@ -123,3 +125,20 @@ def test_default_template_is_one_unfolded_sheet():
     edges = boundary_edges(mesh.faces)
     assert len(np.unique(edges)) == len(edges)
     assert len(mesh.vertices_mm) - 1.5 * len(mesh.faces) - 0.5 * len(edges) + len(mesh.faces) == 1
+
+
+@pytest.mark.parametrize(("weight", "warnings"), [(0.0, 0), (100.0, 1)])
+def test_only_unsolved_equations_warn(weight, warnings, monkeypatch, caplog, rng):
+    """One step solves equations without planes, whose preconditioner is their inverse."""
+    monkeypatch.setattr(template_wrapping, "SOLVER_STEPS", 1)
+    normals = rng.standard_normal((20, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    matrix = sparse.diags(np.linspace(1.0, 2.0, 20)).tocsc()
+    system = template_wrapping._System(matrix, np.full(20, weight), normals)
+    right = rng.standard_normal((20, 3))
+    found = system.solve(right, np.zeros((20, 3)))
+    assert len(caplog.records) == warnings
+    solved = np.abs(system._times(found) - right).max() < 1e-6
+    assert solved == (warnings == 0)
+    assert not system.solve(np.zeros((20, 3)), np.zeros((20, 3))).any()
+    assert len(caplog.records) == warnings

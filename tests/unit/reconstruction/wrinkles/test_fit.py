@@ -78,6 +78,18 @@ def test_texels_come_back_from_their_own_bilinear_reading(rng, shape):
     np.testing.assert_allclose(got.values, texels, atol=1e-6)
 
 
+@pytest.mark.parametrize(("steps", "warnings"), [(30, 0), (10, 1)])
+def test_unsolved_texels_alone_warn(rng, monkeypatch, caplog, steps, warnings):
+    """Thirty steps miss the tolerance of 1e-12 by a factor of 30, which does not matter."""
+    monkeypatch.setattr(wrinkle_texels, "MAX_CG_STEPS", steps)
+    texels = rng.standard_normal((12, 12, 2))
+    ones, products = np.ones((32, 32)), pixels(texels, (32, 32))
+    noise = np.zeros(products.shape)
+    got = wrinkle_texels.fit_texels(ones, products, noise, ones, (12, 12))
+    assert len(caplog.records) == warnings
+    assert (np.abs(got.values - texels).max() < 1e-6) == (warnings == 0)
+
+
 def test_a_map_at_full_resolution_is_kept(rng):
     d = rng.standard_normal((24, 17, 2))
     np.testing.assert_allclose(low_passed(d, (24, 17)).values, d, atol=1e-7)

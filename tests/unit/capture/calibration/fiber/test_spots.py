@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from capture.calibration.fiber import discs
 from capture.calibration.fiber.merge import merge_series
 from capture.calibration.fiber.spots import FiberSpotError, find_fiber_spots
 
@@ -118,3 +119,14 @@ def test_spots_that_have_moved_since_are_followed(rng, fiber_camera, falling):
     followed, shift = spots.track(merged(later, falling), "RGGB")
     np.testing.assert_allclose(shift, [1.3, -0.7], atol=0.03)
     np.testing.assert_allclose(followed.center_px, later.places, atol=0.1)
+
+
+@pytest.mark.parametrize(("evaluations", "warnings"), [(30, 0), (3, 1)])
+def test_unfinished_fits_are_counted_in_one_warning(
+    rng, fiber_camera, falling, monkeypatch, caplog, evaluations, warnings
+):
+    monkeypatch.setattr(discs, "MAX_DISC_EVALUATIONS", evaluations)
+    find(fiber_camera(rng), falling)
+    assert ["28 not converged" in record.getMessage() for record in caplog.records] == (
+        [True] * warnings
+    )
