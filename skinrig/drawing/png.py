@@ -171,7 +171,9 @@ class Scale:
         span = self.high - self.low
         span = span if span > MIN_SPAN else 1.0
         finite = np.isfinite(values)
-        position = np.clip((np.where(finite, values, self.low) - self.low) / span, 0.0, 1.0)
+        # clipped first: a difference of huge values overflows
+        clipped = np.clip(np.where(finite, values, self.low), self.low, self.low + span)
+        position = (clipped - self.low) / span
         return position, finite if valid is None else finite & np.asarray(valid, bool)
 
 
