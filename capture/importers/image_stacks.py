@@ -13,14 +13,16 @@ from capture import raw
 from capture.arrays import Float64Array, FloatArray
 from capture.documents import Fault
 from capture.importers import light_lists
-from capture.importers.images import Photo, PhotoError, find_common_white, read_photo, restate_white
+from capture.importers.images import Photo, PhotoError, read_photo
 from capture.importers.imported_session import (
     DISTANCE_MM,
     create_imported_session,
+    find_common_white,
     hash_file,
     make_placeholder_light,
     make_placeholder_rig,
     make_placeholder_view,
+    restate_white,
 )
 from capture.importers.light_lists import LightList
 from capture.importers.light_tables import LightListError

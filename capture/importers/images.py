@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import re
 import struct
 import zlib
 from collections.abc import Sequence
@@ -334,30 +333,6 @@ def _linear(pixels: NDArray[Any], notes: list[str], white_value: float | None) -
         notes.append(f"{int((~known).sum())} values that are not numbers count as saturated")
     stored = np.where(known, np.clip(dn, 0, WHITE_DN - 1), WHITE_DN).astype(np.uint16)
     return Photo(_frame(stored, FLOAT_BLACK_DN), "linear", (*notes, NOISE_NOTE), white)
-
-
-def find_common_white(values: Sequence[float | None]) -> float | None:
-    """Return the white value under which several files keep their ratios; None: all integers.
-
-    Examples
-    --------
-    >>> find_common_white([None, 2.0, 0.0, 3.0])
-    3.0
-    """
-    given = [value for value in values if value is not None]
-    return max(given) if given else None
-
-
-def restate_white(notes: Sequence[str], white_value: float) -> tuple[str, ...]:
-    """Return a photograph's notes with another white value.
-
-    Examples
-    --------
-    >>> restate_white(["values were divided by 3 to fit the range", "a"], 5.0)
-    ('values were divided by 5 to fit the range', 'a')
-    """
-    pattern = r"^values were divided by \S+ to"
-    return tuple(re.sub(pattern, f"values were divided by {white_value:.6g} to", n) for n in notes)
 
 
 def _channels(pixels: NDArray[Any], where: str, notes: list[str]) -> NDArray[Any]:

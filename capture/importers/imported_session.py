@@ -1,6 +1,7 @@
 """Create the session of imported images, complete or not at all, with a placeholder camera."""
 
 import hashlib
+import re
 import shutil
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -121,3 +122,27 @@ def create_imported_session(
             advice = "Free space or name another folder, then import again; nothing was kept."
             raise SessionDiskError(exc.what, where=str(target), advice=advice) from exc
         raise
+
+
+def find_common_white(values: Sequence[float | None]) -> float | None:
+    """Return the white value under which several files keep their ratios; None: all integers.
+
+    Examples
+    --------
+    >>> find_common_white([None, 2.0, 0.0, 3.0])
+    3.0
+    """
+    given = [value for value in values if value is not None]
+    return max(given) if given else None
+
+
+def restate_white(notes: Sequence[str], white_value: float) -> tuple[str, ...]:
+    """Return a photograph's notes with another white value.
+
+    Examples
+    --------
+    >>> restate_white(["values were divided by 3 to fit the range", "a"], 5.0)
+    ('values were divided by 5 to fit the range', 'a')
+    """
+    pattern = r"^values were divided by \S+ to"
+    return tuple(re.sub(pattern, f"values were divided by {white_value:.6g} to", n) for n in notes)

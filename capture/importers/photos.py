@@ -11,21 +11,16 @@ from pathlib import Path
 from capture import raw
 from capture.documents import Fault, InputError
 from capture.importers.framing import Framing
-from capture.importers.images import (
-    Encoding,
-    Photo,
-    PhotoError,
-    find_common_white,
-    read_photo,
-    restate_white,
-)
+from capture.importers.images import Encoding, Photo, PhotoError, read_photo
 from capture.importers.imported_session import (
     DISTANCE_MM,
     create_imported_session,
+    find_common_white,
     hash_file,
     make_placeholder_light,
     make_placeholder_rig,
     make_placeholder_view,
+    restate_white,
 )
 from capture.plan import Kind, Plan, Step, Value
 from capture.rig import Rig, View

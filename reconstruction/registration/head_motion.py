@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model.checks import Checks
-from model.solver_outcome import UNKNOWN_CONDITION, SolverOutcome, estimate_condition
+from model.solver_outcome import UNKNOWN_CONDITION, SolverOutcome, StopReason, estimate_condition
 from reconstruction.arrays import BoolArray, Float64Array, FloatArray, UInt8Array
 from reconstruction.registration import tracking as registration
 
@@ -45,9 +45,7 @@ MAX_LAST_MOVE_SIGMAS = 0.1
 """Last step, in standard errors, from which a usable frame's motion is reported as unfinished."""
 _DIFFERENCE_MM = 0.01
 _MIN_RESIDUAL_PX = 1e-6
-_RAYLEIGH_MEDIAN = (
-    1.1774100225154747  # median of the length of a unit normal vector in two dimensions
-)
+_RAYLEIGH_MEDIAN = 1.1774100225154747  # median length of a unit normal vector in two dimensions
 
 
 class HeadMotionError(ValueError):
@@ -235,8 +233,7 @@ def estimate(
         found, np.concatenate([points[rows] for rows in chosen]), times, reference
     )
     used = [pose.outcome for pose, usable in zip(found, motion.usable, strict=True) if usable]
-    worst = max(used, key=lambda outcome: outcome.residual)
-    worst.warn_unless_converged("head motion", _log)
+    max(used, key=lambda one: one.residual).warn_unless_converged("head motion", _log)
     return motion
 
 
@@ -280,8 +277,7 @@ def _checked(
 def _facing(points: Float64Array, normals: Float64Array, center: Float64Array) -> BoolArray:
     towards = center - points
     length = np.linalg.norm(towards, axis=1) * np.linalg.norm(normals, axis=1)
-    cosine = np.sum(towards * normals, axis=1) / np.where(length > 0, length, 1.0)
-    return np.asarray(cosine > MIN_TRACK_COSINE)
+    return np.asarray(np.sum(towards * normals, axis=1) > MIN_TRACK_COSINE * length)
 
 
 def _pose(
@@ -322,21 +318,15 @@ def _pose(
         motion = motion + move
         condition = estimate_condition(A)
     stderr = _stderr(r, J, u2, _blocks(seen))
-    least = SMALL_MOVE / MAX_LAST_MOVE_SIGMAS
-    residual = float(np.max(np.abs(move) / np.maximum(stderr, least)))
+    residual = float(np.max(np.abs(move) / np.maximum(stderr, SMALL_MOVE / MAX_LAST_MOVE_SIGMAS)))
     motion = motion if np.isfinite(stderr).all() else np.zeros(6)
     left[found] = length
-    outcome = SolverOutcome(
-        step, residual, condition, "tolerance" if residual < MAX_LAST_MOVE_SIGMAS else "limit"
-    )
-    return _Pose(motion, stderr, left, outcome)
+    stop: StopReason = "tolerance" if residual < MAX_LAST_MOVE_SIGMAS else "limit"
+    return _Pose(motion, stderr, left, SolverOutcome(step, residual, condition, stop))
 
 
 def _worst_part(points: Float64Array, length: Float64Array) -> float:
-    """Return the largest median residual of the parts of a face, 0 if none has three tracks.
-
-    Parts overlap by half, so that one of them contains a local expression as a whole.
-    """
+    """Return the largest median residual of parts that overlap by half; 0 without three tracks."""
     worst = 0.0
     for shift in (0.0, 0.5):
         cell = np.floor(points / FACE_PART_MM + shift).astype(np.intp)

@@ -9,7 +9,8 @@ import numpy as np
 
 from capture.documents import Fault, InputError
 from capture.importers.image_stacks import Encoding, encode_srgb
-from capture.importers.images import find_common_white, read_photo
+from capture.importers.images import read_photo
+from capture.importers.imported_session import find_common_white
 from capture.importers.light_lists import (
     LightList,
     find_images,
@@ -97,7 +98,7 @@ def _without_special(
     files = find_images(directory)
     try:
         stack = _read_reduced(files, mask, encoding)
-    except InputError:  # files that do not fit together are not what the user has to mend first
+    except InputError:  # the number of images comes first, other faults of the files later
         raise error from None
     special = find_special_images(stack.gray, stack.inside, usable=stack.usable)
     kept = [file for number, file in enumerate(files) if number not in special]
