@@ -26,6 +26,8 @@ _log = logging.getLogger(__name__)
 # parameters of a light (intensities, exponent, tilt), of a camera, of a pose or a part
 N_LIGHT, N_RESPONSE, N_TILT = 6, 5, 2
 MIN_INCIDENCE_COSINE = 0.25  # of incidence: at grazing incidence the plate's waviness dominates
+MAX_LAST_STEP_SIGMAS = 0.1
+"""Last step, in standard errors, from which a fit is reported as unfinished."""
 N_LIGHT_FIT_STEPS = 6
 TILT_PRIOR_RAD = 0.05  # largest angle between an LED's axis and the rig's origin
 EXPONENT_PRIOR_STD = 1.0
@@ -294,13 +296,14 @@ class _Fit:
             numbers = numbers + step
             if np.abs(step).max() < 1e-8:
                 break
-        else:
-            _log.warning(
-                "lights by a plate: not converged after %d steps, last step %.2g",
-                N_LIGHT_FIT_STEPS,
-                np.abs(step).max(),
-            )
         errors = np.sqrt(np.clip(np.diag(covariance), 0, None))
+        unfinished = float(np.max(np.abs(step) / np.where(errors > 0.0, errors, np.inf)))
+        if unfinished > MAX_LAST_STEP_SIGMAS:
+            _log.warning(
+                "lights by a plate: not converged after %d steps, last step %.2g standard errors",
+                N_LIGHT_FIT_STEPS,
+                unfinished,
+            )
         table, seen = self._table(numbers, errors)
         silent = [name for name, ok in zip(table.names, seen, strict=True) if not ok]
         unseen = tuple(name for name in silent if name not in dead and name not in swapped)
