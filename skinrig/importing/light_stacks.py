@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from capture.documents import Fault, InputError
-from capture.importers.image_stacks import Encoding, encode_srgb
+from capture.importers.image_stacks import LINEAR_MISFIT_RATIO, Encoding, encode_srgb
 from capture.importers.images import read_photo
 from capture.importers.imported_session import find_common_white
 from capture.importers.light_lists import (
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 ESTIMATE_LIGHTS: Final = "estimate"
 """Value of ``--lights`` under which the images themselves show their lights."""
-LINEAR_MISFIT_RATIO = 0.8
-"""As for listed lights: values count as linear when they fit clearly better so."""
 MIN_SIGN_EVIDENCE = 0.1
 MIN_OBJECT_PX = 20
 
@@ -191,8 +189,8 @@ def _read_reduced(files: Sequence[Path], mask: Path | None, encoding: Encoding) 
     usable: list[BoolArray] = []
     whites: list[float | None] = []
     exposures: list[float] = []
-    shape: tuple[int, ...] = ()
-    inside = np.ones((1, 1), bool)
+    whole = np.zeros((0, 0), bool)
+    inside = whole
     for file in files:
         photo = read_photo(file)
         frame = photo.frame
@@ -200,16 +198,16 @@ def _read_reduced(files: Sequence[Path], mask: Path | None, encoding: Encoding) 
         gray = (to_gray(frame).astype(np.float64) - black) / (frame.white - black)
         if encoding == "linear" and photo.encoding == "sRGB":
             gray = np.asarray(encode_srgb(np.clip(gray, 0.0, 1.0)))
-        if shape and gray.shape != shape:
-            got, expected = (f"{size[1]} x {size[0]}" for size in (gray.shape, shape))
+        if not images:
+            whole = np.ones(gray.shape, bool)
+            if where_mask is not None:
+                whole = read_mask(where_mask, (gray.shape[0], gray.shape[1]))
+        elif gray.shape != whole.shape:
+            got, expected = (f"{size[1]} x {size[0]}" for size in (gray.shape, whole.shape))
             raise LightListError.at("images differ", file.name, got, expected, where=file.parent)
-        shape = gray.shape
         clear = frame.cfa < frame.white
         if frame.pattern != "MONO":
             clear = clear[::2, ::2] & clear[::2, 1::2] & clear[1::2, ::2] & clear[1::2, 1::2]
-        whole = np.ones(shape, bool)
-        if where_mask is not None:
-            whole = read_mask(where_mask, (shape[0], shape[1]))
         reduced, _ = reduce_stack(gray[None], clear[None], whole)
         images.append(reduced.gray[0])
         usable.append(reduced.usable[0])
