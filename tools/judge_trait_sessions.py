@@ -55,7 +55,7 @@ def judge_albedo() -> None:
         [albedo_vectors.encode_albedo(one.r_d, "quantiles") for one in sessions.r_d],
         valid=[one.valid for one in sessions.r_d],
     )
-    columns = {
+    columns: dict[str, list[float]] = {
         "female": [person.sex == "female" for person in people],
         "asian": [person.ethnicity == "asian" for person in people],
         "age": [person.age_years for person in people],
@@ -81,7 +81,7 @@ def effects(
         albedo_vectors.vector(one.r_d, texture, "quantiles", valid=one.valid, region=one.valid)
         for one in maps
     ]
-    return np.linalg.lstsq(design, np.array(rows), rcond=None)[0]
+    return np.asarray(np.linalg.lstsq(design, np.array(rows), rcond=None)[0], np.float64)
 
 
 def judge_surface() -> None:
