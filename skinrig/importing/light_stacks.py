@@ -78,9 +78,27 @@ def find_lights(
         return _estimate_list(directory, mask, encoding)
     source = Path(lights) if lights else None
     try:
-        return FoundLights(find_light_list(directory, lights=source), encoding)
+        listed = find_light_list(directory, lights=source)
     except UnequalCountError as error:
-        return _without_special(directory, source, mask, encoding, error)
+        found = _without_special(directory, source, mask, encoding, error)
+    else:
+        unlisted = [file for file in find_images(directory) if file not in listed.images]
+        texts = (f"{file.name} is not in {listed.file}, and was left out" for file in unlisted)
+        found = FoundLights(listed, encoding, tuple(texts))
+    return replace(found, encoding=_find_encoding(found.lights.images, mask, encoding))
+
+
+def _find_encoding(files: Sequence[Path], mask: Path | None, encoding: Encoding) -> Encoding:
+    """Return the encoding of 8-bit files; ``"auto"`` where the images cannot show it."""
+    from reconstruction.stack_diagnosis.diagnosis import MIN_FRAMES
+
+    if encoding != "auto" or len(files) < MIN_FRAMES or read_photo(files[0]).encoding != "sRGB":
+        return encoding
+    try:
+        stack = _read_reduced(files, mask, encoding)
+    except InputError:  # the import names faults of the files
+        return encoding
+    return _choose_encoding(stack)[0]
 
 
 def _without_special(

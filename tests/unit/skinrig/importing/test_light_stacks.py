@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
-from fixtures.faulty_stacks import dome, render
+from fixtures.faulty_stacks import SHAPES, dome, render, to_srgb
 
 from capture.importers.light_tables import LightListError
 from skinrig.cli import main
@@ -75,3 +75,29 @@ def test_unequal_count_stays_the_error_despite_odd_files(tmp_path):
     with pytest.raises(LightListError, match="does not fit the images") as raised:
         find_lights(tmp_path / "f", lights=None, mask=None, encoding="auto")
     assert raised.value.code == "SR-IMP-007"
+
+
+@pytest.mark.parametrize(("encoding", "seed"), [("sRGB", 7001), ("sRGB", 7005), ("linear", 7005)])
+def test_encoding_of_glossy_images_is_found(encoding, seed, tmp_path):
+    """Highlights that a curve flattens do not make its values linear."""
+    rng = np.random.default_rng(seed)
+    lights = dome(12, rng, 60)
+    images, inside = render(SHAPES[seed % 3], lights, rng, side=64, gloss=2.0, noise=0.005)
+    folder = tmp_path / "f"
+    folder.mkdir()
+    for number, image in enumerate(images):
+        shown = to_srgb(image) if encoding == "sRGB" else image
+        cv2.imwrite(str(folder / f"{number:02d}.png"), np.rint(255 * shown).astype(np.uint8))
+    cv2.imwrite(str(folder / "mask.png"), inside.astype(np.uint8) * 255)
+    np.savetxt(folder / "lights.txt", lights)
+    found = find_lights(folder, lights=None, mask=None, encoding="auto")
+    assert found.encoding == encoding
+
+
+def test_image_that_list_lacks_is_named(tmp_path):
+    images = np.random.default_rng(0).uniform(0.2, 1.0, (5, 40, 40))
+    write(tmp_path / "f", images)
+    rows = [f"{k:02d}.tif 0 0 1" for k in (0, 1, 3, 4)]
+    (tmp_path / "f" / "a.lp").write_text("\n".join(["4", *rows]))
+    found = find_lights(tmp_path / "f", lights=None, mask=None, encoding="auto")
+    assert found.assumed == ("02.tif is not in a.lp, and was left out",)
