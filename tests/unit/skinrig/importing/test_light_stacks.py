@@ -1,5 +1,7 @@
 """Lights of folders: estimates under other exposures, and what is refused before any fit."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -101,3 +103,34 @@ def test_image_that_list_lacks_is_named(tmp_path):
     (tmp_path / "f" / "a.lp").write_text("\n".join(["4", *rows]))
     found = find_lights(tmp_path / "f", lights=None, mask=None, encoding="auto")
     assert found.assumed == ("02.tif is not in a.lp, and was left out",)
+
+
+def test_list_in_scene_frame_is_turned(tmp_path, capsys):
+    turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # camera to scene
+    lights = dome(6, np.random.default_rng(2), 60)
+    images = np.random.default_rng(0).uniform(0.2, 1.0, (6, 40, 40))
+    folder = tmp_path / "f"
+    write(folder, images)
+    np.savetxt(folder / "lights.txt", lights @ turn.T)
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn
+    frames = [{"file_path": "00", "transform_matrix": matrix.tolist()}]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    camera = tmp_path / "transforms.json"
+    found = find_lights(folder, lights=None, mask=None, encoding="auto", camera=camera)
+    np.testing.assert_allclose(found.lights.directions, lights, atol=1e-9)
+    assert "turned into the camera's" in found.assumed[-1]
+    argv = ["import", "olat", str(folder), "--camera", str(camera), "--out", str(tmp_path / "s")]
+    assert main(argv) == 0
+    assert main([*argv, "--lights", "estimate"]) == 3
+    assert "needs no camera" in capsys.readouterr().err
+
+
+def test_cameras_and_videos_state_what_to_do(tmp_path, capsys):
+    for name in ("cam01", "cam02"):
+        (tmp_path / "rig").mkdir(exist_ok=True)
+        write(tmp_path / "rig" / name, np.ones((3, 8, 8)))
+    (tmp_path / "clip.mp4").write_bytes(b"0")
+    for source, advice in (("rig", "cam01 to cam02 look like cameras"), ("clip.mp4", "ffmpeg -i")):
+        assert main(["import", "olat", str(tmp_path / source), "--out", str(tmp_path / "s")]) == 3
+        assert advice in capsys.readouterr().err
