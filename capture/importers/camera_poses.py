@@ -1,7 +1,7 @@
 """Read the orientation of the camera that took a folder of images: transforms.json and COLMAP.
 
-Lists of lights can be in the frame of a scene rather than of the camera. These files state how the
-camera stands in that frame.
+Lists of lights can be in the frame of a scene rather than of the camera. These files state the
+camera's axes in that frame.
 """
 
 from collections.abc import Mapping, Sequence

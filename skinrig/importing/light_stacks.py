@@ -132,7 +132,7 @@ def _require_images(directory: Path) -> None:
                 where=error.where,
                 faults=error.faults,
                 advice=f"Folders {views[0]} to {views[-1]} look like cameras. Normals under listed "
-                "lights are of one camera: name one folder; a list beside them is found.",
+                "lights are of one camera: name one folder; a list next to them is found.",
                 code=error.code,
             ) from None
 

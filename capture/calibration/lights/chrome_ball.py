@@ -48,8 +48,8 @@ def directions_from_chrome_ball(images: Sequence[NDArray], mask: NDArray) -> Flo
     Raises
     ------
     ChromeBallError
-        If shapes differ, an image shows no highlight, or the mask is empty, not a disc, or beside
-        the ball's outline in the images; the message names it.
+        If shapes differ, an image shows no highlight, or the mask is empty, not a disc, or away
+        from the ball's outline in the images; the message names it.
 
     Notes
     -----
@@ -134,7 +134,7 @@ def _fit_disc(mask: BoolArray) -> tuple[BoolArray, Float64Array, float]:
 
 
 def _require_outline(total: Float64Array, middle: Float64Array, radius: float) -> None:
-    """Raise `ChromeBallError` if the images have the ball's outline beside the mask's.
+    """Raise `ChromeBallError` if the images have the ball's outline away from the mask's.
 
     The contrast of a circle is the median over it, so that highlights do not count. Images
     without an outline, such as a dark ball before a dark background, are not judged.
@@ -161,8 +161,8 @@ def _require_outline(total: Float64Array, middle: Float64Array, radius: float) -
     ):
         right, below = (float(value) for value in step * moves[best, :2])
         raise ChromeBallError(
-            f"mask: got a disc beside the ball, whose outline in the images is {right:+.0f} px to "
-            f"the right and {-below:+.0f} px up, with {moves[best, 2]:.2f} times the mask's "
+            "mask: got a disc away from the ball's outline, which the images have "
+            f"{right:+.0f} px to the right and {-below:+.0f} px up, with {moves[best, 2]:.2f} times the mask's "
             "radius; expected the ball's own mask"
         )
 
