@@ -162,8 +162,8 @@ def _require_outline(total: Float64Array, middle: Float64Array, radius: float) -
         right, below = (float(value) for value in step * moves[best, :2])
         raise ChromeBallError(
             "mask: got a disc away from the ball's outline, which the images have "
-            f"{right:+.0f} px to the right and {-below:+.0f} px up, with {moves[best, 2]:.2f} times the mask's "
-            "radius; expected the ball's own mask"
+            f"{right:+.0f} px to the right and {-below:+.0f} px up, with {moves[best, 2]:.2f} "
+            "times the mask's radius; expected the ball's own mask"
         )
 
 
