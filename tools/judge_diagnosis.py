@@ -41,7 +41,7 @@ def list_sets(seeds: int, first: int) -> Iterator[dict[str, Any]]:
         rows = [(one["fault"], one["severity"]) for one in csv.DictReader(file)]
     rows += [("", "")] * N_SOUND
     seed = first
-    for _, (fault, severity), rig, tone in product(range(seeds), rows, RIGS, TONES):
+    for _, rig, tone, (fault, severity) in product(range(seeds), RIGS, TONES, rows):
         yield {"fault": fault, "severity": severity, "rig": rig, "tone": tone, "seed": seed}
         seed += 1
 
