@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture import hdr, raw
+from capture.calibration.sensor.bracket_times import check_times
 from capture.session import FrameRecord, Session
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.pipeline.hold_out import NO_HOLD_OUT, HoldOut
@@ -204,7 +205,7 @@ class DomeImages:
                 "white": first.white,
             }
             try:
-                hdr.check_times(bracket, times, **sensor)
+                check_times(bracket, times, **sensor)
             except hdr.BracketError as error:
                 raise InputsError(f"{first.path}: {error}; correct the times") from error
             rate, spread, valid = hdr.merge(bracket, times, **sensor)

@@ -4,7 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture.hdr import BracketError, check_times, merge, merge_reference, recover_response
+from capture.calibration.sensor.bracket_times import check_times
+from capture.hdr import BracketError, merge, merge_reference, recover_response
 
 SENSOR = {"gain": 2.0, "read_noise": 8.0, "black": 512, "white": 16383}
 TIMES = (0.01, 0.08, 0.64)
