@@ -149,6 +149,7 @@ def import_photos(
     used, views = _rig(entries, rig, camera_serial, sensitivity, light)
     steps = _steps(entries, views, kind)
     assumed = _assumptions(entries, made_up=rig is None, light=light, camera=used.views[0])
+    assumed += _list_unequal_partners(steps)
     plan = Plan(used.name, tuple(step for step, _ in steps))
     listed = [
         {"step": s.id, "sha256": e.sha256, "encoding": e.encoding}
@@ -357,6 +358,19 @@ def _assumptions(
         )
         texts.append("distance, focal length and pixel pitch are not known: no lengths in mm")
     return texts
+
+
+def _list_unequal_partners(steps: Sequence[tuple[Step, _Entry]]) -> list[str]:
+    """Return the pairs of polarizer states whose photographs cannot be subtracted."""
+    pairs: dict[object, list[_Entry]] = {}
+    for step, entry in steps:
+        pairs.setdefault(step.index["state"], []).append(entry)
+    return [
+        f"{' and '.join(entry.file.name for entry in pair)} differ in color or size, so that no "
+        "specular image follows from them"
+        for pair in pairs.values()
+        if len({(entry.view.cfa, entry.view.width_px, entry.view.height_px) for entry in pair}) > 1
+    ]
 
 
 def _commit(session: Session, step: Step, entry: _Entry, clock: Callable[[], datetime]) -> None:

@@ -188,6 +188,7 @@ def import_olat(
     /,
     out: Out,
     lights: str | None = None,
+    camera: Path | None = None,
     mask: Path | None = None,
     encoding: Annotated[str, choice("auto", "sRGB", "linear")] = "auto",
     mm_per_px: float | None = None,
@@ -207,6 +208,9 @@ def import_olat(
     lights
         Light list: .lp, text, JSON or NumPy file, or folder of a chrome ball's images; estimate:
         from the images alone; default: found in the folder.
+    camera
+        transforms.json, or COLMAP's images.txt, in whose frame the list is; default: the list is in
+        the camera's own frame.
     mask
         Image whose bright pixels are the object; default: the folder's *mask* file, else all.
     encoding
@@ -222,7 +226,13 @@ def import_olat(
 
     console = Console(json)
     person = parse_subject(subject, consent, consent_expires)
-    found = find_lights(directory, lights=lights, mask=mask, encoding=encoding)  # type: ignore[arg-type]
+    found = find_lights(
+        directory,
+        lights=lights,
+        mask=mask,
+        encoding=encoding,  # type: ignore[arg-type]
+        camera=camera,
+    )
     done = import_light_list(
         directory,
         out=out,
