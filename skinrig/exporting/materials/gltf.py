@@ -24,7 +24,7 @@ from skinrig.drawing import png
 from skinrig.errors import UnusableError, UsageError
 from skinrig.exporting.images import ImageFolder, encode_png_codes
 from skinrig.exporting.materials import blender
-from skinrig.exporting.materials.material import Material
+from skinrig.exporting.materials.material import Material, list_expression_omissions
 from skinrig.exporting.options import M_PER_MM, ExportSettings
 from skinrig.exporting.sealing import describe_provenance
 
@@ -132,6 +132,7 @@ def write(
     )
     in_blender = f"see extras; {blender.SCRIPT_FILE} sets it in Blender"
     left_out = material.list_mesh_omissions(delivery)
+    left_out += list_expression_omissions(appearance)
     left_out.append(("subsurface light", f"not part of glTF: {in_blender}"))
     if not material.shapes:
         left_out.append(

@@ -11,6 +11,7 @@ import numpy as np
 from model import dipole, fresnel, skin_reflectance
 from model.skin import SkinAppearance
 from skinrig.appearances.contents import list_assumptions
+from skinrig.appearances.dynamic import WRINKLES, describe_parts
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.errors import UsageError, require_choice
 from skinrig.exporting.images import CAMERA_SPACE, DATA_SPACE, SRGB_SPACE, ExportImage
@@ -306,3 +307,17 @@ def similarity_albedo_deficit(r_d: FloatArray, eta: float) -> Float64Array:
         dipole.invert_to_deficit(nodes, eta)
     )  # the root is smooth also at an albedo of 1
     return np.asarray(np.interp(r_d, nodes, root) ** 2, np.float64)
+
+
+def list_expression_omissions(appearance: SkinAppearance) -> list[tuple[str, str]]:
+    """Return measured wrinkles as an omission of a neutral face's material, with the reason.
+
+    Parameters
+    ----------
+    appearance
+        Maps of the face.
+    """
+    if WRINKLES not in describe_parts(appearance):
+        return []
+    why = "the material is that of the neutral face; --to metahuman writes their maps and masks"
+    return [("wrinkles of expressions", why)]
