@@ -99,7 +99,7 @@ def spread_ratio(logs: ArrayLike) -> float:
     >>> round(spread_ratio(np.log([0.8, 0.8])), 9)
     1.25
     """
-    return math.exp(abs(float(np.mean(logs))))
+    return math.exp(abs(float(np.mean(np.asarray(logs, np.float64)))))
 
 
 def measure_end_to_end(stage: BenchmarkStage) -> Iterator[None]:
