@@ -3,7 +3,13 @@
 Each function corresponds to a command of the same name; notebooks display what it returns.
 """
 
-from skinrig.python_api.functions import (
+import os
+
+from skinrig.kernel_cache import set_passive_waiting
+
+set_passive_waiting(os.environ)  # before a library of numerics reads it
+
+from skinrig.python_api.functions import (  # noqa: E402
     calibrate,
     diagnose,
     export,

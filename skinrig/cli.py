@@ -102,6 +102,7 @@ def demo(
 
 for command in (
     capturing.verify,
+    importing.photo,
     importing.diagnose,
     reconstructing.calibrate,
     reconstructing.reconstruct,

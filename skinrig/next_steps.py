@@ -173,7 +173,7 @@ def suggest(found: Workspace, folder: Path) -> tuple[Step, ...]:
         steps = [
             Step("skinrig demo", "all four rigs, simulated, in less than three minutes"),
             Step("skinrig simulate flash --out session", "one simulated rig, with real drivers"),
-            Step("skinrig import photos DIR --out session", "a session from your photographs"),
+            Step("skinrig photo FACE.jpg --out portrait", "maps of the face in your photograph"),
             Step("skinrig doctor", "a check of the installation, with fixes"),
         ]
     return tuple(steps[:MAX_STEPS])

@@ -1,31 +1,56 @@
 """Judge the diagnosis of images under listed lights on sets with one known fault each.
 
-The sets come from ``tests/fixtures/faulty_stacks.py``: heads, reliefs and balls with highlights,
-cast shadows and noise, 12, 24 or 40 lights. Prints, per fault, how many sets have the finding and
-how many name the right images, and the false alarms on sound sets.
+The faults and their severities are the rows of ``tools/pain_suite.csv``. Each is made under three
+rigs' lights and on three skin tones by ``tests/fixtures/faulty_stacks.py``: heads, reliefs and
+balls with highlights, cast shadows and noise. Sound sets are made alike. Prints, per row, how many
+sets have any finding, the right one, and the right images; then the totals and false alarms.
 
-Usage: python tools/judge_diagnosis.py [--seeds N] [--first SEED]
+A set is judged once: finished sets are lines of the file OUT, and a later run goes on there.
+
+Usage: python tools/judge_diagnosis.py [--seeds N] [--first SEED] [--side PX] [--out FILE]
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import json
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from fixtures.faulty_stacks import FAULTS, make  # type: ignore[import-not-found]
+from fixtures.faulty_stacks import GRADED, RIGS, TONES, make  # type: ignore[import-not-found]
 
 from reconstruction.stack_diagnosis import diagnose_stack
 
+TABLE = Path(__file__).with_name("pain_suite.csv")
+N_SOUND = 20
+"""Sound sets per rig, tone and seed."""
 
-def find(fault: str, seed: int) -> tuple[set[tuple[str, tuple[int, ...]]], tuple[int, ...]]:
-    """Return the findings of a set, and the numbers of its faulty images."""
-    stack = make(fault, seed)
+
+def list_sets(seeds: int, first: int) -> Iterator[dict[str, Any]]:
+    """Yield the sets: fault, severity, rig, tone and seed, none of which is used twice."""
+    with TABLE.open() as file:
+        rows = [(one["fault"], one["severity"]) for one in csv.DictReader(file)]
+    rows += [("", "")] * N_SOUND
+    seed = first
+    for _, rig, tone, (fault, severity) in product(range(seeds), RIGS, TONES, rows):
+        yield {"fault": fault, "severity": severity, "rig": rig, "tone": tone, "seed": seed}
+        seed += 1
+
+
+def judge(one: dict[str, Any], side: int) -> dict[str, Any]:
+    """Return a set with its findings: [fault, numbers of the images from 0] each."""
+    severity = float(one["severity"]) if one["severity"] else None
+    options = {"severity": severity, "rig": one["rig"], "tone": one["tone"]}
+    stack = make(one["fault"], one["seed"], side=side, **options)
     found = diagnose_stack(
         stack.images,
         stack.lights,
@@ -33,35 +58,81 @@ def find(fault: str, seed: int) -> tuple[set[tuple[str, tuple[int, ...]]], tuple
         inside=stack.inside,
         rng=np.random.default_rng(0),
     )
-    return {(one.fault, one.frames) for one in found.findings}, stack.frames
+    findings = [[each.fault, list(each.frames)] for each in found.findings]
+    return one | {"frames": list(stack.frames), "findings": findings}
+
+
+def count(judged: list[dict[str, Any]]) -> Counter[str]:
+    """Return how many sets have any finding, the right one, and the right images."""
+    total: Counter[str] = Counter(sets=len(judged))
+    for one in judged:
+        name = GRADED.get(one["fault"])
+        total["any"] += bool(one["findings"])
+        total["found"] += any(fault == name for fault, _ in one["findings"])
+        total["named"] += [name, one["frames"]] in one["findings"]
+        total["single"] += bool(one["frames"])
+        total["named single"] += bool(one["frames"]) and [name, one["frames"]] in one["findings"]
+    return total
+
+
+def print_tables(judged: list[dict[str, Any]]) -> None:
+    """Print one row per fault and severity, then the totals above the stated severity."""
+    with TABLE.open() as file:
+        rows = list(csv.DictReader(file))
+    sets = defaultdict(list)
+    for one in judged:
+        sets[one["fault"], one["severity"]].append(one)
+    print("| fault | severity | sets | any, right finding | right images |")
+    print("| --- | --- | --- | --- | --- |")
+    above = []
+    for row in rows:
+        of_row = sets[row["fault"], row["severity"]]
+        total = count(of_row)
+        above += of_row if row["stated"] == "yes" else []
+        severity = f"{row['severity']} {row['unit']}" + " (below)" * (row["stated"] == "no")
+        print(
+            f"| {row['fault']} | {severity} | {total['sets']} | {total['any']}, {total['found']} "
+            f"| {total['named']} |"
+        )
+    total = count(above)
+    print(
+        f"stated severity or more: {total['sets']} sets, {total['any']} with a finding, "
+        f"{total['found']} with the right one; right images in {total['named single']} of "
+        f"{total['single']} sets with faults of single images"
+    )
+    sound = sets["", ""]
+    print(f"sound: {count(sound)['any']} of {len(sound)} sets with a finding")
+    for name in ("rig", "tone"):
+        for value in {one[name]: None for one in judged}:
+            chosen = count([one for one in above if one[name] == value])
+            alarms = count([one for one in sound if one[name] == value])
+            print(
+                f"{value}: {chosen['found']} of {chosen['sets']}; "
+                f"sound {alarms['any']} of {alarms['sets']}"
+            )
 
 
 def main() -> None:
-    """Judge all faults on the seeds that the command line gives."""
+    """Judge the sets that the command line gives, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=24, help="sets of each fault")
-    parser.add_argument("--first", type=int, default=1000, help="first seed; none is used twice")
+    parser.add_argument("--seeds", type=int, default=1, help="sets per row, rig and tone")
+    parser.add_argument("--first", type=int, default=20_000, help="first seed")
+    parser.add_argument("--side", type=int, default=64, help="pixels")
+    parser.add_argument("--out", type=Path, help="file of the finished sets")
     given = parser.parse_args()
-    seed = given.first
-    print("| fault | sets | found | right images | other findings |")
-    print("| --- | --- | --- | --- | --- |")
-    total: Counter[str] = Counter()
-    for fault, name in FAULTS.items():
-        count: Counter[str] = Counter()
-        for _ in range(given.seeds):
-            found, frames = find(fault, seed)
-            seed += 1
-            count["found"] += any(one == name for one, _ in found)
-            count["named"] += (name, frames) in found
-            count["others"] += any(one != name for one, _ in found)
-        total += count
-        counts = " | ".join(str(count[key]) for key in ("found", "named", "others"))
-        print(f"| {fault} | {given.seeds} | {counts} |", flush=True)
-    sets = given.seeds * len(FAULTS)
-    print(f"| all | {sets} | {total['found']} | {total['named']} | {total['others']} |")
-    sound = 4 * given.seeds
-    alarms = sum(bool(find("", seed + number)[0]) for number in range(sound))
-    print(f"false alarms on sound sets: {alarms} of {sound}")
+    lines = given.out.read_text().splitlines() if given.out and given.out.exists() else []
+    judged = [json.loads(line) for line in lines]
+    done = {one["seed"] for one in judged}
+    for one in list_sets(given.seeds, given.first):
+        if one["seed"] in done:
+            continue
+        judged.append(judge(one, given.side))
+        if given.out:
+            with given.out.open("a") as file:
+                file.write(json.dumps(judged[-1]) + "\n")
+        print(f"\r{len(judged)} sets", end="", file=sys.stderr, flush=True)
+    print(file=sys.stderr)
+    print_tables(judged)
 
 
 if __name__ == "__main__":

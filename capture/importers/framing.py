@@ -5,12 +5,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from capture import raw
 from capture.arrays import UInt16Array
 from capture.documents import Fault
+from capture.importers.face_finding import find_face, frame_face
 from capture.importers.images import Photo, PhotoError
 
 MIN_SIDE_PX = 16
 """Least side of a cropped or reduced photograph, pixels."""
+FACE_CROP = "face"
+"""Crop that asks for the face's surroundings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +26,8 @@ class Framing:
     whole photograph."""
     max_width_px: int | None = None
     """Width that photographs may have; wider ones are reduced by a whole factor. None: any."""
+    around_face: bool = False
+    """Whether `locate` replaces the crop by one around the face of each photograph."""
 
     @classmethod
     def parse(cls, crop: str | None, max_width_px: int | None) -> "Framing":
@@ -30,7 +36,7 @@ class Framing:
         Parameters
         ----------
         crop
-            ``X,Y,WIDTH,HEIGHT`` in pixels, or None.
+            ``X,Y,WIDTH,HEIGHT`` in pixels, ``face``, or None.
         max_width_px
             See `Framing`.
 
@@ -48,15 +54,66 @@ class Framing:
             raise PhotoError(f"width: got {max_width_px}, expected {MIN_SIDE_PX} or more pixels")
         if crop is None:
             return cls(None, max_width_px)
+        if crop == FACE_CROP:
+            return cls(None, max_width_px, around_face=True)
         match = re.fullmatch(r"(\d{1,6}),(\d{1,6}),(\d{1,6}),(\d{1,6})", crop.replace(" ", ""))
         numbers = [int(part) for part in match.groups()] if match else [0] * 4
         if min(numbers[2:]) < MIN_SIDE_PX:
             raise PhotoError(
                 f"crop: got {crop!r}, expected X,Y,WIDTH,HEIGHT in pixels, sides of "
-                f"{MIN_SIDE_PX} or more"
+                f"{MIN_SIDE_PX} or more, or {FACE_CROP}"
             )
         left, top, width, height = numbers
         return cls((left, top, width, height), max_width_px)
+
+    def locate(self, photo: Photo, *, where: str) -> tuple["Framing", tuple[float, ...]]:
+        """Return the framing of one photograph, and its face relative to the cropped image.
+
+        Parameters
+        ----------
+        photo
+            The photograph.
+        where
+            File name for messages.
+
+        Returns
+        -------
+        Framing
+            With the crop around the face, if `around_face`.
+        tuple
+            Left, top, width and height of the face's square over those of the crop; empty without
+            `around_face`.
+
+        Raises
+        ------
+        PhotoError
+            If the photograph shows no face.
+        """
+        if not self.around_face:
+            return self, ()
+        frame = photo.frame
+        gray = frame.pattern == "MONO"
+        scale = 2 if photo.encoding == "raw" and not gray else 1
+        if gray:
+            rgb = frame.cfa[..., None] - np.float32(min(frame.black))
+        else:
+            rgb = raw.linear_rgb(frame, demosaic="superpixel").rgb
+            rgb = rgb / np.float32(1.0 if frame.neutral is None else frame.neutral)
+        face = find_face(rgb)
+        if face is None:
+            size = f"{scale * rgb.shape[1]} x {scale * rgb.shape[0]} px"
+            wanted = "an upright face seen from the front"
+            raise PhotoError(
+                "shows no face that was found",
+                where=where,
+                faults=[Fault("crop", f"{FACE_CROP}, in {size}", wanted)],
+                advice="Give the crop as X,Y,WIDTH,HEIGHT in pixels.",
+            )
+        crop = frame_face(face, (rgb.shape[1], rgb.shape[0]))
+        (left, top, width, height), (x, y, across, down) = crop, face
+        relative = (x - left) / width, (y - top) / height, across / width, down / height
+        chosen = tuple(scale * length for length in crop)
+        return replace(self, crop_px=chosen, around_face=False), relative
 
     def apply(self, photo: Photo, *, where: str) -> Photo:
         """Return the chosen part of a photograph; its pixels are means of whole blocks.

@@ -278,6 +278,7 @@ def _check_png(data: bytes, where: str) -> tuple[str, list[str]]:
     return "PNG", notes
 
 
+_EXIF_POINTER, _COLOR_SPACE_TAG, _UNCALIBRATED = 0x8769, 0xA001, 0xFFFF
 _JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
@@ -307,6 +308,8 @@ def _check_jpeg(data: bytes, where: str) -> tuple[str, list[str]]:
             sized = True
         if marker == 0xE2 and body.startswith(b"ICC_PROFILE\0") and b"sRGB" not in body:
             notes.append("its color profile was not applied; the colors count as sRGB")
+        if marker == 0xE1 and body.startswith(b"Exif\0\0") and _is_uncalibrated(body[6:]):
+            notes.append("its EXIF names no sRGB (uncalibrated color); the colors count as sRGB")
         at += 2 + length
         if marker == 0xDA:
             break
@@ -314,6 +317,18 @@ def _check_jpeg(data: bytes, where: str) -> tuple[str, list[str]]:
     if not sized or data.find(b"\xff\xd9", at) < 0:
         raise cut
     return "JPEG", list(dict.fromkeys(notes))
+
+
+def _is_uncalibrated(tiff: bytes) -> bool:
+    """Return whether EXIF data state a color space that is not sRGB (Exif 2.32, tag 0xA001)."""
+    from PIL.Image import Exif
+
+    found = Exif()
+    try:
+        found.load(b"Exif\0\0" + tiff)
+        return found.get_ifd(_EXIF_POINTER).get(_COLOR_SPACE_TAG) == _UNCALIBRATED
+    except (SyntaxError, ValueError, struct.error, OSError):  # damaged: the pixels may be right
+        return False
 
 
 def _linear(pixels: NDArray[Any], notes: list[str], white_value: float | None) -> Photo:

@@ -67,6 +67,9 @@ class _Entry:
     iso: int | None
     notes: tuple[str, ...]
     white_value: float | None
+    framing: Framing
+    face: tuple[float, ...]
+    """Square of the face relative to the image, see `Framing.locate`; empty: not looked for."""
 
     @property
     def camera(self) -> tuple[object, ...]:
@@ -146,13 +149,18 @@ def import_photos(
     used, views = _rig(entries, rig, camera_serial, sensitivity, light)
     steps = _steps(entries, views, kind)
     assumed = _assumptions(entries, made_up=rig is None, light=light, camera=used.views[0])
+    assumed += _list_unequal_partners(steps)
     plan = Plan(used.name, tuple(step for step, _ in steps))
-    listed = [{"step": s.id, "sha256": e.sha256, "encoding": e.encoding} for s, e in steps]
+    listed = [
+        {"step": s.id, "sha256": e.sha256, "encoding": e.encoding}
+        | ({"face": list(e.face)} if e.face else {})
+        for s, e in steps
+    ]
     extra = {"assumed": assumed, "photographs": listed}
     target = Path(out)
     with create_imported_session(target, plan, used, subject, extra, clock) as session:
         for step, entry in steps:
-            _commit(session, step, entry, framing, clock)
+            _commit(session, step, entry, clock)
     states = tuple(dict.fromkeys(str(step.index["state"]) for step, _ in steps))
     color = {str(step.index["state"]) for step, entry in steps if entry.view.cfa != "MONO"}
     colored = tuple(state for state in states if state in color)
@@ -190,6 +198,7 @@ def _files(directory: Path) -> tuple[list[Path], list[str]]:
 def _inspect(files: Sequence[Path], framing: Framing) -> list[_Entry]:
     """Decode every file once, so that a bad one is found before anything is written."""
     entries, faults = [], []
+    placed: dict[tuple[str, tuple[int, ...]], tuple[Framing, tuple[float, ...]]] = {}
     for file in files:
         try:
             photo = read_photo(file)
@@ -200,7 +209,12 @@ def _inspect(files: Sequence[Path], framing: Framing) -> list[_Entry]:
             reason = f"one that {exc.what}" + (f" ({found})" if found else "")
             faults.append(Fault(file.name, reason, "a photograph"))
             continue
-        entries.append(_entry(file, framing.apply(photo, where=str(file))))
+        # the two polarizer states of one photograph keep one crop
+        key = _parse_stem(file.stem)[0], photo.frame.cfa.shape
+        if key not in placed:
+            placed[key] = framing.locate(photo, where=str(file))
+        own, face = placed[key]
+        entries.append(_entry(file, own.apply(photo, where=str(file)), own, face))
     if faults:
         raise PhotoError(
             f"{len(faults)} of {len(files)} files cannot be imported",
@@ -220,7 +234,7 @@ def _inspect(files: Sequence[Path], framing: Framing) -> list[_Entry]:
     ]
 
 
-def _entry(file: Path, photo: Photo) -> _Entry:
+def _entry(file: Path, photo: Photo, framing: Framing, face: tuple[float, ...]) -> _Entry:
     frame = photo.frame
     view = make_placeholder_view(frame, analyzer_axis_deg=0.0)
     return _Entry(
@@ -232,6 +246,8 @@ def _entry(file: Path, photo: Photo) -> _Entry:
         frame.iso,
         photo.notes,
         photo.white_value,
+        framing,
+        face,
     )
 
 
@@ -344,14 +360,24 @@ def _assumptions(
     return texts
 
 
-def _commit(
-    session: Session, step: Step, entry: _Entry, framing: Framing, clock: Callable[[], datetime]
-) -> None:
+def _list_unequal_partners(steps: Sequence[tuple[Step, _Entry]]) -> list[str]:
+    """Return the pairs of polarizer states whose photographs cannot be subtracted."""
+    pairs: dict[object, list[_Entry]] = {}
+    for step, entry in steps:
+        pairs.setdefault(step.index["state"], []).append(entry)
+    return [
+        f"{' and '.join(entry.file.name for entry in pair)} differ in color or size, so that no "
+        "specular image follows from them"
+        for pair in pairs.values()
+        if len({(entry.view.cfa, entry.view.width_px, entry.view.height_px) for entry in pair}) > 1
+    ]
+
+
+def _commit(session: Session, step: Step, entry: _Entry, clock: Callable[[], datetime]) -> None:
     (view,) = step.cameras
+    photo = read_photo(entry.file, white_value=entry.white_value)
     frame = replace(
-        framing.apply(
-            read_photo(entry.file, white_value=entry.white_value), where=str(entry.file)
-        ).frame,
+        entry.framing.apply(photo, where=str(entry.file)).frame,
         camera_serial=session.rig.view(view).serial,
         step_id=step.id,
         session_id=session.id,

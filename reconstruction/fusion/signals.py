@@ -50,12 +50,16 @@ PRESSED_BLOOD: Final = (0.5, 0.5)
 
 Pressure takes blood out of the skin (Reif et al. 2008, doi:10.1117/1.2870115); its amount is
 assumed."""
-SIGMA_TR_OFFSET: Final = np.array([-0.3, -0.55, -0.65])
-"""Log sigma_tr of a probe's red, green and blue light on layered skin, less the dermis's.
+SIGMA_TR_DISTANCE_MM: Final = 4.0
+"""Distance from the source at which the light of a probe's channel has its sigma_tr.
 
-The dermis's is a mean over the wavelengths of a channel, but those absorbed least travel farthest.
-Set on two simulated people, types III and V."""
-SIGMA_TR_SD: Final = (0.15, 0.1)
+Light of the least absorbed wavelengths travels farthest: at this distance they have most of a
+channel's weight. Set on nine simulated people, types I to VI; see docs/validation/fusion.md."""
+SIGMA_TR_OFFSET: Final = -0.06
+"""Log sigma_tr of a probe's light on layered skin, less the dermis's at that distance.
+
+Set on the same people."""
+SIGMA_TR_SD: Final = (0.07, 0.05)
 """Deviation of log sigma_tr of a probe on layered, pressed skin from the dermis's: standard
 deviations common to the channels, and of each channel."""
 
@@ -85,14 +89,18 @@ class RigBands:
     def log_signals(self, skin: Float64Array) -> Float64Array:
         """Return the three signals of skin (..., 8), see `model.tissue_optics.skin_spectra`.
 
-        sigma_tr is the mean of its logarithm over the wavelengths of a channel, plus
-        `SIGMA_TR_OFFSET`, of skin with `PRESSED_BLOOD`.
+        sigma_tr is the mean over a channel's light at `SIGMA_TR_DISTANCE_MM` from the source, its
+        logarithm plus `SIGMA_TR_OFFSET`, of skin with `PRESSED_BLOOD`.
         """
         bands = self.bands
         if self.kind == "sigma_tr":
             pressed = skin * np.where(np.arange(skin.shape[-1]) == 1, PRESSED_BLOOD[0], 1.0)
-            log_mean = log_sigma_tr(bands.wavelength_nm, pressed) @ bands.weights
-            return np.asarray(log_mean + SIGMA_TR_OFFSET)
+            sigma_tr = np.exp(log_sigma_tr(bands.wavelength_nm, pressed))
+            # shifted by the least sigma_tr, as exponentials far from the source underflow
+            far = sigma_tr - sigma_tr.min(axis=-1, keepdims=True)
+            light = np.exp(-SIGMA_TR_DISTANCE_MM * far)
+            mean = (light * sigma_tr) @ bands.weights / (light @ bands.weights)
+            return np.asarray(np.log(mean) + SIGMA_TR_OFFSET)
         return bands.log_signals(skin)
 
 

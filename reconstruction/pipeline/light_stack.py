@@ -23,7 +23,7 @@ from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.masked_map import masked_map
 from reconstruction.stack_diagnosis import Diagnosis, diagnose_stack
 
-STAGE_REVISION = 4
+STAGE_REVISION = 5
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = ("normals", "albedo", "residual")
@@ -33,6 +33,13 @@ MEMORY_BYTES = 2**30
 """Stacks above this size are stored in a file, not in memory."""
 MIN_KEPT_IMAGES = 4
 """Images without which none is left out."""
+CORRECTED_FAULTS = frozenset(
+    {
+        *("order of lights", "swapped lights", "wrong light", "moved image", "mirrored image"),
+        *("empty image", "dead light", "padded image", "full-bright image"),
+    }
+)
+"""Faults without effect on the maps: another order is used, or the images are left out."""
 OUTLIER_SIGMAS = 4.0
 
 
@@ -64,6 +71,13 @@ class StackLights:
     alive: BoolArray
     stderr_rad: float
     """Standard error of the directions, where they were estimated from the images; else 0."""
+    faults: tuple[str, ...] = ()
+    """Faults of the images that the maps still have."""
+
+    @property
+    def warning(self) -> str:
+        """Mark for the description of each map; empty without faults."""
+        return f"; images have faults: {', '.join(self.faults)}" if self.faults else ""
 
 
 def graph(inputs: Inputs) -> list[stages.PipelineStage]:
@@ -145,9 +159,11 @@ def _lights(inputs: Inputs, stack: LightStack) -> StackLights:
         return StackLights(vectors, near, scale, alive, stderr_rad)
     inputs.assumed += [f"{one.fault}: {one.evidence}; {one.remedy}" for one in found.findings]
     inputs.noted["diagnosis"] = [one.to_json() for one in found.findings]
+    corrected: frozenset[str] = frozenset()
     if np.count_nonzero(~found.left_out) >= MIN_KEPT_IMAGES:
-        alive = ~found.left_out
-    return StackLights(vectors[found.order], near, scale, alive, stderr_rad)
+        alive, corrected = ~found.left_out, CORRECTED_FAULTS
+    faults = dict.fromkeys(one.fault for one in found.findings if one.fault not in corrected)
+    return StackLights(vectors[found.order], near, scale, alive, stderr_rad, tuple(faults))
 
 
 def _listed_lights(session: Session, stack: LightStack) -> tuple[Float64Array, bool, float]:
@@ -267,8 +283,8 @@ def _normals(inputs: Inputs, stack: LightStack, lights: StackLights) -> Mapping[
     stderr_rad = np.hypot(best.stderr_rad, lights.stderr_rad)
     each = stderr_rad[..., None] / np.sqrt(2.0) * np.sqrt(np.maximum(1.0 - n**2, 0.0))
     relative = best.residual / np.where(valid, best.albedo, 1.0)
-    frame = "image frame: x right, y up, z towards the camera"
-    misfit = "root mean square misfit over albedo"
+    frame = "image frame: x right, y up, z towards the camera" + lights.warning
+    misfit = "root mean square misfit over albedo" + lights.warning
     return {
         "normals": masked_map(n, each, valid, MAP_UNITS["normals"], frame),
         "residual": masked_map(relative, None, valid, MAP_UNITS["residual"], misfit),
@@ -312,5 +328,5 @@ def _albedo(
     errors = np.broadcast_to(error[..., None], albedo.shape)
     if channels == 1:
         albedo, errors = albedo[..., 0], errors[..., 0]
-    what = "over what the lights give a white surface, up to one factor"
+    what = "over what the lights give a white surface, up to one factor" + lights.warning
     return masked_map(albedo, errors, valid, "1", what)

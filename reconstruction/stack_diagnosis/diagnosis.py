@@ -229,6 +229,11 @@ def _find_in_images(
     albedo = np.where(valid, maps.albedo, 0.0).astype(np.float64)
     shading = np.maximum(np.einsum("hwi,ni->nhw", normals, rows), 0.0)
     findings = list(axis_faults.find_axes(normals, valid))
+    if not findings:  # wrong axes change shading along rows
+        predicted = albedo * shading[used]
+        findings += light_faults.find_flicker(
+            stack.gray[used], stack.usable[used], valid, predicted
+        )
     findings += light_faults.find_ambient(stack.gray[used], valid, normals, albedo, rows[used])
     relit = np.maximum(np.einsum("hwi,ni->nhw", normals, directions[kept]), 0.0)
     moved = frame_faults.find_moved(

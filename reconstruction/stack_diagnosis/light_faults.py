@@ -30,6 +30,9 @@ MIN_NEAR_COEFFICIENT, MIN_NEAR_SIGMAS = 0.15, 6.0
 """Twice half a width of the object over the distance of the lights, and its certainty."""
 STRENGTH_RANGE = (0.75, 1.35)
 MIN_DRIFT, MIN_DRIFT_SIGMAS = 0.05, 6.0
+MIN_FLICKER = 0.025
+"""Spread of the light from line to line, relative, beyond that across the lines."""
+MIN_LINES, MIN_LINE_SAMPLES = 16, 8
 
 
 def _decode_srgb(values: Float64Array) -> Float64Array:
@@ -197,6 +200,56 @@ def _fit_near(
     whole = max(float(below.sum()), 1e-30)
     coefficient = float(above.sum()) / whole
     return coefficient, float(np.sqrt(np.sum((above - coefficient * below) ** 2))) / whole
+
+
+def find_flicker(
+    gray: Float64Array, usable: BoolArray, inside: BoolArray, predicted: Float64Array
+) -> Iterator[Finding]:
+    """Yield that the light changes from row to row: rolling shutters image flicker as bands.
+
+    Each image is compared with its matte shading line by line, without a smooth trend. What
+    surface and highlights leave is alike along rows and columns; bands lie along one of them.
+
+    Parameters
+    ----------
+    gray, usable
+        (N, H, W).
+    inside
+        (H, W).
+    predicted
+        (N, H, W), by normals and albedo of all images.
+    """
+    spreads = []
+    for image, clear, shading in zip(gray, usable, predicted, strict=True):
+        lit = inside & clear & (image > 0.0)
+        if not lit.any():
+            continue
+        lit &= shading > 0.3 * np.quantile(shading[inside], 0.9)
+        ratio = np.where(lit, np.log(np.where(lit, image, 1.0) / np.where(lit, shading, 1.0)), 0.0)
+        spreads.append(
+            [_spread_of_lines(one, good) for one, good in ((ratio, lit), (ratio.T, lit.T))]
+        )
+    if not spreads:
+        return
+    rows, columns = np.median(np.array(spreads), axis=0)
+    excess = float(np.sqrt(abs(rows**2 - columns**2)))
+    if excess > MIN_FLICKER:
+        name = "row to row" if rows > columns else "column to column"
+        yield Finding(
+            "rolling flicker", (),
+            f"light changes by {excess:.1%} from {name} in most images", excess, MIN_FLICKER,
+            "use lamps without flicker, or exposure times of whole periods of the mains",
+        )  # fmt: skip
+
+
+def _spread_of_lines(ratio: Float64Array, good: BoolArray) -> float:
+    """Return the robust standard deviation of the medians of lines, without their trend."""
+    lines = np.flatnonzero(good.sum(axis=1) >= MIN_LINE_SAMPLES)
+    if len(lines) < MIN_LINES:
+        return 0.0
+    level = np.array([float(np.median(ratio[line, good[line]])) for line in lines])
+    rest = level - np.polyval(np.polyfit(lines, level, 2), lines)
+    return 1.4826 * float(np.median(np.abs(rest)))
 
 
 def find_strengths(strength: Float64Array, right: BoolArray) -> Iterator[Finding]:

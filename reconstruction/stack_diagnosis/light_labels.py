@@ -20,6 +20,8 @@ MIN_RESIDUAL_RATIO = 3.0
 """Residual under the listed light over that under the estimated one that shows a wrong light."""
 GOOD_SCORE_DEG = 1.5
 """Mean angle up to which no other order is tried: some orders are nearly rotations of the list."""
+SWAPPED_RATIO = 1.5
+"""Angle of a light from its row over that from the row of another, if the two are exchanged."""
 SCORE_RATIO = 0.5
 """Ratio of mean angles below which another order is taken."""
 
@@ -50,8 +52,10 @@ def find_order(
     findings: list[Finding] = []
     if agreement.score_deg > GOOD_SCORE_DEG:
         listed_deg = agreement.score_deg
-        name, order, agreement = _best_order(lights, directions, rng, (order, agreement))
-        if name:
+        name, found, closer = _best_order(lights, directions, rng, (order, agreement))
+        # two exchanged lights are named by themselves
+        if name and np.count_nonzero(found != order) > 2:
+            order, agreement = found, closer
             evidence = (
                 f"lights are {listed_deg:.1f} degrees from the list on average, "
                 f"{agreement.score_deg:.1f} if the list is {name}"
@@ -126,18 +130,23 @@ def _explain_wrong(
     """Explain the lights that disagree: exchanged in pairs, repeated, or in another direction."""
     cosine = np.clip(agreement.directions @ directions.T, -1.0, 1.0)
     apart = np.degrees(np.arccos(cosine))  # of image i from row j
+    own = agreement.angle_deg
     mutual = [
-        (float(apart[i, order[j]] + apart[j, order[i]]), i, j)
+        (float(apart[i, order[j]] + apart[j, order[i]]), min(i, j), max(i, j))
         for i in wrong
-        for j in wrong
-        if i < j and max(apart[i, order[j]], apart[j, order[i]]) < agreement.limit_deg
+        for j in range(len(order))
+        if i != j
+        and max(apart[i, order[j]], apart[j, order[i]]) < agreement.limit_deg
+        and own[j] > SWAPPED_RATIO * max(apart[j, order[i]], 0.5 * agreement.limit_deg)
     ]
     findings: list[Finding] = []
     left = set(wrong)
+    free = set(range(len(order)))
     for _, i, j in sorted(mutual):
-        if not {i, j} <= left:
+        if not {i, j} <= free:
             continue
         left -= {i, j}
+        free -= {i, j}
         evidence = (
             f"image {i + 1} is lit from light {order[j] + 1}, "
             f"image {j + 1} from light {order[i] + 1}"

@@ -33,6 +33,8 @@ class BenchmarkStage:
     """Whether sizes are small; limits are then not evaluated and may be missing."""
     smoke: bool = False
     """Whether to call each function once only, as a check that it runs."""
+    selection: str = ""
+    """Rig to measure, for the stage of whole captures; empty: all rigs."""
     points: list[Point] = field(default_factory=list)
     """Measured settings, in the order of the report."""
     limits: LimitValues = field(default_factory=dict)

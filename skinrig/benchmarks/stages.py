@@ -30,10 +30,12 @@ class BenchError(ValueError):
     """Stage name that the table of stages does not contain."""
 
 
-def _iterate_results(name: str, *, toy: bool, smoke: bool = False) -> Iterator[StageBenchmark]:
+def _iterate_results(
+    name: str, *, toy: bool, smoke: bool = False, selection: str = ""
+) -> Iterator[StageBenchmark]:
     """Yield the stage's results: a long stage after each of its parts, any stage at its end."""
     module, function = STAGES[name].rsplit(".", 1)
-    stage = BenchmarkStage(name, toy=toy, smoke=smoke)
+    stage = BenchmarkStage(name, toy=toy, smoke=smoke, selection=selection)
     run = getattr(import_module(f"skinrig.benchmarks.{module}"), function)
     for _ in run(stage) or ():
         yield stage.to_benchmark()
@@ -41,7 +43,13 @@ def _iterate_results(name: str, *, toy: bool, smoke: bool = False) -> Iterator[S
 
 
 def run_stages(
-    names: Sequence[str] | None, *, budget_s: float, toy: bool, out: Path | None, console: Console
+    names: Sequence[str] | None,
+    *,
+    budget_s: float,
+    toy: bool,
+    out: Path | None,
+    console: Console,
+    selection: str = "",
 ) -> dict[str, Any]:
     """Measure stages within a budget, and return the document of the run.
 
@@ -59,6 +67,8 @@ def run_stages(
         Folder for ``bench.json``; None writes nothing.
     console
         Receives results and progress.
+    selection
+        Rig that the stage of whole captures measures; empty: all rigs.
 
     Returns
     -------
@@ -77,6 +87,7 @@ def run_stages(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)  # folder errors are raised before any stage runs
     run = _Run(console, time.perf_counter() + budget_s, requested=bool(names), toy=toy, out=out)
+    run.selection = selection
     run.to_do = list(chosen)
     small = toy or not names
     for name in chosen:
@@ -101,6 +112,8 @@ class _Run:
     requested: bool
     """Whether stages were requested by name; a missing optional package is then an error."""
     toy: bool = False
+    selection: str = ""
+    """Rig that the stage of whole captures measures; empty: all rigs."""
     out: Path | None = None
     """Folder of the document, which is written after each stage; None writes nothing."""
     to_do: list[str] = field(default_factory=list)
@@ -131,7 +144,10 @@ class _Run:
             return
         self.console.progress(f"bench {name}, {size} size")
         try:
-            for made in _iterate_results(name, toy=size == "small", smoke=self.toy):
+            made_so_far = _iterate_results(
+                name, toy=size == "small", smoke=self.toy, selection=self.selection
+            )
+            for made in made_so_far:
                 if name in self.to_do:
                     self._take(name, made, size)
                     self.save()

@@ -12,6 +12,7 @@ from skinrig.exporting.options import ExportSettings, SkinPosition
 
 NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
     "maps": "read maps.json: units, ranges and frames; maps.mtlx holds the color spaces",
+    "ome-zarr": "in Python: xarray.open_zarr('DIR/maps.zarr', group='MAP', consolidated=False)",
     "mtlx": "load skin.mtlx on skin.obj; material.json lists the scene unit and assumptions",
     "gltf": "open skin.glb; in Blender, run skin_in_blender.py for subsurface scattering",
     "usd": "open skin.usdc, in Blender with skin_in_blender.py; usd.json lists assumptions",
@@ -26,7 +27,7 @@ NEXT_STEP_BY_FORMAT: Final[Mapping[str, str]] = {
 
 
 FORMATS: Final = (
-    *("maps", "mtlx", "gltf", "usd", "spectral", "metahuman", "merl", "rgl"),
+    *("maps", "ome-zarr", "mtlx", "gltf", "usd", "spectral", "metahuman", "merl", "rgl"),
     *("mhl", "frames", "event-model", "lp", "stokes", "zarr", "mitsuba"),
 )
 """Formats of appearances, then of sessions; the writers are imported with the chosen one."""
@@ -136,8 +137,9 @@ def export(
     source
         APPEARANCE/ or SESSION/ folder.
     to
-        Format. Appearance: maps, mtlx, gltf, usd, spectral, metahuman, merl, rgl. Session: mhl,
-        frames, lp, stokes, event-model, zarr, mitsuba (simulated dome, flash, gradient).
+        Format. Appearance: maps, ome-zarr, mtlx, gltf, usd, spectral, metahuman, merl, rgl.
+        Session: mhl, frames, lp, stokes, event-model, zarr, mitsuba (simulated dome, flash,
+        gradient).
     use
         Purpose of the copy, such as research, which the subjects' consent must include; required
         for measured data.

@@ -12,7 +12,7 @@ from skinrig.commands.renamed_options import format_notice, renamed_options_of, 
 from skinrig.errors import UnusableError, UsageError
 
 HELP_SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
-    ("Start here", ("demo", "doctor")),
+    ("Start here", ("demo", "photo", "doctor")),
     (
         "Capture with a rig or its simulation",
         ("plan", "simulate", "capture", "serve", "calibrate", "import", "diagnose", "verify"),

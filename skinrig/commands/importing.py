@@ -52,7 +52,8 @@ def import_photos(
     target
         Photographed target, a color chart in the light of the photographs; default: a subject.
     crop
-        Part of each photograph, X,Y,WIDTH,HEIGHT in pixels from the upper left; default: all.
+        Part of each photograph: X,Y,WIDTH,HEIGHT in pixels from the upper left, or face, which
+        finds the face and keeps only its skin in the maps; default: all.
     width
         Largest width of the imported images, pixels: wider ones are averaged by whole factors.
     subject
@@ -93,6 +94,47 @@ def import_photos(
         "skinrig.import/1",
         select_attributes(done, "path", "frames", "assumed", "states", "ignored"),
     )
+
+
+@command
+def photo(
+    photograph: Path,
+    /,
+    out: Out,
+    width: int = 480,
+    subject: str = "unnamed",
+    consent: Consent = None,
+    consent_expires: ConsentExpires = None,
+    json: Json = False,
+) -> None:
+    """Estimate melanin and hemoglobin of the face in one photograph, and write a report.
+
+    The command finds the face, crops and reduces the photograph, and leaves out what is not skin.
+
+    Example: skinrig photo portrait.jpg --out portrait
+
+    Parameters
+    ----------
+    photograph
+        RAW, TIFF, EXR, PNG or JPEG file.
+    width
+        Largest width of the cropped image, pixels: a wider one is averaged by a whole factor.
+    subject
+        Pseudonym of the subject.
+    """
+    from skinrig.consent import parse_subject
+    from skinrig.importing.portraits import analyze_portrait
+
+    console = Console(json)
+    person = parse_subject(subject, consent, consent_expires)
+    done = analyze_portrait(
+        photograph, out, width_px=width, subject=person, progress=console.progress
+    )
+    console.print_each("assumed", done.assumed)
+    console.print_line(f"{done.appearance}: melanin, hemoglobin and the image")
+    console.print_line(f"{done.report}: open it in a browser")
+    values = select_attributes(done, "session", "appearance", "report", "assumed")
+    console.print_document("skinrig.photo/1", values)
 
 
 @import_app.command("mesh", cls=Command)
@@ -146,6 +188,7 @@ def import_olat(
     /,
     out: Out,
     lights: str | None = None,
+    camera: Path | None = None,
     mask: Path | None = None,
     encoding: Annotated[str, choice("auto", "sRGB", "linear")] = "auto",
     mm_per_px: float | None = None,
@@ -165,6 +208,9 @@ def import_olat(
     lights
         Light list: .lp, text, JSON or NumPy file, or folder of a chrome ball's images; estimate:
         from the images alone; default: found in the folder.
+    camera
+        transforms.json, or COLMAP's images.txt, in whose frame the list is; default: the list is in
+        the camera's own frame.
     mask
         Image whose bright pixels are the object; default: the folder's *mask* file, else all.
     encoding
@@ -180,7 +226,13 @@ def import_olat(
 
     console = Console(json)
     person = parse_subject(subject, consent, consent_expires)
-    found = find_lights(directory, lights=lights, mask=mask, encoding=encoding)  # type: ignore[arg-type]
+    found = find_lights(
+        directory,
+        lights=lights,
+        mask=mask,
+        encoding=encoding,  # type: ignore[arg-type]
+        camera=camera,
+    )
     done = import_light_list(
         directory,
         out=out,

@@ -17,6 +17,8 @@ from skinrig.kernel_cache import set_passive_waiting
 
 BUDGET_S = 600.0
 """Default time of a benchmark."""
+END_TO_END_STAGE = "end-to-end"
+"""Stage of whole captures."""
 
 
 @command
@@ -34,6 +36,7 @@ def bench(
     budget: Annotated[float | None, typer.Option(show_default=False)] = None,
     smoke: bool = False,
     extremes: bool = False,
+    end_to_end: str = "",
     out: Path | None = None,
     json: Json = False,
 ) -> None:
@@ -49,12 +52,17 @@ def bench(
 
     Example: skinrig bench --extremes
 
+    Example: skinrig bench --end-to-end flash --out bench
+
     Parameters
     ----------
     smoke
         Run the smallest sizes only, without limits.
     extremes
         Run stiff and extreme cases instead of stages.
+    end_to_end
+        Rig whose errors of maps to measure against seconds from planning to maps: flash; default:
+        none.
     out
         Folder for bench.json, a table and plots, or for extremes.json; default: no files.
     more
@@ -68,8 +76,12 @@ def bench(
     # --stage takes one word only, so the names that follow it arrive as arguments
     stages = [*(stage or ()), *(more or ())] or None
     stages = replace_former_values(stages, FORMER_STAGES) if stages else None
-    if extremes and (smoke or budget is not None):
-        what = "--smoke" if smoke else "--budget"
+    if end_to_end:
+        if stages:
+            raise errors.UsageError("--end-to-end: not an option of --stage; remove one")
+        stages = [END_TO_END_STAGE]
+    if extremes and (smoke or budget is not None or end_to_end):
+        what = "--smoke" if smoke else "--end-to-end" if end_to_end else "--budget"
         raise errors.UsageError(f"{what}: not an option of --extremes; remove it")
     budget = BUDGET_S if budget is None else budget
     if not budget > 0:
@@ -86,7 +98,9 @@ def bench(
     else:
         from skinrig.benchmarks.stages import run_stages
 
-        document = run_stages(stages, budget_s=budget, toy=smoke, out=out, console=console)
+        document = run_stages(
+            stages, budget_s=budget, toy=smoke, out=out, console=console, selection=end_to_end
+        )
         if out is not None:
             bench_table.write_tables(document, out)
     console.print_document(document.pop("schema"), document)

@@ -41,6 +41,9 @@ class PlanOptions:
 
     Attributes
     ----------
+    budget
+        Minimize the error within this time from planning to maps, seconds or minutes, such as 60s
+        or 5min (flash only); default: no limit.
     min_valid_fraction
         Minimum fraction of the complete rig's valid pixels that stay valid, above 0, at most 1.
     forecast
@@ -54,6 +57,7 @@ class PlanOptions:
     """
 
     subject: Subject = "III"
+    budget: str = ""
     min_valid_fraction: float = 0.9
     forecast: Path | None = None
     out: Annotated[Path | None, typer.Option("--out", callback=check_output_file)] = None
@@ -99,6 +103,8 @@ def plan_flash(
     Example: skinrig plan flash --goals "melanin<=12%,hemoglobin<=25%" --subject II
 
     Example: skinrig plan flash --bands 450,580,600 --out plan.json
+
+    Example: skinrig plan flash --budget 60s --width 640
     """
     from capture.plan.led_bands import parse_bands
 
@@ -141,6 +147,7 @@ def _plan(
 ) -> None:
     """Choose a plan, print its forecast and write it."""
     from skinrig.planning.plans import choose, format_choice
+    from skinrig.planning.time_budget import parse_budget
     from skinrig.simulating.subject_records import find_unused_subject_keys
 
     console = Console(common.json)
@@ -158,6 +165,7 @@ def _plan(
         width_px=width,
         max_lights=max_lights,
         min_valid_fraction=common.min_valid_fraction,
+        budget_s=parse_budget(common.budget) if common.budget else None,
         leds=leds,
         **asked,
     )

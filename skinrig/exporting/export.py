@@ -17,6 +17,7 @@ from skinrig.exporting.sealing import ExportResult, export_sealed
 
 APPEARANCE_FORMATS: Final[Mapping[str, str]] = {
     "maps": "maps.write",
+    "ome-zarr": "ome_zarr.write",
     "mtlx": "materials.materialx.write",
     "gltf": "materials.gltf.write",
     "usd": "materials.usd.write",

@@ -25,6 +25,7 @@ from skinrig.appearances.dynamic import WRINKLES
 from skinrig.appearances.texel_placement import TexelPlacement, place_texels
 from skinrig.fitting import probe_sites
 from skinrig.fusing.description import describe_checks, describe_patch, describe_person
+from skinrig.fusing.filled_normals import MEASURED_SUFFIX, fill_normals
 from skinrig.fusing.maps import FUSED_MAPS, estimate_maps
 from skinrig.fusing.measurements import Measurements
 from skinrig.fusing.patches import PATCH_PREFIX, PlacedPatch, place_patch
@@ -178,7 +179,14 @@ def fuse_sources(
     carried = [name for name in maps if name not in FUSED_MAPS]
     position = base.appearance.maps.get("position")
     fused, p_value = estimate_maps(measured, person, errors, position=position, progress=report)
-    maps = {name: maps[name] for name in carried} | fused
+    maps = {name: maps[name] for name in carried}
+    if position is not None:
+        for name in [name for name in NORMAL_MAPS if name in maps]:
+            maps[name], measured_at = fill_normals(maps[name], position)
+            if measured_at is not None:
+                maps[f"{name}{MEASURED_SUFFIX}"] = measured_at
+    carried = list(maps)
+    maps |= fused
     color_rigs = [rig.rig for rig in measured.rigs if rig.kind == "reflectance"]
     provenance = {name: [base.rig] for name in carried}
     provenance |= {name: list(color_rigs) for name in fused}

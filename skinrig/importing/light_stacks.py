@@ -1,5 +1,6 @@
 """Find the lights of a folder of images: the list, the images that belong to it, or an estimate."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from capture.documents import Fault, InputError
+from capture.importers.camera_poses import read_camera_axes
 from capture.importers.image_stacks import LINEAR_MISFIT_RATIO, Encoding, encode_srgb
 from capture.importers.images import read_photo
 from capture.importers.imported_session import find_common_white
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
 
 ESTIMATE_LIGHTS: Final = "estimate"
 """Value of ``--lights`` under which the images themselves show their lights."""
+VIDEO_SUFFIXES = frozenset(".mp4 .mov .avi .mkv .webm .m4v".split())
+CAMERA_FOLDER = re.compile(r"(?i)(cam|view|c)[a-z]*[_-]?\d+$")
 MIN_SIGN_EVIDENCE = 0.1
 MIN_OBJECT_PX = 20
 
@@ -52,7 +56,12 @@ class FoundLights:
 
 
 def find_lights(
-    directory: Path, *, lights: str | None, mask: Path | None, encoding: Encoding
+    directory: Path,
+    *,
+    lights: str | None,
+    mask: Path | None,
+    encoding: Encoding,
+    camera: Path | None = None,
 ) -> FoundLights:
     """Find the lights of a folder of images of one object.
 
@@ -65,7 +74,9 @@ def find_lights(
     mask
         Image of the object; None: the folder's own.
     encoding
-        Of the values of 8-bit files; ``"auto"`` is resolved where lights are estimated.
+        Of the values of 8-bit files; ``"auto"`` is resolved where the images show it.
+    camera
+        transforms.json or COLMAP's images.txt, if the list is in the frame of that file.
 
     Raises
     ------
@@ -74,13 +85,69 @@ def find_lights(
     PhotometricStereoError
         When no list exists and the images do not determine their lights.
     """
+    _require_images(directory)
     if lights == ESTIMATE_LIGHTS:
+        if camera is not None:
+            raise LightListError.at(
+                "needs no camera", "camera", camera.name, "none", where=directory
+            )
         return _estimate_list(directory, mask, encoding)
     source = Path(lights) if lights else None
     try:
-        return FoundLights(find_light_list(directory, lights=source), encoding)
+        listed = find_light_list(directory, lights=source)
     except UnequalCountError as error:
-        return _without_special(directory, source, mask, encoding, error)
+        found = _without_special(directory, source, mask, encoding, error)
+    else:
+        unlisted = [file for file in find_images(directory) if file not in listed.images]
+        texts = (f"{file.name} is not in {listed.file}, and was left out" for file in unlisted)
+        found = FoundLights(listed, encoding, tuple(texts))
+    found = replace(found, encoding=_find_encoding(found.lights.images, mask, encoding))
+    if camera is None:
+        return found
+    axes = read_camera_axes(camera, found.lights.images)
+    turned = replace(found.lights, vectors=found.lights.vectors @ axes.T)
+    text = f"the lights are in the frame of {camera.name}, and were turned into the camera's"
+    return replace(found, lights=turned, assumed=(*found.assumed, text))
+
+
+def _require_images(directory: Path) -> None:
+    """Refuse a video, and folders of several cameras, with what to do."""
+    if directory.is_file() and directory.suffix.lower() in VIDEO_SUFFIXES:
+        raise LightListError(
+            "is a video",
+            where=str(directory),
+            advice="Write its frames to a folder, by `ffmpeg -i VIDEO frames/%05d.png` for one.",
+            code="SR-IMP-005",
+        )
+    if directory.is_dir():
+        try:
+            find_images(directory)
+        except LightListError as error:
+            below = [one.name for one in sorted(directory.iterdir()) if one.is_dir()]
+            views = [name for name in below if CAMERA_FOLDER.match(name)]
+            if len(views) < 2:
+                raise
+            raise LightListError(
+                error.what,
+                where=error.where,
+                faults=error.faults,
+                advice=f"Folders {views[0]} to {views[-1]} look like cameras. Normals under listed "
+                "lights are of one camera: name one folder; a list next to them is found.",
+                code=error.code,
+            ) from None
+
+
+def _find_encoding(files: Sequence[Path], mask: Path | None, encoding: Encoding) -> Encoding:
+    """Return the encoding of 8-bit files; ``"auto"`` where the images cannot show it."""
+    from reconstruction.stack_diagnosis.diagnosis import MIN_FRAMES
+
+    if encoding != "auto" or len(files) < MIN_FRAMES or read_photo(files[0]).encoding != "sRGB":
+        return encoding
+    try:
+        stack = _read_reduced(files, mask, encoding)
+    except InputError:  # the import names faults of the files
+        return encoding
+    return _choose_encoding(stack)[0]
 
 
 def _without_special(

@@ -1,6 +1,8 @@
 """Confirm a plan choice: simulate it, reconstruct it and compare the errors with the forecast."""
 
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,25 +34,8 @@ def confirm_choice(
     calibrate_simulated(
         choice.rig.name, out, steps.targets, steps.calibrations, seed=seed, progress=progress
     )
-    progress(f"simulate the skin {subject}")
-    done = simulate_session(
-        choice.rig.name,
-        out / "session-face",
-        subject=subject,
-        seed=seed,
-        plan=choice.plan,
-        **steps.options,
-    )
-    progress("reconstruct")
-    pipeline.reconstruct(
-        done.session,
-        want=steps.want,
-        out=out / "appearance",
-        calibration=out / "calibration",
-        truth=done.truth_name,
-    )
-    appearance, truth = store.read(out / "appearance"), store.read(out / "truth-face")
-    measured = rig.measure_errors(choice, appearance, truth, seed)
+    progress(f"simulate the skin {subject} and reconstruct")
+    measured = capture_choice(choice, out, subject=subject, seed=seed).errors
     rows = []
     for one in choice.forecasts:
         if one.name in measured:
@@ -59,6 +44,56 @@ def confirm_choice(
             found = {"median": median, "forecast": one.value, "within": low <= median <= high}
             rows.append({"name": one.name, "unit": one.unit, **found, "valid_share": share})
     return rows
+
+
+@dataclass(frozen=True, slots=True)
+class RehearsedCapture:
+    """Errors and times of a simulated capture and its maps."""
+
+    errors: Mapping[str, tuple[float, float]]
+    """Median error, in the unit of the rig's goals, and valid fraction by map."""
+    capture_s: float
+    """Time elapsed on the rig's clock, s."""
+    reconstruct_s: float
+    """Processor time of the reconstruction, s."""
+
+
+def capture_choice(
+    choice: PlanChoice, folder: Path, *, subject: str, seed: int
+) -> RehearsedCapture:
+    """Simulate and reconstruct a chosen plan with the calibration in `folder`.
+
+    Parameters
+    ----------
+    choice
+        Plan of a rig.
+    folder
+        Folder with ``calibration``; session, ground truth and maps are written into it.
+    subject, seed
+        Preset and seed of the simulated subject.
+    """
+    rig = load_planner(choice.rig.name)
+    steps = rig.describe_rehearsal(choice)
+    done = simulate_session(
+        choice.rig.name,
+        folder / "session-face",
+        subject=subject,
+        seed=seed,
+        plan=choice.plan,
+        **steps.options,
+    )
+    begun_s = time.process_time()
+    pipeline.reconstruct(
+        done.session,
+        want=steps.want,
+        out=folder / "appearance",
+        calibration=folder / "calibration",
+        truth=done.truth_name,
+    )
+    reconstruct_s = time.process_time() - begun_s
+    appearance, truth = store.read(folder / "appearance"), store.read(folder / done.truth_name)
+    errors = rig.measure_errors(choice, appearance, truth, seed)
+    return RehearsedCapture(errors, done.rig_seconds, reconstruct_s)
 
 
 def calibrate_simulated(

@@ -19,9 +19,8 @@ from reconstruction.photometric_stereo import light_selection
 from reconstruction.photometric_stereo.light_selection import ErrorPrediction
 from reconstruction.surface import errors as surface_errors
 from reconstruction.surface import estimates as surface_estimates
-from skinrig.arrays import Float64Array
 from skinrig.evaluating import surface as surface_evaluation
-from skinrig.planning import plans
+from skinrig.planning import plan_omissions, plans
 from skinrig.planning.dome_observation import LIGHT_ERROR, DomeObservation, simulate_observation
 from skinrig.planning.plans import PlanChoice, PlanRequest
 
@@ -159,7 +158,7 @@ def _choice(
         "r_d": 100.0 * _r_d_error(prediction, observation),
     }
     forecasts = plans.build_forecasts(medians, FORECAST_RELATIVE_SD, request, "dome")
-    left_out = plans.list_omissions(
+    left_out = plan_omissions.list_omissions(
         "dome",
         (unlit, "lights", len(unlit), len(rig.lights), ", ".join(unlit)),
         (unseen, "cameras", len(unseen), len(rig.views), ", ".join(unseen)),
@@ -191,19 +190,7 @@ def _r_d_error(prediction: ErrorPrediction, observation: DomeObservation) -> flo
     sigma = np.sqrt(
         np.square(prediction.log_albedo[good, None]) * (1.0 + np.square(gloss)) + common[:, None]
     )
-    return _median_magnitude(observation.unresolved[good], sigma)
-
-
-def _median_magnitude(offset: Float64Array, sigma: Float64Array) -> float:
-    """Return the median of |error| for a mixture of normal errors with the given means."""
-    from scipy.special import ndtr
-
-    low, high = 0.0, float(np.max(np.abs(offset) + 2.0 * sigma))
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        below = np.mean(ndtr((middle - offset) / sigma) - ndtr((-middle - offset) / sigma))
-        low, high = (middle, high) if below < 0.5 else (low, middle)
-    return 0.5 * (low + high)
+    return plans.median_magnitude(sigma, observation.unresolved[good])
 
 
 def _is_r_d_reached(

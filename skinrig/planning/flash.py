@@ -2,7 +2,8 @@
 
 The forecast is the Cramér-Rao bound of both chromophores at every pixel of a simulated face. It
 contains the sensor noise at the reflected light, the model error and the prior of illumination, as
-in the report. The settings change only the noise.
+in the report. The error that all pixels of the face share is that of the estimator itself on the
+face's colors without noise. The settings change only the noise.
 """
 
 from collections.abc import Iterator, Mapping
@@ -20,7 +21,7 @@ from reconstruction.pipeline.flash.stages import MIN_SIGNAL_SIGMAS
 from skinrig.arrays import BoolArray, Float64Array
 from skinrig.evaluating import flash
 from skinrig.evaluating.bounds import relative_bounds
-from skinrig.planning import plans
+from skinrig.planning import plan_omissions, plans, time_budget
 from skinrig.planning.camera_separability import assess_camera
 from skinrig.planning.flash_observation import (
     CHROMOPHORE_NAMES,
@@ -56,10 +57,12 @@ class FlashPrediction:
     valid: Mapping[str, BoolArray]
     """(H, W) pixels whose estimate would not be masked."""
     skin: BoolArray
+    bias: Mapping[str, float]
+    """Relative error that all pixels of the face share."""
 
     def median(self, name: str) -> float:
         """Return the predicted median relative error."""
-        return plans.median_magnitude(self.sigma[name][self.valid[name]])
+        return plans.median_magnitude(self.sigma[name][self.valid[name]], self.bias[name])
 
     def valid_share(self, name: str) -> float:
         """Return the fraction of the skin with an unmasked estimate."""
@@ -104,7 +107,7 @@ def predict(
         deviation[skin] = ERROR_OVER_BOUND[name] * bound
         sigma[name] = deviation
         valid[name] = is_detectable(truth, np.where(skin, deviation, 0.0) * truth, skin)
-    return FlashPrediction(sigma, valid, observation.skin)
+    return FlashPrediction(sigma, valid, observation.skin, observation.bias)
 
 
 def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
@@ -121,6 +124,8 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
         percent; empty: forecast of the rig's own plan. The valid fraction refers to the skin that
         full power and the most frames estimate.
     """
+    if request.budget_s is not None:
+        return time_budget.choose_within_budget(generate_choices, rig, request)
     observation = simulate_observation(rig, request.subject, seed=request.seed)
     best = predict(observation, repeats=REPEAT_CHOICES[-1], power=1.0, darks=DARK_CHOICES[-1])
     if not request.goals:
@@ -148,6 +153,17 @@ def choose(rig: Rig, request: PlanRequest) -> PlanChoice:
             break
     plan = build_crossed_plan(rig, **least)
     return _choice(rig, observation, plan, least, request, path=tuple(path), reasons=reasons)
+
+
+def generate_choices(
+    rig: Rig, request: PlanRequest, is_affordable: time_budget.Affordable
+) -> Iterator[PlanChoice]:
+    """Yield affordable plans at full flash power with their forecasts, by increasing duration."""
+    observation = simulate_observation(rig, request.subject, seed=request.seed)
+    for settings in _candidates(rig):
+        plan = build_crossed_plan(rig, **settings)
+        if settings["power"] == POWER_CHOICES[-1] and is_affordable(rig, plan):
+            yield _choice(rig, observation, plan, settings, request)
 
 
 def forecast(rig: Rig, plan: Plan, request: PlanRequest) -> PlanChoice:
@@ -251,7 +267,7 @@ def _choice(
     found = predict(observation, **own)
     medians = {name: 100.0 * found.median(name) for name in CHROMOPHORE_NAMES}
     forecasts = plans.build_forecasts(medians, FORECAST_RELATIVE_SD, request, "flash")
-    left_out = plans.list_omissions(
+    left_out = plan_omissions.list_omissions(
         "flash",
         (not parallel, "parallel", own["repeats"]),
         (own["darks"] < 4, "darks", 4 - own["darks"]),
@@ -259,7 +275,7 @@ def _choice(
             own["power"] < 1.0,
             "energy",
             100.0 * (1.0 - own["power"]),
-            plans.explain_less_light(reasons),
+            plan_omissions.explain_less_light(reasons),
         ),
     )
     powers = [float(step.settings.get("power", 0.0)) for step in plan.steps]

@@ -1,7 +1,8 @@
 """Simulated observation of a face by the flash rig's cross-polarized camera."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -9,7 +10,9 @@ from capture import raw
 from capture.rig import Rig
 from model import color_table
 from model.tissue_optics.layers import ANISOTROPY_SKIN
-from reconstruction.chromophores import shading_prior
+from reconstruction.chromophores import model_error, shading_prior
+from reconstruction.chromophores.face import estimate_face
+from reconstruction.pipeline.flash.stages import load_skin_colors
 from rigsim.population import files as subject_file
 from rigsim.scenes.flash.scene import FlashScene
 from rigsim.sensor import make_sensor, vignetting_map
@@ -23,11 +26,20 @@ WIDTH_PX = 256
 """Pixels across the face that the forecast looks at, each as noisy as one of the whole camera."""
 CONFIRM_PX = 640
 """Pixels across that are simulated: coarser ones mix the colors of different skin."""
-MIXING_POWER = 2.4
+BIAS_PIXELS = 1000
+"""Pixels of a face from which its common error is estimated."""
+BIAS_NOISE = 2e-3
+"""Relative noise of these pixels, far below the model error."""
+SESSION_BIAS: Final[Mapping[str, float]] = {"melanin": 0.047, "hemoglobin": 0.038}
+"""Relative error of sessions beyond that of the estimator on colors without noise.
+
+Means of three faces of one calibration, see docs/validation/forecasts.md; its cause is unknown.
+"""
+MIXING_POWER = 1.6
 """Exponent of the model error's variance over pixel size, for pixels wider than `CONFIRM_PX` gives.
 
-Large pixels mix different skin colors: at 320 px width, the model error of three faces contributed
-2 to 2.8 times as much as at 640 px.
+Large pixels mix different skin colors. Set on faces at 256 px width, see
+docs/validation/forecasts.md.
 """
 
 
@@ -53,6 +65,8 @@ class FlashObservation:
     """Color table of the camera and the light, for errors within a face: with exact optics."""
     log_light_sd: float
     """Standard deviation of log illumination under the prior alone."""
+    bias: Mapping[str, float]
+    """Relative error that all pixels of the face share, by chromophore."""
     mixing: float = 1.0
     """Ratio of the model error's variance to that at `CONFIRM_PX` image width."""
 
@@ -78,10 +92,8 @@ def simulate_observation(
     )
     truth = scene.truth()
     chip = make_sensor(view)
-    light = (
-        scene.radiance("crossed")
-        * vignetting_map(chip.vignetting, view.height_px, view.width_px)[..., None]
-    )
+    radiance = scene.radiance("crossed")
+    light = radiance * vignetting_map(chip.vignetting, view.height_px, view.width_px)[..., None]
     bare = np.asarray(truth["mask"], bool) & (np.asarray(truth["melanin"]) > 0)
     table = color_table.build(
         view.spectral_sensitivity,
@@ -97,6 +109,8 @@ def simulate_observation(
     skin &= (melanin > 0) & (melanin <= table.c_m_max)
     skin &= (hemoglobin > 0) & (hemoglobin <= table.c_hd_max)
     gain, floor = chip.noise_profile(0.008)
+    over_white = to_superpixels((radiance / scene.white_rgb()).astype(np.float64))
+    bias = estimate_face_bias(over_white[skin], melanin[skin], hemoglobin[skin], small)
     return FlashObservation(
         melanin,
         hemoglobin,
@@ -107,8 +121,46 @@ def simulate_observation(
         _superpixel_variance_ratio(view.cfa),
         table,
         log_light_information(),
+        bias,
         max(1.0, CONFIRM_PX / rig.views[0].width_px) ** MIXING_POWER,
     )
+
+
+def estimate_face_bias(
+    colors: Float64Array, melanin: Float64Array, hemoglobin: Float64Array, rig: Rig
+) -> dict[str, float]:
+    """Return the relative error that the pixels of a face share, by chromophore.
+
+    It is the median over some pixels of the error of the estimator itself, without noise: of the
+    optics that it infers from the face, of its color table and of its prior. `SESSION_BIAS` is
+    added.
+
+    Parameters
+    ----------
+    colors
+        (n, 3) crossed-polarized light over that of a white reference.
+    melanin, hemoglobin
+        (n,) true volume fractions.
+    rig
+        The flash rig.
+    """
+    names = rig.views[0].spectral_sensitivity, rig.lights[0].illuminant
+    table, prior = load_skin_colors(*names, has_white=True)
+    step = max(1, len(colors) // BIAS_PIXELS)
+    rgb = colors[::step].astype(np.float32)
+    found = estimate_face(
+        rgb,
+        table,
+        prior=prior,
+        variance=np.square(BIAS_NOISE * rgb),
+        model_error=model_error.load_covariance(),
+        has_white=True,
+    ).found
+    bias = {}
+    for name, truth in zip(CHROMOPHORE_NAMES, (melanin, hemoglobin), strict=True):
+        ratio = getattr(found, name)[found.valid] / truth[::step][found.valid]
+        bias[name] = SESSION_BIAS[name] + (float(np.median(ratio)) - 1.0 if ratio.size else 0.0)
+    return bias
 
 
 def log_light_information() -> float:

@@ -24,7 +24,7 @@ from reconstruction.photometric_stereo.light_selection import rayleigh_mixture_m
 from reconstruction.pipeline.gradient.stages import SMOOTH_PX
 from skinrig.appearances.contents import intersect_valid
 from skinrig.arrays import Float32Array
-from skinrig.planning import plans
+from skinrig.planning import plan_omissions, plans
 from skinrig.planning.gradient_observation import (
     BORDER_PX,
     GradientObservation,
@@ -293,11 +293,11 @@ def _choice(
     missing = [name for name in LIGHT_PATTERNS if name not in setting.patterns]
     states, every = ({strain_state(s) for s in one.steps} - {None} for one in (plan, full))
     lost_ms, full_ms = 1e3 * (PATTERN_EXPOSURE_S - setting.exposure_s), 1e3 * PATTERN_EXPOSURE_S
-    left_out = plans.list_omissions(
+    left_out = plan_omissions.list_omissions(
         "gradient",
         (missing, "patterns", ", ".join(missing)),
         (len(states) < len(every), "states", len(every) - len(states), len(every)),
-        (lost_ms > 0.0, "exposure", lost_ms, full_ms, plans.explain_less_light(reasons)),
+        (lost_ms > 0.0, "exposure", lost_ms, full_ms, plan_omissions.explain_less_light(reasons)),
         (not setting.darks, "darks"),
     )
     reasons += (

@@ -9,10 +9,8 @@ import difflib
 import importlib
 import math
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +24,7 @@ from skinrig.capturing.plan_choice import read_plan
 from skinrig.console import select_attributes
 from skinrig.errors import UsageError, require_choice
 from skinrig.planning.led_information import LedInformation, format_information
-from skinrig.planning.unmodeled_light import list_unmodeled_effects
+from skinrig.planning.plan_omissions import list_unmodeled_effects
 from skinrig.unit_format import format_quantity
 
 SCHEMA = "skinrig.plan-choice/1"
@@ -41,8 +39,6 @@ GOAL_UNITS: Mapping[str, Mapping[str, str]] = {
 
 PERCENT_BY_SITE = "percent_by_site"
 """Key of the probe's error of sigma_tr by site, red, green and blue, %."""
-
-OMISSIONS_TABLE = resources.files("skinrig").joinpath("data/left_out.toml")
 
 _GOAL_PATTERN = re.compile(r"\s*([a-z_]+)\s*<=\s*([0-9.eE+-]+)\s*(deg|%)?\s*")
 
@@ -93,6 +89,8 @@ class PlanRequest:
     """Minimum fraction of the whole rig's valid estimates that stays valid."""
     max_lights: int | None = None
     """Maximum number of lights (dome)."""
+    budget_s: float | None = None
+    """Time from planning to maps, s, within which the error is minimized; None: no limit."""
     leds: tuple[str, ...] = ()
     """Narrow-band LEDs to add (flash), see `capture.plan.led_bands.parse_bands`."""
 
@@ -132,6 +130,14 @@ class PlanChoice:
     """Light figures of flashes, for rigs without LEDs."""
     information: tuple[LedInformation, ...] = ()
     """Bounds with and without narrow-band LEDs (flash); empty without any."""
+    run_times: Mapping[str, float] = field(default_factory=dict)
+    """Forecast seconds of each phase and their sum, see `skinrig.planning.time_budget.RunTimes`;
+    empty if chosen without a budget."""
+
+    @property
+    def medians(self) -> dict[str, float]:
+        """Predicted median errors by map."""
+        return {one.name: one.value for one in self.forecasts}
 
     @property
     def seconds(self) -> float:
@@ -162,6 +168,7 @@ class PlanChoice:
             **select_attributes(self, "left_out", "path", "reasons", "light"),
             "unmodeled": list_unmodeled_effects(self.rig.name),
             **({"leds": leds} if leds else {}),
+            **({"run_times": self.run_times} if self.run_times else {}),
         }
 
 
@@ -244,29 +251,6 @@ def build_forecasts(
     )
 
 
-def list_omissions(rig: str, *rows: tuple[Any, ...]) -> tuple[tuple[str, str], ...]:
-    """List the parts that a plan omits, with reasons.
-
-    Parameters
-    ----------
-    rig
-        Name of the rig.
-    rows
-        Per part: whether it is omitted, its key in `data/left_out.toml`, and the values of that
-        text's placeholders.
-    """
-    table = tomllib.loads(OMISSIONS_TABLE.read_text(encoding="utf-8"))[rig]
-    named = [(table[name], words) for left, name, *words in rows if left]
-    return tuple((row["what"].format(*words), row["why"].format(*words)) for row, words in named)
-
-
-def explain_less_light(reasons: Sequence[str]) -> str:
-    """Return why less light suffices; `reasons` are not empty if the goals are out of reach."""
-    if reasons:
-        return "the error increases by at most 5 %"
-    return "the goals are reached without it"
-
-
 def choose(
     rig_name: str,
     want: str,
@@ -296,22 +280,19 @@ def choose(
         If goals, options or the plan are invalid.
     """
     asked = PlanRequest(parse_goals(want, rig_name), **request)
-    most_lights = asked.max_lights
-    own = load_planner(rig_name)
-    rig = load_rig(rig_name)
-    if width_px is not None:
-        if rig_name == "probe":
-            raise PlanOptionsError(
-                "--width: not an option of the probe, whose spots have fixed pixels; remove it"
-            )
-        # the gradient sphere keeps its pixel size and loses field of view, as in its simulation
-        rig = rig.cropped(width_px) if rig_name == "gradient" else rig.resized(width_px)
+    most_lights, own = asked.max_lights, load_planner(rig_name)
+    rig = load_sized_rig(rig_name, width_px)
     if most_lights is not None and most_lights < 1:
         raise PlanningError(f"--max-lights: got {most_lights}, expected 1 or more")
     if most_lights is not None and rig_name != "dome":
         raise PlanOptionsError(
             f"--max-lights: is an option of the dome, not of the {rig_name} rig; remove it"
         )
+    if asked.budget_s is not None and rig_name != "flash":
+        raise PlanOptionsError(f"--budget: is an option of flash, not of {rig_name}; remove it")
+    if asked.budget_s is not None and (asked.goals or forecast):
+        other = "--goals" if asked.goals else "--forecast"
+        raise PlanOptionsError(f"--budget: got it together with {other}; remove one")
     if forecast is not None:
         plan = read_plan(forecast)
         if plan.rig != rig.name:
@@ -323,6 +304,19 @@ def choose(
     else:
         found = own.choose(rig, asked)
     return found
+
+
+def load_sized_rig(rig_name: str, width_px: int | None) -> Rig:
+    """Return a rig at an image width, px; None: its own."""
+    rig = load_rig(rig_name)
+    if width_px is None:
+        return rig
+    if rig_name == "probe":
+        raise PlanOptionsError(
+            "--width: not an option of the probe, whose spots have fixed pixels; remove it"
+        )
+    # the gradient sphere keeps its pixel size and loses field of view, as in its simulation
+    return rig.cropped(width_px) if rig_name == "gradient" else rig.resized(width_px)
 
 
 def load_planner(rig_name: str) -> Any:
@@ -345,28 +339,31 @@ def forecast_interval(value: float, relative_sd: float) -> tuple[float, float]:
     return value / (1.0 + relative_sd), value * (1.0 + relative_sd)
 
 
-def median_magnitude(scale: ArrayLike) -> float:
-    """Return the median magnitude of a mixture of zero-mean normal errors; infinite if empty.
+def median_magnitude(scale: ArrayLike, offset: ArrayLike = 0.0) -> float:
+    """Return the median magnitude of a mixture of normal errors; infinite if empty.
 
     Parameters
     ----------
     scale : array_like
         Standard deviations of the components, which have equal weights.
+    offset : array_like
+        Means of the components, broadcast to the shape of `scale`.
 
     Examples
     --------
-    >>> round(median_magnitude([1.0, 1.0]), 4)
-    0.6745
+    >>> round(median_magnitude([1.0, 1.0]), 4), round(median_magnitude([1e-3, 1e-3], -2.0), 2)
+    (0.6745, 2.0)
     """
-    from scipy.special import erf
+    from scipy.special import ndtr
 
-    s = np.maximum(np.asarray(scale, np.float64).reshape(-1), 1e-300)
+    s = np.maximum(np.asarray(scale, np.float64), 1e-300)
     if not s.size:
         return math.inf
-    low, high = 0.0, 2.0 * float(s.max())
+    o = np.broadcast_to(np.asarray(offset, np.float64), s.shape)
+    low, high = 0.0, float(np.max(np.abs(o) + 2.0 * s))
     for _ in range(60):
         middle = 0.5 * (low + high)
-        below = float(np.mean(erf(middle / (math.sqrt(2.0) * s))))
+        below = np.mean(ndtr((middle - o) / s) - ndtr((-middle - o) / s))
         low, high = (middle, high) if below < 0.5 else (low, middle)
     return 0.5 * (low + high)
 
@@ -400,6 +397,9 @@ def format_choice(choice: PlanChoice) -> list[str]:
         f"capture: {choice.seconds:.1f} s, {choice.full_seconds - choice.seconds:.1f} s less than "
         "the whole rig's plan"
     )
+    if times := choice.run_times:
+        phases = ", ".join(f"{name} {value:.1f} s" for name, value in times.items())
+        out.append(f"seconds from planning to maps: {phases}")
     out += [f"omitted: {what} ({why})" for what, why in choice.left_out]
     out += [f"not modeled: {what} ({why})" for what, why in list_unmodeled_effects(choice.rig.name)]
     out += [

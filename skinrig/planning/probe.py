@@ -17,7 +17,7 @@ from capture.rig import Rig
 from model.skin import SkinAppearance
 from reconstruction.pipeline.probe.profile_fits import METHOD_NAMES
 from skinrig.evaluating import subsurface
-from skinrig.planning import plans
+from skinrig.planning import plan_omissions, plans
 from skinrig.planning.plans import PlanChoice, PlanRequest
 from skinrig.planning.probe_forecast import Memory, ProbePrediction, ProbeSettings, predict
 from skinrig.planning.probe_observation import ProbeObservation, simulate_observation
@@ -223,7 +223,7 @@ def _choice(
     percent = [100.0 * float(np.median(sigma)) for sigma in found.sigma]
     sites = zip(observation.sites, percent, found.measured, strict=True)
     turned = {name for step in plan.steps for name in step.index if step.index[name]}
-    left_out = plans.list_omissions(
+    left_out = plan_omissions.list_omissions(
         "probe",
         (fewer > 0, "exposures", fewer, N_BRACKETS),
         (longest_s < 0.99 * MAX_EXPOSURE_S, "longest", longest_s),

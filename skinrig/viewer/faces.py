@@ -19,17 +19,19 @@ from skinrig.appearances import dynamic as dynamic_appearance
 from skinrig.appearances.contents import is_fused
 from skinrig.blend_shapes import meshes as blend_shapes
 from skinrig.rendering.geometry import read_own_mesh
+from skinrig.rendering.hole_patches import ClosedMesh, close_holes
 from skinrig.viewer.assets import facial_color as facial_color_assets
 from skinrig.viewer.assets import fitted as fitted_assets
 from skinrig.viewer.assets import reflectance as reflectance_assets
 from skinrig.viewer.assets import surface as wrinkle_assets
 from skinrig.viewer.fine_skin import PERSON_PX, FineSkin
-from skinrig.viewer.holes import ClosedMesh, close_holes
 from skinrig.viewer.microstructure import assets as microstructure_assets
 from skinrig.viewer.scene import MAX_TEXTURE_PX, Assets, Kind, SceneError, SceneSource, ViewerScene
 
 Weights = Mapping[str, float]
 
+MEASURED_TEXTURES: Final = ("albedo_map", "lobe_shares", "translucency", "albedo_traits")
+"""Textures that are not functions of the surface point."""
 EMOTION_STATES: Final = ("happiness", "sadness", "surprise", "fear", "anger", "disgust")
 """The six basic emotions of Ekman."""
 
@@ -211,7 +213,7 @@ def build_scene(
             0, ("geometry of this face", f"{mesh_origin}; display another with --mesh FILE")
         )
     found = found.with_assets({"left_out": tuple(left_out)})
-    return found if whole is None else whole.paint_scene(found)
+    return found if whole is None else _paint_patches(found, whole)
 
 
 def _read(paths: Sequence[Path]) -> tuple[dict[str, Path], dict[str, SkinAppearance]]:
@@ -228,6 +230,14 @@ def _read(paths: Sequence[Path]) -> tuple[dict[str, Path], dict[str, SkinAppeara
                 raise SceneError(f"{path}: {folders[kind]} is of the same kind ({kind}); show one")
             appearances[kind], folders[kind] = appearance, path
     return folders, appearances
+
+
+def _paint_patches(scene: ViewerScene, whole: ClosedMesh) -> ViewerScene:
+    textures = {
+        name: replace(one, values=whole.paint(one.values)) if name in MEASURED_TEXTURES else one
+        for name, one in scene.textures.items()
+    }
+    return replace(scene, textures=textures)
 
 
 def _provenance(

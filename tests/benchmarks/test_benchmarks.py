@@ -17,6 +17,7 @@ HEAVY = {
     "brdf-people",
     "dome-geometry",
     "editing",
+    "end-to-end",
     "gradient-normals",
     "head-motion",
     "independent-skin",

@@ -29,6 +29,22 @@ def test_signals_fall_with_melanin_and_blood(skin, properties):
 
 @settings(FEW, max_examples=10)
 @given(SKIN, PROPERTIES)
+def test_far_light_follows_least_absorbed_wavelengths(skin, properties):
+    probe = signals.RigBands("probe", "Nikon 5100 (NPL)", "LED-B3", "sigma_tr")
+    seen = np.exp(probe.log_signals(signals.skin_of_person(skin, properties)))
+    pressed = skin + np.log([1.0, signals.PRESSED_BLOOD[0]])
+    nm = probe.bands.wavelength_nm
+    each = np.exp(skin_spectra.log_sigma_tr(nm, signals.skin_of_person(pressed, properties)))
+    # the slope of light's logarithm along the distance, of each channel
+    r = signals.SIGMA_TR_DISTANCE_MM + np.array([[-1e-4], [1e-4]])
+    light = np.log(np.exp(-r * each) @ probe.bands.weights)
+    expected = (light[0] - light[1]) / 2e-4 * np.exp(signals.SIGMA_TR_OFFSET)
+    assert np.allclose(seen, expected, rtol=1e-5)
+    assert (seen < each @ probe.bands.weights).all()
+
+
+@settings(FEW, max_examples=10)
+@given(SKIN, PROPERTIES)
 def test_sigma_tr_rises_with_blood(skin, properties):
     less, more = (
         skin_spectra.log_sigma_tr([450.0, 550.0], signals.skin_of_person(skin + step, properties))

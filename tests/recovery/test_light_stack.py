@@ -86,6 +86,26 @@ def test_dead_light_is_reported_and_omitted(tmp_path, capsys):
     assert error_deg(found, n, inside).mean() < 0.5
 
 
+@pytest.mark.parametrize(
+    ("spoil", "fault"),
+    [
+        (lambda images, lights: (images, lights * [-1, 1, 1]), "axes of the list"),
+        (lambda images, lights: (images ** (1 / 2.2), lights), "transfer curve"),
+        (lambda images, lights: (images + 0.08, lights), "ambient light"),
+        (lambda images, lights: (images, lights[::-1]), ""),
+        (lambda images, lights: (images, lights), ""),
+    ],
+)
+def test_maps_bear_faults_that_remain(spoil, fault, tmp_path, capsys):
+    """Faults that are corrected leave no mark, as sound images do."""
+    images, lights, _, inside = ball()
+    spoiled, listed = spoil(np.maximum(images, 0.0), lights)
+    write(tmp_path / "f", np.where(inside, spoiled, 0.0), listed, inside)
+    for one in made(tmp_path, tmp_path / "f", capsys).maps.values():
+        assert ("images have faults" in one.description) == bool(fault)
+        assert fault in one.description
+
+
 @pytest.mark.long
 def test_the_real_buddha_agrees_with_its_reference(tmp_path, capsys, test_data):
     found = made(tmp_path, test_data / "photometric_stereo" / "buddha", capsys)

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -16,7 +17,7 @@ START = "import sys; from skinrig.cli import main; sys.exit(main(sys.argv[1:]))"
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    """A wheel built from the files of the packages, by the installed build backend."""
+    """A wheel of the source distribution, both by the installed build backend."""
     folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
     source.mkdir()
@@ -25,10 +26,15 @@ def wheel(tmp_path_factory):
             (source / name).write_bytes((ROOT / name).read_bytes())
     for package in PACKAGES:
         (source / package).symlink_to(ROOT / package, target_is_directory=True)
+    pack = "import sys; from setuptools import build_meta; build_meta.build_sdist(sys.argv[1])"
     command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-index"]
-    command += ["--no-build-isolation", "--disable-pip-version-check", "-w", str(folder), "."]
-    done = subprocess.run(command, cwd=source, capture_output=True, text=True, timeout=250)
-    assert done.returncode == 0, done.stderr[-2000:]
+    command += ["--no-build-isolation", "--disable-pip-version-check", "-w", str(folder)]
+    for make in ([sys.executable, "-c", pack, str(folder)], command):
+        sources = [str(path) for path in folder.glob("*.tar.gz")]
+        done = subprocess.run(
+            [*make, *sources], cwd=source, capture_output=True, text=True, timeout=250
+        )
+        assert done.returncode == 0, done.stderr[-2000:]
     return next(folder.glob("*.whl"))
 
 
@@ -47,6 +53,10 @@ def test_wheel_has_every_file(wheel):
     with zipfile.ZipFile(wheel) as archive:
         names = {name for name in archive.namelist() if ".dist-info/" not in name}
     assert list_package_files() - names == set()
+    assert names - list_package_files() == set()
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert wheel.name.startswith(f"skinrig-{version}-")
+    assert f"version: {version}\n" in (ROOT / "CITATION.cff").read_text()
     assert wheel.stat().st_size < MAX_WHEEL_BYTES
 
 

@@ -25,6 +25,8 @@ Pattern: TypeAlias = tuple[str, int, int] | tuple[str, int, int, str]
 MARKER_SIDE_RATIO = 0.75  # side of a marker over that of a square, as most boards are printed
 MIN_BOARD_CORNERS = 6  # corners of a board in an image: fewer determine its pose badly
 MIN_BOARD_IMAGES = 3
+MIN_POSE_SHIFT_PX = 2.0
+"""Mean shift of the corners below which two images show one pose."""
 REFINE_HALF_WINDOW_PITCH = 0.35  # half window of corner refinement over the distance of neighbors
 N_SIDE_SAMPLES = 17  # across each side of a marker
 SIDE_SEARCH_BITS = 0.45  # of a marker's bit, on both sides of its border
@@ -349,7 +351,7 @@ def calibrate_intrinsics(
     Raises
     ------
     BoardError
-        If fewer than 3 images show the board, or sizes differ.
+        If fewer than 3 images show the board, at fewer than 3 poses, or sizes differ.
 
     References
     ----------
@@ -383,6 +385,12 @@ def calibrate_intrinsics(
             f" {len(used)} of {len(sizes)}, expected at least {MIN_BOARD_IMAGES}; not in"
             f" {', '.join(missing) or 'any, there were none'}"
         )
+    poses = _count_poses(sightings)
+    if poses < MIN_BOARD_IMAGES:
+        raise BoardError(
+            f"images: got {poses} poses of the board in {len(used)} images, expected at least "
+            f"{MIN_BOARD_IMAGES} that differ; tilt it between images"
+        )
     size = next(iter(sizes.values()))
     objects = [board.points_mm[s.ids].astype(np.float32) for s in sightings]
     pixels = [s.pixels.astype(np.float32) for s in sightings]
@@ -405,6 +413,20 @@ def calibrate_intrinsics(
         tuple(used),
         tuple(missing),
     )
+
+
+def _count_poses(sightings: Sequence[CornerObservation]) -> int:
+    """Return how many of the images differ from all before them."""
+    kept: list[CornerObservation] = []
+    for one in sightings:
+        for other in kept:
+            _, here, there = np.intersect1d(one.ids, other.ids, return_indices=True)
+            shift = np.linalg.norm(one.pixels[here] - other.pixels[there], axis=1)
+            if len(shift) and shift.mean() < MIN_POSE_SHIFT_PX:
+                break
+        else:
+            kept.append(one)
+    return len(kept)
 
 
 def _read(path: str | Path) -> UInt8Array:

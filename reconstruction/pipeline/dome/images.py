@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture import hdr, raw
+from capture.calibration.sensor.bracket_times import check_times
 from capture.session import FrameRecord, Session
 from reconstruction.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from reconstruction.pipeline.hold_out import NO_HOLD_OUT, HoldOut
@@ -196,14 +197,18 @@ class DomeImages:
         for cell, black in enumerate(first.black[:1] if whole else first.black):
             part = slice(cell // 2, None, 2), slice(cell % 2, None, 2)
             part = (slice(None), slice(None)) if whole else part
-            rate, spread, valid = hdr.merge(
-                [frame.cfa[part] for frame in frames],
-                times,
-                gain=noise.gain,
-                read_noise=noise.read_noise,
-                black=black,
-                white=first.white,
-            )
+            bracket = [frame.cfa[part] for frame in frames]
+            sensor = {
+                "gain": noise.gain,
+                "read_noise": noise.read_noise,
+                "black": black,
+                "white": first.white,
+            }
+            try:
+                check_times(bracket, times, **sensor)
+            except hdr.BracketError as error:
+                raise InputsError(f"{first.path}: {error}; correct the times") from error
+            rate, spread, valid = hdr.merge(bracket, times, **sensor)
             span = np.float32(first.white - black)
             values[part] = np.where(valid, rate / span, 0.0)
             variance[part] = np.where(valid, spread / span**2, 0.0)

@@ -33,6 +33,7 @@ from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.face_light import FaceLight, estimate_face_light
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.flash import oxygenation
+from reconstruction.pipeline.flash.skin_stage import skin_stage
 from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.masked_map import masked_map
 from reconstruction.pipeline.skin_tone import maps as tone
@@ -99,17 +100,18 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     rig = load_flash_rig(inputs)
     stage = inputs.stage_maker(STAGE_REVISION)
     table = {"camera": rig.camera, "illuminant": rig.illuminant}
-    which = {"state": inputs.state, "repeat": inputs.repeat}
     by_color = table | model_error.data_hash()
+    which = {"state": inputs.state, "repeat": inputs.repeat}
     of_skin = "melanin melanin_optical_depth hemoglobin shading residual gamut_distance"
     of_skin += " melanin_noise_stderr hemoglobin_noise_stderr face_light"
-    both, shown = "diffuse specular", "image specular_image"
+    shown = "image specular_image"
     return [
         stage("frames", "", "parallel crossed", partial(_frames, rig), **which),
-        stage("separation", "parallel crossed", both, partial(_separate, rig)),
+        stage("separation", "parallel crossed", "light specular", partial(_separate, rig)),
+        skin_stage(stage, inputs),
         stage("chromophores", "diffuse", of_skin, partial(_chromophores, rig), **by_color),
         stage("tsumura", "diffuse", "tsumura_melanin tsumura_hemoglobin", _tsumura),
-        stage("pictures", both, shown, partial(_pictures, rig), **table),
+        stage("pictures", "light specular", shown, partial(_pictures, rig), **table),
         stage(
             "skin reflectance", "diffuse face_light", tone.REFLECTANCE_PRODUCT, _skin_reflectance
         ),
@@ -254,7 +256,7 @@ def separate_each(rig: FlashRig, records: Sequence[FrameRecord]) -> Iterator[Ski
     """Yield the diffuse reflectance of each crossed frame alone."""
     mean_image = _image_reader(rig)
     for record in records:
-        yield _separate(rig, None, mean_image([record]))["diffuse"]
+        yield _separate(rig, None, mean_image([record]))["light"]
 
 
 def _noise(sensor: SensorCalibration | None) -> tuple[float, float] | tuple[None, None]:
@@ -309,7 +311,7 @@ def _separate(
     valid = valid & diffuse.valid & ~dim
     over, shines = "specular light over that of a white reference", specular_valid & valid
     return {
-        "diffuse": _map3(reflectance, np.sqrt(variance), valid, "white reference in place = 1"),
+        "light": _map3(reflectance, np.sqrt(variance), valid, "white reference in place = 1"),
         "specular": _map3(specular / level, specular_error / level, shines, over),
     }
 
@@ -337,11 +339,9 @@ def _assumed_white(rig: FlashRig) -> Float32Array:
     return level.astype(np.float32)
 
 
-def _map3(
-    values: NDArray[Any], stderr: NDArray[Any], valid: BoolArray, description: str
-) -> SkinMap:
+def _map3(values: NDArray[Any], stderr: NDArray[Any], valid: BoolArray, what: str) -> SkinMap:
     good = valid & np.isfinite(values).all(axis=-1) & np.isfinite(stderr).all(axis=-1)
-    return masked_map(values, stderr, good, "1", f"camera RGB, {description}")
+    return masked_map(values, stderr, good, "1", f"camera RGB, {what}")
 
 
 def map_stderr(skin_map: SkinMap) -> Float32Array:
@@ -438,12 +438,12 @@ def _tsumura(diffuse: SkinMap) -> Mapping[str, SkinMap]:
     }
 
 
-def _pictures(rig: FlashRig, diffuse: SkinMap, specular: SkinMap) -> Mapping[str, SkinMap]:
+def _pictures(rig: FlashRig, light: SkinMap, specular: SkinMap) -> Mapping[str, SkinMap]:
     """Convert diffuse and specular light to linear sRGB."""
-    picture = diffuse.values.astype(np.float64)
+    picture = light.values.astype(np.float64)
     if rig.color is not None and rig.neutral is not None:
         picture = rig.color.to_linear_srgb(picture * rig.neutral)
     return {
-        "image": SkinMap(picture.astype(np.float32), "1", valid=diffuse.valid),
+        "image": SkinMap(picture.astype(np.float32), "1", valid=light.valid),
         "specular_image": SkinMap(specular.values, "1", valid=specular.valid),
     }

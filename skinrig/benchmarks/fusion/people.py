@@ -23,6 +23,7 @@ from reconstruction.fusion.person import PersonSkin, Regions, estimate_person
 from reconstruction.fusion.regions import summarize_regions
 from reconstruction.fusion.signals import (
     PRESSED_BLOOD,
+    SIGMA_TR_DISTANCE_MM,
     SIGMA_TR_OFFSET,
     SIGMA_TR_SD,
     RigBands,
@@ -228,7 +229,10 @@ def _draw_sigma_tr(
     sigma_tr = np.sqrt(3.0 * found.dermis * (found.dermis + scattering))
     common = SIGMA_TR_SD[0] * rng.standard_normal() + SIGMA_TR_SD[1] * rng.standard_normal(3)
     own = np.hypot(SITE_SIGMA_TR_SD, SITE_NOISE) * rng.standard_normal((len(fractions), 3))
-    return np.asarray(np.log(sigma_tr) @ weights + SIGMA_TR_OFFSET + common + own)
+    # a channel's light at a distance, as a sum over wavelengths
+    reached = weights * np.exp(-SIGMA_TR_DISTANCE_MM * sigma_tr)[..., None]
+    mean = (reached * sigma_tr[..., None]).sum(axis=1) / reached.sum(axis=1)
+    return np.asarray(np.log(mean) + SIGMA_TR_OFFSET + common + own)
 
 
 def draw_patch(rng: np.random.Generator, *, rotation_deg: float = 0.0) -> PatchNormals:

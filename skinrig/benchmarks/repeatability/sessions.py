@@ -134,9 +134,9 @@ class RigDay:
         for path in (self.folder / "session-person", *self.folder.glob("truth-*")):
             shutil.rmtree(path, ignore_errors=True)
         shutil.rmtree(self.folder / "maps", ignore_errors=True)
-        states: dict[str, Any] = {"flash": {"states": (state,)}, "dome": {"state": state}}
         options = {"seed": RIG_SEED, **self.protocol.options, **person}
-        options |= states.get(self.protocol.rig, {})
+        if self.protocol.rig in ("flash", "dome"):
+            options["states"] = (state,)
         done = simulate_session(
             self.protocol.rig,
             self.folder / "session-person",

@@ -8,6 +8,7 @@ References
 glTF 2.0 specification, ISO/IEC 12113:2022; KHR_materials_ior, KHR_materials_specular.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from importlib.metadata import version
@@ -23,8 +24,9 @@ from skinrig.drawing import png
 from skinrig.errors import UnusableError, UsageError
 from skinrig.exporting.images import ImageFolder, encode_png_codes
 from skinrig.exporting.materials import blender
-from skinrig.exporting.materials.material import Material
+from skinrig.exporting.materials.material import Material, list_expression_omissions
 from skinrig.exporting.options import M_PER_MM, ExportSettings
+from skinrig.exporting.sealing import describe_provenance
 
 GLB_FILE, DOCUMENT_FILE = "skin.glb", "glb.json"
 SCHEMA: Final = "skinrig.export.glb/1"
@@ -108,7 +110,7 @@ def write(
             f"--mesh: got tiles {', '.join(map(str, material.tiles))}, expected tile 1001, as glTF "
             "has one; export to mtlx or usd, or give another mesh"
         )
-    (folder / GLB_FILE).write_bytes(encode_glb(material))
+    (folder / GLB_FILE).write_bytes(encode_glb(material, describe_provenance(appearance)))
     script = blender.Import.from_channels(GLB_FILE, material.median_radius_mm()).script()
     (folder / blender.SCRIPT_FILE).write_text(script, encoding="utf-8")
     out = ImageFolder(folder, delivery)
@@ -130,6 +132,7 @@ def write(
     )
     in_blender = f"see extras; {blender.SCRIPT_FILE} sets it in Blender"
     left_out = material.list_mesh_omissions(delivery)
+    left_out += list_expression_omissions(appearance)
     left_out.append(("subsurface light", f"not part of glTF: {in_blender}"))
     if not material.shapes:
         left_out.append(
@@ -138,18 +141,22 @@ def write(
     return left_out
 
 
-def encode_glb(material: Material) -> bytes:
+def encode_glb(material: Material, provenance: Mapping[str, Any]) -> bytes:
     """Encode a material with its mesh as the bytes of a .glb file.
 
     Parameters
     ----------
     material
         Material with lengths in mm.
+    provenance
+        Source, inputs, versions, assumptions and consent, for the file's ``asset.extras``.
     """
     mesh = material.mesh
     skeleton = resources.files("skinrig.exporting").joinpath("templates/skin.gltf")
     file = pygltflib.GLTF2.from_json(skeleton.read_text(encoding="utf-8"))
-    file.asset = pygltflib.Asset(generator=f"skinrig {version('skinrig')}")
+    file.asset = pygltflib.Asset(
+        generator=f"skinrig {version('skinrig')}", extras={"provenance": dict(provenance)}
+    )
     (surface_material,) = file.materials
     extensions = surface_material.extensions
     surface_material.extensions = {"KHR_materials_ior": {"ior": float(material.eta)}, **extensions}

@@ -11,6 +11,7 @@ import numpy as np
 from model import dipole, fresnel, skin_reflectance
 from model.skin import SkinAppearance
 from skinrig.appearances.contents import list_assumptions
+from skinrig.appearances.dynamic import WRINKLES, describe_parts
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from skinrig.errors import UsageError, require_choice
 from skinrig.exporting.images import CAMERA_SPACE, DATA_SPACE, SRGB_SPACE, ExportImage
@@ -19,6 +20,8 @@ from skinrig.exporting.materials.tangents import FramedMesh
 from skinrig.exporting.materials.udim import TiledMesh
 from skinrig.exporting.options import FIRST_TILE, ExportError, ExportSettings
 from skinrig.rendering.geometry import FittedSurface, read_own_mesh
+from skinrig.rendering.hole_patches import ClosedMesh, close_holes
+from skinrig.viewer.map_filling import fill_holes
 
 COLOR_NOTE: Final = (
     "camera RGB, linear, relative to a perfect white; used as linear sRGB in formats that have no "
@@ -70,6 +73,8 @@ class Material:
         "measured" or "simulated".
     tiles
         UDIM tiles of the mesh; maps cover the first.
+    closed_holes
+        Omissions about holes of the scan, with reasons; the mask is 0 on their patches.
     """
 
     mesh: FramedMesh
@@ -89,6 +94,7 @@ class Material:
     assumed: tuple[str, ...]
     source: str
     tiles: tuple[int, ...] = (FIRST_TILE,)
+    closed_holes: tuple[tuple[str, str], ...] = ()
 
     @staticmethod
     def of(appearance: SkinAppearance, mesh_file: Path | None = None) -> Material:
@@ -110,19 +116,27 @@ class Material:
         """
         model = skin_reflectance.assemble(appearance)
         own = read_own_mesh(appearance)
-        mesh = TiledMesh.of(own) if mesh_file is None else udim.read(mesh_file)
-        surface = FittedSurface.of(model, mesh.first(), rest=own)
+        closed = close_holes(own) if mesh_file is None else ClosedMesh(own, (), ())
+        mesh = TiledMesh.of(closed.mesh) if mesh_file is None else udim.read(mesh_file)
+        surface = FittedSurface.of(model, own if mesh_file is None else mesh.first(), rest=own)
+
+        def paint(values: FloatArray) -> FloatArray:
+            if not closed.charts:
+                return np.nan_to_num(values)
+            return closed.paint(fill_holes(values, model.valid))
+
         framed = FramedMesh.of(mesh)
         # frames are those of the whole mesh, as in a renderer, also at borders of tiles
         on_maps = framed.select_faces(mesh.tile == FIRST_TILE)
         axes, covered = on_maps.texel_frames(surface.atlas.size)
         turned = tangents.rotate_to_tangent(surface.normals, axes, covered)
         inside = 1.0 - fresnel.diffuse_external(model.eta)
-        r_d = np.nan_to_num(model.r_d)
+        r_d = paint(model.r_d)
         stderr = model.r_d_stderr
         depth = model.translucency_mm
         usual = np.median(depth[model.valid], axis=0) if model.valid.any() else np.ones(3)
         known = np.isfinite(depth) & (depth > 0.0)
+        depth = closed.paint(np.where(known, depth, usual))
         return Material(
             mesh=framed,
             shapes={n: d[framed.source].astype(np.float32) for n, d in mesh.shapes.items()},
@@ -133,16 +147,15 @@ class Material:
             axes=axes,
             covered=covered,
             valid=model.valid & covered,
-            surface=surface_fit.fit_ggx_lobe(
-                model.lobes, np.nan_to_num(model.weights), eta=model.eta
-            ),
-            translucency_mm=np.where(known, depth, usual).astype(np.float32),
+            surface=surface_fit.fit_ggx_lobe(model.lobes, paint(model.weights), eta=model.eta),
+            translucency_mm=depth,
             translucency_stderr_mm=model.translucency_stderr_mm,
             deficit=similarity_albedo_deficit(r_d, model.eta),
             eta=model.eta,
             assumed=model.assumed,
             source=appearance.source,
             tiles=mesh.tiles,
+            closed_holes=closed.summary(),
         )
 
     @property
@@ -169,7 +182,7 @@ class Material:
         omissions = [
             (f"the surface at {holes} holes", "not in the scan; give a complete mesh with --mesh")
         ]
-        return (omissions if holes else []) + [
+        return [*self.closed_holes, *(omissions if holes else [])] + [
             (
                 f"maps of tile {tile}",
                 f"maps cover tile {FIRST_TILE}; filled by medians and flat normals",
@@ -294,3 +307,17 @@ def similarity_albedo_deficit(r_d: FloatArray, eta: float) -> Float64Array:
         dipole.invert_to_deficit(nodes, eta)
     )  # the root is smooth also at an albedo of 1
     return np.asarray(np.interp(r_d, nodes, root) ** 2, np.float64)
+
+
+def list_expression_omissions(appearance: SkinAppearance) -> list[tuple[str, str]]:
+    """Return measured wrinkles as an omission of a neutral face's material, with the reason.
+
+    Parameters
+    ----------
+    appearance
+        Maps of the face.
+    """
+    if WRINKLES not in describe_parts(appearance):
+        return []
+    why = "the material is that of the neutral face; --to metahuman writes their maps and masks"
+    return [("wrinkles of expressions", why)]

@@ -9,7 +9,7 @@ import numpy as np
 from model.skin import SkinAppearance
 from skinrig.drawing import templates
 from skinrig.exporting.images import ExportImage, ImageFolder
-from skinrig.exporting.materials.material import MAP_NOTES, Material
+from skinrig.exporting.materials.material import MAP_NOTES, Material, list_expression_omissions
 from skinrig.exporting.options import FIRST_TILE, TILE_SEPARATORS, ExportSettings
 from skinrig.exporting.sealing import IMAGE_ORIENTATION
 
@@ -46,6 +46,7 @@ def write(
     """
     material = Material.of(appearance, delivery.mesh)
     left_out = material.list_mesh_omissions(delivery)
+    left_out += list_expression_omissions(appearance)
     out = ImageFolder(folder, delivery, tiles=material.tiles)
     scale = write_textures(material, out)
     (folder / "skin.obj").write_text(

@@ -20,7 +20,7 @@ from skinrig.drawing import templates
 from skinrig.errors import MissingExtra
 from skinrig.exporting.images import ImageFolder
 from skinrig.exporting.materials import blender, materialx
-from skinrig.exporting.materials.material import Material
+from skinrig.exporting.materials.material import Material, list_expression_omissions
 from skinrig.exporting.options import METERS_PER_UNIT, ExportSettings
 
 USD_FILE, DOCUMENT_FILE = "skin.usdc", "usd.json"
@@ -61,6 +61,7 @@ def write(
         raise MissingExtra("export to USD", "usd") from error
     material = Material.of(appearance, delivery.mesh)
     tiles = material.list_mesh_omissions(delivery)
+    tiles += list_expression_omissions(appearance)
     out = ImageFolder(folder, delivery, tiles=material.tiles)
     scale = materialx.write_textures(material, out)
     out.write_png(material.image("specular_roughness", delivery), materialx.TEXTURE_FOLDER)

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capture.calibration.sensor.bracket_times import check_times
 from capture.hdr import BracketError, merge, merge_reference, recover_response
 
 SENSOR = {"gain": 2.0, "read_noise": 8.0, "black": 512, "white": 16383}
@@ -252,3 +253,13 @@ def test_inconsistent_bracket_images_are_refused(change, says, rng):
     words = {"images": [np.zeros((9, 9, 3), np.uint8)] * 2, "exposures_s": (1.0, 2.0)} | change
     with pytest.raises(BracketError, match=says):
         recover_response(words.pop("images"), words.pop("exposures_s"), rng=rng, **words)
+
+
+def test_wrong_exposure_time_is_named(scene):
+    rng = np.random.default_rng(5)
+    frames = [expose(scene, t, rng) for t in TIMES]
+    check_times(frames, TIMES, **SENSOR)
+    with pytest.raises(BracketError, match=r"exposures_s\[0\]: got 0.013 s, expected 0.01 s"):
+        check_times(frames, (0.013, 0.08, 0.64), **SENSOR)
+    dark = [np.full((40, 40), SENSOR["black"], np.uint16)] * 2
+    check_times(dark, (0.1, 0.4), **SENSOR)  # nothing contradicts

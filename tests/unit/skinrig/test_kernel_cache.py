@@ -77,3 +77,13 @@ def test_kernels_are_cached_until_process_ends(tmp_path):
     place, rest = done.stdout.splitlines()
     assert rest == "6 True"
     assert not os.path.exists(place)
+
+
+def test_import_lets_waiting_threads_sleep():
+    program = "import os, skinrig; print(os.environ['OMP_WAIT_POLICY'])"
+    for given, expected in (({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")):
+        plain = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+        done = subprocess.run(
+            [sys.executable, "-c", program], env=plain | given, capture_output=True, text=True
+        )
+        assert done.stdout.strip() == expected

@@ -452,3 +452,26 @@ def test_random_damage_gives_own_error_or_image_only(suffix, tmp_path):
         except PhotoError:
             refused += 1
     assert refused > 10
+
+
+def test_uncalibrated_color_of_exif_is_noted(picture, tmp_path):
+    """EXIF 2.32: color space 65535 is any but sRGB, such as Adobe RGB."""
+    plain = cv2.imencode(".jpg", picture)[1].tobytes()
+    for space, noted in ((1, False), (65535, True)):
+        body = b"II*\0" + struct.pack("<IHHHIII", 8, 1, 0x8769, 4, 1, 26, 0)
+        body += struct.pack("<HHHIII", 1, 0xA001, 3, 1, space, 0)
+        payload = b"Exif\0\0" + body
+        segment = b"\xff\xe1" + struct.pack(">H", len(payload) + 2) + payload
+        file = tmp_path / f"{space}.jpg"
+        file.write_bytes(plain[:2] + segment + plain[2:])
+        assert any("uncalibrated" in note for note in read_photo(file).notes) == noted
+
+
+def test_gray_partner_of_color_photograph_is_named(picture, tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    cv2.imwrite(str(folder / "anna crossed.png"), picture)
+    for parallel, named in ((picture, False), (picture[..., :1], True)):
+        cv2.imwrite(str(folder / "anna parallel.png"), parallel)
+        done = import_photos(folder, out=tmp_path / f"s-{named}", now=clock)
+        assert any("no specular image follows" in text for text in done.assumed) == named

@@ -33,6 +33,19 @@ def test_fault_is_found_with_its_images(fault):
         assert len(named) == 1, named
 
 
+@pytest.mark.parametrize(("seed", "rig"), [(20148, "flash"), (20146, "dome")])
+def test_exchanged_neighbors_are_named_alone(seed, rig):
+    """The last two of a list exchanged are no other order; the second's angle may be small."""
+    stack = make("two swapped", seed, side=64, severity=15, rig=rig, tone="dark")
+    named = [(one.fault, one.frames) for one in diagnose(stack).findings]
+    assert named == [("swapped lights", stack.frames)]
+
+
+def test_flicker_is_found_beyond_its_severity():
+    stack = make("flicker", 30100, side=64, severity=0.1, rig="flash", tone="medium")
+    assert [one.fault for one in diagnose(stack).findings] == ["rolling flicker"]
+
+
 @pytest.mark.parametrize("seed", [310, 311, 312])
 def test_sound_images_have_no_finding(seed):
     assert diagnose(make("", seed, side=64)).findings == ()

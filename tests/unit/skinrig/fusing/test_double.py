@@ -13,6 +13,7 @@ from reconstruction.surface.errors import interior_error
 from skinrig.appearances import dynamic
 from skinrig.applying.expression import ExpressionRequest, apply_expression
 from skinrig.cli import app
+from skinrig.exporting.materials.material import list_expression_omissions
 from skinrig.fitting.wrinkles import fit_wrinkles
 from skinrig.fusing.cost import compare_without
 from skinrig.fusing.double import FusionInputs, fuse
@@ -234,6 +235,9 @@ def test_fused_wrinkles_move_like_fitted_ones(folders, wrinkled, tmp_path):
     normals = [maps["normals"].values for maps in shown]
     np.testing.assert_array_equal(normals[0], normals[1])
     assert np.abs(normals[0] - normals[2]).max() > 0.1  # the wave of 0.2 rad is there
+    ((omitted, _),) = list_expression_omissions(found)
+    assert omitted == "wrinkles of expressions"
+    assert not list_expression_omissions(store.read(folders / "dome"))
 
 
 def test_wrinkles_of_another_face_are_refused(folders, wrinkled, tmp_path):

@@ -1,10 +1,12 @@
 """Lights of folders: estimates under other exposures, and what is refused before any fit."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
 import tifffile
-from fixtures.faulty_stacks import dome, render
+from fixtures.faulty_stacks import SHAPES, dome, render, to_srgb
 
 from capture.importers.light_tables import LightListError
 from skinrig.cli import main
@@ -75,3 +77,60 @@ def test_unequal_count_stays_the_error_despite_odd_files(tmp_path):
     with pytest.raises(LightListError, match="does not fit the images") as raised:
         find_lights(tmp_path / "f", lights=None, mask=None, encoding="auto")
     assert raised.value.code == "SR-IMP-007"
+
+
+@pytest.mark.parametrize(("encoding", "seed"), [("sRGB", 7001), ("sRGB", 7005), ("linear", 7005)])
+def test_encoding_of_glossy_images_is_found(encoding, seed, tmp_path):
+    """Highlights that a curve flattens do not make its values linear."""
+    rng = np.random.default_rng(seed)
+    lights = dome(12, rng, 60)
+    images, inside = render(SHAPES[seed % 3], lights, rng, side=64, gloss=2.0, noise=0.005)
+    folder = tmp_path / "f"
+    folder.mkdir()
+    for number, image in enumerate(images):
+        shown = to_srgb(image) if encoding == "sRGB" else image
+        cv2.imwrite(str(folder / f"{number:02d}.png"), np.rint(255 * shown).astype(np.uint8))
+    cv2.imwrite(str(folder / "mask.png"), inside.astype(np.uint8) * 255)
+    np.savetxt(folder / "lights.txt", lights)
+    found = find_lights(folder, lights=None, mask=None, encoding="auto")
+    assert found.encoding == encoding
+
+
+def test_image_that_list_lacks_is_named(tmp_path):
+    images = np.random.default_rng(0).uniform(0.2, 1.0, (5, 40, 40))
+    write(tmp_path / "f", images)
+    rows = [f"{k:02d}.tif 0 0 1" for k in (0, 1, 3, 4)]
+    (tmp_path / "f" / "a.lp").write_text("\n".join(["4", *rows]))
+    found = find_lights(tmp_path / "f", lights=None, mask=None, encoding="auto")
+    assert found.assumed == ("02.tif is not in a.lp, and was left out",)
+
+
+def test_list_in_scene_frame_is_turned(tmp_path, capsys):
+    turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # camera to scene
+    lights = dome(6, np.random.default_rng(2), 60)
+    images = np.random.default_rng(0).uniform(0.2, 1.0, (6, 40, 40))
+    folder = tmp_path / "f"
+    write(folder, images)
+    np.savetxt(folder / "lights.txt", lights @ turn.T)
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn
+    frames = [{"file_path": "00", "transform_matrix": matrix.tolist()}]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    camera = tmp_path / "transforms.json"
+    found = find_lights(folder, lights=None, mask=None, encoding="auto", camera=camera)
+    np.testing.assert_allclose(found.lights.directions, lights, atol=1e-9)
+    assert "turned into the camera's" in found.assumed[-1]
+    argv = ["import", "olat", str(folder), "--camera", str(camera), "--out", str(tmp_path / "s")]
+    assert main(argv) == 0
+    assert main([*argv, "--lights", "estimate"]) == 3
+    assert "needs no camera" in capsys.readouterr().err
+
+
+def test_cameras_and_videos_state_what_to_do(tmp_path, capsys):
+    for name in ("cam01", "cam02"):
+        (tmp_path / "rig").mkdir(exist_ok=True)
+        write(tmp_path / "rig" / name, np.ones((3, 8, 8)))
+    (tmp_path / "clip.mp4").write_bytes(b"0")
+    for source, advice in (("rig", "cam01 to cam02 look like cameras"), ("clip.mp4", "ffmpeg -i")):
+        assert main(["import", "olat", str(tmp_path / source), "--out", str(tmp_path / "s")]) == 3
+        assert advice in capsys.readouterr().err

@@ -317,3 +317,19 @@ def test_chart_spectra_have_the_chart_reference_colors():
     white = colorimetry.white_point("D65")
     published = colorimetry.lab_from_xyz(colorimetry.chart_reference("D65"), white)
     assert np.median(colorimetry.delta_e_2000(by_spectra, published)) < 2.0
+
+
+def test_clipped_patches_are_left_out_without_mask():
+    """A white card at the end of the range is no clipped patch; the table beside may be."""
+    image, centers = draw_chart(30, rng=np.random.default_rng(4))
+    whole = measure_patches(image, centers)
+    assert whole.valid.all()
+    clipped = measure_patches(np.minimum(image, 0.45), centers)
+    lost = ~clipped.valid
+    assert lost.any()
+    np.testing.assert_array_equal(lost, (whole.rgb > 0.45).any(axis=1))
+    codes = np.rint(np.clip(255 / 0.7 * image, 0, 255)).astype(np.uint8)
+    at_end = measure_patches(codes, centers)
+    np.testing.assert_array_equal(~at_end.valid, (whole.rgb > 0.7).any(axis=1))
+    white = np.rint(np.clip(250 * image / whole.rgb.max(), 0, 255)).astype(np.uint8)
+    assert measure_patches(white, centers).valid.all()

@@ -310,6 +310,8 @@ def test_images_without_a_board_are_named(test_data):
         calibrate_intrinsics([*paths[:3], np.zeros((100, 100), np.uint8)])
     with pytest.raises(BoardError, match="0 of 0"):
         calibrate_intrinsics([])
+    with pytest.raises(BoardError, match="got 2 poses of the board in 6 images"):
+        calibrate_intrinsics([paths[0]] * 5 + [paths[1]])
 
 
 def test_a_printed_charuco_board_is_found(test_data):

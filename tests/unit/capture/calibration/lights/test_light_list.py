@@ -299,3 +299,32 @@ def test_camera_at_own_origin_projects_to_image_middle():
         "x", np.diag([500.0, 500.0, 1.0]), np.zeros(5), np.eye(3), np.zeros(3), (8, 6)
     )
     np.testing.assert_allclose(camera.project([0.0, 0.0, 10.0]), [0.0, 0.0])
+
+
+def chrome_images(test_data):
+    folder = test_data / "photometric_stereo" / "chrome"
+    images = [cv2.imread(str(folder / f"chrome.{k}.png"), 0) for k in range(12)]
+    return images, cv2.imread(str(folder / "chrome.mask.png"), 0) > 127
+
+
+def test_stray_pixel_of_ball_mask_changes_nothing(test_data):
+    images, mask = chrome_images(test_data)
+    stray = mask.copy()
+    stray[2, 500] = True
+    found = directions_from_chrome_ball(images, stray)
+    np.testing.assert_array_equal(found, directions_from_chrome_ball(images, mask))
+
+
+def test_wrong_ball_masks_are_refused(test_data):
+    images, mask = chrome_images(test_data)
+    half = mask.copy()
+    half[148:] = False
+    two = mask | np.roll(mask, 250, axis=1)
+    for wrong, message in (
+        (half, "overlaps a disc of its area by 64%"),
+        (two, "apart from the largest part"),
+        (np.roll(mask, 20, axis=1), "-20 px to the right and [-+]0 px up"),
+        (np.roll(mask, (14, -14), axis=(0, 1)), "[+]14 px to the right and [+]14 px up"),
+    ):
+        with pytest.raises(ChromeBallError, match=message):
+            directions_from_chrome_ball(images, wrong)

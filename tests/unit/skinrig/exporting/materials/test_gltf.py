@@ -17,6 +17,7 @@ from skinrig.errors import UsageError
 from skinrig.exporting.materials import gltf
 from skinrig.exporting.materials.material import Material
 from skinrig.exporting.options import ExportSettings
+from skinrig.exporting.sealing import describe_provenance
 
 MM = 0.001
 
@@ -53,6 +54,19 @@ def picture(parsed, number):
     view = parsed.bufferViews[parsed.images[number].bufferView]
     blob = parsed.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
     return cv2.imdecode(np.frombuffer(blob, np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def test_file_bears_its_provenance(folder, simulated_face, material):
+    """Rationale: programs that copy the file alone keep its asset. Empty lists are left out."""
+
+    def read(blob):
+        return json.loads(blob[20 : 20 + int.from_bytes(blob[12:16], "little")])["asset"]["extras"]
+
+    held = read((folder / "skin.glb").read_bytes())["provenance"]
+    assert held == {k: v for k, v in describe_provenance(simulated_face).items() if v}
+    assert held["source"] == "simulated"
+    person = {"source": "measured", "consent": [{"pseudonym": "P042"}], "assumed": ["a"]}
+    assert read(gltf.encode_glb(material, person)) == {"provenance": person}
 
 
 def test_lengths_are_meters_and_texture_v_grows_downwards(parsed, material):

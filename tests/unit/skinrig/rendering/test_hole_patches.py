@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from rigsim.geometry.mesh import build_mesh
-from skinrig.viewer import holes as patch_charts
-from skinrig.viewer.scene import Texture
+from skinrig.rendering import hole_patches as patch_charts
 
 RADIUS_MM = 60.0
 
@@ -95,7 +94,7 @@ def test_measured_colors_continue_linearly_into_patches(scan):
     size = 256
     v, u = 1.0 - (np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size
     values = np.stack(np.broadcast_arrays(u[None, :], v[:, None]), axis=-1).astype(np.float32)
-    painted = closed.paint_texture(Texture(values, "f32")).values
+    painted = closed.paint(values)
     for chart in closed.charts:
         column, row = int(chart.center[0] * size), int((1.0 - chart.center[1]) * size)
         middle = chart.rim_uv.mean(axis=0)

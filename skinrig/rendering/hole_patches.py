@@ -5,8 +5,6 @@ own disc in an empty part of the texture. Maps that are functions of the surface
 automatically; measured maps are interpolated from the rim.
 """
 
-import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,7 +16,6 @@ from scipy.sparse.linalg import splu
 from rigsim.geometry.atlas import unwrap
 from rigsim.geometry.mesh import Mesh, build_mesh
 from skinrig.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Int64Array
-from skinrig.viewer.scene import Texture, ViewerScene
 
 MAX_LOOP_MM: Final = 200.0
 """Maximum length of a closed loop: an eye, a nostril, the underside of a chin."""
@@ -229,8 +226,6 @@ PATCH_MARGIN: Final = 4.0 / 256.0
 """Minimum distance of a disc from charts: four texels of a map of 256, for texture filters."""
 MIN_RELATIVE_SCALE: Final = 0.25
 """Minimum texture scale of a patch relative to its surroundings; below it, the hole stays open."""
-MEASURED_TEXTURES: Final = ("albedo_map", "lobe_shares", "translucency", "albedo_traits")
-"""Textures that are not functions of the surface point."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -272,26 +267,19 @@ class ClosedMesh:
     charts: tuple[PatchChart, ...]
     open_loops_mm: tuple[float, ...]
 
-    def paint_scene(self, scene: ViewerScene) -> ViewerScene:
-        """Fill the patches in all measured textures of a scene."""
-        if not self.charts:
-            return scene
-        textures: Mapping[str, Texture] = {
-            name: self.paint_texture(one) if name in MEASURED_TEXTURES else one
-            for name, one in scene.textures.items()
-        }
-        return dataclasses.replace(scene, textures=textures)
+    def paint(self, values: FloatArray) -> Float32Array:
+        """Return values, (..., H, W, C) or (H, W), with patches interpolated from their rims.
 
-    def paint_texture(self, texture: Texture) -> Texture:
-        """Fill the patches of a texture by interpolation from their rims."""
-        values = texture.values.reshape(-1, *texture.values.shape[-3:]).copy()
-        for layer in values:
+        Row 0 is at v = 1. The rims' texels must have values.
+        """
+        layers = np.array(values if values.ndim > 2 else values[..., None], np.float32)
+        for layer in layers.reshape(-1, *layers.shape[-3:]):
             for chart in self.charts:
                 _paint(layer, chart)
-        return dataclasses.replace(texture, values=values.reshape(texture.values.shape))
+        return layers.reshape(values.shape)
 
     def summary(self) -> tuple[tuple[str, str], ...]:
-        """Return the page's omissions about holes, with reasons."""
+        """Return omissions about holes, with reasons."""
         rows = {}
         if self.charts:
             lengths = [chart.patch.length_mm for chart in self.charts]

@@ -1,0 +1,67 @@
+"""Compare the exposure times of a bracket with the light of its frames."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from capture.documents import Fault
+from capture.hdr import BracketError
+
+MAX_TIME_ERROR: Final = 0.1
+"""Relative error of a ratio of exposure times from which it is refused."""
+MIN_SIGNAL_SIGMAS: Final = 10.0
+MIN_COMPARED, MAX_COMPARED = 50, 20_000
+"""Pixels that compare two exposures."""
+
+
+def check_times(
+    frames: Sequence[NDArray[np.integer]],
+    exposures_s: ArrayLike,
+    *,
+    gain: float,
+    read_noise: float,
+    black: float,
+    white: float,
+) -> None:
+    """Refuse a bracket whose light contradicts its exposure times.
+
+    Each frame is compared with that of the next longer time, by the median ratio of pixels that
+    are bright in both and saturated in neither. The parameters are those of `capture.hdr.merge`.
+
+    Raises
+    ------
+    BracketError
+        If a ratio of times is off by more than 10 %.
+
+    Examples
+    --------
+    >>> short, long = np.full((9, 9), 612), np.full((9, 9), 1812)
+    >>> check_times([short, long], [0.1, 1.0], gain=2.0, read_noise=4.0, black=512, white=16383)
+    Traceback (most recent call last):
+        ...
+    capture.hdr.BracketError: Bracket: the light contradicts the exposure times
+      exposures_s[0]: got 0.1 s, expected 0.0769 s, as its light over that of 1 s
+    """
+    times = np.asarray(exposures_s, np.float64)
+    step = max(1, frames[0].size // MAX_COMPARED) if frames else 1
+    samples = [frame.reshape(-1)[::step].astype(np.float64) for frame in frames]
+    faults = []
+    order = np.argsort(times, kind="stable")
+    for k, longer in pairwise(order.tolist()):
+        expected = (samples[longer] - black) * (times[k] / times[longer])
+        sigma = np.sqrt(np.maximum(expected, 0.0) / gain + (read_noise / gain) ** 2 + 1.0 / 12.0)
+        bright = expected > MIN_SIGNAL_SIGMAS * sigma
+        bright &= (samples[k] < white) & (samples[longer] < white)
+        if np.count_nonzero(bright) < MIN_COMPARED:
+            continue
+        ratio = float(np.median((samples[k] - black)[bright] / expected[bright]))
+        if not abs(ratio - 1.0) <= MAX_TIME_ERROR:
+            got, wanted = f"{times[k]:.3g} s", f"{times[k] * ratio:.3g} s"
+            why = f"{wanted}, as its light over that of {times[longer]:.3g} s"
+            faults.append(Fault(f"exposures_s[{k}]", got, why))
+    if faults:
+        what = "the light contradicts the exposure times"
+        raise BracketError(what, where="Bracket", faults=faults)

@@ -1,0 +1,68 @@
+"""Fill the gaps of a face's normals from measured normals around them, with a stated error."""
+
+from typing import Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from model.skin import SkinMap
+from model.vectors import unit_vectors
+from skinrig.appearances.contents import intersect_valid
+
+MEASURED_SUFFIX: Final = "_measured"
+"""Suffix of maps of which normals are measured, not filled."""
+N_NEIGHBORS: Final = 12
+"""Measured texels around a gap's texel whose normals give its error."""
+MAX_GAP_DISTANCE_MM: Final = 4.0
+"""Texels farther from the next measured one stay masked: nothing determines them."""
+SPREAD_FACTOR: Final = 0.46
+"""Standard error of a filled normal over the spread of the measured normals around it.
+
+Set on four simulated people, see docs/validation/fusion.md."""
+
+
+def fill_normals(normals: SkinMap, position: SkinMap) -> tuple[SkinMap, SkinMap | None]:
+    """Fill the gaps of normals whose neighborhood is measured.
+
+    Masked texels have values that were interpolated over the texture. They become valid, with the
+    spread of the nearest measured normals times `SPREAD_FACTOR` as standard error, at least the
+    median standard error of these.
+
+    Parameters
+    ----------
+    normals
+        Unit normals (H, W, 3), rad as standard errors.
+    position
+        Surface points of the same texels, mm.
+
+    Returns
+    -------
+    normals : SkinMap
+        The same values with fewer masked texels.
+    measured : SkinMap or None
+        1 where a normal is measured, 0 where it is filled; None if nothing was filled.
+    """
+    known, on_face = intersect_valid(normals, position), intersect_valid(position)
+    length = np.linalg.norm(normals.values, axis=-1)
+    gap = on_face & ~known & (np.abs(length - 1.0) < 1e-3)
+    if normals.stderr is None or not gap.any() or np.count_nonzero(known) < N_NEIGHBORS:
+        return normals, None
+    tree = cKDTree(position.values[known])
+    distance, near = tree.query(position.values[gap], k=N_NEIGHBORS, workers=1)
+    around = normals.values[known].astype(np.float64)[near]
+    middle = unit_vectors(around.mean(axis=1))
+    cosine = np.clip(np.einsum("gnk,gk->gn", around, middle), -1.0, 1.0)
+    spread = np.sqrt(np.mean(np.square(np.arccos(cosine)), axis=1))
+    errors = normals.stderr[known].reshape(len(tree.data), -1)[near]
+    least = np.median(errors.max(axis=-1), axis=1)
+    stderr = normals.stderr.copy()
+    found = np.maximum(SPREAD_FACTOR * spread, least).astype(stderr.dtype)
+    stderr[gap] = found.reshape(-1, *([1] * (stderr.ndim - 2)))
+    filled = np.zeros_like(gap)
+    filled[gap] = distance[:, 0] < MAX_GAP_DISTANCE_MM
+    whole = known | filled
+    what = f"{normals.description}, gaps filled from measured neighbors"
+    measured = SkinMap(
+        known.astype(np.float32), "1", valid=whole, description="1: measured normal; 0: filled"
+    )
+    return SkinMap(normals.values, normals.unit, stderr, whole, what), measured

@@ -1,0 +1,75 @@
+"""Turn one photograph of a face into maps and a report."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from capture.session.manifest import SubjectRecord
+from skinrig.errors import UnusableError
+
+PORTRAIT_MAPS: Final = ("image", "melanin", "hemoglobin")
+
+
+@dataclass(frozen=True, slots=True)
+class Portrait:
+    """Folders that `analyze_portrait` wrote."""
+
+    session: Path
+    appearance: Path
+    report: Path
+    assumed: tuple[str, ...]
+    """Assumptions in place of calibrations, one sentence each."""
+
+
+def analyze_portrait(
+    photograph: Path,
+    out: Path,
+    *,
+    width_px: int,
+    subject: SubjectRecord,
+    progress: Callable[[str], None],
+) -> Portrait:
+    """Find the face of a photograph, estimate its chromophores, and write a report.
+
+    Parameters
+    ----------
+    photograph
+        RAW, TIFF, EXR, PNG or JPEG file.
+    out
+        Folder for session, maps and report.
+    width_px
+        Largest width of the face's image; a wider one is averaged by a whole factor.
+    subject
+        Person in the photograph, with the consent.
+    progress
+        Called with one line before each step.
+
+    Raises
+    ------
+    skinrig.errors.UnusableError
+        If `photograph` is not a file.
+    capture.importers.images.PhotoError
+        If it cannot be read, or shows no face.
+    """
+    from capture.importers import import_photos
+    from capture.importers.framing import FACE_CROP, Framing
+    from reconstruction.pipeline import recipes as pipeline
+    from skinrig.atomic_file import write_atomically
+    from skinrig.reporting.report import build_any
+
+    if not photograph.is_file():
+        raise UnusableError(
+            f"{photograph}: got no file, expected one photograph; a folder of them is imported by"
+            " `skinrig import photos`"
+        )
+    session, appearance, report = (out / n for n in ("session", "appearance", "report.html"))
+    progress("find the face")
+    done = import_photos(
+        photograph, out=session, framing=Framing.parse(FACE_CROP, width_px), subject=subject
+    )
+    found = pipeline.reconstruct(session, want=PORTRAIT_MAPS, out=appearance, progress=progress)
+    progress("write the report")
+    write_atomically(report, build_any([appearance]).html)
+    assumed = tuple(dict.fromkeys((*done.assumed, *found.assumed)))
+    return Portrait(session, appearance, report, assumed)

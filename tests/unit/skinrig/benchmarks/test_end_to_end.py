@@ -1,0 +1,80 @@
+"""Whole captures: ratios of forecasts, limits, and the choice of a rig."""
+
+import pytest
+
+from skinrig.benchmarks import end_to_end
+from skinrig.benchmarks.stage import BenchmarkStage
+from skinrig.cli import main
+
+BUDGETS_S = (20.0, 40.0, 80.0, 160.0)
+
+
+def measured_case(error_factors, time_factor):
+    """Return points of people whose errors and times are known multiples of the forecasts."""
+    points = {}
+    for budget_s in BUDGETS_S:
+        point = end_to_end.MeasuredPoint()
+        for factor in error_factors:
+            expected = 100.0 / budget_s
+            seconds = dict.fromkeys(end_to_end.RUN_PHASES, 0.25 * budget_s)
+            point.forecast.append({"melanin": expected})
+            point.measured.append({"melanin": factor * expected})
+            point.forecast_s.append(seconds | {"total": budget_s})
+            longer = {name: time_factor * value for name, value in seconds.items()}
+            point.measured_s.append(longer | {"total": time_factor * budget_s})
+        points[64, budget_s] = point
+    return points
+
+
+def run(monkeypatch, error_factors, time_factor=1.0):
+    monkeypatch.setattr(
+        end_to_end, "_measure_case", lambda *_: measured_case(error_factors, time_factor)
+    )
+    stage = BenchmarkStage("end-to-end", selection="flash")
+    list(end_to_end.measure_end_to_end(stage))
+    return stage.to_benchmark()
+
+
+def test_forecast_ratio_is_geometric_mean(monkeypatch):
+    found = run(monkeypatch, (0.5, 2.0), time_factor=1.1)
+    error, seconds = found.limits
+    assert error.got == pytest.approx(1.0)
+    assert seconds.got == pytest.approx(1.1)
+    assert error.passed
+    assert seconds.passed
+
+
+@pytest.mark.parametrize(("factors", "time_factor"), [((1.3, 1.3), 1.0), ((0.7, 0.7), 0.7)])
+def test_wrong_forecast_misses_limit_either_way(monkeypatch, factors, time_factor):
+    found = run(monkeypatch, factors, time_factor)
+    assert not found.limits[0].passed
+    assert found.limits[1].passed == (time_factor == 1.0)
+
+
+def test_points_hold_total_seconds_and_mean_error(monkeypatch):
+    found = run(monkeypatch, (0.5, 1.5), time_factor=2.0)
+    assert [point.timing.seconds for point in found.points] == [2.0 * b for b in BUDGETS_S]
+    first = found.points[0]
+    assert first.error == pytest.approx(100.0 / BUDGETS_S[0])
+    assert first.error_interval[0] < first.error < first.error_interval[1]
+    assert first.extra_values["people"] == 2
+    assert first.extra_values["capture, s"] == pytest.approx(0.5 * BUDGETS_S[0])
+
+
+def test_bench_command_measures_selected_rig(monkeypatch, capsys):
+    asked = {}
+
+    def measured(names, **options):
+        asked.update(names=names, **options)
+        return {"schema": "skinrig.bench/2", "passed": True}
+
+    monkeypatch.setattr("skinrig.benchmarks.stages.run_stages", measured)
+    assert main(["bench", "--end-to-end", "flash"]) == 0
+    assert (asked["names"], asked["selection"]) == (["end-to-end"], "flash")
+    assert main(["bench", "--end-to-end", "flash", "--stage", "hdr"]) == 2
+    assert main(["bench", "--end-to-end", "flash", "--extremes"]) == 2
+
+
+def test_unknown_rig_is_reported_with_known_ones(capsys):
+    assert main(["bench", "--end-to-end", "moon"]) == 3
+    assert "flash" in capsys.readouterr().err
