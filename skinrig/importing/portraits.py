@@ -48,14 +48,14 @@ def analyze_portrait(
     Raises
     ------
     skinrig.errors.UnusableError
-        If `photograph` is not a file.
+        If `photograph` is not a file, or gray, or `out` has content.
     capture.importers.images.PhotoError
         If it cannot be read, or shows no face.
     """
     from capture.importers import import_photos
     from capture.importers.framing import FACE_CROP, Framing
     from reconstruction.pipeline import recipes as pipeline
-    from skinrig.atomic_file import write_atomically
+    from skinrig.atomic_file import replace_folder_atomically, write_atomically
     from skinrig.reporting.report import build_any
 
     if not photograph.is_file():
@@ -63,13 +63,21 @@ def analyze_portrait(
             f"{photograph}: got no file, expected one photograph; a folder of them is imported by"
             " `skinrig import photos`"
         )
-    session, appearance, report = (out / n for n in ("session", "appearance", "report.html"))
-    progress("find the face")
-    done = import_photos(
-        photograph, out=session, framing=Framing.parse(FACE_CROP, width_px), subject=subject
-    )
-    found = pipeline.reconstruct(session, want=PORTRAIT_MAPS, out=appearance, progress=progress)
-    progress("write the report")
-    write_atomically(report, build_any([appearance]).html)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UnusableError(f"--out: {out} exists, expected a new or empty folder; name another")
+    names = "session", "appearance", "report.html"
+    with replace_folder_atomically(out) as made:
+        session, appearance, report = (made / name for name in names)
+        progress("find the face")
+        framing = Framing.parse(FACE_CROP, width_px)
+        done = import_photos(photograph, out=session, framing=framing, subject=subject)
+        if not done.color_states:
+            raise UnusableError(
+                f"{photograph}: got a gray photograph, expected a color photograph, from which "
+                "melanin and hemoglobin follow; give another file"
+            )
+        found = pipeline.reconstruct(session, want=PORTRAIT_MAPS, out=appearance, progress=progress)
+        progress("write the report")
+        write_atomically(report, build_any([appearance]).html)
     assumed = tuple(dict.fromkeys((*done.assumed, *found.assumed)))
-    return Portrait(session, appearance, report, assumed)
+    return Portrait(*(out / name for name in names), assumed)

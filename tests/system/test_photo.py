@@ -9,7 +9,7 @@ import skimage.data
 from typer.testing import CliRunner
 
 from model import store
-from skinrig.cli import app
+from skinrig.cli import app, main
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +43,17 @@ def test_report_is_one_page(portrait):
     assert "Melanosome volume fraction" in page
 
 
-def test_second_run_changes_nothing(portrait):
+def test_second_run_changes_nothing(portrait, capsys):
     _, folder, arguments = portrait
     before = (folder / "out" / "report.html").read_bytes()
-    again = CliRunner().invoke(app, arguments)
-    assert again.exit_code != 0
+    assert main(arguments) == 3
+    assert "expected a new or empty folder" in capsys.readouterr().err
     assert (folder / "out" / "report.html").read_bytes() == before
+
+
+def test_gray_photograph_leaves_nothing(tmp_path, capsys):
+    gray = cv2.cvtColor(skimage.data.astronaut(), cv2.COLOR_RGB2GRAY)
+    cv2.imwrite(str(tmp_path / "me.png"), gray)
+    assert main(["photo", str(tmp_path / "me.png"), "--out", str(tmp_path / "out")]) == 3
+    assert "got a gray photograph" in capsys.readouterr().err
+    assert [one.name for one in tmp_path.iterdir()] == ["me.png"]

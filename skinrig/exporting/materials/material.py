@@ -123,7 +123,9 @@ class Material:
         def paint(values: FloatArray) -> FloatArray:
             if not closed.charts:
                 return np.nan_to_num(values)
-            return closed.paint(fill_holes(values, model.valid))
+            filled = fill_holes(values, model.valid).astype(np.float32)
+            painted = closed.paint(filled)  # rims need values; elsewhere nothing changes
+            return np.where(painted == filled, np.nan_to_num(values), painted)
 
         framed = FramedMesh.of(mesh)
         # frames are those of the whole mesh, as in a renderer, also at borders of tiles

@@ -5,7 +5,10 @@ import pytest
 import skimage.color
 import skimage.data
 
+from model.skin import SkinMap
 from model.skin_tone.measured import measured_skin
+from reconstruction.pipeline.flash.skin_stage import _keep_skin
+from reconstruction.pipeline.inputs import InputsError
 from reconstruction.skin_region import find_face_skin
 
 SIDE = 120
@@ -100,3 +103,12 @@ def test_portrait_keeps_skin_alone():
     }
     assert {name for name, place in skin.items() if found[place]} == set(skin)
     assert {name for name, place in rest.items() if found[place]} == set()
+
+
+def test_clipped_cheeks_are_refused():
+    rgb, skin = scene("II", SURROUNDINGS["cloth"])
+    everywhere = np.ones(skin.shape, bool)
+    _keep_skin("s: neutral", FACE, SkinMap(rgb, "1", valid=everywhere))
+    clipped = everywhere & ~skin
+    with pytest.raises(InputsError, match="cheeks and nose may be clipped"):
+        _keep_skin("s: neutral", FACE, SkinMap(rgb, "1", valid=clipped))
