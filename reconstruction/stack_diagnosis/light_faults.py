@@ -32,6 +32,8 @@ STRENGTH_RANGE = (0.75, 1.35)
 MIN_DRIFT, MIN_DRIFT_SIGMAS = 0.05, 6.0
 MIN_FLICKER = 0.025
 """Spread of the light from line to line, relative, beyond that across the lines."""
+MIN_LIT = 0.5
+"""Light over matte shading; cast shadows have less."""
 MIN_LINES, MIN_LINE_SAMPLES = 16, 8
 
 
@@ -221,7 +223,7 @@ def find_flicker(
     """
     spreads = []
     for image, clear, shading in zip(gray, usable, predicted, strict=True):
-        lit = inside & clear & (image > 0.0)
+        lit = inside & clear & (image > MIN_LIT * shading)  # not in cast shadows
         if not lit.any():
             continue
         lit &= shading > 0.3 * np.quantile(shading[inside], 0.9)

@@ -55,13 +55,7 @@ def write(
     ExportError
         If a selected map is missing, or the appearance has none.
     """
-    names = list(delivery.only) or sorted(appearance.maps)
-    missing = [name for name in names if name not in appearance.maps]
-    if missing or not names:
-        raise ExportError(
-            f"--only: got {missing[0] if missing else 'no maps'}, expected some of "
-            f"{', '.join(sorted(appearance.maps)) or 'a reconstruction that has some'}"
-        )
+    names = choose_maps(appearance, delivery)
     out = ImageFolder(folder, delivery)
     on_mesh = any(name in appearance.files for name in MESH_FILES)
     shown: dict[str, tuple[str, str]] = {}  # file and type by name in the material file
@@ -105,6 +99,24 @@ def write(
         },
     )
     return out.left_out
+
+
+def choose_maps(appearance: SkinAppearance, delivery: ExportSettings) -> list[str]:
+    """Return the names of the selected maps.
+
+    Raises
+    ------
+    ExportError
+        If a selected map is missing, or the appearance has none.
+    """
+    names = list(delivery.only) or sorted(appearance.maps)
+    missing = [name for name in names if name not in appearance.maps]
+    if missing or not names:
+        raise ExportError(
+            f"--only: got {missing[0] if missing else 'no maps'}, expected some of "
+            f"{', '.join(sorted(appearance.maps)) or 'a reconstruction that has some'}"
+        )
+    return names
 
 
 def _image(name: str, skin_map: SkinMap, delivery: ExportSettings, on_mesh: bool) -> ExportImage:

@@ -13,7 +13,8 @@ import numpy as np
 
 from model.skin import SkinAppearance, SkinMap
 from skinrig.errors import MissingExtra
-from skinrig.exporting.options import ExportError, ExportSettings
+from skinrig.exporting.maps import choose_maps
+from skinrig.exporting.options import ExportSettings
 from skinrig.exporting.sealing import IMAGE_ORIENTATION, describe_provenance
 
 if TYPE_CHECKING:
@@ -56,13 +57,7 @@ def write(
         import zarr
     except ImportError as error:
         raise MissingExtra("export to OME-Zarr", "zarr") from error
-    names = list(delivery.only) or sorted(appearance.maps)
-    missing = [name for name in names if name not in appearance.maps]
-    if missing or not names:
-        raise ExportError(
-            f"--only: got {missing[0] if missing else 'no maps'}, expected some of "
-            f"{', '.join(sorted(appearance.maps)) or 'a reconstruction that has some'}"
-        )
+    names = choose_maps(appearance, delivery)
     about = {"schema": SCHEMA, **describe_provenance(appearance), "orientation": IMAGE_ORIENTATION}
     root = zarr.create_group(
         folder / STORE_FOLDER,

@@ -117,7 +117,6 @@ def _require_images(directory: Path) -> None:
             "is a video",
             where=str(directory),
             advice="Write its frames to a folder, by `ffmpeg -i VIDEO frames/%05d.png` for one.",
-            code="SR-IMP-005",
         )
     if directory.is_dir():
         try:

@@ -1,10 +1,12 @@
 """Faults of images under listed lights are named with the right images; sound sets have none."""
 
+import csv
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
-from fixtures.faulty_stacks import FAULTS, make
+from fixtures.faulty_stacks import FAULTS, GRADED, make
 
 from model.metrics import angular_error_rad
 from reconstruction.normal_maps import PhotometricStereoError
@@ -126,6 +128,19 @@ def test_large_stacks_are_read_image_by_image():
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 0.6 * images.nbytes
+
+
+def test_pain_suite_has_each_fault_of_the_diagnosis():
+    table = Path(__file__).parents[4] / "tools" / "pain_suite.csv"
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    stated = {GRADED[row["fault"]] for row in rows if row["stated"] == "yes"}
+    assert stated == set(GRADED.values())
+    for row in rows:
+        severity = float(row["severity"]) if row["severity"] else None
+        stack = make(row["fault"], 0, side=24, severity=severity, rig="flash", tone="dark")
+        sound = make("", 0, side=24, rig="flash", tone="dark")
+        same = np.array_equal(stack.images, sound.images)
+        assert not (same and np.array_equal(stack.lights, sound.lights)), row
 
 
 @pytest.mark.long
