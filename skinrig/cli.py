@@ -107,6 +107,7 @@ for command in (
     reconstructing.reconstruct,
     fusing.fuse,
     measuring.bench,
+    measuring.soak,
     measuring.doctor,
     rendering.render,
     editing.edit,

@@ -141,6 +141,11 @@ class Link:
             self._host_free = max(now, self._host_free) + len(data) * self._byte_s
             self._to_host.append((self._host_free, data))
 
+    @property
+    def quiet_from_s(self) -> float:
+        """Time from which no more bytes of the host arrive unless it sends some, s."""
+        return max((at_s for at_s, _ in self._to_box), default=0.0)
+
     def take(self, size: int) -> bytes:
         """Return at most `size` bytes that have arrived."""
         data = bytes(self._received[:size])

@@ -19,7 +19,7 @@ HELP_SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
     ),
     ("Reconstruct and model", ("reconstruct", "fuse", "fit", "apply", "edit", "analyse")),
     ("Report, render and export", ("report", "view", "render", "export")),
-    ("Measure errors and run times", ("bench",)),
+    ("Measure errors and run times", ("bench", "soak")),
 )
 OTHER_SECTION: Final = "More"
 
