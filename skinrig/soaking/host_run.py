@@ -13,7 +13,7 @@ from capture.acquire import Operator, run_plan
 from capture.devices.camera import open_camera
 from capture.devices.port import Port, PortBusy
 from capture.plan import Plan
-from capture.session import Session, SubjectRecord, resume_unless_complete
+from capture.session import Session, SubjectRecord
 from rigsim.world import World
 from rigsim.world.line_faults import LineTap
 from skinrig.capturing.acquisition import discard_unused_session
@@ -213,10 +213,9 @@ class HostRun:
 
     def _open_session(self) -> tuple[Session, bool]:
         if (self.folder / "session.json").exists():
-            done = resume_unless_complete(self.folder)
+            done = Session.open(self.folder)
             if done.closed:
                 return done, False
-            done.release()
             session, is_new = WitnessedSession.resume(self.folder, disk=self.disk), False
         else:
             now = datetime.fromtimestamp(self.clock_s(), UTC)

@@ -25,6 +25,7 @@ from skinrig.soaking.soaked_session import InvariantViolated, SessionOutcome, So
 from skinrig.soaking.witnesses import WITNESS_RIGS, WitnessRig
 
 SHOTS_PER_DAY = 200
+"""Frames after which a day has no further session."""
 HOURS_PER_DAY = 24.0
 MAX_SESSIONS_PER_DAY = 60
 IDLE_S = 600.0
@@ -75,6 +76,7 @@ def run_soak(
     *,
     hours: float,
     first_day: int = 0,
+    shots_per_day: int = SHOTS_PER_DAY,
     budget_s: float = np.inf,
     progress: Callable[[str], None] = lambda line: None,
 ) -> SoakResult:
@@ -88,6 +90,8 @@ def run_soak(
         Simulated time, h; whole days are simulated.
     first_day
         Number of the first day, >= 0.
+    shots_per_day
+        Frames after which a day has no further session.
     budget_s
         Processor time after which no further day begins, s.
     progress
@@ -106,7 +110,7 @@ def run_soak(
             if time.process_time() - begun_s > budget_s:
                 break
             try:
-                _soak_day(result, seed, day, digest)
+                _soak_day(result, seed, day, digest, shots_per_day)
             except InvariantViolated as violation:
                 replay = f"skinrig soak --seed {seed} --first-day {day} --hours 24"
                 result.failure = f"day {day}, session {result.sessions}: {violation}; {replay}"
@@ -119,14 +123,14 @@ def run_soak(
     return result
 
 
-def _soak_day(result: SoakResult, seed: int, day: int, digest: Any) -> None:
+def _soak_day(result: SoakResult, seed: int, day: int, digest: Any, shots_per_day: int) -> None:
     rng = np.random.default_rng([seed, day])
     worlds: dict[str, tuple[World, str]] = {}
     names = sorted(WITNESS_RIGS)
     shots, time_s = 0, 0.0
     try:
         for number in range(MAX_SESSIONS_PER_DAY):
-            if shots >= SHOTS_PER_DAY:
+            if shots >= shots_per_day:
                 break
             witness = WITNESS_RIGS[str(rng.choice(names))]
             if witness.name not in worlds:

@@ -262,7 +262,7 @@ class SoakedSession:
         from_s = max([world.now, *(world.link(kind).quiet_from_s for kind in units)])
         world.clock.sleep(from_s - world.now)
         ends_s = {kind: world.now + unit.lease_s + DARK_SLACK_S for kind, unit in units.items()}
-        replays = self._find_delivered() if self._rng.random() < 0.3 else []
+        replays = self._find_delivered() if self._rng.random() < 0.6 else []
         while world.now < max(ends_s.values()):
             for kind, unit in units.items():
                 if replays and self._witness.box == kind:
@@ -344,11 +344,18 @@ class SoakedSession:
                 blob = (self._folder / record.file).read_bytes()
                 same = xxhash.xxh3_128_hexdigest(blob) == digest
                 require(same, "no acknowledged frame is altered", record.step_id)
+            serial = self._witness.rig.view(record.camera).serial
+            same = record.actual["serial"] == serial
+            require(same, "no frame of another camera", record.step_id)
             deviation = self._witness.find_deviation(record.step, frame.cfa, record.actual)
             if deviation:
                 yield f"{record.step_id}: {deviation}"
         self._outcome.shots = len(found)
         omitted = session.omitted_steps()
+        if session.closed:
+            have = {step for step, _, _ in found} | set(omitted)
+            missing = [step.id for step in session.plan.steps if step.id not in have]
+            require(not missing, "a complete session has all frames", missing)
         latest = {(step, camera): 0 for step, camera, _ in self._ledger.frames}
         for step, camera, attempt in self._ledger.frames:
             latest[step, camera] = max(latest[step, camera], attempt)
