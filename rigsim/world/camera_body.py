@@ -30,6 +30,8 @@ EXPOSURE_RANGE_S = (1.0 / 8000.0, 30.0)
 
 CLOCK_ROUNDING_US = 1e-3
 """Rounding error of a time in floating-point seconds, us."""
+CLOCK_STEP_S = 1e-6
+"""Step of the controllers' clock, s: a pulse is at the nearest one."""
 FOREIGN_SERIAL = "SR-9999"
 
 
@@ -167,7 +169,8 @@ class CameraBody:
 
     def edge(self, now: float) -> None:
         """Handle a pulse on the camera line."""
-        if self._trigger is Trigger.EDGE and self._armed and now >= self._busy_until:
+        is_ready = now + CLOCK_STEP_S > self._busy_until
+        if self._trigger is Trigger.EDGE and self._armed and is_ready:
             self._open_shutter(now)
         else:
             self.missed_edges += 1
