@@ -122,6 +122,7 @@ dynamic.fit_app.command("reflectance", cls=Command)(reconstructing.fit_reflectan
 app.add_typer(simulating.simulate_app, name="simulate")
 app.add_typer(capturing.capture_app, name="capture")
 app.add_typer(capturing.serve_app, name="serve")
+app.add_typer(capturing.session_app, name="session")
 app.add_typer(planning.plan_app, name="plan")
 app.add_typer(importing.import_app, name="import")
 app.add_typer(dynamic.fit_app, name="fit")

@@ -9,7 +9,10 @@ from rigsim.world import World
 
 LONG_SHARE: Final = 0.15
 """Share of the runs that are long enough to reach the dose limit of an LED."""
-FEW_REQUESTS, MANY_REQUESTS = 25, 700
+FEW_REQUESTS, MANY_REQUESTS, FLASH_REQUESTS = 25, 700, 120
+MEAN_PAUSE_S = 0.4
+FLASH_PAUSE_S = 0.6
+"""Mean pause, s: all requests take longer than the minute of the flash's limit."""
 LIGHT_COMMANDS: Final = {
     "dome": "LED:ON {led},{ms},1000",
     "gradient_sphere": "PATT full,{ms},1000",
@@ -42,7 +45,10 @@ def request_too_much_light(
         setup = ["FLAS:POW 0.05"] if kind == "flash" else ["DOSE:NEW reckless", "SAFE:EYES OPEN"]
         for text in (*setup, "SYST:WDOG 5000"):
             port.ask(text)
-        for number in range(MANY_REQUESTS if many else FEW_REQUESTS):
+        few, pause_s = FEW_REQUESTS, MEAN_PAUSE_S
+        if kind == "flash":
+            few, pause_s = FLASH_REQUESTS, FLASH_PAUSE_S
+        for number in range(MANY_REQUESTS if many else few):
             if not many and rng.random() < 0.3:
                 led = int(rng.integers(lights))
             ms = 500 if many else int(rng.integers(20, 900))
@@ -51,6 +57,6 @@ def request_too_much_light(
                 port.ask(LIGHT_COMMANDS[kind].format(led=led, ms=ms, number=number))
             except CommandRefused:
                 pass  # the limit that is under test
-            world.clock.sleep(1.0 if many else float(rng.exponential(0.4)))
+            world.clock.sleep(1.0 if many else float(rng.exponential(pause_s)))
         world.clock.sleep(1.0)
         port.ask("SAFE")
