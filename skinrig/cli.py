@@ -2,6 +2,7 @@
 
 import logging
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from functools import cache
@@ -183,8 +184,14 @@ def _report_failure(
     return code
 
 
+def _interrupt(number: int, frame: object) -> None:
+    """End like Ctrl-C: temporary folders are removed, child processes and light end."""
+    raise KeyboardInterrupt
+
+
 def run() -> None:
     """Entry point of the console script."""
+    signal.signal(signal.SIGTERM, _interrupt)
     kernel_cache.provide_kernel_cache(os.environ)
     sys.exit(main())
 

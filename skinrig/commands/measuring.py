@@ -121,9 +121,9 @@ def soak(
     from skinrig.soaking.soak import run_soak
 
     console = Console(json)
-    for name, value, least in (("--hours", hours, 0.0), ("--first-day", first_day, 0)):
-        if not value >= least or value == float("inf"):
-            raise errors.UnusableError(f"{name}: got {value:g}, expected {least:g} or more")
+    for name, value in (("--seed", seed), ("--hours", hours), ("--first-day", first_day)):
+        if not 0 <= value < float("inf"):
+            raise errors.UnusableError(f"{name}: got {value:g}, expected 0 or more; raise it")
     if budget is not None and not budget > 0:
         raise errors.UnusableError(f"--budget: got {budget:g}, expected seconds above 0; raise it")
     result = run_soak(

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import xxhash
 
-from capture.acquire import Operator, run_plan
+from capture.acquire import CaptureInterrupted, Operator, run_plan
 from capture.devices.camera import open_camera
 from capture.devices.port import Port, PortBusy
 from capture.plan import Plan
@@ -48,6 +48,10 @@ class Ledger:
 
     frames: dict[tuple[str, str, int], str] = field(default_factory=dict)
     closed: bool = False
+
+
+class SimulatedInterrupt(KeyboardInterrupt):
+    """Ctrl-C at a simulated host; a real one ends the soak."""
 
 
 class SilentConsole(Console):
@@ -105,7 +109,7 @@ class HostTap:
         if self.fault.kind == "kill":
             self.life.end()
         if self.fault.kind == "interrupt":
-            raise KeyboardInterrupt
+            raise SimulatedInterrupt
         if self.fault.kind == "reset" and self._world is not None:
             for name in self._world.rig.boxes:
                 box = self._world.box(name)
@@ -162,7 +166,7 @@ class HostRun:
             self._capture(opened)
         except HostKilled:
             return KILLED, "killed"
-        except (Exception, KeyboardInterrupt) as error:
+        except (Exception, SimulatedInterrupt, CaptureInterrupted) as error:
             return exit_code(error), f"{type(error).__name__}: {error}"
         finally:
             for device in reversed(opened):
@@ -174,7 +178,7 @@ class HostRun:
     def _close(device: Any) -> None:
         try:
             device.close()
-        except (HostKilled, KeyboardInterrupt):
+        except (HostKilled, SimulatedInterrupt):
             device.close()  # the operating system closes what a dead process leaves
 
     def _capture(self, opened: list[Any]) -> None:
