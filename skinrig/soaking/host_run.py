@@ -1,6 +1,6 @@
 """Run one host against a simulated rig: open, capture or resume, end; with at most one fault."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -162,24 +162,24 @@ class HostRun:
         """Run the host; return its exit code, `KILLED` for a killed one, and its message."""
         opened: list[Any] = []
         self.tap.begin(self.disk.life, self.fault, self.world)
+        ended = self._catch(lambda: self._capture(opened))
+        for device in reversed(opened):
+            closed = self._catch(device.close)
+            if closed[0] != EXIT_DONE:  # the operating system closes what a dead process leaves
+                ended = closed if ended[0] == EXIT_DONE else ended
+                self._catch(device.close)
+        self.disk.close_all()
+        return ended
+
+    @staticmethod
+    def _catch(act: Callable[[], None]) -> tuple[int, str]:
         try:
-            self._capture(opened)
+            act()
         except HostKilled:
             return KILLED, "killed"
         except (Exception, SimulatedInterrupt, CaptureInterrupted) as error:
             return exit_code(error), f"{type(error).__name__}: {error}"
-        finally:
-            for device in reversed(opened):
-                self._close(device)
-            self.disk.close_all()
         return EXIT_DONE, "complete"
-
-    @staticmethod
-    def _close(device: Any) -> None:
-        try:
-            device.close()
-        except (HostKilled, SimulatedInterrupt):
-            device.close()  # the operating system closes what a dead process leaves
 
     def _capture(self, opened: list[Any]) -> None:
         boxes = self._open_boxes(opened)
@@ -188,7 +188,8 @@ class HostRun:
         opened.extend(cameras.values())
         fresh = not self.folder.exists()
         session, is_new = self._open_session()
-        if session.closed:
+        if session.closed:  # the host before was killed after its last write
+            self.ledger.closed = True
             return
         unused = discard_unused_session(session, fresh, SilentConsole())
         with unused if is_new else nullcontext():

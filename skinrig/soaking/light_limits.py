@@ -14,6 +14,9 @@ from capture.rig import LedLimits, Rig
 POP_WINDOW_S = 60.0
 FUSION_S = 1.0 / 65.0
 """Darkness, s, that an eye does not notice."""
+EYE_PLANE_MM = 80.0
+"""Distance of the eyes from the head's center, along +z, mm: light from behind does not reach them.
+"""
 ROUNDING = 1e-6
 TIME_ROUNDING_S = 2e-6
 
@@ -62,8 +65,13 @@ def find_limit_violations(
         duty = _find_largest_duty(on_s, off_s, level, limits.duty_window_s)
         if duty > limits.max_duty + TIME_ROUNDING_S * on_s.size:
             yield f"dose: LED {led} had a duty of {duty:.4f}, limit {limits.max_duty:g}"
-    if eyes == "open" and by_led:
-        flashes = _count_flashes_per_s(sorted(i for some in by_led.values() for i in some))
+    seen = [
+        (light.t_on_s, light.t_off_s, light.level)
+        for light in switched
+        if not hasattr(light, "led") or rig.lights[light.led].position_mm[2] > EYE_PLANE_MM
+    ]
+    if eyes == "open" and seen:
+        flashes = _count_flashes_per_s(sorted(seen))
         if flashes > limits.max_flashes_per_s:
             yield f"flicker: {flashes} flashes per second, limit {limits.max_flashes_per_s:g}"
 

@@ -214,7 +214,8 @@ class SoakedSession:
         first_seq = int(self._rng.integers(2**31))
         words = {"rng": self._rng, "first_seq": first_seq}
         try:
-            request_too_much_light(world, self._world_name, self._witness.box, **words)
+            dark = request_too_much_light(world, self._world_name, self._witness.box, **words)
+            require(dark, "dark at once when made dark", self._witness.box)
         except DeviceError:  # the day's faults of the line: the light so far is judged
             self._outcome.faults["reckless host lost"] += 1
         world.clock.sleep(PAUSE_S + MAX_LEASE_S)
