@@ -212,10 +212,12 @@ class SoakedSession:
             world.link(kind).tap = None
         self._pops_before, self._first_light = tuple(world.pops), len(world.switched)
         first_seq = int(self._rng.integers(2**31))
-        words = {"rng": self._rng, "first_seq": first_seq}
+        box = self._witness.box
         try:
-            dark = request_too_much_light(world, self._world_name, self._witness.box, **words)
-            require(dark, "dark at once when made dark", self._witness.box)
+            dark = request_too_much_light(
+                world, self._world_name, box, rng=self._rng, first_seq=first_seq
+            )
+            require(dark, "dark at once when made dark", box)
         except DeviceError:  # the day's faults of the line: the light so far is judged
             self._outcome.faults["reckless host lost"] += 1
         world.clock.sleep(PAUSE_S + MAX_LEASE_S)
@@ -336,10 +338,10 @@ class SoakedSession:
             self._outcome.content_hash = session.content_hash
 
     def _find_deviations(self, session: Session) -> Iterator[str]:
-        found = {}
+        found: set[tuple[str, str, int]] = set()
         for record in session.frames():
             key = (record.step_id, record.camera, record.attempt)
-            found[key] = None
+            found.add(key)
             frame = session.read(record)
             if digest := self._ledger.frames.get(key):
                 blob = (self._folder / record.file).read_bytes()

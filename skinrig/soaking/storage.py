@@ -59,7 +59,7 @@ class LoggedDisk(Disk):
     def __init__(self, root: Path, earlier: "LoggedDisk | None" = None) -> None:
         self.root = root
         self.log: list[Operation] = []
-        self.inodes = itertools.count() if earlier is None else earlier.inodes
+        self.inodes: Iterator[int] = itertools.count() if earlier is None else earlier.inodes
         self.known: dict[int, int] = {} if earlier is None else earlier.known
         self.opened: dict[int, tuple[str, int]] = {}
 

@@ -232,7 +232,11 @@ class CaliperWitness(GradientWitness):
         angle = float(rng.choice([0.0, 45.0, 90.0]))
         patterns = ("full", *(str(name) for name in rng.permutation(LIGHT_PATTERNS[1:])[:2]))
         return gradient_plan(
-            self.rig, angles=[angle], steps=(-1, 1), patterns=dict.fromkeys(patterns), darks=1
+            self.rig,
+            angles=[angle],
+            steps=(-1, 1),
+            patterns=tuple(dict.fromkeys(patterns)),
+            darks=1,
         )
 
     def describe_hold(self, **held: Any) -> Row:

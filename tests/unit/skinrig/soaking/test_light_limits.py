@@ -41,8 +41,14 @@ def test_dose_and_duty_meet_closed_forms(switched, exceeded):
 
 @pytest.mark.parametrize(("every_s", "flashes"), [(0.3, 4), (0.34, 0), (0.005, 0)])
 def test_flashes_count_for_open_eyes_alone(every_s, flashes):
-    switched = pulses(20, lit_s=0.004, every_s=every_s, level=0.1)
+    front, behind = (
+        next(k for k, light in enumerate(DOME.lights) if (light.position_mm[2] > 80.0) == is_front)
+        for is_front in (True, False)
+    )
+    switched = pulses(20, lit_s=0.004, every_s=every_s, level=0.1, led=front)
     assert found(switched) == []
+    unseen = pulses(20, lit_s=0.004, every_s=every_s, level=0.1, led=behind)
+    assert found(unseen, eyes="open") == []
     violations = found(switched, eyes="open")
     assert violations == ([f"flicker: {flashes} flashes per second, limit 3"] if flashes else [])
 
