@@ -30,7 +30,7 @@ FORCE_LIMIT_N = 2.0
 SECONDS_PER_DAY = 86_400.0
 FIRST_DAY_S = 1.8e9
 """Time of the host's clock at the beginning of day 0, s since 1970."""
-KILLED = -1
+KILLED_CODE = -1
 """In place of the exit code of a killed host."""
 
 
@@ -159,7 +159,7 @@ class HostRun:
         return FIRST_DAY_S + self.day * SECONDS_PER_DAY + self.world.now + self.fault.jump_s
 
     def perform(self) -> tuple[int, str]:
-        """Run the host; return its exit code, `KILLED` for a killed one, and its message."""
+        """Run the host; return its exit code, `KILLED_CODE` for a killed one, and its message."""
         opened: list[Any] = []
         self.tap.begin(self.disk.life, self.fault, self.world)
         ended = self._catch(lambda: self._capture(opened))
@@ -176,7 +176,7 @@ class HostRun:
         try:
             act()
         except HostKilled:
-            return KILLED, "killed"
+            return KILLED_CODE, "killed"
         except (Exception, SimulatedInterrupt, CaptureInterrupted) as error:
             return exit_code(error), f"{type(error).__name__}: {error}"
         return EXIT_DONE, "complete"

@@ -17,7 +17,7 @@ FUSION_S = 1.0 / 65.0
 EYE_PLANE_MM = 80.0
 """Distance of the eyes from the head's center, along +z, mm: light from behind does not reach them.
 """
-ROUNDING = 1e-6
+RELATIVE_ROUNDING = 1e-6
 TIME_ROUNDING_S = 2e-6
 
 
@@ -57,7 +57,7 @@ def find_limit_violations(
         on_s, off_s, level = np.array(sorted(intervals)).T
         power_w = rig.lights[led].power_w or 0.0
         dose_ws = float(power_w * (level * (off_s - on_s)).sum())
-        if dose_ws > limits.dose_ws * (1.0 + ROUNDING):
+        if dose_ws > limits.dose_ws * (1.0 + RELATIVE_ROUNDING):
             yield f"dose: LED {led} emitted {dose_ws:.3f} Ws, limit {limits.dose_ws:g}"
         longest_s = float((off_s - on_s).max())
         if longest_s > limits.max_on_s + limits.overlap_s + TIME_ROUNDING_S:

@@ -19,7 +19,7 @@ from rigsim.world.line_faults import LineFaults
 from skinrig.errors import EXIT_BAD_INPUT, EXIT_DEVICE_FAILED, EXIT_DONE, EXIT_INTERRUPTED
 from skinrig.soaking.fault_draw import NO_HOST_FAULT, HostFault, draw_host_fault
 from skinrig.soaking.host_life import HostLife
-from skinrig.soaking.host_run import KILLED, HostRun, HostTap, Ledger
+from skinrig.soaking.host_run import KILLED_CODE, HostRun, HostTap, Ledger
 from skinrig.soaking.light_limits import find_limit_violations
 from skinrig.soaking.reckless_host import LIGHT_COMMANDS, request_too_much_light
 from skinrig.soaking.storage import (
@@ -43,7 +43,7 @@ REPLAY_INTERVAL_S = 0.05
 MAX_LEASE_S = 5.0
 PERSISTENT_ERRORS = ("was refused with 107", "emergency stop", "draws no current")
 """Messages of a rig that cannot go on before a person has acted."""
-DOCUMENTED_CODES = {EXIT_DONE, EXIT_BAD_INPUT, EXIT_DEVICE_FAILED, EXIT_INTERRUPTED, KILLED}
+DOCUMENTED_CODES = {EXIT_DONE, EXIT_BAD_INPUT, EXIT_DEVICE_FAILED, EXIT_INTERRUPTED, KILLED_CODE}
 
 
 class InvariantViolated(AssertionError):
@@ -72,9 +72,9 @@ class Storage:
 
     def __init__(self, root: Path) -> None:
         self.root, self.lies = root, False
-        self._start_anew({})
+        self._restart({})
 
-    def _start_anew(self, image: Image) -> None:
+    def _restart(self, image: Image) -> None:
         self._medium = Medium()
         self._last = LoggedDisk(self.root)
         self._last.adopt(image)
@@ -111,7 +111,7 @@ class Storage:
         for entry in self.root.iterdir():
             shutil.rmtree(entry)
         lay_out(image, self.root)
-        self._start_anew(image)
+        self._restart(image)
 
 
 _NOT_OF_DISK = (*("none", "kill", "interrupt", "abort", "second client", "clock jump", "reset"),)
