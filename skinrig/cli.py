@@ -2,6 +2,7 @@
 
 import logging
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from functools import cache
@@ -108,6 +109,7 @@ for command in (
     reconstructing.reconstruct,
     fusing.fuse,
     measuring.bench,
+    measuring.soak,
     measuring.doctor,
     rendering.render,
     editing.edit,
@@ -122,6 +124,7 @@ dynamic.fit_app.command("reflectance", cls=Command)(reconstructing.fit_reflectan
 app.add_typer(simulating.simulate_app, name="simulate")
 app.add_typer(capturing.capture_app, name="capture")
 app.add_typer(capturing.serve_app, name="serve")
+app.add_typer(capturing.session_app, name="session")
 app.add_typer(planning.plan_app, name="plan")
 app.add_typer(importing.import_app, name="import")
 app.add_typer(dynamic.fit_app, name="fit")
@@ -182,8 +185,14 @@ def _report_failure(
     return code
 
 
+def _interrupt(number: int, frame: object) -> None:
+    """End like Ctrl-C: temporary folders are removed, child processes and light end."""
+    raise KeyboardInterrupt
+
+
 def run() -> None:
     """Entry point of the console script."""
+    signal.signal(signal.SIGTERM, _interrupt)
     kernel_cache.provide_kernel_cache(os.environ)
     sys.exit(main())
 

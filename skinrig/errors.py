@@ -137,7 +137,7 @@ def exit_code(error: BaseException) -> int:
         names & {"DeviceError", "AcquisitionError"}
     ):
         return EXIT_DEVICE_FAILED
-    if own or isinstance(error, (ValueError, OSError)):
+    if own or isinstance(error, (ValueError, OSError, MemoryError)):
         return EXIT_BAD_INPUT
     return EXIT_BUG
 
@@ -206,6 +206,12 @@ def _describe(error: BaseException) -> str:
             "UTF-8; check that it is the right file [SR-CLI-009]"
         )
     text = str(error).strip() or type(error).__name__
+    if isinstance(error, MemoryError):
+        wanted = "" if text == type(error).__name__ else f" ({text})"
+        return (
+            f"memory: not enough for this size{wanted}; close other programs, raise the limit of "
+            "the process (ulimit -v), or use a smaller size [SR-CLI-015]"
+        )
     if exit_code(error) == EXIT_BUG:
         return (
             f"defect of skinrig ({type(error).__name__}: {text}); "

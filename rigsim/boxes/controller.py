@@ -97,6 +97,11 @@ class Controller:
         self.tripped = False
         self.device.reset(now, power_up=True)
 
+    @property
+    def lease_s(self) -> float:
+        """Silence after which it goes dark, s."""
+        return self._lease_ms / 1e3
+
     # time and bytes ---------------------------------------------------------------------------
 
     def deadline(self) -> float:

@@ -28,6 +28,10 @@ ISO_RANGE = (50, 25_600)
 EXPOSURE_RANGE_S = (1.0 / 8000.0, 30.0)
 
 
+CLOCK_ROUNDING_US = 1e-3
+"""Rounding error of a time in floating-point seconds, us."""
+CLOCK_STEP_S = 1e-6
+"""Step of the controllers' clock, s: a pulse is at the nearest one."""
 FOREIGN_SERIAL = "SR-9999"
 
 
@@ -129,7 +133,9 @@ class CameraBody:
         return self._stamp(self.world.now)
 
     def _stamp(self, now: float) -> float:
-        return now * (1.0 + self.world.faults.drift_ppm * 1e-6)
+        # whole microseconds, as controllers count: an exposure never precedes its own request
+        now_s = math.floor(1e6 * now + CLOCK_ROUNDING_US) / 1e6
+        return now_s * (1.0 + self.world.faults.drift_ppm * 1e-6)
 
     def configure(self, want: Exposure) -> Exposure:
         """Set an exposure, limited to the camera's ranges, and return it."""
@@ -163,7 +169,8 @@ class CameraBody:
 
     def edge(self, now: float) -> None:
         """Handle a pulse on the camera line."""
-        if self._trigger is Trigger.EDGE and self._armed and now >= self._busy_until:
+        is_ready = now + CLOCK_STEP_S > self._busy_until
+        if self._trigger is Trigger.EDGE and self._armed and is_ready:
             self._open_shutter(now)
         else:
             self.missed_edges += 1

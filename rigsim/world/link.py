@@ -6,13 +6,16 @@ all that follow.
 """
 
 import math
+from bisect import insort
 from collections import deque
 from collections.abc import Callable
+from operator import itemgetter
 
 import numpy as np
 
 from rigsim.boxes.controller import Controller
 from rigsim.boxes.faults import Faults
+from rigsim.world.line_faults import LineReset, LineTap
 
 STALL_BUFFER_BYTES = 256
 """Capacity of the line while a stalled controller takes nothing, bytes."""
@@ -44,6 +47,11 @@ class Link:
         Called with (time in s, direction, bytes) for the transcript: ``>`` arrives at the
         controller,
         ``<`` arrives at the host.
+
+    Attributes
+    ----------
+    tap : LineTap or None
+        What is between the two ends; None: nothing.
     """
 
     def __init__(
@@ -51,6 +59,10 @@ class Link:
     ) -> None:
         self.box = box
         self.attached = False
+        self.tap: LineTap | None = None
+        self._is_reset = False
+        # lines that the tap holds back: arrival time, direction and bytes
+        self._held_back: list[tuple[float, str, bytes]] = []
         self._faults = faults
         self._rng = rng
         self._record = record
@@ -71,6 +83,7 @@ class Link:
         """Open the port; raise `LinkUnplugged` when the cable is out."""
         self._first_open = min(self._first_open, now)
         self._opened_at = now
+        self._is_reset = False
         self.check(now)
         self.attached = True
         if self._faults.reset_on_open:
@@ -79,11 +92,17 @@ class Link:
     def detach(self) -> None:
         """Close the port; later output of the controller is lost."""
         self.attached = False
+        self._held_back.clear()
         self._to_host.clear()
         self._received.clear()
 
     def check(self, now: float) -> None:
-        """Raise `LinkUnplugged` while the cable is out; an earlier port stays dead."""
+        """Raise `LinkUnplugged` while the cable is out, or after a reset of the connection.
+
+        An earlier port stays dead.
+        """
+        if self._is_reset:
+            raise LinkUnplugged
         out = self._first_open + self._faults.unplug_after
         if now >= out and (now < out + self._faults.replug_after or self._opened_at < out):
             raise LinkUnplugged
@@ -96,8 +115,36 @@ class Link:
             raise LinkStalled
         for line in data.splitlines(keepends=True):
             for copy in self._apply_faults(line):
-                self._box_free = max(now, self._box_free) + len(copy) * self._byte_s
-                self._to_box.append((self._box_free + self._faults.latency, copy))
+                self._pass(">", copy, now)
+        self.check(now)
+
+    def _pass(self, way: str, line: bytes, now: float) -> None:
+        """Put a line on its way, through the tap if there is one."""
+        parts = [(0.0, line)]
+        if self.tap is not None and line != b"\n":
+            try:
+                parts = self.tap.pass_on(way, line)
+            except LineReset:
+                self._is_reset = True
+                return
+        for delay_s, data in parts:
+            if data and delay_s > 0.0:
+                insort(self._held_back, (now + delay_s, way, data), key=itemgetter(0))
+            elif data:
+                self._queue(way, data, now)
+
+    def _queue(self, way: str, data: bytes, now: float) -> None:
+        if way == ">":
+            self._box_free = max(now, self._box_free) + len(data) * self._byte_s
+            self._to_box.append((self._box_free + self._faults.latency, data))
+        else:
+            self._host_free = max(now, self._host_free) + len(data) * self._byte_s
+            self._to_host.append((self._host_free, data))
+
+    @property
+    def quiet_from_s(self) -> float:
+        """Time from which no more bytes of the host arrive unless it sends some, s."""
+        return max((at_s for at_s, _ in self._to_box), default=0.0)
 
     def take(self, size: int) -> bytes:
         """Return at most `size` bytes that have arrived."""
@@ -121,7 +168,8 @@ class Link:
         due = self._to_host[0][0] if self._to_host else math.inf
         if self._to_box:
             due = min(due, max(self._to_box[0][0], self._stall_end(now)))
-        return min(due, self._reset_at, self.box.deadline())
+        held_s = self._held_back[0][0] if self._held_back else math.inf
+        return min(due, held_s, self._reset_at, self.box.deadline())
 
     def advance(self, now: float) -> None:
         """Deliver the bytes due at `now`, in s."""
@@ -129,6 +177,9 @@ class Link:
             self._reset_at = math.inf
             self.box.power_cycle(now, boot_s=self._faults.boot_s, announce=False)
         self._answer(self.box.advance(now), now)
+        while self._held_back and self._held_back[0][0] <= now:
+            _, way, data = self._held_back.pop(0)
+            self._queue(way, data, now)
         while self._to_box and self._to_box[0][0] <= now and self._stall_end(now) <= now:
             _, data = self._to_box.popleft()
             self._record(now, ">", data)
@@ -149,9 +200,7 @@ class Link:
             if self._occurs(self._faults.late):
                 delay_s += self._faults.late_s
             for copy in [*output, *self._apply_faults(line)]:
-                start = max(now + delay_s, self._host_free)
-                self._host_free = start + len(copy) * self._byte_s
-                self._to_host.append((self._host_free, copy))
+                self._pass("<", copy, now + delay_s)
 
     def _stall_end(self, now: float) -> float:
         start = self._first_open + self._faults.stall_after

@@ -1,4 +1,4 @@
-"""`skinrig capture`, `skinrig serve` and `skinrig verify`: sessions of rigs and their checks."""
+"""`skinrig capture`, `serve`, `verify` and `session`: sessions of rigs and their checks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 
 from skinrig import errors
 from skinrig.commands import options
-from skinrig.commands.help import RigCommand, RigFileGroup
+from skinrig.commands.help import Command, Commands, RigCommand, RigFileGroup
 from skinrig.commands.options import choice, command, target_option
 from skinrig.console import Console, format_count, select_attributes
 
@@ -27,6 +27,8 @@ serve_app = typer.Typer(
     subcommand_metavar="RIG [ARGS]...",
     help="Serve a simulated rig, given by name or TOML file, to any client.",
 )
+
+session_app = typer.Typer(cls=Commands, help="Work on a captured session.", no_args_is_help=True)
 
 Eyes = Annotated[str, choice("open", "closed", "shielded")]
 
@@ -333,3 +335,61 @@ def verify(session: Path, /, json: options.Json = False) -> None:
     console.print_document("skinrig.verify/1", figures)
     if not found.ok:
         raise typer.Exit(errors.EXIT_BAD_INPUT)
+
+
+@session_app.command("anonymize", cls=Command)
+@command
+def anonymize(
+    session: Path,
+    /,
+    out: Annotated[Path, typer.Option(metavar="SESSION")],
+    landmarks: Annotated[list[str] | None, typer.Option(metavar="VIEW=FILE")] = None,
+    radius: float = 0.05,
+    drop_images: bool = False,
+    pseudonym: str | None = None,
+    json: options.Json = False,
+) -> None:
+    """Copy a session without eyes and landmarks, or without images; the original is unchanged.
+
+    The copy has a seal of its own and the same consent. What still identifies the subject is
+    printed.
+
+    Example: skinrig session anonymize session --landmarks cam=landmarks.csv --out anonymous
+
+    Example: skinrig session anonymize session --drop-images --out anonymous
+
+    Parameters
+    ----------
+    session
+        SESSION/ folder, closed.
+    out
+        New SESSION/ folder.
+    landmarks
+        CSV table name,x,y in pixels of a view; black discs cover them; repeatable.
+    radius
+        Radius of the discs, fraction of the image's width.
+    drop_images
+        Keep plan, rig and consent, and no frame.
+    pseudonym
+        New pseudonym of the subject; default: unchanged.
+    """
+    from reconstruction.correspondence.landmark_table import read_landmark_table
+    from skinrig.capturing.addresses import parse_addresses
+    from skinrig.capturing.anonymization import AnonymizationOrder, anonymize_session
+
+    console = Console(json)
+    tables = parse_addresses(landmarks or (), "--landmarks")
+    order = AnonymizationOrder(
+        landmarks={view: read_landmark_table(file) for view, file in tables.items()},
+        radius=radius,
+        drop_images=drop_images,
+        pseudonym=pseudonym,
+    )
+    found = anonymize_session(session, out, order, console.progress)
+    console.print_each("removed", found.removed)
+    console.print_each("still identifies", found.identifiable)
+    console.print_line(
+        f"{out}: {format_count(found.frames, 'frame')}, {found.blackened} with black discs"
+    )
+    figures = select_attributes(found, "path", "frames", "blackened", "removed", "identifiable")
+    console.print_document("skinrig.session.anonymize/1", figures)

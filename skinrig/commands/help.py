@@ -15,11 +15,21 @@ HELP_SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
     ("Start here", ("demo", "photo", "doctor")),
     (
         "Capture with a rig or its simulation",
-        ("plan", "simulate", "capture", "serve", "calibrate", "import", "diagnose", "verify"),
+        (
+            "plan",
+            "simulate",
+            "capture",
+            "serve",
+            "calibrate",
+            "import",
+            "diagnose",
+            "verify",
+            "session",
+        ),
     ),
     ("Reconstruct and model", ("reconstruct", "fuse", "fit", "apply", "edit", "analyse")),
     ("Report, render and export", ("report", "view", "render", "export")),
-    ("Measure errors and run times", ("bench",)),
+    ("Measure errors and run times", ("bench", "soak")),
 )
 OTHER_SECTION: Final = "More"
 

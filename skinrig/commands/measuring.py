@@ -1,4 +1,4 @@
-"""`skinrig bench` and `skinrig doctor`: error against run time, and the installation."""
+"""`skinrig bench`, `skinrig soak`, `skinrig doctor`: errors, faults, and the installation."""
 
 import os
 from pathlib import Path
@@ -9,7 +9,7 @@ import typer
 from skinrig import errors
 from skinrig.benchmarks import table as bench_table
 from skinrig.commands import completion
-from skinrig.commands.options import Json, command
+from skinrig.commands.options import Json, Seed, command
 from skinrig.commands.renamed_options import FORMER_STAGES, replace_former_values
 from skinrig.console import Console, select_attributes
 from skinrig.doctor import FIX_KEY, check_controller, check_installation
@@ -105,6 +105,58 @@ def bench(
             bench_table.write_tables(document, out)
     console.print_document(document.pop("schema"), document)
     if not document["passed"]:
+        raise typer.Exit(errors.EXIT_LIMIT_MISSED)
+
+
+@command
+def soak(
+    seed: Seed = 0,
+    hours: float = 24.0,
+    first_day: int = 0,
+    budget: Annotated[float | None, typer.Option(show_default=False)] = None,
+    json: Json = False,
+) -> None:
+    """Run simulated rigs under seeded faults; exit code 1 if a promise is broken.
+
+    Hosts, controllers, cameras, lines, disk and clock are simulated in one process. The seed
+    determines every fault; a failure names the command that repeats it.
+
+    Example: skinrig soak --seed 7 --hours 240
+
+    Parameters
+    ----------
+    hours
+        Simulated time, hours; whole days with 200 frames each.
+    first_day
+        Number of the first day; a day depends on the seed and its number alone.
+    budget
+        Processor time after which no further day begins, seconds; default: no limit.
+    """
+    from skinrig.soaking.soak import run_soak
+
+    console = Console(json)
+    for name, value in (("--seed", seed), ("--hours", hours), ("--first-day", first_day)):
+        if not 0 <= value < float("inf"):
+            raise errors.UnusableError(f"{name}: got {value:g}, expected 0 or more; raise it")
+    if budget is not None and not budget > 0:
+        raise errors.UnusableError(f"--budget: got {budget:g}, expected seconds above 0; raise it")
+    result = run_soak(
+        seed,
+        hours=hours,
+        first_day=first_day,
+        budget_s=float("inf") if budget is None else budget,
+        progress=console.progress,
+    )
+    figures = select_attributes(
+        *(result, "seed", "days", "shots", "sessions", "runs", "power_cuts", "digest", "failure"),
+        *("processor_s", "codes", "faults"),
+    )
+    rows = [(name, figures[name]) for name in ("days", "shots", "sessions", "runs", "power_cuts")]
+    console.print_table(("what", "number"), [*rows, ("faults", result.faults.total())])
+    console.print_line(f"seed {seed}, digest {result.digest}")
+    console.print_line(f"BROKEN: {result.failure}" if result.failure else "all promises kept")
+    console.print_document("skinrig.soak/1", figures)
+    if result.failure:
         raise typer.Exit(errors.EXIT_LIMIT_MISSED)
 
 

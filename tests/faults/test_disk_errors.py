@@ -1,8 +1,6 @@
 """A fault at each operation of the disk: the session resumes or starts again, and loses nothing."""
 
 import contextlib
-import errno
-import os
 from collections import Counter
 
 import numpy as np
@@ -14,75 +12,13 @@ from capture.rig import load_rig
 from capture.session import Disk, Session, SessionDiskError, SubjectRecord, verify
 from skinrig.capturing.acquisition import discard_unused_session
 from skinrig.console import Console
+from skinrig.soaking.host_life import HostKilled
+from skinrig.soaking.storage import DISK_FAULTS, FaultyDisk
 
 RIG = load_rig("flash").resized(16)
 FRAMES = 3
 PLAN = Plan("flash", tuple(Step(f"S{n:03d}", "subject", {}, {}, ("cam",)) for n in range(FRAMES)))
 SCAN = b"ply: a scan"
-OPERATIONS = (
-    *("make_dir", "create", "open_append", "write", "fsync", "fdatasync", "truncate"),
-    *("rename", "remove", "fsync_dir", "lock"),
-)
-FAULTS = ("ENOSPC", "EIO", "EINTR", "EDQUOT", "short write", "kill", "kill in write", "kill after")
-
-
-class Killed(BaseException):
-    """The process ends: nothing after it runs."""
-
-
-class FaultyDisk(Disk):
-    """The real disk, on which one operation fails; a killed process does nothing afterwards."""
-
-    def __init__(self, strike, fault):
-        self.strike, self.fault = strike, fault
-        self.count, self.struck, self.dead = 0, "", False
-        self.descriptors = set()
-
-    def create(self, path):
-        descriptor = super().create(path)
-        self.descriptors.add(descriptor)
-        return descriptor
-
-    def open_append(self, path):
-        descriptor = super().open_append(path)
-        self.descriptors.add(descriptor)
-        return descriptor
-
-    def close(self, descriptor):
-        self.descriptors.discard(descriptor)
-        super().close(descriptor)
-
-    def end(self):
-        """Close what a killed process leaves open."""
-        for descriptor in list(self.descriptors):
-            self.close(descriptor)
-
-    def run(self, name, operation, arguments):
-        if self.dead:
-            raise Killed
-        self.count += 1
-        if self.count != self.strike:
-            return operation(*arguments)
-        self.struck, fault = name, self.fault
-        if name == "write" and fault in ("short write", "kill in write", "ENOSPC"):
-            descriptor, data = arguments
-            operation(descriptor, data[: len(data) // 2])
-        elif fault == "kill after":
-            operation(*arguments)
-        if fault.startswith("kill"):
-            self.dead = True
-            raise Killed
-        number = errno.ENOSPC if fault == "short write" else getattr(errno, fault)
-        raise OSError(number, os.strerror(number))
-
-
-def faulty(name):
-    operation = getattr(FaultyDisk, name)
-    return lambda self, *arguments: self.run(name, operation.__get__(self), arguments)
-
-
-for _name in OPERATIONS:
-    setattr(FaultyDisk, _name, faulty(_name))
 
 
 def create(path, disk):
@@ -110,10 +46,10 @@ def capture(path, disk, acknowledged, *, resume):
 
 def strike(path, number, fault, acknowledged, *, resume=False):
     """Capture on a disk whose operation ``number`` fails; return its name, empty for none."""
-    disk = FaultyDisk(number, fault)
-    with contextlib.suppress(SessionDiskError, Killed):
+    disk = FaultyDisk(path.parent, strike=number, fault=fault)
+    with contextlib.suppress(SessionDiskError, HostKilled):
         capture(path, disk, acknowledged, resume=resume)
-    disk.end()
+    disk.close_all()
     return disk.struck
 
 
@@ -132,7 +68,7 @@ def finish(path, acknowledged):
     assert verify(path).ok
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("fault", DISK_FAULTS)
 def test_session_resumes_or_restarts_after_disk_fault(tmp_path, fault):
     struck = Counter()
     while True:

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fixtures.middle import KINDS, Middle, tap_lines
 from fixtures.operators import by_operator
 
 from capture.acquire import run_plan
@@ -29,6 +28,7 @@ from capture.session import Session, SubjectRecord, verify
 from rigsim.boxes import controller
 from rigsim.boxes.faults import Faults
 from rigsim.world import World
+from rigsim.world.line_faults import LINE_FAULT_KINDS, LineFaults
 
 NAMES = (f"middle-{number}" for number in itertools.count())
 LEASE_SLACK_S = 0.01
@@ -138,7 +138,7 @@ def wrong_frames(scene, session):
     return found
 
 
-def capture(tmp_path, monkeypatch, kind, seed, *, share=0.08):
+def capture(tmp_path, kind, seed, *, share=0.08):
     """Capture a session through a man in the middle; return his strikes and the wrong frames."""
     scene, rng = RIGS[kind], np.random.default_rng([seed, len(kind)])
     world = World(scene.rig, seed=seed, scene=scene, faults=Faults(baud=0.0))
@@ -146,34 +146,32 @@ def capture(tmp_path, monkeypatch, kind, seed, *, share=0.08):
     plan = scene.plan(rng)
     words = {"devices": {}, "subject": SubjectRecord("p"), "source": "simulated", "seed": seed}
     session = Session.create(tmp_path / f"{kind}-{seed}", plan=plan, rig=scene.rig, **words)
-    middle, errors = Middle(rng, world.clock, share), Counter()
-    unit = world.box(kind)
-    with monkeypatch.context() as patched:
-        tap_lines(patched, middle)
-        start = int(rng.integers(2**32))
-        for run in range(MAX_RUNS):
-            box = port = None
-            cameras = {v.name: open_camera(f"sim://{name}/{v.name}") for v in scene.rig.views}
-            try:
-                url, first_seq = f"sim://{kind}?world={name}", (start + 10_000 * run) % 2**32
-                port = Port(url, clock=world.clock, first_seq=first_seq)
-                box = scene.driver(port)
-                boxes = {kind: box}
-                words = by_operator({"eyes": "closed", "run_id": f"run{run}"})
-                run_plan(plan, scene.rig, boxes=boxes, cameras=cameras, session=session, **words)
-                box.close()
-                break
-            except DeviceError as error:
-                errors[type(error).__name__] += 1
-            finally:
-                if port is not None:
-                    port.close()  # the host dies: it sends no SAFE
-                for camera in cameras.values():
-                    camera.close()
-            world.clock.sleep(unit._lease_ms / 1e3 + LEASE_SLACK_S)
-            assert not unit.armed
-            assert not unit.device.lit
-            world.clock.sleep(2.0)
+    middle, errors = LineFaults(rng, share), Counter()
+    unit, world.link(kind).tap = world.box(kind), middle
+    start = int(rng.integers(2**32))
+    for run in range(MAX_RUNS):
+        box = port = None
+        cameras = {v.name: open_camera(f"sim://{name}/{v.name}") for v in scene.rig.views}
+        try:
+            url, first_seq = f"sim://{kind}?world={name}", (start + 10_000 * run) % 2**32
+            port = Port(url, clock=world.clock, first_seq=first_seq)
+            box = scene.driver(port)
+            boxes = {kind: box}
+            words = by_operator({"eyes": "closed", "run_id": f"run{run}"})
+            run_plan(plan, scene.rig, boxes=boxes, cameras=cameras, session=session, **words)
+            box.close()
+            break
+        except DeviceError as error:
+            errors[type(error).__name__] += 1
+        finally:
+            if port is not None:
+                port.close()  # the host dies: it sends no SAFE
+            for camera in cameras.values():
+                camera.close()
+        world.clock.sleep(unit._lease_ms / 1e3 + LEASE_SLACK_S)
+        assert not unit.armed
+        assert not unit.device.lit
+        world.clock.sleep(2.0)
     assert session.pending_frames() == [], errors
     wrong = wrong_frames(scene, session)
     session.close()
@@ -198,11 +196,11 @@ def test_accepted_frames_show_requested_light(tmp_path, monkeypatch, kind, sessi
     if sessions >= 10:
         sessions = int(os.environ.get(SESSIONS_VARIABLE, sessions))
     for seed in range(100, 100 + sessions):
-        struck, wrong = capture(tmp_path, monkeypatch, kind, seed)
+        struck, wrong = capture(tmp_path, kind, seed)
         strikes += struck
         assert wrong == [], seed
     assert strikes.total() >= faults
-    assert sessions < 10 or set(strikes) == set(KINDS)
+    assert sessions < 10 or set(strikes) == set(LINE_FAULT_KINDS)
     print(f"{kind}: {sessions} sessions, {strikes.total()} faults, 0 wrong frames")
 
 
@@ -210,7 +208,7 @@ def test_unchecked_replays_would_give_wrong_frame(tmp_path, monkeypatch):
     deaf = {**vars(wire), "is_behind": lambda number, latest: False}
     monkeypatch.setattr(controller, "wire", SimpleNamespace(**deaf))  # the host's rule stays
     monkeypatch.setattr(shot, "check_report", lambda *_: None)
-    _, wrong = capture(tmp_path, monkeypatch, "flash", seed=102)
+    _, wrong = capture(tmp_path, "flash", seed=111)
     assert wrong
 
 
@@ -235,8 +233,7 @@ def test_lost_host_leaves_dark_although_lines_repeat(monkeypatch, kind, seed):
     scene = RIGS[kind]
     world = World(scene.rig, seed=seed, faults=Faults(baud=0.0))
     name, unit = world.register(next(NAMES)), world.box(kind)
-    middle = Middle(np.random.default_rng(seed), world.clock, share=0.0)
-    tap_lines(monkeypatch, middle)
+    middle = world.link(kind).tap = LineFaults(np.random.default_rng(seed), share=0.0)
     for host in range(2):  # lines of the earlier host repeat, too
         box = scene.driver(Port(f"sim://{kind}?world={name}", clock=world.clock))
         box.set_lease(1.0)

@@ -6,12 +6,8 @@ prefix of the log of operations is such an instant. Three mutants, each leaving 
 sync, show that the model can tell.
 """
 
-import itertools
-import os
 import shutil
 from collections import Counter
-from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,20 +15,10 @@ import pytest
 from capture import raw
 from capture.plan import Plan, Step
 from capture.rig import load_rig
-from capture.session import Disk, Session, SessionError, SubjectRecord, verify
+from capture.session import Session, SessionError, SubjectRecord, verify
+from skinrig.soaking.storage import LoggedDisk, Medium, lay_out
 
 RIG = load_rig("flash").resized(16)
-# what of unsynced data reaches the medium
-DATA_FATES = {
-    "none": lambda data: b"",
-    "all": lambda data: data,
-    "one byte": lambda data: data[:1],
-    "half": lambda data: data[: len(data) // 2],
-    "all but one byte": lambda data: data[:-1],
-    "zeros": lambda data: bytes(len(data)),
-    "half and zeros": lambda data: data[: len(data) // 2].ljust(len(data), b"\0"),
-    "hole": lambda data: bytes(len(data) // 2) + data[len(data) // 2 :],
-}
 
 
 def plan_of(frames):
@@ -52,74 +38,6 @@ def commit(session, step_id):
 
 
 # --- the log --------------------------------------------------------------------------------------
-
-
-class LoggedDisk(Disk):
-    """The real disk without the wait of its syncs, writing down every operation."""
-
-    left_out = "nothing"
-
-    def __init__(self, root):
-        self.root = root
-        self.log = []
-        self.inodes = itertools.count()
-        self.known = {}
-        self.open = {}
-
-    def note(self, *operation):
-        self.log.append(operation)
-
-    def name(self, path):
-        return os.path.relpath(path, self.root)
-
-    def make_dir(self, path):
-        super().make_dir(path)
-        self.note("mkdir", self.name(path))
-
-    def create(self, path):
-        descriptor = super().create(path)
-        inode = self.known[os.fstat(descriptor).st_ino] = next(self.inodes)
-        self.open[descriptor] = (self.name(path), inode)
-        self.note("create", self.name(path), inode)
-        return descriptor
-
-    def open_append(self, path):
-        descriptor = super().open_append(path)
-        self.open[descriptor] = (self.name(path), self.known[os.fstat(descriptor).st_ino])
-        return descriptor
-
-    def write(self, descriptor, data):
-        super().write(descriptor, data)
-        self.note("write", self.open[descriptor][1], bytes(data))
-
-    def truncate(self, descriptor, size):
-        super().truncate(descriptor, size)
-        self.note("truncate", self.open[descriptor][1], size)
-
-    def sync(self, descriptor):
-        name, inode = self.open[descriptor]
-        kinds = {".dng.part": "frame", ".ply.part": "attachment"}
-        kind = next((k for end, k in kinds.items() if name.endswith(end)), Path(name).name)
-        if kind != self.left_out:
-            self.note("sync", inode)
-
-    def fsync(self, descriptor):
-        self.sync(descriptor)
-
-    def fdatasync(self, descriptor):
-        self.sync(descriptor)
-
-    def rename(self, old, new):
-        super().rename(old, new)
-        self.note("rename", self.name(old), self.name(new))
-
-    def remove(self, path):
-        super().remove(path)
-        self.note("remove", self.name(path))
-
-    def fsync_dir(self, path):
-        if self.name(path) != self.left_out:
-            self.note("sync_dir", self.name(path))
 
 
 class NoFrameSync(LoggedDisk):
@@ -145,82 +63,6 @@ class NoJournalSync(LoggedDisk):
 # --- the medium -----------------------------------------------------------------------------------
 
 
-@dataclass
-class Medium:
-    """What is on the medium for certain, and what is still on its way."""
-
-    data: dict = field(default_factory=dict)  # inode -> bytes
-    data_coming: dict = field(default_factory=dict)  # inode -> operations
-    names: dict = field(default_factory=dict)  # path -> inode, or "folder"
-    names_coming: list = field(default_factory=list)  # (folders, names taken away, names given)
-
-    def apply(self, operation):
-        kind, *what = operation
-        parent = os.path.dirname
-        if kind == "create":
-            name, inode = what
-            self.data[inode], self.data_coming[inode] = b"", []
-            self.names_coming.append(({parent(name)}, [], {name: inode}))
-        elif kind == "mkdir":
-            self.names_coming.append(({parent(what[0])}, [], {what[0]: "folder"}))
-        elif kind in ("write", "truncate"):
-            self.data_coming[what[0]].append((kind, what[1]))
-        elif kind == "sync":
-            self.data[what[0]] = self.content(what[0], "all")
-            self.data_coming[what[0]] = []
-        elif kind == "remove":
-            self.names_coming.append(({parent(what[0])}, [what[0]], {}))
-        elif kind == "rename":
-            old, new = what
-            inode = self.tree(len(self.names_coming))[old]
-            if parent(old) == parent(new):
-                self.names_coming.append(({parent(old)}, [old], {new: inode}))
-            else:  # between folders the two names reach the medium separately
-                self.names_coming.append(({parent(new)}, [], {new: inode}))
-                self.names_coming.append(({parent(old)}, [old], {}))
-        elif kind == "sync_dir":
-            folder = "" if what[0] == "." else what[0]
-            arrived = [change for change in self.names_coming if folder in change[0]]
-            self.names_coming = [c for c in self.names_coming if folder not in c[0]]
-            for change in arrived:
-                self.rename_in(self.names, change)
-
-    @staticmethod
-    def rename_in(names, change):
-        _, taken, given = change
-        for name in taken:
-            names.pop(name, None)
-        names.update(given)
-
-    def tree(self, arrived):
-        """Return the names after the first ``arrived`` of those on their way."""
-        names = dict(self.names)
-        for change in self.names_coming[:arrived]:
-            self.rename_in(names, change)
-        return names
-
-    def content(self, inode, fate):
-        data = self.data[inode]
-        if fate == "none":
-            return data
-        for kind, what in self.data_coming[inode]:
-            data = data[:what] if kind == "truncate" else data + DATA_FATES[fate](what)
-        return data
-
-    def images(self):
-        """Yield every state the medium may be found in: path -> bytes, None for a folder."""
-        for arrived in range(len(self.names_coming) + 1):
-            names = self.tree(arrived)
-            for fate in DATA_FATES:
-                image = {}
-                for name in sorted(names):
-                    above = os.path.dirname(name)
-                    if above in ("", *image):  # a name in a folder that is lost is lost with it
-                        inode = names[name]
-                        image[name] = None if inode == "folder" else self.content(inode, fate)
-                yield image
-
-
 def crash_images(log):
     """Yield (image, what was acknowledged before) for every instant of the log, each once."""
     medium, acknowledged, seen = Medium(), frozenset(), set()
@@ -239,14 +81,6 @@ def crash_images(log):
                 yield image, acknowledged
 
 
-def lay_out(image, root):
-    for name, content in image.items():
-        if content is None:
-            (root / name).mkdir()
-        else:
-            (root / name).write_bytes(content)
-
-
 # --- the judgement --------------------------------------------------------------------------------
 
 
@@ -255,9 +89,9 @@ def judge(path, acknowledged, plan):
     frames = acknowledged - {"created", "closed"}  # and the scan
     try:
         if "created" not in acknowledged and not (path / "session.json").exists():
-            create(path, plan, LoggedFrom(path.parent)).release()  # over whatever debris there is
+            create(path, plan, LoggedDisk(path.parent)).release()  # over whatever debris there is
         try:
-            session = Session.resume(path, disk=LoggedFrom(path.parent))
+            session = Session.resume(path, disk=LoggedDisk(path.parent))
         except SessionError as exc:
             if "closed" not in str(exc):
                 raise
@@ -295,16 +129,6 @@ def outcome(session, frames, plan):
         if not right:
             return "corrupt"
     return "ok" if session.plan == plan else "corrupt"
-
-
-class LoggedFrom(LoggedDisk):
-    """A logged disk that finds files which it did not make."""
-
-    def open_append(self, path):
-        descriptor = Disk.open_append(self, path)
-        inode = self.known[os.fstat(descriptor).st_ino] = next(self.inodes)
-        self.open[descriptor] = (self.name(path), inode)
-        return descriptor
 
 
 def create(path, plan, disk):
@@ -395,15 +219,6 @@ class Inheriting(LoggedDisk):
 
     def __init__(self, root, image):
         super().__init__(root)
-        for name in sorted(image):
-            if image[name] is None:
-                self.note("mkdir", name)
-            else:
-                inode = self.known[(root / name).stat().st_ino] = next(self.inodes)
-                self.note("create", name, inode)
-                self.note("write", inode, image[name])
-                self.note("sync", inode)
-        for folder in [".", *(n for n in image if image[n] is None)]:
-            self.note("sync_dir", folder)
+        self.adopt(image)
         # the instants before the image was whole are no instants of this story
         self.log = [("whole", tuple(self.log))]

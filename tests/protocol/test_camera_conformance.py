@@ -385,6 +385,7 @@ class Impostor:
 
     def run(self):
         client, _ = self.server.accept()
+        self.server.close()  # nobody connects again
         with client:
             for reply in self.replies:
                 client.recv(4096)

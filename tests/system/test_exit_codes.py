@@ -10,7 +10,7 @@ from skinrig import errors
 from skinrig.cli import app, main
 from skinrig.commands.help import RigGroup
 
-SPEECHLESS = ("demo", "doctor", "view", "bench")
+SPEECHLESS = ("demo", "doctor", "view", "bench", "soak")
 """Commands that need no argument at all."""
 RIG_ALONE = tuple(
     f"{name} {rig}" for name in ("plan", "serve") for rig in ("flash", "dome", "gradient", "probe")
@@ -77,6 +77,12 @@ UNREADABLE = {
     "analyse color-table": ["--size 8", "file.txt --eumelanin-fraction 0.5 --out t"],
     "analyse lumitexel": ["a"],
     "fuse": ["--out a"],
+    "soak": ["--hours long", "extra"],
+    "session anonymize": [
+        "s",
+        "folder --out a --landmarks cam",
+        "folder --out a --landmarks cam=file.txt --landmarks cam=file.txt",
+    ],
 }
 """What no file could make right."""
 
@@ -132,6 +138,12 @@ UNUSABLE = {
     "calibrate": ["taste folder", "sensor none"],
     "reconstruct": ["none --maps melanin --out a", "none --maps normals --out a --rank 1000"],
     "bench": ["--stage coffee", "--budget 0", "--out file.txt"],
+    "soak": ["--hours -1", "--first-day -1", "--budget 0", "--seed -1"],
+    "session anonymize": [
+        "none --drop-images --out a",
+        "folder --drop-images --out a",
+        "folder --landmarks cam=none.csv --out a",
+    ],
     "render": [
         "folder --light 1,1,1 --out r",
         "folder --light 1,1,1 --exposure 0 --out r",

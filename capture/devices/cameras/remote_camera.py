@@ -1,10 +1,14 @@
 """Camera behind a TCP port: ``tcp://HOST:PORT/VIEW``, as ``skinrig serve`` prints it.
 
-Another program can serve its cameras in the same way: see `capture.devices.cameras.camera_wire`.
+Another program can serve its cameras in the same way: see `capture.devices.cameras.camera_wire`. A
+lost connection is made again once until the next frame arrives; the exposure is lost with it, and
+its frame is refused, so that the step is taken again.
 """
 
 import contextlib
+import logging
 import socket
+import time
 from typing import Any
 
 from capture.devices.camera import (
@@ -23,6 +27,11 @@ from capture.devices.cameras import camera_wire
 from capture.devices.cameras.camera_wire import BadMessage
 from capture.devices.port import LinkLost
 
+log = logging.getLogger(__name__)
+
+RECONNECTION_TIMEOUT_S = 10.0
+"""Largest time to open a camera again after a lost connection, s: it may read out."""
+RECONNECTION_PAUSE_S = 0.2
 ANSWER_TIMEOUT_S = 5.0
 """Largest delay of an answer beyond the requested time, s."""
 DEVELOP_TIMEOUT_S = 300.0
@@ -59,22 +68,54 @@ class RemoteCamera:
 
     def __init__(self, host: str, port: int, view: str) -> None:
         self._url = f"tcp://{host}:{port}/{view}"
+        self._host, self._port, self._view = host, port, view
         self._id = 0
+        self._is_closed = self._is_reconnected = self._is_armed = False
+        self._exposure: Exposure | None = None
+        self._socket: socket.socket | None = None
+        self._connect()
+
+    def _connect(self) -> None:
+        """Connect and open the camera."""
         self._received = bytearray()
         try:
-            self._socket: socket.socket | None = socket.create_connection(
-                (host, port), timeout=ANSWER_TIMEOUT_S
+            self._socket = socket.create_connection(
+                (self._host, self._port), timeout=ANSWER_TIMEOUT_S
             )
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         except OSError as exc:
             raise LinkLost(f"cannot open {self._url}: {exc}; is it being served?") from exc
         try:
-            answer = self._ask("open", version=camera_wire.CAMERA_WIRE_VERSION, view=view)
+            answer = self._exchange(
+                "open", version=camera_wire.CAMERA_WIRE_VERSION, view=self._view
+            )
             with self._translate_errors():
                 self._info = camera_wire.info_from_json(answer["info"])
         except BaseException:
             self._drop()
             raise
+
+    def _reconnect(self, lost: LinkLost) -> None:
+        """Make a lost connection again, with the exposure that was set; raise `lost` if not."""
+        if self._is_closed or self._is_reconnected:
+            raise lost
+        self._is_reconnected = True
+        last_s = time.monotonic() + RECONNECTION_TIMEOUT_S
+        while True:
+            try:
+                self._connect()
+                break
+            except CameraBusy:
+                if time.monotonic() >= last_s:
+                    raise lost from None
+                time.sleep(RECONNECTION_PAUSE_S)
+            except LinkLost:
+                raise lost from None
+        log.warning("%s; connected again", lost)
+        if self._exposure is not None:
+            self._exchange(
+                "configure", exposure_s=self._exposure.exposure_s, iso=self._exposure.iso
+            )
 
     @property
     def info(self) -> CameraInfo:
@@ -88,33 +129,43 @@ class RemoteCamera:
 
     def configure(self, want: Exposure) -> Exposure:
         """Set an exposure and return the settings in effect."""
+        self._exposure = want
         answer = self._ask("configure", exposure_s=want.exposure_s, iso=want.iso)
         with self._translate_errors():
             return Exposure(float(answer["exposure_s"]), int(answer["iso"]))
 
     def arm(self, count: int, trigger: Trigger) -> None:
         """Prepare for `count` frames and drop frames that wait from before."""
+        self._is_armed = False
         self._ask("arm", count=count, trigger=str(trigger))
+        self._is_armed = True
 
     def fire(self) -> None:
         """Start one exposure."""
         self._ask("fire")
 
     def frame(self, timeout_s: float) -> Frame:
-        """Return the next frame, or raise `FrameTimeout`; a damaged one raises `FrameRefused`."""
+        """Return the next frame, or raise `FrameTimeout`.
+
+        A damaged one, and one that was lost with its connection, raise `FrameRefused`.
+        """
         answer = self._ask("frame", timeout_s=timeout_s, reply_delay_s=timeout_s)
         try:
             camera_wire.check_blob(answer, answer["blob"])
-            return camera_wire.frame_from_message(answer["frame"], answer["blob"])
+            frame = camera_wire.frame_from_message(answer["frame"], answer["blob"])
         except (BadMessage, KeyError, TypeError) as exc:
             raise FrameRefused(f"{self._url}: a frame was damaged on its way: {exc!r}") from exc
+        self._is_reconnected = False
+        return frame
 
     def abort(self) -> None:
         """Cancel what was armed."""
+        self._is_armed = False
         self._ask("abort")
 
     def close(self) -> None:
         """Release the camera; calling it twice is allowed."""
+        self._is_closed = True
         self._drop()
 
     def _drop(self) -> None:
@@ -133,7 +184,31 @@ class RemoteCamera:
                 f"{self._url}: got an answer that cannot be decoded: {exc!r}"
             ) from exc
 
-    def _ask(self, request: str, *, reply_delay_s: float = 0.0, **fields: Any) -> dict[str, Any]:
+    def _ask(self, request: str, **fields: Any) -> dict[str, Any]:
+        """Send one request and return its answer; after a lost connection, again on a new one.
+
+        Raises
+        ------
+        FrameRefused
+            When the connection of an armed camera was lost and made again.
+        LinkLost
+            When it cannot be made again, or was lost twice without a frame.
+        """
+        try:
+            return self._exchange(request, **fields)
+        except LinkLost as lost:
+            self._reconnect(lost)
+        if self._is_armed:  # the server has aborted its exposures
+            self._is_armed = False
+            raise FrameRefused(
+                f"{self._url}: the link was lost in {request!r} and made again; the exposure is "
+                "repeated"
+            )
+        return self._exchange(request, **fields)
+
+    def _exchange(
+        self, request: str, *, reply_delay_s: float = 0.0, **fields: Any
+    ) -> dict[str, Any]:
         """Send one request and return the fields of its answer, its bytes under ``blob``."""
         connection = self._socket
         if connection is None:

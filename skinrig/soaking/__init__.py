@@ -1,0 +1,1 @@
+"""Soak tests: simulated rigs, hosts and disks under seeded faults, and what must hold in them."""

@@ -1,0 +1,81 @@
+"""Simulated rigs under seeded faults: promises hold, failures replay, planted bugs are found."""
+
+import datetime
+import json
+import os
+
+import pytest
+from fixtures.planted import BUGS, mutate, planted
+
+from skinrig.cli import main
+from skinrig.soaking.soak import run_soak
+
+SEED_VARIABLE = "SOAK_SEED"
+"""Seed of the long soak; "today": a new one each day."""
+DEFAULT_SEED = "100"
+BUGS_VARIABLE = "SOAK_BUGS"
+""""all": the long test plants every bug."""
+BUDGET_S = 30.0
+SAMPLE = 8
+MIN_BUGS = 40
+MAX_DAYS = 10
+
+
+@pytest.fixture(autouse=True)
+def box_side():
+    """Leave the boxes emulated: bugs are planted into the emulation."""
+
+
+def test_soak_of_same_seed_repeats_every_byte():
+    first, second, other = (run_soak(seed, hours=24, shots_per_day=30) for seed in (5, 5, 6))
+    assert first.failure == second.failure == other.failure == ""
+    assert first.digest == second.digest != other.digest
+    assert first.faults == second.faults
+    assert first.shots >= 30
+
+
+def test_soak_finds_planted_bug_and_names_replay(capsys):
+    bug = next(bug for bug in BUGS if bug["name"] == "lease is a tenth longer")
+    day = str(bug["day"])
+    with planted(bug["file"], mutate(bug)):
+        argv = ["soak", "--seed", str(bug["seed"]), "--first-day", day, "--hours", "24", "--json"]
+        assert main(argv) == 1
+    document = json.loads(capsys.readouterr().out)
+    assert "dark within lease + 10 ms" in document["failure"]
+    assert " ".join(["skinrig", *argv[:-1]]) in document["failure"]
+
+
+@pytest.mark.parametrize("option", [("--hours", "-1"), ("--hours", "nan"), ("--budget", "0")])
+def test_soak_refuses_unusable_numbers(option, capsys):
+    assert main(["soak", *option]) == 3
+    assert option[0] in capsys.readouterr().err
+
+
+def test_planted_bugs_are_many_and_fit_sources():
+    assert len({bug["name"] for bug in BUGS}) == len(BUGS) >= MIN_BUGS
+    for bug in BUGS:
+        assert mutate(bug)
+        assert 0 <= bug["day"] < MAX_DAYS, bug["name"]
+
+
+@pytest.mark.long
+def test_sampled_planted_bugs_are_found():
+    chosen = BUGS if os.environ.get(BUGS_VARIABLE) == "all" else BUGS[:: len(BUGS) // SAMPLE]
+    missed = []
+    for bug in chosen:
+        with planted(bug["file"], mutate(bug)) as changed:
+            assert changed, bug["name"]
+            if not run_soak(bug["seed"], hours=24, first_day=bug["day"]).failure:
+                missed.append(bug["name"])
+    assert missed == []
+
+
+@pytest.mark.long
+def test_soak_of_many_days_keeps_all_promises():
+    given = os.environ.get(SEED_VARIABLE, DEFAULT_SEED)
+    today = datetime.datetime.now(datetime.UTC).date().toordinal()
+    seed = today if given == "today" else int(given)
+    result = run_soak(seed, hours=24 * 365, budget_s=BUDGET_S)
+    print(f"seed {seed}: {result.days} days, {result.shots} frames, {result.faults.total()} faults")
+    assert result.failure == ""
+    assert result.shots > 0
