@@ -18,7 +18,7 @@ MAX_GAP_DISTANCE_MM: Final = 4.0
 SPREAD_FACTOR: Final = 0.46
 """Standard error of a filled normal over the spread of the measured normals around it.
 
-Set on four simulated people, see docs/validation/fusion.md."""
+Set on nine simulated faces, see docs/validation/fusion.md."""
 
 
 def fill_normals(normals: SkinMap, position: SkinMap) -> tuple[SkinMap, SkinMap | None]:
