@@ -98,7 +98,7 @@ class Framing:
             rgb = frame.cfa[..., None] - np.float32(min(frame.black))
         else:
             rgb = raw.linear_rgb(frame, demosaic="superpixel").rgb
-            rgb = rgb / np.float32(1.0 if frame.neutral is None else frame.neutral)
+            rgb = rgb / np.asarray(frame.neutral or (1.0, 1.0, 1.0), np.float32)
         face = find_face(rgb)
         if face is None:
             size = f"{scale * rgb.shape[1]} x {scale * rgb.shape[0]} px"
@@ -109,10 +109,10 @@ class Framing:
                 faults=[Fault("crop", f"{FACE_CROP}, in {size}", wanted)],
                 advice="Give the crop as X,Y,WIDTH,HEIGHT in pixels.",
             )
-        crop = frame_face(face, (rgb.shape[1], rgb.shape[0]))
-        (left, top, width, height), (x, y, across, down) = crop, face
+        left, top, width, height = frame_face(face, (rgb.shape[1], rgb.shape[0]))
+        x, y, across, down = face
         relative = (x - left) / width, (y - top) / height, across / width, down / height
-        chosen = tuple(scale * length for length in crop)
+        chosen = scale * left, scale * top, scale * width, scale * height
         return replace(self, crop_px=chosen, around_face=False), relative
 
     def apply(self, photo: Photo, *, where: str) -> Photo:

@@ -65,9 +65,8 @@ def analyze_portrait(
         )
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UnusableError(f"--out: {out} exists, expected a new or empty folder; name another")
-    names = "session", "appearance", "report.html"
     with replace_folder_atomically(out) as made:
-        session, appearance, report = (made / name for name in names)
+        session, appearance, report = _list_places(made)
         progress("find the face")
         framing = Framing.parse(FACE_CROP, width_px)
         done = import_photos(photograph, out=session, framing=framing, subject=subject)
@@ -80,4 +79,9 @@ def analyze_portrait(
         progress("write the report")
         write_atomically(report, build_any([appearance]).html)
     assumed = tuple(dict.fromkeys((*done.assumed, *found.assumed)))
-    return Portrait(*(out / name for name in names), assumed)
+    return Portrait(*_list_places(out), assumed)
+
+
+def _list_places(folder: Path) -> tuple[Path, Path, Path]:
+    """Return the session, the maps and the report in a folder."""
+    return folder / "session", folder / "appearance", folder / "report.html"
