@@ -95,13 +95,13 @@ class Framing:
         gray = frame.pattern == "MONO"
         scale = 2 if photo.encoding == "raw" and not gray else 1
         if gray:
-            rgb = frame.cfa[..., None] - np.float32(min(frame.black))
+            light = (frame.cfa[..., None] - min(frame.black)).astype(np.float32)
         else:
-            rgb = raw.linear_rgb(frame, demosaic="superpixel").rgb
-            rgb = rgb / np.asarray(frame.neutral or (1.0, 1.0, 1.0), np.float32)
-        face = find_face(rgb)
+            neutral = np.asarray(frame.neutral or (1.0, 1.0, 1.0))
+            light = (raw.linear_rgb(frame, demosaic="superpixel").rgb / neutral).astype(np.float32)
+        face = find_face(light)
         if face is None:
-            size = f"{scale * rgb.shape[1]} x {scale * rgb.shape[0]} px"
+            size = f"{scale * light.shape[1]} x {scale * light.shape[0]} px"
             wanted = "an upright face seen from the front"
             raise PhotoError(
                 "shows no face that was found",
@@ -109,7 +109,7 @@ class Framing:
                 faults=[Fault("crop", f"{FACE_CROP}, in {size}", wanted)],
                 advice="Give the crop as X,Y,WIDTH,HEIGHT in pixels.",
             )
-        left, top, width, height = frame_face(face, (rgb.shape[1], rgb.shape[0]))
+        left, top, width, height = frame_face(face, (light.shape[1], light.shape[0]))
         x, y, across, down = face
         relative = (x - left) / width, (y - top) / height, across / width, down / height
         chosen = scale * left, scale * top, scale * width, scale * height
