@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from model.dipole import gather as dipole_gather
 from model.dipole.gather import SourceTree
 from model.skin_reflectance import transmittance
-from rigsim.geometry.atlas import unwrap
+from rigsim.geometry.atlas import Atlas, unwrap
+from rigsim.geometry.mesh import Mesh
 from rigsim.mitsuba.startup import thread_count
 from rigsim.render import Caster, visibility
 from skinrig.arrays import Float32Array, Float64Array, Int32Array
@@ -84,10 +85,12 @@ class Interior:
     ----------
     surface
         Surface and maps.
-    position_mm, across_mm, along_mm, normals
-        Center of each element, its two sides, and the maps' normal, shape (S, 3).
-    prim
-        Triangle of each element, shape (S,).
+    points_mm
+        Points of the mesh in each element, where its light is sampled, shape (S, P, 3).
+    points_prim
+        Their triangles, shape (S, P).
+    normals
+        Normal of the maps at the center of each element, shape (S, 3).
     tree
         Search tree of positions and areas of the elements.
     tolerance
@@ -95,11 +98,9 @@ class Interior:
     """
 
     surface: FittedSurface
-    position_mm: Float32Array
-    across_mm: Float32Array
-    along_mm: Float32Array
+    points_mm: Float32Array
+    points_prim: Int32Array
     normals: Float32Array
-    prim: Int32Array
     tree: SourceTree
     tolerance: float = dipole_gather.GATHER_TOL
 
@@ -139,7 +140,8 @@ class Interior:
         area = np.linalg.norm(np.cross(across.astype(np.float64), along), axis=-1)
         held = surface.at(uv.astype(np.float32), position, atlas.normal[chosen])
         tree = SourceTree.of(position, area)
-        return Interior(surface, position, across, along, held.normals, atlas.prim[chosen], tree)
+        points = _sample_elements(surface.mesh, atlas, (rows, columns), position, across + along)
+        return Interior(surface, *points, held.normals, tree)
 
     def with_surface(self, surface: FittedSurface) -> Interior:
         """Return the same elements with other maps on the same mesh with the same normals."""
@@ -147,18 +149,15 @@ class Interior:
 
     def compute_entered_flux(self, lighting: Lighting) -> Float64Array:
         """Return the flux entering each element, relative to a white patch, (S, 3)."""
-        faces = lighting.shadows.face_normals[self.prim]
-        total = np.zeros((len(self.prim), 3))
+        faces = lighting.shadows.face_normals[self.points_prim]
+        total = np.zeros((len(self.normals), 3))
         # several points per element anti-alias the shadow edges
-        points = POINTS_PER_SIDE if len(lighting.lamps) < MIN_LIGHTS_FOR_ONE_POINT else 1
-        offsets = (np.arange(points, dtype=np.float32) + np.float32(0.5)) / points - 0.5
+        count = self.points_prim.shape[1] if len(lighting.lamps) < MIN_LIGHTS_FOR_ONE_POINT else 1
         eta = self.surface.model.eta
-        for u in offsets:
-            for v in offsets:
-                place = self.position_mm + u * self.across_mm + v * self.along_mm
-                for lamp in lighting.lamps:
-                    light = lighting.entering_radiance(lamp, place, faces, self.normals, eta)[0]
-                    total += light / points**2
+        for k in range(count):
+            at = np.ascontiguousarray(self.points_mm[:, k]), np.ascontiguousarray(faces[:, k])
+            for lamp in lighting.lamps:
+                total += lighting.entering_radiance(lamp, *at, self.normals, eta)[0] / count
         return total
 
     def compute_exitant_flux(
@@ -190,3 +189,28 @@ class Interior:
             entered_at=entered_at,
             workers=min(thread_count(), 4),
         ).exitance
+
+
+def _sample_elements(
+    mesh: Mesh,
+    atlas: Atlas,
+    element: tuple[NDArray[np.intp], NDArray[np.intp]],
+    center_mm: Float32Array,
+    diagonal_mm: Float32Array,
+) -> tuple[Float32Array, Int32Array]:
+    """Return points of the mesh in each element and their triangles, (S, P, 3) and (S, P).
+
+    Points of the element's plane would lie below neighboring triangles, which would shade them.
+    """
+    fine = unwrap(mesh, atlas.size * POINTS_PER_SIDE)
+    rows, columns = element
+    points = np.repeat(center_mm[:, None], POINTS_PER_SIDE**2, axis=1)
+    prims = np.repeat(atlas.prim[rows, columns][:, None], POINTS_PER_SIDE**2, axis=1)
+    size = np.linalg.norm(diagonal_mm, axis=-1)
+    for k, (i, j) in enumerate(np.ndindex(POINTS_PER_SIDE, POINTS_PER_SIDE)):
+        at = POINTS_PER_SIDE * rows + i, POINTS_PER_SIDE * columns + j
+        # a chart nearby in the texture is another place
+        apart = np.linalg.norm(fine.position_mm[at] - center_mm, axis=-1)
+        own = fine.covered[at] & (apart < size)
+        points[own, k], prims[own, k] = fine.position_mm[at][own], fine.prim[at][own]
+    return points, prims

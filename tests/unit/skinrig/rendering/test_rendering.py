@@ -10,6 +10,7 @@ from model.brdf import tables as brdf_tables
 from model.skin_reflectance import SkinReflectance, transmittance
 from rigsim.geometry.atlas import dilate_texture, unwrap
 from rigsim.geometry.mesh import build_mesh
+from rigsim.render import Caster
 from skinrig.rendering import camera as rendering_camera
 from skinrig.rendering.camera import RenderingError
 from skinrig.rendering.geometry import (
@@ -19,6 +20,7 @@ from skinrig.rendering.geometry import (
     read_mesh,
     read_own_mesh,
 )
+from skinrig.rendering.interior import Interior, Lighting
 from skinrig.rendering.lights import Light
 from skinrig.rendering.render import render_surface as render_laid
 
@@ -392,3 +394,19 @@ def test_a_fully_specular_texel_shows_the_surface_alone(shiny):
     assert np.isfinite(seen.radiance).all()
     np.testing.assert_array_equal(seen.radiance, seen.surface)
     assert np.all(seen.surface > 100.0)
+
+
+def test_rough_mesh_does_not_shade_its_elements(matt):
+    """Points that left the mesh were below neighbors: 12 % of a scan's light was lost."""
+    rng = np.random.default_rng(8)
+    smooth = dome_mesh(height_mm=8.0, steps=40)
+    vertices = smooth.vertices_mm + rng.normal(0.0, 0.15, smooth.vertices_mm.shape)
+    rough = build_mesh(vertices, smooth.faces, smooth.uv)
+    surface = FittedSurface.of(model_on(rough, matt), rough)
+    interior = Interior.of(surface)
+    lamp = Light(name="front", position_mm=FRONT)
+    found = interior.compute_entered_flux(Lighting([lamp], Caster(rough), 1))
+    towards, unshaded = lamp.directions_and_irradiance(interior.points_mm[:, 0])
+    cosine = np.einsum("nk,nk->n", interior.normals.astype(np.float64), towards)
+    expected = unshaded * (cosine * transmittance(cosine, surface.model.eta))[:, None]
+    assert 0.98 < np.mean(found) / np.mean(expected) < 1.002
