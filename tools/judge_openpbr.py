@@ -1,9 +1,10 @@
 """Judge the media of exported OpenPBR materials against the Monte Carlo simulation of tissue.
 
 A half space of sigma_a, sigma_s' and g under index 1.4 is traced; its reflectance and sigma_tr are
-exported as color and radius, and read back. The medium that OpenPBR specifies for them is traced,
-too: isotropic, without a boundary. Prints errors of the parameters, and the ratios of decay and of
-light at distances in units of 1/sigma_tr, each profile over its own total.
+exported as color and radius in float32. The albedo deficit, 1/sigma_tr, sigma_a and sigma_s' are
+recovered from these two numbers and the index alone. The medium that OpenPBR specifies for them is
+traced, too: isotropic, without a boundary. Prints errors of the parameters, and the ratios of decay
+and of light at distances in units of 1/sigma_tr, each profile over its own total.
 
 Usage: python tools/judge_openpbr.py [--photons N]
 """
@@ -18,6 +19,7 @@ import numpy as np
 from model import dipole, fresnel
 from rigsim.tissue.tissue_mc import Layer, LayerStack, TransportResult, trace_photons
 from skinrig.exporting.materials import subsurface_radius
+from skinrig.exporting.materials.material import similarity_albedo_deficit
 
 ETA, G = 1.4, 0.8
 MEDIA = {"red": (0.03, 1.4), "green": (0.15, 1.7), "blue": (0.35, 2.0), "dark": (0.9, 2.2)}
@@ -46,17 +48,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--photons", type=int, default=400_000)
     photons = parser.parse_args().photons
-    print("| medium | sigma_a, sigma_s' read back | decay | light within 1, 1 to 2.5, 2.5 to 5 |")
-    print("| --- | --- | --- | --- |")
+    print(
+        "| medium | 1/sigma_tr read back | sigma_a, sigma_s' read back | decay "
+        "| light within 1, 1 to 2.5, 2.5 to 5 |"
+    )
+    print("| --- | --- | --- | --- | --- |")
     for seed, (name, (sigma_a, sigma_s)) in enumerate(MEDIA.items()):
         sigma_t = sigma_a + sigma_s
         depth_mm = 1.0 / sqrt(3.0 * sigma_a * sigma_t)
         edges_mm = EDGES * depth_mm
         truth = trace(Layer(inf, sigma_a, sigma_s / (1.0 - G), G, ETA), edges_mm, photons, seed)
-        color = (1.0 - fresnel.diffuse_external(ETA)) * truth.reflectance
-        deficit = float(dipole.invert_to_deficit(np.array(truth.reflectance), ETA))
-        radius_mm = float(subsurface_radius.radius_mm(depth_mm, color, deficit))
-        # back from color and radius
+        inside = 1.0 - fresnel.diffuse_external(ETA)
+        exported = float(similarity_albedo_deficit(np.array(truth.reflectance), ETA))
+        color = float(np.float32(inside * truth.reflectance))
+        radius_mm = float(np.float32(subsurface_radius.radius_mm(depth_mm, color, exported)))
+        # back from color and radius, without the deficit of the export
+        deficit = float(dipole.invert_to_deficit(np.array(color / inside), ETA))
         again_mm = float(subsurface_radius.translucency_mm(radius_mm, color, deficit))
         back_t = 1.0 / (again_mm * sqrt(3.0 * deficit))
         errors = (deficit * back_t / sigma_a - 1.0, (1.0 - deficit) * back_t / sigma_s - 1.0)
@@ -70,8 +77,8 @@ def main() -> None:
         slopes = [decay_per_mm(one, edges_mm) for one in (shown, truth)]
         light = ", ".join(f"{ratio:.2f}" for ratio in parts[0] / parts[1])
         print(
-            f"| {name} | {errors[0]:+.1%}, {errors[1]:+.1%} | {slopes[0] / slopes[1]:.3f} "
-            f"| {light} |",
+            f"| {name} | {again_mm / depth_mm - 1.0:+.1e} | {errors[0]:+.1%}, {errors[1]:+.1%} "
+            f"| {slopes[0] / slopes[1]:.3f} | {light} |",
             flush=True,
         )
         print(

@@ -61,6 +61,7 @@ def import_light_list(
     lights: str | Path | LightList | None = None,
     mask: str | Path | None = None,
     encoding: Encoding = "auto",
+    resolved_encoding: Encoding = "auto",
     mm_per_px: float | None = None,
     subject: SubjectRecord | None = None,
     assumed: Sequence[str] = (),
@@ -81,6 +82,8 @@ def import_light_list(
     encoding : {"auto", "sRGB", "linear"}
         Encoding of 8-bit and PNG values. "auto" reads them as linear when three images then predict
         the others clearly better, because light adds up linearly.
+    resolved_encoding : {"auto", "sRGB", "linear"}
+        What the caller found in the images where `encoding` is "auto"; not recorded as asked.
     mm_per_px : float, optional
         Size of a pixel at the object: then the list's rows are positions in mm around the image's
         center, and the lights are near.
@@ -127,8 +130,9 @@ def import_light_list(
         raise LightListError.at("has no such scale", "mm_per_px", str(mm_per_px), "0 < mm < 1000")
     where_mask = Path(mask) if mask else light_lists.find_mask(found.images[0].parent)
     sampled, first, notes = _sample(found, where_mask)
+    read_as = resolved_encoding if encoding == "auto" else encoding
     as_linear = first.encoding == "sRGB" and (
-        encoding == "linear" or (encoding == "auto" and _is_linear_despite_encoding(sampled, found))
+        read_as == "linear" or (read_as == "auto" and _is_linear_despite_encoding(sampled, found))
     )
     shown = "linear" if as_linear else first.encoding
     every = _list_assumptions(found, notes, near=near, as_linear=as_linear, encoding=encoding)

@@ -23,7 +23,7 @@ from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.masked_map import masked_map
 from reconstruction.stack_diagnosis import Diagnosis, diagnose_stack
 
-STAGE_REVISION = 5
+STAGE_REVISION = 6
 """Grows when the code of a stage changes its result, so that older maps are recomputed."""
 
 MAP_NAMES = ("normals", "albedo", "residual")
@@ -33,13 +33,15 @@ MEMORY_BYTES = 2**30
 """Stacks above this size are stored in a file, not in memory."""
 MIN_KEPT_IMAGES = 4
 """Images without which none is left out."""
-CORRECTED_FAULTS = frozenset(
+ORDER_FAULTS = frozenset({"order of lights", "swapped lights"})
+"""Faults without effect on the maps: another order is used."""
+LEFT_OUT_FAULTS = frozenset(
     {
-        *("order of lights", "swapped lights", "wrong light", "moved image", "mirrored image"),
+        *("wrong light", "moved image", "mirrored image"),
         *("empty image", "dead light", "padded image", "full-bright image"),
     }
 )
-"""Faults without effect on the maps: another order is used, or the images are left out."""
+"""Faults without effect on the maps if their images are left out."""
 OUTLIER_SIGMAS = 4.0
 
 
@@ -159,9 +161,9 @@ def _lights(inputs: Inputs, stack: LightStack) -> StackLights:
         return StackLights(vectors, near, scale, alive, stderr_rad)
     inputs.assumed += [f"{one.fault}: {one.evidence}; {one.remedy}" for one in found.findings]
     inputs.noted["diagnosis"] = [one.to_json() for one in found.findings]
-    corrected: frozenset[str] = frozenset()
+    corrected = ORDER_FAULTS
     if np.count_nonzero(~found.left_out) >= MIN_KEPT_IMAGES:
-        alive, corrected = ~found.left_out, CORRECTED_FAULTS
+        alive, corrected = ~found.left_out, ORDER_FAULTS | LEFT_OUT_FAULTS
     faults = dict.fromkeys(one.fault for one in found.findings if one.fault not in corrected)
     return StackLights(vectors[found.order], near, scale, alive, stderr_rad, tuple(faults))
 

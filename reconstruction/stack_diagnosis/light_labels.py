@@ -156,7 +156,7 @@ def _explain_wrong(
         findings.append(
             Finding(
                 "swapped lights", (i, j), evidence,
-                float(agreement.angle_deg[[i, j]].min()), agreement.limit_deg,
+                float(agreement.angle_deg[[i, j]].max()), agreement.limit_deg,
                 "exchange the two images or the two rows of the list",
                 order=tuple(int(k) for k in order),
             )

@@ -232,13 +232,15 @@ def import_olat(
         mask=mask,
         encoding=encoding,  # type: ignore[arg-type]
         camera=camera,
+        mm_per_px=mm_per_px,
     )
     done = import_light_list(
         directory,
         out=out,
         lights=found.lights,
         mask=mask,
-        encoding=found.encoding,
+        encoding=encoding,  # type: ignore[arg-type]
+        resolved_encoding=found.encoding,
         mm_per_px=mm_per_px,
         subject=person,
         assumed=found.assumed,

@@ -45,7 +45,7 @@ class FoundLights:
     lights
         With the images that belong to it.
     encoding
-        Of the values of 8-bit files.
+        Of the values of 8-bit files, as asked or as the images show it.
     assumed
         What the user did not state.
     """
@@ -62,6 +62,7 @@ def find_lights(
     mask: Path | None,
     encoding: Encoding,
     camera: Path | None = None,
+    mm_per_px: float | None = None,
 ) -> FoundLights:
     """Find the lights of a folder of images of one object.
 
@@ -77,6 +78,9 @@ def find_lights(
         Of the values of 8-bit files; ``"auto"`` is resolved where the images show it.
     camera
         transforms.json or COLMAP's images.txt, if the list is in the frame of that file.
+    mm_per_px
+        Size of a pixel at the object, if the rows of the list are positions. These need no camera:
+        its file states neither the object's center nor the scene's unit.
 
     Raises
     ------
@@ -85,6 +89,13 @@ def find_lights(
     PhotometricStereoError
         When no list exists and the images do not determine their lights.
     """
+    if camera is not None and mm_per_px is not None:
+        raise LightListError.at(
+            "turns directions, not positions", "mm_per_px", str(mm_per_px), "none with a camera",
+            where=camera,
+            advice="Leave --mm-per-px out: then the lights count as distant. Or give positions in "
+            "mm around the center of the image, in the camera's axes, without --camera.",
+        )  # fmt: skip
     _require_images(directory)
     if lights == ESTIMATE_LIGHTS:
         if camera is not None:

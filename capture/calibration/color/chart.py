@@ -18,6 +18,7 @@ CHART_ROWS, CHART_COLUMNS = 4, 6
 PATCH_SIDE_PITCH = 0.87  # side of a patch over the distance of neighbors, ColorChecker Classic
 MAX_DETECTION_PX = 2000  # longer sides are reduced for detection only
 MIN_CLIPPED_FRACTION = 0.1  # of a patch's pixels at the image's largest value
+MIN_FLAT_FRACTION = 0.5  # the same: from it a patch is clipped, whatever the range of the type
 MAX_AFFINE_MISFIT = 0.35  # largest residual of an affine map, over the span of the colors
 
 
@@ -92,7 +93,8 @@ def measure_patches(
         From `find_chart`.
     valid : ndarray of bool, shape (H, W) or (H, W, 3), optional
         False where a pixel is saturated or must not be used; None: patches are left out where many
-        pixels have the largest value of the type, or that of several patches.
+        pixels have the largest value of the type, or that of several patches, and where most
+        pixels have the largest value of the image: patches without noise count as clipped.
     fraction : float
         Side of the averaged square over the distance of neighboring patches, at most 0.6 so that a
         chart at 45 degrees stays inside its patches.
@@ -112,6 +114,7 @@ def measure_patches(
     ok = np.zeros(len(centers), dtype=bool)
     top = np.nanmax(np.where(np.isfinite(image), image, np.nan), axis=(0, 1))
     clipped = np.zeros((len(centers), 3), dtype=bool)
+    flat = np.zeros((len(centers), 3), dtype=bool)
     for i, (x, y) in enumerate(centers):
         window = _window(x, y, half, image.shape[:2])
         if window is None or not usable[window].all():
@@ -122,11 +125,13 @@ def measure_patches(
         rgb[i] = values.mean(axis=0)
         stderr[i] = values.std(axis=0, ddof=1) / np.sqrt(len(values))
         ok[i] = True
-        clipped[i] = (values == top).mean(axis=0) > MIN_CLIPPED_FRACTION
+        at_top = (values == top).mean(axis=0)
+        clipped[i] = at_top > MIN_CLIPPED_FRACTION
+        flat[i] = at_top > MIN_FLAT_FRACTION
     if valid is None:
         kind = np.asarray(image).dtype
         full = top == np.iinfo(kind).max if kind.kind in "ui" else np.zeros(3, dtype=bool)
-        ok &= ~(clipped & (full | (clipped.sum(axis=0) > 1))).any(axis=1)
+        ok &= ~(flat | (clipped & (full | (clipped.sum(axis=0) > 1)))).any(axis=1)
     return Patches(np.where(ok[:, None], rgb, np.nan), np.where(ok[:, None], stderr, np.nan), ok)
 
 

@@ -1,6 +1,7 @@
 """Light directions from photographs of a chrome ball, seen from far away."""
 
 from collections.abc import Sequence
+from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,11 @@ MAX_OUTLINE_OFFSET = 0.05
 """Distance of the ball's outline in the images from the mask's, over the radius."""
 MIN_OUTLINE_RATIO = 3.0
 """Contrast at the outline over that at the mask's, and over that of other places."""
-OUTLINE_SIDE_PX = 240
-"""Images are reduced to this size for the search of the outline."""
+MIN_OUTLINE_CONTRAST = 1e-3
+"""Slope at an outline, in roots of the highlights' level per pixel: below it there is none."""
+OUTLINE_SIDE_PX = 256
+OUTLINE_RADIUS_PX = 60
+"""Images are reduced for the search of the outline: their longer side and the ball's radius."""
 OUTLINE_RADII = np.linspace(0.85, 1.15, 7)
 """Radii of the search over the mask's."""
 
@@ -63,7 +67,7 @@ def directions_from_chrome_ball(images: Sequence[NDArray], mask: NDArray) -> Flo
     >>> ball = x**2 + y**2 <= 30**2
     >>> spot = np.exp(-((x - 15) ** 2 + y**2) / 4.0)
     >>> directions_from_chrome_ball([spot], ball).round(2).tolist()
-    [[0.86, -0.0, 0.52]]
+    [[0.87, -0.0, 0.5]]
     """
     inside = np.asarray(mask)
     inside = inside.max(axis=-1) if inside.ndim == 3 else inside
@@ -139,32 +143,46 @@ def _require_outline(total: Float64Array, middle: Float64Array, radius: float) -
     The contrast of a circle is the median over it, so that highlights do not count. Images
     without an outline, such as a dark ball before a dark background, are not judged.
     """
-    step = max(1, max(total.shape) // OUTLINE_SIDE_PX)
+    step = ceil(max(max(total.shape) / OUTLINE_SIDE_PX, radius / OUTLINE_RADIUS_PX, 1.0))
     reduced = gaussian_filter(np.sqrt(np.maximum(total, 0.0)), step)[::step, ::step]
     down, across = np.gradient(reduced)
     center, size = middle / step, radius / step
     angle = np.linspace(0.0, 2.0 * np.pi, 120, endpoint=False)
     out = np.stack([np.cos(angle), np.sin(angle)])
     reach = np.arange(-np.ceil(size), np.ceil(size) + 1.0)
-    moves = np.stack(np.meshgrid(reach, reach, OUTLINE_RADII), axis=-1).reshape(-1, 3)
-    x, y = (center + moves[:, :2]).T[:, :, None] + (size * moves[:, 2:]) * out[:, None]
-    slopes = (map_coordinates(one, [y, x], order=1, mode="nearest") for one in (across, down))
-    radial = sum(slope * normal for slope, normal in zip(slopes, out, strict=True))
-    contrast = np.median(np.abs(radial), axis=1)
+    moves = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
+    rows = [
+        _measure_contrast(across, down, center + moves, size * scale * out)
+        for scale in OUTLINE_RADII
+    ]
+    contrast = np.concatenate(rows)
+    scales = OUTLINE_RADII.repeat(len(moves))
+    moves = np.tile(moves, (len(OUTLINE_RADII), 1))
     best = int(contrast.argmax())
     shift = np.hypot(moves[:, 0], moves[:, 1])
-    off = np.maximum(shift, size * np.abs(moves[:, 2] - 1.0))
+    off = np.maximum(shift, size * np.abs(scales - 1.0))
     here = float(contrast[off <= 1.0].max())
     other = max(here, float(np.median(contrast)))
-    if off[best] > max(MAX_OUTLINE_OFFSET * size, 2.0) and contrast[best] > (
-        MIN_OUTLINE_RATIO * other
+    if off[best] > max(MAX_OUTLINE_OFFSET * size, 2.0) and contrast[best] > max(
+        MIN_OUTLINE_RATIO * other, MIN_OUTLINE_CONTRAST
     ):
-        right, below = (float(value) for value in step * moves[best, :2])
+        right, below = (float(value) for value in step * moves[best])
         raise ChromeBallError(
             "mask: got a disc away from the ball's outline, which the images have "
-            f"{right:+.0f} px to the right and {-below:+.0f} px up, with {moves[best, 2]:.2f} "
+            f"{right:+.0f} px to the right and {-below:+.0f} px up, with {scales[best]:.2f} "
             "times the mask's radius; expected the ball's own mask"
         )
+
+
+def _measure_contrast(
+    across: Float64Array, down: Float64Array, centers: Float64Array, ring: Float64Array
+) -> Float64Array:
+    """Return the median radial slope on circles around centers (N, 2), from a ring (2, A)."""
+    x, y = centers.T[:, :, None] + ring[:, None]
+    normal = ring / np.linalg.norm(ring, axis=0)
+    radial = normal[0] * map_coordinates(across, [y, x], order=1, mode="nearest")
+    radial += normal[1] * map_coordinates(down, [y, x], order=1, mode="nearest")
+    return np.asarray(np.median(np.abs(radial), axis=1))
 
 
 def _highlight_center(gray: NDArray, inside: BoolArray) -> Float64Array | None:

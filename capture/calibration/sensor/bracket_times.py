@@ -29,7 +29,8 @@ def check_times(
     """Refuse a bracket whose light contradicts its exposure times.
 
     Each frame is compared with that of the next longer time, by the median ratio of pixels that
-    are bright in both and saturated in neither. The parameters are those of `capture.hdr.merge`.
+    are bright in both and saturated in neither. Either time of a pair may be the wrong one: the
+    error states their ratio. The parameters are those of `capture.hdr.merge`.
 
     Raises
     ------
@@ -43,7 +44,7 @@ def check_times(
     Traceback (most recent call last):
         ...
     capture.hdr.BracketError: Bracket: the light contradicts the exposure times
-      exposures_s[0]: got 0.1 s, expected 0.0769 s, as its light over that of 1 s
+      exposures_s[0] over exposures_s[1]: got 0.1 (0.1 s over 1 s), expected 0.0769 as their light
     """
     times = np.asarray(exposures_s, np.float64)
     step = max(1, frames[0].size // MAX_COMPARED) if frames else 1
@@ -59,9 +60,10 @@ def check_times(
             continue
         ratio = float(np.median((samples[k] - black)[bright] / expected[bright]))
         if not abs(ratio - 1.0) <= MAX_TIME_ERROR:
-            got, wanted = f"{times[k]:.3g} s", f"{times[k] * ratio:.3g} s"
-            why = f"{wanted}, as its light over that of {times[longer]:.3g} s"
-            faults.append(Fault(f"exposures_s[{k}]", got, why))
+            nominal = times[k] / times[longer]
+            got = f"{nominal:.3g} ({times[k]:.3g} s over {times[longer]:.3g} s)"
+            where = f"exposures_s[{k}] over exposures_s[{longer}]"
+            faults.append(Fault(where, got, f"{nominal * ratio:.3g} as their light"))
     if faults:
         what = "the light contradicts the exposure times"
         raise BracketError(what, where="Bracket", faults=faults)

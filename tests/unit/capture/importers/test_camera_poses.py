@@ -51,6 +51,35 @@ def test_both_files_give_the_same_axes(write, tmp_path):
         read_camera_axes(file, [Path("9.png")])
 
 
+def test_equal_names_follow_their_folders(tmp_path):
+    """Two cameras with equal names of images; without their folders, both would count."""
+    frames = []
+    for camera, turn in (("cam01", TURN), ("cam02", TURN.inv())):
+        matrix = np.eye(4)
+        matrix[:3, :3] = turn.as_matrix()
+        frames.append({"file_path": f"{camera}/01.png", "transform_matrix": matrix.tolist()})
+    file = tmp_path / "transforms.json"
+    file.write_text(json.dumps({"frames": frames}))
+    for camera, turn in (("cam01", TURN), ("Cam02", TURN.inv())):
+        axes = read_camera_axes(file, [tmp_path / camera / "01.tif"])
+        np.testing.assert_allclose(axes, turn.as_matrix().T, atol=1e-9)
+    with pytest.raises(LightListError, match=r"cam01/01 and cam02/01: got \d+.\d degrees apart"):
+        read_camera_axes(file, [tmp_path / "other" / "01.tif"])
+
+
+def test_blank_lines_of_colmap_matter_between_poses(tmp_path):
+    """A long line of points is no pose; poses without lines of points in between are refused."""
+    file = write_colmap(tmp_path / "images.txt", TURN, TURN)
+    text = file.read_text()
+    for changed in (text.replace("1 2 3\n", "1 2 3 " * 4 + "\n"), text + "\n\n"):
+        file.write_text(changed)
+        axes = read_camera_axes(file, IMAGES)
+        np.testing.assert_allclose(axes, TURN.as_matrix().T, atol=1e-9)
+    file.write_text(text.replace("\n\n", "\n"))
+    with pytest.raises(LightListError, match=r"(?s)lacks the lines of points.*got 2 0"):
+        read_camera_axes(file, IMAGES)
+
+
 def test_scale_of_scene_does_not_matter(tmp_path):
     file = write_transforms(tmp_path / "transforms.json", TURN, scale=2.5)
     axes = read_camera_axes(file, [Path("other.png")])
@@ -67,6 +96,11 @@ def test_scale_of_scene_does_not_matter(tmp_path):
             "a.json",
             json.dumps({"frames": [{"file_path": "a", "transform_matrix": (-np.eye(4)).tolist()}]}),
             "rotation",
+        ),
+        (
+            "a.json",
+            f'{{"frames": [{{"file_path": "a", "transform_matrix": [[1{"0" * 400}]]}}]}}',
+            "4 x 4",
         ),
         ("images.txt", "1 nan 0 0 0 0 0 0 1 a.png\n", "QW QX"),
         ("images.txt", "# nothing\n", "0"),

@@ -11,7 +11,8 @@ from fixtures.faulty_stacks import FAULTS, GRADED, make
 from model.metrics import angular_error_rad
 from reconstruction.normal_maps import PhotometricStereoError
 from reconstruction.photometric_stereo import estimate_normals
-from reconstruction.stack_diagnosis import diagnose_stack
+from reconstruction.stack_diagnosis import diagnose_stack, light_labels
+from reconstruction.stack_diagnosis.shading_space import Agreement
 
 NAMED_ALONE = {"two swapped", "dim", "zeros", "dark", "half of zeros", "mirrored"}
 """Faults from which nothing else follows: no other finding is expected."""
@@ -39,8 +40,22 @@ def test_fault_is_found_with_its_images(fault):
 def test_exchanged_neighbors_are_named_alone(seed, rig):
     """The last two of a list exchanged are no other order; the second's angle may be small."""
     stack = make("two swapped", seed, side=64, severity=15, rig=rig, tone="dark")
-    named = [(one.fault, one.frames) for one in diagnose(stack).findings]
-    assert named == [("swapped lights", stack.frames)]
+    (only,) = diagnose(stack).findings
+    assert (only.fault, only.frames) == ("swapped lights", stack.frames)
+    assert only.ratio_to_limit >= 1.0
+
+
+def test_swapped_lights_are_measured_by_larger_angle():
+    """Lights on an arc: one of the pair is 10 degrees from its row, the other only 5 of 6."""
+    rows, seen = (
+        np.array([[np.sin(a), 0.0, np.cos(a)] for a in np.radians(degrees)])
+        for degrees in ([0.0, 8.0, 30.0, 50.0, -40.0], [10.0, 3.0, 30.0, 50.0, -40.0])
+    )
+    angle_deg = np.degrees(np.arccos(np.clip((rows * seen).sum(axis=1), -1.0, 1.0)))
+    agreement = Agreement(seen, np.ones(5), angle_deg, 6.0, 0.01)
+    (only,) = light_labels._explain_wrong([0], np.arange(5), agreement, rows)
+    assert (only.fault, only.frames, only.order) == ("swapped lights", (0, 1), (1, 0, 2, 3, 4))
+    assert only.ratio_to_limit == pytest.approx(10.0 / 6.0)
 
 
 def test_flicker_is_found_beyond_its_severity():

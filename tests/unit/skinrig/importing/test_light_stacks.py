@@ -24,6 +24,12 @@ def estimate(folder, **options):
     return find_lights(folder, **given)
 
 
+def import_assumptions(argv, capsys):
+    capsys.readouterr()
+    assert main(argv) == 0
+    return json.loads(capsys.readouterr().out)["assumed"]
+
+
 def test_float_images_of_other_maxima_show_their_lights(tmp_path):
     """A full-bright and a dark image keep their level, although each file has its own maximum."""
     lights = dome(20, np.random.default_rng(2), 60)
@@ -80,8 +86,8 @@ def test_unequal_count_stays_the_error_despite_odd_files(tmp_path):
 
 
 @pytest.mark.parametrize(("encoding", "seed"), [("sRGB", 7001), ("sRGB", 7005), ("linear", 7005)])
-def test_encoding_of_glossy_images_is_found(encoding, seed, tmp_path):
-    """Highlights that a curve flattens do not make its values linear."""
+def test_encoding_of_glossy_images_is_found(encoding, seed, tmp_path, capsys):
+    """Highlights that a curve flattens do not make its values linear; none of it was asked for."""
     rng = np.random.default_rng(seed)
     lights = dome(12, rng, 60)
     images, inside = render(SHAPES[seed % 3], lights, rng, side=64, gloss=2.0, noise=0.005)
@@ -94,6 +100,12 @@ def test_encoding_of_glossy_images_is_found(encoding, seed, tmp_path):
     np.savetxt(folder / "lights.txt", lights)
     found = find_lights(folder, lights=None, mask=None, encoding="auto")
     assert found.encoding == encoding
+    argv = ["import", "olat", str(folder), "--json"]
+    told = "".join(import_assumptions([*argv, "--out", str(tmp_path / "s")], capsys))
+    assert ("linear light, since shading adds up so" in told) == (encoding == "linear")
+    assert "as asked" not in told
+    asked = [*argv, "--encoding", "linear", "--out", str(tmp_path / "t")]
+    assert "linear light, as asked" in "".join(import_assumptions(asked, capsys))
 
 
 def test_image_that_list_lacks_is_named(tmp_path):
@@ -124,6 +136,10 @@ def test_list_in_scene_frame_is_turned(tmp_path, capsys):
     assert main(argv) == 0
     assert main([*argv, "--lights", "estimate"]) == 3
     assert "needs no camera" in capsys.readouterr().err
+    argv[-1] = str(tmp_path / "near")
+    assert main([*argv, "--mm-per-px", "0.1"]) == 3
+    assert "got 0.1, expected none with a camera" in capsys.readouterr().err
+    assert not (tmp_path / "near").exists()
 
 
 def test_cameras_and_videos_state_what_to_do(tmp_path, capsys):

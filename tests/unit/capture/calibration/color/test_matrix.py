@@ -319,6 +319,20 @@ def test_chart_spectra_have_the_chart_reference_colors():
     assert np.median(colorimetry.delta_e_2000(by_spectra, published)) < 2.0
 
 
+def test_single_clipped_patch_is_left_out():
+    """14-bit codes in 16 bits, and values clipped at 1: neither is the largest of its type."""
+    image, centers = draw_chart(30, rng=np.random.default_rng(4))
+    whole = measure_patches(image, centers)
+    brightest = np.sort(whole.rgb.max(axis=1))
+    share = image / brightest[-2:].mean()
+    scaled = np.minimum(share, 1.0)
+    for clipped in (scaled, np.rint(16383 * scaled).astype(np.uint16)):
+        valid = measure_patches(clipped, centers).valid
+        assert not valid[whole.rgb.max(axis=1).argmax()]
+        assert valid.sum() == 23
+    assert measure_patches(np.rint(12000 * share).astype(np.uint16), centers).valid.all()
+
+
 def test_clipped_patches_are_left_out_without_mask():
     """A white card at the end of the range is no clipped patch; the table beside may be."""
     image, centers = draw_chart(30, rng=np.random.default_rng(4))

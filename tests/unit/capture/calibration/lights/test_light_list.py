@@ -1,4 +1,5 @@
 import dataclasses
+import tracemalloc
 
 import cv2
 import numpy as np
@@ -315,6 +316,18 @@ def test_stray_pixel_of_ball_mask_changes_nothing(test_data):
     np.testing.assert_array_equal(found, directions_from_chrome_ball(images, mask))
 
 
+def test_outline_of_large_ball_needs_little_memory():
+    """A ball that fills the image: all circles at once took 1.9 GB."""
+    y, x = np.mgrid[:240, :240] - 120
+    ball = x**2 + y**2 <= 100**2
+    spot = np.exp(-((x - 15) ** 2 + y**2) / 4.0) + 0.05 * ball
+    tracemalloc.start()
+    directions_from_chrome_ball([spot], ball)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100e6
+
+
 def test_wrong_ball_masks_are_refused(test_data):
     images, mask = chrome_images(test_data)
     half = mask.copy()
@@ -323,6 +336,7 @@ def test_wrong_ball_masks_are_refused(test_data):
     for wrong, message in (
         (half, "overlaps a disc of its area by 64%"),
         (two, "apart from the largest part"),
+        (np.roll(mask, 8, axis=1), "-8 px to the right and [-+]0 px up"),
         (np.roll(mask, 20, axis=1), "-20 px to the right and [-+]0 px up"),
         (np.roll(mask, (14, -14), axis=(0, 1)), "[+]14 px to the right and [+]14 px up"),
     ):
