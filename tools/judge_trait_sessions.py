@@ -41,7 +41,7 @@ COMPARED = 8
 
 def judge_albedo() -> None:
     sessions = load_population_sessions()
-    people = [get_member(name) for name in sessions.mapped]
+    people = [get_member(name) for name in sessions.captured]
     faces = CommonFaces.of(draw_population(), size=FACE_TEXELS, common=2 * sessions.frame.size)
     rng = np.random.default_rng(0)
     exact = [faces.albedo(person, noise=0.0, rng=rng) for person in people]

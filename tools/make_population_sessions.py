@@ -6,7 +6,7 @@ One member under each of seven conditions, then members of the simulated populat
 simulator of the light dome with sensor noise, through its calibration and through the
 reconstruction. One calibration serves all. WORK keeps the estimates of each session, so that an
 interrupted run continues; ``--people 0`` only collects them. People are captured in a random order:
-those of an unfinished run are a random sample. A session takes 38 to 56 s of processor time.
+those of an unfinished run are a random sample. A session takes 23 to 37 s of processor time.
 ``--table`` prints the tables of the validation pages from the stored file and runs nothing.
 """
 
@@ -113,9 +113,7 @@ def collect(work: Path) -> None:
         "lobes": np.array(dome.N_BASIS_BRDFS),
         "condition_names": np.array(list(worn)),
     }
-    mapped = {name: one for name, one in faces.items() if "r_d" in one}
-    stored["mapped"] = np.array(list(mapped))
-    stored["r_d"] = np.array([encode_r_d(one["r_d"], one["valid"]) for one in mapped.values()])
+    stored["r_d"] = np.array([encode_r_d(one["r_d"], one["valid"]) for one in faces.values()])
     half = dataclasses.replace(common_frame(), size=COMMON["common"] // 2)
     stored["frame"] = np.array(json.dumps(half.to_document()))
     for key, sessions in (("people", faces), ("conditions", worn)):

@@ -54,7 +54,9 @@ SIGMA_TR_DISTANCE_MM: Final = 4.0
 """Distance from the source at which the light of a probe's channel has its sigma_tr.
 
 Light of the least absorbed wavelengths travels farthest: at this distance they have most of a
-channel's weight. Set on nine simulated people, types I to VI; see docs/validation/fusion.md."""
+channel's weight. Set on nine simulated people, types I to VI; see docs/validation/fusion.md. It
+holds for the packaged probe, with fibers at 0.3 to 7.05 mm: farther fibers weight longer
+wavelengths more."""
 SIGMA_TR_OFFSET: Final = -0.06
 """Log sigma_tr of a probe's light on layered skin, less the dermis's at that distance.
 

@@ -162,11 +162,11 @@ def analyze_simulated(out: Path, *, people: int | None = None, seed: int = 0) ->
         Seed of the sample.
     """
     sessions = load_population_sessions()
-    count = len(sessions.mapped) if people is None else people
-    if not 2 <= count <= len(sessions.mapped):
-        raise TraitFitError(f"people: got {count}, expected 2 to {len(sessions.mapped)}")
-    chosen = sorted(np.random.default_rng([seed, 1]).permutation(len(sessions.mapped))[:count])
-    some = [get_member(sessions.mapped[k]) for k in chosen]
+    count = len(sessions.captured) if people is None else people
+    if not 2 <= count <= len(sessions.captured):
+        raise TraitFitError(f"people: got {count}, expected 2 to {len(sessions.captured)}")
+    chosen = sorted(np.random.default_rng([seed, 1]).permutation(len(sessions.captured))[:count])
+    some = [get_member(sessions.captured[k]) for k in chosen]
     known = sorted({label for person in some for label in person.labels})
     binary = {
         name: flags

@@ -180,19 +180,18 @@ def analyze_simulated(
         Seed of points and factorizations.
     """
     basis = brdf_tables.default_basis()
-    rng = np.random.default_rng([seed, 70])
+    # one generator per dataset, so that a change of one leaves the others' results as they are
+    alone_rng, a_rng, b_rng = (np.random.default_rng([seed, 70, k]) for k in range(3))
     sessions = load_population_sessions()
-    dataset_a, dataset_b = (
-        _sample(data, points_each, rng) for data in (sessions.conditions, sessions.people)
-    )
+    dataset_a = _sample(sessions.conditions, points_each, a_rng)
+    dataset_b = _sample(sessions.people, points_each, b_rng)
     bare = dataset_a.label == dataset_a.labels.index("normal")
     alone = np.zeros(np.count_nonzero(bare), np.int64)
     one = Dataset("one person", dataset_a.weights[bare], alone, ("normal",), np.nan, 0)
-    how: dict[str, Any] = {"method": method, "rng": rng}
     found = (
-        _analyze_face(one, basis, sessions.lobes, **how),
-        analyze(dataset_a, basis, by_label=False, **how),
-        analyze(dataset_b, basis, by_label=True, **how),
+        _analyze_face(one, basis, sessions.lobes, method=method, rng=alone_rng),
+        analyze(dataset_a, basis, by_label=False, method=method, rng=a_rng),
+        analyze(dataset_b, basis, by_label=True, method=method, rng=b_rng),
     )
     _write(out, found, basis, spheres=found[1], method=method, source="simulated")
     return found

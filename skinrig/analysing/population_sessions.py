@@ -38,10 +38,8 @@ class PopulationSessions:
     """Material weights of the n members, without a condition but their own (dataset B)."""
     conditions: Dataset
     """Material weights of one member under each condition (dataset A)."""
-    mapped: tuple[str, ...]
-    """Names of the members with a map of R_d, m of them."""
     r_d: tuple[AlbedoSample, ...]
-    """R_d of the m members in the common map."""
+    """R_d of the n members in the common map."""
     frame: CommonFrame
     """The common map."""
 
@@ -65,7 +63,6 @@ def load_population_sessions() -> PopulationSessions:
         int(stored["lobes"]),
         _dataset("dataset B", captured, stored, "people"),
         _dataset("dataset A", tuple(stored["condition_names"].tolist()), stored, "conditions"),
-        tuple(stored["mapped"].tolist()),
         tuple(map(decode_r_d, stored["r_d"])),
         CommonFrame.from_document(json.loads(str(stored["frame"]))),
     )

@@ -49,6 +49,10 @@ def fill_normals(normals: SkinMap, position: SkinMap) -> tuple[SkinMap, SkinMap 
         return normals, None
     tree = cKDTree(position.values[known])
     distance, near = tree.query(position.values[gap], k=N_NEIGHBORS, workers=1)
+    filled = np.zeros_like(gap)
+    filled[gap] = distance[:, 0] < MAX_GAP_DISTANCE_MM
+    if not filled.any():
+        return normals, None
     around = normals.values[known].astype(np.float64)[near]
     middle = unit_vectors(around.mean(axis=1))
     cosine = np.clip(np.einsum("gnk,gk->gn", around, middle), -1.0, 1.0)
@@ -58,8 +62,6 @@ def fill_normals(normals: SkinMap, position: SkinMap) -> tuple[SkinMap, SkinMap 
     stderr = normals.stderr.copy()
     found = np.maximum(SPREAD_FACTOR * spread, least).astype(stderr.dtype)
     stderr[gap] = found.reshape(-1, *([1] * (stderr.ndim - 2)))
-    filled = np.zeros_like(gap)
-    filled[gap] = distance[:, 0] < MAX_GAP_DISTANCE_MM
     whole = known | filled
     what = f"{normals.description}, gaps filled from measured neighbors"
     measured = SkinMap(

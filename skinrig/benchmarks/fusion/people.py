@@ -218,7 +218,9 @@ def _draw_sigma_tr(
 ) -> Float64Array:
     """Return log sigma_tr of sites as the probe measures it, (K, 3).
 
-    The coefficients of the pressed dermis are the simulator's.
+    The coefficients of the pressed dermis are the simulator's. The light at a distance and its
+    errors are those that the estimator states, so that these people cannot show a wrong distance
+    or offset; sessions of `tools/judge_fused_people.py` do.
     """
     weights = spectra.band_weights(RIGS[2].camera, RIGS[2].illuminant)
     pressed = fractions[:, 1] * PRESSED_BLOOD[0] * np.exp(PRESSED_BLOOD[1] * rng.standard_normal())

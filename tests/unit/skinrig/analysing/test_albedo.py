@@ -49,7 +49,7 @@ def test_groups_differ_in_histograms_as_generated(lab, capsys):
 def test_more_people_than_were_captured_are_refused(people, tmp_path, capsys):
     argv = ["analyse", "albedo", "--people", people, "--out", str(tmp_path / "out")]
     assert main(argv) == 3
-    most = len(load_population_sessions().mapped)
+    most = len(load_population_sessions().captured)
     assert f"people: got {people}, expected 2 to {most}" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -78,6 +78,6 @@ def test_options_without_effect_are_refused(options, expected, tmp_path, capsys)
 
 def test_analysis_without_faces_uses_sessions(tmp_path):
     found = analysing_albedo.analyze_simulated(tmp_path / "out", people=3)
-    assert set(found.names) < set(load_population_sessions().mapped)
+    assert set(found.names) < set(load_population_sessions().captured)
     assert found.document()["groups"]["all"] == 3
     assert found.explained["face"].size == 2

@@ -1,5 +1,6 @@
 """`skinrig fuse` on small drawn maps: each rig alone, both together, and refused inputs."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -157,6 +158,26 @@ def test_fuse_dome_alone_keeps_its_texture(folders, tmp_path):
     found = fuse(FusionInputs((folders / "dome",)), out=tmp_path / "double")
     assert found.appearance.maps["melanin"].values.shape == (SIDE, SIDE)
     assert found.checks == ()
+
+
+def test_fuse_fills_gaps_of_normals(folders, tmp_path):
+    dome = store.read(folders / "dome")
+    normals = dome.maps["normals"]
+    gap = np.zeros((SIDE, SIDE), bool)
+    gap[11:13, 11] = True
+    near = {
+        "position": SkinMap(0.5 * dome.maps["position"].values, "mm"),
+        "normals": SkinMap(normals.values, "1", normals.stderr, ~gap),
+    }
+    path = store.write(tmp_path / "dome", dataclasses.replace(dome, maps=dome.maps | near))
+    found = fuse(FusionInputs((path,)), out=tmp_path / "double").appearance
+    maps = store.read(tmp_path / "double").maps
+    assert maps["normals"].mask.all()
+    assert maps["normals"].stderr[gap].min() > 0.01
+    np.testing.assert_array_equal(maps["normals_measured"].values, ~gap)
+    assert found.parameters["fusion"]["maps"]["normals_measured"] == ["dome"]
+    whole = fuse(FusionInputs((folders / "dome",)), out=tmp_path / "whole").appearance
+    assert "normals_measured" not in whole.maps
 
 
 def test_fuse_flash_alone_uses_its_image(folders, tmp_path):
