@@ -25,6 +25,8 @@ from capture.devices.camera import (
 from capture.devices.led_box import LedBox
 from capture.plan import Step
 
+log = logging.getLogger(__name__)
+
 N_CLOCK_READINGS = 8
 CLOCK_DRIFT_S_PER_S = 2e-4
 """Largest drift of a camera's clock, s per s."""
@@ -57,6 +59,21 @@ def compare_clocks(camera: Camera, box_clock_s: Callable[[], float]) -> _ClockOf
         if best.uncertainty_s < 2e-3:
             break
     return best
+
+
+def arm_camera(camera: Camera, count: int, box_clock_s: Callable[[], float]) -> _ClockOffset:
+    """Arm a camera for a table and return the offset of its clock afterwards.
+
+    A link that was lost and made again may reach a program with another clock: the offset is that
+    of the link in use. A link that was lost since the arming needs another arming.
+    """
+    camera.arm(count, Trigger.EDGE)
+    try:
+        return compare_clocks(camera, box_clock_s)
+    except FrameRefused as error:
+        log.info("%s", error)
+    camera.arm(count, Trigger.EDGE)
+    return compare_clocks(camera, box_clock_s)
 
 
 class FrameStream:
@@ -177,9 +194,6 @@ class FrameStream:
         return self._rows[place] if abs(self._times[place] - box_s) <= allowed_s else None
 
 
-log = logging.getLogger(__name__)
-
-
 class TableRun:
     """The rows of an armed table, one per step, run once.
 
@@ -218,10 +232,10 @@ class TableRun:
     ) -> None:
         self._run, self._box, self._steps, self._what = run, box, steps, what
         self._cameras = run.step_cameras(steps[0])
-        clocks = {name: compare_clocks(camera, box.ping) for name, camera in self._cameras.items()}
+        clocks = {
+            name: arm_camera(camera, len(steps), box.ping) for name, camera in self._cameras.items()
+        }
         keep_alive()
-        for camera in self._cameras.values():
-            camera.arm(len(steps), Trigger.EDGE)
         began_s = box.trigger(token)
         self.times_s = self._listen(token, began_s, poll_s, keep_alive)
         self._streams = {

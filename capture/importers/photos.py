@@ -35,6 +35,8 @@ IMAGE_CURVES = "linear sRGB"
 SIDECAR_SUFFIXES = frozenset(
     ".txt .md .csv .json .xmp .thm .pp3 .dop .xml .html .pdf .zip .mov .mp4 .lp".split()
 )
+UNEQUAL_PAIR_NOTE = "differ in color or size, so that no specular image follows from them"
+"""End of an assumption that begins with the names of two files."""
 _POLARIZER_WORDS = {"parallel": "parallel", "crossed": "crossed", "cross": "crossed"}
 
 
@@ -366,8 +368,7 @@ def _list_unequal_partners(steps: Sequence[tuple[Step, _Entry]]) -> list[str]:
     for step, entry in steps:
         pairs.setdefault(step.index["state"], []).append(entry)
     return [
-        f"{' and '.join(entry.file.name for entry in pair)} differ in color or size, so that no "
-        "specular image follows from them"
+        f"{' and '.join(entry.file.name for entry in pair)} {UNEQUAL_PAIR_NOTE}"
         for pair in pairs.values()
         if len({(entry.view.cfa, entry.view.width_px, entry.view.height_px) for entry in pair}) > 1
     ]

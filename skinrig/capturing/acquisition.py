@@ -288,7 +288,7 @@ def remove_unused(path: Path, *, with_folder: bool) -> None:
 
 @contextlib.contextmanager
 def _stop_on_signal() -> Iterator[Any]:
-    """Turn the first Ctrl-C into a stop between two steps; the second interrupts at once."""
+    """Turn the first Ctrl-C or SIGTERM into a stop between steps; the second interrupts at once."""
     received: list[int] = []
 
     def record_signal(number: int, frame: object) -> None:
@@ -296,8 +296,10 @@ def _stop_on_signal() -> Iterator[Any]:
             raise KeyboardInterrupt
         received.append(number)
 
-    previous = signal.signal(signal.SIGINT, record_signal)
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    previous = {number: signal.signal(number, record_signal) for number in numbers}
     try:
         yield lambda: bool(received)
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)

@@ -365,7 +365,7 @@ def anonymize(
     out
         New SESSION/ folder.
     landmarks
-        CSV table name,x,y in pixels of a view; black discs cover them; repeatable.
+        CSV table name,x,y in pixels of a view's maps; black discs cover them; repeatable.
     radius
         Radius of the discs, fraction of the image's width.
     drop_images
@@ -373,14 +373,13 @@ def anonymize(
     pseudonym
         New pseudonym of the subject; default: unchanged.
     """
-    from reconstruction.correspondence.landmark_table import read_landmark_table
     from skinrig.capturing.addresses import parse_addresses
     from skinrig.capturing.anonymization import AnonymizationOrder, anonymize_session
 
     console = Console(json)
     tables = parse_addresses(landmarks or (), "--landmarks")
     order = AnonymizationOrder(
-        landmarks={view: read_landmark_table(file) for view, file in tables.items()},
+        landmarks={view: Path(file) for view, file in tables.items()},
         radius=radius,
         drop_images=drop_images,
         pseudonym=pseudonym,

@@ -293,6 +293,10 @@ def choose(
     if asked.budget_s is not None and (asked.goals or forecast):
         other = "--goals" if asked.goals else "--forecast"
         raise PlanOptionsError(f"--budget: got it together with {other}; remove one")
+    if asked.budget_s is not None and asked.leds:
+        raise PlanOptionsError(
+            "--budget: got it together with --bands, whose frames it does not count; remove one"
+        )
     if forecast is not None:
         plan = read_plan(forecast)
         if plan.rig != rig.name:

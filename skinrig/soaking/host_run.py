@@ -85,6 +85,8 @@ class HostTap:
     ----------
     life, fault
         Process of the host, and its fault.
+    has_struck
+        Whether the fault has happened; faults of the disk are noted by the disk.
     """
 
     def __init__(self, faults: LineTap) -> None:
@@ -94,6 +96,7 @@ class HostTap:
     def begin(self, life: HostLife, fault: HostFault, world: World | None) -> None:
         """Begin the run of another host."""
         self.life, self.fault, self._world = life, fault, world
+        self.has_struck = fault.kind == "clock jump"
         self._count = 0
 
     def pass_on(self, way: str, line: bytes) -> list[tuple[float, bytes]]:
@@ -106,6 +109,7 @@ class HostTap:
         return self._faults.pass_on(way, line)
 
     def _strike(self) -> None:
+        self.has_struck |= self.fault.kind in ("kill", "interrupt", "reset")
         if self.fault.kind == "kill":
             self.life.end()
         if self.fault.kind == "interrupt":
@@ -246,6 +250,7 @@ class HostRun:
             self.disk.life.require()
             asked[0] += 1
             at_strike = asked[0] == 1 + self.fault.strike % 12
+            self.tap.has_struck |= at_strike and self.fault.kind in ("second client", "abort")
             if at_strike and self.fault.kind == "second client":
                 self._try_second_client()
             return at_strike and self.fault.kind == "abort"

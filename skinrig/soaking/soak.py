@@ -111,7 +111,9 @@ def run_soak(
                 break
             try:
                 _soak_day(result, seed, day, digest, shots_per_day)
-            except InvariantViolated as violation:
+            except Exception as error:  # a crash needs its seed and day, too
+                expected = isinstance(error, InvariantViolated)
+                violation = str(error) if expected else f"{type(error).__name__}: {error}"
                 replay = f"skinrig soak --seed {seed} --first-day {day} --hours 24"
                 result.failure = f"day {day}, session {result.sessions}: {violation}; {replay}"
             result.days += 1

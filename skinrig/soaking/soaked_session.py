@@ -19,7 +19,7 @@ from rigsim.world.line_faults import LineFaults
 from skinrig.errors import EXIT_BAD_INPUT, EXIT_DEVICE_FAILED, EXIT_DONE, EXIT_INTERRUPTED
 from skinrig.soaking.fault_draw import NO_HOST_FAULT, HostFault, draw_host_fault
 from skinrig.soaking.host_life import HostLife
-from skinrig.soaking.host_run import KILLED_CODE, HostRun, HostTap, Ledger
+from skinrig.soaking.host_run import KILLED_CODE, HostRun, HostTap, Ledger, SecondClientAdmitted
 from skinrig.soaking.light_limits import find_limit_violations
 from skinrig.soaking.reckless_host import LIGHT_COMMANDS, request_too_much_light
 from skinrig.soaking.storage import (
@@ -245,12 +245,15 @@ class SoakedSession:
             self._outcome.power_cuts += 1
         self._outcome.runs += 1
         self._outcome.codes[code] += 1
-        self._outcome.faults[fault.kind] += 1
+        if self._tap.has_struck or disk.struck:
+            self._outcome.faults[fault.kind] += 1
         return code, message
 
     # what must hold -----------------------------------------------------------------------------
 
     def _check_code(self, code: int, message: str, fault: HostFault) -> None:
+        admitted = message.startswith(SecondClientAdmitted.__name__)
+        require(not admitted, "a controller has one host at a time", message)
         documented = code in DOCUMENTED_CODES
         if code == EXIT_BAD_INPUT:
             documented = self._storage.lies or "SessionDiskError" in message

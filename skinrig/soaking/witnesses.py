@@ -28,8 +28,6 @@ WIDTH_PX = 16
 ANGLES_DEG: Final[Mapping[str, int]] = {"parallel": 0, "crossed": 90}
 SHUTTER_TOLERANCE = 0.03
 """Largest relative deviation of the light's duration from the exposure."""
-SHUTTER_TOLERANCE_S = 1e-4
-MICROSECOND_S = 1e-6
 
 Row = tuple[int, int, int]
 """Description of a light, or of what the rig holds: three numbers of a pixel row."""

@@ -1,15 +1,17 @@
 """Bits flipped on the way to a camera and back: the connection is made again, the step retaken."""
 
 import contextlib
+import dataclasses
 import itertools
 import socket
 import threading
+from types import SimpleNamespace
 
 import pytest
 from fixtures.operators import by_operator
 
 from capture.acquire import run_plan
-from capture.devices.camera import open_camera
+from capture.devices.camera import Exposure, FrameRefused, Trigger, open_camera
 from capture.devices.cameras import remote_camera
 from capture.devices.flash import FlashBox
 from capture.devices.port import LinkLost, Port
@@ -17,6 +19,7 @@ from capture.session import Session, SubjectRecord, verify
 from rigsim.boxes.faults import Faults
 from rigsim.world import World
 from rigsim.world.camera_service import CameraService
+from skinrig.errors import EXIT_DEVICE_FAILED, exit_code
 from skinrig.soaking.witnesses import FlashWitness
 
 NAMES = (f"camera-link-{number}" for number in itertools.count())
@@ -90,7 +93,7 @@ def flash_session(tmp_path, monkeypatch):
             name = world.register(next(NAMES))
             opened.callback(world.unregister)
             # the camera reads out on the world's clock while the host waits for it
-            monkeypatch.setattr(remote_camera.time, "sleep", world.clock.sleep)
+            monkeypatch.setattr(remote_camera, "sleep", world.clock.sleep)
             monkeypatch.setattr(remote_camera, "RECONNECTION_PAUSE_S", READOUT_S)
             service = CameraService(world, "127.0.0.1", 0)
             opened.callback(service.close)
@@ -113,6 +116,63 @@ def flash_session(tmp_path, monkeypatch):
         yield capture
 
 
+@pytest.fixture
+def link(monkeypatch):
+    """A camera behind a proxy, and a function that ends its connection."""
+    with contextlib.ExitStack() as opened:
+        scene = FlashWitness()
+        world = World(scene.rig, seed=1, scene=scene, faults=Faults(baud=0.0))
+        monkeypatch.setattr(remote_camera, "sleep", world.clock.sleep)
+        monkeypatch.setattr(remote_camera, "RECONNECTION_PAUSE_S", READOUT_S)
+        service = CameraService(world, "127.0.0.1", 0)
+        opened.callback(service.close)
+        address = service.addresses[scene.rig.views[0].name]
+        _, _, rest = address.rpartition(":")
+        port, _, view = rest.partition("/")
+        proxy = FlippingProxy(int(port), "request", ())
+        opened.callback(proxy.close)
+        camera = open_camera(f"tcp://127.0.0.1:{proxy.port}/{view}")
+        opened.callback(camera.close)
+        yield camera, lambda: proxy.end(*proxy.ends)
+
+
+WANTED = Exposure(0.01, 100)
+
+
+def test_reconnection_to_another_camera_is_refused(link, monkeypatch):
+    camera, cut = link
+    camera.clock_s()
+    cut()
+    camera.clock_s()  # the same camera
+    camera._is_reconnected = False
+    cut()
+    decode = remote_camera.camera_wire.info_from_json
+    changed = SimpleNamespace(
+        **{
+            **vars(remote_camera.camera_wire),
+            "info_from_json": lambda table: dataclasses.replace(decode(table), serial="other"),
+        }
+    )
+    monkeypatch.setattr(remote_camera, "camera_wire", changed)
+    with pytest.raises(LinkLost, match="another camera answered") as lost:
+        camera.clock_s()
+    assert exit_code(lost.value) == EXIT_DEVICE_FAILED
+    assert camera.info.serial != "other"
+
+
+@pytest.mark.parametrize("is_fetched", [True, False])
+def test_link_lost_after_last_frame_costs_nothing(link, is_fetched):
+    camera, cut = link
+    camera.configure(WANTED)
+    camera.arm(1, Trigger.SOFTWARE)
+    camera.fire()
+    if is_fetched:
+        camera.frame(5.0)
+    cut()
+    with contextlib.nullcontext() if is_fetched else pytest.raises(FrameRefused):
+        camera.configure(WANTED)
+
+
 def check_frames(session):
     for record in session.frames():
         cfa = session.read(record).cfa
@@ -132,8 +192,9 @@ def test_flipped_bit_costs_one_retake_at_most(flash_session, way, struck):
 
 
 def test_link_lost_twice_without_frame_ends_capture(flash_session):
-    with pytest.raises(LinkLost, match="lost in"):
+    with pytest.raises(LinkLost, match="lost in") as lost:
         flash_session("request", range(3, 60))
+    assert exit_code(lost.value) == EXIT_DEVICE_FAILED
 
 
 def test_capture_without_second_connection_is_lost(flash_session, monkeypatch):

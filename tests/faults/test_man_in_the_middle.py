@@ -191,7 +191,7 @@ def capture(tmp_path, kind, seed, *, share=0.08):
         pytest.param("gradient_sphere", 10, 200, marks=pytest.mark.long),
     ],
 )
-def test_accepted_frames_show_requested_light(tmp_path, monkeypatch, kind, sessions, faults):
+def test_accepted_frames_show_requested_light(tmp_path, kind, sessions, faults):
     strikes = Counter()
     if sessions >= 10:
         sessions = int(os.environ.get(SESSIONS_VARIABLE, sessions))
@@ -229,7 +229,7 @@ LIGHTS = {
 
 @pytest.mark.parametrize("kind", RIGS)
 @pytest.mark.parametrize("seed", range(3))
-def test_lost_host_leaves_dark_although_lines_repeat(monkeypatch, kind, seed):
+def test_lost_host_leaves_dark_although_lines_repeat(kind, seed):
     scene = RIGS[kind]
     world = World(scene.rig, seed=seed, faults=Faults(baud=0.0))
     name, unit = world.register(next(NAMES)), world.box(kind)

@@ -6,8 +6,10 @@ import os
 
 import pytest
 from fixtures.planted import BUGS, mutate, planted
+from fixtures.product_code import ROOT, text_of
 
 from skinrig.cli import main
+from skinrig.soaking import soak
 from skinrig.soaking.soak import run_soak
 
 SEED_VARIABLE = "SOAK_SEED"
@@ -65,9 +67,27 @@ def test_sampled_planted_bugs_are_found():
     for bug in chosen:
         with planted(bug["file"], mutate(bug)) as changed:
             assert changed, bug["name"]
-            if not run_soak(bug["seed"], hours=24, first_day=bug["day"]).failure:
-                missed.append(bug["name"])
+            failure = run_soak(bug["seed"], hours=24, first_day=bug["day"]).failure
+            if not failure or bug.get("invariant", "") not in failure:
+                missed.append((bug["name"], failure))
     assert missed == []
+    for seed, day in sorted({(bug["seed"], bug["day"]) for bug in chosen}):
+        assert run_soak(seed, hours=24, first_day=day).failure == ""
+
+
+def test_soak_names_replay_of_any_error(monkeypatch):
+    def fail(*_):
+        raise ZeroDivisionError("lost")
+
+    monkeypatch.setattr(soak, "_soak_day", fail)
+    failure = run_soak(5, hours=48, first_day=3).failure
+    assert failure.startswith("day 3, session 0: ZeroDivisionError: lost; skinrig soak --seed 5")
+
+
+def test_planted_lines_without_change_change_nothing():
+    bug = BUGS[0]
+    with planted(bug["file"], "\n\n" + text_of(ROOT / bug["file"])) as changed:
+        assert changed == 0
 
 
 @pytest.mark.long

@@ -8,7 +8,7 @@ its frame is refused, so that the step is taken again.
 import contextlib
 import logging
 import socket
-import time
+from time import monotonic, sleep
 from typing import Any
 
 from capture.devices.camera import (
@@ -70,7 +70,8 @@ class RemoteCamera:
         self._url = f"tcp://{host}:{port}/{view}"
         self._host, self._port, self._view = host, port, view
         self._id = 0
-        self._is_closed = self._is_reconnected = self._is_armed = False
+        self._is_closed = self._is_reconnected = False
+        self._expected_frames = 0
         self._exposure: Exposure | None = None
         self._socket: socket.socket | None = None
         self._connect()
@@ -100,17 +101,24 @@ class RemoteCamera:
         if self._is_closed or self._is_reconnected:
             raise lost
         self._is_reconnected = True
-        last_s = time.monotonic() + RECONNECTION_TIMEOUT_S
+        info = self._info
+        last_s = monotonic() + RECONNECTION_TIMEOUT_S
         while True:
             try:
                 self._connect()
                 break
             except CameraBusy:
-                if time.monotonic() >= last_s:
+                if monotonic() >= last_s:
                     raise lost from None
-                time.sleep(RECONNECTION_PAUSE_S)
+                sleep(RECONNECTION_PAUSE_S)
             except LinkLost:
                 raise lost from None
+        if self._info != info:
+            self._drop()
+            other, self._info = self._info, info
+            raise LinkLost(
+                f"{lost}; then another camera answered: got {other}, expected {info}"
+            ) from None
         log.warning("%s; connected again", lost)
         if self._exposure is not None:
             self._exchange(
@@ -136,9 +144,9 @@ class RemoteCamera:
 
     def arm(self, count: int, trigger: Trigger) -> None:
         """Prepare for `count` frames and drop frames that wait from before."""
-        self._is_armed = False
+        self._expected_frames = 0
         self._ask("arm", count=count, trigger=str(trigger))
-        self._is_armed = True
+        self._expected_frames = count
 
     def fire(self) -> None:
         """Start one exposure."""
@@ -150,6 +158,7 @@ class RemoteCamera:
         A damaged one, and one that was lost with its connection, raise `FrameRefused`.
         """
         answer = self._ask("frame", timeout_s=timeout_s, reply_delay_s=timeout_s)
+        self._expected_frames = max(self._expected_frames - 1, 0)
         try:
             camera_wire.check_blob(answer, answer["blob"])
             frame = camera_wire.frame_from_message(answer["frame"], answer["blob"])
@@ -160,7 +169,7 @@ class RemoteCamera:
 
     def abort(self) -> None:
         """Cancel what was armed."""
-        self._is_armed = False
+        self._expected_frames = 0
         self._ask("abort")
 
     def close(self) -> None:
@@ -190,7 +199,7 @@ class RemoteCamera:
         Raises
         ------
         FrameRefused
-            When the connection of an armed camera was lost and made again.
+            When the connection was lost, and made again, before all frames had arrived.
         LinkLost
             When it cannot be made again, or was lost twice without a frame.
         """
@@ -198,8 +207,8 @@ class RemoteCamera:
             return self._exchange(request, **fields)
         except LinkLost as lost:
             self._reconnect(lost)
-        if self._is_armed:  # the server has aborted its exposures
-            self._is_armed = False
+        if self._expected_frames or request == "frame":  # the server has aborted its exposures
+            self._expected_frames = 0
             raise FrameRefused(
                 f"{self._url}: the link was lost in {request!r} and made again; the exposure is "
                 "repeated"

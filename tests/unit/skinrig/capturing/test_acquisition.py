@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import signal
 
 import pytest
 
@@ -207,3 +208,15 @@ def test_import_records_subject_and_rig_of_photographs(tmp_path, sim, capsys):
     # the rig that ships has a larger camera: these are no photographs of it
     assert main([*argv[:-4], "--out", str(tmp_path / "t"), "--rig", "flash"]) == 3
     assert "was not taken by this rig's camera" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_first_signal_stops_between_steps(number):
+    before = signal.getsignal(number)
+    with acquisition._stop_on_signal() as stopped:
+        assert not stopped()
+        signal.raise_signal(number)
+        assert stopped()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(number)
+    assert signal.getsignal(number) is before

@@ -109,6 +109,7 @@ def test_plan_command_keeps_budget(monkeypatch, rig, tmp_path, capsys):
     ("argv", "code", "words"),
     [
         (["flash", "--budget", "60s", "--goals", "melanin<=9%"], 2, "together with --goals"),
+        (["flash", "--budget", "60s", "--bands", "460"], 2, "together with --bands"),
         (["flash", "--budget", "60"], 2, "add the unit"),
         (["flash", "--budget", "0s"], 3, "above 0"),
         (["dome", "--budget", "60s"], 2, "option of flash, not of dome"),

@@ -2,9 +2,11 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from capture.rig import load_rig
+from rigsim.boxes.eye_guard import EyeFlickerMonitor
 from skinrig.soaking.light_limits import find_limit_violations
 
 DOME, FLASH = load_rig("dome"), load_rig("flash")
@@ -39,18 +41,36 @@ def test_dose_and_duty_meet_closed_forms(switched, exceeded):
     assert not exceeded or exceeded in violations[0]
 
 
-@pytest.mark.parametrize(("every_s", "flashes"), [(0.3, 4), (0.34, 0), (0.005, 0)])
-def test_flashes_count_for_open_eyes_alone(every_s, flashes):
+@pytest.mark.parametrize(
+    ("every_s", "lit_s", "flashes"),
+    [(0.3, 0.004, 4), (0.34, 0.004, 3), (0.45, 0.2, 0), (0.5, 0.004, 0), (0.005, 0.004, 0)],
+)
+def test_flashes_count_for_open_eyes_alone(every_s, lit_s, flashes):
     front, behind = (
         next(k for k, light in enumerate(DOME.lights) if (light.position_mm[2] > 80.0) == is_front)
         for is_front in (True, False)
     )
-    switched = pulses(20, lit_s=0.004, every_s=every_s, level=0.1, led=front)
+    switched = pulses(20, lit_s=lit_s, every_s=every_s, level=0.1, led=front)
     assert found(switched) == []
-    unseen = pulses(20, lit_s=0.004, every_s=every_s, level=0.1, led=behind)
+    unseen = pulses(20, lit_s=lit_s, every_s=every_s, level=0.1, led=behind)
     assert found(unseen, eyes="open") == []
     violations = found(switched, eyes="open")
-    assert violations == ([f"flicker: {flashes} flashes per second, limit 3"] if flashes else [])
+    expected = f"flicker: {flashes} flashes per second, expected below 3"
+    assert violations == ([expected] if flashes else [])
+
+
+@pytest.mark.parametrize("lit_s", [0.004, 0.1, 0.2])
+def test_flashes_that_controller_permits_pass(lit_s):
+    led = next(k for k, light in enumerate(DOME.lights) if light.position_mm[2] > 80.0)
+    monitor, limit, agreed = EyeFlickerMonitor(DOME.lights), DOME.leds.max_flashes_per_s, 0
+    every_s = np.arange(0.25, 0.6, 0.01)
+    for period_s in every_s:
+        switched = pulses(8, lit_s=lit_s, every_s=period_s, level=0.1, led=led)
+        permitted = monitor.flashes_per_s(switched) < limit
+        passed = not found(switched, eyes="open")
+        assert passed or not permitted
+        agreed += passed == permitted
+    assert agreed >= 0.9 * every_s.size
 
 
 def test_pops_per_minute_count_those_of_before():
