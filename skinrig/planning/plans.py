@@ -290,13 +290,9 @@ def choose(
         )
     if asked.budget_s is not None and rig_name != "flash":
         raise PlanOptionsError(f"--budget: is an option of flash, not of {rig_name}; remove it")
-    if asked.budget_s is not None and (asked.goals or forecast):
-        other = "--goals" if asked.goals else "--forecast"
+    others = {"--goals": asked.goals, "--forecast": forecast, "--bands": asked.leds}
+    for other in (name for name, given in others.items() if given and asked.budget_s is not None):
         raise PlanOptionsError(f"--budget: got it together with {other}; remove one")
-    if asked.budget_s is not None and asked.leds:
-        raise PlanOptionsError(
-            "--budget: got it together with --bands, whose frames it does not count; remove one"
-        )
     if forecast is not None:
         plan = read_plan(forecast)
         if plan.rig != rig.name:
@@ -305,8 +301,8 @@ def choose(
                 "this rig [SR-PLN-003]"
             )
         found: PlanChoice = own.forecast(rig, plan, asked)
-    else:
-        found = own.choose(rig, asked)
+        return found
+    found = own.choose(rig, asked)
     return found
 
 

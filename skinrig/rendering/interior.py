@@ -85,6 +85,8 @@ class Interior:
     ----------
     surface
         Surface and maps.
+    position_mm
+        Center of each element, shape (S, 3).
     points_mm
         Points of the mesh in each element, where its light is sampled, shape (S, P, 3).
     points_prim
@@ -98,6 +100,7 @@ class Interior:
     """
 
     surface: FittedSurface
+    position_mm: Float32Array
     points_mm: Float32Array
     points_prim: Int32Array
     normals: Float32Array
@@ -141,7 +144,7 @@ class Interior:
         held = surface.at(uv.astype(np.float32), position, atlas.normal[chosen])
         tree = SourceTree.of(position, area)
         points = _sample_elements(surface.mesh, atlas, (rows, columns), position, across + along)
-        return Interior(surface, *points, held.normals, tree)
+        return Interior(surface, position, *points, held.normals, tree)
 
     def with_surface(self, surface: FittedSurface) -> Interior:
         """Return the same elements with other maps on the same mesh with the same normals."""

@@ -13,7 +13,7 @@ from reconstruction.stack_diagnosis.finding import Finding
 @pytest.mark.parametrize(
     ("kept", "faults"), [(4, ("near lights",)), (3, ("moved image", "near lights"))]
 )
-def test_corrected_orders_are_no_remaining_faults(kept, faults, monkeypatch):
+def test_corrected_orders_are_not_remaining_faults(kept, faults, monkeypatch):
     """The order is used with any number of images; images are left out if four remain."""
     out = np.arange(7) >= kept
     order = np.arange(7)[::-1]
