@@ -12,6 +12,8 @@ from capture.hdr import BracketError
 
 MAX_TIME_ERROR: Final = 0.1
 """Relative error of a ratio of exposure times from which it is refused."""
+SPREAD_PERCENTILES: Final = 10.0, 50.0, 90.0
+"""Percentiles of the pixels' ratios, of which all must be off in one direction."""
 MIN_SIGNAL_SIGMAS: Final = 10.0
 MIN_COMPARED, MAX_COMPARED = 50, 20_000
 """Pixels that compare two exposures."""
@@ -28,14 +30,15 @@ def check_times(
 ) -> None:
     """Refuse a bracket whose light contradicts its exposure times.
 
-    Each frame is compared with that of the next longer time, by the median ratio of pixels that
-    are bright in both and saturated in neither. Either time of a pair may be the wrong one: the
-    error states their ratio. The parameters are those of `capture.hdr.merge`.
+    Each frame is compared with that of the next longer time, by the ratios of pixels that are
+    bright in both and saturated in neither. A false time changes all of them alike. Either time of
+    a pair may be the wrong one: the error states their ratio. The parameters are those of
+    `capture.hdr.merge`.
 
     Raises
     ------
     BracketError
-        If a ratio of times is off by more than 10 %.
+        If eight of ten pixels or more contradict a ratio of times by more than 10 %.
 
     Examples
     --------
@@ -58,8 +61,10 @@ def check_times(
         bright &= (samples[k] < white) & (samples[longer] < white)
         if np.count_nonzero(bright) < MIN_COMPARED:
             continue
-        ratio = float(np.median((samples[k] - black)[bright] / expected[bright]))
-        if not abs(ratio - 1.0) <= MAX_TIME_ERROR:
+        ratios = (samples[k] - black)[bright] / expected[bright]
+        low, ratio, high = np.percentile(ratios, SPREAD_PERCENTILES)
+        # a head that moved between the exposures changes pixels by different ratios
+        if low > 1.0 + MAX_TIME_ERROR or high < 1.0 - MAX_TIME_ERROR:
             nominal = times[k] / times[longer]
             got = f"{nominal:.3g} ({times[k]:.3g} s over {times[longer]:.3g} s)"
             where = f"exposures_s[{k}] over exposures_s[{longer}]"
