@@ -14,6 +14,11 @@ from capture.rig import LedLimits, Rig
 POP_WINDOW_S = 60.0
 FUSION_S = 1.0 / 65.0
 """Darkness, s, that an eye does not notice."""
+MIN_CHANGE = 0.1
+"""Least change of light, over the brightest, that is a flash (WCAG 2.2)."""
+HALF_FLASH = 0.5
+"""Change, flashes, that may lie in another second for the controllers: light that falls slowly has
+its change where the fall begins, here where it ends."""
 EYE_PLANE_MM = 80.0
 """Distance of the eyes from the head's center, along +z, mm: light from behind does not reach them.
 """
@@ -66,13 +71,13 @@ def find_limit_violations(
         if duty > limits.max_duty + TIME_ROUNDING_S * on_s.size:
             yield f"dose: LED {led} had a duty of {duty:.4f}, limit {limits.max_duty:g}"
     seen = [
-        (light.t_on_s, light.t_off_s, light.level)
+        (light.t_on_s, light.t_off_s, light.level * weight)
         for light in switched
-        if not hasattr(light, "led") or rig.lights[light.led].position_mm[2] > EYE_PLANE_MM
+        if (weight := _weigh_at_eyes(rig, light)) > 0.0
     ]
     if eyes == "open" and seen:
         flashes = _count_flashes_per_s(sorted(seen))
-        if flashes >= limits.max_flashes_per_s:  # controllers refuse the limit itself
+        if flashes >= limits.max_flashes_per_s + HALF_FLASH:
             yield (
                 f"flicker: {flashes:g} flashes per second, expected below "
                 f"{limits.max_flashes_per_s:g}"
@@ -93,18 +98,34 @@ def _find_largest_duty(on_s: Any, off_s: Any, level: Any, window_s: float) -> fl
     return float(((light_until(ends_s) - light_until(ends_s - window_s)) / window_s).max())
 
 
+def _weigh_at_eyes(rig: Rig, light: Any) -> float:
+    """Return the relative irradiance on the eyes' plane; 0 for a light behind it."""
+    if not hasattr(light, "led"):
+        return 1.0
+    led = rig.lights[light.led]
+    away = np.subtract(led.position_mm, (0.0, 0.0, EYE_PLANE_MM))
+    return (led.power_w or 0.0) * max(float(away[2]), 0.0) / float(np.linalg.norm(away)) ** 3
+
+
 def _count_flashes_per_s(intervals: Sequence[tuple[float, float, float]]) -> float:
     """Return the flashes of the worst second: half the changes between light and darkness.
 
-    Darkness shorter than `FUSION_S` is light. Controllers locate a change within this time, so that
-    the second is shorter by as much.
+    Darkness shorter than `FUSION_S` is light, and light below `MIN_CHANGE` of the brightest is
+    darkness. Controllers locate a change within the fusion time, so that the second is shorter by
+    as much.
     """
+    on_s, off_s, level = np.array(intervals).T
+    edges_s = np.unique(np.concatenate([on_s, off_s]))
+    steps = np.zeros(edges_s.size)
+    np.add.at(steps, np.searchsorted(edges_s, on_s), level)
+    np.add.at(steps, np.searchsorted(edges_s, off_s), -level)
+    light = np.cumsum(steps)
     changes_s: list[float] = []
     dark_since_s = -np.inf
-    for on_s, off_s, _ in intervals:
-        if on_s > dark_since_s + FUSION_S:
-            changes_s += [dark_since_s, on_s]
-        dark_since_s = max(dark_since_s, off_s)
+    for k in np.flatnonzero(light >= MIN_CHANGE * light.max()).tolist():
+        if edges_s[k] > dark_since_s + FUSION_S:
+            changes_s += [dark_since_s, edges_s[k]]
+        dark_since_s = edges_s[k + 1]
     times_s = np.array([*changes_s[1:], dark_since_s])
     ends = np.searchsorted(times_s, times_s + 1.0 - FUSION_S)
     return float((ends - np.arange(times_s.size)).max()) / 2.0

@@ -16,7 +16,17 @@ MIN_SKIN_FRACTION: Final = 0.02
 """Least fraction of a crop around a face that is skin."""
 
 
-def skin_stage(stage: Callable[..., stages.PipelineStage], inputs: Inputs) -> stages.PipelineStage:
+def find_imported_face(inputs: Inputs) -> tuple[float, ...]:
+    """Return the face's square over the image's sides; empty if the import looked for none."""
+    listed = inputs.session.manifest.extra.get("photographs", ())
+    faces = {one["step"]: one.get("face", ()) for one in listed}
+    shots = inputs.session.frames("subject", state=inputs.state)
+    return tuple(map(float, faces.get(shots[0].step_id, ()))) if shots else ()
+
+
+def skin_stage(
+    stage: Callable[..., stages.PipelineStage], inputs: Inputs, face: tuple[float, ...]
+) -> stages.PipelineStage:
     """Return the stage that makes ``diffuse`` of ``light``.
 
     Parameters
@@ -24,19 +34,15 @@ def skin_stage(stage: Callable[..., stages.PipelineStage], inputs: Inputs) -> st
     stage
         Factory of stages, see `graph.make_stage_factory`.
     inputs
-        Session and state. Where its import found no face, all pixels are kept.
+        Session and state.
+    face
+        See `find_imported_face`.
     """
-    listed = inputs.session.manifest.extra.get("photographs", ())
-    faces = {one["step"]: one.get("face", ()) for one in listed}
-    shots = inputs.session.frames("subject", state=inputs.state)
-    face = tuple(map(float, faces.get(shots[0].step_id, ()))) if shots else ()
     keep = partial(_keep_skin, f"{inputs.session.path}: {inputs.state}", face)
     return stage("skin region", "light", "diffuse", keep, face=list(face))
 
 
 def _keep_skin(what: str, face: tuple[float, ...], light: SkinMap) -> SkinMap:
-    if not face:
-        return light
     skin = find_face_skin(light.values, light.mask, face)
     if np.mean(skin) < MIN_SKIN_FRACTION:
         raise InputsError(

@@ -33,7 +33,7 @@ from reconstruction.chromophores.shading_prior import ShadingPrior
 from reconstruction.face_light import FaceLight, estimate_face_light
 from reconstruction.pipeline import graph as stages
 from reconstruction.pipeline.flash import oxygenation
-from reconstruction.pipeline.flash.skin_stage import skin_stage
+from reconstruction.pipeline.flash.skin_stage import find_imported_face, skin_stage
 from reconstruction.pipeline.inputs import Inputs, InputsError
 from reconstruction.pipeline.masked_map import masked_map
 from reconstruction.pipeline.skin_tone import maps as tone
@@ -104,14 +104,17 @@ def graph(inputs: Inputs) -> list[stages.PipelineStage]:
     which = {"state": inputs.state, "repeat": inputs.repeat}
     of_skin = "melanin melanin_optical_depth hemoglobin shading residual gamut_distance"
     of_skin += " melanin_noise_stderr hemoglobin_noise_stderr face_light"
-    shown = "image specular_image"
+    shown, face = "image specular_image", find_imported_face(inputs)
+    light = "light" if face else "diffuse"
     return [
         stage("frames", "", "parallel crossed", partial(_frames, rig), **which),
-        stage("separation", "parallel crossed", "light specular", partial(_separate, rig)),
-        skin_stage(stage, inputs),
+        stage(
+            "separation", "parallel crossed", f"{light} specular", partial(_separate, rig, light)
+        ),
+        *([skin_stage(stage, inputs, face)] if face else []),
         stage("chromophores", "diffuse", of_skin, partial(_chromophores, rig), **by_color),
         stage("tsumura", "diffuse", "tsumura_melanin tsumura_hemoglobin", _tsumura),
-        stage("pictures", "light specular", shown, partial(_pictures, rig), **table),
+        stage("pictures", f"{light} specular", shown, partial(_pictures, rig), **table),
         stage(
             "skin reflectance", "diffuse face_light", tone.REFLECTANCE_PRODUCT, _skin_reflectance
         ),
@@ -165,9 +168,8 @@ def load_flash_rig(inputs: Inputs) -> FlashRig:
 def _exposure_over_chart(shots: Sequence[FrameRecord], of_chart: str) -> float:
     """Return the exposure of photographs over that of the chart; 1 where one is not recorded."""
     own = describe_exposure(shots[0].settings) if shots else EXPOSURE_UNKNOWN
-    if EXPOSURE_UNKNOWN in (own, of_chart):
-        return 1.0
-    return float(own) / float(of_chart)
+    known = EXPOSURE_UNKNOWN not in (own, of_chart)
+    return float(own) / float(of_chart) if known else 1.0
 
 
 def load_skin_colors(
@@ -256,14 +258,11 @@ def separate_each(rig: FlashRig, records: Sequence[FrameRecord]) -> Iterator[Ski
     """Yield the diffuse reflectance of each crossed frame alone."""
     mean_image = _image_reader(rig)
     for record in records:
-        yield _separate(rig, None, mean_image([record]))["light"]
+        yield _separate(rig, "diffuse", None, mean_image([record]))["diffuse"]
 
 
 def _noise(sensor: SensorCalibration | None) -> tuple[float, float] | tuple[None, None]:
-    """Return gain (electrons per DN) and read noise with rounding, electrons; or None for both.
-
-    A calibration overrides the noise profile of the frames.
-    """
+    """Return a calibration's gain (electrons per DN) and read noise with rounding, or None."""
     if sensor is None:
         return None, None
     gain = float(sensor.mean_gain_e_per_dn().value)
@@ -272,7 +271,7 @@ def _noise(sensor: SensorCalibration | None) -> tuple[float, float] | tuple[None
 
 
 def _separate(
-    rig: FlashRig, parallel: FlashImage | None, crossed: FlashImage
+    rig: FlashRig, light: str, parallel: FlashImage | None, crossed: FlashImage
 ) -> Mapping[str, SkinMap]:
     """Separate diffuse and specular reflection, relative to a white reference at the same pixel."""
     white = rig.white
@@ -311,7 +310,7 @@ def _separate(
     valid = valid & diffuse.valid & ~dim
     over, shines = "specular light over that of a white reference", specular_valid & valid
     return {
-        "light": _map3(reflectance, np.sqrt(variance), valid, "white reference in place = 1"),
+        light: _map3(reflectance, np.sqrt(variance), valid, "white reference in place = 1"),
         "specular": _map3(specular / level, specular_error / level, shines, over),
     }
 
@@ -438,8 +437,9 @@ def _tsumura(diffuse: SkinMap) -> Mapping[str, SkinMap]:
     }
 
 
-def _pictures(rig: FlashRig, light: SkinMap, specular: SkinMap) -> Mapping[str, SkinMap]:
+def _pictures(rig: FlashRig, specular: SkinMap, **diffuse: SkinMap) -> Mapping[str, SkinMap]:
     """Convert diffuse and specular light to linear sRGB."""
+    (light,) = diffuse.values()
     picture = light.values.astype(np.float64)
     if rig.color is not None and rig.neutral is not None:
         picture = rig.color.to_linear_srgb(picture * rig.neutral)

@@ -43,7 +43,14 @@ def test_dose_and_duty_meet_closed_forms(switched, exceeded):
 
 @pytest.mark.parametrize(
     ("every_s", "lit_s", "flashes"),
-    [(0.3, 0.004, 4), (0.34, 0.004, 3), (0.45, 0.2, 0), (0.5, 0.004, 0), (0.005, 0.004, 0)],
+    [
+        (0.2, 0.004, 5),
+        (0.3, 0.004, 4),
+        (0.34, 0.004, 0),
+        (0.45, 0.2, 0),
+        (0.5, 0.004, 0),
+        (0.005, 0.004, 0),
+    ],
 )
 def test_flashes_count_for_open_eyes_alone(every_s, lit_s, flashes):
     front, behind = (
@@ -62,15 +69,13 @@ def test_flashes_count_for_open_eyes_alone(every_s, lit_s, flashes):
 @pytest.mark.parametrize("lit_s", [0.004, 0.1, 0.2])
 def test_flashes_that_controller_permits_pass(lit_s):
     led = next(k for k, light in enumerate(DOME.lights) if light.position_mm[2] > 80.0)
-    monitor, limit, agreed = EyeFlickerMonitor(DOME.lights), DOME.leds.max_flashes_per_s, 0
-    every_s = np.arange(0.25, 0.6, 0.01)
-    for period_s in every_s:
+    monitor, limit = EyeFlickerMonitor(DOME.lights), DOME.leds.max_flashes_per_s
+    for period_s in np.arange(0.25, 0.6, 0.01):
         switched = pulses(8, lit_s=lit_s, every_s=period_s, level=0.1, led=led)
-        permitted = monitor.flashes_per_s(switched) < limit
+        flashes = monitor.flashes_per_s(switched)
         passed = not found(switched, eyes="open")
-        assert passed or not permitted
-        agreed += passed == permitted
-    assert agreed >= 0.9 * every_s.size
+        assert passed or flashes >= limit
+        assert not passed or flashes < limit + 1.0  # half a flash is left to the controllers
 
 
 def test_pops_per_minute_count_those_of_before():
