@@ -85,13 +85,13 @@ def test_export_json_lists_written_and_omitted_items(dome, tmp_path, capsys):
     [
         (["--to", "maps"], 2, "--use: got none"),
         (["--to", "maps", "--use", "film"], 3, "P042 has not agreed"),
-        (["--to", "fbx", "--use", "research"], 3, "expected one of maps, mtlx"),
+        (["--to", "fbx", "--use", "research"], 3, "expected one of maps, ome-zarr, mtlx"),
         (["--to", "mtlx", "--use", "research", "--unit", "inch"], 3, "--unit: got 'inch'"),
         (["--to", "gltf", "--use", "research", "--normal-y", "dx"], 2, "the only one of glTF"),
         (["--to", "maps", "--use", "research", "--only", "melanin"], 3, "got melanin"),
         (["--to", "spectral", "--use", "research"], 3, "as of the flash rig"),
         (["--to", "metahuman", "--use", "research"], 3, "skinrig fit wrinkles"),
-        (["--to", "lp"], 3, "dome holds maps; expected one of maps, mtlx"),
+        (["--to", "lp"], 3, "dome holds maps; expected one of maps, ome-zarr, mtlx"),
     ],
 )
 def test_impossible_export_gives_reason_and_writes_nothing(
