@@ -72,7 +72,7 @@ def to_webp_url(file: bytes) -> str:
 
     out = io.BytesIO()
     image = Image.open(io.BytesIO(file)).convert("RGB")
-    image.save(out, "WEBP", lossless=True, quality=50, method=4)
+    image.save(out, "WEBP", lossless=True, quality=75, method=5)
     return "data:image/webp;base64," + base64.b64encode(out.getvalue()).decode("ascii")
 
 
