@@ -23,6 +23,8 @@ def test_ended_command_leaves_no_temporary_folder(tmp_path, number):
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
+        # background jobs of a shell start with SIGINT ignored
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:
         last_s = time.monotonic() + TIMEOUT_S
         while not any(tmp_path.glob("skinrig-soak-*/s/frames/*")):
