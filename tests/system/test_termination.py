@@ -1,4 +1,4 @@
-"""Commands that are told to end: exit code 130, and nothing temporary is left."""
+"""Interrupted and terminated commands: exit code 130, and no temporary folder is left."""
 
 import os
 import signal

@@ -68,7 +68,7 @@ def test_equal_names_follow_their_folders(tmp_path):
 
 
 def test_blank_lines_of_colmap_matter_between_poses(tmp_path):
-    """A long line of points is no pose; poses without lines of points in between are refused."""
+    """Long lines of points are not poses; poses without lines of points are refused."""
     file = write_colmap(tmp_path / "images.txt", TURN, TURN)
     text = file.read_text()
     for changed in (text.replace("1 2 3\n", "1 2 3 " * 4 + "\n"), text + "\n\n"):

@@ -101,9 +101,9 @@ def test_encoding_of_glossy_images_is_found(encoding, seed, tmp_path, capsys):
     found = find_lights(folder, lights=None, mask=None, encoding="auto")
     assert found.encoding == encoding
     argv = ["import", "olat", str(folder), "--json"]
-    told = "".join(import_assumptions([*argv, "--out", str(tmp_path / "s")], capsys))
-    assert ("linear light, since shading adds up so" in told) == (encoding == "linear")
-    assert "as asked" not in told
+    assumed = "".join(import_assumptions([*argv, "--out", str(tmp_path / "s")], capsys))
+    assert ("linear light, since shading adds up so" in assumed) == (encoding == "linear")
+    assert "as asked" not in assumed
     asked = [*argv, "--encoding", "linear", "--out", str(tmp_path / "t")]
     assert "linear light, as asked" in "".join(import_assumptions(asked, capsys))
 

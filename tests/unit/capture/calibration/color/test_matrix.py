@@ -334,7 +334,7 @@ def test_single_clipped_patch_is_left_out():
 
 
 def test_clipped_patches_are_left_out_without_mask():
-    """A white card at the end of the range is no clipped patch; the table beside may be."""
+    """A white card at the end of the range is not a clipped patch; the table around it may be."""
     image, centers = draw_chart(30, rng=np.random.default_rng(4))
     whole = measure_patches(image, centers)
     assert whole.valid.all()
