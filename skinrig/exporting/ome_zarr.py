@@ -97,7 +97,7 @@ def _write_array(
     group: Group, name: str, values: Any, *, fill: float, label: dict[str, Any] | None = None
 ) -> None:
     """Write an array as the only resolution of an image."""
-    from zarr.codecs import GzipCodec
+    from zarr.codecs import BloscCodec
 
     axes = ["c", "y", "x"][3 - values.ndim :]
     kinds = {"c": "channel", "y": "space", "x": "space"}
@@ -118,7 +118,8 @@ def _write_array(
         "0",
         data=values,
         chunks=(*(1 for _ in axes[:-2]), *chunks[-2:]),
-        compressors=[GzipCodec(level=5)],
+        # zarr's gzip writes the time into each chunk; equal maps must give equal bytes
+        compressors=[BloscCodec(cname="zstd", clevel=5)],
         fill_value=fill,
         dimension_names=axes,
     )
