@@ -19,7 +19,12 @@ from skinrig.appearances.contents import hash_file
 from skinrig.arrays import BoolArray, FloatArray
 from skinrig.drawing import png
 from skinrig.exporting.options import FIRST_TILE, ExportSettings
-from skinrig.exporting.sealing import describe_provenance, write_json
+from skinrig.exporting.sealing import (
+    PROVENANCE_KEY,
+    describe_provenance,
+    format_provenance,
+    write_json,
+)
 
 SRGB_SPACE: Final = "linear sRGB"
 CAMERA_SPACE: Final = "camera RGB, linear, white balanced"
@@ -103,6 +108,8 @@ class ImageFolder:
         Existing folder.
     delivery
         Names of tiles.
+    appearance
+        Source of the images; its provenance is in each file.
     records
         Record of each file by name, JSON values.
     tiles
@@ -113,6 +120,7 @@ class ImageFolder:
 
     root: Path
     delivery: ExportSettings
+    appearance: SkinAppearance
     records: dict[str, dict[str, Any]] = field(default_factory=dict)
     tiles: tuple[int, ...] = (FIRST_TILE,)
     left_out: list[tuple[str, str]] = field(default_factory=list)
@@ -127,6 +135,7 @@ class ImageFolder:
         def put(path: Path, one: ExportImage) -> dict[str, Any]:
             channels = {"Y" if one.values.ndim == 2 else "RGB": one.values}
             header = {"unit": one.unit, "colorSpace": one.space, "comments": one.what}
+            header[PROVENANCE_KEY] = format_provenance(self.appearance)
             write_channels(path, channels, header, rec709=one.space == SRGB_SPACE)
             return {"encoding": "32-bit float, the value itself"}
 
@@ -140,7 +149,8 @@ class ImageFolder:
 
         def put(path: Path, one: ExportImage) -> dict[str, Any]:
             codes, record = encode_png_codes(one)
-            path.write_bytes(png.encode(codes, quick=True))
+            text = format_provenance(self.appearance)
+            path.write_bytes(png.insert_text(png.encode(codes, quick=True), PROVENANCE_KEY, text))
             return record
 
         low, high = png_code_range(image)
@@ -157,10 +167,11 @@ class ImageFolder:
             for image in images:
                 self.write_exr(image, folder)
 
-    def document(self, file: str, appearance: SkinAppearance, content: Mapping[str, Any]) -> None:
+    def document(self, file: str, content: Mapping[str, Any]) -> None:
         """Write the document of an export: provenance and the record of each file."""
         files = dict(sorted(self.records.items()))
-        write_json(self.root / file, {**describe_provenance(appearance), **content, "files": files})
+        provenance = describe_provenance(self.appearance)
+        write_json(self.root / file, {**provenance, **content, "files": files})
 
     def _tiled(
         self,

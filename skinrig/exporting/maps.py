@@ -20,7 +20,7 @@ from skinrig.exporting.images import (
 from skinrig.exporting.materials import materialx, tangents
 from skinrig.exporting.materials.tangents import FramedMesh
 from skinrig.exporting.options import ExportError, ExportSettings
-from skinrig.exporting.sealing import IMAGE_ORIENTATION
+from skinrig.exporting.sealing import IMAGE_ORIENTATION, format_provenance
 from skinrig.rendering.geometry import MESH_FILES, GeometryError, read_own_mesh
 
 DOCUMENT_FILE: Final = "maps.json"
@@ -56,7 +56,7 @@ def write(
         If a selected map is missing, or the appearance has none.
     """
     names = choose_maps(appearance, delivery)
-    out = ImageFolder(folder, delivery)
+    out = ImageFolder(folder, delivery, appearance)
     on_mesh = any(name in appearance.files for name in MESH_FILES)
     shown: dict[str, tuple[str, str]] = {}  # file and type by name in the material file
     for name in names:
@@ -81,14 +81,15 @@ def write(
         normal, why = _tangent_normals(appearance, names, out)
         if why:
             out.record_omission("normal", why)
-    text = materialx.format_image_nodes(shown, delivery, tangent_normal=normal)
+    text = materialx.format_image_nodes(
+        shown, delivery, tangent_normal=normal, provenance=format_provenance(appearance)
+    )
     (folder / "maps.mtlx").write_text(text, encoding="utf-8")
     for name, data in sorted(appearance.files.items()):
         (folder / "files").mkdir(exist_ok=True)
         (folder / "files" / name).write_bytes(data)
     out.document(
         DOCUMENT_FILE,
-        appearance,
         {
             "schema": SCHEMA,
             "orientation": IMAGE_ORIENTATION,

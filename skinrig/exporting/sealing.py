@@ -74,6 +74,8 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
     path.write_text(text + "\n", encoding="utf-8")
 
 
+PROVENANCE_KEY: Final = "provenance"
+"""Name of the JSON text of `format_provenance` in the metadata of EXR, PNG, MaterialX and USD."""
 IMAGE_ORIENTATION: Final = (
     "row 0 of every image is its top; of a texture that is v = 1, with (0, 0) bottom left"
 )
@@ -106,3 +108,14 @@ def describe_provenance(appearance: SkinAppearance) -> dict[str, Any]:
         "assumed": list(dict.fromkeys(assumed)),
         "consent": consent.read_consent(appearance),
     }
+
+
+def format_provenance(appearance: SkinAppearance) -> str:
+    """Format the provenance of an appearance as one line of ASCII, JSON.
+
+    Examples
+    --------
+    >>> json.loads(format_provenance(SkinAppearance({}, "simulated", seed=7)))["seed"]
+    7
+    """
+    return json.dumps(describe_provenance(appearance), allow_nan=False, separators=(",", ":"))

@@ -113,12 +113,11 @@ def write(
     (folder / GLB_FILE).write_bytes(encode_glb(material, describe_provenance(appearance)))
     script = blender.Import.from_channels(GLB_FILE, material.median_radius_mm()).script()
     (folder / blender.SCRIPT_FILE).write_text(script, encoding="utf-8")
-    out = ImageFolder(folder, delivery)
+    out = ImageFolder(folder, delivery, appearance)
     out.errors(material.error_images())
     facts = material.facts(appearance)
     out.document(
         DOCUMENT_FILE,
-        appearance,
         {
             **facts,
             "schema": SCHEMA,

@@ -11,7 +11,7 @@ from skinrig.drawing import templates
 from skinrig.exporting.images import ExportImage, ImageFolder
 from skinrig.exporting.materials.material import MAP_NOTES, Material, list_expression_omissions
 from skinrig.exporting.options import FIRST_TILE, TILE_SEPARATORS, ExportSettings
-from skinrig.exporting.sealing import IMAGE_ORIENTATION
+from skinrig.exporting.sealing import IMAGE_ORIENTATION, format_provenance
 
 MATERIALX_FILE, DOCUMENT_FILE = "skin.mtlx", "material.json"
 SCHEMA: Final = "skinrig.export.material/1"
@@ -47,14 +47,12 @@ def write(
     material = Material.of(appearance, delivery.mesh)
     left_out = material.list_mesh_omissions(delivery)
     left_out += list_expression_omissions(appearance)
-    out = ImageFolder(folder, delivery, tiles=material.tiles)
+    out = ImageFolder(folder, delivery, appearance, tiles=material.tiles)
     scale = write_textures(material, out)
     (folder / "skin.obj").write_text(
         material.mesh.to_obj(delivery.units_per_mm, delivery.scene_unit), encoding="utf-8"
     )
-    out.document(
-        DOCUMENT_FILE, appearance, describe_material(material, appearance, delivery, SCHEMA, scale)
-    )
+    out.document(DOCUMENT_FILE, describe_material(material, appearance, delivery, SCHEMA, scale))
     return left_out
 
 
@@ -74,7 +72,7 @@ def write_textures(material: Material, out: ImageFolder) -> float:
         TEXTURE_FOLDER,
     )
     out.errors(material.error_images(), TEXTURE_FOLDER)
-    text = format_openpbr(material, scale, out.delivery)
+    text = format_openpbr(material, scale, out.delivery, format_provenance(out.appearance))
     (out.root / MATERIALX_FILE).write_text(text, encoding="utf-8")
     return scale
 
@@ -115,7 +113,9 @@ def describe_material(
     }
 
 
-def format_openpbr(material: Material, radius_mm: float, delivery: ExportSettings) -> str:
+def format_openpbr(
+    material: Material, radius_mm: float, delivery: ExportSettings, provenance: str
+) -> str:
     """Format a material whose textures are in `TEXTURE_FOLDER`.
 
     Parameters
@@ -126,6 +126,8 @@ def format_openpbr(material: Material, radius_mm: float, delivery: ExportSetting
         Subsurface radius; the texture of radius scales is relative to it.
     delivery
         Scene unit, names of tiles, green of the normal map.
+    provenance
+        JSON, see `skinrig.exporting.sealing.format_provenance`.
     """
     return templates.render(
         "exporting/templates/openpbr.mtlx",
@@ -133,12 +135,17 @@ def format_openpbr(material: Material, radius_mm: float, delivery: ExportSetting
         radius=f"{radius_mm * delivery.units_per_mm:.9g}",
         eta=f"{material.eta:.9g}",
         delivery=delivery,
+        provenance=provenance,
         folder=TEXTURE_FOLDER,
     )
 
 
 def format_image_nodes(
-    files: Mapping[str, tuple[str, str]], delivery: ExportSettings, *, tangent_normal: str | None
+    files: Mapping[str, tuple[str, str]],
+    delivery: ExportSettings,
+    *,
+    tangent_normal: str | None,
+    provenance: str,
 ) -> str:
     """Format a node graph with one image node per map, which records its color space.
 
@@ -150,11 +157,17 @@ def format_image_nodes(
         Names of tiles, green of the normal map.
     tangent_normal
         Name of a 16-bit normal map in tangent space; None: no such map.
+    provenance
+        JSON, see `skinrig.exporting.sealing.format_provenance`.
     """
     shown = {name: (_all_tiles(file, delivery), kind) for name, (file, kind) in files.items()}
     normal = None if tangent_normal is None else _all_tiles(tangent_normal, delivery)
     return templates.render(
-        "exporting/templates/maps.mtlx", files=shown, normal=normal, delivery=delivery
+        "exporting/templates/maps.mtlx",
+        files=shown,
+        normal=normal,
+        delivery=delivery,
+        provenance=provenance,
     )
 
 

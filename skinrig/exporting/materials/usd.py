@@ -22,6 +22,7 @@ from skinrig.exporting.images import ImageFolder
 from skinrig.exporting.materials import blender, materialx
 from skinrig.exporting.materials.material import Material, list_expression_omissions
 from skinrig.exporting.options import METERS_PER_UNIT, ExportSettings
+from skinrig.exporting.sealing import PROVENANCE_KEY, format_provenance
 
 USD_FILE, DOCUMENT_FILE = "skin.usdc", "usd.json"
 SCHEMA: Final = "skinrig.export.usd/1"
@@ -62,11 +63,14 @@ def write(
     material = Material.of(appearance, delivery.mesh)
     tiles = material.list_mesh_omissions(delivery)
     tiles += list_expression_omissions(appearance)
-    out = ImageFolder(folder, delivery, tiles=material.tiles)
+    out = ImageFolder(folder, delivery, appearance, tiles=material.tiles)
     scale = materialx.write_textures(material, out)
     out.write_png(material.image("specular_roughness", delivery), materialx.TEXTURE_FOLDER)
     names = {name: Tf.MakeValidIdentifier(name) for name in material.shapes}
-    _write_stage(folder / USD_FILE, material, names, scale * delivery.units_per_mm, delivery)
+    radius = scale * delivery.units_per_mm
+    _write_stage(
+        folder / USD_FILE, material, names, radius, delivery, format_provenance(appearance)
+    )
     textures = (
         ("Subsurface Radius", _place(delivery, "subsurface_radius_scale", "exr"), 1.0),
         # Blender's level of 0.5 is the reflection of a dielectric
@@ -75,7 +79,7 @@ def write(
     script = blender.Import(USD_FILE, scale, None, textures).script()
     (folder / blender.SCRIPT_FILE).write_text(script, encoding="utf-8")
     facts = materialx.describe_material(material, appearance, delivery, SCHEMA, scale)
-    out.document(DOCUMENT_FILE, appearance, {**facts, "blend_shapes": names})
+    out.document(DOCUMENT_FILE, {**facts, "blend_shapes": names})
     what = "subsurface scattering and specular weight of UsdPreviewSurface"
     in_blender = f"the mtlx network has both; {blender.SCRIPT_FILE} sets them"
     left_out = [*tiles, (what, f"not part of it: {in_blender}")]
@@ -90,6 +94,7 @@ def _write_stage(
     names: Mapping[str, str],
     radius: float,
     delivery: ExportSettings,
+    provenance: str,
 ) -> None:
     """Write the stage; blend shapes keep their names."""
     from pxr import Sdf, Vt
@@ -110,6 +115,7 @@ def _write_stage(
     )
     layer = Sdf.Layer.CreateAnonymous(".usda")
     layer.ImportFromString(text)
+    layer.customLayerData = {PROVENANCE_KEY: provenance}
     extent = np.stack([points.min(axis=0), points.max(axis=0)])
     corners = Vt.IntArray.FromNumpy(np.ascontiguousarray(mesh.faces.reshape(-1), np.int32))
     counts = Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32))

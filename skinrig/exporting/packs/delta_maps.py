@@ -77,7 +77,7 @@ def write(
             "facial_color, wrinkles or microstructure; run `skinrig fit facial-color`, `skinrig "
             "fit wrinkles` or `skinrig fit microstructure`"
         )
-    out = ImageFolder(folder, delivery)
+    out = ImageFolder(folder, delivery, appearance)
     document: dict[str, Any] = {}
     known: set[str] = set()
     if FACIAL_COLOR in parts:
@@ -100,7 +100,6 @@ def write(
         )
     out.document(
         DOCUMENT_FILE,
-        appearance,
         {
             "schema": SCHEMA,
             "orientation": IMAGE_ORIENTATION,

@@ -31,7 +31,13 @@ from skinrig.arrays import BoolArray, Float32Array, Float64Array
 from skinrig.errors import require_choice
 from skinrig.exporting.images import write_channels
 from skinrig.exporting.options import ExportError, ExportSettings
-from skinrig.exporting.sealing import IMAGE_ORIENTATION, describe_provenance, write_json
+from skinrig.exporting.sealing import (
+    IMAGE_ORIENTATION,
+    PROVENANCE_KEY,
+    describe_provenance,
+    format_provenance,
+    write_json,
+)
 from skinrig.exporting.sessions.copies import write_session_document
 
 REFLECTANCE_FILE, STOKES_FILE, SPECTRAL_DOCUMENT = "reflectance.exr", "stokes.exr", "spectral.json"
@@ -148,6 +154,7 @@ def _reflectance(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
         "are unknown"
     )
     header = {"spectralLayoutVersion": LAYOUT_VERSION, "comments": what}
+    header[PROVENANCE_KEY] = format_provenance(appearance)
     write_channels(folder / REFLECTANCE_FILE, channels, header)
     origin = {"what": what, "origin": "modelled", "unit": "1", "channels": list(channels)}
     return {**origin, "valid_share": float(valid.mean())}
@@ -175,7 +182,8 @@ def _stokes(appearance: SkinAppearance, folder: Path) -> dict[str, Any]:
         "measured. Bands of the camera at their mean wavelengths, not narrow lines; a white "
         "reference in the same position = 1"
     )
-    write_channels(folder / STOKES_FILE, channels, build_stokes_header(what))
+    header = build_stokes_header(what) | {PROVENANCE_KEY: format_provenance(appearance)}
+    write_channels(folder / STOKES_FILE, channels, header)
     return {
         "what": what,
         "origin": "measured",

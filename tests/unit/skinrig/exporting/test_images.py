@@ -7,6 +7,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from model.skin import SkinAppearance
 from skinrig.errors import UnusableError
 from skinrig.exporting.images import (
     CAMERA_SPACE,
@@ -17,6 +18,8 @@ from skinrig.exporting.images import (
 )
 from skinrig.exporting.options import ExportSettings
 
+SOURCE = SkinAppearance({}, "simulated")
+
 
 @pytest.fixture
 def ramp(rng):
@@ -26,7 +29,7 @@ def ramp(rng):
 
 
 def test_exr_stores_values_exactly_with_unit(tmp_path, ramp):
-    out = ImageFolder(tmp_path, ExportSettings(udim="dot"))
+    out = ImageFolder(tmp_path, ExportSettings(udim="dot"), SOURCE)
     name = out.write_exr(ExportImage(name="depth", values=ramp, unit="mm", what="of the patch"))
     assert name == "exr/depth.1001.exr"
     with OpenEXR.File(str(tmp_path / name)) as file:
@@ -42,7 +45,7 @@ def test_exr_stores_values_exactly_with_unit(tmp_path, ramp):
 
 
 def test_only_linear_srgb_claims_srgb_primaries(tmp_path, ramp):
-    out = ImageFolder(tmp_path, ExportSettings())
+    out = ImageFolder(tmp_path, ExportSettings(), SOURCE)
     claims = {}
     for space in (SRGB_SPACE, CAMERA_SPACE):
         name = out.write_exr(
@@ -54,7 +57,7 @@ def test_only_linear_srgb_claims_srgb_primaries(tmp_path, ramp):
 
 
 def test_16_bit_png_decodes_to_values_by_record(tmp_path, ramp):
-    out = ImageFolder(tmp_path, ExportSettings())
+    out = ImageFolder(tmp_path, ExportSettings(), SOURCE)
     name = out.write_png(ExportImage(name="depth", values=ramp, unit="mm", low=-0.5, high=3.5))
     told = out.records[name]
     codes = cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED)[..., ::-1]
@@ -67,7 +70,7 @@ def test_16_bit_png_decodes_to_values_by_record(tmp_path, ramp):
 
 
 def test_color_png_uses_srgb_curve_and_counts_clipping(tmp_path, ramp):
-    out = ImageFolder(tmp_path, ExportSettings())
+    out = ImageFolder(tmp_path, ExportSettings(), SOURCE)
     name = out.write_png(ExportImage(name="color", values=ramp, unit="1", space=SRGB_SPACE))
     codes = cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED)[..., ::-1] / 65535.0
     linear = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)

@@ -20,6 +20,7 @@ from skinrig.exporting.packs.detail_maps import (
 )
 
 SIDE = 48
+SOURCE = SkinAppearance({}, "simulated")
 
 
 def read(path):
@@ -64,7 +65,7 @@ def test_cavity_map_is_dark_only_in_wrinkle_creases(tmp_path):
     slopes[..., 0] = -np.gradient(depth)
     valid = np.ones((SIDE, SIDE), bool)
     valid[:4] = False
-    out = ImageFolder(tmp_path, ExportSettings())
+    out = ImageFolder(tmp_path, ExportSettings(), SOURCE)
     told = detail_maps.write_cavity(slopes, valid, 2 * SIDE, out)
     seen = read(tmp_path / "exr/cavity.exr")
     assert seen.shape == (2 * SIDE, 2 * SIDE)
@@ -80,7 +81,7 @@ def test_cavity_map_is_dark_only_in_wrinkle_creases(tmp_path):
 
 
 def test_cavity_without_valid_normals_is_not_made(tmp_path):
-    out = ImageFolder(tmp_path, ExportSettings())
+    out = ImageFolder(tmp_path, ExportSettings(), SOURCE)
     told = detail_maps.write_cavity(np.zeros((8, 8, 2)), np.zeros((8, 8), bool), 8, out)
     assert (told, out.left_out) == ({}, [("cavity", "wrinkle normals have no valid texel")])
     assert list(tmp_path.iterdir()) == []
@@ -179,7 +180,7 @@ def test_scatter_is_model_translucency_at_pack_size(patch, tmp_path, monkeypatch
     monkeypatch.setattr(detail_maps, "SCATTER_SIZE", patch.side)
     face = patch.face(parameters={"assumed": ["translucency is the population's", "other"]})
     onto = store.write(tmp_path / "model", face)
-    out = ImageFolder(tmp_path, ExportSettings(target_face=onto))
+    out = ImageFolder(tmp_path, ExportSettings(target_face=onto), SOURCE)
     told = detail_maps.write_scatter(out)
     shown, depth = read(tmp_path / "exr/scatter.exr"), face.maps["translucency"]
     np.testing.assert_allclose(shown[depth.valid], depth.values[depth.valid], rtol=1e-6)
@@ -187,7 +188,7 @@ def test_scatter_is_model_translucency_at_pack_size(patch, tmp_path, monkeypatch
     assert out.left_out == []
     without = {n: m for n, m in face.maps.items() if n != "translucency"}
     bare = store.write(tmp_path / "bare", dataclasses.replace(face, maps=without))
-    out = ImageFolder(tmp_path, ExportSettings(target_face=bare))
+    out = ImageFolder(tmp_path, ExportSettings(target_face=bare), SOURCE)
     assert detail_maps.write_scatter(out) == {}
     assert "skinrig fit reflectance" in out.left_out[0][1]
 
