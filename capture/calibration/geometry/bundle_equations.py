@@ -5,6 +5,7 @@ axes, a translation), each pose of the board six. The normal equations are summe
 by image, with analytic derivatives.
 """
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
@@ -19,6 +20,8 @@ from capture.calibration.geometry.board_pose import BoardPose, FlatTarget
 from capture.calibration.geometry.intrinsics import CameraPose, distort
 from capture.calibration.record import CalibrationError
 from capture.calibration.robust import HUBER_SIGMAS, huber_weights, mad_sigma
+
+_log = logging.getLogger(__name__)
 
 Gauge: TypeAlias = Literal["board", "cameras"]
 
@@ -36,6 +39,7 @@ MAX_BUNDLE_STEPS = 100
 
 
 COST_TOL = 1e-10  # relative decrease of the cost
+STALL_TOL = 1e-6  # largest predicted decrease, relative, at which rounding may end the steps
 
 
 MIN_SIGMA_PX = 1e-9
@@ -171,6 +175,14 @@ class BundleProblem:
                     break
                 damping *= 10.0
             if new > cost:
+                left = float(g @ cho_solve(cho_factor(H + 1e-6 * np.diag(np.diag(H))), g))
+                left /= max(cost, 1e-300)
+                if left > STALL_TOL:
+                    _log.warning(
+                        "bundle adjustment: no step lowers the misfit, although its derivatives "
+                        "predict %.2g of it; compare the errors with the residuals",
+                        left,
+                    )
                 break
             cameras, poses = trial
             damping = max(damping / 10.0, 1e-12)

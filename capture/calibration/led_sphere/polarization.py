@@ -27,14 +27,17 @@ LOG_LEAK_SCATTER = 1.5  # of its logarithm
 TYPICAL_AXIS_ERROR_RAD = np.radians(1.0)
 AXIS_ERROR_RANGE_RAD = (np.radians(0.02), np.radians(5.0))
 AXIS_T_DOF = 4.0  # degrees of freedom of Student's t for the lights' own axes: some may be far off
-MAX_POLARIZER_STEPS = 60
+MAX_POLARIZER_STEPS = 200
 POLARIZER_STEP_TOL = 1e-6
 POLARIZER_DERIVATIVE_STEP = 1e-5
+STEP_PARTS = (1.0, 0.5, 0.25, 0.1, 0.02, 0.0)  # of a light's step, tried
+MAX_TURN_STEP_RAD = 0.1
 # widths of the axes' scatter within which a light may have a second solution
 MODE_SCATTER_WIDTHS = 6.0
 MAX_MODE_AXIS_ERROR_RAD = np.radians(30.0)
 N_MODE_GRID = 41
 N_MODE_ITERATIONS = 5
+MAX_MODE_ROUNDS = 6
 MODE_TOL_RAD = np.radians(0.01)
 MIN_POLARIZED_LIGHTS = 6
 
@@ -244,9 +247,16 @@ class _PolarizerProblem:
         self.shared = np.array([zero, np.log(TYPICAL_LEAK), np.log(TYPICAL_LEAK)])
         self.scatter = float(TYPICAL_AXIS_ERROR_RAD)
         self.pull = np.ones(count)  # weight of each light's turn among all, from Student's t
-        u = self._transmitted(self.turn, self.shared)
-        power = np.sum(weight * u**2, axis=0)
-        self.strength = np.sum(weight * u * values, axis=0) / np.where(power > 0, power, 1.0)
+        self.strength, _ = self._fit_strength(self.turn, self.shared)
+
+    def _fit_strength(
+        self, turn: Float64Array, shared: Float64Array
+    ) -> tuple[Float64Array, Float64Array]:
+        """Return each light's best intensity and its weighted squared misfit."""
+        u = self._transmitted(turn, shared)
+        power = np.sum(self.weight * u**2, axis=0)
+        strength = np.sum(self.weight * u * self.values, axis=0) / np.where(power > 0, power, 1.0)
+        return strength, np.sum(self.weight * (self.values - strength * u) ** 2, axis=0)
 
     def _transmitted(self, turn: Float64Array, shared: Float64Array) -> Float64Array:
         zero, light, analyzer = shared
@@ -273,12 +283,13 @@ class _PolarizerProblem:
             (AXIS_T_DOF + 1) * tails.sum() + 2 * self.lit.sum() * np.log(self.scatter)
         )
 
-    def _normal(self) -> _ArrowSystem:
-        """Return blocks (L, 2, 2), borders (L, 2, 3), corner (3, 3), and both right sides."""
+    def _normal(self) -> tuple[_ArrowSystem, _ArrowSystem]:
+        """Return the equations of Gauss and Newton, and those with each light's curvature."""
         h = POLARIZER_DERIVATIVE_STEP
         u = self._transmitted(self.turn, self.shared)
-        by_turn = self._transmitted(self.turn + h, self.shared)
-        by_turn = (by_turn - self._transmitted(self.turn - h, self.shared)) / (2 * h)
+        above = self._transmitted(self.turn + h, self.shared)
+        below = self._transmitted(self.turn - h, self.shared)
+        by_turn = (above - below) / (2 * h)
         by_shared = [
             (
                 self._transmitted(self.turn, self.shared + e)
@@ -301,21 +312,26 @@ class _PolarizerProblem:
         block[~self.lit, 0, 0] = 1.0
         corner[1:, 1:] += np.eye(2) / LOG_LEAK_SCATTER**2
         other[1:] -= (self.shared[1:] - np.log(TYPICAL_LEAK)) / LOG_LEAK_SCATTER**2
-        return _ArrowSystem(block, border, corner, one, other)
+        # crossed light is quadratic in the turn: without its curvature, steps halve the distance
+        bend = (above - 2.0 * u + below) / h**2
+        curved = block.copy()
+        curved[:, 1, 1] -= np.sum(w * miss * self.strength * bend, axis=0)
+        curved[:, 0, 1] -= np.sum(w * miss * by_turn, axis=0)
+        curved[:, 1, 0] = curved[:, 0, 1]
+        bent = np.linalg.det(curved) <= 1e-3 * np.linalg.det(block)
+        curved[bent] = block[bent]
+        rest = border, corner, one, other
+        return _ArrowSystem(block, *rest), _ArrowSystem(curved, *rest)
 
     def solve(self) -> _PolarizerProblem:
         """Descend with Marquardt's damping; between steps fit the scatter of the axes."""
         damping = 1e-3
         now = self._objective(self.strength, self.turn, self.shared)
         for _ in range(MAX_POLARIZER_STEPS):
-            arrow = self._normal()
+            plain, curved = self._normal()
             while True:
-                local, shared = arrow.solve(damping)
-                trial = (
-                    self.strength + local[:, 0],
-                    self.turn + np.clip(local[:, 1], -0.1, 0.1),
-                    self.shared + np.clip(shared, -0.5, 0.5),
-                )
+                local, shared = curved.solve(damping)
+                trial = self._stepped(local, self.shared + np.clip(shared, -0.5, 0.5))
                 cost = self._objective(*trial)
                 if cost <= now or damping > 1e8:
                     break
@@ -324,7 +340,7 @@ class _PolarizerProblem:
             if gain >= 0:
                 self.strength, self.turn, self.shared = trial
             damping = max(damping / 10, 1e-9)
-            wider = self._scatter(arrow.covariance()[0][:, 1, 1])
+            wider = self._scatter(plain.covariance()[0][:, 1, 1])
             # Weight of a residual z under Student's t with nu degrees of freedom: (nu + 1) / (nu +
             # z^2), the expectation step of its scale mixture of normals.
             self.pull = np.where(
@@ -344,10 +360,25 @@ class _PolarizerProblem:
             )
         return self
 
+    def _stepped(
+        self, local: Float64Array, shared: Float64Array
+    ) -> tuple[Float64Array, Float64Array, Float64Array]:
+        """Return the parameters after a step that each light shortens until its own cost falls."""
+        best = np.full(len(self.turn), np.inf)
+        strength, turn = self.strength, self.turn
+        for part in STEP_PARTS:
+            trial = self.turn + part * np.clip(local[:, 1], -MAX_TURN_STEP_RAD, MAX_TURN_STEP_RAD)
+            level, cost = self._fit_strength(trial, shared)
+            cost += self.pull * trial**2 / self.scatter**2
+            lower = cost < best
+            best = np.where(lower, cost, best)
+            strength, turn = np.where(lower, level, strength), np.where(lower, trial, turn)
+        return strength, turn, shared
+
     def solve_all_modes(self) -> _PolarizerProblem:
         """Descend, then again from better solutions of single lights on the other side."""
         self.solve()
-        for _ in range(6):
+        for _ in range(MAX_MODE_ROUNDS):
             modes, cost = self._modes()
             better = self.lit & (cost[0] < self._light_cost(self.turn)[0] - 1e-2)
             if not better.any():
@@ -355,14 +386,13 @@ class _PolarizerProblem:
             self.turn = np.where(better, modes[0], self.turn)
             self.strength = np.where(better, self._light_cost(self.turn)[1], self.strength)
             self.solve()
+        else:
+            _log.warning("axes of polarizers: still change sides after %d rounds", MAX_MODE_ROUNDS)
         return self
 
     def _light_cost(self, turn: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Return each light's own part of the cost at its best intensity, and that intensity."""
-        u = self._transmitted(turn, self.shared)
-        power = np.sum(self.weight * u**2, axis=0)
-        strength = np.sum(self.weight * u * self.values, axis=0) / np.where(power > 0, power, 1.0)
-        miss = np.sum(self.weight * (self.values - strength * u) ** 2, axis=0)
+        strength, miss = self._fit_strength(turn, self.shared)
         tail = (AXIS_T_DOF + 1) * np.log1p(turn**2 / (AXIS_T_DOF * self.scatter**2))
         return miss + tail, strength
 
@@ -410,7 +440,7 @@ class _PolarizerProblem:
         spread = ((self.pull[self.lit] * z) ** 2).sum()
         known = np.clip(slope**2 / max(spread, 1e-9) / len(z), 0.2, 1.0)
         self.pull = np.full_like(self.pull, known)
-        local, both, shared = self._normal().covariance()
+        local, both, shared = self._normal()[0].covariance()
         u = self._transmitted(self.turn, self.shared)
         chi2 = float(np.sum(self.weight * (self.values - self.strength * u) ** 2))
         # information from the data, not from the prior of the axes: 1 - posterior / prior variance

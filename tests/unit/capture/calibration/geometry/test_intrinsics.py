@@ -209,6 +209,20 @@ def test_a_bundle_finds_cameras_within_their_errors(rng, gauge):
     assert chi2.ppf(1e-3, degrees) < squares < chi2.ppf(1 - 1e-3, degrees)
 
 
+@pytest.mark.parametrize("noise_px", [0.0, 0.1])
+def test_bundle_warns_only_where_steps_fail(rng, monkeypatch, caplog, noise_px):
+    nominal = geometry.nominal_cameras(DOME.subset(views=["C06", "C07"]))
+    true = {name: bent(camera, 0.3 * LENS) for name, camera in nominal.items()}
+    seen = sightings_of(true, boards_in_view(rng, 6), rng, noise_px)
+    bundle.adjust(seen, BOARD, nominal)
+    assert caplog.records == []
+    problem, cost = bundle_equations.BundleProblem, bundle_equations.BundleProblem._cost
+    tried = iter(range(1, 10_000))  # each trial costs more than the one before
+    monkeypatch.setattr(problem, "_cost", lambda self, *at: cost(self, *at) + next(tried))
+    bundle.adjust(seen, BOARD, nominal)
+    assert any("no step lowers the misfit" in r.getMessage() for r in caplog.records)
+
+
 def test_bundle_resists_five_percent_wrong_corners(rng):
     nominal = geometry.nominal_cameras(DOME.subset(views=["C06", "C07", "C08"]))
     places = boards_in_view(rng, 6)

@@ -55,6 +55,14 @@ def spots(
     return readings, counted / amount, variance / amount**2, good, truth
 
 
+@pytest.mark.parametrize("seed", [2, 3])
+def test_far_axes_converge_from_two_readings(seed, caplog):
+    """Gauss and Newton's steps alone halve the distance of a crossed light, and reach the limit."""
+    *data, _ = spots(np.random.default_rng(seed), zero_deg=0.6, turn_deg=1.0, series=TWO_STATES)
+    fit_polarizers(*data, GLASS)
+    assert caplog.records == []
+
+
 @pytest.mark.parametrize("zero_deg", [0.0, 0.6, -10.0])
 def test_analyzer_polarizers_and_axes_are_within_their_errors(rng, zero_deg):
     *data, truth = spots(rng, zero_deg=zero_deg, turn_deg=0.3)
