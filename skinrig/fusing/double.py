@@ -6,14 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
+from capture.rig import load_rig
 from model import store
 from model.skin import SkinAppearance
 from model.skin_reflectance import NORMAL_MAPS, TRANSLUCENCY_MAP
 from reconstruction.fusion.consistency import MIN_PROBABILITY, RigCheck, check_rigs, name_faulty_rig
 from reconstruction.fusion.patch_normals import PatchCheck
 from reconstruction.fusion.person import PersonSkin
-from reconstruction.fusion.signals import RigBands
+from reconstruction.fusion.signals import SIGMA_TR_DISTANCE_MM, RigBands
 from reconstruction.fusion.texels import OffsetModel
+from reconstruction.pipeline.probe.stages import PROFILE_FILE
 from skinrig.appearances import face_textures
 from skinrig.appearances.contents import (
     FUSION_KEY,
@@ -295,6 +299,7 @@ def measure(sources: Sources, given: FusionInputs) -> Measurements:
         left_out += [(f"probe: {site}", why) for site, why in placed.left_out]
         camera, illuminant, _ = probe.spectra()
         bands = RigBands("probe", camera, illuminant, "sigma_tr")
+        assumed += _assume_light_distance(probe)
     name = "r_d" if dome is not None else "diffuse"
     first = (sources.get("dome") or sources.by_rig["flash"]).appearance.maps[name]
     return Measurements(
@@ -308,6 +313,22 @@ def measure(sources: Sources, given: FusionInputs) -> Measurements:
         placement,
         COVARIANCE_NAME in given.without,
     )
+
+
+def _assume_light_distance(probe: Source) -> list[str]:
+    """Return what is assumed of a probe's light if its fibers are not the packaged probe's."""
+    document = probe.appearance.files.get(PROFILE_FILE)
+    packaged = load_rig("probe").probe
+    if document is None or packaged is None:
+        return []
+    radius_mm, usual_mm = json.loads(document)["radius_mm"], packaged.radius_mm
+    if len(radius_mm) == len(usual_mm) and np.allclose(radius_mm, usual_mm, atol=0.05):
+        return []
+    return [
+        f"probe: its light has sigma_tr at {SIGMA_TR_DISTANCE_MM:g} mm, set for fibers at "
+        f"{usual_mm[0]:g} to {usual_mm[-1]:g} mm; its fibers are at {min(radius_mm):g} to "
+        f"{max(radius_mm):g} mm"
+    ]
 
 
 def _place_flash(dome: Source, flash: Source, given: FusionInputs) -> TexelPlacement:

@@ -1,6 +1,7 @@
 """`skinrig fuse` on small drawn maps: each rig alone, both together, and refused inputs."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -8,17 +9,20 @@ import pytest
 from scipy import ndimage
 from typer.testing import CliRunner
 
+from capture.rig import load_rig
 from model import store
 from model.skin import SkinAppearance, SkinMap
+from reconstruction.pipeline.probe.stages import PROFILE_FILE
 from reconstruction.surface.errors import interior_error
 from skinrig.appearances import dynamic
 from skinrig.applying.expression import ExpressionRequest, apply_expression
 from skinrig.cli import app
 from skinrig.exporting.materials.material import list_expression_omissions
 from skinrig.fitting.wrinkles import fit_wrinkles
+from skinrig.fusing import double
 from skinrig.fusing.cost import compare_without
 from skinrig.fusing.double import FusionInputs, fuse
-from skinrig.fusing.sources import FusionInputError, read_sources
+from skinrig.fusing.sources import FusionInputError, Source, read_sources
 from skinrig.fusing.texel_colors import LOG_R_D_OVER_REFLECTANCE, DomeColors
 
 SIDE = 24
@@ -319,3 +323,14 @@ def test_fuse_patch_of_unknown_site_is_left_out(folders, tmp_path):
     found = fuse(FusionInputs(paths), out=tmp_path / "double")
     assert "elbow" in dict(found.left_out)["gradient: normals"]
     assert "patch_normals_elbow" not in found.appearance.maps
+
+
+@pytest.mark.parametrize(("scale", "stated"), [(1.0, 0), (0.5, 1)])
+def test_other_probe_states_its_light_distance(tmp_path, scale, stated):
+    """sigma_tr of the light is fitted to the packaged probe's distances of fibers."""
+    radius_mm = [scale * r for r in load_rig("probe").probe.radius_mm]
+    files = {PROFILE_FILE: json.dumps({"radius_mm": radius_mm}).encode()}
+    probe = Source("probe", tmp_path, SkinAppearance({}, "simulated", files=files))
+    texts = double._assume_light_distance(probe)
+    assert len(texts) == stated
+    assert all(f"its fibers are at {min(radius_mm):g} to" in text for text in texts)
