@@ -106,16 +106,19 @@ def draw_melanin_map(
 
 
 def _suntan(points: Float32Array, base: float, rng: np.random.Generator) -> FloatArray:
-    """Return the lack of suntan under a cap or behind glasses; the base is tanned skin."""
+    """Return the lack of suntan under a cap or behind glasses; the base is tanned skin.
+
+    Borders are about 15 mm wide: neither stays in one place for the days that a suntan takes.
+    """
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     gain = float(rng.uniform(0.25, 0.5)) * (0.4 + 0.6 * float(np.exp(-base / 0.1)))
     if rng.random() < 0.5:
         edge = float(rng.uniform(56.0, 70.0))  # lower edge of a cap
-        hidden = soft_step((y - edge - 0.0025 * x * x) / 1.5)
+        hidden = soft_step((y - edge - 0.0025 * x * x) / 7.0)
     else:
         half_width, half_height = rng.uniform(22.0, 25.0), rng.uniform(13.0, 17.0)
-        q = ((np.abs(x) - 34.0) / half_width) ** 4 + ((y - 21.0) / half_height) ** 4
-        hidden = soft_step((1.0 - q) * 4.0) * soft_step((z + 40.0) / 5.0)
+        q = ((np.abs(x) - 34.0) / half_width) ** 2 + ((y - 21.0) / half_height) ** 2
+        hidden = soft_step((1.0 - q) * 1.2) * soft_step((z + 40.0) / 8.0)
     return -gain * hidden
 
 
