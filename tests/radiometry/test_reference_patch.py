@@ -72,7 +72,7 @@ def test_relief_changes_light_by_few_percent():
             draw_patch(person, "forehead", relief=relief, **options),
             rig,
             width_px=4,
-            samples=1024,
+            samples=256,
             seed=2,
         ).rgb.mean(axis=(0, 1))
         for relief in (False, True)
