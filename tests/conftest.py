@@ -4,6 +4,7 @@ import csv
 import gc
 import ipaddress
 import os
+import signal
 import socket
 import sys
 from collections import Counter
@@ -99,6 +100,8 @@ class ExamplesAlone:
 
 def pytest_configure(config):
     config.pluginmanager.register(ExamplesAlone())
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a background job of a shell
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     if not hasattr(config, "workerinput"):  # before any process of several compiles
         remove_stale_kernels()
 

@@ -274,12 +274,8 @@ def _scan_coarse(real: InputPrecision) -> str:
     )
 
 
-def _scan_turned(real: InputPrecision) -> str:
-    return _wrap_scan(real, (2.0, 0.8, 1.0), rotation=QUARTER_TURN)
-
-
-def _scan_far(real: InputPrecision) -> str:
-    return _wrap_scan(real, (2.0, 0.8, 1.0), shift_mm=1e5)
+def _scan_far_turned(real: InputPrecision) -> str:
+    return _wrap_scan(real, (2.0, 0.8, 1.0), rotation=QUARTER_TURN, shift_mm=1e5)
 
 
 def _scan_ball(real: InputPrecision) -> str:

@@ -120,13 +120,13 @@ def test_a_hidden_none_would_be_found():
         assert none_defaults_without_none(ast.parse(code)) == ["f.a"]
 
 
-@pytest.mark.parametrize("package", ["capture", "reconstruction", "rigsim", "model"])
-def test_a_package_works_without_the_application(package):
+def test_packages_work_without_the_application():
     """No module of the four packages needs ``skinrig``: they are libraries of their own."""
     names = [
         ".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
-        for p in modules(package)
+        for p in modules("capture", "reconstruction", "rigsim", "model")
     ]
+    assert len(names) > 400
     code = (
         "import importlib, sys, warnings\n"
         "warnings.simplefilter('ignore')\n"

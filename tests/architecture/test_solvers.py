@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import cache
 
 import pytest
 from fixtures.product_code import PACKAGES, ROOT, modules, text_of
@@ -74,17 +75,19 @@ def describe_iterations(source):
     return found
 
 
+@cache
 def iterative_modules():
     """Return path, text and solvers of each module of the packages that iterates."""
-    for path in modules(*PACKAGES):
-        if {"benchmarks", "extremes"} & set(path.parts):
-            continue
-        if found := describe_iterations(text_of(path)):
-            yield path.relative_to(ROOT).as_posix(), text_of(path), found
+    return [
+        (path.relative_to(ROOT).as_posix(), text_of(path), found)
+        for path in modules(*PACKAGES)
+        if not {"benchmarks", "extremes"} & set(path.parts)
+        and (found := describe_iterations(text_of(path)))
+    ]
 
 
 def test_every_iterative_solver_reports_its_end():
-    found = list(iterative_modules())
+    found = iterative_modules()
     assert len(found) > 30
     silent = {path for path, text, _ in found if not REPORTS.search(text)}
     assert sorted(silent - set(NEED_NO_REPORT)) == []

@@ -8,6 +8,8 @@ import math
 import pytest
 
 from skinrig.benchmarks.document import SCHEMA
+from skinrig.benchmarks.dome.people import QUANTITY_NAMES, REGION_LANDMARKS, TOY_PEOPLE
+from skinrig.benchmarks.stage import BenchmarkStage
 from skinrig.benchmarks.stages import STAGES, BenchError, run_stages
 from skinrig.console import Console, to_json_value
 from skinrig.evaluating.skin_bands import MELANIN_BANDS
@@ -116,10 +118,39 @@ def problems(stage):
     return found
 
 
+def every_region_has_values(made):
+    assert len(made.points) == len(REGION_LANDMARKS) * len(QUANTITY_NAMES)
+    assert {point.extra_values["people"] for point in made.points} == {TOY_PEOPLE}
+    assert min(point.extra_values["mean"] for point in made.points) > 0.0
+    (pull,) = (limit for limit in made.limits if limit.name.startswith("largest mean error"))
+    assert pull.got < pull.bound
+
+
+def more_lobes_predict_held_out_lights_better(made):
+    lobes = [point for point in made.points if point.knobs["part"] == "lobes"]
+    error = {point.knobs["rank"]: point.error for point in lobes}
+    assert error[1] > 1.5 * error[4]
+    assert made.limits[0].passed
+    texture = [point.knobs for point in made.points if point.knobs["part"] == "texture"]
+    assert len({knobs["levels"] for knobs in texture}) > 1
+    assert len({knobs["iterations"] for knobs in texture}) > 1
+
+
+RESULTS = {
+    "brdf-people": every_region_has_values,
+    "reflectance": more_lobes_predict_held_out_lights_better,
+}
+"""Checks of results that hold at toy size, too; a run at toy size evaluates no limits."""
+
+
 @pytest.mark.parametrize(
     "stage", [pytest.param(s, marks=pytest.mark.long if s in HEAVY else ()) for s in STAGES]
 )
-def test_stage_result_satisfies_schema(stage, tmp_path, capsys):
+def test_stage_result_satisfies_schema(stage, tmp_path, capsys, monkeypatch):
+    made, to_benchmark = [], BenchmarkStage.to_benchmark
+    monkeypatch.setattr(
+        BenchmarkStage, "to_benchmark", lambda self: made.append(to_benchmark(self)) or made[-1]
+    )
     document = run_stages([stage], budget_s=60.0, toy=True, out=tmp_path, console=Console(True))
     written = json.loads((tmp_path / "bench.json").read_text())
     assert written == to_json_value(document)
@@ -127,6 +158,8 @@ def test_stage_result_satisfies_schema(stage, tmp_path, capsys):
     assert written["skin_bands"].keys() == MELANIN_BANDS.keys()
     assert list(written["stages"]) == [stage]
     assert problems(written["stages"][stage]) == []
+    if stage in RESULTS:
+        RESULTS[stage](made[-1])
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from collections import Counter
 from contextlib import ExitStack
 
 import pytest
-from fixtures.compiled.sides import choose_side, on_both_sides
+from fixtures.compiled.sides import choose_side, leave_real_lines_to_one_side, on_both_sides
 
 from capture.devices.flash import FlashBox
 from capture.devices.port import (
@@ -37,6 +37,10 @@ def pytest_generate_tests(metafunc):
         *("test_caliper_faults.py", "test_probe_faults.py"),
     )
     on_both_sides(metafunc, long=files)  # the compiled side is marked pytest.mark.long
+
+
+def pytest_collection_modifyitems(config, items):
+    leave_real_lines_to_one_side(config, items)
 
 
 @pytest.fixture(autouse=True)

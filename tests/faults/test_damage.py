@@ -65,7 +65,7 @@ def flip(file, byte, bit):
 
 @pytest.mark.parametrize("kind", ["closed", "interrupted"])
 @pytest.mark.parametrize(
-    "flips_per_file", [30, pytest.param(500, marks=pytest.mark.long, id="500")]
+    "flips_per_file", [30, pytest.param(200, marks=pytest.mark.long, id="200")]
 )
 def test_flipped_bit_in_any_file_is_reported(request, rng, kind, flips_per_file):
     path = request.getfixturevalue(kind)

@@ -1,6 +1,7 @@
 """Run the tests of hardware on a given port, or on the images that `make firmware` has built."""
 
 import contextlib
+from types import SimpleNamespace
 
 import pytest
 from fixtures.compiled.targets import TARGETS, start_target
@@ -12,7 +13,7 @@ __all__ = ["quick_close"]
 
 
 def pytest_generate_tests(metafunc):
-    if "device_port" not in metafunc.fixturenames:
+    if "target" not in metafunc.fixturenames:
         return
     url = metafunc.config.getoption("--device-port")
     only = getattr(metafunc.module, "BOX", None)
@@ -23,17 +24,22 @@ def pytest_generate_tests(metafunc):
         if only is None or pair[1] in only
     ]
     given = [url] if url else images
-    metafunc.parametrize("device_port", given, indirect=True, scope="module")
+    metafunc.parametrize("target", given, indirect=True, scope="module")
 
 
 @pytest.fixture(scope="module")
-def device_port(request):
-    """URL of the box: given on the command line, or of an image that runs meanwhile."""
+def target(request):
+    """The box with its URL: given on the command line, or an image that runs meanwhile."""
     if isinstance(request.param, str):
-        yield request.param
+        yield SimpleNamespace(url=request.param, board="")
         return
     with contextlib.closing(start_target(*request.param)) as target:
-        yield target.url
+        yield target
+
+
+@pytest.fixture(scope="module")
+def device_port(target):
+    return target.url
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import serial
-from fixtures.compiled.sides import choose_side, on_both_sides
+from fixtures.compiled.sides import choose_side, leave_real_lines_to_one_side, on_both_sides
 from fixtures.quick_close import quick_close
 from serial import rfc2217
 
@@ -57,6 +57,10 @@ def pytest_generate_tests(metafunc):
             *(f"test_{kind}_driver.py" for kind in BOXES),
         ),
     )
+
+
+def pytest_collection_modifyitems(config, items):
+    leave_real_lines_to_one_side(config, items)
 
 
 @pytest.fixture(autouse=True)

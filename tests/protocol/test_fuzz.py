@@ -148,8 +148,8 @@ def test_damage_to_frames_is_not_missed(rng):
 
 @pytest.mark.long
 @pytest.mark.timeout(300)
-def test_damage_in_million_frames_is_almost_always_detected(rng):
-    """At one in 65 536 fifteen would be missed; the syntax lets fewer than a third through."""
-    missed = undetected(rng, 1_000_000)
-    print(f"undetected corruptions per 1e6 damaged frames: {missed}")
-    assert missed <= 5
+def test_damage_to_many_frames_is_almost_always_detected(rng):
+    """At one in 65 536 five would be missed; the syntax lets fewer than a third through."""
+    missed = undetected(rng, 330_000)
+    print(f"undetected corruptions per 330,000 damaged frames: {missed}")
+    assert missed <= 1

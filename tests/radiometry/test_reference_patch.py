@@ -64,7 +64,10 @@ def test_noise_of_patch_falls_with_samples(renders):
 
 @pytest.mark.long
 def test_relief_changes_light_by_few_percent():
-    """Rationale: slopes of .15 rms and grooves of 15 um leave the light within 10 %."""
+    """Rationale: slopes of .15 rms and grooves of 15 um leave the light within 10 %.
+
+    Tolerance: the standard error of the ratio is 2 %, a fifth of the bound.
+    """
     rig, person = load_rig("flash"), PersonSkin.of_preset("II")
     options = {"field_mm": 2.0, "voxel_mm": 0.05, "alpha": 0.15}
     flat, uneven = (
@@ -72,7 +75,7 @@ def test_relief_changes_light_by_few_percent():
             draw_patch(person, "forehead", relief=relief, **options),
             rig,
             width_px=4,
-            samples=1024,
+            samples=256,
             seed=2,
         ).rgb.mean(axis=(0, 1))
         for relief in (False, True)

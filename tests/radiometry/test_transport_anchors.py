@@ -197,7 +197,7 @@ def test_half_spaces_match_adding_and_doubling(engine, eta, test_data):
     chosen = [(float(a), float(total)) for a, n, total, _ in table if float(n) == eta]
     assert len(chosen) == 10
     for albedo, total in chosen:
-        run = traced(half_space(albedo, eta), 200_000, engine)
+        run = traced(half_space(albedo, eta), 100_000, engine)
         assert agrees(run.specular + run.reflectance, run.reflectance_stderr, total), albedo
 
 

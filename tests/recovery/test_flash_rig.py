@@ -62,7 +62,7 @@ def narrow(tmp_path_factory):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("subject", "seed"), [("I", 300), ("III", 302), ("IV", 303), ("VI", 305)])
+@pytest.mark.parametrize(("subject", "seed"), [("I", 300), ("III", 302), ("VI", 305)])
 def test_chromophores_are_recovered_within_their_bounds(
     tmp_path, calibration, captured, subject, seed, rng
 ):

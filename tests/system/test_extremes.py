@@ -18,7 +18,7 @@ HEAVY = {
     *("layer 20 times stiffer than its tissue", "scan 14 mm away", "search of two steps"),
     *("points 100 000 px away", "collapsed image", "incompressible tissue"),
     *("mirror up to 80 degrees", "scan of a ball", "texture of 8192 texels"),
-    *("half of a face", "coarse scan", "scan turned by 90 degrees", "scan 100 m away"),
+    *("half of a face", "coarse scan", "scan turned and 100 m away"),
 }
 
 

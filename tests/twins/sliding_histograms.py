@@ -38,13 +38,7 @@ def match_sliding(
     return HistogramMatch(out, np.isfinite(out))
 
 
-@njit(
-    "void(float64[:, ::1], float64[:, ::1], boolean[:, ::1], boolean[:, ::1], int64[::1], "
-    "float64[:, ::1])",
-    cache=True,
-    parallel=True,
-    error_model="numpy",
-)
+@njit(cache=True, parallel=True, error_model="numpy")
 def _match_pixels(a: Any, b: Any, va: Any, vb: Any, half: Any, out: Any) -> None:
     """Write what each pixel's own window makes of it, NaN where it is not valid or empty.
 

@@ -38,7 +38,7 @@ ALL_RIGS: Final = "+".join(rig.rig for rig in RIGS)
 
 def measure_fusion(stage: BenchmarkStage) -> None:
     """Measure errors and coverage over rigs and iterations, and the trials of faulty rigs."""
-    count, texels = (2, 800) if stage.toy else (N_PEOPLE, 1600)
+    count, texels = (2, 400) if stage.toy else (N_PEOPLE, 1600)
     faces = [
         draw_face(SKIN_TYPES[k % len(SKIN_TYPES)], FIRST_SEED + k, texels=texels)
         for k in range(count)
@@ -59,7 +59,7 @@ def measure_fusion(stage: BenchmarkStage) -> None:
         held, half = fused[f"{name} coverage"], fused[f"{name} half"]
         stage.limits["least", name] = held + half
         stage.limits["most", name] = held - half
-    trials = 4 if stage.toy else N_TRIALS
+    trials = 2 if stage.toy else N_TRIALS
     named, alarms = _run_trials(trials, texels=400)
     stage.limits["named"] = 20.0 * named / trials
     stage.limits["alarms"] = 20.0 * alarms / trials

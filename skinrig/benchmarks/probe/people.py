@@ -24,20 +24,22 @@ from skinrig.simulating.simulation import simulate_session
 PROBED_SITES: Final = ("forehead", "cheek", "chin")
 """Sites of table 2; its neck is measured below the chin."""
 TOY_PEOPLE: Final = 2
+N_TOY_SITES: Final = 2
 
 
 def measure_people(stage: BenchmarkStage) -> None:
     """Measure mean and deviation of sigma_tr over members of the population."""
     members = choose_members(1)[: TOY_PEOPLE if stage.toy else None]
+    sites = PROBED_SITES[: N_TOY_SITES if stage.toy else None]
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as place:
-        people = probe_people(Path(place), members)
+        people = probe_people(Path(place), members, sites)
     timing = Timing.single((time.perf_counter() - began) / len(members))
     published = weyrich_2005()
     worst = 0.0
     for k in range(people.true.shape[1]):
         s, c = divmod(k, len(CHANNEL_NAMES))
-        site = SITE_OF_LABEL.get(PROBED_SITES[s], PROBED_SITES[s])
+        site = SITE_OF_LABEL.get(sites[s], sites[s])
         p = published.sites.index(site)
         extra = people.describe(k) | {
             "published mean": float(published.mean_per_mm[p, c]),
@@ -52,7 +54,9 @@ def measure_people(stage: BenchmarkStage) -> None:
     }
 
 
-def probe_people(folder: Path, members: Sequence[Member]) -> PeopleValues:
+def probe_people(
+    folder: Path, members: Sequence[Member], sites: Sequence[str] = PROBED_SITES
+) -> PeopleValues:
     """Simulate and fit probe sessions of people; return sigma_tr in 1/mm, site by site.
 
     Parameters
@@ -61,22 +65,24 @@ def probe_people(folder: Path, members: Sequence[Member]) -> PeopleValues:
         Empty folder of the sessions. One calibration serves all people.
     members
         Members of the population.
+    sites
+        Sites of table 2 that are probed.
     """
     phantom, paper = folder / "session-phantom", folder / "block.json"
     simulate_session("probe", phantom, target="phantom", seed=1)
     paper.write_text(json.dumps(dict(phantom_certificate())), encoding="utf-8")
     calibrate("fiber", [phantom], folder / "calibration", phantom=paper)
-    shape = (len(members), len(PROBED_SITES), len(CHANNEL_NAMES))
+    shape = (len(members), len(sites), len(CHANNEL_NAMES))
     estimated, stderr, true = np.full((3, *shape), np.nan)
     for row, member in enumerate(members):
-        done = resimulate("probe", folder, subject=member.name, seed=row, sites=PROBED_SITES)
+        done = resimulate("probe", folder, subject=member.name, seed=row, sites=tuple(sites))
         fits, known = reconstruct_maps(folder, done, ["subsurface"])
         document = evaluation.read_document(fits, SUBSURFACE_FILE)
         for one in [] if document is None else evaluation.site_measurements(member.name, document):
-            at = row, PROBED_SITES.index(one.site)
+            at = row, sites.index(one.site)
             estimated[at], stderr[at] = one.sigma_tr_per_mm, one.stderr_per_mm
         for entry in evaluation.true_profiles(known).values():
-            true[row, PROBED_SITES.index(str(entry["site"]))] = entry["sigma_tr_per_mm"]
+            true[row, sites.index(str(entry["site"]))] = entry["sigma_tr_per_mm"]
     return PeopleValues(
         tuple(members), *(v.reshape(len(members), -1) for v in (estimated, stderr, true))
     )

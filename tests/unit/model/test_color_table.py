@@ -21,11 +21,9 @@ def fractions(rng, count, lowest=0.0):
     return np.minimum(u**3, C_M_MAX), np.minimum(v**3, C_HD_MAX)
 
 
-@pytest.mark.parametrize("camera", spectra.camera_names())
 @pytest.mark.parametrize("anisotropy", color_table.STORED_ANISOTROPIES)
-def test_lookup_is_band_average_of_accurate_tier(camera, anisotropy, rng):
+def test_lookup_is_band_average_of_accurate_tier(anisotropy, rng):
     c_m, c_hd = fractions(rng, 60)
-    table = color_table.build(camera, "D65", anisotropy=anisotropy)
     reflectance = two_layer_reflectance(
         spectra.WAVELENGTH_NM,
         c_m,
@@ -34,8 +32,11 @@ def test_lookup_is_band_average_of_accurate_tier(camera, anisotropy, rng):
         anisotropy=anisotropy,
         directions=24,
     )
-    direct = spectra.band_average(reflectance, camera, "D65")
-    np.testing.assert_allclose(table.lookup(c_m, c_hd), direct, rtol=1e-4)
+    assert spectra.camera_names()
+    for camera in spectra.camera_names():
+        table = color_table.build(camera, "D65", anisotropy=anisotropy)
+        direct = spectra.band_average(reflectance, camera, "D65")
+        np.testing.assert_allclose(table.lookup(c_m, c_hd), direct, rtol=1e-4, err_msg=camera)
 
 
 def test_nodes_are_on_cube_root_axes(table):

@@ -72,7 +72,6 @@ def spotted(table, melanin, mole_melanin, rng):
     ("melanin", "mole_melanin", "explained_away"),
     [
         (0.05, 0.1, True),
-        (0.05, 0.12, True),
         (0.05, 0.2, True),
         (0.09, 0.15, True),
         (0.09, 0.22, False),

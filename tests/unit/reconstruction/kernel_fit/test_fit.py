@@ -119,14 +119,14 @@ def test_hierarchical_search_matches_exhaustive_search(rng):
 
 @pytest.mark.long
 @pytest.mark.timeout(600)
-def test_ten_random_cases_agree_with_the_exhaustive_search():
+def test_five_random_cases_agree_with_the_exhaustive_search():
     """Each on every fourth alpha and sigma of the full grid, from a random first one.
 
-    The bounds do not see the grid's spacing but its size, and 10 searches may miss with a chance of
-    1e-5 in all; the full grid itself is searched once.
+    The bounds do not see the grid's spacing but its size, and five searches may miss with a
+    chance of 5e-6 in all; the full grid itself is searched once.
     """
     rng = np.random.default_rng(7)
-    for case in range(11):
+    for case in range(6):
         i, j, step = (*rng.integers(4, size=2), 4) if case else (0, 0, 1)
         grid = ALPHA_GRID[i::step], SIGMAS_UM[j::step]
         full, part = compared(rng, 200, 4096, grid)

@@ -66,7 +66,7 @@ person = make_subject("III", size=128)
 small = load_rig("dome").resized(96).subset(views=["C02"])
 layers = LayerStack((Layer(0.1, 1.0, 9.0, 0.8, 1.4),))
 patch = make_micro_skin("cheek", seed=3, size_mm=1.2)
-def render_all(seed=0):
+def render_all():
     sessions = []
     for renderer in ("mitsuba", "fast"):
         choice = choose_renderer(renderer)
@@ -82,21 +82,19 @@ def render_all(seed=0):
     probe = load_rig("probe")
     render_fiber_images.cache_clear()
     sessions.append(render_fiber_images(build_probe(probe, seed=0), probe.views[0]))
-    return [
-        *sessions,
-        *render(seed),
-        render_voxels(describe_flat_layers(layers), samples=16, seed=seed),
-    ]
+    return [*sessions, *render_seeded()]
+def render_seeded(seed=0):
+    return [*render(seed), render_voxels(describe_flat_layers(layers), samples=16, seed=seed)]
 def digest(images):
     assert all(np.max(image) > 0.0 for image in images)
     return [hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest() for image in images]
 found = []
-for count in (1, 2, 4):
+for count in (1, 3):
     dr.set_thread_count(count)
     assert dr.thread_count() == count
     numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
     found.append(digest(render_all()))
-print(json.dumps([found, digest(render_all(seed=1))]))
+print(json.dumps([found, digest(render_seeded(seed=1))]))
 """
 )
 
@@ -143,10 +141,12 @@ def test_second_process_compiles_nothing(tmp_path):
 @pytest.mark.long
 def test_images_do_not_depend_on_threads():
     """Images of sessions of all rigs by both renderers, `olat`, `path` and `tissue`."""
-    found, other_seed = run(THREADED, NUMBA_NUM_THREADS="4")
-    assert found[1:] == found[:1] * 2
-    unchanged = [a == b for a, b in zip(found[0], other_seed, strict=True)]
-    assert unchanged == [True] * 10 + [False] * 4
+    found, other_seed = run(THREADED, NUMBA_NUM_THREADS="3")
+    one, three = found
+    assert len(one) == 14
+    assert three == one
+    unchanged = [a == b for a, b in zip(one[-5:], other_seed, strict=True)]
+    assert unchanged == [True] + [False] * 4
 
 
 @pytest.mark.render

@@ -110,7 +110,7 @@ def test_table_agrees_with_many_photons_traced_now(tissue):
     table = SkinTable.load(tissue)
     rng = np.random.default_rng(2)
     drawn = [
-        (float(rng.choice(table.wavelength_nm)), 0.5 * u**3, 0.32 * v**3, 300_000)
+        (float(rng.choice(table.wavelength_nm)), 0.5 * u**3, 0.32 * v**3, 150_000)
         for u, v in rng.random((12, 2))
     ]
     entries = (*ENTRIES[4:], *drawn)

@@ -5,7 +5,6 @@ import pytest
 
 from rigsim.light import surface_brdf
 from skinrig.benchmarks.dome import people
-from skinrig.benchmarks.stage import BenchmarkStage
 
 
 def skin(*, roughness, oil=0.0):
@@ -49,15 +48,3 @@ def test_specular_reflectance_equals_monte_carlo_integral(rng):
 
 def test_dark_surface_has_no_roughness():
     assert np.isnan(people.facet_roughness(lambda light, view: np.zeros(len(light))))
-
-
-@pytest.mark.long
-def test_toy_people_have_values_in_every_region():
-    stage = BenchmarkStage("brdf-people", toy=True)
-    people.measure_people(stage)
-    assert len(stage.points) == len(people.REGION_LANDMARKS) * len(people.QUANTITY_NAMES)
-    for point in stage.points:
-        assert point.extra_values["people"] == people.TOY_PEOPLE
-        assert point.extra_values["mean"] > 0.0
-    got, bound = stage.limits["pull"]
-    assert got < bound
