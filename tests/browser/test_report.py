@@ -152,8 +152,26 @@ def test_enlarged_image_reads_values_of_map(browser, pages):
         found.append(float(re.search(r"ground truth: ≈ ([0-9.]+)", text)[1]))
     np.testing.assert_allclose(found, expected, atol=0.1 / 64)
     before = dialog.locator(".stage").screenshot()
-    dialog.get_by_role("slider").fill("100")
+    dialog.get_by_role("slider", name="divider").fill("100")
     assert dialog.locator(".stage").screenshot() != before
+    # the difference of two images around gray, and of an image with itself
+    difference = dialog.locator("canvas.difference")
+    spread = """c => Math.max(...c.getContext("2d").getImageData(0, 0, c.width, c.height)
+      .data.map((code, i) => i % 4 < 3 ? Math.abs(code - 128) : 0))"""
+    dialog.get_by_role("slider", name="gain").fill("8")
+    assert difference.evaluate(spread) > 20
+    chosen = dialog.get_by_role("combobox")
+    chosen.nth(1).select_option(chosen.nth(0).input_value())
+    assert difference.evaluate(spread) == 0
+    chosen.nth(1).select_option(str(1 - int(chosen.nth(0).input_value())))
+    dialog.get_by_role("button", name="Flip").click()
+    assert difference.count() == 0
+    side = "() => document.querySelector('.stage').style.getPropertyValue('--divider')"
+    shown = set()
+    for _ in range(6):  # three seconds, 0.5 s each side
+        shown.add(page.evaluate(side))
+        page.wait_for_timeout(500)
+    assert shown == {"0%", "100%"}
     page.keyboard.press("Escape")
     page.locator("dialog").wait_for(state="detached")
     assert problems == []
