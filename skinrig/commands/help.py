@@ -28,7 +28,7 @@ HELP_SECTIONS: Final[tuple[tuple[str, tuple[str, ...]], ...]] = (
         ),
     ),
     ("Reconstruct and model", ("reconstruct", "fuse", "fit", "apply", "edit", "analyse")),
-    ("Report, render and export", ("report", "view", "render", "export")),
+    ("Report, render and export", ("report", "status", "view", "render", "export")),
     ("Measure errors and run times", ("bench", "soak")),
 )
 OTHER_SECTION: Final = "More"

@@ -144,6 +144,7 @@ def build_scene(
     preset: str = DEFAULT_PRESET,
     seed: int = 0,
     size: int = 2048,
+    people: Sequence[str] = (),
 ) -> ViewerScene:
     """Build the scene of fitted folders, or of a simulated person without any.
 
@@ -165,12 +166,15 @@ def build_scene(
         own seed.
     size
         Side of the large textures, 64 to 4096 texels.
+    people
+        Skin types of several simulated people in place of ``preset``, on the same head.
 
     Raises
     ------
     SceneError
-        If the size is out of range, a folder cannot be displayed, two are of one kind, landmarks
-        are missing, or landmarks or a calibration are not applicable.
+        If the size is out of range, people are given with folders, a folder cannot be displayed,
+        two are of one kind, landmarks are missing, or landmarks or a calibration are not
+        applicable.
     model.store.StoreError
         If a folder is not readable.
     rigsim.subject.SubjectError, rigsim.geometry.mesh.MeshError,
@@ -189,6 +193,11 @@ def build_scene(
         raise SceneError(
             "--calibration: got a folder without a dome's appearance; give the appearance, too"
         )
+    if people and paths:
+        raise SceneError(
+            "--people: got simulated people and an appearance; show one of both, or a page each"
+        )
+    preset = people[0] if people else preset
     folders, appearances = _read(paths)
     whole, mesh_origin = _mesh(appearances, mesh)
     kind: Kind = "procedural" if mesh is None else "mesh"
@@ -203,7 +212,11 @@ def build_scene(
     source = SceneSource(kind, *of, landmarks, calibration)
     if not paths:
         provenance = {"source": "simulated", "kind": kind, "preset": preset, "seed": seed}
-        return assemble_scene(source, provenance | ({} if mesh is None else {"mesh": mesh.name}))
+        provenance |= {} if mesh is None else {"mesh": mesh.name}
+        if len(people) < 2:
+            return assemble_scene(source, provenance)
+        scene = assemble_scene(source, provenance | {"preset": ", ".join(people)})
+        return scene.with_assets(_build_people(people, seed, size, surface))
     found = assemble_scene(source, _provenance(source, paths, whole, mesh_origin))
     movement = "movement was not captured; blend shapes are from the file or simulated"
     holes = () if whole is None else whole.summary()
@@ -214,6 +227,17 @@ def build_scene(
         )
     found = found.with_assets({"left_out": tuple(left_out)})
     return found if whole is None else _paint_patches(found, whole)
+
+
+def _build_people(people: Sequence[str], seed: int, size: int, surface: Mesh | None) -> Assets:
+    """Build the chromophores of all people but the first, as textures of their own."""
+    textures = {}
+    for number, preset in enumerate(people[1:], start=1):
+        subject = make_subject(preset, seed=seed, size=min(size, PERSON_PX), mesh=surface)
+        found = facial_color_assets.simulate_chromophores(subject, FineSkin(subject, size))
+        for name, texture in facial_color_assets.build_textures(found).items():
+            textures[f"{name}_person_{number}"] = texture
+    return {"textures": textures, "facts": {"people": list(people)}}
 
 
 def _read(paths: Sequence[Path]) -> tuple[dict[str, Path], dict[str, SkinAppearance]]:

@@ -8,14 +8,31 @@
 // omitting them, in radiance where 1 is a white surface. V.detail.state has this error; if it is below
 // the tolerance, they are omitted.
 Object.assign(V.defaults, {detail: 1, detail_tolerance: 2 / 255});
-V.detail = {ALBEDO: 0.8, NORMALS: 400, state: {}};
+V.detail = {ALBEDO: 0.8, NORMALS: 400, state: {}, found: new Map()};
 V.statistics.detail = V.detail.state;
 
-// Maximum derivative of diffuse and specular radiance by a slope, over normals and directions.
+// The same for all lights: sums over the directional lights, and the environment's diffuse part.
 V.detail.sensitivity = p => {
+  const key = V.detail.sensitivityOf(p);
+  const sum = {...key};
+  for (const {to: [x, y, z], intensity} of V.furtherLights(p)) {
+    if (!(intensity > 0)) continue;
+    const one = V.detail.sensitivityOf({...p, light_intensity: intensity,
+      light_azimuth_deg: Math.atan2(x, z) / V.RAD, light_elevation_deg: Math.asin(y) / V.RAD});
+    sum.diffuse += one.diffuse;
+    sum.specular += one.specular;
+  }
+  // irradiance over pi is at most the intensity, and falls off no faster than a cosine
+  if (p.environment !== "none") sum.diffuse += p.environment_intensity * V.detail.ALBEDO;
+  return sum;
+};
+
+// Maximum derivative of diffuse and specular radiance by a slope, over normals and directions, for one light.
+V.detail.sensitivityOf = p => {
   const key = [p.light_azimuth_deg, p.light_elevation_deg, p.light_intensity, p.roughness,
     p.specular_intensity, p.f0, p.camera_yaw_deg, p.camera_pitch_deg].join();
-  if (V.detail.found?.key === key) return V.detail.found;
+  const known = V.detail.found.get(key);
+  if (known) return known;
   const l = V.direction(p.light_azimuth_deg, p.light_elevation_deg);
   const v = V.direction(p.camera_yaw_deg, p.camera_pitch_deg);
   const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -46,8 +63,10 @@ V.detail.sensitivity = p => {
     largest = Math.max(largest, Math.hypot(change(t), change(b)));
   }
   // the derivative of a cosine is at most 1
-  V.detail.found = {key, diffuse: p.light_intensity * V.detail.ALBEDO, specular: largest};
-  return V.detail.found;
+  if (V.detail.found.size > 8) V.detail.found.clear();
+  const found = {diffuse: p.light_intensity * V.detail.ALBEDO, specular: largest};
+  V.detail.found.set(key, found);
+  return found;
 };
 
 // Interpolate a list by level, linearly in the logarithm, as its entries decrease geometrically.
