@@ -223,7 +223,8 @@ def view(
     side = head.size_px or (PEOPLE_PX if people else FACE_PX)
     given |= select_attributes(head, "preset", "seed") | {"size": side, "people": people}
     console.progress("making textures and tables")
-    scene = faces.build_scene(appearance or [], **given)
+    scene = faces.build_scene(appearance or [], **given, progress=console.progress)
+    console.progress("packing")
     document: dict[str, Any]
     if port is None:
         document = page.write(scene, out)

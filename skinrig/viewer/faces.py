@@ -53,6 +53,10 @@ ACTION_UNITS: Final[Mapping[str, Mapping[str, float]]] = tomllib.loads(
 """Weights of ARKit shapes, without side, by expression."""
 
 
+def _ignore(_content: str) -> None:
+    """Report no progress."""
+
+
 def build_presets(names: Iterable[str]) -> dict[str, dict[str, float]]:
     """Build blend-shape weights by preset, in display order.
 
@@ -102,21 +106,26 @@ def _add_weights(parts: Iterable[Mapping[str, float]]) -> dict[str, float]:
     return total
 
 
-ASSET_BUILDERS: Final[tuple[Callable[[SceneSource], Assets], ...]] = (
-    facial_color_assets.build_assets,
-    reflectance_assets.build_default_scattering,
-    wrinkle_assets.build_surface_assets,
-    fitted_assets.build_assets,
-    wrinkle_assets.build_assets,
-    microstructure_assets.build_assets,
+ASSET_BUILDERS: Final[Mapping[str, Callable[[SceneSource], Assets]]] = MappingProxyType(
+    {
+        "blood, melanin and their colors": facial_color_assets.build_assets,
+        "scattering": reflectance_assets.build_default_scattering,
+        "surface topography": wrinkle_assets.build_surface_assets,
+        "basis BRDFs and traits": fitted_assets.build_assets,
+        "wrinkles": wrinkle_assets.build_assets,
+        "microstructure": microstructure_assets.build_assets,
+    }
 )
-"""Builders of the page's assets, in the order of its parts; they are independent."""
+"""Builders of the page's assets by content, in the order of its parts; they are independent."""
 
 
-def assemble_scene(source: SceneSource, provenance: Mapping[str, Any]) -> ViewerScene:
-    """Assemble the scene of a source from all asset builders."""
+def assemble_scene(
+    source: SceneSource, provenance: Mapping[str, Any], progress: Callable[[str], None] = _ignore
+) -> ViewerScene:
+    """Assemble the scene of a source from all asset builders; ``progress`` gets each content."""
     scene = ViewerScene(mesh=source.mesh, provenance=provenance)
-    for build in ASSET_BUILDERS:
+    for content, build in ASSET_BUILDERS.items():
+        progress(content)
         scene = scene.with_assets(build(source))
     names = (*scene.mesh.shapes, *scene.params.get("weights", {}))
     return scene.with_assets(
@@ -145,6 +154,7 @@ def build_scene(
     seed: int = 0,
     size: int = 2048,
     people: Sequence[str] = (),
+    progress: Callable[[str], None] = _ignore,
 ) -> ViewerScene:
     """Build the scene of fitted folders, or of a simulated person without any.
 
@@ -168,6 +178,8 @@ def build_scene(
         Side of the large textures, 64 to 4096 texels.
     people
         Skin types of several simulated people in place of ``preset``, on the same head.
+    progress
+        Called with each content before it is made.
 
     Raises
     ------
@@ -207,6 +219,7 @@ def build_scene(
         kind = next(name for name in CAPTURED_KINDS if name in appearances)
     surface = None if whole is None else whole.mesh
     subject = make_subject(preset, seed=seed, size=min(size, PERSON_PX), mesh=surface)
+    progress("fine skin")
     skin = FineSkin(subject, size)
     of = build_viewer_mesh(subject), size, seed, subject, skin, appearances, folders
     source = SceneSource(kind, *of, landmarks, calibration)
@@ -214,10 +227,11 @@ def build_scene(
         provenance = {"source": "simulated", "kind": kind, "preset": preset, "seed": seed}
         provenance |= {} if mesh is None else {"mesh": mesh.name}
         if len(people) < 2:
-            return assemble_scene(source, provenance)
-        scene = assemble_scene(source, provenance | {"preset": ", ".join(people)})
+            return assemble_scene(source, provenance, progress)
+        scene = assemble_scene(source, provenance | {"preset": ", ".join(people)}, progress)
+        progress(f"people {', '.join(people[1:])}")
         return scene.with_assets(_build_people(people, seed, size, surface))
-    found = assemble_scene(source, _provenance(source, paths, whole, mesh_origin))
+    found = assemble_scene(source, _provenance(source, paths, whole, mesh_origin), progress)
     movement = "movement was not captured; blend shapes are from the file or simulated"
     holes = () if whole is None else whole.summary()
     left_out = [*holes, ("expressions of this face", movement)]
