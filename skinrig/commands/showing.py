@@ -90,7 +90,7 @@ def report(
 
 @command
 def status(
-    folder: Path = Path(),
+    folder: Path,
     /,
     out: Annotated[Path | None, typer.Option("-o", "--out", callback=check_output_page)] = None,
     json: Json = False,
@@ -106,7 +106,7 @@ def status(
     Parameters
     ----------
     folder
-        Folder of results; default: the current one.
+        Folder of results, such as that of a demo.
     out
         HTML page to write; default: none.
     """

@@ -5,6 +5,7 @@ import io
 import os
 import re
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from model import store
 from model.skin import MAP_UNITS, SkinAppearance, SkinMap
 from skinrig.reporting import report
 from skinrig.reporting.page import Image, Images, render_page
+from skinrig.reporting.status import build_status_page, read_status
 
 WIDTHS = (1250, 400)
 
@@ -220,6 +222,30 @@ def test_axe_finds_nothing_serious(browser, pages, axe, scheme, width):
         assert findings == []
         assert passes > 10
         context.close()
+
+
+@pytest.mark.parametrize(("scheme", "width"), [("light", 390), ("dark", 1250)])
+def test_axe_accepts_enlarged_image_and_status(browser, pages, axe, tmp_path, scheme, width):
+    context, page, _ = opened(browser, pages[0], scheme=scheme, width=width, bypass_csp=True)
+    page.locator(".maps .enlarge").first.press("Enter")
+    dialog = page.locator("dialog[open]")
+    dialog.get_by_role("slider", name="gain").fill("8")
+    dialog.get_by_role("button", name="Flip").press("Enter")
+    findings, _ = serious(page, axe)
+    assert findings == []
+    box = dialog.bounding_box()
+    assert box["x"] >= 0
+    assert box["x"] + box["width"] <= width
+    context.close()
+    path = tmp_path / "status.html"
+    path.write_text(build_status_page(read_status(pages[0].parent / "one", today=date(2026, 1, 1))))
+    context, page, problems = opened(browser, path, scheme=scheme, width=width, bypass_csp=True)
+    findings, passes = serious(page, axe)
+    assert findings == []
+    assert passes > 10
+    assert problems == []
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    context.close()
 
 
 def test_axe_finds_image_without_text_and_low_contrast(browser, pages, axe, tmp_path):
