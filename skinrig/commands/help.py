@@ -177,7 +177,7 @@ class RigCommand(Command):
         if not further:
             super().format_options(ctx, formatter)
             return
-        hidden = [one for one in self.params if set(further) & set(one.opts)]
+        hidden = [cast(Any, one) for one in self.params if set(further) & set(one.opts)]
         for one in hidden:
             one.hidden = True
         try:

@@ -17,7 +17,7 @@ FLAT = {"relief": 0, "wrinkles": 0, "microstructure": 0, "hybrid_normals": 0, "d
 NO_ENVIRONMENT = {"environment": "none", "environment_intensity": 1.0, "environment_azimuth_deg": 0}
 NO_LIGHT = {"light_intensity": 0, "ambient": 0, "fill": 0, "rim": 0, "shadows": 0}
 DARK = FLAT | NO_LIGHT | NO_ENVIRONMENT
-BAND_ERROR = 0.03
+BAND_ERROR = 0.02
 """Error of irradiance without bands above 2, fraction of its largest value."""
 
 

