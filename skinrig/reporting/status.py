@@ -113,7 +113,7 @@ def read_status(folder: Path, *, today: date) -> FolderStatus:
         replace(one, command=_run_inside(one.command, folder))
         for one in suggest(scan(folder), folder)
     ]
-    return FolderStatus(folder.absolute().name, tuple(results), tuple(checks), steps)
+    return FolderStatus(folder.absolute().name, tuple(results), tuple(checks), tuple(steps))
 
 
 def _run_inside(command: str, folder: Path) -> str:
