@@ -47,7 +47,7 @@ def test_uniform_environment_gives_irradiance_of_its_radiance(viewer):
     half, less, _ = shown(viewer, environment="uniform", environment_intensity=0.5)
     np.testing.assert_allclose(half, 0.5, atol=1e-3)
     np.testing.assert_allclose(less, 0.5 * specular, rtol=2e-3, atol=1e-4)
-    none, dark, _ = shown(viewer)
+    none, dark, _ = shown(viewer, environment="constructor")  # from a damaged link
     assert not none.any()
     assert not dark.any()
 
@@ -128,6 +128,7 @@ def test_timeline_plays_blood_and_wrinkles_until_paused(viewer):
             break
     assert viewer.page.evaluate(time) != 3.6
     group.get_by_role("button", name="Pause").press("Enter")
+    assert group.get_by_role("button", name="Play").get_attribute("aria-pressed") == "false"
     paused = viewer.page.evaluate(time)
     viewer.page.wait_for_timeout(400)
     assert viewer.page.evaluate(time) == paused

@@ -155,6 +155,7 @@ V.faceOf = p => JSON.parse(JSON.stringify(Object.fromEntries(
 
 // Reset to the initial parameters; weights and traits added later are set to 0.
 V.reset = () => {
+  V.playing = false;
   const back = JSON.parse(JSON.stringify(V.initial));
   for (const name of ["weights", "traits"]) {
     for (const key of Object.keys(V.params[name])) back[name][key] ??= 0;

@@ -23,7 +23,7 @@ V.detail.sensitivity = p => {
     sum.specular += one.specular;
   }
   // irradiance over pi is at most the intensity, and falls off no faster than a cosine
-  if (p.environment !== "none") sum.diffuse += p.environment_intensity * V.detail.ALBEDO;
+  if (V.surrounded(p)) sum.diffuse += p.environment_intensity * V.detail.ALBEDO;
   return sum;
 };
 

@@ -30,6 +30,7 @@ V.ENVIRONMENTS = {
     return [0.12 + 2.1 * toward, 0.11 + 2.2 * toward, 0.1 + 2.4 * toward];
   },
 };
+V.surrounded = p => Object.hasOwn(V.ENVIRONMENTS, p.environment) && p.environment !== "none";
 V.harmonics = ([x, y, z]) => [
   0.2820948, 0.4886025 * y, 0.4886025 * z, 0.4886025 * x, 1.0925484 * x * y, 1.0925484 * y * z,
   0.3153916 * (3 * z * z - 1), 1.0925484 * x * z, 0.5462742 * (x * x - y * y),
@@ -48,6 +49,7 @@ V.environmentHarmonics = p => {
   const key = [p.environment, p.environment_azimuth_deg, p.environment_intensity].join();
   if (V.environmentCache.has(key)) return V.environmentCache.get(key);
   const out = new Array(27).fill(0);
+  if (!V.surrounded(p)) return out;
   const turn = p.environment_azimuth_deg * V.RAD;
   const [cos, sin] = [Math.cos(turn), Math.sin(turn)];
   const places = V.lattice(4000);
@@ -72,7 +74,7 @@ V.lightUniforms = p => {
     u_further_to: further.flatMap(one => one.to),
     u_further_intensity: further.map(one => one.intensity),
     u_environment: V.environmentHarmonics(p),
-    u_surrounded: Number(p.environment !== "none"),
+    u_surrounded: Number(V.surrounded(p)),
   };
 };
 

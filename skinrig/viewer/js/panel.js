@@ -232,6 +232,7 @@ V.buildPresets = box => {
     const button = V.element("button", {type: "button", "aria-pressed": "false"}, V.capital(name));
     button.onclick = () => {
       const weights = Object.fromEntries(V.weightNames().map(one => [one, preset.weights?.[one] ?? 0]));
+      V.playing = false;
       V.set({...preset, weights});
       V.announce(`Expression: ${name}`);
     };

@@ -49,9 +49,11 @@ V.buildTimeline = box => {
     show();
     V.announce(V.playing ? "Timeline plays" : "Timeline paused");
   };
-  slider.input.addEventListener("pointerdown", () => { V.playing = false; show(); });
   box.append(V.element("div", {className: "buttons"}, button), slider.box);
-  return slider.update;
+  return p => {
+    slider.update(p);
+    show();
+  };
 };
 V.timelineChange = time => {
   V.playing = false;
