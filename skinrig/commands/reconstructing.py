@@ -13,7 +13,8 @@ from skinrig.commands.options import Json, MeshFile, NewMaps, OptionalOut, Out, 
 from skinrig.commands.renamed_options import replace_former_values
 from skinrig.console import Console, format_count, select_attributes
 from skinrig.errors import UnusableError, UsageError
-from skinrig.next_steps import shell_quote
+from skinrig.next_steps import shell_quote, suggest
+from skinrig.workspace import scan
 
 
 @command
@@ -55,10 +56,19 @@ def calibrate(
     rows = [(name.replace("_", " "), value) for name, value in done.summary]
     console.print_table(("quantity", "value"), rows)
     console.print_each("found", done.findings)
-    for change in done.drift:
-        if change.change and (change.sigmas is None or abs(change.sigmas) > 2):
-            console.print_line(f"drift: {change}")
-    console.print_line(f"{done.path}: valid until {done.calibration.valid_until}")
+    drift = [
+        one for one in done.drift if one.change and (one.sigmas is None or abs(one.sigmas) > 2)
+    ]
+    console.print_each("drift", drift)
+    remarks = [
+        *([format_count(len(done.findings), "finding")] if done.findings else []),
+        *([f"drift of {format_count(len(drift), 'value')}"] if drift else []),
+    ]
+    verdict = f"check {' and '.join(remarks)} before use" if remarks else "usable, no finding"
+    console.print_line(f"{done.path}: {verdict}; valid until {done.calibration.valid_until}")
+    for step in suggest(scan(out.parent), out.parent):
+        if step.command.startswith("skinrig reconstruct"):
+            console.print_line(f"next: {step.command}")
     values = {"path": done.path, "values": dict(done.summary), "findings": done.findings}
     console.print_document("skinrig.calibrate/1", values | {"drift": [str(d) for d in done.drift]})
 
