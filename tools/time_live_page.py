@@ -64,7 +64,7 @@ def compare_detail(page: Any, distance_mm: float, asked: Any) -> tuple[float, ..
 
 LIGHTINGS = {
     "key light": {"fill": 0, "rim": 0, "environment": "none"},
-    "three-point": {"fill": 0.3, "rim": 0.35, "environment": "none"},
+    "three-point": {"light_intensity": 2.2, "fill": 0.3, "rim": 0.3, "environment": "none"},
     "overcast sky": {"fill": 0, "rim": 0, "light_intensity": 0, "environment": "overcast"},
 }
 MOVED = {

@@ -11,7 +11,8 @@ Object.assign(V.defaults, {detail: 1, detail_tolerance: 2 / 255});
 V.detail = {ALBEDO: 0.8, NORMALS: 400, state: {}, found: new Map()};
 V.statistics.detail = V.detail.state;
 
-// The same for all lights: sums over the directional lights, and the environment's diffuse part.
+// The same for all lights. Fill and rim light reach part of the face: their derivatives are RMS over the
+// visible normals of a ball, by projected area, in place of the maximum. The environment adds its diffuse part.
 V.detail.sensitivity = p => {
   const key = V.detail.sensitivityOf(p);
   const sum = {...key};
@@ -19,8 +20,8 @@ V.detail.sensitivity = p => {
     if (!(intensity > 0)) continue;
     const one = V.detail.sensitivityOf({...p, light_intensity: intensity,
       light_azimuth_deg: Math.atan2(x, z) / V.RAD, light_elevation_deg: Math.asin(y) / V.RAD});
-    sum.diffuse += one.diffuse;
-    sum.specular += one.specular;
+    sum.diffuse += one.diffuseRms;
+    sum.specular += one.specularRms;
   }
   // irradiance over pi is at most the intensity, and falls off no faster than a cosine
   if (V.surrounded(p)) sum.diffuse += p.environment_intensity * V.detail.ALBEDO;
@@ -49,7 +50,7 @@ V.detail.sensitivityOf = p => {
     return strength * Math.max(dot(n, l), 0) * Math.exp((c2 - 1) / (c2 * m2))
       / (Math.PI * m2 * c2 * c2);
   };
-  let largest = 0;
+  let [largest, squares, lit, seen] = [0, 0, 0, 0];
   for (let i = 0; i < V.detail.NORMALS; i++) {
     const y = 1 - (2 * i + 1) / V.detail.NORMALS;
     const turn = i * Math.PI * (3 - Math.sqrt(5));
@@ -60,11 +61,17 @@ V.detail.sensitivityOf = p => {
     const step = 1e-3;
     const change = axis => (specular(unit(n.map((c, j) => c + step * axis[j])))
       - specular(unit(n.map((c, j) => c - step * axis[j])))) / (2 * step);
-    largest = Math.max(largest, Math.hypot(change(t), change(b)));
+    const found = Math.hypot(change(t), change(b));
+    largest = Math.max(largest, found);
+    squares += dot(n, v) * found ** 2;
+    lit += dot(n, v) * (dot(n, l) > 0);
+    seen += dot(n, v);
   }
   // the derivative of a cosine is at most 1
   if (V.detail.found.size > 8) V.detail.found.clear();
-  const found = {diffuse: p.light_intensity * V.detail.ALBEDO, specular: largest};
+  const diffuse = p.light_intensity * V.detail.ALBEDO;
+  const found = {diffuse, specular: largest, diffuseRms: diffuse * Math.sqrt(lit / seen),
+    specularRms: Math.sqrt(squares / seen)};
   V.detail.found.set(key, found);
   return found;
 };

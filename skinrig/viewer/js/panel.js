@@ -245,7 +245,7 @@ V.buildPresets = box => {
 // Lights of the whole scene, one button each.
 V.LIGHTINGS = {
   "Key light": {light_intensity: 3.2, ambient: 0.12, fill: 0, rim: 0, environment: "none"},
-  "Three-point": {light_intensity: 2.6, ambient: 0.05, fill: 0.3, rim: 0.35, environment: "none"},
+  "Three-point": {light_intensity: 2.2, ambient: 0.12, fill: 0.3, rim: 0.3, environment: "none"},
   "Overcast sky": {light_intensity: 0, ambient: 0, fill: 0, rim: 0, environment: "overcast", environment_intensity: 2.4},
   "Room with a window": {light_intensity: 0, ambient: 0, fill: 0, rim: 0, environment: "window", environment_intensity: 2.4},
 };
